@@ -1,0 +1,141 @@
+"""L-BFGS with a strong Wolfe line search (Nocedal & Wright, Numerical Optimization, algorithms 7.4, 3.5, 3.6).
+
+Written for resuming: everything the next iteration needs is in `state()`, and evaluations are the expensive part, so
+none is repeated.  A step whose value is not finite is treated as far too long.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+#: f may stay this much above Armijo's line: the sufficient decrease constant c1, and the curvature constant c2.
+ARMIJO, CURVATURE = 1e-4, 0.9
+MAX_EVALUATIONS = 12  # a line search
+FIRST_STEP = 0.1  # of the first direction, in units of f / |g|^2
+
+
+class LBFGS:
+    """Minimises f: R^n -> R.
+
+    Args:
+        evaluate: x (n,) float64 -> (f, gradient (n,)).
+        x: where to start.
+        memory: pairs kept.
+    """
+
+    def __init__(self, evaluate: Callable[[Tensor], tuple[float, Tensor]], x: Tensor, memory: int = 20):
+        self.evaluate, self.memory, self.x = evaluate, memory, x
+        self.f: float | None = None
+        self.g: Tensor = torch.zeros_like(x)
+        self.pairs: list[tuple[Tensor, Tensor]] = []
+        self.evaluations = 0
+
+    def step(self) -> bool:
+        """One iteration.  False: no lower point was found along the search direction nor along the gradient."""
+        if self.f is None:
+            self.f, self.g = self._evaluate(self.x)
+        if not float(self.g.abs().max()) > 0:
+            return False
+        for attempt in range(2):
+            direction = self._direction()
+            slope = float(direction @ self.g)
+            if not self.pairs:
+                length = FIRST_STEP * 2.0 * abs(self.f) / max(-slope, 1e-300)
+            else:
+                length = 1.0
+            if slope < 0 and self._search(direction, slope, length):
+                return True
+            if not self.pairs:
+                return False
+            self.pairs = []  # the curvature learnt misleads: forget it and go down the gradient
+        return False
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything needed to go on: tensors only."""
+        out = {"x": self.x, "g": self.g, "f": torch.tensor([] if self.f is None else [self.f], dtype=torch.float64)}
+        if self.pairs:
+            out["s"], out["y"] = (torch.stack([p[k] for p in self.pairs]) for k in (0, 1))
+        return out
+
+    def load(self, state: dict[str, Tensor]) -> None:
+        """Go on from `state()`."""
+        self.x, self.g = state["x"], state["g"]
+        self.f = float(state["f"][0]) if len(state["f"]) else None
+        self.pairs = list(zip(state["s"], state["y"], strict=True)) if "s" in state else []
+
+    def _evaluate(self, x: Tensor) -> tuple[float, Tensor]:
+        self.evaluations += 1
+        return self.evaluate(x)
+
+    def _direction(self) -> Tensor:
+        """-H g by the two-loop recursion."""
+        q, saved = -self.g, []
+        for s, y in reversed(self.pairs):
+            a = (s @ q) / (s @ y)
+            saved.append(a)
+            q = q - a * y
+        if self.pairs:
+            s, y = self.pairs[-1]
+            q = q * ((s @ y) / (y @ y))
+        for (s, y), a in zip(self.pairs, reversed(saved), strict=True):
+            q = q + s * (a - (y @ q) / (s @ y))
+        return q
+
+    def _accept(self, x: Tensor, f: float, g: Tensor) -> bool:
+        s, y = x - self.x, g - self.g
+        if float(s @ y) > 1e-14 * float(s.norm() * y.norm()):  # keep the estimate positive definite
+            self.pairs = [*self.pairs[-self.memory + 1 :], (s, y)]
+        self.x, self.f, self.g = x, f, g
+        return True
+
+    def _search(self, d: Tensor, slope0: float, t: float) -> bool:
+        """Move to a point along d that meets the strong Wolfe conditions, or the best lower one found."""
+        f0 = self.f
+        low = (0.0, f0, slope0)  # step, value, slope at the best point that satisfies Armijo
+        high = None
+        best = None
+        for _ in range(MAX_EVALUATIONS):
+            x = self.x + t * d
+            f, g = self._evaluate(x)
+            if not math.isfinite(f) or not bool(torch.isfinite(g).all()):
+                high = (t, math.inf, math.inf)
+                t = low[0] + 0.1 * (t - low[0])
+                continue
+            slope = float(g @ d)
+            if f < f0 and (best is None or f < best[1]):
+                best = (x, f, g)
+            if f > f0 + ARMIJO * t * slope0 or (low[0] > 0 and f >= low[1]):
+                high = (t, f, slope)
+            elif abs(slope) <= -CURVATURE * slope0:
+                return self._accept(x, f, g)
+            elif slope * ((high[0] if high else math.inf) - low[0]) >= 0:
+                high, low = low, (t, f, slope)
+            else:
+                low = (t, f, slope)
+            t = _interpolate(low, high) if high else 4.0 * t
+            if high and abs(high[0] - low[0]) < 1e-10 * max(high[0], low[0]):
+                break
+        return self._accept(*best) if best else False
+
+
+def _interpolate(a: tuple, b: tuple) -> float:
+    """Minimum of the cubic through two points (step, value, slope), kept in the inner 80 % between them."""
+    (ta, fa, ga), (tb, fb, gb) = a, b
+    span = tb - ta
+    t = ta + 0.5 * span
+    if math.isfinite(fb):
+        d1 = ga + gb - 3.0 * (fb - fa) / span
+        square = d1 * d1 - ga * gb
+        if square >= 0:
+            d2 = math.copysign(math.sqrt(square), span)
+            denominator = gb - ga + 2.0 * d2
+            if denominator != 0:
+                t = tb - span * (gb + d2 - d1) / denominator
+    else:
+        t = ta + 0.1 * span
+    low, high = sorted((ta + 0.1 * span, ta + 0.9 * span))
+    return min(max(t, low), high)

@@ -1,0 +1,257 @@
+"""B-spline spaces and surfaces (thesis 2.4 and appendix A; Piegl & Tiller, The NURBS Book, 1997).
+
+Notation
+    p, q    degrees along u and v
+    t       knot vector, open: the end knots have multiplicity p + 1; domain [t_p, t_n] (here [0, 1])
+    n       number of control points along one axis, len(t) = n + p + 1
+    s       knot span: t_s <= x < t_{s+1}; the last span is closed, so x = 1 belongs to it
+    N       basis values, (..., p + 1): N_{s-p..s, p}(x), the only ones that do not vanish
+
+Values come from the triangular left/right scheme on a non-empty span: it never divides by zero, however
+often knots repeat.  A derivative is a difference of the basis of lower degree (eq. 2.4.9).  Positions are
+float64; callers round the finished basis values to float32 if they want to, which keeps the cancellation
+in x - t_i out of single precision.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from math import comb
+
+import torch
+from torch import Tensor
+
+from caustic_cli.errors import InputError
+
+MAX_DEGREE = 15
+#: Two knots closer than this (relative to the domain's length 1) cannot be told apart by float64 basis values.
+KNOT_RESOLUTION = 1e-12
+
+
+def open_knots(n: int, degree: int) -> Tensor:
+    """Open, equispaced knot vector on [0, 1] for `n` control points of `degree`: (n + degree + 1,), float64."""
+    if n < degree + 1:
+        raise InputError(f"a spline of degree {degree} needs at least {degree + 1} control points, got {n}")
+    inner = torch.linspace(0.0, 1.0, n - degree + 1, dtype=torch.float64)
+    return torch.cat([inner.new_zeros(degree), inner, inner.new_ones(degree)])
+
+
+@dataclass(frozen=True, eq=False)
+class SplineSpace:
+    """The B-splines of one degree over one open knot vector on [0, 1].
+
+    Args:
+        degree: polynomial degree p, 1 to 15.
+        knots: (n + p + 1,) non-decreasing; end knots 0 and 1 with multiplicity p + 1, inner ones at most p
+            (a knot of multiplicity p + 1 tears the surface, so it is refused).
+
+    Raises:
+        InputError: the degree or the knot vector is not of that form.
+    """
+
+    degree: int
+    knots: Tensor
+
+    def __post_init__(self):
+        p, t = self.degree, torch.as_tensor(self.knots, dtype=torch.float64).detach().cpu()
+        object.__setattr__(self, "knots", t)
+        if not 1 <= p <= MAX_DEGREE:
+            raise InputError(f"spline degree must be 1 to {MAX_DEGREE}, got {p}")
+        if t.ndim != 1 or len(t) < 2 * (p + 1):
+            raise InputError(f"a knot vector of degree {p} needs at least {2 * (p + 1)} knots, got {tuple(t.shape)}")
+        if not bool(torch.isfinite(t).all()) or bool((t.diff() < 0).any()):
+            raise InputError("a knot vector must be finite and non-decreasing")
+        if bool((t[: p + 1] != 0).any()) or bool((t[-p - 1 :] != 1).any()):
+            raise InputError(f"a knot vector of degree {p} must begin with {p + 1} zeros and end with {p + 1} ones")
+        inner = t[p + 1 : -p - 1]
+        if len(inner):
+            values, counts = torch.unique(inner, return_counts=True)
+            if bool((values <= 0).any()) or bool((values >= 1).any()):
+                raise InputError(f"inner knots must lie strictly between 0 and 1 for degree {p}")
+            if bool((counts > p).any()):
+                raise InputError(f"an inner knot may be repeated at most {p} times for degree {p}: more tears the surface")
+            gaps = torch.cat([values.new_zeros(1), values, values.new_ones(1)]).diff()
+            if bool((gaps < KNOT_RESOLUTION).any()):
+                raise InputError(f"distinct knots must be at least {KNOT_RESOLUTION:g} apart")
+
+    @classmethod
+    def uniform(cls, n: int, degree: int) -> SplineSpace:
+        """Open and equispaced knots for `n` control points (the thesis' lenses)."""
+        if not 1 <= degree <= MAX_DEGREE:
+            raise InputError(f"spline degree must be 1 to {MAX_DEGREE}, got {degree}")
+        return cls(degree, open_knots(n, degree))
+
+    @property
+    def n(self) -> int:
+        """Number of control points."""
+        return len(self.knots) - self.degree - 1
+
+    @cached_property
+    def breaks(self) -> Tensor:
+        """The distinct knots, ascending: the borders of the polynomial pieces."""
+        return torch.unique(self.knots)
+
+    @cached_property
+    def greville(self) -> Tensor:
+        """Greville abscissae u*_i = (t_{i+1} + ... + t_{i+p}) / p, eq. 4.1.1: (n,)."""
+        return self.knots[1:-1].unfold(0, self.degree, 1).mean(-1)
+
+    def span(self, x: Tensor) -> Tensor:
+        """Index s of the knot span of every x: (...) int64, t_s <= x < t_{s+1}; x outside [0, 1] takes the end span."""
+        inside = torch.searchsorted(self.knots.to(x.device), x.detach().double().contiguous(), right=True) - 1
+        return inside.clamp(self.degree, self.n - 1)
+
+    def basis(self, x: Tensor, derivative: int = 0) -> tuple[Tensor, Tensor]:
+        """Index of the first non-vanishing basis function and the p + 1 values there.
+
+        Args:
+            x: (...) positions in [0, 1]; differentiable (a NURBS or an intersection may move along the surface).
+            derivative: order of the derivative, 0 or more.
+
+        Returns:
+            first (...) int64, values (..., p + 1) float64.
+        """
+        x = x.double()
+        s = self.span(x)
+        p, t = self.degree, self.knots.to(x.device)
+        if derivative > p:
+            return s - p, torch.zeros(*x.shape, p + 1, dtype=torch.float64, device=x.device)
+        low = p - derivative
+        values = [torch.ones_like(x)]  # degree 0 on the span
+        for k in range(1, low + 1):  # raise the degree one at a time
+            nxt, saved = [], torch.zeros_like(x)
+            for r in range(k):
+                right, left = t[s + r + 1], t[s + r + 1 - k]
+                term = values[r] / (right - left)  # t_{s+1} > t_s lies inside: never 0
+                nxt.append(saved + (right - x) * term)
+                saved = (x - left) * term
+            values = nxt + [saved]
+        for k in range(low + 1, p + 1):  # eq. 2.4.9: N'_{i,k} = k N_{i,k-1} / (t_{i+k} - t_i) - k N_{i+1,k-1} / (...)
+            nxt, saved = [], torch.zeros_like(x)
+            for r in range(k):
+                term = k * values[r] / (t[s + r + 1] - t[s + r + 1 - k])
+                nxt.append(saved - term)
+                saved = term
+            values = nxt + [saved]
+        return s - p, torch.stack(values, -1)
+
+    def matrix(self, x: Tensor, derivative: int = 0) -> Tensor:
+        """Collocation matrix of all n basis functions at the points x (m,): (m, n) float64, dense."""
+        first, values = self.basis(x, derivative)
+        columns = first[:, None] + torch.arange(self.degree + 1, device=x.device)
+        return values.new_zeros(len(x), self.n).scatter(1, columns, values)
+
+    def derivative_matrix(self) -> Tensor:
+        """Differences D with D @ P the control points of the derivative, a spline of degree p - 1: (n - 1, n)."""
+        p, t, n = self.degree, self.knots, self.n
+        step = t[p + 1 : p + n] - t[1:n]
+        scale = torch.where(step > 0, p / step.clamp_min(KNOT_RESOLUTION), 0.0)
+        rows = torch.arange(n - 1)
+        out = torch.zeros(n - 1, n, dtype=torch.float64)
+        out[rows, rows], out[rows, rows + 1] = -scale, scale
+        return out
+
+    def insert(self, new_knots) -> tuple[SplineSpace, Tensor]:
+        """Boehm's knot insertion: the finer space and the matrix T (n', n) with T @ P the same spline in it."""
+        p = self.degree
+        matrix = torch.eye(self.n, dtype=torch.float64)
+        t = self.knots
+        for x in torch.as_tensor(new_knots, dtype=torch.float64).reshape(-1).sort().values:
+            if not 0 < float(x) < 1:
+                raise InputError(f"a knot to insert must lie strictly between 0 and 1, got {float(x):g}")
+            s = int(torch.searchsorted(t, x, right=True)) - 1
+            n = len(t) - p - 1
+            left = torch.arange(s - p + 1, s + 1)
+            ratio = (x - t[left]) / (t[left + p] - t[left])
+            step = torch.zeros(n + 1, n, dtype=torch.float64)
+            keep = torch.arange(0, s - p + 1)
+            step[keep, keep] = 1.0
+            step[left, left], step[left, left - 1] = ratio, 1.0 - ratio
+            tail = torch.arange(s + 1, n + 1)
+            step[tail, tail - 1] = 1.0
+            matrix, t = step @ matrix, torch.cat([t[: s + 1], x[None], t[s + 1 :]])
+        return SplineSpace(p, t), matrix
+
+    def change_of_basis(self, finer: SplineSpace) -> Tensor:
+        """Matrix T (n', n) that carries control points into another space of splines.
+
+        Exact (knot insertion) where `finer` has the same degree and all these knots; otherwise the interpolant at the
+        new Greville abscissae.
+        """
+        if finer.degree == self.degree:
+            missing, it = [], 0
+            for x in finer.knots.tolist():
+                if it < len(self.knots) and abs(x - float(self.knots[it])) < KNOT_RESOLUTION:
+                    it += 1
+                else:
+                    missing.append(x)
+            if it == len(self.knots):
+                return self.insert(missing)[1]
+        return torch.linalg.solve(finer.matrix(finer.greville), self.matrix(finer.greville))
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A B-spline surface, or a NURBS surface when it has weights (eqs. 2.4.7, 2.4.8).
+
+    Args:
+        spaces: the spline spaces along u and v.
+        points: (n, m, d) control points.
+        weights: (n, m) positive NURBS weights, or None for a plain B-spline.
+    """
+
+    spaces: tuple[SplineSpace, SplineSpace]
+    points: Tensor
+    weights: Tensor | None = None
+
+    def __post_init__(self):
+        expected = (self.spaces[0].n, self.spaces[1].n)
+        if self.points.ndim != 3 or tuple(self.points.shape[:2]) != expected:
+            raise InputError(f"control points must have shape {expected} x d, got {tuple(self.points.shape)}")
+        if self.weights is not None:
+            if tuple(self.weights.shape) != expected:
+                raise InputError(f"NURBS weights must have shape {expected}, got {tuple(self.weights.shape)}")
+            if not bool((self.weights > 0).all()):
+                raise InputError("NURBS weights must all be positive")
+
+    def _polynomial(self, net: Tensor, u: Tensor, v: Tensor, du: int, dv: int) -> Tensor:
+        """Sum of N_i^(du)(u) N_j^(dv)(v) net_ij: (..., d)."""
+        (i, bu), (j, bv) = self.spaces[0].basis(u, du), self.spaces[1].basis(v, dv)
+        rows = i[..., None] + torch.arange(bu.shape[-1], device=i.device)
+        cols = j[..., None] + torch.arange(bv.shape[-1], device=j.device)
+        local = net[rows[..., :, None], cols[..., None, :]]  # (..., p + 1, q + 1, d)
+        return torch.einsum("...a,...b,...abd->...d", bu.to(net.dtype), bv.to(net.dtype), local)
+
+    def evaluate(self, u: Tensor, v: Tensor, du: int = 0, dv: int = 0) -> Tensor:
+        """The point, or the mixed partial derivative d^(du+dv) S / du^du dv^dv, at u, v (...): (..., d).
+
+        Any order for a B-spline; for a NURBS by the quotient rule (Piegl & Tiller, eq. 4.20), also any order.
+        """
+        if self.weights is None:
+            return self._polynomial(self.points, u, v, du, dv)
+        w = self.weights[..., None]
+        homogeneous = torch.cat([self.points * w, w], -1)
+        known: dict[tuple[int, int], Tensor] = {}
+        table = {(a, b): self._polynomial(homogeneous, u, v, a, b) for a in range(du + 1) for b in range(dv + 1)}
+        for a in range(du + 1):
+            for b in range(dv + 1):
+                value = table[a, b][..., :-1]
+                for k in range(a + 1):
+                    for m in range(b + 1):
+                        if k or m:
+                            value = value - comb(a, k) * comb(b, m) * table[k, m][..., -1:] * known[a - k, b - m]
+                known[a, b] = value / table[0, 0][..., -1:]
+        return known[du, dv]
+
+    def insert(self, new_u=(), new_v=()) -> Surface:
+        """The same surface over finer knot vectors."""
+        (su, tu), (sv, tv) = self.spaces[0].insert(new_u), self.spaces[1].insert(new_v)
+
+        def carry(net: Tensor) -> Tensor:
+            return torch.einsum("ai,bj,ijd->abd", tu.to(net), tv.to(net), net)
+
+        if self.weights is None:
+            return Surface((su, sv), carry(self.points))
+        w = carry(self.weights[..., None])
+        return Surface((su, sv), carry(self.points * self.weights[..., None]) / w, w[..., 0])

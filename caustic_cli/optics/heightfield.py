@@ -1,0 +1,101 @@
+"""The exit surface as a height field over the aperture: z(x, y) = sum_ij P_ij N_i(u) N_j(v) (thesis 4.1).
+
+The control points stand at the Greville abscissae, so (u, v) -> (x, y) is linear, x = (2u - 1) r_x, and a ray of a
+plane wave needs no intersection: it is sampled on the surface itself.
+
+On a tensor-product sample the basis values are constants and the surface is three small matrix products,
+    Z = B_u P B_v^T,    Z_x = B_u' P B_v^T / (2 r_x),    Z_y = B_u P B_v'^T / (2 r_y),
+whose cost does not depend on the degree.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from caustic_cli.optics.bspline import SplineSpace
+from caustic_cli.optics.sampling import Sample
+from caustic_cli.scene import Lens
+
+
+@dataclass(frozen=True, eq=False)
+class HeightField:
+    """Spline spaces over an aperture of half widths (r_x, r_y) mm."""
+
+    spaces: tuple[SplineSpace, SplineSpace]
+    half_size: tuple[float, float]
+
+    @classmethod
+    def of(cls, lens: Lens) -> HeightField:
+        """The field a lens describes."""
+        if lens.knots is None:
+            spaces = tuple(SplineSpace.uniform(n, p) for n, p in zip(lens.control, lens.degree, strict=True))
+        else:
+            spaces = tuple(SplineSpace(p, torch.as_tensor(t, dtype=torch.float64))
+                           for p, t in zip(lens.degree, lens.knots, strict=True))
+        return cls(spaces, lens.half_size)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Control points (n, m)."""
+        return self.spaces[0].n, self.spaces[1].n
+
+    def control_xy(self) -> tuple[Tensor, Tensor]:
+        """Positions of the control points along x (n,) and y (m,), mm float64 (eq. 4.1.4)."""
+        return tuple((2.0 * s.greville - 1.0) * r for s, r in zip(self.spaces, self.half_size, strict=True))
+
+    def prepare(self, sample: Sample, dtype: torch.dtype) -> Evaluator:
+        """Everything about the surface at these rays that does not depend on the heights; values in `dtype`."""
+        (su, sv), (rx, ry) = self.spaces, self.half_size
+        if sample.tensor:
+            return _TensorEvaluator(
+                *(m.to(dtype) for m in (su.matrix(sample.u), su.matrix(sample.u, 1) / (2 * rx),
+                                        sv.matrix(sample.v), sv.matrix(sample.v, 1) / (2 * ry))))
+        i, bu = su.basis(sample.u)
+        j, bv = sv.basis(sample.v)
+        du, dv = su.basis(sample.u, 1)[1] / (2 * rx), sv.basis(sample.v, 1)[1] / (2 * ry)
+        return _ScatteredEvaluator(i * sv.n + j, sv.n, *(b.to(dtype) for b in (bu, du, bv, dv)))
+
+    def slope_bound(self, heights: Tensor) -> float:
+        """An upper bound of |grad z|: the derivative's control net holds the derivative in its convex hull."""
+        (su, sv), (rx, ry) = self.spaces, self.half_size
+        h = heights.detach().double().cpu()
+        zx = (su.derivative_matrix() @ h).abs().max() / (2 * rx)
+        zy = (h @ sv.derivative_matrix().T).abs().max() / (2 * ry)
+        return float(torch.hypot(zx, zy))
+
+
+class Evaluator:
+    """Heights (n, m) -> z, dz/dx, dz/dy at the prepared rays (mm and dimensionless), linear in the heights."""
+
+    def __call__(self, heights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        raise NotImplementedError
+
+
+class _TensorEvaluator(Evaluator):
+    def __init__(self, bu: Tensor, du: Tensor, bv: Tensor, dv: Tensor):
+        self.bu, self.du, self.bv_t, self.dv_t = bu, du, bv.T.contiguous(), dv.T.contiguous()
+
+    def __call__(self, heights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        rows = self.bu @ heights  # (m_u, m)
+        return rows @ self.bv_t, (self.du @ heights) @ self.bv_t, rows @ self.dv_t  # (m_u, m_v) each
+
+
+class _ScatteredEvaluator(Evaluator):
+    def __init__(self, corner: Tensor, stride: int, bu: Tensor, du: Tensor, bv: Tensor, dv: Tensor):
+        self.corner, self.stride, self.bu, self.du, self.bv, self.dv = corner, stride, bu, du, bv, dv
+
+    def __call__(self, heights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        flat = heights.reshape(-1)
+        z = zx = zy = 0.0
+        columns = torch.arange(self.bv.shape[1], device=flat.device)
+        for a in range(self.bu.shape[1]):  # one row of the local net at a time bounds the memory
+            at = (self.corner + a * self.stride)[:, None] + columns
+            row = flat.index_select(0, at.reshape(-1)).view(at.shape)  # (N, q + 1)
+            value, slope = (row * self.bv).sum(1), (row * self.dv).sum(1)
+            z = z + self.bu[:, a] * value
+            zx = zx + self.du[:, a] * value
+            zy = zy + self.bu[:, a] * slope
+        return z, zx, zy

@@ -1,0 +1,60 @@
+"""Refraction and reflection at a smooth surface: Snell in vector form, Fresnel, Schlick (thesis 2.1.3).
+
+A height field z(x, y) has the normal N = (-z_x, -z_y, 1), which can never vanish.  With a unit direction d, the
+ratio eta = n_in / n_out and c = d . N, the refracted unit direction is
+
+    t = eta d + (s - eta c) / |N|^2 N,    s = t . N = sqrt(|N|^2 (1 - eta^2) + eta^2 c^2),
+
+Snell's law (eq. 2.1.10) without normalising anything; a negative radicand is total internal reflection.  For a plane
+wave along +z inside a lens it is the closed form of 3.2 (thesis notes 1) with s = S.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+#: Radicand below which a ray counts as totally reflected.  The refracted ray would leave within 1e-8 rad of the
+#: tangent plane, where its derivative (about 1 / s) carries no digits.
+CRITICAL = 1e-16
+
+
+def refract(d, slope_x: Tensor, slope_y: Tensor, eta: float):
+    """Refract unit directions at a height field.
+
+    Args:
+        d: (d_x, d_y, d_z), tensors or plain floats, unit length, d . N > 0.
+        slope_x, slope_y: z_x, z_y at the hit.
+        eta: n_in / n_out.
+
+    Returns:
+        t: (t_x, t_y, t_z) unit directions (finite, and meaningless, where reflected),
+        passes: bool, False where the ray is totally reflected,
+        c, s: d . N and t . N, both cosines times |N|, for the Fresnel terms.
+    """
+    norm2 = 1.0 + slope_x * slope_x + slope_y * slope_y
+    c = d[2] - d[0] * slope_x - d[1] * slope_y
+    # |N|^2 (1 - eta^2) + eta^2 c^2, with the constant part 1 split off where c = d_z = 1 so that nothing cancels
+    radicand = norm2 + (eta * eta) * (c * c - norm2)
+    passes = radicand > CRITICAL * norm2
+    s = torch.where(passes, radicand, torch.ones_like(radicand)).sqrt()  # a masked argument keeps NaN out of gradients
+    gamma = (s - eta * c) / norm2
+    return (eta * d[0] - gamma * slope_x, eta * d[1] - gamma * slope_y, eta * d[2] + gamma), passes, c, s
+
+
+def reflectance(kind: str, c, s, eta: float):
+    """Part of the power reflected, from c and s of `refract` (any common factor): none, schlick or exact (unpolarised).
+
+    Exact: (r_s^2 + r_p^2) / 2 with r_s = (eta c - s) / (eta c + s), r_p = (c - eta s) / (c + eta s).
+    Schlick: R0 + (1 - R0) (1 - cos)^5 with the larger of the two angles, eqs. 2.1.13 and 2.1.14; it needs true cosines.
+    """
+    if kind == "none":
+        return torch.zeros_like(s) if isinstance(s, Tensor) else 0.0
+    if kind == "schlick":
+        r0 = ((eta - 1.0) / (eta + 1.0)) ** 2
+        x = 1.0 - (s if eta > 1 else c)
+        x2 = x * x
+        return r0 + (1.0 - r0) * (x2 * x2 * x)
+    rs = (eta * c - s) / (eta * c + s)
+    rp = (c - eta * s) / (c + eta * s)
+    return 0.5 * (rs * rs + rp * rp)

@@ -1,0 +1,133 @@
+"""From landing points to an image: bincount, truncated Gaussian, raised cosine (thesis 4.4).
+
+Notation, in pixels (w = 1)
+    x        landing coordinate, 0 at the frame's low edge
+    i0       pixel that holds it, floor(x);  phi = x - i0 in [0, 1)
+    v        filter size, odd;  r = (v - 1) / 2
+    d_k      distance k + 1/2 - phi from the centre of pixel i0 + k, k = -r..r
+
+Every ray's shares are normalised over its v x v pixels, so its weight is conserved.  Rays in the r ghost pixels around
+the frame still reach into it; their shares reach 2 r pixels out, so the image is accumulated on a frame padded by 2 r
+and cropped (thesis notes 7 and 8).  What falls on the padding is counted as lost, never renormalised.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from caustic_cli.errors import InputError
+from caustic_cli.scene import Screen
+
+FILTERS = ("bincount", "gaussian", "cosine")
+MAX_FILTER = 63
+
+
+@dataclass(frozen=True)
+class Filter:
+    """A reconstruction filter.
+
+    Args:
+        kind: bincount, gaussian (truncated, C0: eq. 4.4.5) or cosine (raised cosine, C1).
+        size: (v_x, v_y) pixels, odd; 1 is bincount along that axis.
+        alpha: (alpha_x, alpha_y) of the Gaussian per pixel squared; alpha per mm^2 times w^2 (thesis notes 15).
+    """
+
+    kind: str = "bincount"
+    size: tuple[int, int] = (1, 1)
+    alpha: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self):
+        if self.kind not in FILTERS:
+            raise InputError(f"reconstruction must be one of {', '.join(FILTERS)}, got {self.kind!r}")
+        for v in self.size:
+            if not (isinstance(v, int) and 1 <= v <= MAX_FILTER and v % 2):
+                raise InputError(f"filter size must be an odd number 1 to {MAX_FILTER}, got {v!r}")
+        if any(not math.isfinite(a) or a < 0 for a in self.alpha):
+            raise InputError(f"alpha must be finite and not negative, got {self.alpha}")
+
+    @property
+    def reach(self) -> tuple[int, int]:
+        """Pixels a share can travel from the ray's own, (r_x, r_y)."""
+        return (0, 0) if self.kind == "bincount" else ((self.size[0] - 1) // 2, (self.size[1] - 1) // 2)
+
+    def shares(self, phi: Tensor, axis: int) -> Tensor:
+        """Shares of a ray at sub-pixel position phi (...) among its v pixels along an axis: (..., v), sum 1."""
+        r = self.reach[axis]
+        v = 2 * r + 1
+        if v == 1:
+            return torch.ones_like(phi)[..., None]
+        d = torch.arange(-r, r + 1, device=phi.device, dtype=phi.dtype) + 0.5 - phi[..., None]
+        if self.kind == "cosine":  # the v shifted cosines cancel: no normalisation needed
+            return (1.0 + torch.cos(d * (2.0 * math.pi / v))) / v
+        return self._gaussian(d, v, self.alpha[axis])
+
+    @staticmethod
+    def _gaussian(d: Tensor, v: int, alpha: float) -> Tensor:
+        """exp(-alpha d^2) - exp(-alpha (v/2)^2), normalised; by expm1, since for small alpha both terms are nearly 1."""
+        room = (0.25 * v * v - d * d).clamp_min(0.0)
+        if alpha == 0.0:  # the limit of small alpha is a parabola
+            f = room
+        else:  # divided by the largest term, so that a large alpha cannot underflow all of them
+            least = (d * d).amin(-1, keepdim=True).detach()
+            f = -torch.exp(-alpha * (d * d - least)) * torch.expm1(-alpha * room)
+        return f / f.sum(-1, keepdim=True)
+
+    def kernel(self, axis: int) -> Tensor:
+        """Mean shares of rays spread evenly over a pixel: (v,), float64, sum 1.
+
+        Convolving a target with it gives the image a perfect lens would render: both sides of a loss, filtered alike.
+        """
+        fine = 512
+        phi = (torch.arange(fine, dtype=torch.float64) + 0.5) / fine
+        return self.shares(phi, axis).mean(0)
+
+    def smooth(self, image: Tensor) -> Tensor:
+        """`image` (n_x, n_y) as this filter would render it; light that leaves the frame is lost."""
+        kernels = [self.kernel(axis).to(image) for axis in (0, 1)]
+        out = image[None, None]
+        out = torch.nn.functional.conv2d(out, kernels[0].view(1, 1, -1, 1), padding=(self.reach[0], 0))
+        return torch.nn.functional.conv2d(out, kernels[1].view(1, 1, 1, -1), padding=(0, self.reach[1]))[0, 0]
+
+
+def splat(x: Tensor, y: Tensor, weight: Tensor, screen: Screen, filter: Filter) -> tuple[Tensor, Tensor]:
+    """Accumulate rays into an image.
+
+    Args:
+        x, y: landing points on the screen's plane, mm (any shape, the same); differentiable for filters of size > 1.
+        weight: power of each ray; differentiable.
+
+    Returns:
+        image (n_x, n_y), power per pixel; off_screen, the power that fell outside the frame.  They sum to weight.sum().
+    """
+    x, y, weight = x.reshape(-1), y.reshape(-1), weight.reshape(-1)
+    first, shares, inside = [], [], None
+    for axis, at in ((0, x), (1, y)):
+        n, r = screen.resolution[axis], filter.reach[axis]
+        at = (at + screen.half_size[axis]) / screen.pixel[axis]
+        near = (at >= -r) & (at < n + r)  # False for NaN and infinity too, so that floor() below is always defined
+        at = torch.where(near, at, torch.zeros_like(at))
+        i0 = at.detach().floor()
+        first.append(i0.long() + r)  # index of the first share on the padded frame, whose origin is -2 r
+        shares.append(filter.shares(at - i0, axis))
+        inside = near if inside is None else inside & near
+    kept = torch.where(inside, weight, torch.zeros_like(weight))
+    (nx, ny), (rx, ry) = screen.resolution, filter.reach
+    shape = (nx + 4 * rx, ny + 4 * ry)
+    padded = weight.new_zeros(shape[0] * shape[1])
+    for k in range(shares[0].shape[1]):
+        at = ((first[0] + k) * shape[1] + first[1])[:, None] + torch.arange(shares[1].shape[1], device=x.device)
+        part = (kept * shares[0][:, k])[:, None] * shares[1]
+        padded = padded.scatter_add(0, at.reshape(-1), part.reshape(-1))
+    padded = padded.view(shape)
+    image = padded[2 * rx : 2 * rx + nx, 2 * ry : 2 * ry + ny]
+    outside = torch.where(inside, torch.zeros_like(weight), weight).sum()  # and the padding, summed rather than subtracted
+    if rx:
+        outside = outside + padded[: 2 * rx].sum() + padded[2 * rx + nx :].sum()
+    if ry:
+        rows = padded[2 * rx : 2 * rx + nx]
+        outside = outside + rows[:, : 2 * ry].sum() + rows[:, 2 * ry + ny :].sum()
+    return image, outside

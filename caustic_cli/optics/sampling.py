@@ -1,0 +1,132 @@
+"""Where rays start: samples of the unit square (u, v), the lens' aperture (thesis 4.2.1).
+
+Every random number is a hash of (seed, dimension, ray index), so a sample does not depend on how it is cut into
+chunks, on the device or on the number of threads, and any ray can be traced again alone.
+
+    grid        centres of nu x nv equal cells
+    lines       a grid whose columns and rows are each shifted at random within their cell: fresh rays that keep the
+                tensor-product structure which makes a spline surface cheap to evaluate
+    stratified  one ray anywhere in each cell (the perturbed grid of 4.2.1, kept inside [0, 1]: thesis notes 9)
+    uniform     independent rays
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from caustic_cli.errors import InputError
+
+SAMPLERS = ("grid", "lines", "stratified", "uniform")
+_MASK = 0xFFFFFFFF
+
+
+def _mix(x: Tensor) -> Tensor:
+    """A 32-bit integer hash (C. Wellons' "lowbias32") of int64 tensors holding 32-bit values."""
+    x = x ^ (x >> 16)
+    x = (x * 0x7FEB352D) & _MASK
+    x = x ^ (x >> 15)
+    x = (x * 0x846CA68B) & _MASK
+    return x ^ (x >> 16)
+
+
+def random_numbers(seed: int, dimension: int, index: Tensor) -> Tensor:
+    """Uniform numbers strictly inside (0, 1), float64, one for every int64 ray index: a pure function of its arguments."""
+    key = torch.tensor([(seed * 0x9E3779B1 + dimension * 0x85EBCA77 + 1) & _MASK], device=index.device)
+    key = _mix(key ^ ((seed >> 16) & _MASK))
+    low, high = index & _MASK, index >> 32
+    return (_mix(_mix(low ^ key) + 0x632BE5AB * (dimension + 1) + high & _MASK).double() + 0.5) * 2.0**-32
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Some rays of a sampler: the points (u_k, v_k), or with `tensor` all pairs (u_a, v_b), a fastest last.
+
+    `share` is each ray's part of the source's power, a scalar or one value a ray (shape of the ray grid).
+    """
+
+    u: Tensor
+    v: Tensor
+    tensor: bool
+    share: Tensor
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of everything traced from this sample: (len(u), len(v)) or (len(u),)."""
+        return (len(self.u), len(self.v)) if self.tensor else (len(self.u),)
+
+
+@dataclass(frozen=True, eq=False)
+class Sampler:
+    """A whole set of rays, cut into chunks on demand.
+
+    Args:
+        kind: one of SAMPLERS.
+        shape: cells (nu, nv) along u and v; nu * nv rays.
+        seed: of the random kinds.
+        profile: relative irradiance (a, b) over the aperture, constant per cell, or None (eq. 4.2.3).
+        device: where the samples live.
+    """
+
+    kind: str
+    shape: tuple[int, int]
+    seed: int = 0
+    profile: Tensor | None = None
+    device: str | torch.device = "cpu"
+
+    def __post_init__(self):
+        if self.kind not in SAMPLERS:
+            raise InputError(f"sampler must be one of {', '.join(SAMPLERS)}, got {self.kind!r}")
+
+    @classmethod
+    def of_size(cls, kind: str, rays: int, aspect: float = 1.0, **options) -> Sampler:
+        """About `rays` rays in cells as nearly square as whole numbers allow on an aperture of width / height `aspect`."""
+        nu = max(1, round(math.sqrt(rays * aspect)))
+        return cls(kind, (nu, max(1, round(rays / nu))), **options)
+
+    @property
+    def count(self) -> int:
+        """Number of rays."""
+        return self.shape[0] * self.shape[1]
+
+    def chunks(self, size: int = 1 << 20) -> Iterator[Sample]:
+        """The rays in order, at most about `size` at a time; shares over all chunks sum to 1."""
+        norm = 1.0 / self.count
+        if self.profile is not None:
+            total = sum(float(self._irradiance(s).sum()) for s in self._points(size))
+            if not total > 0:
+                raise InputError("[source] profile: every ray fell where it is black; use more rays")
+            norm = 1.0 / total
+        for s in self._points(size):
+            share = norm * self._irradiance(s) if self.profile is not None else torch.tensor(norm, dtype=torch.float64)
+            yield Sample(s.u, s.v, s.tensor, share.to(self.device))
+
+    def _points(self, size: int) -> Iterator[Sample]:
+        nu, nv = self.shape
+        one = torch.ones((), dtype=torch.float64)
+        if self.kind in ("grid", "lines"):
+            i, j = torch.arange(nu, device=self.device), torch.arange(nv, device=self.device)
+            du = dv = 0.5
+            if self.kind == "lines":
+                du, dv = random_numbers(self.seed, 0, i), random_numbers(self.seed, 1, j)
+            u, v = (i + du) / nu, (j + dv) / nv
+            rows = max(1, size // nv)
+            for a in range(0, nu, rows):
+                yield Sample(u[a : a + rows].double(), v.double(), True, one)
+            return
+        for a in range(0, self.count, size):
+            k = torch.arange(a, min(a + size, self.count), device=self.device)
+            du, dv = random_numbers(self.seed, 0, k), random_numbers(self.seed, 1, k)
+            if self.kind == "stratified":
+                du, dv = (k // nv + du) / nu, (k % nv + dv) / nv
+            yield Sample(du, dv, False, one)
+
+    def _irradiance(self, s: Sample) -> Tensor:
+        profile = self.profile.to(self.device, torch.float64)
+        a = (s.u * profile.shape[0]).long().clamp_max(profile.shape[0] - 1)
+        b = (s.v * profile.shape[1]).long().clamp_max(profile.shape[1] - 1)
+        return profile[a[:, None], b[None, :]] if s.tensor else profile[a, b]

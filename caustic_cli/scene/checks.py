@@ -1,0 +1,52 @@
+"""Validation shared by the scene's parts: one sentence saying what, where and what would be accepted."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from caustic_cli.errors import InputError
+
+
+def number(where: str, value, low: float = -math.inf, high: float = math.inf, *, open_low: bool = False) -> float:
+    """`value` as a finite float in [low, high], or (low, high] with `open_low`.
+
+    Raises:
+        InputError: naming `where`, the accepted range and the value.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError(f"{where} must be a number, got {value!r}")
+    value = float(value)
+    ok = math.isfinite(value) and value <= high and (value > low if open_low else value >= low)
+    if not ok:
+        raise InputError(f"{where} must be {_range(low, high, open_low)}, got {value:g}")
+    return value
+
+
+def whole(where: str, value, low: int, high: int) -> int:
+    """`value` as an int in [low, high]."""
+    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+        raise InputError(f"{where} must be a whole number {low} to {high}, got {value!r}")
+    return value
+
+
+def pair(where: str, value, check) -> tuple:
+    """Two numbers, each through `check(where, element)`."""
+    if isinstance(value, str) or not isinstance(value, Sequence) or len(value) != 2:
+        raise InputError(f"{where} must be a pair [x, y], got {value!r}")
+    return check(where, value[0]), check(where, value[1])
+
+
+def choice(where: str, value, names: Sequence[str]) -> str:
+    """`value` if it is one of `names`."""
+    if value not in names:
+        raise InputError(f"{where} must be one of {', '.join(names)}, got {value!r}")
+    return value
+
+
+def _range(low: float, high: float, open_low: bool) -> str:
+    if math.isinf(high):
+        if math.isinf(low):
+            return "finite"
+        return f"greater than {low:g}" if open_low else f"at least {low:g}"
+    return f"greater than {low:g} and at most {high:g}" if open_low else f"{low:g} to {high:g}"

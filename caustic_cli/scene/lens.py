@@ -1,0 +1,138 @@
+"""The lens: flat entrance at z_in, a B-spline exit surface over a rectangular aperture (thesis 4.1).
+
+Notation
+    r_x, r_y     half widths of the aperture [-r_x, r_x] x [-r_y, r_y], mm
+    f(x, y)      offset surface: what the control heights vary about, mm (eq. 5.1.2)
+    rho          radius of curvature of a spherical offset; rho > 0 is concave towards the screen (it spreads light)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from caustic_cli.errors import InputError
+from caustic_cli.scene import checks
+
+#: Most control points along one axis: beyond it the dense basis matrices alone fill a workstation's memory.
+MAX_CONTROL = 4096
+FRESNEL = ("none", "schlick", "exact")
+
+
+@dataclass(frozen=True)
+class Offset:
+    """f(x, y) = thickness + sag_x(x) + sag_y(y), the surface that a height of zero stands for.
+
+    Args:
+        thickness: f(0, 0), mm.
+        radius: (rho_x, rho_y) mm, inf for flat.  Equal and finite radii give the sphere of table 6.1,
+            thickness + rho - sqrt(rho^2 - x^2 - y^2); different ones the sum of two circular profiles.
+    """
+
+    thickness: float = 5.0
+    radius: tuple[float, float] = (math.inf, math.inf)
+
+    def __post_init__(self):
+        checks.number("[lens] thickness", self.thickness)
+        for r in self.radius:
+            if math.isnan(r) or r == 0:
+                raise InputError(f"[lens] radius must be a non-zero number or inf, got {r!r}")
+
+    @classmethod
+    def for_magnification(cls, mag: tuple[float, float], index: float, throw: float, thickness: float) -> Offset:
+        """The sphere that spreads parallel light over `mag` times the aperture: rho = (n - 1) (z_screen - z_lens) / (mag - 1).
+
+        Source: thesis table 6.1, thesis notes 12.  `throw` is z_screen, `thickness` is z_lens (both mm).
+        """
+        reach = (index - 1.0) * (throw - thickness)
+        return cls(thickness, tuple(math.inf if m == 1 else reach / (m - 1.0) for m in mag))
+
+    def sag(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """f(x, y) - thickness at points x, y (broadcast), float64 mm.
+
+        Raises:
+            InputError: the sphere ends inside the aperture.
+        """
+        x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
+        rx, ry = self.radius
+        terms = [(x * x + y * y, rx)] if rx == ry else [(x * x, rx), (y * y, ry)]
+        total = np.zeros(x.shape)
+        for square, rho in terms:
+            if math.isinf(rho):
+                continue
+            if square.max(initial=0.0) >= rho * rho:
+                raise InputError(
+                    f"[lens] radius must exceed the lens' own reach of {math.sqrt(square.max()):.4g} mm, got {abs(rho):.4g} mm"
+                    " (a smaller --mag or a longer --throw gives a larger radius)"
+                )
+            # rho - sign sqrt(rho^2 - s) without its cancellation
+            total = total + square / (rho + math.copysign(1.0, rho) * np.sqrt(rho * rho - square))
+        return total
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A lens of refractive index n with flat entrance and B-spline exit.
+
+    Args:
+        size: full width and height of the aperture, mm.
+        z_in: position of the flat entrance surface, mm.
+        index: refractive index (the surroundings have 1).
+        control: control points along x and y.
+        degree: spline degrees along x and y.
+        knots: (knots_u, knots_v) on [0, 1], or None for open equispaced ones.
+        min_thickness: least distance of every control height from z_in, mm (4.1.2).
+        offset: the surface the heights vary about.
+        height_range: least and largest departure from the offset, mm (5.1.1).
+        fresnel: reflection losses at both surfaces: none, schlick or exact (unpolarised).
+    """
+
+    size: tuple[float, float] = (10.0, 10.0)
+    z_in: float = 0.0
+    index: float = 1.5443
+    control: tuple[int, int] = (50, 50)
+    degree: tuple[int, int] = (3, 3)
+    knots: tuple[Sequence[float], Sequence[float]] | None = None
+    min_thickness: float = 0.0
+    offset: Offset = field(default_factory=Offset)
+    height_range: tuple[float, float] = (-1.0, 1.0)
+    fresnel: str = "exact"
+
+    def __post_init__(self):
+        checks.pair("[lens] size", self.size, lambda w, x: checks.number(w, x, 1e-6, 1e6))
+        checks.number("[lens] z_in", self.z_in)
+        checks.number("[lens] index", self.index, 1.0, 5.0, open_low=True)
+        checks.pair("[lens] degree", self.degree, lambda w, x: checks.whole(w, x, 1, 15))
+        for name, n, p in zip("xy", self.control, self.degree, strict=True):
+            checks.whole(f"[lens] control ({name})", n, p + 1, MAX_CONTROL)
+        checks.number("[lens] min_thickness", self.min_thickness, 0.0)
+        low, high = checks.pair("[lens] height_range", self.height_range, checks.number)
+        if not low < high:
+            raise InputError(f"[lens] height_range must ascend, got [{low:g}, {high:g}]")
+        checks.choice("[lens] fresnel", self.fresnel, FRESNEL)
+
+    @property
+    def half_size(self) -> tuple[float, float]:
+        """(r_x, r_y) mm."""
+        return self.size[0] / 2.0, self.size[1] / 2.0
+
+    def height_bounds(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Least and largest control height at control points x (n,), y (m,): two (n, m) float64, mm.
+
+        Every height at least z_in + min_thickness keeps the whole surface there, by the convex hull property (4.1.2).
+
+        Raises:
+            InputError: the bounds leave no room.
+        """
+        f = self.offset.thickness + self.offset.sag(x[:, None], y[None, :])
+        low = np.maximum(f + self.height_range[0], self.z_in + self.min_thickness)
+        high = f + self.height_range[1]
+        if not (low < high).all():
+            raise InputError(
+                f"[lens] min_thickness of {self.min_thickness:g} mm leaves the heights no room: offset plus height_range"
+                f" reaches only {high.min() - self.z_in:.4g} mm above z_in; raise thickness or height_range"
+            )
+        return low, high
