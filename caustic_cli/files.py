@@ -10,6 +10,10 @@ from pathlib import Path
 
 from caustic_cli.errors import InputError
 
+#: What marks a file as made by this program, so that it may be replaced.
+SOFTWARE = "caustic"
+NPY_HEADER = 256  # bytes; NumPy itself pads to 64 or 128
+
 
 @contextlib.contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
@@ -45,21 +49,34 @@ def write_bytes(path: str | Path, data: bytes) -> None:
         temporary.write_bytes(data)
 
 
-def refuse_overwrite(path: str | Path, force: bool) -> None:
-    """Stop before work begins when `path` exists and was not asked to be replaced.
+def is_ours(path: str | Path) -> bool:
+    """Whether this program made the file: our mark in a PNG, our header in a .npy, our name at either end of another."""
+    with open(path, "rb") as f:
+        head = f.read(1024)
+        f.seek(max(0, os.path.getsize(path) - 1024))
+        tail = f.read()
+    if head.startswith(b"\x93NUMPY\x01\x00"):
+        return int.from_bytes(head[8:10], "little") == NPY_HEADER - 10
+    if head.startswith(b"\x89PNG"):
+        return b"Software\x00" + SOFTWARE.encode() in head
+    return SOFTWARE.encode() in head + b"\n" + tail
+
+
+def refuse_foreign(path: str | Path, force: bool = False) -> None:
+    """Stop before work begins when `path` cannot be written, or holds something this program did not make.
 
     Raises:
-        InputError: it exists and `force` is false, it is a directory, or its directory does not exist.
+        InputError: its directory is missing or read-only, it is a directory, or it is foreign and `force` is false.
     """
     path = Path(path)
     if path.is_dir():
         raise InputError(f"{path}: is a directory; a file name is needed")
-    if path.exists() and not force:
-        raise InputError(f"{path}: exists already and is not replaced without --force")
     if not path.parent.is_dir():
-        raise InputError(f"{path}: its directory {path.parent} does not exist")
+        raise InputError(f"{path}: its directory {path.parent} does not exist; make it first")
     if not os.access(path.parent, os.W_OK):
-        raise InputError(f"{path}: its directory {path.parent} cannot be written to")
+        raise InputError(f"{path}: its directory {path.parent} is read-only; one you may write to is needed")
+    if path.exists() and not force and not is_ours(path):
+        raise InputError(f"{path}: exists and was not made by caustic; --force replaces it, another name spares it")
 
 
 def _sync_directory(directory: Path) -> None:

@@ -40,13 +40,10 @@ class LBFGS:
             self.f, self.g = self._evaluate(self.x)
         if not float(self.g.abs().max()) > 0:
             return False
-        for attempt in range(2):
+        for _ in range(2):
             direction = self._direction()
             slope = float(direction @ self.g)
-            if not self.pairs:
-                length = FIRST_STEP * 2.0 * abs(self.f) / max(-slope, 1e-300)
-            else:
-                length = 1.0
+            length = 1.0 if self.pairs else FIRST_STEP * 2.0 * abs(self.f) / max(-slope, 1e-300)
             if slope < 0 and self._search(direction, slope, length):
                 return True
             if not self.pairs:

@@ -19,6 +19,10 @@ from caustic_cli.scene import checks
 LOSSES = ("rms", "rms-light")
 
 
+class NoLight(CausticError):
+    """Not one ray reached the screen."""
+
+
 def gaussian_matrix(n: int, sigma: float) -> Tensor:
     """Blur along one axis by a Gaussian of `sigma` pixels, cut at 4 sigma: (n, n) float64; light leaving the frame is lost."""
     reach = max(1, math.ceil(4.0 * sigma))
@@ -49,12 +53,13 @@ class Loss:
         """Loss of an image (n_x, n_y) made by rays that carried `leaving` out of the lens: scalar, in units of eq. 5.2.1.
 
         Raises:
-            CausticError: no light to compare.
+            NoLight: no light to compare.
         """
-        power = image.sum() if self.name == "rms" else leaving
-        if not float(power.detach()) > 0:
-            raise CausticError("no light reaches the screen, so there is nothing to improve: every ray is reflected inside"
-                               " the lens or misses the screen; check index, throw, mag and screen size")
+        total = image.sum()
+        if not float(total.detach()) > 0:
+            raise NoLight("no light reaches the screen, so there is nothing to improve: every ray is reflected inside"
+                          " the lens or misses the screen; check index, throw, mag and screen size")
+        power = total if self.name == "rms" else leaving
         residual = image / power - self.target
         if self.blur is not None:
             residual = self.blur[0] @ residual @ self.blur[1].T

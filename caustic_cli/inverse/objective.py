@@ -48,6 +48,7 @@ class Objective:
 
     def __init__(self, scene: Scene, field: HeightField, sampler: Sampler, filter: Filter, target: Tensor, loss: str, *,
                  blur: float = 0.0, filter_target: bool = True, apron: int = 0, dtype: torch.dtype = torch.float32):
+        self.device = sampler.device
         self.screen, self.filter, self.apron = scene.screen.grown((apron, apron)), filter, apron
         wide = torch.nn.functional.pad(target.double().to(sampler.device), (apron, apron, apron, apron))
         self.loss = Loss(loss, filter.smooth(wide) if filter_target else wide, blur)
@@ -64,7 +65,7 @@ class Objective:
 
     def __call__(self, heights: Tensor) -> Evaluation:
         """Value and gradient at heights (n, m) mm float64."""
-        heights = heights.detach().requires_grad_()
+        heights = heights.detach().to(self.device).requires_grad_()
         image, leaving = self.image(heights)
         loss = self.loss(image, leaving)
         (gradient,) = torch.autograd.grad(loss, heights)

@@ -126,14 +126,14 @@ class SplineSpace:
                 term = values[r] / (right - left)  # t_{s+1} > t_s lies inside: never 0
                 nxt.append(saved + (right - x) * term)
                 saved = (x - left) * term
-            values = nxt + [saved]
+            values = [*nxt, saved]
         for k in range(low + 1, p + 1):  # eq. 2.4.9: N'_{i,k} = k N_{i,k-1} / (t_{i+k} - t_i) - k N_{i+1,k-1} / (...)
             nxt, saved = [], torch.zeros_like(x)
             for r in range(k):
                 term = k * values[r] / (t[s + r + 1] - t[s + r + 1 - k])
                 nxt.append(saved - term)
                 saved = term
-            values = nxt + [saved]
+            values = [*nxt, saved]
         return s - p, torch.stack(values, -1)
 
     def matrix(self, x: Tensor, derivative: int = 0) -> Tensor:

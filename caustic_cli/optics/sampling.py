@@ -13,6 +13,7 @@ chunks, on the device or on the number of threads, and any ray can be traced aga
 from __future__ import annotations
 
 import math
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -40,6 +41,11 @@ def random_numbers(seed: int, dimension: int, index: Tensor) -> Tensor:
     key = _mix(key ^ ((seed >> 16) & _MASK))
     low, high = index & _MASK, index >> 32
     return (_mix(_mix(low ^ key) + 0x632BE5AB * (dimension + 1) + high & _MASK).double() + 0.5) * 2.0**-32
+
+
+def stream(seed: int, name: str) -> int:
+    """A seed for the rays of one purpose ("render", "stage 3"), unrelated to the same user's seed for another."""
+    return zlib.crc32(f"{seed}/{name}".encode())
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,119 @@
+"""caustic design: find the lens whose caustic is TARGET."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from caustic_cli import console
+from caustic_cli.commands import options
+from caustic_cli.errors import InputError
+
+EXAMPLES = """Examples:
+
+  caustic design flame.png --source plane --mag 3
+
+  caustic design --resume flame.caustic --iterations 400
+"""
+
+Text = str | None
+
+
+def run(
+    target: Annotated[Path, typer.Argument(metavar="TARGET", help="The picture: an image file or a 2-D .npy of irradiance;"
+                                           " with --resume, the project.", show_default=False)],
+    source: Annotated[Text, typer.Option(help="plane: parallel light along +z as wide as the lens.  [default: plane]")] = None,
+    mag: Annotated[float | None, typer.Option(help="Width of the picture over width of the lens.  [default: 3]")] = None,
+    lens_size: Annotated[Text, typer.Option(metavar="W[xH]", help="Lens aperture, mm.  [default: 10x10]")] = None,
+    throw: Annotated[float | None, typer.Option(help="Lens origin to screen, mm.  [default: 300]")] = None,
+    screen_size: Annotated[Text, typer.Option(metavar="W[xH]", help="Screen, mm.  [default: picture plus margin]")] = None,
+    resolution: Annotated[Text, typer.Option(metavar="N[xM]", help="Pixels over the whole screen; N alone counts across, rows"
+                                             " follow the shape.  [default: 250]")] = None,
+    margin: Annotated[float | None, typer.Option(help="Dark border, part of the picture's width in all.  [default: 0.28]")]
+    = None,
+    index: Annotated[float | None, typer.Option(help="Refractive index of the lens.  [default: 1.5443]")] = None,
+    glass: Annotated[Text, typer.Option(help="Material instead of --index: N-BK7, SILICA, PMMA, PC, ...")] = None,
+    control: Annotated[Text, typer.Option(metavar="N[xM]", help="Control points of the lens.  [default: 128 + degree]")] = None,
+    degree: Annotated[Text, typer.Option(metavar="P[xQ]", help="Spline degree, 1 to 15.  [default: 3]")] = None,
+    min_thickness: Annotated[float | None, typer.Option(help="Least thickness of the lens, mm.  [default: 1]")] = None,
+    linear: Annotated[bool, typer.Option("--linear", help="Pixel values are irradiance as they are, not sRGB-encoded.")] = False,
+    flip: Annotated[Text, typer.Option(metavar="x|y|xy", help="Mirror the picture, for a viewer on the lens' side.")] = None,
+    start: Annotated[Text, typer.Option(metavar="offset|PROJECT", help="First surface: the sphere that follows from --mag, or"
+                                        " the lens of another project.  [default: offset]")] = None,
+    quality: Annotated[Text, typer.Option(help="draft, standard or fine.  [default: standard]")] = None,
+    rays: Annotated[Text, typer.Option(metavar="N", help="Rays of the last stage.  [default: 9 per pixel]")] = None,
+    loss: Annotated[Text, typer.Option(help="rms (eq. 5.2.1) or rms-light, where every ray counts.  [default: rms-light]")] = None,
+    network: Annotated[Text, typer.Option(help="none, sparse or dense.  [default: none]")] = None,
+    optimizer: Annotated[Text, typer.Option(help="lbfgs or adam.  [default: lbfgs; adam for a network]")] = None,
+    lr: Annotated[float | None, typer.Option(help="Learning rate of adam.  [default: 0.001]")] = None,
+    iterations: Annotated[int | None, typer.Option(help="Iterations in all; with --resume, counted from the very first."
+                                                   "  [default: what the stages say]")] = None,
+    time_limit: Annotated[float | None, typer.Option(metavar="SECONDS", help="Stop optimising after so many seconds."
+                                                     "  [default: none]")] = None,
+    config: Annotated[Path | None, typer.Option(metavar="FILE", help="TOML with any keys of project.toml; options win.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the project TARGET from its last checkpoint.")] = False,
+    out: Annotated[Path | None, typer.Option("-o", "--out", metavar="DIR", help="Project directory."
+                                             "  [default: TARGET's stem + .caustic, here]")] = None,
+    force: options.Force = False,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+    seed: options.Seed = None,
+    device: options.Device = "auto",
+    dtype: options.Dtype = None,
+    threads: options.Threads = None,
+    debug: options.Debug = False,
+) -> None:
+    """Find the lens whose caustic is the picture TARGET."""
+    began = time.monotonic()
+    given = {
+        ("source", "type", "--source"): source,
+        ("lens", "size", "--lens-size"): lens_size and options.both(options.size("--lens-size", lens_size)),
+        ("lens", "index", "--index"): index,
+        ("lens", "glass", "--glass"): glass,
+        ("lens", "control", "--control"): control and options.both(options.counts("--control", control)),
+        ("lens", "degree", "--degree"): degree and options.both(options.counts("--degree", degree)),
+        ("lens", "min_thickness", "--min-thickness"): min_thickness,
+        ("screen", "z", "--throw"): throw,
+        ("target", "encoding", "--linear"): "linear" if linear else None,
+        ("target", "flip", "--flip"): flip,
+        ("design", "loss", "--loss"): loss,
+        ("design", "network", "--network"): network,
+        ("design", "optimizer", "--optimizer"): optimizer or ("adam" if network in ("sparse", "dense") else None),
+        ("design", "lr", "--lr"): lr,
+        ("design", "iterations", "--iterations"): iterations,
+        ("design", "time_limit", "--time-limit"): time_limit,
+        ("design", "start", "--start"): start,
+        ("design", "seed", "--seed"): seed,
+        ("design", "dtype", "--dtype"): dtype,
+    }
+    given = {key: value for key, value in given.items() if value is not None}
+    screen = options.size("--screen-size", screen_size) if screen_size else None
+    pixels = options.counts("--resolution", resolution) if resolution else None
+    shaped = {"mag": mag, "margin": margin, "quality": quality, "rays": options.rays("--rays", rays) if rays else None}
+    if iterations is not None and not 1 <= iterations <= 10**9:
+        raise InputError(f"--iterations must be a whole number 1 to 1e9, got {iterations}")
+    if time_limit is not None and not time_limit > 0:
+        raise InputError(f"--time-limit must be greater than 0 s, got {time_limit:g}")
+    device = options.start_torch(device, threads)
+    say = console.Reporter(quiet)
+
+    from caustic_cli import session  # noqa: PLC0415
+
+    if resume:
+        names = [key[2] for key in given if key[2] not in ("--iterations", "--time-limit")]
+        names += [f"--{k}" for k, v in shaped.items() if v is not None]
+        names += [n for n, v in (("--screen-size", screen), ("--resolution", pixels), ("--config", config)) if v is not None]
+        if names:
+            raise InputError(f"--resume goes on with a project as it is, so {', '.join(names)} cannot be given;"
+                             " --iterations and --time-limit can, and project.toml can be edited")
+        project = session.find(target, out)
+        figures = session.resume(project, iterations, time_limit, device, say, began)
+    else:
+        project = session.begin(target, out, given, screen, pixels, shaped, config, force)
+        figures = session.design(project, device, say, began)
+    say.table(str(project.path), [*console.figures_rows(figures), ("ended by", figures["reason"])])
+    if json:
+        console.emit_json(figures)

@@ -1,0 +1,104 @@
+"""Options that several commands share, defined once, and the parsing of sizes and counts."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from caustic_cli.errors import InputError
+
+Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing on stderr but errors.")]
+Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace what is in the way.")]
+Seed = Annotated[int | None, typer.Option(help="Seed of every random number; the same seed gives the same bytes.  [default: 0]")]
+Device = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
+Dtype = Annotated[str | None, typer.Option(help="Precision of the rays: float32 or float64.")]
+Threads = Annotated[int | None, typer.Option(help="Threads to use; default: all cores.")]
+Project = Annotated[Path, typer.Argument(help="Project directory made by caustic design.", show_default=False)]
+
+
+def numbers(option: str, text: str, count: tuple[int, ...], separator: str = r"[xX×]") -> tuple[float, ...]:
+    """Numbers parted by x ("10x8") or by what `separator` matches.
+
+    Raises:
+        InputError: naming the option.
+    """
+    parts = re.split(separator, text.strip())
+    try:
+        values = tuple(float(p) for p in parts)
+    except ValueError:
+        values = ()
+    if len(values) not in count or not all(math.isfinite(v) for v in values):
+        form = "a number or two like 10x8" if separator.startswith("[x") else f"{max(count)} numbers parted by commas"
+        raise InputError(f"{option} must be {form}, got {text!r}")
+    return values
+
+
+def size(option: str, text: str) -> tuple[float, float] | tuple[float]:
+    """W or WxH in mm, greater than 0."""
+    values = numbers(option, text, (1, 2))
+    if min(values) <= 0:
+        raise InputError(f"{option} must be greater than 0, got {text!r}")
+    return values
+
+
+def counts(option: str, text: str) -> tuple[int, ...]:
+    """N or NxM, whole and at least 1."""
+    values = numbers(option, text, (1, 2))
+    if any(v != int(v) or v < 1 for v in values):
+        raise InputError(f"{option} must be whole numbers of at least 1, got {text!r}")
+    return tuple(int(v) for v in values)
+
+
+def both(values: tuple) -> list:
+    """One value for both axes, or one each."""
+    return list(values) if len(values) == 2 else [values[0], values[0]]
+
+
+def rays(option: str, text: str) -> int:
+    """A number of rays, also written 2e6."""
+    (value,) = numbers(option, text, (1,))
+    if value != int(value) or not 1 <= value <= 1e12:
+        raise InputError(f"{option} must be a whole number 1 to 1e12 (2e6 is fine), got {text!r}")
+    return int(value)
+
+
+def start_torch(device: str, threads: int | None):
+    """Load torch, set its threads, and choose the device: "cpu" or "cuda".
+
+    Raises:
+        InputError: an unknown device, CUDA asked for but absent, or fewer than one thread.
+    """
+    if device not in ("auto", "cpu", "cuda"):
+        raise InputError(f"--device must be auto, cpu or cuda, got {device!r}")
+    if threads is not None and not 1 <= threads <= 1024:
+        raise InputError(f"--threads must be a whole number 1 to 1024, got {threads}")
+    import torch  # noqa: PLC0415
+
+    if threads:
+        torch.set_num_threads(threads)
+    if device == "cuda" and not torch.cuda.is_available():
+        raise InputError("--device cuda: no CUDA device is at hand here; use auto or cpu")
+    return "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
+
+
+def dtype_of(name: str):
+    """The torch dtype of float32 or float64."""
+    import torch  # noqa: PLC0415
+
+    if name not in ("float32", "float64"):
+        raise InputError(f"--dtype must be float32 or float64, got {name!r}")
+    return getattr(torch, name)
+
+
+def indices(option: str, text: str) -> tuple[int, int]:
+    """I,J: two whole numbers of at least 0."""
+    values = numbers(option, text, (2,), ",")
+    if any(v != int(v) or v < 0 for v in values):
+        raise InputError(f"{option} must be two whole numbers like 3,5, got {text!r}")
+    return int(values[0]), int(values[1])

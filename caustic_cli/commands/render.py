@@ -1,0 +1,82 @@
+"""caustic render: trace the lens of a project, write the irradiance image and its figures."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from caustic_cli import console
+from caustic_cli.commands import options
+from caustic_cli.errors import InputError
+
+EXAMPLES = """Examples:
+
+  caustic render flame.caustic --rays 4e6
+
+  caustic render flame.caustic --screen-at 280 -o near.png --json
+"""
+
+
+def run(
+    project: options.Project,
+    rays: Annotated[str, typer.Option(metavar="N", help="Number of rays, independent of those of the design.")] = "1000000",
+    reconstruction: Annotated[str, typer.Option(help="bincount, gaussian or cosine; the figures are always by bincount.")]
+    = "bincount",
+    filter_size: Annotated[str, typer.Option(metavar="V[xW]", help="Filter size, odd, pixels.")] = "3",
+    alpha: Annotated[float | None, typer.Option(help="Of the gaussian, 1/mm^2.  [default: 1 per pixel^2]")] = None,
+    screen_at: Annotated[float | None, typer.Option(metavar="Z", help="Put the screen here instead, mm.")] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--out", metavar="PNG",
+                                                help="Image to write.  [default: render.png in PROJECT]")] = None,
+    npy: Annotated[Path | None, typer.Option(metavar="FILE", help="Also write the irradiance: power per pixel as a part "
+                                             "of the source's, float64, [i, j].")] = None,
+    force: options.Force = False,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+    seed: options.Seed = None,
+    device: options.Device = "auto",
+    dtype: options.Dtype = None,
+    threads: options.Threads = None,
+    debug: options.Debug = False,
+) -> None:
+    """Trace the lens of PROJECT; write the irradiance image and its figures."""
+    began = time.monotonic()
+    count = options.rays("--rays", rays)
+    size = options.both(options.counts("--filter-size", filter_size))
+    device = options.start_torch(device, threads)
+
+    from caustic_cli.derive import filter_from  # noqa: PLC0415
+    from caustic_cli.files import refuse_foreign  # noqa: PLC0415
+    from caustic_cli.picture import write_image, write_npy  # noqa: PLC0415
+    from caustic_cli.project import RENDER, Project  # noqa: PLC0415
+    from caustic_cli.scene import Screen  # noqa: PLC0415
+    from caustic_cli.studies.retrace import retrace, white_level  # noqa: PLC0415
+
+    opened = Project.open(project)
+    image_path = output or project / RENDER
+    for path in (image_path, npy):
+        if path is not None:
+            refuse_foreign(path, force)
+    scene = opened.scene()
+    target = opened.target(scene)
+    field, checkpoint = opened.lens(scene)
+    screen = scene.screen
+    if screen_at is not None:
+        screen = Screen(screen.size, screen_at, screen.resolution)
+    if alpha is not None and reconstruction != "gaussian":
+        raise InputError(f"--alpha belongs to --reconstruction gaussian, got {reconstruction}")
+    filter = filter_from(reconstruction, size, screen, alpha)
+    exposure, figures = retrace(
+        scene, field, checkpoint.state.heights, target, rays=count, filter=filter, screen=screen, device=device,
+        seed=opened.settings["design"]["seed"] if seed is None else seed, dtype=options.dtype_of(dtype or "float64"))
+    image = exposure.image.cpu().numpy()
+    write_image(image_path, image, white_level(image, target), opened.settings["target"]["encoding"])
+    if npy is not None:
+        write_npy(npy, image)
+    figures |= {"iterations": checkpoint.state.total, "seconds": time.monotonic() - began, "image": str(image_path)}
+    say = console.Reporter(quiet)
+    say.table(f"{project}", console.figures_rows(figures))
+    if json:
+        console.emit_json(figures)

@@ -1,0 +1,85 @@
+"""What goes where: results to stdout, everything meant for a person to stderr.
+
+Results never pass through Rich, which wraps at 80 columns when piped.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+
+class Reporter:
+    """Talks to the user on stderr unless `quiet`.  Colour follows the terminal and NO_COLOR."""
+
+    def __init__(self, quiet: bool = False):
+        self.console = Console(stderr=True, quiet=quiet, highlight=False, soft_wrap=True)
+
+    def say(self, text: str) -> None:
+        """A line for the user."""
+        self.console.print(text, markup=False)
+
+    def table(self, title: str, rows: list[tuple[str, str]]) -> None:
+        """Two columns: what, and its value."""
+        table = Table(title=title, show_header=False, title_justify="left", title_style="bold")
+        table.add_column()
+        table.add_column()
+        for name, value in rows:
+            table.add_row(name, value)
+        self.console.print(table)
+
+    @contextmanager
+    def progress(self, total: int | None, columns: str = ""):
+        """A progress bar on a terminal, nothing elsewhere; `columns` shows the task's field `text`."""
+        bar = Progress(TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+                       TextColumn(columns or "{task.fields[text]}"), TimeElapsedColumn(), TextColumn("left"),
+                       TimeRemainingColumn(), console=self.console, transient=True,
+                       disable=not self.console.is_terminal or self.console.quiet)
+        with bar:
+            task = bar.add_task("", total=total, text="")
+            yield lambda description="", text="", done=None, whole=None: bar.update(
+                task, description=description, text=text, completed=done, total=whole)
+
+
+def emit_json(value: dict) -> None:
+    """Exactly one JSON object on stdout."""
+    sys.stdout.write(json.dumps(value, allow_nan=False) + "\n")
+    sys.stdout.flush()
+
+
+def emit(line: str) -> None:
+    """A line of results on stdout."""
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+def error(message: str) -> None:
+    """One line on stderr, said even when quiet."""
+    sys.stderr.write(f"caustic: {' '.join(message.split())}\n")
+
+
+def figures_rows(figures: dict) -> list[tuple[str, str]]:
+    """The JSON figures as a person reads them."""
+    def number(key: str, form: str) -> str:
+        value = figures.get(key)
+        return "-" if value is None else format(value, form)
+
+    lost = ", ".join(f"{name.replace('_', ' ')} {value:.2%}" for name, value in figures["lost"].items() if value > 5e-7)
+    return [
+        ("relative RMS error", number("relative_rms", ".4f")),
+        ("loss (eq. 5.2.1)", number("loss", ".4e")),
+        ("PSNR", number("psnr_db", ".2f") + " dB"),
+        ("SSIM", number("ssim", ".4f")),
+        ("light on the screen", number("on_screen", ".2%")),
+        ("light on the picture", number("on_target", ".2%")),
+        ("lost", lost or "nothing"),
+        ("rays", number("rays", ",d")),
+        ("iterations", number("iterations", "d")),
+        ("time", number("seconds", ".1f") + " s"),
+        ("image", str(figures["image"])),
+    ]

@@ -1,0 +1,164 @@
+"""The settings that follow from others: a complete project from a picture and what the user said.
+
+Screen, picture and offset surface follow from the magnification; the stages from control net, rays and pixels.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+
+from caustic_cli.errors import InputError
+from caustic_cli.inverse.designer import Options
+from caustic_cli.inverse.schedule import Stage, coarse_to_fine
+from caustic_cli.optics.reconstruction import Filter
+from caustic_cli.scene import Offset, Screen, checks
+from caustic_cli.settings import index_of, with_defaults
+
+DEFAULT_MAG = 3.0
+DEFAULT_MARGIN = 0.28  # table 6.1: the screen is 6.4 wide where the picture is 5
+DEFAULT_RESOLUTION = 250
+DEFAULT_SPANS = 128  # knot spans of the finished net; 128 halve evenly through the stages
+NETWORK_CONTROL = 50  # table D.2
+RAYS_PER_PIXEL = 9.0  # 750 x 750 rays on 250 x 250 pixels, tables D.1 and D.2
+SINGLE_STAGE_ITERATIONS = 1000  # thesis 6.2.1
+
+Settings = dict[str, dict[str, Any]]
+
+
+def complete(given: Settings, aspect: float, *, mag: float | None = None, margin: float | None = None,
+             width: int | None = None, quality: str | None = None, rays: int | None = None) -> Settings:
+    """Every setting a project needs.
+
+    Args:
+        given: what the user fixed, by options or --config.
+        aspect: height over width of the picture.
+        mag: picture width over lens width; margin: black border, part of the picture's width in all.
+        width: pixels across the screen when only that is known; the rows follow the screen's shape.
+        quality: of the default stages; rays: of the last default stage.
+
+    Raises:
+        InputError: a value is out of range, or two contradict each other.
+    """
+    s = with_defaults(given)
+    lens, screen, target = s["lens"], s["screen"], s["target"]
+    if mag is not None:
+        mag = checks.number("--mag", mag, 1e-3, 1e3)
+    margin = checks.number("--margin", DEFAULT_MARGIN if margin is None else margin, 0.0, 100.0)
+    checks.pair("[lens] size", lens["size"], lambda w, x: checks.number(w, x, 1e-6, 1e6))
+    checks.number("[screen] z", screen["z"])
+    if "size" not in target or mag is not None:
+        if mag is None and "size" in screen:
+            fit = min(screen["size"][0], screen["size"][1] / aspect) / (1.0 + margin)
+        else:
+            fit = (mag or DEFAULT_MAG) * lens["size"][0]
+        target["size"] = [fit, fit * aspect]
+    if "size" not in screen:
+        screen["size"] = [(1.0 + margin) * x for x in target["size"]]
+    if "resolution" not in screen:
+        nx = width or DEFAULT_RESOLUTION
+        screen["resolution"] = [nx, max(2, round(nx * screen["size"][1] / screen["size"][0]))]
+    Screen(tuple(screen["size"]), screen["z"], tuple(screen["resolution"]))
+    _complete_lens(lens, screen, target)
+    _complete_design(s, quality, rays)
+    return s
+
+
+def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[str, Any]) -> None:
+    index, scale = index_of(lens), max(lens["size"]) / 10.0
+    checks.number("[lens] index", index, 1.0, 5.0, open_low=True)
+    if "glass" not in lens:
+        lens["index"] = index
+    else:
+        lens.setdefault("wavelength", 587.5618)
+    lens.setdefault("thickness", 5.0 * scale)
+    lens.setdefault("height_range", [-scale, scale])
+    if screen["z"] <= lens["thickness"] + lens["height_range"][1]:
+        raise InputError(f"[screen] z must lie behind the lens, which is up to"
+                         f" {lens['thickness'] + lens['height_range'][1]:.4g} mm thick, got {screen['z']:g} mm")
+    if "radius" not in lens:
+        mag = tuple(t / w for t, w in zip(target["size"], lens["size"], strict=True))
+        lens["radius"] = list(Offset.for_magnification(mag, index, screen["z"], lens["thickness"]).radius)
+
+
+def _complete_design(s: Settings, quality: str | None, rays: int | None) -> None:
+    lens, screen, design = s["lens"], s["screen"], s["design"]
+    degree = tuple(checks.whole("[lens] degree", p, 1, 15) for p in lens["degree"])
+    plain = design["network"] == "none" and design["optimizer"] == "lbfgs"
+    if "control" not in lens:
+        lens["control"] = ([DEFAULT_SPANS + p for p in degree] if design["network"] == "none" else [NETWORK_CONTROL] * 2)
+    design.setdefault("preconditioner", "laplacian" if plain else "none")
+    if "stages" in design:
+        if quality or rays:
+            raise InputError("--quality and --rays shape the default stages, but the configuration brings [[design.stages]]"
+                             " of its own: change them there")
+        design["stages"] = [_complete_stage(stage, s) for stage in design["stages"]]
+        return
+    nx, ny = screen["resolution"]
+    rays = rays or min(4_000_000, max(40_000, int(RAYS_PER_PIXEL * nx * ny)))
+    if plain and "knots_u" not in lens:
+        stages = coarse_to_fine(tuple(lens["control"]), degree, rays, (nx, ny), quality or "standard")
+    else:
+        stages = [Stage(tuple(lens["control"]), rays, apron=math.ceil(0.04 * max(nx, ny)),
+                        iterations=SINGLE_STAGE_ITERATIONS, tolerance=2e-3 if plain else 0.0)]
+    design["stages"] = [_stage_table(stage) for stage in stages]
+
+
+def _stage_table(stage: Stage) -> dict[str, Any]:
+    return {"control": list(stage.control), "rays": stage.rays, "sampler": stage.sampler,
+            "reconstruction": stage.filter.kind, "filter_size": list(stage.filter.size), "blur": stage.blur,
+            "apron": stage.apron, "iterations": stage.iterations, "tolerance": stage.tolerance}
+
+
+def _complete_stage(table: dict[str, Any], s: Settings) -> dict[str, Any]:
+    nx, ny = s["screen"]["resolution"]
+    base = {"control": list(s["lens"]["control"]), "rays": int(RAYS_PER_PIXEL * nx * ny), "sampler": "lines",
+            "reconstruction": "cosine", "filter_size": [3, 3], "blur": 0.0, "apron": 0,
+            "iterations": SINGLE_STAGE_ITERATIONS, "tolerance": 0.0}
+    return {**base, **table}
+
+
+def filter_from(kind: str, size, screen: Screen, per_mm2: float | None = None, per_pixel2: float | None = None) -> Filter:
+    """A reconstruction filter; the Gaussian's alpha in 1/mm^2 or 1/pixel^2 (default 1 per pixel^2)."""
+    if per_mm2 is not None and per_pixel2 is not None:
+        raise InputError("alpha_per_mm2 and alpha_per_pixel2 say the same thing twice: give one of them")
+    if kind == "bincount":
+        size = (1, 1)
+    alpha = (0.0, 0.0)
+    if kind == "gaussian":
+        alpha = tuple(per_mm2 * w * w for w in screen.pixel) if per_mm2 is not None else (
+            (1.0 if per_pixel2 is None else per_pixel2,) * 2)
+    return Filter(kind, tuple(size), alpha)
+
+
+def build_stages(settings: Settings) -> list[Stage]:
+    """The stages of complete settings.
+
+    Raises:
+        InputError: there are none, a value is out of range, or the last stage is not on the lens' own control net.
+    """
+    screen = settings["screen"]
+    on = Screen(tuple(screen["size"]), screen["z"], tuple(screen["resolution"]))
+    stages = []
+    for t in settings["design"].get("stages", []):
+        f = filter_from(t["reconstruction"], t["filter_size"], on, t.get("alpha_per_mm2"), t.get("alpha_per_pixel2"))
+        stages.append(Stage(tuple(t["control"]), t["rays"], t["sampler"], f, t["blur"], t["apron"], t["iterations"],
+                            t["tolerance"]))
+    if not stages:
+        raise InputError("[[design.stages]] at least one stage is needed")
+    if list(stages[-1].control) != list(settings["lens"]["control"]):
+        raise InputError(f"[[design.stages]] the last stage's control {list(stages[-1].control)} must be the lens' own,"
+                         f" {settings['lens']['control']}")
+    return stages
+
+
+def build_options(settings: Settings) -> Options:
+    """The design options of complete settings."""
+    d = settings["design"]
+    dtype = {"float32": torch.float32, "float64": torch.float64}[checks.choice("[design] dtype", d["dtype"],
+                                                                              ("float32", "float64"))]
+    checks.whole("[design] seed", d["seed"], 0, 2**31 - 1)
+    return Options(d["loss"], d["optimizer"], d["lr"], d["network"], d["initial"], d["preconditioner"],
+                   d["filter_target"], d["seed"], dtype)

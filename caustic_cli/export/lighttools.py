@@ -1,0 +1,90 @@
+"""The LightTools archive: one `.npz` with the sampled surface, the exact B-spline beside it, and the whole scene.
+
+Lengths are mm, powers W, angles degrees.  Reals are float64, counts (`shape`, `resolution`, `degrees`,
+`format_version`) int64, names strings; `numpy.load` reads it with allow_pickle=False.  Grids are indexed [i, j], i along
++x and j along +y, and flattened row-major: x varies slowest.
+
+Arrays are stored uncompressed, in a fixed order and without the time of writing, so that the same lens gives the same
+bytes whatever the day or the zlib.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from caustic_cli import __version__
+from caustic_cli.export.surface import sample_grid
+from caustic_cli.files import atomic_path
+from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.scene import PlaneWave, Scene
+
+FORMAT_VERSION = 1
+
+
+def write_lighttools(path: str | Path, scene: Scene, field: HeightField, heights: Tensor,
+                     samples: tuple[int, int] | None = None) -> None:
+    """Write the archive whole or not at all.
+
+    Keys: points, normals (N, 3); shape (2,); x (nx,), y (ny,), z (nx, ny); lens_half_size (2,), z_in, refractive_index;
+    screen_half_size (2,), z_screen, resolution (2,); those of `_source`; control_points (n, m, 3) with x, y at the
+    Greville abscissae, degrees (2,), knots_u, knots_v on [0, 1]; unit, format_version, created_by.
+
+    Args:
+        heights: (n, m) control heights, mm.
+        samples: (nx, ny) of the cloud, or None for a grid on the knots (`sample_grid`).
+
+    Raises:
+        InputError: the samples are too few or too many, or the file cannot be written there.
+    """
+    grid = sample_grid(field, heights, samples)
+    x, y = (c.numpy() for c in field.control_xy())
+    x, y = np.broadcast_arrays(x[:, None], y[None, :])
+    arrays = {
+        "points": grid.points,
+        "normals": grid.normals,
+        "shape": np.array(grid.z.shape, np.int64),
+        "x": grid.x,
+        "y": grid.y,
+        "z": grid.z,
+        "lens_half_size": _reals(scene.lens.half_size),
+        "z_in": _reals(scene.lens.z_in),
+        "refractive_index": _reals(scene.lens.index),
+        "screen_half_size": _reals(scene.screen.half_size),
+        "z_screen": _reals(scene.screen.z),
+        "resolution": np.array(scene.screen.resolution, np.int64),
+        **_source(scene.source),
+        "control_points": np.stack([x, y, heights.detach().double().cpu().numpy()], -1),
+        "degrees": np.array([s.degree for s in field.spaces], np.int64),
+        "knots_u": field.spaces[0].knots.numpy(),
+        "knots_v": field.spaces[1].knots.numpy(),
+        "unit": np.array("mm"),
+        "format_version": np.array(FORMAT_VERSION, np.int64),
+        "created_by": np.array(f"caustic {__version__}"),
+    }
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:  # an open file: savez would rename `lens.dat`
+        np.savez(file, **arrays)  # dates every entry 1980-01-01
+
+
+def _source(source: PlaneWave) -> dict[str, np.ndarray]:
+    """The source's keys.  A plane wave stands nowhere and does not spread: no positions, one power, cone 0.
+
+    `source_power` is (1,): the power through the aperture.  `source_profile` (a, b), the relative irradiance over the
+    aperture [i, j], is there only when the wave is not uniform.
+    """
+    keys = {
+        "source_type": np.array("plane"),
+        "source_positions": np.zeros((0, 3)),
+        "source_power": _reals([source.power]),
+        "cone_half_angle": _reals(0.0),
+    }
+    if source.profile is not None:
+        keys["source_profile"] = _reals(source.profile)
+    return keys
+
+
+def _reals(value) -> np.ndarray:
+    """`value` as a float64 array of its own shape."""
+    return np.array(value, np.float64)

@@ -1,0 +1,288 @@
+"""The design loop: stages of Adam or L-BFGS over a parametrisation of the control heights (thesis ch. 5).
+
+A design is resumed bitwise: `State` holds everything the next iteration depends on, and every random number is a
+function of the seed and the stage.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from caustic_cli.errors import CausticError, InputError
+from caustic_cli.inverse.lbfgs import LBFGS
+from caustic_cli.inverse.losses import NoLight
+from caustic_cli.inverse.objective import Objective
+from caustic_cli.inverse.parametrisation import Heights, parametrise
+from caustic_cli.inverse.schedule import Stage
+from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.sampling import Sampler, stream
+from caustic_cli.scene import Scene, checks
+
+OPTIMIZERS = ("lbfgs", "adam")
+#: A stage's flatness is judged over so many iterations.
+FLAT_SPAN = 10
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to look for the heights; the stages say with what.
+
+    loss: a name in `losses`; optimizer, lr: lbfgs, or adam with its learning rate; network, initial, preconditioner:
+    see `parametrisation`; filter_target: filter the target as the render is filtered; seed: of rays and networks;
+    dtype: precision of the rays.
+    """
+
+    loss: str = "rms-light"
+    optimizer: str = "lbfgs"
+    lr: float = 1e-3
+    network: str = "none"
+    initial: str = "zero"
+    preconditioner: str = "laplacian"
+    filter_target: bool = True
+    seed: int = 0
+    dtype: torch.dtype = torch.float32
+
+    def __post_init__(self):
+        checks.choice("[design] optimizer", self.optimizer, OPTIMIZERS)
+        checks.number("[design] lr", self.lr, 0.0, open_low=True)
+        if self.optimizer == "lbfgs" and self.network != "none":
+            raise InputError("[design] optimizer lbfgs works on the heights themselves (network none);"
+                             " a network needs optimizer adam")
+
+
+@dataclass
+class State:
+    """Where a design stands.
+
+    stage, iteration: index of the stage and iterations done in it; total: iterations done in all; heights (n, m) mm
+    float64, the lens so far; parameters, optimizer: tensors by name, empty when a stage has yet to begin; history:
+    rows (iteration, stage, loss, on_screen, seconds); seconds: spent so far; reason: why it ended, "" if it has not.
+    """
+
+    heights: Tensor
+    stage: int = 0
+    iteration: int = 0
+    total: int = 0
+    parameters: dict[str, Tensor] = field(default_factory=dict)
+    optimizer: dict[str, Tensor] = field(default_factory=dict)
+    history: list[tuple[int, int, float, float, float]] = field(default_factory=list)
+    seconds: float = 0.0
+    reason: str = ""
+
+
+class Designer:
+    """Designs one lens.
+
+    Args:
+        scene: its lens holds the final control net; stages replace `control`.
+        target: (n_x, n_y) irradiance on the scene's screen, not all zero.
+        stages, options: how.
+        device: where rays are traced.
+    """
+
+    def __init__(self, scene: Scene, target: Tensor, stages: list[Stage], options: Options, device: str = "cpu"):
+        if not stages:
+            raise InputError("[[design.stages]] at least one stage is needed")
+        if scene.lens.knots is not None and any(s.control != scene.lens.control for s in stages):
+            raise InputError("[lens] knots: a lens with knots of its own is designed on its own net; every stage's control"
+                             f" must be {list(scene.lens.control)}")
+        self.scene, self.target, self.stages, self.options, self.device = scene, target, stages, options, device
+        for stage in stages:
+            self._bounds(stage)  # refuse an impossible lens before any work
+
+    def field(self, stage: int) -> HeightField:
+        """The spline spaces of a stage."""
+        return HeightField.of(replace(self.scene.lens, control=self.stages[stage].control))
+
+    def begin(self, heights: Tensor | None = None) -> State:
+        """A fresh state: the parametrisation's own beginning, or `heights` (n, m) mm on the first stage's net."""
+        module = self._parametrise(0, heights)
+        return State(module().detach(), parameters=module.state_dict())
+
+    def run(self, state: State, *, iterations: int = 0, time_limit: float = math.inf,
+            stop: Callable[[], bool] = lambda: False, on_iteration: Callable[[State], None] = lambda s: None) -> State:
+        """Go on from `state` until the stages are done.
+
+        Args:
+            iterations: in all, counted from the very beginning; 0 for what the stages say.
+            time_limit: seconds for this run; each stage gets its part.
+            stop: asked after every iteration; True ends the run with the state whole.
+            on_iteration: told after every iteration.
+
+        Raises:
+            CausticError: no light reaches the screen, or values stopped being finite.
+        """
+        began, before = time.monotonic(), state.seconds
+        limit = iterations or sum(s.iterations for s in self.stages)
+        last = len(self.stages) - 1
+        costs = [s.iterations * (s.rays + 20.0 * s.control[0] * s.control[1]) for s in self.stages]
+        ahead = sum(costs[state.stage :])
+        state.reason = ""
+        for k in range(state.stage, last + 1):
+            deadline = began + time_limit
+            if k < last and ahead and math.isfinite(time_limit):
+                deadline = began + time_limit * sum(costs[state.stage : k + 1]) / ahead
+            done = self._stage(state, k, limit, deadline, stop, on_iteration, began - before)
+            if not done or k == last:
+                break
+            state = self._next(state, k + 1)
+        return state
+
+    def _stage(self, state: State, k: int, limit: int, deadline: float, stop, on_iteration, origin: float) -> bool:
+        """Iterate stage k in place.  True: the stage is done; False: the whole design ends here, for `state.reason`."""
+        stage, final = self.stages[k], k == len(self.stages) - 1
+        cap = math.inf if final else stage.iterations
+        method = heights = None
+        while True:
+            # Only what a checkpoint holds decides whether to go on, so that a resumed run decides alike.
+            if state.iteration >= cap:
+                return True
+            if self._flat(state, stage.tolerance):
+                state.reason = "no progress"
+                return True
+            if state.total >= limit or stop():
+                state.reason = "interrupted" if stop() else "iterations"
+                return False
+            if time.monotonic() >= deadline and (state.iteration > 0 or final):
+                state.reason = "time limit"
+                return not final
+            if method is None:
+                heights = self._parametrise(k, state.heights if self.options.network == "none" else None)
+                if state.parameters:
+                    heights.load_state_dict(state.parameters)
+                method = (_Adam if self.options.optimizer == "adam" else _Newtonlike)(
+                    self._objective(k), heights, self.options.lr)
+                if state.optimizer:
+                    method.load(state.optimizer)
+            if not method.step():
+                state.reason = "no progress"
+                return True
+            state.heights = heights().detach()
+            if not bool(torch.isfinite(state.heights).all()):
+                raise CausticError("the heights stopped being finite; a smaller --lr may help")
+            state.iteration, state.total, state.seconds = state.iteration + 1, state.total + 1, time.monotonic() - origin
+            state.history.append((state.total, k, method.loss, method.on_screen, state.seconds))
+            state.parameters, state.optimizer = heights.state_dict(), method.state()
+            on_iteration(state)
+
+    def _objective(self, k: int) -> Objective:
+        stage, o, scene = self.stages[k], self.options, self.scene
+        profile = None if scene.source.profile is None else torch.from_numpy(scene.source.profile)
+        sampler = Sampler.of_size(stage.sampler, stage.rays, scene.lens.size[0] / scene.lens.size[1],
+                                  seed=stream(o.seed, f"stage {k}"), profile=profile, device=self.device)
+        return Objective(scene, self.field(k), sampler, stage.filter, self.target, o.loss, blur=stage.blur,
+                         filter_target=o.filter_target, apron=stage.apron, dtype=o.dtype)
+
+    def _next(self, state: State, k: int) -> State:
+        """The state at the beginning of stage k: the same surface on its net."""
+        keep = self.options.network != "none" or self.options.optimizer == "adam"
+        if self.stages[k].control == self.stages[k - 1].control and keep:
+            return replace(state, stage=k, iteration=0, optimizer={})
+        if self.options.network != "none":
+            raise InputError("[[design.stages]] control cannot change between stages of a network")
+        tu, tv = (a.change_of_basis(b) for a, b in zip(self.field(k - 1).spaces, self.field(k).spaces, strict=True))
+        return replace(state, stage=k, iteration=0, parameters={}, optimizer={}, heights=tu @ state.heights @ tv.T)
+
+    def _parametrise(self, k: int, start: Tensor | None) -> Heights:
+        o = self.options
+        low, high = self._bounds(self.stages[k])
+        return parametrise(low, high, o.network, start=start, degree=self.scene.lens.degree, initial=o.initial,
+                           preconditioner=o.preconditioner, seed=o.seed)
+
+    def _bounds(self, stage: Stage) -> tuple[Tensor, Tensor]:
+        lens = replace(self.scene.lens, control=stage.control)
+        x, y = HeightField.of(lens).control_xy()
+        low, high = lens.height_bounds(x.numpy(), y.numpy())
+        if high.max() >= self.scene.screen.z:
+            raise InputError(f"[screen] z must lie behind the lens, whose surface may reach {high.max():.4g} mm,"
+                             f" got {self.scene.screen.z:g} mm")
+        return torch.from_numpy(low), torch.from_numpy(high)
+
+    @staticmethod
+    def _flat(state: State, tolerance: float) -> bool:
+        """Whether the last FLAT_SPAN iterations of this stage hardly lowered the loss."""
+        if tolerance == 0 or state.iteration <= FLAT_SPAN:
+            return False
+        losses = [row[2] for row in state.history[-FLAT_SPAN - 1 :]]
+        return losses[-1] > (1.0 - tolerance) * losses[0]
+
+
+class _Adam:
+    """Adam on the loss itself, as the thesis runs it; `loss` and `on_screen` belong to the point before the step."""
+
+    def __init__(self, objective: Objective, heights: Heights, lr: float):
+        self.objective, self.heights, self.loss, self.on_screen = objective, heights, math.inf, 0.0
+        self.adam = torch.optim.Adam(heights.parameters(), lr=lr)
+
+    def step(self) -> bool:
+        self.adam.zero_grad()
+        z = self.heights()
+        e = self.objective(z.detach())
+        if not math.isfinite(e.loss) or not bool(torch.isfinite(e.gradient).all()):
+            raise CausticError("the loss stopped being finite; a smaller --lr may help")
+        z.backward(e.gradient.to(z.device))
+        self.adam.step()
+        self.loss, self.on_screen = e.loss, e.on_screen
+        return True
+
+    def state(self) -> dict[str, Tensor]:
+        out = {}
+        for k, entry in self.adam.state_dict()["state"].items():
+            out |= {f"{k}.{name}": value for name, value in entry.items()}
+        return out
+
+    def load(self, state: dict[str, Tensor]) -> None:
+        whole = self.adam.state_dict()
+        whole["state"] = {}
+        for key, value in state.items():
+            k, name = key.split(".")
+            whole["state"].setdefault(int(k), {})[name] = value
+        self.adam.load_state_dict(whole)
+
+
+class _Newtonlike:
+    """L-BFGS on half the squared relative RMS, whose curvature near the minimum is that of a least-squares problem."""
+
+    def __init__(self, objective: Objective, heights: Heights, lr: float):
+        self.objective, self.heights = objective, heights
+        (self.parameter,) = heights.parameters()
+        self.pixels = objective.loss.target.numel()
+        self.seen: dict[float, float] = {}
+        self.method = LBFGS(self._evaluate, self.parameter.detach().reshape(-1).clone())
+        self.loss, self.on_screen = math.inf, 0.0
+
+    def _evaluate(self, x: Tensor) -> tuple[float, Tensor]:
+        self.parameter.data = x.view(self.parameter.shape)
+        z = self.heights()
+        try:
+            e = self.objective(z.detach())
+        except NoLight:
+            if self.method.f is None:
+                raise
+            return math.inf, torch.zeros_like(x)  # a step too far: the line search turns back
+        relative = e.loss * self.pixels
+        (g,) = torch.autograd.grad(z, self.parameter, e.gradient.to(z.device) * (self.pixels * relative))
+        value = 0.5 * relative * relative
+        self.seen[value] = e.on_screen
+        return value, g.reshape(-1)
+
+    def step(self) -> bool:
+        self.seen = {}
+        moved = self.method.step()
+        self.parameter.data = self.method.x.view(self.parameter.shape)
+        if self.method.f is not None:
+            self.loss = math.sqrt(2.0 * self.method.f) / self.pixels
+            self.on_screen = self.seen.get(self.method.f, self.on_screen)
+        return moved
+
+    def state(self) -> dict[str, Tensor]:
+        return self.method.state()
+
+    def load(self, state: dict[str, Tensor]) -> None:
+        self.method.load(state)

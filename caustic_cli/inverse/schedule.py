@@ -1,0 +1,69 @@
+"""How a design proceeds: a list of stages, coarse to fine.
+
+Early stages see the picture through a wide blur on a small control net with few rays, late ones at full detail.  The
+blur halves from stage to stage, so that light always knows which way to go.  Each stage traces rays of its own.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from caustic_cli.optics.reconstruction import Filter
+from caustic_cli.scene import checks
+
+QUALITIES = ("draft", "standard", "fine")
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stretch of a design.
+
+    Args:
+        control: control points along x and y; a finer net than the stage before takes over its surface.
+        rays: number of rays; sampler: see `caustic_cli.optics.sampling`.
+        filter: reconstruction filter of the render inside the loss.
+        blur: Gaussian seen by the loss on both render and target, pixels.
+        apron: pixels added around the screen, dark in the target, that catch stray light.
+        iterations: optimiser iterations; the last stage goes on to the design's total.
+        tolerance: ends the stage when ten iterations lowered the loss by less than this part; 0 never.
+    """
+
+    control: tuple[int, int]
+    rays: int
+    sampler: str = "lines"
+    filter: Filter = field(default_factory=lambda: Filter("cosine", (3, 3)))
+    blur: float = 0.0
+    apron: int = 0
+    iterations: int = 30
+    tolerance: float = 2e-3
+
+    def __post_init__(self):
+        checks.whole("[[design.stages]] rays", self.rays, 1, 10**12)
+        checks.number("[[design.stages]] blur", self.blur, 0.0, 1000.0)
+        checks.whole("[[design.stages]] apron", self.apron, 0, 4096)
+        checks.whole("[[design.stages]] iterations", self.iterations, 0, 10**9)
+        checks.number("[[design.stages]] tolerance", self.tolerance, 0.0, 1.0)
+
+
+def coarse_to_fine(control: tuple[int, int], degree: tuple[int, int], rays: int, resolution: tuple[int, int],
+                   quality: str = "standard", filter: Filter | None = None) -> list[Stage]:
+    """The default stages for a picture of `resolution` pixels, ending on `control` points with `rays` rays.
+
+    Blurs are 1/16 of the screen at first and halve down to none.  Control nets have a quarter, half and all of the
+    final knot spans, so knot insertion carries the surface on unchanged when those divide.
+    """
+    checks.choice("--quality", quality, QUALITIES)
+    filter = filter or Filter("cosine", (3, 3))
+    early, late = {"draft": (15, 25), "standard": (25, 50), "fine": (40, 120)}[quality]
+    pixels = max(resolution)
+    blurs = [2.0**k * pixels / 250.0 for k in (4, 3, 2, 1, 0, -1)] + [0.0]
+    shrink = [4, 4, 2, 2, 1, 1, 1]
+    fewer = [0.16, 0.16, 0.3, 0.3, 0.64, 1.0, 1.0]
+    stages = []
+    for k, (blur, part, few) in enumerate(zip(blurs, shrink, fewer, strict=True)):
+        net = tuple(min(n, max(p + 1, -(-(n - p) // part) + p)) for n, p in zip(control, degree, strict=True))
+        apron = math.ceil(pixels * (0.12 if blur > 1 else 0.04))
+        stages.append(Stage(net, max(1, int(rays * few)), "lines", filter, round(blur, 6), apron,
+                            late if k == len(blurs) - 1 else early))
+    return stages

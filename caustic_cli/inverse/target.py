@@ -1,0 +1,52 @@
+"""The picture on the screen's pixels: exact area averages of a picture of constant square cells."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import sparse
+
+from caustic_cli.errors import InputError
+from caustic_cli.scene import Screen
+
+
+def overlap(cells: np.ndarray, pixels: np.ndarray) -> sparse.csr_array:
+    """Part of each pixel's width covered by each cell: (len(pixels) - 1, len(cells) - 1), from ascending edges in mm."""
+    edges = np.unique(np.concatenate([cells, pixels]))
+    middle = 0.5 * (edges[:-1] + edges[1:])
+    row, column = np.searchsorted(pixels, middle) - 1, np.searchsorted(cells, middle) - 1
+    rows, columns = len(pixels) - 1, len(cells) - 1
+    inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+    value = np.diff(edges)[inside] / np.diff(pixels)[row[inside]]
+    return sparse.coo_array((value, (row[inside], column[inside])), shape=(rows, columns)).tocsr()
+
+
+def target_on_screen(irradiance: np.ndarray, size: tuple[float, float], screen: Screen, flip: str = "") -> np.ndarray:
+    """Mean irradiance of a picture on each pixel of a screen, dark around the picture: (n_x, n_y) float64.
+
+    Args:
+        irradiance: (a, b), [i, j] with i along +x and j along +y, finite and not negative, any scale.
+        size: width and height of the picture on the screen, mm, centred.
+        flip: "x" and/or "y": mirror the picture for a viewer on the lens' side.
+
+    Raises:
+        InputError: the picture is larger than the screen, or black there.
+    """
+    for name, picture, whole in zip(("width", "height"), size, screen.size, strict=True):
+        if picture > whole * (1 + 1e-9):
+            raise InputError(f"[target] size: the picture's {name} of {picture:g} mm must fit on the screen's {whole:g} mm"
+                             " (a smaller --mag, a larger --screen-size)")
+    if "x" in flip:
+        irradiance = irradiance[::-1]
+    if "y" in flip:
+        irradiance = irradiance[:, ::-1]
+    mean = irradiance
+    for axis in (0, 1):
+        cells = np.linspace(-0.5, 0.5, irradiance.shape[axis] + 1) * size[axis]
+        pixels = np.linspace(-0.5, 0.5, screen.resolution[axis] + 1) * screen.size[axis]
+        if abs(cells[0] - pixels[0]) < 1e-9 * screen.size[axis]:  # a picture as wide as the screen shares its edges exactly
+            cells[[0, -1]] = pixels[[0, -1]]
+        covers = overlap(cells, pixels)
+        mean = covers @ mean if axis == 0 else (covers @ mean.T).T
+    if not mean.sum() > 0:
+        raise InputError("target is black all over: a picture with some light in it is needed")
+    return np.ascontiguousarray(mean)

@@ -1,0 +1,111 @@
+"""The manual page, from the commands themselves: `python -m caustic_cli.manpage > man/caustic.1`.
+
+Options and their help come from the parser, so they cannot differ from `--help`; the sections around them are below.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+
+import typer
+
+from caustic_cli import __version__
+from caustic_cli.cli import app
+
+HEAD = r""".TH CAUSTIC 1 "" "caustic {version}" "User Commands"
+.SH NAME
+caustic \- design free-form lenses that throw a picture as a caustic
+.SH SYNOPSIS
+.B caustic
+.I COMMAND
+.RI [ OPTIONS ]
+.SH DESCRIPTION
+Give it a picture, and it finds the free-form lens that throws this picture as a caustic: a B-spline surface is shaped by
+differentiable ray tracing until the light lands where the picture is bright.
+.PP
+Lengths are millimetres, angles degrees, wavelengths nanometres, powers watts.  Results go to standard output, everything
+meant for a person to standard error.
+.SH COMMANDS
+"""
+
+TAIL = r""".SH FILES
+A project is a directory:
+.TP
+.I NAME.caustic/project.toml
+Everything that defines the scene and the design, with units.  Editing it and rendering again is a normal way to work.
+.TP
+.I NAME.caustic/checkpoints.h5
+Control heights, optimiser state, loss history, provenance (HDF5); replaced as a whole, never half-written.
+.TP
+.IR NAME.caustic/target.png " or " target.npy
+The target as used.
+.TP
+.I NAME.caustic/render.png
+The caustic, as last rendered.
+.TP
+.I NAME.caustic/report.png
+Target, caustic, lens height, loss against time.
+.SH ORIENTATION
+Arrays are indexed [i, j], i along +x and j along +y.  Image files are the screen seen from +z: column 0 is the \-x edge,
+row 0 the +y edge.  Seen from the lens' side the picture is mirrored;
+.B \-\-flip x
+designs for that viewer.
+.SH EXIT STATUS
+.TP
+.B 0
+Done.
+.TP
+.B 1
+Could not finish; the message says why and what is safe on disk.
+.TP
+.B 2
+Bad usage or bad input: one line says what, where, and what would be accepted.
+.TP
+.B 130, 143
+Interrupted by SIGINT or SIGTERM, after the last state was saved.
+.SH ENVIRONMENT
+.TP
+.B NO_COLOR
+Set to anything: no colour.
+.SH EXAMPLES
+.nf
+caustic design flame.png --source plane --mag 3
+caustic render flame.caustic --rays 4e6 --json
+caustic gradmap flame.caustic --control 60,70 --check
+caustic export flame.caustic --format stl -o flame.stl
+caustic convergence flame.caustic --study rays
+.fi
+"""
+
+
+def build() -> str:
+    """The whole page as roff."""
+    root = typer.main.get_command(app)
+    parts = [HEAD.format(version=__version__)]
+    for name, command in root.commands.items():
+        parts.append(_command(name, command))
+    return "".join(parts) + TAIL
+
+
+def _command(name: str, command) -> str:
+    arguments = [p for p in command.params if p.param_type_name == "argument"]
+    flags = [p for p in command.params if p.param_type_name == "option"]
+    usage = " ".join((p.metavar or p.name.upper()) for p in arguments)
+    lines = [f".SS caustic {name} {_plain(usage)} [OPTIONS]", _plain(command.help or "")]
+    for p in flags:
+        names = ", ".join(_plain(o) for o in sorted([*p.opts, *p.secondary_opts], key=len, reverse=True))
+        value = "" if p.is_flag else " \\fI" + _plain(p.metavar or p.name.upper()) + "\\fR"
+        default = "" if p.default in (None, False) or p.is_flag or callable(p.default) else f"  [default: {p.default}]"
+        lines += [".TP", f"\\fB{names}\\fR{value}", _plain((p.help or "") + default)]
+    return "\n".join(lines) + "\n"
+
+
+def _plain(text: str) -> str:
+    """Text as roff shows it: backslashes, hyphens and leading dots made safe."""
+    text = re.sub(r"\s+", " ", text).strip().replace("\\", "\\e").replace("-", "\\-")
+    return "\\&" + text if text[:1] in (".", "'") else text
+
+
+if __name__ == "__main__":
+    sys.stdout.write(build())

@@ -1,0 +1,202 @@
+"""Pictures in and out: reading a target, writing images.
+
+A picture file is the screen seen from +z: column 0 is the -x edge, row 0 the +y edge.  Arrays are [i, j], i along +x and
+j along +y.  Pixel values are sRGB-encoded or linear; irradiance is always linear.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageOps, PngImagePlugin, UnidentifiedImageError
+
+from caustic_cli.errors import InputError
+from caustic_cli.files import NPY_HEADER, SOFTWARE, atomic_path
+
+ENCODINGS = ("srgb", "linear")
+#: Largest picture read, in pixels: a float64 copy of it is half a gigabyte.
+MAX_PIXELS = 8192 * 8192
+ACCEPTED = "an image (PNG, JPEG, TIFF, ...) or a 2-D .npy array is needed"
+#: Luminance of linear sRGB primaries (IEC 61966-2-1, Rec. 709).
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+
+
+def to_linear(value: np.ndarray) -> np.ndarray:
+    """sRGB-encoded values in [0, 1] to linear ones (IEC 61966-2-1)."""
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
+def to_srgb(value: np.ndarray) -> np.ndarray:
+    """Linear values in [0, 1] to sRGB-encoded ones."""
+    return np.where(value <= 0.0031308, value * 12.92, 1.055 * np.maximum(value, 1e-12) ** (1 / 2.4) - 0.055)
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A target as it is kept in a project.
+
+    values: uint8 or uint16 codes in image order (rows from the top), or float64 irradiance in array order [i, j];
+    encoding: what the codes mean.
+    """
+
+    values: np.ndarray
+    encoding: str
+
+    @property
+    def suffix(self) -> str:
+        """.png, or .npy for floating-point irradiance."""
+        return ".npy" if self.values.dtype == np.float64 else ".png"
+
+    @property
+    def aspect(self) -> float:
+        """Height over width."""
+        a, b = self.irradiance_shape
+        return b / a
+
+    @property
+    def irradiance_shape(self) -> tuple[int, int]:
+        """Cells along x and y."""
+        return self.values.shape if self.values.dtype == np.float64 else self.values.shape[::-1]
+
+    def irradiance(self) -> np.ndarray:
+        """Linear irradiance (a, b), [i, j], float64; codes are scaled to [0, 1]."""
+        if self.values.dtype == np.float64:
+            return self.values
+        top = np.iinfo(self.values.dtype).max
+        table = np.arange(top + 1) / top
+        if self.encoding == "srgb":
+            table = to_linear(table)
+        return np.ascontiguousarray(table[self.values][::-1].T)
+
+    def write(self, path: Path) -> None:
+        """Write it losslessly; `path` ends in `suffix`."""
+        if self.suffix == ".npy":
+            write_npy(path, self.values)
+        else:
+            _write_png(path, Image.fromarray(self.values))
+
+
+def read_picture(path: str | Path, linear: bool = False) -> Picture:
+    """The picture at `path`, reduced to one channel of luminance.
+
+    8- and 16-bit grey codes are kept as they are.  Colour becomes luminance, alpha lies over black, a camera's
+    orientation tag is obeyed.  A .npy array, and a floating-point image, is linear irradiance.
+
+    Raises:
+        InputError: there is no such picture, or it is too large, too small, black, negative or not finite.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise InputError(f"{path}: is a directory; {ACCEPTED}")
+    try:
+        picture = _read_npy(path) if path.suffix.lower() == ".npy" else _read_image(path, linear)
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file; {ACCEPTED}") from error
+    except PermissionError as error:
+        raise InputError(f"{path}: cannot be read (permission denied); {ACCEPTED}") from error
+    a, b = picture.irradiance_shape
+    if min(a, b) < 2:
+        raise InputError(f"{path}: is {a} x {b} pixels; a picture of at least 2 x 2 is needed")
+    if not picture.values.any():
+        raise InputError(f"{path}: is black all over; a picture with some light in it is needed")
+    return picture
+
+
+def _check_size(path: Path, width: int, height: int) -> None:
+    if width * height > MAX_PIXELS:
+        raise InputError(f"{path}: is {width} x {height} pixels; at most {MAX_PIXELS} pixels (8192 x 8192) are read")
+
+
+def _read_npy(path: Path) -> Picture:
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (ValueError, EOFError, OSError) as error:
+        if isinstance(error, FileNotFoundError | PermissionError):
+            raise
+        raise InputError(f"{path}: is not a readable .npy array; {ACCEPTED}") from error
+    if not isinstance(array, np.ndarray) or array.ndim != 2 or array.dtype.kind not in "fiub":
+        raise InputError(f"{path}: a .npy target must be a 2-D array of real numbers")
+    _check_size(path, *array.shape)
+    values = np.array(array, dtype=np.float64)
+    if not np.isfinite(values).all():
+        raise InputError(f"{path}: holds {int((~np.isfinite(values)).sum())} values that are NaN or infinite;"
+                         " finite irradiance is needed")
+    if (values < 0).any():
+        raise InputError(f"{path}: holds negative values (least {values.min():g}); irradiance must be at least 0")
+    if values.size and values.max() > 1e300:
+        raise InputError(f"{path}: holds values up to {values.max():g}; irradiance must be at most 1e300")
+    return Picture(values, "linear")
+
+
+def _read_image(path: Path, linear: bool) -> Picture:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the size is checked below, in our words
+            with Image.open(path) as image:
+                _check_size(path, *image.size)
+                image = ImageOps.exif_transpose(image)
+                image.load()
+    except (FileNotFoundError, PermissionError, InputError):
+        raise
+    except Image.DecompressionBombError as error:
+        raise InputError(f"{path}: is too large; at most {MAX_PIXELS} pixels (8192 x 8192) are read") from error
+    except (UnidentifiedImageError, OSError, ValueError, SyntaxError, EOFError) as error:
+        raise InputError(f"{path}: is not an image that can be read; {ACCEPTED}") from error
+    encoding = "linear" if linear else "srgb"
+    if image.mode == "F":
+        values = np.asarray(image, dtype=np.float64)
+        if not np.isfinite(values).all() or (values < 0).any():
+            raise InputError(f"{path}: holds values that are negative, NaN or infinite; irradiance must be finite")
+        return Picture(np.ascontiguousarray(values[::-1].T), "linear")
+    if image.mode.startswith("I"):
+        codes = np.asarray(image.convert("I"))
+        if codes.min(initial=0) < 0 or codes.max(initial=0) > 65535:
+            raise InputError(f"{path}: holds integers outside 0 to 65535; an 8- or 16-bit picture is needed")
+        return Picture(codes.astype(np.uint16), encoding)
+    transparent = "transparency" in image.info or image.mode in ("LA", "La", "PA", "RGBA", "RGBa")
+    if image.mode in ("1", "L") and not transparent:
+        return Picture(np.array(image.convert("L")), encoding)
+    return Picture(_luminance(image, linear, transparent), encoding)
+
+
+def _luminance(image: Image.Image, linear: bool, transparent: bool) -> np.ndarray:
+    """16-bit codes of the luminance of a colour or transparent picture over black: (rows, columns) uint16."""
+    codes = np.asarray(image.convert("RGBA" if transparent else "RGB"))
+    table = np.arange(256) / 255.0
+    table = table if linear else to_linear(table)
+    out = np.empty(codes.shape[:2], dtype=np.uint16)
+    for k in range(0, len(codes), 256):  # in strips, so that a large photograph is not held in float64 three times
+        strip = codes[k : k + 256]
+        light = table[strip[..., :3]] @ LUMINANCE
+        if transparent:
+            light = light * (strip[..., 3] / 255.0)
+        light = np.clip(light, 0.0, 1.0)
+        out[k : k + 256] = np.rint((light if linear else to_srgb(light)) * 65535.0)
+    return out
+
+
+def write_image(path: str | Path, irradiance: np.ndarray, white: float, encoding: str) -> None:
+    """Write irradiance (n_x, n_y), [i, j], as an 8-bit grey PNG with `white` (and everything above) at 255."""
+    value = np.clip(irradiance / white if white > 0 else np.zeros_like(irradiance), 0.0, 1.0)
+    value = to_srgb(value) if encoding == "srgb" else value
+    _write_png(Path(path), Image.fromarray(np.rint(value * 255.0).astype(np.uint8).T[::-1].copy()))
+
+
+def write_npy(path: str | Path, array: np.ndarray) -> None:
+    """Write a .npy (format 1.0) whose header is padded to NPY_HEADER bytes: how this program knows its own."""
+    array = np.ascontiguousarray(array)
+    text = repr({"descr": np.lib.format.dtype_to_descr(array.dtype), "fortran_order": False, "shape": array.shape})
+    header = text.ljust(NPY_HEADER - 11) + "\n"
+    with atomic_path(path) as temporary, open(temporary, "wb") as f:
+        f.write(b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header.encode("latin1"))
+        f.write(array.tobytes())
+
+
+def _write_png(path: Path, image: Image.Image) -> None:
+    info = PngImagePlugin.PngInfo()
+    info.add_text("Software", SOFTWARE)
+    with atomic_path(path) as temporary:
+        image.save(temporary, format="PNG", pnginfo=info)

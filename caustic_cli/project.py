@@ -1,0 +1,110 @@
+"""A project directory: the scene and the design in text, the lens in a checkpoint, pictures beside them.
+
+    NAME.caustic/  project.toml  checkpoints.h5  target.png (or target.npy)  render.png  report.png
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from caustic_cli import checkpoint, settings
+from caustic_cli.checkpoint import Checkpoint
+from caustic_cli.derive import Settings, complete
+from caustic_cli.errors import InputError
+from caustic_cli.files import write_bytes
+from caustic_cli.inverse.target import target_on_screen
+from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.picture import Picture, read_picture
+from caustic_cli.scene import Scene
+
+TOML, CHECKPOINT, RENDER, REPORT = "project.toml", "checkpoints.h5", "render.png", "report.png"
+
+
+def is_project(path: Path) -> bool:
+    """Whether a directory holds a project.toml."""
+    return (path / TOML).is_file()
+
+
+@dataclass(frozen=True, eq=False)
+class Project:
+    """An opened project: its directory, complete settings, target picture and source profile."""
+
+    path: Path
+    settings: Settings
+    picture: Picture
+    profile: Picture | None = None
+
+    @classmethod
+    def open(cls, path: str | Path) -> Project:
+        """Read project.toml and the pictures it names.
+
+        Raises:
+            InputError: not a project, or something in it is missing, damaged or out of range.
+        """
+        path = Path(path)
+        if not path.is_dir() or not is_project(path):
+            raise InputError(f"{path}: is not a caustic project; a directory with a {TOML} is needed"
+                             " (caustic design makes one)")
+        given = settings.read(path / TOML)
+        try:
+            picture = _picture(path, given.get("target", {}).get("file", "target.png"),
+                               given.get("target", {}).get("encoding", "srgb") == "linear")
+            profile = given.get("source", {}).get("profile")
+            full = complete(given, picture.aspect)
+            return cls(path, full, picture, _picture(path, profile, True) if profile else None)
+        except InputError as error:
+            raise InputError(f"{path / TOML}: {error}") from error
+
+    def scene(self) -> Scene:
+        """The scene it describes."""
+        try:
+            return settings.build_scene(self.settings, None if self.profile is None else self.profile.irradiance())
+        except InputError as error:
+            raise InputError(f"{self.path / TOML}: {error}") from error
+
+    def target(self, scene: Scene) -> np.ndarray:
+        """The picture on the scene's screen, (n_x, n_y)."""
+        t = self.settings["target"]
+        return target_on_screen(self.picture.irradiance(), tuple(t["size"]), scene.screen, t["flip"])
+
+    def load(self) -> Checkpoint:
+        """The design so far."""
+        return checkpoint.load(self.path / CHECKPOINT)
+
+    def save(self, state: Checkpoint) -> None:
+        """Write the design so far."""
+        checkpoint.save(self.path / CHECKPOINT, state)
+
+    def lens(self, scene: Scene) -> tuple[HeightField, Checkpoint]:
+        """The designed surface over the scene's aperture.
+
+        Raises:
+            InputError: there is none, or project.toml was edited to another net than the lens was designed on.
+        """
+        state = self.load()
+        field = HeightField(state.spaces, scene.lens.half_size)
+        degree = tuple(s.degree for s in state.spaces)
+        if degree != scene.lens.degree:
+            raise InputError(f"{self.path / TOML}: [lens] degree {list(scene.lens.degree)} is not that of the designed lens,"
+                             f" {list(degree)}; design again to change it")
+        done = state.state.stage == len(self.settings["design"]["stages"]) - 1
+        if done and field.shape != scene.lens.control:
+            raise InputError(f"{self.path / TOML}: [lens] control {list(scene.lens.control)} is not that of the designed lens,"
+                             f" {list(field.shape)}; design again to change it")
+        return field, state
+
+    def write(self) -> None:
+        """Write project.toml and the pictures; the directory exists."""
+        self.picture.write(self.path / self.settings["target"]["file"])
+        if self.profile is not None:
+            self.profile.write(self.path / self.settings["source"]["profile"])
+        write_bytes(self.path / TOML, settings.dump(self.settings).encode())
+
+
+def _picture(directory: Path, name: str, linear: bool) -> Picture:
+    if name != Path(name).name or name in ("", ".", ".."):
+        raise InputError(f"a picture's file must be a name within the project directory, got {name!r}")
+    return read_picture(directory / name, linear)

@@ -1,0 +1,260 @@
+"""A design from beginning to end: make or open the project, run the loop, keep checkpoints, judge the lens, report.
+
+Nothing is written before everything the user gave has been checked.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from caustic_cli import __version__, settings
+from caustic_cli.checkpoint import Checkpoint
+from caustic_cli.console import Reporter
+from caustic_cli.derive import build_options, build_stages, complete
+from caustic_cli.errors import InputError, Interrupted
+from caustic_cli.inverse.designer import Designer, State
+from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.sampling import Sample
+from caustic_cli.picture import read_picture, write_image
+from caustic_cli.project import CHECKPOINT, RENDER, REPORT, TOML, Project, is_project
+from caustic_cli.scene import Scene
+from caustic_cli.studies.panels import write_report
+from caustic_cli.studies.retrace import FINAL_RAYS, retrace, white_level
+
+#: Points along each side of the aperture at which the report draws the surface.
+REPORT_SAMPLES = 401
+
+
+def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: dict, config: Path | None,
+          force: bool) -> Project:
+    """Check everything, then make the project directory.
+
+    Args:
+        given: (section, key, option) -> value, what the options say.
+        screen: --screen-size, one or two lengths; pixels: --resolution, one or two counts; shaped: mag, margin, quality, rays.
+
+    Raises:
+        InputError: something is wrong; nothing was written.
+    """
+    said = settings.read(config) if config else {}
+    for (section, key, _), value in given.items():
+        said.setdefault(section, {})[key] = value
+    if "index" in said.get("lens", {}) and "glass" in said["lens"]:
+        names = [option for (_, key, option) in given if key in ("index", "glass")]
+        if len(names) == 1:  # an option replaces what the configuration says
+            del said["lens"]["glass" if names[0] == "--index" else "index"]
+    picture = read_picture(target, said.get("target", {}).get("encoding") == "linear")
+    if screen:
+        height = screen[1] if len(screen) == 2 else screen[0] * picture.aspect
+        said.setdefault("screen", {})["size"] = [screen[0], height]
+        given = {**given, ("screen", "size", "--screen-size"): screen}
+    if pixels and len(pixels) == 2:
+        said.setdefault("screen", {})["resolution"] = list(pixels)
+    elif pixels:
+        said.get("screen", {}).pop("resolution", None)
+    given = {**given, ("screen", "resolution", "--resolution"): pixels}
+    profile = said.get("source", {}).get("profile")
+    light = read_picture(config.parent / profile, linear=True) if profile else None
+    path = out or Path(f"{target.stem or 'design'}.caustic")
+    try:
+        full = complete(said, picture.aspect, width=pixels[0] if pixels and len(pixels) == 1 else None, **shaped)
+        full["target"] |= {"file": f"target{picture.suffix}", "encoding": picture.encoding}
+        if light is not None:
+            full["source"]["profile"] = f"profile{light.suffix}"
+        project = Project(path, full, picture, light)
+        _designer(project, "cpu")  # builds and so checks scene, target, stages, options
+        _first_heights(project)
+    except InputError as error:
+        message = str(error)
+        for section, key, option in given:
+            message = message.replace(f"[{section}] {key}", option)
+        raise InputError(message) from error
+    _make_directory(path, force)
+    project.write()
+    return project
+
+
+def find(target: Path, out: Path | None) -> Project:
+    """The project that --resume means: TARGET itself, or the one that designing TARGET would make."""
+    path = target if target.is_dir() else (out or Path(f"{target.stem}.caustic"))
+    if not target.exists() and not path.exists():
+        raise InputError(f"{target}: no such project; --resume needs a directory made by caustic design")
+    return Project.open(path)
+
+
+def design(project: Project, device: str, say: Reporter, began: float) -> dict:
+    """Run a new design to its end; returns the figures of the JSON table."""
+    designer, target = _designer(project, device)
+    state = designer.begin(_first_heights(project))
+    return _run(project, designer, target, state, say, began, 0, None, device)
+
+
+def resume(project: Project, iterations: int | None, time_limit: float | None, device: str, say: Reporter,
+           began: float) -> dict:
+    """Go on from the last checkpoint; with nothing left to do, judge the lens again."""
+    designer, target = _designer(project, device)
+    state = project.load().state
+    if state.stage >= len(designer.stages):
+        raise InputError(f"{project.path / TOML}: has {len(designer.stages)} stages, but the checkpoint stands in stage"
+                         f" {state.stage + 1}")
+    if tuple(state.heights.shape) != designer.stages[state.stage].control:
+        raise InputError(f"{project.path / TOML}: stage {state.stage + 1} has control"
+                         f" {list(designer.stages[state.stage].control)}, but the checkpoint {list(state.heights.shape)}")
+    if iterations is not None:
+        project.settings["design"]["iterations"] = iterations
+        project.write()
+    return _run(project, designer, target, state, say, began, iterations, time_limit, device)
+
+
+def sphere() -> tuple[Scene, HeightField, torch.Tensor]:
+    """The lens a design begins from when nothing but defaults is said, its field and heights."""
+    full = complete({}, 1.0)
+    scene = settings.build_scene(full)
+    field = HeightField.of(scene.lens)
+    x, y = (c.numpy() for c in field.control_xy())
+    offset = scene.lens.offset
+    return scene, field, torch.from_numpy(offset.thickness + offset.sag(x[:, None], y[None, :]))
+
+
+def _designer(project: Project, device: str) -> tuple[Designer, np.ndarray]:
+    scene = project.scene()
+    target = project.target(scene)
+    stages, chosen = build_stages(project.settings), build_options(project.settings)
+    return Designer(scene, torch.from_numpy(target), stages, chosen, device), target
+
+
+def _first_heights(project: Project) -> torch.Tensor | None:
+    """Heights of --start PROJECT on the first stage's net, or None for the offset surface.
+
+    Raises:
+        InputError: no such project, or its lens is of another size.
+    """
+    start = project.settings["design"]["start"]
+    if start == "offset":
+        return None
+    if not is_project(Path(start)):
+        raise InputError(f"[design] start must be offset or a project directory, got {start!r}")
+    other = Project.open(start)
+    field, checkpoint = other.lens(other.scene())
+    if other.settings["lens"]["size"] != project.settings["lens"]["size"]:
+        raise InputError(f"[design] start: the lens of {start} is {other.settings['lens']['size']} mm, not"
+                         f" {project.settings['lens']['size']} mm")
+    net = _designer(project, "cpu")[0].field(0)
+    tu, tv = (a.change_of_basis(b) for a, b in zip(field.spaces, net.spaces, strict=True))
+    return tu @ checkpoint.state.heights @ tv.T
+
+
+def _make_directory(path: Path, force: bool) -> None:
+    """An empty place for a project.
+
+    Raises:
+        InputError: something stands there, or the place cannot be written to.
+    """
+    if path.exists():
+        if not path.is_dir():
+            raise InputError(f"{path}: exists and is not a directory; -o DIR chooses another place")
+        if any(path.iterdir()):
+            if not is_project(path):
+                raise InputError(f"{path}: exists and is not a caustic project; -o DIR chooses another place")
+            if not force:
+                raise InputError(f"{path}: holds a design already; --resume goes on with it, --force begins anew,"
+                                 " -o DIR chooses another place")
+            for name in (CHECKPOINT, RENDER, REPORT):
+                (path / name).unlink(missing_ok=True)
+    try:
+        path.mkdir(exist_ok=True)
+        probe = path / ".caustic-probe"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written to ({error.strerror}); -o DIR chooses another place") from error
+
+
+def _run(project: Project, designer: Designer, target: np.ndarray, state: State, say: Reporter, began: float,
+         iterations: int | None, time_limit: float | None, device: str) -> dict:
+    chosen = project.settings["design"]
+    limit = chosen["time_limit"] if time_limit is None else time_limit
+    provenance = {
+        "caustic": __version__, "torch": torch.__version__, "numpy": np.__version__, "device": device,
+        "threads": torch.get_num_threads(), "seed": chosen["seed"],
+        "target_sha256": hashlib.sha256(np.ascontiguousarray(project.picture.values).tobytes()).hexdigest(),
+    }
+
+    def keep(now: State, results: dict | None = None) -> None:
+        project.save(Checkpoint(now, designer.field(now.stage).spaces, provenance, results or {}))
+
+    total = chosen["iterations"] or sum(s.iterations for s in designer.stages)
+    with _signals() as asked, say.progress(total) as show:
+        stage, saved = -1, time.monotonic()
+
+        def on_iteration(now: State) -> None:
+            nonlocal stage, saved
+            if now.stage != stage:
+                stage = now.stage
+                s = designer.stages[stage]
+                say.say(f"stage {stage + 1}/{len(designer.stages)}: {s.control[0]} x {s.control[1]} control points,"
+                        f" {s.rays:,} rays, blur {s.blur:g} px")
+            _, _, loss, on_screen, _ = now.history[-1]
+            show(f"stage {stage + 1}/{len(designer.stages)}",
+                 f"loss {loss * target.size:.4f}  on screen {on_screen:.1%}", now.total, total)
+            if time.monotonic() - saved >= chosen["checkpoint_every"]:
+                keep(now)
+                saved = time.monotonic()
+
+        keep(state)
+        state = designer.run(state, iterations=chosen["iterations"], time_limit=limit, stop=lambda: bool(asked),
+                             on_iteration=on_iteration)
+        keep(state)
+        if asked:
+            raise Interrupted(f"interrupted after {state.total} iterations; {project.path / CHECKPOINT} is saved,"
+                              f" caustic design --resume {project.path} goes on", 128 + asked[0])
+        figures = _judge(project, designer, target, state, device)
+        figures |= {"iterations": state.total, "seconds": time.monotonic() - began, "image": str(project.path / RENDER),
+                    "project": str(project.path), "reason": state.reason}
+        keep(state, figures)
+    return figures
+
+
+def _judge(project: Project, designer: Designer, target: np.ndarray, state: State, device: str) -> dict:
+    """Retrace the finished lens with rays of its own; write render.png and report.png."""
+    scene, field = designer.scene, designer.field(state.stage)
+    exposure, figures = retrace(scene, field, state.heights, target, rays=FINAL_RAYS, device=device,
+                                seed=project.settings["design"]["seed"])
+    image, encoding = exposure.image.cpu().numpy(), project.settings["target"]["encoding"]
+    write_image(project.path / RENDER, image, white_level(image, target), encoding)
+    history = np.array(state.history, dtype=float).reshape(-1, 5)
+    write_report(project.path / REPORT, target, image, _surface(field, state.heights), history, scene.lens, scene.screen,
+                 figures, encoding)
+    return figures
+
+
+def _surface(field: HeightField, heights: torch.Tensor) -> np.ndarray:
+    """The surface on an even grid over the aperture, mm."""
+    u = torch.linspace(0.0, 1.0, REPORT_SAMPLES, dtype=torch.float64)
+    return field.prepare(Sample(u, u, True, torch.ones(())), torch.float64)(heights)[0].numpy()
+
+
+@contextmanager
+def _signals() -> Iterator[list[int]]:
+    """Collect SIGINT and SIGTERM instead of dying of them; a second SIGINT interrupts at once."""
+    asked: list[int] = []
+
+    def handler(number: int, _frame) -> None:
+        if asked and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        asked.append(number)
+
+    before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield asked
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)

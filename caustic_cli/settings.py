@@ -1,0 +1,241 @@
+"""What project.toml may say: sections, keys, units, defaults; and how it becomes a scene and a schedule.
+
+Settings are a plain nested dict with the file's own keys.  Ranges are checked where the scene and the stages are
+built; here, keys and types.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+
+from caustic_cli import __version__
+from caustic_cli.errors import InputError
+from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen, checks
+from caustic_cli.scene.materials import D_LINE, refractive_index
+
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True)
+class Key:
+    """A key of project.toml: its type, and the comment written beside it."""
+
+    kind: str  # number, whole, text, flag, numbers (two), wholes (two), list (of numbers)
+    note: str = ""
+
+
+SCHEMA: dict[str, dict[str, Key]] = {
+    "source": {
+        "type": Key("text", "plane: parallel light along +z, as wide as the lens"),
+        "power": Key("number", "W, through the aperture"),
+        "profile": Key("text", "file here with the relative irradiance over the aperture"),
+    },
+    "lens": {
+        "size": Key("numbers", "mm, full width and height of the aperture"),
+        "z_in": Key("number", "mm, flat entrance surface"),
+        "thickness": Key("number", "mm, offset surface at the centre"),
+        "radius": Key("numbers", "mm, of the offset along x and y; inf is flat, positive spreads light"),
+        "height_range": Key("numbers", "mm, least and largest departure from the offset"),
+        "min_thickness": Key("number", "mm, least distance of the surface from z_in"),
+        "index": Key("number", "refractive index"),
+        "glass": Key("text", "material, instead of index"),
+        "wavelength": Key("number", "nm, at which the glass is taken"),
+        "fresnel": Key("text", "reflection losses: none, schlick or exact"),
+        "control": Key("wholes", "control points of the finished lens"),
+        "degree": Key("wholes", "spline degrees"),
+        "knots_u": Key("list", "knot vector on [0, 1] along x"),
+        "knots_v": Key("list", "knot vector on [0, 1] along y"),
+    },
+    "screen": {
+        "z": Key("number", "mm, from the lens' origin"),
+        "size": Key("numbers", "mm, full width and height"),
+        "resolution": Key("wholes", "pixels"),
+    },
+    "target": {
+        "file": Key("text", "the picture, in this directory"),
+        "size": Key("numbers", "mm, width and height of the picture on the screen"),
+        "encoding": Key("text", "of the picture's values: srgb or linear"),
+        "flip": Key("text", "mirror the picture along x, y or xy; empty for none"),
+    },
+    "design": {
+        "loss": Key("text", "rms (eq. 5.2.1) or rms-light"),
+        "optimizer": Key("text", "lbfgs or adam"),
+        "lr": Key("number", "learning rate of adam"),
+        "network": Key("text", "none, sparse or dense"),
+        "initial": Key("text", "parameters at first: zero, uniform (+-1e-4) or random"),
+        "preconditioner": Key("text", "none or laplacian"),
+        "filter_target": Key("flag", "filter the target as the render is filtered"),
+        "start": Key("text", "offset, or where the first surface came from"),
+        "iterations": Key("whole", "in all; 0: what the stages say"),
+        "time_limit": Key("number", "s; inf for none"),
+        "checkpoint_every": Key("number", "s between checkpoints"),
+        "seed": Key("whole", "of rays and networks"),
+        "dtype": Key("text", "of the rays: float32 or float64"),
+    },
+}
+STAGE: dict[str, Key] = {
+    "control": Key("wholes", "control points"),
+    "rays": Key("whole"),
+    "sampler": Key("text", "grid, lines, stratified or uniform"),
+    "reconstruction": Key("text", "bincount, gaussian or cosine"),
+    "filter_size": Key("wholes", "pixels, odd"),
+    "alpha_per_mm2": Key("number", "of the gaussian, 1/mm^2 (eq. 4.4.5)"),
+    "alpha_per_pixel2": Key("number", "of the gaussian, 1/pixel^2, instead of alpha_per_mm2"),
+    "blur": Key("number", "pixels, of render and target in the loss"),
+    "apron": Key("whole", "dark pixels around the screen that catch stray light"),
+    "iterations": Key("whole"),
+    "tolerance": Key("number", "ends the stage when 10 iterations gain less than this part; 0 never"),
+}
+DEFAULTS: dict[str, dict[str, Any]] = {
+    "source": {"type": "plane", "power": 1.0},
+    "lens": {"size": [10.0, 10.0], "z_in": 0.0, "min_thickness": 1.0, "fresnel": "exact", "degree": [3, 3]},
+    "screen": {"z": 300.0},
+    "target": {"encoding": "srgb", "flip": ""},
+    "design": {"loss": "rms-light", "optimizer": "lbfgs", "lr": 1e-3, "network": "none", "initial": "zero",
+               "filter_target": True, "start": "offset", "iterations": 0, "time_limit": math.inf,
+               "checkpoint_every": 10.0, "seed": 0, "dtype": "float32"},
+}
+DEFAULT_INDEX = 1.5443  # table D.2
+
+
+def parse(text: str, where: str) -> dict[str, dict[str, Any]]:
+    """Settings from TOML text: every key known and of its type; defaults are not filled in.
+
+    Raises:
+        InputError: naming `where` and the offending key.
+    """
+    try:
+        raw = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{where}: is not valid TOML: {error}") from error
+    version = raw.pop("format_version", FORMAT_VERSION)
+    if not isinstance(version, int) or version > FORMAT_VERSION:
+        raise InputError(f"{where}: has format_version {version!r}; this caustic {__version__} reads up to {FORMAT_VERSION}")
+    raw.pop("created_by", None)
+    out: dict[str, dict[str, Any]] = {}
+    for section, table in raw.items():
+        if section not in SCHEMA:
+            raise InputError(f"{where}: [{section}] is not a section{_near(section, SCHEMA)}")
+        if not isinstance(table, dict):
+            raise InputError(f"{where}: {section} must be a section, written [{section}]")
+        out[section] = {}
+        for key, value in table.items():
+            if (section, key) == ("design", "stages"):
+                out[section][key] = _stages(value, where)
+                continue
+            out[section][key] = _typed(f"{where}: [{section}] {key}", key, value, SCHEMA[section])
+    return out
+
+
+def _stages(tables, where: str) -> list[dict[str, Any]]:
+    if not isinstance(tables, list) or not tables or not all(isinstance(t, dict) for t in tables):
+        raise InputError(f"{where}: [[design.stages]] must be a list of tables")
+    return [{k: _typed(f"{where}: [[design.stages]] {k}", k, v, STAGE) for k, v in t.items()} for t in tables]
+
+
+def _typed(where: str, key: str, value, keys: dict[str, Key]):
+    if key not in keys:
+        raise InputError(f"{where} is not a key{_near(key, keys)}")
+    kind = keys[key].kind
+    if kind == "text":
+        if not isinstance(value, str):
+            raise InputError(f"{where} must be text in quotes, got {value!r}")
+        return value
+    if kind == "flag":
+        if not isinstance(value, bool):
+            raise InputError(f"{where} must be true or false, got {value!r}")
+        return value
+    if kind in ("number", "whole"):
+        return _numeric(where, value, kind == "whole")
+    if not isinstance(value, list) or (kind != "list" and len(value) != 2):
+        raise InputError(f"{where} must be a pair [x, y], got {value!r}")
+    return [_numeric(where, v, kind == "wholes") for v in value]
+
+
+def _numeric(where: str, value, whole: bool):
+    wanted = int if whole else int | float
+    if isinstance(value, bool) or not isinstance(value, wanted) or (isinstance(value, float) and math.isnan(value)):
+        raise InputError(f"{where} must be a {'whole ' if whole else ''}number, got {value!r}")
+    return value if whole else float(value)
+
+
+def _near(name: str, known) -> str:
+    close = difflib.get_close_matches(name, known, 1, 0.5)
+    return f"; did you mean {close[0]}?" if close else f"; known are {', '.join(known)}"
+
+
+def with_defaults(settings: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Settings with every section present and constant defaults filled in."""
+    return {section: {**DEFAULTS[section], **settings.get(section, {})} for section in SCHEMA}
+
+
+def dump(settings: dict[str, dict[str, Any]]) -> str:
+    """TOML text in the schema's order, each key with its unit or meaning beside it."""
+    lines = ["# A caustic project: edit by hand as you like, then `caustic render` or `caustic design --resume`.",
+             f"format_version = {FORMAT_VERSION}", f'created_by = "caustic {__version__}"']
+    for section, keys in SCHEMA.items():
+        lines += ["", f"[{section}]", *_assignments(settings.get(section, {}), keys)]
+    for stage in settings.get("design", {}).get("stages", []):
+        lines += ["", "[[design.stages]]", *_assignments(stage, STAGE)]
+    return "\n".join(lines) + "\n"
+
+
+def _assignments(values: dict[str, Any], keys: dict[str, Key]) -> list[str]:
+    rows = [(f"{key} = {_toml(values[key])}", spec.note) for key, spec in keys.items() if key in values]
+    width = min(40, max((len(text) for text, _ in rows), default=0))
+    return [f"{text:<{width}}  # {note}" if note else text for text, note in rows]
+
+
+def _toml(value) -> str:
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_toml(v) for v in value) + "]"
+    return tomli_w.dumps({"k": value})[len("k = ") :].strip()
+
+
+def index_of(lens: dict[str, Any]) -> float:
+    """Refractive index from the keys index, or glass and wavelength."""
+    if "glass" in lens:
+        if "index" in lens:
+            raise InputError("[lens] takes index or glass, not both")
+        return refractive_index(lens["glass"], lens.get("wavelength", D_LINE))
+    return lens.get("index", DEFAULT_INDEX)
+
+
+def build_lens(settings: dict[str, dict[str, Any]]) -> Lens:
+    """The lens that the [lens] section describes; all its keys must be there."""
+    lens = settings["lens"]
+    if ("knots_u" in lens) != ("knots_v" in lens):
+        raise InputError("[lens] knots_u and knots_v go together: give both or neither")
+    knots = (tuple(lens["knots_u"]), tuple(lens["knots_v"])) if "knots_u" in lens else None
+    if knots and any(len(t) != n + p + 1 for t, n, p in zip(knots, lens["control"], lens["degree"], strict=True)):
+        raise InputError("[lens] knots_u and knots_v must have control + degree + 1 entries each")
+    offset = Offset(lens["thickness"], tuple(lens["radius"]))
+    return Lens(tuple(lens["size"]), lens["z_in"], index_of(lens), tuple(lens["control"]), tuple(lens["degree"]), knots,
+                lens["min_thickness"], offset, tuple(lens["height_range"]), lens["fresnel"])
+
+
+def build_scene(settings: dict[str, dict[str, Any]], profile: np.ndarray | None = None) -> Scene:
+    """The whole scene; `profile` is the source's irradiance if [source] names one."""
+    checks.choice("[source] type", settings["source"]["type"], ("plane",))
+    screen = settings["screen"]
+    return Scene(PlaneWave(settings["source"]["power"], profile), build_lens(settings),
+                 Screen(tuple(screen["size"]), screen["z"], tuple(screen["resolution"])))
+
+
+def read(path: Path) -> dict[str, dict[str, Any]]:
+    """Settings from a TOML file."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file; a TOML file is needed") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as text ({error}); a TOML file is needed") from error
+    return parse(text, str(path))

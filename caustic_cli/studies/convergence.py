@@ -1,0 +1,211 @@
+"""What accuracy costs in time: the error of an image against one made with many more rays, setting by setting.
+
+    rays            samplers x numbers of rays, bincount: how fast does each kind of ray converge
+    reconstruction  filters x numbers of rays: what blur costs in bias and saves in noise
+    precision       float32 against float64 on the same rays: is single precision enough here
+
+A bincount image has noise only.  For n independent rays its error is sqrt(N / n) on N evenly lit pixels, order 1/2;
+with one ray in each of n cells only the cells on a pixel's border contribute, which gives order 3/4 once there are
+several rays a pixel.  Orders are therefore fitted over settings with at least one ray a pixel.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from caustic_cli import __version__
+from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.reconstruction import Filter
+from caustic_cli.optics.sampling import SAMPLERS
+from caustic_cli.scene import Scene, checks
+from caustic_cli.studies.fit import Order, order
+from caustic_cli.studies.measurement import REFERENCE_SEED, Bench, Reference, Setting
+from caustic_cli.studies.metrics import relative_rms
+from caustic_cli.studies.report import Study
+
+#: Rays of the largest setting: each study then takes 10 to 30 s on two cores at 250 x 250 pixels.
+MAX_RAYS = {"rays": 1 << 20, "reconstruction": 1 << 19, "precision": 1 << 19}
+#: Reconstruction filters compared, kind and size in pixels.  The Gaussian's alpha is 0: with the thesis' alpha of 1 per
+#: cm^2 and pixels of a fraction of a mm it cannot be told from that limit.
+FILTERS = (Filter(), *(Filter(kind, (v, v)) for kind in ("gaussian", "cosine") for v in (3, 5, 11)))
+#: Single precision is enough where it changes the image by less than this part of the error its rays leave anyway:
+#: it then adds half a percent to it in quadrature.
+NEGLIGIBLE = 0.1
+#: An order below this is no convergence: halving the error would take a thousand times the rays.
+STALLED = 0.1
+#: Repeats of one setting on an idle machine differ by a few tenths; by more than this, something else was running.
+BUSY = 2.0
+
+_COMMON = {
+    "series": "the curve this setting belongs to",
+    "sampler": "kind of rays",
+    "rays": "rays traced",
+    "error": "relative RMS against the reference, each image over its own mean; root mean square over the repeats",
+}
+_TIMES = {
+    "seconds": "wall time of sampling, tracing and reconstruction, s; median of the repeats",
+    "seconds_min": "least of them, s",
+    "seconds_max": "most of them, s",
+}
+
+
+def run_study(name: str, scene: Scene, field: HeightField, heights: Tensor, *, seed: int = 0,
+              dtype: torch.dtype | None = None, max_rays: int | None = None, repeats: int = 3,
+              progress: Callable[[int, int], None] | None = None) -> Study:
+    """Measure one of STUDIES on a lens.  Its errors repeat from run to run; its times do not.
+
+    Args:
+        name: rays, reconstruction or precision.
+        heights: (n, m) control heights, mm; the study runs on their device.
+        seed: of the rays studied; the reference takes others.
+        dtype: precision of the rays studied, None for float64 (`precision` always compares both).
+        max_rays: rays of the largest setting, None for MAX_RAYS; the reference takes many times more.
+        repeats: rounds, each with fresh rays.
+        progress: told (rays traced, rays in all) after every image.
+
+    Raises:
+        InputError: unknown study, or numbers out of range.
+        CausticError: no light reaches the screen.
+    """
+    checks.choice("--study", name, tuple(STUDIES))
+    max_rays = checks.whole("--rays", MAX_RAYS[name] if max_rays is None else max_rays, 256, 1 << 32)
+    checks.whole("--repeats", repeats, 1, 1000)
+    bench = Bench(scene, field, heights.detach().double(), seed, repeats, max_rays, progress)
+    return STUDIES[name](bench, dtype or torch.float64)
+
+
+def study_rays(bench: Bench, dtype: torch.dtype) -> Study:
+    """Error against the number of rays, for every sampler."""
+    settings = [Setting(kind, kind, bench.max_rays >> k, Filter(), dtype)
+                for k in range(6, -1, -1) for kind in SAMPLERS]
+    bench.plan(settings)
+    truth = bench.reference(Filter())
+    rows = bench.measure(settings, lambda s, image, _: {"error": relative_rms(image, truth.image)})
+    orders = _orders(bench, rows)
+    best = min(rows, key=lambda row: row["error"])
+    advice = (f"a relative error of {best['error']:.2g} costs {best['seconds']:.2g} s with {best['rays']}"
+              f" {best['sampler']} rays; {_halving(orders[best['series']])}{_haste(rows)}")
+    return Study("rays", _COMMON | _TIMES, rows, orders, advice, _about(bench, dtype, truth))
+
+
+def study_reconstruction(bench: Bench, dtype: torch.dtype) -> Study:
+    """Error of filters, split into the bias of their blur and the noise that it leaves.
+
+    A filter's own reference is what its images tend to.  The bincount reference smoothed by `Filter.smooth` is not
+    quite that, because light is not even within a pixel: how far off it is stands beside it, as `kernel`.  That
+    reference is rendered on a screen grown by the filters' reach, so that light blurred into the frame is in it.
+    """
+    settings = [Setting(f.kind if f.size[0] == 1 else f"{f.kind} {f.size[0]}", "lines", bench.max_rays >> k, f, dtype)
+                for k in (4, 2, 0) for f in FILTERS]
+    bench.plan(settings, filtered=len(FILTERS) - 1)
+    reach = max(f.reach[0] for f in FILTERS)
+    wide = bench.reference(Filter(), bench.scene.screen.grown((reach, reach)))
+
+    def crop(image: Tensor) -> Tensor:
+        return image[reach : image.shape[0] - reach, reach : image.shape[1] - reach]
+
+    truth, own, fixed = crop(wide.image), {}, {}
+    for f in FILTERS:
+        own[f] = Reference(truth, wide.rays, wide.error) if f == Filter() else bench.reference(f)
+        fixed[f] = {"bias": relative_rms(own[f].image, truth),
+                    "kernel": relative_rms(crop(f.smooth(wide.image)), own[f].image), "reference_error": own[f].error}
+
+    def figures(s: Setting, image: Tensor, _) -> dict:
+        noise = relative_rms(image, own[s.filter].image)
+        return {"error": relative_rms(image, truth), "noise": noise, **fixed[s.filter]}
+
+    rows = bench.measure(settings, figures)
+    for row, s in zip(rows, settings, strict=True):
+        row |= {"filter": s.filter.kind, "size": s.filter.size[0]}
+    columns = _COMMON | {
+        "filter": "reconstruction filter",
+        "size": "its size, pixels along either axis",
+        "noise": "relative RMS against the filter's own reference: what more rays remove",
+        "bias": "relative RMS between the filter's own reference and the reference: what they do not",
+        "kernel": "relative RMS between the reference smoothed by Filter.smooth and the filter's own reference",
+        "reference_error": "estimated relative RMS of the filter's own reference",
+    } | _TIMES
+    parts = []
+    for k in range(0, len(rows), len(FILTERS)):
+        plain, best = rows[k], min(rows[k : k + len(FILTERS)], key=lambda row: row["error"])
+        than = f" in {best['seconds']:.2g} s"
+        if best is not plain:
+            than += f" (bincount {plain['error']:.2g} in {plain['seconds']:.2g} s)"
+        parts.append(f"with {best['rays']} rays {best['series']} has the least error, {best['error']:.2g}{than}")
+    about = _about(bench, dtype, wide) | {"orders_of": "noise"}
+    return Study("reconstruction", columns, rows, _orders(bench, rows, "noise"), "; ".join(parts) + _haste(rows), about)
+
+
+def study_precision(bench: Bench, _dtype) -> Study:
+    """Both precisions on the same rays: how far apart their images are, beside how wrong either is."""
+    settings = [Setting(f"{kind} {_name(dtype)}", kind, bench.max_rays >> k, Filter(), dtype)
+                for k in (4, 2, 0) for kind in SAMPLERS for dtype in (torch.float64, torch.float32)]
+    bench.plan(settings)
+    truth = bench.reference(Filter())
+
+    def figures(s: Setting, image: Tensor, before: Tensor | None) -> dict:
+        difference = relative_rms(image, before) if s.dtype == torch.float32 else None
+        return {"error": relative_rms(image, truth.image), "difference": difference}
+
+    rows = bench.measure(settings, figures)
+    for double, single in zip(rows[::2], rows[1::2], strict=True):
+        double |= {"dtype": "float64", "speedup": None}
+        single |= {"dtype": "float32", "speedup": double["seconds"] / single["seconds"]}
+    columns = _COMMON | {
+        "dtype": "precision of the rays",
+        "difference": "relative RMS between the float32 and the float64 image of the same rays",
+        "speedup": "time of float64 over time of float32",
+    } | _TIMES
+    largest = rows[-2 * len(SAMPLERS) :]
+    worst = max(largest[1::2], key=lambda row: row["difference"] / max(row["error"], truth.error))
+    verdict = "float32 is enough" if worst["difference"] <= NEGLIGIBLE * worst["error"] else "use float64"
+    advice = (f"float32 changes the image of {worst['rays']} {worst['sampler']} rays by {worst['difference']:.2g},"
+              f" where the rays leave an error of {worst['error']:.2g}, and is {worst['speedup']:.2g} times as fast:"
+              f" {verdict}{_haste(rows)}")
+    return Study("precision", columns, rows, _orders(bench, rows), advice, _about(bench, None, truth))
+
+
+def _orders(bench: Bench, rows: list[dict], column: str = "error") -> dict[str, Order | None]:
+    """Fitted order of every series over its settings with at least one ray a pixel."""
+    table: dict[str, list[dict]] = {}
+    for row in rows:
+        table.setdefault(row["series"], []).append(row)
+    pixels = bench.scene.screen.resolution[0] * bench.scene.screen.resolution[1]
+    return {name: order([r["rays"] for r in some], [r[column] for r in some], pixels) for name, some in table.items()}
+
+
+def _halving(found: Order | None) -> str:
+    """What half the error costs: error ~ n^-k asks for 2^(1/k) times the rays, and as much more time."""
+    if found is None or found.exponent < STALLED:
+        return "more rays hardly lower it"
+    return f"halving it costs {2.0 ** (1.0 / found.exponent):.2g} times as much"
+
+
+def _haste(rows: list[dict]) -> str:
+    """A warning where the machine was too busy for its times to mean much."""
+    spread = statistics.median(row["seconds_max"] / row["seconds_min"] for row in rows)
+    return f" (half of the times varied more than {spread:.1f}-fold: the machine was busy)" if spread > BUSY else ""
+
+
+def _about(bench: Bench, dtype: torch.dtype | None, truth: Reference) -> dict:
+    """How a study was made; everything but the threads' speed follows from it."""
+    seeds = [bench.seed + REFERENCE_SEED, bench.seed + REFERENCE_SEED + 1]
+    return {"version": __version__, "seed": bench.seed, "repeats": bench.repeats, "max_rays": bench.max_rays,
+            "dtype": "float32 and float64" if dtype is None else _name(dtype), "device": str(bench.heights.device),
+            "threads": torch.get_num_threads(), "reference_rays": truth.rays, "reference_sampler": "lines",
+            "reference_seeds": seeds, "reference_dtype": "float64", "reference_error": truth.error,
+            "orders_of": "error"}
+
+
+def _name(dtype: torch.dtype) -> str:
+    return str(dtype).removeprefix("torch.")
+
+
+#: Every study by name: of a bench, with rays of a dtype.
+STUDIES: dict[str, Callable[[Bench, torch.dtype], Study]] = {
+    "rays": study_rays, "reconstruction": study_reconstruction, "precision": study_precision,
+}

@@ -1,0 +1,51 @@
+"""Convergence orders by regression, and the Pareto front of error against cost.
+
+An order k says error = C n^-k: minus the slope of the least-squares line through (log n, log error).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+#: Least number of settings an order is read from: two always fit a line exactly and would hide that they do not.
+MIN_POINTS = 3
+
+
+@dataclass(frozen=True)
+class Order:
+    """A fitted order: exponent k, its standard error of the regression, points used, and the range of n they cover."""
+
+    exponent: float
+    deviation: float
+    points: int
+    low: float
+    high: float
+
+
+def order(n: Sequence[float], error: Sequence[float], least: float = 0.0) -> Order | None:
+    """Order k of error = C n^-k over the settings with n >= `least`, over all where fewer than MIN_POINTS have that.
+
+    Errors of exactly 0 carry no order and are left out.  None when fewer than MIN_POINTS remain, or all n are equal.
+    """
+    n, error = np.asarray(n, float), np.asarray(error, float)
+    use = error > 0
+    if np.count_nonzero(use & (n >= least)) >= MIN_POINTS:
+        use &= n >= least
+    x, y = np.log(n[use]), np.log(error[use])
+    if len(x) < MIN_POINTS or np.ptp(x) == 0:
+        return None
+    dx = x - x.mean()
+    slope = float(dx @ y / (dx @ dx))
+    residual = y - y.mean() - slope * dx
+    deviation = float(np.sqrt(residual @ residual / (len(x) - 2) / (dx @ dx)))
+    return Order(-slope, deviation, len(x), float(n[use].min()), float(n[use].max()))
+
+
+def pareto(cost: Sequence[float], error: Sequence[float]) -> list[bool]:
+    """For every setting, whether no other one is at least as good in both and better in one."""
+    points = list(zip(cost, error, strict=True))
+    return [not any(c <= cost_ and e <= error_ and (c, e) != (cost_, error_) for c, e in points)
+            for cost_, error_ in points]

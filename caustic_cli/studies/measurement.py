@@ -1,0 +1,152 @@
+"""Error and time of many settings, measured against one reference in one run.
+
+Notation
+    setting     a way to make the image: rays, filter, precision
+    reference   the mean of two float64 images of their own rays, many times more than any setting's
+    error       relative RMS between two images, each over its own mean (metrics.relative_rms)
+
+The two halves A and B of a reference are independent, so (A + B) / 2 is wrong by about |A - B| / 2.  Its rays are `lines`:
+unbiased, and about ten times as fast as the rest because a tensor product of rays makes the spline cheap.
+
+Settings take turns, round after round, so that a machine that slows down for a while slows all of them.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from caustic_cli.errors import CausticError
+from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.reconstruction import Filter
+from caustic_cli.optics.sampling import Sampler
+from caustic_cli.optics.tracing import expose
+from caustic_cli.scene import Scene, Screen
+from caustic_cli.studies.metrics import relative_rms
+
+#: Rays of a bincount reference over those of the largest setting.  Errors fall like n^-1/2 at worst, so the reference is
+#: wrong by an eighth of the largest setting, which adds less than 1 % to it in quadrature.
+REFERENCE_FACTOR = 64
+#: The same for a reference made with another filter, which smooths its own noise and takes longer a ray.
+FILTERED_FACTOR = 16
+#: Distance from a study's seed to its reference's: no number of repeats reaches it.
+REFERENCE_SEED = 1_000_003
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A way to make the image; `series` names the curve it belongs to, `rays` is rounded to whole cells."""
+
+    series: str
+    sampler: str
+    rays: int
+    filter: Filter
+    dtype: torch.dtype
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Image (n_x, n_y), how many rays made it, and the estimate of its own error (relative RMS)."""
+
+    image: Tensor
+    rays: int
+    error: float
+
+
+#: (setting, its image, the image of the setting before it in the same round or None) -> figures by column name
+Figures = Callable[[Setting, Tensor, Tensor | None], dict[str, float | None]]
+
+
+@dataclass
+class Bench:
+    """A lens to be measured.
+
+    Args:
+        scene, heightfield, heights: the lens; (n, m) mm float64, on the device to work on.
+        seed: of the rays of the first round; each round takes the next one.
+        repeats: rounds.
+        max_rays: rays of the largest setting.
+        progress: told (rays traced, rays in all) after every image, or None.
+    """
+
+    scene: Scene
+    heightfield: HeightField
+    heights: Tensor
+    seed: int
+    repeats: int
+    max_rays: int
+    progress: Callable[[int, int], None] | None = None
+    done: int = field(default=0, init=False)
+    total: int = field(default=0, init=False)
+
+    def plan(self, settings: Sequence[Setting], filtered: int = 0) -> None:
+        """Announce all the work: the settings, a bincount reference, and so many others."""
+        references = (REFERENCE_FACTOR + filtered * FILTERED_FACTOR) * self.max_rays
+        self.total = references + self.repeats * sum(s.rays for s in settings)
+
+    def sampler(self, setting: Setting, seed: int) -> Sampler:
+        """The rays of a setting: about as many as it asks for, on this lens' aperture, weighted by the source's profile."""
+        size, profile = self.scene.lens.size, self.scene.source.profile
+        return Sampler.of_size(setting.sampler, setting.rays, size[0] / size[1], seed=seed, device=self.heights.device,
+                               profile=None if profile is None else torch.as_tensor(profile))
+
+    def image(self, setting: Setting, seed: int, screen: Screen | None = None) -> Tensor:
+        """The image that a setting makes with the rays of `seed`: (n_x, n_y) float64."""
+        return expose(self.scene, self.heightfield, self.heights, self.sampler(setting, seed), setting.filter,
+                      setting.dtype, screen).image
+
+    def reference(self, filter: Filter, screen: Screen | None = None) -> Reference:
+        """The image to compare with, through `filter`.
+
+        Raises:
+            CausticError: no light reaches the screen.
+        """
+        factor = REFERENCE_FACTOR if filter == Filter() else FILTERED_FACTOR
+        half = Setting("reference", "lines", factor * self.max_rays // 2, filter, torch.float64)
+        images = []
+        for k in (0, 1):
+            images.append(self.image(half, self.seed + REFERENCE_SEED + k, screen))
+            self._tick(half.rays)
+        if not all(float(image.sum()) > 0 for image in images):
+            raise CausticError("no light reaches the screen, so there is no image to study: every ray is reflected inside"
+                               " the lens or misses the screen; check index, throw, mag and screen size")
+        return Reference(sum(images) / 2.0, 2 * self.sampler(half, 0).count, relative_rms(*images) / 2.0)
+
+    def measure(self, settings: Sequence[Setting], figures: Figures) -> list[dict]:
+        """Run every setting in turn, each round with the same fresh rays for all: one row a setting.
+
+        A row holds series, sampler, rays, the figures (root mean square over the rounds; None stays None), and seconds,
+        seconds_min, seconds_max (median and extremes).  One untimed run of the smallest setting warms the machine up.
+        """
+        found: list[list[dict]] = [[] for _ in settings]
+        times: list[list[float]] = [[] for _ in settings]
+        self.image(min(settings, key=lambda s: s.rays), self.seed)
+        for k in range(self.repeats):
+            before = None
+            for i, setting in enumerate(settings):
+                start = time.perf_counter()
+                image = self.image(setting, self.seed + k)
+                times[i].append(time.perf_counter() - start)
+                found[i].append(figures(setting, image, before))
+                before = image
+                self._tick(setting.rays)
+        rows = []
+        for setting, values, seconds in zip(settings, found, times, strict=True):
+            row = {"series": setting.series, "sampler": setting.sampler, "rays": self.sampler(setting, 0).count}
+            for name in values[0]:
+                column = [v[name] for v in values]
+                row[name] = None if None in column else math.sqrt(statistics.fmean(c * c for c in column))
+            row |= {"seconds": statistics.median(seconds), "seconds_min": min(seconds), "seconds_max": max(seconds)}
+            rows.append(row)
+        return rows
+
+    def _tick(self, rays: int) -> None:
+        self.done += rays
+        if self.progress is not None:
+            self.progress(self.done, self.total)

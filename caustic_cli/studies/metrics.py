@@ -1,0 +1,137 @@
+"""Figures of merit: how good an image is as a picture of its target.  NumPy, float64.
+
+Notation
+    J, T        image and target, (n_x, n_y), power or irradiance per pixel, each on any scale
+    S J         sum of all pixels
+    K           J S T / S J, the image scaled to the target's sum
+    L           max T, the peak and the data range
+
+    loss            sqrt(mean((J / S J - T / S T)^2)), eq. 5.2.1
+    relative_rms    loss times the number of pixels: RMS error over the mean of the normalised target
+    psnr_db         10 log10(L^2 / mean((K - T)^2))
+    ssim            mean of (2 m_K m_T + c_1)(2 s_KT + c_2) / ((m_K^2 + m_T^2 + c_1)(s_K^2 + s_T^2 + c_2)), local means m,
+                    variances s^2 and covariance s_KT under an 11 x 11 Gaussian window; c_i = (k_i L)^2
+
+A black image is compared as it is, all zero: its relative_rms against an even target is 1.  What has no value (the
+logarithm of no error, anything relative to a black target) is None, because JSON has neither infinity nor NaN.
+
+Sources: thesis 5.2; Wang, Bovik, Sheikh, Simoncelli, IEEE Trans. Image Processing 13, 600 (2004) for SSIM.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from caustic_cli.errors import InputError
+
+if TYPE_CHECKING:
+    from caustic_cli.optics.tracing import Exposure
+
+#: Window of Wang et al.: standard deviation and half width in pixels, and their two stabilising constants.
+SSIM_SIGMA, SSIM_RADIUS, SSIM_K1, SSIM_K2 = 1.5, 5, 0.01, 0.03
+
+
+def loss(image, target) -> float:
+    """Eq. 5.2.1 between image and target, (n_x, n_y) each on any scale: a part of the whole light, per pixel.
+
+    Raises:
+        InputError: the two differ in shape, or hold something that is not a finite number.
+    """
+    image, target = _pair(image, target)
+    return float(np.sqrt(np.mean((_normalised(image) - _normalised(target)) ** 2)))
+
+
+def relative_rms(image, target) -> float:
+    """`loss` times the number of pixels: the RMS error in units of the mean of the target."""
+    return loss(image, target) * np.size(_array(target))
+
+
+def psnr_db(image, target) -> float | None:
+    """Peak signal to noise ratio in dB of the image scaled to the target's sum, peak = target maximum.
+
+    None where the two are equal (it would be infinite) or the target is black (it has no peak).
+    """
+    image, target = _pair(image, target)
+    peak = target.max()
+    if not peak > 0:
+        return None
+    error = np.mean((_normalised(image) * (target.sum() / peak) - target / peak) ** 2)
+    return -10.0 * math.log10(error) if error > 0 else None
+
+
+def ssim(image, target) -> float | None:
+    """Mean structural similarity of the image scaled to the target's sum, at most 1; None for a black target.
+
+    Population covariances; the mean is over the pixels whose window lies inside the picture.  A picture narrower than
+    the window has none: there the borders are reflected and every pixel counts.
+    """
+    image, target = _pair(image, target)
+    peak = target.max()
+    if not peak > 0:
+        return None
+    k, t = _normalised(image) * (target.sum() / peak), target / peak  # the data range is 1 now
+
+    def window(a: np.ndarray) -> np.ndarray:
+        return gaussian_filter(a, SSIM_SIGMA, mode="reflect", radius=SSIM_RADIUS)
+
+    m_k, m_t = window(k), window(t)
+    var_k, var_t, cov = window(k * k) - m_k * m_k, window(t * t) - m_t * m_t, window(k * t) - m_k * m_t
+    c1, c2 = SSIM_K1**2, SSIM_K2**2
+    local = (2 * m_k * m_t + c1) * (2 * cov + c2) / ((m_k**2 + m_t**2 + c1) * (var_k + var_t + c2))
+    if min(local.shape) > 2 * SSIM_RADIUS:
+        local = local[SSIM_RADIUS:-SSIM_RADIUS, SSIM_RADIUS:-SSIM_RADIUS]
+    return float(local.mean())
+
+
+def on_target(image, target) -> float:
+    """Part of the source's power that lands where the target is not zero; `image` in parts of the source's power."""
+    image, target = _pair(image, target)
+    return float(image[target > 0].sum())
+
+
+def judge(exposure: Exposure, target) -> dict:
+    """The figures that `render --json` and `design --json` share, ready for `json.dumps(..., allow_nan=False)`.
+
+    Args:
+        exposure: a traced image; eq. 5.2.1 asks for bincount reconstruction.
+        target: (n_x, n_y), any scale.
+
+    Returns:
+        loss, relative_rms, psnr_db, ssim (None where undefined), on_screen, on_target, lost (name -> part of the source's
+        power; with on_screen they sum to 1) and rays.
+    """
+    image = exposure.image
+    return {
+        "loss": loss(image, target),
+        "relative_rms": relative_rms(image, target),
+        "psnr_db": psnr_db(image, target),
+        "ssim": ssim(image, target),
+        "on_screen": float(_array(image).sum()),
+        "on_target": on_target(image, target),
+        "lost": {name: float(value) for name, value in exposure.lost.items()},
+        "rays": int(exposure.rays),
+    }
+
+
+def _array(a) -> np.ndarray:
+    """An array, or a tensor on any device, as float64."""
+    return np.asarray(a.detach().cpu() if hasattr(a, "detach") else a, dtype=np.float64)
+
+
+def _pair(image, target) -> tuple[np.ndarray, np.ndarray]:
+    image, target = _array(image), _array(target)
+    if image.ndim != 2 or not image.size or image.shape != target.shape:
+        raise InputError(f"image and target must be 2-D pictures of the same shape, got {image.shape} and {target.shape}")
+    if not (np.isfinite(image).all() and np.isfinite(target).all()):
+        raise InputError("image and target must hold finite numbers only, got NaN or infinity")
+    return image, target
+
+
+def _normalised(a: np.ndarray) -> np.ndarray:
+    """a / S a, or zeros for a picture without light."""
+    total = a.sum()
+    return a / total if total > 0 else np.zeros_like(a)

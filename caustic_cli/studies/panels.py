@@ -1,0 +1,60 @@
+"""report.png: target, caustic, lens height, and loss against time, side by side."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from caustic_cli.files import atomic_path
+from caustic_cli.picture import SOFTWARE, to_srgb
+from caustic_cli.scene import Lens, Screen
+
+
+def write_report(path: Path, target: np.ndarray, image: np.ndarray, heights: np.ndarray, history: np.ndarray,
+                 lens: Lens, screen: Screen, figures: dict, encoding: str) -> None:
+    """Write the four panels.
+
+    Args:
+        target, image: (n_x, n_y) irradiance; drawn at the same exposure and in the picture's encoding.
+        heights: (a, b) surface heights on an even grid over the aperture, mm; the sphere that fits best is taken out,
+            because it hides the relief.
+        history: (k, 5) rows iteration, stage, loss, on_screen, seconds.
+    """
+    import matplotlib  # noqa: PLC0415
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt  # noqa: PLC0415
+
+    figure, axes = plt.subplots(2, 2, figsize=(10, 9.2), constrained_layout=True)
+    extent = [-screen.half_size[0], screen.half_size[0], -screen.half_size[1], screen.half_size[1]]
+    scale = target.sum() / target.max()
+    relative = figures["relative_rms"]
+    titles = ("target", "caustic" if relative is None else f"caustic, relative RMS error {relative:.3f}")
+    for axis, picture, title in zip(axes[0], (target, image), titles, strict=True):
+        shown = np.clip(picture / max(picture.sum(), 1e-300) * scale, 0.0, 1.0)
+        axis.imshow((to_srgb(shown) if encoding == "srgb" else shown).T, origin="lower", extent=extent, cmap="gray",
+                    vmin=0, vmax=1)
+        axis.set(title=title, xlabel="x on the screen (mm)", ylabel="y (mm)")
+    rx, ry = lens.half_size
+    drawn = axes[1, 0].imshow(_without_sphere(heights, rx, ry).T * 1e3, origin="lower", extent=[-rx, rx, -ry, ry], cmap="viridis")
+    figure.colorbar(drawn, ax=axes[1, 0], label="µm")
+    axes[1, 0].set(title="lens height, best paraboloid removed", xlabel="x on the lens (mm)", ylabel="y (mm)")
+    last = axes[1, 1]
+    for stage in np.unique(history[:, 1]):
+        rows = history[history[:, 1] == stage]
+        last.semilogy(rows[:, 4], rows[:, 2] * target.size, lw=1.5)
+    last.set(title="loss of each stage (its own blur) against time", xlabel="s", ylabel="relative RMS")
+    last.grid(alpha=0.3, which="both")
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=100, metadata={"Software": SOFTWARE})
+    plt.close(figure)
+
+
+def _without_sphere(heights: np.ndarray, rx: float, ry: float) -> np.ndarray:
+    """`heights` less its least-squares fit by 1, x, y, x^2 + y^2."""
+    x = np.linspace(-rx, rx, heights.shape[0])[:, None] + np.zeros(heights.shape[1])
+    y = np.linspace(-ry, ry, heights.shape[1]) + np.zeros(heights.shape)
+    terms = np.stack([np.ones_like(x), x, y, x * x + y * y], -1).reshape(-1, 4)
+    fit, *_ = np.linalg.lstsq(terms, heights.reshape(-1), rcond=None)
+    return heights - (terms @ fit).reshape(heights.shape)
