@@ -1,8 +1,8 @@
 """The LightTools archive: one `.npz` with the sampled surface, the exact B-spline beside it, and the whole scene.
 
 Lengths are mm, powers W, angles degrees.  Reals are float64, counts (`shape`, `resolution`, `degrees`,
-`format_version`) int64, names strings; `numpy.load` reads it with allow_pickle=False.  Grids are indexed [i, j], i along
-+x and j along +y, and flattened row-major: x varies slowest.
+`format_version`) int64, names strings; `numpy.load` reads it with allow_pickle=False.  Grids are indexed [i, j], i
+along +x and j along +y, and flattened row-major: x varies slowest.
 
 Arrays are stored uncompressed, in a fixed order and without the time of writing, so that the same lens gives the same
 bytes whatever the day or the zlib.

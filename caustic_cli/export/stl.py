@@ -5,8 +5,8 @@
 all little-endian; lengths are mm in the scene's coordinates, since STL itself knows no unit.  The solid is the exit
 surface, four walls along its border and the flat entrance at z_in; corners run counter-clockwise seen from outside.
 
-STL corners are float32: beside some mm of thickness they resolve the sag to about 5e-7 mm.  That is fine for a printer or a
-picture, not for tracing the caustic on a dense grid; the LightTools archive keeps float64.
+STL corners are float32: beside some mm of thickness they resolve the sag to about 5e-7 mm.  That is fine for a printer
+or a picture, not for tracing the caustic on a dense grid; the LightTools archive keeps float64.
 """
 
 from __future__ import annotations

@@ -5,9 +5,9 @@ Notation
     z            heights z[a, b] at (x_a, y_b), mm, in the scene's coordinates
     zx, zy       slopes dz/dx, dz/dy there
 
-Whoever reads such a grid lays a spline of his own through it.  That returns the designed surface only if every knot is
-a grid line: a not-a-knot bicubic through 4 steps a knot span gives a cubic lens back to rounding, and through an
-arbitrary grid as dense it moves the light by a large part of a pixel.
+Whoever reads such a grid lays a spline of their own through it.  That returns the designed surface only if every knot
+is a grid line: a not-a-knot bicubic through 4 steps a span gives a cubic lens back to rounding (1e-10 mm on a screen
+300 mm away); through an arbitrary grid as dense it is off by 1e-4 mm for a smooth relief and 0.1 mm for a rough one.
 """
 
 from __future__ import annotations

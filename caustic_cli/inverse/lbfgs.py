@@ -43,7 +43,7 @@ class LBFGS:
         for _ in range(2):
             direction = self._direction()
             slope = float(direction @ self.g)
-            length = 1.0 if self.pairs else FIRST_STEP * 2.0 * abs(self.f) / max(-slope, 1e-300)
+            length = 1.0 if self.pairs else FIRST_STEP * 2.0 * (abs(self.f) or 1.0) / max(-slope, 1e-300)
             if slope < 0 and self._search(direction, slope, length):
                 return True
             if not self.pairs:
@@ -60,9 +60,10 @@ class LBFGS:
 
     def load(self, state: dict[str, Tensor]) -> None:
         """Go on from `state()`."""
-        self.x, self.g = state["x"], state["g"]
+        self.x, self.g = state["x"].clone(), state["g"].clone()
         self.f = float(state["f"][0]) if len(state["f"]) else None
-        self.pairs = list(zip(state["s"], state["y"], strict=True)) if "s" in state else []
+        # Rows are copied: sums over a vector depend, in the last bit, on how its memory is aligned.
+        self.pairs = [(s.clone(), y.clone()) for s, y in zip(state["s"], state["y"], strict=True)] if "s" in state else []
 
     def _evaluate(self, x: Tensor) -> tuple[float, Tensor]:
         self.evaluations += 1
@@ -85,7 +86,7 @@ class LBFGS:
     def _accept(self, x: Tensor, f: float, g: Tensor) -> bool:
         s, y = x - self.x, g - self.g
         if float(s @ y) > 1e-14 * float(s.norm() * y.norm()):  # keep the estimate positive definite
-            self.pairs = [*self.pairs[-self.memory + 1 :], (s, y)]
+            self.pairs = [*self.pairs, (s, y)][-self.memory :]
         self.x, self.f, self.g = x, f, g
         return True
 

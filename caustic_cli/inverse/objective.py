@@ -7,6 +7,7 @@ Everything that does not depend on the heights (basis matrices, filtered target,
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -14,10 +15,14 @@ from torch import Tensor
 
 from caustic_cli.inverse.losses import Loss
 from caustic_cli.optics.heightfield import HeightField
-from caustic_cli.optics.reconstruction import Filter, splat
+from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.tracing import PlaneTracer
 from caustic_cli.scene import Scene
+
+
+#: Rays traced at a time, and the number up to which the prepared chunks are kept from one evaluation to the next.
+CHUNK, KEPT_RAYS = 1 << 20, 1 << 22
 
 
 @dataclass(frozen=True)
@@ -52,23 +57,42 @@ class Objective:
         self.screen, self.filter, self.apron = scene.screen.grown((apron, apron)), filter, apron
         wide = torch.nn.functional.pad(target.double().to(sampler.device), (apron, apron, apron, apron))
         self.loss = Loss(loss, filter.smooth(wide) if filter_target else wide, blur)
-        self.tracers = [PlaneTracer(scene, field, s, dtype) for s in sampler.chunks()]
+        self.scene, self.field, self.sampler, self.dtype = scene, field, sampler, dtype
+        self.kept = list(self._tracers()) if sampler.count <= KEPT_RAYS else None
 
-    def image(self, heights: Tensor) -> tuple[Tensor, Tensor]:
-        """Differentiable image (n_x, n_y) on the widened screen, and the power leaving the lens; both float64."""
-        image, leaving = 0.0, 0.0
-        for tracer in self.tracers:
-            landing = tracer(heights)
-            image = image + splat(landing.x, landing.y, landing.weight, self.screen, self.filter)[0].double()
-            leaving = leaving + landing.leaving.double()
-        return image, leaving
+    def _tracers(self) -> Iterator[PlaneTracer]:
+        tracer = None
+        for sample in self.sampler.chunks(CHUNK):
+            tracer = PlaneTracer(self.scene, self.field, sample, self.dtype, tracer)
+            yield tracer
 
     def __call__(self, heights: Tensor) -> Evaluation:
-        """Value and gradient at heights (n, m) mm float64."""
+        """Value and gradient at heights (n, m) mm float64.
+
+        The loss sees rays through the image alone.  So the image is accumulated chunk by chunk, the loss gives its
+        derivative by the image, and each chunk is traced again to pull that back: memory does not grow with rays.
+        A single chunk keeps its graph instead of being traced again.
+        """
         heights = heights.detach().to(self.device).requires_grad_()
-        image, leaving = self.image(heights)
-        loss = self.loss(image, leaving)
-        (gradient,) = torch.autograd.grad(loss, heights)
+        single = self.kept is not None and len(self.kept) == 1
+        image, leaving = 0.0, 0.0
+        with torch.set_grad_enabled(single):
+            for tracer in self.kept or self._tracers():
+                part = tracer.expose(heights, self.screen, self.filter)
+                image, leaving = image + part.image.double(), leaving + part.leaving.double()
+        if single:
+            loss = self.loss(image, leaving)
+            (gradient,) = torch.autograd.grad(loss, heights)
+        else:
+            image, leaving = image.requires_grad_(), leaving.requires_grad_()
+            loss = self.loss(image, leaving)
+            by_image, by_leaving = torch.autograd.grad(loss, (image, leaving), allow_unused=True)
+            by_leaving = torch.zeros_like(leaving) if by_leaving is None else by_leaving
+            gradient = torch.zeros_like(heights)
+            for tracer in self.kept or self._tracers():
+                part = tracer.expose(heights, self.screen, self.filter)
+                gradient += torch.autograd.grad((part.image, part.leaving), heights,
+                                                (by_image.to(part.image.dtype), by_leaving.to(part.leaving.dtype)))[0]
         a = self.apron
         inner = image.detach()[a : image.shape[0] - a, a : image.shape[1] - a]
         return Evaluation(float(loss.detach()), gradient, float(inner.sum()))

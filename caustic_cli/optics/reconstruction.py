@@ -124,10 +124,16 @@ def splat(x: Tensor, y: Tensor, weight: Tensor, screen: Screen, filter: Filter) 
         padded = padded.scatter_add(0, at.reshape(-1), part.reshape(-1))
     padded = padded.view(shape)
     image = padded[2 * rx : 2 * rx + nx, 2 * ry : 2 * ry + ny]
-    outside = torch.where(inside, torch.zeros_like(weight), weight).sum()  # and the padding, summed rather than subtracted
+    outside = torch.where(inside, torch.zeros_like(weight), weight).sum()
+    return image, outside + padding(padded, filter.reach)
+
+
+def padding(padded: Tensor, reach: tuple[int, int]) -> Tensor:
+    """Power on the 2 r pixels around the frame of a padded image, summed rather than found by subtraction."""
+    (rx, ry), total = reach, padded.new_zeros(())
     if rx:
-        outside = outside + padded[: 2 * rx].sum() + padded[2 * rx + nx :].sum()
+        total = total + padded[: 2 * rx].sum() + padded[-2 * rx :].sum()
     if ry:
-        rows = padded[2 * rx : 2 * rx + nx]
-        outside = outside + rows[:, : 2 * ry].sum() + rows[:, 2 * ry + ny :].sum()
-    return image, outside
+        rows = padded[2 * rx : padded.shape[0] - 2 * rx]
+        total = total + rows[:, : 2 * ry].sum() + rows[:, -2 * ry :].sum()
+    return total

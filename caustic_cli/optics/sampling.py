@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
+from caustic_cli.optics.kernels import fused
 
 SAMPLERS = ("grid", "lines", "stratified", "uniform")
 _MASK = 0xFFFFFFFF
@@ -37,10 +38,19 @@ def _mix(x: Tensor) -> Tensor:
 
 def random_numbers(seed: int, dimension: int, index: Tensor) -> Tensor:
     """Uniform numbers strictly inside (0, 1), float64, one for every int64 ray index: a pure function of its arguments."""
-    key = torch.tensor([(seed * 0x9E3779B1 + dimension * 0x85EBCA77 + 1) & _MASK], device=index.device)
-    key = _mix(key ^ ((seed >> 16) & _MASK))
     low, high = index & _MASK, index >> 32
-    return (_mix(_mix(low ^ key) + 0x632BE5AB * (dimension + 1) + high & _MASK).double() + 0.5) * 2.0**-32
+    return (_mix(_mix(low ^ key(seed, dimension)) + salt(dimension) + high & _MASK).double() + 0.5) * 2.0**-32
+
+
+def key(seed: int, dimension: int) -> int:
+    """What a ray's index is mixed with."""
+    start = torch.tensor((seed * 0x9E3779B1 + dimension * 0x85EBCA77 + 1) & _MASK) ^ ((seed >> 16) & _MASK)
+    return int(_mix(start))
+
+
+def salt(dimension: int) -> int:
+    """What keeps the dimensions of one seed apart."""
+    return 0x632BE5AB * (dimension + 1)
 
 
 def stream(seed: int, name: str) -> int:
@@ -115,14 +125,22 @@ class Sampler:
         nu, nv = self.shape
         one = torch.ones((), dtype=torch.float64)
         if self.kind in ("grid", "lines"):
-            i, j = torch.arange(nu, device=self.device), torch.arange(nv, device=self.device)
-            du = dv = 0.5
+            i, j = (torch.arange(k, device=self.device) for k in (nu, nv))
+            du = dv = torch.tensor(0.5, dtype=torch.float64, device=self.device)
             if self.kind == "lines":
                 du, dv = random_numbers(self.seed, 0, i), random_numbers(self.seed, 1, j)
             u, v = (i + du) / nu, (j + dv) / nv
             rows = max(1, size // nv)
             for a in range(0, nu, rows):
-                yield Sample(u[a : a + rows].double(), v.double(), True, one)
+                yield Sample(u[a : a + rows], v, True, one)
+            return
+        if fused(self.device):
+            from caustic_cli.optics.kernels.functions import scattered_points  # noqa: PLC0415
+
+            for a in range(0, self.count, size):
+                points = scattered_points([key(self.seed, d) for d in (0, 1)], [salt(0), salt(1)], a,
+                                          min(a + size, self.count), nu, nv, self.kind == "stratified")
+                yield Sample(*points, False, one)
             return
         for a in range(0, self.count, size):
             k = torch.arange(a, min(a + size, self.count), device=self.device)

@@ -19,9 +19,10 @@ from torch import Tensor
 from caustic_cli.errors import InputError
 from caustic_cli.optics.heightfield import Evaluator, HeightField
 from caustic_cli.optics.interface import reflectance, refract
+from caustic_cli.optics.kernels import fused
 from caustic_cli.optics.reconstruction import Filter, splat
 from caustic_cli.optics.sampling import Sample, Sampler
-from caustic_cli.scene import Scene, Screen
+from caustic_cli.scene import Lens, Scene, Screen
 
 LOSSES = ("missed_lens", "missed_surface", "total_internal_reflection", "fresnel", "absorbed", "off_screen")
 #: A direction cosine to the screen's normal below this counts as parallel to it: the ray never arrives.
@@ -52,6 +53,15 @@ class Landing:
     leaving: Tensor
 
 
+@dataclass(frozen=True)
+class Part:
+    """What some rays contribute: image (n_x, n_y) and leaving (), differentiable; lost by name, not differentiable."""
+
+    image: Tensor
+    leaving: Tensor
+    lost: dict[str, Tensor]
+
+
 class PlaneTracer:
     """Traces one sample of a plane wave through a lens; prepared once, called for any heights.
 
@@ -61,32 +71,53 @@ class PlaneTracer:
         sample: the rays.
         dtype: precision of the ray arithmetic.  Heights are float64 and enter relative to their mean, so float32 rays
             see sag, not thickness.
+        like: the tracer of the chunk before, whose basis values along v are taken over where they are the same.
     """
 
-    def __init__(self, scene: Scene, field: HeightField, sample: Sample, dtype: torch.dtype):
-        self.scene, self.dtype, self.evaluator = scene, dtype, field.prepare(sample, dtype)
+    def __init__(self, scene: Scene, field: HeightField, sample: Sample, dtype: torch.dtype, like: PlaneTracer | None = None):
+        self.scene, self.dtype = scene, dtype
+        self.evaluator = field.prepare(sample, dtype, None if like is None else like.evaluator)
         (rx, ry), device = field.half_size, sample.u.device
         x, y = ((2.0 * sample.u - 1.0) * rx).to(dtype), ((2.0 * sample.v - 1.0) * ry).to(dtype)
         self.x, self.y = (x[:, None], y[None, :]) if sample.tensor else (x, y)
         self.share = sample.share.to(device=device, dtype=dtype)
-        self.shape = sample.shape
+        self.shape, self.fused = sample.shape, fused(device)
 
-    def __call__(self, heights: Tensor) -> Landing:
-        """Heights (n, m) mm float64 -> where the rays land."""
-        reference = heights.detach().mean()
-        return trace_plane(self.scene, self.evaluator, (heights - reference).to(self.dtype), float(reference),
-                           self.x, self.y, self.share, self.shape)
+    def __call__(self, heights: Tensor, screen_z: float | None = None) -> Landing:
+        """Heights (n, m) mm float64 -> where the rays land at screen_z (default: the scene's): the plain-torch reference."""
+        sag, reference = self._sag(heights)
+        z = self.scene.screen.z if screen_z is None else screen_z
+        return trace_plane(self.scene.lens, self.evaluator, sag, z - reference, self.x, self.y, self.share, self.shape)
+
+    def expose(self, heights: Tensor, screen: Screen, filter: Filter) -> Part:
+        """Heights (n, m) mm float64 -> image and energy account on a screen; by the fused kernel on a CPU."""
+        if not self.fused:
+            landing = self(heights, screen.z)
+            image, off = splat(landing.x, landing.y, landing.weight, screen, filter)
+            return Part(image, landing.leaving, {**landing.lost, "off_screen": landing.lost["off_screen"] + off})
+        from caustic_cli.optics.kernels.functions import plane_image  # noqa: PLC0415
+
+        sag, reference = self._sag(heights)
+        lens = self.scene.lens
+        image, leaving, lost = plane_image(self.evaluator(sag), (self.x, self.y, self.share), lens.index, lens.fresnel,
+                                           screen.z - reference, screen, filter)
+        return Part(image, leaving, lost)
+
+    def _sag(self, heights: Tensor) -> tuple[Tensor, float]:
+        reference = float(heights.detach().mean())
+        return (heights - reference).to(self.dtype), reference
 
 
-def trace_plane(scene: Scene, evaluator: Evaluator, sag_net: Tensor, reference: float, x, y, share, shape) -> Landing:
+def trace_plane(lens: Lens, evaluator: Evaluator, sag_net: Tensor, height: float, x, y, share, shape) -> Landing:
     """The plane-wave path: surface, Snell, Fresnel, plane of the screen.
 
     Args:
-        sag_net: (n, m) control heights relative to `reference` mm.
+        sag_net: (n, m) control heights relative to some plane, mm.
+        height: of the screen above that plane, mm.
         x, y: where the rays leave the lens, broadcastable to `shape`, mm.
         share: part of the source's power per ray, scalar or `shape`.
     """
-    n, kind = scene.lens.index, scene.lens.fresnel
+    n, kind = lens.index, lens.fresnel
     sag, slope_x, slope_y = evaluator(sag_net)
     # Plain floats where the plane wave's direction is constant: the products with 0 and 1 are never computed on rays.
     direction, passes, c, s = refract((0.0, 0.0, 1.0), slope_x, slope_y, n)
@@ -98,7 +129,7 @@ def trace_plane(scene: Scene, evaluator: Evaluator, sag_net: Tensor, reference: 
     none = torch.zeros_like(inside)
     leaving = torch.where(passes, inside * (1.0 - reflected), none)
     arrives = passes & (direction[2] > PARALLEL)
-    path = (scene.screen.z - reference - sag) / torch.where(arrives, direction[2], torch.ones_like(direction[2]))
+    path = (height - sag) / torch.where(arrives, direction[2], torch.ones_like(direction[2]))
     on_way = arrives & (path > 0)
     path = torch.where(on_way, path, torch.zeros_like(path))
     status = torch.where(passes, int(Status.OK), int(Status.TOTAL_INTERNAL_REFLECTION))
@@ -141,14 +172,13 @@ def expose(scene: Scene, field: HeightField, heights: Tensor, sampler: Sampler, 
         raise InputError(f"[screen] z must lie behind the lens, whose surface reaches {float(heights.max()):.6g} mm,"
                          f" got {screen.z:g} mm")
     image = torch.zeros(screen.resolution, dtype=torch.float64, device=sampler.device)
-    lost, leaving = dict.fromkeys(LOSSES, 0.0), 0.0
+    lost, leaving, tracer = dict.fromkeys(LOSSES, 0.0), 0.0, None
     with torch.no_grad():
         for sample in sampler.chunks(chunk):
-            landing = PlaneTracer(scene, field, sample, dtype)(heights)
-            part, off = splat(landing.x, landing.y, landing.weight, screen, filter)
-            image += part.double()
-            for name, value in landing.lost.items():
+            tracer = PlaneTracer(scene, field, sample, dtype, tracer)
+            part = tracer.expose(heights, screen, filter)
+            image += part.image
+            leaving += float(part.leaving)
+            for name, value in part.lost.items():
                 lost[name] += float(value)
-            lost["off_screen"] += float(off)
-            leaving += float(landing.leaving)
     return Exposure(image, lost, leaving, sampler.count)

@@ -16,7 +16,10 @@ def number(where: str, value, low: float = -math.inf, high: float = math.inf, *,
     """
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"{where} must be a number, got {value!r}")
-    value = float(value)
+    try:
+        value = float(value)
+    except OverflowError:  # a whole number of hundreds of digits
+        value = math.inf if value > 0 else -math.inf
     ok = math.isfinite(value) and value <= high and (value > low if open_low else value >= low)
     if not ok:
         raise InputError(f"{where} must be {_range(low, high, open_low)}, got {value:g}")

@@ -29,9 +29,8 @@ from caustic_cli.studies.report import Study
 
 #: Rays of the largest setting: each study then takes 10 to 30 s on two cores at 250 x 250 pixels.
 MAX_RAYS = {"rays": 1 << 20, "reconstruction": 1 << 19, "precision": 1 << 19}
-#: Reconstruction filters compared, kind and size in pixels.  The Gaussian's alpha is 0: with the thesis' alpha of 1 per
-#: cm^2 and pixels of a fraction of a mm it cannot be told from that limit.
-FILTERS = (Filter(), *(Filter(kind, (v, v)) for kind in ("gaussian", "cosine") for v in (3, 5, 11)))
+#: Reconstruction filters compared; the Gaussian's alpha is 1 per pixel squared.
+FILTERS = (Filter(), *(Filter(kind, (v, v), (1.0, 1.0)) for kind in ("gaussian", "cosine") for v in (3, 5, 11)))
 #: Single precision is enough where it changes the image by less than this part of the error its rays leave anyway:
 #: it then adds half a percent to it in quadrature.
 NEGLIGIBLE = 0.1
@@ -44,7 +43,8 @@ _COMMON = {
     "series": "the curve this setting belongs to",
     "sampler": "kind of rays",
     "rays": "rays traced",
-    "error": "relative RMS against the reference, each image over its own mean; root mean square over the repeats",
+    "error": "relative RMS against the reference, each image over its own mean, less the reference's own error in"
+             " quadrature; root mean square over the repeats",
 }
 _TIMES = {
     "seconds": "wall time of sampling, tracing and reconstruction, s; median of the repeats",
@@ -84,7 +84,7 @@ def study_rays(bench: Bench, dtype: torch.dtype) -> Study:
                 for k in range(6, -1, -1) for kind in SAMPLERS]
     bench.plan(settings)
     truth = bench.reference(Filter())
-    rows = bench.measure(settings, lambda s, image, _: {"error": relative_rms(image, truth.image)})
+    rows = bench.measure(settings, lambda _, image, __: {"error": truth.error_of(image)})
     orders = _orders(bench, rows)
     best = min(rows, key=lambda row: row["error"])
     advice = (f"a relative error of {best['error']:.2g} costs {best['seconds']:.2g} s with {best['rays']}"
@@ -96,27 +96,19 @@ def study_reconstruction(bench: Bench, dtype: torch.dtype) -> Study:
     """Error of filters, split into the bias of their blur and the noise that it leaves.
 
     A filter's own reference is what its images tend to.  The bincount reference smoothed by `Filter.smooth` is not
-    quite that, because light is not even within a pixel: how far off it is stands beside it, as `kernel`.  That
-    reference is rendered on a screen grown by the filters' reach, so that light blurred into the frame is in it.
+    quite that, because light is not even within a pixel and some is blurred in from beyond the frame: how far off it is
+    stands beside it, as `kernel`.
     """
     settings = [Setting(f.kind if f.size[0] == 1 else f"{f.kind} {f.size[0]}", "lines", bench.max_rays >> k, f, dtype)
                 for k in (4, 2, 0) for f in FILTERS]
     bench.plan(settings, filtered=len(FILTERS) - 1)
-    reach = max(f.reach[0] for f in FILTERS)
-    wide = bench.reference(Filter(), bench.scene.screen.grown((reach, reach)))
-
-    def crop(image: Tensor) -> Tensor:
-        return image[reach : image.shape[0] - reach, reach : image.shape[1] - reach]
-
-    truth, own, fixed = crop(wide.image), {}, {}
-    for f in FILTERS:
-        own[f] = Reference(truth, wide.rays, wide.error) if f == Filter() else bench.reference(f)
-        fixed[f] = {"bias": relative_rms(own[f].image, truth),
-                    "kernel": relative_rms(crop(f.smooth(wide.image)), own[f].image), "reference_error": own[f].error}
+    truth = bench.reference(Filter())
+    own = {f: truth if f == Filter() else bench.reference(f) for f in FILTERS}
+    fixed = {f: {"bias": relative_rms(r.image, truth.image), "kernel": relative_rms(f.smooth(truth.image), r.image),
+                 "reference_error": r.error} for f, r in own.items()}
 
     def figures(s: Setting, image: Tensor, _) -> dict:
-        noise = relative_rms(image, own[s.filter].image)
-        return {"error": relative_rms(image, truth), "noise": noise, **fixed[s.filter]}
+        return {"error": truth.error_of(image), "noise": own[s.filter].error_of(image), **fixed[s.filter]}
 
     rows = bench.measure(settings, figures)
     for row, s in zip(rows, settings, strict=True):
@@ -136,7 +128,7 @@ def study_reconstruction(bench: Bench, dtype: torch.dtype) -> Study:
         if best is not plain:
             than += f" (bincount {plain['error']:.2g} in {plain['seconds']:.2g} s)"
         parts.append(f"with {best['rays']} rays {best['series']} has the least error, {best['error']:.2g}{than}")
-    about = _about(bench, dtype, wide) | {"orders_of": "noise"}
+    about = _about(bench, dtype, truth) | {"orders_of": "noise"}
     return Study("reconstruction", columns, rows, _orders(bench, rows, "noise"), "; ".join(parts) + _haste(rows), about)
 
 
@@ -149,7 +141,7 @@ def study_precision(bench: Bench, _dtype) -> Study:
 
     def figures(s: Setting, image: Tensor, before: Tensor | None) -> dict:
         difference = relative_rms(image, before) if s.dtype == torch.float32 else None
-        return {"error": relative_rms(image, truth.image), "difference": difference}
+        return {"error": truth.error_of(image), "difference": difference}
 
     rows = bench.measure(settings, figures)
     for double, single in zip(rows[::2], rows[1::2], strict=True):

@@ -5,8 +5,9 @@ Notation
     reference   the mean of two float64 images of their own rays, many times more than any setting's
     error       relative RMS between two images, each over its own mean (metrics.relative_rms)
 
-The two halves A and B of a reference are independent, so (A + B) / 2 is wrong by about |A - B| / 2.  Its rays are `lines`:
-unbiased, and about ten times as fast as the rest because a tensor product of rays makes the spline cheap.
+The two halves A and B of a reference are independent, so (A + B) / 2 is wrong by about |A - B| / 2; and its rays are
+others than a setting's, so its error adds to the setting's in quadrature and is taken off again.  They are `lines`:
+unbiased, and several times as fast as stratified ones because a tensor product of rays makes the spline cheap.
 
 Settings take turns, round after round, so that a machine that slows down for a while slows all of them.
 """
@@ -27,11 +28,11 @@ from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.tracing import expose
-from caustic_cli.scene import Scene, Screen
+from caustic_cli.scene import Scene
 from caustic_cli.studies.metrics import relative_rms
 
-#: Rays of a bincount reference over those of the largest setting.  Errors fall like n^-1/2 at worst, so the reference is
-#: wrong by an eighth of the largest setting, which adds less than 1 % to it in quadrature.
+#: Rays of a bincount reference over those of the largest setting.  The error of lines falls like n^-1/2 at worst, to an
+#: eighth; against a better sampler's it was a quarter or less, so what is taken off in quadrature is a few per cent.
 REFERENCE_FACTOR = 64
 #: The same for a reference made with another filter, which smooths its own noise and takes longer a ray.
 FILTERED_FACTOR = 16
@@ -57,6 +58,13 @@ class Reference:
     image: Tensor
     rays: int
     error: float
+
+    def error_of(self, image: Tensor) -> float:
+        """Relative RMS of `image` (n_x, n_y) against the truth: against this image, less this image's own error.
+
+        sqrt(d^2 - error^2); 0 for an image that is closer to the reference than the truth is.
+        """
+        return math.sqrt(max(0.0, relative_rms(image, self.image) ** 2 - self.error**2))
 
 
 #: (setting, its image, the image of the setting before it in the same round or None) -> figures by column name
@@ -91,17 +99,17 @@ class Bench:
         self.total = references + self.repeats * sum(s.rays for s in settings)
 
     def sampler(self, setting: Setting, seed: int) -> Sampler:
-        """The rays of a setting: about as many as it asks for, on this lens' aperture, weighted by the source's profile."""
+        """The rays of a setting: about as many as it asks for, over the aperture, with the source's profile."""
         size, profile = self.scene.lens.size, self.scene.source.profile
         return Sampler.of_size(setting.sampler, setting.rays, size[0] / size[1], seed=seed, device=self.heights.device,
                                profile=None if profile is None else torch.as_tensor(profile))
 
-    def image(self, setting: Setting, seed: int, screen: Screen | None = None) -> Tensor:
+    def image(self, setting: Setting, seed: int) -> Tensor:
         """The image that a setting makes with the rays of `seed`: (n_x, n_y) float64."""
         return expose(self.scene, self.heightfield, self.heights, self.sampler(setting, seed), setting.filter,
-                      setting.dtype, screen).image
+                      setting.dtype).image
 
-    def reference(self, filter: Filter, screen: Screen | None = None) -> Reference:
+    def reference(self, filter: Filter) -> Reference:
         """The image to compare with, through `filter`.
 
         Raises:
@@ -111,11 +119,11 @@ class Bench:
         half = Setting("reference", "lines", factor * self.max_rays // 2, filter, torch.float64)
         images = []
         for k in (0, 1):
-            images.append(self.image(half, self.seed + REFERENCE_SEED + k, screen))
+            images.append(self.image(half, self.seed + REFERENCE_SEED + k))
             self._tick(half.rays)
         if not all(float(image.sum()) > 0 for image in images):
-            raise CausticError("no light reaches the screen, so there is no image to study: every ray is reflected inside"
-                               " the lens or misses the screen; check index, throw, mag and screen size")
+            raise CausticError("no light reaches the screen, so there is no image to study: every ray is reflected"
+                               " inside the lens or misses the screen; check index, throw, mag and screen size")
         return Reference(sum(images) / 2.0, 2 * self.sampler(half, 0).count, relative_rms(*images) / 2.0)
 
     def measure(self, settings: Sequence[Setting], figures: Figures) -> list[dict]:

@@ -9,8 +9,8 @@ Notation
     loss            sqrt(mean((J / S J - T / S T)^2)), eq. 5.2.1
     relative_rms    loss times the number of pixels: RMS error over the mean of the normalised target
     psnr_db         10 log10(L^2 / mean((K - T)^2))
-    ssim            mean of (2 m_K m_T + c_1)(2 s_KT + c_2) / ((m_K^2 + m_T^2 + c_1)(s_K^2 + s_T^2 + c_2)), local means m,
-                    variances s^2 and covariance s_KT under an 11 x 11 Gaussian window; c_i = (k_i L)^2
+    ssim            mean of (2 m_K m_T + c_1)(2 s_KT + c_2) / ((m_K^2 + m_T^2 + c_1)(s_K^2 + s_T^2 + c_2)), local
+                    means m, variances s^2 and covariance s_KT under an 11 x 11 Gaussian window; c_i = (k_i L)^2
 
 A black image is compared as it is, all zero: its relative_rms against an even target is 1.  What has no value (the
 logarithm of no error, anything relative to a black target) is None, because JSON has neither infinity nor NaN.
@@ -59,8 +59,8 @@ def psnr_db(image, target) -> float | None:
     peak = target.max()
     if not peak > 0:
         return None
-    error = np.mean((_normalised(image) * (target.sum() / peak) - target / peak) ** 2)
-    return -10.0 * math.log10(error) if error > 0 else None
+    error = loss(image, target) * (target.sum() / peak)  # RMS of K - T over L
+    return -20.0 * math.log10(error) if error > 0 else None
 
 
 def ssim(image, target) -> float | None:
@@ -101,8 +101,8 @@ def judge(exposure: Exposure, target) -> dict:
         target: (n_x, n_y), any scale.
 
     Returns:
-        loss, relative_rms, psnr_db, ssim (None where undefined), on_screen, on_target, lost (name -> part of the source's
-        power; with on_screen they sum to 1) and rays.
+        loss, relative_rms, psnr_db, ssim (None where undefined), on_screen, on_target, lost (name -> part of the
+        source's power; with on_screen they sum to 1) and rays.
     """
     image = exposure.image
     return {
@@ -125,7 +125,8 @@ def _array(a) -> np.ndarray:
 def _pair(image, target) -> tuple[np.ndarray, np.ndarray]:
     image, target = _array(image), _array(target)
     if image.ndim != 2 or not image.size or image.shape != target.shape:
-        raise InputError(f"image and target must be 2-D pictures of the same shape, got {image.shape} and {target.shape}")
+        raise InputError("image and target must be 2-D pictures of the same shape,"
+                         f" got {image.shape} and {target.shape}")
     if not (np.isfinite(image).all() and np.isfinite(target).all()):
         raise InputError("image and target must hold finite numbers only, got NaN or infinity")
     return image, target

@@ -11,7 +11,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from caustic_cli.errors import InputError
-from caustic_cli.files import atomic_path, write_bytes
+from caustic_cli.files import SOFTWARE, atomic_path, write_bytes
 from caustic_cli.studies.fit import Order, pareto
 
 #: Colours of Okabe and Ito, told apart by every kind of colour vision, and a marker of its own for each curve.
@@ -71,8 +71,8 @@ def as_csv(study: Study) -> str:
 
 
 def as_json(study: Study) -> str:
-    """Everything, one object; there is neither infinity nor NaN in it."""
-    return json.dumps(asdict(study), indent=2, allow_nan=False) + "\n"
+    """Everything, one object that begins with who made it; there is neither infinity nor NaN in it."""
+    return json.dumps({"created_by": SOFTWARE} | asdict(study), indent=2, allow_nan=False) + "\n"
 
 
 def plot(study: Study, path: str | Path) -> None:
@@ -85,20 +85,22 @@ def plot(study: Study, path: str | Path) -> None:
     rows = [row for row in study.rows if row["error"] > 0]
     for k, series in enumerate(dict.fromkeys(row["series"] for row in rows)):
         mine = [row for row in rows if row["series"] == series]
-        spread = [[row["seconds"] - row["seconds_min"] for row in mine], [row["seconds_max"] - row["seconds"] for row in mine]]
+        spread = [[row["seconds"] - row["seconds_min"] for row in mine],
+                  [row["seconds_max"] - row["seconds"] for row in mine]]
         order = study.orders.get(series)
         axes.errorbar([row["seconds"] for row in mine], [row["error"] for row in mine], xerr=spread, linewidth=1,
                       elinewidth=0.6, markersize=5, color=COLOURS[k % len(COLOURS)], marker=MARKERS[k % len(MARKERS)],
-                      label=series if order is None else f"{series}, order {order.exponent:.2f}")
+                      label=series if order is None else f"{series}, {study.about['orders_of']} of order {order.exponent:.2f}")
     best = pareto([row["seconds"] for row in rows], [row["error"] for row in rows])
     front = sorted((row["seconds"], row["error"]) for row, on in zip(rows, best, strict=True) if on)
-    axes.plot(*zip(*front, strict=True), linestyle=":", color="black", marker="o", markersize=11, markerfacecolor="none",
-              label="Pareto front")
+    axes.plot([seconds for seconds, _ in front], [error for _, error in front], linestyle=":", color="black",
+              marker="o", markersize=11, markerfacecolor="none", label="Pareto front")
     if study.about["reference_error"] > 0:
-        axes.axhline(study.about["reference_error"], color="grey", linewidth=0.8, linestyle="--", label="error of the reference")
+        axes.axhline(study.about["reference_error"], color="grey", linewidth=0.8, linestyle="--",
+                     label="error of the reference")
     axes.set(xlabel="time (s): median, least and most", ylabel="error: relative RMS against the reference",
              title=f"{study.name}: error and time")
     axes.grid(which="major", linewidth=0.4)
     axes.legend(fontsize="small")
     with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png", metadata={"Software": None})
+        figure.savefig(temporary, format="png", metadata={"Software": SOFTWARE})

@@ -1,0 +1,31 @@
+"""Settings for every test: one torch thread, fixed seeds, and hypothesis without randomness or clocks."""
+
+import warnings
+
+import pytest
+import torch
+from hypothesis import HealthCheck, settings
+
+with warnings.catch_warnings():  # torch loads this module on the first forward-mode derivative, and it warns of torch itself
+    warnings.simplefilter("ignore", DeprecationWarning)
+    import torch._decomp.decompositions_for_jvp
+
+torch.set_num_threads(1)  # the tests' tensors are small, and results must not depend on the machine's cores
+settings.register_profile("caustic", derandomize=True, deadline=None, max_examples=40, database=None,
+                          suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("caustic")
+
+
+@pytest.fixture(params=["fused", "torch"])
+def kernels(request, monkeypatch) -> str:
+    """Both ways of doing the same on a CPU: the fused kernels, and the plain-torch reference that other devices use."""
+    monkeypatch.setenv("CAUSTIC_KERNELS", {"fused": "", "torch": "torch"}[request.param])
+    return request.param
+
+
+@pytest.fixture(autouse=True)
+def _seeded():
+    """Every test starts from the same generator state and leaves torch's defaults alone."""
+    torch.manual_seed(0)
+    yield
+    assert torch.get_default_dtype() == torch.float32

@@ -1,0 +1,165 @@
+"""The derivative of the image along one control height: three ways, its symmetries, its refusals, its picture."""
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from caustic_cli.errors import InputError
+from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.reconstruction import Filter, splat
+from caustic_cli.optics.sampling import SAMPLERS, Sampler
+from caustic_cli.optics.tracing import PlaneTracer
+from caustic_cli.scene import Lens, PlaneWave, Scene, Screen
+from caustic_cli.studies.gradmap import compare, difference_step, finite_difference, gradient_image, plot_gradient
+
+COSINE = Filter("cosine", (3, 5))  # C1: central differences are sharp
+PROFILE = torch.tensor([[1.0, 0.2, 0.0], [0.5, 2.0, 1.0]], dtype=torch.float64)
+
+
+def bumpy(fresnel="exact", control=(9, 8), degree=(3, 2), amplitude=0.03):
+    """A lens with smooth bumps, 100 mm before a screen that most of its light reaches."""
+    lens = Lens((10.0, 8.0), 0.0, 1.5443, control, degree, fresnel=fresnel)
+    scene = Scene(PlaneWave(), lens, Screen((14.3, 11.7), 100.0, (23, 19)))
+    field = HeightField.of(lens)
+    x, y = field.control_xy()
+    heights = 5.0 + amplitude * torch.sin(x[:, None]) * torch.cos(0.7 * y) + 0.01 * amplitude * x[:, None] ** 2
+    return scene, field, heights
+
+
+@pytest.mark.parametrize("fresnel", ["none", "schlick", "exact"])
+@pytest.mark.parametrize("kind", SAMPLERS)
+def test_equals_central_differences(kind, fresnel):
+    scene, field, heights = bumpy(fresnel)
+    checked = 0
+    for control, profile in (((4, 3), None), ((0, 0), PROFILE), ((8, 4), PROFILE)):
+        sampler = Sampler(kind, (61, 53), seed=3, profile=profile)
+        gradient = gradient_image(scene, field, heights, control, sampler=sampler, filter=COSINE)
+        found = compare(gradient, scene, field, heights, control, sampler=sampler, filter=COSINE)
+        # rounding of slopes over a step of 1e-4 pixels: measured 1e-10 to 2e-8 here
+        assert found.relative_error < 1e-6
+        checked += int((gradient != 0).sum())
+    assert checked > 100
+
+
+@pytest.mark.parametrize("filter", [COSINE, Filter("gaussian", (3, 3), (1.0, 1.0)), Filter("gaussian", (7, 5))])
+@pytest.mark.parametrize("kind", ["lines", "stratified"])
+def test_dot_product_identity_with_reverse_mode(kind, filter):
+    """<y, J e_ij> = <J' y, e_ij> for random images y: forward and reverse mode are the same linear map."""
+    scene, field, heights = bumpy()
+    sampler = Sampler(kind, (60, 50), seed=1)
+    leaf = heights.clone().requires_grad_()
+    (sample,) = sampler.chunks()
+    landing = PlaneTracer(scene, field, sample, torch.float64)(leaf)
+    image = splat(landing.x, landing.y, landing.weight, scene.screen, filter)[0]
+    for seed, control in enumerate([(4, 3), (0, 7), (8, 0), (2, 5)]):
+        y = torch.randn(image.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+        (pulled,) = torch.autograd.grad(image, leaf, y, retain_graph=True)
+        forward = gradient_image(scene, field, heights, control, sampler=sampler, filter=filter)
+        assert forward.abs().sum() > 0
+        scale = float(y.norm() * forward.norm())
+        assert float((y * forward).sum()) == pytest.approx(float(pulled[control]), abs=1e-12 * scale)
+
+
+@pytest.mark.parametrize(("degree", "size"), [((3, 3), (3, 3)), ((3, 3), (11, 11)), ((5, 3), (3, 3))])
+@pytest.mark.parametrize("fresnel", ["none", "exact"])
+def test_flat_lens_moves_light_and_makes_none(degree, size, fresnel):
+    """Thesis fig. 6.1.1: a bright mountain in a dark valley, of sum zero; Fresnel is flat about normal incidence."""
+    lens = Lens((4.0, 4.0), control=(13, 13), degree=degree, fresnel=fresnel)
+    scene = Scene(PlaneWave(), lens, Screen((8.0, 8.0), 30.0, (41, 41)))
+    field = HeightField.of(lens)
+    heights = torch.full(field.shape, 5.0, dtype=torch.float64)
+    filter = Filter("gaussian", size)
+    g = gradient_image(scene, field, heights, (6, 6), sampler=Sampler("grid", (300, 300)), filter=filter)
+    assert abs(float(g.sum())) < 1e-12 * float(g.abs().sum())
+    assert g[20, 20] == g.max() and g.min() < 0
+    for mirrored in (g.flip(0), g.flip(1), *([g.T] if degree[0] == degree[1] else [])):
+        torch.testing.assert_close(g, mirrored, atol=1e-6 * float(g.max()), rtol=0)
+
+
+def test_reach_is_the_support_of_the_basis_function():
+    """On a flat lens rays go straight on: exact zeros outside the support grown by the filter, none left out within."""
+    lens = Lens((4.0, 4.0), control=(12, 12), degree=(2, 2), fresnel="none")
+    scene = Scene(PlaneWave(), lens, Screen((4.0, 4.0), 30.0, (40, 40)))
+    field = HeightField.of(lens)
+    heights = torch.full(field.shape, 5.0, dtype=torch.float64)
+    filter = Filter("cosine", (3, 3))
+    g = gradient_image(scene, field, heights, (4, 5), sampler=Sampler("grid", (330, 330)), filter=filter)
+    touched = g != 0
+    assert int(touched.sum()) > 100
+    t = field.spaces[0].knots
+    for axis, k in ((0, 4), (1, 5)):
+        low, high = 40 * float(t[k]), 40 * float(t[k + 3])
+        hit = torch.nonzero(touched.any(1 - axis)).flatten()
+        assert [int(hit[0]), int(hit[-1])] == [int(low) - 1, int(high - 1e-9) + 1]
+
+
+def test_chunks_and_single_precision_change_nothing_that_matters():
+    scene, field, heights = bumpy()
+    for kind in ("lines", "uniform"):
+        sampler = Sampler(kind, (71, 67))
+        whole = gradient_image(scene, field, heights, (3, 3), sampler=sampler, filter=COSINE)
+        parts = gradient_image(scene, field, heights, (3, 3), sampler=sampler, filter=COSINE, chunk=500)
+        single = gradient_image(scene, field, heights, (3, 3), sampler=sampler, filter=COSINE, dtype=torch.float32)
+        assert float((whole - parts).norm()) < 1e-13 * float(whole.norm())
+        assert single.dtype == torch.float64
+        assert float((whole - single).norm()) < 1e-4 * float(whole.norm())
+
+
+def test_difference_step_moves_rays_by_that_part_of_a_pixel():
+    scene, field, heights = bumpy()
+    step = difference_step(scene, field, (4, 3), pixels=0.01)
+    moved = heights.clone()
+    moved[4, 3] += step
+    (sample,) = Sampler("grid", (80, 80)).chunks()
+    a, b = (PlaneTracer(scene, field, sample, torch.float64)(h) for h in (heights, moved))
+    wx, wy = scene.screen.pixel
+    most = max(float((a.x - b.x).abs().max()) / wx, float((a.y - b.y).abs().max()) / wy)
+    assert 0.001 < most < 0.011
+
+
+def test_compare_sees_a_wrong_derivative():
+    scene, field, heights = bumpy()
+    sampler = Sampler("lines", (60, 60))
+    right = finite_difference(scene, field, heights, (4, 3), sampler=sampler, filter=COSINE)
+    found = compare(1.01 * right, scene, field, heights, (4, 3), sampler=sampler, filter=COSINE)
+    assert found.relative_error == pytest.approx(0.01, rel=1e-6)
+    assert found.largest_error == pytest.approx(0.01 * float(right.abs().max()), rel=1e-6)
+
+
+@pytest.mark.parametrize("filter", [Filter(), *(Filter("cosine", size) for size in ((1, 1), (3, 1), (1, 5)))])
+def test_bincount_is_refused(filter):
+    scene, field, heights = bumpy()
+    with pytest.raises(InputError, match="gaussian or cosine reconstruction with a filter size of 3 or more"):
+        gradient_image(scene, field, heights, (0, 0), sampler=Sampler("grid", (4, 4)), filter=filter)
+
+
+@pytest.mark.parametrize("control", [(-1, 0), (9, 0), (0, 8)])
+def test_unknown_control_point_is_refused(control):
+    scene, field, heights = bumpy()
+    with pytest.raises(InputError, match="must be a whole number 0 to"):
+        gradient_image(scene, field, heights, control, sampler=Sampler("grid", (4, 4)), filter=COSINE)
+
+
+def test_plot_shows_the_screen_from_behind_and_repeats_byte_for_byte(tmp_path):
+    scene = Scene(PlaneWave(), Lens(), Screen((4.0, 4.0), 300.0, (4, 4)))
+    gradient = torch.zeros(4, 4, dtype=torch.float64)
+    gradient[3, 0] = 1e-3  # +x, -y: the lower right corner
+    for name in ("a.png", "b.png"):
+        plot_gradient(tmp_path / name, gradient, scene, "one pixel")
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.png", "b.png"]
+    rgb = np.asarray(Image.open(tmp_path / "a.png").convert("RGB")).astype(int)
+    map_only = rgb[:, : int(0.78 * rgb.shape[1])]  # the rest is the colour bar
+    rows, columns = np.nonzero((map_only[..., 0] > 150) & (map_only[..., 1] < 60))
+    assert len(rows) > 1000
+    assert rows.min() > rgb.shape[0] / 2 and columns.min() > map_only.shape[1] / 2
+    coloured = (map_only.max(-1) - map_only.min(-1) > 8).sum()  # zeros are white, so nothing else has a colour
+    assert coloured < 1.1 * len(rows)
+
+
+def test_plot_of_nothing_is_a_plot(tmp_path):
+    scene = Scene(PlaneWave(), Lens(), Screen((4.0, 2.0), 300.0, (4, 2)))
+    plot_gradient(tmp_path / "zero.png", torch.zeros(4, 2), scene, "all zero")
+    with Image.open(tmp_path / "zero.png") as image:
+        assert image.size[0] > 100
