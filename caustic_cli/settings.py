@@ -215,8 +215,6 @@ def build_lens(settings: dict[str, dict[str, Any]]) -> Lens:
     if ("knots_u" in lens) != ("knots_v" in lens):
         raise InputError("[lens] knots_u and knots_v go together: give both or neither")
     knots = (tuple(lens["knots_u"]), tuple(lens["knots_v"])) if "knots_u" in lens else None
-    if knots and any(len(t) != n + p + 1 for t, n, p in zip(knots, lens["control"], lens["degree"], strict=True)):
-        raise InputError("[lens] knots_u and knots_v must have control + degree + 1 entries each")
     offset = Offset(lens["thickness"], tuple(lens["radius"]))
     return Lens(tuple(lens["size"]), lens["z_in"], index_of(lens), tuple(lens["control"]), tuple(lens["degree"]), knots,
                 lens["min_thickness"], offset, tuple(lens["height_range"]), lens["fresnel"])

@@ -144,7 +144,8 @@ def test_the_apron_is_dark_and_widens_the_frame():
     assert torch.equal(function.loss.target[3:-3, 3:-3], disc() / disc().sum())
     assert float(function.loss.target.sum()) == pytest.approx(1.0, abs=1e-14)
     wide = expose(SCENE, FIELD, heights(), Sampler("lines", (40, 36), 1), COSINE, screen=SCENE.screen.grown((3, 3)))
-    expected = Loss("rms-light", torch.nn.functional.pad(disc(), (3, 3, 3, 3)))(wide.image, torch.tensor(wide.leaving))
+    target = torch.nn.functional.pad(disc(), (3, 3, 3, 3))
+    expected = Loss("rms-light", target)(wide.image, torch.tensor(wide.leaving, dtype=torch.float64))
     evaluation = function(heights())
     assert evaluation.loss == pytest.approx(float(expected), rel=1e-12)
     assert evaluation.on_screen == pytest.approx(objective()(heights()).on_screen, rel=1e-12)
@@ -163,6 +164,18 @@ def test_chunks_do_not_change_value_or_gradient(name, fresnel, kept, monkeypatch
     assert cut.loss == pytest.approx(whole.loss, rel=1e-12)
     assert cut.on_screen == pytest.approx(whole.on_screen, rel=1e-12)
     torch.testing.assert_close(cut.gradient, whole.gradient, rtol=0, atol=1e-12 * float(whole.gradient.abs().max()))
+
+
+@pytest.mark.parametrize("chunk", [300, 10**6])
+def test_bins_without_fresnel_have_a_slope_of_zero(chunk, monkeypatch):
+    """Moving a ray within its pixel changes nothing then: that is a gradient of 0, not an error."""
+    monkeypatch.setattr(module, "CHUNK", chunk)
+    scene = replace(SCENE, lens=replace(LENS, fresnel="none"))
+    evaluation = objective(scene=scene, f=Filter())(heights())
+    assert evaluation.loss > 1e-3
+    assert evaluation.gradient.shape == (7, 6)
+    assert not evaluation.gradient.any()
+    assert objective(scene=scene)(heights()).gradient.any()
 
 
 def test_heights_are_left_alone():

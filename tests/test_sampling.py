@@ -73,12 +73,12 @@ def test_lines_are_a_tensor_grid(kind):
 
 @pytest.mark.usefixtures("kernels")
 @pytest.mark.parametrize("kind", SAMPLERS)
-@pytest.mark.parametrize("size", [1, 7, 29, 30, 100, 10**6])
+@pytest.mark.parametrize("size", [20, 30, 100, 10**6])
 def test_chunks_do_not_change_the_rays(kind, size):
     """Positions bitwise; shares, too, but for a profile's, whose norm is a sum over chunks: one rounding for each, 1e-13."""
     profile = torch.rand(5, 3, dtype=torch.float64)
     for p in (None, profile):
-        sampler = Sampler(kind, (31, 29), 11, p)
+        sampler = Sampler(kind, (17, 29), 11, p)
         whole, cut = points(sampler), points(sampler, size)
         assert torch.equal(whole[0], cut[0])
         assert torch.equal(whole[1], cut[1])
@@ -198,14 +198,14 @@ def test_streams_of_different_seeds_and_dimensions_are_uncorrelated():
 
 @pytest.mark.parametrize("kind", ["stratified", "lines", "uniform"])
 def test_the_mean_over_seeds_is_even(kind):
-    """All samples of 400 seeds together fill a 16 x 16 grid of cells that does not fit theirs: shifts are uniform, too."""
-    u, v = (torch.cat(at) for at in zip(*(points(Sampler(kind, (5, 7), seed))[:2] for seed in range(400)), strict=True))
+    """All samples of 100 seeds together fill a 16 x 16 grid of cells that does not fit theirs: shifts are uniform, too."""
+    u, v = (torch.cat(at) for at in zip(*(points(Sampler(kind, (10, 14), seed))[:2] for seed in range(100)), strict=True))
     assert len(u) == 14000
     counts = np.histogram2d(u, v, 16, [[0, 1], [0, 1]])[0]
     expected = len(u) / 256
     spread = float(((counts - expected) ** 2).mean() / expected)  # 1 for independent rays, with standard error 0.09
-    # stratified rays are more even than independent ones; whole lines of 5 or 7 rays move together and are less so
-    low, high = {"uniform": (0.7, 1.3), "stratified": (0.2, 1.1), "lines": (0.5, 12.0)}[kind]
+    # stratified rays are more even than independent ones; lines, too, but whole lines of rays move together
+    low, high = {"uniform": (0.7, 1.3), "stratified": (0.2, 0.8), "lines": (0.3, 1.5)}[kind]
     assert low < spread < high
 
 

@@ -247,7 +247,8 @@ def test_exposure_does_not_depend_on_threads():
     try:
         for threads in (1, 3):
             torch.set_num_threads(threads)
-            exposures[threads] = [expose(scene, field, heights, Sampler(k, (31, 29), 2), FILTERS[2]) for k in ("lines", "uniform")]
+            samplers = (Sampler(kind, (31, 29), 2) for kind in ("lines", "uniform"))
+            exposures[threads] = [expose(scene, field, heights, s, FILTERS[2]) for s in samplers]
     finally:
         torch.set_num_threads(1)
     for one, three in zip(*exposures.values(), strict=True):

@@ -71,7 +71,7 @@ def run(
                           dtype=options.dtype_of(dtype) if dtype else None,
                           progress=lambda done, whole: show(study, "rays", done, whole))
     paths = write(found, output)
-    rows = [(name, "no order could be fitted" if order is None else f"error ~ rays^{order.exponent:.2f} (+-{order.deviation:.2f})")
+    rows = [(name, "no order could be fitted" if order is None else f"error ~ rays^-{order.exponent:.2f} (+-{order.deviation:.2f})")
             for name, order in found.orders.items()]
     say.table(f"{study}: fitted orders", [*rows, ("advice", found.advice), ("written", ", ".join(map(str, paths)))])
     if json:

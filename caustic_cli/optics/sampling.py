@@ -129,7 +129,7 @@ class Sampler:
             du = dv = torch.tensor(0.5, dtype=torch.float64, device=self.device)
             if self.kind == "lines":
                 du, dv = random_numbers(self.seed, 0, i), random_numbers(self.seed, 1, j)
-            u, v = (i + du) / nu, (j + dv) / nv
+            u, v = (i + du) / nu, (j + dv) / nv  # du, dv are float64
             rows = max(1, size // nv)
             for a in range(0, nu, rows):
                 yield Sample(u[a : a + rows], v, True, one)

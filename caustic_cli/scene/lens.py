@@ -38,7 +38,7 @@ class Offset:
     def __post_init__(self):
         checks.number("[lens] thickness", self.thickness)
         for r in self.radius:
-            if math.isnan(r) or r == 0:
+            if isinstance(r, bool) or not isinstance(r, int | float) or math.isnan(r) or r == 0:
                 raise InputError(f"[lens] radius must be a non-zero number or inf, got {r!r}")
 
     @classmethod
@@ -106,8 +106,12 @@ class Lens:
         checks.number("[lens] z_in", self.z_in)
         checks.number("[lens] index", self.index, 1.0, 5.0, open_low=True)
         checks.pair("[lens] degree", self.degree, lambda w, x: checks.whole(w, x, 1, 15))
-        for name, n, p in zip("xy", self.control, self.degree, strict=True):
-            checks.whole(f"[lens] control ({name})", n, p + 1, MAX_CONTROL)
+        least = iter(self.degree)
+        checks.pair("[lens] control", self.control, lambda w, n: checks.whole(w, n, next(least) + 1, MAX_CONTROL))
+        if self.knots is not None:
+            for axis, t, n, p in zip("uv", self.knots, self.control, self.degree, strict=True):
+                if len(t) != n + p + 1:
+                    raise InputError(f"[lens] knots_{axis} must have control + degree + 1 = {n + p + 1} entries, got {len(t)}")
         checks.number("[lens] min_thickness", self.min_thickness, 0.0)
         low, high = checks.pair("[lens] height_range", self.height_range, checks.number)
         if not low < high:

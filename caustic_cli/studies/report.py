@@ -87,10 +87,12 @@ def plot(study: Study, path: str | Path) -> None:
         mine = [row for row in rows if row["series"] == series]
         spread = [[row["seconds"] - row["seconds_min"] for row in mine],
                   [row["seconds_max"] - row["seconds"] for row in mine]]
-        order = study.orders.get(series)
+        order, label = study.orders.get(series), series
+        if order is not None:
+            label += f", {study.about['orders_of']} of order {order.exponent:.2f}"
         axes.errorbar([row["seconds"] for row in mine], [row["error"] for row in mine], xerr=spread, linewidth=1,
                       elinewidth=0.6, markersize=5, color=COLOURS[k % len(COLOURS)], marker=MARKERS[k % len(MARKERS)],
-                      label=series if order is None else f"{series}, {study.about['orders_of']} of order {order.exponent:.2f}")
+                      label=label)
     best = pareto([row["seconds"] for row in rows], [row["error"] for row in rows])
     front = sorted((row["seconds"], row["error"]) for row, on in zip(rows, best, strict=True) if on)
     axes.plot([seconds for seconds, _ in front], [error for _, error in front], linestyle=":", color="black",
