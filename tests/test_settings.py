@@ -1,0 +1,245 @@
+"""project.toml: what it says comes back, what it cannot say is refused by name, and what follows from what."""
+
+import math
+import tomllib
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from caustic_cli import settings
+from caustic_cli.derive import build_options, build_stages, complete
+from caustic_cli.errors import InputError
+from caustic_cli.settings import SCHEMA, STAGE, build_lens, build_scene, dump, parse
+
+INDEX = 1.5443  # table D.2
+
+number = st.floats(allow_nan=False)
+whole = st.integers(-(2**63), 2**63 - 1)
+VALUES = {"number": number, "whole": whole, "text": st.text(st.characters(exclude_categories=["Cs"]), max_size=12),
+          "flag": st.booleans(), "numbers": st.lists(number, min_size=2, max_size=2),
+          "wholes": st.lists(whole, min_size=2, max_size=2), "list": st.lists(number, max_size=5)}
+
+
+def some(keys):
+    return st.fixed_dictionaries({}, optional={name: VALUES[key.kind] for name, key in keys.items()})
+
+
+@st.composite
+def written(draw):
+    s = {section: draw(some(keys)) for section, keys in SCHEMA.items()}
+    stages = draw(st.lists(some(STAGE).filter(bool), max_size=2))
+    if stages:
+        s["design"]["stages"] = stages
+    return s
+
+
+# reading and writing
+
+
+@given(written())
+def test_parse_undoes_dump(s):
+    assert parse(dump(s), "here") == s
+
+
+@given(written())
+def test_dump_is_toml_any_reader_reads(s):
+    raw = tomllib.loads(dump(s))
+    assert raw.pop("format_version") == 1
+    assert raw.pop("created_by").startswith("caustic ")
+    assert raw == s
+
+
+def test_complete_settings_round_trip():
+    s = complete({}, 0.75)
+    assert parse(dump(s), "here") == s
+    assert dump(parse(dump(s), "here")) == dump(s)
+
+
+def test_every_length_carries_its_unit():
+    text = dump(complete({}, 1.0)).splitlines()
+    for key in ("size", "z_in", "thickness", "radius", "height_range", "min_thickness", "z"):
+        rows = [line for line in text if line.split(" =")[0] == key]
+        assert rows and all("# mm" in line for line in rows), key
+    noted = [line for line in text if " = " in line and "#" in line]
+    assert len(noted) > 40
+
+
+@pytest.mark.parametrize(("text", "words"), [
+    ("[lens]\ndegre = [3, 3]", ["[lens]", "degre", "degree"]),
+    ("[lense]\nindex = 1.5", ["lense", "lens"]),
+    ("[screen]\nresolutoin = [2, 2]", ["[screen]", "resolution"]),
+    ("[[design.stages]]\nblurr = 1.0", ["design.stages", "blurr", "blur"]),
+    ("[source]\nzzzzzz = 1", ["zzzzzz", "type", "power"]),
+    ("lens = 3", ["lens", "section"]),
+    ("[lens]\nindex = '1.5'", ["[lens] index", "number", "'1.5'"]),
+    ("[lens]\nindex = true", ["[lens] index", "number"]),
+    ("[lens]\nindex = nan", ["[lens] index", "nan"]),
+    ("[lens]\nsize = 10", ["[lens] size", "pair"]),
+    ("[lens]\nsize = [10]", ["[lens] size", "pair"]),
+    ("[lens]\nsize = [1, 2, 3]", ["[lens] size", "pair"]),
+    ("[lens]\nsize = [1, '2']", ["[lens] size", "number"]),
+    ("[lens]\ncontrol = [3.0, 3]", ["[lens] control", "whole"]),
+    ("[design]\nseed = 1.5", ["[design] seed", "whole"]),
+    ("[design]\nfilter_target = 1", ["[design] filter_target", "true or false"]),
+    ("[design]\nloss = 3", ["[design] loss", "text"]),
+    ("[design]\nstages = 3", ["stages", "tables"]),
+    ("[design]\nstages = []", ["stages"]),
+    ("format_version = 99", ["format_version", "99", "1"]),
+    ("format_version = 'one'", ["format_version", "one"]),
+    ("[lens", ["TOML"]),
+    ("a = 1\na = 2", ["TOML"]),
+])
+def test_refused_by_name(text, words):
+    with pytest.raises(InputError) as caught:
+        parse(text, "there.toml")
+    message = str(caught.value)
+    assert message.startswith("there.toml: ") and "\n" not in message
+    assert all(word in message for word in words), message
+
+
+@pytest.mark.parametrize("version", ["0", "-1", "true"])
+def test_a_format_version_that_never_was_is_refused(version):
+    with pytest.raises(InputError, match="format_version"):
+        parse(f"format_version = {version}", "there.toml")
+
+
+def test_a_whole_number_serves_as_a_length():
+    assert parse("[screen]\nz = 300\nsize = [40, 30]", "here")["screen"] == {"z": 300.0, "size": [40.0, 30.0]}
+
+
+def test_a_file_that_is_no_text(tmp_path):
+    (tmp_path / "a.toml").write_bytes(b"\xff\xfe\x00")
+    for path in (tmp_path / "a.toml", tmp_path / "none.toml", tmp_path):
+        with pytest.raises(InputError, match="TOML file is needed"):
+            settings.read(path)
+
+
+# what follows from what
+
+
+def test_the_default_scene_is_table_d2():
+    s = complete({}, 1.0)
+    assert s["lens"]["size"] == [10.0, 10.0] and s["screen"]["z"] == 300.0 and s["lens"]["index"] == INDEX
+    assert s["target"]["size"] == pytest.approx([30.0, 30.0])
+    assert s["screen"]["size"] == pytest.approx([38.4, 38.4])
+    assert s["screen"]["resolution"] == [250, 250]
+    assert s["lens"]["control"] == [131, 131] and s["lens"]["degree"] == [3, 3]
+    build_scene(s), build_stages(s), build_options(s)
+
+
+def test_mag_3():
+    s = complete({}, 1.0, mag=3.0)
+    assert s["target"]["size"] == pytest.approx([30.0, 30.0]) and s["screen"]["size"] == pytest.approx([38.4, 38.4])
+    assert s["lens"]["radius"] == pytest.approx([(INDEX - 1) * (300 - 5) / 2] * 2, rel=1e-14)
+    assert build_lens(s).offset.radius == tuple(s["lens"]["radius"])
+
+
+def test_mag_1_is_flat():
+    assert complete({}, 1.0, mag=1.0)["lens"]["radius"] == [math.inf, math.inf]
+
+
+def test_mag_counts_lens_widths():
+    s = complete({"lens": {"size": [20.0, 20.0]}}, 1.0, mag=2.0, margin=0.5)
+    assert s["target"]["size"] == pytest.approx([40.0, 40.0]) and s["screen"]["size"] == pytest.approx([60.0, 60.0])
+
+
+def test_a_non_square_picture_keeps_its_shape():
+    s = complete({}, 0.5, mag=3.0)
+    assert s["target"]["size"] == pytest.approx([30.0, 15.0])
+    assert s["screen"]["size"] == pytest.approx([38.4, 19.2])
+    assert s["screen"]["resolution"] == [250, 125]
+    reach = (INDEX - 1) * 295  # each axis has its own magnification, 3 and 1.5
+    assert s["lens"]["radius"] == pytest.approx([reach / 2, reach / 0.5])
+
+
+@pytest.mark.parametrize(("width", "aspect", "expected"), [(24, 1.0, [24, 24]), (100, 2.0, [100, 200]), (100, 0.753, [100, 75]),
+                                                           (2, 0.01, [2, 2])])
+def test_resolution_counts_across(width, aspect, expected):
+    assert complete({}, aspect, width=width)["screen"]["resolution"] == expected
+
+
+def test_screen_size_alone_sets_the_picture():
+    s = complete({"screen": {"size": [64.0, 64.0]}}, 1.0)
+    assert s["target"]["size"] == pytest.approx([50.0, 50.0])
+
+
+def test_a_picture_fits_on_a_screen_of_another_shape():
+    for aspect in (0.5, 1.0, 3.0):
+        s = complete({"screen": {"size": [64.0, 32.0]}}, aspect)
+        width, height = s["target"]["size"]
+        assert height == pytest.approx(aspect * width)
+        assert width <= 50.0 + 1e-9 and height <= 25.0 + 1e-9
+        assert width == pytest.approx(50.0) or height == pytest.approx(25.0)
+
+
+def test_what_was_given_is_kept():
+    given_ = {"lens": {"radius": [100.0, 90.0], "control": [20, 21], "degree": [2, 5]}, "screen": {"resolution": [7, 9]}}
+    s = complete(given_, 1.0)
+    assert s["lens"]["radius"] == [100.0, 90.0] and s["lens"]["control"] == [20, 21] and s["screen"]["resolution"] == [7, 9]
+
+
+def test_glass_replaces_the_index():
+    s = complete({"lens": {"glass": "N-BK7"}}, 1.0)
+    assert "index" not in s["lens"]
+    assert build_lens(s).index == pytest.approx(1.5168, abs=1e-4)  # n_d of the Schott catalogue
+    with pytest.raises(InputError, match="not both"):
+        complete({"lens": {"glass": "N-BK7", "index": 1.5}}, 1.0)
+
+
+@pytest.mark.parametrize(("quality", "first", "last"), [("draft", 15, 25), ("standard", 25, 50), ("fine", 40, 120)])
+def test_quality_shapes_the_stages(quality, first, last):
+    stages = complete({}, 1.0, quality=quality)["design"]["stages"]
+    assert stages[0]["iterations"] == first and stages[-1]["iterations"] == last
+
+
+def test_stages_end_sharp_on_the_lens_own_net():
+    s = complete({"lens": {"control": [19, 35]}}, 1.0, rays=5000)
+    stages = build_stages(s)
+    assert stages[-1].control == (19, 35) and stages[-1].rays == 5000 and stages[-1].blur == 0.0
+    blurs = [stage.blur for stage in stages]
+    assert blurs == sorted(blurs, reverse=True) and blurs[0] > 0
+
+
+@pytest.mark.parametrize("design", [{"network": "dense", "optimizer": "adam"}, {"optimizer": "adam"}])
+def test_adam_has_one_stage(design):
+    assert len(complete({"design": design}, 1.0)["design"]["stages"]) == 1
+
+
+@pytest.mark.parametrize(("given_", "shaped", "word"), [
+    ({}, {"mag": 0.0}, "--mag"), ({}, {"mag": math.nan}, "--mag"), ({}, {"mag": -3.0}, "--mag"),
+    ({}, {"margin": -0.1}, "--margin"), ({}, {"quality": "superb"}, "--quality"),
+    ({"screen": {"z": 3.0}}, {}, "[screen] z"), ({"screen": {"z": math.inf}}, {}, "[screen] z"),
+    ({"lens": {"degree": [99, 99]}}, {}, "[lens] degree"), ({"lens": {"index": 1.0}}, {}, "[lens] index"),
+    ({"lens": {"glass": "wood"}}, {}, "wood"), ({"lens": {"size": [0.0, 1.0]}}, {}, "[lens] size"),
+    ({"screen": {"size": [0.0, 1.0]}}, {}, "[screen] size"),
+    ({"design": {"stages": [{"blur": 1.0}]}}, {"rays": 1000}, "--rays"),
+])
+def test_out_of_range(given_, shaped, word):
+    with pytest.raises(InputError) as caught:
+        complete(given_, 1.0, **shaped)
+    assert word in str(caught.value)
+
+
+@pytest.mark.parametrize(("change", "word"), [
+    ({"design": {"stages": [{"control": [9, 9]}]}}, "control"),
+    ({"design": {"stages": [{"alpha_per_mm2": 1.0, "alpha_per_pixel2": 1.0, "reconstruction": "gaussian"}]}}, "alpha"),
+    ({"design": {"stages": [{"reconstruction": "moon"}]}}, "reconstruction"),
+    ({"design": {"stages": [{"filter_size": [2, 2]}]}}, "filter"),
+    ({"design": {"stages": [{"rays": 0}]}}, "rays"),
+    ({"design": {"stages": [{"sampler": "moon"}]}}, "sampler"),
+])
+def test_stages_out_of_range(change, word):
+    with pytest.raises(InputError) as caught:
+        build_stages(complete(change, 1.0))
+    assert word in str(caught.value)
+
+
+@pytest.mark.parametrize(("key", "value"), [("optimizer", "moon"), ("dtype", "float16"), ("seed", -1), ("lr", 0.0),
+                                            ("loss", "moon"), ("network", "moon"), ("preconditioner", "moon"),
+                                            ("initial", "moon")])
+def test_design_options_out_of_range(key, value):
+    """Before any work begins: a design must not find out after it has made its directory."""
+    with pytest.raises(InputError) as caught:
+        build_options(complete({"design": {key: value}}, 1.0))
+    assert key in str(caught.value)
