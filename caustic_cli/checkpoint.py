@@ -41,6 +41,10 @@ class Checkpoint:
     results: dict
 
 
+class _Newer(InputError):
+    """A checkpoint of a later version."""
+
+
 def save(path: Path, checkpoint: Checkpoint) -> None:
     """Write a checkpoint atomically."""
     state, spaces = checkpoint.state, checkpoint.spaces
@@ -75,20 +79,23 @@ def load(path: Path) -> Checkpoint:
         with h5py.File(path, "r") as f:
             version = int(f.attrs["format_version"])
             if version > FORMAT_VERSION:
-                raise InputError(f"{path}: has format version {version}; this caustic {__version__} reads up to {FORMAT_VERSION}")
+                raise _Newer(f"{path}: has format version {version}; this caustic {__version__} reads up to {FORMAT_VERSION}")
+            rows = f["history"][()]
+            if rows.ndim != 2 or rows.shape[1] != len(HISTORY):
+                raise ValueError("history")
             group = f["state"]
             state = State(
                 torch.from_numpy(f["lens/heights"][()]),
                 **{k: int(group.attrs[k]) for k in ("stage", "iteration", "total")},
                 **{name: {k: torch.from_numpy(np.asarray(v[()])) for k, v in group[name].items()}
                    for name in ("parameters", "optimizer")},
-                history=[(int(r[0]), int(r[1]), *map(float, r[2:])) for r in f["history"][()]],
+                history=[(int(r[0]), int(r[1]), *map(float, r[2:])) for r in rows],
                 seconds=float(group.attrs["seconds"]), reason=str(group.attrs["reason"]))
             spaces = tuple(SplineSpace(int(p), torch.from_numpy(f[f"lens/knots_{axis}"][()]))
                            for p, axis in zip(f["lens"].attrs["degree"], "uv", strict=True))
             checkpoint = Checkpoint(state, spaces, json.loads(f.attrs["provenance"]), json.loads(f.attrs["results"]))
     except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
-        if isinstance(error, InputError):
+        if isinstance(error, _Newer):
             raise
         raise InputError(f"{path}: is damaged or not a caustic checkpoint ({type(error).__name__});"
                          " a whole checkpoints.h5 is needed") from error

@@ -5,6 +5,7 @@ Torch is loaded inside the commands' bodies only, so that --help answers at once
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 from typing import Annotated
@@ -54,6 +55,11 @@ def run(arguments: list[str]) -> int:
     except BrokenPipeError:  # whoever read our results has read enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except SystemExit as stop:  # how Typer ends a command whose output nobody reads any more
+        if isinstance(stop.__context__, OSError) and stop.__context__.errno == errno.EPIPE:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 0
+        return stop.code if isinstance(stop.code, int) else 1
     except typer.Exit as stop:
         return stop.exit_code
     except (KeyboardInterrupt, typer.Abort):
@@ -75,6 +81,9 @@ def _report(problem: Exception) -> int:
         return 2 if isinstance(problem, InputError) else 1
     if hasattr(problem, "format_message"):  # a usage error of the command-line parser, whichever version wraps it
         message = problem.format_message()
+        if type(problem).__name__ == "NoArgsIsHelpError":  # no command at all: the message is the whole help
+            sys.stderr.write(message + "\n")
+            return 2
         if message:
             console.error(f"{message} (see caustic --help)")
         return 2

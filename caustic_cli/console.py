@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import sys
+import threading
 from contextlib import contextmanager
 
 from rich.console import Console
@@ -26,12 +27,27 @@ class Reporter:
 
     def table(self, title: str, rows: list[tuple[str, str]]) -> None:
         """Two columns: what, and its value."""
+        if not self.console.is_terminal:  # a log: nothing wrapped, nothing cut
+            width = max(len(name) for name, _ in rows)
+            self.say("\n".join([title, *(f"  {name:<{width}}  {value}" for name, value in rows)]))
+            return
         table = Table(title=title, show_header=False, title_justify="left", title_style="bold")
-        table.add_column()
-        table.add_column()
+        table.add_column(no_wrap=True)
+        table.add_column(overflow="fold")
         for name, value in rows:
             table.add_row(name, value)
         self.console.print(table)
+
+    @contextmanager
+    def patience(self, text: str, seconds: float = 1.5):
+        """Say `text` if the block is still at work after so many seconds."""
+        timer = threading.Timer(seconds, self.say, (text,))
+        timer.daemon = True
+        timer.start()
+        try:
+            yield
+        finally:
+            timer.cancel()
 
     @contextmanager
     def progress(self, total: int | None, columns: str = ""):

@@ -49,6 +49,12 @@ def complete(given: Settings, aspect: float, *, mag: float | None = None, margin
     margin = checks.number("--margin", DEFAULT_MARGIN if margin is None else margin, 0.0, 100.0)
     checks.pair("[lens] size", lens["size"], lambda w, x: checks.number(w, x, 1e-6, 1e6))
     checks.number("[screen] z", screen["z"])
+    if "size" in screen:
+        checks.pair("[screen] size", screen["size"], lambda w, x: checks.number(w, x, 1e-6, 1e9))
+    if "size" in target:
+        checks.pair("[target] size", target["size"], lambda w, x: checks.number(w, x, 1e-6, 1e9))
+    checks.choice("[target] flip", target["flip"], ("", "x", "y", "xy"))
+    checks.choice("[target] encoding", target["encoding"], ("srgb", "linear"))
     if "size" not in target or mag is not None:
         if mag is None and "size" in screen:
             fit = min(screen["size"][0], screen["size"][1] / aspect) / (1.0 + margin)

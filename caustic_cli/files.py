@@ -12,6 +12,7 @@ from caustic_cli.errors import InputError
 
 #: What marks a file as made by this program, so that it may be replaced.
 SOFTWARE = "caustic"
+MARK = SOFTWARE.encode()
 NPY_HEADER = 256  # bytes; NumPy itself pads to 64 or 128
 
 
@@ -50,23 +51,29 @@ def write_bytes(path: str | Path, data: bytes) -> None:
 
 
 def is_ours(path: str | Path) -> bool:
-    """Whether this program made the file: our mark in a PNG, our header in a .npy, our name at either end of another."""
+    """Whether this program made the file: by our mark in a PNG, .npy, .npz, STL or JSON; nothing else is ours."""
     with open(path, "rb") as f:
         head = f.read(1024)
-        f.seek(max(0, os.path.getsize(path) - 1024))
+        size = os.path.getsize(path)
+        f.seek(max(0, size - 1024))
         tail = f.read()
     if head.startswith(b"\x93NUMPY\x01\x00"):
         return int.from_bytes(head[8:10], "little") == NPY_HEADER - 10
     if head.startswith(b"\x89PNG"):
-        return b"Software\x00" + SOFTWARE.encode() in head
-    return SOFTWARE.encode() in head + b"\n" + tail
+        return b"Software\x00" + MARK in head
+    if head.startswith(b"PK"):
+        return tail.endswith(MARK)  # the archive's comment
+    if MARK in head[:80] and len(head) >= 84 and not head.startswith(b"solid"):
+        return size == 84 + 50 * int.from_bytes(head[80:84], "little")  # the header of a binary STL
+    return b'"created_by": "' + MARK in head + tail
 
 
 def refuse_foreign(path: str | Path, force: bool = False) -> None:
     """Stop before work begins when `path` cannot be written, or holds something this program did not make.
 
     Raises:
-        InputError: its directory is missing or read-only, it is a directory, or it is foreign and `force` is false.
+        InputError: its directory is missing or read-only, it is a directory, it is foreign and `force` is false, or it
+            is what a project is made of.
     """
     path = Path(path)
     if path.is_dir():
@@ -75,6 +82,8 @@ def refuse_foreign(path: str | Path, force: bool = False) -> None:
         raise InputError(f"{path}: its directory {path.parent} does not exist; make it first")
     if not os.access(path.parent, os.W_OK):
         raise InputError(f"{path}: its directory {path.parent} is read-only; one you may write to is needed")
+    if (path.parent / "project.toml").exists() and path.name.startswith(("project.toml", "checkpoints.h5", "target.", "profile.")):
+        raise InputError(f"{path}: is part of the project and is never replaced by an output; choose another name")
     if path.exists() and not force and not is_ours(path):
         raise InputError(f"{path}: exists and was not made by caustic; --force replaces it, another name spares it")
 

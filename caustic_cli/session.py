@@ -220,6 +220,8 @@ def _run(project: Project, designer: Designer, target: np.ndarray, state: State,
         figures |= {"iterations": state.total, "seconds": time.monotonic() - began, "image": str(project.path / RENDER),
                     "project": str(project.path), "reason": state.reason}
         keep(state, figures)
+        if asked:
+            raise Interrupted(f"interrupted when the design was done; {project.path} is whole", 128 + asked[0])
     return figures
 
 

@@ -117,8 +117,8 @@ def parse(text: str, where: str) -> dict[str, dict[str, Any]]:
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{where}: is not valid TOML: {error}") from error
     version = raw.pop("format_version", FORMAT_VERSION)
-    if not isinstance(version, int) or version > FORMAT_VERSION:
-        raise InputError(f"{where}: has format_version {version!r}; this caustic {__version__} reads up to {FORMAT_VERSION}")
+    if type(version) is not int or not 1 <= version <= FORMAT_VERSION:
+        raise InputError(f"{where}: has format_version {version!r}; this caustic {__version__} reads 1 to {FORMAT_VERSION}")
     raw.pop("created_by", None)
     out: dict[str, dict[str, Any]] = {}
     for section, table in raw.items():

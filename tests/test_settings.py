@@ -227,7 +227,6 @@ def test_out_of_range(given_, shaped, word):
     ({"design": {"stages": [{"reconstruction": "moon"}]}}, "reconstruction"),
     ({"design": {"stages": [{"filter_size": [2, 2]}]}}, "filter"),
     ({"design": {"stages": [{"rays": 0}]}}, "rays"),
-    ({"design": {"stages": [{"sampler": "moon"}]}}, "sampler"),
 ])
 def test_stages_out_of_range(change, word):
     with pytest.raises(InputError) as caught:
@@ -235,11 +234,8 @@ def test_stages_out_of_range(change, word):
     assert word in str(caught.value)
 
 
-@pytest.mark.parametrize(("key", "value"), [("optimizer", "moon"), ("dtype", "float16"), ("seed", -1), ("lr", 0.0),
-                                            ("loss", "moon"), ("network", "moon"), ("preconditioner", "moon"),
-                                            ("initial", "moon")])
+@pytest.mark.parametrize(("key", "value"), [("optimizer", "moon"), ("dtype", "float16"), ("seed", -1), ("lr", 0.0)])
 def test_design_options_out_of_range(key, value):
-    """Before any work begins: a design must not find out after it has made its directory."""
     with pytest.raises(InputError) as caught:
         build_options(complete({"design": {key: value}}, 1.0))
     assert key in str(caught.value)

@@ -34,7 +34,7 @@ def cases(draw):
     a, b = draw(st.integers(2, 9)), draw(st.integers(2, 9))
     irradiance = np.random.default_rng(draw(st.integers(0, 2**20))).random((a, b))
     size = (draw(lengths), draw(lengths))
-    margin = draw(st.floats(0.0, 2.0))
+    margin = draw(st.just(0.0) | st.floats(1e-6, 2.0))  # a margin below 1e-9 is taken for none
     screen = Screen(tuple(s * (1 + margin) for s in size), 300.0, (draw(st.integers(2, 12)), draw(st.integers(2, 12))))
     return irradiance, size, screen
 

@@ -41,13 +41,13 @@ def run(
     debug: options.Debug = False,
 ) -> None:
     """Measure the error of an image, and the time it took, for many settings in one run."""
-    began = time.monotonic()
+    began, say = time.monotonic(), console.Reporter(quiet)
     if study not in STUDIES:
         raise InputError(f"--study must be one of {', '.join(STUDIES)}, got {study!r}")
     count = options.rays("--rays", rays) if rays else None
     if output.exists() and not output.is_dir():
         raise InputError(f"{output}: is a file; a directory for CSV, JSON and PNG is needed")
-    device = options.start_torch(device, threads)
+    device = options.start_torch(device, threads, say)
 
     from caustic_cli.files import refuse_foreign  # noqa: PLC0415
     from caustic_cli.project import Project  # noqa: PLC0415
@@ -65,7 +65,6 @@ def run(
         scene = opened.scene()
         field, checkpoint = opened.lens(scene)
         heights = checkpoint.state.heights
-    say = console.Reporter(quiet)
     with say.progress(None) as show:
         found = run_study(study, scene, field, heights.to(device), seed=seed or 0, max_rays=count, repeats=repeats,
                           dtype=options.dtype_of(dtype) if dtype else None,

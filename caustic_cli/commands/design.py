@@ -67,7 +67,7 @@ def run(
     debug: options.Debug = False,
 ) -> None:
     """Find the lens whose caustic is the picture TARGET."""
-    began = time.monotonic()
+    began, say = time.monotonic(), console.Reporter(quiet)
     given = {
         ("source", "type", "--source"): source,
         ("lens", "size", "--lens-size"): lens_size and options.both(options.size("--lens-size", lens_size)),
@@ -97,8 +97,7 @@ def run(
         raise InputError(f"--iterations must be a whole number 1 to 1e9, got {iterations}")
     if time_limit is not None and not time_limit > 0:
         raise InputError(f"--time-limit must be greater than 0 s, got {time_limit:g}")
-    device = options.start_torch(device, threads)
-    say = console.Reporter(quiet)
+    device = options.start_torch(device, threads, say)
 
     from caustic_cli import session  # noqa: PLC0415
 

@@ -16,7 +16,7 @@ EXAMPLES = """Examples:
 
   caustic gradmap flame.caustic --control 60,70
 
-  caustic gradmap flame.caustic --control 60,70 --filter-size 11 --check --json
+  caustic gradmap flame.caustic --filter-size 11 --check --json
 """
 
 
@@ -43,11 +43,11 @@ def run(
     debug: options.Debug = False,
 ) -> None:
     """Show how the image changes with one control height, by one forward-mode pass."""
-    began = time.monotonic()
+    began, say = time.monotonic(), console.Reporter(quiet)
     count = options.rays("--rays", rays)
     size = options.both(options.counts("--filter-size", filter_size))
     points = [options.indices("--control", text) for text in control or []]
-    device = options.start_torch(device, threads)
+    device = options.start_torch(device, threads, say)
 
     from caustic_cli.derive import filter_from  # noqa: PLC0415
     from caustic_cli.files import refuse_foreign  # noqa: PLC0415
@@ -78,7 +78,7 @@ def run(
         raise InputError(f"--alpha belongs to --reconstruction gaussian, got {reconstruction}")
     filter = filter_from(reconstruction, size, scene.screen, alpha)
     sampler = sampler_for(scene, count, opened.settings["design"]["seed"] if seed is None else seed, device)
-    heights, say, maps = checkpoint.state.heights, console.Reporter(quiet), []
+    heights, maps = checkpoint.state.heights, []
     for point, (image, data) in zip(points, files, strict=True):
         gradient = gradmap.gradient_image(scene, field, heights, point, sampler=sampler, filter=filter,
                                           dtype=options.dtype_of(dtype or "float64"))

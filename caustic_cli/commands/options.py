@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from caustic_cli.console import Reporter
 from caustic_cli.errors import InputError
 
 Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout.")]
@@ -68,8 +69,8 @@ def rays(option: str, text: str) -> int:
     return int(value)
 
 
-def start_torch(device: str, threads: int | None):
-    """Load torch, set its threads, and choose the device: "cpu" or "cuda".
+def start_torch(device: str, threads: int | None, say: Reporter):
+    """Load torch, set its threads, choose the device ("cpu" or "cuda"), and have the CPU's kernels compiled.
 
     Raises:
         InputError: an unknown device, CUDA asked for but absent, or fewer than one thread.
@@ -84,7 +85,15 @@ def start_torch(device: str, threads: int | None):
         torch.set_num_threads(threads)
     if device == "cuda" and not torch.cuda.is_available():
         raise InputError("--device cuda: no CUDA device is at hand here; use auto or cpu")
-    return "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
+    device = "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
+    from caustic_cli.optics.kernels import fused  # noqa: PLC0415
+
+    if fused(device):
+        from caustic_cli.optics.kernels.functions import compile_kernels  # noqa: PLC0415
+
+        with say.patience("compiling the ray kernels for this machine, once: about half a minute"):
+            compile_kernels(torch.float32, torch.float64)
+    return device
 
 
 def dtype_of(name: str):

@@ -42,10 +42,10 @@ def run(
     debug: options.Debug = False,
 ) -> None:
     """Trace the lens of PROJECT; write the irradiance image and its figures."""
-    began = time.monotonic()
+    began, say = time.monotonic(), console.Reporter(quiet)
     count = options.rays("--rays", rays)
     size = options.both(options.counts("--filter-size", filter_size))
-    device = options.start_torch(device, threads)
+    device = options.start_torch(device, threads, say)
 
     from caustic_cli.derive import filter_from  # noqa: PLC0415
     from caustic_cli.files import refuse_foreign  # noqa: PLC0415
@@ -68,15 +68,17 @@ def run(
     if alpha is not None and reconstruction != "gaussian":
         raise InputError(f"--alpha belongs to --reconstruction gaussian, got {reconstruction}")
     filter = filter_from(reconstruction, size, screen, alpha)
-    exposure, figures = retrace(
-        scene, field, checkpoint.state.heights, target, rays=count, filter=filter, screen=screen, device=device,
-        seed=opened.settings["design"]["seed"] if seed is None else seed, dtype=options.dtype_of(dtype or "float64"))
+    try:
+        exposure, figures = retrace(
+            scene, field, checkpoint.state.heights, target, rays=count, filter=filter, screen=screen, device=device,
+            seed=opened.settings["design"]["seed"] if seed is None else seed, dtype=options.dtype_of(dtype or "float64"))
+    except InputError as error:
+        raise InputError(str(error).replace("[screen] z", "--screen-at") if screen_at is not None else str(error)) from error
     image = exposure.image.cpu().numpy()
     write_image(image_path, image, white_level(image, target), opened.settings["target"]["encoding"])
     if npy is not None:
         write_npy(npy, image)
     figures |= {"iterations": checkpoint.state.total, "seconds": time.monotonic() - began, "image": str(image_path)}
-    say = console.Reporter(quiet)
     say.table(f"{project}", console.figures_rows(figures))
     if json:
         console.emit_json(figures)

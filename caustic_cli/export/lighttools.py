@@ -10,6 +10,7 @@ bytes whatever the day or the zlib.
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from torch import Tensor
 
 from caustic_cli import __version__
 from caustic_cli.export.surface import sample_grid
-from caustic_cli.files import atomic_path
+from caustic_cli.files import MARK, atomic_path
 from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.scene import PlaneWave, Scene
 
@@ -64,8 +65,10 @@ def write_lighttools(path: str | Path, scene: Scene, field: HeightField, heights
         "format_version": np.array(FORMAT_VERSION, np.int64),
         "created_by": np.array(f"caustic {__version__}"),
     }
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:  # an open file: savez would rename `lens.dat`
+    with atomic_path(path) as temporary, open(temporary, "w+b") as file:  # an open file: savez would rename `lens.dat`
         np.savez(file, **arrays)  # dates every entry 1980-01-01
+        with zipfile.ZipFile(file, "a") as archive:
+            archive.comment = MARK
 
 
 def _source(source: PlaneWave) -> dict[str, np.ndarray]:

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse.lbfgs import LBFGS
-from caustic_cli.inverse.losses import NoLight
+from caustic_cli.inverse.losses import LOSSES, NoLight
 from caustic_cli.inverse.objective import Objective
-from caustic_cli.inverse.parametrisation import Heights, parametrise
+from caustic_cli.inverse.parametrisation import INITIAL, NETWORKS, PRECONDITIONERS, Heights, parametrise
 from caustic_cli.inverse.schedule import Stage
 from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.optics.sampling import Sampler, stream
@@ -49,6 +49,10 @@ class Options:
     dtype: torch.dtype = torch.float32
 
     def __post_init__(self):
+        checks.choice("[design] loss", self.loss, LOSSES)
+        checks.choice("[design] network", self.network, NETWORKS)
+        checks.choice("[design] initial", self.initial, INITIAL)
+        checks.choice("[design] preconditioner", self.preconditioner, PRECONDITIONERS)
         checks.choice("[design] optimizer", self.optimizer, OPTIMIZERS)
         checks.number("[design] lr", self.lr, 0.0, open_low=True)
         if self.optimizer == "lbfgs" and self.network != "none":

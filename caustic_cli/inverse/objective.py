@@ -20,7 +20,6 @@ from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.tracing import PlaneTracer
 from caustic_cli.scene import Scene
 
-
 #: Rays traced at a time, and the number up to which the prepared chunks are kept from one evaluation to the next.
 CHUNK, KEPT_RAYS = 1 << 20, 1 << 22
 
@@ -82,7 +81,7 @@ class Objective:
                 image, leaving = image + part.image.double(), leaving + part.leaving.double()
         if single:
             loss = self.loss(image, leaving)
-            (gradient,) = torch.autograd.grad(loss, heights)
+            gradient = torch.autograd.grad(loss, heights)[0] if loss.requires_grad else torch.zeros_like(heights)
         else:
             image, leaving = image.requires_grad_(), leaving.requires_grad_()
             loss = self.loss(image, leaving)
@@ -91,8 +90,12 @@ class Objective:
             gradient = torch.zeros_like(heights)
             for tracer in self.kept or self._tracers():
                 part = tracer.expose(heights, self.screen, self.filter)
-                gradient += torch.autograd.grad((part.image, part.leaving), heights,
-                                                (by_image.to(part.image.dtype), by_leaving.to(part.leaving.dtype)))[0]
+                # Whole pixels, and what leaves a lens without reflections, do not depend on the heights at all.
+                pulls = [(value, by.to(value.dtype)) for value, by in ((part.image, by_image), (part.leaving, by_leaving))
+                         if value.requires_grad]
+                if pulls:
+                    values, by = zip(*pulls, strict=True)
+                    gradient += torch.autograd.grad(values, heights, by)[0]
         a = self.apron
         inner = image.detach()[a : image.shape[0] - a, a : image.shape[1] - a]
         return Evaluation(float(loss.detach()), gradient, float(inner.sum()))

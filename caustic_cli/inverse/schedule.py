@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass, field
 
 from caustic_cli.optics.reconstruction import Filter
+from caustic_cli.optics.sampling import SAMPLERS
 from caustic_cli.scene import checks
 
 QUALITIES = ("draft", "standard", "fine")
@@ -40,6 +41,7 @@ class Stage:
 
     def __post_init__(self):
         checks.whole("[[design.stages]] rays", self.rays, 1, 10**12)
+        checks.choice("[[design.stages]] sampler", self.sampler, SAMPLERS)
         checks.number("[[design.stages]] blur", self.blur, 0.0, 1000.0)
         checks.whole("[[design.stages]] apron", self.apron, 0, 4096)
         checks.whole("[[design.stages]] iterations", self.iterations, 0, 10**9)

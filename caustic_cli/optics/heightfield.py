@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.kernels import fused
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.scene import Lens
 
@@ -47,21 +46,13 @@ class HeightField:
         """Positions of the control points along x (n,) and y (m,), mm float64 (eq. 4.1.4)."""
         return tuple((2.0 * s.greville - 1.0) * r for s, r in zip(self.spaces, self.half_size, strict=True))
 
-    def prepare(self, sample: Sample, dtype: torch.dtype, like: Evaluator | None = None) -> Evaluator:
-        """Everything about the surface at these rays that does not depend on the heights; values in `dtype`.
-
-        `like` is the evaluator of another sample, whose basis values along v serve again where v is the same tensor.
-        """
+    def prepare(self, sample: Sample, dtype: torch.dtype) -> Evaluator:
+        """Everything about the surface at these rays that does not depend on the heights; values in `dtype`."""
         (su, sv), (rx, ry) = self.spaces, self.half_size
         if sample.tensor:
-            if isinstance(like, _TensorEvaluator) and like.v is sample.v:
-                bv_t, dv_t = like.bv_t, like.dv_t
-            else:
-                bv_t, dv_t = (m.to(dtype).T.contiguous() for m in (sv.matrix(sample.v), sv.matrix(sample.v, 1) / (2 * ry)))
-            bu, du = su.matrix(sample.u).to(dtype), (su.matrix(sample.u, 1) / (2 * rx)).to(dtype)
-            return _TensorEvaluator(sample.v, bu, du, bv_t, dv_t)
-        if fused(sample.u.device):
-            return _KernelEvaluator(self, sample, dtype)
+            return _TensorEvaluator(
+                *(m.to(dtype) for m in (su.matrix(sample.u), su.matrix(sample.u, 1) / (2 * rx),
+                                        sv.matrix(sample.v), sv.matrix(sample.v, 1) / (2 * ry))))
         i, bu = su.basis(sample.u)
         j, bv = sv.basis(sample.v)
         du, dv = su.basis(sample.u, 1)[1] / (2 * rx), sv.basis(sample.v, 1)[1] / (2 * ry)
@@ -84,8 +75,8 @@ class Evaluator:
 
 
 class _TensorEvaluator(Evaluator):
-    def __init__(self, v: Tensor, bu: Tensor, du: Tensor, bv_t: Tensor, dv_t: Tensor):
-        self.v, self.bu, self.du, self.bv_t, self.dv_t = v, bu, du, bv_t, dv_t
+    def __init__(self, bu: Tensor, du: Tensor, bv: Tensor, dv: Tensor):
+        self.bu, self.du, self.bv_t, self.dv_t = bu, du, bv.T.contiguous(), dv.T.contiguous()
 
     def __call__(self, heights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         rows = self.bu @ heights  # (m_u, m)
@@ -108,19 +99,3 @@ class _ScatteredEvaluator(Evaluator):
             zx = zx + self.du[:, a] * value
             zy = zy + self.bu[:, a] * slope
         return z, zx, zy
-
-
-class _KernelEvaluator(Evaluator):
-    """The same by the CPU kernel, which holds no basis values: only the points."""
-
-    def __init__(self, field: HeightField, sample: Sample, dtype: torch.dtype):
-        from caustic_cli.optics.kernels.functions import Axis  # noqa: PLC0415
-
-        self.u, self.v, self.dtype = sample.u.numpy(), sample.v.numpy(), dtype
-        self.axes = tuple(Axis(s) for s in field.spaces)
-        self.scale = tuple(0.5 / r for r in field.half_size)
-
-    def __call__(self, heights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        from caustic_cli.optics.kernels.functions import ScatteredSurface  # noqa: PLC0415
-
-        return ScatteredSurface.apply(heights, self.u, self.v, self.axes, self.scale, self.dtype)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -75,33 +76,38 @@ class PlaneTracer:
     """
 
     def __init__(self, scene: Scene, field: HeightField, sample: Sample, dtype: torch.dtype, like: PlaneTracer | None = None):
-        self.scene, self.dtype = scene, dtype
-        self.evaluator = field.prepare(sample, dtype, None if like is None else like.evaluator)
-        (rx, ry), device = field.half_size, sample.u.device
-        x, y = ((2.0 * sample.u - 1.0) * rx).to(dtype), ((2.0 * sample.v - 1.0) * ry).to(dtype)
-        self.x, self.y = (x[:, None], y[None, :]) if sample.tensor else (x, y)
-        self.share = sample.share.to(device=device, dtype=dtype)
-        self.shape, self.fused = sample.shape, fused(device)
+        self.scene, self.field, self.sample, self.dtype = scene, field, sample, dtype
+        self.kernel = None
+        if fused(sample.u.device):
+            from caustic_cli.optics.kernels.functions import PlaneKernel  # noqa: PLC0415
+
+            self.kernel = PlaneKernel(field.spaces, field.half_size, sample.u, sample.v, sample.tensor, sample.share, dtype,
+                                      None if like is None else like.kernel)
+
+    @cached_property
+    def evaluator(self) -> Evaluator:
+        """The surface at the rays, for the reference; the kernel brings its own."""
+        return self.field.prepare(self.sample, self.dtype)
 
     def __call__(self, heights: Tensor, screen_z: float | None = None) -> Landing:
         """Heights (n, m) mm float64 -> where the rays land at screen_z (default: the scene's): the plain-torch reference."""
         sag, reference = self._sag(heights)
         z = self.scene.screen.z if screen_z is None else screen_z
-        return trace_plane(self.scene.lens, self.evaluator, sag, z - reference, self.x, self.y, self.share, self.shape)
+        (rx, ry), s = self.field.half_size, self.sample
+        x, y = ((2.0 * s.u - 1.0) * rx).to(self.dtype), ((2.0 * s.v - 1.0) * ry).to(self.dtype)
+        if s.tensor:
+            x, y = x[:, None], y[None, :]
+        return trace_plane(self.scene.lens, self.evaluator, sag, z - reference, x, y, s.share.to(self.dtype), s.shape)
 
     def expose(self, heights: Tensor, screen: Screen, filter: Filter) -> Part:
         """Heights (n, m) mm float64 -> image and energy account on a screen; by the fused kernel on a CPU."""
-        if not self.fused:
+        if self.kernel is None:
             landing = self(heights, screen.z)
             image, off = splat(landing.x, landing.y, landing.weight, screen, filter)
             return Part(image, landing.leaving, {**landing.lost, "off_screen": landing.lost["off_screen"] + off})
-        from caustic_cli.optics.kernels.functions import plane_image  # noqa: PLC0415
-
         sag, reference = self._sag(heights)
         lens = self.scene.lens
-        image, leaving, lost = plane_image(self.evaluator(sag), (self.x, self.y, self.share), lens.index, lens.fresnel,
-                                           screen.z - reference, screen, filter)
-        return Part(image, leaving, lost)
+        return Part(*self.kernel(sag, lens.index, lens.fresnel, screen.z - reference, screen, filter))
 
     def _sag(self, heights: Tensor) -> tuple[Tensor, float]:
         reference = float(heights.detach().mean())

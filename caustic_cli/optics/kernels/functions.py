@@ -8,73 +8,134 @@ import torch
 from torch import Tensor
 
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.kernels import blocks, plane, spline
+from caustic_cli.optics.kernels import blocks, plane, shares, spline
 from caustic_cli.optics.reconstruction import Filter, padding
 from caustic_cli.scene import Screen
 
 _FRESNEL = {"none": plane.NONE, "schlick": plane.SCHLICK, "exact": plane.EXACT}
-_KIND = {"bincount": plane.BINCOUNT, "gaussian": plane.GAUSSIAN, "cosine": plane.COSINE}
+_KIND = {"bincount": shares.BINCOUNT, "gaussian": shares.GAUSSIAN, "cosine": shares.COSINE}
 
 
 def _blocks() -> int:
     """Blocks to cut the rays into; numba's threads follow torch's."""
     count = blocks()
     numba.set_num_threads(max(1, min(count, numba.config.NUMBA_NUM_THREADS)))
+    if torch.get_num_threads() != count:  # numba's OpenMP layer resets the count it shares with torch when it starts
+        torch.set_num_threads(count)
     return count
 
 
-def plane_image(surface, rays: tuple[Tensor, Tensor, Tensor], index: float, fresnel: str, height: float, screen: Screen,
-                filter: Filter) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-    """The fused form of `tracing.trace_plane` and `reconstruction.splat`.
+#: Scattered rays are handed to the kernel in rows of so many.
+ROW = 1024
+
+
+class PlaneKernel:
+    """The fused form of a height field at the rays of a plane wave, `tracing.trace_plane` and `reconstruction.splat`.
 
     Args:
-        surface: sag, dz/dx, dz/dy of the rays, (a, b) or (N,); differentiable.
-        rays: x, y mm and share, parts of the source's power, broadcastable to them.
-        height: of the screen above the sag's zero, mm.
-
-    Returns:
-        image (n_x, n_y) and the power leaving the lens (), float64, differentiable; what was lost, by name.
+        spaces, half_size: of the height field; half widths in mm.
+        u, v: the rays' parameters; with `tensor` all pairs of them, else pairwise.
+        share: part of the source's power per ray, scalar or of the rays' shape.
+        dtype: of everything stored.
+        like: the kernel of another sample, whose basis values along v serve again where v is the same tensor.
     """
-    shape = tuple(surface[0].shape) if surface[0].ndim == 2 else (len(surface[0]), 1)
-    grid = [np.broadcast_to(t.numpy().reshape(t.shape if t.ndim != 1 else (-1, 1)), shape) for t in rays]
-    size = tuple(2 * r + 1 for r in filter.reach)
-    arguments = (*grid, float(index), _FRESNEL[fresnel], float(height), screen.half_size, screen.pixel, screen.resolution,
-                 _KIND[filter.kind], size, tuple(float(a) for a in filter.alpha), _blocks())
-    padded, leaving, ledger = _PlaneImage.apply(*(s.reshape(shape) for s in surface), arguments)
-    (nx, ny), (rx, ry) = screen.resolution, filter.reach
-    image = padded[2 * rx : 2 * rx + nx, 2 * ry : 2 * ry + ny]
-    return image, leaving, {"fresnel": ledger[plane.FRESNEL], "total_internal_reflection": ledger[plane.REFLECTED],
-                            "off_screen": ledger[plane.OFF_SCREEN] + padding(padded.detach(), filter.reach)}
+
+    def __init__(self, spaces, half_size, u: Tensor, v: Tensor, tensor: bool, share: Tensor, dtype: torch.dtype,
+                 like: PlaneKernel | None = None):
+        (su, sv), (rx, ry) = spaces, half_size
+        self.dtype, self.tensor, self.v = dtype, tensor, v
+        if tensor:
+            self.first, bu = su.basis(u)
+            du = su.basis(u, 1)[1] / (2.0 * rx)
+            self.bu, self.du = (b.to(dtype).contiguous() for b in (bu, du))
+            if like is not None and like.v is v:
+                self.along_v = like.along_v
+            else:
+                self.along_v = tuple(m.to(dtype).T.contiguous() for m in (sv.matrix(v), sv.matrix(v, 1) / (2.0 * ry)))
+            x, y, shape = u[:, None], v[None, :], (len(u), len(v))
+        else:
+            columns = min(ROW, len(u))
+            short = -len(u) % columns  # rays without power fill the last row
+            if short:
+                share = torch.nn.functional.pad(share.expand(len(u)), (0, short))
+                u, v = (torch.nn.functional.pad(t, (0, short), value=0.5) for t in (u, v))
+            shape = (len(u) // columns, columns)
+            self.first = torch.arange(shape[0])
+            self.bu = self.du = torch.ones(shape[0], 1, dtype=dtype)
+            self.points, self.scale = (u.numpy(), v.numpy()), (0.5 / rx, 0.5 / ry)
+            self.axes = (Axis(su), Axis(sv))
+            x, y, share = u.view(shape), v.view(shape), share.view(shape) if share.ndim else share
+        self.shape = shape
+        coordinates = ((2.0 * x - 1.0) * rx, (2.0 * y - 1.0) * ry, share)
+        self.rays = tuple(np.broadcast_to(t.to(dtype).numpy(), shape) for t in coordinates)
+        self.rows = (self.first.numpy(), self.bu.numpy(), self.du.numpy())
+
+    def __call__(self, sag: Tensor, index: float, fresnel: str, height: float, screen: Screen,
+                 filter: Filter) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+        """Control heights (n, m) relative to some plane, mm, and the screen's height above it, mm.
+
+        Returns:
+            image (n_x, n_y) and the power leaving the lens (), float64, differentiable; what was lost, by name.
+        """
+        if self.tensor:
+            net, net_y = (sag.to(self.dtype) @ m for m in self.along_v)  # (n, m_v)
+            nets = (net, net, net_y)
+        else:
+            nets = (t.view(self.shape) for t in _ScatteredSurface.apply(sag, *self.points, self.axes, self.scale, self.dtype))
+        size = tuple(2 * r + 1 for r in filter.reach)
+        real = (index, height, *screen.half_size, *screen.pixel, *filter.alpha)
+        whole = (_FRESNEL[fresnel], *screen.resolution, _KIND[filter.kind], *size)
+        arguments = (*self.rays, np.array(real, np.float64), np.array(whole, np.int64), _blocks())
+        padded, leaving, ledger = _PlaneImage.apply(*nets, self.rows, not self.tensor, arguments)
+        (nx, ny), (rx, ry) = screen.resolution, filter.reach
+        image = padded[2 * rx : 2 * rx + nx, 2 * ry : 2 * ry + ny]
+        return image, leaving, {"fresnel": ledger[plane.FRESNEL], "total_internal_reflection": ledger[plane.REFLECTED],
+                                "off_screen": ledger[plane.OFF_SCREEN] + padding(padded.detach(), filter.reach)}
+
+
+def compile_kernels(*dtypes: torch.dtype) -> None:
+    """Have the kernels ready for rays of these precisions: from numba's cache, or compiled for this machine."""
+    space, at = SplineSpace.uniform(4, 3), torch.tensor([0.25, 0.75], dtype=torch.float64)
+    share, screen = torch.tensor(0.25, dtype=torch.float64), Screen((10.0, 10.0), 10.0, (4, 4))
+    for dtype in dtypes:
+        for tensor in (True, False):
+            kernel = PlaneKernel((space, space), (1.0, 1.0), at, at, tensor, share, dtype)
+            sag = torch.zeros(4, 4, dtype=dtype, requires_grad=True)
+            kernel(sag, 1.5, "exact", 10.0, screen, Filter("cosine", (3, 3)))[0].sum().backward()
 
 
 class _PlaneImage(torch.autograd.Function):
-    """(sag, gx, gy) (a, b) and the kernel's other arguments -> padded image, power leaving the lens (), ledger (4,)."""
+    """Three nets (n, b), and how `plane.forward` is to use them -> padded image, power leaving the lens (), ledger (4,)."""
 
     @staticmethod
-    def forward(sag: Tensor, gx: Tensor, gy: Tensor, arguments: tuple):
-        image, ledger = plane.forward(sag.numpy(), gx.numpy(), gy.numpy(), *arguments)
+    def forward(net: Tensor, net_x: Tensor, net_y: Tensor, rows: tuple, apart: bool, arguments: tuple):
+        image, ledger = plane.forward(*rows, *_arrays(net, net_x, net_y), *arguments)
         return torch.from_numpy(image), torch.tensor(ledger[plane.LEAVING], dtype=torch.float64), torch.from_numpy(ledger)
 
     @staticmethod
     def setup_context(ctx, inputs, output):
-        *surface, ctx.arguments = inputs
-        ctx.save_for_backward(*surface)
-        ctx.save_for_forward(*surface)
+        *nets, ctx.rows, ctx.apart, ctx.arguments = inputs
+        ctx.save_for_backward(*nets)
+        ctx.save_for_forward(*nets)
         ctx.mark_non_differentiable(output[2])
 
     @staticmethod
     def backward(ctx, by_image, by_leaving, _):
-        surface = [t.numpy() for t in ctx.saved_tensors]
-        grads = plane.backward(by_image.contiguous().numpy(), float(by_leaving), *surface, *ctx.arguments)
-        return *(torch.from_numpy(g) for g in grads), None
+        nets = ctx.saved_tensors
+        grads = plane.backward(by_image.contiguous().numpy(), float(by_leaving), ctx.apart, *ctx.rows, *_arrays(*nets),
+                               *ctx.arguments)
+        return *(torch.from_numpy(g).to(n.dtype) for g, n in zip(grads, nets, strict=True)), None, None, None
 
     @staticmethod
     def jvp(ctx, *tangents):
-        surface = [t.numpy() for t in ctx.saved_tensors]
-        along = [np.zeros_like(s) if t is None else t.contiguous().numpy()
-                 for t, s in zip(tangents[:3], surface, strict=True)]
-        image, leaving = plane.tangent(*along, *surface, *ctx.arguments)
+        nets = ctx.saved_tensors
+        along = [torch.zeros_like(n) if t is None else t for t, n in zip(tangents[:3], nets, strict=True)]
+        image, leaving = plane.tangent(*_arrays(*along), *ctx.rows, *_arrays(*nets), *ctx.arguments)
         return torch.from_numpy(image), torch.tensor(leaving, dtype=torch.float64), None
+
+
+def _arrays(*tensors: Tensor) -> list[np.ndarray]:
+    return [t.detach().contiguous().numpy() for t in tensors]
 
 
 def scattered_points(keys, salts, start: int, stop: int, nu: int, nv: int, stratified: bool) -> tuple[Tensor, Tensor]:
@@ -94,7 +155,7 @@ class Axis:
         self.arguments = (space.knots.numpy(), breaks.numpy(), spans.numpy(), space.degree)
 
 
-class ScatteredSurface(torch.autograd.Function):
+class _ScatteredSurface(torch.autograd.Function):
     """Heights (n, m) and points -> z, dz/dx, dz/dy (N,) in `dtype`; linear in the heights."""
 
     @staticmethod
@@ -118,4 +179,4 @@ class ScatteredSurface(torch.autograd.Function):
 
     @staticmethod
     def jvp(ctx, tangent, *_):
-        return ScatteredSurface.forward(tangent, *ctx.rest)
+        return _ScatteredSurface.forward(tangent, *ctx.rest)

@@ -21,123 +21,13 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from caustic_cli.optics.kernels.shares import shares, table
+
 NONE, SCHLICK, EXACT = 0, 1, 2
-BINCOUNT, GAUSSIAN, COSINE = 0, 1, 2
-#: Below this alpha (v/2)^2 the Gaussian's shares come from Taylor series, without cancellation; above LARGE from plain
-#: exponentials, because the recursion over pixels would overflow.
-SMALL, LARGE = 0.05, 80.0
-CRITICAL, PARALLEL = 1e-16, 1e-9  # see interface.CRITICAL and tracing.PARALLEL
+CRITICAL = 1e-16  # see interface.CRITICAL
 FRESNEL, REFLECTED, OFF_SCREEN, LEAVING = 0, 1, 2, 3  # columns of the ledger
 
 _OPTIONS = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
-
-
-@njit(inline="always", **_OPTIONS)
-def _sine_cosine(x):
-    """sin and cos for |x| <= pi / 3 by Taylor series: the first terms left out are 7e-16 and 5e-17."""
-    y = x * x
-    s = 1.0 - y * (1 / 42.0) * (1.0 - y * (1 / 72.0) * (1.0 - y * (1 / 110.0) * (1.0 - y * (1 / 156.0) * (1.0 - y * (1 / 210.0)))))
-    s = x * (1.0 - y * (1 / 6.0) * (1.0 - y * (1 / 20.0) * s))
-    c = 1.0 - y * (1 / 56.0) * (1.0 - y * (1 / 90.0) * (1.0 - y * (1 / 132.0) * (1.0 - y * (1 / 182.0) * (1.0 - y * (1 / 240.0)))))
-    c = 1.0 - y * (1 / 2.0) * (1.0 - y * (1 / 12.0) * (1.0 - y * (1 / 30.0) * c))
-    return s, c
-
-
-@njit(inline="always", **_OPTIONS)
-def _exp_small(x):
-    """exp(x) for |x| <= 2: exp(x / 8)^8, relative error about 1e-14."""
-    z = 0.125 * x
-    e = 1.0 + z * (1.0 + z * (1 / 2 + z * (1 / 6 + z * (1 / 24 + z * (1 / 120 + z * (
-        1 / 720 + z * (1 / 5040 + z * (1 / 40320 + z * (1 / 362880 + z / 3628800)))))))))
-    e *= e
-    e *= e
-    return e * e
-
-
-@njit(**_OPTIONS)
-def _gaussian(phi, v, alpha, table, out, slope):
-    """Shares and their derivatives by phi of a Gaussian truncated at v / 2: see reconstruction.Filter and `_table`."""
-    r = (v - 1) // 2
-    q = 0.5 - phi
-    square = 0.25 * v * v
-    total = 0.0
-    change = 0.0
-    if alpha * square < SMALL:  # both divided by alpha exp(-alpha (v/2)^2); every series' argument is below SMALL
-        for k in range(v):
-            d = k - r + q
-            x = alpha * max(square - d * d, 0.0)
-            y = alpha * d * d
-            e = 1.0 - y * (1.0 - y * (1 / 2.0) * (1.0 - y * (1 / 3.0) * (1.0 - y * (1 / 4.0) * (1.0 - y * (1 / 5.0) * (1.0 - y * (1 / 6.0))))))
-            p = 1.0 - x * (1 / 2.0) * (1.0 - x * (1 / 3.0) * (1.0 - x * (1 / 4.0) * (1.0 - x * (1 / 5.0) * (1.0 - x * (1 / 6.0) * (1.0 - x * (1 / 7.0))))))
-            out[k] = max(square - d * d, 0.0) * p * e
-            slope[k] = 2.0 * d * e
-            total += out[k]
-            change += slope[k]
-    elif alpha <= LARGE:  # both divided by exp(-alpha q^2): exp(-alpha (d^2 - q^2)) follows from pixel to pixel
-        if alpha <= 2.0:
-            edge = table[0] * _exp_small(alpha * q * q)
-            up = _exp_small(-2.0 * alpha * q)
-        else:
-            edge = math.exp(-alpha * (square - q * q))
-            up = math.exp(-2.0 * alpha * q)
-        down = 1.0 / up
-        rise, fall, ratio_up, ratio_down = 1.0, 1.0, up * table[1], down * table[1]
-        out[r] = 1.0 - edge
-        slope[r] = 2.0 * alpha * q
-        for k in range(1, r + 1):
-            rise *= ratio_up
-            fall *= ratio_down
-            ratio_up *= table[2]
-            ratio_down *= table[2]
-            out[r + k] = max(rise - edge, 0.0)
-            out[r - k] = max(fall - edge, 0.0)
-            slope[r + k] = 2.0 * alpha * (q + k) * rise
-            slope[r - k] = 2.0 * alpha * (q - k) * fall
-        for k in range(v):
-            total += out[k]
-            change += slope[k]
-    else:
-        for k in range(v):
-            d = k - r + q
-            e = math.exp(-alpha * (d * d - q * q))
-            out[k] = -e * math.expm1(-alpha * max(square - d * d, 0.0))
-            slope[k] = 2.0 * alpha * d * e
-            total += out[k]
-            change += slope[k]
-    inverse = 1.0 / total
-    for k in range(v):
-        out[k] *= inverse
-        slope[k] = (slope[k] - out[k] * change) * inverse
-
-
-@njit(**_OPTIONS)
-def _shares(kind, phi, v, alpha, table, out, slope):
-    """Shares of a ray at sub-pixel position phi among its v pixels, and their derivatives by phi."""
-    if v == 1:
-        out[0] = 1.0
-        slope[0] = 0.0
-    elif kind == COSINE:  # cos(theta (k - r + q)) by addition from one sine and cosine
-        theta = 2.0 * math.pi / v
-        s, c = _sine_cosine(theta * (0.5 - phi))
-        each = 1.0 / v
-        for k in range(v):
-            out[k] = each + c * table[k] - s * table[v + k]
-            slope[k] = theta * (s * table[k] + c * table[v + k])
-    else:
-        _gaussian(phi, v, alpha, table, out, slope)
-
-
-@njit(**_OPTIONS)
-def _table(kind, v, alpha):
-    """Constants of an axis: cos and sin of 2 pi (k - r) / v over v, or exp(-alpha v^2 / 4), exp(-alpha), exp(-2 alpha)."""
-    out = np.zeros(2 * v + 3)
-    if kind == COSINE:
-        for k in range(v):
-            out[k] = math.cos(2.0 * math.pi * (k - (v - 1) // 2) / v) / v
-            out[v + k] = math.sin(2.0 * math.pi * (k - (v - 1) // 2) / v) / v
-    else:
-        out[0], out[1], out[2] = math.exp(-0.25 * alpha * v * v), math.exp(-alpha), math.exp(-2.0 * alpha)
-    return out
 
 
 @njit(inline="always", **_OPTIONS)
@@ -179,157 +69,246 @@ def _pixel(at, half, pixel, n, r):
     return True, int(i0) + r, p - i0
 
 
-@njit(parallel=True, **_OPTIONS)
-def forward(sag, gx, gy, x, y, share, n, fresnel, height, half, pixel, resolution, kind, size, alpha, blocks):
-    """Padded image (n_x + 4 r_x, n_y + 4 r_y) and the ledger (4,): fresnel, reflected, off_screen, leaving.
-
-    sag, gx, gy, x, y mm, share parts of the source's power: (a, b), the last three broadcast views; height: of the screen above the sag's zero, mm; half, pixel (2,) mm; size, alpha (2,) of the filter, alpha
-    per pixel squared.
-    """
-    rows, columns = sag.shape
-    vx, vy = size
+@njit(**_OPTIONS)
+def _forward_row(sag, gx, gy, x, y, share, real, whole, tables, image, ledger, work):
+    """Add the rays of one row to an image and a ledger.  Row arrays are (b,); work (4, longest v)."""
+    n, height, half_x, half_y = real[0], real[1], real[2], real[3]
+    pixel_x, pixel_y, alpha_x, alpha_y = real[4], real[5], real[6], real[7]
+    fresnel, nx, ny, kind, vx, vy = whole[0], whole[1], whole[2], whole[3], whole[4], whole[5]
+    entrance = _entrance(fresnel, n)
+    sx, sy, dx, dy = work[0], work[1], work[2], work[3]
     rx, ry = (vx - 1) // 2, (vy - 1) // 2
-    nx, ny = resolution
-    images = np.zeros((blocks, nx + 4 * rx, ny + 4 * ry))
-    ledgers = np.zeros((blocks, 4))
-    entrance = 0.0 if fresnel == NONE else (n - 1.0) * (n - 1.0) / ((n + 1.0) * (n + 1.0))
-    table_x, table_y = _table(kind, vx, alpha[0]), _table(kind, vy, alpha[1])
-    for block in prange(blocks):
-        image = images[block]
-        sx, dx, sy, dy = np.empty(vx), np.empty(vx), np.empty(vy), np.empty(vy)
-        lost_fresnel, lost_reflected, lost_off, leaving = 0.0, 0.0, 0.0, 0.0
-        for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-            for j in range(columns):
-                emitted = share[i, j]
-                inside = emitted * (1.0 - entrance)
-                passes, m, _, through, _ = _bend(fresnel, gx[i, j], gy[i, j], n)
-                if not passes:
-                    lost_fresnel += emitted - inside
-                    lost_reflected += inside
-                    continue
-                weight = inside * through
-                lost_fresnel += emitted - weight
-                leaving += weight
-                h = height - sag[i, j]
-                reach = h * m
-                in_x, i0, phi_x = _pixel(x[i, j] + reach * gx[i, j], half[0], pixel[0], nx, rx)
-                in_y, j0, phi_y = _pixel(y[i, j] + reach * gy[i, j], half[1], pixel[1], ny, ry)
-                if not (in_x and in_y and h > 0.0):
-                    lost_off += weight
-                    continue
-                if vx == 1 and vy == 1:
-                    image[i0, j0] += weight
-                    continue
-                _shares(kind, phi_x, vx, alpha[0], table_x, sx, dx)
-                _shares(kind, phi_y, vy, alpha[1], table_y, sy, dy)
-                for a in range(vx):
-                    part = weight * sx[a]
-                    for b in range(vy):
-                        image[i0 + a, j0 + b] += part * sy[b]
-        ledgers[block, 0], ledgers[block, 1], ledgers[block, 2], ledgers[block, 3] = (
-            lost_fresnel, lost_reflected, lost_off, leaving)
+    lost_fresnel, lost_reflected, lost_off, leaving = 0.0, 0.0, 0.0, 0.0
+    for j in range(len(sag)):
+        emitted = share[j]
+        inside = emitted * (1.0 - entrance)
+        passes, m, _, through, _ = _bend(fresnel, gx[j], gy[j], n)
+        if not passes:
+            lost_fresnel += emitted - inside
+            lost_reflected += inside
+            continue
+        weight = inside * through
+        lost_fresnel += emitted - weight
+        leaving += weight
+        h = height - sag[j]
+        reach = h * m
+        in_x, i0, phi_x = _pixel(x[j] + reach * gx[j], half_x, pixel_x, nx, rx)
+        in_y, j0, phi_y = _pixel(y[j] + reach * gy[j], half_y, pixel_y, ny, ry)
+        if not (in_x and in_y and h > 0.0):
+            lost_off += weight
+            continue
+        if vx == 1 and vy == 1:
+            image[i0, j0] += weight
+            continue
+        shares(kind, phi_x, vx, alpha_x, tables[0], sx, dx, False)
+        shares(kind, phi_y, vy, alpha_y, tables[1], sy, dy, False)
+        for a in range(vx):
+            part = weight * sx[a]
+            for b in range(vy):
+                image[i0 + a, j0 + b] += part * sy[b]
+    ledger[FRESNEL] += lost_fresnel
+    ledger[REFLECTED] += lost_reflected
+    ledger[OFF_SCREEN] += lost_off
+    ledger[LEAVING] += leaving
+
+
+@njit(**_OPTIONS)
+def _backward_row(grad, grad_leaving, sag, gx, gy, x, y, share, real, whole, tables, by_sag, by_gx, by_gy, work):
+    """Adjoint of `_forward_row`: derivatives by sag, gx, gy of one row, from those by the padded image and leaving power."""
+    n, height, half_x, half_y = real[0], real[1], real[2], real[3]
+    pixel_x, pixel_y, alpha_x, alpha_y = real[4], real[5], real[6], real[7]
+    fresnel, nx, ny, kind, vx, vy = whole[0], whole[1], whole[2], whole[3], whole[4], whole[5]
+    entrance = _entrance(fresnel, n)
+    sx, sy, dx, dy = work[0], work[1], work[2], work[3]
+    rx, ry = (vx - 1) // 2, (vy - 1) // 2
+    for j in range(len(sag)):
+        slope_x, slope_y = gx[j], gy[j]
+        passes, m, dm, through, dthrough = _bend(fresnel, slope_x, slope_y, n)
+        if not passes:
+            by_sag[j], by_gx[j], by_gy[j] = 0.0, 0.0, 0.0
+            continue
+        inside = share[j] * (1.0 - entrance)
+        weight = inside * through
+        h = height - sag[j]
+        reach = h * m
+        in_x, i0, phi_x = _pixel(x[j] + reach * slope_x, half_x, pixel_x, nx, rx)
+        in_y, j0, phi_y = _pixel(y[j] + reach * slope_y, half_y, pixel_y, ny, ry)
+        by_weight, by_x, by_y = grad_leaving, 0.0, 0.0
+        if in_x and in_y and h > 0.0:
+            shares(kind, phi_x, vx, alpha_x, tables[0], sx, dx, True)
+            shares(kind, phi_y, vy, alpha_y, tables[1], sy, dy, True)
+            for a in range(vx):
+                along, across = 0.0, 0.0
+                for b in range(vy):
+                    g = grad[i0 + a, j0 + b]
+                    along += g * sy[b]
+                    across += g * dy[b]
+                by_weight += sx[a] * along
+                by_x += dx[a] * along
+                by_y += sx[a] * across
+            by_x *= weight / pixel_x
+            by_y *= weight / pixel_y
+        dot = by_x * slope_x + by_y * slope_y
+        by_a = h * dm * dot + by_weight * inside * dthrough
+        by_sag[j] = -m * dot
+        by_gx[j] = reach * by_x + 2.0 * slope_x * by_a
+        by_gy[j] = reach * by_y + 2.0 * slope_y * by_a
+
+
+@njit(**_OPTIONS)
+def _tangent_row(t_sag, t_gx, t_gy, sag, gx, gy, x, y, share, real, whole, tables, image, work):
+    """Add the tangent of one row's image along (t_sag, t_gx, t_gy) to `image`; returns the leaving power's."""
+    n, height, half_x, half_y = real[0], real[1], real[2], real[3]
+    pixel_x, pixel_y, alpha_x, alpha_y = real[4], real[5], real[6], real[7]
+    fresnel, nx, ny, kind, vx, vy = whole[0], whole[1], whole[2], whole[3], whole[4], whole[5]
+    entrance = _entrance(fresnel, n)
+    sx, sy, dx, dy = work[0], work[1], work[2], work[3]
+    rx, ry = (vx - 1) // 2, (vy - 1) // 2
+    leaving = 0.0
+    for j in range(len(sag)):
+        slope_x, slope_y = gx[j], gy[j]
+        passes, m, dm, through, dthrough = _bend(fresnel, slope_x, slope_y, n)
+        if not passes:
+            continue
+        inside = share[j] * (1.0 - entrance)
+        weight = inside * through
+        da = 2.0 * (slope_x * t_gx[j] + slope_y * t_gy[j])
+        dw = inside * dthrough * da
+        leaving += dw
+        h = height - sag[j]
+        reach = h * m
+        d_reach = -t_sag[j] * m + h * dm * da
+        in_x, i0, phi_x = _pixel(x[j] + reach * slope_x, half_x, pixel_x, nx, rx)
+        in_y, j0, phi_y = _pixel(y[j] + reach * slope_y, half_y, pixel_y, ny, ry)
+        if not (in_x and in_y and h > 0.0):
+            continue
+        shares(kind, phi_x, vx, alpha_x, tables[0], sx, dx, True)
+        shares(kind, phi_y, vy, alpha_y, tables[1], sy, dy, True)
+        move_x = weight * (d_reach * slope_x + reach * t_gx[j]) / pixel_x
+        move_y = weight * (d_reach * slope_y + reach * t_gy[j]) / pixel_y
+        for a in range(vx):
+            along, across = dw * sx[a] + move_x * dx[a], move_y * sx[a]
+            for b in range(vy):
+                image[i0 + a, j0 + b] += along * sy[b] + across * dy[b]
+    return leaving
+
+
+@njit(inline="always", **_OPTIONS)
+def _combine(i, first, bu, du, net, net_x, net_y, sag, gx, gy):
+    """Row i of the surface from the nets already contracted along v: sag, dz/dx, dz/dy (b,)."""
+    sag[:] = 0.0
+    gx[:] = 0.0
+    gy[:] = 0.0
+    for a in range(bu.shape[1]):
+        value, slope = bu[i, a], du[i, a]
+        row, row_x, row_y = net[first[i] + a], net_x[first[i] + a], net_y[first[i] + a]
+        for j in range(len(sag)):
+            sag[j] += value * row[j]
+            gx[j] += slope * row_x[j]
+            gy[j] += value * row_y[j]
+
+
+@njit(**_OPTIONS)
+def _spread(i, first, bu, du, by_sag, by_gx, by_gy, nets):
+    """Adjoint of `_combine`: add the derivatives by row i to those by the nets (3, n, b)."""
+    for a in range(bu.shape[1]):
+        value, slope, at = bu[i, a], du[i, a], first[i] + a
+        out, out_x, out_y = nets[0, at], nets[1, at], nets[2, at]
+        for j in range(len(by_sag)):
+            out[j] += value * by_sag[j]
+            out_x[j] += slope * by_gx[j]
+            out_y[j] += value * by_gy[j]
+
+
+@njit(**_OPTIONS)
+def _entrance(fresnel, n):
+    """Reflectance of the flat entrance at normal incidence."""
+    return 0.0 if fresnel == NONE else (n - 1.0) * (n - 1.0) / ((n + 1.0) * (n + 1.0))
+
+
+@njit(**_OPTIONS)
+def _tables(real, whole):
+    """Constants of the filter along x and y: (2, as many as the longer needs)."""
+    out = np.zeros((2, 2 * max(whole[4], whole[5]) + 3))
+    for axis in range(2):
+        constants = table(whole[3], whole[4 + axis], real[6 + axis])
+        out[axis, : len(constants)] = constants
+    return out
+
+
+@njit(parallel=True, **_OPTIONS)
+def _total(images):
+    """Sum over blocks, in order, into the first."""
     for i in prange(images.shape[1]):
-        for block in range(1, blocks):
+        for block in range(1, images.shape[0]):
             for j in range(images.shape[2]):
                 images[0, i, j] += images[block, i, j]
+    return images[0]
+
+
+@njit(parallel=True, **_OPTIONS)
+def forward(first, bu, du, net, net_x, net_y, x, y, share, real, whole, blocks):
+    """Padded image (n_x + 4 r_x, n_y + 4 r_y) and the ledger (4,): fresnel, reflected, off_screen, leaving.
+
+    The surface comes by rows.  Row i of the sag is sum_k bu[i, k] net[first[i] + k], of dz/dx the same with du and net_x,
+    of dz/dy with bu and net_y.  first (a,) int64; bu, du (a, p + 1); nets (n, b); x, y mm and share, parts of the
+    source's power, (a, b).
+    real: index, height of the screen above the sag's zero, half width and height of the screen and of a pixel (mm), alpha
+    along x and y (per pixel squared).  whole: kind of Fresnel losses, pixels along x and y, kind of filter, its sizes.
+    """
+    tables, longest = _tables(real, whole), max(whole[4], whole[5])
+    wide, high = whole[1] + 2 * (whole[4] - 1), whole[2] + 2 * (whole[5] - 1)
+    rows, columns = x.shape
+    images = np.zeros((blocks, wide, high))
+    ledgers = np.zeros((blocks, 4))
+    for block in prange(blocks):
+        sag, gx, gy = np.empty(columns, net.dtype), np.empty(columns, net.dtype), np.empty(columns, net.dtype)
+        work = np.empty((4, longest))
+        for i in range(block * rows // blocks, (block + 1) * rows // blocks):
+            _combine(i, first, bu, du, net, net_x, net_y, sag, gx, gy)
+            _forward_row(sag, gx, gy, x[i], y[i], share[i], real, whole, tables, images[block], ledgers[block], work)
     ledger = np.zeros(4)
     for block in range(blocks):
         ledger += ledgers[block]
-    return images[0], ledger
+    return _total(images), ledger
 
 
 @njit(parallel=True, **_OPTIONS)
-def backward(grad, grad_leaving, sag, gx, gy, x, y, share, n, fresnel, height, half, pixel, resolution, kind, size, alpha,
-             blocks):
-    """Adjoint of `forward`: derivatives by sag, gx, gy (a, b), from those by the padded image and by the leaving power."""
-    rows, columns = sag.shape
-    vx, vy = size
-    rx, ry = (vx - 1) // 2, (vy - 1) // 2
-    nx, ny = resolution
-    out_sag, out_x, out_y = np.empty_like(sag), np.empty_like(sag), np.empty_like(sag)
-    entrance = 0.0 if fresnel == NONE else (n - 1.0) * (n - 1.0) / ((n + 1.0) * (n + 1.0))
-    table_x, table_y = _table(kind, vx, alpha[0]), _table(kind, vy, alpha[1])
+def backward(grad, grad_leaving, apart, first, bu, du, net, net_x, net_y, x, y, share, real, whole, blocks):
+    """Adjoint of `forward`: derivatives by the three nets (n, b) float64, from those by the padded image and leaving power.
+
+    apart: no two rows share a row of the nets, so that one sum serves all blocks.
+    """
+    tables, longest = _tables(real, whole), max(whole[4], whole[5])
+    rows, columns = x.shape
+    nets = np.zeros((3, 1 if apart else blocks, net.shape[0], columns))
     for block in prange(blocks):
-        sx, dx, sy, dy = np.empty(vx), np.empty(vx), np.empty(vy), np.empty(vy)
+        sag, gx, gy = np.empty(columns, net.dtype), np.empty(columns, net.dtype), np.empty(columns, net.dtype)
+        by_sag, by_gx, by_gy = np.empty(columns), np.empty(columns), np.empty(columns)
+        work = np.empty((4, longest))
         for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-            for j in range(columns):
-                slope_x, slope_y = gx[i, j], gy[i, j]
-                passes, m, dm, through, dthrough = _bend(fresnel, slope_x, slope_y, n)
-                if not passes:
-                    out_sag[i, j], out_x[i, j], out_y[i, j] = 0.0, 0.0, 0.0
-                    continue
-                inside = share[i, j] * (1.0 - entrance)
-                weight = inside * through
-                h = height - sag[i, j]
-                reach = h * m
-                in_x, i0, phi_x = _pixel(x[i, j] + reach * slope_x, half[0], pixel[0], nx, rx)
-                in_y, j0, phi_y = _pixel(y[i, j] + reach * slope_y, half[1], pixel[1], ny, ry)
-                by_weight, by_x, by_y = grad_leaving, 0.0, 0.0
-                if in_x and in_y and h > 0.0:
-                    _shares(kind, phi_x, vx, alpha[0], table_x, sx, dx)
-                    _shares(kind, phi_y, vy, alpha[1], table_y, sy, dy)
-                    for a in range(vx):
-                        along, across = 0.0, 0.0
-                        for b in range(vy):
-                            g = grad[i0 + a, j0 + b]
-                            along += g * sy[b]
-                            across += g * dy[b]
-                        by_weight += sx[a] * along
-                        by_x += dx[a] * along
-                        by_y += sx[a] * across
-                    by_x *= weight / pixel[0]
-                    by_y *= weight / pixel[1]
-                dot = by_x * slope_x + by_y * slope_y
-                by_a = h * dm * dot + by_weight * inside * dthrough
-                out_sag[i, j] = -m * dot
-                out_x[i, j] = reach * by_x + 2.0 * slope_x * by_a
-                out_y[i, j] = reach * by_y + 2.0 * slope_y * by_a
-    return out_sag, out_x, out_y
+            _combine(i, first, bu, du, net, net_x, net_y, sag, gx, gy)
+            _backward_row(grad, grad_leaving, sag, gx, gy, x[i], y[i], share[i], real, whole, tables,
+                          by_sag, by_gx, by_gy, work)
+            _spread(i, first, bu, du, by_sag, by_gx, by_gy, nets[:, np.int64(0) if apart else np.int64(block)])
+    return _total(nets[0]), _total(nets[1]), _total(nets[2])
 
 
 @njit(parallel=True, **_OPTIONS)
-def tangent(t_sag, t_gx, t_gy, sag, gx, gy, x, y, share, n, fresnel, height, half, pixel, resolution, kind, size, alpha,
-            blocks):
-    """Derivative of `forward` along (t_sag, t_gx, t_gy): the padded image's tangent, and the leaving power's."""
-    rows, columns = sag.shape
-    vx, vy = size
-    rx, ry = (vx - 1) // 2, (vy - 1) // 2
-    nx, ny = resolution
-    images = np.zeros((blocks, nx + 4 * rx, ny + 4 * ry))
-    leavings = np.zeros(blocks)
-    entrance = 0.0 if fresnel == NONE else (n - 1.0) * (n - 1.0) / ((n + 1.0) * (n + 1.0))
-    table_x, table_y = _table(kind, vx, alpha[0]), _table(kind, vy, alpha[1])
+def tangent(t_net, t_net_x, t_net_y, first, bu, du, net, net_x, net_y, x, y, share, real, whole, blocks):
+    """Derivative of `forward` along (t_net, t_net_x, t_net_y): the padded image's tangent, and the leaving power's."""
+    tables, longest = _tables(real, whole), max(whole[4], whole[5])
+    wide, high = whole[1] + 2 * (whole[4] - 1), whole[2] + 2 * (whole[5] - 1)
+    rows, columns = x.shape
+    images = np.zeros((blocks, wide, high))
+    leaving = np.zeros(blocks)
     for block in prange(blocks):
-        image = images[block]
-        sx, dx, sy, dy = np.empty(vx), np.empty(vx), np.empty(vy), np.empty(vy)
+        sag, gx, gy = np.empty(columns, net.dtype), np.empty(columns, net.dtype), np.empty(columns, net.dtype)
+        t_sag, t_gx, t_gy = np.empty(columns, net.dtype), np.empty(columns, net.dtype), np.empty(columns, net.dtype)
+        work = np.empty((4, longest))
         for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-            for j in range(columns):
-                slope_x, slope_y = gx[i, j], gy[i, j]
-                passes, m, dm, through, dthrough = _bend(fresnel, slope_x, slope_y, n)
-                if not passes:
-                    continue
-                inside = share[i, j] * (1.0 - entrance)
-                weight = inside * through
-                da = 2.0 * (slope_x * t_gx[i, j] + slope_y * t_gy[i, j])
-                dw = inside * dthrough * da
-                leavings[block] += dw
-                h = height - sag[i, j]
-                reach = h * m
-                d_reach = -t_sag[i, j] * m + h * dm * da
-                in_x, i0, phi_x = _pixel(x[i, j] + reach * slope_x, half[0], pixel[0], nx, rx)
-                in_y, j0, phi_y = _pixel(y[i, j] + reach * slope_y, half[1], pixel[1], ny, ry)
-                if not (in_x and in_y and h > 0.0):
-                    continue
-                _shares(kind, phi_x, vx, alpha[0], table_x, sx, dx)
-                _shares(kind, phi_y, vy, alpha[1], table_y, sy, dy)
-                move_x = weight * (d_reach * slope_x + reach * t_gx[i, j]) / pixel[0]
-                move_y = weight * (d_reach * slope_y + reach * t_gy[i, j]) / pixel[1]
-                for a in range(vx):
-                    along, across = dw * sx[a] + move_x * dx[a], move_y * sx[a]
-                    for b in range(vy):
-                        image[i0 + a, j0 + b] += along * sy[b] + across * dy[b]
-    for i in prange(images.shape[1]):
-        for block in range(1, blocks):
-            for j in range(images.shape[2]):
-                images[0, i, j] += images[block, i, j]
-    return images[0], leavings.sum()
+            _combine(i, first, bu, du, net, net_x, net_y, sag, gx, gy)
+            _combine(i, first, bu, du, t_net, t_net_x, t_net_y, t_sag, t_gx, t_gy)
+            leaving[block] += _tangent_row(t_sag, t_gx, t_gy, sag, gx, gy, x[i], y[i], share[i], real, whole,
+                                           tables, images[block], work)
+    return _total(images), leaving.sum()

@@ -1,0 +1,346 @@
+"""Designs from beginning to end: the lens gets better, a resumed run is the run, the same seed the same bytes, signals."""
+
+import itertools
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from caustic_cli import checkpoint, cli, session
+
+TINY = ["--resolution", "24", "--control", "12", "--rays", "4000", "--quiet", "--threads", "1"]
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path, monkeypatch):
+    """A fresh directory with a picture, few rays for the verdict, and no report (its drawing takes most of the time)."""
+    monkeypatch.chdir(tmp_path)
+    y, x = np.mgrid[0:24, 0:24]
+    light = 40 + 200 * np.exp(-((x - 8) ** 2 + (y - 9) ** 2) / 30.0)
+    Image.fromarray(light.astype(np.uint8)).save("blob.png")
+    monkeypatch.setattr(session, "FINAL_RAYS", 40_000)
+    monkeypatch.setattr(session, "write_report", lambda *args: None)
+
+
+def design(capfd, *arguments, code=0) -> dict:
+    """Figures of `caustic design`, or its error line."""
+    assert cli.run(["design", *map(str, arguments), "--json"]) == code
+    out, err = capfd.readouterr()
+    return json.loads(out) if code == 0 else err
+
+
+def load(project):
+    return checkpoint.load(Path(project) / "checkpoints.h5")
+
+
+def content(project) -> dict:
+    """Everything a design is, but for the clock."""
+    held = load(project)
+    s = held.state
+    tensors = {f"{group}.{k}": v for group in ("parameters", "optimizer") for k, v in getattr(s, group).items()}
+    return {"heights": s.heights, **tensors, "counts": (s.stage, s.iteration, s.total), "reason": s.reason,
+            "history": [row[:4] for row in s.history], "provenance": held.provenance,
+            "knots": torch.cat([space.knots for space in held.spaces]),
+            "results": {k: v for k, v in held.results.items() if k not in ("seconds", "image", "project")}}
+
+
+def assert_same(a: dict, b: dict) -> None:
+    assert a.keys() == b.keys()
+    for key, value in a.items():
+        if isinstance(value, torch.Tensor):
+            assert value.dtype == b[key].dtype and torch.equal(value, b[key]), key
+        else:
+            assert value == b[key], key
+
+
+def exported(project) -> bytes:
+    assert cli.run(["export", project, "-o", "lens.npz", "--force", "--quiet", "--samples", "9"]) == 0
+    return Path("lens.npz").read_bytes()
+
+
+def assert_same_files(a: str, b: str) -> None:
+    assert (Path(a) / "render.png").read_bytes() == (Path(b) / "render.png").read_bytes()
+    assert exported(a) == exported(b)
+
+
+STAGES = """
+[screen]
+resolution = [24, 24]
+[lens]
+control = [12, 12]
+[design]
+optimizer = "{optimizer}"
+{more}
+""" + "".join(f"""
+[[design.stages]]
+control = [{net}, {net}]
+rays = {rays}
+blur = {blur}
+apron = 2
+iterations = 7
+""" for net, rays, blur in ((7, 1500, 1.5), (7, 2000, 0.5), (12, 3000, 0.0)))
+
+
+def staged(name="c.toml", optimizer="lbfgs", more="") -> str:
+    Path(name).write_text(STAGES.format(optimizer=optimizer, more=more))
+    return name
+
+
+# resume
+
+KINDS = {
+    "lbfgs": [],
+    "lbfgs in double precision": ["--dtype", "float64"],
+    "lbfgs by rms": ["--loss", "rms"],
+    "adam": ["--optimizer", "adam"],
+    "adam, sparse network": ["--network", "sparse"],
+    "adam, dense network": ["--network", "dense"],
+    "stages of lbfgs": ["--config", "lbfgs.toml"],
+    "stages of adam": ["--config", "adam.toml"],
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_twenty_iterations_are_ten_and_ten_bitwise(capfd, kind):
+    staged("lbfgs.toml"), staged("adam.toml", "adam")
+    options = [*(TINY if "--config" not in KINDS[kind] else ["--quiet", "--threads", "1"]), *KINDS[kind], "--seed", "5"]
+    design(capfd, "blob.png", *options, "--iterations", 20, "-o", "whole")
+    half = design(capfd, "blob.png", *options, "--iterations", 10, "-o", "parts")
+    assert half["iterations"] == 10 and half["reason"] == "iterations"
+    figures = design(capfd, "--resume", "parts", "--iterations", 20, "--quiet", "--threads", 1)
+    assert figures["iterations"] == 20 == len(load("parts").state.history)
+    assert_same(content("whole"), content("parts"))
+    assert_same_files("whole", "parts")
+    assert (Path("whole") / "project.toml").read_bytes() == (Path("parts") / "project.toml").read_bytes()
+
+
+@pytest.mark.parametrize("optimizer", ["lbfgs", "adam"])
+def test_resuming_at_and_beside_a_stage_boundary(capfd, optimizer):
+    """Stages of 7, 7 and the rest: stops just before, at and just after each change of net."""
+    config, options = staged(optimizer=optimizer), ["--quiet", "--threads", "1"]
+    design(capfd, "blob.png", "--config", config, "--iterations", 16, "-o", "whole", *options)
+    assert [row[1] for row in load("whole").state.history] == [0] * 7 + [1] * 7 + [2] * 2
+    stops = (1, 6, 7, 8, 13, 14, 15, 16)
+    design(capfd, "blob.png", "--config", config, "--iterations", stops[0], "-o", "parts", *options)
+    for stop in stops[1:]:
+        design(capfd, "--resume", "parts", "--iterations", stop, *options)
+    assert_same(content("whole"), content("parts"))
+
+
+def test_resume_finds_the_project_by_its_picture_and_goes_on(capfd):
+    design(capfd, "blob.png", *TINY, "--iterations", 2)
+    assert design(capfd, "--resume", "blob.png", "--iterations", 4, "--quiet")["iterations"] == 4
+    assert design(capfd, "--resume", "blob.caustic", "--quiet")["iterations"] == 4  # nothing left: judged again
+    assert len(load("blob.caustic").state.history) == 4
+
+
+def test_resume_takes_no_other_settings(capfd):
+    design(capfd, "blob.png", *TINY, "--iterations", 1)
+    before = (Path("blob.caustic") / "project.toml").read_bytes()
+    for extra in (["--mag", 2], ["--seed", 0], ["--resolution", 30], ["--rays", 5000], ["--linear"], ["--quality", "draft"]):
+        err = design(capfd, "--resume", "blob.caustic", "--iterations", 3, *extra, code=2)
+        assert extra[0] in err and err.count("\n") == 1
+    assert (Path("blob.caustic") / "project.toml").read_bytes() == before
+    assert load("blob.caustic").state.total == 1
+
+
+def test_fewer_iterations_than_done_lose_nothing(capfd):
+    design(capfd, "blob.png", *TINY, "--iterations", 4)
+    heights = load("blob.caustic").state.heights
+    assert design(capfd, "--resume", "blob.caustic", "--iterations", 2, "--quiet")["iterations"] == 4
+    assert torch.equal(load("blob.caustic").state.heights, heights)
+
+
+# seeds
+
+
+@pytest.mark.parametrize("options", [[], ["--network", "sparse"]])
+def test_the_seed_decides_every_byte(capfd, options):
+    for name, seed in (("a", 3), ("b", 3), ("c", 4)):
+        design(capfd, "blob.png", *TINY, *options, "--iterations", 4, "--seed", seed, "-o", name)
+    assert_same(content("a"), content("b"))
+    assert_same_files("a", "b")
+    assert (Path("a") / "render.png").read_bytes() != (Path("c") / "render.png").read_bytes()
+    assert exported("a") != exported("c")
+
+
+def test_render_repeats_and_follows_its_seed(capfd):
+    design(capfd, "blob.png", *TINY, "--iterations", 2)
+    images = []
+    for seed in (1, 1, 2):
+        assert cli.run(["render", "blob.caustic", "--rays", "5000", "--seed", str(seed), "--npy", "a.npy", "--quiet"]) == 0
+        images.append((Path("a.npy").read_bytes(), (Path("blob.caustic") / "render.png").read_bytes()))
+    assert images[0] == images[1] != images[2]
+
+
+def test_threads_are_what_was_asked_for():
+    """In a process of its own: the first design of a process must not differ from the next, whatever loads meanwhile."""
+    program = f"""
+import torch
+from caustic_cli import cli, session
+session.FINAL_RAYS, session.write_report = 1000, lambda *args: None
+for name in "ab":
+    assert cli.run(["design", "blob.png", *{TINY!r}, "--iterations", "3", "-o", name]) == 0
+    assert torch.get_num_threads() == 1, torch.get_num_threads()
+"""
+    environment = {**os.environ, "PYTHONPATH": str(Path(cli.__file__).parents[1])}
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment, check=False)
+    assert done.returncode == 0, done.stderr
+    assert_same(content("a"), content("b"))
+
+
+# progress
+
+
+@pytest.mark.parametrize("kind", ["default", "rms", "staged"])
+def test_a_design_improves_the_picture(capfd, kind):
+    options = {"default": TINY, "rms": [*TINY, "--loss", "rms"], "staged": ["--config", staged(), "--quiet"]}[kind]
+    first = design(capfd, "blob.png", *options, "--iterations", 1, "-o", "p")
+    last = design(capfd, "--resume", "p", "--iterations", 60, "--quiet")
+    assert last["relative_rms"] < 0.5 * first["relative_rms"]
+    assert last["on_screen"] > 0.85  # the rest is reflected at the two surfaces
+    assert last["ssim"] > first["ssim"] and last["psnr_db"] > first["psnr_db"]
+
+
+def test_lbfgs_never_goes_uphill_within_a_stage(capfd):
+    design(capfd, "blob.png", "--config", staged(), "--iterations", 30, "--quiet", "-o", "p")
+    rows, checked = load("p").state.history, 0
+    for a, b in itertools.pairwise(rows):
+        if a[1] == b[1]:
+            assert b[2] <= a[2]
+            checked += 1
+    assert checked > 15
+
+
+@pytest.mark.parametrize("network", ["none", "sparse", "dense"])
+def test_adam_improves_the_loss(capfd, network):
+    design(capfd, "blob.png", *TINY, "--optimizer", "adam", "--network", network, "--iterations", 25)
+    losses = [row[2] for row in load("blob.caustic").state.history]
+    assert losses[-1] < 0.97 * losses[0]
+
+
+def test_the_two_losses_lead_to_different_lenses(capfd):
+    for loss in ("rms", "rms-light"):
+        design(capfd, "blob.png", *TINY, "--loss", loss, "--iterations", 3, "-o", loss)
+    assert not torch.equal(load("rms").state.heights, load("rms-light").state.heights)
+
+
+@pytest.mark.parametrize(("quality", "total"), [("draft", 115), ("standard", 200), ("fine", 360)])
+def test_quality(capfd, quality, total):
+    design(capfd, "blob.png", *TINY, "--quality", quality, "--iterations", 1)
+    text = (Path("blob.caustic") / "project.toml").read_text()
+    assert sum(int(line.split("=")[1].split("#")[0]) for line in text.split("[[design.stages]]", 1)[1].splitlines()
+               if line.startswith("iterations")) == total
+
+
+def test_a_start_from_another_project_takes_its_lens_over(capfd):
+    plain = design(capfd, "blob.png", *TINY, "--iterations", 40, "-o", "old")
+    taken = design(capfd, "blob.png", "--config", one_stage(), "--start", "old", "--quiet", "--iterations", 1, "-o", "new")
+    fresh = design(capfd, "blob.png", "--config", one_stage(), "--quiet", "--iterations", 1, "-o", "fresh")
+    assert taken["relative_rms"] < 1.1 * plain["relative_rms"] < 0.7 * fresh["relative_rms"]
+
+
+def one_stage(more="") -> str:
+    Path("one.toml").write_text("[screen]\nresolution = [24, 24]\n[lens]\ncontrol = [12, 12]\n" + more +
+                                "[[design.stages]]\ncontrol = [12, 12]\nrays = 4000\n")
+    return "one.toml"
+
+
+def test_a_project_started_from_another_stands_on_its_own(capfd):
+    """Its first surface is in its checkpoint: the other may be moved away."""
+    design(capfd, "blob.png", *TINY, "--iterations", 2, "-o", "old")
+    design(capfd, "blob.png", *TINY, "--start", "old", "--iterations", 2, "-o", "new")
+    Path("old").rename("elsewhere")
+    assert design(capfd, "--resume", "new", "--iterations", 3, "--quiet")["iterations"] == 3
+    assert cli.run(["render", "new", "--rays", "1000", "--quiet"]) == 0
+
+
+@pytest.mark.parametrize("options", [[], ["--optimizer", "adam"]])
+def test_the_time_limit_ends_it(capfd, options):
+    figures = design(capfd, "blob.png", *TINY, *options, "--iterations", 1_000_000, "--time-limit", 0.2)
+    assert figures["reason"] in (["time limit"] if options else ["time limit", "no progress"])
+    assert 1 <= figures["iterations"] < 100_000
+    assert load("blob.caustic").state.total == figures["iterations"]
+    assert cli.run(["render", "blob.caustic", "--rays", "1000", "--quiet"]) == 0
+
+
+def test_a_time_limit_reaches_the_last_stage(capfd):
+    """However short: a lens on a coarse net alone would not be the lens of project.toml."""
+    design(capfd, "blob.png", *TINY, "--time-limit", 0.01)
+    state = load("blob.caustic").state
+    assert state.stage == 6 and tuple(state.heights.shape) == (12, 12)
+
+
+# what cannot be done
+
+
+def test_no_light_on_the_screen_is_said_and_ends_in_1(capfd):
+    """Light through one corner of the aperture only, which --mag 3's surface throws far off a tiny screen."""
+    profile = np.zeros((20, 20))
+    profile[0, 0] = 1.0
+    np.save("corner.npy", profile)
+    Path("one.toml").write_text("[source]\nprofile = 'corner.npy'\n[lens]\ncontrol = [12, 12]\nradius = [80.3, 80.3]\n"
+                                "[screen]\nsize = [2.0, 2.0]\nresolution = [24, 24]\n"
+                                "[[design.stages]]\ncontrol = [12, 12]\nrays = 4000\n")
+    err = design(capfd, "blob.png", "--config", "one.toml", "--quiet", code=1)
+    assert err.startswith("caustic: ") and err.count("\n") == 1 and "no light reaches the screen" in err
+    assert not (Path("blob.caustic") / "render.png").exists()
+
+
+@pytest.mark.parametrize(("section", "line"), [
+    ("design", "loss = 'moon'"), ("design", "network = 'moon'"), ("design", "initial = 'moon'"),
+    ("design", "preconditioner = 'moon'"), ("design", "optimizer = 'moon'"), ("design", "dtype = 'moon'"),
+    ("[design.stages]", "sampler = 'moon'"), ("[design.stages]", "reconstruction = 'moon'"), ("lens", "fresnel = 'moon'"),
+    ("target", "flip = 'moon'"), ("screen", "size = [0, 1]"), ("lens", "knots_u = [0, 1]"), ("design", "time_limit = nan"),
+])
+def test_a_word_that_means_nothing_is_refused_before_anything_is_made(capfd, section, line):
+    Path("c.toml").write_text(f"[{section}]\n{line}\n")
+    err = design(capfd, "blob.png", *(TINY[:4] + TINY[6:] if "stages" in section else TINY), "--iterations", 1,
+                 "--config", "c.toml", code=2)
+    assert err.count("\n") == 1 and line.split()[0] in err, err
+    assert not Path("blob.caustic").exists()
+
+
+# signals
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_saves_and_the_design_goes_on(capfd, number, status):
+    arguments = [*TINY[:-3], "--threads", "1", "--optimizer", "adam", "--iterations", "100000000"]
+    program = [sys.executable, "-m", "caustic_cli", "design", "blob.png", *arguments]
+    environment = {**os.environ, "PYTHONPATH": str(Path(cli.__file__).parents[1])}
+    with subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment) as process:
+        try:
+            begun = Path("blob.caustic/checkpoints.h5")
+            for _ in range(1200):
+                if begun.exists() or process.poll() is not None:
+                    break
+                time.sleep(0.05)
+            time.sleep(0.3)
+            process.send_signal(number)
+            out, err = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    assert process.returncode == status, err
+    assert out == ""
+    said = [line for line in err.splitlines() if line.startswith("caustic: ")]
+    assert len(said) == 1 and "--resume" in said[0] and "Traceback" not in err
+    state = load("blob.caustic").state
+    assert state.total == len(state.history) and state.reason == "interrupted"
+    assert f"{state.total} iterations" in said[0]
+    assert sorted(p.name for p in Path("blob.caustic").iterdir()) == ["checkpoints.h5", "project.toml", "target.png"]
+
+    total = state.total + 2
+    assert design(capfd, "--resume", "blob.caustic", "--iterations", total, "--quiet", "--threads", 1)["iterations"] == total
+    if number == signal.SIGINT:  # and where it was interrupted leaves no trace
+        design(capfd, "blob.png", *TINY, "--optimizer", "adam", "--iterations", total, "-o", "whole")
+        whole, parts = content("whole"), content("blob.caustic")
+        assert_same({k: v for k, v in whole.items() if k != "provenance"}, {k: v for k, v in parts.items() if k != "provenance"})

@@ -1,0 +1,55 @@
+"""man/caustic.1 is what the commands say, today."""
+
+import re
+from pathlib import Path
+
+import pytest
+import typer
+
+from caustic_cli import manpage
+from caustic_cli.cli import app
+
+PAGE = Path(__file__).parents[1] / "man" / "caustic.1"
+COMMANDS = typer.main.get_command(app).commands
+
+
+def plain() -> str:
+    """The page without roff's escapes."""
+    return re.sub(r"\\f[A-Z]", "", manpage.build().replace("\\-", "-").replace("\\&", "").replace("\\e", "\\"))
+
+
+def test_the_committed_page_is_fresh():
+    assert PAGE.read_text(encoding="utf-8") == manpage.build(), "python -m caustic_cli.manpage > man/caustic.1"
+
+
+def test_five_commands():
+    assert set(COMMANDS) == {"design", "render", "gradmap", "export", "convergence"}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_option_is_in_its_command_section(name, capsys):
+    with pytest.raises(SystemExit):
+        COMMANDS[name].main(["--help"], prog_name=f"caustic {name}")
+    text = capsys.readouterr().out
+    options = set(re.findall(r"^\s+(?:-\w, )?(--[a-z-]+)", text, re.M)) - {"--help"}
+    assert len(options) > 5
+    section = plain().split(f".SS caustic {name} ", 1)[1].split(".SS ")[0].split(".SH ")[0]
+    listed = set(re.findall(r"^(--[a-z-]+)", section, re.M))
+    assert listed == options
+
+
+def test_sections_in_the_usual_order():
+    heads = re.findall(r"^\.SH (.*)$", manpage.build(), re.M)
+    assert heads == ["NAME", "SYNOPSIS", "DESCRIPTION", "COMMANDS", "FILES", "ORIENTATION", "EXIT STATUS", "ENVIRONMENT",
+                     "EXAMPLES"]
+
+
+def test_no_line_is_taken_for_a_request_by_accident():
+    known = {"TH", "SH", "SS", "TP", "PP", "B", "I", "RI", "IR", "BR", "nf", "fi"}
+    requests = re.findall(r"^[.'](\S*)", manpage.build(), re.M)
+    assert len(requests) > 100 and set(requests) <= known
+
+
+def test_every_example_is_of_a_command_that_is():
+    examples = re.findall(r"^caustic (\w+)", plain().split(".SH EXAMPLES")[1], re.M)
+    assert set(examples) == set(COMMANDS)
