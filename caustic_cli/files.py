@@ -63,8 +63,8 @@ def is_ours(path: str | Path) -> bool:
         return b"Software\x00" + MARK in head
     if head.startswith(b"PK"):
         return tail.endswith(MARK)  # the archive's comment
-    if MARK in head[:80] and len(head) >= 84 and not head.startswith(b"solid"):
-        return size == 84 + 50 * int.from_bytes(head[80:84], "little")  # the header of a binary STL
+    if MARK in head[:80] and size == 84 + 50 * int.from_bytes(head[80:84], "little"):
+        return True  # the header of a binary STL
     return b'"created_by": "' + MARK in head + tail
 
 
