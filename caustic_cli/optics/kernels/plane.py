@@ -1,17 +1,18 @@
 """Fused CPU kernel: refraction at the exit surface -> landing point -> splat, with its adjoint and its tangent.
 
-The function of `tracing.trace_plane` followed by `reconstruction.splat`, computed ray by ray without storing anything
-between; both are the reference it is tested against.  Storage is float32 or float64, arithmetic in registers and the
-image always float64.
+The function of `tracing.trace_plane` followed by `reconstruction.splat`, a row of rays at a time without storing anything
+between rows; both are the reference it is tested against.  Storage is float32 or float64, everything past the surface
+float64.
 
 Notation, a ray with slopes g = (z_x, z_y) at the exit surface, a = |g|^2, index n
     s       sqrt(1 - (n^2 - 1) a), cosine of refraction times |N|
     m       (n - s) / (n a + s), so that the ray lands at x + h m g with h the height of the screen above the surface
     R       reflectance of the exit surface
-    sx, sy  shares among the v_x x v_y pixels around the landing point; dx, dy their derivatives by sub-pixel position
+    p       landing point in pixels from the frame's low edge; phi its fractional part
 
-Each of a fixed number of blocks of rays has an image of its own and they are added in order, so the result does not
-depend on timing, only on the number of blocks (the number of threads).
+Each of a fixed number of blocks of rows has an image of its own and they are added in order, so the result does not depend
+on timing, only on the number of blocks (the number of threads).  Loops write one array each, so that they become vector
+instructions; only the scatter and the gather of pixels go ray by ray.
 """
 
 from __future__ import annotations
@@ -21,222 +22,309 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from caustic_cli.optics.kernels.shares import shares, table
+from caustic_cli.optics.kernels.shares import OPTIONS, shares
 
 NONE, SCHLICK, EXACT = 0, 1, 2
 CRITICAL = 1e-16  # see interface.CRITICAL
 FRESNEL, REFLECTED, OFF_SCREEN, LEAVING = 0, 1, 2, 3  # columns of the ledger
+# Rows of a block's scratch of vectors: the surface, powers, landing points, derivatives; five more for `shares`.
+SAG, GX, GY, POWER, PX, PY, PHI, BY_POWER, BY_PX, BY_PY, BY_A, T_SAG, T_GX, T_GY, T_POWER, REACH, VECTORS = range(17)
+SCRATCH = 5
 
-_OPTIONS = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
 
-
-@njit(inline="always", **_OPTIONS)
-def _bend(fresnel, gx, gy, n):
-    """passes, m, dm/da, transmittance, its derivative by a."""
-    a = gx * gx + gy * gy
+@njit(inline="always", **OPTIONS)
+def _s(a, n):
+    """s, or 1 beyond the critical angle; and whether the ray passes."""
     radicand = 1.0 - (n * n - 1.0) * a
-    if not radicand > CRITICAL * (1.0 + a):
-        return False, 0.0, 0.0, 0.0, 0.0
-    s = math.sqrt(radicand)
-    ds = -0.5 * (n * n - 1.0) / s
+    passes = radicand > CRITICAL * (1.0 + a)
+    return math.sqrt(radicand if passes else 1.0), passes
+
+
+@njit(inline="always", **OPTIONS)
+def _m(a, n):
+    """m and dm/da."""
+    s, _ = _s(a, n)
     under = 1.0 / (n * a + s)
     m = (n - s) * under
-    dm = -(ds + m * (n + ds)) * under
+    ds = -0.5 * (n * n - 1.0) / s
+    return m, -(ds + m * (n + ds)) * under
+
+
+@njit(inline="always", **OPTIONS)
+def _reflected(fresnel, a, n):
+    """R and dR/da."""
+    s, _ = _s(a, n)
+    ds = -0.5 * (n * n - 1.0) / s
     if fresnel == EXACT:
         us, up = 1.0 / (n + s), 1.0 / (1.0 + n * s)
         rs, rp = (n - s) * us, (1.0 - n * s) * up
-        reflected = 0.5 * (rs * rs + rp * rp)
-        dr = -2.0 * n * (rs * us * us + rp * up * up) * ds
-    elif fresnel == SCHLICK:
+        return 0.5 * (rs * rs + rp * rp), -2.0 * n * (rs * us * us + rp * up * up) * ds
+    if fresnel == SCHLICK:
         r0 = (n - 1.0) * (n - 1.0) / ((n + 1.0) * (n + 1.0))
         inverse = 1.0 / math.sqrt(1.0 + a)
         x = 1.0 - s * inverse
         x4 = x * x * x * x
-        reflected = r0 + (1.0 - r0) * x4 * x
-        dr = -5.0 * (1.0 - r0) * x4 * (ds - 0.5 * s / (1.0 + a)) * inverse
-    else:
-        reflected, dr = 0.0, 0.0
-    return True, m, dm, 1.0 - reflected, -dr
+        return r0 + (1.0 - r0) * x4 * x, -5.0 * (1.0 - r0) * x4 * (ds - 0.5 * s / (1.0 + a)) * inverse
+    return 0.0, 0.0
 
 
-@njit(inline="always", **_OPTIONS)
-def _pixel(at, half, pixel, n, r):
-    """inside the frame grown by r pixels, index of the first share on the padded frame, sub-pixel position."""
-    p = (at + half) / pixel
-    if not (p >= -r and p < n + r):  # False for NaN and infinity too
-        return False, 0, 0.0
-    i0 = math.floor(p)
-    return True, int(i0) + r, p - i0
+@njit(**OPTIONS)
+def _powers(fresnel, gx, gy, share, n, inside, out):
+    """Power of each ray behind the lens; -1 where it is totally reflected."""
+    for j in range(len(out)):
+        a = gx[j] * gx[j] + gy[j] * gy[j]
+        _, passes = _s(a, n)
+        reflected, _ = _reflected(fresnel, a, n)
+        out[j] = share[j] * inside * (1.0 - reflected) if passes else -1.0
 
 
-@njit(**_OPTIONS)
-def _forward_row(sag, gx, gy, x, y, share, real, whole, tables, image, ledger, work):
-    """Add the rays of one row to an image and a ledger.  Row arrays are (b,); work (4, longest v)."""
-    n, height, half_x, half_y = real[0], real[1], real[2], real[3]
-    pixel_x, pixel_y, alpha_x, alpha_y = real[4], real[5], real[6], real[7]
-    fresnel, nx, ny, kind, vx, vy = whole[0], whole[1], whole[2], whole[3], whole[4], whole[5]
-    entrance = _entrance(fresnel, n)
-    sx, sy, dx, dy = work[0], work[1], work[2], work[3]
+@njit(**OPTIONS)
+def _reach(sag, gx, gy, n, height, out):
+    """h m: how far a ray of unit slope is carried, mm."""
+    for j in range(len(out)):
+        m, _ = _m(gx[j] * gx[j] + gy[j] * gy[j], n)
+        out[j] = (height - sag[j]) * m
+
+
+@njit(**OPTIONS)
+def _landing(reach, slope, x, half, pixel, out):
+    """Landing points in pixels along the axis of `slope`."""
+    inverse = 1.0 / pixel
+    for j in range(len(out)):
+        out[j] = (x[j] + reach[j] * slope[j] + half) * inverse
+
+
+@njit(**OPTIONS)
+def _fraction(p, out):
+    for j in range(len(out)):
+        out[j] = p[j] - math.floor(p[j])
+
+
+@njit(**OPTIONS)
+def _aim(vectors, x, y, share, real, whole, sx, sy, dx, dy, sloping):
+    """Powers, landing points and shares of one row, from its surface in `vectors`."""
+    n, height, fresnel, kind = real[0], real[1], whole[0], whole[3]
+    inside = 1.0 - _entrance(fresnel, n)
+    v, scratch = vectors, vectors[VECTORS:]
+    _powers(fresnel, v[GX], v[GY], share, n, inside, v[POWER])
+    _reach(v[SAG], v[GX], v[GY], n, height, v[REACH])
+    _landing(v[REACH], v[GX], x, real[2], real[4], v[PX])
+    _landing(v[REACH], v[GY], y, real[3], real[5], v[PY])
+    if whole[4] > 1:
+        _fraction(v[PX], v[PHI])
+    shares(kind, whole[4], real[6], v[PHI], sx, dx, scratch, sloping)
+    if whole[5] > 1:
+        _fraction(v[PY], v[PHI])
+    shares(kind, whole[5], real[7], v[PHI], sy, dy, scratch, sloping)
+
+
+@njit(**OPTIONS)
+def _scatter(vectors, share, real, whole, sx, sy, image, ledger, column):
+    """Add one row's rays to the padded image and the ledger.  column: (longest v,) scratch."""
+    # Everything the loop needs is a local: after a store to the image the compiler would have to read an array again.
+    entrance, vx, vy, height = _entrance(whole[0], real[0]), whole[4], whole[5], real[1]
     rx, ry = (vx - 1) // 2, (vy - 1) // 2
+    low_x, low_y, high_x, high_y = float(-rx), float(-ry), float(whole[1] + rx), float(whole[2] + ry)
+    sag, power, px, py = vectors[SAG], vectors[POWER], vectors[PX], vectors[PY]
     lost_fresnel, lost_reflected, lost_off, leaving = 0.0, 0.0, 0.0, 0.0
-    for j in range(len(sag)):
-        emitted = share[j]
-        inside = emitted * (1.0 - entrance)
-        passes, m, _, through, _ = _bend(fresnel, gx[j], gy[j], n)
-        if not passes:
+    for j in range(len(power)):
+        emitted, weight = share[j], power[j]
+        if weight < 0.0:
+            inside = emitted * (1.0 - entrance)
             lost_fresnel += emitted - inside
             lost_reflected += inside
             continue
-        weight = inside * through
         lost_fresnel += emitted - weight
         leaving += weight
-        h = height - sag[j]
-        reach = h * m
-        in_x, i0, phi_x = _pixel(x[j] + reach * gx[j], half_x, pixel_x, nx, rx)
-        in_y, j0, phi_y = _pixel(y[j] + reach * gy[j], half_y, pixel_y, ny, ry)
-        if not (in_x and in_y and h > 0.0):
+        x, y = px[j], py[j]
+        if not (x >= low_x and x < high_x and y >= low_y and y < high_y and height > sag[j]):  # False for NaN too
             lost_off += weight
             continue
-        if vx == 1 and vy == 1:
-            image[i0, j0] += weight
+        i0, j0 = int(math.floor(x)) + rx, int(math.floor(y)) + ry
+        if vx == 3 and vy == 3:
+            b0, b1, b2 = sy[0, j], sy[1, j], sy[2, j]
+            for a in range(3):
+                part, row = weight * sx[a, j], image[i0 + a]
+                row[j0] += part * b0
+                row[j0 + 1] += part * b1
+                row[j0 + 2] += part * b2
             continue
-        shares(kind, phi_x, vx, alpha_x, tables[0], sx, dx, False)
-        shares(kind, phi_y, vy, alpha_y, tables[1], sy, dy, False)
+        for b in range(vy):
+            column[b] = weight * sy[b, j]
         for a in range(vx):
-            part = weight * sx[a]
+            part, row = sx[a, j], image[i0 + a, j0 : j0 + vy]
             for b in range(vy):
-                image[i0 + a, j0 + b] += part * sy[b]
+                row[b] += part * column[b]
     ledger[FRESNEL] += lost_fresnel
     ledger[REFLECTED] += lost_reflected
     ledger[OFF_SCREEN] += lost_off
     ledger[LEAVING] += leaving
 
 
-@njit(**_OPTIONS)
-def _backward_row(grad, grad_leaving, sag, gx, gy, x, y, share, real, whole, tables, by_sag, by_gx, by_gy, work):
-    """Adjoint of `_forward_row`: derivatives by sag, gx, gy of one row, from those by the padded image and leaving power."""
-    n, height, half_x, half_y = real[0], real[1], real[2], real[3]
-    pixel_x, pixel_y, alpha_x, alpha_y = real[4], real[5], real[6], real[7]
-    fresnel, nx, ny, kind, vx, vy = whole[0], whole[1], whole[2], whole[3], whole[4], whole[5]
-    entrance = _entrance(fresnel, n)
-    sx, sy, dx, dy = work[0], work[1], work[2], work[3]
+@njit(**OPTIONS)
+def _gather(vectors, real, whole, sx, sy, dx, dy, grad, grad_leaving, column, tilt):
+    """Derivatives by each ray's power and pixel coordinates, from those by the padded image."""
+    vx, vy, height, scale_x, scale_y = whole[4], whole[5], real[1], 1.0 / real[4], 1.0 / real[5]
     rx, ry = (vx - 1) // 2, (vy - 1) // 2
-    for j in range(len(sag)):
-        slope_x, slope_y = gx[j], gy[j]
-        passes, m, dm, through, dthrough = _bend(fresnel, slope_x, slope_y, n)
-        if not passes:
-            by_sag[j], by_gx[j], by_gy[j] = 0.0, 0.0, 0.0
-            continue
-        inside = share[j] * (1.0 - entrance)
-        weight = inside * through
-        h = height - sag[j]
-        reach = h * m
-        in_x, i0, phi_x = _pixel(x[j] + reach * slope_x, half_x, pixel_x, nx, rx)
-        in_y, j0, phi_y = _pixel(y[j] + reach * slope_y, half_y, pixel_y, ny, ry)
-        by_weight, by_x, by_y = grad_leaving, 0.0, 0.0
-        if in_x and in_y and h > 0.0:
-            shares(kind, phi_x, vx, alpha_x, tables[0], sx, dx, True)
-            shares(kind, phi_y, vy, alpha_y, tables[1], sy, dy, True)
-            for a in range(vx):
-                along, across = 0.0, 0.0
+    low_x, low_y, high_x, high_y = float(-rx), float(-ry), float(whole[1] + rx), float(whole[2] + ry)
+    sag, power, px, py = vectors[SAG], vectors[POWER], vectors[PX], vectors[PY]
+    by_power, by_px, by_py = vectors[BY_POWER], vectors[BY_PX], vectors[BY_PY]
+    for j in range(len(power)):
+        weight = power[j]
+        value, along_x, along_y = grad_leaving, 0.0, 0.0
+        x, y = px[j], py[j]
+        if weight >= 0.0 and x >= low_x and x < high_x and y >= low_y and y < high_y and height > sag[j]:
+            i0, j0 = int(math.floor(x)) + rx, int(math.floor(y)) + ry
+            if vx == 3 and vy == 3:
+                b0, b1, b2, d0, d1, d2 = sy[0, j], sy[1, j], sy[2, j], dy[0, j], dy[1, j], dy[2, j]
+                for a in range(3):
+                    row = grad[i0 + a]
+                    g0, g1, g2 = row[j0], row[j0 + 1], row[j0 + 2]
+                    along = g0 * b0 + g1 * b1 + g2 * b2
+                    value += sx[a, j] * along
+                    along_x += dx[a, j] * along
+                    along_y += sx[a, j] * (g0 * d0 + g1 * d1 + g2 * d2)
+            else:
                 for b in range(vy):
-                    g = grad[i0 + a, j0 + b]
-                    along += g * sy[b]
-                    across += g * dy[b]
-                by_weight += sx[a] * along
-                by_x += dx[a] * along
-                by_y += sx[a] * across
-            by_x *= weight / pixel_x
-            by_y *= weight / pixel_y
-        dot = by_x * slope_x + by_y * slope_y
-        by_a = h * dm * dot + by_weight * inside * dthrough
-        by_sag[j] = -m * dot
-        by_gx[j] = reach * by_x + 2.0 * slope_x * by_a
-        by_gy[j] = reach * by_y + 2.0 * slope_y * by_a
+                    column[b], tilt[b] = sy[b, j], dy[b, j]
+                for a in range(vx):
+                    along, across, row = 0.0, 0.0, grad[i0 + a, j0 : j0 + vy]
+                    for b in range(vy):
+                        along += row[b] * column[b]
+                        across += row[b] * tilt[b]
+                    value += sx[a, j] * along
+                    along_x += dx[a, j] * along
+                    along_y += sx[a, j] * across
+        by_power[j], by_px[j], by_py[j] = value, along_x * weight * scale_x, along_y * weight * scale_y
 
 
-@njit(**_OPTIONS)
-def _tangent_row(t_sag, t_gx, t_gy, sag, gx, gy, x, y, share, real, whole, tables, image, work):
-    """Add the tangent of one row's image along (t_sag, t_gx, t_gy) to `image`; returns the leaving power's."""
-    n, height, half_x, half_y = real[0], real[1], real[2], real[3]
-    pixel_x, pixel_y, alpha_x, alpha_y = real[4], real[5], real[6], real[7]
-    fresnel, nx, ny, kind, vx, vy = whole[0], whole[1], whole[2], whole[3], whole[4], whole[5]
-    entrance = _entrance(fresnel, n)
-    sx, sy, dx, dy = work[0], work[1], work[2], work[3]
-    rx, ry = (vx - 1) // 2, (vy - 1) // 2
-    leaving = 0.0
-    for j in range(len(sag)):
-        slope_x, slope_y = gx[j], gy[j]
-        passes, m, dm, through, dthrough = _bend(fresnel, slope_x, slope_y, n)
-        if not passes:
-            continue
-        inside = share[j] * (1.0 - entrance)
-        weight = inside * through
-        da = 2.0 * (slope_x * t_gx[j] + slope_y * t_gy[j])
-        dw = inside * dthrough * da
-        leaving += dw
+@njit(**OPTIONS)
+def _by_a(fresnel, sag, gx, gy, share, by_power, by_px, by_py, n, height, inside, out):
+    """Derivative by a = |g|^2, by way of the landing point and of the reflectance; 0 where totally reflected."""
+    for j in range(len(out)):
+        a = gx[j] * gx[j] + gy[j] * gy[j]
+        _, passes = _s(a, n)
+        _, dm = _m(a, n)
+        _, dr = _reflected(fresnel, a, n)
+        value = (height - sag[j]) * dm * (by_px[j] * gx[j] + by_py[j] * gy[j]) - by_power[j] * share[j] * inside * dr
+        out[j] = value if passes else 0.0
+
+
+@njit(**OPTIONS)
+def _by_slope(reach, slope, by_p, by_a, out):
+    for j in range(len(out)):
+        out[j] = reach[j] * by_p[j] + 2.0 * slope[j] * by_a[j]
+
+
+@njit(**OPTIONS)
+def _by_sag(reach, sag, gx, gy, by_px, by_py, height, out):
+    for j in range(len(out)):  # reach / h = m; nothing lands where h is not positive
         h = height - sag[j]
-        reach = h * m
-        d_reach = -t_sag[j] * m + h * dm * da
-        in_x, i0, phi_x = _pixel(x[j] + reach * slope_x, half_x, pixel_x, nx, rx)
-        in_y, j0, phi_y = _pixel(y[j] + reach * slope_y, half_y, pixel_y, ny, ry)
-        if not (in_x and in_y and h > 0.0):
+        out[j] = -reach[j] / (h if h > 0.0 else 1.0) * (by_px[j] * gx[j] + by_py[j] * gy[j])
+
+
+@njit(**OPTIONS)
+def _pull(vectors, share, real, whole):
+    """Derivatives by the surface, left in T_SAG, T_GX, T_GY, from those by power and pixel coordinates."""
+    n, height, v = real[0], real[1], vectors
+    inside = 1.0 - _entrance(whole[0], n)
+    _by_a(whole[0], v[SAG], v[GX], v[GY], share, v[BY_POWER], v[BY_PX], v[BY_PY], n, height, inside, v[BY_A])
+    _by_slope(v[REACH], v[GX], v[BY_PX], v[BY_A], v[T_GX])
+    _by_slope(v[REACH], v[GY], v[BY_PY], v[BY_A], v[T_GY])
+    _by_sag(v[REACH], v[SAG], v[GX], v[GY], v[BY_PX], v[BY_PY], height, v[T_SAG])
+
+
+@njit(**OPTIONS)
+def _push(vectors, share, real, whole):
+    """Tangents of power and pixel coordinates, left in T_POWER, BY_PX, BY_PY, along T_SAG, T_GX, T_GY."""
+    n, height, v = real[0], real[1], vectors
+    inside = 1.0 - _entrance(whole[0], n)
+    for j in range(v.shape[1]):
+        gx, gy, tx, ty = v[GX, j], v[GY, j], v[T_GX, j], v[T_GY, j]
+        a, da = gx * gx + gy * gy, 2.0 * (gx * tx + gy * ty)
+        m, dm = _m(a, n)
+        _, dr = _reflected(whole[0], a, n)
+        h = height - v[SAG, j]
+        change = -v[T_SAG, j] * m + h * dm * da
+        v[T_POWER, j] = -share[j] * inside * dr * da
+        v[BY_PX, j] = (change * gx + h * m * tx) / real[4]
+        v[BY_PY, j] = (change * gy + h * m * ty) / real[5]
+
+
+@njit(**OPTIONS)
+def _scatter_tangent(vectors, real, whole, sx, sy, dx, dy, image):
+    """Add the tangent of one row's image; returns the leaving power's."""
+    vx, vy = whole[4], whole[5]
+    rx, ry = (vx - 1) // 2, (vy - 1) // 2
+    low_x, low_y, high_x, high_y = float(-rx), float(-ry), float(whole[1] + rx), float(whole[2] + ry)
+    v, leaving, height = vectors, 0.0, real[1]
+    for j in range(v.shape[1]):
+        weight, change = v[POWER, j], v[T_POWER, j]
+        if weight < 0.0:
             continue
-        shares(kind, phi_x, vx, alpha_x, tables[0], sx, dx, True)
-        shares(kind, phi_y, vy, alpha_y, tables[1], sy, dy, True)
-        move_x = weight * (d_reach * slope_x + reach * t_gx[j]) / pixel_x
-        move_y = weight * (d_reach * slope_y + reach * t_gy[j]) / pixel_y
+        leaving += change
+        x, y = v[PX, j], v[PY, j]
+        if not (x >= low_x and x < high_x and y >= low_y and y < high_y and height > v[SAG, j]):
+            continue
+        i0, j0 = int(math.floor(x)) + rx, int(math.floor(y)) + ry
+        move_x, move_y = weight * v[BY_PX, j], weight * v[BY_PY, j]
         for a in range(vx):
-            along, across = dw * sx[a] + move_x * dx[a], move_y * sx[a]
+            along, across = change * sx[a, j] + move_x * dx[a, j], move_y * sx[a, j]
             for b in range(vy):
-                image[i0 + a, j0 + b] += along * sy[b] + across * dy[b]
+                image[i0 + a, j0 + b] += along * sy[b, j] + across * dy[b, j]
     return leaving
 
 
-@njit(inline="always", **_OPTIONS)
+@njit(**OPTIONS)
+def _add(weight, row, out):
+    for j in range(len(out)):
+        out[j] += weight * row[j]
+
+
+@njit(**OPTIONS)
+def _weighted(weights, net, first, out):
+    """Weighted sum of consecutive rows of a net, three at a time: a pass over `out` costs as much as the products."""
+    out[:] = 0.0
+    a, count = 0, len(weights)
+    while a + 2 < count:
+        p, q, r = net[first + a], net[first + a + 1], net[first + a + 2]
+        for j in range(len(out)):
+            out[j] += weights[a] * p[j] + weights[a + 1] * q[j] + weights[a + 2] * r[j]
+        a += 3
+    while a < count:
+        _add(weights[a], net[first + a], out)
+        a += 1
+
+
+@njit(**OPTIONS)
 def _combine(i, first, bu, du, net, net_x, net_y, sag, gx, gy):
     """Row i of the surface from the nets already contracted along v: sag, dz/dx, dz/dy (b,)."""
-    sag[:] = 0.0
-    gx[:] = 0.0
-    gy[:] = 0.0
-    for a in range(bu.shape[1]):
-        value, slope = bu[i, a], du[i, a]
-        row, row_x, row_y = net[first[i] + a], net_x[first[i] + a], net_y[first[i] + a]
-        for j in range(len(sag)):
-            sag[j] += value * row[j]
-            gx[j] += slope * row_x[j]
-            gy[j] += value * row_y[j]
+    _weighted(bu[i], net, first[i], sag)
+    _weighted(du[i], net_x, first[i], gx)
+    _weighted(bu[i], net_y, first[i], gy)
 
 
-@njit(**_OPTIONS)
-def _spread(i, first, bu, du, by_sag, by_gx, by_gy, nets):
+@njit(**OPTIONS)
+def _spread(i, first, bu, du, by_sag, by_gx, by_gy, nets, apart):
     """Adjoint of `_combine`: add the derivatives by row i to those by the nets (3, n, b)."""
     for a in range(bu.shape[1]):
-        value, slope, at = bu[i, a], du[i, a], first[i] + a
-        out, out_x, out_y = nets[0, at], nets[1, at], nets[2, at]
-        for j in range(len(by_sag)):
-            out[j] += value * by_sag[j]
-            out_x[j] += slope * by_gx[j]
-            out_y[j] += value * by_gy[j]
+        if apart:
+            _add(bu[i, a], by_sag, nets[0, first[i] + a])
+            _add(du[i, a], by_gx, nets[1, first[i] + a])
+        else:
+            value, slope, out = bu[i, a], du[i, a], nets[0, first[i] + a]
+            for j in range(len(out)):
+                out[j] += value * by_sag[j] + slope * by_gx[j]
+        _add(bu[i, a], by_gy, nets[2, first[i] + a])
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _entrance(fresnel, n):
     """Reflectance of the flat entrance at normal incidence."""
     return 0.0 if fresnel == NONE else (n - 1.0) * (n - 1.0) / ((n + 1.0) * (n + 1.0))
 
 
-@njit(**_OPTIONS)
-def _tables(real, whole):
-    """Constants of the filter along x and y: (2, as many as the longer needs)."""
-    out = np.zeros((2, 2 * max(whole[4], whole[5]) + 3))
-    for axis in range(2):
-        constants = table(whole[3], whole[4 + axis], real[6 + axis])
-        out[axis, : len(constants)] = constants
-    return out
-
-
-@njit(parallel=True, **_OPTIONS)
+@njit(parallel=True, **OPTIONS)
 def _total(images):
     """Sum over blocks, in order, into the first."""
     for i in prange(images.shape[1]):
@@ -246,69 +334,72 @@ def _total(images):
     return images[0]
 
 
-@njit(parallel=True, **_OPTIONS)
+@njit(parallel=True, **OPTIONS)
 def forward(first, bu, du, net, net_x, net_y, x, y, share, real, whole, blocks):
     """Padded image (n_x + 4 r_x, n_y + 4 r_y) and the ledger (4,): fresnel, reflected, off_screen, leaving.
 
     The surface comes by rows.  Row i of the sag is sum_k bu[i, k] net[first[i] + k], of dz/dx the same with du and net_x,
     of dz/dy with bu and net_y.  first (a,) int64; bu, du (a, p + 1); nets (n, b); x, y mm and share, parts of the
     source's power, (a, b).
+
     real: index, height of the screen above the sag's zero, half width and height of the screen and of a pixel (mm), alpha
     along x and y (per pixel squared).  whole: kind of Fresnel losses, pixels along x and y, kind of filter, its sizes.
     """
-    tables, longest = _tables(real, whole), max(whole[4], whole[5])
-    wide, high = whole[1] + 2 * (whole[4] - 1), whole[2] + 2 * (whole[5] - 1)
     rows, columns = x.shape
-    images = np.zeros((blocks, wide, high))
+    vx, vy = whole[4], whole[5]
+    images = np.zeros((blocks, whole[1] + 2 * (vx - 1), whole[2] + 2 * (vy - 1)))
     ledgers = np.zeros((blocks, 4))
     for block in prange(blocks):
-        sag, gx, gy = np.empty(columns, net.dtype), np.empty(columns, net.dtype), np.empty(columns, net.dtype)
-        work = np.empty((4, longest))
+        v = np.zeros((VECTORS + SCRATCH, columns))
+        sx, sy, column = np.empty((vx, columns)), np.empty((vy, columns)), np.empty(max(vx, vy))
         for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-            _combine(i, first, bu, du, net, net_x, net_y, sag, gx, gy)
-            _forward_row(sag, gx, gy, x[i], y[i], share[i], real, whole, tables, images[block], ledgers[block], work)
+            _combine(i, first, bu, du, net, net_x, net_y, v[SAG], v[GX], v[GY])
+            _aim(v, x[i], y[i], share[i], real, whole, sx, sy, sx, sy, False)
+            _scatter(v, share[i], real, whole, sx, sy, images[block], ledgers[block], column)
     ledger = np.zeros(4)
     for block in range(blocks):
         ledger += ledgers[block]
     return _total(images), ledger
 
 
-@njit(parallel=True, **_OPTIONS)
+@njit(parallel=True, **OPTIONS)
 def backward(grad, grad_leaving, apart, first, bu, du, net, net_x, net_y, x, y, share, real, whole, blocks):
     """Adjoint of `forward`: derivatives by the three nets (n, b) float64, from those by the padded image and leaving power.
 
-    apart: no two rows share a row of the nets, so that one sum serves all blocks.
+    apart: no two rows share a row of the nets, so that one sum serves all blocks.  Otherwise net_x is taken to be net
+    itself, and the sum of both derivatives comes as the first.
     """
-    tables, longest = _tables(real, whole), max(whole[4], whole[5])
     rows, columns = x.shape
+    vx, vy = whole[4], whole[5]
     nets = np.zeros((3, 1 if apart else blocks, net.shape[0], columns))
     for block in prange(blocks):
-        sag, gx, gy = np.empty(columns, net.dtype), np.empty(columns, net.dtype), np.empty(columns, net.dtype)
-        by_sag, by_gx, by_gy = np.empty(columns), np.empty(columns), np.empty(columns)
-        work = np.empty((4, longest))
+        v = np.zeros((VECTORS + SCRATCH, columns))
+        sx, sy, dx, dy = np.empty((vx, columns)), np.empty((vy, columns)), np.empty((vx, columns)), np.empty((vy, columns))
+        column, tilt = np.empty(max(vx, vy)), np.empty(max(vx, vy))
         for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-            _combine(i, first, bu, du, net, net_x, net_y, sag, gx, gy)
-            _backward_row(grad, grad_leaving, sag, gx, gy, x[i], y[i], share[i], real, whole, tables,
-                          by_sag, by_gx, by_gy, work)
-            _spread(i, first, bu, du, by_sag, by_gx, by_gy, nets[:, np.int64(0) if apart else np.int64(block)])
+            _combine(i, first, bu, du, net, net_x, net_y, v[SAG], v[GX], v[GY])
+            _aim(v, x[i], y[i], share[i], real, whole, sx, sy, dx, dy, True)
+            _gather(v, real, whole, sx, sy, dx, dy, grad, grad_leaving, column, tilt)
+            _pull(v, share[i], real, whole)
+            _spread(i, first, bu, du, v[T_SAG], v[T_GX], v[T_GY], nets[:, np.int64(0) if apart else np.int64(block)],
+                    apart)
     return _total(nets[0]), _total(nets[1]), _total(nets[2])
 
 
-@njit(parallel=True, **_OPTIONS)
+@njit(parallel=True, **OPTIONS)
 def tangent(t_net, t_net_x, t_net_y, first, bu, du, net, net_x, net_y, x, y, share, real, whole, blocks):
     """Derivative of `forward` along (t_net, t_net_x, t_net_y): the padded image's tangent, and the leaving power's."""
-    tables, longest = _tables(real, whole), max(whole[4], whole[5])
-    wide, high = whole[1] + 2 * (whole[4] - 1), whole[2] + 2 * (whole[5] - 1)
     rows, columns = x.shape
-    images = np.zeros((blocks, wide, high))
+    vx, vy = whole[4], whole[5]
+    images = np.zeros((blocks, whole[1] + 2 * (vx - 1), whole[2] + 2 * (vy - 1)))
     leaving = np.zeros(blocks)
     for block in prange(blocks):
-        sag, gx, gy = np.empty(columns, net.dtype), np.empty(columns, net.dtype), np.empty(columns, net.dtype)
-        t_sag, t_gx, t_gy = np.empty(columns, net.dtype), np.empty(columns, net.dtype), np.empty(columns, net.dtype)
-        work = np.empty((4, longest))
+        v = np.zeros((VECTORS + SCRATCH, columns))
+        sx, sy, dx, dy = np.empty((vx, columns)), np.empty((vy, columns)), np.empty((vx, columns)), np.empty((vy, columns))
         for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-            _combine(i, first, bu, du, net, net_x, net_y, sag, gx, gy)
-            _combine(i, first, bu, du, t_net, t_net_x, t_net_y, t_sag, t_gx, t_gy)
-            leaving[block] += _tangent_row(t_sag, t_gx, t_gy, sag, gx, gy, x[i], y[i], share[i], real, whole,
-                                           tables, images[block], work)
+            _combine(i, first, bu, du, net, net_x, net_y, v[SAG], v[GX], v[GY])
+            _combine(i, first, bu, du, t_net, t_net_x, t_net_y, v[T_SAG], v[T_GX], v[T_GY])
+            _aim(v, x[i], y[i], share[i], real, whole, sx, sy, dx, dy, True)
+            _push(v, share[i], real, whole)
+            leaving[block] += _scatter_tangent(v, real, whole, sx, sy, dx, dy, images[block])
     return _total(images), leaving.sum()

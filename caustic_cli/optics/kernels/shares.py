@@ -1,4 +1,8 @@
-"""Shares of a ray among pixels, and their derivatives, for the CPU kernels: the functions of `reconstruction.Filter`.
+"""Shares of rays among pixels, and their derivatives, a batch at a time: the functions of `reconstruction.Filter`.
+
+Every loop writes one array from a few others, which is what lets the compiler turn it into vector instructions.
+
+Numba caches the kernels of `plane` by that file's time stamp alone: after editing here, touch plane.py.
 
 Notation, in pixels: v filter size, r = (v - 1) / 2, phi sub-pixel position, q = 1/2 - phi, d = k - r + q the distance from
 the centre of pixel k = 0..v - 1.  A Gaussian on the integer lattice needs two exponentials, whatever v.
@@ -8,138 +12,214 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 from numba import njit
 
 BINCOUNT, GAUSSIAN, COSINE = 0, 1, 2
-#: Below this alpha (v/2)^2 the Gaussian's shares come from Taylor series, without cancellation; above LARGE from plain
-#: exponentials, because the recursion over pixels would overflow.
-SMALL, LARGE = 0.05, 80.0
+#: Below this alpha (v/2)^2 the Gaussian's shares come from Taylor series, without cancellation.
+SMALL = 0.05
 TINY = 1e-3  # and below this from shorter ones
+#: Up to this alpha exp(-2 alpha q) stays within the reach of `_exp` and the recursion over pixels; above, plain exponentials.
+MODERATE = 2.0
 
-_OPTIONS = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
-
-
-@njit(inline="always", **_OPTIONS)
-def _sine_cosine(x):
-    """sin and cos for |x| <= pi / 3 by Taylor series: the first terms left out are 7e-16 and 5e-17."""
-    y = x * x
-    s = 1.0 - y * (1 / 110.0) * (1.0 - y * (1 / 156.0) * (1.0 - y * (1 / 210.0)))
-    s = 1.0 - y * (1 / 20.0) * (1.0 - y * (1 / 42.0) * (1.0 - y * (1 / 72.0) * s))
-    s = x * (1.0 - y * (1 / 6.0) * s)
-    c = 1.0 - y * (1 / 132.0) * (1.0 - y * (1 / 182.0) * (1.0 - y * (1 / 240.0)))
-    c = 1.0 - y * (1 / 30.0) * (1.0 - y * (1 / 56.0) * (1.0 - y * (1 / 90.0) * c))
-    c = 1.0 - y * (1 / 2.0) * (1.0 - y * (1 / 12.0) * c)
-    return s, c
+OPTIONS = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
 
 
-@njit(inline="always", **_OPTIONS)
-def _exp_small(x):
-    """exp(x) for |x| <= 2: exp(x / 8)^8, relative error about 1e-14."""
+@njit(inline="always", **OPTIONS)
+def _exp(x):
+    """exp(x) for |x| <= 2: exp(x / 8)^8, relative error about 1e-14, without a branch."""
     z = 0.125 * x
-    e = 1.0 + z * (1.0 + z * (1 / 2 + z * (1 / 6 + z * (1 / 24 + z * (1 / 120 + z * (
-        1 / 720 + z * (1 / 5040 + z * (1 / 40320 + z * (1 / 362880 + z / 3628800)))))))))
+    e = 1 / 5040 + z * (1 / 40320 + z * (1 / 362880 + z * (1 / 3628800)))
+    e = 1.0 + z * (1.0 + z * (1 / 2 + z * (1 / 6 + z * (1 / 24 + z * (1 / 120 + z * (1 / 720 + z * e))))))
     e *= e
     e *= e
     return e * e
 
 
-@njit(inline="always", **_OPTIONS)
-def _gaussian(phi, v, alpha, constants, out, slope, sloping):
-    """Shares, and with `sloping` their derivatives by phi, of a Gaussian truncated at v / 2; constants: see `table`."""
-    r = (v - 1) // 2
-    q = 0.5 - phi
-    square = 0.25 * v * v
-    total = 0.0
-    if alpha * square < SMALL:  # both divided by alpha exp(-alpha (v/2)^2); every series' argument is below SMALL
-        short = alpha * square < TINY
-        for k in range(v):
-            d = k - r + q
-            room = max(square - d * d, 0.0)
-            x = alpha * room
-            y = alpha * d * d
-            if short:
-                e = 1.0 - y * (1.0 - y * (1 / 2.0) * (1.0 - y * (1 / 3.0)))
-                p = 1.0 - x * (1 / 2.0) * (1.0 - x * (1 / 3.0) * (1.0 - x * (1 / 4.0)))
-            else:
-                e = 1.0 - y * (1 / 4.0) * (1.0 - y * (1 / 5.0) * (1.0 - y * (1 / 6.0)))
-                e = 1.0 - y * (1.0 - y * (1 / 2.0) * (1.0 - y * (1 / 3.0) * e))
-                p = 1.0 - x * (1 / 5.0) * (1.0 - x * (1 / 6.0) * (1.0 - x * (1 / 7.0)))
-                p = 1.0 - x * (1 / 2.0) * (1.0 - x * (1 / 3.0) * (1.0 - x * (1 / 4.0) * p))
-            out[k] = room * p * e
-            total += out[k]
-            if sloping:
-                slope[k] = 2.0 * d * e
-    elif alpha <= LARGE:  # both divided by exp(-alpha q^2): exp(-alpha (d^2 - q^2)) follows from pixel to pixel
-        if alpha <= 2.0:
-            edge = constants[0] * _exp_small(alpha * q * q)
-            up = _exp_small(-2.0 * alpha * q)
-        else:
-            edge = math.exp(-alpha * (square - q * q))
-            up = math.exp(-2.0 * alpha * q)
-        ratio_up, ratio_down = up * constants[1], constants[1] / up
-        rise, fall = 1.0, 1.0
-        out[r] = 1.0 - edge
-        total = out[r]
+@njit(inline="always", **OPTIONS)
+def _sine(x):
+    """sin(x) for |x| <= pi / 3 by its Taylor series: the first term left out is 4e-15."""
+    y = x * x
+    s = 1.0 - y * (1 / 110.0) * (1.0 - y * (1 / 156.0) * (1.0 - y * (1 / 210.0)))
+    return x * (1.0 - y * (1 / 6.0) * (1.0 - y * (1 / 20.0) * (1.0 - y * (1 / 42.0) * (1.0 - y * (1 / 72.0) * s))))
+
+
+@njit(inline="always", **OPTIONS)
+def _cosine(x):
+    """cos(x) for |x| <= pi / 3 by its Taylor series: the first term left out is 3e-16."""
+    y = x * x
+    c = 1.0 - y * (1 / 132.0) * (1.0 - y * (1 / 182.0) * (1.0 - y * (1 / 240.0)))
+    return 1.0 - y * (1 / 2.0) * (1.0 - y * (1 / 12.0) * (1.0 - y * (1 / 30.0) * (1.0 - y * (1 / 56.0) * (1.0 - y * (1 / 90.0) * c))))
+
+
+@njit(**OPTIONS)
+def _scaled(by, phi, v, out):
+    """out[j] = by f(by phi') for the cosine filter's two functions: out[0] cosines, out[1] sines of theta q, over v."""
+    for j in range(len(phi)):
+        out[0, j] = _cosine(by * (0.5 - phi[j])) / v
+    for j in range(len(phi)):
+        out[1, j] = _sine(by * (0.5 - phi[j])) / v
+
+
+@njit(**OPTIONS)
+def _raised_cosine(phi, v, out, slope, scratch, sloping):
+    theta = 2.0 * math.pi / v
+    _scaled(theta, phi, v, scratch)
+    for k in range(v):  # cos(theta (k - r + q)) by addition
+        c, s = math.cos(theta * (k - (v - 1) // 2)), math.sin(theta * (k - (v - 1) // 2))
+        _mix(1.0 / v, c, -s, scratch[0], scratch[1], out[k])
         if sloping:
-            slope[r] = 2.0 * alpha * q
-        for k in range(1, r + 1):
-            rise *= ratio_up
-            fall *= ratio_down
-            ratio_up *= constants[2]
-            ratio_down *= constants[2]
-            out[r + k] = max(rise - edge, 0.0)
-            out[r - k] = max(fall - edge, 0.0)
-            total += out[r + k] + out[r - k]
+            _mix(0.0, theta * s, theta * c, scratch[0], scratch[1], slope[k])
+
+
+@njit(**OPTIONS)
+def _mix(constant, a, b, x, y, out):
+    for j in range(len(out)):
+        out[j] = constant + a * x[j] + b * y[j]
+
+
+@njit(**OPTIONS)
+def _short_series(phi, offset, square, alpha, out):
+    """`_series` where its arguments are below TINY."""
+    for j in range(len(phi)):
+        d = offset - phi[j]
+        room = max(square - d * d, 0.0)
+        x, y = alpha * room, alpha * d * d
+        p = 1.0 - x * (1 / 2.0) * (1.0 - x * (1 / 3.0) * (1.0 - x * (1 / 4.0)))
+        out[j] = room * p * (1.0 - y * (1.0 - y * (1 / 2.0) * (1.0 - y * (1 / 3.0))))
+
+
+@njit(**OPTIONS)
+def _series(phi, offset, square, alpha, out):
+    """A pixel's share of a very wide Gaussian, over alpha exp(-alpha (v/2)^2); the series' arguments are below SMALL."""
+    for j in range(len(phi)):
+        d = offset - phi[j]
+        room = max(square - d * d, 0.0)
+        x, y = alpha * room, alpha * d * d
+        e = 1.0 - y * (1 / 4.0) * (1.0 - y * (1 / 5.0) * (1.0 - y * (1 / 6.0)))
+        p = 1.0 - x * (1 / 5.0) * (1.0 - x * (1 / 6.0) * (1.0 - x * (1 / 7.0)))
+        p = 1.0 - x * (1 / 2.0) * (1.0 - x * (1 / 3.0) * (1.0 - x * (1 / 4.0) * p))
+        out[j] = room * p * (1.0 - y * (1.0 - y * (1 / 2.0) * (1.0 - y * (1 / 3.0) * e)))
+
+
+@njit(**OPTIONS)
+def _series_slope(phi, offset, alpha, out):
+    for j in range(len(phi)):
+        d = offset - phi[j]
+        y = alpha * d * d
+        e = 1.0 - y * (1 / 4.0) * (1.0 - y * (1 / 5.0) * (1.0 - y * (1 / 6.0)))
+        out[j] = 2.0 * d * (1.0 - y * (1.0 - y * (1 / 2.0) * (1.0 - y * (1 / 3.0) * e)))
+
+
+@njit(**OPTIONS)
+def _recursion(phi, v, alpha, out, slope, scratch, sloping):
+    """Shares over exp(-alpha q^2): exp(-alpha (d^2 - q^2)) follows from pixel to pixel."""
+    r = (v - 1) // 2
+    edge, up, down, rise, fall = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
+    least = math.exp(-0.25 * alpha * v * v)
+    for j in range(len(phi)):
+        edge[j] = least * _exp(alpha * (0.5 - phi[j]) * (0.5 - phi[j]))
+    for j in range(len(phi)):
+        up[j] = _exp(-2.0 * alpha * (0.5 - phi[j]))
+    for j in range(len(phi)):
+        down[j] = 1.0 / up[j]
+    rise[:] = 1.0
+    fall[:] = 1.0
+    for k in range(r + 1):
+        if k:
+            ratio = math.exp(-alpha * (2 * k - 1))
+            for j in range(len(phi)):
+                rise[j] *= ratio * up[j]
+            for j in range(len(phi)):
+                fall[j] *= ratio * down[j]
+            _above(fall, edge, out[r - k])
             if sloping:
-                slope[r + k] = 2.0 * alpha * (q + k) * rise
-                slope[r - k] = 2.0 * alpha * (q - k) * fall
-    else:
-        for k in range(v):
-            d = k - r + q
-            e = math.exp(-alpha * (d * d - q * q))
-            out[k] = -e * math.expm1(-alpha * max(square - d * d, 0.0))
-            total += out[k]
-            if sloping:
-                slope[k] = 2.0 * alpha * d * e
-    inverse = 1.0 / total
+                _lean(phi, -k, alpha, fall, slope[r - k])
+        _above(rise, edge, out[r + k])
+        if sloping:
+            _lean(phi, k, alpha, rise, slope[r + k])
+
+
+@njit(**OPTIONS)
+def _above(value, edge, out):
+    for j in range(len(out)):
+        out[j] = max(value[j] - edge[j], 0.0)
+
+
+@njit(**OPTIONS)
+def _lean(phi, k, alpha, value, out):
+    for j in range(len(out)):
+        out[j] = 2.0 * alpha * (0.5 - phi[j] + k) * value[j]
+
+
+@njit(**OPTIONS)
+def _exponentials(phi, v, alpha, out, slope, sloping):
+    """Shares over exp(-alpha q^2) of a narrow Gaussian, whose recursion would overflow."""
     for k in range(v):
-        out[k] *= inverse
+        for j in range(len(phi)):
+            q = 0.5 - phi[j]
+            d = k - (v - 1) // 2 + q
+            e = math.exp(-alpha * (d * d - q * q))
+            out[k, j] = -e * math.expm1(-alpha * max(0.25 * v * v - d * d, 0.0))
+            if sloping:
+                slope[k, j] = 2.0 * alpha * d * e
+
+
+@njit(**OPTIONS)
+def _normalise(v, out, slope, scratch, sloping):
+    total, change = scratch[0], scratch[1]
+    total[:] = 0.0
+    for k in range(v):
+        row = out[k]
+        for j in range(len(total)):
+            total[j] += row[j]
+    for j in range(len(total)):
+        total[j] = 1.0 / total[j]
+    for k in range(v):
+        row = out[k]
+        for j in range(len(total)):
+            row[j] *= total[j]
     if sloping:
-        change = 0.0
+        change[:] = 0.0
         for k in range(v):
-            change += slope[k]
+            row = slope[k]
+            for j in range(len(total)):
+                change[j] += row[j]
         for k in range(v):
-            slope[k] = (slope[k] - out[k] * change) * inverse
+            _turn(slope[k], out[k], change, total)
 
 
-@njit(inline="always", **_OPTIONS)
-def shares(kind, phi, v, alpha, constants, out, slope, sloping):
-    """Shares of a ray at sub-pixel position phi among its v pixels, and with `sloping` their derivatives by phi."""
+@njit(**OPTIONS)
+def _turn(slope, share, change, inverse):
+    for j in range(len(slope)):
+        slope[j] = (slope[j] - share[j] * change[j]) * inverse[j]
+
+
+@njit(**OPTIONS)
+def shares(kind, v, alpha, phi, out, slope, scratch, sloping):
+    """Shares out (v, b) of rays at sub-pixel positions phi (b,), and with `sloping` their derivatives by phi.
+
+    scratch: (5, b).
+    """
     if v == 1:
         out[0] = 1.0
-        slope[0] = 0.0
-    elif kind == COSINE:  # cos(theta (k - r + q)) by addition from one sine and cosine
-        theta = 2.0 * math.pi / v
-        s, c = _sine_cosine(theta * (0.5 - phi))
-        each = 1.0 / v
-        for k in range(v):
-            out[k] = each + c * constants[k] - s * constants[v + k]
         if sloping:
-            for k in range(v):
-                slope[k] = theta * (s * constants[k] + c * constants[v + k])
-    else:
-        _gaussian(phi, v, alpha, constants, out, slope, sloping)
-
-
-@njit(**_OPTIONS)
-def table(kind, v, alpha):
-    """Constants of an axis: cos and sin of 2 pi (k - r) / v over v, or exp(-alpha v^2 / 4), exp(-alpha), exp(-2 alpha)."""
-    out = np.zeros(2 * v + 3)
+            slope[0] = 0.0
+        return
     if kind == COSINE:
+        _raised_cosine(phi, v, out, slope, scratch, sloping)
+        return
+    square = 0.25 * v * v
+    if alpha * square < SMALL:
         for k in range(v):
-            out[k] = math.cos(2.0 * math.pi * (k - (v - 1) // 2) / v) / v
-            out[v + k] = math.sin(2.0 * math.pi * (k - (v - 1) // 2) / v) / v
+            offset = k - (v - 1) // 2 + 0.5
+            if alpha * square < TINY:
+                _short_series(phi, offset, square, alpha, out[k])
+            else:
+                _series(phi, offset, square, alpha, out[k])
+            if sloping:
+                _series_slope(phi, offset, alpha, slope[k])
+    elif alpha <= MODERATE:
+        _recursion(phi, v, alpha, out, slope, scratch, sloping)
     else:
-        out[0], out[1], out[2] = math.exp(-0.25 * alpha * v * v), math.exp(-alpha), math.exp(-2.0 * alpha)
-    return out
+        _exponentials(phi, v, alpha, out, slope, sloping)
+    _normalise(v, out, slope, scratch, sloping)

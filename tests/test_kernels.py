@@ -1,0 +1,179 @@
+"""The fused CPU kernels against the plain-torch reference: every precision, filter, size, loss and odd case.
+
+Bounds.  float64: both sides round differently, some 1e-15 per operation, and a landing point 300 mm away is worth 1e-13 of a
+pixel, so values agree to 1e-12 and gradients to 1e-11 of their norm.  float32: the kernel computes in double precision from a
+float32 surface, so it is compared with the float64 reference of the same rounded surface, to 1e-5.
+"""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from caustic_cli.optics.bspline import SplineSpace
+from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.kernels import shares as kernel_shares
+from caustic_cli.optics.kernels.functions import PlaneKernel
+from caustic_cli.optics.reconstruction import Filter, splat
+from caustic_cli.optics.sampling import Sampler
+from caustic_cli.optics.tracing import PlaneTracer, trace_plane
+from caustic_cli.scene import Lens, PlaneWave, Scene, Screen
+
+FILTERS = [Filter(), *(Filter("cosine", (v, w)) for v, w in ((3, 3), (1, 5), (11, 3), (15, 15))),
+           *(Filter("gaussian", (v, w), (a, b)) for v, w, a, b in (
+               (3, 3, 0.0, 0.0), (3, 3, 2.6e-6, 1e-4), (3, 5, 0.01, 0.02), (11, 11, 0.03, 0.001), (5, 11, 0.3, 1.9),
+               (3, 3, 2.1, 30.0), (3, 7, 100.0, 700.0), (1, 3, 1.0, 1.0)))]
+SCREEN = Screen((6.0, 4.0), 40.0, (31, 20))
+
+
+def scene(fresnel: str = "exact", degree=(3, 2)) -> Scene:
+    return Scene(PlaneWave(), Lens(size=(4.0, 3.0), control=(12, 16), degree=degree, fresnel=fresnel), SCREEN)
+
+
+def heights(shape=(12, 16), rough: float = 0.02, seed: int = 0) -> torch.Tensor:
+    noise = torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return 5.0 + rough * noise
+
+
+def exposures(scene: Scene, z: torch.Tensor, filter: Filter, kind: str, dtype=torch.float64, rays: int = 1500):
+    """(image, leaving, lost) by kernel and by reference, differentiable, of the same rays."""
+    field = HeightField.of(scene.lens)
+    (sample,) = Sampler.of_size(kind, rays, seed=3).chunks()
+    tracer = PlaneTracer(scene, field, sample, dtype)
+    part = tracer.expose(z, scene.screen, filter)
+    yield part.image, part.leaving, {k: float(v.detach()) for k, v in part.lost.items()}
+    landing = tracer(z)
+    image, off = splat(landing.x, landing.y, landing.weight, scene.screen, filter)
+    lost = {k: float(v.detach()) for k, v in landing.lost.items()}
+    yield image, landing.leaving, {**lost, "off_screen": lost["off_screen"] + float(off.detach())}
+
+
+@pytest.mark.parametrize("kind", ["lines", "stratified"])
+@pytest.mark.parametrize("fresnel", ["none", "schlick", "exact"])
+@pytest.mark.parametrize("filter", FILTERS, ids=str)
+def test_value_and_gradient_in_float64(filter, fresnel, kind):
+    pull = torch.randn(SCREEN.resolution, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    results = []
+    z = heights().requires_grad_()
+    for image, leaving, lost in exposures(scene(fresnel), z, filter, kind):
+        value = (image * pull).sum() + 0.3 * leaving
+        gradient = torch.autograd.grad(value, z)[0] if value.requires_grad else torch.zeros_like(z)
+        results.append((image.detach(), float(leaving.detach()), lost, gradient))
+    (image, leaving, lost, gradient), (image_, leaving_, lost_, gradient_) = results
+    torch.testing.assert_close(image, image_, rtol=0, atol=1e-12 * float(image_.max()))
+    assert leaving == pytest.approx(leaving_, rel=1e-12)
+    assert lost == pytest.approx(lost_, abs=1e-13)
+    assert float((gradient - gradient_).norm()) <= 1e-11 * float(gradient_.norm()) + 1e-300
+
+
+@pytest.mark.parametrize("rough", [0.02, 0.5])
+@pytest.mark.parametrize("kind", ["lines", "stratified"])
+@pytest.mark.parametrize("filter", FILTERS[1:], ids=str)
+def test_forward_mode_is_the_transpose_of_reverse_mode(filter, kind, rough):
+    """<y, J v> = <J' y, v>; with rough 0.5 some rays are totally reflected and some miss the screen."""
+    field = HeightField.of(scene().lens)
+    (sample,) = Sampler.of_size(kind, 1500, seed=3).chunks()
+    tracer = PlaneTracer(scene(), field, sample, torch.float64)
+    z, v = heights(rough=rough), heights(seed=7) - 5.0
+    y = torch.randn(SCREEN.resolution, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    with torch.autograd.forward_ad.dual_level():
+        part = tracer.expose(torch.autograd.forward_ad.make_dual(z, v), SCREEN, filter)
+        image = torch.autograd.forward_ad.unpack_dual(part.image).tangent
+        leaving = torch.autograd.forward_ad.unpack_dual(part.leaving).tangent
+    forward = float((y * image).sum() + 0.3 * leaving)
+    z.requires_grad_()
+    part = tracer.expose(z, SCREEN, filter)
+    (gradient,) = torch.autograd.grad((y * part.image).sum() + 0.3 * part.leaving, z)
+    scale = float((y.abs() * image.abs()).sum() + 0.3 * leaving.abs())
+    assert scale > 1e-4
+    assert abs(forward - float((gradient * v).sum())) <= 1e-12 * scale
+
+
+@pytest.mark.parametrize("kind", ["lines", "stratified"])
+@pytest.mark.parametrize("filter", [f for f in FILTERS if f.reach != (0, 0)], ids=str)
+def test_float32_against_float64(filter, kind):
+    """Rounding slopes to float32 moves a ray by some 1e-6 pixels here: image and gradient within 1e-5 of their norm.
+
+    The gradient of a Gaussian much narrower than a pixel turns over within 1 / sqrt(alpha) of one: 1e-4 there.
+    """
+    bound, results = 1e-5 if max(filter.alpha) <= 2.0 else 1e-4, []
+    pull = torch.linspace(-1, 1, 31 * 20, dtype=torch.float64).view(31, 20) ** 2
+    for dtype in (torch.float32, torch.float64):
+        z = heights().requires_grad_()
+        image = next(exposures(scene(), z, filter, kind, dtype))[0]
+        results.append((image.detach(), torch.autograd.grad((image * pull).sum(), z)[0]))
+    for a, b in zip(*results, strict=True):
+        assert float((a - b).norm()) <= bound * float(b.norm())
+
+
+@pytest.mark.parametrize("height", [5.5, 8.0, 40.0])
+@pytest.mark.parametrize("rough", [0.0, 0.02, 0.3, 2.0])
+def test_hard_surfaces_are_finite_and_agree(rough, height):
+    """Flat, rough, mostly reflecting; the screen touching the surface: nothing but finite numbers, and the reference's."""
+    s = Scene(PlaneWave(), scene().lens, Screen((6.0, 4.0), height, (31, 20)))
+    z, results = heights(rough=rough).requires_grad_(), []
+    for image, leaving, lost in exposures(s, z, Filter("cosine", (3, 3)), "lines"):
+        (gradient,) = torch.autograd.grad(image.sum() + (image * image).sum() + leaving, z)
+        assert bool(torch.isfinite(image).all()) and bool(torch.isfinite(gradient).all())
+        assert float(image.detach().sum()) + sum(lost.values()) == pytest.approx(1.0, abs=1e-12)
+        results.append((image.detach(), gradient, lost))
+    torch.testing.assert_close(results[0][0], results[1][0], rtol=0, atol=1e-12)
+    assert float((results[0][1] - results[1][1]).norm()) <= 1e-10 * float(results[1][1].norm()) + 1e-15
+    assert results[0][2] == pytest.approx(results[1][2], abs=1e-13)
+
+
+def test_landing_on_borders():
+    """Rays a rounding error from a pixel's border, on the frame's border, and in the ghost pixels, by both paths."""
+    pixel = SCREEN.pixel[0]
+    for shift in (0.0, 1e-17, -1e-17, 1e-16, -1e-16, 0.5 * pixel, 1.5 * pixel, 3.0 - pixel, 3.0, 3.0 + pixel, -3.0, 3.2):
+        for filter in (Filter(), Filter("cosine", (3, 3)), Filter("gaussian", (5, 3), (0.3, 0.3))):
+            at = torch.tensor([0.5 + shift / 4.0, 0.5], dtype=torch.float64)
+            space = SplineSpace.uniform(4, 3)
+            share = torch.tensor(0.25, dtype=torch.float64)
+            kernel = PlaneKernel((space, space), (2.0, 1.5), at, at, True, share, torch.float64)
+            image, _, lost = kernel(torch.zeros(4, 4, dtype=torch.float64), 1.5, "none", 10.0, SCREEN, filter)
+            x, y = (2.0 * at - 1.0) * 2.0, (2.0 * at - 1.0) * 1.5
+            grid = [t.reshape(-1) for t in torch.meshgrid(x, y, indexing="ij")]
+            expected, off = splat(*grid, torch.full((4,), 0.25, dtype=torch.float64), SCREEN, filter)
+            torch.testing.assert_close(image, expected, rtol=0, atol=1e-14)
+            assert float(lost["off_screen"]) == pytest.approx(float(off), abs=1e-14)
+
+
+def test_points_on_knots_are_evaluated_in_the_right_span():
+    """Scattered rays exactly on knots, repeated ones too, and at both ends: the plain-torch surface, to rounding."""
+    knots = torch.tensor([0, 0, 0, 0, 0.25, 0.5, 0.5, 0.5, 0.75, 1, 1, 1, 1], dtype=torch.float64)
+    space = SplineSpace(3, knots)
+    u = torch.tensor([0.0, 0.25, 0.5, 0.75, 1.0, 0.5 - 1e-16, 0.1], dtype=torch.float64)
+    field = HeightField((space, space), (2.0, 2.0))
+    lens = Lens(size=(4.0, 4.0), control=(9, 9))
+    net = heights((9, 9), 0.05)
+    share = torch.full((7,), 1.0 / 7.0, dtype=torch.float64)
+    kernel = PlaneKernel(field.spaces, field.half_size, u, u.flip(0).contiguous(), False, share, torch.float64)
+    sample = next(Sampler("uniform", (7, 1)).chunks())
+    sample = type(sample)(u, u.flip(0).contiguous(), False, share)
+    landing = trace_plane(lens, field.prepare(sample, torch.float64), net - 5.0, 35.0, (2 * u - 1) * 2.0,
+                          (2 * u.flip(0) - 1) * 2.0, share, (7,))
+    expected, _ = splat(landing.x, landing.y, landing.weight, SCREEN, Filter("cosine", (5, 5)))
+    image, _, _ = kernel(net - 5.0, lens.index, "exact", 35.0, SCREEN, Filter("cosine", (5, 5)))
+    torch.testing.assert_close(image, expected, rtol=0, atol=1e-13)
+
+
+def test_the_number_of_blocks_changes_rounding_only():
+    """More threads than rows, one thread: sums in another order."""
+    before, images = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 64):
+            torch.set_num_threads(threads)
+            images.append(next(exposures(scene(), heights(), Filter("cosine", (3, 3)), "lines", rays=900))[0])
+    finally:
+        torch.set_num_threads(before)
+    torch.testing.assert_close(images[0], images[1], rtol=0, atol=1e-15)
+    torch.testing.assert_close(images[0], images[2], rtol=0, atol=1e-15)
+
+
+def test_series_and_recursion_meet():
+    """On either side of the borders between formulas the shares are the same function."""
+    for border in (4 * kernel_shares.TINY / 9, 4 * kernel_shares.SMALL / 9, kernel_shares.MODERATE):
+        a, b = (next(exposures(scene(), heights(), Filter("gaussian", (3, 3), (alpha, alpha)), "lines"))[0]
+                for alpha in (border * (1 - 1e-12), border * (1 + 1e-12)))
+        torch.testing.assert_close(a, b, rtol=0, atol=1e-12)
