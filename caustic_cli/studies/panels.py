@@ -44,7 +44,7 @@ def write_report(path: Path, target: np.ndarray, image: np.ndarray, heights: np.
     for stage in np.unique(history[:, 1]):
         rows = history[history[:, 1] == stage]
         last.semilogy(rows[:, 4], rows[:, 2] * target.size, lw=1.5)
-    last.set(title="loss of each stage (its own blur) against time", xlabel="s", ylabel="relative RMS")
+    last.set(title="loss of each stage against time", xlabel="s", ylabel="relative RMS")
     last.grid(alpha=0.3, which="both")
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", dpi=100, metadata={"Software": SOFTWARE})

@@ -140,7 +140,7 @@ def _scatter(vectors, share, real, whole, sx, sy, image, ledger, column):
         if not (x >= low_x and x < high_x and y >= low_y and y < high_y and height > sag[j]):  # False for NaN too
             lost_off += weight
             continue
-        i0, j0 = int(math.floor(x)) + rx, int(math.floor(y)) + ry
+        i0, j0 = math.floor(x) + rx, math.floor(y) + ry
         if vx == 3 and vy == 3:
             b0, b1, b2 = sy[0, j], sy[1, j], sy[2, j]
             for a in range(3):
@@ -174,7 +174,7 @@ def _gather(vectors, real, whole, sx, sy, dx, dy, grad, grad_leaving, column, ti
         value, along_x, along_y = grad_leaving, 0.0, 0.0
         x, y = px[j], py[j]
         if weight >= 0.0 and x >= low_x and x < high_x and y >= low_y and y < high_y and height > sag[j]:
-            i0, j0 = int(math.floor(x)) + rx, int(math.floor(y)) + ry
+            i0, j0 = math.floor(x) + rx, math.floor(y) + ry
             if vx == 3 and vy == 3:
                 b0, b1, b2, d0, d1, d2 = sy[0, j], sy[1, j], sy[2, j], dy[0, j], dy[1, j], dy[2, j]
                 for a in range(3):
@@ -266,7 +266,7 @@ def _scatter_tangent(vectors, real, whole, sx, sy, dx, dy, image):
         x, y = v[PX, j], v[PY, j]
         if not (x >= low_x and x < high_x and y >= low_y and y < high_y and height > v[SAG, j]):
             continue
-        i0, j0 = int(math.floor(x)) + rx, int(math.floor(y)) + ry
+        i0, j0 = math.floor(x) + rx, math.floor(y) + ry
         move_x, move_y = weight * v[BY_PX, j], weight * v[BY_PY, j]
         for a in range(vx):
             along, across = change * sx[a, j] + move_x * dx[a, j], move_y * sx[a, j]
