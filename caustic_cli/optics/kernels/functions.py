@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.kernels import blocks, plane, shares, spline
+from caustic_cli.optics.kernels import bend, blocks, plane, shares, spline
 from caustic_cli.optics.reconstruction import Filter, padding
 from caustic_cli.scene import Screen
 
-_FRESNEL = {"none": plane.NONE, "schlick": plane.SCHLICK, "exact": plane.EXACT}
+_FRESNEL = {"none": bend.NONE, "schlick": bend.SCHLICK, "exact": bend.EXACT}
 _KIND = {"bincount": shares.BINCOUNT, "gaussian": shares.GAUSSIAN, "cosine": shares.COSINE}
 
 

@@ -4,15 +4,9 @@ The function of `tracing.trace_plane` followed by `reconstruction.splat`, a row 
 between rows; both are the reference it is tested against.  Storage is float32 or float64, everything past the surface
 float64.
 
-Notation, a ray with slopes g = (z_x, z_y) at the exit surface, a = |g|^2, index n
-    s       sqrt(1 - (n^2 - 1) a), cosine of refraction times |N|
-    m       (n - s) / (n a + s), so that the ray lands at x + h m g with h the height of the screen above the surface
-    R       reflectance of the exit surface
-    p       landing point in pixels from the frame's low edge; phi its fractional part
-
 Each of a fixed number of blocks of rows has an image of its own and they are added in order, so the result does not depend
-on timing, only on the number of blocks (the number of threads).  Loops write one array each, so that they become vector
-instructions; only the scatter and the gather of pixels go ray by ray.
+on timing, only on the number of blocks (the number of threads).  Only the scatter and the gather of pixels go ray by ray; the
+rest (`bend`, `shares`) goes a row at a time in vector instructions.
 """
 
 from __future__ import annotations
@@ -22,99 +16,52 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from caustic_cli.optics.kernels.bend import (
+    BY_POWER,
+    BY_PX,
+    BY_PY,
+    GX,
+    GY,
+    PHI,
+    POWER,
+    PX,
+    PY,
+    REACH,
+    SAG,
+    SCRATCH,
+    T_GX,
+    T_GY,
+    T_POWER,
+    T_SAG,
+    VECTORS,
+    entrance,
+    fraction,
+    landing,
+    powers,
+    pull,
+    push,
+    reach,
+)
 from caustic_cli.optics.kernels.shares import OPTIONS, shares
 
-NONE, SCHLICK, EXACT = 0, 1, 2
-CRITICAL = 1e-16  # see interface.CRITICAL
 FRESNEL, REFLECTED, OFF_SCREEN, LEAVING = 0, 1, 2, 3  # columns of the ledger
-# Rows of a block's scratch of vectors: the surface, powers, landing points, derivatives; five more for `shares`.
-SAG, GX, GY, POWER, PX, PY, PHI, BY_POWER, BY_PX, BY_PY, BY_A, T_SAG, T_GX, T_GY, T_POWER, REACH, VECTORS = range(17)
-SCRATCH = 5
-
-
-@njit(inline="always", **OPTIONS)
-def _s(a, n):
-    """s, or 1 beyond the critical angle; and whether the ray passes."""
-    radicand = 1.0 - (n * n - 1.0) * a
-    passes = radicand > CRITICAL * (1.0 + a)
-    return math.sqrt(radicand if passes else 1.0), passes
-
-
-@njit(inline="always", **OPTIONS)
-def _m(a, n):
-    """m and dm/da."""
-    s, _ = _s(a, n)
-    under = 1.0 / (n * a + s)
-    m = (n - s) * under
-    ds = -0.5 * (n * n - 1.0) / s
-    return m, -(ds + m * (n + ds)) * under
-
-
-@njit(inline="always", **OPTIONS)
-def _reflected(fresnel, a, n):
-    """R and dR/da."""
-    s, _ = _s(a, n)
-    ds = -0.5 * (n * n - 1.0) / s
-    if fresnel == EXACT:
-        us, up = 1.0 / (n + s), 1.0 / (1.0 + n * s)
-        rs, rp = (n - s) * us, (1.0 - n * s) * up
-        return 0.5 * (rs * rs + rp * rp), -2.0 * n * (rs * us * us + rp * up * up) * ds
-    if fresnel == SCHLICK:
-        r0 = (n - 1.0) * (n - 1.0) / ((n + 1.0) * (n + 1.0))
-        inverse = 1.0 / math.sqrt(1.0 + a)
-        x = 1.0 - s * inverse
-        x4 = x * x * x * x
-        return r0 + (1.0 - r0) * x4 * x, -5.0 * (1.0 - r0) * x4 * (ds - 0.5 * s / (1.0 + a)) * inverse
-    return 0.0, 0.0
-
-
-@njit(**OPTIONS)
-def _powers(fresnel, gx, gy, share, n, inside, out):
-    """Power of each ray behind the lens; -1 where it is totally reflected."""
-    for j in range(len(out)):
-        a = gx[j] * gx[j] + gy[j] * gy[j]
-        _, passes = _s(a, n)
-        reflected, _ = _reflected(fresnel, a, n)
-        out[j] = share[j] * inside * (1.0 - reflected) if passes else -1.0
-
-
-@njit(**OPTIONS)
-def _reach(sag, gx, gy, n, height, out):
-    """h m: how far a ray of unit slope is carried, mm."""
-    for j in range(len(out)):
-        m, _ = _m(gx[j] * gx[j] + gy[j] * gy[j], n)
-        out[j] = (height - sag[j]) * m
-
-
-@njit(**OPTIONS)
-def _landing(reach, slope, x, half, pixel, out):
-    """Landing points in pixels along the axis of `slope`."""
-    inverse = 1.0 / pixel
-    for j in range(len(out)):
-        out[j] = (x[j] + reach[j] * slope[j] + half) * inverse
-
-
-@njit(**OPTIONS)
-def _fraction(p, out):
-    for j in range(len(out)):
-        out[j] = p[j] - math.floor(p[j])
 
 
 @njit(**OPTIONS)
 def _aim(vectors, x, y, share, real, whole, sx, sy, dx, dy, sloping):
     """Powers, landing points and shares of one row, from its surface in `vectors`."""
     n, height, fresnel, kind = real[0], real[1], whole[0], whole[3]
-    inside = 1.0 - _entrance(fresnel, n)
+    inside = 1.0 - entrance(fresnel, n)
     v, scratch = vectors, vectors[VECTORS:]
-    _powers(fresnel, v[GX], v[GY], share, n, inside, v[POWER])
-    _reach(v[SAG], v[GX], v[GY], n, height, v[REACH])
-    _landing(v[REACH], v[GX], x, real[2], real[4], v[PX])
-    _landing(v[REACH], v[GY], y, real[3], real[5], v[PY])
+    powers(fresnel, v[GX], v[GY], share, n, inside, v[POWER])
+    reach(v[SAG], v[GX], v[GY], n, height, v[REACH])
+    landing(v[REACH], v[GX], x, real[2], real[4], v[PX])
+    landing(v[REACH], v[GY], y, real[3], real[5], v[PY])
     if whole[4] > 1:
-        _fraction(v[PX], v[PHI])
+        fraction(v[PX], v[PHI])
     shares(kind, whole[4], real[6], v[PHI], sx, dx, scratch, sloping)
     if whole[5] > 1:
-        _fraction(v[PY], v[PHI])
+        fraction(v[PY], v[PHI])
     shares(kind, whole[5], real[7], v[PHI], sy, dy, scratch, sloping)
 
 
@@ -122,7 +69,7 @@ def _aim(vectors, x, y, share, real, whole, sx, sy, dx, dy, sloping):
 def _scatter(vectors, share, real, whole, sx, sy, image, ledger, column):
     """Add one row's rays to the padded image and the ledger.  column: (longest v,) scratch."""
     # Everything the loop needs is a local: after a store to the image the compiler would have to read an array again.
-    entrance, vx, vy, height = _entrance(whole[0], real[0]), whole[4], whole[5], real[1]
+    lost_before, vx, vy, height = entrance(whole[0], real[0]), whole[4], whole[5], real[1]
     rx, ry = (vx - 1) // 2, (vy - 1) // 2
     low_x, low_y, high_x, high_y = float(-rx), float(-ry), float(whole[1] + rx), float(whole[2] + ry)
     sag, power, px, py = vectors[SAG], vectors[POWER], vectors[PX], vectors[PY]
@@ -130,7 +77,7 @@ def _scatter(vectors, share, real, whole, sx, sy, image, ledger, column):
     for j in range(len(power)):
         emitted, weight = share[j], power[j]
         if weight < 0.0:
-            inside = emitted * (1.0 - entrance)
+            inside = emitted * (1.0 - lost_before)
             lost_fresnel += emitted - inside
             lost_reflected += inside
             continue
@@ -196,59 +143,6 @@ def _gather(vectors, real, whole, sx, sy, dx, dy, grad, grad_leaving, column, ti
                     along_x += dx[a, j] * along
                     along_y += sx[a, j] * across
         by_power[j], by_px[j], by_py[j] = value, along_x * weight * scale_x, along_y * weight * scale_y
-
-
-@njit(**OPTIONS)
-def _by_a(fresnel, sag, gx, gy, share, by_power, by_px, by_py, n, height, inside, out):
-    """Derivative by a = |g|^2, by way of the landing point and of the reflectance; 0 where totally reflected."""
-    for j in range(len(out)):
-        a = gx[j] * gx[j] + gy[j] * gy[j]
-        _, passes = _s(a, n)
-        _, dm = _m(a, n)
-        _, dr = _reflected(fresnel, a, n)
-        value = (height - sag[j]) * dm * (by_px[j] * gx[j] + by_py[j] * gy[j]) - by_power[j] * share[j] * inside * dr
-        out[j] = value if passes else 0.0
-
-
-@njit(**OPTIONS)
-def _by_slope(reach, slope, by_p, by_a, out):
-    for j in range(len(out)):
-        out[j] = reach[j] * by_p[j] + 2.0 * slope[j] * by_a[j]
-
-
-@njit(**OPTIONS)
-def _by_sag(reach, sag, gx, gy, by_px, by_py, height, out):
-    for j in range(len(out)):  # reach / h = m; nothing lands where h is not positive
-        h = height - sag[j]
-        out[j] = -reach[j] / (h if h > 0.0 else 1.0) * (by_px[j] * gx[j] + by_py[j] * gy[j])
-
-
-@njit(**OPTIONS)
-def _pull(vectors, share, real, whole):
-    """Derivatives by the surface, left in T_SAG, T_GX, T_GY, from those by power and pixel coordinates."""
-    n, height, v = real[0], real[1], vectors
-    inside = 1.0 - _entrance(whole[0], n)
-    _by_a(whole[0], v[SAG], v[GX], v[GY], share, v[BY_POWER], v[BY_PX], v[BY_PY], n, height, inside, v[BY_A])
-    _by_slope(v[REACH], v[GX], v[BY_PX], v[BY_A], v[T_GX])
-    _by_slope(v[REACH], v[GY], v[BY_PY], v[BY_A], v[T_GY])
-    _by_sag(v[REACH], v[SAG], v[GX], v[GY], v[BY_PX], v[BY_PY], height, v[T_SAG])
-
-
-@njit(**OPTIONS)
-def _push(vectors, share, real, whole):
-    """Tangents of power and pixel coordinates, left in T_POWER, BY_PX, BY_PY, along T_SAG, T_GX, T_GY."""
-    n, height, v = real[0], real[1], vectors
-    inside = 1.0 - _entrance(whole[0], n)
-    for j in range(v.shape[1]):
-        gx, gy, tx, ty = v[GX, j], v[GY, j], v[T_GX, j], v[T_GY, j]
-        a, da = gx * gx + gy * gy, 2.0 * (gx * tx + gy * ty)
-        m, dm = _m(a, n)
-        _, dr = _reflected(whole[0], a, n)
-        h = height - v[SAG, j]
-        change = -v[T_SAG, j] * m + h * dm * da
-        v[T_POWER, j] = -share[j] * inside * dr * da
-        v[BY_PX, j] = (change * gx + h * m * tx) / real[4]
-        v[BY_PY, j] = (change * gy + h * m * ty) / real[5]
 
 
 @njit(**OPTIONS)
@@ -318,12 +212,6 @@ def _spread(i, first, bu, du, by_sag, by_gx, by_gy, nets, apart):
         _add(bu[i, a], by_gy, nets[2, first[i] + a])
 
 
-@njit(**OPTIONS)
-def _entrance(fresnel, n):
-    """Reflectance of the flat entrance at normal incidence."""
-    return 0.0 if fresnel == NONE else (n - 1.0) * (n - 1.0) / ((n + 1.0) * (n + 1.0))
-
-
 @njit(parallel=True, **OPTIONS)
 def _total(images):
     """Sum over blocks, in order, into the first."""
@@ -380,7 +268,7 @@ def backward(grad, grad_leaving, apart, first, bu, du, net, net_x, net_y, x, y, 
             _combine(i, first, bu, du, net, net_x, net_y, v[SAG], v[GX], v[GY])
             _aim(v, x[i], y[i], share[i], real, whole, sx, sy, dx, dy, True)
             _gather(v, real, whole, sx, sy, dx, dy, grad, grad_leaving, column, tilt)
-            _pull(v, share[i], real, whole)
+            pull(v, share[i], real, whole)
             _spread(i, first, bu, du, v[T_SAG], v[T_GX], v[T_GY], nets[:, np.int64(0) if apart else np.int64(block)],
                     apart)
     return _total(nets[0]), _total(nets[1]), _total(nets[2])
@@ -400,6 +288,6 @@ def tangent(t_net, t_net_x, t_net_y, first, bu, du, net, net_x, net_y, x, y, sha
             _combine(i, first, bu, du, net, net_x, net_y, v[SAG], v[GX], v[GY])
             _combine(i, first, bu, du, t_net, t_net_x, t_net_y, v[T_SAG], v[T_GX], v[T_GY])
             _aim(v, x[i], y[i], share[i], real, whole, sx, sy, dx, dy, True)
-            _push(v, share[i], real, whole)
+            push(v, share[i], real, whole)
             leaving[block] += _scatter_tangent(v, real, whole, sx, sy, dx, dy, images[block])
     return _total(images), leaving.sum()

@@ -1,0 +1,151 @@
+"""A row of rays refracted at the exit surface and carried to the screen, with derivatives, for the CPU kernels.
+
+Every loop writes one array from a few others, which is what lets the compiler turn it into vector instructions.  Numba caches
+the kernels of `plane` by that file's time stamp alone: after editing here, touch plane.py.
+
+Notation, a ray with slopes g = (z_x, z_y) at the exit surface, a = |g|^2, index n
+    s       sqrt(1 - (n^2 - 1) a), cosine of refraction times |N|
+    m       (n - s) / (n a + s), so that the ray lands at x + h m g with h the height of the screen above the surface
+    R       reflectance of the exit surface
+"""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+from caustic_cli.optics.kernels.shares import OPTIONS
+
+NONE, SCHLICK, EXACT = 0, 1, 2
+CRITICAL = 1e-16  # see interface.CRITICAL
+# Rows of a block's scratch of vectors: the surface, powers, landing points, derivatives; five more for `shares`.
+SAG, GX, GY, POWER, PX, PY, PHI, BY_POWER, BY_PX, BY_PY, BY_A, T_SAG, T_GX, T_GY, T_POWER, REACH, VECTORS = range(17)
+SCRATCH = 5
+
+
+@njit(**OPTIONS)
+def entrance(fresnel, n):
+    """Reflectance of the flat entrance at normal incidence."""
+    return 0.0 if fresnel == NONE else (n - 1.0) * (n - 1.0) / ((n + 1.0) * (n + 1.0))
+
+
+@njit(inline="always", **OPTIONS)
+def _s(a, n):
+    """s, or 1 beyond the critical angle; and whether the ray passes."""
+    radicand = 1.0 - (n * n - 1.0) * a
+    passes = radicand > CRITICAL * (1.0 + a)
+    return math.sqrt(radicand if passes else 1.0), passes
+
+
+@njit(inline="always", **OPTIONS)
+def _m(a, n):
+    """m and dm/da."""
+    s, _ = _s(a, n)
+    under = 1.0 / (n * a + s)
+    m = (n - s) * under
+    ds = -0.5 * (n * n - 1.0) / s
+    return m, -(ds + m * (n + ds)) * under
+
+
+@njit(inline="always", **OPTIONS)
+def _reflected(fresnel, a, n):
+    """R and dR/da."""
+    s, _ = _s(a, n)
+    ds = -0.5 * (n * n - 1.0) / s
+    if fresnel == EXACT:
+        us, up = 1.0 / (n + s), 1.0 / (1.0 + n * s)
+        rs, rp = (n - s) * us, (1.0 - n * s) * up
+        return 0.5 * (rs * rs + rp * rp), -2.0 * n * (rs * us * us + rp * up * up) * ds
+    if fresnel == SCHLICK:
+        r0 = (n - 1.0) * (n - 1.0) / ((n + 1.0) * (n + 1.0))
+        inverse = 1.0 / math.sqrt(1.0 + a)
+        x = 1.0 - s * inverse
+        x4 = x * x * x * x
+        return r0 + (1.0 - r0) * x4 * x, -5.0 * (1.0 - r0) * x4 * (ds - 0.5 * s / (1.0 + a)) * inverse
+    return 0.0, 0.0
+
+
+@njit(**OPTIONS)
+def powers(fresnel, gx, gy, share, n, inside, out):
+    """Power of each ray behind the lens; -1 where it is totally reflected."""
+    for j in range(len(out)):
+        a = gx[j] * gx[j] + gy[j] * gy[j]
+        _, passes = _s(a, n)
+        reflected, _ = _reflected(fresnel, a, n)
+        out[j] = share[j] * inside * (1.0 - reflected) if passes else -1.0
+
+
+@njit(**OPTIONS)
+def reach(sag, gx, gy, n, height, out):
+    """h m: how far a ray of unit slope is carried, mm."""
+    for j in range(len(out)):
+        m, _ = _m(gx[j] * gx[j] + gy[j] * gy[j], n)
+        out[j] = (height - sag[j]) * m
+
+
+@njit(**OPTIONS)
+def landing(reach, slope, x, half, pixel, out):
+    """Landing points in pixels along the axis of `slope`."""
+    inverse = 1.0 / pixel
+    for j in range(len(out)):
+        out[j] = (x[j] + reach[j] * slope[j] + half) * inverse
+
+
+@njit(**OPTIONS)
+def fraction(p, out):
+    for j in range(len(out)):
+        out[j] = p[j] - math.floor(p[j])
+
+
+@njit(**OPTIONS)
+def _by_a(fresnel, sag, gx, gy, share, by_power, by_px, by_py, n, height, inside, out):
+    """Derivative by a = |g|^2, by way of the landing point and of the reflectance; 0 where totally reflected."""
+    for j in range(len(out)):
+        a = gx[j] * gx[j] + gy[j] * gy[j]
+        _, passes = _s(a, n)
+        _, dm = _m(a, n)
+        _, dr = _reflected(fresnel, a, n)
+        value = (height - sag[j]) * dm * (by_px[j] * gx[j] + by_py[j] * gy[j]) - by_power[j] * share[j] * inside * dr
+        out[j] = value if passes else 0.0
+
+
+@njit(**OPTIONS)
+def _by_slope(reach, slope, by_p, by_a, out):
+    for j in range(len(out)):
+        out[j] = reach[j] * by_p[j] + 2.0 * slope[j] * by_a[j]
+
+
+@njit(**OPTIONS)
+def _by_sag(reach, sag, gx, gy, by_px, by_py, height, out):
+    for j in range(len(out)):  # reach / h = m; nothing lands where h is not positive
+        h = height - sag[j]
+        out[j] = -reach[j] / (h if h > 0.0 else 1.0) * (by_px[j] * gx[j] + by_py[j] * gy[j])
+
+
+@njit(**OPTIONS)
+def pull(vectors, share, real, whole):
+    """Derivatives by the surface, left in T_SAG, T_GX, T_GY, from those by power and pixel coordinates."""
+    n, height, v = real[0], real[1], vectors
+    inside = 1.0 - entrance(whole[0], n)
+    _by_a(whole[0], v[SAG], v[GX], v[GY], share, v[BY_POWER], v[BY_PX], v[BY_PY], n, height, inside, v[BY_A])
+    _by_slope(v[REACH], v[GX], v[BY_PX], v[BY_A], v[T_GX])
+    _by_slope(v[REACH], v[GY], v[BY_PY], v[BY_A], v[T_GY])
+    _by_sag(v[REACH], v[SAG], v[GX], v[GY], v[BY_PX], v[BY_PY], height, v[T_SAG])
+
+
+@njit(**OPTIONS)
+def push(vectors, share, real, whole):
+    """Tangents of power and pixel coordinates, left in T_POWER, BY_PX, BY_PY, along T_SAG, T_GX, T_GY."""
+    n, height, v = real[0], real[1], vectors
+    inside = 1.0 - entrance(whole[0], n)
+    for j in range(v.shape[1]):
+        gx, gy, tx, ty = v[GX, j], v[GY, j], v[T_GX, j], v[T_GY, j]
+        a, da = gx * gx + gy * gy, 2.0 * (gx * tx + gy * ty)
+        m, dm = _m(a, n)
+        _, dr = _reflected(whole[0], a, n)
+        h = height - v[SAG, j]
+        change = -v[T_SAG, j] * m + h * dm * da
+        v[T_POWER, j] = -share[j] * inside * dr * da
+        v[BY_PX, j] = (change * gx + h * m * tx) / real[4]
+        v[BY_PY, j] = (change * gy + h * m * ty) / real[5]
