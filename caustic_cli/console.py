@@ -39,7 +39,7 @@ class Reporter:
         self.console.print(table)
 
     @contextmanager
-    def patience(self, text: str, seconds: float = 1.5):
+    def patience(self, text: str, seconds: float = 4.0):
         """Say `text` if the block is still at work after so many seconds."""
         timer = threading.Timer(seconds, self.say, (text,))
         timer.daemon = True
