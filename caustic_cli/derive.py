@@ -110,6 +110,9 @@ def _complete_design(s: Settings, quality: str | None, rays: int | None) -> None
         stages = [Stage(tuple(lens["control"]), rays, apron=math.ceil(0.04 * max(nx, ny)),
                         iterations=SINGLE_STAGE_ITERATIONS, tolerance=2e-3 if plain else 0.0)]
     design["stages"] = [_stage_table(stage) for stage in stages]
+    if design["loss"] == "rms":  # eq. 5.2.1 knows the screen alone
+        for table in design["stages"]:
+            table["apron"] = 0
 
 
 def _stage_table(stage: Stage) -> dict[str, Any]:

@@ -67,7 +67,7 @@ class PlaneKernel:
             x, y, share = u.view(shape), v.view(shape), share.view(shape) if share.ndim else share
         self.shape = shape
         coordinates = ((2.0 * x - 1.0) * rx, (2.0 * y - 1.0) * ry, share)
-        self.rays = tuple(np.broadcast_to(t.to(dtype).numpy(), shape) for t in coordinates)
+        self.rays = tuple(_strided(np.broadcast_to(t.to(dtype).numpy(), shape)) for t in coordinates)
         self.rows = (self.first.numpy(), self.bu.numpy(), self.du.numpy())
 
     def __call__(self, sag: Tensor, index: float, fresnel: str, height: float, screen: Screen,
@@ -93,13 +93,23 @@ class PlaneKernel:
                                 "off_screen": ledger[plane.OFF_SCREEN] + padding(padded.detach(), filter.reach)}
 
 
+def _strided(array: np.ndarray) -> np.ndarray:
+    """The same values read-only and not contiguous: tensor and scattered rays then share one compiled kernel."""
+    if array.flags.c_contiguous:
+        wide = np.empty((array.shape[0], array.shape[1] + 1), array.dtype)
+        wide[:, :-1] = array
+        array = np.broadcast_to(wide[:, :-1], array.shape)
+    return array
+
+
 def compile_kernels(*dtypes: torch.dtype) -> None:
     """Have the kernels ready for rays of these precisions: from numba's cache, or compiled for this machine."""
-    space, at = SplineSpace.uniform(4, 3), torch.tensor([0.25, 0.75], dtype=torch.float64)
+    space, at = SplineSpace.uniform(4, 3), torch.linspace(0.0, 1.0, 2 * ROW, dtype=torch.float64)
     share, screen = torch.tensor(0.25, dtype=torch.float64), Screen((10.0, 10.0), 10.0, (4, 4))
     for dtype in dtypes:
         for tensor in (True, False):
-            kernel = PlaneKernel((space, space), (1.0, 1.0), at, at, tensor, share, dtype)
+            points = at[:2] if tensor else at
+            kernel = PlaneKernel((space, space), (1.0, 1.0), points, points, tensor, share, dtype)
             sag = torch.zeros(4, 4, dtype=dtype, requires_grad=True)
             kernel(sag, 1.5, "exact", 10.0, screen, Filter("cosine", (3, 3)))[0].sum().backward()
 
