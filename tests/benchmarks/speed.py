@@ -175,20 +175,32 @@ def plot(results: dict, path: Path) -> None:
     """Each scaling on logarithmic axes."""
     from matplotlib.figure import Figure  # noqa: PLC0415
 
-    figure = Figure(figsize=(12, 6.5), layout="constrained")
-    for axes, name in zip(figure.subplots(2, 3).flat, ("rays", "control", "degree", "pixels", "filter", "memory"), strict=True):
+    figure = Figure(figsize=(15, 6.5), layout="constrained")
+    panels = dict(zip(("against_torch", "rays", "control", "degree", "pixels", "filter", "threads", "memory"),
+                      figure.subplots(2, 4).flat, strict=True))
+    for name, axes in panels.items():
         rows = results[name]
-        if name == "memory":
+        if name == "against_torch":
+            places = range(len(rows))
+            axes.bar([p - 0.2 for p in places], [r["torch_whole_ms"] for r in rows], 0.4, label="plain torch")
+            axes.bar([p + 0.2 for p in places], [r["fused_whole_ms"] for r in rows], 0.4, label="fused")
+            axes.set(yscale="log", ylabel="ms per iteration")
+            axes.set_xticks(list(places), [f"{r['filter']}\nalpha {r['alpha_per_pixel2']:.1g}" for r in rows], fontsize=7)
+            axes.legend()
+        elif name == "memory":
             for what in ("render", "gradient"):
                 mine = [r for r in rows if r["what"] == what]
                 axes.semilogx([r["rays"] for r in mine], [r["peak_MiB"] for r in mine], "o-", label=what)
             axes.set(xlabel="rays", ylabel="peak memory (MiB)", ylim=(0, None))
             axes.legend()
         else:
-            (axes.loglog if name in ("rays", "control", "pixels") else axes.plot)(
-                [r[name] for r in rows], [r["ms"] for r in rows], "o-")
+            axes.plot([r[name] for r in rows], [r["ms"] for r in rows], "o-")
+            if name == "rays":
+                axes.set(xscale="log", yscale="log")
+            else:
+                axes.set_ylim(0, None)
             axes.set(xlabel=name, ylabel="ms per iteration")
-        axes.grid(alpha=0.3, which="both")
+        axes.grid(alpha=0.3)
     figure.savefig(path, dpi=90, metadata={"Software": None})
 
 
