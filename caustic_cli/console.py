@@ -11,7 +11,7 @@ import threading
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 
@@ -50,10 +50,10 @@ class Reporter:
             timer.cancel()
 
     @contextmanager
-    def progress(self, total: int | None, columns: str = ""):
-        """A progress bar on a terminal, nothing elsewhere; `columns` shows the task's field `text`."""
-        bar = Progress(TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"),
-                       TextColumn(columns or "{task.fields[text]}"), TimeElapsedColumn(), TextColumn("left"),
+    def progress(self, total: int | None):
+        """A progress bar on a terminal, nothing elsewhere; `total` may become known later."""
+        bar = Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
+                       TextColumn("{task.fields[text]}"), TimeElapsedColumn(), TextColumn("left"),
                        TimeRemainingColumn(), console=self.console, transient=True,
                        disable=not self.console.is_terminal or self.console.quiet)
         with bar:

@@ -16,7 +16,7 @@ import pytest
 import typer
 from PIL import Image
 
-from caustic_cli import __version__, cli, session
+from caustic_cli import __version__, cli, console, session
 
 COMMANDS = ("design", "render", "gradmap", "export", "convergence")
 SHARED_KEYS = {"loss", "relative_rms", "psnr_db", "ssim", "on_screen", "on_target", "lost", "rays", "iterations", "seconds",
@@ -365,3 +365,16 @@ def test_results_into_a_closed_pipe(here):
     program = (f"{shlex.quote(sys.executable)} -m caustic_cli render blob.caustic --rays 1000 --json --quiet; echo $? >&2")
     done = subprocess.run(["bash", "-c", f"({program}) | true"], capture_output=True, text=True, env=ENVIRONMENT, check=False)
     assert done.stderr == "0\n"
+
+
+@pytest.mark.parametrize("total", [None, 30])
+def test_the_progress_bar_draws_on_a_terminal(total, monkeypatch, capfd):
+    """Also while its total is not known yet, as a study's is not at first."""
+    monkeypatch.setenv("TTY_COMPATIBLE", "1")
+    monkeypatch.setenv("TERM", "xterm")
+    reporter = console.Reporter()
+    reporter.console._force_terminal = True
+    with reporter.progress(total) as show:
+        reporter.console.print("", end="")
+        show("stage 1/2", "loss 0.5", 10, 30)
+    assert "10/30" in capfd.readouterr().err
