@@ -19,8 +19,10 @@ from caustic_cli.optics.kernels.shares import OPTIONS
 
 NONE, SCHLICK, EXACT = 0, 1, 2
 CRITICAL = 1e-16  # see interface.CRITICAL
-# Rows of a block's scratch of vectors: the surface, powers, landing points, derivatives; five more for `shares`.
-SAG, GX, GY, POWER, PX, PY, PHI, BY_POWER, BY_PX, BY_PY, BY_A, T_SAG, T_GX, T_GY, T_POWER, REACH, VECTORS = range(17)
+# Rows of a block's scratch of vectors: the surface, powers, landing points, derivatives, what turns the results of `shares`
+# into shares; five more for its own use.
+SAG, GX, GY, POWER, PX, PY, PHI, BY_POWER, BY_PX, BY_PY, BY_A, T_SAG, T_GX, T_GY, T_POWER, REACH = range(16)
+OVER_X, OVER_Y, LEAN_X, LEAN_Y, VECTORS = range(16, 21)
 SCRATCH = 5
 
 

@@ -25,6 +25,19 @@ def _blocks() -> int:
     return count
 
 
+class _Workspace:
+    """Arrays that the kernels overwrite, kept from one call to the next."""
+
+    def __init__(self):
+        self.arrays: dict[str, np.ndarray] = {}
+
+    def __call__(self, name: str, *shape: int) -> np.ndarray:
+        array = self.arrays.get(name)
+        if array is None or array.shape != shape:
+            array = self.arrays[name] = np.zeros(shape)
+        return array
+
+
 #: Scattered rays are handed to the kernel in rows of so many.
 ROW = 1024
 
@@ -37,13 +50,15 @@ class PlaneKernel:
         u, v: the rays' parameters; with `tensor` all pairs of them, else pairwise.
         share: part of the source's power per ray, scalar or of the rays' shape.
         dtype: of everything stored.
-        like: the kernel of another sample, whose basis values along v serve again where v is the same tensor.
+        like: the kernel of another sample, whose basis values along v serve again where v is the same tensor, and whose
+            workspace serves both.
     """
 
     def __init__(self, spaces, half_size, u: Tensor, v: Tensor, tensor: bool, share: Tensor, dtype: torch.dtype,
                  like: PlaneKernel | None = None):
         (su, sv), (rx, ry) = spaces, half_size
         self.dtype, self.tensor, self.v = dtype, tensor, v
+        self.workspace = _Workspace() if like is None else like.workspace
         if tensor:
             self.first, bu = su.basis(u)
             du = su.basis(u, 1)[1] / (2.0 * rx)
@@ -85,8 +100,8 @@ class PlaneKernel:
         size = tuple(2 * r + 1 for r in filter.reach)
         real = (index, height, *screen.half_size, *screen.pixel, *filter.alpha)
         whole = (_FRESNEL[fresnel], *screen.resolution, _KIND[filter.kind], *size)
-        arguments = (*self.rays, np.array(real, np.float64), np.array(whole, np.int64), _blocks())
-        padded, leaving, ledger = _PlaneImage.apply(*nets, self.rows, not self.tensor, arguments)
+        arguments = (*self.rays, np.array(real, np.float64), np.array(whole, np.int64))
+        padded, leaving, ledger = _PlaneImage.apply(*nets, self.rows, not self.tensor, arguments, self.workspace)
         (nx, ny), (rx, ry) = screen.resolution, filter.reach
         image = padded[2 * rx : 2 * rx + nx, 2 * ry : 2 * ry + ny]
         return image, leaving, {"fresnel": ledger[plane.FRESNEL], "total_internal_reflection": ledger[plane.REFLECTED],
@@ -118,13 +133,13 @@ class _PlaneImage(torch.autograd.Function):
     """Three nets (n, b), and how `plane.forward` is to use them -> padded image, power leaving the lens (), ledger (4,)."""
 
     @staticmethod
-    def forward(net: Tensor, net_x: Tensor, net_y: Tensor, rows: tuple, apart: bool, arguments: tuple):
-        image, ledger = plane.forward(*rows, *_arrays(net, net_x, net_y), *arguments)
+    def forward(net: Tensor, net_x: Tensor, net_y: Tensor, rows: tuple, apart: bool, arguments: tuple, workspace: _Workspace):
+        image, ledger = plane.forward(*_images(arguments, workspace), *rows, *_arrays(net, net_x, net_y), *arguments)
         return torch.from_numpy(image), torch.tensor(ledger[plane.LEAVING], dtype=torch.float64), torch.from_numpy(ledger)
 
     @staticmethod
     def setup_context(ctx, inputs, output):
-        *nets, ctx.rows, ctx.apart, ctx.arguments = inputs
+        *nets, ctx.rows, ctx.apart, ctx.arguments, ctx.workspace = inputs
         ctx.save_for_backward(*nets)
         ctx.save_for_forward(*nets)
         ctx.mark_non_differentiable(output[2])
@@ -132,16 +147,26 @@ class _PlaneImage(torch.autograd.Function):
     @staticmethod
     def backward(ctx, by_image, by_leaving, _):
         nets = ctx.saved_tensors
-        grads = plane.backward(by_image.contiguous().numpy(), float(by_leaving), ctx.apart, *ctx.rows, *_arrays(*nets),
-                               *ctx.arguments)
-        return *(torch.from_numpy(g).to(n.dtype) for g, n in zip(grads, nets, strict=True)), None, None, None
+        scratch = _images(ctx.arguments, ctx.workspace)[1]
+        sums = ctx.workspace("nets", 3, 1 if ctx.apart else len(scratch), *nets[0].shape)
+        grads = plane.backward(by_image.contiguous().numpy(), float(by_leaving), ctx.apart, sums, scratch, *ctx.rows,
+                               *_arrays(*nets), *ctx.arguments)
+        return *(torch.from_numpy(g).to(n.dtype) for g, n in zip(grads, nets, strict=True)), None, None, None, None
 
     @staticmethod
     def jvp(ctx, *tangents):
         nets = ctx.saved_tensors
         along = [torch.zeros_like(n) if t is None else t for t, n in zip(tangents[:3], nets, strict=True)]
-        image, leaving = plane.tangent(*_arrays(*along), *ctx.rows, *_arrays(*nets), *ctx.arguments)
+        image, leaving = plane.tangent(*_arrays(*along), *_images(ctx.arguments, ctx.workspace), *ctx.rows, *_arrays(*nets),
+                                       *ctx.arguments)
         return torch.from_numpy(image), torch.tensor(leaving, dtype=torch.float64), None
+
+
+def _images(arguments: tuple, workspace: _Workspace) -> tuple[np.ndarray, np.ndarray]:
+    """Images and scratch of all blocks, to be overwritten."""
+    x, whole, blocks = arguments[0], arguments[-1], _blocks()
+    padded = (int(n + 2 * (v - 1)) for n, v in zip(whole[1:3], whole[4:6], strict=True))
+    return workspace("images", blocks, *padded), workspace("scratch", blocks, int(plane.scratch_rows(whole)), x.shape[1])
 
 
 def _arrays(*tensors: Tensor) -> list[np.ndarray]:

@@ -22,6 +22,10 @@ from caustic_cli.optics.kernels.bend import (
     BY_PY,
     GX,
     GY,
+    LEAN_X,
+    LEAN_Y,
+    OVER_X,
+    OVER_Y,
     PHI,
     POWER,
     PX,
@@ -45,6 +49,7 @@ from caustic_cli.optics.kernels.bend import (
 from caustic_cli.optics.kernels.shares import OPTIONS, shares
 
 FRESNEL, REFLECTED, OFF_SCREEN, LEAVING = 0, 1, 2, 3  # columns of the ledger
+UINT, ONE, TWO = np.uintp, np.uintp(1), np.uintp(2)  # an unsigned index is never taken to count from the end
 
 
 @njit(**OPTIONS)
@@ -59,10 +64,10 @@ def _aim(vectors, x, y, share, real, whole, sx, sy, dx, dy, sloping):
     landing(v[REACH], v[GY], y, real[3], real[5], v[PY])
     if whole[4] > 1:
         fraction(v[PX], v[PHI])
-    shares(kind, whole[4], real[6], v[PHI], sx, dx, scratch, sloping)
+    shares(kind, whole[4], real[6], v[PHI], sx, dx, v[OVER_X], v[LEAN_X], scratch, sloping)
     if whole[5] > 1:
         fraction(v[PY], v[PHI])
-    shares(kind, whole[5], real[7], v[PHI], sy, dy, scratch, sloping)
+    shares(kind, whole[5], real[7], v[PHI], sy, dy, v[OVER_Y], v[LEAN_Y], scratch, sloping)
 
 
 @njit(**OPTIONS)
@@ -73,6 +78,7 @@ def _scatter(vectors, share, real, whole, sx, sy, image, ledger, column):
     rx, ry = (vx - 1) // 2, (vy - 1) // 2
     low_x, low_y, high_x, high_y = float(-rx), float(-ry), float(whole[1] + rx), float(whole[2] + ry)
     sag, power, px, py = vectors[SAG], vectors[POWER], vectors[PX], vectors[PY]
+    over_x, over_y = vectors[OVER_X], vectors[OVER_Y]
     lost_fresnel, lost_reflected, lost_off, leaving = 0.0, 0.0, 0.0, 0.0
     for j in range(len(power)):
         emitted, weight = share[j], power[j]
@@ -87,14 +93,16 @@ def _scatter(vectors, share, real, whole, sx, sy, image, ledger, column):
         if not (x >= low_x and x < high_x and y >= low_y and y < high_y and height > sag[j]):  # False for NaN too
             lost_off += weight
             continue
+        weight *= over_x[j] * over_y[j]
         i0, j0 = math.floor(x) + rx, math.floor(y) + ry
         if vx == 3 and vy == 3:
-            b0, b1, b2 = sy[0, j], sy[1, j], sy[2, j]
+            i, k, b0, b1, b2 = UINT(i0), UINT(j0), sy[0, j], sy[1, j], sy[2, j]
             for a in range(3):
-                part, row = weight * sx[a, j], image[i0 + a]
-                row[j0] += part * b0
-                row[j0 + 1] += part * b1
-                row[j0 + 2] += part * b2
+                part = weight * sx[a, j]
+                image[i, k] += part * b0
+                image[i, k + ONE] += part * b1
+                image[i, k + TWO] += part * b2
+                i += ONE
             continue
         for b in range(vy):
             column[b] = weight * sy[b, j]
@@ -116,17 +124,19 @@ def _gather(vectors, real, whole, sx, sy, dx, dy, grad, grad_leaving, column, ti
     low_x, low_y, high_x, high_y = float(-rx), float(-ry), float(whole[1] + rx), float(whole[2] + ry)
     sag, power, px, py = vectors[SAG], vectors[POWER], vectors[PX], vectors[PY]
     by_power, by_px, by_py = vectors[BY_POWER], vectors[BY_PX], vectors[BY_PY]
+    over_x, over_y, lean_x, lean_y = vectors[OVER_X], vectors[OVER_Y], vectors[LEAN_X], vectors[LEAN_Y]
     for j in range(len(power)):
         weight = power[j]
-        value, along_x, along_y = grad_leaving, 0.0, 0.0
+        value, along_x, along_y = 0.0, 0.0, 0.0
         x, y = px[j], py[j]
         if weight >= 0.0 and x >= low_x and x < high_x and y >= low_y and y < high_y and height > sag[j]:
             i0, j0 = math.floor(x) + rx, math.floor(y) + ry
             if vx == 3 and vy == 3:
+                i, k = UINT(i0), UINT(j0)
                 b0, b1, b2, d0, d1, d2 = sy[0, j], sy[1, j], sy[2, j], dy[0, j], dy[1, j], dy[2, j]
                 for a in range(3):
-                    row = grad[i0 + a]
-                    g0, g1, g2 = row[j0], row[j0 + 1], row[j0 + 2]
+                    g0, g1, g2 = grad[i, k], grad[i, k + ONE], grad[i, k + TWO]
+                    i += ONE
                     along = g0 * b0 + g1 * b1 + g2 * b2
                     value += sx[a, j] * along
                     along_x += dx[a, j] * along
@@ -142,7 +152,10 @@ def _gather(vectors, real, whole, sx, sy, dx, dy, grad, grad_leaving, column, ti
                     value += sx[a, j] * along
                     along_x += dx[a, j] * along
                     along_y += sx[a, j] * across
-        by_power[j], by_px[j], by_py[j] = value, along_x * weight * scale_x, along_y * weight * scale_y
+            over = over_x[j] * over_y[j]
+            along_x, along_y = over * (along_x - value * lean_x[j]), over * (along_y - value * lean_y[j])
+            value *= over
+        by_power[j], by_px[j], by_py[j] = grad_leaving + value, along_x * weight * scale_x, along_y * weight * scale_y
 
 
 @njit(**OPTIONS)
@@ -161,7 +174,9 @@ def _scatter_tangent(vectors, real, whole, sx, sy, dx, dy, image):
         if not (x >= low_x and x < high_x and y >= low_y and y < high_y and height > v[SAG, j]):
             continue
         i0, j0 = math.floor(x) + rx, math.floor(y) + ry
-        move_x, move_y = weight * v[BY_PX, j], weight * v[BY_PY, j]
+        over = v[OVER_X, j] * v[OVER_Y, j]
+        move_x, move_y = over * weight * v[BY_PX, j], over * weight * v[BY_PY, j]
+        change = over * change - move_x * v[LEAN_X, j] - move_y * v[LEAN_Y, j]
         for a in range(vx):
             along, across = change * sx[a, j] + move_x * dx[a, j], move_y * sx[a, j]
             for b in range(vy):
@@ -214,32 +229,50 @@ def _spread(i, first, bu, du, by_sag, by_gx, by_gy, nets, apart):
 
 @njit(parallel=True, **OPTIONS)
 def _total(images):
-    """Sum over blocks, in order, into the first."""
+    """Sum over blocks, in order."""
+    total = np.empty(images.shape[1:])
     for i in prange(images.shape[1]):
+        total[i] = images[0, i]
         for block in range(1, images.shape[0]):
             for j in range(images.shape[2]):
-                images[0, i, j] += images[block, i, j]
-    return images[0]
+                total[i, j] += images[block, i, j]
+    return total
+
+
+def scratch_rows(whole) -> int:
+    """Rows of ray vectors that a block works in."""
+    return VECTORS + SCRATCH + 2 * (whole[4] + whole[5])
+
+
+@njit(**OPTIONS)
+def _cut(scratch, vx, vy):
+    """A block's scratch as vectors, shares along x and y, their slopes."""
+    a = VECTORS + SCRATCH
+    b, c, d = a + vx, a + vx + vy, a + 2 * vx + vy
+    return scratch[:a], scratch[a:b], scratch[b:c], scratch[c:d], scratch[d:]
 
 
 @njit(parallel=True, **OPTIONS)
-def forward(first, bu, du, net, net_x, net_y, x, y, share, real, whole, blocks):
+def forward(images, scratch, first, bu, du, net, net_x, net_y, x, y, share, real, whole):
     """Padded image (n_x + 4 r_x, n_y + 4 r_y) and the ledger (4,): fresnel, reflected, off_screen, leaving.
 
     The surface comes by rows.  Row i of the sag is sum_k bu[i, k] net[first[i] + k], of dz/dx the same with du and net_x,
     of dz/dy with bu and net_y.  first (a,) int64; bu, du (a, p + 1); nets (n, b); x, y mm and share, parts of the
     source's power, (a, b).
 
+    images (blocks, n_x + 4 r_x, n_y + 4 r_y) and scratch (blocks, `scratch_rows`, b) are overwritten; they set the number of
+    blocks.
+
     real: index, height of the screen above the sag's zero, half width and height of the screen and of a pixel (mm), alpha
     along x and y (per pixel squared).  whole: kind of Fresnel losses, pixels along x and y, kind of filter, its sizes.
     """
-    rows, columns = x.shape
+    rows, blocks = len(x), len(images)
     vx, vy = whole[4], whole[5]
-    images = np.zeros((blocks, whole[1] + 2 * (vx - 1), whole[2] + 2 * (vy - 1)))
     ledgers = np.zeros((blocks, 4))
     for block in prange(blocks):
-        v = np.zeros((VECTORS + SCRATCH, columns))
-        sx, sy, column = np.empty((vx, columns)), np.empty((vy, columns)), np.empty(max(vx, vy))
+        images[block] = 0.0
+        v, sx, sy, _, _ = _cut(scratch[block], vx, vy)
+        column = np.empty(max(vx, vy))
         for i in range(block * rows // blocks, (block + 1) * rows // blocks):
             _combine(i, first, bu, du, net, net_x, net_y, v[SAG], v[GX], v[GY])
             _aim(v, x[i], y[i], share[i], real, whole, sx, sy, sx, sy, False)
@@ -251,18 +284,22 @@ def forward(first, bu, du, net, net_x, net_y, x, y, share, real, whole, blocks):
 
 
 @njit(parallel=True, **OPTIONS)
-def backward(grad, grad_leaving, apart, first, bu, du, net, net_x, net_y, x, y, share, real, whole, blocks):
+def backward(grad, grad_leaving, apart, nets, scratch, first, bu, du, net, net_x, net_y, x, y, share, real, whole):
     """Adjoint of `forward`: derivatives by the three nets (n, b) float64, from those by the padded image and leaving power.
 
     apart: no two rows share a row of the nets, so that one sum serves all blocks.  Otherwise net_x is taken to be net
     itself, and the sum of both derivatives comes as the first.
+
+    nets (3, 1 if apart else blocks, n, b) and scratch as in `forward` are overwritten.
     """
-    rows, columns = x.shape
+    rows, blocks = len(x), len(scratch)
     vx, vy = whole[4], whole[5]
-    nets = np.zeros((3, 1 if apart else blocks, net.shape[0], columns))
+    if apart:
+        nets[:] = 0.0
     for block in prange(blocks):
-        v = np.zeros((VECTORS + SCRATCH, columns))
-        sx, sy, dx, dy = np.empty((vx, columns)), np.empty((vy, columns)), np.empty((vx, columns)), np.empty((vy, columns))
+        if not apart:
+            nets[:, block] = 0.0
+        v, sx, sy, dx, dy = _cut(scratch[block], vx, vy)
         column, tilt = np.empty(max(vx, vy)), np.empty(max(vx, vy))
         for i in range(block * rows // blocks, (block + 1) * rows // blocks):
             _combine(i, first, bu, du, net, net_x, net_y, v[SAG], v[GX], v[GY])
@@ -275,15 +312,14 @@ def backward(grad, grad_leaving, apart, first, bu, du, net, net_x, net_y, x, y, 
 
 
 @njit(parallel=True, **OPTIONS)
-def tangent(t_net, t_net_x, t_net_y, first, bu, du, net, net_x, net_y, x, y, share, real, whole, blocks):
+def tangent(t_net, t_net_x, t_net_y, images, scratch, first, bu, du, net, net_x, net_y, x, y, share, real, whole):
     """Derivative of `forward` along (t_net, t_net_x, t_net_y): the padded image's tangent, and the leaving power's."""
-    rows, columns = x.shape
+    rows, blocks = len(x), len(images)
     vx, vy = whole[4], whole[5]
-    images = np.zeros((blocks, whole[1] + 2 * (vx - 1), whole[2] + 2 * (vy - 1)))
     leaving = np.zeros(blocks)
     for block in prange(blocks):
-        v = np.zeros((VECTORS + SCRATCH, columns))
-        sx, sy, dx, dy = np.empty((vx, columns)), np.empty((vy, columns)), np.empty((vx, columns)), np.empty((vy, columns))
+        images[block] = 0.0
+        v, sx, sy, dx, dy = _cut(scratch[block], vx, vy)
         for i in range(block * rows // blocks, (block + 1) * rows // blocks):
             _combine(i, first, bu, du, net, net_x, net_y, v[SAG], v[GX], v[GY])
             _combine(i, first, bu, du, t_net, t_net_x, t_net_y, v[T_SAG], v[T_GX], v[T_GY])
