@@ -14,8 +14,8 @@ from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Options
 from caustic_cli.inverse.schedule import Stage, coarse_to_fine
 from caustic_cli.optics.reconstruction import Filter
-from caustic_cli.scene import Offset, Screen, checks
-from caustic_cli.settings import index_of, with_defaults
+from caustic_cli.scene import Offset, PlaneWave, Screen, Source, checks
+from caustic_cli.settings import SOURCES, build_source, index_of, with_defaults
 
 DEFAULT_MAG = 3.0
 DEFAULT_MARGIN = 0.28  # table 6.1: the screen is 6.4 wide where the picture is 5
@@ -24,6 +24,8 @@ DEFAULT_SPANS = 128  # knot spans of the finished net; 128 halve evenly through 
 NETWORK_CONTROL = 50  # table D.2
 RAYS_PER_PIXEL = 9.0  # 750 x 750 rays on 250 x 250 pixels, tables D.1 and D.2
 SINGLE_STAGE_ITERATIONS = 1000  # thesis 6.2.1
+STEEPEST = 1.25  # least radius of a derived sphere, in half diagonals of the lens: slopes up to 1.3
+SOURCE_DISTANCE, SOURCE_WIDTH, SOURCE_GRID = 5.0, 0.2, (25, 25)  # in lens widths; the grid of fig. 6.4.1
 
 Settings = dict[str, dict[str, Any]]
 
@@ -55,6 +57,7 @@ def complete(given: Settings, aspect: float, *, mag: float | None = None, margin
         checks.pair("[target] size", target["size"], lambda w, x: checks.number(w, x, 1e-6, 1e9))
     checks.choice("[target] flip", target["flip"], ("", "x", "y", "xy"))
     checks.choice("[target] encoding", target["encoding"], ("srgb", "linear"))
+    _complete_source(s["source"], lens)
     if "size" not in target or mag is not None:
         if mag is None and "size" in screen:
             fit = min(screen["size"][0], screen["size"][1] / aspect) / (1.0 + margin)
@@ -67,12 +70,25 @@ def complete(given: Settings, aspect: float, *, mag: float | None = None, margin
         nx = width or DEFAULT_RESOLUTION
         screen["resolution"] = [nx, max(2, round(nx * screen["size"][1] / screen["size"][0]))]
     Screen(tuple(screen["size"]), screen["z"], tuple(screen["resolution"]))
-    _complete_lens(lens, screen, target)
+    _complete_lens(lens, screen, target, build_source(s))
     _complete_design(s, quality, rays)
     return s
 
 
-def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[str, Any]) -> None:
+def _complete_source(source: dict[str, Any], lens: dict[str, Any]) -> None:
+    """Where a source stands and how large it is, if not said: five lens widths before it, a fifth of one wide."""
+    width = max(lens["size"])
+    checks.choice("[source] type", source["type"], SOURCES)
+    if source["type"] != "plane":
+        source.setdefault("position", [[0.0, 0.0, lens["z_in"] - SOURCE_DISTANCE * width]])
+        source.setdefault("size", [SOURCE_WIDTH * width] * 2)
+        source.setdefault("grid", list(SOURCE_GRID))
+    else:
+        for key in ("intensity", "aim"):  # a plane wave has neither
+            source.pop(key, None)
+
+
+def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[str, Any], source: Source) -> None:
     index, scale = index_of(lens), max(lens["size"]) / 10.0
     checks.number("[lens] index", index, 1.0, 5.0, open_low=True)
     if "glass" not in lens:
@@ -86,7 +102,14 @@ def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[st
                          f" {lens['thickness'] + lens['height_range'][1]:.4g} mm thick, got {screen['z']:g} mm")
     if "radius" not in lens:
         mag = tuple(t / w for t, w in zip(target["size"], lens["size"], strict=True))
-        lens["radius"] = list(Offset.for_magnification(mag, index, screen["z"], lens["thickness"]).radius)
+        vergence = 0.0
+        if not isinstance(source, PlaneWave) and source.nearest < lens["z_in"]:  # divergence at the surface, 1/mm
+            vergence = 1.0 / (lens["z_in"] - source.centre[2] + (lens["thickness"] - lens["z_in"]) / index)
+        radius = Offset.for_magnification(mag, index, screen["z"], lens["thickness"], vergence).radius
+        if vergence:  # light from nearby may ask for more than a sphere over this aperture can do
+            least = STEEPEST * math.hypot(*lens["size"]) / 2.0
+            radius = [math.copysign(max(abs(r), least), r) for r in radius]
+        lens["radius"] = list(radius)
 
 
 def _complete_design(s: Settings, quality: str | None, rays: int | None) -> None:
@@ -103,16 +126,22 @@ def _complete_design(s: Settings, quality: str | None, rays: int | None) -> None
         design["stages"] = [_complete_stage(stage, s) for stage in design["stages"]]
         return
     nx, ny = screen["resolution"]
+    sampler = _sampler(s)
     rays = rays or min(4_000_000, max(40_000, int(RAYS_PER_PIXEL * nx * ny)))
     if plain and "knots_u" not in lens:
-        stages = coarse_to_fine(tuple(lens["control"]), degree, rays, (nx, ny), quality or "standard")
+        stages = coarse_to_fine(tuple(lens["control"]), degree, rays, (nx, ny), quality or "standard", sampler=sampler)
     else:
-        stages = [Stage(tuple(lens["control"]), rays, apron=math.ceil(0.04 * max(nx, ny)),
+        stages = [Stage(tuple(lens["control"]), rays, sampler, apron=math.ceil(0.04 * max(nx, ny)),
                         iterations=SINGLE_STAGE_ITERATIONS, tolerance=2e-3 if plain else 0.0)]
     design["stages"] = [_stage_table(stage) for stage in stages]
     if design["loss"] == "rms":  # eq. 5.2.1 knows the screen alone
         for table in design["stages"]:
             table["apron"] = 0
+
+
+def _sampler(s: Settings) -> str:
+    """A tensor product of rays makes a plane wave cheap; others are intersected one by one."""
+    return "lines" if s["source"]["type"] == "plane" else "stratified"
 
 
 def _stage_table(stage: Stage) -> dict[str, Any]:
@@ -123,7 +152,7 @@ def _stage_table(stage: Stage) -> dict[str, Any]:
 
 def _complete_stage(table: dict[str, Any], s: Settings) -> dict[str, Any]:
     nx, ny = s["screen"]["resolution"]
-    base = {"control": list(s["lens"]["control"]), "rays": int(RAYS_PER_PIXEL * nx * ny), "sampler": "lines",
+    base = {"control": list(s["lens"]["control"]), "rays": int(RAYS_PER_PIXEL * nx * ny), "sampler": _sampler(s),
             "reconstruction": "cosine", "filter_size": [3, 3], "blur": 0.0, "apron": 0,
             "iterations": SINGLE_STAGE_ITERATIONS, "tolerance": 0.0}
     return {**base, **table}
@@ -153,8 +182,9 @@ def build_stages(settings: Settings) -> list[Stage]:
     stages = []
     for t in settings["design"].get("stages", []):
         f = filter_from(t["reconstruction"], t["filter_size"], on, t.get("alpha_per_mm2"), t.get("alpha_per_pixel2"))
+        source = build_source(settings, type=t["source"]) if "source" in t else None
         stages.append(Stage(tuple(t["control"]), t["rays"], t["sampler"], f, t["blur"], t["apron"], t["iterations"],
-                            t["tolerance"]))
+                            t["tolerance"], source))
     if not stages:
         raise InputError("[[design.stages]] at least one stage is needed")
     if list(stages[-1].control) != list(settings["lens"]["control"]):

@@ -58,12 +58,23 @@ class Project:
         except InputError as error:
             raise InputError(f"{path / TOML}: {error}") from error
 
-    def scene(self) -> Scene:
-        """The scene it describes."""
+    def scene(self, given: dict[tuple[str, str, str], object] | None = None) -> Scene:
+        """The scene it describes; `given`, (section, key, option) -> value, replaces some of its settings."""
+        profile = None if self.profile is None else self.profile.irradiance()
+        if not given:
+            try:
+                return settings.build_scene(self.settings, profile)
+            except InputError as error:
+                raise InputError(f"{self.path / TOML}: {error}") from error
+        changed = {section: dict(values) for section, values in self.settings.items()}
+        for (section, key, _), value in given.items():
+            changed[section][key] = value
+        if changed["source"]["type"] != "plane":
+            changed["source"].pop("profile", None)
         try:
-            return settings.build_scene(self.settings, None if self.profile is None else self.profile.irradiance())
+            return settings.build_scene(complete(changed, self.picture.aspect), profile)
         except InputError as error:
-            raise InputError(f"{self.path / TOML}: {error}") from error
+            raise InputError(settings.as_options(str(error), given)) from error
 
     def target(self, scene: Scene) -> np.ndarray:
         """The picture on the scene's screen, (n_x, n_y)."""

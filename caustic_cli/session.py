@@ -73,10 +73,7 @@ def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: d
         _designer(project, "cpu")  # builds and so checks scene, target, stages, options
         _first_heights(project)
     except InputError as error:
-        message = str(error)
-        for section, key, option in given:
-            message = message.replace(f"[{section}] {key}", option)
-        raise InputError(message) from error
+        raise InputError(settings.as_options(str(error), given)) from error
     _make_directory(path, force)
     project.write()
     return project

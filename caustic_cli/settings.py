@@ -18,7 +18,7 @@ import tomli_w
 
 from caustic_cli import __version__
 from caustic_cli.errors import InputError
-from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen, checks
+from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen, Source, checks
 from caustic_cli.scene.materials import D_LINE, refractive_index
 
 FORMAT_VERSION = 1
@@ -28,15 +28,23 @@ FORMAT_VERSION = 1
 class Key:
     """A key of project.toml: its type, and the comment written beside it."""
 
-    kind: str  # number, whole, text, flag, numbers (two), wholes (two), list (of numbers)
+    kind: str  # number, whole, text, flag, numbers (two), wholes (two), list (of numbers), points (x, y, z, or a list of such)
     note: str = ""
 
 
 SCHEMA: dict[str, dict[str, Key]] = {
     "source": {
-        "type": Key("text", "plane: parallel light along +z, as wide as the lens"),
-        "power": Key("number", "W, through the aperture"),
-        "profile": Key("text", "file here with the relative irradiance over the aperture"),
+        "type": Key("text", "plane (as wide as the lens), point, grid (of points) or disc"),
+        "power": Key("number", "W, of all: through the aperture, or into the cone"),
+        "profile": Key("text", "plane: file here with the relative irradiance over the aperture"),
+        "position": Key("points", "mm; point: one or several [x, y, z]; grid, disc: the centre"),
+        "powers": Key("list", "point: relative power of each position"),
+        "size": Key("numbers", "mm, full width and height of a grid or disc"),
+        "grid": Key("wholes", "points of a grid along x and y"),
+        "cone": Key("number", "degrees, half-angle of the cone about +z; without it, as wide as the lens"),
+        "angle": Key("number", "degrees, disc at infinity (the sun: 0.533): full angle it is seen under"),
+        "intensity": Key("text", "uniform in solid angle, or lambertian"),
+        "aim": Key("flag", "sample rays on the lens, not all over the cone"),
     },
     "lens": {
         "size": Key("numbers", "mm, full width and height of the aperture"),
@@ -82,9 +90,10 @@ SCHEMA: dict[str, dict[str, Key]] = {
     },
 }
 STAGE: dict[str, Key] = {
+    "source": Key("text", "type of source in this stage, with the other keys of [source]"),
     "control": Key("wholes", "control points"),
     "rays": Key("whole"),
-    "sampler": Key("text", "grid, lines, stratified or uniform"),
+    "sampler": Key("text", "grid, lines, stratified, uniform or sobol"),
     "reconstruction": Key("text", "bincount, gaussian or cosine"),
     "filter_size": Key("wholes", "pixels, odd"),
     "alpha_per_mm2": Key("number", "of the gaussian, 1/mm^2 (eq. 4.4.5)"),
@@ -95,7 +104,7 @@ STAGE: dict[str, Key] = {
     "tolerance": Key("number", "ends the stage when 10 iterations gain less than this part; 0 never"),
 }
 DEFAULTS: dict[str, dict[str, Any]] = {
-    "source": {"type": "plane", "power": 1.0},
+    "source": {"type": "plane", "power": 1.0, "intensity": "uniform", "aim": True},
     "lens": {"size": [10.0, 10.0], "z_in": 0.0, "min_thickness": 1.0, "fresnel": "exact", "degree": [3, 3]},
     "screen": {"z": 300.0},
     "target": {"encoding": "srgb", "flip": ""},
@@ -103,6 +112,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
                "filter_target": True, "start": "offset", "iterations": 0, "time_limit": math.inf,
                "checkpoint_every": 10.0, "seed": 0, "dtype": "float32"},
 }
+SOURCES = ("plane", "point", "grid", "disc")
 DEFAULT_INDEX = 1.5443  # table D.2
 
 
@@ -155,6 +165,11 @@ def _typed(where: str, key: str, value, keys: dict[str, Key]):
         return value
     if kind in ("number", "whole"):
         return _numeric(where, value, kind == "whole")
+    if kind == "points":
+        points = value if isinstance(value, list) and value and isinstance(value[0], list) else [value]
+        if not all(isinstance(p, list) and len(p) == 3 for p in points):
+            raise InputError(f"{where} must be [x, y, z] or a list of such, got {value!r}")
+        return [[_numeric(where, v, False) for v in p] for p in points]
     if not isinstance(value, list) or (kind != "list" and len(value) != 2):
         raise InputError(f"{where} must be a pair [x, y], got {value!r}")
     return [_numeric(where, v, kind == "wholes") for v in value]
@@ -220,12 +235,42 @@ def build_lens(settings: dict[str, dict[str, Any]]) -> Lens:
                 lens["min_thickness"], offset, tuple(lens["height_range"]), lens["fresnel"])
 
 
+def build_source(settings: dict[str, dict[str, Any]], profile: np.ndarray | None = None, type: str | None = None) -> Source:
+    """What the [source] section describes, or that as another `type`.  `profile`: its irradiance if it names one.
+
+    A key that the type has no use for is left alone, so that stages may change the type.
+    """
+    s = settings["source"]
+    type = checks.choice("[source] type", type or s["type"], SOURCES)
+    if type == "plane":
+        return PlaneWave(s["power"], profile)
+    if "profile" in s and s["type"] != "plane":
+        raise InputError(f"[source] profile belongs to type plane, got type {s['type']}")
+    options = {"cone": s.get("cone"), "intensity": s["intensity"], "aimed": s["aim"]}
+    positions = [tuple(p) for p in s["position"]]
+    if type == "point":
+        powers = s.get("powers", [1.0] * len(positions))
+        total = math.fsum(powers)
+        return Points(tuple(positions), tuple(s["power"] * p / total for p in powers) if total > 0 else tuple(powers), **options)
+    if len(positions) != 1 and "angle" not in s:
+        raise InputError(f"[source] position of a {type} is its centre, one [x, y, z], got {len(positions)}")
+    if type == "grid":
+        return Points.grid(positions[0], tuple(s["size"]), tuple(s["grid"]), s["power"], **options)
+    return Disc(positions[0], tuple(s["size"]), s["power"], angle=s.get("angle"), **options)
+
+
 def build_scene(settings: dict[str, dict[str, Any]], profile: np.ndarray | None = None) -> Scene:
     """The whole scene; `profile` is the source's irradiance if [source] names one."""
-    checks.choice("[source] type", settings["source"]["type"], ("plane",))
     screen = settings["screen"]
-    return Scene(PlaneWave(settings["source"]["power"], profile), build_lens(settings),
+    return Scene(build_source(settings, profile), build_lens(settings),
                  Screen(tuple(screen["size"]), screen["z"], tuple(screen["resolution"])))
+
+
+def as_options(message: str, given) -> str:
+    """A message about settings, in the words of the options (section, key, option) that gave them."""
+    for section, key, option in given:
+        message = message.replace(f"[{section}] {key}", option)
+    return message
 
 
 def read(path: Path) -> dict[str, dict[str, Any]]:

@@ -131,7 +131,7 @@ def test_landing_on_borders():
             space = SplineSpace.uniform(4, 3)
             share = torch.tensor(0.25, dtype=torch.float64)
             kernel = PlaneKernel((space, space), (2.0, 1.5), at, at, True, share, torch.float64)
-            image, _, lost = kernel(torch.zeros(4, 4, dtype=torch.float64), 1.5, "none", 10.0, SCREEN, filter)
+            image, _, lost = kernel(torch.zeros(4, 4, dtype=torch.float64), Lens(index=1.5, fresnel="none"), 10.0, SCREEN, filter)
             x, y = (2.0 * at - 1.0) * 2.0, (2.0 * at - 1.0) * 1.5
             grid = [t.reshape(-1) for t in torch.meshgrid(x, y, indexing="ij")]
             expected, off = splat(*grid, torch.full((4,), 0.25, dtype=torch.float64), SCREEN, filter)
@@ -154,7 +154,7 @@ def test_points_on_knots_are_evaluated_in_the_right_span():
     landing = trace_plane(lens, field.prepare(sample, torch.float64), net - 5.0, 35.0, (2 * u - 1) * 2.0,
                           (2 * u.flip(0) - 1) * 2.0, share, (7,))
     expected, _ = splat(landing.x, landing.y, landing.weight, SCREEN, Filter("cosine", (5, 5)))
-    image, _, _ = kernel(net - 5.0, lens.index, "exact", 35.0, SCREEN, Filter("cosine", (5, 5)))
+    image, _, _ = kernel(net - 5.0, lens, 35.0, SCREEN, Filter("cosine", (5, 5)))
     torch.testing.assert_close(image, expected, rtol=0, atol=1e-13)
 
 

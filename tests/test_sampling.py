@@ -249,4 +249,4 @@ def test_of_size_gives_about_that_many_rays_in_square_cells(rays, aspect):
 
 def test_unknown_sampler_is_refused():
     with pytest.raises(InputError, match="grid, lines, stratified, uniform, got 'sobol'"):
-        Sampler("sobol", (2, 2))
+        Sampler("halton", (2, 2))

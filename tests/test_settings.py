@@ -18,7 +18,8 @@ number = st.floats(allow_nan=False)
 whole = st.integers(-(2**63), 2**63 - 1)
 VALUES = {"number": number, "whole": whole, "text": st.text(st.characters(exclude_categories=["Cs"]), max_size=12),
           "flag": st.booleans(), "numbers": st.lists(number, min_size=2, max_size=2),
-          "wholes": st.lists(whole, min_size=2, max_size=2), "list": st.lists(number, max_size=5)}
+          "wholes": st.lists(whole, min_size=2, max_size=2), "list": st.lists(number, max_size=5),
+          "points": st.lists(st.lists(number, min_size=3, max_size=3), min_size=1, max_size=3)}
 
 
 def some(keys):

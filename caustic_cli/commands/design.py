@@ -25,7 +25,12 @@ Text = str | None
 def run(
     target: Annotated[Path, typer.Argument(metavar="TARGET", help="The picture: an image file or a 2-D .npy of irradiance;"
                                            " with --resume, the project.", show_default=False)],
-    source: Annotated[Text, typer.Option(help="plane: parallel light along +z as wide as the lens.  [default: plane]")] = None,
+    source: options.SourceType = None,
+    source_position: options.SourcePosition = None,
+    source_size: options.SourceSize = None,
+    source_grid: options.SourceGrid = None,
+    source_angle: options.SourceAngle = None,
+    cone: options.Cone = None,
     mag: Annotated[float | None, typer.Option(help="Width of the picture over width of the lens.  [default: 3]")] = None,
     lens_size: Annotated[Text, typer.Option(metavar="W[xH]", help="Lens aperture, mm.  [default: 10x10]")] = None,
     throw: Annotated[float | None, typer.Option(help="Lens origin to screen, mm.  [default: 300]")] = None,
@@ -69,7 +74,7 @@ def run(
     """Find the lens whose caustic is the picture TARGET."""
     began, say = time.monotonic(), console.Reporter(quiet)
     given = {
-        ("source", "type", "--source"): source,
+        **options.source(source, source_position, source_size, source_grid, source_angle, cone),
         ("lens", "size", "--lens-size"): lens_size and options.both(options.size("--lens-size", lens_size)),
         ("lens", "index", "--index"): index,
         ("lens", "glass", "--glass"): glass,

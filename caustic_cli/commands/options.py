@@ -23,6 +23,33 @@ Threads = Annotated[int | None, typer.Option(help="Threads to use; default: all 
 Project = Annotated[Path, typer.Argument(help="Project directory made by caustic design.", show_default=False)]
 
 
+SourceType = Annotated[str | None, typer.Option(help="plane: parallel light along +z as wide as the lens; point; grid of"
+                                                " points; disc, an extended source.  [default: plane]")]
+SourcePosition = Annotated[list[str] | None, typer.Option(metavar="X,Y,Z", help="Point (may be repeated), or centre of a grid or"
+                                                          " disc, mm.  [default: on the axis, five lens widths before it]")]
+SourceSize = Annotated[str | None, typer.Option(metavar="W[xH]", help="Grid or disc, mm.  [default: a fifth of the lens]")]
+SourceGrid = Annotated[str | None, typer.Option(metavar="N[xM]", help="Points of a grid.  [default: 25x25]")]
+SourceAngle = Annotated[float | None, typer.Option(metavar="DEG", help="Disc at infinity: full angle it is seen under (the sun:"
+                                                   " 0.533).")]
+Cone = Annotated[float | None, typer.Option(metavar="DEG", help="Half-angle of a source's cone about +z.  [default: as wide as"
+                                            " the lens]")]
+
+
+def source(kind: str | None, position: list[str] | None, size_: str | None, grid: str | None, angle: float | None,
+           cone: float | None) -> dict[tuple[str, str, str], object]:
+    """The source options as (section, key, option) -> value, without those that were not given."""
+    given = {
+        ("source", "type", "--source"): kind or ("disc" if angle is not None else None),
+        ("source", "position", "--source-position"):
+            [list(numbers("--source-position", p, (3,), ",")) for p in position] if position else None,
+        ("source", "size", "--source-size"): both(size("--source-size", size_)) if size_ else None,
+        ("source", "grid", "--source-grid"): both(counts("--source-grid", grid)) if grid else None,
+        ("source", "angle", "--source-angle"): angle,
+        ("source", "cone", "--cone"): cone,
+    }
+    return {key: value for key, value in given.items() if value is not None}
+
+
 def numbers(option: str, text: str, count: tuple[int, ...], separator: str = r"[xX×]") -> tuple[float, ...]:
     """Numbers parted by x ("10x8") or by what `separator` matches.
 

@@ -27,6 +27,12 @@ def run(
     = "bincount",
     filter_size: Annotated[str, typer.Option(metavar="V[xW]", help="Filter size, odd, pixels.")] = "3",
     alpha: Annotated[float | None, typer.Option(help="Of the gaussian, 1/mm^2.  [default: 1 per pixel^2]")] = None,
+    source: options.SourceType = None,
+    source_position: options.SourcePosition = None,
+    source_size: options.SourceSize = None,
+    source_grid: options.SourceGrid = None,
+    source_angle: options.SourceAngle = None,
+    cone: options.Cone = None,
     screen_at: Annotated[float | None, typer.Option(metavar="Z", help="Put the screen here instead, mm.")] = None,
     output: Annotated[Path | None, typer.Option("-o", "--out", metavar="PNG",
                                                 help="Image to write.  [default: render.png in PROJECT]")] = None,
@@ -45,6 +51,7 @@ def run(
     began, say = time.monotonic(), console.Reporter(quiet)
     count = options.rays("--rays", rays)
     size = options.both(options.counts("--filter-size", filter_size))
+    given = options.source(source, source_position, source_size, source_grid, source_angle, cone)
     device = options.start_torch(device, threads, say)
 
     from caustic_cli.derive import filter_from  # noqa: PLC0415
@@ -59,7 +66,7 @@ def run(
     for path in (image_path, npy):
         if path is not None:
             refuse_foreign(path, force)
-    scene = opened.scene()
+    scene = opened.scene(given)
     target = opened.target(scene)
     field, checkpoint = opened.lens(scene)
     screen = scene.screen

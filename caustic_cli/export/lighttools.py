@@ -20,7 +20,8 @@ from caustic_cli import __version__
 from caustic_cli.export.surface import sample_grid
 from caustic_cli.files import MARK, atomic_path
 from caustic_cli.optics.heightfield import HeightField
-from caustic_cli.scene import PlaneWave, Scene
+from caustic_cli.scene import Disc, PlaneWave, Scene
+from caustic_cli.scene.source import covering_cone
 
 FORMAT_VERSION = 1
 
@@ -56,7 +57,7 @@ def write_lighttools(path: str | Path, scene: Scene, field: HeightField, heights
         "screen_half_size": _reals(scene.screen.half_size),
         "z_screen": _reals(scene.screen.z),
         "resolution": np.array(scene.screen.resolution, np.int64),
-        **_source(scene.source),
+        **_source(scene),
         "control_points": np.stack([x, y, heights.detach().double().cpu().numpy()], -1),
         "degrees": np.array([s.degree for s in field.spaces], np.int64),
         "knots_u": field.spaces[0].knots.numpy(),
@@ -71,12 +72,26 @@ def write_lighttools(path: str | Path, scene: Scene, field: HeightField, heights
             archive.comment = MARK
 
 
-def _source(source: PlaneWave) -> dict[str, np.ndarray]:
+def _source(scene: Scene) -> dict[str, np.ndarray]:
     """The source's keys.  A plane wave stands nowhere and does not spread: no positions, one power, cone 0.
 
-    `source_power` is (1,): the power through the aperture.  `source_profile` (a, b), the relative irradiance over the
-    aperture [i, j], is there only when the wave is not uniform.
+    `source_power` (k,), of each position; (1,), through the aperture, for a plane wave or a disc at infinity.  `source_profile`
+    (a, b), the relative irradiance over the aperture [i, j], is there only when a wave is not uniform; `source_size` (2,) mm
+    or `source_angle` (full, degrees) only for a disc; `source_intensity` where there is a cone.
     """
+    source = scene.source
+    if not isinstance(source, PlaneWave):
+        disc, far = isinstance(source, Disc), isinstance(source, Disc) and source.angle is not None
+        keys = {
+            "source_type": np.array(source.kind),
+            "source_positions": _reals(np.zeros((0, 3)) if far else [source.position] if disc else source.positions),
+            "source_power": _reals([source.power] if disc else source.powers),
+            "cone_half_angle": _reals(source.angle / 2.0 if far else
+                                      np.degrees(covering_cone(source, scene.lens.half_size, scene.lens.z_in))),
+        }
+        if far:
+            return keys | {"source_angle": _reals(source.angle)}
+        return keys | {"source_intensity": np.array(source.intensity)} | ({"source_size": _reals(source.size)} if disc else {})
     keys = {
         "source_type": np.array("plane"),
         "source_positions": np.zeros((0, 3)),

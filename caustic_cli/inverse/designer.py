@@ -20,8 +20,9 @@ from caustic_cli.inverse.losses import LOSSES, NoLight
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.parametrisation import INITIAL, NETWORKS, PRECONDITIONERS, Heights, parametrise
 from caustic_cli.inverse.schedule import Stage
+from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.heightfield import HeightField
-from caustic_cli.optics.sampling import Sampler, stream
+from caustic_cli.optics.sampling import stream
 from caustic_cli.scene import Scene, checks
 
 OPTIMIZERS = ("lbfgs", "adam")
@@ -177,10 +178,10 @@ class Designer:
 
     def _objective(self, k: int) -> Objective:
         stage, o, scene = self.stages[k], self.options, self.scene
-        profile = None if scene.source.profile is None else torch.from_numpy(scene.source.profile)
-        sampler = Sampler.of_size(stage.sampler, stage.rays, scene.lens.size[0] / scene.lens.size[1],
-                                  seed=stream(o.seed, f"stage {k}"), profile=profile, device=self.device)
-        return Objective(scene, self.field(k), sampler, stage.filter, self.target, o.loss, blur=stage.blur,
+        if stage.source is not None:
+            scene = replace(scene, source=stage.source)
+        rays = rays_of(scene, stage.sampler, stage.rays, stream(o.seed, f"stage {k}"), self.device)
+        return Objective(scene, self.field(k), rays, stage.filter, self.target, o.loss, blur=stage.blur,
                          filter_target=o.filter_target, apron=stage.apron, dtype=o.dtype)
 
     def _next(self, state: State, k: int) -> State:

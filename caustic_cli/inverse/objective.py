@@ -14,10 +14,10 @@ import torch
 from torch import Tensor
 
 from caustic_cli.inverse.losses import Loss
+from caustic_cli.optics.emission import Rays
 from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
-from caustic_cli.optics.sampling import Sampler
-from caustic_cli.optics.tracing import PlaneTracer
+from caustic_cli.optics.tracing import PlaneTracer, RayTracer, tracer
 from caustic_cli.scene import Scene
 
 #: Rays traced at a time, and the number up to which the prepared chunks are kept from one evaluation to the next.
@@ -50,7 +50,7 @@ class Objective:
         dtype: precision of the rays.
     """
 
-    def __init__(self, scene: Scene, field: HeightField, sampler: Sampler, filter: Filter, target: Tensor, loss: str, *,
+    def __init__(self, scene: Scene, field: HeightField, sampler: Rays, filter: Filter, target: Tensor, loss: str, *,
                  blur: float = 0.0, filter_target: bool = True, apron: int = 0, dtype: torch.dtype = torch.float32):
         self.device = sampler.device
         self.screen, self.filter, self.apron = scene.screen.grown((apron, apron)), filter, apron
@@ -59,11 +59,11 @@ class Objective:
         self.scene, self.field, self.sampler, self.dtype = scene, field, sampler, dtype
         self.kept = list(self._tracers()) if sampler.count <= KEPT_RAYS else None
 
-    def _tracers(self) -> Iterator[PlaneTracer]:
-        tracer = None
-        for sample in self.sampler.chunks(CHUNK):
-            tracer = PlaneTracer(self.scene, self.field, sample, self.dtype, tracer)
-            yield tracer
+    def _tracers(self) -> Iterator[PlaneTracer | RayTracer]:
+        traced = None
+        for rays in self.sampler.chunks(CHUNK):
+            traced = tracer(self.scene, self.field, rays, self.dtype, traced)
+            yield traced
 
     def __call__(self, heights: Tensor) -> Evaluation:
         """Value and gradient at heights (n, m) mm float64.
@@ -76,8 +76,8 @@ class Objective:
         single = self.kept is not None and len(self.kept) == 1
         image, leaving = 0.0, 0.0
         with torch.set_grad_enabled(single):
-            for tracer in self.kept or self._tracers():
-                part = tracer.expose(heights, self.screen, self.filter)
+            for traced in self.kept or self._tracers():
+                part = traced.expose(heights, self.screen, self.filter)
                 image, leaving = image + part.image.double(), leaving + part.leaving.double()
         if single:
             loss = self.loss(image, leaving)
@@ -88,8 +88,8 @@ class Objective:
             by_image, by_leaving = torch.autograd.grad(loss, (image, leaving), allow_unused=True)
             by_leaving = torch.zeros_like(leaving) if by_leaving is None else by_leaving
             gradient = torch.zeros_like(heights)
-            for tracer in self.kept or self._tracers():
-                part = tracer.expose(heights, self.screen, self.filter)
+            for traced in self.kept or self._tracers():
+                part = traced.expose(heights, self.screen, self.filter)
                 # Whole pixels, and what leaves a lens without reflections, do not depend on the heights at all.
                 pulls = [(value, by.to(value.dtype)) for value, by in ((part.image, by_image), (part.leaving, by_leaving))
                          if value.requires_grad]

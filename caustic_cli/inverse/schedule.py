@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import SAMPLERS
-from caustic_cli.scene import checks
+from caustic_cli.scene import Source, checks
 
 QUALITIES = ("draft", "standard", "fine")
 
@@ -27,6 +27,7 @@ class Stage:
         blur: Gaussian seen by the loss on both render and target, pixels.
         apron: pixels added around the screen, dark in the target, that catch stray light.
         iterations: optimiser iterations; the last stage goes on to the design's total.
+        source: what shines during this stage, None for the scene's own (6.4: a point first, then the grid).
         tolerance: ends the stage when ten iterations lowered the loss by less than this part; 0 never.
     """
 
@@ -38,6 +39,7 @@ class Stage:
     apron: int = 0
     iterations: int = 30
     tolerance: float = 2e-3
+    source: Source | None = None
 
     def __post_init__(self):
         checks.whole("[[design.stages]] rays", self.rays, 1, 10**12)
@@ -49,7 +51,7 @@ class Stage:
 
 
 def coarse_to_fine(control: tuple[int, int], degree: tuple[int, int], rays: int, resolution: tuple[int, int],
-                   quality: str = "standard", filter: Filter | None = None) -> list[Stage]:
+                   quality: str = "standard", filter: Filter | None = None, sampler: str = "lines") -> list[Stage]:
     """The default stages for a picture of `resolution` pixels, ending on `control` points with `rays` rays.
 
     Blurs are 1/16 of the screen at first and halve down to none.  Control nets have a quarter, half and all of the
@@ -66,6 +68,6 @@ def coarse_to_fine(control: tuple[int, int], degree: tuple[int, int], rays: int,
     for k, (blur, part, few) in enumerate(zip(blurs, shrink, fewer, strict=True)):
         net = tuple(min(n, max(p + 1, -(-(n - p) // part) + p)) for n, p in zip(control, degree, strict=True))
         apron = math.ceil(pixels * (0.12 if blur > 1 else 0.04))
-        stages.append(Stage(net, max(1, int(rays * few)), "lines", filter, round(blur, 6), apron,
+        stages.append(Stage(net, max(1, int(rays * few)), sampler, filter, round(blur, 6), apron,
                             late if k == len(blurs) - 1 else early))
     return stages

@@ -10,6 +10,8 @@ whose cost does not depend on the degree.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -58,13 +60,30 @@ class HeightField:
         du, dv = su.basis(sample.u, 1)[1] / (2 * rx), sv.basis(sample.v, 1)[1] / (2 * ry)
         return _ScatteredEvaluator(i * sv.n + j, sv.n, *(b.to(dtype) for b in (bu, du, bv, dv)))
 
-    def slope_bound(self, heights: Tensor) -> float:
-        """An upper bound of |grad z|: the derivative's control net holds the derivative in its convex hull."""
+    def at(self, heights: Tensor, x: Tensor, y: Tensor,
+           orders: Sequence[tuple[int, int]] = ((0, 0), (1, 0), (0, 1))) -> list[Tensor]:
+        """Derivatives of these orders by x and y at points (N,) mm, each (N,) float64, mm^(1 - a - b); linear in the heights."""
+        (su, sv), (rx, ry), flat = self.spaces, self.half_size, heights.double().reshape(-1)
+        u, v, out = 0.5 * (x / rx + 1.0), 0.5 * (y / ry + 1.0), []
+        for a, b in orders:
+            (i, bu), (j, bv) = su.basis(u, a), sv.basis(v, b)
+            corner, columns, total = i * sv.n + j, torch.arange(sv.degree + 1, device=flat.device), 0.0
+            for k in range(su.degree + 1):  # one row of the local net at a time bounds the memory
+                at = (corner + k * sv.n)[:, None] + columns
+                total = total + bu[:, k] * (flat.index_select(0, at.reshape(-1)).view(at.shape) * bv).sum(1)
+            out.append(total / ((2.0 * rx) ** a * (2.0 * ry) ** b))
+        return out
+
+    def slope_bounds(self, heights: Tensor) -> tuple[float, float]:
+        """Upper bounds of |dz/dx| and |dz/dy|: the derivative's control net holds the derivative in its convex hull."""
         (su, sv), (rx, ry) = self.spaces, self.half_size
         h = heights.detach().double().cpu()
-        zx = (su.derivative_matrix() @ h).abs().max() / (2 * rx)
-        zy = (h @ sv.derivative_matrix().T).abs().max() / (2 * ry)
-        return float(torch.hypot(zx, zy))
+        return (float((su.derivative_matrix() @ h).abs().max() / (2 * rx)),
+                float((h @ sv.derivative_matrix().T).abs().max() / (2 * ry)))
+
+    def slope_bound(self, heights: Tensor) -> float:
+        """An upper bound of |grad z|."""
+        return math.hypot(*self.slope_bounds(heights))
 
 
 class Evaluator:

@@ -8,6 +8,7 @@ chunks, on the device or on the number of threads, and any ray can be traced aga
                 tensor-product structure which makes a spline surface cheap to evaluate
     stratified  one ray anywhere in each cell (the perturbed grid of 4.2.1, kept inside [0, 1]: thesis notes 9)
     uniform     independent rays
+    sobol       a scrambled Sobol sequence (torch's), which fills the square more evenly than chance
 """
 
 from __future__ import annotations
@@ -23,7 +24,9 @@ from torch import Tensor
 from caustic_cli.errors import InputError
 from caustic_cli.optics.kernels import fused
 
-SAMPLERS = ("grid", "lines", "stratified", "uniform")
+SAMPLERS = ("grid", "lines", "stratified", "uniform", "sobol")
+#: Length of torch's Sobol sequence.
+SOBOL_RAYS = 1 << 30
 _MASK = 0xFFFFFFFF
 
 
@@ -56,6 +59,40 @@ def salt(dimension: int) -> int:
 def stream(seed: int, name: str) -> int:
     """A seed for the rays of one purpose ("render", "stage 3"), unrelated to the same user's seed for another."""
     return zlib.crc32(f"{seed}/{name}".encode())
+
+
+def numbers(kind: str, shape: tuple[int, int], seed: int, dimensions: int, start: int, stop: int,
+            device: str | torch.device = "cpu") -> list[Tensor]:
+    """Points of the unit cube for rays start..stop: `dimensions` tensors (stop - start,) float64.
+
+    The first two fill nu x nv cells, over and over for more rays than cells; the others are independent, or Sobol's.
+    """
+    if kind == "sobol":
+        if stop > SOBOL_RAYS:
+            raise InputError(f"the sobol sampler has at most {SOBOL_RAYS} rays, got {stop}")
+        engine = torch.quasirandom.SobolEngine(dimensions, scramble=True, seed=seed)
+        points = engine.fast_forward(start).draw(stop - start, dtype=torch.float64)
+        return [x.contiguous().to(device) for x in points.T]
+    k, (nu, nv) = torch.arange(start, stop, device=device), shape
+    if kind in ("grid", "lines"):
+        cell, turn = k % (nu * nv), k // (nu * nv)
+        i, j = cell // nv, cell % nv
+        du = dv = torch.tensor(0.5, dtype=torch.float64, device=device)
+        if kind == "lines":
+            du, dv = random_numbers(seed, 0, turn * nu + i), random_numbers(seed, 1, turn * nv + j)
+        first = [(i + du) / nu, (j + dv) / nv]
+    elif fused(device):
+        from caustic_cli.optics.kernels.functions import scattered_points  # noqa: PLC0415
+
+        first = list(scattered_points([key(seed, d) for d in (0, 1)], [salt(0), salt(1)], start, stop, nu, nv,
+                                      kind == "stratified"))
+    else:
+        du, dv = random_numbers(seed, 0, k), random_numbers(seed, 1, k)
+        if kind == "stratified":
+            cell = k % (nu * nv)
+            du, dv = (cell // nv + du) / nu, (cell % nv + dv) / nv
+        first = [du, dv]
+    return first + [random_numbers(seed, d, k) for d in range(2, dimensions)]
 
 
 @dataclass(frozen=True)
@@ -134,20 +171,8 @@ class Sampler:
             for a in range(0, nu, rows):
                 yield Sample(u[a : a + rows], v, True, one)
             return
-        if fused(self.device):
-            from caustic_cli.optics.kernels.functions import scattered_points  # noqa: PLC0415
-
-            for a in range(0, self.count, size):
-                points = scattered_points([key(self.seed, d) for d in (0, 1)], [salt(0), salt(1)], a,
-                                          min(a + size, self.count), nu, nv, self.kind == "stratified")
-                yield Sample(*points, False, one)
-            return
         for a in range(0, self.count, size):
-            k = torch.arange(a, min(a + size, self.count), device=self.device)
-            du, dv = random_numbers(self.seed, 0, k), random_numbers(self.seed, 1, k)
-            if self.kind == "stratified":
-                du, dv = (k // nv + du) / nu, (k % nv + dv) / nv
-            yield Sample(du, dv, False, one)
+            yield Sample(*numbers(self.kind, self.shape, self.seed, 2, a, min(a + size, self.count), self.device), False, one)
 
     def _irradiance(self, s: Sample) -> Tensor:
         profile = self.profile.to(self.device, torch.float64)

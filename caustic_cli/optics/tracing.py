@@ -1,9 +1,11 @@
 """Light from the source to the screen, ray by ray (thesis 4.3.1).
 
-    plane wave:  free-form surface -> screen
+    plane wave:     free-form surface -> screen
+    other sources:  flat entrance -> free-form surface -> screen
 
 A plane wave meets the flat entrance at normal incidence, which bends nothing and reflects the same part of every ray,
-so its rays start on the exit surface.
+so its rays start on the exit surface.  All others start inside the entrance, where `emission` puts them once for a scene,
+and are intersected with the surface.
 
 Powers are parts of what the source emits.  Nothing vanishes: image + every entry of `lost` = 1.
 """
@@ -18,11 +20,14 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
+from caustic_cli.optics import intersection
+from caustic_cli.optics.bundle import Bundle
+from caustic_cli.optics.emission import Rays
 from caustic_cli.optics.heightfield import Evaluator, HeightField
 from caustic_cli.optics.interface import reflectance, refract
 from caustic_cli.optics.kernels import fused
 from caustic_cli.optics.reconstruction import Filter, splat
-from caustic_cli.optics.sampling import Sample, Sampler
+from caustic_cli.optics.sampling import Sample
 from caustic_cli.scene import Lens, Scene, Screen
 
 LOSSES = ("missed_lens", "missed_surface", "total_internal_reflection", "fresnel", "absorbed", "off_screen")
@@ -36,6 +41,7 @@ class Status(IntEnum):
     OK = 0
     TOTAL_INTERNAL_REFLECTION = 1
     AWAY_FROM_SCREEN = 2
+    MISSED_SURFACE = 3
 
 
 @dataclass(frozen=True)
@@ -102,16 +108,59 @@ class PlaneTracer:
     def expose(self, heights: Tensor, screen: Screen, filter: Filter) -> Part:
         """Heights (n, m) mm float64 -> image and energy account on a screen; by the fused kernel on a CPU."""
         if self.kernel is None:
-            landing = self(heights, screen.z)
-            image, off = splat(landing.x, landing.y, landing.weight, screen, filter)
-            return Part(image, landing.leaving, {**landing.lost, "off_screen": landing.lost["off_screen"] + off})
+            return _collect(self(heights, screen.z), screen, filter)
         sag, reference = self._sag(heights)
-        lens = self.scene.lens
-        return Part(*self.kernel(sag, lens.index, lens.fresnel, screen.z - reference, screen, filter))
+        return Part(*self.kernel(sag, self.scene.lens, screen.z - reference, screen, filter))
 
     def _sag(self, heights: Tensor) -> tuple[Tensor, float]:
         reference = float(heights.detach().mean())
         return (heights - reference).to(self.dtype), reference
+
+
+class RayTracer:
+    """Traces a bundle of rays through a lens; prepared once, called for any heights.  Arguments as of `PlaneTracer`.
+
+    Hits are found in float64 whatever `dtype` is.
+    """
+
+    def __init__(self, scene: Scene, field: HeightField, bundle: Bundle, dtype: torch.dtype, like: RayTracer | None = None):
+        self.scene, self.field, self.bundle, self.dtype = scene, field, bundle, dtype
+        self.kernel = None
+        if fused(bundle.x.device):
+            from caustic_cli.optics.kernels.functions import RayKernel  # noqa: PLC0415
+
+            self.kernel = RayKernel(field.spaces, field.half_size, bundle, dtype, None if like is None else like.kernel)
+
+    def __call__(self, heights: Tensor, screen_z: float | None = None) -> Landing:
+        """Heights (n, m) mm float64 -> where the rays land at screen_z (default: the scene's): the plain-torch reference."""
+        b, lens, d = self.bundle, self.scene.lens, self.dtype
+        z = self.scene.screen.z if screen_z is None else screen_z
+        t, gx, gy, found = intersection.meet(self.field, heights, b)
+        hit, reference = found == intersection.Status.HIT, float(heights.detach().mean())
+        sag = (b.z - reference + t * b.dz).to(d)
+        inside = torch.where(hit, b.share, torch.zeros_like(b.share)).to(d)
+        direction = tuple(c.to(d) for c in (b.dx, b.dy, b.dz))
+        landing = carry(lens, direction, sag, gx.to(d), gy.to(d), (b.x + t * b.dx).to(d), (b.y + t * b.dy).to(d), inside,
+                        z - reference)
+        lost = landing.lost | {"missed_surface": (b.share.to(d) - inside).sum()}
+        status = torch.where(hit, landing.status, int(Status.MISSED_SURFACE))
+        return Landing(landing.x, landing.y, landing.weight, status, self._with_lost(lost), landing.leaving)
+
+    def expose(self, heights: Tensor, screen: Screen, filter: Filter) -> Part:
+        """Heights (n, m) mm float64 -> image and energy account on a screen; by the fused kernel on a CPU."""
+        if self.kernel is None:
+            return _collect(self(heights, screen.z), screen, filter)
+        part = Part(*self.kernel(heights, self.scene.lens, float(heights.detach().mean()), screen, filter))
+        return Part(part.image, part.leaving, self._with_lost(part.lost))
+
+    def _with_lost(self, lost: dict[str, Tensor]) -> dict[str, Tensor]:
+        """With what these rays' part of the source lost before the lens' inside."""
+        return {**lost, **{name: lost.get(name, 0.0) + value for name, value in self.bundle.lost.items()}}
+
+
+def tracer(scene: Scene, field: HeightField, rays: Sample | Bundle, dtype: torch.dtype, like=None) -> PlaneTracer | RayTracer:
+    """What traces some rays of the scene's source.  `like`: the tracer of the chunk before."""
+    return (PlaneTracer if isinstance(rays, Sample) else RayTracer)(scene, field, rays, dtype, like)
 
 
 def trace_plane(lens: Lens, evaluator: Evaluator, sag_net: Tensor, height: float, x, y, share, shape) -> Landing:
@@ -123,13 +172,28 @@ def trace_plane(lens: Lens, evaluator: Evaluator, sag_net: Tensor, height: float
         x, y: where the rays leave the lens, broadcastable to `shape`, mm.
         share: part of the source's power per ray, scalar or `shape`.
     """
-    n, kind = lens.index, lens.fresnel
     sag, slope_x, slope_y = evaluator(sag_net)
-    # Plain floats where the plane wave's direction is constant: the products with 0 and 1 are never computed on rays.
-    direction, passes, c, s = refract((0.0, 0.0, 1.0), slope_x, slope_y, n)
-    entrance = reflectance(kind, 1.0, 1.0, 1.0 / n)  # normal incidence: the same for every ray
+    entrance = reflectance(lens.fresnel, 1.0, 1.0, 1.0 / lens.index)  # normal incidence: the same for every ray
     emitted = torch.broadcast_to(share, shape)
     inside = emitted * (1.0 - entrance)
+    # Plain floats where the plane wave's direction is constant: the products with 0 and 1 are never computed on rays.
+    landing = carry(lens, (0.0, 0.0, 1.0), sag, slope_x, slope_y, x, y, inside, height)
+    lost = landing.lost | {"fresnel": (emitted - inside).sum() + landing.lost["fresnel"]}
+    return Landing(landing.x, landing.y, landing.weight, landing.status, lost, landing.leaving)
+
+
+def carry(lens: Lens, incoming, sag: Tensor, slope_x: Tensor, slope_y: Tensor, x, y, inside: Tensor, height: float) -> Landing:
+    """From the exit surface to the screen: Snell, Fresnel, plane of the screen.
+
+    Args:
+        incoming: unit direction inside the lens, tensors or plain floats.
+        sag, slope_x, slope_y: of the surface at the rays, relative to some plane (mm), and dimensionless.
+        x, y: the points there, mm.
+        inside: power each ray carries up to the surface.
+        height: of the screen above that plane, mm.
+    """
+    n, kind = lens.index, lens.fresnel
+    direction, passes, c, s = refract(incoming, slope_x, slope_y, n)
     length = torch.sqrt(1.0 + slope_x * slope_x + slope_y * slope_y) if kind == "schlick" else 1.0
     reflected = reflectance(kind, c / length, s / length, n)
     none = torch.zeros_like(inside)
@@ -141,12 +205,17 @@ def trace_plane(lens: Lens, evaluator: Evaluator, sag_net: Tensor, height: float
     status = torch.where(passes, int(Status.OK), int(Status.TOTAL_INTERNAL_REFLECTION))
     status = torch.where(passes & ~on_way, int(Status.AWAY_FROM_SCREEN), status)
     lost = {
-        "fresnel": (emitted - inside).sum() + torch.where(passes, inside * reflected, none).sum(),
+        "fresnel": torch.where(passes, inside * reflected, none).sum(),
         "total_internal_reflection": torch.where(passes, none, inside).sum(),
         "off_screen": torch.where(on_way, none, leaving).sum(),
     }
     weight = torch.where(on_way, leaving, none)
     return Landing(x + path * direction[0], y + path * direction[1], weight, status, lost, leaving.sum())
+
+
+def _collect(landing: Landing, screen: Screen, filter: Filter) -> Part:
+    image, off = splat(landing.x, landing.y, landing.weight, screen, filter)
+    return Part(image, landing.leaving, {**landing.lost, "off_screen": landing.lost["off_screen"] + off})
 
 
 @dataclass(frozen=True)
@@ -163,7 +232,7 @@ class Exposure:
     rays: int
 
 
-def expose(scene: Scene, field: HeightField, heights: Tensor, sampler: Sampler, filter: Filter | None = None,
+def expose(scene: Scene, field: HeightField, heights: Tensor, sampler: Rays, filter: Filter | None = None,
            dtype: torch.dtype = torch.float64, screen: Screen | None = None, chunk: int = 1 << 19) -> Exposure:
     """Trace all rays of a sampler and collect them: the value of the one function every command asks about.
 
@@ -178,11 +247,11 @@ def expose(scene: Scene, field: HeightField, heights: Tensor, sampler: Sampler, 
         raise InputError(f"[screen] z must lie behind the lens, whose surface reaches {float(heights.max()):.6g} mm,"
                          f" got {screen.z:g} mm")
     image = torch.zeros(screen.resolution, dtype=torch.float64, device=sampler.device)
-    lost, leaving, tracer = dict.fromkeys(LOSSES, 0.0), 0.0, None
+    lost, leaving, traced = dict.fromkeys(LOSSES, 0.0), 0.0, None
     with torch.no_grad():
-        for sample in sampler.chunks(chunk):
-            tracer = PlaneTracer(scene, field, sample, dtype, tracer)
-            part = tracer.expose(heights, screen, filter)
+        for rays in sampler.chunks(chunk):
+            traced = tracer(scene, field, rays, dtype, traced)
+            part = traced.expose(heights, screen, filter)
             image += part.image
             leaving += float(part.leaving)
             for name, value in part.lost.items():

@@ -42,13 +42,17 @@ class Offset:
                 raise InputError(f"[lens] radius must be a non-zero number or inf, got {r!r}")
 
     @classmethod
-    def for_magnification(cls, mag: tuple[float, float], index: float, throw: float, thickness: float) -> Offset:
-        """The sphere that spreads parallel light over `mag` times the aperture: rho = (n - 1) (z_screen - z_lens) / (mag - 1).
+    def for_magnification(cls, mag: tuple[float, float], index: float, throw: float, thickness: float,
+                          vergence: float = 0.0) -> Offset:
+        """The sphere that spreads light over `mag` times the aperture: rho = (n - 1) T / (mag - 1 - T V), T = z_screen - z_lens.
 
-        Source: thesis table 6.1, thesis notes 12.  `throw` is z_screen, `thickness` is z_lens (both mm).
+        For parallel light (V = 0) that is table 6.1's, thesis notes 12.  `throw` is z_screen, `thickness` is z_lens (mm);
+        `vergence` V is one over the distance, behind the lens, from which the light seems to come (1/mm): paraxially a ray
+        at height x lands at x (1 + T V + (n - 1) T / rho).
         """
-        reach = (index - 1.0) * (throw - thickness)
-        return cls(thickness, tuple(math.inf if m == 1 else reach / (m - 1.0) for m in mag))
+        reach = throw - thickness
+        powers = [(m - 1.0 - reach * vergence) / ((index - 1.0) * reach) for m in mag]
+        return cls(thickness, tuple(math.inf if p == 0 else 1.0 / p for p in powers))
 
     def sag(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """f(x, y) - thickness at points x, y (broadcast), float64 mm.

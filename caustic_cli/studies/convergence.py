@@ -188,7 +188,7 @@ def _about(bench: Bench, dtype: torch.dtype | None, truth: Reference) -> dict:
     seeds = [bench.seed + REFERENCE_SEED, bench.seed + REFERENCE_SEED + 1]
     return {"version": __version__, "seed": bench.seed, "repeats": bench.repeats, "max_rays": bench.max_rays,
             "dtype": "float32 and float64" if dtype is None else _name(dtype), "device": str(bench.heights.device),
-            "threads": torch.get_num_threads(), "reference_rays": truth.rays, "reference_sampler": "lines",
+            "threads": torch.get_num_threads(), "reference_rays": truth.rays, "reference_sampler": "stratified",
             "reference_seeds": seeds, "reference_dtype": "float64", "reference_error": truth.error,
             "orders_of": "error"}
 

@@ -26,10 +26,11 @@ from torch.autograd import forward_ad
 
 from caustic_cli.errors import InputError
 from caustic_cli.files import SOFTWARE, atomic_path
+from caustic_cli.optics.emission import Rays
 from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
-from caustic_cli.optics.sampling import Sample, Sampler
-from caustic_cli.optics.tracing import PlaneTracer, expose
+from caustic_cli.optics.sampling import Sample
+from caustic_cli.optics.tracing import expose, tracer
 from caustic_cli.scene import Scene
 
 #: Pixels by which a central difference may move a landing point.  With d pixels the relative error is of order d^2 (the
@@ -40,7 +41,7 @@ DIFFERENCE_PIXELS = 1e-4
 
 
 def gradient_image(scene: Scene, field: HeightField, heights: Tensor, control: tuple[int, int], *,
-                   sampler: Sampler, filter: Filter, dtype: torch.dtype = torch.float64,
+                   sampler: Rays, filter: Filter, dtype: torch.dtype = torch.float64,
                    chunk: int = 1 << 19) -> Tensor:
     """dJ/dP_ij for control = (i, j): (n_x, n_y) float64, parts of the source's power per mm.
 
@@ -59,14 +60,15 @@ def gradient_image(scene: Scene, field: HeightField, heights: Tensor, control: t
                          f" more along both axes, got {filter.kind} of size {filter.size[0]} x {filter.size[1]}, under"
                          " which no pixel changes when a ray moves a little")
     heights = heights.detach().to(sampler.device, torch.float64)
-    total = torch.zeros(scene.screen.resolution, dtype=torch.float64, device=sampler.device)
-    for sample in sampler.chunks(chunk):
-        near = _under(field, control, sample)
-        if not all(near.shape):
-            continue
-        tracer = PlaneTracer(scene, field, near, dtype)
+    total, traced = torch.zeros(scene.screen.resolution, dtype=torch.float64, device=sampler.device), None
+    for rays in sampler.chunks(chunk):
+        if isinstance(rays, Sample):
+            rays = _under(field, control, rays)
+            if not all(rays.shape):
+                continue
+        traced = tracer(scene, field, rays, dtype, traced)
         with forward_ad.dual_level():
-            image = tracer.expose(forward_ad.make_dual(heights, direction), scene.screen, filter).image
+            image = traced.expose(forward_ad.make_dual(heights, direction), scene.screen, filter).image
             total += forward_ad.unpack_dual(image).tangent.double()
     return total
 
@@ -83,7 +85,7 @@ def difference_step(scene: Scene, field: HeightField, control: tuple[int, int],
 
 
 def finite_difference(scene: Scene, field: HeightField, heights: Tensor, control: tuple[int, int], *,
-                      sampler: Sampler, filter: Filter, step: float | None = None) -> Tensor:
+                      sampler: Rays, filter: Filter, step: float | None = None) -> Tensor:
     """The same derivative by central differences of two float64 renders with the same rays: (n_x, n_y), per mm.
 
     Every ray is traced by `expose`, so nothing but the physics is shared with `gradient_image`.  Float64 whatever the
@@ -115,7 +117,7 @@ class Comparison:
 
 
 def compare(gradient: Tensor, scene: Scene, field: HeightField, heights: Tensor, control: tuple[int, int], *,
-            sampler: Sampler, filter: Filter, step: float | None = None) -> Comparison:
+            sampler: Rays, filter: Filter, step: float | None = None) -> Comparison:
     """How far `gradient` (of `gradient_image` with the same rays and filter) is from `finite_difference`.
 
     A few 1e-8 are left with the cosine filter in float64; the truncated Gaussian has kinks (it is only C0), and leaves

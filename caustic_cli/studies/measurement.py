@@ -6,8 +6,8 @@ Notation
     error       relative RMS between two images, each over its own mean (metrics.relative_rms)
 
 The two halves A and B of a reference are independent, so (A + B) / 2 is wrong by about |A - B| / 2; and its rays are
-others than a setting's, so its error adds to the setting's in quadrature and is taken off again.  They are `lines`:
-unbiased, and several times as fast as stratified ones because a tensor product of rays makes the spline cheap.
+others than a setting's, so its error adds to the setting's in quadrature and is taken off again.  They are `stratified`:
+unbiased, with an error of order 3/4.
 
 Settings take turns, round after round, so that a machine that slows down for a while slows all of them.
 """
@@ -24,18 +24,16 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import CausticError
+from caustic_cli.optics.emission import Rays, rays_of
 from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
-from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.tracing import expose
 from caustic_cli.scene import Scene
 from caustic_cli.studies.metrics import relative_rms
 
-#: Rays of a bincount reference over those of the largest setting.  The error of lines falls like n^-1/2 at worst, to an
-#: eighth; against a better sampler's it was a quarter or less, so what is taken off in quadrature is a few per cent.
-REFERENCE_FACTOR = 64
-#: The same for a reference made with another filter, which smooths its own noise and takes longer a ray.
-FILTERED_FACTOR = 16
+#: Rays of a reference over those of the largest setting: an error of order 3/4 falls to an eighth, so what is taken off in
+#: quadrature is a few per cent.
+REFERENCE_FACTOR = 16
 #: Distance from a study's seed to its reference's: no number of repeats reaches it.
 REFERENCE_SEED = 1_000_003
 
@@ -95,14 +93,12 @@ class Bench:
 
     def plan(self, settings: Sequence[Setting], filtered: int = 0) -> None:
         """Announce all the work: the settings, a bincount reference, and so many others."""
-        references = (REFERENCE_FACTOR + filtered * FILTERED_FACTOR) * self.max_rays
+        references = (1 + filtered) * REFERENCE_FACTOR * self.max_rays
         self.total = references + self.repeats * sum(s.rays for s in settings)
 
-    def sampler(self, setting: Setting, seed: int) -> Sampler:
-        """The rays of a setting: about as many as it asks for, over the aperture, with the source's profile."""
-        size, profile = self.scene.lens.size, self.scene.source.profile
-        return Sampler.of_size(setting.sampler, setting.rays, size[0] / size[1], seed=seed, device=self.heights.device,
-                               profile=None if profile is None else torch.as_tensor(profile))
+    def sampler(self, setting: Setting, seed: int) -> Rays:
+        """The rays of a setting: about as many as it asks for."""
+        return rays_of(self.scene, setting.sampler, setting.rays, seed, self.heights.device)
 
     def image(self, setting: Setting, seed: int) -> Tensor:
         """The image that a setting makes with the rays of `seed`: (n_x, n_y) float64."""
@@ -115,8 +111,7 @@ class Bench:
         Raises:
             CausticError: no light reaches the screen.
         """
-        factor = REFERENCE_FACTOR if filter == Filter() else FILTERED_FACTOR
-        half = Setting("reference", "lines", factor * self.max_rays // 2, filter, torch.float64)
+        half = Setting("reference", "stratified", REFERENCE_FACTOR * self.max_rays // 2, filter, torch.float64)
         images = []
         for k in (0, 1):
             images.append(self.image(half, self.seed + REFERENCE_SEED + k))

@@ -6,9 +6,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from caustic_cli.optics.emission import Rays, rays_of
 from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
-from caustic_cli.optics.sampling import Sampler, stream
+from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.tracing import Exposure, expose
 from caustic_cli.scene import Scene, Screen
 from caustic_cli.studies.metrics import judge
@@ -17,11 +18,9 @@ from caustic_cli.studies.metrics import judge
 FINAL_RAYS = 4_000_000
 
 
-def sampler_for(scene: Scene, rays: int, seed: int, device: str = "cpu") -> Sampler:
-    """About `rays` stratified rays over the aperture, with the source's profile, unrelated to those of any design."""
-    profile = None if scene.source.profile is None else torch.from_numpy(scene.source.profile)
-    return Sampler.of_size("stratified", rays, scene.lens.size[0] / scene.lens.size[1], seed=stream(seed, "render"),
-                           profile=profile, device=device)
+def sampler_for(scene: Scene, rays: int, seed: int, device: str = "cpu") -> Rays:
+    """About `rays` stratified rays of the scene's source, unrelated to those of any design."""
+    return rays_of(scene, "stratified", rays, stream(seed, "render"), device)
 
 
 def retrace(scene: Scene, field: HeightField, heights: Tensor, target: np.ndarray, *, rays: int, seed: int = 0,

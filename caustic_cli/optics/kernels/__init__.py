@@ -16,5 +16,11 @@ def fused(device: torch.device | str) -> bool:
 
 
 def blocks() -> int:
-    """Blocks of rays with an image of their own: torch's number of threads, so that --threads decides both."""
-    return torch.get_num_threads()
+    """Blocks to cut the rays into, each with sums of its own: torch's threads, which numba's follow, so --threads decides."""
+    import numba  # noqa: PLC0415
+
+    count = torch.get_num_threads()
+    numba.set_num_threads(max(1, min(count, numba.config.NUMBA_NUM_THREADS)))
+    if torch.get_num_threads() != count:  # numba's OpenMP layer resets the count it shares with torch when it starts
+        torch.set_num_threads(count)
+    return count

@@ -26,12 +26,6 @@ OVER_X, OVER_Y, LEAN_X, LEAN_Y, VECTORS = range(16, 21)
 SCRATCH = 5
 
 
-@njit(**OPTIONS)
-def entrance(fresnel, n):
-    """Reflectance of the flat entrance at normal incidence."""
-    return 0.0 if fresnel == NONE else (n - 1.0) * (n - 1.0) / ((n + 1.0) * (n + 1.0))
-
-
 @njit(inline="always", **OPTIONS)
 def _s(a, n):
     """s, or 1 beyond the critical angle; and whether the ray passes."""
@@ -129,7 +123,7 @@ def _by_sag(reach, sag, gx, gy, by_px, by_py, height, out):
 def pull(vectors, share, real, whole):
     """Derivatives by the surface, left in T_SAG, T_GX, T_GY, from those by power and pixel coordinates."""
     n, height, v = real[0], real[1], vectors
-    inside = 1.0 - entrance(whole[0], n)
+    inside = real[8]
     _by_a(whole[0], v[SAG], v[GX], v[GY], share, v[BY_POWER], v[BY_PX], v[BY_PY], n, height, inside, v[BY_A])
     _by_slope(v[REACH], v[GX], v[BY_PX], v[BY_A], v[T_GX])
     _by_slope(v[REACH], v[GY], v[BY_PY], v[BY_A], v[T_GY])
@@ -140,7 +134,7 @@ def pull(vectors, share, real, whole):
 def push(vectors, share, real, whole):
     """Tangents of power and pixel coordinates, left in T_POWER, BY_PX, BY_PY, along T_SAG, T_GX, T_GY."""
     n, height, v = real[0], real[1], vectors
-    inside = 1.0 - entrance(whole[0], n)
+    inside = real[8]
     for j in range(v.shape[1]):
         gx, gy, tx, ty = v[GX, j], v[GY, j], v[T_GX, j], v[T_GY, j]
         a, da = gx * gx + gy * gy, 2.0 * (gx * tx + gy * ty)

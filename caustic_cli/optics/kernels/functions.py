@@ -1,28 +1,25 @@
-"""The kernels as differentiable torch functions: reverse mode by the written adjoint, forward mode by the tangent."""
+"""The kernels as differentiable torch functions: reverse mode by the written adjoint, forward mode by the tangent.
+
+A surface at the rays (along a tensor product of points, at scattered points, at the rays' hits) feeds one kernel that
+refracts, carries to the screen and splats.
+"""
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
 
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.kernels import bend, blocks, plane, shares, spline
+from caustic_cli.optics.bundle import Bundle
+from caustic_cli.optics.interface import reflectance
+from caustic_cli.optics.kernels import bend, blocks, plane, points, shares
+from caustic_cli.optics.kernels.surface import FusedSurface, RayHits, scattered_surface
 from caustic_cli.optics.reconstruction import Filter, padding
-from caustic_cli.scene import Screen
+from caustic_cli.scene import Lens, Screen
 
 _FRESNEL = {"none": bend.NONE, "schlick": bend.SCHLICK, "exact": bend.EXACT}
 _KIND = {"bincount": shares.BINCOUNT, "gaussian": shares.GAUSSIAN, "cosine": shares.COSINE}
-
-
-def _blocks() -> int:
-    """Blocks to cut the rays into; numba's threads follow torch's."""
-    count = blocks()
-    numba.set_num_threads(max(1, min(count, numba.config.NUMBA_NUM_THREADS)))
-    if torch.get_num_threads() != count:  # numba's OpenMP layer resets the count it shares with torch when it starts
-        torch.set_num_threads(count)
-    return count
 
 
 class _Workspace:
@@ -77,35 +74,82 @@ class PlaneKernel:
             shape = (len(u) // columns, columns)
             self.first = torch.arange(shape[0])
             self.bu = self.du = torch.ones(shape[0], 1, dtype=dtype)
-            self.points, self.scale = (u.numpy(), v.numpy()), (0.5 / rx, 0.5 / ry)
-            self.axes = (Axis(su), Axis(sv))
+            self.points = (u.numpy(), v.numpy())
+            self.surface = FusedSurface(spaces, half_size) if like is None else like.surface
             x, y, share = u.view(shape), v.view(shape), share.view(shape) if share.ndim else share
         self.shape = shape
         coordinates = ((2.0 * x - 1.0) * rx, (2.0 * y - 1.0) * ry, share)
         self.rays = tuple(_strided(np.broadcast_to(t.to(dtype).numpy(), shape)) for t in coordinates)
         self.rows = (self.first.numpy(), self.bu.numpy(), self.du.numpy())
 
-    def __call__(self, sag: Tensor, index: float, fresnel: str, height: float, screen: Screen,
-                 filter: Filter) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-        """Control heights (n, m) relative to some plane, mm, and the screen's height above it, mm.
-
-        Returns:
-            image (n_x, n_y) and the power leaving the lens (), float64, differentiable; what was lost, by name.
-        """
+    def __call__(self, sag: Tensor, lens: Lens, height: float, screen: Screen, filter: Filter):
+        """Control heights (n, m) relative to some plane, mm, and the screen's height above it, mm: see `_splat`."""
         if self.tensor:
             net, net_y = (sag.to(self.dtype) @ m for m in self.along_v)  # (n, m_v)
             nets = (net, net, net_y)
         else:
-            nets = (t.view(self.shape) for t in _ScatteredSurface.apply(sag, *self.points, self.axes, self.scale, self.dtype))
-        size = tuple(2 * r + 1 for r in filter.reach)
-        real = (index, height, *screen.half_size, *screen.pixel, *filter.alpha)
-        whole = (_FRESNEL[fresnel], *screen.resolution, _KIND[filter.kind], *size)
-        arguments = (*self.rays, np.array(real, np.float64), np.array(whole, np.int64))
-        padded, leaving, ledger = _PlaneImage.apply(*nets, self.rows, not self.tensor, arguments, self.workspace)
-        (nx, ny), (rx, ry) = screen.resolution, filter.reach
-        image = padded[2 * rx : 2 * rx + nx, 2 * ry : 2 * ry + ny]
-        return image, leaving, {"fresnel": ledger[plane.FRESNEL], "total_internal_reflection": ledger[plane.REFLECTED],
-                                "off_screen": ledger[plane.OFF_SCREEN] + padding(padded.detach(), filter.reach)}
+            nets = [t.view(self.shape) for t in scattered_surface(self.surface, sag, *self.points, self.dtype)]
+        passed = 1.0 - reflectance(lens.fresnel, 1.0, 1.0, 1.0 / lens.index)  # the entrance, at normal incidence
+        x, y, share = self.rays
+        rays = (x, y, _none(self.dtype), _none(self.dtype), share)
+        return _splat(nets, self.rows, not self.tensor, rays, lens, height, (passed, 0.0), screen, filter, self.workspace)
+
+
+class RayKernel:
+    """The fused form of `intersection`, `tracing.carry` and `reconstruction.splat` for rays of any direction.
+
+    Args:
+        spaces, half_size: of the height field; half widths in mm.
+        bundle: the rays inside the lens, at its entrance.
+        dtype: of everything stored; hits are always found in float64.
+        like: the kernel of another bundle through the same field, whose workspace serves both.
+    """
+
+    def __init__(self, spaces, half_size, bundle: Bundle, dtype: torch.dtype, like: RayKernel | None = None):
+        self.dtype, count = dtype, len(bundle.x)
+        self.surface = FusedSurface(spaces, half_size) if like is None else like.surface
+        self.workspace = _Workspace() if like is None else like.workspace
+        self.hits, self.z = RayHits(self.surface, bundle), bundle.z
+        columns = min(ROW, count)
+        self.short = -count % columns
+        self.shape = ((count + self.short) // columns, columns)
+        rows = [torch.nn.functional.pad(t.to(dtype), (0, self.short)).view(self.shape)
+                for t in (bundle.x, bundle.y, bundle.dx, bundle.dy, bundle.share)]  # rays without power fill the last row
+        self.rays = tuple(_strided(t.numpy()) for t in rows)
+        ones = np.ones((self.shape[0], 1), torch.empty((), dtype=dtype).numpy().dtype)
+        self.rows = (np.arange(self.shape[0]), ones, ones)
+
+    def __call__(self, heights: Tensor, lens: Lens, reference: float, screen: Screen, filter: Filter):
+        """Control heights (n, m) mm float64; `reference` is where the screen's height is counted from, mm: see `_splat`."""
+        found = self.hits(heights, self.dtype)
+        nets = [torch.nn.functional.pad(t, (0, self.short)).view(self.shape) for t in found]
+        return _splat(nets, self.rows, True, self.rays, lens, screen.z - reference, (1.0, self.z - reference), screen, filter,
+                      self.workspace)
+
+
+def _splat(nets, rows, apart: bool, rays, lens: Lens, height: float, start, screen: Screen, filter: Filter,
+           workspace: _Workspace) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+    """Call the kernel.  start: part of the power that passes the entrance, and height at which slanted rays begin, mm.
+
+    Returns:
+        image (n_x, n_y) and the power leaving the lens (), float64, differentiable; what was lost, by name.
+    """
+    size = tuple(2 * r + 1 for r in filter.reach)
+    real = (lens.index, height, *screen.half_size, *screen.pixel, *filter.alpha, *start)
+    slanted = rays[2].shape == rays[0].shape
+    whole = (_FRESNEL[lens.fresnel], *screen.resolution, _KIND[filter.kind], *size, int(slanted))
+    arguments = (*rays, np.array(real, np.float64), np.array(whole, np.int64))
+    padded, leaving, ledger = _Image.apply(*nets, rows, apart, arguments, workspace)
+    (nx, ny), (rx, ry) = screen.resolution, filter.reach
+    image = padded[2 * rx : 2 * rx + nx, 2 * ry : 2 * ry + ny]
+    lost = {"missed_surface": ledger[plane.MISSED]} if slanted else {}
+    return image, leaving, lost | {"fresnel": ledger[plane.FRESNEL], "total_internal_reflection": ledger[plane.REFLECTED],
+                                   "off_screen": ledger[plane.OFF_SCREEN] + padding(padded.detach(), filter.reach)}
+
+
+def _none(dtype: torch.dtype) -> np.ndarray:
+    """What stands for directions where all rays run along z."""
+    return _strided(np.zeros((2, 2), torch.empty((), dtype=dtype).numpy().dtype))
 
 
 def _strided(array: np.ndarray) -> np.ndarray:
@@ -126,11 +170,11 @@ def compile_kernels(*dtypes: torch.dtype) -> None:
             points = at[:2] if tensor else at
             kernel = PlaneKernel((space, space), (1.0, 1.0), points, points, tensor, share, dtype)
             sag = torch.zeros(4, 4, dtype=dtype, requires_grad=True)
-            kernel(sag, 1.5, "exact", 10.0, screen, Filter("cosine", (3, 3)))[0].sum().backward()
+            kernel(sag, Lens(index=1.5), 10.0, screen, Filter("cosine", (3, 3)))[0].sum().backward()
 
 
-class _PlaneImage(torch.autograd.Function):
-    """Three nets (n, b), and how `plane.forward` is to use them -> padded image, power leaving the lens (), ledger (4,)."""
+class _Image(torch.autograd.Function):
+    """Three nets (n, b), and how `plane.forward` is to use them -> padded image, power leaving the lens (), ledger."""
 
     @staticmethod
     def forward(net: Tensor, net_x: Tensor, net_y: Tensor, rows: tuple, apart: bool, arguments: tuple, workspace: _Workspace):
@@ -164,9 +208,9 @@ class _PlaneImage(torch.autograd.Function):
 
 def _images(arguments: tuple, workspace: _Workspace) -> tuple[np.ndarray, np.ndarray]:
     """Images and scratch of all blocks, to be overwritten."""
-    x, whole, blocks = arguments[0], arguments[-1], _blocks()
+    x, whole, count = arguments[0], arguments[-1], blocks()
     padded = (int(n + 2 * (v - 1)) for n, v in zip(whole[1:3], whole[4:6], strict=True))
-    return workspace("images", blocks, *padded), workspace("scratch", blocks, int(plane.scratch_rows(whole)), x.shape[1])
+    return workspace("images", count, *padded), workspace("scratch", count, int(plane.scratch_rows(whole)), x.shape[1])
 
 
 def _arrays(*tensors: Tensor) -> list[np.ndarray]:
@@ -175,43 +219,6 @@ def _arrays(*tensors: Tensor) -> list[np.ndarray]:
 
 def scattered_points(keys, salts, start: int, stop: int, nu: int, nv: int, stratified: bool) -> tuple[Tensor, Tensor]:
     """The points u, v of rays start..stop of a stratified or uniform `Sampler`: (stop - start,) float64 each."""
-    _blocks()
+    blocks()
     keys, salts = (tuple(np.uint64(k) for k in pair) for pair in (keys, salts))
-    return tuple(torch.from_numpy(a) for a in spline.scatter(keys, salts, start, stop, nu, nv, stratified))
-
-
-class Axis:
-    """A spline space as the kernels take it: knots, breaks, the span of each piece, the degree."""
-
-    def __init__(self, space: SplineSpace):
-        self.space = space
-        breaks = space.breaks
-        spans = torch.searchsorted(space.knots, breaks[:-1].contiguous(), right=True) - 1
-        self.arguments = (space.knots.numpy(), breaks.numpy(), spans.numpy(), space.degree)
-
-
-class _ScatteredSurface(torch.autograd.Function):
-    """Heights (n, m) and points -> z, dz/dx, dz/dy (N,) in `dtype`; linear in the heights."""
-
-    @staticmethod
-    def forward(heights: Tensor, u: np.ndarray, v: np.ndarray, axes: tuple[Axis, Axis], scale, dtype: torch.dtype):
-        out = [torch.empty(len(u), dtype=dtype) for _ in range(3)]
-        spline.evaluate(u, v, heights.double().contiguous().numpy(), *axes[0].arguments, *axes[1].arguments, *scale,
-                        *(t.numpy() for t in out), _blocks())
-        return tuple(out)
-
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        heights, *ctx.rest = inputs
-        ctx.shape, ctx.heights_dtype = tuple(heights.shape), heights.dtype
-
-    @staticmethod
-    def backward(ctx, *grads):
-        u, v, axes, scale, _ = ctx.rest
-        out = spline.pull_back(u, v, *(g.contiguous().numpy() for g in grads), ctx.shape, *axes[0].arguments,
-                               *axes[1].arguments, *scale, _blocks())
-        return torch.from_numpy(out).to(ctx.heights_dtype), None, None, None, None, None
-
-    @staticmethod
-    def jvp(ctx, tangent, *_):
-        return _ScatteredSurface.forward(tangent, *ctx.rest)
+    return tuple(torch.from_numpy(a) for a in points.scatter(keys, salts, start, stop, nu, nv, stratified))

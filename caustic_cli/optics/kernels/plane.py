@@ -16,6 +16,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from caustic_cli.optics.kernels import slant
 from caustic_cli.optics.kernels.bend import (
     BY_POWER,
     BY_PX,
@@ -38,7 +39,6 @@ from caustic_cli.optics.kernels.bend import (
     T_POWER,
     T_SAG,
     VECTORS,
-    entrance,
     fraction,
     landing,
     powers,
@@ -48,20 +48,23 @@ from caustic_cli.optics.kernels.bend import (
 )
 from caustic_cli.optics.kernels.shares import OPTIONS, shares
 
-FRESNEL, REFLECTED, OFF_SCREEN, LEAVING = 0, 1, 2, 3  # columns of the ledger
+FRESNEL, REFLECTED, OFF_SCREEN, LEAVING, MISSED, COLUMNS = range(6)  # of the ledger
 UINT, ONE, TWO = np.uintp, np.uintp(1), np.uintp(2)  # an unsigned index is never taken to count from the end
 
 
 @njit(**OPTIONS)
-def _aim(vectors, x, y, share, real, whole, sx, sy, dx, dy, sloping):
+def _aim(vectors, x, y, along_x, along_y, share, real, whole, sx, sy, dx, dy, sloping):
     """Powers, landing points and shares of one row, from its surface in `vectors`."""
     n, height, fresnel, kind = real[0], real[1], whole[0], whole[3]
-    inside = 1.0 - entrance(fresnel, n)
     v, scratch = vectors, vectors[VECTORS:]
-    powers(fresnel, v[GX], v[GY], share, n, inside, v[POWER])
-    reach(v[SAG], v[GX], v[GY], n, height, v[REACH])
-    landing(v[REACH], v[GX], x, real[2], real[4], v[PX])
-    landing(v[REACH], v[GY], y, real[3], real[5], v[PY])
+    if whole[6]:
+        v[REACH] = v[SAG]
+        slant.aim(v, x, y, along_x, along_y, share, real, fresnel)
+    else:
+        powers(fresnel, v[GX], v[GY], share, n, real[8], v[POWER])
+        reach(v[SAG], v[GX], v[GY], n, height, v[REACH])
+        landing(v[REACH], v[GX], x, real[2], real[4], v[PX])
+        landing(v[REACH], v[GY], y, real[3], real[5], v[PY])
     if whole[4] > 1:
         fraction(v[PX], v[PHI])
     shares(kind, whole[4], real[6], v[PHI], sx, dx, v[OVER_X], v[LEAN_X], scratch, sloping)
@@ -74,18 +77,21 @@ def _aim(vectors, x, y, share, real, whole, sx, sy, dx, dy, sloping):
 def _scatter(vectors, share, real, whole, sx, sy, image, ledger, column):
     """Add one row's rays to the padded image and the ledger.  column: (longest v,) scratch."""
     # Everything the loop needs is a local: after a store to the image the compiler would have to read an array again.
-    lost_before, vx, vy, height = entrance(whole[0], real[0]), whole[4], whole[5], real[1]
+    passed, vx, vy, height = real[8], whole[4], whole[5], real[1]
     rx, ry = (vx - 1) // 2, (vy - 1) // 2
     low_x, low_y, high_x, high_y = float(-rx), float(-ry), float(whole[1] + rx), float(whole[2] + ry)
     sag, power, px, py = vectors[SAG], vectors[POWER], vectors[PX], vectors[PY]
     over_x, over_y = vectors[OVER_X], vectors[OVER_Y]
-    lost_fresnel, lost_reflected, lost_off, leaving = 0.0, 0.0, 0.0, 0.0
+    lost_fresnel, lost_reflected, lost_off, lost_missed, leaving = 0.0, 0.0, 0.0, 0.0, 0.0
     for j in range(len(power)):
         emitted, weight = share[j], power[j]
         if weight < 0.0:
-            inside = emitted * (1.0 - lost_before)
+            inside = emitted * passed
             lost_fresnel += emitted - inside
-            lost_reflected += inside
+            if weight == slant.MISSED_POWER:
+                lost_missed += inside
+            else:
+                lost_reflected += inside
             continue
         lost_fresnel += emitted - weight
         leaving += weight
@@ -114,6 +120,7 @@ def _scatter(vectors, share, real, whole, sx, sy, image, ledger, column):
     ledger[REFLECTED] += lost_reflected
     ledger[OFF_SCREEN] += lost_off
     ledger[LEAVING] += leaving
+    ledger[MISSED] += lost_missed
 
 
 @njit(**OPTIONS)
@@ -253,8 +260,8 @@ def _cut(scratch, vx, vy):
 
 
 @njit(parallel=True, **OPTIONS)
-def forward(images, scratch, first, bu, du, net, net_x, net_y, x, y, share, real, whole):
-    """Padded image (n_x + 4 r_x, n_y + 4 r_y) and the ledger (4,): fresnel, reflected, off_screen, leaving.
+def forward(images, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, share, real, whole):
+    """Padded image (n_x + 4 r_x, n_y + 4 r_y) and the ledger (COLUMNS,), power by what became of it.
 
     The surface comes by rows.  Row i of the sag is sum_k bu[i, k] net[first[i] + k], of dz/dx the same with du and net_x,
     of dz/dy with bu and net_y.  first (a,) int64; bu, du (a, p + 1); nets (n, b); x, y mm and share, parts of the
@@ -264,27 +271,30 @@ def forward(images, scratch, first, bu, du, net, net_x, net_y, x, y, share, real
     blocks.
 
     real: index, height of the screen above the sag's zero, half width and height of the screen and of a pixel (mm), alpha
-    along x and y (per pixel squared).  whole: kind of Fresnel losses, pixels along x and y, kind of filter, its sizes.
+    along x and y (per pixel squared), part of the power that passes the entrance, height at which slanted rays start.  whole:
+    kind of Fresnel losses, pixels along x and y, kind of filter, its sizes, and 1 for slanted rays: `along_x` and `along_y`
+    (a, b) are then their directions' components, and instead of the sag comes the distance along them to the surface.
     """
     rows, blocks = len(x), len(images)
     vx, vy = whole[4], whole[5]
-    ledgers = np.zeros((blocks, 4))
+    ledgers = np.zeros((blocks, COLUMNS))
     for block in prange(blocks):
         images[block] = 0.0
         v, sx, sy, _, _ = _cut(scratch[block], vx, vy)
         column = np.empty(max(vx, vy))
         for i in range(block * rows // blocks, (block + 1) * rows // blocks):
             _combine(i, first, bu, du, net, net_x, net_y, v[SAG], v[GX], v[GY])
-            _aim(v, x[i], y[i], share[i], real, whole, sx, sy, sx, sy, False)
+            _aim(v, x[i], y[i], along_x[i], along_y[i], share[i], real, whole, sx, sy, sx, sy, False)
             _scatter(v, share[i], real, whole, sx, sy, images[block], ledgers[block], column)
-    ledger = np.zeros(4)
+    ledger = np.zeros(COLUMNS)
     for block in range(blocks):
         ledger += ledgers[block]
     return _total(images), ledger
 
 
 @njit(parallel=True, **OPTIONS)
-def backward(grad, grad_leaving, apart, nets, scratch, first, bu, du, net, net_x, net_y, x, y, share, real, whole):
+def backward(grad, grad_leaving, apart, nets, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, share, real,
+             whole):
     """Adjoint of `forward`: derivatives by the three nets (n, b) float64, from those by the padded image and leaving power.
 
     apart: no two rows share a row of the nets, so that one sum serves all blocks.  Otherwise net_x is taken to be net
@@ -303,16 +313,19 @@ def backward(grad, grad_leaving, apart, nets, scratch, first, bu, du, net, net_x
         column, tilt = np.empty(max(vx, vy)), np.empty(max(vx, vy))
         for i in range(block * rows // blocks, (block + 1) * rows // blocks):
             _combine(i, first, bu, du, net, net_x, net_y, v[SAG], v[GX], v[GY])
-            _aim(v, x[i], y[i], share[i], real, whole, sx, sy, dx, dy, True)
+            _aim(v, x[i], y[i], along_x[i], along_y[i], share[i], real, whole, sx, sy, dx, dy, True)
             _gather(v, real, whole, sx, sy, dx, dy, grad, grad_leaving, column, tilt)
-            pull(v, share[i], real, whole)
+            if whole[6]:
+                slant.pull(v, along_x[i], along_y[i], share[i], real, whole[0])
+            else:
+                pull(v, share[i], real, whole)
             _spread(i, first, bu, du, v[T_SAG], v[T_GX], v[T_GY], nets[:, np.int64(0) if apart else np.int64(block)],
                     apart)
     return _total(nets[0]), _total(nets[1]), _total(nets[2])
 
 
 @njit(parallel=True, **OPTIONS)
-def tangent(t_net, t_net_x, t_net_y, images, scratch, first, bu, du, net, net_x, net_y, x, y, share, real, whole):
+def tangent(t_net, t_net_x, t_net_y, images, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, share, real, whole):
     """Derivative of `forward` along (t_net, t_net_x, t_net_y): the padded image's tangent, and the leaving power's."""
     rows, blocks = len(x), len(images)
     vx, vy = whole[4], whole[5]
@@ -323,7 +336,10 @@ def tangent(t_net, t_net_x, t_net_y, images, scratch, first, bu, du, net, net_x,
         for i in range(block * rows // blocks, (block + 1) * rows // blocks):
             _combine(i, first, bu, du, net, net_x, net_y, v[SAG], v[GX], v[GY])
             _combine(i, first, bu, du, t_net, t_net_x, t_net_y, v[T_SAG], v[T_GX], v[T_GY])
-            _aim(v, x[i], y[i], share[i], real, whole, sx, sy, dx, dy, True)
-            push(v, share[i], real, whole)
+            _aim(v, x[i], y[i], along_x[i], along_y[i], share[i], real, whole, sx, sy, dx, dy, True)
+            if whole[6]:
+                slant.push(v, along_x[i], along_y[i], share[i], real, whole[0])
+            else:
+                push(v, share[i], real, whole)
             leaving[block] += _scatter_tangent(v, real, whole, sx, sy, dx, dy, images[block])
     return _total(images), leaving.sum()

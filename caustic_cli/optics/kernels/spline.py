@@ -1,114 +1,184 @@
-"""CPU kernels at scattered points: where rays start, and the height field's value and slopes there.
+"""CPU kernels for the height field at arbitrary points, with their adjoints: one polynomial for each knot-span product.
 
-The functions of `sampling.random_numbers` and of `heightfield`'s scattered evaluator (the references they are tested
-against), ray by ray.  The triangular basis scheme is that of `bspline.SplineSpace.basis`.
+The functions of `heightfield`'s scattered evaluator (the reference they are tested against).  A ray at (u, v) in [0, 1]^2
+finds its span product (i, j) and evaluates
+
+    z = sum_ab c[i, j, a, b] xi^a eta^b,    xi = (u - u_i) / h_i in [-1/2, 1/2], u_i the span's middle, h_i its width,
+
+by Horner's scheme.  The coefficients c follow from the control heights by small constant matrices, c = M_i P_local M_j^T, so
+a point costs the same few products wherever it lies.  In a span's own centred variable the power basis is well conditioned;
+in a global one it is not (degree 7 loses everything in single precision).
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+import torch
 from numba import njit, prange
 
-_OPTIONS = {"cache": True, "error_model": "numpy"}
-_M = np.uint64(0xFFFFFFFF)
-MAX_ORDER = 16
+from caustic_cli.optics.bspline import SplineSpace
+
+_OPTIONS = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
+
+
+class Axis:
+    """The pieces of a spline space, and what the kernels know of them.
+
+    first (I,): first basis function that does not vanish on a piece; matrices (I, p + 1, p + 1): [i, a, k] is the
+    coefficient of xi^a in basis function first + k; geometry: breaks (I + 1,), middles (I,), one over widths (I,).
+    """
+
+    def __init__(self, space: SplineSpace):
+        breaks = space.breaks
+        middle, width = (breaks[1:] + breaks[:-1]) / 2.0, breaks[1:] - breaks[:-1]
+        self.space, self.first = space, space.basis(middle)[0].numpy()
+        rows = [space.basis(middle, a)[1] * (width**a / math.factorial(a))[:, None] for a in range(space.degree + 1)]
+        self.matrices = torch.stack(rows, 1).contiguous().numpy()
+        self.geometry = (breaks.numpy(), middle.numpy(), (1.0 / width).numpy())
+
+
+@njit(parallel=True, **_OPTIONS)
+def coefficients(heights, first_u, mu, first_v, mv):
+    """(n, m) control heights -> (I, J, p + 1, q + 1)."""
+    p, q = mu.shape[1], mv.shape[1]
+    out = np.empty((len(mu), len(mv), p, q))
+    for i in prange(len(mu)):
+        part = np.empty((p, q))
+        for j in range(len(mv)):
+            for a in range(p):
+                for b in range(q):
+                    total = 0.0
+                    for k in range(p):
+                        total += mu[i, a, k] * heights[first_u[i] + k, first_v[j] + b]
+                    part[a, b] = total
+            for a in range(p):
+                for b in range(q):
+                    total = 0.0
+                    for k in range(q):
+                        total += part[a, k] * mv[j, b, k]
+                    out[i, j, a, b] = total
+    return out
+
+
+@njit(parallel=True, **_OPTIONS)
+def pull_coefficients(grads, n, m, first_u, mu, first_v, mv):
+    """Adjoint of `coefficients`: derivatives (blocks, I, J, p + 1, q + 1), added in order of the blocks -> (n, m)."""
+    p, q = mu.shape[1], mv.shape[1]
+    rows = np.zeros((len(mu), p, m))
+    for i in prange(len(mu)):
+        total, part = np.empty((p, q)), np.empty((p, q))
+        for j in range(len(mv)):
+            total[:] = grads[0, i, j]
+            for block in range(1, len(grads)):
+                total += grads[block, i, j]
+            for a in range(p):
+                for b in range(q):
+                    value = 0.0
+                    for k in range(q):
+                        value += total[a, k] * mv[j, k, b]
+                    part[a, b] = value
+            for a in range(p):
+                for b in range(q):
+                    value = 0.0
+                    for k in range(p):
+                        value += mu[i, k, a] * part[k, b]
+                    rows[i, a, first_v[j] + b] += value
+    out = np.zeros((n, m))
+    for i in range(len(mu)):
+        for a in range(p):
+            out[first_u[i] + a] += rows[i, a]
+    return out
 
 
 @njit(inline="always", **_OPTIONS)
-def _mix(x):
-    x ^= x >> np.uint64(16)
-    x = (x * np.uint64(0x7FEB352D)) & _M
-    x ^= x >> np.uint64(15)
-    x = (x * np.uint64(0x846CA68B)) & _M
-    return x ^ (x >> np.uint64(16))
+def piece(x, breaks):
+    """The piece that holds x; the outermost ones also hold what lies beyond."""
+    last = len(breaks) - 2  # guess from equal spans, then walk: at once right on an equispaced knot vector
+    i = min(max(int(x * (last + 1)), 0), last)
+    while i > 0 and x < breaks[i]:
+        i -= 1
+    while i < last and x >= breaks[i + 1]:
+        i += 1
+    return i
 
 
 @njit(inline="always", **_OPTIONS)
-def _number(key, salt, index):
-    """A uniform number strictly inside (0, 1): see sampling.random_numbers."""
-    return (float(_mix((_mix((index & _M) ^ key) + salt + (index >> np.uint64(32))) & _M)) + 0.5) * 2.0**-32
+def jet(c, i, j, xi, eta):
+    """z and its derivatives by xi and eta."""
+    p, q = c.shape[2], c.shape[3]
+    z, z_xi, z_eta = 0.0, 0.0, 0.0
+    for a in range(p - 1, -1, -1):
+        row, slope = c[i, j, a, q - 1], 0.0
+        for b in range(q - 2, -1, -1):
+            slope = slope * eta + row
+            row = row * eta + c[i, j, a, b]
+        z_xi = z_xi * xi + z
+        z = z * xi + row
+        z_eta = z_eta * xi + slope
+    return z, z_xi, z_eta
+
+
+@njit(inline="always", **_OPTIONS)
+def curvatures(c, i, j, xi, eta):
+    """Second derivatives of z by xi xi, xi eta, eta eta."""
+    p, q = c.shape[2], c.shape[3]
+    z, z_xi, half_xi, z_eta, mixed, half_eta = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for a in range(p - 1, -1, -1):
+        row, slope, half = 0.0, 0.0, 0.0
+        for b in range(q - 1, -1, -1):
+            half = half * eta + slope
+            slope = slope * eta + row
+            row = row * eta + c[i, j, a, b]
+        half_xi = half_xi * xi + z_xi
+        z_xi = z_xi * xi + z
+        z = z * xi + row
+        mixed = mixed * xi + z_eta
+        z_eta = z_eta * xi + slope
+        half_eta = half_eta * xi + half
+    return 2.0 * half_xi, mixed, 2.0 * half_eta
+
+
+@njit(inline="always", **_OPTIONS)
+def push_powers(grad, i, j, xi, eta, by_z, by_xi, by_eta, powers):
+    """Adjoint of `jet`: add to the derivatives (I, J, p + 1, q + 1) by the coefficients.  powers: scratch (2, q + 1)."""
+    p, q = grad.shape[2], grad.shape[3]
+    power, slope = 1.0, 0.0
+    for b in range(q):
+        powers[0, b], powers[1, b] = power, slope
+        slope = slope * eta + power
+        power *= eta
+    power, slope = 1.0, 0.0
+    for a in range(p):
+        value, along = by_z * power + by_xi * slope, by_eta * power
+        row = grad[i, j, a]
+        for b in range(q):
+            row[b] += value * powers[0, b] + along * powers[1, b]
+        slope = slope * xi + power
+        power *= xi
 
 
 @njit(parallel=True, **_OPTIONS)
-def scatter(keys, salts, start, stop, nu, nv, stratified):
-    """Points u, v (stop - start,) of rays start..stop; stratified in nu x nv cells, or independent."""
-    u, v = np.empty(stop - start), np.empty(stop - start)
-    for k in prange(stop - start):
-        index = np.uint64(start + k)
-        a, b = _number(keys[0], salts[0], index), _number(keys[1], salts[1], index)
-        if stratified:
-            a, b = ((start + k) // nv + a) / nu, ((start + k) % nv + b) / nv
-        u[k], v[k] = a, b
-    return u, v
-
-
-@njit(**_OPTIONS)
-def _basis(x, t, breaks, spans, p, out, slope):
-    """First non-vanishing function; the p + 1 values and first derivatives by x at x go to out and slope."""
-    low, high = 0, len(breaks) - 2  # guess from equal spans, then walk: at once right on an equispaced knot vector
-    piece = min(max(int(x * (high + 1)), low), high)
-    while piece > low and x < breaks[piece]:
-        piece -= 1
-    while piece < high and x >= breaks[piece + 1]:
-        piece += 1
-    s = spans[piece]
-    out[0] = 1.0
-    for k in range(1, p + 1):
-        saved, saved_slope = 0.0, 0.0
-        last = k == p
-        for r in range(k):
-            right, left = t[s + r + 1], t[s + r + 1 - k]
-            term = out[r] / (right - left)
-            if last:
-                change = k * term
-                slope[r] = saved_slope - change
-                saved_slope = change
-            out[r] = saved + (right - x) * term
-            saved = (x - left) * term
-        out[k] = saved
-        if last:
-            slope[k] = saved_slope
-    return s - p
-
-
-@njit(parallel=True, **_OPTIONS)
-def evaluate(u, v, heights, tu, bu, su, p, tv, bv, sv, q, scale_x, scale_y, z, zx, zy, blocks):
-    """Height and slopes at points (u, v) (N,) into z, zx, zy (N,): t knots, b breaks, s span of each break."""
+def evaluate(u, v, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y, z, zx, zy, blocks):
+    """Height and slopes at points (u, v) (N,) into z, zx, zy (N,): breaks, middles, one over widths of the pieces."""
     count = len(u)
     for block in prange(blocks):
-        nu, du, nv, dv = np.empty(MAX_ORDER), np.empty(MAX_ORDER), np.empty(MAX_ORDER), np.empty(MAX_ORDER)
         for k in range(block * count // blocks, (block + 1) * count // blocks):
-            i = _basis(u[k], tu, bu, su, p, nu, du)
-            j = _basis(v[k], tv, bv, sv, q, nv, dv)
-            value, along, across = 0.0, 0.0, 0.0
-            for a in range(p + 1):
-                row, slope = 0.0, 0.0
-                for b in range(q + 1):
-                    h = heights[i + a, j + b]
-                    row += h * nv[b]
-                    slope += h * dv[b]
-                value += nu[a] * row
-                along += du[a] * row
-                across += nu[a] * slope
-            z[k], zx[k], zy[k] = value, along * scale_x, across * scale_y
+            i, j = piece(u[k], bu), piece(v[k], bv)
+            value, along, across = jet(c, i, j, (u[k] - mu[i]) * wu[i], (v[k] - mv[j]) * wv[j])
+            z[k], zx[k], zy[k] = value, along * wu[i] * scale_x, across * wv[j] * scale_y
 
 
 @njit(parallel=True, **_OPTIONS)
-def pull_back(u, v, gz, gx, gy, shape, tu, bu, su, p, tv, bv, sv, q, scale_x, scale_y, blocks):
-    """Adjoint of `evaluate`: derivative by the heights (n, m) float64, added block by block in order."""
-    nets = np.zeros((blocks, shape[0], shape[1]))
-    count = len(u)
+def pull_back(u, v, gz, gx, gy, bu, mu, wu, bv, mv, wv, scale_x, scale_y, grads):
+    """Adjoint of `evaluate`: derivatives by the coefficients into grads (blocks, I, J, p + 1, q + 1), overwritten."""
+    count, blocks = len(u), len(grads)
     for block in prange(blocks):
-        net = nets[block]
-        nu, du, nv, dv = np.empty(MAX_ORDER), np.empty(MAX_ORDER), np.empty(MAX_ORDER), np.empty(MAX_ORDER)
+        grad = grads[block]
+        grad[:] = 0.0
+        powers = np.empty((2, grad.shape[3]))
         for k in range(block * count // blocks, (block + 1) * count // blocks):
-            i = _basis(u[k], tu, bu, su, p, nu, du)
-            j = _basis(v[k], tv, bv, sv, q, nv, dv)
-            for a in range(p + 1):
-                row = gz[k] * nu[a] + gx[k] * scale_x * du[a]
-                slope = gy[k] * scale_y * nu[a]
-                for b in range(q + 1):
-                    net[i + a, j + b] += row * nv[b] + slope * dv[b]
-    for block in range(1, blocks):
-        nets[0] += nets[block]
-    return nets[0]
+            i, j = piece(u[k], bu), piece(v[k], bv)
+            push_powers(grad, i, j, (u[k] - mu[i]) * wu[i], (v[k] - mv[j]) * wv[j], gz[k], gx[k] * wu[i] * scale_x,
+                        gy[k] * wv[j] * scale_y, powers)

@@ -1,0 +1,194 @@
+"""CPU kernels: where rays meet the height field, with derivatives by the implicit function theorem (thesis 4.3.2).
+
+Notation, in (u, v, z)-space (eq. 4.3.2)
+    f(t) = o_z + t d_z - Z(o_u + t d_u, o_v + t d_v), negative below the surface
+    c    = f'(t) = d_z - Z_u d_u - Z_v d_v, at the hit the cosine of incidence times |N|
+    L    bound of |Z_u| |d_u| + |Z_v| |d_v| from the derivative's control net: d_z - L <= c <= d_z + L
+
+A ray with L < d_z meets the surface once: Newton's iteration inside a bracket that bisection takes over.  For any other one
+the first root is isolated before that.  At the hit, f(t; P) = 0 gives dt/dP = (N_i N_j) / c, whatever method found t.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+from caustic_cli.optics.kernels.spline import _OPTIONS, curvatures, jet, piece, push_powers
+
+HIT, MISSED, UNRESOLVED = 0, 1, 2
+#: Roundings of the heights and of t that a root may be off by.
+FEW_ULP = 4.0 * 2.220446049250313e-16
+MOST_STEPS = 100
+#: Cosine (times |N|) below which a hit is grazing: inside glass such a ray is totally reflected and carries no power on.
+LEAST_COSINE = 1e-12
+#: Part of the way through the surface's box below which two roots are not told apart: the surface then rises above the ray
+#: by no more than some 1e-12 of that way, and the ray may as well pass.
+FINEST = 1e-6
+MOST_PROBES = 20000
+
+
+@njit(inline="always", **_OPTIONS)
+def _value(c, u, v, bu, mu, wu, bv, mv, wv):
+    """Z, Z_u, Z_v at (u, v)."""
+    i, j = piece(u, bu), piece(v, bv)
+    z, z_xi, z_eta = jet(c, i, j, (u - mu[i]) * wu[i], (v - mv[j]) * wv[j])
+    return z, z_xi * wu[i], z_eta * wv[j]
+
+
+@njit(inline="always", **_OPTIONS)
+def _leaves(o, d):
+    """The t at which a coordinate leaves [0, 1]."""
+    if d > 0.0:
+        return (1.0 - o) / d
+    return o / -d if d < 0.0 else np.inf
+
+
+@njit(**_OPTIONS)
+def _first_bracket(low, high, f_low, ray, slope, c, bu, mu, wu, bv, mv, wv):
+    """(a, b, found): f(a) < 0 <= f(b) around the first root in [low, high], or none (found 0), or undecided (2).
+
+    No root lies between a and b if the two lines that bound f, with slope d_z + L from a and d_z - L from b, stay below 0.
+    """
+    ou, ov, oz, du, dv, dz = ray
+    rise, fall = dz + slope, dz - slope
+    least = FINEST * (high - low)
+    a, f_a, step = low, f_low, high - low
+    for _ in range(MOST_PROBES):
+        b = min(a + step, high)
+        z, _, _ = _value(c, ou + b * du, ov + b * dv, bu, mu, wu, bv, mv, wv)
+        f_b = oz + b * dz - z
+        if f_b < 0.0:
+            across = (f_b - f_a - fall * (b - a)) / (rise - fall)
+            if step <= least or f_a + rise * across < 0.0:
+                if b >= high:
+                    return a, b, 0
+                a, f_a, step = b, f_b, 2.0 * step
+                continue
+        elif step <= least:
+            return a, b, 1
+        step = max(0.5 * (b - a), 0.999 * least)
+    return a, high, 2
+
+
+@njit(**_OPTIONS)
+def _root(ray, start, limits, slope, c, bu, mu, wu, bv, mv, wv):
+    """(t, status) of the first hit.  limits: least and largest height; start: where Newton begins, negative for none."""
+    ou, ov, oz, du, dv, dz = ray
+    z_low, z_high = limits
+    if not (ou >= 0.0 and ou <= 1.0 and ov >= 0.0 and ov <= 1.0 and dz > 0.0):
+        return 0.0, MISSED
+    side = min(_leaves(ou, du), _leaves(ov, dv))
+    low, high = max(0.0, (z_low - oz) / dz), min(side, (z_high - oz) / dz)
+    closed = high < side  # the top of the hull lies inside the aperture: f >= 0 there
+    if low > high:
+        return 0.0, MISSED
+    z, _, _ = _value(c, ou + low * du, ov + low * dv, bu, mu, wu, bv, mv, wv)
+    f_low = oz + low * dz - z
+    if f_low >= 0.0:  # on the hull's floor, which the surface then touches; or the ray begins above the surface
+        return low, HIT if low > 0.0 or f_low == 0.0 else MISSED
+    if not slope < dz:
+        low, high, found = _first_bracket(low, high, f_low, ray, slope, c, bu, mu, wu, bv, mv, wv)
+        if found != 1:
+            return 0.0, MISSED if found == 0 else UNRESOLVED
+        closed = True
+    t = start if start >= 0.0 else (0.5 * (z_low + z_high) - oz) / dz
+    t = min(max(t, low), high)
+    size = max(abs(z_low), abs(z_high), abs(oz))
+    close, narrow = FEW_ULP * size, FEW_ULP * max(high, size)
+    for _ in range(MOST_STEPS):
+        z, zu, zv = _value(c, ou + t * du, ov + t * dv, bu, mu, wu, bv, mv, wv)
+        f = oz + t * dz - z
+        if f < 0.0:
+            low = t
+        else:
+            high, closed = t, True
+        step = f / (dz - zu * du - zv * dv)
+        if (abs(f) <= close and abs(step) <= narrow) or high - low <= narrow:
+            if not closed and high - t <= narrow and f < -close:
+                return 0.0, MISSED
+            return t, HIT
+        t -= step
+        if t >= high and not closed:  # does the surface reach that far at all?
+            z, _, _ = _value(c, ou + high * du, ov + high * dv, bu, mu, wu, bv, mv, wv)
+            if oz + high * dz - z < 0.0:
+                return 0.0, MISSED
+            closed = True
+        if not (t > low and t < high):
+            t = 0.5 * (low + high)
+    return t, UNRESOLVED
+
+
+@njit(parallel=True, **_OPTIONS)
+def intersect(ou, ov, oz, du, dv, dz, start, limits, slopes, c, bu, mu, wu, bv, mv, wv, t, status, blocks):
+    """First hits of rays (N,) into t and status (N,).
+
+    limits: least and largest control height; slopes: bounds of |Z_u| and |Z_v|; start (N,) where Newton begins, or empty.
+    """
+    count = len(ou)
+    for block in prange(blocks):
+        for k in range(block * count // blocks, (block + 1) * count // blocks):
+            ray = (ou[k], ov[k], oz[k], du[k], dv[k], dz[k])
+            slope = slopes[0] * abs(du[k]) + slopes[1] * abs(dv[k])
+            begin = start[k] if len(start) else -1.0
+            t[k], status[k] = _root(ray, begin, limits, slope, c, bu, mu, wu, bv, mv, wv)
+
+
+@njit(parallel=True, **_OPTIONS)
+def slopes_at(ou, ov, oz, du, dv, dz, t, status, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y, reach, gx, gy, blocks):
+    """Distances to the hits (-1 for none) and dz/dx, dz/dy there into reach, gx, gy (N,)."""
+    count = len(ou)
+    for block in prange(blocks):
+        for k in range(block * count // blocks, (block + 1) * count // blocks):
+            reach[k], gx[k], gy[k] = -1.0, 0.0, 0.0
+            if status[k] == HIT:
+                _, a, b = _value(c, ou[k] + t[k] * du[k], ov[k] + t[k] * dv[k], bu, mu, wu, bv, mv, wv)
+                reach[k], gx[k], gy[k] = t[k], a * scale_x, b * scale_y
+
+
+@njit(inline="always", **_OPTIONS)
+def _bends(t, ou, ov, du, dv, c, bu, mu, wu, bv, mv, wv):
+    """Where a hit lies in its span product; d(Z_u)/dt and d(Z_v)/dt along the ray."""
+    u, v = ou + t * du, ov + t * dv
+    i, j = piece(u, bu), piece(v, bv)
+    xi, eta = (u - mu[i]) * wu[i], (v - mv[j]) * wv[j]
+    uu, uv, vv = curvatures(c, i, j, xi, eta)
+    uu, uv, vv = uu * wu[i] * wu[i], uv * wu[i] * wv[j], vv * wv[j] * wv[j]
+    return i, j, xi, eta, uu * du + uv * dv, uv * du + vv * dv
+
+
+@njit(parallel=True, **_OPTIONS)
+def pull_back(by_t, by_gx, by_gy, ou, ov, oz, du, dv, dz, t, gx, gy, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y, grads):
+    """Adjoint of the hits: derivatives by the coefficients (blocks, I, J, p + 1, q + 1), overwritten.
+
+    by_*: derivatives by distance and slopes (N,); t, gx, gy: what `slopes_at` found.
+    """
+    count, blocks = len(t), len(grads)
+    for block in prange(blocks):
+        grad = grads[block]
+        grad[:] = 0.0
+        powers = np.empty((2, grad.shape[3]))
+        for k in range(block * count // blocks, (block + 1) * count // blocks):
+            if t[k] < 0.0:
+                continue
+            i, j, xi, eta, along_u, along_v = _bends(t[k], ou[k], ov[k], du[k], dv[k], c, bu, mu, wu, bv, mv, wv)
+            cosine = max(dz[k] - gx[k] * du[k] / scale_x - gy[k] * dv[k] / scale_y, LEAST_COSINE)
+            by_u, by_v = by_gx[k] * scale_x, by_gy[k] * scale_y
+            by_z = (by_t[k] + by_u * along_u + by_v * along_v) / cosine
+            push_powers(grad, i, j, xi, eta, by_z, by_u * wu[i], by_v * wv[j], powers)
+
+
+@njit(parallel=True, **_OPTIONS)
+def push(change, ou, ov, oz, du, dv, dz, t, gx, gy, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y, out_t, out_x, out_y, blocks):
+    """Tangents of the hits' distances and slopes along the coefficients `change`, into out_t, out_x, out_y (N,)."""
+    count = len(t)
+    for block in prange(blocks):
+        for k in range(block * count // blocks, (block + 1) * count // blocks):
+            out_t[k], out_x[k], out_y[k] = 0.0, 0.0, 0.0
+            if t[k] < 0.0:
+                continue
+            i, j, xi, eta, along_u, along_v = _bends(t[k], ou[k], ov[k], du[k], dv[k], c, bu, mu, wu, bv, mv, wv)
+            z, z_xi, z_eta = jet(change, i, j, xi, eta)
+            move = z / max(dz[k] - gx[k] * du[k] / scale_x - gy[k] * dv[k] / scale_y, LEAST_COSINE)
+            out_t[k] = move
+            out_x[k], out_y[k] = (z_xi * wu[i] + along_u * move) * scale_x, (z_eta * wv[j] + along_v * move) * scale_y

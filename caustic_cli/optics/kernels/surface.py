@@ -1,0 +1,130 @@
+"""The height field at arbitrary points as differentiable torch functions of the control heights, by the kernels of `spline`."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from caustic_cli.optics.bspline import SplineSpace
+from caustic_cli.optics.bundle import Bundle
+from caustic_cli.optics.kernels import blocks, hit, spline
+
+
+class FusedSurface:
+    """What the kernels know of a height field of half widths (r_x, r_y) mm, made once for all heights."""
+
+    def __init__(self, spaces: tuple[SplineSpace, SplineSpace], half_size: tuple[float, float]):
+        self.axes = tuple(spline.Axis(s) for s in spaces)
+        self.shape = tuple(s.n for s in spaces)
+        self.scale = (0.5 / half_size[0], 0.5 / half_size[1])
+        self.linear = tuple(x for a in self.axes for x in (a.first, a.matrices))
+        self.geometry = tuple(x for a in self.axes for x in a.geometry)
+        self.grads: np.ndarray | None = None
+
+    def coefficients(self, heights: Tensor) -> np.ndarray:
+        """(n, m) mm -> the polynomial of every span product, (I, J, p + 1, q + 1) float64."""
+        return spline.coefficients(heights.detach().double().contiguous().numpy(), *self.linear)
+
+    def workspace(self) -> np.ndarray:
+        """Derivatives by the coefficients, a set for each block, to be overwritten."""
+        shape = (blocks(), *(len(a.first) for a in self.axes), *(a.matrices.shape[1] for a in self.axes))
+        if self.grads is None or self.grads.shape != shape:
+            self.grads = np.zeros(shape)
+        return self.grads
+
+    def pull(self, grads: np.ndarray) -> Tensor:
+        """Derivatives by the coefficients, block by block -> by the heights, (n, m) float64."""
+        return torch.from_numpy(spline.pull_coefficients(grads, *self.shape, *self.linear))
+
+
+def scattered_surface(surface: FusedSurface, heights: Tensor, u: np.ndarray, v: np.ndarray, dtype: torch.dtype):
+    """Heights (n, m) mm, points in [0, 1]^2 (N,) -> z mm, dz/dx, dz/dy (N,) in `dtype`, linear in the heights."""
+    return _ScatteredSurface.apply(heights, surface, u, v, dtype)
+
+
+class _ScatteredSurface(torch.autograd.Function):
+    @staticmethod
+    def forward(heights: Tensor, surface: FusedSurface, u: np.ndarray, v: np.ndarray, dtype: torch.dtype):
+        out = [torch.empty(len(u), dtype=dtype) for _ in range(3)]
+        spline.evaluate(u, v, surface.coefficients(heights), *surface.geometry, *surface.scale, *(t.numpy() for t in out),
+                        blocks())
+        return tuple(out)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        heights, *ctx.rest = inputs
+        ctx.heights_dtype = heights.dtype
+
+    @staticmethod
+    def backward(ctx, *by):
+        surface, u, v, _ = ctx.rest
+        grads = surface.workspace()
+        spline.pull_back(u, v, *(g.contiguous().numpy() for g in by), *surface.geometry, *surface.scale, grads)
+        return surface.pull(grads).to(ctx.heights_dtype), None, None, None, None
+
+    @staticmethod
+    def jvp(ctx, tangent, *_):
+        return _ScatteredSurface.forward(tangent, *ctx.rest)
+
+
+class RayHits:
+    """Where the rays of a bundle meet a height field: the fused form of `intersection.meet` by Newton's method."""
+
+    def __init__(self, surface: FusedSurface, bundle: Bundle):
+        self.surface = surface
+        su, sv = surface.scale
+        self.rays = tuple(t.double().contiguous().numpy() for t in
+                          (bundle.x * su + 0.5, bundle.y * sv + 0.5, torch.full_like(bundle.x, bundle.z), bundle.dx * su,
+                           bundle.dy * sv, bundle.dz))
+        self.t, self.status = np.zeros(len(bundle.x)), np.zeros(len(bundle.x), np.int8)
+
+    def __call__(self, heights: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+        """Heights (n, m) mm -> distance along each ray to its hit (mm; -1 for none), dz/dx and dz/dy there, (N,) in `dtype`."""
+        return _Hits.apply(heights, self, dtype)
+
+    def find(self, heights: Tensor, start: np.ndarray | None = None) -> np.ndarray:
+        """Fill t (mm) and status of every ray; returns the coefficients of the surface.
+
+        start: distances at which Newton's iteration begins, or None for the middle of the heights' range.
+        """
+        c, h = self.surface.coefficients(heights), heights.detach().double()
+        slopes = [float((a.space.derivative_matrix() @ x).abs().max()) for a, x in zip(self.surface.axes, (h, h.T), strict=True)]
+        limits = (float(h.min()), float(h.max()))
+        hit.intersect(*self.rays, np.empty(0) if start is None else start, limits, tuple(slopes), c, *self.surface.geometry,
+                      self.t, self.status, blocks())
+        return c
+
+
+class _Hits(torch.autograd.Function):
+    @staticmethod
+    def forward(heights: Tensor, rays: RayHits, dtype: torch.dtype):
+        c = rays.find(heights)
+        out = [torch.empty(len(rays.t), dtype=dtype) for _ in range(3)]
+        hit.slopes_at(*rays.rays, rays.t, rays.status, c, *rays.surface.geometry, *rays.surface.scale,
+                      *(t.numpy() for t in out), blocks())
+        return tuple(out)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        heights, ctx.rays, ctx.dtype = inputs
+        ctx.save_for_backward(heights, *output)
+        ctx.save_for_forward(heights, *output)
+
+    @staticmethod
+    def backward(ctx, *by):
+        heights, *found = ctx.saved_tensors
+        surface = ctx.rays.surface
+        grads = surface.workspace()
+        hit.pull_back(*(g.contiguous().numpy() for g in by), *ctx.rays.rays, *(t.detach().numpy() for t in found),
+                      surface.coefficients(heights), *surface.geometry, *surface.scale, grads)
+        return surface.pull(grads).to(heights.dtype), None, None
+
+    @staticmethod
+    def jvp(ctx, tangent, *_):
+        heights, *found = ctx.saved_tensors
+        surface = ctx.rays.surface
+        out = [torch.empty(len(found[0]), dtype=ctx.dtype) for _ in range(3)]
+        hit.push(surface.coefficients(tangent), *ctx.rays.rays, *(t.detach().numpy() for t in found),
+                 surface.coefficients(heights), *surface.geometry, *surface.scale, *(t.numpy() for t in out), blocks())
+        return tuple(out)

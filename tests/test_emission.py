@@ -1,0 +1,199 @@
+"""Rays of points and discs: power, directions, aiming, limits."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from caustic_cli.errors import InputError
+from caustic_cli.optics.emission import Emission, rays_of
+from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.tracing import expose
+from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
+from caustic_cli.scene.source import covering_cone
+
+LENS = Lens(size=(10.0, 8.0), control=(8, 7), z_in=0.0, index=1.5, fresnel="none")
+
+
+def scene(source, lens=LENS):
+    return Scene(source, lens, Screen((40.0, 32.0), 100.0, (20, 16)))
+
+
+def whole(source, kind="stratified", rays=40_000, lens=LENS, **options):
+    (bundle,) = rays_of(scene(source, lens), kind, rays, **options).chunks()
+    return bundle
+
+
+def rectangle(rx, ry, h):
+    """Solid angle of a rectangle seen from height h above its centre."""
+    return 4.0 * math.asin(rx * ry / math.sqrt((rx * rx + h * h) * (ry * ry + h * h)))
+
+
+@pytest.mark.parametrize("kind", ["grid", "lines", "stratified", "uniform", "sobol"])
+@pytest.mark.parametrize("aimed", [True, False])
+def test_a_point_sends_the_lens_the_solid_angle_it_covers(kind, aimed):
+    source = Points(((0.0, 0.0, -6.0),), cone=60.0, aimed=aimed)
+    bundle = whole(source, kind)
+    part = rectangle(5.0, 4.0, 6.0) / (4.0 * math.pi * math.sin(math.radians(30.0)) ** 2)
+    assert float(bundle.share.sum()) == pytest.approx(part, abs=0.012 if kind == "uniform" or not aimed else 2e-3)
+    assert float(bundle.share.sum()) + sum(bundle.lost.values()) == pytest.approx(1.0, abs=1e-13)
+    if aimed:
+        assert bool((bundle.share > 0).all())  # none wasted
+
+
+def test_a_cone_within_the_lens_is_sampled_itself():
+    bundle = whole(Points(((0.5, -0.5, -6.0),), cone=20.0))
+    torch.testing.assert_close(bundle.share, torch.full_like(bundle.share, 1.0 / len(bundle.share)))
+    assert bundle.lost["missed_lens"] == pytest.approx(0.0, abs=1e-13)
+    sine = torch.hypot(bundle.dx, bundle.dy) * 1.5  # Snell at the flat entrance
+    assert float(sine.max()) <= math.sin(math.radians(20.0)) * (1 + 1e-12)
+    assert float((1 - torch.sqrt(1 - sine**2)).mean()) == pytest.approx(math.sin(math.radians(10.0)) ** 2, rel=1e-3)
+
+
+def test_lambertian_light_is_even_in_sine_squared():
+    bundle = whole(Points(((0.0, 0.0, -6.0),), cone=30.0, intensity="lambertian"))
+    sine2 = (bundle.dx**2 + bundle.dy**2) * 1.5**2
+    assert float(sine2.mean()) == pytest.approx(0.5 * math.sin(math.radians(30.0)) ** 2, rel=1e-3)
+    part = float(whole(Points(((0.0, 0.0, -6.0),), cone=60.0, intensity="lambertian")).share.sum())
+    cone = float(whole(Points(((0.0, 0.0, -6.0),), cone=60.0, intensity="lambertian", aimed=False)).share.sum())
+    assert part == pytest.approx(cone, abs=5e-3)
+    assert part > float(whole(Points(((0.0, 0.0, -6.0),), cone=60.0)).share.sum())
+
+
+@pytest.mark.parametrize("half", [1e-6, 1e-4, 0.27])
+def test_narrow_cones_keep_their_digits(half):
+    """1 - cos theta from sin^2(theta / 2): hard case 3."""
+    bundle = whole(Points(((0.0, 0.0, -6.0),), cone=half))
+    tangent = torch.hypot(bundle.x, bundle.y) / 6.0
+    assert float(tangent.max() / math.tan(math.radians(half))) == pytest.approx(1.0, abs=1e-2)
+    assert float((tangent**2).mean() / math.tan(math.radians(half)) ** 2) == pytest.approx(0.5, rel=1e-3)
+
+
+def test_rays_point_away_from_the_source():
+    source = Points(((1.0, -2.0, -7.0), (-3.0, 0.0, -5.0)), (1.0, 3.0))
+    bundle = whole(source, rays=2000)
+    first = torch.arange(len(bundle.x)) < len(bundle.x) // 2
+    for mine, (x, y, z) in zip((first, ~first), source.positions, strict=True):
+        dx, dy = bundle.dx[mine] * 1.5, bundle.dy[mine] * 1.5
+        dz = torch.sqrt(1 - dx**2 - dy**2)
+        torch.testing.assert_close(x - z * dx / dz, bundle.x[mine])
+        torch.testing.assert_close(y - z * dy / dz, bundle.y[mine])
+    torch.testing.assert_close(bundle.dx**2 + bundle.dy**2 + bundle.dz**2, torch.ones_like(bundle.dx))
+
+
+def test_powers_are_shared_as_asked():
+    source = Points(((0.0, 0.0, -6.0), (0.0, 0.0, -6.0)), (1.0, 3.0), cone=20.0)
+    bundle = whole(source, rays=2000)
+    half = len(bundle.share) // 2
+    assert float(bundle.share[half:].sum() / bundle.share[:half].sum()) == pytest.approx(3.0)
+
+
+def test_a_grid_is_equispaced_with_its_borders():
+    source = Points.grid((0.0, 0.0, -5.0), (2.0, 2.0), (25, 25))
+    xs = sorted({p[0] for p in source.positions})
+    assert (len(source.positions), len(xs), xs[0], xs[-1]) == (625, 25, -1.0, 1.0)
+    assert source.power == pytest.approx(1.0)
+    assert Points.grid((0.0, 0.0, -5.0), (2.0, 2.0), (1, 1)).positions == ((0.0, 0.0, -5.0),)
+
+
+def test_a_disc_shines_from_all_of_itself():
+    bundle = whole(Disc((0.5, 0.0, -8.0), (2.0, 1.0), cone=70.0), rays=200_000)
+    dz = torch.sqrt(1 - (bundle.dx**2 + bundle.dy**2) * 1.5**2)
+    x = bundle.x - 8.0 * bundle.dx * 1.5 / dz
+    y = bundle.y - 8.0 * bundle.dy * 1.5 / dz
+    inside = ((x - 0.5) / 1.0) ** 2 + (y / 0.5) ** 2
+    assert 0.999 < float(inside.max()) < 1.0 + 1e-9
+    # power from each point of the ellipse is even up to what the lens' rim takes away
+    weight = bundle.share / bundle.share.sum()
+    assert float((weight * inside).sum()) == pytest.approx(0.5, abs=0.02)
+
+
+def test_a_disc_without_size_is_a_point():
+    point = whole(Points(((0.0, 0.0, -8.0),), cone=60.0, intensity="lambertian"))
+    disc = whole(Disc((0.0, 0.0, -8.0), (0.0, 0.0), cone=60.0))
+    torch.testing.assert_close(point.share, disc.share)
+    torch.testing.assert_close(point.dx, disc.dx)
+
+
+def test_the_sun_fills_its_angle_evenly():
+    bundle = whole(Disc(angle=0.533))
+    half = math.radians(0.533) / 2
+    sine = torch.hypot(bundle.dx, bundle.dy) * 1.5
+    assert float(sine.max()) == pytest.approx(math.sin(half), rel=1e-3)
+    assert float((sine**2).mean()) == pytest.approx(0.5 * math.sin(half) ** 2, rel=1e-2)
+    assert float(bundle.share.sum()) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("kind", ["stratified", "uniform", "sobol", "lines", "grid"])
+def test_rays_do_not_depend_on_chunks(kind):
+    emission = rays_of(scene(Points.grid((0.0, 0.0, -6.0), (1.0, 1.0), (2, 2))), kind, 1000, seed=4)
+    (one,) = emission.chunks()
+    many = list(emission.chunks(77))
+    assert len(many) > 10
+    for name in ("x", "y", "dx", "dy", "dz", "share"):
+        # torch rounds powers and cosines in its vector loop and in its tail differently: an ulp
+        torch.testing.assert_close(torch.cat([getattr(b, name) for b in many]), getattr(one, name), rtol=1e-15, atol=1e-18)
+    assert sum(b.lost["missed_lens"] for b in many) == pytest.approx(one.lost["missed_lens"], abs=1e-14)
+
+
+def heights(lens, mag=2.0, throw=100.0):
+    x, y = HeightField.of(lens).control_xy()
+    offset = Offset.for_magnification((mag, mag), lens.index, throw, 5.0)
+    return offset.thickness + torch.from_numpy(offset.sag(x[:, None].numpy(), y[None, :].numpy()))
+
+
+def test_a_source_a_kilometre_away_is_a_plane_wave():
+    """Thesis notes 16, and hard case 3: z = -1e6 mm."""
+    lens = Lens(size=(10.0, 8.0), control=(8, 7), index=1.5)
+    field, z, images = HeightField.of(lens), heights(lens), []
+    for source in (PlaneWave(), Points(((0.0, 0.0, -1e6),))):
+        for dtype in (torch.float64, torch.float32):
+            images.append(expose(scene(source, lens), field, z, rays_of(scene(source, lens), "grid", 1_000_000), dtype=dtype))
+    for exposure in images[1:]:
+        image = exposure.image / exposure.image.sum()
+        reference = images[0].image / images[0].image.sum()
+        assert float((image - reference).norm() / reference.norm()) < 1e-3
+    # Along a line the rays land where the plane wave's do, to the divergence's 1e-4 mm.
+    assert images[2].lost["missed_lens"] == pytest.approx(1 - 80.0 / (math.pi * (25 + 16)), abs=1e-6)
+
+
+def test_aimed_and_unaimed_rays_make_the_same_image():
+    lens = Lens(size=(10.0, 8.0), control=(8, 7), index=1.5)
+    field, z = HeightField.of(lens), heights(lens)
+    images = {}
+    for aimed in (True, False):
+        here = scene(Points(((1.0, 0.0, -9.0),), cone=50.0, aimed=aimed), lens)
+        images[aimed] = [expose(here, field, z, rays_of(here, "uniform", 200_000, seed)).image for seed in range(4)]
+    mean = {k: torch.stack(v).mean(0) for k, v in images.items()}
+    noise = torch.sqrt(sum(torch.stack(v).var(0) / 4 for v in images.values())) + 1e-9
+    score = ((mean[True] - mean[False]) / noise)[mean[True] > 1e-5]
+    assert len(score) > 50
+    assert float(score.pow(2).mean()) < 3.0  # each has 6 degrees of freedom: mean 1.5
+
+
+@pytest.mark.parametrize("source, message", [
+    (lambda: Points(()), "position must name 1 to"),
+    (lambda: Points(((0.0, 0.0),)), "three numbers"),
+    (lambda: Points(((0.0, 0.0, math.nan),)), "position"),
+    (lambda: Points(((0.0, 0.0, -5.0),), (0.0,)), "not all be 0"),
+    (lambda: Points(((0.0, 0.0, -5.0),), (1.0, 2.0)), "one for each"),
+    (lambda: Points(((0.0, 0.0, -5.0),), cone=0.0), "cone"),
+    (lambda: Points(((0.0, 0.0, -5.0),), cone=91.0), "cone"),
+    (lambda: Points(((0.0, 0.0, -5.0),), intensity="blue"), "intensity"),
+    (lambda: Points.grid((0.0, 0.0, -5.0), (1.0, 1.0), (0, 3)), "grid"),
+    (lambda: Disc(size=(-1.0, 1.0)), "size"),
+    (lambda: Disc(angle=200.0), "angle"),
+    (lambda: scene(Points(((0.0, 0.0, 0.0),))), "before the lens"),
+    (lambda: Emission(scene(Disc()), "halton", (2, 2)), "sampler"),
+])
+def test_impossible_sources_are_refused(source, message):
+    with pytest.raises(InputError, match=message):
+        source()
+
+
+def test_the_covering_cone_reaches_every_corner():
+    source = Points(((2.0, 1.0, -6.0),))
+    assert math.tan(covering_cone(source, (5.0, 4.0), 0.0)) * 6.0 == pytest.approx(math.hypot(7.0, 5.0))
+    assert bool((whole(source).share > 0).all())

@@ -1,0 +1,229 @@
+"""Rays against the height field: roots, first roots, misses, derivatives; reference and kernel alike."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch.autograd import forward_ad
+
+from caustic_cli.optics import intersection
+from caustic_cli.optics.bspline import SplineSpace
+from caustic_cli.optics.bundle import Bundle
+from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.intersection import Status
+from caustic_cli.optics.kernels.surface import FusedSurface, RayHits
+
+
+def bundle(x, y, z, dx, dy, dz):
+    x, y, dx, dy, dz = (torch.as_tensor(a, dtype=torch.float64) for a in (x, y, dx, dy, dz))
+    length = torch.sqrt(dx * dx + dy * dy + dz * dz)
+    return Bundle(x, y, z, dx / length, dy / length, dz / length, torch.ones_like(x), {})
+
+
+def field(n=9, m=8, degrees=(3, 2), half=(5.0, 4.0), repeat=False):
+    spaces = [SplineSpace.uniform(n, degrees[0]), SplineSpace.uniform(m, degrees[1])]
+    if repeat:
+        spaces = [s.insert([0.5] * (s.degree - 1))[0] for s in spaces]
+    return HeightField(tuple(spaces), half)
+
+
+def bumpy(f, size, seed=0):
+    return 2.0 + size * torch.randn(f.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def fan(count, widest, seed=0, half=(5.0, 4.0), z=0.0):
+    g = torch.Generator().manual_seed(seed)
+    u = torch.rand(5, count, generator=g, dtype=torch.float64)
+    tangent, phi = torch.tan(widest * u[2]), 2 * math.pi * u[3]
+    return bundle((2 * u[0] - 1) * half[0], (2 * u[1] - 1) * half[1], z, tangent * torch.cos(phi), tangent * torch.sin(phi),
+                  torch.ones(count))
+
+
+def find_fused(f, heights, rays, start=None):
+    hits = RayHits(FusedSurface(f.spaces, f.half_size), rays)
+    hits.find(heights, start)
+    return torch.from_numpy(hits.t.copy()), torch.from_numpy(hits.status.astype(np.int64))
+
+
+FINDERS = {"reference": intersection.find, "kernel": find_fused}
+
+
+@pytest.fixture(params=FINDERS)
+def find(request):
+    return FINDERS[request.param]
+
+
+def residual(f, heights, rays, t):
+    return rays.z + t * rays.dz - f.at(heights, rays.x + t * rays.dx, rays.y + t * rays.dy)[0]
+
+
+@pytest.mark.parametrize("degrees", [(1, 1), (3, 2), (5, 5), (10, 10), (15, 2)])
+@pytest.mark.parametrize("repeat", [False, True])
+def test_hits_lie_on_the_surface(find, degrees, repeat):
+    f = field(17, 16, degrees, repeat=repeat)
+    heights, rays = bumpy(f, 0.05), fan(3000, 0.7)
+    t, status = find(f, heights, rays)
+    hit = status == Status.HIT
+    assert 1000 < int(hit.sum()) < 3000
+    assert not bool((status == Status.UNRESOLVED).any())
+    x, y = rays.x + t * rays.dx, rays.y + t * rays.dy
+    on = (x.abs() <= 5 + 1e-9) & (y.abs() <= 4 + 1e-9)
+    assert bool(on[hit].all())
+    assert float(residual(f, heights, rays, t)[hit & on].abs().max()) < 4e-15 * 4
+    # What misses leaves by the side, below the surface.
+    side = torch.minimum((5 - rays.x * rays.dx.sign()) / rays.dx.abs(), (4 - rays.y * rays.dy.sign()) / rays.dy.abs())
+    missed = status == Status.MISSED
+    assert int(missed.sum()) > 10
+    inner = side[missed] * (1 - 1e-9)
+    z = f.at(heights, rays.x[missed] + inner * rays.dx[missed], rays.y[missed] + inner * rays.dy[missed])[0]
+    assert bool((rays.z + inner * rays.dz[missed] - z < 1e-7).all())
+
+
+def test_kernel_and_reference_find_the_same():
+    f = field()
+    for size in (0.02, 0.3, 1.0):
+        heights, rays = bumpy(f, size), fan(2000, 1.3, 1)
+        (a, sa), (b, sb) = intersection.find(f, heights, rays), find_fused(f, heights, rays)
+        assert bool((sa == sb).all())
+        hit = sa == Status.HIT
+        assert int(hit.sum()) > 100
+        torch.testing.assert_close(a[hit], b[hit], rtol=0, atol=1e-9)  # grazing hits are ill conditioned
+
+
+def first_by_marching(f, heights, rays, steps=20_001):
+    """The first sign change on a fine grid of distances, from the values alone."""
+    top = float(heights.max()) - rays.z
+    s = torch.linspace(0, 1, steps, dtype=torch.float64)
+    out = torch.full_like(rays.x, math.inf)
+    for k in range(len(rays.x)):
+        t = s * top / rays.dz[k]
+        x, y = rays.x[k] + t * rays.dx[k], rays.y[k] + t * rays.dy[k]
+        inside = (x.abs() <= f.half_size[0]) & (y.abs() <= f.half_size[1])
+        value = rays.z + t * rays.dz[k] - f.at(heights, x.clamp(-5, 5), y.clamp(-4, 4))[0]
+        above = (inside & (value >= 0)).nonzero()
+        if len(above):
+            out[k] = t[above[0, 0]]
+    return out
+
+
+def test_the_first_of_several_roots_is_found(find):
+    """Hard case 2: grazing rays on a surface of slope 2 and more."""
+    f = field(17, 16)
+    heights, rays = bumpy(f, 0.8), fan(150, 1.45, 3)
+    t, status = find(f, heights, rays)
+    reference = first_by_marching(f, heights, rays)
+    hit = status == Status.HIT
+    both = hit & torch.isfinite(reference)
+    step = (float(heights.max()) / rays.dz) / 20_000
+    assert int(both.sum()) > 60
+    # a bump narrower than the march's step may be found that the march stepped over, never the other way round
+    assert bool((t[both] <= reference[both] + 1e-9).all())
+    assert float(((reference - t)[both] <= 1.01 * step[both]).double().mean()) > 0.97
+    assert float((hit == torch.isfinite(reference)).double().mean()) > 0.97
+
+
+def test_several_roots_do_occur_above():
+    f = field(17, 16)
+    slopes = f.slope_bounds(bumpy(f, 0.8))
+    rays = fan(150, 1.45, 3)
+    assert float(((slopes[0] * rays.dx.abs() + slopes[1] * rays.dy.abs()) > rays.dz).double().mean()) > 0.5
+
+
+@pytest.mark.parametrize("x, y", [(0.0, 0.0), (5.0, 4.0), (-5.0, 4.0), (5.0, 0.0), (1.25, -1.0)])
+def test_a_plane_is_hit_where_geometry_says(find, x, y):
+    f = field()
+    gx, gy = f.control_xy()
+    heights = 3.0 + 0.1 * gx[:, None] - 0.05 * gy[None, :]
+    rays = bundle([x] * 3, [y] * 3, 0.0, [0.0, -0.02 * np.sign(x), 0.0], [0.0, 0.0, -0.03 * np.sign(y)], [1.0] * 3)
+    t, status = find(f, heights, rays)
+    assert bool((status == Status.HIT).all())
+    exact = (3.0 + 0.1 * x - 0.05 * y) / (rays.dz - 0.1 * rays.dx + 0.05 * rays.dy)
+    torch.testing.assert_close(t, exact, rtol=4e-15, atol=0)
+
+
+def test_edges_knots_and_flat_surfaces(find):
+    """Rays along knot lines, through their crossings, along the border; a surface whose hull has no thickness."""
+    f = field()
+    breaks = (2 * f.spaces[0].breaks - 1) * 5.0
+    x = breaks.repeat(3)
+    flat = torch.full(f.shape, 2.0, dtype=torch.float64)
+    for heights in (flat, bumpy(f, 0.1)):
+        for dx, dy in ((0.0, 0.0), (0.0, 0.2), (1e-300, 0.0), (-1e-17, 1e-17)):
+            rays = bundle(x, torch.zeros_like(x), 0.0, torch.full_like(x, dx), torch.full_like(x, dy), torch.ones_like(x))
+            t, status = find(f, heights, rays)
+            leaves = (x == 5.0) & (dx > 0) | (x == -5.0) & (dx < 0)  # on the border, outward
+            assert bool((status[~leaves] == Status.HIT).all())
+            assert float(residual(f, heights, rays, t)[~leaves].abs().max()) < 1e-14
+
+
+def test_what_cannot_hit_is_missed(find):
+    f = field()
+    rays = bundle([0.0, 6.0, 0.0, 4.9], [0.0, 0.0, 0.0, 0.0], 0.0, [0.0, 0.0, 1.0, 1.0], [0.0] * 4, [-1.0, 1.0, 0.0, 0.1])
+    _, status = find(f, bumpy(f, 0.01), rays)
+    assert status.tolist() == [Status.MISSED] * 4
+    above = bundle([0.0], [0.0], 10.0, [0.0], [0.0], [1.0])
+    assert find(f, bumpy(f, 0.01), above)[1].tolist() == [Status.MISSED]
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 10_000), size=st.sampled_from([0.0, 1e-9, 0.01, 0.3, 3.0]), p=st.integers(1, 6),
+       widest=st.sampled_from([0.0, 0.3, 1.2, 1.57]))
+def test_always_finite_and_on_the_surface(seed, size, p, widest):
+    f = field(9, 8, (p, 2))
+    heights, rays = bumpy(f, size, seed) + 4 * size, fan(64, widest, seed)
+    results = [find(f, heights, rays) for find in FINDERS.values()]
+    for t, status in results:
+        assert bool(torch.isfinite(t).all())
+        hit = status == Status.HIT
+        assert bool((residual(f, heights, rays, t)[hit].abs() < 1e-12 * (1 + 8 * size)).all())
+    assert bool((results[0][1] == results[1][1]).all())
+
+
+def meet_fused(f, heights, rays):
+    return RayHits(FusedSurface(f.spaces, f.half_size), rays)(heights, torch.float64)
+
+
+@pytest.mark.parametrize("meet", [lambda *a: intersection.meet(*a)[:3], meet_fused], ids=["reference", "kernel"])
+def test_derivatives_by_the_implicit_function_theorem(meet):
+    """Against central differences, in both modes, on a surface steep enough to matter."""
+    f = field()
+    heights, rays = bumpy(f, 0.15), fan(40, 0.9, 5)
+    status = intersection.find(f, heights, rays)[1]
+    g = torch.Generator().manual_seed(7)
+    along = torch.randn(f.shape, generator=g, dtype=torch.float64)
+    with forward_ad.dual_level():
+        duals = meet(f, forward_ad.make_dual(heights, along), rays)
+        tangents = [forward_ad.unpack_dual(t).tangent for t in duals]
+    step = 1e-6
+    up, down = meet(f, heights + step * along, rays), meet(f, heights - step * along, rays)
+    hit = status == Status.HIT
+    assert int(hit.sum()) > 20
+    for tangent, a, b in zip(tangents, up, down, strict=True):
+        torch.testing.assert_close(tangent[hit], ((a - b) / (2 * step))[hit], rtol=1e-6, atol=1e-7)
+        assert float(tangent[~hit].abs().sum()) == 0.0
+    by = [torch.randn(len(rays.x), generator=g, dtype=torch.float64) for _ in range(3)]
+    leaf = heights.clone().requires_grad_()
+    (pulled,) = torch.autograd.grad(meet(f, leaf, rays), leaf, by)
+    assert float((pulled * along).sum()) == pytest.approx(float(sum((b * t).sum() for b, t in zip(by, tangents, strict=True))),
+                                                          rel=1e-11)
+
+
+def test_derivatives_equal_those_of_unrolled_newton():
+    """Newton's steps differentiated one by one tend to the implicit derivative, at the price of a graph a step long."""
+    f = field()
+    heights, rays = bumpy(f, 0.05), fan(30, 0.4, 5)
+    leaf = heights.clone().requires_grad_()
+    status = intersection.find(f, heights, rays)[1]
+    hit = status == Status.HIT
+    t = torch.full_like(rays.x, 2.0)
+    for _ in range(8):
+        z, zx, zy = f.at(leaf, rays.x + t * rays.dx, rays.y + t * rays.dy)
+        t = t - (rays.z + t * rays.dz - z) / (rays.dz - zx * rays.dx - zy * rays.dy)
+    (unrolled,) = torch.autograd.grad(t[hit].sum(), leaf, retain_graph=True)
+    (implicit,) = torch.autograd.grad(intersection.meet(f, leaf, rays)[0][hit].sum(), leaf)
+    torch.testing.assert_close(implicit, unrolled, rtol=1e-11, atol=1e-12)
