@@ -15,7 +15,7 @@ from caustic_cli.optics import intersection
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.bundle import Bundle
 from caustic_cli.optics.heightfield import HeightField
-from caustic_cli.optics.intersection import Status
+from caustic_cli.optics.intersection import Method, Status
 from caustic_cli.optics.kernels.surface import FusedSurface, RayHits
 
 
@@ -50,7 +50,7 @@ def find_fused(f, heights, rays, start=None):
     return torch.from_numpy(hits.t.copy()), torch.from_numpy(hits.status.astype(np.int64))
 
 
-FINDERS = {"reference": intersection.find, "kernel": find_fused}
+FINDERS = {"reference": intersection.reference, "kernel": find_fused}
 
 
 @pytest.fixture(params=FINDERS)
@@ -88,7 +88,7 @@ def test_kernel_and_reference_find_the_same():
     f = field()
     for size in (0.02, 0.3, 1.0):
         heights, rays = bumpy(f, size), fan(2000, 1.3, 1)
-        (a, sa), (b, sb) = intersection.find(f, heights, rays), find_fused(f, heights, rays)
+        (a, sa), (b, sb) = intersection.reference(f, heights, rays), find_fused(f, heights, rays)
         assert bool((sa == sb).all())
         hit = sa == Status.HIT
         assert int(hit.sum()) > 100
@@ -227,3 +227,39 @@ def test_derivatives_equal_those_of_unrolled_newton():
     (unrolled,) = torch.autograd.grad(t[hit].sum(), leaf, retain_graph=True)
     (implicit,) = torch.autograd.grad(intersection.meet(f, leaf, rays)[0][hit].sum(), leaf)
     torch.testing.assert_close(implicit, unrolled, rtol=1e-11, atol=1e-12)
+
+
+# the three methods
+
+
+@pytest.mark.parametrize("size", [0.05, 0.6])
+def test_mesh_and_newton_agree_on_what_is_hit(size):
+    f = field(17, 16)
+    heights, rays = bumpy(f, size), fan(4000, 0.8 if size < 0.1 else 1.3, 4)
+    exact, status = intersection.find(f, heights, rays)
+    hit = status == Status.HIT
+    assert 1000 < int(hit.sum()) < 4000
+    errors = []
+    for parts in (4, 16):
+        mesh, by_mesh = intersection.find(f, heights, rays, Method("mesh", (parts, parts)))
+        both, by_both = intersection.find(f, heights, rays, Method("mesh+newton", (parts, parts)))
+        assert float((by_mesh == status).double().mean()) > 0.98  # rays near the rim, and grazing ones, may differ
+        met = hit & (by_both == Status.HIT)
+        assert float((by_both == by_mesh).double().mean()) > 0.98
+        same = (both - exact)[met].abs() < 1e-9
+        assert float(same.double().mean()) > (0.999 if size < 0.1 else 0.98)
+        assert float(residual(f, heights, rays, both)[met].abs().max()) < 1e-13
+        errors.append(float((mesh - exact)[hit & (by_mesh == Status.HIT)].abs().median()))
+    assert errors[0] / errors[1] == pytest.approx(16.0, rel=0.25)
+
+
+def test_the_derivative_at_a_mesh_hit_tends_to_the_implicit_one():
+    f = field()
+    heights, rays = bumpy(f, 0.05), fan(300, 0.4, 5)
+    leaf, found = heights.clone().requires_grad_(), {}
+    for name in ("newton", "mesh+newton", "mesh"):
+        t, gx, gy, status = intersection.meet(f, leaf, rays, Method(name, (32, 32)))
+        hit = status == Status.HIT
+        (found[name],) = torch.autograd.grad((t + gx - 2 * gy)[hit].sum(), leaf)
+    torch.testing.assert_close(found["mesh+newton"], found["newton"], rtol=1e-10, atol=1e-10)
+    assert 0 < float((found["mesh"] - found["newton"]).norm() / found["newton"].norm()) < 1e-3

@@ -248,5 +248,5 @@ def test_of_size_gives_about_that_many_rays_in_square_cells(rays, aspect):
 
 
 def test_unknown_sampler_is_refused():
-    with pytest.raises(InputError, match="grid, lines, stratified, uniform, got 'sobol'"):
+    with pytest.raises(InputError, match="grid, lines, stratified, uniform, sobol, got 'halton'"):
         Sampler("halton", (2, 2))

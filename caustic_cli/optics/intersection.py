@@ -9,18 +9,26 @@ Notation
 A ray with L < d_z meets the surface once.  Newton's iteration then runs inside a bracket, from the control net's hull and the
 aperture, that bisection takes over where a step leaves it.  For any other ray the first root is isolated before that.
 
-This is the plain-torch reference, and the path for other devices; `kernels.hit` is its fused form.
+`reference` is plain torch, and the path for other devices; `kernels.hit` is its fused form.  The thesis' triangle mesh is in
+`mesh`.  At the hit, f(t; P) = 0 gives dt/dP = N_i N_j / c, whatever found t: no iteration is ever differentiated.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import IntEnum
 
 import torch
 from torch import Tensor
 
+from caustic_cli.errors import InputError
 from caustic_cli.optics.bundle import Bundle
 from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.kernels import fused
+from caustic_cli.optics.mesh import TriangleMesh
+from caustic_cli.scene import checks
+
+METHODS = ("newton", "mesh", "mesh+newton")
 
 
 class Status(IntEnum):
@@ -42,17 +50,37 @@ FINEST = 1e-6
 MOST_PROBES = 20_000
 
 
-def meet(field: HeightField, heights: Tensor, bundle: Bundle) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+@dataclass(frozen=True)
+class Method:
+    """How hits are found.
+
+    Args:
+        name: newton, mesh, or mesh+newton, which begins Newton's iteration at the mesh's hit.
+        parts: (n_u, n_v), parts that the mesh cuts each knot span into.
+        recursive: look for the mesh's span products four rectangles at a time, or through all of them.
+    """
+
+    name: str = "newton"
+    parts: tuple[int, int] = (4, 4)
+    recursive: bool = True
+
+    def __post_init__(self):
+        checks.choice("intersection method", self.name, METHODS)
+
+
+def meet(field: HeightField, heights: Tensor, bundle: Bundle,
+         method: Method | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """First hits of a bundle.
 
     Args:
         heights: (n, m) control heights, mm.
+        method: None for Newton's, which decides ray by ray, from the surface's slopes, whether it has to isolate the root.
 
     Returns:
         t, distance to the hit (mm; -1 for none), dz/dx and dz/dy there, all (N,) float64, differentiable once in either mode by
-        the heights; status (N,), a `Status` each.
+        the heights; status (N,), a `Status` each.  Where a mesh found t, these are those of the surface above that point.
     """
-    t, status = find(field, heights, bundle)
+    t, status = find(field, heights, bundle, method)
     hit = status == Status.HIT
     t = torch.where(hit, t, torch.zeros_like(t))
     x, y = bundle.x + t * bundle.dx, bundle.y + t * bundle.dy
@@ -69,8 +97,29 @@ def meet(field: HeightField, heights: Tensor, bundle: Bundle) -> tuple[Tensor, T
 
 
 @torch.no_grad()
-def find(field: HeightField, heights: Tensor, bundle: Bundle) -> tuple[Tensor, Tensor]:
-    """t (N,) float64 of the first hit of every ray, and its status (N,)."""
+def find(field: HeightField, heights: Tensor, bundle: Bundle, method: Method | None = None) -> tuple[Tensor, Tensor]:
+    """t (N,) float64 of the first hit of every ray, and its status (N,); on a CPU by the kernels."""
+    method, b = method or Method(), bundle
+    start = None
+    if method.name != "newton":
+        mesh = TriangleMesh(field, heights, *method.parts)
+        start, missed, _ = mesh.intersect(b.x, b.y, torch.full_like(b.x, b.z), b.dx, b.dy, b.dz, method.recursive)
+        if method.name == "mesh":
+            return torch.where(missed == 0, start, torch.zeros_like(start)), missed.long()
+    if fused(b.x.device):
+        from caustic_cli.optics.kernels.surface import FusedSurface, RayHits  # noqa: PLC0415
+
+        hits = RayHits(FusedSurface(field.spaces, field.half_size), bundle)
+        hits.find(heights, None if start is None else start.numpy())
+        return torch.from_numpy(hits.t), torch.from_numpy(hits.status).long()
+    if start is not None:
+        raise InputError("mesh+newton intersection runs on the CPU; use newton")
+    return reference(field, heights, bundle)
+
+
+@torch.no_grad()
+def reference(field: HeightField, heights: Tensor, bundle: Bundle) -> tuple[Tensor, Tensor]:
+    """The same by Newton's method in plain torch."""
     h = heights.detach().double()
     lowest, highest = float(h.min()), float(h.max())
     (rx, ry), b = field.half_size, bundle

@@ -26,6 +26,8 @@ LEAST_COSINE = 1e-12
 #: by no more than some 1e-12 of that way, and the ray may as well pass.
 FINEST = 1e-6
 MOST_PROBES = 20000
+#: A hit is looked for at first within this part of the way through the box from where a mesh has it.
+NEAR = 1e-3
 
 
 @njit(inline="always", **_OPTIONS)
@@ -72,8 +74,24 @@ def _first_bracket(low, high, f_low, ray, slope, c, bu, mu, wu, bv, mv, wv):
 
 
 @njit(**_OPTIONS)
+def _bracket_around(start, low, high, ray, c, bu, mu, wu, bv, mv, wv):
+    """(a, b, found): the narrowest of ever wider intervals around `start` with f(a) < 0 <= f(b), inside [low, high]."""
+    ou, ov, oz, du, dv, dz = ray
+    reach = NEAR * (high - low)
+    while True:
+        a, b = max(low, start - reach), min(high, start + reach)
+        z_a, _, _ = _value(c, ou + a * du, ov + a * dv, bu, mu, wu, bv, mv, wv)
+        z_b, _, _ = _value(c, ou + b * du, ov + b * dv, bu, mu, wu, bv, mv, wv)
+        if oz + a * dz < z_a and oz + b * dz >= z_b:
+            return a, b, 1
+        if a <= low and b >= high:
+            return a, b, 0
+        reach *= 4.0
+
+
+@njit(**_OPTIONS)
 def _root(ray, start, limits, slope, c, bu, mu, wu, bv, mv, wv):
-    """(t, status) of the first hit.  limits: least and largest height; start: where Newton begins, negative for none."""
+    """(t, status) of the first hit.  limits: least and largest height; start: near which it is, negative if not known."""
     ou, ov, oz, du, dv, dz = ray
     z_low, z_high = limits
     if not (ou >= 0.0 and ou <= 1.0 and ov >= 0.0 and ov <= 1.0 and dz > 0.0):
@@ -87,7 +105,12 @@ def _root(ray, start, limits, slope, c, bu, mu, wu, bv, mv, wv):
     f_low = oz + low * dz - z
     if f_low >= 0.0:  # on the hull's floor, which the surface then touches; or the ray begins above the surface
         return low, HIT if low > 0.0 or f_low == 0.0 else MISSED
-    if not slope < dz:
+    if start >= 0.0:
+        low, high, found = _bracket_around(min(max(start, low), high), low, high, ray, c, bu, mu, wu, bv, mv, wv)
+        if found == 0:
+            return 0.0, MISSED
+        closed = True
+    elif not slope < dz:
         low, high, found = _first_bracket(low, high, f_low, ray, slope, c, bu, mu, wu, bv, mv, wv)
         if found != 1:
             return 0.0, MISSED if found == 0 else UNRESOLVED
@@ -123,7 +146,8 @@ def _root(ray, start, limits, slope, c, bu, mu, wu, bv, mv, wv):
 def intersect(ou, ov, oz, du, dv, dz, start, limits, slopes, c, bu, mu, wu, bv, mv, wv, t, status, blocks):
     """First hits of rays (N,) into t and status (N,).
 
-    limits: least and largest control height; slopes: bounds of |Z_u| and |Z_v|; start (N,) where Newton begins, or empty.
+    limits: least and largest control height; slopes: bounds of |Z_u| and |Z_v|; start (N,): near which the hits are, infinite
+    for none; or empty, if that is not known.
     """
     count = len(ou)
     for block in prange(blocks):
@@ -131,6 +155,9 @@ def intersect(ou, ov, oz, du, dv, dz, start, limits, slopes, c, bu, mu, wu, bv, 
             ray = (ou[k], ov[k], oz[k], du[k], dv[k], dz[k])
             slope = slopes[0] * abs(du[k]) + slopes[1] * abs(dv[k])
             begin = start[k] if len(start) else -1.0
+            if begin == np.inf:
+                t[k], status[k] = 0.0, MISSED
+                continue
             t[k], status[k] = _root(ray, begin, limits, slope, c, bu, mu, wu, bv, mv, wv)
 
 

@@ -86,7 +86,7 @@ class RayHits:
     def find(self, heights: Tensor, start: np.ndarray | None = None) -> np.ndarray:
         """Fill t (mm) and status of every ray; returns the coefficients of the surface.
 
-        start: distances at which Newton's iteration begins, or None for the middle of the heights' range.
+        start: distances (N,) near which the hits are, infinite for none; None if that is not known.
         """
         c, h = self.surface.coefficients(heights), heights.detach().double()
         slopes = [float((a.space.derivative_matrix() @ x).abs().max()) for a, x in zip(self.surface.axes, (h, h.T), strict=True)]
