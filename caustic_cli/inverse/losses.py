@@ -6,7 +6,7 @@ Every term is a dimensionless root mean square t; r is the relative residual N (
     rms-light   r with P = P_out, the power that leaves the lens: every ray counts.
     throughput  t^2 is the part of the light beside the screen, each ray weighted by its distance from it (1 at the apron's rim):
                 it pulls back where rms-light, which sees how much light is out there but not how far, has no slope
-    diffusion   the Laplacian of r, with P = P_out: errors that alternate from pixel to pixel count, those that the eye averages do not
+    diffusion   the Laplacian of r, with P = P_out: errors that alternate from pixel to pixel count
     uniformity  standard deviation of J over its mean where the target is not dark: no picture is asked for (5.2)
     laplacian, curvature    of the lens, see `penalties`
 
