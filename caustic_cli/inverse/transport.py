@@ -35,7 +35,12 @@ from caustic_cli.inverse.multigrid import Multigrid
 
 FAST = {"cache": True, "error_model": "numpy", "nogil": True}
 FINE = 4  # raster points a source cell, along each axis
-LEVELS = (64, 8, 1)  # of how many times fewer sites
+LEVELS = (64, 16, 4, 1)
+ROUGH = 0.5
+WIDE = 0.6
+SUB = 2
+VERB = False
+  # of how many times fewer sites
 MAX_LATTICE = 1024  # the picture is halved until it has at most so many pixels along an axis
 BOND = 4.0  # border of a missing cell
 COARSE_TOLERANCE, LINEAR_TOLERANCE = 1e-2, 3e-2
@@ -84,7 +89,7 @@ def centres(n: int, half: float, pad: int = 0) -> np.ndarray:
     return (np.arange(-pad, n + pad) + 0.5) * (2.0 * half / n) - half
 
 
-def solve(source, target, source_half, target_half, *, start=None, smooth=1.5, tolerance=3e-3, most=10) -> Transport:
+def solve(source, target, source_half, target_half, *, start=None, smooth=1.5, tolerance=5e-3, most=10) -> Transport:
     """The map that carries `source` onto `target` at least quadratic cost.
 
     Args:
@@ -122,7 +127,8 @@ def solve(source, target, source_half, target_half, *, start=None, smooth=1.5, t
         elif old is None:
             psi = 0.5 * ((a / c) * sites.y1**2 + (b / d) * sites.y2**2)
         else:
-            psi = _prices(_rounded(psi, old, raster, (a, b)), sites, raster)
+            coarse = [centres(int(ROUGH * len(x)), h) for x, h in zip(raster, (a, b), strict=True)]
+            psi = _prices(_rounded(psi, old, coarse, (a, b)), sites, coarse)
         psi, error, taken = _newton(psi, sites, raster, f, (a, b), tolerance if fewer == 1 else COARSE_TOLERANCE, most)
         steps += taken
     potential, x, y = _smoothed(psi, sites, (n, m), (a, b), smooth)
@@ -231,7 +237,7 @@ def _resampled(potential, shape: tuple[int, int], half: tuple[float, float], ras
 def _rounded(psi: np.ndarray, sites: _Sites, raster: list, half: tuple[float, float]) -> np.ndarray:
     """phi of a coarser level on a finer raster, its kinks rounded over about a cell: new sites then find room between old."""
     shape = tuple(len(x) for x in raster)
-    width = [0.6 * s / len(psi) ** 0.5 for s in shape]
+    width = [WIDE * s / len(psi) ** 0.5 for s in shape]
     pad = [int(np.ceil(3.0 * w)) for w in width]
     wide = [centres(s, h, p) for s, h, p in zip(shape, half, pad, strict=True)]
     phi, _ = laguerre.envelope(psi, *sites.lines, *wide)
