@@ -35,12 +35,8 @@ from caustic_cli.inverse.multigrid import Multigrid
 
 FAST = {"cache": True, "error_model": "numpy", "nogil": True}
 FINE = 4  # raster points a source cell, along each axis
-LEVELS = (64, 16, 4, 1)
-ROUGH = 0.5
-WIDE = 0.6
-SUB = 2
-VERB = False
-  # of how many times fewer sites
+LEVELS = (64, 16, 4, 1)  # of how many times fewer sites
+ROUGH, WIDE = 0.5, 0.4  # a coarse phi is rounded on a raster so much coarser than the next level's, over such a part of a cell
 MAX_LATTICE = 1024  # the picture is halved until it has at most so many pixels along an axis
 BOND = 4.0  # border of a missing cell
 COARSE_TOLERANCE, LINEAR_TOLERANCE = 1e-2, 3e-2
@@ -53,7 +49,7 @@ class Transport:
     """A map and what it was made of.
 
     Attributes:
-        potential: phi at the source's cell centres, (n, m) float64, mm^2; its mean is 0.
+        potential: phi at the corners of the source's cells, edges included, (n + 1, m + 1) float64, mm^2; its mean is 0.
         x, y: the map there, mm; the exact gradient of phi.
         error: light in the wrong cell, part of the whole (before phi is smoothed).
         sites, steps: point masses of the finest level, and Newton steps of all levels.
@@ -89,6 +85,11 @@ def centres(n: int, half: float, pad: int = 0) -> np.ndarray:
     return (np.arange(-pad, n + pad) + 0.5) * (2.0 * half / n) - half
 
 
+def corners(n: int, half: float) -> np.ndarray:
+    """Edges of n cells on [-half, half], (n + 1,)."""
+    return np.linspace(-half, half, n + 1)
+
+
 def solve(source, target, source_half, target_half, *, start=None, smooth=1.5, tolerance=5e-3, most=10) -> Transport:
     """The map that carries `source` onto `target` at least quadratic cost.
 
@@ -96,7 +97,7 @@ def solve(source, target, source_half, target_half, *, start=None, smooth=1.5, t
         source: density on [-a, a] x [-b, b], (n, m) float64, not negative, [i, j] with i along +x; any unit.
         target: density on [-c, c] x [-d, d], (k, l) float64, not negative; zeros stay dark.
         source_half, target_half: (a, b) and (c, d), mm.
-        start: potential of a similar problem on the same source cells, (n, m), mm^2, or None.
+        start: potential of a similar problem on the same source cells, (n + 1, m + 1), mm^2, or None.
         smooth: width of the average over phi, source cells: a triangle of twice this width; at least 0.5.
         tolerance: light in the wrong cell at which Newton's method stops, a part of the whole.
         most: Newton steps a level.
@@ -226,12 +227,10 @@ def _prices(phi: np.ndarray, sites: _Sites, raster: list) -> np.ndarray:
 def _resampled(potential, shape: tuple[int, int], half: tuple[float, float], raster: list) -> np.ndarray:
     """A start potential on the raster, or InputError."""
     v = np.asarray(potential, dtype=np.float64)
-    if v.shape != shape or not np.isfinite(v).all():
-        raise InputError(f"the start potential must be {shape[0]} x {shape[1]} finite values, as the source is")
-    degree = [min(3, s - 1) for s in shape]
-    if 0 in degree:
-        raise InputError("a start potential needs at least 2 x 2 source cells")
-    return RectBivariateSpline(centres(shape[0], half[0]), centres(shape[1], half[1]), v, kx=degree[0], ky=degree[1])(*raster)
+    if v.shape != (shape[0] + 1, shape[1] + 1) or not np.isfinite(v).all():
+        raise InputError(f"the start potential must be {shape[0] + 1} x {shape[1] + 1} finite values, one a corner of a cell")
+    at = [corners(s, h) for s, h in zip(shape, half, strict=True)]
+    return RectBivariateSpline(*at, v, kx=min(3, shape[0]), ky=min(3, shape[1]))(*raster)
 
 
 def _rounded(psi: np.ndarray, sites: _Sites, raster: list, half: tuple[float, float]) -> np.ndarray:
@@ -327,18 +326,16 @@ def _matrix(head, link, end, weight, mass, goal, missing, touched, bond):
 
 
 def _smoothed(psi, sites: _Sites, shape, half, smooth: float) -> list[np.ndarray]:
-    """phi and its gradient, averaged with a triangle over 2 `smooth` source cells, at the cell centres."""
+    """phi and its gradient, averaged with a triangle over 2 `smooth` source cells, at the cells' corners."""
     box = np.ones(max(round(FINE * smooth), 1))
-    kernel = np.convolve(np.convolve(box, box), (1.0, 1.0))  # of even length, so that it is centred between raster points
+    kernel = np.convolve(np.convolve(box, box), (1.0, 1.0))  # of even length: centred between two raster points, as corners are
     kernel /= kernel.sum()
     pad = FINE * int(np.ceil(len(kernel) / (2 * FINE)))
     raster = [centres(FINE * s, h, pad) for s, h in zip(shape, half, strict=True)]
     phi, site = laguerre.envelope(psi, *sites.lines, *raster)
-    low = pad + FINE // 2 - len(kernel) // 2
-    out = []
+    low, out = pad - len(kernel) // 2, []
     for v in (phi, sites.y1[site], sites.y2[site]):
         for axis in (0, 1):
-            taps = (v.take(range(low + k, low + k + FINE * shape[axis], FINE), axis) * w for k, w in enumerate(kernel))
-            v = sum(taps)
+            v = sum(w * v.take(range(low + k, low + k + FINE * shape[axis] + 1, FINE), axis) for k, w in enumerate(kernel))
         out.append(v)
     return out
