@@ -181,7 +181,32 @@ def density(f, x, y, a, b):
 
 
 @njit(**FAST)
-def _cells(low, high, psi, y1, y2, site, head, link, end, degree, f, a, b, mass, weight):
+def sampled(f, x1, x2, a, b):
+    """Bilinear values of f on a raster, (n, m); (1, 1) where f is one constant."""
+    if f.size == 1:
+        return f.copy()
+    out = np.empty((len(x1), len(x2)))
+    for i in range(len(x1)):
+        for j in range(len(x2)):
+            out[i, j] = density(f, x1[i], x2[j], a, b)
+    return out
+
+
+@njit(**FAST)
+def _means(site, values, sites):
+    """Mean of raster values in each cell, (N,)."""
+    total, count = np.zeros(sites), np.zeros(sites)
+    if values.size == 1:
+        return np.full(sites, values[0, 0])
+    for i in range(site.shape[0]):
+        for j in range(site.shape[1]):
+            total[site[i, j]] += values[i, j]
+            count[site[i, j]] += 1.0
+    return total / np.maximum(count, 1.0)
+
+
+@njit(**FAST)
+def _cells(low, high, psi, y1, y2, site, head, link, end, degree, f, level, a, b, mass, weight):
     """`cells` for the sites low..high."""
     room, flat = 0, f.size == 1
     rn, rm = site.shape
@@ -212,15 +237,12 @@ def _cells(low, high, psi, y1, y2, site, head, link, end, degree, f, a, b, mass,
                 n = _clip(px, py, po, n, ax, ay, c, -1, qx, qy, qo)
                 px, py, po, qx, qy, qo = qx, qy, qo, px, py, po
                 k, missed = 0, missed + 1
-        area, cx, cy = 0.0, 0.0, 0.0
+        area = 0.0
         for k in range(1, n - 1):
-            t = 0.5 * ((px[k] - px[0]) * (py[k + 1] - py[0]) - (px[k + 1] - px[0]) * (py[k] - py[0]))
-            area += t
-            cx += t * (px[0] + px[k] + px[k + 1])
-            cy += t * (py[0] + py[k] + py[k + 1])
+            area += 0.5 * ((px[k] - px[0]) * (py[k + 1] - py[0]) - (px[k + 1] - px[0]) * (py[k] - py[0]))
         if not area > 0.0:
             continue
-        mass[p] = area * (f[0, 0] if flat else density(f, cx / (3.0 * area), cy / (3.0 * area), a, b))
+        mass[p] = area * level[p]
         for k in range(n):
             if po[k] >= 0:
                 k1 = k + 1 if k + 1 < n else 0
@@ -231,17 +253,17 @@ def _cells(low, high, psi, y1, y2, site, head, link, end, degree, f, a, b, mass,
 
 
 @njit(parallel=True, **FAST)
-def cells(psi, y1, y2, site, head, link, end, degree, f, a, b):
+def cells(psi, y1, y2, site, head, link, end, degree, f, values, a, b):
     """Mass of every cell and d(mass) across every border.
 
     Returns:
-        mass (N,): source light in the cell, f at its centroid times its area;
+        mass (N,): source light in the cell, its area times the mean over its raster points of `values`, the source f sampled;
         weight (half-borders,): f times the border's length over the sites' distance, the derivative of the mass by the
         difference of the two prices (Kitagawa, Merigot & Thibert, J. Eur. Math. Soc. 21, 2019, theorem 1.3).
     """
     sites, tasks = len(psi), 32
-    mass, weight = np.zeros(sites), np.zeros(len(end))
+    mass, weight, level = np.zeros(sites), np.zeros(len(end)), _means(site, values, sites)
     for task in prange(tasks):
-        _cells(task * sites // tasks, (task + 1) * sites // tasks, psi, y1, y2, site, head, link, end, degree, f, a, b, mass,
-               weight)
+        _cells(task * sites // tasks, (task + 1) * sites // tasks, psi, y1, y2, site, head, link, end, degree, f, level, a, b,
+               mass, weight)
     return mass, weight

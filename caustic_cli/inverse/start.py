@@ -150,7 +150,7 @@ def heights(map_: Transport, aim, x, y, d, index: float, z_screen: float, mean: 
         tx, ty, tz = aim[0] - x, aim[1] - y, z_screen - z
         length = np.sqrt(tx * tx + ty * ty + tz * tz)
         lean = index * d[2] - tz / length
-        if not (lean > 0).all() or not (tz > 0).all():
+        if not ((index * (d[0] * tx + d[1] * ty + d[2] * tz) > length) & (tz > 0)).all():  # t . N > 0
             raise InputError("the picture cannot be reached by refraction: a smaller picture or a longer throw is needed")
         rest = [(t / length - index * v) / lean - s for t, v, s in zip((tx, ty), d, slope, strict=False)]
         z = main + integrate(*rest, step)

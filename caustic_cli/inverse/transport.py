@@ -114,14 +114,15 @@ def solve(source, target, source_half, target_half, *, start=None, smooth=1.5, t
     f = np.maximum(f / f.mean(), DARKEST)
     f = f[:1, :1] if np.ptp(f) == 0 else f
     f = f / (f.mean() * 4.0 * a * b)
-    pyramid = _pyramid(g, (c, d), n * m)
+    most_sites = int(n * m * f.mean() ** 2 / (f * f).mean())  # so that where most light is, a cell is not below a source cell
+    pyramid = _pyramid(g, (c, d), most_sites)
     psi = sites = None
     steps = 0
     for fewer in LEVELS:
         if start is not None and fewer > 1:
             continue
-        goal = max(n * m // fewer, 16)
-        raster = [centres(max(int(FINE * s * (goal / (n * m)) ** 0.5), 32), h) for s, h in ((n, a), (m, b))]
+        goal = max(most_sites // fewer, 16)
+        raster = [centres(max(int(FINE * s * fewer**-0.5), 32), h) for s, h in ((n, a), (m, b))]
         old, sites = sites, _sites(pyramid, 1.0 / goal)
         if start is not None:
             psi = _prices(_resampled(start, (n, m), (a, b), raster), sites, raster)
@@ -130,7 +131,7 @@ def solve(source, target, source_half, target_half, *, start=None, smooth=1.5, t
         else:
             coarse = [centres(int(ROUGH * len(x)), h) for x, h in zip(raster, (a, b), strict=True)]
             psi = _prices(_rounded(psi, old, coarse, (a, b)), sites, coarse)
-        psi, error, taken = _newton(psi, sites, raster, f, (a, b), tolerance if fewer == 1 else COARSE_TOLERANCE, most)
+        psi, error, taken = _newton(psi, sites, raster, (f, laguerre.sampled(f, *raster, a, b), a, b), tolerance if fewer == 1 else COARSE_TOLERANCE, most)
         steps += taken
     potential, x, y = _smoothed(psi, sites, (n, m), (a, b), smooth)
     return Transport(potential - potential.mean(), x, y, error, len(psi), steps, time.perf_counter() - began)
@@ -244,7 +245,7 @@ def _rounded(psi: np.ndarray, sites: _Sites, raster: list, half: tuple[float, fl
     return phi[pad[0] : -pad[0], pad[1] : -pad[1]]
 
 
-def _cells(psi: np.ndarray, sites: _Sites, raster: list, f: np.ndarray, half: tuple[float, float]) -> tuple:
+def _cells(psi: np.ndarray, sites: _Sites, raster: list, light: tuple) -> tuple:
     """Prices (those of missing cells lowered until they touch), masses of the cells, and the derivative's graph."""
     phi, site = laguerre.envelope(psi, *sites.lines, *raster)
     seen = np.zeros(len(psi), bool)
@@ -255,15 +256,15 @@ def _cells(psi: np.ndarray, sites: _Sites, raster: list, f: np.ndarray, half: tu
         psi = np.where(seen, psi, back)
         touched = site.ravel()[at[missing]].astype(np.int64)
         distance = np.hypot(sites.y1[missing] - sites.y1[touched], sites.y2[missing] - sites.y2[touched])
-        bond = BOND * np.sqrt(sites.mass[missing] * f.mean()) / distance
+        bond = BOND * np.sqrt(sites.mass[missing] * light[0].mean()) / distance
     net = laguerre.borders(site, len(psi))
-    mass, weight = laguerre.cells(psi, sites.y1, sites.y2, site, *net, f, *half)
+    mass, weight = laguerre.cells(psi, sites.y1, sites.y2, site, *net, *light)
     return psi, mass, (*net[:3], weight, mass, sites.mass, missing, touched, bond)
 
 
-def _newton(psi, sites: _Sites, raster: list, f, half, tolerance: float, most: int) -> tuple[np.ndarray, float, int]:
+def _newton(psi, sites: _Sites, raster: list, light: tuple, tolerance: float, most: int) -> tuple[np.ndarray, float, int]:
     """Prices whose cells hold the sites' masses, the light still in a wrong cell, and the steps taken."""
-    psi, mass, graph = _cells(psi, sites, raster, f, half)
+    psi, mass, graph = _cells(psi, sites, raster, light)
     excess = mass - sites.mass
     error = 0.5 * float(np.abs(excess).sum())
     for step in range(most):
@@ -273,7 +274,7 @@ def _newton(psi, sites: _Sites, raster: list, f, half, tolerance: float, most: i
         change -= change.mean()
         length, best = 1.0, None
         while length > 0.05:
-            new = _cells(psi + length * change, sites, raster, f, half)
+            new = _cells(psi + length * change, sites, raster, light)
             left = new[1] - sites.mass
             size = 0.5 * float(np.abs(left).sum())
             if best is None or size < best[1]:
