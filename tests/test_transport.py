@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.interpolate import RectBivariateSpline
+from scipy.sparse import coo_matrix
 
 from caustic_cli.errors import InputError
 from caustic_cli.inverse import laguerre, start, transport
@@ -19,14 +20,14 @@ def corners(n, m):
     return transport.corners(n, A)[:, None], transport.corners(m, B)[None, :]
 
 
-def flame(k=60, l=50):
+def flame(size=(60, 50)):
     """Two bright bodies on black."""
-    x, y = np.meshgrid(transport.centres(k, 1.0), transport.centres(l, 1.0), indexing="ij")
+    x, y = np.meshgrid(*(transport.centres(s, 1.0) for s in size), indexing="ij")
     return ((x + 0.5) ** 2 + y**2 < 0.09) + 0.5 * ((x - 0.4) ** 2 + (y - 0.3) ** 2 < 0.12)
 
 
-def smooth(k=50, l=50):
-    x, y = np.meshgrid(transport.centres(k, 1.0), transport.centres(l, 1.0), indexing="ij")
+def smooth(size=(50, 50)):
+    x, y = np.meshgrid(*(transport.centres(s, 1.0) for s in size), indexing="ij")
     return 1.0 + 0.6 * np.sin(3.0 * x) * np.cos(2.0 * y) + np.exp(-8.0 * (x * x + (y - 0.2) ** 2))
 
 
@@ -77,7 +78,8 @@ def test_one_dimension_follows_the_quantiles():
     quantile = (transport.corners(96, A) + A) / (2 * A)
     cumulated = np.append(0.0, np.cumsum(weight)) / weight.sum()
     edges = np.linspace(-C, C, 9)
-    exact = np.where(quantile < cumulated[2], np.interp(quantile, cumulated[:3], edges[:3]), np.interp(quantile, cumulated[4:], edges[4:]))
+    low, high = np.interp(quantile, cumulated[:3], edges[:3]), np.interp(quantile, cumulated[4:], edges[4:])
+    exact = np.where(quantile < cumulated[2], low, high)
     gap = np.abs(quantile - cumulated[2]) < 3 / 96
     error = np.abs(found.x - exact[:, None])[3:-3][~gap[3:-3]]
     assert error.max() < 0.35
@@ -96,7 +98,8 @@ def test_gaussian_to_gaussian():
     assert np.abs(found.y - 1.5 * y)[core].max() < 0.15
 
 
-@pytest.mark.parametrize("target", [flame(), smooth(), np.random.default_rng(1).random((33, 70)) ** 4], ids=["flame", "smooth", "rough"])
+@pytest.mark.parametrize("target", [flame(), smooth(), np.random.default_rng(1).random((33, 70)) ** 4],
+                         ids=["flame", "smooth", "rough"])
 def test_convex_and_the_map_is_its_gradient(target):
     found = solve(target)
     z = found.potential
@@ -149,9 +152,9 @@ def test_one_bright_pixel(shape):
     assert np.isfinite(found.potential).all()
 
 
-@pytest.mark.parametrize(("n", "m", "k", "l"), [(40, 7, 3, 90), (5, 64, 61, 2), (1, 1, 4, 4), (2, 3, 300, 1)])
-def test_any_sizes(n, m, k, l):
-    found = solve(np.random.default_rng(0).random((k, l)), n, m)
+@pytest.mark.parametrize(("n", "m", "size"), [(40, 7, (3, 90)), (5, 64, (61, 2)), (1, 1, (4, 4)), (2, 3, (300, 1))])
+def test_any_sizes(n, m, size):
+    found = solve(np.random.default_rng(0).random(size), n, m)
     assert found.potential.shape == found.x.shape == found.y.shape == (n + 1, m + 1)
     assert np.abs(found.x).max() <= C
     assert np.abs(found.y).max() <= D
@@ -188,7 +191,8 @@ def bad(value):
 @pytest.mark.parametrize("call", [
     lambda: solve(np.zeros((5, 5))), lambda: solve(np.ones(5)), lambda: solve(bad(np.nan)), lambda: solve(bad(-1.0)),
     lambda: solve(np.ones((0, 4))), lambda: solve(np.ones((4, 4)), source=bad(np.inf)), lambda: solve(np.ones((4, 4)), smooth=0.1),
-    lambda: solve(np.ones((4, 4)), half=(C, 0.0)), lambda: solve(np.ones((4, 4)), half=(C,)), lambda: solve(np.ones((4, 4)), half="x"),
+    lambda: solve(np.ones((4, 4)), half=(C, 0.0)), lambda: solve(np.ones((4, 4)), half=(C,)),
+    lambda: solve(np.ones((4, 4)), half="x"),
     lambda: solve(np.ones((4, 4)), start=np.zeros((4, 4))),
     lambda: surface(np.ones((4, 4)), index=0.9), lambda: surface(np.ones((4, 4)), z_screen=4.0),
     lambda: surface(np.ones((4, 4)), directions=(np.zeros((65, 65)),) * 3), lambda: surface(np.ones((4, 4)), directions=(1.0, 2.0)),
@@ -268,9 +272,9 @@ def test_integration_is_exact_for_parabolas():
 def test_multigrid_solves_a_graph():
     n = 40
     index = np.arange(n * n).reshape(n, n)
-    pairs = np.concatenate([np.stack([index[1:], index[:-1]], -1).reshape(-1, 2), np.stack([index[:, 1:], index[:, :-1]], -1).reshape(-1, 2)])
+    sides = [(index[1:], index[:-1]), (index[:, 1:], index[:, :-1])]
+    pairs = np.concatenate([np.stack(side, -1).reshape(-1, 2) for side in sides])
     weight = np.random.default_rng(0).random(len(pairs)) + 0.01
-    from scipy.sparse import coo_matrix
     w = coo_matrix((np.r_[weight, weight], (np.r_[pairs[:, 0], pairs[:, 1]], np.r_[pairs[:, 1], pairs[:, 0]]))).tocsr()
     diagonal = np.asarray(w.sum(1)).ravel()
     r = np.random.default_rng(1).standard_normal(n * n)

@@ -18,7 +18,51 @@ STRONG, OVER, SMALLEST, LEVELS = 0.25, 1.6, 60, 14
 
 
 @njit(**FAST)
-def _aggregate(start, column, entry, diagonal):
+def matrix(head, link, end, weight, mass, goal, missing, touched, bond):
+    """The derivative of cells' masses by prices, negated: start, column, entry off the diagonal in CSR form, and the diagonal.
+
+    Args:
+        head, link, end, weight: the cells' borders, as of `laguerre.borders` and `laguerre.cells`.
+        mass, goal (N,): of each cell, and wanted: a cell too light counts by the secant.
+        missing, touched, bond: sites without a cell (ascending), the sites they are tied to, and how firmly.
+    """
+    n = len(head)
+    stiff = np.ones(n)
+    for p in range(n):
+        if mass[p] < goal[p]:
+            stiff[p] = 0.5 * (1.0 + np.sqrt(goal[p] / max(mass[p], 1e-4 * goal[p])))
+    extra, after = np.full(n, -1, np.int32), np.full(len(missing), -1, np.int32)
+    for h in range(len(missing)):
+        after[h], extra[touched[h]] = extra[touched[h]], h
+    room = len(end) + 2 * len(missing)
+    start, column, entry, diagonal = np.zeros(n + 1, np.int64), np.empty(room, np.int32), np.empty(room), np.zeros(n)
+    used, own = 0, 0
+    for p in range(n):
+        e = head[p]
+        while e >= 0:
+            w = 0.5 * (weight[e] + weight[e ^ 1]) * max(stiff[p], stiff[end[e]])
+            if w > 0.0:
+                column[used], entry[used] = end[e], -w
+                used += 1
+            e = link[e]
+        h = extra[p]
+        while h >= 0:
+            column[used], entry[used] = missing[h], -bond[h]
+            used += 1
+            h = after[h]
+        if own < len(missing) and missing[own] == p:
+            column[used], entry[used] = touched[own], -bond[own]
+            used += 1
+            own += 1
+        start[p + 1] = used
+        for e in range(start[p], used):
+            diagonal[p] -= entry[e]
+        diagonal[p] = diagonal[p] * (1.0 + 1e-10) if diagonal[p] > 0.0 else 1.0
+    return start, column[:used].copy(), entry[:used].copy(), diagonal
+
+
+@njit(**FAST)
+def _aggregate(start, column, entry):
     """Aggregate of each node (n,), and how many there are."""
     n = len(start) - 1
     group, count = np.full(n, -1, np.int32), 0
@@ -122,7 +166,7 @@ class Multigrid:
             n = len(diagonal)
             if n <= SMALLEST or len(self.levels) == LEVELS:
                 break
-            group, count = _aggregate(start, column, entry, diagonal)
+            group, count = _aggregate(start, column, entry)
             if count > 0.9 * n:
                 break
             self.levels.append((start, column, entry, diagonal, group, count))

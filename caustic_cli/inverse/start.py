@@ -129,7 +129,8 @@ def _directions(directions, shape) -> tuple:
     d = tuple(np.asarray(v, dtype=np.float64) for v in directions)
     if len(d) != 3 or any(v.shape != tuple(shape) for v in d):
         raise InputError(f"directions must be three arrays of shape {tuple(shape)}, a corner of a source cell each")
-    if not all(np.isfinite(v).all() for v in d) or (np.abs(d[0] ** 2 + d[1] ** 2 + d[2] ** 2 - 1) > 1e-6).any() or (d[2] <= 0).any():
+    unit = all(np.isfinite(v).all() for v in d) and (np.abs(d[0] ** 2 + d[1] ** 2 + d[2] ** 2 - 1) < 1e-6).all()
+    if not unit or (d[2] <= 0).any():
         raise InputError("directions must be finite unit vectors with a positive z component")
     return d
 
@@ -149,7 +150,7 @@ def heights(map_: Transport, aim, x, y, d, index: float, z_screen: float, mean: 
     for _ in range(REPEATS):
         tx, ty, tz = aim[0] - x, aim[1] - y, z_screen - z
         length = np.sqrt(tx * tx + ty * ty + tz * tz)
-        lean = index * d[2] - tz / length
+        lean = index * d[2] - tz / length  # N_z, up to a factor
         if not ((index * (d[0] * tx + d[1] * ty + d[2] * tz) > length) & (tz > 0)).all():  # t . N > 0
             raise InputError("the picture cannot be reached by refraction: a smaller picture or a longer throw is needed")
         rest = [(t / length - index * v) / lean - s for t, v, s in zip((tx, ty), d, slope, strict=False)]

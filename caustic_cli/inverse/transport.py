@@ -25,21 +25,20 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from scipy import ndimage
 from scipy.interpolate import RectBivariateSpline
 
 from caustic_cli.errors import InputError
 from caustic_cli.inverse import laguerre
-from caustic_cli.inverse.multigrid import Multigrid
+from caustic_cli.inverse.multigrid import Multigrid, matrix
 
-FAST = {"cache": True, "error_model": "numpy", "nogil": True}
 FINE = 4  # raster points a source cell, along each axis
 LEVELS = (64, 16, 4, 1)  # of how many times fewer sites
 ROUGH, WIDE = 0.5, 0.4  # a coarse phi is rounded on a raster so much coarser than the next level's, over such a part of a cell
 MAX_LATTICE = 1024  # the picture is halved until it has at most so many pixels along an axis
 BOND = 4.0  # border of a missing cell
 COARSE_TOLERANCE, LINEAR_TOLERANCE = 1e-2, 3e-2
+EVENER = (1.0, 0.7, 0.4, 0.2, 0.1, 0.03, 0.0)  # parts of uniform light, if a level fails on the source itself
 DARKEST = 1e-3  # the source is lifted to this part of its mean: a cell without light has no derivative
 MAX_CELLS = 4096
 
@@ -131,10 +130,26 @@ def solve(source, target, source_half, target_half, *, start=None, smooth=1.5, t
         else:
             coarse = [centres(int(ROUGH * len(x)), h) for x, h in zip(raster, (a, b), strict=True)]
             psi = _prices(_rounded(psi, old, coarse, (a, b)), sites, coarse)
-        psi, error, taken = _newton(psi, sites, raster, (f, laguerre.sampled(f, *raster, a, b), a, b), tolerance if fewer == 1 else COARSE_TOLERANCE, most)
+        enough = tolerance if fewer == 1 else COARSE_TOLERANCE
+        found, error, taken = _newton(psi, sites, raster, _light(f, 0.0, raster, a, b), enough, most)
         steps += taken
+        if error > 10.0 * enough and f.size > 1:  # lost in the dark parts of the source
+            psi = 0.5 * ((a / c) * sites.y1**2 + (b / d) * sites.y2**2)
+            for even in EVENER:
+                light = _light(f, even, raster, a, b)
+                psi, left, taken = _newton(psi, sites, raster, light, COARSE_TOLERANCE if even else enough, most)
+                steps += taken
+            if left < error:
+                found, error = psi, left
+        psi = found
     potential, x, y = _smoothed(psi, sites, (n, m), (a, b), smooth)
     return Transport(potential - potential.mean(), x, y, error, len(psi), steps, time.perf_counter() - began)
+
+
+def _light(f: np.ndarray, even: float, raster: list, a: float, b: float) -> tuple:
+    """What `laguerre.cells` needs of the source, mixed with a part `even` of uniform light."""
+    lit = (1.0 - even) * f + even * f.mean()
+    return lit, laguerre.sampled(lit, *raster, a, b), a, b
 
 
 def _density(name: str, value) -> np.ndarray:
@@ -270,7 +285,7 @@ def _newton(psi, sites: _Sites, raster: list, light: tuple, tolerance: float, mo
     for step in range(most):
         if error < tolerance or len(psi) == 1:
             return psi, error, step
-        change, _ = Multigrid(*_matrix(*graph)).solve(excess - excess.mean(), LINEAR_TOLERANCE)
+        change, _ = Multigrid(*matrix(*graph)).solve(excess - excess.mean(), LINEAR_TOLERANCE)
         change -= change.mean()
         length, best = 1.0, None
         while length > 0.05:
@@ -286,44 +301,6 @@ def _newton(psi, sites: _Sites, raster: list, light: tuple, tolerance: float, mo
             return psi, error, step
         (psi, mass, graph), error, excess = best
     return psi, error, most
-
-
-@njit(**FAST)
-def _matrix(head, link, end, weight, mass, goal, missing, touched, bond):
-    """The derivative of the cells' masses by the prices, negated: off-diagonal part in CSR form, and the diagonal."""
-    n = len(head)
-    stiff = np.ones(n)
-    for p in range(n):
-        if mass[p] < goal[p]:
-            stiff[p] = 0.5 * (1.0 + np.sqrt(goal[p] / max(mass[p], 1e-4 * goal[p])))
-    extra, after = np.full(n, -1, np.int32), np.full(len(missing), -1, np.int32)
-    for h in range(len(missing)):
-        after[h], extra[touched[h]] = extra[touched[h]], h
-    room = len(end) + 2 * len(missing)
-    start, column, entry, diagonal = np.zeros(n + 1, np.int64), np.empty(room, np.int32), np.empty(room), np.zeros(n)
-    used, own = 0, 0
-    for p in range(n):
-        e = head[p]
-        while e >= 0:
-            w = 0.5 * (weight[e] + weight[e ^ 1]) * max(stiff[p], stiff[end[e]])
-            if w > 0.0:
-                column[used], entry[used] = end[e], -w
-                used += 1
-            e = link[e]
-        h = extra[p]
-        while h >= 0:
-            column[used], entry[used] = missing[h], -bond[h]
-            used += 1
-            h = after[h]
-        if own < len(missing) and missing[own] == p:
-            column[used], entry[used] = touched[own], -bond[own]
-            used += 1
-            own += 1
-        start[p + 1] = used
-        for e in range(start[p], used):
-            diagonal[p] -= entry[e]
-        diagonal[p] = diagonal[p] * (1.0 + 1e-10) if diagonal[p] > 0.0 else 1.0
-    return start, column[:used].copy(), entry[:used].copy(), diagonal
 
 
 def _smoothed(psi, sites: _Sites, shape, half, smooth: float) -> list[np.ndarray]:
