@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 
 FAST = {"cache": True, "error_model": "numpy", "nogil": True}
-STRONG, OVER, SMALLEST, LEVELS = 0.25, 1.6, 60, 14
+STRONG, OVER, SMALLEST, LEVELS = 0.25, 1.6, 60, 10
 
 
 @njit(**FAST)
@@ -167,7 +167,7 @@ class Multigrid:
             if n <= SMALLEST or len(self.levels) == LEVELS:
                 break
             group, count = _aggregate(start, column, entry)
-            if count > 0.9 * n:
+            if count > 0.6 * n:
                 break
             self.levels.append((start, column, entry, diagonal, group, count))
             start, column, entry, diagonal = _coarsen(start, column, entry, diagonal, group, count)

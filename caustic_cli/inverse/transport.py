@@ -35,6 +35,7 @@ from caustic_cli.inverse import laguerre
 from caustic_cli.inverse.multigrid import Multigrid, matrix
 
 FINE = 4  # raster points a source cell, along each axis
+LEAST = 128  # raster points along an axis
 LEVELS = (64, 16, 4, 1)  # of how many times fewer sites
 ROUGH, WIDE = 0.5, 0.4  # a coarse phi is rounded on a raster so much coarser than the next level's, over such a part of a cell
 MAX_LATTICE = 1024  # the picture is halved until it has at most so many pixels along an axis
@@ -124,7 +125,7 @@ def solve(source, target, source_half, target_half, *, start=None, smooth=1.5, t
         if start is not None and fewer > 1:
             continue
         goal = max(most_sites // fewer, 16)
-        raster = [centres(max(int(FINE * s * fewer**-0.5), 32), h) for s, h in ((n, a), (m, b))]
+        raster = [centres(max(int(FINE * s * fewer**-0.5), LEAST), h) for s, h in ((n, a), (m, b))]
         old, sites = sites, _sites(pyramid, 1.0 / goal)
         if start is not None:
             psi = _prices(_resampled(start, (n, m), (a, b), raster), sites, raster)
