@@ -12,7 +12,7 @@ import torch
 
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Options
-from caustic_cli.inverse.schedule import Stage, coarse_to_fine
+from caustic_cli.inverse.schedule import Stage, coarse_to_fine, refinement, refinement_spans
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.scene import Offset, PlaneWave, Screen, Source, checks
 from caustic_cli.settings import SOURCES, build_source, index_of, with_defaults
@@ -24,6 +24,7 @@ DEFAULT_SPANS = 128  # knot spans of the finished net; 128 halve evenly through 
 NETWORK_CONTROL = 50  # table D.2
 RAYS_PER_PIXEL = 9.0  # 750 x 750 rays on 250 x 250 pixels, tables D.1 and D.2
 SINGLE_STAGE_ITERATIONS = 1000  # thesis 6.2.1
+DRAFT_SECONDS, FINE_SECONDS = 8.0, 60.0  # time limits below and from which another quality is the better use of the time
 STEEPEST = 1.25  # least radius of a derived sphere, in half diagonals of the lens: slopes up to 1.3
 SOURCE_DISTANCE, SOURCE_WIDTH, SOURCE_GRID = 5.0, 0.2, (25, 25)  # in lens widths; the grid of fig. 6.4.1
 
@@ -113,30 +114,42 @@ def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[st
 
 
 def _complete_design(s: Settings, quality: str | None, rays: int | None) -> None:
-    lens, screen, design = s["lens"], s["screen"], s["design"]
+    lens, screen, design, given = s["lens"], s["screen"], s["design"], quality
     degree = tuple(checks.whole("[lens] degree", p, 1, 15) for p in lens["degree"])
     plain = design["network"] == "none" and design["optimizer"] == "lbfgs"
+    design.setdefault("start", "transport" if plain else "offset")
+    if design["start"] == "transport" and design["network"] != "none":
+        raise InputError("[design] start transport gives a surface, which a network cannot begin from; use start offset, or"
+                         " network none")
+    quality, moved = quality or _quality(design["time_limit"]), plain and design["start"] != "offset"
     if "control" not in lens:
-        lens["control"] = ([DEFAULT_SPANS + p for p in degree] if design["network"] == "none" else [NETWORK_CONTROL] * 2)
+        spans = refinement_spans(max(screen["resolution"]), quality) if moved else DEFAULT_SPANS
+        lens["control"] = ([spans + p for p in degree] if design["network"] == "none" else [NETWORK_CONTROL] * 2)
     design.setdefault("preconditioner", "laplacian" if plain else "none")
     if "stages" in design:
-        if quality or rays:
+        if given or rays:
             raise InputError("--quality and --rays shape the default stages, but the configuration brings [[design.stages]]"
                              " of its own: change them there")
         design["stages"] = [_complete_stage(stage, s) for stage in design["stages"]]
         return
     nx, ny = screen["resolution"]
-    sampler = _sampler(s)
-    rays = rays or min(4_000_000, max(40_000, int(RAYS_PER_PIXEL * nx * ny)))
-    if plain and "knots_u" not in lens:
-        stages = coarse_to_fine(tuple(lens["control"]), degree, rays, (nx, ny), quality or "standard", sampler=sampler)
+    sampler, base = _sampler(s), min(4_000_000, max(40_000, int(RAYS_PER_PIXEL * nx * ny)))
+    if moved:
+        stages = refinement(tuple(lens["control"]), rays, (nx, ny), quality, sampler=sampler)
+    elif plain and "knots_u" not in lens:
+        stages = coarse_to_fine(tuple(lens["control"]), degree, rays or base, (nx, ny), quality, sampler=sampler)
     else:
-        stages = [Stage(tuple(lens["control"]), rays, sampler, apron=math.ceil(0.04 * max(nx, ny)),
+        stages = [Stage(tuple(lens["control"]), rays or base, sampler, apron=math.ceil(0.04 * max(nx, ny)),
                         iterations=SINGLE_STAGE_ITERATIONS, tolerance=2e-3 if plain else 0.0)]
     design["stages"] = [_stage_table(stage) for stage in stages]
     if design["loss"].strip() == "rms":  # eq. 5.2.1 knows the screen alone
         for table in design["stages"]:
             table["apron"] = 0
+
+
+def _quality(time_limit: float) -> str:
+    """What a time limit leaves room for at 250 x 250 pixels on two cores."""
+    return "draft" if time_limit < DRAFT_SECONDS else "fine" if FINE_SECONDS <= time_limit < math.inf else "standard"
 
 
 def _sampler(s: Settings) -> str:

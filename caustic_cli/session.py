@@ -10,6 +10,7 @@ import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from caustic_cli.console import Reporter
 from caustic_cli.derive import build_options, build_stages, complete
 from caustic_cli.errors import InputError, Interrupted
 from caustic_cli.inverse.designer import Designer, State
+from caustic_cli.inverse.first import first_surface
 from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.picture import read_picture, write_image
@@ -34,8 +36,8 @@ REPORT_SAMPLES = 401
 
 
 def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: dict, config: Path | None,
-          force: bool) -> Project:
-    """Check everything, then make the project directory.
+          force: bool) -> tuple[Project, torch.Tensor | None]:
+    """Check everything, then make the project directory; also returns the first heights, None for the offset surface.
 
     Args:
         given: (section, key, option) -> value, what the options say.
@@ -71,12 +73,15 @@ def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: d
             full["source"]["profile"] = f"profile{light.suffix}"
         project = Project(path, full, picture, light)
         _designer(project, "cpu")  # builds and so checks scene, target, stages, options
-        _first_heights(project)
+        first = _first_heights(project)
+        if first is not None and _make_room(full, said, first):
+            _designer(project, "cpu")
+            first = _first_heights(project)
     except InputError as error:
         raise InputError(settings.as_options(str(error), given)) from error
     _make_directory(path, force)
     project.write()
-    return project
+    return project, first
 
 
 def find(target: Path, out: Path | None) -> Project:
@@ -87,10 +92,10 @@ def find(target: Path, out: Path | None) -> Project:
     return Project.open(path)
 
 
-def design(project: Project, device: str, say: Reporter, began: float) -> dict:
-    """Run a new design to its end; returns the figures of the JSON table."""
+def design(project: Project, first: torch.Tensor | None, device: str, say: Reporter, began: float) -> dict:
+    """Run a new design from its first heights to its end; returns the figures of the JSON table."""
     designer, target = _designer(project, device)
-    state = designer.begin(_first_heights(project))
+    state = designer.begin(first)
     return _run(project, designer, target, state, say, began, 0, None, device)
 
 
@@ -129,16 +134,19 @@ def _designer(project: Project, device: str) -> tuple[Designer, np.ndarray]:
 
 
 def _first_heights(project: Project) -> torch.Tensor | None:
-    """Heights of --start PROJECT on the first stage's net, or None for the offset surface.
+    """Heights of the transport start or of --start PROJECT on the first stage's net, or None for the offset surface.
 
     Raises:
-        InputError: no such project, or its lens is of another size.
+        InputError: no such project, its lens is of another size, or transport cannot reach the picture.
     """
     start = project.settings["design"]["start"]
     if start == "offset":
         return None
+    if start == "transport":
+        designer, target = _designer(project, "cpu")
+        return first_surface(designer.scene, target, designer.field(0))
     if not is_project(Path(start)):
-        raise InputError(f"[design] start must be offset or a project directory, got {start!r}")
+        raise InputError(f"[design] start must be transport, offset or a project directory, got {start!r}")
     other = Project.open(start)
     field, checkpoint = other.lens(other.scene())
     if other.settings["lens"]["size"] != project.settings["lens"]["size"]:
@@ -147,6 +155,23 @@ def _first_heights(project: Project) -> torch.Tensor | None:
     net = _designer(project, "cpu")[0].field(0)
     tu, tv = (a.change_of_basis(b) for a, b in zip(field.spaces, net.spaces, strict=True))
     return tu @ checkpoint.state.heights @ tv.T
+
+
+def _make_room(full: dict, said: dict, first: torch.Tensor) -> bool:
+    """Widen height_range and thickness, unless the user fixed them, to what the first surface needs; True if they changed."""
+    lens = settings.build_lens(full)
+    offset = HeightField.of(replace(lens, control=tuple(first.shape)))
+    x, y = (c.numpy() for c in offset.control_xy())
+    base = lens.offset.thickness + lens.offset.sag(x[:, None], y[None, :])
+    departure = 2.0 * float(np.abs(first.numpy() - base).max())
+    short = lens.z_in + lens.min_thickness - float(first.min())
+    fixed, changed = said.get("lens", {}), False
+    if departure > lens.height_range[1] and "height_range" not in fixed:
+        full["lens"]["height_range"], changed = [-departure, departure], True
+    if short > 0 and "thickness" not in fixed:
+        full["lens"]["thickness"] += 1.5 * short + 0.02 * max(lens.size)
+        changed = True
+    return changed
 
 
 def _make_directory(path: Path, force: bool) -> None:

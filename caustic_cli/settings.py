@@ -82,7 +82,7 @@ SCHEMA: dict[str, dict[str, Key]] = {
         "initial": Key("text", "parameters at first: zero, uniform (+-1e-4) or random"),
         "preconditioner": Key("text", "none or laplacian"),
         "filter_target": Key("flag", "filter the target as the render is filtered"),
-        "start": Key("text", "offset, or where the first surface came from"),
+        "start": Key("text", "transport, offset, or the project whose lens was the first surface"),
         "iterations": Key("whole", "in all; 0: what the stages say"),
         "time_limit": Key("number", "s; inf for none"),
         "checkpoint_every": Key("number", "s between checkpoints"),
@@ -110,7 +110,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "screen": {"z": 300.0},
     "target": {"encoding": "srgb", "flip": ""},
     "design": {"loss": "rms-light", "optimizer": "lbfgs", "lr": 1e-3, "network": "none", "initial": "zero",
-               "filter_target": True, "max_slope": 0.0, "start": "offset", "iterations": 0, "time_limit": math.inf,
+               "filter_target": True, "max_slope": 0.0, "iterations": 0, "time_limit": math.inf,
                "checkpoint_every": 10.0, "seed": 0, "dtype": "float32"},
 }
 SOURCES = ("plane", "point", "grid", "disc")

@@ -203,11 +203,28 @@ for name in "ab":
 @pytest.mark.parametrize("kind", ["default", "rms", "staged"])
 def test_a_design_improves_the_picture(capfd, kind):
     options = {"default": TINY, "rms": [*TINY, "--loss", "rms"], "staged": ["--config", staged(), "--quiet"]}[kind]
-    first = design(capfd, "blob.png", *options, "--iterations", 1, "-o", "p")
+    first = design(capfd, "blob.png", *options, "--start", "offset", "--iterations", 1, "-o", "p")
     last = design(capfd, "--resume", "p", "--iterations", 60, "--quiet")
     assert last["relative_rms"] < 0.5 * first["relative_rms"]
     assert last["on_screen"] > 0.85  # the rest is reflected at the two surfaces
     assert last["ssim"] > first["ssim"] and last["psnr_db"] > first["psnr_db"]
+
+
+def test_transport_begins_where_the_offset_ends(capfd):
+    sphere = design(capfd, "blob.png", *TINY, "--start", "offset", "-o", "sphere")
+    moved = design(capfd, "blob.png", *TINY, "--iterations", 1, "-o", "moved")
+    assert moved["relative_rms"] < 1.2 * sphere["relative_rms"]
+    assert load("moved").state.history[0][2] < 0.5 * load("sphere").state.history[0][2]
+    assert "start = \"transport\"" in Path("moved/project.toml").read_text()
+
+
+@pytest.mark.parametrize("limit, control", [(5, 32), (20, 36), (90, 48)])
+def test_the_time_limit_chooses_the_quality(capfd, limit, control, monkeypatch):
+    monkeypatch.setattr(session, "_run", lambda *args: {"lost": {}, "image": "", "reason": ""})
+    design(capfd, "blob.png", "--resolution", "24", "--quiet", "--threads", "1", "--time-limit", limit, "-o", "p")
+    stages = session.Project.open("p").settings["design"]["stages"]
+    assert stages[-1]["control"] == [control + 3, control + 3]
+    assert stages[-1]["rays"] == {5: 40_000, 20: 40_000, 90: 57_600}[limit] and len(stages) == {5: 1, 20: 2, 90: 3}[limit]
 
 
 def test_lbfgs_never_goes_uphill_within_a_stage(capfd):
@@ -235,7 +252,7 @@ def test_the_two_losses_lead_to_different_lenses(capfd):
 
 @pytest.mark.parametrize(("quality", "total"), [("draft", 115), ("standard", 200), ("fine", 360)])
 def test_quality(capfd, quality, total):
-    design(capfd, "blob.png", *TINY, "--quality", quality, "--iterations", 1)
+    design(capfd, "blob.png", *TINY, "--quality", quality, "--start", "offset", "--iterations", 1)
     text = (Path("blob.caustic") / "project.toml").read_text()
     assert sum(int(line.split("=")[1].split("#")[0]) for line in text.split("[[design.stages]]", 1)[1].splitlines()
                if line.startswith("iterations")) == total
@@ -244,7 +261,7 @@ def test_quality(capfd, quality, total):
 def test_a_start_from_another_project_takes_its_lens_over(capfd):
     plain = design(capfd, "blob.png", *TINY, "--iterations", 40, "-o", "old")
     taken = design(capfd, "blob.png", "--config", one_stage(), "--start", "old", "--quiet", "--iterations", 1, "-o", "new")
-    fresh = design(capfd, "blob.png", "--config", one_stage(), "--quiet", "--iterations", 1, "-o", "fresh")
+    fresh = design(capfd, "blob.png", "--config", one_stage(), "--start", "offset", "--quiet", "--iterations", 1, "-o", "fresh")
     assert taken["relative_rms"] < 1.1 * plain["relative_rms"] < 0.7 * fresh["relative_rms"]
 
 
@@ -276,7 +293,8 @@ def test_a_time_limit_reaches_the_last_stage(capfd):
     """However short: a lens on a coarse net alone would not be the lens of project.toml."""
     design(capfd, "blob.png", *TINY, "--time-limit", 0.01)
     state = load("blob.caustic").state
-    assert state.stage == 6 and tuple(state.heights.shape) == (12, 12)
+    stages = session.Project.open("blob.caustic").settings["design"]["stages"]
+    assert state.stage == len(stages) - 1 and tuple(state.heights.shape) == (12, 12)
 
 
 # what cannot be done
@@ -290,7 +308,7 @@ def test_no_light_on_the_screen_is_said_and_ends_in_1(capfd):
     Path("one.toml").write_text("[source]\nprofile = 'corner.npy'\n[lens]\ncontrol = [12, 12]\nradius = [80.3, 80.3]\n"
                                 "[screen]\nsize = [2.0, 2.0]\nresolution = [24, 24]\n"
                                 "[[design.stages]]\ncontrol = [12, 12]\nrays = 4000\n")
-    err = design(capfd, "blob.png", "--config", "one.toml", "--quiet", code=1)
+    err = design(capfd, "blob.png", "--config", "one.toml", "--start", "offset", "--quiet", code=1)
     assert err.startswith("caustic: ") and err.count("\n") == 1 and "no light reaches the screen" in err
     assert not (Path("blob.caustic") / "render.png").exists()
 

@@ -41,8 +41,8 @@ def designed(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(session, "FINAL_RAYS", 10_000)
         patch.setattr(session, "write_report", lambda *args: None)
-        project = session.begin(folder / "blob.npy", folder / "blob.caustic", {}, None, None, {}, folder / "c.toml", False)
-        session.design(project, "cpu", Reporter(quiet=True), 0.0)
+        project, first = session.begin(folder / "blob.npy", folder / "blob.caustic", {}, None, None, {}, folder / "c.toml", False)
+        session.design(project, first, "cpu", Reporter(quiet=True), 0.0)
     return project.path
 
 
@@ -280,7 +280,7 @@ def test_a_profile_weights_the_light(designed, tmp_path, monkeypatch, capfd):
     np.save("half.npy", profile)
     Image.fromarray(np.full((8, 8), 200, dtype=np.uint8)).save("even.png")
     (tmp_path / "c.toml").write_text("[source]\nprofile = 'half.npy'\n" + CONFIG.replace("iterations = 4", "iterations = 1"))
-    assert cli.run(["design", "even.png", "--config", "c.toml", "--quiet"]) == 0
+    assert cli.run(["design", "even.png", "--config", "c.toml", "--start", "offset", "--quiet"]) == 0
     assert np.array_equal(np.load("even.caustic/profile.npy"), profile)
     figures, image = render(tmp_path / "even.caustic", capfd)
     assert image[:8].sum() < 1e-3 * image.sum() < image[12:].sum()

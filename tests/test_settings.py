@@ -125,7 +125,7 @@ def test_the_default_scene_is_table_d2():
     assert s["target"]["size"] == pytest.approx([30.0, 30.0])
     assert s["screen"]["size"] == pytest.approx([38.4, 38.4])
     assert s["screen"]["resolution"] == [250, 250]
-    assert s["lens"]["control"] == [131, 131] and s["lens"]["degree"] == [3, 3]
+    assert s["lens"]["control"] == [378, 378] and s["lens"]["degree"] == [3, 3]
     build_scene(s), build_stages(s), build_options(s)
 
 
@@ -188,14 +188,20 @@ def test_glass_replaces_the_index():
         complete({"lens": {"glass": "N-BK7", "index": 1.5}}, 1.0)
 
 
+OFFSET = {"design": {"start": "offset"}}
+
+
 @pytest.mark.parametrize(("quality", "first", "last"), [("draft", 15, 25), ("standard", 25, 50), ("fine", 40, 120)])
 def test_quality_shapes_the_stages(quality, first, last):
-    stages = complete({}, 1.0, quality=quality)["design"]["stages"]
+    stages = complete(OFFSET, 1.0, quality=quality)["design"]["stages"]
     assert stages[0]["iterations"] == first and stages[-1]["iterations"] == last
+    moved = [complete({}, 1.0, quality=q)["design"]["stages"] for q in ("draft", "standard", "fine")]
+    assert [len(s) for s in moved] == [1, 2, 3]
+    assert [s[-1]["control"][0] for s in moved] == sorted(s[-1]["control"][0] for s in moved)
 
 
 def test_stages_end_sharp_on_the_lens_own_net():
-    s = complete({"lens": {"control": [19, 35]}}, 1.0, rays=5000)
+    s = complete({"lens": {"control": [19, 35]}, **OFFSET}, 1.0, rays=5000)
     stages = build_stages(s)
     assert stages[-1].control == (19, 35) and stages[-1].rays == 5000 and stages[-1].blur == 0.0
     blurs = [stage.blur for stage in stages]

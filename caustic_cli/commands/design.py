@@ -41,16 +41,17 @@ def run(
     = None,
     index: Annotated[float | None, typer.Option(help="Refractive index of the lens.  [default: 1.5443]")] = None,
     glass: Annotated[Text, typer.Option(help="Material instead of --index: N-BK7, SILICA, PMMA, PC, ...")] = None,
-    control: Annotated[Text, typer.Option(metavar="N[xM]", help="Control points of the lens.  [default: 128 + degree]")] = None,
+    control: Annotated[Text, typer.Option(metavar="N[xM]", help="Control points.  [default: by picture and quality]")] = None,
     degree: Annotated[Text, typer.Option(metavar="P[xQ]", help="Spline degree, 1 to 15.  [default: 3]")] = None,
     min_thickness: Annotated[float | None, typer.Option(help="Least thickness of the lens, mm.  [default: 1]")] = None,
     max_slope: Annotated[float | None, typer.Option(help="Limit of the surface's slope, mm per mm.  [default: none]")] = None,
     linear: Annotated[bool, typer.Option("--linear", help="Pixel values are irradiance as they are, not sRGB-encoded.")] = False,
     flip: Annotated[Text, typer.Option(metavar="x|y|xy", help="Mirror the picture, for a viewer on the lens' side.")] = None,
-    start: Annotated[Text, typer.Option(metavar="offset|PROJECT", help="First surface: the sphere that follows from --mag, or"
-                                        " the lens of another project.  [default: offset]")] = None,
+    start: Annotated[Text, typer.Option(metavar="transport|offset|PROJECT", help="First surface: by optimal transport of the"
+                                        " light to the picture, the sphere that follows from --mag, or the lens of another"
+                                        " project.  [default: transport; offset for a network or adam]")] = None,
     quality: Annotated[Text, typer.Option(help="draft, standard or fine.  [default: standard]")] = None,
-    rays: Annotated[Text, typer.Option(metavar="N", help="Rays of the last stage.  [default: 9 per pixel]")] = None,
+    rays: Annotated[Text, typer.Option(metavar="N", help="Rays of the last stage.  [default: by quality]")] = None,
     loss: Annotated[Text, typer.Option(help="rms (eq. 5.2.1), rms-light, where every ray counts, throughput, diffusion,"
                                        " uniformity, laplacian, curvature; or a weighted sum: 'rms-light + 0.01 laplacian'."
                                        "  [default: rms-light]")] = None,
@@ -120,8 +121,9 @@ def run(
         project = session.find(target, out)
         figures = session.resume(project, iterations, time_limit, device, say, began)
     else:
-        project = session.begin(target, out, given, screen, pixels, shaped, config, force)
-        figures = session.design(project, device, say, began)
+        with say.patience("solving the transport of the light to the picture"):
+            project, first = session.begin(target, out, given, screen, pixels, shaped, config, force)
+        figures = session.design(project, first, device, say, began)
     say.table(str(project.path), [*console.figures_rows(figures), ("ended by", figures["reason"])])
     if json:
         console.emit_json(figures)

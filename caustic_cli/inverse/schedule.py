@@ -71,3 +71,30 @@ def coarse_to_fine(control: tuple[int, int], degree: tuple[int, int], rays: int,
         stages.append(Stage(net, max(1, int(rays * few)), sampler, filter, round(blur, 6), apron,
                             late if k == len(blurs) - 1 else early))
     return stages
+
+
+#: What a quality means after a transport start: knot spans per pixel and their most, rays a pixel, iterations of each stage.
+REFINEMENT = {"draft": (0.5, 256, 9, (12,)), "standard": (1.5, 512, 36, (8, 10)), "fine": (2.0, 768, 100, (20, 25, 25))}
+LEAST_SPANS = 32
+MOST_RAYS = 16_000_000
+
+
+def refinement_spans(pixels: int, quality: str) -> int:
+    """Knot spans along each axis of the lens for a screen of so many pixels: about as fine as the picture."""
+    checks.choice("--quality", quality, QUALITIES)
+    density, most, _, _ = REFINEMENT[quality]
+    return min(most, max(LEAST_SPANS, round(density * pixels)))
+
+
+def refinement(control: tuple[int, int], rays: int | None, resolution: tuple[int, int], quality: str = "standard",
+               filter: Filter | None = None, sampler: str = "lines") -> list[Stage]:
+    """The default stages after a transport start, whose surface has every scale right already: full detail at once.
+
+    Each stage traces rays of its own, because an optimiser learns the ones it sees.
+    """
+    checks.choice("--quality", quality, QUALITIES)
+    _, _, each, iterations = REFINEMENT[quality]
+    rays = rays or min(MOST_RAYS, max(40_000, each * resolution[0] * resolution[1]))
+    apron = math.ceil(0.04 * max(resolution))
+    return [Stage(control, max(1, rays // 2) if k + 1 < len(iterations) else rays, sampler, filter or Filter("cosine", (3, 3)), 0.0,
+                  apron, count) for k, count in enumerate(iterations)]

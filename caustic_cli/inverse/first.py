@@ -1,0 +1,102 @@
+"""The first surface of a design by transport: what lights the exit surface, and the heights that send it onto the picture.
+
+Notation
+    p = (x, y, z)   a point of the exit surface; o = (x_0, y_0, z_0) the source, h its distance before the entrance
+    s               tangents of the ray's direction from the source, (d_x, d_y) / d_z; q = |s|
+    f               power on the exit surface, seen along z, per area
+
+A ray of tangent q crosses the entrance at h q from the axis through the source and the glass under it by t q', with
+q' = q / sqrt(n^2 (1 + q^2) - q^2) by Snell; t is the height of p above the entrance.  So the point p is reached by the q with
+h q + t q' = |(x - x_0, y - y_0)|, and f = I(q) (1 - R(q)) (1 + q^2)^(-3/2) |d(s_x, s_y) / d(x, y)|.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from scipy.interpolate import RectBivariateSpline
+from torch import Tensor
+
+from caustic_cli.inverse import start
+from caustic_cli.inverse.target import overlap
+from caustic_cli.inverse.transport import corners
+from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.interface import reflectance
+from caustic_cli.scene import Disc, PlaneWave, Scene
+from caustic_cli.scene.source import covering_cone
+
+#: Source cells along the lens' longer side: a picture of 250 x 250 pixels is resolved, and they are cheap.
+CELLS = 256
+#: Newton steps for q; its function is concave and nearly linear, so each doubles the digits.
+STEPS = 8
+#: Surfaces solved for in turn where the light depends on the surface it meets.
+PASSES = 2
+
+
+def first_surface(scene: Scene, target: np.ndarray, field: HeightField, cells: int = CELLS) -> Tensor:
+    """Control heights (n, m) mm float64 of a lens that throws the picture, from the light of the source's centre.
+
+    Args:
+        scene: source, lens and screen.
+        target: (n_x, n_y) irradiance on its screen.
+        field: spline spaces of the heights.
+        cells: source cells along the lens' longer side.
+
+    Raises:
+        InputError: the picture is out of reach of refraction.
+    """
+    lens, half = scene.lens, scene.lens.half_size
+    shape = tuple(max(2, round(cells * r / max(half))) for r in half)
+    x, y = corners(shape[0], half[0]), corners(shape[1], half[1])
+    z = lens.offset.thickness + lens.offset.sag(x[:, None], y[None, :])
+    mean, found = float(z.mean()), None
+    for _ in range(1 if _parallel(scene) else PASSES):
+        light, directions = _light(scene, x, y, z, shape)
+        found = start.surface(light, target, half, scene.screen.half_size, lens.index, scene.screen.z, mean, directions,
+                              start=None if found is None else found.transport.potential)
+        z = found.heights
+    spline = RectBivariateSpline(x, y, z)
+    at = [torch.linalg.inv(s.matrix(s.greville)) for s in field.spaces]
+    values = torch.from_numpy(spline(*(c.numpy() for c in field.control_xy())))
+    return at[0] @ values @ at[1].T
+
+
+def _parallel(scene: Scene) -> bool:
+    return isinstance(scene.source, PlaneWave) or (isinstance(scene.source, Disc) and scene.source.angle is not None)
+
+
+def _light(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray, shape) -> tuple[np.ndarray, tuple | None]:
+    """Power in the cells between corners x, y, and the unit directions inside the glass there (None for along z)."""
+    source, lens = scene.source, scene.lens
+    if _parallel(scene):
+        profile = getattr(source, "profile", None)
+        if profile is None:
+            return np.ones(shape), None
+        for axis in (0, 1):  # the profile's cells, averaged over these
+            covers = overlap(np.linspace(0.0, 1.0, profile.shape[axis] + 1), np.linspace(0.0, 1.0, shape[axis] + 1))
+            profile = covers @ profile if axis == 0 else (covers @ profile.T).T
+        return profile, None
+    x0, y0, z0 = source.centre
+    h, t, n = lens.z_in - z0, z - lens.z_in, lens.index
+    dx, dy = x[:, None] - x0, y[None, :] - y0
+    rho = np.hypot(dx, dy)
+    q = rho / (h + t / n)
+    for _ in range(STEPS):
+        root = np.sqrt(n * n * (1.0 + q * q) - q * q)
+        q = q - (h * q + t * q / root - rho) / (h + t * n * n / root**3)
+    root = np.sqrt(n * n * (1.0 + q * q) - q * q)
+    ratio = 1.0 / (h + t / root)  # q / rho
+    sx, sy = dx * ratio, dy * ratio
+    gx, gy = np.gradient(sx, x, y), np.gradient(sy, x, y)
+    cosine = 1.0 / np.sqrt(1.0 + q * q)
+    inside = root * cosine / n
+    power = np.abs(gx[0] * gy[1] - gx[1] * gy[0]) * cosine**3
+    if lens.fresnel != "none":
+        power *= 1.0 - reflectance("exact", cosine, inside, 1.0 / n)
+    if source.intensity == "lambertian":
+        power *= cosine
+    power = np.where(q <= math.tan(min(covering_cone(source, lens.half_size, lens.z_in), 1.57079)) * (1 + 1e-9), power, 0.0)
+    light = 0.25 * (power[1:, 1:] + power[:-1, 1:] + power[1:, :-1] + power[:-1, :-1])
+    return light, (sx * cosine / n, sy * cosine / n, inside)
