@@ -42,9 +42,14 @@ class Turns(Designer):
 
 
 class Entry:
-    """A design that takes turns; a `studies.training.Contender`."""
+    """A design that takes turns; a `studies.training.Contender`.
 
-    def __init__(self, series: str, scene: Scene, target: Tensor, stages: list[Stage], options: Options, device: str):
+    Raises:
+        InputError: the lens leaves the heights no room.
+        CausticError: no light reaches the screen.
+    """
+
+    def __init__(self, series: str, stages: list[Stage], options: Options, scene: Scene, target: Tensor, device: str = "cpu"):
         self.series, self.optimizer, self.network = series, options.optimizer, options.network
         self.designer = Turns(scene, target, stages, options, device)
         self.designer.run(self.designer.begin(), iterations=1)  # what the first iteration alone waits for
@@ -95,7 +100,11 @@ class Entry:
 
 def entries_of(project: Project | None, device: str, dtype: torch.dtype | None = None,
                seed: int | None = None) -> tuple[Scene, np.ndarray, list[Entry]]:
-    """Scene, target (n_x, n_y) and contenders of a project; without one, of a bright disc on fewer pixels and control points."""
+    """Scene, target (n_x, n_y) and contenders of a project; without one, of a bright disc on fewer pixels and control points.
+
+    Raises:
+        InputError, CausticError: as of `plans` and `Entry`.
+    """
     if project is None:
         full = complete({"screen": {"resolution": [PIXELS, PIXELS]}, "lens": {"control": [CONTROL, CONTROL]}}, 1.0)
         scene = settings.build_scene(full)
@@ -103,7 +112,8 @@ def entries_of(project: Project | None, device: str, dtype: torch.dtype | None =
     else:
         full, scene = project.settings, project.scene()
         target = project.target(scene)
-    return scene, target, entries(scene, target, full, device, dtype, seed)
+    goal = torch.from_numpy(target)
+    return scene, target, [Entry(*plan, scene, goal, device) for plan in plans(scene, full, dtype, seed)]
 
 
 def disc(scene: Scene, size: tuple[float, float]) -> np.ndarray:
@@ -112,21 +122,20 @@ def disc(scene: Scene, size: tuple[float, float]) -> np.ndarray:
     return target_on_screen((np.hypot(x[:, None], x) <= DISC).astype(float), size, scene.screen)
 
 
-def entries(scene: Scene, target: np.ndarray, full: Settings, device: str, dtype: torch.dtype | None = None,
-            seed: int | None = None) -> list[Entry]:
-    """All contenders for a target, their first iteration tried out.
+def plans(scene: Scene, full: Settings, dtype: torch.dtype | None = None,
+          seed: int | None = None) -> list[tuple[str, list[Stage], Options]]:
+    """What every contender for a target is called, and how it designs; dtype and seed replace those of the settings.
 
     L-BFGS on the finished control net, on nets of half and a quarter of its knot spans, and coarse to fine; Adam on the heights
     themselves and on the networks of the thesis, on its control net.  Rays, filter, apron and loss are those of the last stage.
 
     Raises:
-        InputError: the lens leaves the heights no room.
-        CausticError: no light reaches the screen.
+        InputError: a setting is out of range.
     """
     last, options = build_stages(full)[-1], build_options(full)
     options = replace(options, dtype=dtype or options.dtype, seed=options.seed if seed is None else seed)
     last = replace(last, blur=0.0, iterations=ENDLESS, tolerance=0.0, source=None)
-    goal, lens = torch.from_numpy(target), scene.lens
+    lens = scene.lens
     nets = [lens.control] if lens.knots is not None else list(dict.fromkeys(
         tuple(max(p + 1, math.ceil((n - p) / part) + p) for n, p in zip(lens.control, lens.degree, strict=True)) for part in PARTS))
     newton = replace(options, optimizer="lbfgs", network="none", initial="zero", preconditioner="laplacian")
@@ -144,7 +153,7 @@ def entries(scene: Scene, target: np.ndarray, full: Settings, device: str, dtype
         if kind != "dense" or math.prod(net) <= NETWORK_CONTROL**2:  # weights: the square of the control points
             name = "adam" if kind == "none" else f"adam, {kind} network"
             found.append((f"{name}, {_net(net)}", [replace(last, control=net)], replace(adam, network=kind)))
-    return [Entry(series, scene, goal, stages, o, device) for series, stages, o in found]
+    return found
 
 
 def _net(control: tuple[int, int]) -> str:
