@@ -177,7 +177,7 @@ def test_errors_of_zero_are_in_the_table_but_not_in_the_picture(meeting, tmp_pat
 
 
 class Rival:
-    """A contender whose error halves with every iteration of a tenth of a second on a clock of its own."""
+    """A contender that comes closer to its goal with every iteration, of a tenth of a second on a clock of its own."""
 
     optimizer, network = "adam", "none"
 
@@ -220,8 +220,8 @@ def test_contenders_get_equal_time_and_an_independent_verdict():
 def test_the_contenders_of_a_project(small):
     scene, target, full = small
     plans = contest.plans(scene, full)
-    assert [series for series, *_ in plans] == ["lbfgs, 19x19", "lbfgs, 11x11", "lbfgs, 7x7", "lbfgs, coarse to fine", "adam, 19x19",
-                                           "adam, sparse network, 19x19", "adam, dense network, 19x19"]
+    assert [series for series, *_ in plans] == ["lbfgs, 19x19", "lbfgs, 11x11", "lbfgs, 7x7", "lbfgs, coarse to fine",
+                                           "adam, 19x19", "adam, sparse network, 19x19", "adam, dense network, 19x19"]
     assert [(o.optimizer, o.network) for *_, o in plans[3:]] == [("lbfgs", "none"), ("adam", "none"), ("adam", "sparse"),
                                                                 ("adam", "dense")]
     assert all(stages[-1].rays == 5000 and stages[-1].tolerance == 0 for _, stages, _ in plans)

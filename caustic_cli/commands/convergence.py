@@ -14,13 +14,9 @@ from caustic_cli.errors import InputError
 
 EXAMPLES = """Examples:
 
-  caustic convergence
-
-  caustic convergence flame.caustic --study rays -o accuracy
+  caustic convergence -o accuracy
 
   caustic convergence flame.caustic --study design --seconds 20
-
-  caustic convergence --study precision --json
 """
 
 STUDIES = ("intersection", "rays", "reconstruction", "precision", "design")
