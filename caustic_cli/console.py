@@ -86,6 +86,9 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
         return "-" if value is None else format(value, form)
 
     lost = ", ".join(f"{name.replace('_', ' ')} {value:.2%}" for name, value in figures["lost"].items() if value > 5e-7)
+    noise = []
+    if "error_estimate" in figures:
+        noise = [("noise of the image", f"{figures['error_estimate']:.2g}, estimated; {figures['rays_traced']:,} rays in all")]
     return [
         ("relative RMS error", number("relative_rms", ".4f")),
         ("loss (eq. 5.2.1)", number("loss", ".4e")),
@@ -95,6 +98,7 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
         ("light on the picture", number("on_target", ".2%")),
         ("lost", lost or "nothing"),
         ("rays", number("rays", ",d")),
+        *noise,
         ("iterations", number("iterations", "d")),
         ("time", number("seconds", ".1f") + " s"),
         ("image", str(figures["image"])),

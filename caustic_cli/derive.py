@@ -134,7 +134,7 @@ def _complete_design(s: Settings, quality: str | None, rays: int | None) -> None
         stages = [Stage(tuple(lens["control"]), rays, sampler, apron=math.ceil(0.04 * max(nx, ny)),
                         iterations=SINGLE_STAGE_ITERATIONS, tolerance=2e-3 if plain else 0.0)]
     design["stages"] = [_stage_table(stage) for stage in stages]
-    if design["loss"] == "rms":  # eq. 5.2.1 knows the screen alone
+    if design["loss"].strip() == "rms":  # eq. 5.2.1 knows the screen alone
         for table in design["stages"]:
             table["apron"] = 0
 
@@ -200,4 +200,4 @@ def build_options(settings: Settings) -> Options:
                                                                               ("float32", "float64"))]
     checks.whole("[design] seed", d["seed"], 0, 2**31 - 1)
     return Options(d["loss"], d["optimizer"], d["lr"], d["network"], d["initial"], d["preconditioner"],
-                   d["filter_target"], d["seed"], dtype)
+                   d["filter_target"], d["seed"], dtype, d["max_slope"])

@@ -74,7 +74,8 @@ SCHEMA: dict[str, dict[str, Key]] = {
         "flip": Key("text", "mirror the picture along x, y or xy; empty for none"),
     },
     "design": {
-        "loss": Key("text", "rms (eq. 5.2.1) or rms-light"),
+        "loss": Key("text", "weighted sum of rms (eq. 5.2.1), rms-light, throughput, diffusion, uniformity, laplacian, curvature"),
+        "max_slope": Key("number", "limit of the surface's slope; 0 for none"),
         "optimizer": Key("text", "lbfgs or adam"),
         "lr": Key("number", "learning rate of adam"),
         "network": Key("text", "none, sparse or dense"),
@@ -109,7 +110,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "screen": {"z": 300.0},
     "target": {"encoding": "srgb", "flip": ""},
     "design": {"loss": "rms-light", "optimizer": "lbfgs", "lr": 1e-3, "network": "none", "initial": "zero",
-               "filter_target": True, "start": "offset", "iterations": 0, "time_limit": math.inf,
+               "filter_target": True, "max_slope": 0.0, "start": "offset", "iterations": 0, "time_limit": math.inf,
                "checkpoint_every": 10.0, "seed": 0, "dtype": "float32"},
 }
 SOURCES = ("plane", "point", "grid", "disc")

@@ -8,7 +8,7 @@ import torch
 from scipy.ndimage import gaussian_filter1d
 
 from caustic_cli.errors import CausticError, InputError
-from caustic_cli.inverse.losses import LOSSES, Loss, gaussian_matrix
+from caustic_cli.inverse.losses import Loss, gaussian_matrix, parse
 
 SHAPE = (9, 7)
 G = torch.Generator().manual_seed(2)
@@ -32,7 +32,7 @@ def test_rms_light_divides_by_the_power_that_left_the_lens():
     assert float(Loss("rms-light", TARGET)(IMAGE, FULL)) == pytest.approx(naive(IMAGE, 0.9), rel=1e-13)
 
 
-@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize("name", ["rms", "rms-light"])
 def test_scales_cancel(name):
     """Any power, any scale of the target: only proportions count."""
     value = float(Loss(name, TARGET)(IMAGE, FULL))
@@ -50,7 +50,7 @@ def test_only_rms_light_minds_light_that_is_lost():
     assert float(Loss("rms-light", TARGET)(perfect, one)) < 1e-17
 
 
-@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize("name", ["rms", "rms-light"])
 @pytest.mark.parametrize("blur", [0.0, 1.3])
 def test_gradient_is_finite_differences(name, blur):
     loss = Loss(name, TARGET, blur)
@@ -59,7 +59,7 @@ def test_gradient_is_finite_differences(name, blur):
     assert torch.autograd.gradcheck(loss, (image, leaving), eps=1e-8, atol=1e-7, rtol=1e-5)
 
 
-@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize("name", ["rms", "rms-light"])
 def test_a_perfect_picture_pulls_at_nothing(name):
     """The root is not differentiable at 0: its gradient there must be 0 and not NaN, which would destroy the lens."""
     image = (0.25 * TARGET).requires_grad_()
@@ -70,7 +70,7 @@ def test_a_perfect_picture_pulls_at_nothing(name):
     assert bool(torch.isfinite(gradient).all())
 
 
-@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize("name", ["rms", "rms-light"])
 def test_no_light_is_an_error_in_a_sentence(name):
     for dark in (torch.zeros(SHAPE, dtype=torch.float64), torch.full(SHAPE, math.nan, dtype=torch.float64)):
         with pytest.raises(CausticError, match="no light reaches the screen"):
@@ -78,7 +78,7 @@ def test_no_light_is_an_error_in_a_sentence(name):
 
 
 def test_unknown_loss_is_refused():
-    with pytest.raises(InputError, match="loss must be one of rms, rms-light, got 'l1'"):
+    with pytest.raises(InputError, match="got 'l1'"):
         Loss("l1", TARGET)
 
 
@@ -101,7 +101,7 @@ def test_blur_keeps_the_light_of_the_interior():
     assert float(gaussian_matrix(5, 1e-3).sub(torch.eye(5)).abs().max()) == 0.0  # no blur at all, and no 0 / 0
 
 
-@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize("name", ["rms", "rms-light"])
 def test_blurred_loss_compares_blurred_pictures(name):
     def blurred(a):
         for axis in (0, 1):
@@ -124,3 +124,64 @@ def test_blur_sees_how_far_light_has_to_go():
     sharp, soft = Loss("rms-light", target), Loss("rms-light", target, 3.0)
     assert float(sharp(near, one)) == float(sharp(far, one))
     assert float(soft(near, one)) < 0.7 * float(soft(far, one))
+
+
+@pytest.mark.parametrize("text", ["throughput", "diffusion", "uniformity",
+                                  "rms-light + 0.5 throughput + 2 * diffusion + 0.1 uniformity"])
+def test_every_term_has_the_slope_of_differences(text):
+    loss = Loss(text, TARGET, 0.0, 2)
+    image, leaving = IMAGE.clone().requires_grad_(), FULL.clone().requires_grad_()
+    assert torch.autograd.gradcheck(loss, (image, leaving), eps=1e-8, atol=1e-7, rtol=1e-5)
+
+
+def test_terms_add_in_squares():
+    one, two = (Loss(name, TARGET, 0.0, 2)(IMAGE, FULL) for name in ("rms-light", "diffusion"))
+    both = Loss("rms-light + 0.25 diffusion", TARGET, 0.0, 2)(IMAGE, FULL)
+    assert float(both) == pytest.approx(math.sqrt(float(one) ** 2 + 0.25 * float(two) ** 2), rel=1e-13)
+    with_penalty = Loss("rms-light", TARGET)(IMAGE, FULL, torch.tensor(3.0, dtype=torch.float64))
+    assert float(with_penalty) * TARGET.numel() == pytest.approx(math.sqrt((float(one) * TARGET.numel()) ** 2 + 3.0), rel=1e-13)
+
+
+def test_throughput_counts_light_beside_the_screen_by_distance():
+    loss = Loss("throughput", TARGET, 0.0, 2)
+    one = torch.ones((), dtype=torch.float64)
+    for (i, j), expected in {(4, 3): 0.0, (2, 2): 0.0, (1, 3): 0.5, (0, 3): 1.0, (4, 5): 0.5, (8, 6): 1.0}.items():
+        image = torch.zeros(SHAPE, dtype=torch.float64)
+        image[i, j] = 0.3
+        assert (float(loss(image, one)) * TARGET.numel()) ** 2 == pytest.approx(0.3 * expected, abs=1e-15)
+
+
+def test_uniformity_asks_for_no_picture():
+    flat = torch.full(SHAPE, 0.01, dtype=torch.float64)
+    region = torch.zeros(SHAPE, dtype=torch.bool)
+    region[2:5, 2:6] = True
+    loss = Loss("uniformity", TARGET, region=region)
+    assert float(loss(flat, FULL)) == 0.0
+    flat[~region] = 0.7
+    assert float(loss(flat, FULL)) < 1e-15
+    values = IMAGE[region]
+    assert float(loss(IMAGE, FULL)) * TARGET.numel() == pytest.approx(float(values.std(correction=0) / values.mean()), rel=1e-12)
+
+
+def test_diffusion_minds_what_alternates():
+    base = TARGET / TARGET.sum()
+    i, j = torch.meshgrid(torch.arange(SHAPE[0]), torch.arange(SHAPE[1]), indexing="ij")
+    chequered, smooth = 1e-4 * (-1.0) ** (i + j), 1e-4 * torch.ones(SHAPE, dtype=torch.float64)
+    one = torch.ones((), dtype=torch.float64)
+    assert float(Loss("diffusion", TARGET)(base + chequered, one)) > 4e-4
+    assert float(Loss("diffusion", TARGET)(base + smooth, one)) < 1e-15
+
+
+@pytest.mark.parametrize("text, terms", [
+    ("rms", [(1.0, "rms")]),
+    ("rms-light + 0.1 laplacian", [(1.0, "rms-light"), (0.1, "laplacian")]),
+    ("2*rms+1e-3 * curvature".replace("2*rms", "2 * rms"), [(2.0, "rms"), (1e-3, "curvature")]),
+])
+def test_parse(text, terms):
+    assert parse(text) == terms
+
+
+@pytest.mark.parametrize("text", ["", "l1", "rms +", "-1 rms", "nan rms", "inf rms", "x rms", "laplacian", "0 rms", "rms rms"])
+def test_parse_refuses(text):
+    with pytest.raises(InputError, match="loss must"):
+        parse(text)

@@ -9,8 +9,9 @@ import torch
 
 from caustic_cli.errors import CausticError
 from caustic_cli.inverse import objective as module
-from caustic_cli.inverse.losses import LOSSES, Loss
+from caustic_cli.inverse.losses import Loss
 from caustic_cli.inverse.objective import Objective
+from caustic_cli.inverse.penalties import Penalty
 from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
@@ -40,7 +41,7 @@ def objective(loss: str = "rms-light", *, scene: Scene = SCENE, f: Filter = COSI
     return Objective(scene, FIELD, sampler, f, disc() if target is None else target, loss, dtype=dtype, **options)
 
 
-@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize("name", ["rms", "rms-light"])
 @pytest.mark.parametrize("filter_target", [True, False])
 def test_value_is_the_loss_of_the_exposed_image(name, filter_target):
     z = heights()
@@ -53,7 +54,7 @@ def test_value_is_the_loss_of_the_exposed_image(name, filter_target):
     assert evaluation.on_screen < 0.9  # some light has left: it matters which power divides
 
 
-@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize("name", ["rms", "rms-light"])
 @pytest.mark.parametrize("options", [{}, {"blur": 1.5, "apron": 3}, {"apron": 2, "f": Filter("cosine", (5, 3))}], ids=str)
 def test_gradient_is_finite_differences(name, options):
     """Central differences along random directions; the second derivative jumps at pixel edges, so they are right to O(h) only."""
@@ -78,7 +79,7 @@ def test_taylor_remainder_is_of_order_two():
     assert np.polyfit(np.log(steps), np.log(rest), 1)[0] == pytest.approx(2.0, abs=0.05)
 
 
-@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize("name", ["rms", "rms-light"])
 def test_float32_rays_give_the_same_slope(name):
     """Landing points are off by 1e-5 of a pixel, the shares' derivatives likewise; the gradient sums 1440 rays: 1e-4 relative."""
     double, single = objective(name)(heights()), objective(name, dtype=torch.float32)(heights())
@@ -151,7 +152,7 @@ def test_the_apron_is_dark_and_widens_the_frame():
     assert evaluation.on_screen == pytest.approx(objective()(heights()).on_screen, rel=1e-12)
 
 
-@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize("name", ["rms", "rms-light"])
 @pytest.mark.parametrize("fresnel", ["none", "exact"])
 @pytest.mark.parametrize("kept", [True, False])
 def test_chunks_do_not_change_value_or_gradient(name, fresnel, kept, monkeypatch):
@@ -188,3 +189,39 @@ def test_heights_are_left_alone():
     assert first.loss == second.loss
     assert torch.equal(first.gradient, second.gradient)
     assert math.isfinite(first.loss)
+
+
+@pytest.mark.parametrize("loss, max_slope", [("rms-light + 1e-3 laplacian", 0.0), ("rms + 0.01 curvature + 0.3 throughput", 0.0),
+                                             ("rms-light", 0.02)])
+@pytest.mark.parametrize("chunks", [1, 3])
+def test_penalties_have_the_slope_of_differences(loss, max_slope, chunks, monkeypatch):
+    lens = Lens(control=(8, 7), degree=(3, 2), offset=Offset(5.0, (80.0, 80.0)))
+    scene, field = Scene(PlaneWave(), lens, Screen((36.0, 36.0), resolution=(18, 15))), HeightField.of(lens)
+    x, y = field.control_xy()
+    g = torch.Generator().manual_seed(3)
+    heights = 5.0 + (x[:, None] ** 2 + y**2) / 160 + 0.01 * torch.randn(8, 7, generator=g, dtype=torch.float64)
+    along = torch.randn(8, 7, generator=g, dtype=torch.float64)
+    sampler = Sampler("grid", (90, 90))
+    if chunks > 1:
+        monkeypatch.setattr("caustic_cli.inverse.objective.CHUNK", 3000)
+    target = torch.rand(18, 15, generator=g, dtype=torch.float64)
+    function = Objective(scene, field, sampler, Filter("cosine", (5, 5)), target, loss, apron=3, max_slope=max_slope,
+                         dtype=torch.float64)
+    step = 1e-6
+    difference = (function(heights + step * along).loss - function(heights - step * along).loss) / (2 * step)
+    e = function(heights)
+    assert float((e.gradient * along).sum()) == pytest.approx(difference, rel=1e-5)
+    plain = Objective(scene, field, sampler, Filter("cosine", (5, 5)), target, loss.split(" ")[0], apron=3, dtype=torch.float64)
+    assert e.loss > plain(heights).loss
+
+
+def test_the_offset_itself_costs_nothing():
+    lens = Lens(control=(8, 7), degree=(3, 2), offset=Offset(5.0, (80.0, 80.0)))
+    scene, field = Scene(PlaneWave(), lens, Screen((36.0, 36.0))), HeightField.of(lens)
+    penalty = Penalty(scene, field, [(1.0, "laplacian"), (1.0, "curvature")])
+    x, y = (c.numpy() for c in field.control_xy())
+    base = torch.from_numpy(lens.offset.thickness + lens.offset.sag(x[:, None], y[None, :]))
+    assert float(penalty(base)) == 0.0
+    gain = (lens.index - 1.0) * 295.0
+    bump = base + 1e-4 * torch.from_numpy(x[:, None] ** 2 + 0 * y[None, :])  # not quite a parabola: its net's heights are
+    assert float(penalty(bump)) == pytest.approx(2 * (gain * 2e-4) ** 2, rel=0.2)

@@ -132,3 +132,23 @@ def test_what_a_section_says_is_what_is_built():
     assert isinstance(source, Points) and source.powers == (0.5, 1.5) and source.positions[1] == (1, 0, -6.0)
     assert isinstance(settings.build_source(complete({"source": {"type": "disc"}}, 1.0)), Disc)
     assert settings.build_source(full, type="plane").power == 2.0
+
+
+def test_render_to_a_tolerance(capfd):
+    run(capfd, "design", "blob.png", *TINY, "--iterations", "3")
+    render = ["render", "blob.caustic", "--quiet", "--threads", "1", "-o", "a.png", "--force", "--rays", "4000"]
+    truth = run(capfd, *render[:-2], "--rays", "1e7", "--npy", "truth.npy", "--seed", "5")
+    for tolerance in (0.05, 0.005):
+        figures = run(capfd, *render, "--tolerance", tolerance, "--npy", "a.npy")
+        image, exact = np.load("a.npy"), np.load("truth.npy")
+        error = np.sqrt(np.mean((image - exact) ** 2)) / exact.mean()
+        assert figures["error_estimate"] <= tolerance
+        assert error == pytest.approx(figures["error_estimate"], rel=0.25)
+        assert figures["rays"] <= figures["rays_traced"] < 3 * figures["rays"]
+        assert figures["on_screen"] + sum(figures["lost"].values()) == pytest.approx(1.0, abs=1e-12)
+    assert figures["relative_rms"] == pytest.approx(truth["relative_rms"], rel=0.01)
+
+
+@pytest.mark.parametrize("tolerance", ["0", "-1", "nan", "100"])
+def test_a_tolerance_has_to_be_possible(capfd, tolerance):
+    assert "--tolerance must be" in run(capfd, "render", "blob.caustic", "--tolerance", tolerance, code=2)

@@ -44,13 +44,16 @@ def run(
     control: Annotated[Text, typer.Option(metavar="N[xM]", help="Control points of the lens.  [default: 128 + degree]")] = None,
     degree: Annotated[Text, typer.Option(metavar="P[xQ]", help="Spline degree, 1 to 15.  [default: 3]")] = None,
     min_thickness: Annotated[float | None, typer.Option(help="Least thickness of the lens, mm.  [default: 1]")] = None,
+    max_slope: Annotated[float | None, typer.Option(help="Limit of the surface's slope, mm per mm.  [default: none]")] = None,
     linear: Annotated[bool, typer.Option("--linear", help="Pixel values are irradiance as they are, not sRGB-encoded.")] = False,
     flip: Annotated[Text, typer.Option(metavar="x|y|xy", help="Mirror the picture, for a viewer on the lens' side.")] = None,
     start: Annotated[Text, typer.Option(metavar="offset|PROJECT", help="First surface: the sphere that follows from --mag, or"
                                         " the lens of another project.  [default: offset]")] = None,
     quality: Annotated[Text, typer.Option(help="draft, standard or fine.  [default: standard]")] = None,
     rays: Annotated[Text, typer.Option(metavar="N", help="Rays of the last stage.  [default: 9 per pixel]")] = None,
-    loss: Annotated[Text, typer.Option(help="rms (eq. 5.2.1) or rms-light, where every ray counts.  [default: rms-light]")] = None,
+    loss: Annotated[Text, typer.Option(help="rms (eq. 5.2.1), rms-light, where every ray counts, throughput, diffusion,"
+                                       " uniformity, laplacian, curvature; or a weighted sum: 'rms-light + 0.01 laplacian'."
+                                       "  [default: rms-light]")] = None,
     network: Annotated[Text, typer.Option(help="none, sparse or dense.  [default: none]")] = None,
     optimizer: Annotated[Text, typer.Option(help="lbfgs or adam.  [default: lbfgs; adam for a network]")] = None,
     lr: Annotated[float | None, typer.Option(help="Learning rate of adam.  [default: 0.001]")] = None,
@@ -81,6 +84,7 @@ def run(
         ("lens", "control", "--control"): control and options.both(options.counts("--control", control)),
         ("lens", "degree", "--degree"): degree and options.both(options.counts("--degree", degree)),
         ("lens", "min_thickness", "--min-thickness"): min_thickness,
+        ("design", "max_slope", "--max-slope"): max_slope,
         ("screen", "z", "--throw"): throw,
         ("target", "encoding", "--linear"): "linear" if linear else None,
         ("target", "flip", "--flip"): flip,

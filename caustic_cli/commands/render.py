@@ -23,6 +23,8 @@ EXAMPLES = """Examples:
 def run(
     project: options.Project,
     rays: Annotated[str, typer.Option(metavar="N", help="Number of rays, independent of those of the design.")] = "1000000",
+    tolerance: Annotated[float | None, typer.Option(metavar="ERROR", help="Add rays until the image's noise, estimated,"
+                                                    " is below this relative RMS; --rays is where it begins.")] = None,
     reconstruction: Annotated[str, typer.Option(help="bincount, gaussian or cosine; the figures are always by bincount.")]
     = "bincount",
     filter_size: Annotated[str, typer.Option(metavar="V[xW]", help="Filter size, odd, pixels.")] = "3",
@@ -50,6 +52,8 @@ def run(
     """Trace the lens of PROJECT; write the irradiance image and its figures."""
     began, say = time.monotonic(), console.Reporter(quiet)
     count = options.rays("--rays", rays)
+    if tolerance is not None and not 0 < tolerance < 100:
+        raise InputError(f"--tolerance must be greater than 0 and less than 100, got {tolerance:g}")
     size = options.both(options.counts("--filter-size", filter_size))
     given = options.source(source, source_position, source_size, source_grid, source_angle, cone)
     device = options.start_torch(device, threads, say)
@@ -78,7 +82,8 @@ def run(
     try:
         exposure, figures = retrace(
             scene, field, checkpoint.state.heights, target, rays=count, filter=filter, screen=screen, device=device,
-            seed=opened.settings["design"]["seed"] if seed is None else seed, dtype=options.dtype_of(dtype or "float64"))
+            seed=opened.settings["design"]["seed"] if seed is None else seed, dtype=options.dtype_of(dtype or "float64"),
+            tolerance=tolerance)
     except InputError as error:
         raise InputError(str(error).replace("[screen] z", "--screen-at") if screen_at is not None else str(error)) from error
     image = exposure.image.cpu().numpy()

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse.lbfgs import LBFGS
-from caustic_cli.inverse.losses import LOSSES, NoLight
+from caustic_cli.inverse.losses import NoLight, parse
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.parametrisation import INITIAL, NETWORKS, PRECONDITIONERS, Heights, parametrise
 from caustic_cli.inverse.schedule import Stage
@@ -34,7 +34,8 @@ FLAT_SPAN = 10
 class Options:
     """How to look for the heights; the stages say with what.
 
-    loss: a name in `losses`; optimizer, lr: lbfgs, or adam with its learning rate; network, initial, preconditioner:
+    loss: weighted terms, see `losses`; max_slope: limit of the lens' slope, 0 for none;
+    optimizer, lr: lbfgs, or adam with its learning rate; network, initial, preconditioner:
     see `parametrisation`; filter_target: filter the target as the render is filtered; seed: of rays and networks;
     dtype: precision of the rays.
     """
@@ -48,9 +49,11 @@ class Options:
     filter_target: bool = True
     seed: int = 0
     dtype: torch.dtype = torch.float32
+    max_slope: float = 0.0
 
     def __post_init__(self):
-        checks.choice("[design] loss", self.loss, LOSSES)
+        parse(self.loss)
+        checks.number("[design] max_slope", self.max_slope, 0.0)
         checks.choice("[design] network", self.network, NETWORKS)
         checks.choice("[design] initial", self.initial, INITIAL)
         checks.choice("[design] preconditioner", self.preconditioner, PRECONDITIONERS)
@@ -97,6 +100,9 @@ class Designer:
         if scene.lens.knots is not None and any(s.control != scene.lens.control for s in stages):
             raise InputError("[lens] knots: a lens with knots of its own is designed on its own net; every stage's control"
                              f" must be {list(scene.lens.control)}")
+        if any(name == "throughput" for _, name in parse(options.loss)) and not all(s.apron for s in stages):
+            raise InputError("[design] loss: throughput needs dark pixels around the screen that catch stray light; every stage"
+                             " needs an apron")
         self.scene, self.target, self.stages, self.options, self.device = scene, target, stages, options, device
         for stage in stages:
             self._bounds(stage)  # refuse an impossible lens before any work
@@ -182,7 +188,7 @@ class Designer:
             scene = replace(scene, source=stage.source)
         rays = rays_of(scene, stage.sampler, stage.rays, stream(o.seed, f"stage {k}"), self.device)
         return Objective(scene, self.field(k), rays, stage.filter, self.target, o.loss, blur=stage.blur,
-                         filter_target=o.filter_target, apron=stage.apron, dtype=o.dtype)
+                         filter_target=o.filter_target, apron=stage.apron, max_slope=o.max_slope, dtype=o.dtype)
 
     def _next(self, state: State, k: int) -> State:
         """The state at the beginning of stage k: the same surface on its net."""

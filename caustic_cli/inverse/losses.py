@@ -1,7 +1,14 @@
-"""How far an image is from its target (thesis 5.2).
+"""How far an image is from its target, and what is minded beside that (thesis 5.2, 6.4, 7.2).
 
-    rms         sqrt(mean((J / sum J - T / sum T)^2)), eq. 5.2.1.  Light thrown off the screen costs nothing (notes 13).
-    rms-light   the same with J / P_out, P_out the power that leaves the lens: every ray counts.
+Every term is a dimensionless root mean square t; r is the relative residual N (J / P - T / sum T) on N pixels.
+
+    rms         r with P = sum J, eq. 5.2.1.  Light thrown off the screen costs nothing (notes 13).
+    rms-light   r with P = P_out, the power that leaves the lens: every ray counts.
+    throughput  t^2 is the part of the light beside the screen, each ray weighted by its distance from it (1 at the apron's rim):
+                it pulls back where rms-light, which sees how much light is out there but not how far, has no slope
+    diffusion   the Laplacian of r, with P = P_out: errors that alternate from pixel to pixel count
+    uniformity  standard deviation of J over its mean where the target is not dark: no picture is asked for (5.2)
+    laplacian, curvature    of the lens, see `penalties`
 
 Both sides may be blurred by the same matrices, J -> G_x J G_y^T: the residual is then seen at a coarser scale.
 """
@@ -13,10 +20,10 @@ import math
 import torch
 from torch import Tensor
 
-from caustic_cli.errors import CausticError
-from caustic_cli.scene import checks
+from caustic_cli.errors import CausticError, InputError
 
-LOSSES = ("rms", "rms-light")
+LOSSES = ("rms", "rms-light", "throughput", "diffusion", "uniformity")
+PENALTIES = ("laplacian", "curvature")
 
 
 class NoLight(CausticError):
@@ -33,24 +40,55 @@ def gaussian_matrix(n: int, sigma: float) -> Tensor:
     return kernel / torch.exp(-0.5 * (k / sigma) ** 2).sum()
 
 
+def parse(text: str) -> list[tuple[float, str]]:
+    """"rms-light + 0.1 laplacian" -> [(1.0, "rms-light"), (0.1, "laplacian")].
+
+    Raises:
+        InputError: an unknown name, a weight that is not a number of at least 0, or nothing that looks at the image.
+    """
+    terms = []
+    for part in text.split("+"):
+        weight, _, name = part.strip().rpartition(" ")
+        try:
+            value = float(weight.replace("*", "").strip() or 1.0)
+        except ValueError:
+            value = math.nan
+        if not (0.0 <= value < math.inf) or name not in LOSSES + PENALTIES:
+            raise InputError(f"[design] loss must be names with weights such as 'rms-light + 0.1 laplacian', of"
+                             f" {', '.join(LOSSES + PENALTIES)}; got {part.strip()!r}")
+        terms.append((value, name))
+    if not any(weight > 0 and name in LOSSES for weight, name in terms):
+        raise InputError(f"[design] loss must have one of {', '.join(LOSSES)} with a weight above 0, got {text!r}")
+    return terms
+
+
 class Loss:
-    """A named loss against one target.
+    """Weighted terms against one target: sqrt(sum_k w_k t_k^2) / pixels, so that one of weight 1 is eq. 5.2.1 itself.
 
     Args:
-        name: one of LOSSES.
+        text: see `parse`.
         target: (n_x, n_y) irradiance to reach, any scale, not all zero, already filtered as the render will be.
         blur: standard deviation in pixels of the Gaussian both sides are seen through; 0 for none.
+        apron: pixels on each side that do not belong to the screen.
+        region: (n_x, n_y) bool, where `uniformity` looks; None for where the target is not dark.
     """
 
-    def __init__(self, name: str, target: Tensor, blur: float = 0.0):
-        self.name = checks.choice("[design] loss", name, LOSSES)
+    def __init__(self, text: str, target: Tensor, blur: float = 0.0, apron: int = 0, region: Tensor | None = None):
+        self.terms = [(weight, name) for weight, name in parse(text) if name in LOSSES and weight > 0]
         self.blur = None
         if blur > 0:
             self.blur = tuple(gaussian_matrix(n, blur).to(target) for n in target.shape)
         self.target = target / target.sum()
+        self.region = target > 0 if region is None else region
+        beyond = [(torch.arange(n).to(target) - apron - 0.5 * (n - 2 * apron - 1)).abs() - 0.5 * (n - 2 * apron - 1)
+                  for n in target.shape]
+        self.distance = torch.maximum(*torch.broadcast_tensors(beyond[0][:, None], beyond[1][None, :])).clamp_min(0.0)
+        self.apron = apron
 
-    def __call__(self, image: Tensor, leaving: Tensor) -> Tensor:
+    def __call__(self, image: Tensor, leaving: Tensor, penalty: Tensor | float = 0.0) -> Tensor:
         """Loss of an image (n_x, n_y) made by rays that carried `leaving` out of the lens: scalar, in units of eq. 5.2.1.
+
+        penalty: sum of weighted squares of what does not concern the image.
 
         Raises:
             NoLight: no light to compare.
@@ -59,11 +97,22 @@ class Loss:
         if not float(total.detach()) > 0:
             raise NoLight("no light reaches the screen, so there is nothing to improve: every ray is reflected inside"
                           " the lens or misses the screen; check index, throw, mag and screen size")
-        power = total if self.name == "rms" else leaving
-        residual = image / power - self.target
+        square = sum(weight * self._square(name, image, leaving, total) for weight, name in self.terms) + penalty
+        pixels = self.target.numel()
+        if not float(square.detach()) > 0:
+            return square / pixels  # a perfect picture: the root's slope is infinite there, the square's is 0
+        return square.sqrt() / pixels
+
+    def _square(self, name: str, image: Tensor, leaving: Tensor, total: Tensor) -> Tensor:
+        if name == "throughput":
+            return (image * self.distance).sum() / (self.apron * leaving)
+        if name == "uniformity":
+            inside = image[self.region]
+            return inside.var(correction=0) / inside.mean().clamp_min(1e-300) ** 2
+        residual = (image / (total if name == "rms" else leaving) - self.target) * self.target.numel()
         if self.blur is not None:
             residual = self.blur[0] @ residual @ self.blur[1].T
-        square = (residual * residual).mean()
-        if not float(square.detach()) > 0:
-            return square  # a perfect picture: the root's slope is infinite there, the square's is 0
-        return square.sqrt()
+        if name == "diffusion":
+            padded = torch.nn.functional.pad(residual[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
+            residual = padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:] - 4.0 * residual
+        return (residual * residual).mean()

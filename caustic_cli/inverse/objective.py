@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from caustic_cli.inverse.losses import Loss
+from caustic_cli.inverse.losses import PENALTIES, Loss, parse
+from caustic_cli.inverse.penalties import Penalty
 from caustic_cli.optics.emission import Rays
 from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
@@ -42,20 +43,24 @@ class Objective:
         sampler: the rays, the same at every evaluation.
         filter: reconstruction filter.
         target: (n_x, n_y) irradiance on the scene's screen.
-        loss: name of the loss.
+        loss: weighted terms, see `losses.parse`.
         blur: pixels, see `Loss`.
         filter_target: filter the target as the render is filtered.
         apron: pixels by which the screen is widened on every side, dark in the target: light that has left the screen
             is seen there and pulled back.
+        max_slope: limit of the lens' slope, 0 for none.
         dtype: precision of the rays.
     """
 
     def __init__(self, scene: Scene, field: HeightField, sampler: Rays, filter: Filter, target: Tensor, loss: str, *,
-                 blur: float = 0.0, filter_target: bool = True, apron: int = 0, dtype: torch.dtype = torch.float32):
+                 blur: float = 0.0, filter_target: bool = True, apron: int = 0, max_slope: float = 0.0,
+                 dtype: torch.dtype = torch.float32):
         self.device = sampler.device
         self.screen, self.filter, self.apron = scene.screen.grown((apron, apron)), filter, apron
         wide = torch.nn.functional.pad(target.double().to(sampler.device), (apron, apron, apron, apron))
-        self.loss = Loss(loss, filter.smooth(wide) if filter_target else wide, blur)
+        self.loss = Loss(loss, filter.smooth(wide) if filter_target else wide, blur, apron, wide > 0)
+        minded = [(weight, name) for weight, name in parse(loss) if name in PENALTIES and weight > 0]
+        self.penalty = Penalty(scene, field, minded, max_slope, sampler.device)
         self.scene, self.field, self.sampler, self.dtype = scene, field, sampler, dtype
         self.kept = list(self._tracers()) if sampler.count <= KEPT_RAYS else None
 
@@ -74,20 +79,21 @@ class Objective:
         """
         heights = heights.detach().to(self.device).requires_grad_()
         single = self.kept is not None and len(self.kept) == 1
-        image, leaving = 0.0, 0.0
+        image, leaving, penalty = 0.0, 0.0, self.penalty(heights) if self.penalty else torch.zeros((), device=self.device)
         with torch.set_grad_enabled(single):
             for traced in self.kept or self._tracers():
                 part = traced.expose(heights, self.screen, self.filter)
                 image, leaving = image + part.image.double(), leaving + part.leaving.double()
         if single:
-            loss = self.loss(image, leaving)
+            loss = self.loss(image, leaving, penalty)
             gradient = torch.autograd.grad(loss, heights)[0] if loss.requires_grad else torch.zeros_like(heights)
         else:
             image, leaving = image.requires_grad_(), leaving.requires_grad_()
-            loss = self.loss(image, leaving)
-            by_image, by_leaving = torch.autograd.grad(loss, (image, leaving), allow_unused=True)
+            loss = self.loss(image, leaving, penalty)
+            wanted = (image, leaving, heights) if penalty.requires_grad else (image, leaving)
+            by_image, by_leaving, *direct = torch.autograd.grad(loss, wanted, allow_unused=True)
             by_leaving = torch.zeros_like(leaving) if by_leaving is None else by_leaving
-            gradient = torch.zeros_like(heights)
+            gradient = direct[0] if direct else torch.zeros_like(heights)
             for traced in self.kept or self._tracers():
                 part = traced.expose(heights, self.screen, self.filter)
                 # Whole pixels, and what leaves a lens without reflections, do not depend on the heights at all.

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from torch import Tensor
 
+from caustic_cli.errors import CausticError
 from caustic_cli.optics.emission import Rays, rays_of
 from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
@@ -16,6 +20,10 @@ from caustic_cli.studies.metrics import judge
 
 #: Rays of the retrace that ends a design.
 FINAL_RAYS = 4_000_000
+#: Independent images whose scatter tells their mean's noise: over thousands of pixels four are plenty.
+BATCHES = 4
+#: Most rays that --tolerance may ask for in one go.
+MOST_RAYS = 10**11
 
 
 def sampler_for(scene: Scene, rays: int, seed: int, device: str = "cpu") -> Rays:
@@ -23,21 +31,68 @@ def sampler_for(scene: Scene, rays: int, seed: int, device: str = "cpu") -> Rays
     return rays_of(scene, "stratified", rays, stream(seed, "render"), device)
 
 
+@dataclass(frozen=True)
+class Converged:
+    """An image traced until its noise was low enough.
+
+    exposure: the mean of BATCHES independent ones; error: estimated relative RMS of that mean's noise, from their variance;
+    traced: rays spent in all, those of the attempts before it included.
+    """
+
+    exposure: Exposure
+    error: float
+    traced: int
+
+
+def converge(scene: Scene, field: HeightField, heights: Tensor, tolerance: float, *, rays: int, seed: int = 0,
+             screen: Screen | None = None, device: str = "cpu", dtype: torch.dtype = torch.float64) -> Converged:
+    """Trace BATCHES independent sets of stratified rays, about `rays` in all, then more until the noise is at most `tolerance`.
+
+    The relative RMS noise of the mean of B images J_k is sqrt(mean over pixels of var(J_k) / B) / mean(J).  Stratified rays
+    converge with order 3/4, so n rays that leave an error e are followed by n (e / tolerance)^(4/3).
+
+    Raises:
+        CausticError: MOST_RAYS are not enough, or no light reaches the screen.
+    """
+    each, traced = max(1, rays // BATCHES), 0
+    while True:
+        parts = [expose(scene, field, heights, rays_of(scene, "stratified", each, stream(seed, f"batch {k}"), device), None, dtype,
+                        screen) for k in range(BATCHES)]
+        traced += sum(p.rays for p in parts)
+        images = torch.stack([p.image for p in parts])
+        mean = images.mean(0)
+        if not float(mean.sum()) > 0:
+            raise CausticError("no light reaches the screen, so there is no image to converge")
+        error = math.sqrt(float(images.var(0).mean()) / BATCHES) / float(mean.mean())
+        if error <= tolerance:
+            lost = {name: math.fsum(p.lost[name] for p in parts) / BATCHES for name in parts[0].lost}
+            leaving = math.fsum(p.leaving for p in parts) / BATCHES
+            return Converged(Exposure(mean, lost, leaving, sum(p.rays for p in parts)), error, traced)
+        each = int(each * min(32.0, max(1.3, 1.1 * (error / tolerance) ** (4.0 / 3.0))))
+        if each * BATCHES > MOST_RAYS:
+            raise CausticError(f"--tolerance {tolerance:g} asks for more than {MOST_RAYS:.0e} rays: {traced:,} left an estimated"
+                               f" error of {error:.2g}; fewer pixels or a larger tolerance need fewer")
+
+
 def retrace(scene: Scene, field: HeightField, heights: Tensor, target: np.ndarray, *, rays: int, seed: int = 0,
             filter: Filter | None = None, screen: Screen | None = None, device: str = "cpu",
-            dtype: torch.dtype = torch.float64) -> tuple[Exposure, dict]:
-    """Trace a lens with stratified rays of its own.
+            dtype: torch.dtype = torch.float64, tolerance: float | None = None) -> tuple[Exposure, dict]:
+    """Trace a lens with stratified rays of its own; with `tolerance`, as many as that asks for (`converge`).
 
     Returns:
         the exposure, reconstructed by `filter` (bincount unless given), and the figures of the JSON table, always by
-        bincount, with the rays that were traced.
+        bincount, with the rays that were traced; with `tolerance` also error_estimate and rays_traced.
     """
-    sampler = sampler_for(scene, rays, seed, device)
-    counted = expose(scene, field, heights, sampler, None, dtype, screen)
-    figures = judge(counted, target)
+    if tolerance is None:
+        counted = expose(scene, field, heights, sampler_for(scene, rays, seed, device), None, dtype, screen)
+        figures = judge(counted, target)
+    else:
+        found = converge(scene, field, heights, tolerance, rays=rays, seed=seed, screen=screen, device=device, dtype=dtype)
+        counted = found.exposure
+        figures = judge(counted, target) | {"error_estimate": found.error, "rays_traced": found.traced}
     if filter is None or filter.reach == (0, 0):
         return counted, figures
-    return expose(scene, field, heights, sampler, filter, dtype, screen), figures
+    return expose(scene, field, heights, sampler_for(scene, counted.rays, seed, device), filter, dtype, screen), figures
 
 
 def white_level(image: np.ndarray, target: np.ndarray) -> float:

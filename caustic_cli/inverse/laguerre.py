@@ -1,0 +1,269 @@
+"""Laguerre cells of point masses over a rectangle: a raster finds who borders whom, clipping finds areas and borders.
+
+Notation
+    y_p, psi_p    site p and its price, mm and mm^2;  phi(x) = max_p (x . y_p - psi_p), convex and piecewise linear
+    cell of p     where the maximum is attained by p: a convex polygon of the source rectangle (Aurenhammer 1987)
+    row           sites sit on rows y_1 = const and are sorted by y_2 in each: then both Legendre transforms split into one
+                  pass along each axis, each linear in the points it reads and writes (Lucet, Numer. Algorithms 16, 1997)
+
+Two cells are neighbours when they share a side or a corner of the raster.  A border much shorter than the raster's pitch is
+missed, which adds at most a quarter of its square to either area.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+FAST = {"cache": True, "error_model": "numpy", "nogil": True}
+MISSED = 16  # cuts added to a cell after those of its neighbours on the raster
+
+
+@njit(**FAST)
+def _line(y, f, n, x, value, place, hull):
+    """value[r] = max_j<n (x[r] y[j] - f[j]), place[r] the index; y and x ascend, f may be infinite."""
+    top = 0
+    for j in range(n):
+        if f[j] == np.inf:
+            continue
+        while top > 0:  # the lower convex hull of (y, f)
+            b = hull[top - 1]
+            if y[j] <= y[b]:
+                if f[j] >= f[b]:
+                    break
+                top -= 1
+                continue
+            if top == 1:
+                break
+            a = hull[top - 2]
+            if (f[b] - f[a]) * (y[j] - y[b]) < (f[j] - f[b]) * (y[b] - y[a]):
+                break
+            top -= 1
+        if top > 0 and y[j] <= y[hull[top - 1]]:
+            continue
+        hull[top] = j
+        top += 1
+    if top == 0:
+        value[:] = -np.inf
+        place[:] = -1
+        return
+    k = 0
+    for r in range(len(x)):
+        while k + 1 < top and f[hull[k + 1]] - f[hull[k]] <= x[r] * (y[hull[k + 1]] - y[hull[k]]):
+            k += 1
+        value[r] = x[r] * y[hull[k]] - f[hull[k]]
+        place[r] = hull[k]
+
+
+@njit(parallel=True, **FAST)
+def envelope(psi, rows, first, y2, x1, x2):
+    """phi and the site that attains it on a raster.
+
+    Args:
+        psi: (N,) prices, y2: (N,) second coordinates; sites first[i]..first[i + 1] are on row rows[i], y2 ascending.
+        x1 (n,), x2 (m,): the raster, ascending.
+
+    Returns:
+        phi (n, m), site (n, m) int32.
+    """
+    n, m, k = len(x1), len(x2), len(rows)
+    part, who = np.empty((m, k)), np.empty((m, k), np.int32)
+    for i in prange(k):
+        a, b = first[i], first[i + 1]
+        value, place, hull = np.empty(m), np.empty(m, np.int32), np.empty(b - a, np.int32)
+        _line(y2[a:b], psi[a:b], b - a, x2, value, place, hull)
+        for r in range(m):
+            part[r, i], who[r, i] = -value[r], a + place[r]
+    phi, site = np.empty((n, m)), np.empty((n, m), np.int32)
+    strips = (m + 15) // 16
+    for s in prange(strips):
+        value, place, hull = np.empty((16, n)), np.empty((16, n), np.int32), np.empty(k, np.int32)
+        low, high = 16 * s, min(16 * s + 16, m)
+        for r in range(low, high):
+            _line(rows, part[r], k, x1, value[r - low], place[r - low], hull)
+        for i in range(n):
+            for r in range(low, high):
+                phi[i, r], site[i, r] = value[r - low, i], who[r, place[r - low, i]]
+    return phi, site
+
+
+@njit(parallel=True, **FAST)
+def prices(phi, rows, first, y2, x1, x2):
+    """The Legendre transform back: psi_p = max over the raster of x . y_p - phi(x), (N,), and where: index i m + j, (N,)."""
+    n, m, k = len(x1), len(x2), len(rows)
+    part, which = np.empty((k, m)), np.empty((k, m), np.int32)
+    for r in prange(m):
+        value, place, hull = np.empty(k), np.empty(k, np.int32), np.empty(n, np.int32)
+        _line(x1, phi[:, r].copy(), n, rows, value, place, hull)
+        for i in range(k):
+            part[i, r], which[i, r] = -value[i], place[i]
+    psi, at = np.empty(len(y2)), np.empty(len(y2), np.int64)
+    for i in prange(k):
+        a, b = first[i], first[i + 1]
+        value, place, hull = np.empty(b - a), np.empty(b - a, np.int32), np.empty(m, np.int32)
+        _line(x2, part[i], m, y2[a:b], value, place, hull)
+        for p in range(a, b):
+            psi[p], at[p] = value[p - a], which[i, place[p - a]] * m + place[p - a]
+    return psi, at
+
+
+@njit(**FAST)
+def _join(p, q, head, link, end, degree, count):
+    """Note the border of p and q, unless it is known; half-borders 2 e and 2 e + 1 belong to the two sides."""
+    a, b = (p, q) if degree[p] <= degree[q] else (q, p)
+    e = head[a]
+    while e >= 0:
+        if end[e] == b:
+            return count
+        e = link[e]
+    end[count], link[count], head[p] = q, head[p], count
+    end[count + 1], link[count + 1], head[q] = p, head[q], count + 1
+    degree[p] += 1
+    degree[q] += 1
+    return count + 2
+
+
+@njit(**FAST)
+def borders(site, sites):
+    """Neighbours in a raster of cells, as linked lists of half-borders.
+
+    Returns:
+        head (N,): a site's first half-border or -1; link: the next one; end: the site on its other side; degree (N,).
+    """
+    n, m = site.shape
+    head, degree = np.full(sites, -1, np.int32), np.zeros(sites, np.int32)
+    room = 16 * sites + 64
+    link, end = np.empty(room, np.int32), np.empty(room, np.int32)
+    count = 0
+    for i in range(n):
+        for j in range(m):
+            p = site[i, j]
+            below = i + 1 < n
+            if j + 1 < m and site[i, j + 1] != p and count + 8 < room:
+                count = _join(p, site[i, j + 1], head, link, end, degree, count)
+            if below and site[i + 1, j] != p and count + 8 < room:
+                count = _join(p, site[i + 1, j], head, link, end, degree, count)
+            if below and j + 1 < m and site[i + 1, j + 1] != p and count + 8 < room:
+                count = _join(p, site[i + 1, j + 1], head, link, end, degree, count)
+            if below and j > 0 and site[i + 1, j - 1] != p and count + 8 < room:
+                count = _join(p, site[i + 1, j - 1], head, link, end, degree, count)
+    return head, link[:count], end[:count], degree
+
+
+@njit(**FAST)
+def _clip(px, py, owner, n, ax, ay, c, q, qx, qy, qowner):
+    """The part of a convex polygon where ax x + ay y <= c; side k runs from vertex k to k + 1 and has an owner."""
+    out = 0
+    for k in range(n):
+        k1 = k + 1 if k + 1 < n else 0
+        d0, d1 = ax * px[k] + ay * py[k] - c, ax * px[k1] + ay * py[k1] - c
+        if d0 <= 0.0:
+            qx[out], qy[out], qowner[out] = px[k], py[k], owner[k]
+            out += 1
+        if (d0 <= 0.0) != (d1 <= 0.0):
+            t = d0 / (d0 - d1)
+            qx[out], qy[out] = px[k] + t * (px[k1] - px[k]), py[k] + t * (py[k1] - py[k])
+            qowner[out] = q if d0 <= 0.0 else owner[k]
+            out += 1
+    return out
+
+
+@njit(**FAST)
+def density(f, x, y, a, b):
+    """Bilinear value at (x, y) of the cell values f over [-a, a] x [-b, b]."""
+    n, m = f.shape
+    u = min(max((x + a) * (0.5 * n / a) - 0.5, 0.0), n - 1.0)
+    v = min(max((y + b) * (0.5 * m / b) - 0.5, 0.0), m - 1.0)
+    i, j = min(int(u), max(n - 2, 0)), min(int(v), max(m - 2, 0))
+    i1, j1 = min(i + 1, n - 1), min(j + 1, m - 1)
+    u, v = u - i, v - j
+    return (f[i, j] * (1 - u) + f[i1, j] * u) * (1 - v) + (f[i, j1] * (1 - u) + f[i1, j1] * u) * v
+
+
+@njit(**FAST)
+def sampled(f, x1, x2, a, b):
+    """Bilinear values of f on a raster, (n, m); (1, 1) where f is one constant."""
+    if f.size == 1:
+        return f.copy()
+    out = np.empty((len(x1), len(x2)))
+    for i in range(len(x1)):
+        for j in range(len(x2)):
+            out[i, j] = density(f, x1[i], x2[j], a, b)
+    return out
+
+
+@njit(**FAST)
+def _means(site, values, sites):
+    """Mean of raster values in each cell, (N,)."""
+    total, count = np.zeros(sites), np.zeros(sites)
+    if values.size == 1:
+        return np.full(sites, values[0, 0])
+    for i in range(site.shape[0]):
+        for j in range(site.shape[1]):
+            total[site[i, j]] += values[i, j]
+            count[site[i, j]] += 1.0
+    return total / np.maximum(count, 1.0)
+
+
+@njit(**FAST)
+def _cells(low, high, psi, y1, y2, site, head, link, end, degree, f, level, a, b, mass, weight):
+    """`cells` for the sites low..high."""
+    room, flat = 0, f.size == 1
+    rn, rm = site.shape
+    for p in range(low, high):
+        room = max(room, degree[p])
+    room = 2 * room + 12 + MISSED
+    px, py, qx, qy = np.empty(room), np.empty(room), np.empty(room), np.empty(room)
+    po, qo = np.empty(room, np.int32), np.empty(room, np.int32)
+    for p in range(low, high):
+        if head[p] < 0 and len(psi) > 1:
+            continue
+        px[0], px[1], px[2], px[3] = -a, a, a, -a
+        py[0], py[1], py[2], py[3] = -b, -b, b, b
+        po[:4] = -1
+        n, e = 4, head[p]
+        while e >= 0 and n > 0:
+            q = end[e]
+            n = _clip(px, py, po, n, y1[q] - y1[p], y2[q] - y2[p], psi[q] - psi[p], e, qx, qy, qo)
+            px, py, po, qx, qy, qo = qx, qy, qo, px, py, po
+            e = link[e]
+        k, missed = 0, 0
+        while k < n and missed < MISSED:  # a vertex that the raster gives to someone else: cut there too
+            i = min(max(int((px[k] + a) * (0.5 * rn / a)), 0), rn - 1)
+            j = min(max(int((py[k] + b) * (0.5 * rm / b)), 0), rm - 1)
+            q, k = site[i, j], k + 1
+            ax, ay, c = y1[q] - y1[p], y2[q] - y2[p], psi[q] - psi[p]
+            if q != p and ax * px[k - 1] + ay * py[k - 1] - c > 1e-9 * abs(c):
+                n = _clip(px, py, po, n, ax, ay, c, -1, qx, qy, qo)
+                px, py, po, qx, qy, qo = qx, qy, qo, px, py, po
+                k, missed = 0, missed + 1
+        area = 0.0
+        for k in range(1, n - 1):
+            area += 0.5 * ((px[k] - px[0]) * (py[k + 1] - py[0]) - (px[k + 1] - px[0]) * (py[k] - py[0]))
+        if not area > 0.0:
+            continue
+        mass[p] = area * level[p]
+        for k in range(n):
+            if po[k] >= 0:
+                k1 = k + 1 if k + 1 < n else 0
+                q = end[po[k]]
+                length = np.hypot(px[k1] - px[k], py[k1] - py[k])
+                g = f[0, 0] if flat else density(f, 0.5 * (px[k] + px[k1]), 0.5 * (py[k] + py[k1]), a, b)
+                weight[po[k]] = g * length / np.hypot(y1[q] - y1[p], y2[q] - y2[p])
+
+
+@njit(parallel=True, **FAST)
+def cells(psi, y1, y2, site, head, link, end, degree, f, values, a, b):
+    """Mass of every cell and d(mass) across every border.
+
+    Returns:
+        mass (N,): source light in the cell, its area times the mean over its raster points of `values`, the source f sampled;
+        weight (half-borders,): f times the border's length over the sites' distance, the derivative of the mass by the
+        difference of the two prices (Kitagawa, Merigot & Thibert, J. Eur. Math. Soc. 21, 2019, theorem 1.3).
+    """
+    sites, tasks = len(psi), 32
+    mass, weight, level = np.zeros(sites), np.zeros(len(end)), _means(site, values, sites)
+    for task in prange(tasks):
+        _cells(task * sites // tasks, (task + 1) * sites // tasks, psi, y1, y2, site, head, link, end, degree, f, level, a, b,
+               mass, weight)
+    return mass, weight

@@ -1,0 +1,62 @@
+"""What a design minds about the lens itself (thesis 6.4): bumps, and slopes beyond a limit.
+
+Notation
+    d       departure of the surface from the offset, mm
+    G       (n - 1) T, mm, with T from lens to screen: a curvature d_xx moves light apart by the factor 1 + G d_xx
+
+    laplacian   root mean square of G (d_xx + d_yy): how much the lens magnifies unevenly
+    curvature   root mean square of G sqrt(d_xx^2 + 2 d_xy^2 + d_yy^2): the bending energy of a thin plate
+    slope       root mean square of 100 max(0, |grad z| / limit - 1)
+
+Means are over the Greville abscissae of the control net.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from caustic_cli.errors import InputError
+from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.scene import Scene
+
+STIFFNESS = 100.0
+
+
+class Penalty:
+    """Weighted squares of what a surface is asked not to have.
+
+    Args:
+        scene, field: the lens and the spline spaces of its heights.
+        terms: (weight, name) of `losses.PENALTIES`.
+        max_slope: limit of |grad z|, 0 for none.
+    """
+
+    def __init__(self, scene: Scene, field: HeightField, terms: list[tuple[float, str]], max_slope: float = 0.0,
+                 device: str | torch.device = "cpu"):
+        self.terms, self.limit = terms, max_slope
+        if terms and min(s.degree for s in field.spaces) < 2:
+            raise InputError("[design] loss: laplacian and curvature need splines of degree 2 or more")
+        (su, sv), (rx, ry) = field.spaces, field.half_size
+        self.u = [(su.matrix(su.greville, k) / (2.0 * rx) ** k).to(device) for k in range(3)]
+        self.v = [(sv.matrix(sv.greville, k) / (2.0 * ry) ** k).T.to(device) for k in range(3)]
+        x, y = (c.numpy() for c in field.control_xy())
+        offset = scene.lens.offset
+        self.base = torch.from_numpy(offset.thickness + offset.sag(x[:, None], y[None, :])).to(device)
+        self.gain = (scene.lens.index - 1.0) * (scene.screen.z - offset.thickness)
+
+    def __bool__(self) -> bool:
+        return bool(self.terms) or self.limit > 0
+
+    def __call__(self, heights: Tensor) -> Tensor:
+        """Heights (n, m) mm -> sum of weighted squares, scalar."""
+        d, total = self.gain * (heights - self.base), heights.new_zeros(())
+        xx, xy, yy = self.u[2] @ d @ self.v[0], self.u[1] @ d @ self.v[1], self.u[0] @ d @ self.v[2]
+        for weight, name in self.terms:
+            square = (xx + yy) ** 2 if name == "laplacian" else xx * xx + 2.0 * xy * xy + yy * yy
+            total = total + weight * square.mean()
+        if self.limit > 0:
+            slope2 = (self.u[1] @ heights @ self.v[0]) ** 2 + (self.u[0] @ heights @ self.v[1]) ** 2
+            excess = (slope2.clamp_min(1e-300).sqrt() / self.limit - 1.0).clamp_min(0.0)
+            total = total + (STIFFNESS * excess).square().mean()
+        return total

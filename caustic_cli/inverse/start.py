@@ -1,0 +1,190 @@
+"""From an optimal transport map to a lens surface: the heights whose refracted rays land where the map says.
+
+Notation
+    p = (x, y, z)    a point of the exit surface;  d its ray inside the glass, a unit vector
+    T                where it shall land on the plane z_screen;  t = (T - p) / |T - p|, the direction it needs
+    N                normal (-z_x, -z_y, 1); Snell's law (thesis eq. 2.1.10) asks n d - t to be parallel to it, so
+
+                     z_x = (t_x - n d_x) / (n d_z - t_z),    z_y likewise
+
+T = grad phi, so to first order in all angles z = (phi - |(x, y)|^2 / 2) / ((n - 1) D), D = z_screen - z.  That part is exact;
+only the rest of the slopes is integrated, in the least-squares sense (a Poisson equation by the cosine transform, Strang,
+SIAM Review 41, 1999).  z enters t, so this is repeated, always at the same mean height.
+
+The slopes needed are not quite a gradient.  What they miss moves the landing points by e(x, y), a smooth field that grows with
+the angles.  Each pixel of the picture is then moved by -e of the place that lights it, transported again, and the rays are
+sent to T + e, which a surface can do.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.fft import dctn, idctn
+from scipy.interpolate import RectBivariateSpline
+from scipy.ndimage import gaussian_filter
+
+from caustic_cli.errors import InputError
+from caustic_cli.inverse.laguerre import prices
+from caustic_cli.inverse.transport import Transport, corners, solve
+
+EVEN = 2.0  # cells over which e is smoothed: at a kink of phi the rays miss by the spline's own width, which is no error of T
+ENOUGH = 0.05  # pixels of e, root mean square, that are left alone
+REPEATS = 4  # of the heights; each takes another factor of about angle^2 / throw off the error
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """A surface and where it sends the light.
+
+    Attributes:
+        heights: z at the corners of the source's cells, edges of the aperture included, (n + 1, m + 1) float64, mm.
+        x, y: landing points of the rays that leave there, mm, traced with the gradient of the bicubic spline through z.
+        miss: root mean square distance between them and where they were sent, weighted by the source, mm.
+        corrections: how often the picture was moved.
+        transport: the last map.
+        seconds: wall time.
+    """
+
+    heights: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    miss: float
+    corrections: int
+    transport: Transport
+    seconds: float
+
+
+def surface(source, target, source_half, target_half, index, z_screen, thickness, directions=None, *, corrections=2,
+            **options) -> Start:
+    """Exit surface of a lens that throws `target` on the screen.
+
+    Args:
+        source: irradiance of the exit surface, seen along z, (n, m), any unit.
+        target: the picture, (k, l), any unit; half sizes in mm as for `transport.solve`.
+        index: of the glass; 1 outside.
+        z_screen, thickness: the screen's plane and the surface's mean height, mm.
+        directions: unit directions inside the glass at those corners, three (n + 1, m + 1) arrays, or None for (0, 0, 1).
+        corrections: how often, at most, the picture is moved by what the rays miss and transported again.
+        options: of `transport.solve`.
+
+    Raises:
+        InputError: as `transport.solve`; an index not above 1, a screen not above the lens, directions that are no unit
+            vectors towards it, or a picture out of reach of refraction.
+    """
+    began = time.perf_counter()
+    shape = np.shape(source)
+    if not 1.0 < index <= 5.0:
+        raise InputError(f"index must be more than 1 and at most 5, got {index!r}")
+    if not (np.isfinite(z_screen) and np.isfinite(thickness) and z_screen > thickness):
+        raise InputError(f"the screen at {z_screen!r} mm must lie beyond the lens' height of {thickness!r} mm")
+    d = _directions(directions, (shape[0] + 1, shape[1] + 1))
+    half = tuple(float(h) for h in source_half)
+    map_ = solve(source, target, half, target_half, **options)
+    x, y = corners(shape[0], half[0])[:, None], corners(shape[1], half[1])[None, :]
+    light = np.pad(np.asarray(source, dtype=np.float64), 1)
+    light = light[1:, 1:] + light[:-1, 1:] + light[1:, :-1] + light[:-1, :-1]
+    light /= light.sum()
+    pixel = [2.0 * h / s for h, s in zip(target_half, np.shape(target), strict=True)]
+    aim, shift = (map_.x, map_.y), np.zeros((2, *light.shape))
+    for again in range(corrections + 1):
+        z = heights(map_, aim, x, y, d, index, z_screen, thickness)
+        landing = land(z, x, y, d, index, z_screen)
+        off = np.stack([w - t for w, t in zip(landing, aim, strict=True)])
+        miss = float(np.sqrt((light * (off**2).sum(0)).sum()))
+        off = np.stack([gaussian_filter(w, EVEN) for w in off])
+        if again == corrections or not np.sqrt((light * (off**2).sum(0)).sum()) > ENOUGH * min(pixel):
+            break
+        shift += off
+        moved, reach = _moved(np.asarray(target, dtype=np.float64), pixel, map_.potential, shift, x, y)
+        map_ = solve(source, moved, half, reach, start=map_.potential, **{k: v for k, v in options.items() if k != "start"})
+        aim = map_.x + shift[0], map_.y + shift[1]
+    return Start(z, *landing, miss, again, map_, time.perf_counter() - began)
+
+
+def _moved(target, pixel, potential, shift, x, y) -> tuple[np.ndarray, tuple[float, float]]:
+    """The picture with each pixel moved by -shift of the place that lights it, in a frame wide enough, and its half sizes."""
+    shape = target.shape
+    at = [(np.arange(s) + 0.5 - 0.5 * s) * w for s, w in zip(shape, pixel, strict=True)]
+    from_ = prices(potential, at[0], np.arange(shape[0] + 1) * shape[1], np.tile(at[1], shape[0]), x[:, 0], y[0])[1]
+    bright = target.ravel() > 0
+    moves = [-s.ravel()[from_[bright]] / w for s, w in zip(shift, pixel, strict=True)]
+    frame = [min(int(np.ceil(np.abs(m).max())) + 1, s) for m, s in zip(moves, shape, strict=True)]
+    to = [i[bright] + f + np.clip(m, 1 - f, f - 1) for i, f, m in zip(np.indices(shape).reshape(2, -1), frame, moves, strict=True)]
+    low = [np.floor(t).astype(np.int64) for t in to]
+    wide = [s + 2 * f for s, f in zip(shape, frame, strict=True)]
+    out = np.zeros(wide[0] * wide[1])
+    for i in (0, 1):  # a pixel is shared by the four that it then covers
+        for j in (0, 1):
+            share = np.abs(1 - i - (to[0] - low[0])) * np.abs(1 - j - (to[1] - low[1]))
+            out += np.bincount((low[0] + i) * wide[1] + low[1] + j, share * target.ravel()[bright], len(out))
+    return out.reshape(wide), tuple(0.5 * s * w for s, w in zip(wide, pixel, strict=True))
+
+
+def _directions(directions, shape) -> tuple:
+    if directions is None:
+        return 0.0, 0.0, 1.0
+    d = tuple(np.asarray(v, dtype=np.float64) for v in directions)
+    if len(d) != 3 or any(v.shape != tuple(shape) for v in d):
+        raise InputError(f"directions must be three arrays of shape {tuple(shape)}, a corner of a source cell each")
+    unit = all(np.isfinite(v).all() for v in d) and (np.abs(d[0] ** 2 + d[1] ** 2 + d[2] ** 2 - 1) < 1e-6).all()
+    if not unit or (d[2] <= 0).any():
+        raise InputError("directions must be finite unit vectors with a positive z component")
+    return d
+
+
+def heights(map_: Transport, aim, x, y, d, index: float, z_screen: float, mean: float) -> np.ndarray:
+    """Heights at the corners x (n + 1, 1), y (1, m + 1), mm, whose rays land at `aim` as nearly as a surface can.
+
+    Args:
+        map_: a map close to `aim` (two arrays, mm): its potential is taken as it is, and only the rest integrated.
+        d, index, z_screen, mean: ray directions in the glass, its index, the screen's plane and the heights' mean, mm.
+    """
+    step = float(x[1, 0] - x[0, 0]), float(y[0, 1] - y[0, 0])
+    scale = 1.0 / ((index - 1.0) * (z_screen - mean))
+    main = scale * (map_.potential - 0.5 * (x * x + y * y))
+    slope = scale * (map_.x - x), scale * (map_.y - y)
+    z = main - main.mean() + mean
+    for _ in range(REPEATS):
+        tx, ty, tz = aim[0] - x, aim[1] - y, z_screen - z
+        length = np.sqrt(tx * tx + ty * ty + tz * tz)
+        lean = index * d[2] - tz / length  # N_z, up to a factor
+        if not ((index * (d[0] * tx + d[1] * ty + d[2] * tz) > length) & (tz > 0)).all():  # t . N > 0
+            raise InputError("the picture cannot be reached by refraction: a smaller picture or a longer throw is needed")
+        rest = [(t / length - index * v) / lean - s for t, v, s in zip((tx, ty), d, slope, strict=False)]
+        z = main + integrate(*rest, step)
+        z += mean - z.mean()
+    return z
+
+
+def integrate(sx: np.ndarray, sy: np.ndarray, step: tuple[float, float]) -> np.ndarray:
+    """The surface (n, m) of mean 0 whose differences are nearest to the slopes at its points, in the least-squares sense."""
+    n, m = sx.shape
+    hx, hy = step
+    ax, ay = 0.5 * (sx[1:] + sx[:-1]) / hx, 0.5 * (sy[:, 1:] + sy[:, :-1]) / hy
+    right = np.diff(ax, axis=0, prepend=0.0, append=0.0) + np.diff(ay, axis=1, prepend=0.0, append=0.0)
+    wave = -((2.0 * np.sin(0.5 * np.pi * np.arange(n) / n) / hx)[:, None] ** 2) - (
+        2.0 * np.sin(0.5 * np.pi * np.arange(m) / m) / hy) ** 2
+    wave[0, 0] = 1.0
+    spectrum = dctn(right, norm="ortho") / wave
+    spectrum[0, 0] = 0.0
+    return idctn(spectrum, norm="ortho")
+
+
+def land(z: np.ndarray, x, y, d, index: float, z_screen: float) -> tuple[np.ndarray, np.ndarray]:
+    """Landing points (n, m), mm, of the rays d through the bicubic spline of z; NaN where totally reflected."""
+    spline = RectBivariateSpline(x[:, 0], y[0], z, kx=min(3, len(z) - 1), ky=min(3, z.shape[1] - 1))
+    return refract(x, y, z, spline(x[:, 0], y[0], dx=1), spline(x[:, 0], y[0], dy=1), d, index, z_screen)
+
+
+def refract(x, y, z, zx, zy, d, index: float, z_screen: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where rays d inside the glass land that leave it at (x, y, z) with slopes zx, zy (vector form of Snell's law)."""
+    norm2 = 1.0 + zx * zx + zy * zy
+    c = d[2] - d[0] * zx - d[1] * zy
+    with np.errstate(invalid="ignore"):
+        s = np.sqrt(norm2 * (1.0 - index**2) + (index * c) ** 2)
+    gamma = (s - index * c) / norm2
+    reach = (z_screen - z) / (index * d[2] + gamma)
+    return x + reach * (index * d[0] - gamma * zx), y + reach * (index * d[1] - gamma * zy)
