@@ -82,7 +82,7 @@ class Entry:
 
     @property
     def loss(self) -> float | None:
-        """Of the last iteration, relative RMS; None before the first."""
+        """Of the last iteration, times the pixels; None before the first."""
         return self.state.history[-1][2] * self.pixels if self.state.history else None
 
     def advance(self, seconds: float) -> None:

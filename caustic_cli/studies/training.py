@@ -43,8 +43,8 @@ COLUMNS = {
     "iteration": "wall time of one iteration so far, s; median",
     "iteration_min": "least of them, s",
     "iteration_max": "most of them, s",
-    "loss": "the design's own loss, relative RMS as it is trained on (filtered, blurred in early stages); empty before the first"
-            " iteration",
+    "loss": "the last iteration's own loss times the pixels, for rms a relative RMS (filtered, blurred in early stages); empty"
+            " before the first iteration",
     "error": "relative RMS between the retraced image and the target, each over its own mean",
 }
 
@@ -53,7 +53,7 @@ class Contender(Protocol):
     """A design that goes on when it is its turn.
 
     series, optimizer, network: see COLUMNS; heights (n, m) mm over `field`; seconds, iterations: spent so far; steps: seconds of
-    every iteration so far; loss: the last iteration's, relative RMS; done: it cannot be improved further.
+    every iteration so far; loss: the last iteration's, times the pixels; done: it cannot be improved further.
     """
 
     series: str
