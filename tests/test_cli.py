@@ -146,6 +146,10 @@ BAD = {
     "render over the project": ("render blob.caustic --rays 1000 -o blob.caustic/project.toml", "project.toml"),
     "export over a foreign file": ("export blob.caustic -o blob.png", "--force"),
     "convergence study": ("convergence --study moon", "--study"),
+    "convergence seconds of another study": ("convergence --study rays --seconds 3", "--seconds"),
+    "convergence repeats of designs": ("convergence --study design --repeats 3", "--repeats"),
+    "convergence precision of intersections": ("convergence --dtype float32", "--dtype"),
+    "convergence no time": ("convergence blob.caustic --study design --seconds 0", "--seconds"),
     "convergence into a file": ("convergence -o blob.png", "blob.png"),
 }
 
@@ -233,7 +237,9 @@ def test_render_json(here, capfd, options):
 
 
 @pytest.mark.parametrize("text", ["gradmap blob.caustic --rays 2000", "export blob.caustic", "export blob.caustic --format stl",
-                                  "convergence blob.caustic --rays 4000 --repeats 2 -o c"])
+                                  "convergence blob.caustic --rays 2000 --repeats 1 -o c",
+                                  "convergence blob.caustic --study rays --rays 4000 --repeats 2 -o c",
+                                  "convergence blob.caustic --study design --rays 2000 --seconds 0.05 -o c"])
 def test_the_others_print_one_object_too(here, capfd, text):
     code, out, err = run(text + " --json --quiet", capfd)
     assert (code, err) == (0, "") and out.count("\n") == 1 and isinstance(json.loads(out), dict)
@@ -251,7 +257,7 @@ def test_quiet_is_silent_and_stdout_is_for_results(here, capfd, text):
 @pytest.mark.parametrize("text", ["render blob.caustic --rays 1000 -o a.png --npy a.npy",
                                   "gradmap blob.caustic --rays 1000 -o b.png", "export blob.caustic",
                                   "export blob.caustic --format stl",
-                                  "convergence blob.caustic --rays 2000 --repeats 2"])
+                                  "convergence blob.caustic --study rays --rays 2000 --repeats 2"])
 def test_what_it_made_it_replaces_unasked(here, capfd, text):
     for _ in range(2):
         code, _, err = run(text + " --quiet", capfd)

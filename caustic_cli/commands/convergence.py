@@ -14,21 +14,29 @@ from caustic_cli.errors import InputError
 
 EXAMPLES = """Examples:
 
-  caustic convergence flame.caustic --study rays -o accuracy
+  caustic convergence -o accuracy
 
-  caustic convergence --study precision --json
+  caustic convergence flame.caustic --study design --seconds 20
 """
 
-STUDIES = ("rays", "reconstruction", "precision")
+STUDIES = ("intersection", "rays", "reconstruction", "precision", "design")
+#: What the progress of a study counts.
+UNITS = {"intersection": "evaluations", "design": "turns"}
 
 
 def run(
     project: Annotated[Path | None, typer.Argument(metavar="[PROJECT]", help="Project made by caustic design; without one, the"
-                                                   " sphere a design begins from.", show_default=False)] = None,
-    study: Annotated[str, typer.Option(help="rays, reconstruction or precision.")] = "rays",
+                                                   " sphere a design begins from (intersection: the scene of the thesis' table"
+                                                   " D.3; design: a bright disc).", show_default=False)] = None,
+    study: Annotated[str, typer.Option(help="intersection: of rays and surface, by the thesis' triangle mesh and by Newton's"
+                                       " method; rays: samplers; reconstruction: filters; precision: float32 and float64; design:"
+                                       " optimisers, networks and control nets.")] = "intersection",
     rays: Annotated[str | None, typer.Option(metavar="N", help="Rays of the largest setting; the reference takes 16 times as"
-                                             " many.  [default: by study, about half a minute in all]")] = None,
-    repeats: Annotated[int, typer.Option(help="Rounds, each with fresh rays; the times' median and range are reported.")] = 3,
+                                             " many.  Of intersection: rays intersected; of design: rays of a retrace."
+                                             "  [default: by study, about half a minute in all]")] = None,
+    repeats: Annotated[int | None, typer.Option(help="Rounds, each with fresh rays (intersection: the same); the times' median and"
+                                                " range are reported.  [default: 3; intersection: 9]")] = None,
+    seconds: Annotated[float | None, typer.Option(help="Of design: for each contender.  [default: 4]")] = None,
     output: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Where CSV, JSON and PNG go.")]
     = Path("convergence"),
     force: options.Force = False,
@@ -40,40 +48,68 @@ def run(
     threads: options.Threads = None,
     debug: options.Debug = False,
 ) -> None:
-    """Measure the error of an image, and the time it took, for many settings in one run."""
+    """Measure errors, and the time they took, for many settings in one run."""
     began, say = time.monotonic(), console.Reporter(quiet)
     if study not in STUDIES:
         raise InputError(f"--study must be one of {', '.join(STUDIES)}, got {study!r}")
     count = options.rays("--rays", rays) if rays else None
+    for option, given, for_study in (("--seconds", seconds is not None, study == "design"),
+                                     ("--repeats", repeats is not None, study != "design"),
+                                     ("--dtype", dtype is not None, study != "intersection")):
+        if given and not for_study:
+            raise InputError(f"{option} has no meaning for --study {study}: leave it out")
+    precision = options.dtype_of(dtype) if dtype else None
     if output.exists() and not output.is_dir():
         raise InputError(f"{output}: is a file; a directory for CSV, JSON and PNG is needed")
     device = options.start_torch(device, threads, say)
 
-    from caustic_cli.files import refuse_foreign  # noqa: PLC0415
-    from caustic_cli.project import Project  # noqa: PLC0415
-    from caustic_cli.session import sphere  # noqa: PLC0415
-    from caustic_cli.studies.convergence import run_study  # noqa: PLC0415
-    from caustic_cli.studies.report import write  # noqa: PLC0415
+    from caustic_cli.studies import intersection, report, training  # noqa: PLC0415
 
     if output.is_dir():
-        for kind in ("json", "png"):
-            refuse_foreign(output / f"{study}.{kind}", force)
-    if project is None:
-        scene, field, heights = sphere()
-    else:
-        opened = Project.open(project)
-        scene = opened.scene()
-        field, checkpoint = opened.lens(scene)
-        heights = checkpoint.state.heights
+        plots = {"intersection": intersection.PLOTS, "design": training.PLOTS}.get(study)
+        report.refuse_foreign_files(report.paths_of(study, output, plots), force)
+    opened = _open(project)
     with say.progress(None) as show:
-        found = run_study(study, scene, field, heights.to(device), seed=seed or 0, max_rays=count, repeats=repeats,
-                          dtype=options.dtype_of(dtype) if dtype else None,
-                          progress=lambda done, whole: show(study, "rays", done, whole))
-    paths = write(found, output)
-    rows = [(name, "no order could be fitted" if order is None else f"error ~ rays^-{order.exponent:.2f} (+-{order.deviation:.2f})")
+        def progress(done: int, whole: int) -> None:
+            show(study, UNITS.get(study, "rays"), done, whole)
+
+        if study == "intersection":
+            case = (intersection.of_lens(*opened[1:], count, seed or 0) if opened else intersection.table_d3(count, seed or 0))
+            found = intersection.run_intersection(case, seed=seed or 0, repeats=repeats, progress=progress)
+        elif study == "design":
+            from caustic_cli import contest  # noqa: PLC0415
+
+            scene, target, entries = contest.entries_of(opened[0] if opened else None, device, precision, seed)
+            found = training.run_training(scene, target, entries, seconds=seconds, seed=seed or 0, rays=count, device=device,
+                                          progress=progress)
+        else:
+            from caustic_cli.session import sphere  # noqa: PLC0415
+            from caustic_cli.studies.convergence import run_study  # noqa: PLC0415
+
+            scene, field, heights = opened[1:] if opened else sphere()
+            found = run_study(study, scene, field, heights.to(device), seed=seed or 0, max_rays=count,
+                              repeats=3 if repeats is None else repeats, dtype=precision, progress=progress)
+    paths = report.write(found, output)
+    rows = [(name, "no order could be fitted" if order is None
+             else f"error ~ {found.against}^-{order.exponent:.2f} (+-{order.deviation:.2f})")
             for name, order in found.orders.items()]
-    say.table(f"{study}: fitted orders", [*rows, ("advice", found.advice), ("written", ", ".join(map(str, paths)))])
+    if "source" in found.about:
+        rows.insert(0, ("rays", f"{found.about['rays']:,} from {found.about['source']}"))
+    say.table(f"{study}: fitted orders" if found.orders else study,
+              [*rows, ("advice", found.advice), ("written", ", ".join(map(str, paths)))])
     if json:
         console.emit_json({"study": study, "advice": found.advice, "rows": found.rows, "files": [str(p) for p in paths],
                            "orders": {k: None if o is None else o.exponent for k, o in found.orders.items()},
                            "seconds": time.monotonic() - began})
+
+
+def _open(path: Path | None) -> tuple | None:
+    """The project, its scene, its lens' field and heights; None for no path."""
+    if path is None:
+        return None
+    from caustic_cli.project import Project  # noqa: PLC0415
+
+    opened = Project.open(path)
+    scene = opened.scene()
+    field, checkpoint = opened.lens(scene)
+    return opened, scene, field, checkpoint.state.heights

@@ -11,7 +11,6 @@ several rays a pixel.  Orders are therefore fitted over settings with at least o
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Callable
 
 import torch
@@ -23,7 +22,7 @@ from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import SAMPLERS
 from caustic_cli.scene import Scene, checks
 from caustic_cli.studies.fit import Order, order
-from caustic_cli.studies.measurement import REFERENCE_SEED, Bench, Reference, Setting
+from caustic_cli.studies.measurement import REFERENCE_SEED, Bench, Reference, Setting, haste
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.report import Study
 
@@ -36,8 +35,6 @@ FILTERS = (Filter(), *(Filter(kind, (v, v), (1.0, 1.0)) for kind in ("gaussian",
 NEGLIGIBLE = 0.1
 #: An order below this is no convergence: halving the error would take a thousand times the rays.
 STALLED = 0.1
-#: Repeats of one setting on an idle machine differ by a few tenths; by more than this, something else was running.
-BUSY = 2.0
 
 _COMMON = {
     "series": "the curve this setting belongs to",
@@ -88,7 +85,7 @@ def study_rays(bench: Bench, dtype: torch.dtype) -> Study:
     orders = _orders(bench, rows)
     best = min(rows, key=lambda row: row["error"])
     advice = (f"a relative error of {best['error']:.2g} costs {best['seconds']:.2g} s with {best['rays']}"
-              f" {best['sampler']} rays; {_halving(orders[best['series']])}{_haste(rows)}")
+              f" {best['sampler']} rays; {_halving(orders[best['series']])}{haste(rows)}")
     return Study("rays", _COMMON | _TIMES, rows, orders, advice, _about(bench, dtype, truth))
 
 
@@ -129,7 +126,7 @@ def study_reconstruction(bench: Bench, dtype: torch.dtype) -> Study:
             than += f" (bincount {plain['error']:.2g} in {plain['seconds']:.2g} s)"
         parts.append(f"with {best['rays']} rays {best['series']} has the least error, {best['error']:.2g}{than}")
     about = _about(bench, dtype, truth) | {"orders_of": "noise"}
-    return Study("reconstruction", columns, rows, _orders(bench, rows, "noise"), "; ".join(parts) + _haste(rows), about)
+    return Study("reconstruction", columns, rows, _orders(bench, rows, "noise"), "; ".join(parts) + haste(rows), about)
 
 
 def study_precision(bench: Bench, _dtype) -> Study:
@@ -157,7 +154,7 @@ def study_precision(bench: Bench, _dtype) -> Study:
     verdict = "float32 is enough" if worst["difference"] <= NEGLIGIBLE * worst["error"] else "use float64"
     advice = (f"float32 changes the image of {worst['rays']} {worst['sampler']} rays by {worst['difference']:.2g},"
               f" where the rays leave an error of {worst['error']:.2g}, and is {worst['speedup']:.2g} times as fast:"
-              f" {verdict}{_haste(rows)}")
+              f" {verdict}{haste(rows)}")
     return Study("precision", columns, rows, _orders(bench, rows), advice, _about(bench, None, truth))
 
 
@@ -175,12 +172,6 @@ def _halving(found: Order | None) -> str:
     if found is None or found.exponent < STALLED:
         return "more rays hardly lower it"
     return f"halving it costs {2.0 ** (1.0 / found.exponent):.2g} times as much"
-
-
-def _haste(rows: list[dict]) -> str:
-    """A warning where the machine was too busy for its times to mean much."""
-    spread = statistics.median(row["seconds_max"] / row["seconds_min"] for row in rows)
-    return f" (half of the times varied more than {spread:.1f}-fold: the machine was busy)" if spread > BUSY else ""
 
 
 def _about(bench: Bench, dtype: torch.dtype | None, truth: Reference) -> dict:

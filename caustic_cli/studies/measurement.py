@@ -36,6 +36,8 @@ from caustic_cli.studies.metrics import relative_rms
 REFERENCE_FACTOR = 16
 #: Distance from a study's seed to its reference's: no number of repeats reaches it.
 REFERENCE_SEED = 1_000_003
+#: Repeats of one setting on an idle machine differ by a few tenths; by more than this, something else was running.
+BUSY = 2.0
 
 
 @dataclass(frozen=True)
@@ -153,3 +155,9 @@ class Bench:
         self.done += rays
         if self.progress is not None:
             self.progress(self.done, self.total)
+
+
+def haste(rows: Sequence[dict], name: str = "seconds") -> str:
+    """A warning where the machine was too busy for its times, with their spread in `<name>_min` and `_max`, to mean much."""
+    spread = statistics.median(row[f"{name}_max"] / row[f"{name}_min"] for row in rows)
+    return f" (half of the times varied more than {spread:.1f}-fold: the machine was busy)" if spread > BUSY else ""

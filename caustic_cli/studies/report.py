@@ -1,17 +1,24 @@
-"""A study's result as a table (CSV), as data (JSON) and as a plot (PNG): `<study>.csv`, `.json`, `.png`."""
+"""A study's result as a table (CSV), as data (JSON) and as plots (PNG): `<study>.csv`, `.json`, `.png`.
+
+A study may bring plots of its own: each has an ending that follows the study's name, "" or "-pareto".
+"""
 
 from __future__ import annotations
 
 import csv
 import io
 import json
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from caustic_cli.errors import InputError
-from caustic_cli.files import SOFTWARE, atomic_path, write_bytes
+from caustic_cli.files import SOFTWARE, atomic_path, refuse_foreign, write_bytes
 from caustic_cli.studies.fit import Order, pareto
 
 #: Colours of Okabe and Ito, told apart by every kind of colour vision, and a marker of its own for each curve.
@@ -28,10 +35,12 @@ class Study:
         columns: meaning and unit of every column, in the order of the table.
         rows: one setting each, column name -> value (None where it does not apply); every row has `series`, `error`
             and `seconds`.
-        orders: fitted order in the number of rays of every series, None where it could not be fitted;
-            `about["orders_of"]` names the column.
+        orders: fitted order in `against` of every curve, None where it could not be fitted;
+            `about["orders_of"]` names the column where the curves are the series.
         advice: one sentence.
         about: how it was made: seed, repeats, device, the reference and its own error, ...
+        against: what the orders are fitted in.
+        plots: the ending of every picture's name -> what draws it.
     """
 
     name: str
@@ -40,10 +49,37 @@ class Study:
     orders: dict[str, Order | None]
     advice: str
     about: dict
+    against: str = "rays"
+    plots: dict[str, Drawing] = field(default_factory=lambda: PLOTS)
+
+
+#: Draws a study on an empty figure.
+Drawing = Callable[[Study, Figure], None]
+
+
+def paths_of(name: str, directory: str | Path, plots: dict[str, Drawing] | None = None) -> list[Path]:
+    """The files of a study: CSV, JSON and a PNG for each of its plots."""
+    directory = Path(directory)
+    endings = PLOTS if plots is None else plots
+    return [directory / f"{name}.csv", directory / f"{name}.json", *(directory / f"{name}{end}.png" for end in endings)]
+
+
+def refuse_foreign_files(paths: list[Path], force: bool = False) -> None:
+    """Stop before work begins where one of `paths_of` cannot be written or would replace what this program did not make.
+
+    A CSV has no room for our mark: it is ours if the JSON beside it is.
+
+    Raises:
+        InputError: naming the file.
+    """
+    table, *marked = paths
+    for path in marked:
+        refuse_foreign(path, force)
+    refuse_foreign(table, force or marked[0].exists())
 
 
 def write(study: Study, directory: str | Path) -> list[Path]:
-    """Write the three files into `directory`, made if missing; each is written whole.  Returns their paths.
+    """Write the files into `directory`, made if missing; each is written whole.  Returns their paths.
 
     Raises:
         InputError: the directory cannot be made or written to.
@@ -54,10 +90,11 @@ def write(study: Study, directory: str | Path) -> list[Path]:
     except OSError as error:
         raise InputError(f"{directory}: cannot be made ({error.strerror}); a directory you may write to is needed") \
             from error
-    paths = [directory / f"{study.name}.{kind}" for kind in ("csv", "json", "png")]
+    paths = paths_of(study.name, directory, study.plots)
     write_bytes(paths[0], as_csv(study).encode())
     write_bytes(paths[1], as_json(study).encode())
-    plot(study, paths[2])
+    for path, draw in zip(paths[2:], study.plots.values(), strict=True):
+        plot(study, path, draw)
     return paths
 
 
@@ -72,37 +109,74 @@ def as_csv(study: Study) -> str:
 
 def as_json(study: Study) -> str:
     """Everything, one object that begins with who made it; there is neither infinity nor NaN in it."""
-    return json.dumps({"created_by": SOFTWARE} | asdict(study), indent=2, allow_nan=False) + "\n"
+    data = {f.name: getattr(study, f.name) for f in fields(study) if f.name != "plots"}
+    data["orders"] = {name: None if found is None else vars(found) for name, found in study.orders.items()}
+    return json.dumps({"created_by": SOFTWARE} | data, indent=2, allow_nan=False) + "\n"
 
 
-def plot(study: Study, path: str | Path) -> None:
-    """Error against time on logarithmic axes, one curve a series, the Pareto front ringed and joined.
-
-    An error of exactly 0 has no place on such an axis and is left out.
-    """
+def plot(study: Study, path: str | Path, draw: Drawing | None = None) -> None:
+    """Write one picture of a study, by default error against time."""
     figure = Figure(figsize=(7.2, 5.2), dpi=150, layout="constrained")
-    axes = figure.add_subplot(xscale="log", yscale="log")
-    rows = [row for row in study.rows if row["error"] > 0]
-    for k, series in enumerate(dict.fromkeys(row["series"] for row in rows)):
-        mine = [row for row in rows if row["series"] == series]
-        spread = [[row["seconds"] - row["seconds_min"] for row in mine],
-                  [row["seconds_max"] - row["seconds"] for row in mine]]
-        order, label = study.orders.get(series), series
-        if order is not None:
-            label += f", {study.about['orders_of']} of order {order.exponent:.2f}"
-        axes.errorbar([row["seconds"] for row in mine], [row["error"] for row in mine], xerr=spread, linewidth=1,
-                      elinewidth=0.6, markersize=5, color=COLOURS[k % len(COLOURS)], marker=MARKERS[k % len(MARKERS)],
-                      label=label)
-    best = pareto([row["seconds"] for row in rows], [row["error"] for row in rows])
-    front = sorted((row["seconds"], row["error"]) for row, on in zip(rows, best, strict=True) if on)
-    axes.plot([seconds for seconds, _ in front], [error for _, error in front], linestyle=":", color="black",
-              marker="o", markersize=11, markerfacecolor="none", label="Pareto front")
+    (draw or draw_error_and_time)(study, figure)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format="png", metadata={"Software": SOFTWARE})
+
+
+def draw_error_and_time(study: Study, figure: Figure) -> None:
+    """Error against time, one curve a series, the Pareto front ringed and joined."""
+    axes = figure.add_subplot()
+    draw_front(axes, study)
     if study.about["reference_error"] > 0:
         axes.axhline(study.about["reference_error"], color="grey", linewidth=0.8, linestyle="--",
                      label="error of the reference")
     axes.set(xlabel="time (s): median, least and most", ylabel="error: relative RMS against the reference",
              title=f"{study.name}: error and time")
-    axes.grid(which="major", linewidth=0.4)
     axes.legend(fontsize="small")
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png", metadata={"Software": SOFTWARE})
+
+
+def draw_front(axes: Axes, study: Study) -> None:
+    """The curves of error against time on logarithmic axes, with bars where a row knows its spread, and the Pareto front.
+
+    An error or a time of exactly 0 has no place on such axes and is left out.
+    """
+    axes.set(xscale="log", yscale="log")
+    rows = [row for row in study.rows if row["error"] > 0 and row["seconds"] > 0]
+    for series, style in styles(row["series"] for row in study.rows).items():
+        mine = [row for row in rows if row["series"] == series]
+        if not mine:
+            continue
+        order, label = study.orders.get(series), series
+        if order is not None:
+            label += f", {study.about['orders_of']} of order {order.exponent:.2f}"
+        axes.errorbar([row["seconds"] for row in mine], [row["error"] for row in mine], xerr=spread(mine), label=label, **style)
+    best = pareto([row["seconds"] for row in rows], [row["error"] for row in rows])
+    front = sorted((row["seconds"], row["error"]) for row, on in zip(rows, best, strict=True) if on)
+    axes.plot([seconds for seconds, _ in front], [error for _, error in front], linestyle=":", color="black",
+              marker="o", markersize=11, markerfacecolor="none", label="Pareto front")
+    axes.grid(which="major", linewidth=0.4)
+    plain_ticks(axes.xaxis)
+
+
+def plain_ticks(axis: Axis) -> None:
+    """Plain numbers at 1, 2 and 5 on a logarithmic axis that spans less than three decades, once everything is drawn on it."""
+    low, high = axis.get_view_interval()
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 1000.0 * low else (1.0,)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def styles(series: Iterable[str]) -> dict[str, dict]:
+    """How the curve of each series looks, as options of `Axes.errorbar`."""
+    return {name: {"linewidth": 1, "elinewidth": 0.6, "markersize": 5, "color": COLOURS[k % len(COLOURS)],
+                   "marker": MARKERS[k % len(MARKERS)]} for k, name in enumerate(dict.fromkeys(series))}
+
+
+def spread(rows: list[dict]) -> list[list[float]] | None:
+    """How far the least and the most time of every row lie from its median, s; None where rows have none."""
+    if not rows or "seconds_min" not in rows[0]:
+        return None
+    return [[row["seconds"] - row["seconds_min"] for row in rows], [row["seconds_max"] - row["seconds"] for row in rows]]
+
+
+#: The one picture of a study that brings none of its own.
+PLOTS: dict[str, Drawing] = {"": draw_error_and_time}

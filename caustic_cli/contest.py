@@ -1,0 +1,160 @@
+"""The designs that `convergence --study design` lets run against each other."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from caustic_cli import settings
+from caustic_cli.derive import NETWORK_CONTROL, Settings, build_options, build_stages, complete
+from caustic_cli.inverse.designer import Designer, Options, State
+from caustic_cli.inverse.objective import Objective
+from caustic_cli.inverse.schedule import Stage, coarse_to_fine
+from caustic_cli.inverse.target import target_on_screen
+from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.project import Project
+from caustic_cli.scene import Scene
+
+#: A contest without a project: pixels across the screen, and control points, 64 spans and the degree.
+PIXELS, CONTROL = 96, 67
+#: Of its picture, a bright disc: cells across, and radius over half the width.
+CELLS, DISC = 480, 0.8
+#: Knot spans of the control nets compared: all, half, and a quarter.
+PARTS = (1, 2, 4)
+ENDLESS = 10**9
+
+
+class Turns(Designer):
+    """A designer that keeps what a stage prepares from one turn to the next."""
+
+    _kept: tuple[int, Objective] | None = None
+
+    def _objective(self, k: int) -> Objective:
+        if self._kept is None or self._kept[0] != k:
+            self._kept = None  # never two at once: they are large
+            self._kept = k, super()._objective(k)
+        return self._kept[1]
+
+
+class Entry:
+    """A design that takes turns; a `studies.training.Contender`.
+
+    Raises:
+        InputError: the lens leaves the heights no room.
+        CausticError: no light reaches the screen.
+    """
+
+    def __init__(self, series: str, stages: list[Stage], options: Options, scene: Scene, target: Tensor, device: str = "cpu"):
+        self.series, self.optimizer, self.network = series, options.optimizer, options.network
+        self.designer = Turns(scene, target, stages, options, device)
+        self.designer.run(self.designer.begin(), iterations=1)  # what the first iteration alone waits for
+        self.state, self.done, self.pixels = self.designer.begin(), False, target.numel()
+
+    @property
+    def field(self) -> HeightField:
+        """The spline spaces of the stage it is in."""
+        return self.designer.field(self.state.stage)
+
+    @property
+    def heights(self) -> Tensor:
+        """(n, m) mm."""
+        return self.state.heights
+
+    @property
+    def seconds(self) -> float:
+        """Spent so far."""
+        return self.state.seconds
+
+    @property
+    def iterations(self) -> int:
+        """Done so far."""
+        return self.state.total
+
+    @property
+    def steps(self) -> list[float]:
+        """Seconds of every iteration so far."""
+        return np.diff([0.0, *(row[4] for row in self.state.history)]).tolist()
+
+    @property
+    def loss(self) -> float | None:
+        """Of the last iteration, times the pixels; None before the first."""
+        return self.state.history[-1][2] * self.pixels if self.state.history else None
+
+    def advance(self, seconds: float) -> None:
+        """Iterate for so long, at least once."""
+        end, steps = time.monotonic() + seconds, 0
+
+        def count(_: State) -> None:
+            nonlocal steps
+            steps += 1
+
+        self.state = self.designer.run(self.state, iterations=ENDLESS, on_iteration=count,
+                                       stop=lambda: steps > 0 and time.monotonic() >= end)
+        self.done = self.state.reason != "interrupted"
+
+
+def entries_of(project: Project | None, device: str, dtype: torch.dtype | None = None,
+               seed: int | None = None) -> tuple[Scene, np.ndarray, list[Entry]]:
+    """Scene, target (n_x, n_y) and contenders of a project; without one, of a bright disc on fewer pixels and control points.
+
+    Raises:
+        InputError, CausticError: as of `plans` and `Entry`.
+    """
+    if project is None:
+        full = complete({"screen": {"resolution": [PIXELS, PIXELS]}, "lens": {"control": [CONTROL, CONTROL]}}, 1.0)
+        scene = settings.build_scene(full)
+        target = disc(scene, tuple(full["target"]["size"]))
+    else:
+        full, scene = project.settings, project.scene()
+        target = project.target(scene)
+    goal = torch.from_numpy(target)
+    return scene, target, [Entry(*plan, scene, goal, device) for plan in plans(scene, full, dtype, seed)]
+
+
+def disc(scene: Scene, size: tuple[float, float]) -> np.ndarray:
+    """A bright disc in a dark square of `size` mm on the scene's screen: (n_x, n_y)."""
+    x = (np.arange(CELLS) + 0.5) * 2.0 / CELLS - 1.0
+    return target_on_screen((np.hypot(x[:, None], x) <= DISC).astype(float), size, scene.screen)
+
+
+def plans(scene: Scene, full: Settings, dtype: torch.dtype | None = None,
+          seed: int | None = None) -> list[tuple[str, list[Stage], Options]]:
+    """What every contender for a target is called, and how it designs; dtype and seed replace those of the settings.
+
+    L-BFGS on the finished control net, on nets of half and a quarter of its knot spans, and coarse to fine; Adam on the heights
+    themselves and on the networks of the thesis, on its control net.  Rays, filter, apron and loss are those of the last stage.
+
+    Raises:
+        InputError: a setting is out of range.
+    """
+    last, options = build_stages(full)[-1], build_options(full)
+    options = replace(options, dtype=dtype or options.dtype, seed=options.seed if seed is None else seed)
+    last = replace(last, blur=0.0, iterations=ENDLESS, tolerance=0.0, source=None)
+    lens = scene.lens
+    nets = [lens.control] if lens.knots is not None else list(dict.fromkeys(
+        tuple(max(p + 1, math.ceil((n - p) / part) + p) for n, p in zip(lens.control, lens.degree, strict=True)) for part in PARTS))
+    newton = replace(options, optimizer="lbfgs", network="none", initial="zero", preconditioner="laplacian")
+    found = [(f"lbfgs, {_net(net)}", [replace(last, control=net)], newton) for net in nets]
+    if len(nets) > 1:
+        stages = coarse_to_fine(lens.control, lens.degree, last.rays, scene.screen.resolution, filter=last.filter,
+                                sampler=last.sampler)
+        stages = [replace(s, apron=0 if options.loss == "rms" else s.apron) for s in stages]
+        stages[-1] = replace(stages[-1], iterations=ENDLESS, tolerance=0.0)
+        found.append(("lbfgs, coarse to fine", stages, newton))
+    net = lens.control if lens.knots is not None else tuple(min(n, max(NETWORK_CONTROL, p + 1)) for n, p in
+                                                           zip(lens.control, lens.degree, strict=True))
+    adam = replace(options, optimizer="adam", initial="zero", preconditioner="none")
+    for kind in ("none", "sparse", "dense"):
+        if kind != "dense" or math.prod(net) <= NETWORK_CONTROL**2:  # weights: the square of the control points
+            name = "adam" if kind == "none" else f"adam, {kind} network"
+            found.append((f"{name}, {_net(net)}", [replace(last, control=net)], replace(adam, network=kind)))
+    return found
+
+
+def _net(control: tuple[int, int]) -> str:
+    return "x".join(map(str, control))

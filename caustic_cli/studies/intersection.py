@@ -1,0 +1,335 @@
+"""What accuracy costs where rays meet the surface: the thesis' triangle mesh beside Newton's method (thesis 4.3.3, 6.3).
+
+Notation
+    o, d        a ray's start and unit direction inside the lens, mm
+    Z           the B-spline surface; T the mesh, every knot span cut in n_u = n_v parts
+    t, t*       distance to the hit that a method finds, and to the exact one
+    t-error     |t - t*|, mm
+    z-error     |o_z + t d_z - Z| below or above the hit, mm; for the mesh |T - Z|
+
+t* comes from float64 Newton hits by two more steps with f(t) = o_z + t d_z - Z in extended precision; where that leaves |f| is
+the reference's own error.  The thesis finds order 2 in n_u for both errors (eq. 4.3.21 and fig. 6.2.14).
+
+Times are those of one evaluation with new heights, as a design needs it in every iteration: for the mesh vertices, boxes and
+search, for Newton the polynomials of the spans and the iteration.  What the rays alone decide is made before.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from caustic_cli import __version__
+from caustic_cli.errors import CausticError
+from caustic_cli.optics.bspline import SplineSpace
+from caustic_cli.optics.bundle import Bundle
+from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.intersection import Method, Status, find
+from caustic_cli.optics.kernels.surface import FusedSurface, RayHits
+from caustic_cli.scene import PlaneWave, Points, Scene, checks
+from caustic_cli.studies.fit import Order, order
+from caustic_cli.studies.measurement import haste
+from caustic_cli.studies.report import Study, draw_front, plain_ticks, spread, styles
+
+#: Table D.3, its lengths in mm: half width of the lens, radius of the sphere, depth of the source, half-angle of its cone (rad).
+HALF, RADIUS, DEPTH, CONE, NET, DEGREE, RAYS = 5.0, 9.0, 6.0, 0.8, 15, 3, 25_000
+#: Rounds of timings, unless said.
+REPEATS = 9
+#: Most cells of the mesh along an axis, and most knot span products that are gone through one by one.
+MOST_CELLS, MOST_FLAT = 1600, 4096
+#: Parts for a mesh that only tells Newton where to begin.
+COARSE = (1, 2, 4, 8)
+#: What the name of a series ends in whose boxes are gone through one by one.
+FLAT = ", flat boxes"
+#: Of a lens in parallel light: how far before it the point source stands instead, in lens widths.
+AWAY = 5.0
+#: t-errors, mm, that the advice compares, and the one at which Newton and the mesh are.
+ROUGH, FINE, EQUAL = 1e-4, 1e-9, 1e-6
+
+COLUMNS = {
+    "series": "method: mesh, looked for four rectangles of knot span products at a time; mesh, flat boxes, through all of them"
+              " one by one; newton; mesh+newton, which begins at the mesh's hit",
+    "n_u": "parts that the mesh cuts every knot span into along either axis",
+    "rays": "rays in all",
+    "hits": "rays found to meet the surface",
+    "strayed": "rays that only this method or only the reference finds to meet it; the errors are over the others",
+    "error": "mean t-error, mm",
+    "t_max": "maximum t-error, mm",
+    "z_mean": "mean z-error, mm",
+    "z_max": "maximum z-error, mm",
+    "seconds": "wall time of one evaluation with new heights, s; median of the repeats",
+    "seconds_min": "least of them, s",
+    "seconds_max": "most of them, s",
+}
+#: Curves whose order is fitted: what they are called, and their column.
+FITTED = {"mean z-error": "z_mean", "mean t-error": "error", "maximum z-error": "z_max", "maximum t-error": "t_max"}
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A surface and rays that meet it: heights (n, m) mm, and where the rays come from in words."""
+
+    field: HeightField
+    heights: Tensor
+    rays: Bundle
+    source: str
+
+
+def table_d3(rays: int | None = None, seed: int = 0) -> Case:
+    """The scene of table D.3: a point source in the glass, 6 mm below the crest of a sphere of 9 mm, no entrance surface.
+
+    The cone of half-angle 0.8 rad is sampled at random, evenly over its solid angle.
+    """
+    field = HeightField((SplineSpace.uniform(NET, DEGREE),) * 2, (HALF, HALF))
+    x, y = field.control_xy()
+    heights = torch.sqrt(RADIUS**2 - x[:, None] ** 2 - y**2) - RADIUS
+    generator = torch.Generator().manual_seed(seed)
+    a, b = torch.rand(2, rays or RAYS, generator=generator, dtype=torch.float64)
+    w = 2.0 * math.sin(CONE / 2.0) ** 2 * a  # 1 - cos of the angle to the axis
+    sine, zero = torch.sqrt(w * (2.0 - w)), torch.zeros_like(w)
+    bundle = Bundle(zero, zero, -DEPTH, sine * torch.cos(2 * math.pi * b), sine * torch.sin(2 * math.pi * b), 1.0 - w,
+                    torch.full_like(w, 1.0 / len(w)), {})
+    return Case(field, heights, bundle, f"table D.3: a point {DEPTH:g} mm below the surface, cone {CONE:g} rad")
+
+
+def of_lens(scene: Scene, field: HeightField, heights: Tensor, rays: int | None = None, seed: int = 0) -> Case:
+    """A lens and the rays of its own source that enter it; rays along z are exact at once, so a plane wave gives way to a point.
+
+    Raises:
+        CausticError: no ray enters the lens.
+    """
+    source = f"{len(scene.source.positions)} points" if isinstance(scene.source, Points) else "the disc"
+    if isinstance(scene.source, PlaneWave):
+        away = AWAY * max(scene.lens.size)
+        scene = replace(scene, source=Points(((0.0, 0.0, scene.lens.z_in - away),)))
+        source = f"a point on the axis, {away:g} mm before the lens, as rays along z need no search"
+    sampler = rays_of(scene, "uniform", rays or RAYS, seed)
+    bundle = next(iter(sampler.chunks(sampler.count)))
+    inside = bundle.share > 0
+    if not bool(inside.any()):
+        raise CausticError("no ray enters the lens, so there is nothing to intersect; check source position and cone")
+    bundle = replace(bundle, **{k: getattr(bundle, k)[inside].contiguous() for k in ("x", "y", "dx", "dy", "dz", "share")})
+    return Case(field, heights.detach().double().cpu(), bundle, source)
+
+
+def exact_heights(field: HeightField, heights: Tensor, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Z at points x, y (N,) mm in NumPy's longdouble, 64 bits of mantissa on x86: (N,) mm."""
+    (i, bu), (j, bv) = (_exact_basis(s, 0.5 * (c / r + 1.0)) for s, c, r in zip(field.spaces, (x, y), field.half_size, strict=True))
+    h, total = heights.numpy().astype(np.longdouble), np.zeros_like(x)
+    for k, b in enumerate(bu):
+        row = sum(c * h[i + k, j + n] for n, c in enumerate(bv))
+        total = total + b * row
+    return total
+
+
+def _exact_basis(space: SplineSpace, u: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+    """First non-zero basis function at u (N,), and the p + 1 values, (N,) each, by the triangular scheme of `bspline`."""
+    u, t = np.clip(u, 0.0, 1.0), space.knots.numpy().astype(np.longdouble)
+    span = space.span(torch.from_numpy(u.astype(np.float64))).numpy()
+    values = [np.ones_like(u)]
+    for degree in range(1, space.degree + 1):
+        saved = np.zeros_like(u)
+        for r in range(degree):
+            right, left = t[span + r + 1] - u, u - t[span + 1 - degree + r]
+            part = values[r] / (right + left)
+            values[r], saved = saved + right * part, left * part
+        values.append(saved)
+    return span - space.degree, values
+
+
+def reference(case: Case) -> tuple[np.ndarray, np.ndarray, float]:
+    """t* (N,) longdouble mm, which rays hit (N,), and how far off the surface the hits still are, mm.
+
+    Raises:
+        CausticError: no ray meets the surface.
+    """
+    t, status = find(case.field, case.heights, case.rays)
+    hit = (status == Status.HIT).numpy()
+    if not hit.any():
+        raise CausticError("no ray meets the surface, so there are no hits to study")
+    b = case.rays
+    _, zx, zy = case.field.at(case.heights, b.x + t * b.dx, b.y + t * b.dy)
+    cosine = torch.where(status == Status.HIT, b.dz - zx * b.dx - zy * b.dy, torch.ones_like(t)).numpy()
+    t = t.numpy().astype(np.longdouble)
+    for _ in range(2):
+        t = t - _above(case, t) / cosine
+    return t, hit, float(np.abs(_above(case, t)[hit]).max())
+
+
+def _above(case: Case, t: np.ndarray) -> np.ndarray:
+    """f(t) (N,), mm: how high above the surface the rays are at t (N,) longdouble."""
+    x, y, dx, dy, dz = (getattr(case.rays, k).numpy().astype(np.longdouble) for k in ("x", "y", "dx", "dy", "dz"))
+    return case.rays.z + t * dz - exact_heights(case.field, case.heights, x + t * dx, y + t * dy)
+
+
+def settings_of(field: HeightField, most: int | None = None) -> list[tuple[str, int | None]]:
+    """(series, n_u) of all settings: n_u = 1, 2, 4, .. up to `most` or to what memory is reasonable for."""
+    spans = [len(s.breaks) - 1 for s in field.spaces]
+    most = most or max(COARSE[2], min(128, MOST_CELLS // max(spans)))
+    parts = [2**k for k in range(int(math.log2(most)) + 1)]
+    flat = parts if spans[0] * spans[1] <= MOST_FLAT else []
+    return [*(("mesh", n) for n in parts), *((f"mesh{FLAT}", n) for n in flat), ("newton", None),
+            *(("mesh+newton", n) for n in COARSE)]
+
+
+def run_intersection(case: Case, *, seed: int = 0, repeats: int | None = None, most: int | None = None,
+                     progress: Callable[[int, int], None] | None = None) -> Study:
+    """Measure all methods on the rays of a case, in turns.  The errors repeat from run to run, the times do not.
+
+    Args:
+        seed: of the rays, only to be told.
+        repeats: timed rounds, None for REPEATS.
+        most: largest n_u, a power of 2; None for 128, less for a lens with many knot spans.
+        progress: told (evaluations done, in all) after each.
+    """
+    repeats = checks.whole("--repeats", REPEATS if repeats is None else repeats, 1, 1000)
+    settings = settings_of(case.field, most)
+    total, done = len(settings) * (1 + repeats), 0
+    truth, hit, residual = reference(case)
+    hits = RayHits(FusedSurface(case.field.spaces, case.field.half_size), case.rays)
+    rows, times = [], [[] for _ in settings]
+    for k in range(-1, repeats):  # the first round is for the errors and warms the machine up
+        for i, (series, n) in enumerate(settings):
+            start = time.perf_counter()
+            t, status = _evaluate(case, hits, series, n)
+            times[i].append(time.perf_counter() - start)
+            if k < 0:
+                rows.append({"series": series, "n_u": n, **_errors(case, t, status, truth, hit)})
+            done += 1
+            if progress is not None:
+                progress(done, total)
+    for row, (_, *seconds) in zip(rows, times, strict=True):
+        row |= {"seconds": statistics.median(seconds), "seconds_min": min(seconds), "seconds_max": max(seconds)}
+    mesh = [row for row in rows if row["series"] == "mesh"]
+    parts = [row["n_u"] for row in mesh]
+    orders = {f"mesh, {name}": order(parts, [row[column] for row in mesh]) for name, column in FITTED.items()}
+    newton, at_equal = next(row for row in rows if row["series"] == "newton"), seconds_at(mesh, EQUAL)
+    about = {"version": __version__, "source": case.source, "seed": seed, "repeats": repeats, "rays": len(case.rays.x),
+             "control": list(case.field.shape), "degree": [s.degree for s in case.field.spaces], "dtype": "float64",
+             "device": "cpu", "threads": torch.get_num_threads(), "reference": "newton in float64, two steps in longdouble",
+             "reference_bits": int(np.finfo(np.longdouble).nmant) + 1, "reference_error": residual,
+             "reference_hits": int(hit.sum()), "equal_error": EQUAL, "mesh_seconds": at_equal,
+             "newton_times_as_fast": None if at_equal is None else at_equal / newton["seconds"]}
+    return Study("intersection", COLUMNS, rows, orders, _advice(rows, about["newton_times_as_fast"]) + haste(rows), about,
+                 "n_u", PLOTS)
+
+
+def _evaluate(case: Case, hits: RayHits, series: str, n: int | None) -> tuple[Tensor, Tensor]:
+    """t (N,) and status (N,) as one setting finds them."""
+    if n is None:
+        hits.find(case.heights)
+        return torch.from_numpy(hits.t), torch.from_numpy(hits.status)
+    return find(case.field, case.heights, case.rays, Method(series.removesuffix(FLAT), (n, n), not series.endswith(FLAT)))
+
+
+def _errors(case: Case, t: Tensor, status: Tensor, truth: np.ndarray, hit: np.ndarray) -> dict:
+    """Hits and errors of one setting, over the rays that it and the reference find to meet the surface."""
+    found = (status == Status.HIT).numpy()
+    both = found & hit
+    t = np.where(both, t.numpy(), truth).astype(np.longdouble)
+    off, above = np.abs(t - truth)[both], np.abs(_above(case, t))[both]
+    if not both.any():
+        off = above = np.zeros(1)
+    return {"rays": len(t), "hits": int(found.sum()), "strayed": int((found != hit).sum()), "error": float(off.mean()),
+            "t_max": float(off.max()), "z_mean": float(above.mean()), "z_max": float(above.max())}
+
+
+def seconds_at(rows: list[dict], error: float) -> float | None:
+    """Time at which a series of falling errors reaches `error`, between settings by a power law; None beyond them."""
+    for a, b in pairwise(rows):
+        if a["error"] >= error >= b["error"] > 0 and a["error"] > b["error"]:
+            part = math.log(a["error"] / error) / math.log(a["error"] / b["error"])
+            return math.exp((1.0 - part) * math.log(a["seconds"]) + part * math.log(b["seconds"]))
+    return None
+
+
+def _advice(rows: list[dict], faster: float | None) -> str:
+    """What accuracy costs here, in one sentence."""
+    rough, fine = (min((row for row in rows if row["error"] <= error), key=lambda row: row["seconds"], default=None)
+                   for error in (ROUGH, FINE))
+    if fine is None:
+        best = min(rows, key=lambda row: row["error"])
+        text = f"no method reaches a t-error of {FINE:g} mm; the least, {best['error']:.2g} mm, is that of {_named(best)}"
+    elif fine is rough:
+        text = (f"{_named(fine)} is the fastest way to a t-error of {ROUGH:g} mm and reaches {fine['error']:.2g} mm at no extra"
+                f" cost, in {1e3 * fine['seconds']:.3g} ms")
+    else:
+        text = (f"t-error {FINE:g} mm costs {fine['seconds'] / rough['seconds']:.2g} x the time of {ROUGH:g} mm: {_named(fine)}"
+                f" in {1e3 * fine['seconds']:.3g} ms against {_named(rough)} in {1e3 * rough['seconds']:.3g} ms")
+    return text if faster is None else f"{text}; at {EQUAL:g} mm newton is {faster:.2g} times as fast as the mesh"
+
+
+def _named(row: dict) -> str:
+    return row["series"] if row["n_u"] is None else f"{row['series']} with n_u = {row['n_u']}"
+
+
+def _fit_label(found: Order | None) -> str:
+    return "" if found is None else f": n$_u^{{{-found.exponent:.2f}}}$"
+
+
+def draw_convergence(study: Study, figure: Figure) -> None:
+    """Fig. 6.2.14: mean z- and t-error, computation time and number of intersections against n_u."""
+    figure.set_size_inches(10.0, 7.4)
+    panels, style = figure.subplots(2, 2), styles(row["series"] for row in study.rows)
+    table = {name: [row for row in study.rows if row["series"] == name] for name in style}
+    mesh, (newton,) = table["mesh"], table["newton"]
+    n = np.array([row["n_u"] for row in mesh], float)
+    for axes, kind, columns in ((panels[0, 0], "z-error", ("z_mean", "z_max")), (panels[0, 1], "t-error", ("error", "t_max"))):
+        for word, column, line in zip(("mean", "maximum"), columns, ("-", "--"), strict=True):
+            found = study.orders[f"mesh, {word} {kind}"]
+            y = np.array([row[column] for row in mesh])
+            use = y > 0
+            axes.plot(n[use], y[use], linestyle=line, linewidth=1, color=style["mesh"]["color"], marker="o" if line == "-" else "^",
+                      markersize=5, markerfacecolor=None if line == "-" else "none", label=f"mesh, {word}{_fit_label(found)}")
+        for name, line in (("mesh+newton", "-"), ("newton", ":")):
+            points = [row for row in table[name] if row[columns[0]] > 0]
+            if points and name == "newton":
+                axes.axhline(points[0][columns[0]], color=style[name]["color"], linestyle=line, label=f"{name}, mean")
+            elif points:
+                axes.plot([row["n_u"] for row in points], [row[columns[0]] for row in points], color=style[name]["color"],
+                          linewidth=1, marker=style[name]["marker"], markersize=5, label=f"{name}, mean")
+        axes.set(xscale="log", yscale="log", ylabel=f"{kind} (mm)", title=f"{kind}, with the fitted orders")
+    for name, rows in table.items():
+        if name != "newton" and rows:
+            panels[1, 0].errorbar([row["n_u"] for row in rows], [row["seconds"] for row in rows], yerr=spread(rows), label=name,
+                                  **style[name])
+            panels[1, 1].plot([row["n_u"] for row in rows], [row["hits"] for row in rows], linewidth=1, label=name, markersize=5,
+                              color=style[name]["color"], marker=style[name]["marker"])
+    for axes, value in ((panels[1, 0], newton["seconds"]), (panels[1, 1], newton["hits"])):
+        axes.axhline(value, color=style["newton"]["color"], linestyle=":", label="newton")
+    panels[1, 0].set(xscale="log", yscale="log", ylabel="time (s): median, least and most", title="computation time")
+    panels[1, 1].set(xscale="log", ylabel=f"of {newton['rays']} rays", title="number of intersections")
+    panels[1, 1].ticklabel_format(axis="y", useOffset=False)
+    most = max(abs(row["hits"] - newton["hits"]) for row in study.rows)
+    panels[1, 1].set_ylim(newton["hits"] - 1.1 * most - 5, newton["hits"] + 1.1 * most + 5)
+    plain_ticks(panels[1, 0].yaxis)
+    for axes in panels.flat:
+        axes.set_xscale("log", base=2)
+        axes.set_xticks(n, [f"{k:g}" for k in n])
+        axes.set_xlabel("n$_u$ = n$_v$")
+        axes.grid(which="major", linewidth=0.4)
+        axes.legend(fontsize="small")
+
+
+def draw_pareto(study: Study, figure: Figure) -> None:
+    """Error against time; dashed, the errors that the advice is about."""
+    axes = figure.add_subplot()
+    draw_front(axes, study)
+    for error in (ROUGH, EQUAL, FINE):
+        axes.axhline(error, color="grey", linewidth=0.6, linestyle="--")
+    axes.set(xlabel="time (s): median, least and most", ylabel="mean t-error (mm)", title="intersection: error and time")
+    axes.legend(fontsize="small")
+
+
+#: Endings of the pictures' names, and what draws them.
+PLOTS = {"": draw_convergence, "-pareto": draw_pareto}
