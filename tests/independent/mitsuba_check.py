@@ -22,7 +22,8 @@ Rays of points and discs are drawn independently all over the cone, none aimed, 
 Give at least 4 renders of different --seed for such a source: then both images' variances are known, and each pixel
 (--bin of them along each side taken together) that expects 25 of Mitsuba's rays or more is judged by
     Z               difference of absolute powers over its standard deviation.  Mitsuba's rays are independent, so the
-                    squares of their weights tell its variance; the render's comes from the renders' scatter
+                    squares of their weights tell its variance; the render's comes from the renders' scatter,
+                    taken over 3 x 3 of these pixels
     chi2            mean of Z^2, between 0.9 and 1.05
     beyond 3 sigma  part of the pixels, at most 0.004 (normal: 0.0027); largest |Z| below 6
     neighbours      correlation of Z with the next pixel's, below 0.05: a systematic difference has extent, noise has none
@@ -293,6 +294,8 @@ def judge(renders: np.ndarray, image: np.ndarray, squares: np.ndarray, rays: int
     renders, image, squares = (a.reshape(*a.shape[:-2], nx // side, side, ny // side, side).sum((-3, -1))
                                for a in (renders, image, squares))
     render, scatter = renders.mean(0), renders.var(0, ddof=1) / len(renders)
+    around = around_each(render)  # few renders tell a pixel's variance badly: as much a unit of light as its neighbours'
+    scatter = render * around_each(scatter) / np.where(around > 0, around, 1.0)
     per_ray = squares.sum() / image.sum()
     judged = render >= LEAST_RAYS * per_ray
     each = np.where(image > 0, squares / np.where(image > 0, image, 1.0), per_ray)  # what a ray brings there
@@ -315,6 +318,12 @@ def judge(renders: np.ndarray, image: np.ndarray, squares: np.ndarray, rays: int
     print(f"light                  Mitsuba - render = {image.sum() - sums.mean():.2e}, Z {light:.2f}  (below {LIGHT})")
     return bool(CHI2[0] <= chi2 <= CHI2[1] and beyond <= BEYOND and largest < LARGEST and abs(neighbours) < NEIGHBOURS
                 and abs(light) < LIGHT)
+
+
+def around_each(a: np.ndarray) -> np.ndarray:
+    """Sums over the 3 x 3 pixels around each."""
+    padded = np.pad(a, 1)
+    return sum(padded[i : i + a.shape[0], j : j + a.shape[1]] for i in range(3) for j in range(3))
 
 
 def correlation(a: np.ndarray, b: np.ndarray) -> float:
