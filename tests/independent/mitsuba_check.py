@@ -24,9 +24,9 @@ Give at least 4 renders of different --seed for such a source: then both images'
     Z               difference of absolute powers over its standard deviation.  Mitsuba's rays are independent, so the
                     squares of their weights tell its variance; the render's comes from the renders' scatter,
                     taken over 3 x 3 of these pixels
-    chi2            mean of Z^2, between 0.9 and 1.05
-    beyond 3 sigma  part of the pixels, at most 0.004 (normal: 0.0027); largest |Z| below 6
-    neighbours      correlation of Z with the next pixel's, below 0.05: a systematic difference has extent, noise has none
+    chi2            mean of Z^2, off 1 by at most 0.02 and 3 sigma
+    beyond 3 sigma  part of the pixels, at most 0.0027 (normal) and 3 sigma; largest |Z| below 6
+    neighbours      correlation of Z with the next pixel's, below 0.05 and 3 sigma: a systematic difference has extent, noise has none
     light           power on the screen: |Z| below 4; noise of the relative RMS: of both images
 
 Exit status: 0 they agree, 1 they do not, 2 bad input.
@@ -45,7 +45,8 @@ TOLERANCE = 0.05
 #: A flipped image may correlate better than the image itself by this much: symmetric pictures differ by noise alone.
 TIE = 1e-3
 LEAST_RAYS, LEAST_RENDERS = 25, 4
-CHI2, BEYOND, LARGEST, NEIGHBOURS, LIGHT = (0.9, 1.05), 0.004, 6.0, 0.05, 4.0
+#: Part of normal values beyond 3 sigma; what chi2 may be off by beside its own 3 sigma, for the mesh; and the other limits.
+NORMAL, CHI2, LARGEST, NEIGHBOURS, LIGHT = 0.0027, 0.02, 6.0, 0.05, 4.0
 BATCH = 1 << 20
 SHAPES = ("entrance", "exit", "screen")
 VARIANTS = ("llvm_ad_mono", "llvm_ad_rgb", "scalar_rgb")  # the scalar one works everywhere and takes minutes
@@ -311,12 +312,14 @@ def judge(renders: np.ndarray, image: np.ndarray, squares: np.ndarray, rays: int
     print(f"judged                 {judged.sum()} of {judged.size} pixels of {side} x {side},"
           f" {render[judged].sum() / render.sum():.4f} of the light, {np.sqrt(per_ray / np.mean(render[judged])):.3f} mean noise;"
           f" render's part of the variance {np.mean(scatter[judged]) / np.mean((each * expected + scatter)[judged]):.2f}")
-    print(f"beyond 3 sigma         {beyond:.5f}  (at most {BEYOND}; normal 0.0027)")
-    print(f"chi2 a pixel           {chi2:.4f}  ({CHI2[0]} to {CHI2[1]}; one sigma {np.sqrt(2 / len(some)):.4f})")
+    most, off = NORMAL + 3 * np.sqrt(NORMAL / len(some)), CHI2 + 3 * np.sqrt(2 / len(some))
+    related = NEIGHBOURS + 3 / np.sqrt(2 * len(some))
+    print(f"beyond 3 sigma         {beyond:.5f}  (at most {most:.5f}; normal {NORMAL})")
+    print(f"chi2 a pixel           {chi2:.4f}  ({1 - off:.3f} to {1 + off:.3f}; one sigma {np.sqrt(2 / len(some)):.4f})")
     print(f"mean Z, largest |Z|    {some.mean():.4f}, {largest:.2f}  (below {LARGEST})")
-    print(f"neighbours             {neighbours:.4f}  (below {NEIGHBOURS})")
+    print(f"neighbours             {neighbours:.4f}  (below {related:.3f})")
     print(f"light                  Mitsuba - render = {image.sum() - sums.mean():.2e}, Z {light:.2f}  (below {LIGHT})")
-    return bool(CHI2[0] <= chi2 <= CHI2[1] and beyond <= BEYOND and largest < LARGEST and abs(neighbours) < NEIGHBOURS
+    return bool(abs(chi2 - 1) <= off and beyond <= most and largest < LARGEST and abs(neighbours) < related
                 and abs(light) < LIGHT)
 
 
