@@ -26,7 +26,7 @@ Give at least 4 renders of different --seed for such a source: then both images'
                     taken over 3 x 3 of these pixels
     chi2            mean of Z^2, off 1 by at most 0.02 and 3 sigma
     beyond 3 sigma  part of the pixels, at most 0.0027 (normal) and 3 sigma; largest |Z| below 6
-    neighbours      correlation of Z with the next pixel's, below 0.05 and 3 sigma: a systematic difference has extent, noise has none
+    neighbours      correlation of Z with the next pixel's, below 0.05 and 3 sigma: noise has no extent
     light           power on the screen: |Z| below 4; noise of the relative RMS: of both images
 
 Exit status: 0 they agree, 1 they do not, 2 bad input.
