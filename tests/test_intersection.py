@@ -161,6 +161,17 @@ def test_edges_knots_and_flat_surfaces(find):
             assert float(residual(f, heights, rays, t)[~leaves].abs().max()) < 1e-14
 
 
+def test_a_surface_that_lies_on_the_floor_of_its_hull(find):
+    """Every ray that lands there ends where its bracket begins."""
+    f = field(20, 20)
+    heights = torch.full(f.shape, 2.0, dtype=torch.float64)
+    heights[15:, 15:] = 3.0
+    rays = fan(500, 0.5, half=(1.0, 1.0))
+    t, status = find(f, heights, rays)
+    assert bool((status == Status.HIT).all())
+    torch.testing.assert_close(t, 2.0 / rays.dz, rtol=4e-15, atol=0)
+
+
 def test_what_cannot_hit_is_missed(find):
     f = field()
     rays = bundle([0.0, 6.0, 0.0, 4.9], [0.0, 0.0, 0.0, 0.0], 0.0, [0.0, 0.0, 1.0, 1.0], [0.0] * 4, [-1.0, 1.0, 0.0, 0.1])

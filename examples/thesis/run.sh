@@ -1,5 +1,5 @@
 #!/bin/sh
-# Every plane-wave experiment of the thesis' chapter 6.2, into the current directory.  Usage: run.sh [ITERATIONS]
+# Every experiment of the thesis' chapters 6.2 and 6.4, into the current directory.  Usage: run.sh [ITERATIONS]
 set -eu
 here=$(dirname "$0")
 iterations=${1:-1000}
@@ -12,3 +12,5 @@ for mag in 1 3 5; do
             -o "$picture-mag$mag.caustic"
     done
 done
+caustic design "$here/../flame.png" --config "$here/point.toml" --iterations "$((iterations < 400 ? iterations : 400))" \
+    -o point.caustic

@@ -101,16 +101,19 @@ def _root(ray, start, limits, slope, c, bu, mu, wu, bv, mv, wv):
     closed = high < side  # the top of the hull lies inside the aperture: f >= 0 there
     if low > high:
         return 0.0, MISSED
-    z, _, _ = _value(c, ou + low * du, ov + low * dv, bu, mu, wu, bv, mv, wv)
-    f_low = oz + low * dz - z
-    if f_low >= 0.0:  # on the hull's floor, which the surface then touches; or the ray begins above the surface
-        return low, HIT if low > 0.0 or f_low == 0.0 else MISSED
+    safe, f_low = slope < dz, -1.0
+    opened = not (safe and start < 0.0 and low > 0.0)  # otherwise f <= 0 at low: looked at if the iteration comes there
+    if opened:
+        z, _, _ = _value(c, ou + low * du, ov + low * dv, bu, mu, wu, bv, mv, wv)
+        f_low = oz + low * dz - z
+        if f_low >= 0.0:  # on the hull's floor, which the surface then touches; or the ray begins above the surface
+            return low, HIT if low > 0.0 or f_low == 0.0 else MISSED
     if start >= 0.0:
         low, high, found = _bracket_around(min(max(start, low), high), low, high, ray, c, bu, mu, wu, bv, mv, wv)
         if found == 0:
             return 0.0, MISSED
         closed = True
-    elif not slope < dz:
+    elif not safe:
         low, high, found = _first_bracket(low, high, f_low, ray, slope, c, bu, mu, wu, bv, mv, wv)
         if found != 1:
             return 0.0, MISSED if found == 0 else UNRESOLVED
@@ -123,7 +126,7 @@ def _root(ray, start, limits, slope, c, bu, mu, wu, bv, mv, wv):
         z, zu, zv = _value(c, ou + t * du, ov + t * dv, bu, mu, wu, bv, mv, wv)
         f = oz + t * dz - z
         if f < 0.0:
-            low = t
+            low, opened = t, True
         else:
             high, closed = t, True
         step = f / (dz - zu * du - zv * dv)
@@ -137,6 +140,11 @@ def _root(ray, start, limits, slope, c, bu, mu, wu, bv, mv, wv):
             if oz + high * dz - z < 0.0:
                 return 0.0, MISSED
             closed = True
+        if t <= low and not opened:  # does the surface touch the hull's floor there?
+            z, _, _ = _value(c, ou + low * du, ov + low * dv, bu, mu, wu, bv, mv, wv)
+            if oz + low * dz - z >= 0.0:
+                return low, HIT
+            opened = True
         if not (t > low and t < high):
             t = 0.5 * (low + high)
     return t, UNRESOLVED
