@@ -135,7 +135,7 @@ def _complete_design(s: Settings, quality: str | None, rays: int | None) -> None
     nx, ny = screen["resolution"]
     sampler, base = _sampler(s), min(4_000_000, max(40_000, int(RAYS_PER_PIXEL * nx * ny)))
     if moved:
-        stages = refinement(tuple(lens["control"]), rays, (nx, ny), quality, sampler=sampler)
+        stages = refinement(tuple(lens["control"]), rays, (nx, ny), quality, scattered=sampler != "lines")
     elif plain and "knots_u" not in lens:
         stages = coarse_to_fine(tuple(lens["control"]), degree, rays or base, (nx, ny), quality, sampler=sampler)
     else:
@@ -160,14 +160,15 @@ def _sampler(s: Settings) -> str:
 def _stage_table(stage: Stage) -> dict[str, Any]:
     return {"control": list(stage.control), "rays": stage.rays, "sampler": stage.sampler,
             "reconstruction": stage.filter.kind, "filter_size": list(stage.filter.size), "blur": stage.blur,
-            "apron": stage.apron, "iterations": stage.iterations, "tolerance": stage.tolerance}
+            "apron": stage.apron, "iterations": stage.iterations, "tolerance": stage.tolerance,
+            "oversample": stage.oversample}
 
 
 def _complete_stage(table: dict[str, Any], s: Settings) -> dict[str, Any]:
     nx, ny = s["screen"]["resolution"]
     base = {"control": list(s["lens"]["control"]), "rays": int(RAYS_PER_PIXEL * nx * ny), "sampler": _sampler(s),
             "reconstruction": "cosine", "filter_size": [3, 3], "blur": 0.0, "apron": 0,
-            "iterations": SINGLE_STAGE_ITERATIONS, "tolerance": 0.0}
+            "iterations": SINGLE_STAGE_ITERATIONS, "tolerance": 0.0, "oversample": 1}
     return {**base, **table}
 
 
@@ -197,7 +198,7 @@ def build_stages(settings: Settings) -> list[Stage]:
         f = filter_from(t["reconstruction"], t["filter_size"], on, t.get("alpha_per_mm2"), t.get("alpha_per_pixel2"))
         source = build_source(settings, type=t["source"]) if "source" in t else None
         stages.append(Stage(tuple(t["control"]), t["rays"], t["sampler"], f, t["blur"], t["apron"], t["iterations"],
-                            t["tolerance"], source))
+                            t["tolerance"], source, t["oversample"]))
     if not stages:
         raise InputError("[[design.stages]] at least one stage is needed")
     if list(stages[-1].control) != list(settings["lens"]["control"]):

@@ -225,3 +225,28 @@ def test_the_offset_itself_costs_nothing():
     gain = (lens.index - 1.0) * 295.0
     bump = base + 1e-4 * torch.from_numpy(x[:, None] ** 2 + 0 * y[None, :])  # not quite a parabola: its net's heights are
     assert float(penalty(bump)) == pytest.approx(2 * (gain * 2e-4) ** 2, rel=0.2)
+
+
+@pytest.mark.parametrize("chunks", [1, 3])
+def test_oversampling_adds_up_smaller_pixels(chunks, monkeypatch):
+    lens = Lens(control=(8, 7), degree=(3, 2), offset=Offset(5.0, (80.0, 80.0)))
+    scene, field = Scene(PlaneWave(), lens, Screen((36.0, 36.0), resolution=(18, 15))), HeightField.of(lens)
+    x, y = field.control_xy()
+    g = torch.Generator().manual_seed(3)
+    heights = 5.0 + (x[:, None] ** 2 + y**2) / 160 + 0.01 * torch.randn(8, 7, generator=g, dtype=torch.float64)
+    along, target = torch.randn(8, 7, generator=g, dtype=torch.float64), torch.rand(18, 15, generator=g, dtype=torch.float64)
+    if chunks > 1:
+        monkeypatch.setattr("caustic_cli.inverse.objective.CHUNK", 3000)
+    sampler = Sampler("grid", (90, 90))
+    function = Objective(scene, field, sampler, Filter("cosine", (3, 3)), target, "rms-light", apron=2, oversample=3,
+                         filter_target=False, dtype=torch.float64)
+    fine = replace(scene.screen.grown((2, 2)), resolution=(66, 57))
+    image = expose(scene, field, heights, sampler, Filter("cosine", (3, 3)), screen=fine).image
+    pooled = sum(image[a::3, b::3] for a in range(3) for b in range(3))
+    wide = torch.nn.functional.pad(target, (2, 2, 2, 2))
+    leaving = torch.tensor(expose(scene, field, heights, sampler).leaving, dtype=torch.float64)
+    e = function(heights)
+    assert e.loss == pytest.approx(float(Loss("rms-light", wide)(pooled, leaving)), rel=1e-12)
+    step = 1e-6
+    difference = (function(heights + step * along).loss - function(heights - step * along).loss) / (2 * step)
+    assert float((e.gradient * along).sum()) == pytest.approx(difference, rel=1e-5)

@@ -125,7 +125,7 @@ def test_the_default_scene_is_table_d2():
     assert s["target"]["size"] == pytest.approx([30.0, 30.0])
     assert s["screen"]["size"] == pytest.approx([38.4, 38.4])
     assert s["screen"]["resolution"] == [250, 250]
-    assert s["lens"]["control"] == [378, 378] and s["lens"]["degree"] == [3, 3]
+    assert s["lens"]["control"] == [503, 503] and s["lens"]["degree"] == [3, 3]
     build_scene(s), build_stages(s), build_options(s)
 
 

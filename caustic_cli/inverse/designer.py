@@ -188,7 +188,8 @@ class Designer:
             scene = replace(scene, source=stage.source)
         rays = rays_of(scene, stage.sampler, stage.rays, stream(o.seed, f"stage {k}"), self.device)
         return Objective(scene, self.field(k), rays, stage.filter, self.target, o.loss, blur=stage.blur,
-                         filter_target=o.filter_target, apron=stage.apron, max_slope=o.max_slope, dtype=o.dtype)
+                         filter_target=o.filter_target, apron=stage.apron, max_slope=o.max_slope,
+                         oversample=stage.oversample, dtype=o.dtype)
 
     def _next(self, state: State, k: int) -> State:
         """The state at the beginning of stage k: the same surface on its net."""

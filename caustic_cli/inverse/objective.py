@@ -8,7 +8,7 @@ Everything that does not depend on the heights (basis matrices, filtered target,
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -49,20 +49,32 @@ class Objective:
         apron: pixels by which the screen is widened on every side, dark in the target: light that has left the screen
             is seen there and pulled back.
         max_slope: limit of the lens' slope, 0 for none.
+        oversample: the filter works on pixels so many times smaller along each axis, which are then added up: a render that
+            is nearly a bincount, and yet smooth in the heights.
         dtype: precision of the rays.
     """
 
     def __init__(self, scene: Scene, field: HeightField, sampler: Rays, filter: Filter, target: Tensor, loss: str, *,
                  blur: float = 0.0, filter_target: bool = True, apron: int = 0, max_slope: float = 0.0,
-                 dtype: torch.dtype = torch.float32):
+                 oversample: int = 1, dtype: torch.dtype = torch.float32):
         self.device = sampler.device
-        self.screen, self.filter, self.apron = scene.screen.grown((apron, apron)), filter, apron
+        screen = scene.screen.grown((apron, apron))
+        self.screen = replace(screen, resolution=tuple(oversample * n for n in screen.resolution))
+        self.filter, self.apron, self.oversample = filter, apron, oversample
         wide = torch.nn.functional.pad(target.double().to(sampler.device), (apron, apron, apron, apron))
-        self.loss = Loss(loss, filter.smooth(wide) if filter_target else wide, blur, apron, wide > 0)
+        smooth = wide
+        if filter_target:
+            smooth = self._pool(filter.smooth(wide.repeat_interleave(oversample, 0).repeat_interleave(oversample, 1)))
+        self.loss = Loss(loss, smooth, blur, apron, wide > 0)
         minded = [(weight, name) for weight, name in parse(loss) if name in PENALTIES and weight > 0]
         self.penalty = Penalty(scene, field, minded, max_slope, sampler.device)
         self.scene, self.field, self.sampler, self.dtype = scene, field, sampler, dtype
         self.kept = list(self._tracers()) if sampler.count <= KEPT_RAYS else None
+
+    def _pool(self, image: Tensor) -> Tensor:
+        """Pixels of the screen from those of the render."""
+        k, (n, m) = self.oversample, image.shape
+        return image if k == 1 else image.view(n // k, k, m // k, k).sum((1, 3))
 
     def _tracers(self) -> Iterator[PlaneTracer | RayTracer]:
         traced = None
@@ -83,7 +95,7 @@ class Objective:
         with torch.set_grad_enabled(single):
             for traced in self.kept or self._tracers():
                 part = traced.expose(heights, self.screen, self.filter)
-                image, leaving = image + part.image.double(), leaving + part.leaving.double()
+                image, leaving = image + self._pool(part.image).double(), leaving + part.leaving.double()
         if single:
             loss = self.loss(image, leaving, penalty)
             gradient = torch.autograd.grad(loss, heights)[0] if loss.requires_grad else torch.zeros_like(heights)
@@ -97,8 +109,8 @@ class Objective:
             for traced in self.kept or self._tracers():
                 part = traced.expose(heights, self.screen, self.filter)
                 # Whole pixels, and what leaves a lens without reflections, do not depend on the heights at all.
-                pulls = [(value, by.to(value.dtype)) for value, by in ((part.image, by_image), (part.leaving, by_leaving))
-                         if value.requires_grad]
+                both = ((self._pool(part.image), by_image), (part.leaving, by_leaving))
+                pulls = [(value, by.to(value.dtype)) for value, by in both if value.requires_grad]
                 if pulls:
                     values, by = zip(*pulls, strict=True)
                     gradient += torch.autograd.grad(values, heights, by)[0]

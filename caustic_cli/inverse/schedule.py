@@ -29,6 +29,7 @@ class Stage:
         iterations: optimiser iterations; the last stage goes on to the design's total.
         source: what shines during this stage, None for the scene's own (6.4: a point first, then the grid).
         tolerance: ends the stage when ten iterations lowered the loss by less than this part; 0 never.
+        oversample: see `Objective`.
     """
 
     control: tuple[int, int]
@@ -40,6 +41,7 @@ class Stage:
     iterations: int = 30
     tolerance: float = 2e-3
     source: Source | None = None
+    oversample: int = 1
 
     def __post_init__(self):
         checks.whole("[[design.stages]] rays", self.rays, 1, 10**12)
@@ -48,6 +50,7 @@ class Stage:
         checks.whole("[[design.stages]] apron", self.apron, 0, 4096)
         checks.whole("[[design.stages]] iterations", self.iterations, 0, 10**9)
         checks.number("[[design.stages]] tolerance", self.tolerance, 0.0, 1.0)
+        checks.whole("[[design.stages]] oversample", self.oversample, 1, 8)
 
 
 def coarse_to_fine(control: tuple[int, int], degree: tuple[int, int], rays: int, resolution: tuple[int, int],
@@ -73,28 +76,42 @@ def coarse_to_fine(control: tuple[int, int], degree: tuple[int, int], rays: int,
     return stages
 
 
-#: What a quality means after a transport start: knot spans per pixel and their most, rays a pixel, iterations of each stage.
-REFINEMENT = {"draft": (0.5, 256, 9, (12,)), "standard": (1.5, 512, 36, (8, 10)), "fine": (2.0, 768, 100, (20, 25, 25))}
+#: What a quality means after a transport start: knot spans per pixel and their most, rays a pixel, and the stages by sampler and
+#: iterations.  The first stage takes half the rays where others follow.
+REFINEMENT = {
+    "draft": (1.0, 256, 16, (("lines", 12),)),
+    "standard": (2.0, 768, 64, (("lines", 8), ("lines", 12))),
+    "fine": (2.0, 768, 64, (("lines", 25), ("stratified", 35), ("stratified", 35))),
+}
 LEAST_SPANS = 32
-MOST_RAYS = 16_000_000
+LEAST_RAYS, MOST_RAYS = 40_000, 16_000_000
+OVERSAMPLE = 2
 
 
 def refinement_spans(pixels: int, quality: str) -> int:
-    """Knot spans along each axis of the lens for a screen of so many pixels: about as fine as the picture."""
+    """Knot spans along each axis of the lens for a screen of so many pixels: finer than the picture."""
     checks.choice("--quality", quality, QUALITIES)
     density, most, _, _ = REFINEMENT[quality]
     return min(most, max(LEAST_SPANS, round(density * pixels)))
 
 
 def refinement(control: tuple[int, int], rays: int | None, resolution: tuple[int, int], quality: str = "standard",
-               filter: Filter | None = None, sampler: str = "lines") -> list[Stage]:
+               filter: Filter | None = None, scattered: bool = False) -> list[Stage]:
     """The default stages after a transport start, whose surface has every scale right already: full detail at once.
 
     Each stage traces rays of its own, because an optimiser learns the ones it sees.
+
+    Args:
+        rays: of the last stage, None for what the quality says.
+        scattered: the source's rays have to be intersected one by one: take a quarter of them, stratified.
     """
     checks.choice("--quality", quality, QUALITIES)
-    _, _, each, iterations = REFINEMENT[quality]
-    rays = rays or min(MOST_RAYS, max(40_000, each * resolution[0] * resolution[1]))
-    apron = math.ceil(0.04 * max(resolution))
-    return [Stage(control, max(1, rays // 2) if k + 1 < len(iterations) else rays, sampler, filter or Filter("cosine", (3, 3)), 0.0,
-                  apron, count) for k, count in enumerate(iterations)]
+    _, _, each, plan = REFINEMENT[quality]
+    rays = rays or min(MOST_RAYS, max(LEAST_RAYS, each * resolution[0] * resolution[1] // (4 if scattered else 1)))
+    filter, apron = filter or Filter("cosine", (3, 3)), math.ceil(0.04 * max(resolution))
+    stages = []
+    for k, (sampler, iterations) in enumerate(plan):
+        some = max(1, rays // 2) if k == 0 < len(plan) - 1 else rays
+        stages.append(Stage(control, some, "stratified" if scattered else sampler, filter, 0.0, apron, iterations,
+                            oversample=OVERSAMPLE))
+    return stages
