@@ -28,6 +28,7 @@ from caustic_cli.optics.sampling import Sample
 from caustic_cli.picture import read_picture, write_image
 from caustic_cli.project import CHECKPOINT, RENDER, REPORT, TOML, Project, is_project
 from caustic_cli.scene import Scene
+from caustic_cli.scene.source import blur_limit
 from caustic_cli.studies.panels import write_report
 from caustic_cli.studies.retrace import FINAL_RAYS, retrace, white_level
 
@@ -95,8 +96,17 @@ def find(target: Path, out: Path | None) -> Project:
 def design(project: Project, first: torch.Tensor | None, device: str, say: Reporter, began: float) -> dict:
     """Run a new design from its first heights to its end; returns the figures of the JSON table."""
     designer, target = _designer(project, device)
+    _say_blur(designer.scene, say)
     state = designer.begin(first)
     return _run(project, designer, target, state, say, began, 0, None, device)
+
+
+def _say_blur(scene: Scene, say: Reporter) -> None:
+    """What no lens can do about an extended source, before time is spent on it."""
+    blur, pixel = blur_limit(scene.source, scene.lens.z_in, scene.screen.z - scene.lens.z_in), max(scene.screen.pixel)
+    if blur > 0:
+        finer = f"; the picture's detail below that, {blur / pixel:.3g} pixels, is out of reach" if blur > pixel else ""
+        say.say(f"the source's own size blurs every point over {blur:.3g} mm on the screen{finer}")
 
 
 def resume(project: Project, iterations: int | None, time_limit: float | None, device: str, say: Reporter,

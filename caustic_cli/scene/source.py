@@ -152,6 +152,21 @@ class Disc:
 Source = PlaneWave | Points | Disc
 
 
+def blur_limit(source: Source, z_in: float, throw: float) -> float:
+    """Width in mm, on a screen `throw` mm beyond the entrance, over which an extended source blurs every point; 0 for a point.
+
+    To first order the throw times the angle under which the lens sees the source: a lens can show nothing finer.
+    """
+    if isinstance(source, Disc):
+        if source.angle is not None:
+            return throw * math.radians(source.angle)
+        return throw * max(source.size) / (z_in - source.position[2])
+    if isinstance(source, Points) and source.kind == "grid":
+        points = np.array(source.positions)
+        return throw * float(np.ptp(points[:, :2], axis=0).max()) / (z_in - source.nearest)
+    return 0.0
+
+
 def covering_cone(source: Points | Disc, half_size: tuple[float, float], z_in: float) -> float:
     """Half-angle of the source's cone, rad: what it says, or the least that covers the aperture from all of the source."""
     if source.cone is not None:

@@ -1,4 +1,4 @@
-"""report.png: target, caustic, lens height, and loss against time, side by side."""
+"""report.png: target, caustic, error, lens height, and loss and light against time, side by side."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from caustic_cli.scene import Lens, Screen
 
 def write_report(path: Path, target: np.ndarray, image: np.ndarray, heights: np.ndarray, history: np.ndarray,
                  lens: Lens, screen: Screen, figures: dict, encoding: str) -> None:
-    """Write the four panels.
+    """Write the panels.
 
     Args:
         target, image: (n_x, n_y) irradiance; drawn at the same exposure and in the picture's encoding.
@@ -26,26 +26,32 @@ def write_report(path: Path, target: np.ndarray, image: np.ndarray, heights: np.
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt  # noqa: PLC0415
 
-    figure, axes = plt.subplots(2, 2, figsize=(10, 9.2), constrained_layout=True)
+    figure, axes = plt.subplots(2, 3, figsize=(14.4, 8.8), constrained_layout=True)
     extent = [-screen.half_size[0], screen.half_size[0], -screen.half_size[1], screen.half_size[1]]
     scale = target.sum() / target.max()
     relative = figures["relative_rms"]
     titles = ("target", "caustic" if relative is None else f"caustic, relative RMS error {relative:.3f}")
-    for axis, picture, title in zip(axes[0], (target, image), titles, strict=True):
+    for axis, picture, title in zip(axes[0, :2], (target, image), titles, strict=True):
         shown = np.clip(picture / max(picture.sum(), 1e-300) * scale, 0.0, 1.0)
         axis.imshow((to_srgb(shown) if encoding == "srgb" else shown).T, origin="lower", extent=extent, cmap="gray",
                     vmin=0, vmax=1)
         axis.set(title=title, xlabel="x on the screen (mm)", ylabel="y (mm)")
+    error = image / max(image.sum(), 1e-300) - target / target.sum()
+    drawn = axes[0, 2].imshow(error.T * target.size, origin="lower", extent=extent, cmap="coolwarm", vmin=-1.0, vmax=1.0)
+    figure.colorbar(drawn, ax=axes[0, 2], label="of the mean irradiance")
+    axes[0, 2].set(title="error: too dark (blue), too bright (red)", xlabel="x on the screen (mm)", ylabel="y (mm)")
     rx, ry = lens.half_size
     drawn = axes[1, 0].imshow(_without_sphere(heights, rx, ry).T * 1e3, origin="lower", extent=[-rx, rx, -ry, ry], cmap="viridis")
     figure.colorbar(drawn, ax=axes[1, 0], label="µm")
     axes[1, 0].set(title="lens height, best paraboloid removed", xlabel="x on the lens (mm)", ylabel="y (mm)")
-    last = axes[1, 1]
     for stage in np.unique(history[:, 1]):
         rows = history[history[:, 1] == stage]
-        last.semilogy(rows[:, 4], rows[:, 2] * target.size, lw=1.5)
-    last.set(title="loss of each stage against time", xlabel="s", ylabel="relative RMS")
-    last.grid(alpha=0.3, which="both")
+        axes[1, 1].semilogy(rows[:, 4], rows[:, 2] * target.size, lw=1.5)
+        axes[1, 2].plot(rows[:, 4], rows[:, 3], lw=1.5)
+    axes[1, 1].set(title="loss of each stage against time", xlabel="s", ylabel="relative RMS")
+    axes[1, 2].set(title="light on the screen against time", xlabel="s", ylabel="part of the source's power", ylim=(0.0, 1.0))
+    for last in axes[1, 1:]:
+        last.grid(alpha=0.3, which="both")
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", dpi=100, metadata={"Software": SOFTWARE})
     plt.close(figure)
