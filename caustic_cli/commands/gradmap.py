@@ -58,6 +58,7 @@ def run(
 
     opened = Project.open(project)
     scene = opened.scene()
+    options.compile_for(scene, device, say)
     field, checkpoint = opened.lens(scene)
     points = points or [(field.shape[0] // 2, field.shape[1] // 2)]
     for i, j in points:

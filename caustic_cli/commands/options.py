@@ -123,6 +123,20 @@ def start_torch(device: str, threads: int | None, say: Reporter):
     return device
 
 
+def compile_for(scene, device: str, say: Reporter) -> None:
+    """Have the CPU's kernels compiled that a scene needs beyond those of `start_torch`."""
+    import torch  # noqa: PLC0415
+
+    from caustic_cli.optics.kernels import fused  # noqa: PLC0415
+    from caustic_cli.scene import PlaneWave  # noqa: PLC0415
+
+    if fused(device) and not isinstance(scene.source, PlaneWave):
+        from caustic_cli.optics.kernels.functions import compile_ray_kernels  # noqa: PLC0415
+
+        with say.patience("compiling the intersection kernels for this machine, once: about half a minute"):
+            compile_ray_kernels(torch.float32, torch.float64)
+
+
 def dtype_of(name: str):
     """The torch dtype of float32 or float64."""
     import torch  # noqa: PLC0415

@@ -71,6 +71,7 @@ def run(
         if path is not None:
             refuse_foreign(path, force)
     scene = opened.scene(given)
+    options.compile_for(scene, device, say)
     target = opened.target(scene)
     field, checkpoint = opened.lens(scene)
     screen = scene.screen

@@ -173,6 +173,15 @@ def compile_kernels(*dtypes: torch.dtype) -> None:
             kernel(sag, Lens(index=1.5), 10.0, screen, Filter("cosine", (3, 3)))[0].sum().backward()
 
 
+def compile_ray_kernels(*dtypes: torch.dtype) -> None:
+    """Have the kernels ready for rays of any direction, as `compile_kernels` does for a plane wave's."""
+    space, one, none = SplineSpace.uniform(4, 3), torch.ones(2, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
+    for dtype in dtypes:
+        kernel = RayKernel((space, space), (1.0, 1.0), Bundle(none, none, 0.0, none, none, one, one, {}), dtype)
+        heights = torch.ones(4, 4, dtype=torch.float64, requires_grad=True)
+        kernel(heights, Lens(index=1.5), 0.0, Screen((10.0, 10.0), 10.0, (4, 4)), Filter("cosine", (3, 3)))[0].sum().backward()
+
+
 class _Image(torch.autograd.Function):
     """Three nets (n, b), and how `plane.forward` is to use them -> padded image, power leaving the lens (), ledger."""
 
