@@ -67,6 +67,7 @@ def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: d
     profile = said.get("source", {}).get("profile")
     light = read_picture(config.parent / profile, linear=True) if profile else None
     path = out or Path(f"{target.stem or 'design'}.caustic")
+    _check_place(path, force)  # before the transport, which may take a minute
     try:
         full = complete(said, picture.aspect, width=pixels[0] if pixels and len(pixels) == 1 else None, **shaped)
         full["target"] |= {"file": f"target{picture.suffix}", "encoding": picture.encoding}
@@ -184,25 +185,35 @@ def _make_room(full: dict, said: dict, first: torch.Tensor) -> bool:
     return changed
 
 
+def _check_place(path: Path, force: bool) -> None:
+    """Refuse a path where something stands that a new project must not replace; changes nothing.
+
+    Raises:
+        InputError: it is no directory, not a project, or a project without `force`.
+    """
+    if not path.exists():
+        return
+    if not path.is_dir():
+        raise InputError(f"{path}: exists and is not a directory; -o DIR chooses another place")
+    if any(path.iterdir()):
+        if not is_project(path):
+            raise InputError(f"{path}: exists and is not a caustic project; -o DIR chooses another place")
+        if not force:
+            raise InputError(f"{path}: holds a design already; --resume goes on with it, --force begins anew,"
+                             " -o DIR chooses another place")
+
+
 def _make_directory(path: Path, force: bool) -> None:
     """An empty place for a project.
 
     Raises:
         InputError: something stands there, or the place cannot be written to.
     """
-    if path.exists():
-        if not path.is_dir():
-            raise InputError(f"{path}: exists and is not a directory; -o DIR chooses another place")
-        if any(path.iterdir()):
-            if not is_project(path):
-                raise InputError(f"{path}: exists and is not a caustic project; -o DIR chooses another place")
-            if not force:
-                raise InputError(f"{path}: holds a design already; --resume goes on with it, --force begins anew,"
-                                 " -o DIR chooses another place")
-            for name in (CHECKPOINT, RENDER, REPORT):
-                (path / name).unlink(missing_ok=True)
+    _check_place(path, force)
     try:
         path.mkdir(exist_ok=True)
+        for name in (CHECKPOINT, RENDER, REPORT):
+            (path / name).unlink(missing_ok=True)
         probe = path / ".caustic-probe"
         probe.touch()
         probe.unlink()

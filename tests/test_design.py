@@ -362,3 +362,9 @@ def test_a_signal_saves_and_the_design_goes_on(capfd, number, status):
         design(capfd, "blob.png", *TINY, "--optimizer", "adam", "--iterations", total, "-o", "whole")
         whole, parts = content("whole"), content("blob.caustic")
         assert_same({k: v for k, v in whole.items() if k != "provenance"}, {k: v for k, v in parts.items() if k != "provenance"})
+
+
+def test_a_place_that_is_taken_is_refused_before_the_transport_is_solved(capfd, monkeypatch):
+    design(capfd, "blob.png", *TINY, "--iterations", "1")
+    monkeypatch.setattr(session, "first_surface", lambda *args: pytest.fail("solved for nothing"))
+    assert "holds a design already" in design(capfd, "blob.png", *TINY, code=2)
