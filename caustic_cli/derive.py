@@ -58,7 +58,7 @@ def complete(given: Settings, aspect: float, *, mag: float | None = None, margin
         checks.pair("[target] size", target["size"], lambda w, x: checks.number(w, x, 1e-6, 1e9))
     checks.choice("[target] flip", target["flip"], ("", "x", "y", "xy"))
     checks.choice("[target] encoding", target["encoding"], ("srgb", "linear"))
-    _complete_source(s["source"], lens)
+    _complete_source(s["source"], lens, [stage.get("source", "") for stage in s["design"].get("stages", [])])
     if "size" not in target or mag is not None:
         if mag is None and "size" in screen:
             fit = min(screen["size"][0], screen["size"][1] / aspect) / (1.0 + margin)
@@ -76,11 +76,16 @@ def complete(given: Settings, aspect: float, *, mag: float | None = None, margin
     return s
 
 
-def _complete_source(source: dict[str, Any], lens: dict[str, Any]) -> None:
-    """Where a source stands and how large it is, if not said: five lens widths before it, a fifth of one wide."""
+def _complete_source(source: dict[str, Any], lens: dict[str, Any], stages: list[str]) -> None:
+    """Where a source stands and how large it is, if not said: five lens widths before it, a fifth of one wide.
+
+    `stages`: the types that stages name, "" for the source's own; they need these keys of a plane wave too.
+    """
     width = max(lens["size"])
     checks.choice("[source] type", source["type"], SOURCES)
-    if source["type"] != "plane":
+    for type in filter(None, stages):
+        checks.choice("[[design.stages]] source", type, SOURCES)
+    if {source["type"], *stages} - {"plane", ""}:
         source.setdefault("position", [[0.0, 0.0, lens["z_in"] - SOURCE_DISTANCE * width]])
         source.setdefault("size", [SOURCE_WIDTH * width] * 2)
         source.setdefault("grid", list(SOURCE_GRID))

@@ -152,3 +152,13 @@ def test_render_to_a_tolerance(capfd):
 @pytest.mark.parametrize("tolerance", ["0", "-1", "nan", "100"])
 def test_a_tolerance_has_to_be_possible(capfd, tolerance):
     assert "--tolerance must be" in run(capfd, "render", "blob.caustic", "--tolerance", tolerance, code=2)
+
+
+def test_a_stage_of_a_plane_wave_may_have_a_source_that_stands_somewhere(capfd):
+    plane = SCHEDULE.replace('type = "grid"', 'type = "plane"').replace("position = [0, 0, -40]", "")
+    Path("schedule.toml").write_text(plane)
+    run(capfd, "design", "blob.png", "--config", "schedule.toml", "--resolution", "24", "--start", "offset", "--quiet")
+    run(capfd, "render", "blob.caustic", "--rays", "4000", "--quiet")
+    Path("schedule.toml").write_text(plane.replace('"point"', '"sun"'))
+    assert run(capfd, "design", "blob.png", "--config", "schedule.toml", "-o", "x", code=2) == (
+        "caustic: [[design.stages]] source must be one of plane, point, grid, disc, got 'sun'")
