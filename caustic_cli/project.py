@@ -69,6 +69,7 @@ class Project:
         changed = {section: dict(values) for section, values in self.settings.items()}
         for (section, key, _), value in given.items():
             changed[section][key] = value
+        settings.refuse_unused(changed["source"], given)
         if changed["source"]["type"] != "plane":
             changed["source"].pop("profile", None)
         try:

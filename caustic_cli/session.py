@@ -70,6 +70,7 @@ def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: d
     _check_place(path, force)  # before the transport, which may take a minute
     try:
         full = complete(said, picture.aspect, width=pixels[0] if pixels and len(pixels) == 1 else None, **shaped)
+        settings.refuse_unused(full["source"], given, [stage.get("source") for stage in full["design"]["stages"]])
         full["target"] |= {"file": f"target{picture.suffix}", "encoding": picture.encoding}
         if light is not None:
             full["source"]["profile"] = f"profile{light.suffix}"
@@ -79,8 +80,8 @@ def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: d
         if first is not None and _make_room(full, said, first):
             _designer(project, "cpu")
             first = _first_heights(project)
-    except InputError as error:
-        raise InputError(settings.as_options(str(error), given)) from error
+    except InputError as error:  # about a project.toml that is not written yet
+        raise InputError(settings.as_options(str(error).removeprefix(f"{path / TOML}: "), given)) from error
     _make_directory(path, force)
     project.write()
     return project, first

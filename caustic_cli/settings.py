@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 import math
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -115,6 +116,8 @@ DEFAULTS: dict[str, dict[str, Any]] = {
                "checkpoint_every": 10.0, "seed": 0, "dtype": "float32"},
 }
 SOURCES = ("plane", "point", "grid", "disc")
+USED_BY: dict[str, tuple[str, ...]] = {"position": SOURCES[1:], "size": SOURCES[2:], "grid": ("grid",), "cone": SOURCES[1:],
+                                       "angle": ("disc",)}
 DEFAULT_INDEX = 1.5443  # table D.2
 
 
@@ -273,6 +276,27 @@ def as_options(message: str, given) -> str:
     for section, key, option in given:
         message = message.replace(f"[{section}] {key}", option)
     return message
+
+
+def refuse_unused(source: dict[str, Any], given, stages: Sequence[str | None] = ()) -> None:
+    """Refuse options (section, key, option) for the source that its type, and that of every stage, would ignore.
+
+    Keys in a file may stay when the type changes; an option was meant for this one run.
+
+    Raises:
+        InputError: naming the option.
+    """
+    types = {source["type"], *stages} - {None}
+    options = {key: option for section, key, option in given if section == "source" and key in USED_BY}
+    for key, option in options.items():
+        if not types & set(USED_BY[key]):
+            *others, last = USED_BY[key]
+            wanted = f"{', '.join(others)} or {last}" if others else last
+            raise InputError(f"{option} belongs to --source {wanted}, got {source['type']}")
+    if types == {"disc"} and "angle" in source:
+        for key, option in options.items():
+            if key != "angle":
+                raise InputError(f"{option} has no meaning for a disc at infinity, which is an angle wide (--source-angle)")
 
 
 def read(path: Path) -> dict[str, dict[str, Any]]:

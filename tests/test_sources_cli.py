@@ -162,3 +162,28 @@ def test_a_stage_of_a_plane_wave_may_have_a_source_that_stands_somewhere(capfd):
     Path("schedule.toml").write_text(plane.replace('"point"', '"sun"'))
     assert run(capfd, "design", "blob.png", "--config", "schedule.toml", "-o", "x", code=2) == (
         "caustic: [[design.stages]] source must be one of plane, point, grid, disc, got 'sun'")
+
+
+@pytest.mark.parametrize(("options", "message"), [
+    (["--source-position", "0,0,-50"], "--source-position belongs to --source point, grid or disc, got plane"),
+    (["--source", "point", "--source-size", "2"], "--source-size belongs to --source grid or disc, got point"),
+    (["--source", "disc", "--source-grid", "5"], "--source-grid belongs to --source grid, got disc"),
+    (["--source", "grid", "--source-angle", "1"], "--source-angle belongs to --source disc, got grid"),
+    (["--source-angle", "1", "--cone", "20"], "--cone has no meaning for a disc at infinity"),
+])
+def test_options_that_the_source_would_ignore_are_refused(capfd, options, message):
+    assert message in run(capfd, "design", "blob.png", *options, *TINY, code=2)
+    assert not Path("blob.caustic").exists()
+    run(capfd, "design", "blob.png", *TINY, "--iterations", "1")
+    assert message in run(capfd, "render", "blob.caustic", *options, code=2)
+
+
+def test_an_option_may_be_meant_for_the_source_of_a_stage(capfd):
+    Path("schedule.toml").write_text(SCHEDULE.replace('type = "grid"', 'type = "plane"').replace("position = [0, 0, -40]", ""))
+    run(capfd, "design", "blob.png", "--config", "schedule.toml", "--resolution", "24", "--source-position", "0,0,-40",
+        "--start", "offset", "--quiet")
+
+
+def test_a_refusal_names_no_file_that_was_never_written(capfd):
+    assert run(capfd, "design", "blob.png", "--source", "point", "--source-position", "0,0,5", *TINY, code=2).startswith(
+        "caustic: --source-position must lie before the lens")
