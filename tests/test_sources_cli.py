@@ -9,6 +9,7 @@ from PIL import Image
 
 from caustic_cli import cli, session, settings
 from caustic_cli.derive import complete
+from caustic_cli.errors import InputError
 from caustic_cli.scene import Disc, Offset, Points
 
 TINY = ["--resolution", "24", "--control", "12", "--rays", "4000", "--quiet", "--threads", "1"]
@@ -187,3 +188,10 @@ def test_an_option_may_be_meant_for_the_source_of_a_stage(capfd):
 def test_a_refusal_names_no_file_that_was_never_written(capfd):
     assert run(capfd, "design", "blob.png", "--source", "point", "--source-position", "0,0,5", *TINY, code=2).startswith(
         "caustic: --source-position must lie before the lens")
+
+
+@pytest.mark.parametrize("type", ["point", "grid"])
+@pytest.mark.parametrize("power", [0.0, -1.0, float("inf")])
+def test_a_bad_power_is_named_as_the_key_it_is(type, power):
+    with pytest.raises(InputError, match=r"\[source\] power must be"):
+        complete({"source": {"type": type, "power": power}}, 1.0)
