@@ -68,8 +68,10 @@ def converge(scene: Scene, field: HeightField, heights: Tensor, tolerance: float
             lost = {name: math.fsum(p.lost[name] for p in parts) / BATCHES for name in parts[0].lost}
             leaving = math.fsum(p.leaving for p in parts) / BATCHES
             return Converged(Exposure(mean, lost, leaving, sum(p.rays for p in parts)), error, traced)
-        each = int(each * min(32.0, max(1.3, 1.1 * (error / tolerance) ** (4.0 / 3.0))))
-        if each * BATCHES > MOST_RAYS:
+        more = max(1.3, 1.1 * (error / tolerance) ** (4.0 / 3.0))
+        foreseen = each * more if each > mean.numel() else 0.0  # too few rays a pixel foretell nothing
+        each = int(each * min(32.0, more))
+        if max(each, foreseen) * BATCHES > MOST_RAYS:
             raise CausticError(f"--tolerance {tolerance:g} asks for more than {MOST_RAYS:.0e} rays: {traced:,} left an estimated"
                                f" error of {error:.2g}; fewer pixels or a larger tolerance need fewer")
 
