@@ -12,7 +12,7 @@ import torch
 
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Options
-from caustic_cli.inverse.schedule import Stage, coarse_to_fine, refinement, refinement_spans
+from caustic_cli.inverse.schedule import LEAST_SPANS, Stage, coarse_to_fine, refinement, refinement_spans
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.scene import Offset, PlaneWave, Screen, Source, checks
 from caustic_cli.settings import SOURCES, build_source, index_of, with_defaults
@@ -122,11 +122,16 @@ def _complete_design(s: Settings, quality: str | None, rays: int | None) -> None
     lens, screen, design, given = s["lens"], s["screen"], s["design"], quality
     degree = tuple(checks.whole("[lens] degree", p, 1, 15) for p in lens["degree"])
     plain = design["network"] == "none" and design["optimizer"] == "lbfgs"
-    design.setdefault("start", "transport" if plain else "offset")
+    held = "control" not in lens or min(n - p for n, p in zip(lens["control"], degree, strict=True)) >= LEAST_SPANS
+    source = s["source"]
+    several = source["type"] == "point" and len(source["position"]) > 1
+    design.setdefault("start", "transport" if plain and held and not several else "offset")
     if design["start"] == "transport" and design["network"] != "none":
         raise InputError("[design] start transport gives a surface, which a network cannot begin from; use start offset, or"
                          " network none")
-    quality, moved = quality or _quality(design["time_limit"]), plain and design["start"] != "offset"
+    quality = quality or _quality(design["time_limit"])
+    # One point's transport is right at every scale at once, if the net can hold it; otherwise from coarse to fine.
+    moved = plain and held and design["start"] != "offset" and not several and source["type"] in ("plane", "point")
     if "control" not in lens:
         spans = refinement_spans(max(screen["resolution"]), quality) if moved else DEFAULT_SPANS
         lens["control"] = ([spans + p for p in degree] if design["network"] == "none" else [NETWORK_CONTROL] * 2)

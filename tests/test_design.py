@@ -212,7 +212,8 @@ def test_a_design_improves_the_picture(capfd, kind):
 
 def test_transport_begins_where_the_offset_ends(capfd):
     sphere = design(capfd, "blob.png", *TINY, "--start", "offset", "-o", "sphere")
-    moved = design(capfd, "blob.png", *TINY, "--iterations", 1, "-o", "moved")
+    fine = ["--resolution", "24", "--control", "35", "--rays", "40000", "--quiet", "--threads", "1"]
+    moved = design(capfd, "blob.png", *fine, "--iterations", 1, "-o", "moved")
     assert moved["relative_rms"] < 1.2 * sphere["relative_rms"]
     assert load("moved").state.history[0][2] < 0.7 * load("sphere").state.history[0][2]
     assert "start = \"transport\"" in Path("moved/project.toml").read_text()

@@ -49,7 +49,8 @@ def run(
     flip: Annotated[Text, typer.Option(metavar="x|y|xy", help="Mirror the picture, for a viewer on the lens' side.")] = None,
     start: Annotated[Text, typer.Option(metavar="transport|offset|PROJECT", help="First surface: by optimal transport of the"
                                         " light to the picture, the sphere that follows from --mag, or the lens of another"
-                                        " project.  [default: transport; offset for a network or adam]")] = None,
+                                        " project.  [default: transport; offset for a network, adam, several"
+                                        " points or a small net]")] = None,
     quality: Annotated[Text, typer.Option(help="draft, standard or fine.  [default: standard]")] = None,
     rays: Annotated[Text, typer.Option(metavar="N", help="Rays of the last stage.  [default: by quality]")] = None,
     loss: Annotated[Text, typer.Option(help="rms (eq. 5.2.1), rms-light, where every ray counts, throughput, diffusion,"

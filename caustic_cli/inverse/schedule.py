@@ -81,7 +81,7 @@ def coarse_to_fine(control: tuple[int, int], degree: tuple[int, int], rays: int,
 REFINEMENT = {
     "draft": (1.0, 256, 16, (("lines", 12),)),
     "standard": (2.0, 768, 64, (("lines", 8), ("lines", 12))),
-    "fine": (2.0, 768, 64, (("lines", 25), ("stratified", 35), ("stratified", 35))),
+    "fine": (2.0, 768, 64, (("lines", 25), ("stratified", 30), ("stratified", 25))),
 }
 LEAST_SPANS = 32
 LEAST_RAYS, MOST_RAYS = 40_000, 16_000_000
