@@ -6,6 +6,7 @@ Nothing is written before everything the user gave has been checked.
 from __future__ import annotations
 
 import hashlib
+import os
 import signal
 import time
 from collections.abc import Iterator
@@ -190,8 +191,12 @@ def _check_place(path: Path, force: bool) -> None:
     """Refuse a path where something stands that a new project must not replace; changes nothing.
 
     Raises:
-        InputError: it is no directory, not a project, or a project without `force`.
+        InputError: it is no directory, not a project, a project without `force`, or cannot be written to.
     """
+    place = path if path.exists() else path.parent
+    if not place.exists() or not os.access(place, os.W_OK):
+        reason = "no such directory" if not place.exists() else "permission denied"
+        raise InputError(f"{path}: cannot be written to ({reason}); -o DIR chooses another place")
     if not path.exists():
         return
     if not path.is_dir():

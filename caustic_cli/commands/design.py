@@ -108,6 +108,10 @@ def run(
         raise InputError(f"--iterations must be a whole number 1 to 1e9, got {iterations}")
     if time_limit is not None and not time_limit > 0:
         raise InputError(f"--time-limit must be greater than 0 s, got {time_limit:g}")
+    if not resume:
+        from caustic_cli.picture import read_picture  # noqa: PLC0415
+
+        read_picture(target, linear)  # before torch is loaded and kernels are compiled for nothing
     device = options.start_torch(device, threads, say)
 
     from caustic_cli import session  # noqa: PLC0415
