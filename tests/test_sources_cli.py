@@ -184,6 +184,9 @@ def test_an_option_may_be_meant_for_the_source_of_a_stage(capfd):
     Path("schedule.toml").write_text(SCHEDULE.replace('type = "grid"', 'type = "plane"').replace("position = [0, 0, -40]", ""))
     run(capfd, "design", "blob.png", "--config", "schedule.toml", "--resolution", "24", "--source-position", "0,0,-40",
         "--start", "offset", "--quiet")
+    project = session.Project.open("blob.caustic")
+    assert project.settings["source"]["type"] == "plane"
+    assert session.build_stages(project.settings)[0].source == Points(((0.0, 0.0, -40.0),))
 
 
 def test_a_refusal_names_no_file_that_was_never_written(capfd):

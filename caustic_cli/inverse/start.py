@@ -22,6 +22,7 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from scipy.fft import dctn, idctn
 from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import gaussian_filter
@@ -29,6 +30,7 @@ from scipy.ndimage import gaussian_filter
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.laguerre import prices
 from caustic_cli.inverse.transport import Transport, corners, solve
+from caustic_cli.optics.interface import refract
 
 EVEN = 2.0  # cells over which e is smoothed: at a kink of phi the rays miss by the spline's own width, which is no error of T
 ENOUGH = 0.05  # pixels of e, root mean square, that are left alone
@@ -176,15 +178,12 @@ def integrate(sx: np.ndarray, sy: np.ndarray, step: tuple[float, float]) -> np.n
 def land(z: np.ndarray, x, y, d, index: float, z_screen: float) -> tuple[np.ndarray, np.ndarray]:
     """Landing points (n, m), mm, of the rays d through the bicubic spline of z; NaN where totally reflected."""
     spline = RectBivariateSpline(x[:, 0], y[0], z, kx=min(3, len(z) - 1), ky=min(3, z.shape[1] - 1))
-    return refract(x, y, z, spline(x[:, 0], y[0], dx=1), spline(x[:, 0], y[0], dy=1), d, index, z_screen)
+    return thrown(x, y, z, spline(x[:, 0], y[0], dx=1), spline(x[:, 0], y[0], dy=1), d, index, z_screen)
 
 
-def refract(x, y, z, zx, zy, d, index: float, z_screen: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where rays d inside the glass land that leave it at (x, y, z) with slopes zx, zy (vector form of Snell's law)."""
-    norm2 = 1.0 + zx * zx + zy * zy
-    c = d[2] - d[0] * zx - d[1] * zy
-    with np.errstate(invalid="ignore"):
-        s = np.sqrt(norm2 * (1.0 - index**2) + (index * c) ** 2)
-    gamma = (s - index * c) / norm2
-    reach = (z_screen - z) / (index * d[2] + gamma)
-    return x + reach * (index * d[0] - gamma * zx), y + reach * (index * d[1] - gamma * zy)
+def thrown(x, y, z, zx, zy, d, index: float, z_screen: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where rays d inside the glass land that leave it at (x, y, z) with slopes zx, zy; NaN where totally reflected."""
+    d = [v if isinstance(v, float) else torch.from_numpy(v) for v in d]
+    (tx, ty, tz), passes, _, _ = refract(d, torch.from_numpy(zx), torch.from_numpy(zy), index)
+    reach = np.where(passes.numpy(), (z_screen - z) / tz.numpy(), np.nan)
+    return x + reach * tx.numpy(), y + reach * ty.numpy()

@@ -14,9 +14,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-#: Radicand below which a ray counts as totally reflected.  The refracted ray would leave within 1e-8 rad of the
-#: tangent plane, where its derivative (about 1 / s) carries no digits.
-CRITICAL = 1e-16
+from caustic_cli.optics.tolerances import CRITICAL
 
 
 def refract(d, slope_x: Tensor, slope_y: Tensor, eta: float):

@@ -26,6 +26,7 @@ from caustic_cli.optics.bundle import Bundle
 from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.optics.kernels import fused
 from caustic_cli.optics.mesh import TriangleMesh
+from caustic_cli.optics.tolerances import FEW_ULP, FINEST, LEAST_COSINE, MOST_PROBES, MOST_STEPS
 from caustic_cli.scene import checks
 
 METHODS = ("newton", "mesh", "mesh+newton")
@@ -37,17 +38,6 @@ class Status(IntEnum):
     HIT = 0
     MISSED = 1  # it leaves the aperture below the surface: the lens' side absorbs it
     UNRESOLVED = 2  # the search gave up; counted as missed
-
-
-#: Roundings of the heights and of t that a root may be off by.
-FEW_ULP = 4.0 * 2.220446049250313e-16
-MOST_STEPS = 100
-#: Cosine (times |N|) below which a hit is grazing: inside glass such a ray is totally reflected and carries no power on.
-LEAST_COSINE = 1e-12
-#: Part of the way through the surface's box below which two roots are not told apart: the surface then rises above the ray
-#: by no more than some 1e-12 of that way, and the ray may as well pass.
-FINEST = 1e-6
-MOST_PROBES = 20_000
 
 
 @dataclass(frozen=True)

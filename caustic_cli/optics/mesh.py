@@ -68,8 +68,5 @@ class TriangleMesh:
         from caustic_cli.optics.kernels.mesh import intersect  # noqa: PLC0415 - numba is slow to load
 
         rays = [a.detach().double().contiguous().numpy() for a in torch.broadcast_tensors(x, y, z, dx, dy, dz)]
-        count = blocks()
-        found = intersect(*rays, *self._breaks, *self.shape, self._vertices, self._low, self._high, recursive, count)
-        if torch.get_num_threads() != count:  # numba's OpenMP layer resets the count it shares with torch when it starts
-            torch.set_num_threads(count)
+        found = intersect(*rays, *self._breaks, *self.shape, self._vertices, self._low, self._high, recursive, blocks())
         return tuple(torch.from_numpy(a) for a in found)

@@ -28,11 +28,10 @@ from caustic_cli.optics.interface import reflectance, refract
 from caustic_cli.optics.kernels import fused
 from caustic_cli.optics.reconstruction import Filter, splat
 from caustic_cli.optics.sampling import Sample
+from caustic_cli.optics.tolerances import PARALLEL
 from caustic_cli.scene import Lens, Scene, Screen
 
 LOSSES = ("missed_lens", "missed_surface", "total_internal_reflection", "fresnel", "absorbed", "off_screen")
-#: A direction cosine to the screen's normal below this counts as parallel to it: the ray never arrives.
-PARALLEL = 1e-9
 
 
 class Status(IntEnum):

@@ -16,9 +16,9 @@ import math
 from numba import njit
 
 from caustic_cli.optics.kernels.shares import OPTIONS
+from caustic_cli.optics.tolerances import CRITICAL
 
 NONE, SCHLICK, EXACT = 0, 1, 2
-CRITICAL = 1e-16  # see interface.CRITICAL
 # Rows of a block's scratch of vectors: the surface, powers, landing points, derivatives, what turns the results of `shares`
 # into shares; five more for its own use.
 SAG, GX, GY, POWER, PX, PY, PHI, BY_POWER, BY_PX, BY_PY, BY_A, T_SAG, T_GX, T_GY, T_POWER, REACH = range(16)

@@ -15,17 +15,9 @@ import numpy as np
 from numba import njit, prange
 
 from caustic_cli.optics.kernels.spline import _OPTIONS, curvatures, jet, piece, push_powers
+from caustic_cli.optics.tolerances import FEW_ULP, FINEST, LEAST_COSINE, MOST_PROBES, MOST_STEPS
 
 HIT, MISSED, UNRESOLVED = 0, 1, 2
-#: Roundings of the heights and of t that a root may be off by.
-FEW_ULP = 4.0 * 2.220446049250313e-16
-MOST_STEPS = 100
-#: Cosine (times |N|) below which a hit is grazing: inside glass such a ray is totally reflected and carries no power on.
-LEAST_COSINE = 1e-12
-#: Part of the way through the surface's box below which two roots are not told apart: the surface then rises above the ray
-#: by no more than some 1e-12 of that way, and the ray may as well pass.
-FINEST = 1e-6
-MOST_PROBES = 20000
 #: A hit is looked for at first within this part of the way through the box from where a mesh has it.
 NEAR = 1e-3
 

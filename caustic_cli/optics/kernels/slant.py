@@ -21,7 +21,6 @@ from caustic_cli.optics.kernels.bend import (
     BY_POWER,
     BY_PX,
     BY_PY,
-    CRITICAL,
     EXACT,
     GX,
     GY,
@@ -37,8 +36,8 @@ from caustic_cli.optics.kernels.bend import (
     T_SAG,
 )
 from caustic_cli.optics.kernels.shares import OPTIONS
+from caustic_cli.optics.tolerances import CRITICAL, PARALLEL
 
-PARALLEL = 1e-9  # see tracing.PARALLEL
 REFLECTED_POWER, MISSED_POWER = -1.0, -2.0
 
 
