@@ -8,11 +8,14 @@
     attributes                format_version, created_by, provenance (JSON), results (JSON)
 
 A file whose writer was killed cannot be read, so a checkpoint is never updated in place: it is written beside the old
-one and renamed.
+one and renamed.  Before the HDF5 data stands a block of SEAL bytes (HDF5 calls it the user block) with the sha256 of all
+that follows, so that nothing of a damaged file is believed.  Files of earlier versions have none.
 """
 
 from __future__ import annotations
 
+import hashlib
+import io
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,12 +26,14 @@ import torch
 
 from caustic_cli import __version__
 from caustic_cli.errors import InputError
-from caustic_cli.files import atomic_path
+from caustic_cli.files import write_bytes
 from caustic_cli.inverse.designer import State
 from caustic_cli.optics.bspline import SplineSpace
 
 FORMAT_VERSION = 1
 HISTORY = ("iteration", "stage", "loss", "on_screen", "seconds")
+#: Length of the block before the data, the least that HDF5 allows; and what an HDF5 file without one begins with.
+SEAL, SIGNATURE = 512, b"\x89HDF\r\n\x1a\n"
 
 
 @dataclass(frozen=True)
@@ -41,14 +46,18 @@ class Checkpoint:
     results: dict
 
 
-class _Newer(InputError):
-    """A checkpoint of a later version."""
+class _Refused(InputError):
+    """A checkpoint of a later version, or with a checksum that is not its own."""
 
 
 def save(path: Path, checkpoint: Checkpoint) -> None:
-    """Write a checkpoint atomically."""
+    """Write a checkpoint atomically.
+
+    Raises:
+        CausticError: it could not be written; the one before is whole.
+    """
     state, spaces = checkpoint.state, checkpoint.spaces
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as f:
+    with h5py.File("checkpoint", "w", driver="core", backing_store=False) as f:  # in memory: a full disk is no HDF5 matter
         f.attrs["format_version"] = FORMAT_VERSION
         f.attrs["created_by"] = f"caustic {__version__}"
         f.attrs["provenance"] = json.dumps(checkpoint.provenance, sort_keys=True)
@@ -65,6 +74,29 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
                 part[key] = value.detach().cpu().numpy()
         f["history"] = np.array(state.history, dtype=np.float64).reshape(-1, len(HISTORY))
         f["history"].attrs["columns"] = ",".join(HISTORY)
+        f.flush()
+        image = f.id.get_file_image()
+    write_bytes(path, seal(image) + image)
+
+
+def seal(image: bytes) -> bytes:
+    """The block that stands before an HDF5 image."""
+    return f"caustic checkpoint, HDF5 from byte {SEAL}, sha256 {hashlib.sha256(image).hexdigest()}\n".encode().ljust(SEAL)
+
+
+def _read(f: h5py.File, name: str) -> np.ndarray:
+    """A dataset that lies in the file as it is: none elsewhere, none that grows when it is read."""
+    made = f[name].id.get_create_plist()
+    if made.get_external_count() or made.get_layout() not in (h5py.h5d.CONTIGUOUS, h5py.h5d.COMPACT):
+        raise ValueError(f"layout of {name}")
+    if f[name].nbytes > f.id.get_filesize():
+        raise ValueError(f"size of {name}")
+    return np.asarray(f[name][()])
+
+
+def _refuse_link(name: str, link) -> None:
+    if not isinstance(link, h5py.HardLink):
+        raise ValueError(f"link {name}")
 
 
 def load(path: Path) -> Checkpoint:
@@ -76,26 +108,34 @@ def load(path: Path) -> Checkpoint:
     if not path.is_file():
         raise InputError(f"{path}: no such file; a project with a designed lens is needed (caustic design makes one)")
     try:
-        with h5py.File(path, "r") as f:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    try:
+        whole = data.startswith(SIGNATURE) or data[:SEAL] == seal(data[SEAL:])
+        with h5py.File(io.BytesIO(data), "r") as f:
             version = int(f.attrs["format_version"])
             if version > FORMAT_VERSION:
-                raise _Newer(f"{path}: has format version {version}; this caustic {__version__} reads up to {FORMAT_VERSION}")
-            rows = f["history"][()]
+                raise _Refused(f"{path}: has format version {version}; this caustic {__version__} reads up to {FORMAT_VERSION}")
+            if not whole:
+                raise _Refused(f"{path}: is damaged (its checksum is not that of its content); a whole checkpoints.h5 is needed")
+            f.visititems_links(_refuse_link)
+            rows = _read(f, "history")
             if rows.ndim != 2 or rows.shape[1] != len(HISTORY):
                 raise ValueError("history")
             group = f["state"]
             state = State(
-                torch.from_numpy(f["lens/heights"][()]),
+                torch.from_numpy(_read(f, "lens/heights")),
                 **{k: int(group.attrs[k]) for k in ("stage", "iteration", "total")},
-                **{name: {k: torch.from_numpy(np.asarray(v[()])) for k, v in group[name].items()}
+                **{name: {k: torch.from_numpy(_read(f, f"state/{name}/{k}")) for k in group[name]}
                    for name in ("parameters", "optimizer")},
                 history=[(int(r[0]), int(r[1]), *map(float, r[2:])) for r in rows],
                 seconds=float(group.attrs["seconds"]), reason=str(group.attrs["reason"]))
-            spaces = tuple(SplineSpace(int(p), torch.from_numpy(f[f"lens/knots_{axis}"][()]))
+            spaces = tuple(SplineSpace(int(p), torch.from_numpy(_read(f, f"lens/knots_{axis}")))
                            for p, axis in zip(f["lens"].attrs["degree"], "uv", strict=True))
             checkpoint = Checkpoint(state, spaces, json.loads(f.attrs["provenance"]), json.loads(f.attrs["results"]))
-    except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
-        if isinstance(error, _Newer):
+    except (OSError, KeyError, ValueError, TypeError, RuntimeError, OverflowError, MemoryError) as error:
+        if isinstance(error, _Refused):
             raise
         raise InputError(f"{path}: is damaged or not a caustic checkpoint ({type(error).__name__});"
                          " a whole checkpoints.h5 is needed") from error

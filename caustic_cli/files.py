@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import os
 import tempfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from caustic_cli.errors import InputError
+from caustic_cli.errors import CausticError, InputError
 
 #: What marks a file as made by this program, so that it may be replaced.
 SOFTWARE = "caustic"
 MARK = SOFTWARE.encode()
 NPY_HEADER = 256  # bytes; NumPy itself pads to 64 or 128
+#: A temporary file nobody has written to for so many seconds was left by a killed process.
+LEFT_BEHIND = 600.0
 
 
 @contextlib.contextmanager
@@ -22,8 +26,10 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
     Raises:
         InputError: the directory cannot be written to.
+        CausticError: the file could not be written, on a full disk for instance; what stood there before still does.
     """
     path = Path(path)
+    _sweep(path)
     try:
         handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=path.suffix, dir=path.parent)
     except OSError as error:
@@ -39,9 +45,20 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
             os.fsync(f.fileno())
         os.replace(temporary, path)
         _sync_directory(path.parent)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
+    except BaseException as problem:
+        with contextlib.suppress(OSError):  # the directory may be gone, or read-only by now
+            temporary.unlink(missing_ok=True)
+        if isinstance(problem, OSError):
+            raise CausticError(f"{path}: could not be written ({problem.strerror or problem})") from problem
         raise
+
+
+def _sweep(path: Path) -> None:
+    """Remove what processes that were killed while they wrote `path` have left beside it."""
+    for left in path.parent.glob(f".{glob.escape(path.name)}.????????{path.suffix}"):
+        with contextlib.suppress(OSError):  # another process was faster
+            if left.is_file() and time.time() - left.stat().st_mtime > LEFT_BEHIND:
+                left.unlink()
 
 
 def write_bytes(path: str | Path, data: bytes) -> None:

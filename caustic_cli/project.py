@@ -5,7 +5,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from contextlib import ExitStack
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -30,12 +31,16 @@ def is_project(path: Path) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Project:
-    """An opened project: its directory, complete settings, target picture and source profile."""
+    """An opened project: its directory, complete settings, target picture and source profile.
+
+    hold: what lets go of the directory when the design that works there is done.
+    """
 
     path: Path
     settings: Settings
     picture: Picture
     profile: Picture | None = None
+    hold: ExitStack = field(default_factory=ExitStack, repr=False)
 
     @classmethod
     def open(cls, path: str | Path) -> Project:
@@ -108,12 +113,16 @@ class Project:
                              f" {list(field.shape)}; design again to change it")
         return field, state
 
-    def write(self) -> None:
-        """Write project.toml and the pictures; the directory exists."""
-        self.picture.write(self.path / self.settings["target"]["file"])
+    def write(self, path: Path | None = None) -> None:
+        """Write project.toml and the pictures to `path`, the project's own unless given; the directory exists.
+
+        project.toml comes last: where it is, the rest is.
+        """
+        path = path or self.path
+        self.picture.write(path / self.settings["target"]["file"])
         if self.profile is not None:
-            self.profile.write(self.path / self.settings["source"]["profile"])
-        write_bytes(self.path / TOML, settings.dump(self.settings).encode())
+            self.profile.write(path / self.settings["source"]["profile"])
+        write_bytes(path / TOML, settings.dump(self.settings).encode())
 
 
 def _picture(directory: Path, name: str, linear: bool) -> Picture:

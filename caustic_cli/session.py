@@ -6,7 +6,6 @@ Nothing is written before everything the user gave has been checked.
 from __future__ import annotations
 
 import hashlib
-import os
 import signal
 import time
 from collections.abc import Iterator
@@ -17,11 +16,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from caustic_cli import __version__, settings
+from caustic_cli import __version__, place, settings
 from caustic_cli.checkpoint import Checkpoint
 from caustic_cli.console import Reporter
 from caustic_cli.derive import build_options, build_stages, complete
-from caustic_cli.errors import InputError, Interrupted
+from caustic_cli.errors import CausticError, InputError, Interrupted
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.first import first_surface
 from caustic_cli.optics.heightfield import HeightField
@@ -68,7 +67,7 @@ def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: d
     profile = said.get("source", {}).get("profile")
     light = read_picture(config.parent / profile, linear=True) if profile else None
     path = out or Path(f"{target.stem or 'design'}.caustic")
-    _check_place(path, force)  # before the transport, which may take a minute
+    place.check(path, force)  # before the transport, which may take a minute
     try:
         full = complete(said, picture.aspect, width=pixels[0] if pixels and len(pixels) == 1 else None, **shaped)
         settings.refuse_unused(full["source"], given, [stage.get("source") for stage in full["design"]["stages"]])
@@ -83,8 +82,7 @@ def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: d
             first = _first_heights(project)
     except InputError as error:  # about a project.toml that is not written yet
         raise InputError(settings.as_options(str(error).removeprefix(f"{path / TOML}: "), given)) from error
-    _make_directory(path, force)
-    project.write()
+    place.settle(project, force)
     return project, first
 
 
@@ -98,10 +96,11 @@ def find(target: Path, out: Path | None) -> Project:
 
 def design(project: Project, first: torch.Tensor | None, device: str, say: Reporter, began: float) -> dict:
     """Run a new design from its first heights to its end; returns the figures of the JSON table."""
-    designer, target = _designer(project, device)
-    _say_blur(designer.scene, say)
-    state = designer.begin(first)
-    return _run(project, designer, target, state, say, began, 0, None, device)
+    with project.hold:
+        designer, target = _designer(project, device)
+        _say_blur(designer.scene, say)
+        state = designer.begin(first)
+        return _run(project, designer, target, state, say, began, 0, None, device)
 
 
 def _say_blur(scene: Scene, say: Reporter) -> None:
@@ -115,18 +114,21 @@ def _say_blur(scene: Scene, say: Reporter) -> None:
 def resume(project: Project, iterations: int | None, time_limit: float | None, device: str, say: Reporter,
            began: float) -> dict:
     """Go on from the last checkpoint; with nothing left to do, judge the lens again."""
-    designer, target = _designer(project, device)
-    state = project.load().state
-    if state.stage >= len(designer.stages):
-        raise InputError(f"{project.path / TOML}: has {len(designer.stages)} stages, but the checkpoint stands in stage"
-                         f" {state.stage + 1}")
-    if tuple(state.heights.shape) != designer.stages[state.stage].control:
-        raise InputError(f"{project.path / TOML}: stage {state.stage + 1} has control"
-                         f" {list(designer.stages[state.stage].control)}, but the checkpoint {list(state.heights.shape)}")
-    if iterations is not None:
-        project.settings["design"]["iterations"] = iterations
-        project.write()
-    return _run(project, designer, target, state, say, began, iterations, time_limit, device)
+    with project.hold:
+        project.hold.enter_context(place.held(project.path))
+        designer, target = _designer(project, device)
+        begun = (project.path / CHECKPOINT).exists()  # if not, it was killed before its first checkpoint
+        state = project.load().state if begun else designer.begin(_first_heights(project))
+        if state.stage >= len(designer.stages):
+            raise InputError(f"{project.path / TOML}: has {len(designer.stages)} stages, but the checkpoint stands in stage"
+                             f" {state.stage + 1}")
+        if tuple(state.heights.shape) != designer.stages[state.stage].control:
+            raise InputError(f"{project.path / TOML}: stage {state.stage + 1} has control"
+                             f" {list(designer.stages[state.stage].control)}, but the checkpoint {list(state.heights.shape)}")
+        if iterations is not None:
+            project.settings["design"]["iterations"] = iterations
+            project.write()
+        return _run(project, designer, target, state, say, began, iterations, time_limit, device)
 
 
 def sphere() -> tuple[Scene, HeightField, torch.Tensor]:
@@ -187,46 +189,6 @@ def _make_room(full: dict, said: dict, first: torch.Tensor) -> bool:
     return changed
 
 
-def _check_place(path: Path, force: bool) -> None:
-    """Refuse a path where something stands that a new project must not replace; changes nothing.
-
-    Raises:
-        InputError: it is no directory, not a project, a project without `force`, or cannot be written to.
-    """
-    place = path if path.exists() else path.parent
-    if not place.exists() or not os.access(place, os.W_OK):
-        reason = "no such directory" if not place.exists() else "permission denied"
-        raise InputError(f"{path}: cannot be written to ({reason}); -o DIR chooses another place")
-    if not path.exists():
-        return
-    if not path.is_dir():
-        raise InputError(f"{path}: exists and is not a directory; -o DIR chooses another place")
-    if any(path.iterdir()):
-        if not is_project(path):
-            raise InputError(f"{path}: exists and is not a caustic project; -o DIR chooses another place")
-        if not force:
-            raise InputError(f"{path}: holds a design already; --resume goes on with it, --force begins anew,"
-                             " -o DIR chooses another place")
-
-
-def _make_directory(path: Path, force: bool) -> None:
-    """An empty place for a project.
-
-    Raises:
-        InputError: something stands there, or the place cannot be written to.
-    """
-    _check_place(path, force)
-    try:
-        path.mkdir(exist_ok=True)
-        for name in (CHECKPOINT, RENDER, REPORT):
-            (path / name).unlink(missing_ok=True)
-        probe = path / ".caustic-probe"
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written to ({error.strerror}); -o DIR chooses another place") from error
-
-
 def _run(project: Project, designer: Designer, target: np.ndarray, state: State, say: Reporter, began: float,
          iterations: int | None, time_limit: float | None, device: str) -> dict:
     chosen = project.settings["design"]
@@ -237,8 +199,15 @@ def _run(project: Project, designer: Designer, target: np.ndarray, state: State,
         "target_sha256": hashlib.sha256(np.ascontiguousarray(project.picture.values).tobytes()).hexdigest(),
     }
 
+    safe = "nothing of it is on disk"
+
     def keep(now: State, results: dict | None = None) -> None:
-        project.save(Checkpoint(now, designer.field(now.stage).spaces, provenance, results or {}))
+        nonlocal safe
+        try:
+            project.save(Checkpoint(now, designer.field(now.stage).spaces, provenance, results or {}))
+        except CausticError as error:
+            raise CausticError(f"{error} after iteration {now.total}; {safe}") from error
+        safe = f"the checkpoint of iteration {now.total} is whole, caustic design --resume {project.path} goes on from it"
 
     total = chosen["iterations"] or sum(s.iterations for s in designer.stages)
     with _signals() as asked, say.progress(total) as show:

@@ -1,0 +1,114 @@
+"""The place of a project on disk: free or taken, born whole, and held by one design at a time.
+
+The lock is the operating system's on the directory itself, so it ends with the process that holds it, killed or not, and
+nothing of it is left behind.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from caustic_cli.errors import InputError
+from caustic_cli.files import LEFT_BEHIND, is_ours
+from caustic_cli.project import CHECKPOINT, RENDER, REPORT, Project, is_project
+
+try:
+    import fcntl
+except ImportError:  # Windows has other locks; there, two designs in one directory are the user's care
+    fcntl = None
+
+
+def check(path: Path, force: bool) -> None:
+    """Refuse a path where something stands that a new project must not replace; changes nothing.
+
+    Raises:
+        InputError: it is no directory, not a project, a project without `force`, or cannot be written to.
+    """
+    place = path if path.exists() else path.parent
+    if not place.exists() or not os.access(place, os.W_OK):
+        reason = "no such directory" if not place.exists() else "permission denied"
+        raise InputError(f"{path}: cannot be written to ({reason}); -o DIR chooses another place")
+    if not path.exists():
+        return
+    if not path.is_dir():
+        raise InputError(f"{path}: exists and is not a directory; -o DIR chooses another place")
+    if not is_project(path) and not all(_of_a_birth(p) for p in path.iterdir()):
+        raise InputError(f"{path}: exists and is not a caustic project; -o DIR chooses another place")
+    if is_project(path) and not force:
+        raise InputError(f"{path}: holds a design already; --resume goes on with it, --force begins anew,"
+                         " -o DIR chooses another place")
+
+
+def _of_a_birth(path: Path) -> bool:
+    """Whether a file is what a project begins with: one may have been killed before its project.toml was written."""
+    return path.is_file() and (path.name.startswith((".target.", ".profile.", ".project.toml."))
+                               or (path.stem in ("target", "profile") and is_ours(path)))
+
+
+def settle(project: Project, force: bool) -> None:
+    """Write a new project to its place and hold it (`Project.hold`).
+
+    Where nothing stands it is made beside it and renamed, so that it is there as a whole or not at all.
+
+    Raises:
+        InputError: something stands there, another design works there, or it cannot be written to.
+    """
+    path = project.path
+    check(path, force)
+    try:
+        if path.exists():
+            project.hold.enter_context(held(path))
+            for name in (CHECKPOINT, RENDER, REPORT):
+                (path / name).unlink(missing_ok=True)
+            project.write(path)
+            return
+        for left in path.parent.glob(".*.caustic-new"):
+            if time.time() - left.stat().st_mtime > LEFT_BEHIND:
+                shutil.rmtree(left, ignore_errors=True)
+        cradle = Path(tempfile.mkdtemp(suffix=".caustic-new", prefix=".", dir=path.parent))
+        try:
+            umask = os.umask(0)
+            os.umask(umask)
+            cradle.chmod(0o777 & ~umask)
+            project.hold.enter_context(held(cradle))
+            project.write(cradle)
+            os.rename(cradle, path)
+        except BaseException:
+            project.hold.close()
+            shutil.rmtree(cradle, ignore_errors=True)
+            raise
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written to ({error.strerror}); -o DIR chooses another place") from error
+
+
+@contextlib.contextmanager
+def held(directory: Path) -> Iterator[None]:
+    """Hold a directory alone, until the block or the process ends.
+
+    Raises:
+        InputError: another process holds it.
+    """
+    handle = os.open(directory, os.O_RDONLY)
+    try:
+        _lock(handle, directory)
+        yield
+    finally:
+        os.close(handle)
+
+
+def _lock(handle: int, directory: Path) -> None:
+    if fcntl is None:
+        return
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise InputError(f"{directory}: another caustic design is at work there; wait until it is done, or -o DIR chooses"
+                         " another place") from error
+    except OSError:  # a network file system without locks: as on Windows
+        return
