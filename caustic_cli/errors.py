@@ -3,6 +3,9 @@
 Only the command line turns these into exit codes; every other module raises them.
 """
 
+#: How torch says that memory is short: on a CPU (its allocator, a failed mmap) and on a CUDA device.
+SHORTAGE = ("out of memory", "not enough memory", "can't allocate memory", "Cannot allocate memory")
+
 
 class CausticError(Exception):
     """Something this program could not do; the message is one line for the user (exit status 1)."""
@@ -22,3 +25,8 @@ class Interrupted(CausticError):
     def __init__(self, message: str, status: int):
         super().__init__(message)
         self.status = status
+
+
+def is_shortage(error: BaseException) -> bool:
+    """Whether an error says that memory ran out: NumPy's MemoryError, or one of torch's."""
+    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and any(s in str(error) for s in SHORTAGE))

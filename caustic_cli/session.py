@@ -224,8 +224,8 @@ def _run(project: Project, designer: Designer, target: np.ndarray, state: State,
             show(f"stage {stage + 1}/{len(designer.stages)}",
                  f"loss {loss * target.size:.4f}  on screen {on_screen:.1%}", now.total, total)
             if time.monotonic() - saved >= chosen["checkpoint_every"]:
+                saved = time.monotonic()  # before the writing, which takes its time too
                 keep(now)
-                saved = time.monotonic()
 
         keep(state)
         state = designer.run(state, iterations=chosen["iterations"], time_limit=limit, stop=lambda: bool(asked),
