@@ -14,7 +14,7 @@ import typer
 
 from caustic_cli import __version__, console
 from caustic_cli.commands import convergence, design, export, gradmap, render
-from caustic_cli.errors import CausticError, InputError, Interrupted
+from caustic_cli.errors import CausticError, InputError, Interrupted, is_shortage
 
 DESCRIPTION = """Design free-form lenses that throw a picture as a caustic.
 
@@ -87,7 +87,7 @@ def _report(problem: Exception) -> int:
         if message:
             console.error(f"{message} (see caustic --help)")
         return 2
-    if isinstance(problem, MemoryError):
+    if is_shortage(problem):
         console.error("out of memory; fewer --rays, a smaller --control or --resolution needs less")
     elif isinstance(problem, OSError) and problem.strerror:
         console.error(f"{problem.filename or 'a file'}: {problem.strerror}")

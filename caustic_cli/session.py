@@ -199,7 +199,8 @@ def _run(project: Project, designer: Designer, target: np.ndarray, state: State,
         "target_sha256": hashlib.sha256(np.ascontiguousarray(project.picture.values).tobytes()).hexdigest(),
     }
 
-    safe = "nothing of it is on disk"
+    goes_on = f"caustic design --resume {project.path} goes on from it"
+    safe = f"the one before is whole, {goes_on}" if (project.path / CHECKPOINT).exists() else "nothing of it is on disk"
 
     def keep(now: State, results: dict | None = None) -> None:
         nonlocal safe
@@ -207,7 +208,7 @@ def _run(project: Project, designer: Designer, target: np.ndarray, state: State,
             project.save(Checkpoint(now, designer.field(now.stage).spaces, provenance, results or {}))
         except CausticError as error:
             raise CausticError(f"{error} after iteration {now.total}; {safe}") from error
-        safe = f"the checkpoint of iteration {now.total} is whole, caustic design --resume {project.path} goes on from it"
+        safe = f"the one of iteration {now.total} is whole, {goes_on}"
 
     total = chosen["iterations"] or sum(s.iterations for s in designer.stages)
     with _signals() as asked, say.progress(total) as show:

@@ -7,17 +7,20 @@ Everything that does not depend on the heights (basis matrices, filtered target,
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from caustic_cli.inverse import ranks
 from caustic_cli.inverse.losses import PENALTIES, Loss, parse
 from caustic_cli.inverse.penalties import Penalty
 from caustic_cli.optics.emission import Rays
 from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
+from caustic_cli.optics.shortage import smaller
 from caustic_cli.optics.tracing import PlaneTracer, RayTracer, tracer
 from caustic_cli.scene import Scene
 
@@ -69,7 +72,12 @@ class Objective:
         minded = [(weight, name) for weight, name in parse(loss) if name in PENALTIES and weight > 0]
         self.penalty = Penalty(scene, field, minded, max_slope, sampler.device)
         self.scene, self.field, self.sampler, self.dtype = scene, field, sampler, dtype
-        self.kept = list(self._tracers()) if sampler.count <= KEPT_RAYS else None
+        self.chunk, self.kept = CHUNK, None
+        if sampler.count <= KEPT_RAYS:
+            try:
+                self.kept = list(self._tracers())
+            except (MemoryError, RuntimeError) as error:
+                self.chunk = smaller(self.chunk, error)
 
     def _pool(self, image: Tensor) -> Tensor:
         """Pixels of the screen from those of the render."""
@@ -77,8 +85,10 @@ class Objective:
         return image if k == 1 else image.view(n // k, k, m // k, k).sum((1, 3))
 
     def _tracers(self) -> Iterator[PlaneTracer | RayTracer]:
-        traced = None
-        for rays in self.sampler.chunks(CHUNK):
+        """This rank's chunks, ready to be traced."""
+        (rank, count), traced = ranks.place(), None
+        size = min(self.chunk, math.ceil(self.sampler.count / count)) if count > 1 else self.chunk
+        for rays in self.sampler.chunks(size, rank, count):
             traced = tracer(self.scene, self.field, rays, self.dtype, traced)
             yield traced
 
@@ -87,33 +97,53 @@ class Objective:
 
         The loss sees rays through the image alone.  So the image is accumulated chunk by chunk, the loss gives its
         derivative by the image, and each chunk is traced again to pull that back: memory does not grow with rays.
-        A single chunk keeps its graph instead of being traced again.
+        A single chunk keeps its graph instead of being traced again.  Where memory runs out, smaller chunks are tried.
+
+        Raises:
+            CausticError: out of memory, or no light reaches the screen.
         """
+        while True:
+            try:
+                return self._evaluate(heights)
+            except (MemoryError, RuntimeError) as error:
+                if ranks.place()[1] > 1:  # the others wait for this chunk's image
+                    raise
+                problem = error.with_traceback(None)  # which would hold all that was allocated
+            self.chunk, self.kept = smaller(self.chunk, problem), None
+
+    def _evaluate(self, heights: Tensor) -> Evaluation:
         heights = heights.detach().to(self.device).requires_grad_()
         single = self.kept is not None and len(self.kept) == 1
-        image, leaving, penalty = 0.0, 0.0, self.penalty(heights) if self.penalty else torch.zeros((), device=self.device)
+        penalty = self.penalty(heights) if self.penalty else torch.zeros((), device=self.device)
+        image = torch.zeros(self.loss.target.shape, dtype=torch.float64, device=self.device)
+        leaving, parts = torch.zeros((), dtype=torch.float64, device=self.device), []
         with torch.set_grad_enabled(single):
             for traced in self.kept or self._tracers():
-                part = traced.expose(heights, self.screen, self.filter)
-                image, leaving = image + self._pool(part.image).double(), leaving + part.leaving.double()
-        if single:
-            loss = self.loss(image, leaving, penalty)
-            gradient = torch.autograd.grad(loss, heights)[0] if loss.requires_grad else torch.zeros_like(heights)
-        else:
-            image, leaving = image.requires_grad_(), leaving.requires_grad_()
-            loss = self.loss(image, leaving, penalty)
-            wanted = (image, leaving, heights) if penalty.requires_grad else (image, leaving)
-            by_image, by_leaving, *direct = torch.autograd.grad(loss, wanted, allow_unused=True)
-            by_leaving = torch.zeros_like(leaving) if by_leaving is None else by_leaving
-            gradient = direct[0] if direct else torch.zeros_like(heights)
-            for traced in self.kept or self._tracers():
-                part = traced.expose(heights, self.screen, self.filter)
-                # Whole pixels, and what leaves a lens without reflections, do not depend on the heights at all.
-                both = ((self._pool(part.image), by_image), (part.leaving, by_leaving))
-                pulls = [(value, by.to(value.dtype)) for value, by in both if value.requires_grad]
-                if pulls:
-                    values, by = zip(*pulls, strict=True)
-                    gradient += torch.autograd.grad(values, heights, by)[0]
+                part = self._see(traced, heights)
+                image, leaving = image + part[0].detach().double(), leaving + part[1].detach().double()
+                if single:
+                    parts.append(part)
+        ranks.add(image, leaving)
+        image, leaving = image.requires_grad_(), leaving.requires_grad_()
+        loss = self.loss(image, leaving, penalty)
+        wanted = (image, leaving, heights) if penalty.requires_grad else (image, leaving)
+        by_image, by_leaving, *direct = torch.autograd.grad(loss, wanted, allow_unused=True)
+        gradient = torch.zeros_like(heights)
+        for part in parts or (self._see(traced, heights) for traced in self.kept or self._tracers()):
+            # Whole pixels, and what leaves a lens without reflections, do not depend on the heights at all.
+            pulls = [(value, by.to(value.dtype)) for value, by in zip(part, (by_image, by_leaving), strict=True)
+                     if value.requires_grad and by is not None]
+            if pulls:
+                values, by = zip(*pulls, strict=True)
+                gradient += torch.autograd.grad(values, heights, by)[0]
+        ranks.add(gradient)
+        if direct:
+            gradient += direct[0]
         a = self.apron
         inner = image.detach()[a : image.shape[0] - a, a : image.shape[1] - a]
         return Evaluation(float(loss.detach()), gradient, float(inner.sum()))
+
+    def _see(self, traced: PlaneTracer | RayTracer, heights: Tensor) -> tuple[Tensor, Tensor]:
+        """What a chunk adds to the image, and to the power that leaves the lens."""
+        part = traced.expose(heights, self.screen, self.filter)
+        return self._pool(part.image), part.leaving

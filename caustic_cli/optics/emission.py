@@ -66,10 +66,13 @@ class Emission:
         one = torch.ones(1, dtype=torch.float64, device=self.device)
         return torch.tensor([source.position], dtype=torch.float64, device=self.device), one
 
-    def chunks(self, size: int = 1 << 20) -> Iterator[Bundle]:
-        """The rays in order, at most `size` at a time; their shares and what they lost sum to 1 over all chunks."""
+    def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[Bundle]:
+        """The rays in order, at most `size` at a time; their shares and what they lost sum to 1 over all chunks.
+
+        With `step`, only every step-th chunk from number `first` on: the part of one of several processes.
+        """
         far = not isinstance(self.scene.source, Points) and self.scene.source.angle is not None
-        for start in range(0, self.count, size):
+        for start in range(first * size, self.count, step * size):
             stop = min(start + size, self.count)
             dimensions = 2 if isinstance(self.scene.source, Points) else 4
             draws = numbers(self.kind, self.shape, self.seed, dimensions, start, stop, self.device)

@@ -146,19 +146,22 @@ class Sampler:
         """Number of rays."""
         return self.shape[0] * self.shape[1]
 
-    def chunks(self, size: int = 1 << 20) -> Iterator[Sample]:
-        """The rays in order, at most about `size` at a time; shares over all chunks sum to 1."""
+    def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[Sample]:
+        """The rays in order, at most about `size` at a time; shares over all chunks sum to 1.
+
+        With `step`, only every step-th chunk from number `first` on: the part of one of several processes.
+        """
         norm = 1.0 / self.count
         if self.profile is not None:
             total = sum(float(self._irradiance(s).sum()) for s in self._points(size))
             if not total > 0:
                 raise InputError("[source] profile: every ray fell where it is black; use more rays")
             norm = 1.0 / total
-        for s in self._points(size):
+        for s in self._points(size, first, step):
             share = norm * self._irradiance(s) if self.profile is not None else torch.tensor(norm, dtype=torch.float64)
             yield Sample(s.u, s.v, s.tensor, share.to(self.device))
 
-    def _points(self, size: int) -> Iterator[Sample]:
+    def _points(self, size: int, first: int = 0, step: int = 1) -> Iterator[Sample]:
         nu, nv = self.shape
         one = torch.ones((), dtype=torch.float64)
         if self.kind in ("grid", "lines"):
@@ -168,10 +171,10 @@ class Sampler:
                 du, dv = random_numbers(self.seed, 0, i), random_numbers(self.seed, 1, j)
             u, v = (i + du) / nu, (j + dv) / nv  # du, dv are float64
             rows = max(1, size // nv)
-            for a in range(0, nu, rows):
+            for a in range(first * rows, nu, step * rows):
                 yield Sample(u[a : a + rows], v, True, one)
             return
-        for a in range(0, self.count, size):
+        for a in range(first * size, self.count, step * size):
             yield Sample(*numbers(self.kind, self.shape, self.seed, 2, a, min(a + size, self.count), self.device), False, one)
 
     def _irradiance(self, s: Sample) -> Tensor:

@@ -28,6 +28,7 @@ from caustic_cli.optics.interface import reflectance, refract
 from caustic_cli.optics.kernels import fused
 from caustic_cli.optics.reconstruction import Filter, splat
 from caustic_cli.optics.sampling import Sample
+from caustic_cli.optics.shortage import with_less
 from caustic_cli.optics.tolerances import PARALLEL
 from caustic_cli.scene import Lens, Scene, Screen
 
@@ -235,16 +236,23 @@ def expose(scene: Scene, field: HeightField, heights: Tensor, sampler: Rays, fil
            dtype: torch.dtype = torch.float64, screen: Screen | None = None, chunk: int = 1 << 19) -> Exposure:
     """Trace all rays of a sampler and collect them: the value of the one function every command asks about.
 
-    Chunks are accumulated in float64, so neither memory nor rounding grows with the number of rays.
+    Chunks are accumulated in float64, so neither memory nor rounding grows with the number of rays.  Where memory runs out,
+    smaller ones are tried.
 
     Raises:
         InputError: the lens reaches the screen.
+        CausticError: out of memory.
     """
     screen, filter = screen or scene.screen, filter or Filter()
     heights = heights.detach().to(sampler.device, torch.float64)
     if float(heights.max()) >= screen.z:
         raise InputError(f"[screen] z must lie behind the lens, whose surface reaches {float(heights.max()):.6g} mm,"
                          f" got {screen.z:g} mm")
+    return with_less(lambda size: _expose(scene, field, heights, sampler, filter, dtype, screen, size), chunk)
+
+
+def _expose(scene: Scene, field: HeightField, heights: Tensor, sampler: Rays, filter: Filter, dtype: torch.dtype,
+            screen: Screen, chunk: int) -> Exposure:
     image = torch.zeros(screen.resolution, dtype=torch.float64, device=sampler.device)
     lost, leaving, traced = dict.fromkeys(LOSSES, 0.0), 0.0, None
     with torch.no_grad():

@@ -13,7 +13,7 @@ import sys
 import time
 
 import torch
-import torch._dynamo  # noqa: F401  what Adam loads when it is made
+import torch._dynamo
 
 from caustic_cli import cli, session
 from caustic_cli.commands import export, render  # noqa: F401

@@ -126,7 +126,8 @@ def test_a_killed_design_goes_on_and_nothing_is_lost(server):
 
 def test_a_killed_export_or_render_leaves_the_old_file_or_the_new(server):
     assert server([*DESIGN, "--iterations", "3"])[0] == 0, server.log.read_text()
-    outputs = {"lens.npz": ["export", "blob.caustic", "--samples", "301"], "lens.stl": ["export", "blob.caustic", "--format", "stl"],
+    outputs = {"lens.npz": ["export", "blob.caustic", "--samples", "301"],
+               "lens.stl": ["export", "blob.caustic", "--format", "stl"],
                "image.png": ["render", "blob.caustic", "--rays", "200000"]}
     chance, whole, late = random.Random(KILLS), {}, 0
     for name, command in outputs.items():
