@@ -94,11 +94,6 @@ def _read(f: h5py.File, name: str) -> np.ndarray:
     return np.asarray(f[name][()])
 
 
-def _refuse_link(name: str, link) -> None:
-    if not isinstance(link, h5py.HardLink):
-        raise ValueError(f"link {name}")
-
-
 def load(path: Path) -> Checkpoint:
     """Read a checkpoint.
 
@@ -119,7 +114,8 @@ def load(path: Path) -> Checkpoint:
                 raise _Refused(f"{path}: has format version {version}; this caustic {__version__} reads up to {FORMAT_VERSION}")
             if not whole:
                 raise _Refused(f"{path}: is damaged (its checksum is not that of its content); a whole checkpoints.h5 is needed")
-            f.visititems_links(_refuse_link)
+            if f.visititems_links(lambda name, link: None if isinstance(link, h5py.HardLink) else name):
+                raise ValueError("link")
             rows = _read(f, "history")
             if rows.ndim != 2 or rows.shape[1] != len(HISTORY):
                 raise ValueError("history")
@@ -134,9 +130,9 @@ def load(path: Path) -> Checkpoint:
             spaces = tuple(SplineSpace(int(p), torch.from_numpy(_read(f, f"lens/knots_{axis}")))
                            for p, axis in zip(f["lens"].attrs["degree"], "uv", strict=True))
             checkpoint = Checkpoint(state, spaces, json.loads(f.attrs["provenance"]), json.loads(f.attrs["results"]))
-    except (OSError, KeyError, ValueError, TypeError, RuntimeError, OverflowError, MemoryError) as error:
-        if isinstance(error, _Refused):
-            raise
+    except _Refused:
+        raise
+    except Exception as error:  # what a broken file makes HDF5 stumble over may be anything
         raise InputError(f"{path}: is damaged or not a caustic checkpoint ({type(error).__name__});"
                          " a whole checkpoints.h5 is needed") from error
     if tuple(state.heights.shape) != (spaces[0].n, spaces[1].n) or not bool(torch.isfinite(state.heights).all()):

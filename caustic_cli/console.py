@@ -14,6 +14,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+#: Characters of an error line; more is what somebody put into a file.
+LONGEST_LINE = 4000
+
 
 class Reporter:
     """Talks to the user on stderr unless `quiet`.  Colour follows the terminal and NO_COLOR."""
@@ -75,8 +78,9 @@ def emit(line: str) -> None:
 
 
 def error(message: str) -> None:
-    """One line on stderr, said even when quiet."""
-    sys.stderr.write(f"caustic: {' '.join(message.split())}\n")
+    """One line on stderr, said even when quiet; nothing in it, a hostile file's name for instance, commands the terminal."""
+    line = "".join(c if c.isprintable() else "?" for c in " ".join(message.split()))
+    sys.stderr.write(f"caustic: {line if len(line) <= LONGEST_LINE else line[:LONGEST_LINE] + ' ...'}\n")
 
 
 def figures_rows(figures: dict) -> list[tuple[str, str]]:

@@ -223,5 +223,9 @@ def build_options(settings: Settings) -> Options:
     dtype = {"float32": torch.float32, "float64": torch.float64}[checks.choice("[design] dtype", d["dtype"],
                                                                               ("float32", "float64"))]
     checks.whole("[design] seed", d["seed"], 0, 2**31 - 1)
+    checks.whole("[design] iterations", d["iterations"], 0, 10**9)
+    for key in ("time_limit", "checkpoint_every"):
+        if not d[key] > 0:
+            raise InputError(f"[design] {key} must be greater than 0 s, got {d[key]:g}")
     return Options(d["loss"], d["optimizer"], d["lr"], d["network"], d["initial"], d["preconditioner"],
                    d["filter_target"], d["seed"], dtype, d["max_slope"])

@@ -6,12 +6,13 @@ j along +y.  Pixel values are sRGB-encoded or linear; irradiance is always linea
 
 from __future__ import annotations
 
+import stat
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageOps, PngImagePlugin, UnidentifiedImageError
+from PIL import Image, ImageOps, PngImagePlugin
 
 from caustic_cli.errors import InputError
 from caustic_cli.files import NPY_HEADER, SOFTWARE, atomic_path
@@ -89,14 +90,20 @@ def read_picture(path: str | Path, linear: bool = False) -> Picture:
         InputError: there is no such picture, or it is too large, too small, black, negative or not finite.
     """
     path = Path(path)
-    if path.is_dir():
-        raise InputError(f"{path}: is a directory; {ACCEPTED}")
     try:
+        mode = path.stat().st_mode
+        if not stat.S_ISREG(mode):
+            kind = "a directory" if stat.S_ISDIR(mode) else "not a regular file"
+            raise InputError(f"{path}: is {kind}; {ACCEPTED}")
         picture = _read_npy(path) if path.suffix.lower() == ".npy" else _read_image(path, linear)
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file; {ACCEPTED}") from error
     except PermissionError as error:
         raise InputError(f"{path}: cannot be read (permission denied); {ACCEPTED}") from error
+    except (OSError, ValueError) as error:  # a name too long, or with a zero byte
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: cannot be read ({error}); {ACCEPTED}") from error
     a, b = picture.irradiance_shape
     if min(a, b) < 2:
         raise InputError(f"{path}: is {a} x {b} pixels; a picture of at least 2 x 2 is needed")
@@ -113,10 +120,12 @@ def _check_size(path: Path, width: int, height: int) -> None:
 def _read_npy(path: Path) -> Picture:
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
-        if isinstance(error, FileNotFoundError | PermissionError):
-            raise
-        raise InputError(f"{path}: is not a readable .npy array; {ACCEPTED}") from error
+    except (FileNotFoundError, PermissionError):
+        raise
+    except Exception as error:  # what a broken header makes NumPy's parser stumble over may be anything
+        raise InputError(f"{path}: is not a readable .npy array ({type(error).__name__}); {ACCEPTED}") from error
+    if isinstance(array, np.lib.npyio.NpzFile):
+        array.close()
     if not isinstance(array, np.ndarray) or array.ndim != 2 or array.dtype.kind not in "fiub":
         raise InputError(f"{path}: a .npy target must be a 2-D array of real numbers")
     _check_size(path, *array.shape)
@@ -137,14 +146,16 @@ def _read_image(path: Path, linear: bool) -> Picture:
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the size is checked below, in our words
             with Image.open(path) as image:
                 _check_size(path, *image.size)
+                if image.format == "EPS":  # which Pillow would have Ghostscript draw
+                    raise InputError(f"{path}: is a drawing, not pixels; {ACCEPTED}")
                 image = ImageOps.exif_transpose(image)
                 image.load()
     except (FileNotFoundError, PermissionError, InputError):
         raise
     except Image.DecompressionBombError as error:
         raise InputError(f"{path}: is too large; at most {MAX_PIXELS} pixels (8192 x 8192) are read") from error
-    except (UnidentifiedImageError, OSError, ValueError, SyntaxError, EOFError) as error:
-        raise InputError(f"{path}: is not an image that can be read; {ACCEPTED}") from error
+    except Exception as error:  # what a broken file makes one of Pillow's many decoders stumble over may be anything
+        raise InputError(f"{path}: is not an image that can be read ({type(error).__name__}); {ACCEPTED}") from error
     encoding = "linear" if linear else "srgb"
     if image.mode == "F":
         values = np.asarray(image, dtype=np.float64)

@@ -13,7 +13,7 @@ import numpy as np
 
 from caustic_cli import checkpoint, settings
 from caustic_cli.checkpoint import Checkpoint
-from caustic_cli.derive import Settings, complete
+from caustic_cli.derive import Settings, build_options, build_stages, complete
 from caustic_cli.errors import InputError
 from caustic_cli.files import write_bytes
 from caustic_cli.inverse.target import target_on_screen
@@ -59,6 +59,7 @@ class Project:
                                given.get("target", {}).get("encoding", "srgb") == "linear")
             profile = given.get("source", {}).get("profile")
             full = complete(given, picture.aspect)
+            build_stages(full), build_options(full)  # a project whose design is impossible is not opened for its lens either
             return cls(path, full, picture, _picture(path, profile, True) if profile else None)
         except InputError as error:
             raise InputError(f"{path / TOML}: {error}") from error
@@ -122,10 +123,14 @@ class Project:
         self.picture.write(path / self.settings["target"]["file"])
         if self.profile is not None:
             self.profile.write(path / self.settings["source"]["profile"])
-        write_bytes(path / TOML, settings.dump(self.settings).encode())
+        self.write_settings(path)
+
+    def write_settings(self, path: Path | None = None) -> None:
+        """Write project.toml alone."""
+        write_bytes((path or self.path) / TOML, settings.dump(self.settings).encode())
 
 
 def _picture(directory: Path, name: str, linear: bool) -> Picture:
-    if name != Path(name).name or name in ("", ".", ".."):
-        raise InputError(f"a picture's file must be a name within the project directory, got {name!r}")
+    if name != Path(name).name or name in ("", ".", "..", TOML, CHECKPOINT, RENDER, REPORT):
+        raise InputError(f"a picture's file must be the name of one within the project directory, got {name!r}")
     return read_picture(directory / name, linear)

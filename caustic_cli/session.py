@@ -127,7 +127,7 @@ def resume(project: Project, iterations: int | None, time_limit: float | None, d
                              f" {list(designer.stages[state.stage].control)}, but the checkpoint {list(state.heights.shape)}")
         if iterations is not None:
             project.settings["design"]["iterations"] = iterations
-            project.write()
+            project.write_settings()
         return _run(project, designer, target, state, say, began, iterations, time_limit, device)
 
 

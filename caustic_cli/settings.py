@@ -23,6 +23,7 @@ from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Scre
 from caustic_cli.scene.materials import D_LINE, refractive_index
 
 FORMAT_VERSION = 1
+MAX_BYTES = 1 << 24  # of a TOML file: a hundred thousand source points fit
 
 
 @dataclass(frozen=True)
@@ -129,8 +130,10 @@ def parse(text: str, where: str) -> dict[str, dict[str, Any]]:
     """
     try:
         raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # besides TOML's own: digits without end, brackets without end
         raise InputError(f"{where}: is not valid TOML: {error}") from error
+    if not _fits(raw):
+        raise InputError(f"{where}: holds a whole number of more than 64 bits")
     version = raw.pop("format_version", FORMAT_VERSION)
     if type(version) is not int or not 1 <= version <= FORMAT_VERSION:
         raise InputError(f"{where}: has format_version {version!r}; this caustic {__version__} reads 1 to {FORMAT_VERSION}")
@@ -148,6 +151,13 @@ def parse(text: str, where: str) -> dict[str, dict[str, Any]]:
                 continue
             out[section][key] = _typed(f"{where}: [{section}] {key}", key, value, SCHEMA[section])
     return out
+
+
+def _fits(value) -> bool:
+    """Whether all whole numbers within have at most the 64 bits that TOML asks for."""
+    if isinstance(value, dict | list):
+        return all(map(_fits, value.values() if isinstance(value, dict) else value))
+    return not isinstance(value, int) or -(2**63) <= value < 2**63
 
 
 def _stages(tables, where: str) -> list[dict[str, Any]]:
@@ -303,7 +313,11 @@ def refuse_unused(source: dict[str, Any], given, stages: Sequence[str | None] = 
 def read(path: Path) -> dict[str, dict[str, Any]]:
     """Settings from a TOML file."""
     try:
-        text = path.read_text(encoding="utf-8")
+        with open(path, "rb") as f:
+            text = f.read(MAX_BYTES + 1)
+        if len(text) > MAX_BYTES:
+            raise InputError(f"{path}: is too large; a TOML file of at most {MAX_BYTES:,} bytes is read")
+        text = text.decode().replace("\r\n", "\n")
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file; a TOML file is needed") from error
     except (OSError, UnicodeDecodeError) as error:
