@@ -5,7 +5,7 @@
     /state                    attributes stage, iteration, total, seconds, reason
     /state/parameters/*, /state/optimizer/*   tensors by name
     /history                  (iterations, 5): iteration, stage, loss (eq. 5.2.1), on_screen, seconds
-    attributes                format_version, created_by, provenance (JSON), results (JSON)
+    attributes                format_version, created_by, provenance, results, inputs (JSON)
 
 A file whose writer was killed cannot be read, so a checkpoint is never updated in place: it is written beside the old
 one and renamed.  Before the HDF5 data stands a block of SEAL bytes (HDF5 calls it the user block) with the sha256 of all
@@ -17,7 +17,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import h5py
@@ -38,12 +38,16 @@ SEAL, SIGNATURE = 512, b"\x89HDF\r\n\x1a\n"
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A design's state, the spline spaces of its heights, where it came from and, once finished, its figures."""
+    """A design's state, the spline spaces of its heights, where it came from and, once finished, its figures.
+
+    inputs: digests of what it was made from, see `reuse`.
+    """
 
     state: State
     spaces: tuple[SplineSpace, SplineSpace]
     provenance: dict
     results: dict
+    inputs: dict = field(default_factory=dict)
 
 
 class _Refused(InputError):
@@ -61,7 +65,8 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
         f.attrs["format_version"] = FORMAT_VERSION
         f.attrs["created_by"] = f"caustic {__version__}"
         f.attrs["provenance"] = json.dumps(checkpoint.provenance, sort_keys=True)
-        f.attrs["results"] = json.dumps(checkpoint.results, sort_keys=True)
+        f.attrs["results"] = json.dumps(checkpoint.results)
+        f.attrs["inputs"] = json.dumps(checkpoint.inputs, sort_keys=True)
         f["lens/heights"] = state.heights.cpu().numpy()
         f["lens"].attrs["degree"] = [s.degree for s in spaces]
         f["lens/knots_u"], f["lens/knots_v"] = (s.knots.numpy() for s in spaces)
@@ -129,7 +134,11 @@ def load(path: Path) -> Checkpoint:
                 seconds=float(group.attrs["seconds"]), reason=str(group.attrs["reason"]))
             spaces = tuple(SplineSpace(int(p), torch.from_numpy(_read(f, f"lens/knots_{axis}")))
                            for p, axis in zip(f["lens"].attrs["degree"], "uv", strict=True))
-            checkpoint = Checkpoint(state, spaces, json.loads(f.attrs["provenance"]), json.loads(f.attrs["results"]))
+            texts = f.attrs["provenance"], f.attrs["results"], f.attrs.get("inputs", "{}")
+            tables = [json.loads(text) for text in texts]
+            if not all(isinstance(table, dict) for table in tables):
+                raise ValueError("tables")
+            checkpoint = Checkpoint(state, spaces, *tables)
     except _Refused:
         raise
     except Exception as error:  # what a broken file makes HDF5 stumble over may be anything

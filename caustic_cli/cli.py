@@ -45,13 +45,24 @@ for _info, _name in zip(app.registered_commands, ("design", "render", "gradmap",
     _info.name = _name
 
 
+def parser():
+    """The parser of the whole command line."""
+    root = typer.main.get_command(app)
+    for command in root.commands.values():
+        for parameter in command.params:
+            parameter.show_envvar = False  # every option has a variable; the manual says how it is called
+    return root
+
+
 def run(arguments: list[str]) -> int:
     """Run one command line and return its exit status."""
-    debug = "--debug" in arguments
+    debug = "--debug" in arguments or bool(os.environ.get("CAUSTIC_DEBUG"))
     try:
-        typer.main.get_command(app).main(arguments, prog_name="caustic", standalone_mode=False)
+        status = parser().main(arguments, prog_name="caustic", standalone_mode=False, auto_envvar_prefix="CAUSTIC")
         sys.stdout.flush()
-        return 0
+        if status == 130:  # how some versions of Typer pass a KeyboardInterrupt on
+            raise KeyboardInterrupt
+        return status if isinstance(status, int) else 0
     except BrokenPipeError:  # whoever read our results has read enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0

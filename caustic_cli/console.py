@@ -6,30 +6,57 @@ Results never pass through Rich, which wraps at 80 columns when piped.
 from __future__ import annotations
 
 import json
+import math
 import sys
 import threading
+import time
 from contextlib import contextmanager
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from caustic_cli.errors import InputError
+
 #: Characters of an error line; more is what somebody put into a file.
 LONGEST_LINE = 4000
+#: Seconds between two lines of --progress json.
+LINE_EVERY = 0.5
 
 
 class Reporter:
-    """Talks to the user on stderr unless `quiet`.  Colour follows the terminal and NO_COLOR."""
+    """Talks to the user on stderr unless `quiet`.  Colour follows the terminal and NO_COLOR.
 
-    def __init__(self, quiet: bool = False):
+    With `progress` json it talks to a program instead, one JSON object a line, of the kind (`event`) message, progress or
+    result.
+
+    Raises:
+        InputError: `progress` is neither auto nor json.
+    """
+
+    def __init__(self, quiet: bool = False, progress: str = "auto"):
+        if progress not in ("auto", "json"):
+            raise InputError(f"--progress must be auto or json, got {progress!r}")
         self.console = Console(stderr=True, quiet=quiet, highlight=False, soft_wrap=True)
+        self.lines = progress == "json"
 
     def say(self, text: str) -> None:
         """A line for the user."""
-        self.console.print(text, markup=False)
+        if self.lines:
+            self._line(event="message", text=text)
+        else:
+            self.console.print(text, markup=False)
+
+    def _line(self, **values) -> None:
+        if not self.console.quiet:
+            sys.stderr.write(json.dumps(values) + "\n")
+            sys.stderr.flush()
 
     def table(self, title: str, rows: list[tuple[str, str]]) -> None:
         """Two columns: what, and its value."""
+        if self.lines:
+            self._line(event="result", title=title, rows=dict(rows))
+            return
         if not self.console.is_terminal:  # a log: nothing wrapped, nothing cut
             width = max(len(name) for name, _ in rows)
             self.say("\n".join([title, *(f"  {name:<{width}}  {value}" for name, value in rows)]))
@@ -54,7 +81,19 @@ class Reporter:
 
     @contextmanager
     def progress(self, total: int | None):
-        """A progress bar on a terminal, nothing elsewhere; `total` may become known later."""
+        """A progress bar on a terminal, nothing elsewhere; `total` may become known later.  Lines come every LINE_EVERY seconds."""
+        if self.lines:
+            began, last = time.monotonic(), -math.inf
+
+            def tell(description="", text="", done=None, whole=None) -> None:
+                nonlocal last
+                now = time.monotonic()
+                if now - last >= LINE_EVERY or done == whole:
+                    last = now
+                    self._line(event="progress", what=description, text=text, done=done, total=whole, seconds=round(now - began, 3))
+
+            yield tell
+            return
         bar = Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
                        TextColumn("{task.fields[text]}"), TimeElapsedColumn(), TextColumn("left"),
                        TimeRemainingColumn(), console=self.console, transient=True,

@@ -8,10 +8,8 @@ from __future__ import annotations
 import re
 import sys
 
-import typer
-
 from caustic_cli import __version__
-from caustic_cli.cli import app
+from caustic_cli.cli import parser
 
 HEAD = r""".TH CAUSTIC 1 "" "caustic {version}" "User Commands"
 .SH NAME
@@ -51,6 +49,18 @@ Arrays are indexed [i, j], i along +x and j along +y.  Image files are the scree
 row 0 the +y edge.  Seen from the lens' side the picture is mirrored;
 .B \-\-flip x
 designs for that viewer.
+.SH THE SAME AGAIN
+A design, render or export of the same inputs with the same options as before is no work: the command says so, prints the same
+JSON, touches what it made, so that
+.BR make (1)
+finds it newer than its sources, and exits 0.
+.B \-\-force
+does it anew.
+.SH COMPLETION
+.B caustic \-\-install\-completion
+adds completion of commands and options to the shell;
+.B caustic \-\-show\-completion
+prints what it would add.
 .SH EXIT STATUS
 .TP
 .B 0
@@ -65,6 +75,16 @@ Bad usage or bad input: one line says what, where, and what would be accepted.
 .B 130, 143
 Interrupted by SIGINT or SIGTERM, after the last state was saved.
 .SH ENVIRONMENT
+.TP
+.BI CAUSTIC_ COMMAND _ OPTION
+The default of an option, hyphens written as underscores: CAUSTIC_DESIGN_MAG=2, CAUSTIC_RENDER_RAYS=4e6, CAUSTIC_DESIGN_LINEAR=1.
+What the command line says wins.
+.TP
+.B CAUSTIC_QUIET, CAUSTIC_PROGRESS, CAUSTIC_SEED, CAUSTIC_DEVICE, CAUSTIC_DTYPE, CAUSTIC_THREADS, CAUSTIC_DEBUG
+The same for the options that most commands share.
+.TP
+.B CAUSTIC_KERNELS
+"torch" runs the plain-torch reference instead of the compiled kernels.
 .TP
 .B NO_COLOR
 Set to anything: no colour.
@@ -81,7 +101,7 @@ caustic convergence flame.caustic --study rays
 
 def build() -> str:
     """The whole page as roff."""
-    root = typer.main.get_command(app)
+    root = parser()
     parts = [HEAD.format(version=__version__)]
     for name, command in root.commands.items():
         parts.append(_command(name, command))

@@ -33,13 +33,16 @@ def is_project(path: Path) -> bool:
 class Project:
     """An opened project: its directory, complete settings, target picture and source profile.
 
-    hold: what lets go of the directory when the design that works there is done.
+    asked: digest of what its user gave (`reuse`); found: the checkpoint, where the same had been asked for before; hold: what
+    lets go of the directory when the design that works there is done.
     """
 
     path: Path
     settings: Settings
     picture: Picture
     profile: Picture | None = None
+    asked: str = ""
+    found: Checkpoint | None = None
     hold: ExitStack = field(default_factory=ExitStack, repr=False)
 
     @classmethod

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from caustic_cli import __version__, place, settings
+from caustic_cli import __version__, place, reuse, settings
 from caustic_cli.checkpoint import Checkpoint
 from caustic_cli.console import Reporter
 from caustic_cli.derive import build_options, build_stages, complete
@@ -39,6 +39,8 @@ REPORT_SAMPLES = 401
 def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: dict, config: Path | None,
           force: bool) -> tuple[Project, torch.Tensor | None]:
     """Check everything, then make the project directory; also returns the first heights, None for the offset surface.
+
+    Where the same has been designed already, or begun, that project is opened instead (`Project.found`).
 
     Args:
         given: (section, key, option) -> value, what the options say.
@@ -67,14 +69,16 @@ def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: d
     profile = said.get("source", {}).get("profile")
     light = read_picture(config.parent / profile, linear=True) if profile else None
     path = out or Path(f"{target.stem or 'design'}.caustic")
-    place.check(path, force)  # before the transport, which may take a minute
     try:
         full = complete(said, picture.aspect, width=pixels[0] if pixels and len(pixels) == 1 else None, **shaped)
         settings.refuse_unused(full["source"], given, [stage.get("source") for stage in full["design"]["stages"]])
         full["target"] |= {"file": f"target{picture.suffix}", "encoding": picture.encoding}
         if light is not None:
             full["source"]["profile"] = f"profile{light.suffix}"
-        project = Project(path, full, picture, light)
+        project = Project(path, full, picture, light, asked=reuse.digest(full, picture, light))
+        if not force and (same := reuse.same_design(path, project.asked)):
+            return replace(same[0], found=same[1]), None
+        place.check(path, force)  # before the transport, which may take a minute
         _designer(project, "cpu")  # builds and so checks scene, target, stages, options
         first = _first_heights(project)
         if first is not None and _make_room(full, said, first):
@@ -95,7 +99,15 @@ def find(target: Path, out: Path | None) -> Project:
 
 
 def design(project: Project, first: torch.Tensor | None, device: str, say: Reporter, began: float) -> dict:
-    """Run a new design from its first heights to its end; returns the figures of the JSON table."""
+    """Run a new design from its first heights to its end; returns the figures of the JSON table.
+
+    One that `begin` found needs no work, or goes on.
+    """
+    if project.found is not None:
+        figures = reuse.finished(project, project.found)
+        say.say(f"{project.path}: was designed from the same picture with the same options, so "
+                + ("there is nothing to do; --force designs it anew" if figures else "it goes on from its checkpoint"))
+        return figures or resume(project, None, None, device, say, began)
     with project.hold:
         designer, target = _designer(project, device)
         _say_blur(designer.scene, say)
@@ -118,7 +130,8 @@ def resume(project: Project, iterations: int | None, time_limit: float | None, d
         project.hold.enter_context(place.held(project.path))
         designer, target = _designer(project, device)
         begun = (project.path / CHECKPOINT).exists()  # if not, it was killed before its first checkpoint
-        state = project.load().state if begun else designer.begin(_first_heights(project))
+        before = project.load() if begun else None
+        state = before.state if begun else designer.begin(_first_heights(project))
         if state.stage >= len(designer.stages):
             raise InputError(f"{project.path / TOML}: has {len(designer.stages)} stages, but the checkpoint stands in stage"
                              f" {state.stage + 1}")
@@ -128,6 +141,8 @@ def resume(project: Project, iterations: int | None, time_limit: float | None, d
         if iterations is not None:
             project.settings["design"]["iterations"] = iterations
             project.write_settings()
+        if begun:
+            project = replace(project, asked=reuse.asked_of(project, before))
         return _run(project, designer, target, state, say, began, iterations, time_limit, device)
 
 
@@ -199,13 +214,14 @@ def _run(project: Project, designer: Designer, target: np.ndarray, state: State,
         "target_sha256": hashlib.sha256(np.ascontiguousarray(project.picture.values).tobytes()).hexdigest(),
     }
 
+    inputs = reuse.inputs(project)
     goes_on = f"caustic design --resume {project.path} goes on from it"
     safe = f"the one before is whole, {goes_on}" if (project.path / CHECKPOINT).exists() else "nothing of it is on disk"
 
     def keep(now: State, results: dict | None = None) -> None:
         nonlocal safe
         try:
-            project.save(Checkpoint(now, designer.field(now.stage).spaces, provenance, results or {}))
+            project.save(Checkpoint(now, designer.field(now.stage).spaces, provenance, results or {}, inputs))
         except CausticError as error:
             raise CausticError(f"{error} after iteration {now.total}; {safe}") from error
         safe = f"the one of iteration {now.total} is whole, {goes_on}"

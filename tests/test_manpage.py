@@ -40,12 +40,13 @@ def test_every_option_is_in_its_command_section(name, capsys):
 
 def test_sections_in_the_usual_order():
     heads = re.findall(r"^\.SH (.*)$", manpage.build(), re.M)
-    assert heads == ["NAME", "SYNOPSIS", "DESCRIPTION", "COMMANDS", "FILES", "ORIENTATION", "EXIT STATUS", "ENVIRONMENT",
+    assert heads == ["NAME", "SYNOPSIS", "DESCRIPTION", "COMMANDS", "FILES", "ORIENTATION", "THE SAME AGAIN",
+                     "COMPLETION", "EXIT STATUS", "ENVIRONMENT",
                      "EXAMPLES"]
 
 
 def test_no_line_is_taken_for_a_request_by_accident():
-    known = {"TH", "SH", "SS", "TP", "PP", "B", "I", "RI", "IR", "BR", "nf", "fi"}
+    known = {"TH", "SH", "SS", "TP", "PP", "B", "I", "RI", "IR", "BR", "BI", "nf", "fi"}
     requests = re.findall(r"^[.'](\S*)", manpage.build(), re.M)
     assert len(requests) > 100 and set(requests) <= known
 

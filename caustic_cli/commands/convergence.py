@@ -42,6 +42,7 @@ def run(
     force: options.Force = False,
     json: options.Json = False,
     quiet: options.Quiet = False,
+    progress: options.Progress = "auto",
     seed: options.Seed = None,
     device: options.Device = "auto",
     dtype: options.Dtype = None,
@@ -49,7 +50,7 @@ def run(
     debug: options.Debug = False,
 ) -> None:
     """Measure errors, and the time they took, for many settings in one run."""
-    began, say = time.monotonic(), console.Reporter(quiet)
+    began, say = time.monotonic(), console.Reporter(quiet, progress)
     if study not in STUDIES:
         raise InputError(f"--study must be one of {', '.join(STUDIES)}, got {study!r}")
     count = options.rays("--rays", rays) if rays else None
@@ -70,25 +71,25 @@ def run(
         report.refuse_foreign_files(report.paths_of(study, output, plots), force)
     opened = _open(project)
     with say.progress(None) as show:
-        def progress(done: int, whole: int) -> None:
+        def tell(done: int, whole: int) -> None:
             show(study, UNITS.get(study, "rays"), done, whole)
 
         if study == "intersection":
             case = (intersection.of_lens(*opened[1:], count, seed or 0) if opened else intersection.table_d3(count, seed or 0))
-            found = intersection.run_intersection(case, seed=seed or 0, repeats=repeats, progress=progress)
+            found = intersection.run_intersection(case, seed=seed or 0, repeats=repeats, progress=tell)
         elif study == "design":
             from caustic_cli import contest  # noqa: PLC0415
 
             scene, target, entries = contest.entries_of(opened[0] if opened else None, device, precision, seed)
             found = training.run_training(scene, target, entries, seconds=seconds, seed=seed or 0, rays=count, device=device,
-                                          progress=progress)
+                                          progress=tell)
         else:
             from caustic_cli.session import sphere  # noqa: PLC0415
             from caustic_cli.studies.convergence import run_study  # noqa: PLC0415
 
             scene, field, heights = opened[1:] if opened else sphere()
             found = run_study(study, scene, field, heights.to(device), seed=seed or 0, max_rays=count,
-                              repeats=3 if repeats is None else repeats, dtype=precision, progress=progress)
+                              repeats=3 if repeats is None else repeats, dtype=precision, progress=tell)
     paths = report.write(found, output)
     rows = [(name, "no order could be fitted" if order is None
              else f"error ~ {found.against}^-{order.exponent:.2f} (+-{order.deviation:.2f})")

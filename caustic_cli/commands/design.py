@@ -70,6 +70,7 @@ def run(
     force: options.Force = False,
     json: options.Json = False,
     quiet: options.Quiet = False,
+    progress: options.Progress = "auto",
     seed: options.Seed = None,
     device: options.Device = "auto",
     dtype: options.Dtype = None,
@@ -77,7 +78,7 @@ def run(
     debug: options.Debug = False,
 ) -> None:
     """Find the lens whose caustic is the picture TARGET."""
-    began, say = time.monotonic(), console.Reporter(quiet)
+    began, say = time.monotonic(), console.Reporter(quiet, progress)
     given = {
         **options.source(source, source_position, source_size, source_grid, source_angle, cone),
         ("lens", "size", "--lens-size"): lens_size and options.both(options.size("--lens-size", lens_size)),

@@ -37,7 +37,7 @@ def run(
     debug: options.Debug = False,
 ) -> None:
     """Write the lens of PROJECT in the format of another program."""
-    began = time.monotonic()
+    asked, began, say = locals(), time.monotonic(), console.Reporter(quiet)
     if format not in FORMATS:
         raise InputError(f"--format must be one of {', '.join(FORMATS)}, got {format!r}")
     grid = tuple(options.both(options.counts("--samples", samples))) if samples else None
@@ -46,15 +46,23 @@ def run(
     from caustic_cli.export.stl import write_stl  # noqa: PLC0415
     from caustic_cli.files import refuse_foreign  # noqa: PLC0415
     from caustic_cli.project import Project  # noqa: PLC0415
+    from caustic_cli.reuse import Outputs  # noqa: PLC0415
 
     opened = Project.open(project)
     path = output or Path(project.resolve().stem + FORMATS[format])
     refuse_foreign(path, force)
+    made = Outputs(opened, "export", asked, [path])
+    if not force and (found := made.found()):
+        say.say(f"{path}: is what the same options made of the same project, so there is nothing to do; --force does it again")
+        if json:
+            console.emit_json(found)
+        return
     scene = opened.scene()
     field, checkpoint = opened.lens(scene)
     write = {"lighttools": write_lighttools, "stl": write_stl}[format]
     write(path, scene, field, checkpoint.state.heights, grid)
-    size = path.stat().st_size
-    console.Reporter(quiet).say(f"{path}: {size:,} bytes")
+    figures = {"file": str(path), "format": format, "bytes": path.stat().st_size, "seconds": time.monotonic() - began}
+    made.keep(figures)
+    say.say(f"{path}: {figures['bytes']:,} bytes")
     if json:
-        console.emit_json({"file": str(path), "format": format, "bytes": size, "seconds": time.monotonic() - began})
+        console.emit_json(figures)

@@ -13,13 +13,16 @@ from caustic_cli.console import Reporter
 from caustic_cli.errors import InputError
 
 Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing on stderr but errors.")]
-Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", envvar="CAUSTIC_QUIET", help="Say nothing on stderr but errors.")]
+Debug = Annotated[bool, typer.Option("--debug", envvar="CAUSTIC_DEBUG", help="Show the traceback of an error.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace what is in the way.")]
-Seed = Annotated[int | None, typer.Option(help="Seed of every random number; the same seed gives the same bytes.  [default: 0]")]
-Device = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
-Dtype = Annotated[str | None, typer.Option(help="Precision of the rays: float32 or float64.")]
-Threads = Annotated[int | None, typer.Option(help="Threads to use; default: all cores.")]
+Seed = Annotated[int | None, typer.Option(envvar="CAUSTIC_SEED", help="Seed of every random number; the same seed gives the same"
+                                          " bytes.  [default: 0]")]
+Device = Annotated[str, typer.Option(envvar="CAUSTIC_DEVICE", help="auto, cpu or cuda.")]
+Dtype = Annotated[str | None, typer.Option(envvar="CAUSTIC_DTYPE", help="Precision of the rays: float32 or float64.")]
+Threads = Annotated[int | None, typer.Option(envvar="CAUSTIC_THREADS", help="Threads to use; default: all cores.")]
+Progress = Annotated[str, typer.Option(envvar="CAUSTIC_PROGRESS", metavar="auto|json", help="json: everything on stderr but errors"
+                                       " is JSON, one object a line, and the work's progress is among it.")]
 Project = Annotated[Path, typer.Argument(help="Project directory made by caustic design.", show_default=False)]
 
 

@@ -43,6 +43,7 @@ def run(
     force: options.Force = False,
     json: options.Json = False,
     quiet: options.Quiet = False,
+    progress: options.Progress = "auto",
     seed: options.Seed = None,
     device: options.Device = "auto",
     dtype: options.Dtype = None,
@@ -50,7 +51,7 @@ def run(
     debug: options.Debug = False,
 ) -> None:
     """Trace the lens of PROJECT; write the irradiance image and its figures."""
-    began, say = time.monotonic(), console.Reporter(quiet)
+    asked, began, say = locals(), time.monotonic(), console.Reporter(quiet, progress)
     count = options.rays("--rays", rays)
     if tolerance is not None and not 0 < tolerance < 100:
         raise InputError(f"--tolerance must be greater than 0 and less than 100, got {tolerance:g}")
@@ -62,6 +63,7 @@ def run(
     from caustic_cli.files import refuse_foreign  # noqa: PLC0415
     from caustic_cli.picture import write_image, write_npy  # noqa: PLC0415
     from caustic_cli.project import RENDER, Project  # noqa: PLC0415
+    from caustic_cli.reuse import Outputs  # noqa: PLC0415
     from caustic_cli.scene import Screen  # noqa: PLC0415
     from caustic_cli.studies.retrace import retrace, white_level  # noqa: PLC0415
 
@@ -70,6 +72,13 @@ def run(
     for path in (image_path, npy):
         if path is not None:
             refuse_foreign(path, force)
+    made = Outputs(opened, "render", asked, (image_path, npy))
+    if not force and (figures := made.found()):
+        say.say(f"{image_path}: is what the same options made of the same project, so there is nothing to do; --force does it"
+                " again")
+        if json:
+            console.emit_json(figures)
+        return
     scene = opened.scene(given)
     options.compile_for(scene, device, say)
     target = opened.target(scene)
@@ -92,6 +101,7 @@ def run(
     if npy is not None:
         write_npy(npy, image)
     figures |= {"iterations": checkpoint.state.total, "seconds": time.monotonic() - began, "image": str(image_path)}
+    made.keep(figures)
     say.table(f"{project}", console.figures_rows(figures))
     if json:
         console.emit_json(figures)

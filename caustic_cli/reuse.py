@@ -1,0 +1,126 @@
+"""The same inputs and options again are no work: what was made stays, and only its time stamps say that it was asked for.
+
+A design's inputs are remembered in its checkpoint, those of other outputs in the project's RECORD, each by its hash.  Outputs
+are touched, checkpoint first, so that make finds them newer than the files they were made from.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from caustic_cli import __version__, settings
+from caustic_cli.checkpoint import Checkpoint
+from caustic_cli.derive import Settings
+from caustic_cli.errors import CausticError, InputError
+from caustic_cli.files import write_bytes
+from caustic_cli.picture import Picture
+from caustic_cli.project import CHECKPOINT, RENDER, REPORT, Project, is_project
+
+RECORD = ".outputs.json"
+#: Options that say where and how loudly, not what.
+IRRELEVANT = ("project", "output", "force", "json", "quiet", "debug", "threads", "progress", "npy")
+
+
+def digest(full: Settings, *pictures: Picture | None) -> str:
+    """Hash of complete settings and the pictures they speak of; of another project to start from, its lens too."""
+    found = hashlib.sha256(f"{__version__}\n{settings.dump(full)}".encode())
+    for picture in filter(None, pictures):
+        found.update(f"{picture.values.shape}{picture.values.dtype}{picture.encoding}".encode())
+        found.update(np.ascontiguousarray(picture.values).tobytes())
+    start = Path(full["design"]["start"])
+    if is_project(start):
+        found.update(_hash(start / CHECKPOINT).encode())
+    return found.hexdigest()
+
+
+def inputs(project: Project) -> dict[str, str]:
+    """What a checkpoint remembers: `asked`, the digest of what the user gave, and `settings`, of what became of it."""
+    return {"asked": project.asked, "settings": digest(project.settings, project.picture, project.profile)}
+
+
+def asked_of(project: Project, checkpoint: Checkpoint) -> str:
+    """What a project's user gave, "" if it has been edited since."""
+    before = checkpoint.inputs
+    return before.get("asked", "") if inputs(project)["settings"] == before.get("settings") else ""
+
+
+def same_design(path: Path, asked: str) -> tuple[Project, Checkpoint] | None:
+    """The design at `path`, if it is one of what is `asked` again."""
+    if not is_project(path) or not (path / CHECKPOINT).exists():
+        return None
+    try:
+        project = Project.open(path)
+        checkpoint = project.load()
+    except InputError:  # damaged: whoever wants the place will say so
+        return None
+    return (project, checkpoint) if asked == asked_of(project, checkpoint) else None
+
+
+def finished(project: Project, checkpoint: Checkpoint) -> dict | None:
+    """The figures of a finished design whose files are all there, which are touched; None if something is left to do."""
+    files = [project.path / name for name in (CHECKPOINT, RENDER, REPORT)]
+    if not checkpoint.results or not all(p.exists() for p in files):
+        return None
+    _touch(files)
+    return checkpoint.results | {"image": str(project.path / RENDER), "project": str(project.path)}
+
+
+class Outputs:
+    """What a command writes from a project.
+
+    Args:
+        project: where from; command: the command's name; options: all it was called with, by name.
+        paths: the files it writes.
+    """
+
+    def __init__(self, project: Project, command: str, options: dict, paths: Iterable[Path | None]):
+        self.record, self.paths = project.path / RECORD, [p for p in paths if p is not None]
+        given = {k: str(v) for k, v in sorted(options.items()) if k not in IRRELEVANT}
+        inputs = [digest(project.settings, project.picture, project.profile), _hash(project.path / CHECKPOINT)]
+        self.asked = hashlib.sha256(json.dumps([command, given, inputs]).encode()).hexdigest()
+        self.key = " ".join(str(p.resolve()) for p in self.paths)
+
+    def found(self) -> dict | None:
+        """The figures of the time when the same was asked for, if every file is still what it was then; they are touched."""
+        held = self._held().get(self.key)
+        if not isinstance(held, dict) or held.get("asked") != self.asked or not isinstance(held.get("figures"), dict):
+            return None
+        if held.get("files") != [_hash(p) for p in self.paths]:
+            return None
+        _touch(self.paths)
+        return held["figures"]
+
+    def keep(self, figures: dict) -> None:
+        """Remember what was made."""
+        entry = {"asked": self.asked, "files": [_hash(p) for p in self.paths], "figures": figures}
+        with contextlib.suppress(CausticError):  # a project that cannot be written to has no memory; the output is there
+            write_bytes(self.record, json.dumps(self._held() | {self.key: entry}, indent=1).encode())
+
+    def _held(self) -> dict:
+        try:
+            held = json.loads(self.record.read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError):
+            return {}
+        return held if isinstance(held, dict) else {}
+
+
+def _hash(path: Path) -> str:
+    """sha256 of a file, "" if it cannot be read."""
+    try:
+        with open(path, "rb") as f:
+            return hashlib.file_digest(f, "sha256").hexdigest()
+    except OSError:
+        return ""
+
+
+def _touch(paths: Iterable[Path]) -> None:
+    for path in paths:
+        with contextlib.suppress(OSError):  # read-only: then make must run the command again, which costs little
+            os.utime(path)

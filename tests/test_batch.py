@@ -1,0 +1,208 @@
+"""Batch life: the same again is no work, progress a program can read, defaults from the environment, completion, make -j."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from caustic_cli import checkpoint, cli, session
+from caustic_cli.inverse.designer import Designer
+
+DESIGN = ["design", "blob.png", "--resolution", "16", "--control", "9", "--rays", "2000", "--start", "offset", "--iterations", "3",
+          "--threads", "1"]
+EXAMPLES = Path(__file__).parents[1] / "examples"
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(cli.__file__).parents[1])}
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    paint("blob.png", 5)
+    monkeypatch.setattr(session, "FINAL_RAYS", 5000)
+    monkeypatch.setattr(session, "write_report", lambda path, *rest: path.write_bytes(b"a report"))
+
+
+def paint(name, centre):
+    y, x = np.mgrid[0:16, 0:16]
+    Image.fromarray((40 + 200 * np.exp(-((x - centre) ** 2 + (y - 6) ** 2) / 15.0)).astype(np.uint8)).save(name)
+
+
+def run(arguments, capfd, code=0):
+    assert cli.run(list(map(str, arguments))) == code
+    return capfd.readouterr()
+
+
+def age(*paths):
+    for path in paths:
+        os.utime(path, (1000, 1000))
+
+
+def forbidden(*args, **options):
+    pytest.fail("worked although there was nothing to do")
+
+
+def interrupt(*args, **options):
+    raise KeyboardInterrupt
+
+
+# the same again
+
+
+def test_the_same_design_again_is_no_work(capfd, monkeypatch):
+    first, _ = run([*DESIGN, "--json"], capfd)
+    files = [Path("blob.caustic") / name for name in ("checkpoints.h5", "render.png", "report.png", "project.toml")]
+    before = [p.read_bytes() for p in files]
+    age(*files)
+    monkeypatch.setattr(Designer, "run", forbidden)
+    monkeypatch.setattr(session, "retrace", forbidden)
+    again, err = run([*DESIGN, "--json"], capfd)
+    assert again == first and "nothing to do" in err and "--force" in err
+    assert [p.read_bytes() for p in files] == before
+    stamps = [p.stat().st_mtime for p in files]
+    assert 1000 < stamps[0] <= stamps[1] <= stamps[2] and stamps[3] == 1000  # make finds them newer than the picture
+
+
+def test_force_designs_the_same_again(capfd):
+    run([*DESIGN, "--quiet"], capfd)
+    age("blob.caustic/checkpoints.h5")
+    _, err = run([*DESIGN, "--force"], capfd)
+    assert "nothing to do" not in err and os.path.getmtime("blob.caustic/checkpoints.h5") > 1000
+
+
+@pytest.mark.parametrize("change", ["option", "picture", "edited", "raised"])
+def test_another_design_is_refused_as_before(capfd, change):
+    run([*DESIGN, "--quiet"], capfd)
+    more = ["--mag", "2"] if change == "option" else []
+    if change == "picture":
+        paint("blob.png", 7)
+    if change == "edited":
+        path = Path("blob.caustic/project.toml")
+        path.write_text(path.read_text().replace("z = 300.0", "z = 301.0"))
+    if change == "raised":
+        run(["design", "--resume", "blob.caustic", "--iterations", "5", "--quiet"], capfd)
+    assert "holds a design already" in run([*DESIGN, *more], capfd, 2).err
+
+
+def test_an_unfinished_design_goes_on_when_it_is_asked_for_again(capfd, monkeypatch):
+    with monkeypatch.context() as patch:  # killed after its last iteration, before the verdict
+        patch.setattr(session, "_judge", interrupt)
+        assert run([*DESIGN, "--quiet"], capfd, 130).err == "caustic: interrupted\n"
+    assert not checkpoint.load(Path("blob.caustic/checkpoints.h5")).results
+    out, err = run([*DESIGN, "--json"], capfd)
+    assert "goes on from its checkpoint" in err and json.loads(out)["iterations"] == 3
+    Path("blob.caustic/render.png").unlink()  # and what is missing is made again
+    assert "goes on" in run(DESIGN, capfd).err and Path("blob.caustic/render.png").exists()
+    assert "nothing to do" in run(DESIGN, capfd).err
+
+
+def test_a_start_from_another_lens_is_an_input(capfd):
+    run([*DESIGN, "--quiet"], capfd)
+    second = [*DESIGN[:8], "--start", "blob.caustic", "--iterations", "1", "-o", "second.caustic", "--threads", "1"]
+    run(second, capfd)
+    assert "nothing to do" in run(second, capfd).err
+    run(["design", "--resume", "blob.caustic", "--iterations", "6", "--quiet"], capfd)
+    assert "holds a design already" in run(second, capfd, 2).err
+
+
+RENDER = ["render", "blob.caustic", "--rays", "3000", "-o", "a.png", "--npy", "a.npy", "--json"]
+EXPORT = ["export", "blob.caustic", "--samples", "9", "-o", "a.npz", "--json"]
+
+
+@pytest.mark.parametrize("command", [RENDER, EXPORT], ids=["render", "export"])
+def test_the_same_output_again_is_no_work(capfd, monkeypatch, command):
+    run([*DESIGN, "--quiet"], capfd)
+    first, err = run(command, capfd)
+    files = sorted(Path().glob("a.*"))
+    assert "nothing to do" not in err and files
+    age(*files)
+    with monkeypatch.context() as patch:
+        patch.setattr("caustic_cli.studies.retrace.retrace", forbidden)
+        patch.setattr("caustic_cli.export.lighttools.write_lighttools", forbidden)
+        again, err = run(command, capfd)
+    assert again == first and "nothing to do" in err and all(p.stat().st_mtime > 1000 for p in files)
+    assert "nothing to do" not in run([*command, "--force"], capfd).err
+    option = ["--seed", "4"] if command is RENDER else ["--samples", "8"]
+    assert "nothing to do" not in run([*command, *option], capfd).err
+    assert "nothing to do" not in run(command, capfd).err  # that was another file
+    for spoil in ("missing", "other bytes", "broken record"):
+        if spoil == "missing":
+            files[0].unlink()
+        elif spoil == "other bytes":
+            files[-1].write_bytes(files[-1].read_bytes()[:700] + files[-1].read_bytes()[701:] + b"caustic")
+        else:
+            Path("blob.caustic/.outputs.json").write_text('{"a": [1')
+        assert "nothing to do" not in run(command, capfd).err
+        assert "nothing to do" in run(command, capfd).err
+    text = Path("blob.caustic/project.toml").read_text()
+    Path("blob.caustic/project.toml").write_text(text.replace("z = 300.0", "z = 200.0"))
+    assert "nothing to do" not in run(command, capfd).err
+
+
+# progress
+
+
+def test_progress_as_json_lines(capfd):
+    out, err = run([*DESIGN, "--progress", "json", "--json"], capfd)
+    lines = [json.loads(line) for line in err.splitlines()]
+    assert json.loads(out)["iterations"] == 3
+    steps = [line for line in lines if line["event"] == "progress"]
+    assert steps and steps[-1]["done"] == steps[-1]["total"] == 3 and "loss" in steps[-1]["text"] and steps[-1]["seconds"] >= 0
+    assert {line["event"] for line in lines} == {"message", "progress", "result"}
+    assert run([*DESIGN, "--progress", "json", "--quiet", "--force"], capfd).err == ""
+    assert "--progress" in run([*DESIGN, "--progress", "moon"], capfd, 2).err
+
+
+# the environment
+
+
+def test_defaults_from_the_environment(capfd, monkeypatch):
+    monkeypatch.setenv("CAUSTIC_DESIGN_MAG", "2")
+    monkeypatch.setenv("CAUSTIC_DESIGN_LINEAR", "1")
+    monkeypatch.setenv("CAUSTIC_SEED", "7")
+    monkeypatch.setenv("CAUSTIC_QUIET", "1")
+    assert run([*DESIGN, "--seed", "8"], capfd).err == ""
+    text = Path("blob.caustic/project.toml").read_text()
+    assert "size = [20.0, 20.0]" in text and 'encoding = "linear"' in text and "seed = 8" in text  # the command line wins
+    run([*DESIGN, "-o", "other"], capfd)
+    assert "seed = 7" in Path("other/project.toml").read_text()
+    monkeypatch.setenv("CAUSTIC_DESIGN_MAG", "three")
+    err = run(DESIGN, capfd, 2).err
+    assert "--mag" in err and err.count("\n") == 1
+
+
+# the shell and make
+
+
+def test_completion_is_installed_and_completes(tmp_path):
+    home = tmp_path / "home"
+    home.mkdir()
+    done = subprocess.run([sys.executable, "-m", "caustic_cli", "--install-completion", "bash"], check=True, text=True,
+                          capture_output=True, env={**ENVIRONMENT, "HOME": str(home)})
+    assert "installed" in done.stdout and (home / ".bash_completions" / "caustic.sh").exists()
+    asked = {"_CAUSTIC_COMPLETE": "complete_bash", "COMP_WORDS": "caustic render --screen", "COMP_CWORD": "2"}
+    done = subprocess.run([sys.executable, "-m", "caustic_cli"], check=True, text=True, capture_output=True,
+                          env=ENVIRONMENT | asked)
+    assert done.stdout.split() == ["--screen-at"]
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+def test_make_gives_each_of_several_jobs_one_thread():
+    for name in ("Makefile", "flame.png", "flame.toml", "ball.png", "ball.toml", "tophat.png", "tophat.toml"):
+        shutil.copy(EXAMPLES / name, name)
+    Path("caustic").write_text("#!/bin/sh\necho \"$@\" >> log\nmkdir -p \"${2%.png}.caustic\"\n"
+                               "[ $1 = design ] && touch ${2%.png}.caustic/checkpoints.h5 || touch $2/render.png\n")
+    Path("caustic").chmod(0o755)
+    for jobs, expected in ((["-j2"], True), ([], False)):
+        subprocess.run(["make", *jobs, "CAUSTIC=./caustic"], check=True, capture_output=True)
+        said = Path("log").read_text().splitlines()
+        assert len(said) == 6 and all(("--threads 1" in line) == expected for line in said)
+        Path("log").unlink()
+        done = subprocess.run(["make", *jobs, "CAUSTIC=./caustic"], check=True, capture_output=True, text=True)
+        assert "Nothing to be done" in done.stdout
+        subprocess.run(["make", "clean"], check=True, capture_output=True)
