@@ -21,6 +21,7 @@ from caustic_cli.checkpoint import Checkpoint
 from caustic_cli.console import Reporter
 from caustic_cli.derive import build_options, build_stages, complete
 from caustic_cli.errors import CausticError, InputError, Interrupted
+from caustic_cli.inverse import ranks
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.first import first_surface
 from caustic_cli.optics.heightfield import HeightField
@@ -146,6 +147,21 @@ def resume(project: Project, iterations: int | None, time_limit: float | None, d
         return _run(project, designer, target, state, say, began, iterations, time_limit, device)
 
 
+def follow(device: str) -> None:
+    """What every rank but the first does: design along with it, reading, deciding and writing nothing."""
+    with _signals():  # the first rank's to answer
+        while task := ranks.hear():
+            *parts, state, limit = task
+            project = Project(Path(), *parts)
+            _designer(project, device)[0].run(state, iterations=project.settings["design"]["iterations"], time_limit=limit)
+
+
+def _on_cpu(state: State) -> State:
+    """A state that can be sent."""
+    return replace(state, heights=state.heights.cpu(), parameters={k: v.cpu() for k, v in state.parameters.items()},
+                   optimizer={k: v.cpu() for k, v in state.optimizer.items()})
+
+
 def sphere() -> tuple[Scene, HeightField, torch.Tensor]:
     """The lens a design begins from when nothing but defaults is said, its field and heights."""
     full = complete({}, 1.0)
@@ -245,6 +261,7 @@ def _run(project: Project, designer: Designer, target: np.ndarray, state: State,
                 keep(now)
 
         keep(state)
+        ranks.tell((project.settings, project.picture, project.profile, _on_cpu(state), limit))
         state = designer.run(state, iterations=chosen["iterations"], time_limit=limit, stop=lambda: bool(asked),
                              on_iteration=on_iteration)
         keep(state)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from pathlib import Path
 from typing import Annotated
@@ -78,7 +79,8 @@ def run(
     debug: options.Debug = False,
 ) -> None:
     """Find the lens whose caustic is the picture TARGET."""
-    began, say = time.monotonic(), console.Reporter(quiet, progress)
+    speaks = os.environ.get("RANK", "0") == "0"  # under torchrun, the first of all
+    began, say = time.monotonic(), console.Reporter(quiet or not speaks, progress)
     given = {
         **options.source(source, source_position, source_size, source_grid, source_angle, cone),
         ("lens", "size", "--lens-size"): lens_size and options.both(options.size("--lens-size", lens_size)),
@@ -109,30 +111,35 @@ def run(
         raise InputError(f"--iterations must be a whole number 1 to 1e9, got {iterations}")
     if time_limit is not None and not time_limit > 0:
         raise InputError(f"--time-limit must be greater than 0 s, got {time_limit:g}")
-    if not resume:
+    if not resume and speaks:
         from caustic_cli.picture import read_picture  # noqa: PLC0415
 
         read_picture(target, linear)  # before torch is loaded and kernels are compiled for nothing
     device = options.start_torch(device, threads, say)
 
     from caustic_cli import session  # noqa: PLC0415
+    from caustic_cli.inverse import ranks  # noqa: PLC0415
 
-    if resume:
-        names = [key[2] for key in given if key[2] not in ("--iterations", "--time-limit")]
-        names += [f"--{k}" for k, v in shaped.items() if v is not None]
-        names += [n for n, v in (("--screen-size", screen), ("--resolution", pixels), ("--config", config)) if v is not None]
-        if names:
-            raise InputError(f"--resume goes on with a project as it is, so {', '.join(names)} cannot be given;"
-                             " --iterations and --time-limit can, and project.toml can be edited")
-        project = session.find(target, out)
-        options.compile_for(project.scene(), device, say)
-        figures = session.resume(project, iterations, time_limit, device, say, began)
-    else:
-        with say.patience("solving the transport of the light to the picture; the first time, its kernels are compiled, which"
-                          " takes about half a minute"):
-            project, first = session.begin(target, out, given, screen, pixels, shaped, config, force)
-        options.compile_for(project.scene(), device, say)
-        figures = session.design(project, first, device, say, began)
+    with ranks.together(device) as rank:
+        if rank > 0:
+            session.follow(device)
+            return
+        if resume:
+            names = [key[2] for key in given if key[2] not in ("--iterations", "--time-limit")]
+            names += [f"--{k}" for k, v in shaped.items() if v is not None]
+            names += [n for n, v in (("--screen-size", screen), ("--resolution", pixels), ("--config", config)) if v is not None]
+            if names:
+                raise InputError(f"--resume goes on with a project as it is, so {', '.join(names)} cannot be given;"
+                                 " --iterations and --time-limit can, and project.toml can be edited")
+            project = session.find(target, out)
+            options.compile_for(project.scene(), device, say)
+            figures = session.resume(project, iterations, time_limit, device, say, began)
+        else:
+            with say.patience("solving the transport of the light to the picture; the first time, its kernels are compiled, which"
+                              " takes about half a minute"):
+                project, first = session.begin(target, out, given, screen, pixels, shaped, config, force)
+            options.compile_for(project.scene(), device, say)
+            figures = session.design(project, first, device, say, began)
     say.table(str(project.path), [*console.figures_rows(figures), ("ended by", figures["reason"])])
     if json:
         console.emit_json(figures)

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import CausticError, InputError
+from caustic_cli.inverse import ranks
 from caustic_cli.inverse.lbfgs import LBFGS
 from caustic_cli.inverse.losses import NoLight, parse
 from caustic_cli.inverse.objective import Objective
@@ -157,10 +158,11 @@ class Designer:
             if self._flat(state, stage.tolerance):
                 state.reason = "no progress"
                 return True
-            if state.total >= limit or stop():
-                state.reason = "interrupted" if stop() else "iterations"
+            asked, late = (ranks.agree(said, self.device) for said in (stop(), time.monotonic() >= deadline))
+            if state.total >= limit or asked:
+                state.reason = "interrupted" if asked else "iterations"
                 return False
-            if time.monotonic() >= deadline and (state.iteration > 0 or final):
+            if late and (state.iteration > 0 or final):
                 state.reason = "time limit"
                 return not final
             if method is None:

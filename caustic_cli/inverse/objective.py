@@ -112,7 +112,9 @@ class Objective:
             self.chunk, self.kept = smaller(self.chunk, problem), None
 
     def _evaluate(self, heights: Tensor) -> Evaluation:
-        heights = heights.detach().to(self.device).requires_grad_()
+        heights = heights.detach().to(self.device).clone()
+        ranks.share(heights)
+        heights.requires_grad_()
         single = self.kept is not None and len(self.kept) == 1
         penalty = self.penalty(heights) if self.penalty else torch.zeros((), device=self.device)
         image = torch.zeros(self.loss.target.shape, dtype=torch.float64, device=self.device)

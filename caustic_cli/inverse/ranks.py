@@ -1,35 +1,50 @@
 """One design by several processes (`torchrun`): each rank traces its part of the rays, and images and gradients are summed.
 
-All ranks walk through the same design with the same numbers; only what they trace differs.  So whatever depends on a clock or
-on a signal is decided by rank 0 for all.  In a single process every function here does nothing.
+Rank 0 reads, decides, writes and speaks.  The others hear from it what is to be designed and walk through the same loop with
+the same numbers; only what they trace differs.  Whatever depends on a clock or a signal is rank 0's to say.  In a single
+process every function here does nothing.
 """
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from caustic_cli.errors import CausticError
+from caustic_cli.errors import CausticError, Interrupted
 
 
-def join(device: str) -> None:
-    """Meet the other ranks if torchrun started this process: over gloo on CPUs, over nccl on GPUs, one for each rank."""
+@contextmanager
+def together(device: str) -> Iterator[int]:
+    """Meet the other ranks if torchrun started this process, over gloo on CPUs and nccl on GPUs; gives the rank.
+
+    Rank 0 lets the others go when its block ends; when it fails, they learn it from their next sum.
+    """
     if int(os.environ.get("WORLD_SIZE", "1")) == 1 or "MASTER_ADDR" not in os.environ:
+        yield 0
         return
     if not dist.is_available():
         raise CausticError("this torch was built without torch.distributed, which torchrun needs")
     if device == "cuda":
         torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")) % torch.cuda.device_count())
     dist.init_process_group("nccl" if device == "cuda" else "gloo")
+    rank = dist.get_rank()
+    try:
+        yield rank
+    except Interrupted:
+        _say_goodbye(rank)
+        raise
+    _say_goodbye(rank)
 
 
-def leave() -> None:
-    """Part from the other ranks."""
-    if place()[1] > 1:
-        dist.destroy_process_group()
+def _say_goodbye(rank: int) -> None:
+    if rank == 0:
+        tell(None)
+    dist.destroy_process_group()
 
 
 def place() -> tuple[int, int]:
@@ -39,18 +54,30 @@ def place() -> tuple[int, int]:
     return 0, 1
 
 
+def tell(task) -> None:
+    """Rank 0: what the others are to do (`hear`), None for nothing more."""
+    if place()[1] > 1:
+        _call(dist.broadcast_object_list, [task], 0)
+
+
+def hear():
+    """The other ranks: what rank 0 tells."""
+    task = [None]
+    _call(dist.broadcast_object_list, task, 0)
+    return task[0]
+
+
 def add(*tensors: Tensor) -> None:
     """Replace each tensor by its sum over all ranks; every rank gets the same bits."""
     if place()[1] > 1:
         for tensor in tensors:
-            dist.all_reduce(tensor)
+            _call(dist.all_reduce, tensor)
 
 
-def share(*tensors: Tensor) -> None:
-    """Replace each tensor by that of rank 0."""
+def share(tensor: Tensor) -> None:
+    """Replace a tensor by that of rank 0."""
     if place()[1] > 1:
-        for tensor in tensors:
-            dist.broadcast(tensor, 0)
+        _call(dist.broadcast, tensor, 0)
 
 
 def agree(answer: bool, device: str | torch.device = "cpu") -> bool:
@@ -58,5 +85,13 @@ def agree(answer: bool, device: str | torch.device = "cpu") -> bool:
     if place()[1] == 1:
         return answer
     said = torch.tensor(int(answer), device=device)
-    dist.broadcast(said, 0)
+    share(said)
     return bool(said)
+
+
+def _call(collective, *arguments) -> None:
+    try:
+        collective(*arguments)
+    except RuntimeError as error:
+        raise CausticError(f"rank {dist.get_rank()}: another rank has stopped, and what it said tells why"
+                           f" ({str(error).splitlines()[0][:200]})") from error
