@@ -17,6 +17,8 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import subprocess
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -34,6 +36,13 @@ FORMAT_VERSION = 1
 HISTORY = ("iteration", "stage", "loss", "on_screen", "seconds")
 #: Length of the block before the data, the least that HDF5 allows; and what an HDF5 file without one begins with.
 SEAL, SIGNATURE = 512, b"\x89HDF\r\n\x1a\n"
+#: Reads every attribute of a file, then says its version.
+PROBE = """
+import sys, h5py
+with h5py.File(sys.argv[1], "r") as f:
+    f.visititems(lambda name, item: [*item.attrs.values()] and None)
+    print([*f.attrs.values()] and int(f.attrs["format_version"]))
+"""
 
 
 @dataclass(frozen=True)
@@ -48,10 +57,6 @@ class Checkpoint:
     provenance: dict
     results: dict
     inputs: dict = field(default_factory=dict)
-
-
-class _Refused(InputError):
-    """A checkpoint of a later version, or with a checksum that is not its own."""
 
 
 def save(path: Path, checkpoint: Checkpoint) -> None:
@@ -89,12 +94,32 @@ def seal(image: bytes) -> bytes:
     return f"caustic checkpoint, HDF5 from byte {SEAL}, sha256 {hashlib.sha256(image).hexdigest()}\n".encode().ljust(SEAL)
 
 
+class _Newer(InputError):
+    """A checkpoint of a later version."""
+
+    def __init__(self, path: Path, version: int):
+        super().__init__(f"{path}: has format version {version}; this caustic {__version__} reads up to {FORMAT_VERSION}")
+
+
+def _version(path: Path) -> int:
+    """Format version of a file that no checksum vouches for, 0 if it cannot be read; all its attributes are read in passing.
+
+    In a process of its own: HDF5's library may crash over a damaged file.
+    """
+    try:
+        done = subprocess.run([sys.executable, "-P", "-c", PROBE, str(path.absolute())], capture_output=True, text=True,
+                              timeout=60, check=False)
+        return int(done.stdout) if done.returncode == 0 else 0
+    except (OSError, ValueError, subprocess.SubprocessError):
+        return 0
+
+
 def _read(f: h5py.File, name: str) -> np.ndarray:
     """A dataset that lies in the file as it is: none elsewhere, none that grows when it is read."""
     made = f[name].id.get_create_plist()
     if made.get_external_count() or made.get_layout() not in (h5py.h5d.CONTIGUOUS, h5py.h5d.COMPACT):
         raise ValueError(f"layout of {name}")
-    if f[name].nbytes > f.id.get_filesize():
+    if f[name].dtype.kind not in "fiub" or f[name].nbytes > f.id.get_filesize():
         raise ValueError(f"size of {name}")
     return np.asarray(f[name][()])
 
@@ -111,14 +136,18 @@ def load(path: Path) -> Checkpoint:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    if data[:SEAL] != seal(data[SEAL:]):
+        version = _version(path)
+        if version > FORMAT_VERSION:
+            raise _Newer(path, version)
+        if version == 0 or not data.startswith(SIGNATURE):
+            raise InputError(f"{path}: is damaged (its checksum is not that of its content) or not a caustic checkpoint; a whole"
+                             " checkpoints.h5 is needed")
     try:
-        whole = data.startswith(SIGNATURE) or data[:SEAL] == seal(data[SEAL:])
         with h5py.File(io.BytesIO(data), "r") as f:
             version = int(f.attrs["format_version"])
             if version > FORMAT_VERSION:
-                raise _Refused(f"{path}: has format version {version}; this caustic {__version__} reads up to {FORMAT_VERSION}")
-            if not whole:
-                raise _Refused(f"{path}: is damaged (its checksum is not that of its content); a whole checkpoints.h5 is needed")
+                raise _Newer(path, version)
             if f.visititems_links(lambda name, link: None if isinstance(link, h5py.HardLink) else name):
                 raise ValueError("link")
             rows = _read(f, "history")
@@ -139,7 +168,7 @@ def load(path: Path) -> Checkpoint:
             if not all(isinstance(table, dict) for table in tables):
                 raise ValueError("tables")
             checkpoint = Checkpoint(state, spaces, *tables)
-    except _Refused:
+    except _Newer:
         raise
     except Exception as error:  # what a broken file makes HDF5 stumble over may be anything
         raise InputError(f"{path}: is damaged or not a caustic checkpoint ({type(error).__name__});"
