@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from caustic_cli import checkpoint, cli, files, place, session
+from caustic_cli import checkpoint, cli, files, place, session, verdict
 from caustic_cli.errors import CausticError
 from caustic_cli.inverse import objective
 from caustic_cli.inverse.objective import Objective
@@ -31,8 +31,8 @@ def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     y, x = np.mgrid[0:16, 0:16]
     Image.fromarray((40 + 200 * np.exp(-((x - 5) ** 2 + (y - 6) ** 2) / 15.0)).astype(np.uint8)).save("blob.png")
-    monkeypatch.setattr(session, "FINAL_RAYS", 5000)
-    monkeypatch.setattr(session, "write_report", lambda *args: None)
+    monkeypatch.setattr(verdict, "FINAL_RAYS", 5000)
+    monkeypatch.setattr(verdict, "write_report", lambda *args: None)
 
 
 def run(arguments, capfd, code):
@@ -51,8 +51,8 @@ def content(folder) -> dict:
 
 FULL = """
 import json, resource, sys
-from caustic_cli import cli, session
-session.FINAL_RAYS, session.write_report = 5000, lambda *args: None
+from caustic_cli import cli, session, verdict
+verdict.FINAL_RAYS, verdict.write_report = 5000, lambda *args: None
 resource.setrlimit(resource.RLIMIT_FSIZE, (9000, 9000))  # writing beyond fails as on a full disk
 for arguments in json.load(sys.stdin):
     print(cli.run(arguments), flush=True)
@@ -155,13 +155,13 @@ def test_one_design_at_a_time_holds_a_project(capfd, monkeypatch):
             assert "another caustic design is at work there" in run(arguments, capfd, 2)
         assert content("blob.caustic") == before
         run(["export", "blob.caustic", "--quiet"], capfd, 0)  # to look is allowed
-    judged = session._judge
+    judged = session.judge
 
     def judge(*arguments):
         inner.append(cli.run(["design", "--resume", str(arguments[0].path), "--quiet"]))
         return judged(*arguments)
 
-    monkeypatch.setattr(session, "_judge", judge)
+    monkeypatch.setattr(session, "judge", judge)
     for arguments in ([*DESIGN, "-o", "fresh"], [*DESIGN, "--force"], ["design", "--resume", "fresh", "--quiet"]):
         assert cli.run(arguments) == 0
     assert inner == [2, 2, 2]

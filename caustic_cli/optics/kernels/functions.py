@@ -141,6 +141,7 @@ def _splat(nets, rows, apart: bool, rays, lens: Lens, height: float, start, scre
     arguments = (*rays, np.array(real, np.float64), np.array(whole, np.int64))
     padded, leaving, ledger = _Image.apply(*nets, rows, apart, arguments, workspace)
     (nx, ny), (rx, ry) = screen.resolution, filter.reach
+    padded = padded[:, : ny + 4 * ry]  # beyond lies what rounds the scatter's steps up to four pixels
     image = padded[2 * rx : 2 * rx + nx, 2 * ry : 2 * ry + ny]
     lost = {"missed_surface": ledger[plane.MISSED]} if slanted else {}
     return image, leaving, lost | {"fresnel": ledger[plane.FRESNEL], "total_internal_reflection": ledger[plane.REFLECTED],
@@ -218,8 +219,9 @@ class _Image(torch.autograd.Function):
 def _images(arguments: tuple, workspace: _Workspace) -> tuple[np.ndarray, np.ndarray]:
     """Images and scratch of all blocks, to be overwritten."""
     x, whole, count = arguments[0], arguments[-1], blocks()
-    padded = (int(n + 2 * (v - 1)) for n, v in zip(whole[1:3], whole[4:6], strict=True))
-    return workspace("images", count, *padded), workspace("scratch", count, int(plane.scratch_rows(whole)), x.shape[1])
+    nx, ny = (int(n + 2 * (v - 1)) for n, v in zip(whole[1:3], whole[4:6], strict=True))
+    images = workspace("images", count, nx, ny + int(-whole[5] % 4))
+    return images, workspace("scratch", count, int(plane.scratch_rows(whole)), x.shape[1])
 
 
 def _arrays(*tensors: Tensor) -> list[np.ndarray]:
