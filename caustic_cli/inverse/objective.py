@@ -79,6 +79,11 @@ class Objective:
             except (MemoryError, RuntimeError) as error:
                 self.chunk = smaller(self.chunk, error)
 
+    @property
+    def whole(self) -> bool:
+        """Whether chunks keep their graphs: a kernel's holds the net or the surface at its rays, plain torch's every step."""
+        return self.kept is not None and (len(self.kept) == 1 or all(t.kernel is not None for t in self.kept))
+
     def _pool(self, image: Tensor) -> Tensor:
         """Pixels of the screen from those of the render."""
         k, (n, m) = self.oversample, image.shape
@@ -97,7 +102,7 @@ class Objective:
 
         The loss sees rays through the image alone.  So the image is accumulated chunk by chunk, the loss gives its
         derivative by the image, and each chunk is traced again to pull that back: memory does not grow with rays.
-        A single chunk keeps its graph instead of being traced again.  Where memory runs out, smaller chunks are tried.
+        Where there is little to keep, the graph is kept instead of tracing again.  Where memory runs out, smaller chunks are tried.
 
         Raises:
             CausticError: out of memory, or no light reaches the screen.
@@ -115,15 +120,14 @@ class Objective:
         heights = heights.detach().to(self.device).clone()
         ranks.share(heights)
         heights.requires_grad_()
-        single = self.kept is not None and len(self.kept) == 1
         penalty = self.penalty(heights) if self.penalty else torch.zeros((), device=self.device)
         image = torch.zeros(self.loss.target.shape, dtype=torch.float64, device=self.device)
         leaving, parts = torch.zeros((), dtype=torch.float64, device=self.device), []
-        with torch.set_grad_enabled(single):
+        with torch.set_grad_enabled(self.whole):
             for traced in self.kept or self._tracers():
                 part = self._see(traced, heights)
                 image, leaving = image + part[0].detach().double(), leaving + part[1].detach().double()
-                if single:
+                if self.whole:
                     parts.append(part)
         ranks.add(image, leaving)
         image, leaving = image.requires_grad_(), leaving.requires_grad_()
