@@ -13,7 +13,8 @@ from scipy.interpolate import BSpline, RectBivariateSpline
 from caustic_cli import __version__
 from caustic_cli.errors import InputError
 from caustic_cli.export.lighttools import write_lighttools
-from caustic_cli.export.stl import TRIANGLE, solid, write_stl
+from caustic_cli.export.mesh import solid
+from caustic_cli.export.stl import TRIANGLE, write_stl
 from caustic_cli.export.surface import STEPS_PER_SPAN, sample_grid
 from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.optics.sampling import Sample
