@@ -32,6 +32,7 @@ from caustic_cli.scene import Scene
 from caustic_cli.scene.source import blur_limit
 from caustic_cli.studies.panels import write_report
 from caustic_cli.studies.retrace import FINAL_RAYS, retrace, white_level
+from caustic_cli.surfaces import SUFFIXES, onto, read_surface
 
 #: Points along each side of the aperture at which the report draws the surface.
 REPORT_SAMPLES = 401
@@ -147,10 +148,10 @@ def _designer(project: Project, device: str) -> tuple[Designer, np.ndarray]:
 
 
 def _first_heights(project: Project) -> torch.Tensor | None:
-    """Heights of the transport start or of --start PROJECT on the first stage's net, or None for the offset surface.
+    """Heights of the transport start or of --start on the first stage's net, or None for the offset surface.
 
     Raises:
-        InputError: no such project, its lens is of another size, or transport cannot reach the picture.
+        InputError: no such project or surface, its lens is of another size, or transport cannot reach the picture.
     """
     start = project.settings["design"]["start"]
     if start == "offset":
@@ -158,16 +159,18 @@ def _first_heights(project: Project) -> torch.Tensor | None:
     if start == "transport":
         designer, target = _designer(project, "cpu")
         return first_surface(designer.scene, target, designer.field(0))
+    net = _designer(project, "cpu")[0].field(0)
+    if Path(start).suffix.lower() in SUFFIXES and not Path(start).is_dir():
+        return onto(*read_surface(start, net.half_size), net)
     if not is_project(Path(start)):
-        raise InputError(f"[design] start must be transport, offset or a project directory, got {start!r}")
+        raise InputError("[design] start must be transport, offset, a project directory or a lens surface"
+                         f" ({', '.join(SUFFIXES)}), got {start!r}")
     other = Project.open(start)
     field, checkpoint = other.lens(other.scene())
     if other.settings["lens"]["size"] != project.settings["lens"]["size"]:
         raise InputError(f"[design] start: the lens of {start} is {other.settings['lens']['size']} mm, not"
                          f" {project.settings['lens']['size']} mm")
-    net = _designer(project, "cpu")[0].field(0)
-    tu, tv = (a.change_of_basis(b) for a, b in zip(field.spaces, net.spaces, strict=True))
-    return tu @ checkpoint.state.heights @ tv.T
+    return onto(field, checkpoint.state.heights, net)
 
 
 def _make_room(full: dict, said: dict, first: torch.Tensor) -> bool:

@@ -83,7 +83,7 @@ SCHEMA: dict[str, dict[str, Key]] = {
         "initial": Key("text", "parameters at first: zero, uniform (+-1e-4) or random"),
         "preconditioner": Key("text", "none or laplacian"),
         "filter_target": Key("flag", "filter the target as the render is filtered"),
-        "start": Key("text", "transport, offset, or the project whose lens was the first surface"),
+        "start": Key("text", "transport, offset, or the project or file whose lens was the first surface"),
         "iterations": Key("whole", "in all; 0: what the stages say"),
         "time_limit": Key("number", "s; inf for none"),
         "checkpoint_every": Key("number", "s between checkpoints"),

@@ -47,9 +47,10 @@ def run(
     max_slope: Annotated[float | None, typer.Option(help="Limit of the surface's slope, mm per mm.  [default: none]")] = None,
     linear: Annotated[bool, typer.Option("--linear", help="Pixel values are irradiance as they are, not sRGB-encoded.")] = False,
     flip: Annotated[Text, typer.Option(metavar="x|y|xy", help="Mirror the picture, for a viewer on the lens' side.")] = None,
-    start: Annotated[Text, typer.Option(metavar="transport|offset|PROJECT", help="First surface: by optimal transport of the"
+    start: Annotated[Text, typer.Option(metavar="transport|offset|PROJECT|FILE", help="First surface: by optimal transport of the"
                                         " light to the picture, the sphere that follows from --mag, or the lens of another"
-                                        " project.  [default: transport; offset for a network, adam, several"
+                                        " project or of a file: .npz or .step as exported, .npy of heights in mm."
+                                        "  [default: transport; offset for a network, adam, several"
                                         " points or a small net]")] = None,
     quality: Annotated[Text, typer.Option(help="draft, standard or fine.  [default: standard]")] = None,
     rays: Annotated[Text, typer.Option(metavar="N", help="Rays of the last stage.  [default: by quality]")] = None,

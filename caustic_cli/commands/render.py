@@ -21,7 +21,8 @@ EXAMPLES = """Examples:
 
 
 def run(
-    project: options.Project,
+    project: Annotated[Path, typer.Argument(help="Project directory made by caustic design, or an .npz made by caustic export.",
+                                            show_default=False)],
     rays: Annotated[str, typer.Option(metavar="N", help="Number of rays, independent of those of the design.")] = "1000000",
     tolerance: Annotated[float | None, typer.Option(metavar="ERROR", help="Add rays until the image's noise, estimated,"
                                                     " is below this relative RMS; --rays is where it begins.")] = None,
@@ -65,15 +66,27 @@ def run(
     from caustic_cli.scene import Screen  # noqa: PLC0415
     from caustic_cli.studies.retrace import retrace, white_level  # noqa: PLC0415
 
-    opened = Project.open(project)
-    image_path = output or project / RENDER
+    opened = archive = None
+    if project.suffix.lower() == ".npz" and project.is_file():
+        from caustic_cli.archive import open_archive  # noqa: PLC0415
+
+        archive = open_archive(project)
+        if given:
+            raise InputError(f"{next(iter(given))[2]}: an archive's source is fixed; render its project under another light")
+    else:
+        opened = Project.open(project)
+    image_path = output or (project / RENDER if opened else Path(project.stem + ".png"))
     for path in (image_path, npy):
         if path is not None:
             refuse_foreign(path, force)
-    scene = opened.scene(given)
+    if opened:
+        scene = opened.scene(given)
+        target, (field, checkpoint) = opened.target(scene), opened.lens(scene)
+        heights, iterations = checkpoint.state.heights, checkpoint.state.total
+        encoding, own_seed = opened.settings["target"]["encoding"], opened.settings["design"]["seed"]
+    else:
+        (scene, field, heights), target, iterations, encoding, own_seed = archive, None, None, "srgb", 0
     options.compile_for(scene, device, say)
-    target = opened.target(scene)
-    field, checkpoint = opened.lens(scene)
     screen = scene.screen
     if screen_at is not None:
         screen = Screen(screen.size, screen_at, screen.resolution)
@@ -82,16 +95,15 @@ def run(
     filter = filter_from(reconstruction, size, screen, alpha)
     try:
         exposure, figures = retrace(
-            scene, field, checkpoint.state.heights, target, rays=count, filter=filter, screen=screen, device=device,
-            seed=opened.settings["design"]["seed"] if seed is None else seed, dtype=options.dtype_of(dtype or "float64"),
-            tolerance=tolerance)
+            scene, field, heights, target, rays=count, filter=filter, screen=screen, device=device,
+            seed=own_seed if seed is None else seed, dtype=options.dtype_of(dtype or "float64"), tolerance=tolerance)
     except InputError as error:
         raise InputError(str(error).replace("[screen] z", "--screen-at") if screen_at is not None else str(error)) from error
     image = exposure.image.cpu().numpy()
-    write_image(image_path, image, white_level(image, target), opened.settings["target"]["encoding"])
+    write_image(image_path, image, white_level(image, target), encoding)
     if npy is not None:
         write_npy(npy, image)
-    figures |= {"iterations": checkpoint.state.total, "seconds": time.monotonic() - began, "image": str(image_path)}
+    figures |= {"iterations": iterations, "seconds": time.monotonic() - began, "image": str(image_path)}
     say.table(f"{project}", console.figures_rows(figures))
     if json:
         console.emit_json(figures)

@@ -98,20 +98,18 @@ def judge(exposure: Exposure, target) -> dict:
 
     Args:
         exposure: a traced image; eq. 5.2.1 asks for bincount reconstruction.
-        target: (n_x, n_y), any scale.
+        target: (n_x, n_y), any scale, or None where there is none: what compares with it is None then.
 
     Returns:
         loss, relative_rms, psnr_db, ssim (None where undefined), on_screen, on_target, lost (name -> part of the
         source's power; with on_screen they sum to 1) and rays.
     """
     image = exposure.image
+    against = (loss, relative_rms, psnr_db, ssim)
     return {
-        "loss": loss(image, target),
-        "relative_rms": relative_rms(image, target),
-        "psnr_db": psnr_db(image, target),
-        "ssim": ssim(image, target),
+        **{figure.__name__: None if target is None else figure(image, target) for figure in against},
         "on_screen": float(_array(image).sum()),
-        "on_target": on_target(image, target),
+        "on_target": None if target is None else on_target(image, target),
         "lost": {name: float(value) for name, value in exposure.lost.items()},
         "rays": int(exposure.rays),
     }
