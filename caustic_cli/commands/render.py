@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import typer
 
 from caustic_cli import console
 from caustic_cli.commands import options
-from caustic_cli.errors import InputError
+from caustic_cli.errors import CausticError, InputError
 
 EXAMPLES = """Examples:
 
@@ -41,6 +42,9 @@ def run(
                                                 help="Image to write.  [default: render.png in PROJECT]")] = None,
     npy: Annotated[Path | None, typer.Option(metavar="FILE", help="Also write the irradiance: power per pixel as a part "
                                              "of the source's, float64, [i, j].")] = None,
+    verify: Annotated[str | None, typer.Option(metavar="mitsuba", help="Trace the same lens in Mitsuba 3 (pip install"
+                                               " 'caustic-cli[verify]') with as many rays and compare, pixel by pixel; writes"
+                                               " verify.png beside the image.  Exit status 1 if they disagree.")] = None,
     force: options.Force = False,
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -56,6 +60,10 @@ def run(
     if tolerance is not None and not 0 < tolerance < 100:
         raise InputError(f"--tolerance must be greater than 0 and less than 100, got {tolerance:g}")
     size = options.both(options.counts("--filter-size", filter_size))
+    if verify not in (None, "mitsuba"):
+        raise InputError(f"--verify must be mitsuba, got {verify!r}")
+    if verify and screen_at is not None:
+        raise InputError("--verify compares on the project's own screen: give no --screen-at")
     given = options.source(source, source_position, source_size, source_grid, source_angle, cone)
     device = options.start_torch(device, threads, say)
 
@@ -76,7 +84,8 @@ def run(
     else:
         opened = Project.open(project)
     image_path = output or (project / RENDER if opened else Path(project.stem + ".png"))
-    for path in (image_path, npy):
+    panels = image_path.with_name("verify.png" if output is None else f"{image_path.stem}-verify.png") if verify else None
+    for path in (image_path, npy, panels):
         if path is not None:
             refuse_foreign(path, force)
     if opened:
@@ -86,6 +95,10 @@ def run(
         encoding, own_seed = opened.settings["target"]["encoding"], opened.settings["design"]["seed"]
     else:
         (scene, field, heights), target, iterations, encoding, own_seed = archive, None, None, "srgb", 0
+    if verify:
+        from caustic_cli.studies.verify import require_mitsuba  # noqa: PLC0415
+
+        require_mitsuba(scene)
     options.compile_for(scene, device, say)
     screen = scene.screen
     if screen_at is not None:
@@ -105,5 +118,32 @@ def run(
         write_npy(npy, image)
     figures |= {"iterations": iterations, "seconds": time.monotonic() - began, "image": str(image_path)}
     say.table(f"{project}", console.figures_rows(figures))
+    if verify:
+        figures["verify"] = _verify(scene, field, heights, count, own_seed if seed is None else seed, panels, say)
     if json:
         console.emit_json(figures)
+    if verify and not figures["verify"]["agree"]:
+        raise CausticError(f"the image and Mitsuba's disagree by more than noise; see {panels}")
+
+
+def _verify(scene, field, heights, rays: int, seed: int, panels: Path, say: console.Reporter) -> dict:
+    """The figures of the comparison with Mitsuba; its picture is written to `panels`."""
+    from caustic_cli.export.mitsuba import quick_samples, write_mitsuba  # noqa: PLC0415
+    from caustic_cli.studies.verify import verify, write_panels  # noqa: PLC0415
+
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "lens.xml"
+        write_mitsuba(path, scene, field, heights, quick_samples(field), dark=True)
+        verdict = verify(path, scene, field, heights, rays, seed)
+    write_panels(panels, verdict, scene)
+    f = verdict.figures
+    say.table(f"Mitsuba {f['mitsuba']}, {f['variant']}", [
+        ("verdict", "agree" if verdict.agree else "DISAGREE"),
+        ("mean Z^2, beyond 3, largest", f"{f['z_mean_square']:.3f}, {f['z_beyond_3']:.2%}, {f['z_largest']:.2f}"
+                                        "  (of noise: 1, 0.27%, 4)"),
+        ("judged", f"{f['pixels']:,} of {f['pixel_side']} x {f['pixel_side']} pixels, {f['noise']:.1%} noise each"),
+        ("relative RMS beyond noise", f"{f['relative_rms_beyond_noise']:.4f} of {f['relative_rms']:.4f}"),
+        ("light on the screen", f"{f['on_screen']:.6f}, render {f['on_screen_render']:.6f} ({f['light_z']:.1f} sigma)"),
+        ("correlation, and turned", f"{f['correlation']:.5f}, {f['correlation_turned']:.5f}"),
+        ("image", str(panels))])
+    return f | {"image": str(panels)}

@@ -21,7 +21,7 @@ from torch import Tensor
 from caustic_cli.errors import InputError
 from caustic_cli.export.mesh import mesh_grid, refuse_open, rim_of, triangles
 from caustic_cli.export.ply import write_mesh
-from caustic_cli.export.surface import SurfaceGrid
+from caustic_cli.export.surface import STEPS_PER_SPAN, SurfaceGrid
 from caustic_cli.export.text import CREATED, real
 from caustic_cli.files import write_bytes
 from caustic_cli.optics.heightfield import HeightField
@@ -33,6 +33,8 @@ SAMPLES = 256
 #: The collimated light starts so far before the entrance, mm, and the holder is so many lens widths wide.
 BEFORE, WIDE = 1.0, 50.0
 DEPTH = 4
+#: Points along an axis of a mesh that Mitsuba loads in seconds.
+QUICK = 2048
 
 
 def companions(path: str | Path) -> tuple[Path, Path]:
@@ -42,17 +44,13 @@ def companions(path: str | Path) -> tuple[Path, Path]:
 
 
 def write_mitsuba(path: str | Path, scene: Scene, field: HeightField, heights: Tensor,
-                  samples: tuple[int, int] | None = None, tolerance: float | None = None) -> None:
-    """Write the meshes and then the scene.  Arguments as of `closed_mesh`.
+                  samples: tuple[int, int] | None = None, tolerance: float | None = None, dark: bool = False) -> None:
+    """Write the meshes and then the scene.  Arguments as of `closed_mesh`; `dark`: without its light, whatever that is.
 
     Raises:
         InputError: as `closed_mesh`; a light that Mitsuba has no emitter for; or the files cannot be written there.
     """
-    write_scene(path, scene, field, heights, _light(scene), mesh_grid(field, heights, samples, tolerance))
-
-
-def write_scene(path: str | Path, scene: Scene, field: HeightField, heights: Tensor, light: list[str], grid: SurfaceGrid) -> None:
-    """Write lens, holder, screen, camera and `light` (lines of XML)."""
+    light, grid = [] if dark else _light(scene), mesh_grid(field, heights, samples, tolerance)
     refuse_open(float(grid.z.min()), scene.lens.z_in)
     exit_mesh, sides = companions(path)
     write_mesh(exit_mesh, grid.points, triangles(*grid.z.shape), grid.normals, text=False)
@@ -85,6 +83,12 @@ def write_scene(path: str | Path, scene: Scene, field: HeightField, heights: Ten
         "</shape>", *light, "</scene>", "",
     ]
     write_bytes(path, "\n".join(lines).encode())
+
+
+def quick_samples(field: HeightField) -> tuple[int, int]:
+    """Samples along x and y for a mesh that loads quickly: four steps a knot span, or as many as `QUICK` allows."""
+    spans = [len(s.breaks) - 1 for s in field.spaces]
+    return tuple(min(STEPS_PER_SPAN, max(1, QUICK // k)) * k + 1 for k in spans)
 
 
 def _walls(grid: SurfaceGrid, z_in: float) -> tuple[np.ndarray, np.ndarray]:
