@@ -265,6 +265,8 @@ def _run(project: Project, designer: Designer, target: np.ndarray, state: State,
         state = designer.run(state, iterations=chosen["iterations"], time_limit=limit, stop=lambda: bool(asked),
                              on_iteration=on_iteration)
         keep(state)
+        if not asked:
+            state.heights = designer.within_limits(state)
         if asked:
             raise Interrupted(f"interrupted after {state.total} iterations; {project.path / CHECKPOINT} is saved,"
                               f" caustic design --resume {project.path} goes on", 128 + asked[0])

@@ -77,6 +77,7 @@ SCHEMA: dict[str, dict[str, Key]] = {
     "design": {
         "loss": Key("text", "weighted sum of rms (eq. 5.2.1), rms-light, throughput, diffusion, uniformity, laplacian, curvature"),
         "max_slope": Key("number", "limit of the surface's slope; 0 for none"),
+        "min_radius": Key("number", "mm, least radius of concave places (the tool's); 0 for any"),
         "optimizer": Key("text", "lbfgs or adam"),
         "lr": Key("number", "learning rate of adam"),
         "network": Key("text", "none, sparse or dense"),
@@ -112,7 +113,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "screen": {"z": 300.0},
     "target": {"encoding": "srgb", "flip": ""},
     "design": {"loss": "rms-light", "optimizer": "lbfgs", "lr": 1e-3, "network": "none", "initial": "zero",
-               "filter_target": True, "max_slope": 0.0, "iterations": 0, "time_limit": math.inf,
+               "filter_target": True, "max_slope": 0.0, "min_radius": 0.0, "iterations": 0, "time_limit": math.inf,
                "checkpoint_every": 10.0, "seed": 0, "dtype": "float32"},
 }
 SOURCES = ("plane", "point", "grid", "disc")

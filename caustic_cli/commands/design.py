@@ -45,6 +45,8 @@ def run(
     degree: Annotated[Text, typer.Option(metavar="P[xQ]", help="Spline degree, 1 to 15.  [default: 3]")] = None,
     min_thickness: Annotated[float | None, typer.Option(help="Least thickness of the lens, mm.  [default: 1]")] = None,
     max_slope: Annotated[float | None, typer.Option(help="Limit of the surface's slope, mm per mm.  [default: none]")] = None,
+    min_radius: Annotated[float | None, typer.Option(metavar="MM", help="Least radius of curvature of concave places, such as a"
+                                                     " tool's.  [default: any]")] = None,
     linear: Annotated[bool, typer.Option("--linear", help="Pixel values are irradiance as they are, not sRGB-encoded.")] = False,
     flip: Annotated[Text, typer.Option(metavar="x|y|xy", help="Mirror the picture, for a viewer on the lens' side.")] = None,
     start: Annotated[Text, typer.Option(metavar="transport|offset|PROJECT|FILE", help="First surface: by optimal transport of the"
@@ -88,6 +90,7 @@ def run(
         ("lens", "degree", "--degree"): degree and options.both(options.counts("--degree", degree)),
         ("lens", "min_thickness", "--min-thickness"): min_thickness,
         ("design", "max_slope", "--max-slope"): max_slope,
+        ("design", "min_radius", "--min-radius"): min_radius,
         ("screen", "z", "--throw"): throw,
         ("target", "encoding", "--linear"): "linear" if linear else None,
         ("target", "flip", "--flip"): flip,

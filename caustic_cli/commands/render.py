@@ -45,6 +45,11 @@ def run(
     verify: Annotated[str | None, typer.Option(metavar="mitsuba", help="Trace the same lens in Mitsuba 3 (pip install"
                                                " 'caustic-cli[verify]') with as many rays and compare, pixel by pixel; writes"
                                                " verify.png beside the image.  Exit status 1 if they disagree.")] = None,
+    report: Annotated[bool, typer.Option("--report", help="Also say what making the lens asks for: wall, stock, slopes, concave"
+                                         " radius, margin to internal reflection, sharpness, tolerances; writes report.json"
+                                         " beside the image.")] = False,
+    tool_radius: Annotated[float | None, typer.Option(metavar="MM", help="Radius of the tool that --report tries in concave"
+                                                      " places.")] = None,
     force: options.Force = False,
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -60,6 +65,8 @@ def run(
     if tolerance is not None and not 0 < tolerance < 100:
         raise InputError(f"--tolerance must be greater than 0 and less than 100, got {tolerance:g}")
     size = options.both(options.counts("--filter-size", filter_size))
+    if tool_radius is not None and not (report and tool_radius > 0):
+        raise InputError(f"--tool-radius belongs to --report and must be greater than 0 mm, got {tool_radius:g}")
     if verify not in (None, "mitsuba"):
         raise InputError(f"--verify must be mitsuba, got {verify!r}")
     if verify and screen_at is not None:
@@ -85,7 +92,8 @@ def run(
         opened = Project.open(project)
     image_path = output or (project / RENDER if opened else Path(project.stem + ".png"))
     panels = image_path.with_name("verify.png" if output is None else f"{image_path.stem}-verify.png") if verify else None
-    for path in (image_path, npy, panels):
+    sheet = image_path.with_name("report.json" if output is None else f"{image_path.stem}-report.json") if report else None
+    for path in (image_path, npy, panels, sheet):
         if path is not None:
             refuse_foreign(path, force)
     if opened:
@@ -118,6 +126,12 @@ def run(
         write_npy(npy, image)
     figures |= {"iterations": iterations, "seconds": time.monotonic() - began, "image": str(image_path)}
     say.table(f"{project}", console.figures_rows(figures))
+    if report:
+        from caustic_cli.studies import manufacture  # noqa: PLC0415
+
+        figures["report"] = manufacture.manufacture(scene, field, heights, tool_radius, own_seed if seed is None else seed)
+        manufacture.write_json(sheet, figures["report"])
+        say.table(str(sheet), manufacture.rows(figures["report"]))
     if verify:
         figures["verify"] = _verify(scene, field, heights, count, own_seed if seed is None else seed, panels, say)
     if json:

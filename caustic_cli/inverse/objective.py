@@ -48,14 +48,14 @@ class Objective:
         filter_target: filter the target as the render is filtered.
         apron: pixels by which the screen is widened on every side, dark in the target: light that has left the screen
             is seen there and pulled back.
-        max_slope: limit of the lens' slope, 0 for none.
+        max_slope: limit of the lens' slope, 0 for none; min_radius: least radius of concave places, mm, 0 for any.
         oversample: the filter works on pixels so many times smaller along each axis, which are then added up: a render that
             is nearly a bincount, and yet smooth in the heights.
         dtype: precision of the rays.
     """
 
     def __init__(self, scene: Scene, field: HeightField, sampler: Rays, filter: Filter, target: Tensor, loss: str, *,
-                 blur: float = 0.0, filter_target: bool = True, apron: int = 0, max_slope: float = 0.0,
+                 blur: float = 0.0, filter_target: bool = True, apron: int = 0, max_slope: float = 0.0, min_radius: float = 0.0,
                  oversample: int = 1, dtype: torch.dtype = torch.float32):
         self.device = sampler.device
         screen = scene.screen.grown((apron, apron))
@@ -67,7 +67,7 @@ class Objective:
             smooth = self._pool(filter.smooth(wide.repeat_interleave(oversample, 0).repeat_interleave(oversample, 1)))
         self.loss = Loss(loss, smooth, blur, apron, wide > 0)
         minded = [(weight, name) for weight, name in parse(loss) if name in PENALTIES and weight > 0]
-        self.penalty = Penalty(scene, field, minded, max_slope, sampler.device)
+        self.penalty = Penalty(scene, field, minded, max_slope, sampler.device, min_radius)
         self.scene, self.field, self.sampler, self.dtype = scene, field, sampler, dtype
         self.kept = list(self._tracers()) if sampler.count <= KEPT_RAYS else None
 
