@@ -82,6 +82,8 @@ def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: d
         if first is not None and _make_room(full, said, first):
             _designer(project, "cpu")
             first = _first_heights(project)
+        if first is not None:
+            first = _designer(project, "cpu")[0].within_limits(State(first))
     except InputError as error:  # about a project.toml that is not written yet
         raise InputError(settings.as_options(str(error).removeprefix(f"{path / TOML}: "), given)) from error
     _make_directory(path, force)
