@@ -15,7 +15,7 @@ from caustic_cli.inverse.designer import Options
 from caustic_cli.inverse.schedule import LEAST_SPANS, Stage, coarse_to_fine, refinement, refinement_spans
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.scene import Offset, PlaneWave, Screen, Source, checks
-from caustic_cli.settings import SOURCES, build_source, index_of, with_defaults
+from caustic_cli.settings import SOURCES, build_screen, build_source, index_of, with_defaults
 
 DEFAULT_MAG = 3.0
 DEFAULT_MARGIN = 0.28  # table 6.1: the screen is 6.4 wide where the picture is 5
@@ -70,7 +70,7 @@ def complete(given: Settings, aspect: float, *, mag: float | None = None, margin
     if "resolution" not in screen:
         nx = width or DEFAULT_RESOLUTION
         screen["resolution"] = [nx, max(2, round(nx * screen["size"][1] / screen["size"][0]))]
-    Screen(tuple(screen["size"]), screen["z"], tuple(screen["resolution"]))
+    build_screen(s)
     _complete_lens(lens, screen, target, build_source(s))
     _complete_design(s, quality, rays)
     return s
@@ -201,8 +201,7 @@ def build_stages(settings: Settings) -> list[Stage]:
     Raises:
         InputError: there are none, a value is out of range, or the last stage is not on the lens' own control net.
     """
-    screen = settings["screen"]
-    on = Screen(tuple(screen["size"]), screen["z"], tuple(screen["resolution"]))
+    on = build_screen(settings)
     stages = []
     for t in settings["design"].get("stages", []):
         f = filter_from(t["reconstruction"], t["filter_size"], on, t.get("alpha_per_mm2"), t.get("alpha_per_pixel2"))

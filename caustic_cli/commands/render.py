@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -62,7 +63,6 @@ def run(
     from caustic_cli.files import refuse_foreign  # noqa: PLC0415
     from caustic_cli.picture import write_image, write_npy  # noqa: PLC0415
     from caustic_cli.project import RENDER, Project  # noqa: PLC0415
-    from caustic_cli.scene import Screen  # noqa: PLC0415
     from caustic_cli.studies.retrace import retrace, white_level  # noqa: PLC0415
 
     opened = Project.open(project)
@@ -76,7 +76,7 @@ def run(
     field, checkpoint = opened.lens(scene)
     screen = scene.screen
     if screen_at is not None:
-        screen = Screen(screen.size, screen_at, screen.resolution)
+        screen = replace(screen, z=screen_at)
     if alpha is not None and reconstruction != "gaussian":
         raise InputError(f"--alpha belongs to --reconstruction gaussian, got {reconstruction}")
     filter = filter_from(reconstruction, size, screen, alpha)

@@ -18,7 +18,7 @@ from caustic_cli.inverse.penalties import Penalty
 from caustic_cli.optics.emission import Rays
 from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
-from caustic_cli.optics.tracing import PlaneTracer, RayTracer, tracer
+from caustic_cli.optics.tracing import BandTracer, PlaneTracer, RayTracer, StepTracer, tracers
 from caustic_cli.scene import Scene
 
 #: Rays traced at a time, and the number up to which the prepared chunks are kept from one evaluation to the next.
@@ -76,11 +76,8 @@ class Objective:
         k, (n, m) = self.oversample, image.shape
         return image if k == 1 else image.view(n // k, k, m // k, k).sum((1, 3))
 
-    def _tracers(self) -> Iterator[PlaneTracer | RayTracer]:
-        traced = None
-        for rays in self.sampler.chunks(CHUNK):
-            traced = tracer(self.scene, self.field, rays, self.dtype, traced)
-            yield traced
+    def _tracers(self) -> Iterator[PlaneTracer | RayTracer | StepTracer | BandTracer]:
+        return tracers(self.scene, self.field, self.sampler, self.dtype, CHUNK)
 
     def __call__(self, heights: Tensor) -> Evaluation:
         """Value and gradient at heights (n, m) mm float64.

@@ -146,6 +146,10 @@ class Sampler:
         """Number of rays."""
         return self.shape[0] * self.shape[1]
 
+    def through(self, _scene) -> Sampler:
+        """These rays again: on the exit surface, no index has bent them yet."""
+        return self
+
     def chunks(self, size: int = 1 << 20) -> Iterator[Sample]:
         """The rays in order, at most about `size` at a time; shares over all chunks sum to 1."""
         norm = 1.0 / self.count
