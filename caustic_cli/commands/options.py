@@ -124,13 +124,13 @@ def start_torch(device: str, threads: int | None, say: Reporter):
 
 
 def compile_for(scene, device: str, say: Reporter) -> None:
-    """Have the CPU's kernels compiled that a scene needs beyond those of `start_torch`."""
+    """Have the CPU's kernels compiled that a scene needs beyond those of `start_torch`; None for any scene's."""
     import torch  # noqa: PLC0415
 
     from caustic_cli.optics.kernels import fused  # noqa: PLC0415
     from caustic_cli.scene import PlaneWave  # noqa: PLC0415
 
-    if fused(device) and not isinstance(scene.source, PlaneWave):
+    if fused(device) and (scene is None or not isinstance(scene.source, PlaneWave)):
         from caustic_cli.optics.kernels.functions import compile_ray_kernels  # noqa: PLC0415
 
         with say.patience("compiling the intersection kernels for this machine, once: about half a minute"):

@@ -37,6 +37,10 @@ def run(
     source_angle: options.SourceAngle = None,
     cone: options.Cone = None,
     screen_at: Annotated[float | None, typer.Option(metavar="Z", help="Put the screen here instead, mm.")] = None,
+    effects: Annotated[str, typer.Option(metavar="auto|none|NAME[,NAME...]", help="Effects to simulate: what the scene calls"
+                                         " for, none that can be left out, or just these (--explain lists them).")] = "auto",
+    explain: Annotated[bool, typer.Option("--explain", help="Show which effects are simulated, why, what each costs, and what"
+                                          " leaving it out does.")] = False,
     output: Annotated[Path | None, typer.Option("-o", "--out", metavar="PNG",
                                                 help="Image to write.  [default: render.png in PROJECT]")] = None,
     npy: Annotated[Path | None, typer.Option(metavar="FILE", help="Also write the irradiance: power per pixel as a part "
@@ -61,17 +65,19 @@ def run(
 
     from caustic_cli.derive import filter_from  # noqa: PLC0415
     from caustic_cli.files import refuse_foreign  # noqa: PLC0415
+    from caustic_cli.optics.plan import compile_plan, parse_effects  # noqa: PLC0415
     from caustic_cli.picture import write_image, write_npy  # noqa: PLC0415
     from caustic_cli.project import RENDER, Project  # noqa: PLC0415
     from caustic_cli.studies.retrace import retrace, white_level  # noqa: PLC0415
 
+    wanted = parse_effects(effects)
     opened = Project.open(project)
     image_path = output or project / RENDER
     for path in (image_path, npy):
         if path is not None:
             refuse_foreign(path, force)
     scene = opened.scene(given)
-    options.compile_for(scene, device, say)
+    options.compile_for(scene if wanted is None and not explain else None, device, say)
     target = opened.target(scene)
     field, checkpoint = opened.lens(scene)
     screen = scene.screen
@@ -80,11 +86,13 @@ def run(
     if alpha is not None and reconstruction != "gaussian":
         raise InputError(f"--alpha belongs to --reconstruction gaussian, got {reconstruction}")
     filter = filter_from(reconstruction, size, screen, alpha)
+    seed, precision = opened.settings["design"]["seed"] if seed is None else seed, options.dtype_of(dtype or "float64")
+    heights = checkpoint.state.heights
     try:
-        exposure, figures = retrace(
-            scene, field, checkpoint.state.heights, target, rays=count, filter=filter, screen=screen, device=device,
-            seed=opened.settings["design"]["seed"] if seed is None else seed, dtype=options.dtype_of(dtype or "float64"),
-            tolerance=tolerance)
+        scene = replace(scene, screen=screen)
+        plan = compile_plan(scene, field, heights, wanted)
+        exposure, figures = retrace(plan.scene, field, heights, target, rays=count, filter=filter, device=device, seed=seed,
+                                    dtype=precision, tolerance=tolerance, steps=plan.steps)
     except InputError as error:
         raise InputError(str(error).replace("[screen] z", "--screen-at") if screen_at is not None else str(error)) from error
     image = exposure.image.cpu().numpy()
@@ -93,5 +101,11 @@ def run(
         write_npy(npy, image)
     figures |= {"iterations": checkpoint.state.total, "seconds": time.monotonic() - began, "image": str(image_path)}
     say.table(f"{project}", console.figures_rows(figures))
+    if explain:
+        from caustic_cli.studies import effects as study  # noqa: PLC0415
+
+        figures["effects"] = study.explain(plan, scene, field, heights.to(device), rays=min(count, study.RAYS), seed=seed,
+                                           dtype=precision)
+        say.say("\n".join(study.table(figures["effects"])))
     if json:
         console.emit_json(figures)

@@ -12,8 +12,8 @@ class Bundle:
     """Rays that start at (x, y, z) in unit directions (dx, dy, dz) inside the lens; x .. dz (N,) float64, z one for all, mm.
 
     share (N,): power each carries in, a part of what the source emits.  lost: what these rays' part of the source lost before
-    the lens' inside, by name ("missed_lens", "fresnel"): with share it sums to the rays' part of the source.  field: unit vectors (N,)
-    of polarised light, see `polarisation`; None for light whose polarisation is not asked for.
+    the lens' inside, by name ("missed_lens", "fresnel"): with share it sums to the rays' part of the source.  field: unit vectors
+    (N,) of polarised light, see `polarisation`; None where that is not asked for.
     """
 
     x: Tensor

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.kernels import fused
 from caustic_cli.optics.tolerances import LEAST_COSINE
 
 #: Steps of the search over a knot span: a dip under the surface narrower than that is not seen.  It carries little light, at
@@ -71,15 +72,27 @@ def again(field: HeightField, heights: Tensor, o, d, below: bool) -> tuple[Tenso
     return t_found, found
 
 
+def surface_at(field: HeightField, heights: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """z (mm), z_x, z_y at points (N,) mm, float64, linear in the heights; on a CPU by the kernels."""
+    if not (fused(x.device) and len(x)):
+        return tuple(field.at(heights, x, y))
+    from caustic_cli.optics.kernels.surface import FusedSurface, scattered_surface  # noqa: PLC0415
+
+    at = ((0.5 * (c.detach() / r + 1.0)).contiguous().numpy() for c, r in zip((x, y), field.half_size, strict=True))
+    return scattered_surface(FusedSurface(field.spaces, field.half_size), heights.double(), *at, torch.float64)
+
+
 def touch(field: HeightField, heights: Tensor, o, d, t: Tensor):
     """The hit at distance t (N,), not differentiated, of rays o, d that may depend on the heights.
 
     Returns:
         (x, y, z) mm, slopes (z_x, z_y), and the distance, (N,) each, with their first derivatives in reverse mode.
     """
-    moved = [c + t * v for c, v in zip(o, d, strict=True)]
+    moved, differentiate = [c + t * v for c, v in zip(o, d, strict=True)], torch.is_grad_enabled()
     x, y = moved[0].detach(), moved[1].detach()
-    z, gx, gy = field.at(heights, x, y)
+    z, gx, gy = surface_at(field, heights, x, y)
+    if not differentiate:
+        return tuple(moved), (gx, gy), t
     with torch.no_grad():
         xx, xy, yy = field.at(heights, x, y, ((2, 0), (1, 1), (0, 2)))
         flat = [v.detach() for v in d]

@@ -5,8 +5,8 @@ Notation
     E       unit vector of the field, normal to d
     s, p    s = d x N / |d x N|, normal to the plane of incidence;  p = s x d within it
 
-Fresnel's amplitudes behind are t_s E_s and t_p E_p; light without retardation stays linearly polarised.  In normal incidence s and p
-are the same and any plane of incidence will do.  Born and Wolf, Principles of Optics, 1.5.2.
+Fresnel's amplitudes behind are t_s E_s and t_p E_p; light without retardation stays linearly polarised.  In normal incidence s
+and p are the same and any plane of incidence will do.  Born and Wolf, Principles of Optics, 1.5.2.
 """
 
 from __future__ import annotations

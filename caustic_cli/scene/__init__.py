@@ -9,7 +9,7 @@ from caustic_cli.scene.source import Disc, PlaneWave, Points, Source
 
 __all__ = ["Band", "Disc", "Lens", "Light", "Offset", "PlaneWave", "Points", "Scene", "Screen", "Source"]
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from caustic_cli.errors import InputError
 from caustic_cli.scene.materials import refractive_index
@@ -38,7 +38,7 @@ class Scene:
     source: Source
     lens: Lens
     screen: Screen
-    light: Light = Light()
+    light: Light = field(default_factory=Light)
 
     def __post_init__(self):
         if not self.lens.mirror and self.screen.z <= self.lens.z_in:
