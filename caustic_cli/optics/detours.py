@@ -42,7 +42,7 @@ def ghost(lens: Lens, field: HeightField, beam: Beam, heights: Tensor, reference
     start = Bundle(x.detach().clamp(-rx, rx), y.detach().clamp(-ry, ry), lens.z_in, d[0].detach(), d[1].detach(),
                    c.detach(), power.detach(), {})
     t, status = intersection.find(field, heights, start)
-    on &= status == intersection.Status.HIT
+    on = on & (status == intersection.Status.HIT)
     t = torch.where(on, t, torch.zeros_like(t))
     z = torch.full_like(x, lens.z_in)
     o = torch.where(on, x, start.x), torch.where(on, y, start.y), z
