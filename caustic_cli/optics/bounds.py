@@ -64,7 +64,7 @@ def bounds_of(scene: Scene, field: HeightField, heights: Tensor) -> Bounds:
         critical = most * math.sin(min(i, math.pi / 2.0))
         out = inside + math.asin(critical) - i if critical < 1.0 else math.pi / 2.0
     climb = slope * math.tan(out) if out < math.pi / 2.0 else (math.inf if slope > 0 else 0.0)
-    reach = _reach(scene, inside, float(heights.max()))
+    reach = _reach(scene, inside, float(heights.min()), float(heights.max()))
     ghost, polarised = _ghost(scene, field, heights, inside, most), _polarised(incidence, critical, most)
     return Bounds(incidence, inside, slope, lean, most, critical, climb, reach, ghost, polarised)
 
@@ -99,11 +99,14 @@ def _polarised(incidence: float, critical: float, n: float) -> float:
     return (rs - rp) / (2.0 - rs - rp) * (outer[0] - outer[1]) / 2.0
 
 
-def _reach(scene: Scene, inside: float, top: float) -> float:
-    """How far from the axis rays can be at the surface's greatest height, in half widths of the aperture."""
+def _reach(scene: Scene, inside: float, lowest: float, top: float) -> float:
+    """How far from the axis rays can be at the surface's greatest height, in half widths of the aperture; infinite where the
+    surface may dip below the entrance, which rays then never meet from below."""
     source, lens = scene.source, scene.lens
     if isinstance(source, PlaneWave):
         return 1.0
+    if lowest < lens.z_in:
+        return math.inf
     drift = (top - lens.z_in) * math.tan(inside)
     if isinstance(source, Disc) and source.angle is not None:
         return 1.0 + drift / min(lens.half_size)

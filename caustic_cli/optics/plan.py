@@ -203,6 +203,8 @@ def _missed(scene: Scene, b: Bounds) -> Effect:
         return Effect("missed-surface", False, "every ray of a plane wave is on the surface", b.reach, 1.0)
     if b.reach <= 1.0:
         return Effect("missed-surface", False, f"no ray gets beyond {b.reach:.4g} of the aperture's half width", b.reach, 1.0)
+    if math.isinf(b.reach):
+        return Effect("missed-surface", True, "the surface may dip below the entrance", None, 1.0, fixed=True)
     return Effect("missed-surface", True, f"rays may get to {b.reach:.4g} of the aperture's half width below the surface: a side"
                   " of the lens takes them", b.reach, 1.0, fixed=True)
 
