@@ -46,6 +46,8 @@ def complete(given: Settings, aspect: float, *, mag: float | None = None, margin
         InputError: a value is out of range, or two contradict each other.
     """
     s = with_defaults(given)
+    if s["lens"].get("mirror", False) and "z" not in given.get("screen", {}):
+        s["screen"]["z"] = -s["screen"]["z"]
     lens, screen, target = s["lens"], s["screen"], s["target"]
     if mag is not None:
         mag = checks.number("--mag", mag, 1e-3, 1e3)
@@ -103,15 +105,19 @@ def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[st
         lens.setdefault("wavelength", 587.5618)
     lens.setdefault("thickness", 5.0 * scale)
     lens.setdefault("height_range", [-scale, scale])
-    if screen["z"] <= lens["thickness"] + lens["height_range"][1]:
+    mirror = lens.get("mirror", False)
+    if mirror and screen["z"] >= lens["thickness"] + lens["height_range"][0]:
+        raise InputError(f"[screen] z must lie before the mirror, which begins at"
+                         f" {lens['thickness'] + lens['height_range'][0]:.4g} mm, got {screen['z']:g} mm")
+    if not mirror and screen["z"] <= lens["thickness"] + lens["height_range"][1]:
         raise InputError(f"[screen] z must lie behind the lens, which is up to"
                          f" {lens['thickness'] + lens['height_range'][1]:.4g} mm thick, got {screen['z']:g} mm")
     if "radius" not in lens:
         mag = tuple(t / w for t, w in zip(target["size"], lens["size"], strict=True))
         vergence = 0.0
         if not isinstance(source, PlaneWave) and source.nearest < lens["z_in"]:  # divergence at the surface, 1/mm
-            vergence = 1.0 / (lens["z_in"] - source.centre[2] + (lens["thickness"] - lens["z_in"]) / index)
-        radius = Offset.for_magnification(mag, index, screen["z"], lens["thickness"], vergence).radius
+            vergence = 1.0 / (lens["z_in"] - source.centre[2] + (lens["thickness"] - lens["z_in"]) / (1.0 if mirror else index))
+        radius = Offset.for_magnification(mag, -1.0 if mirror else index, screen["z"], lens["thickness"], vergence).radius
         if vergence:  # light from nearby may ask for more than a sphere over this aperture can do
             least = STEEPEST * math.hypot(*lens["size"]) / 2.0
             radius = [math.copysign(max(abs(r), least), r) for r in radius]

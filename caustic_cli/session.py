@@ -106,7 +106,7 @@ def design(project: Project, first: torch.Tensor | None, device: str, say: Repor
 
 def _say_blur(scene: Scene, say: Reporter) -> None:
     """What no lens can do about an extended source, before time is spent on it."""
-    blur, pixel = blur_limit(scene.source, scene.lens.z_in, scene.screen.z - scene.lens.z_in), max(scene.screen.pixel)
+    blur, pixel = blur_limit(scene.source, scene.lens.z_in, abs(scene.screen.z - scene.lens.z_in)), max(scene.screen.pixel)
     if blur > 0:
         finer = f"; the picture's detail below that, {blur / pixel:.3g} pixels, is out of reach" if blur > pixel else ""
         say.say(f"the source's own size blurs every point over {blur:.3g} mm on the screen{finer}")

@@ -216,7 +216,7 @@ def test_a_shifted_screen_sees_the_same_light_elsewhere(source, kernels):
 
 def test_a_tilted_screen_that_cuts_into_the_lens_is_refused():
     scene = scene_of(screen=Screen((16.0, 14.0), 9.0, (8, 8), (0.0, 60.0)))
-    with pytest.raises(ValueError, match="its tilt takes it 6.928 mm nearer"):
+    with pytest.raises(ValueError, match=r"its tilt takes it 6\.928 mm nearer"):
         check_room(scene, torch.full((9, 8), 3.0), scene.screen)
 
 

@@ -31,6 +31,14 @@ def run(
     source_grid: options.SourceGrid = None,
     source_angle: options.SourceAngle = None,
     cone: options.Cone = None,
+    polarisation: options.Polarisation = None,
+    wavelengths: options.Wavelengths = None,
+    absorption: options.Absorption = None,
+    roughness: options.Roughness = None,
+    screen_tilt: options.ScreenTilt = None,
+    screen_shift: options.ScreenShift = None,
+    mirror: Annotated[bool, typer.Option("--mirror", help="The surface reflects; the screen stands on the source's side, --throw"
+                                         " before it.")] = False,
     mag: Annotated[float | None, typer.Option(help="Width of the picture over width of the lens.  [default: 3]")] = None,
     lens_size: Annotated[Text, typer.Option(metavar="W[xH]", help="Lens aperture, mm.  [default: 10x10]")] = None,
     throw: Annotated[float | None, typer.Option(help="Lens origin to screen, mm.  [default: 300]")] = None,
@@ -80,6 +88,8 @@ def run(
     began, say = time.monotonic(), console.Reporter(quiet)
     given = {
         **options.source(source, source_position, source_size, source_grid, source_angle, cone),
+        **options.physics(polarisation, wavelengths, absorption, roughness, screen_tilt, screen_shift),
+        ("lens", "mirror", "--mirror"): mirror or None,
         ("lens", "size", "--lens-size"): lens_size and options.both(options.size("--lens-size", lens_size)),
         ("lens", "index", "--index"): index,
         ("lens", "glass", "--glass"): glass,
@@ -87,7 +97,7 @@ def run(
         ("lens", "degree", "--degree"): degree and options.both(options.counts("--degree", degree)),
         ("lens", "min_thickness", "--min-thickness"): min_thickness,
         ("design", "max_slope", "--max-slope"): max_slope,
-        ("screen", "z", "--throw"): throw,
+        ("screen", "z", "--throw"): -throw if mirror and throw is not None else throw,
         ("target", "encoding", "--linear"): "linear" if linear else None,
         ("target", "flip", "--flip"): flip,
         ("design", "loss", "--loss"): loss,

@@ -51,6 +51,8 @@ def run(
     path = output or Path(project.resolve().stem + FORMATS[format])
     refuse_foreign(path, force)
     scene = opened.scene()
+    if scene.lens.mirror:
+        raise InputError(f"{project}: is a mirror, and the formats hold lenses: nothing is exported")
     field, checkpoint = opened.lens(scene)
     write = {"lighttools": write_lighttools, "stl": write_stl}[format]
     write(path, scene, field, checkpoint.state.heights, grid)

@@ -36,6 +36,12 @@ def run(
     source_grid: options.SourceGrid = None,
     source_angle: options.SourceAngle = None,
     cone: options.Cone = None,
+    polarisation: options.Polarisation = None,
+    wavelengths: options.Wavelengths = None,
+    absorption: options.Absorption = None,
+    roughness: options.Roughness = None,
+    screen_tilt: options.ScreenTilt = None,
+    screen_shift: options.ScreenShift = None,
     screen_at: Annotated[float | None, typer.Option(metavar="Z", help="Put the screen here instead, mm.")] = None,
     effects: Annotated[str, typer.Option(metavar="auto|none|NAME[,NAME...]", help="Effects to simulate: what the scene calls"
                                          " for, none that can be left out, or just these (--explain lists them).")] = "auto",
@@ -61,6 +67,7 @@ def run(
         raise InputError(f"--tolerance must be greater than 0 and less than 100, got {tolerance:g}")
     size = options.both(options.counts("--filter-size", filter_size))
     given = options.source(source, source_position, source_size, source_grid, source_angle, cone)
+    given |= options.physics(polarisation, wavelengths, absorption, roughness, screen_tilt, screen_shift)
     device = options.start_torch(device, threads, say)
 
     from caustic_cli.derive import filter_from  # noqa: PLC0415
