@@ -15,6 +15,7 @@ from caustic_cli.inverse.designer import Options
 from caustic_cli.inverse.schedule import LEAST_SPANS, Stage, coarse_to_fine, refinement, refinement_spans
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.scene import Offset, PlaneWave, Screen, Source, checks
+from caustic_cli.scene.light import RGB
 from caustic_cli.settings import SOURCES, build_screen, build_source, index_of, with_defaults
 
 DEFAULT_MAG = 3.0
@@ -26,6 +27,7 @@ RAYS_PER_PIXEL = 9.0  # 750 x 750 rays on 250 x 250 pixels, tables D.1 and D.2
 SINGLE_STAGE_ITERATIONS = 1000  # thesis 6.2.1
 DRAFT_SECONDS, FINE_SECONDS = 8.0, 60.0  # time limits below and from which another quality is the better use of the time
 STEEPEST = 1.25  # least radius of a derived sphere, in half diagonals of the lens: slopes up to 1.3
+COLOR_GLASS = "N-BK7"  # of a coloured picture, unless glass or index is said: dispersion has to be known
 SOURCE_DISTANCE, SOURCE_WIDTH, SOURCE_GRID = 5.0, 0.2, (25, 25)  # in lens widths; the grid of fig. 6.4.1
 
 Settings = dict[str, dict[str, Any]]
@@ -49,6 +51,10 @@ def complete(given: Settings, aspect: float, *, mag: float | None = None, margin
     if s["lens"].get("mirror", False) and "z" not in given.get("screen", {}):
         s["screen"]["z"] = -s["screen"]["z"]
     lens, screen, target = s["lens"], s["screen"], s["target"]
+    if target.get("color", False):
+        s["source"].setdefault("wavelengths", list(RGB))
+        if "index" not in lens:
+            lens.setdefault("glass", COLOR_GLASS)
     if mag is not None:
         mag = checks.number("--mag", mag, 1e-3, 1e3)
     margin = checks.number("--margin", DEFAULT_MARGIN if margin is None else margin, 0.0, 100.0)

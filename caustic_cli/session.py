@@ -55,7 +55,11 @@ def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: d
         names = [option for (_, key, option) in given if key in ("index", "glass")]
         if len(names) == 1:  # an option replaces what the configuration says
             del said["lens"]["glass" if names[0] == "--index" else "index"]
-    picture = read_picture(target, said.get("target", {}).get("encoding") == "linear")
+    goal = said.get("target", {})
+    picture = read_picture(target, goal.get("encoding") == "linear", goal.get("color", False))
+    if goal.get("color", False):
+        light = [float(c) for c in picture.irradiance().sum((1, 2))]
+        said.setdefault("source", {}).setdefault("weights", [c / sum(light) for c in light])
     if screen:
         height = screen[1] if len(screen) == 2 else screen[0] * picture.aspect
         said.setdefault("screen", {})["size"] = [screen[0], height]
@@ -157,7 +161,7 @@ def _first_heights(project: Project) -> torch.Tensor | None:
         return None
     if start == "transport":
         designer, target = _designer(project, "cpu")
-        return first_surface(designer.scene, target, designer.field(0))
+        return first_surface(designer.scene, _grey(target), designer.field(0))
     if not is_project(Path(start)):
         raise InputError(f"[design] start must be transport, offset or a project directory, got {start!r}")
     other = Project.open(start)
@@ -253,7 +257,7 @@ def _run(project: Project, designer: Designer, target: np.ndarray, state: State,
                         f" {s.rays:,} rays, blur {s.blur:g} px")
             _, _, loss, on_screen, _ = now.history[-1]
             show(f"stage {stage + 1}/{len(designer.stages)}",
-                 f"loss {loss * target.size:.4f}  on screen {on_screen:.1%}", now.total, total)
+                 f"loss {loss * _grey(target).size:.4f}  on screen {on_screen:.1%}", now.total, total)
             if time.monotonic() - saved >= chosen["checkpoint_every"]:
                 keep(now)
                 saved = time.monotonic()
@@ -282,9 +286,14 @@ def _judge(project: Project, designer: Designer, target: np.ndarray, state: Stat
     image, encoding = exposure.image.cpu().numpy(), project.settings["target"]["encoding"]
     write_image(project.path / RENDER, image, white_level(image, target), encoding)
     history = np.array(state.history, dtype=float).reshape(-1, 5)
-    write_report(project.path / REPORT, target, image, _surface(field, state.heights), history, scene.lens, scene.screen,
-                 figures, encoding)
+    write_report(project.path / REPORT, _grey(target), _grey(image), _surface(field, state.heights), history, scene.lens,
+                 scene.screen, figures, encoding)
     return figures
+
+
+def _grey(image: np.ndarray) -> np.ndarray:
+    """(n_x, n_y) of an image, the colours of a coloured one added up."""
+    return image if image.ndim == 2 else image.sum(0)
 
 
 def _surface(field: HeightField, heights: torch.Tensor) -> np.ndarray:

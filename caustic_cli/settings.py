@@ -81,6 +81,7 @@ SCHEMA: dict[str, dict[str, Key]] = {
         "size": Key("numbers", "mm, width and height of the picture on the screen"),
         "encoding": Key("text", "of the picture's values: srgb or linear"),
         "flip": Key("text", "mirror the picture along x, y or xy; empty for none"),
+        "color": Key("flag", "red, green and blue apart, at the source's three wavelengths"),
     },
     "design": {
         "loss": Key("text", "weighted sum of rms (eq. 5.2.1), rms-light, throughput, diffusion, uniformity, laplacian, curvature"),
@@ -289,7 +290,8 @@ def build_screen(settings: dict[str, dict[str, Any]]) -> Screen:
 def build_light(settings: dict[str, dict[str, Any]]) -> Light:
     """Wavelengths and polarisation of the [source] section, whatever its type."""
     s = settings["source"]
-    return Light(s.get("polarisation"), tuple(s.get("wavelengths", ())), tuple(s.get("weights", ())))
+    return Light(s.get("polarisation"), tuple(s.get("wavelengths", ())), tuple(s.get("weights", ())),
+                 color=settings["target"].get("color", False))
 
 
 def as_options(message: str, given) -> str:

@@ -54,6 +54,8 @@ def run(
     min_thickness: Annotated[float | None, typer.Option(help="Least thickness of the lens, mm.  [default: 1]")] = None,
     max_slope: Annotated[float | None, typer.Option(help="Limit of the surface's slope, mm per mm.  [default: none]")] = None,
     linear: Annotated[bool, typer.Option("--linear", help="Pixel values are irradiance as they are, not sRGB-encoded.")] = False,
+    color: Annotated[bool, typer.Option("--color", help="Keep red, green and blue apart (611, 549, 464 nm), with the glass' index"
+                                        " for each.  [default glass: N-BK7]")] = False,
     flip: Annotated[Text, typer.Option(metavar="x|y|xy", help="Mirror the picture, for a viewer on the lens' side.")] = None,
     start: Annotated[Text, typer.Option(metavar="transport|offset|PROJECT", help="First surface: by optimal transport of the"
                                         " light to the picture, the sphere that follows from --mag, or the lens of another"
@@ -100,6 +102,7 @@ def run(
         ("screen", "z", "--throw"): -throw if mirror and throw is not None else throw,
         ("target", "encoding", "--linear"): "linear" if linear else None,
         ("target", "flip", "--flip"): flip,
+        ("target", "color", "--color"): color or None,
         ("design", "loss", "--loss"): loss,
         ("design", "network", "--network"): network,
         ("design", "optimizer", "--optimizer"): optimizer or ("adam" if network in ("sparse", "dense") else None),
@@ -121,7 +124,7 @@ def run(
     if not resume:
         from caustic_cli.picture import read_picture  # noqa: PLC0415
 
-        read_picture(target, linear)  # before torch is loaded and kernels are compiled for nothing
+        read_picture(target, linear, color)  # before torch is loaded and kernels are compiled for nothing
     device = options.start_torch(device, threads, say)
 
     from caustic_cli import session  # noqa: PLC0415
