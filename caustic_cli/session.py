@@ -56,7 +56,11 @@ def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: d
         names = [option for (_, key, option) in given if key in ("index", "glass")]
         if len(names) == 1:  # an option replaces what the configuration says
             del said["lens"]["glass" if names[0] == "--index" else "index"]
-    picture = read_picture(target, said.get("target", {}).get("encoding") == "linear")
+    goal = said.get("target", {})
+    picture = read_picture(target, goal.get("encoding") == "linear", goal.get("color", False))
+    if goal.get("color", False):
+        light = [float(c) for c in picture.irradiance().sum((1, 2))]
+        said.setdefault("source", {}).setdefault("weights", [c / sum(light) for c in light])
     if screen:
         height = screen[1] if len(screen) == 2 else screen[0] * picture.aspect
         said.setdefault("screen", {})["size"] = [screen[0], height]
@@ -109,7 +113,7 @@ def design(project: Project, first: torch.Tensor | None, device: str, say: Repor
 
 def _say_blur(scene: Scene, say: Reporter) -> None:
     """What no lens can do about an extended source, before time is spent on it."""
-    blur, pixel = blur_limit(scene.source, scene.lens.z_in, scene.screen.z - scene.lens.z_in), max(scene.screen.pixel)
+    blur, pixel = blur_limit(scene.source, scene.lens.z_in, abs(scene.screen.z - scene.lens.z_in)), max(scene.screen.pixel)
     if blur > 0:
         finer = f"; the picture's detail below that, {blur / pixel:.3g} pixels, is out of reach" if blur > pixel else ""
         say.say(f"the source's own size blurs every point over {blur:.3g} mm on the screen{finer}")
@@ -160,7 +164,7 @@ def _first_heights(project: Project) -> torch.Tensor | None:
         return None
     if start == "transport":
         designer, target = _designer(project, "cpu")
-        return first_surface(designer.scene, target, designer.field(0))
+        return first_surface(designer.scene, _grey(target), designer.field(0))
     net = _designer(project, "cpu")[0].field(0)
     if Path(start).suffix.lower() in SUFFIXES and not Path(start).is_dir():
         return onto(*read_surface(start, net.half_size), net)
@@ -258,7 +262,7 @@ def _run(project: Project, designer: Designer, target: np.ndarray, state: State,
                         f" {s.rays:,} rays, blur {s.blur:g} px")
             _, _, loss, on_screen, _ = now.history[-1]
             show(f"stage {stage + 1}/{len(designer.stages)}",
-                 f"loss {loss * target.size:.4f}  on screen {on_screen:.1%}", now.total, total)
+                 f"loss {loss * _grey(target).size:.4f}  on screen {on_screen:.1%}", now.total, total)
             if time.monotonic() - saved >= chosen["checkpoint_every"]:
                 keep(now)
                 saved = time.monotonic()
@@ -289,9 +293,14 @@ def _judge(project: Project, designer: Designer, target: np.ndarray, state: Stat
     image, encoding = exposure.image.cpu().numpy(), project.settings["target"]["encoding"]
     write_image(project.path / RENDER, image, white_level(image, target), encoding)
     history = np.array(state.history, dtype=float).reshape(-1, 5)
-    write_report(project.path / REPORT, target, image, _surface(field, state.heights), history, scene.lens, scene.screen,
-                 figures, encoding)
+    write_report(project.path / REPORT, _grey(target), _grey(image), _surface(field, state.heights), history, scene.lens,
+                 scene.screen, figures, encoding)
     return figures
+
+
+def _grey(image: np.ndarray) -> np.ndarray:
+    """(n_x, n_y) of an image, the colours of a coloured one added up."""
+    return image if image.ndim == 2 else image.sum(0)
 
 
 def _surface(field: HeightField, heights: torch.Tensor) -> np.ndarray:

@@ -31,6 +31,14 @@ def run(
     source_grid: options.SourceGrid = None,
     source_angle: options.SourceAngle = None,
     cone: options.Cone = None,
+    polarisation: options.Polarisation = None,
+    wavelengths: options.Wavelengths = None,
+    absorption: options.Absorption = None,
+    roughness: options.Roughness = None,
+    screen_tilt: options.ScreenTilt = None,
+    screen_shift: options.ScreenShift = None,
+    mirror: Annotated[bool, typer.Option("--mirror", help="The surface reflects; the screen stands on the source's side, --throw"
+                                         " before it.")] = False,
     mag: Annotated[float | None, typer.Option(help="Width of the picture over width of the lens.  [default: 3]")] = None,
     lens_size: Annotated[Text, typer.Option(metavar="W[xH]", help="Lens aperture, mm.  [default: 10x10]")] = None,
     throw: Annotated[float | None, typer.Option(help="Lens origin to screen, mm.  [default: 300]")] = None,
@@ -48,6 +56,8 @@ def run(
     min_radius: Annotated[float | None, typer.Option(metavar="MM", help="Least radius of curvature of concave places, such as a"
                                                      " tool's.  [default: any]")] = None,
     linear: Annotated[bool, typer.Option("--linear", help="Pixel values are irradiance as they are, not sRGB-encoded.")] = False,
+    color: Annotated[bool, typer.Option("--color", help="Keep red, green and blue apart (611, 549, 464 nm), with the glass' index"
+                                        " for each.  [default glass: N-BK7]")] = False,
     flip: Annotated[Text, typer.Option(metavar="x|y|xy", help="Mirror the picture, for a viewer on the lens' side.")] = None,
     start: Annotated[Text, typer.Option(metavar="transport|offset|PROJECT|FILE", help="First surface: by optimal transport of the"
                                         " light to the picture, the sphere that follows from --mag, or the lens of another"
@@ -83,6 +93,8 @@ def run(
     began, say = time.monotonic(), console.Reporter(quiet)
     given = {
         **options.source(source, source_position, source_size, source_grid, source_angle, cone),
+        **options.physics(polarisation, wavelengths, absorption, roughness, screen_tilt, screen_shift),
+        ("lens", "mirror", "--mirror"): mirror or None,
         ("lens", "size", "--lens-size"): lens_size and options.both(options.size("--lens-size", lens_size)),
         ("lens", "index", "--index"): index,
         ("lens", "glass", "--glass"): glass,
@@ -91,9 +103,10 @@ def run(
         ("lens", "min_thickness", "--min-thickness"): min_thickness,
         ("design", "max_slope", "--max-slope"): max_slope,
         ("design", "min_radius", "--min-radius"): min_radius,
-        ("screen", "z", "--throw"): throw,
+        ("screen", "z", "--throw"): -throw if mirror and throw is not None else throw,
         ("target", "encoding", "--linear"): "linear" if linear else None,
         ("target", "flip", "--flip"): flip,
+        ("target", "color", "--color"): color or None,
         ("design", "loss", "--loss"): loss,
         ("design", "network", "--network"): network,
         ("design", "optimizer", "--optimizer"): optimizer or ("adam" if network in ("sparse", "dense") else None),
@@ -115,7 +128,7 @@ def run(
     if not resume:
         from caustic_cli.picture import read_picture  # noqa: PLC0415
 
-        read_picture(target, linear)  # before torch is loaded and kernels are compiled for nothing
+        read_picture(target, linear, color)  # before torch is loaded and kernels are compiled for nothing
     device = options.start_torch(device, threads, say)
 
     from caustic_cli import session  # noqa: PLC0415

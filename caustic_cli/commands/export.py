@@ -80,6 +80,8 @@ def run(
     for file in written:
         refuse_foreign(file, force)
     scene = opened.scene()
+    if scene.lens.mirror:
+        raise InputError(f"{project}: is a mirror, and the formats hold lenses: nothing is exported")
     field, checkpoint = opened.lens(scene)
     getattr(home, f"write_{format}")(path, scene, field, checkpoint.state.heights, **given)
     if beside is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated
@@ -37,7 +38,17 @@ def run(
     source_grid: options.SourceGrid = None,
     source_angle: options.SourceAngle = None,
     cone: options.Cone = None,
+    polarisation: options.Polarisation = None,
+    wavelengths: options.Wavelengths = None,
+    absorption: options.Absorption = None,
+    roughness: options.Roughness = None,
+    screen_tilt: options.ScreenTilt = None,
+    screen_shift: options.ScreenShift = None,
     screen_at: Annotated[float | None, typer.Option(metavar="Z", help="Put the screen here instead, mm.")] = None,
+    effects: Annotated[str, typer.Option(metavar="auto|none|NAME[,NAME...]", help="Effects to simulate: what the scene calls"
+                                         " for, none that can be left out, or just these (--explain lists them).")] = "auto",
+    explain: Annotated[bool, typer.Option("--explain", help="Show which effects are simulated, why, what each costs, and what"
+                                          " leaving it out does.")] = False,
     output: Annotated[Path | None, typer.Option("-o", "--out", metavar="PNG",
                                                 help="Image to write.  [default: render.png in PROJECT]")] = None,
     npy: Annotated[Path | None, typer.Option(metavar="FILE", help="Also write the irradiance: power per pixel as a part "
@@ -72,15 +83,17 @@ def run(
     if verify and screen_at is not None:
         raise InputError("--verify compares on the project's own screen: give no --screen-at")
     given = options.source(source, source_position, source_size, source_grid, source_angle, cone)
+    given |= options.physics(polarisation, wavelengths, absorption, roughness, screen_tilt, screen_shift)
     device = options.start_torch(device, threads, say)
 
     from caustic_cli.derive import filter_from  # noqa: PLC0415
     from caustic_cli.files import refuse_foreign  # noqa: PLC0415
+    from caustic_cli.optics.plan import compile_plan, parse_effects  # noqa: PLC0415
     from caustic_cli.picture import write_image, write_npy  # noqa: PLC0415
     from caustic_cli.project import RENDER, Project  # noqa: PLC0415
-    from caustic_cli.scene import Screen  # noqa: PLC0415
     from caustic_cli.studies.retrace import retrace, white_level  # noqa: PLC0415
 
+    wanted = parse_effects(effects)
     opened = archive = None
     if project.suffix.lower() == ".npz" and project.is_file():
         from caustic_cli.archive import open_archive  # noqa: PLC0415
@@ -107,17 +120,19 @@ def run(
         from caustic_cli.studies.verify import require_mitsuba  # noqa: PLC0415
 
         require_mitsuba(scene)
-    options.compile_for(scene, device, say)
+    options.compile_for(scene if wanted is None and not explain else None, device, say)
     screen = scene.screen
     if screen_at is not None:
-        screen = Screen(screen.size, screen_at, screen.resolution)
+        screen = replace(screen, z=screen_at)
     if alpha is not None and reconstruction != "gaussian":
         raise InputError(f"--alpha belongs to --reconstruction gaussian, got {reconstruction}")
     filter = filter_from(reconstruction, size, screen, alpha)
+    seed, precision = own_seed if seed is None else seed, options.dtype_of(dtype or "float64")
     try:
-        exposure, figures = retrace(
-            scene, field, heights, target, rays=count, filter=filter, screen=screen, device=device,
-            seed=own_seed if seed is None else seed, dtype=options.dtype_of(dtype or "float64"), tolerance=tolerance)
+        scene = replace(scene, screen=screen)
+        plan = compile_plan(scene, field, heights, wanted)
+        exposure, figures = retrace(plan.scene, field, heights, target, rays=count, filter=filter, device=device, seed=seed,
+                                    dtype=precision, tolerance=tolerance, steps=plan.steps)
     except InputError as error:
         raise InputError(str(error).replace("[screen] z", "--screen-at") if screen_at is not None else str(error)) from error
     image = exposure.image.cpu().numpy()
@@ -126,14 +141,20 @@ def run(
         write_npy(npy, image)
     figures |= {"iterations": iterations, "seconds": time.monotonic() - began, "image": str(image_path)}
     say.table(f"{project}", console.figures_rows(figures))
+    if explain:
+        from caustic_cli.studies import effects as study  # noqa: PLC0415
+
+        figures["effects"] = study.explain(plan, scene, field, heights.to(device), rays=min(count, study.RAYS), seed=seed,
+                                           dtype=precision)
+        say.say("\n".join(study.table(figures["effects"])))
     if report:
         from caustic_cli.studies import manufacture  # noqa: PLC0415
 
-        figures["report"] = manufacture.manufacture(scene, field, heights, tool_radius, own_seed if seed is None else seed)
+        figures["report"] = manufacture.manufacture(scene, field, heights, tool_radius, seed)
         manufacture.write_json(sheet, figures["report"])
         say.table(str(sheet), manufacture.rows(figures["report"]))
     if verify:
-        figures["verify"] = _verify(scene, field, heights, count, own_seed if seed is None else seed, panels, say)
+        figures["verify"] = _verify(scene, field, heights, count, seed, panels, say)
     if json:
         console.emit_json(figures)
     if verify and not figures["verify"]["agree"]:

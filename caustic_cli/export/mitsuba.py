@@ -26,6 +26,7 @@ from caustic_cli.export.text import CREATED, real
 from caustic_cli.files import write_bytes
 from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.scene import Disc, PlaneWave, Scene
+from caustic_cli.scene.plain import beyond_plain
 from caustic_cli.scene.source import covering_cone
 
 #: Rays a pixel of the scene's own sampler, Mitsuba's `spp`.
@@ -120,6 +121,8 @@ def _light(scene: Scene) -> list[str]:
         InputError: Mitsuba has none like this.
     """
     source, lens = scene.source, scene.lens
+    if beyond_plain(scene):
+        raise InputError(f"--format mitsuba is written for clear lenses and straight screens, not {', '.join(beyond_plain(scene))}")
     if isinstance(source, PlaneWave):
         if source.profile is not None:
             raise InputError("--format mitsuba: its collimated emitter is uniform, so a source with a profile cannot be written")

@@ -224,9 +224,13 @@ class Designer:
         lens = replace(self.scene.lens, control=stage.control)
         x, y = HeightField.of(lens).control_xy()
         low, high = lens.height_bounds(x.numpy(), y.numpy())
-        if high.max() >= self.scene.screen.z:
+        screen = self.scene.screen
+        if lens.mirror and low.min() <= screen.z + screen.depth:
+            raise InputError(f"[screen] z must lie before the mirror, whose surface may reach {low.min():.4g} mm,"
+                             f" got {screen.z:g} mm")
+        if not lens.mirror and high.max() >= screen.z - screen.depth:
             raise InputError(f"[screen] z must lie behind the lens, whose surface may reach {high.max():.4g} mm,"
-                             f" got {self.scene.screen.z:g} mm")
+                             f" got {screen.z:g} mm")
         return torch.from_numpy(low), torch.from_numpy(high)
 
     @staticmethod

@@ -54,8 +54,8 @@ def first_surface(scene: Scene, target: np.ndarray, field: HeightField, cells: i
     mean, found = float(z.mean()), None
     for _ in range(1 if _parallel(scene) else PASSES):
         light, directions = _light(scene, x, y, z, shape)
-        found = start.surface(light, target, half, scene.screen.half_size, lens.index, scene.screen.z, mean, directions,
-                              start=None if found is None else found.transport.potential)
+        found = start.surface(light, target, half, scene.screen.half_size, lens.bend, scene.screen.z, mean, directions,
+                              centre=scene.screen.shift, start=None if found is None else found.transport.potential)
         z = found.heights
     spline = RectBivariateSpline(x, y, z)
     at = [torch.linalg.inv(s.matrix(s.greville)) for s in field.spaces]
@@ -79,7 +79,7 @@ def _light(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray, shape) -> 
             profile = covers @ profile if axis == 0 else (covers @ profile.T).T
         return profile, None
     x0, y0, z0 = source.centre
-    h, t, n = lens.z_in - z0, z - lens.z_in, lens.index
+    h, t, n = lens.z_in - z0, z - lens.z_in, lens.inside
     dx, dy = x[:, None] - x0, y[None, :] - y0
     rho = np.hypot(dx, dy)
     q = rho / (h + t / n)

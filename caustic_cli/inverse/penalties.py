@@ -48,7 +48,7 @@ class Penalty:
         x, y = (c.numpy() for c in field.control_xy())
         offset = scene.lens.offset
         self.base = torch.from_numpy(offset.thickness + offset.sag(x[:, None], y[None, :])).to(device)
-        self.gain = (scene.lens.index - 1.0) * (scene.screen.z - offset.thickness)
+        self.gain = (scene.lens.bend - 1.0) * (scene.screen.z - offset.thickness)
 
     def __bool__(self) -> bool:
         return bool(self.terms) or self.limit > 0 or self.radius > 0

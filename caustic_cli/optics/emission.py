@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -24,7 +24,8 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.bundle import Bundle
-from caustic_cli.optics.interface import reflectance
+from caustic_cli.optics.interface import reflectance, reflectances
+from caustic_cli.optics.polarisation import beyond, field_of, part_s
 from caustic_cli.optics.sampling import SAMPLERS, Sampler, numbers
 from caustic_cli.scene import PlaneWave, Points, Scene
 from caustic_cli.scene.source import covering_cone
@@ -55,6 +56,10 @@ class Emission:
     def count(self) -> int:
         """Number of rays."""
         return self.shape[0] * self.shape[1] * len(self._points[0])
+
+    def through(self, scene: Scene) -> Emission:
+        """The same rays as another scene refracts them: of its own index and polarisation."""
+        return self if scene is self.scene else replace(self, scene=scene)
 
     @cached_property
     def _points(self) -> tuple[Tensor, Tensor]:
@@ -119,25 +124,35 @@ class Emission:
         x, y = x.clamp(-rx, rx), y.clamp(-ry, ry)
         sx, sy = (x - x0) / h, (y - y0) / h  # rays that miss the lens stay finite; they carry nothing
         dz = 1.0 / torch.sqrt(1.0 + sx * sx + sy * sy)
-        return self._enter(x, y, sx * dz, sy * dz, dz, share, float(part.sum()))
+        return enter(self.scene, x, y, sx * dz, sy * dz, dz, share, float(part.sum()))
 
     def _far(self, u: Tensor, v: Tensor, a: Tensor, b: Tensor) -> Bundle:
         (rx, ry), half = self.scene.lens.half_size, math.radians(self.scene.source.angle) / 2.0
         sine = a.sqrt() * math.sin(half)  # even over the projected solid angle: an evenly bright disc
         dx, dy = sine * torch.cos(2 * math.pi * b), sine * torch.sin(2 * math.pi * b)
         share = torch.full_like(u, 1.0 / self.count)
-        return self._enter((2.0 * u - 1.0) * rx, (2.0 * v - 1.0) * ry, dx, dy, torch.sqrt(1.0 - dx * dx - dy * dy), share,
+        return enter(self.scene, (2.0 * u - 1.0) * rx, (2.0 * v - 1.0) * ry, dx, dy, torch.sqrt(1.0 - dx * dx - dy * dy), share,
                            len(u) / self.count)
 
-    def _enter(self, x: Tensor, y: Tensor, dx: Tensor, dy: Tensor, dz: Tensor, share: Tensor, emitted: float) -> Bundle:
-        """Through the flat entrance: Snell keeps n (d_x, d_y), Fresnel takes its part."""
-        lens = self.scene.lens
-        ux, uy = dx / lens.index, dy / lens.index
-        uz = torch.sqrt(1.0 - ux * ux - uy * uy)
-        reflected = reflectance(lens.fresnel, dz, uz, 1.0 / lens.index) * share
-        inside = share - reflected
-        arriving, lost = float(share.sum()), float(reflected.sum())
-        return Bundle(x, y, lens.z_in, ux, uy, uz, inside, {"missed_lens": emitted - arriving, "fresnel": lost})
+
+def enter(scene: Scene, x: Tensor, y: Tensor, dx: Tensor, dy: Tensor, dz: Tensor, share: Tensor, emitted: float) -> Bundle:
+    """Rays of unit directions through points of the flat entrance: Snell keeps n (d_x, d_y), Fresnel takes its part.
+
+    share: power of each that arrives there; emitted: of all at their source.
+    """
+    lens, n = scene.lens, scene.lens.inside
+    ux, uy = dx / n, dy / n
+    uz = torch.sqrt(1.0 - ux * ux - uy * uy)
+    kind, field = "none" if lens.mirror else lens.fresnel, None
+    if kind == "exact" and scene.light.polarisation is not None:
+        before, after, flat = (dx, dy, dz), (ux, uy, uz), (0.0, 0.0, 1.0)
+        e = field_of(scene.light.polarisation, before)
+        (rs, rp), s = reflectances(dz, uz, 1.0 / n), part_s(e, before, flat)
+        reflected, field = (s * rs + (1.0 - s) * rp) * share, beyond(e, before, after, flat, dz, uz, 1.0 / n)
+    else:
+        reflected = reflectance(kind, dz, uz, 1.0 / n) * share
+    arriving, lost = float(share.sum()), float(reflected.sum())
+    return Bundle(x, y, lens.z_in, ux, uy, uz, share - reflected, {"missed_lens": emitted - arriving, "fresnel": lost}, field)
 
 
 Rays = Sampler | Emission

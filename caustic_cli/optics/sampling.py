@@ -27,6 +27,8 @@ from caustic_cli.optics.kernels import fused
 SAMPLERS = ("grid", "lines", "stratified", "uniform", "sobol")
 #: Length of torch's Sobol sequence.
 SOBOL_RAYS = 1 << 30
+#: Largest of `normal_numbers`, whose uniform ones are at least 2^-33.
+LARGEST_NORMAL = math.sqrt(66.0 * math.log(2.0))
 _MASK = 0xFFFFFFFF
 
 
@@ -43,6 +45,13 @@ def random_numbers(seed: int, dimension: int, index: Tensor) -> Tensor:
     """Uniform numbers strictly inside (0, 1), float64, one for every int64 ray index: a pure function of its arguments."""
     low, high = index & _MASK, index >> 32
     return (_mix(_mix(low ^ key(seed, dimension)) + salt(dimension) + high & _MASK).double() + 0.5) * 2.0**-32
+
+
+def normal_numbers(seed: int, index: Tensor) -> tuple[Tensor, Tensor]:
+    """Two independent standard normal numbers, float64, for every int64 index (Box and Muller)."""
+    radius = torch.sqrt(-2.0 * torch.log(random_numbers(seed, 0, index)))
+    angle = 2.0 * math.pi * random_numbers(seed, 1, index)
+    return radius * torch.cos(angle), radius * torch.sin(angle)
 
 
 def key(seed: int, dimension: int) -> int:
@@ -145,6 +154,10 @@ class Sampler:
     def count(self) -> int:
         """Number of rays."""
         return self.shape[0] * self.shape[1]
+
+    def through(self, _scene) -> Sampler:
+        """These rays again: on the exit surface, no index has bent them yet."""
+        return self
 
     def chunks(self, size: int = 1 << 20) -> Iterator[Sample]:
         """The rays in order, at most about `size` at a time; shares over all chunks sum to 1."""

@@ -34,6 +34,7 @@ from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.tracing import expose
 from caustic_cli.scene import Disc, PlaneWave, Scene
+from caustic_cli.scene.plain import beyond_plain
 from caustic_cli.scene.source import covering_cone
 from caustic_cli.studies.retrace import BATCHES
 
@@ -57,10 +58,12 @@ def require_mitsuba(scene: Scene) -> None:
     """Refuse before work begins what cannot be verified.
 
     Raises:
-        InputError: Mitsuba is not installed, or the scene's reflections are not the exact ones, which alone it knows.
+        InputError: Mitsuba is not installed, or the scene has what is not written for it, or other reflections than exact ones.
     """
     if find_spec("mitsuba") is None:
         raise InputError("--verify mitsuba needs Mitsuba 3, which is not installed: pip install 'caustic-cli[verify]'")
+    if beyond_plain(scene):
+        raise InputError(f"--verify mitsuba traces clear lenses and straight screens, not {', '.join(beyond_plain(scene))}")
     if scene.lens.fresnel != "exact":
         raise InputError(f"--verify mitsuba knows exact Fresnel reflection only; [lens] fresnel is {scene.lens.fresnel}")
 
