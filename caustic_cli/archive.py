@@ -25,7 +25,8 @@ def open_archive(path: str | Path) -> tuple[Scene, HeightField, Tensor]:
     try:
         lens = Lens(size=tuple(2.0 * h for h in field.half_size), z_in=float(data["z_in"]), index=float(data["refractive_index"]),
                     control=field.shape, degree=tuple(s.degree for s in field.spaces),
-                    knots=tuple(tuple(s.knots.tolist()) for s in field.spaces), fresnel=_text(data, "fresnel", "exact"))
+                    knots=tuple(tuple(s.knots.tolist()) for s in field.spaces), fresnel=_text(data, "fresnel", "exact"),
+                    aperture=_text(data, "aperture", "rectangle"))
         screen = Screen(tuple(2.0 * h for h in _reals(data, "screen_half_size", 2)), float(data["z_screen"]),
                         tuple(int(n) for n in _reals(data, "resolution", 2)))
         return Scene(_source(data), lens, screen), field, heights

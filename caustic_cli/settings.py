@@ -64,6 +64,8 @@ SCHEMA: dict[str, dict[str, Key]] = {
         "absorption": Key("number", "1/mm, a in exp(-a t) through t mm of glass (Beer-Lambert)"),
         "roughness": Key("number", "standard deviation of the slopes of the exit's microfacets along an axis"),
         "mirror": Key("flag", "the surface reflects; the screen stands on the source's side"),
+        "aperture": Key("text", "rectangle, or circle: the largest within size"),
+        "border": Key("number", "mm, width of a rim around the aperture, for the mount"),
         "control": Key("wholes", "control points of the finished lens"),
         "degree": Key("wholes", "spline degrees"),
         "knots_u": Key("list", "knot vector on [0, 1] along x"),
@@ -248,7 +250,8 @@ def build_lens(settings: dict[str, dict[str, Any]]) -> Lens:
     offset = Offset(lens["thickness"], tuple(lens["radius"]))
     return Lens(tuple(lens["size"]), lens["z_in"], index_of(lens), tuple(lens["control"]), tuple(lens["degree"]), knots,
                 lens["min_thickness"], offset, tuple(lens["height_range"]), lens["fresnel"], lens.get("absorption", 0.0),
-                lens.get("roughness", 0.0), lens.get("glass"), lens.get("mirror", False))
+                lens.get("roughness", 0.0), lens.get("glass"), lens.get("mirror", False),
+                lens.get("aperture", "rectangle"), lens.get("border", 0.0))
 
 
 def build_source(settings: dict[str, dict[str, Any]], profile: np.ndarray | None = None, type: str | None = None) -> Source:

@@ -22,14 +22,14 @@ from test_export import CASES, make, signed_volume
 from caustic_cli.errors import InputError
 from caustic_cli.export.lighttools import write_lighttools
 from caustic_cli.export.lighttools_script import companions, write_script
-from caustic_cli.export.mesh import closed_mesh, mesh_grid
+from caustic_cli.export.mesh import closed_mesh
 from caustic_cli.export.mitsuba import write_mitsuba
 from caustic_cli.export.obj import write_obj
 from caustic_cli.export.ply import write_ply
 from caustic_cli.export.points import write_csv, write_xyz
 from caustic_cli.export.step import write_step
 from caustic_cli.export.stl import write_stl
-from caustic_cli.export.surface import STEPS_PER_SPAN, second_derivative_bounds
+from caustic_cli.export.surface import STEPS_PER_SPAN, sample_grid, second_derivative_bounds
 from caustic_cli.export.zemax import write_zemax
 from caustic_cli.files import is_ours
 from caustic_cli.optics.sampling import Sample
@@ -165,7 +165,7 @@ def test_points(tmp_path, lens, rays, capsys, write, suffix, options):
     path = tmp_path / f"lens.{suffix}"
     write(path, *lens)
     points = np.loadtxt(path, **options)
-    grid = mesh_grid(lens[1], lens[2], None, None)
+    grid = sample_grid(lens[1], lens[2], None)
     ordered = grid.points.reshape(*grid.z.shape, 3).swapaxes(0, 1).reshape(-1, 3)
     assert (points == ordered).all()  # the last bit, x fastest
     error = off(lens[0], rays, *through(*grid_of(points), rays))
@@ -194,7 +194,7 @@ def test_meshes(tmp_path, lens, rays, capsys, write, suffix):
     say(capsys, suffix, error)
     assert error < LIMIT
     if suffix != "stl":
-        assert (z == mesh_grid(field, heights, None, None).z).all()
+        assert (z == sample_grid(field, heights, None).z).all()
     assert is_ours(path)
 
 
@@ -354,7 +354,7 @@ def test_mitsuba_meshes(tmp_path, lens, rays, capsys):
     error = off(lens[0], rays, *through(*grid_of(np.array(exit_.vertices)), rays))
     say(capsys, "mitsuba, exit mesh", error)
     assert error < LIMIT
-    grid = mesh_grid(lens[1], lens[2], None, None)
+    grid = sample_grid(lens[1], lens[2], None)
     assert np.abs(exit_.vertex_normals - grid.normals).max() < 1e-12
     sides = trimesh.load(tmp_path / shapes["sides"].find("string").get("value"), process=False)
     assert len(sides.faces) == 2 * (2 * sum(grid.z.shape) - 4)
@@ -426,7 +426,7 @@ def test_the_lighttools_block_holds_the_points(tmp_path, lens):
     assert words[:10] == ["0", "0", "9", "6", "0", "0", "54", "0", "0", "0"]
     assert words[-8:] == ["1", "4", "CartesianMapper", "1", "0", "0", "0", "0"]
     points = np.array(words[10:-9], float).reshape(6, 9, 3)
-    expected = mesh_grid(lens[1], lens[2], (9, 6), None).points.reshape(9, 6, 3).swapaxes(0, 1)
+    expected = sample_grid(lens[1], lens[2], (9, 6)).points.reshape(9, 6, 3).swapaxes(0, 1)
     assert (points == expected).all()
 
 
@@ -462,7 +462,7 @@ def test_the_spline_comes_back_to_the_last_bit(tmp_path, case, write, name):
 def test_heights_on_the_knots_come_back(tmp_path, lens, rays, capsys):
     scene, field, heights = lens
     samples = tuple(STEPS_PER_SPAN * (n - 3) + 1 for n in field.shape)
-    np.save(tmp_path / "z.npy", mesh_grid(field, heights, samples, None).z)
+    np.save(tmp_path / "z.npy", sample_grid(field, heights, samples).z)
     net = onto(*read_surface(tmp_path / "z.npy", scene.lens.half_size), field)
     assert (net - heights).abs().max() < 1e-9
     f, gx, gy = (t.numpy() for t in field.at(net, *map(torch.as_tensor, rays[:2])))

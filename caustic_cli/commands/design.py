@@ -41,6 +41,10 @@ def run(
                                          " before it.")] = False,
     mag: Annotated[float | None, typer.Option(help="Width of the picture over width of the lens.  [default: 3]")] = None,
     lens_size: Annotated[Text, typer.Option(metavar="W[xH]", help="Lens aperture, mm.  [default: 10x10]")] = None,
+    aperture: Annotated[Text, typer.Option(metavar="rectangle|circle", help="Shape of the lens; a circle is as wide as --lens-size."
+                                           "  [default: rectangle]")] = None,
+    border: Annotated[float | None, typer.Option(metavar="MM", help="Width of a rim around the aperture, which exported solids have"
+                                                 " for their mount.  [default: 0]")] = None,
     throw: Annotated[float | None, typer.Option(help="Lens origin to screen, mm.  [default: 300]")] = None,
     screen_size: Annotated[Text, typer.Option(metavar="W[xH]", help="Screen, mm.  [default: picture plus margin]")] = None,
     resolution: Annotated[Text, typer.Option(metavar="N[xM]", help="Pixels over the whole screen; N alone counts across, rows"
@@ -96,6 +100,8 @@ def run(
         **options.physics(polarisation, wavelengths, absorption, roughness, screen_tilt, screen_shift),
         ("lens", "mirror", "--mirror"): mirror or None,
         ("lens", "size", "--lens-size"): lens_size and options.both(options.size("--lens-size", lens_size)),
+        ("lens", "aperture", "--aperture"): aperture,
+        ("lens", "border", "--border"): border,
         ("lens", "index", "--index"): index,
         ("lens", "glass", "--glass"): glass,
         ("lens", "control", "--control"): control and options.both(options.counts("--control", control)),

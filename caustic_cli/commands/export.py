@@ -76,10 +76,14 @@ def run(
     path = output or Path(project.resolve().stem + suffix)
     home = import_module(f"caustic_cli.export.{module}")
     beside = import_module("caustic_cli.export.lighttools_script") if script else None
-    written = [path, *(beside or home).companions(path)] if script or format == "mitsuba" else [path]
+    scene = opened.scene()
+    written = [path]
+    if format == "mitsuba":
+        written += home.companions(path, scene.lens.round)
+    elif script:
+        written += beside.companions(path)
     for file in written:
         refuse_foreign(file, force)
-    scene = opened.scene()
     if scene.lens.mirror:
         raise InputError(f"{project}: is a mirror, and the formats hold lenses: nothing is exported")
     field, checkpoint = opened.lens(scene)

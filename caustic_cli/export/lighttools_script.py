@@ -159,6 +159,8 @@ def write_script(path: str | Path, scene: Scene, field: HeightField, heights: Te
         raise InputError("--script: its source is uniform, so one with a profile cannot be written")
     if isinstance(source, Disc) and source.size[0] != source.size[1] and source.angle is None:
         raise InputError("--script: its disc is round, so an elliptical one cannot be written")
+    if scene.lens.round:
+        raise InputError("--script: its freeform solid is a rectangle, so a circular aperture cannot be written")
     script, block = companions(path)
     words = {"@CREATED@": CREATED, "@NPZ@": path.name, "@NAME@": script.name, "@STEM@": path.stem, "@FLAT@": str(FLAT)}
     text = SCRIPT

@@ -1,5 +1,5 @@
-"""The whole scene for Mitsuba 3: `NAME.xml`, to be run as `mitsuba NAME.xml`, and beside it two meshes, `NAME-exit.ply` and
-`NAME-sides.ply` (binary, float64).
+"""The whole scene for Mitsuba 3: `NAME.xml`, to be run as `mitsuba NAME.xml`, and beside it its meshes, `NAME-exit.ply`,
+`NAME-sides.ply` and a round lens' `NAME-holder.ply` (binary, float64).
 
     entrance, exit   the lens, smooth `dielectric`; the exit surface is a mesh with its normals at the vertices
     sides, holder    black: what leaves by the sides or goes past the lens is lost, as in a render
@@ -19,13 +19,13 @@ import numpy as np
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.export.mesh import mesh_grid, refuse_open, rim_of, triangles
+from caustic_cli.export.mesh import patch, refuse_open, rim_of, triangles
 from caustic_cli.export.ply import write_mesh
-from caustic_cli.export.surface import STEPS_PER_SPAN, SurfaceGrid
+from caustic_cli.export.surface import STEPS_PER_SPAN
 from caustic_cli.export.text import CREATED, real
 from caustic_cli.files import write_bytes
 from caustic_cli.optics.heightfield import HeightField
-from caustic_cli.scene import Disc, PlaneWave, Scene
+from caustic_cli.scene import Disc, Lens, PlaneWave, Scene
 from caustic_cli.scene.plain import beyond_plain
 from caustic_cli.scene.source import covering_cone
 
@@ -38,10 +38,10 @@ DEPTH = 4
 QUICK = 2048
 
 
-def companions(path: str | Path) -> tuple[Path, Path]:
-    """The meshes beside a scene file: of the exit surface and of the sides."""
+def companions(path: str | Path, round: bool = True) -> list[Path]:
+    """The meshes beside a scene file: of the exit surface, of the sides, and of a round lens' holder."""
     path = Path(path)
-    return path.with_name(f"{path.stem}-exit.ply"), path.with_name(f"{path.stem}-sides.ply")
+    return [path.with_name(f"{path.stem}-{name}.ply") for name in ("exit", "sides", "holder")[: 3 if round else 2]]
 
 
 def write_mitsuba(path: str | Path, scene: Scene, field: HeightField, heights: Tensor,
@@ -51,16 +51,19 @@ def write_mitsuba(path: str | Path, scene: Scene, field: HeightField, heights: T
     Raises:
         InputError: as `closed_mesh`; a light that Mitsuba has no emitter for; or the files cannot be written there.
     """
-    light, grid = [] if dark else _light(scene), mesh_grid(field, heights, samples, tolerance)
-    refuse_open(float(grid.z.min()), scene.lens.z_in)
-    exit_mesh, sides = companions(path)
-    write_mesh(exit_mesh, grid.points, triangles(*grid.z.shape), grid.normals, text=False)
-    write_mesh(sides, *_walls(grid, scene.lens.z_in), text=False)
+    light, surface = [] if dark else _light(scene), patch(scene.lens, field, heights, samples, tolerance)
+    refuse_open(float(surface.points[..., 2].min()), scene.lens.z_in)
+    exit_mesh, sides = companions(path, False)
+    points, normals = (a.reshape(-1, 3) for a in (surface.points, surface.normals))
+    write_mesh(exit_mesh, points, triangles(surface.points), normals, text=False)
+    rim = points[rim_of(*surface.points.shape[:2])]
+    write_mesh(sides, *_strip(rim, rim * [1.0, 1.0, 0.0] + [0.0, 0.0, scene.lens.z_in]), text=False)
     lens, screen, spin = scene.lens, scene.screen, '<rotate x="1" angle="180"/>'  # rectangles look to -z
     glass = f'<bsdf type="dielectric"><float name="int_ior" value="{real(lens.index)}"/><float name="ext_ior" value="1"/></bsdf>'
     black = '<bsdf type="diffuse"><rgb name="reflectance" value="0"/></bsdf>'
     (rx, ry), (sx, sy) = lens.half_size, screen.half_size
-    away = 0.9 * (screen.z - float(grid.z.max()))
+    flat, holder = ("disk", _round_holder(path, rx, lens.z_in, black)) if lens.round else ("rectangle", _holder(lens, black))
+    away = 0.9 * (screen.z - float(points[:, 2].max()))
     width, height = screen.resolution[0], max(1, round(screen.resolution[0] * sy / sx))
     lines = [
         f"<!-- {CREATED}; millimetres -->", '<scene version="3.0.0">',
@@ -72,13 +75,13 @@ def write_mitsuba(path: str | Path, scene: Scene, field: HeightField, heights: T
         f'  <sampler type="independent"><integer name="sample_count" value="{SAMPLES}"/></sampler>',
         f'  <film type="hdrfilm"><integer name="width" value="{width}"/><integer name="height" value="{height}"/>',
         '    <string name="pixel_format" value="luminance"/><rfilter type="box"/></film>', "</sensor>",
-        '<shape type="rectangle" id="entrance">', f"  {glass}",
+        f'<shape type="{flat}" id="entrance">', f"  {glass}",
         f'  <transform name="to_world">{spin}<scale x="{real(rx)}" y="{real(ry)}"/>'
         f'<translate z="{real(lens.z_in)}"/></transform>', "</shape>",
         f'<shape type="ply" id="exit"><string name="filename" value="{exit_mesh.name}"/>{glass}</shape>',
         f'<shape type="ply" id="sides"><string name="filename" value="{sides.name}"/>'
         f'<boolean name="face_normals" value="true"/>{black}</shape>',
-        *_holder(lens.half_size, lens.z_in, black),
+        *holder,
         '<shape type="rectangle" id="screen">', '  <bsdf type="diffuse"><rgb name="reflectance" value="1"/></bsdf>',
         f'  <transform name="to_world">{spin}<scale x="{real(sx)}" y="{real(sy)}"/><translate z="{real(screen.z)}"/></transform>',
         "</shape>", *light, "</scene>", "",
@@ -92,26 +95,31 @@ def quick_samples(field: HeightField) -> tuple[int, int]:
     return tuple(min(STEPS_PER_SPAN, max(1, QUICK // k)) * k + 1 for k in spans)
 
 
-def _walls(grid: SurfaceGrid, z_in: float) -> tuple[np.ndarray, np.ndarray]:
-    """The sides alone: vertices and outward triangles."""
-    rim = rim_of(*grid.z.shape)
-    top = grid.points[rim]
-    feet = top.copy()
-    feet[:, 2] = z_in
-    high, low = np.arange(len(rim)), len(rim) + np.arange(len(rim))
-    next_high, next_low = np.roll(high, -1), np.roll(low, -1)
-    return np.concatenate([top, feet]), np.concatenate([np.stack([low, next_low, next_high], -1),
-                                                        np.stack([low, next_high, high], -1)])
+def _strip(top: np.ndarray, low: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Between two loops (k, 3), counter-clockwise from +z: vertices, and triangles seen from outside."""
+    high, below = np.arange(len(top)), len(top) + np.arange(len(low))
+    after, after_below = np.roll(high, -1), np.roll(below, -1)
+    return np.concatenate([top, low]), np.concatenate([np.stack([below, after_below, after], -1),
+                                                       np.stack([below, after, high], -1)])
 
 
-def _holder(half: tuple[float, float], z: float, black: str) -> list[str]:
+def _holder(lens: Lens, black: str) -> list[str]:
     """Four black rectangles around the entrance."""
-    (rx, ry), wide, lines = half, WIDE * max(half), []
+    (rx, ry), wide, lines = lens.half_size, WIDE * max(lens.half_size), []
     for cx, cy, hx, hy in ((-(rx + wide) / 2, 0, (wide - rx) / 2, wide), ((rx + wide) / 2, 0, (wide - rx) / 2, wide),
                            (0, -(ry + wide) / 2, rx, (wide - ry) / 2), (0, (ry + wide) / 2, rx, (wide - ry) / 2)):
         lines += [f'<shape type="rectangle">{black}', f'  <transform name="to_world"><scale x="{real(hx)}" y="{real(hy)}"/>'
-                  f'<translate x="{real(cx)}" y="{real(cy)}" z="{real(z)}"/></transform>', "</shape>"]
+                  f'<translate x="{real(cx)}" y="{real(cy)}" z="{real(lens.z_in)}"/></transform>', "</shape>"]
     return lines
+
+
+def _round_holder(path: str | Path, radius: float, z: float, black: str) -> list[str]:
+    """A black ring around the entrance, in a mesh of its own."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 4096, endpoint=False)
+    inner = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full_like(angle, z)], -1)
+    file = companions(path, True)[2]
+    write_mesh(file, *_strip(inner, inner * [WIDE, WIDE, 1.0]), text=False)
+    return [f'<shape type="ply" id="holder"><string name="filename" value="{file.name}"/>{black}</shape>']
 
 
 def _light(scene: Scene) -> list[str]:
@@ -126,13 +134,13 @@ def _light(scene: Scene) -> list[str]:
     if isinstance(source, PlaneWave):
         if source.profile is not None:
             raise InputError("--format mitsuba: its collimated emitter is uniform, so a source with a profile cannot be written")
-        (rx, ry), area = lens.half_size, lens.size[0] * lens.size[1]
+        (rx, ry), area = lens.half_size, lens.size[0] * lens.size[1] * (math.pi / 4.0 if lens.round else 1.0)
         radiance = real(source.power / area)
-        return ['<shape type="rectangle" id="light">',
+        return [f'<shape type="{"disk" if lens.round else "rectangle"}" id="light">',
                 f'  <transform name="to_world"><scale x="{real(rx)}" y="{real(ry)}"/>'
                 f'<translate z="{real(lens.z_in - BEFORE)}"/></transform>',
                 f'  <emitter type="directionalarea"><rgb name="radiance" value="{radiance}"/></emitter>', "</shape>"]
-    cone = covering_cone(source, lens.half_size, lens.z_in)
+    cone = covering_cone(source, lens.half_size, lens.z_in, lens.round)
     if not isinstance(source, Disc):
         return _spots(source, cone)
     if source.angle is not None or source.intensity != "lambertian" or source.cone is not None:

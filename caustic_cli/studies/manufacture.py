@@ -49,6 +49,10 @@ def manufacture(scene: Scene, field: HeightField, heights: Tensor, tool_radius: 
         raise InputError(f"--tool-radius must be greater than 0 mm, got {tool_radius:g}")
     lens, pixel = scene.lens, max(scene.screen.pixel)
     z, *derivatives = sampled(field, heights, [_points(s) for s in field.spaces])
+    if lens.round:  # what lies beyond the circle takes the middle's place
+        (u, v) = (torch.linspace(-1.0, 1.0, n, dtype=torch.float64) for n in z.shape)
+        beyond, at = u[:, None] ** 2 + v[None, :] ** 2 > 1.0, tuple(n // 2 for n in z.shape)
+        z, *derivatives = (torch.where(beyond, t[at], t) for t in (z, *derivatives))
     bends = curvature.largest(*derivatives)
     bent, at = float(bends.max()), divmod(int(bends.argmax()), bends.shape[1])
     where = [(2.0 * k / (n - 1) - 1.0) * r for k, n, r in zip(at, z.shape, field.half_size, strict=True)]

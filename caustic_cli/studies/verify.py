@@ -139,7 +139,12 @@ def _trace(mi, world, scene: Scene, rays: int, seed: int) -> tuple[np.ndarray, n
 def emitted(scene: Scene, rays: int, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Starts and directions (3, N) of independent rays, batch by batch, and what each carries: 1 on average over all of them."""
     source, (rx, ry), z_in = scene.source, scene.lens.half_size, scene.lens.z_in
-    far = isinstance(source, Disc) and source.angle is not None
+    far, round_ = isinstance(source, Disc) and source.angle is not None, scene.lens.round
+    if getattr(source, "profile", None) is not None:
+        line = (np.arange(2000) + 0.5) / 1000 - 1
+        x, y = np.meshgrid(line, line, indexing="ij")
+        within = x * x + y * y <= 1 if round_ else np.ones_like(x, bool)
+        mean = _profile(source.profile, x[within], y[within]).mean()
     for first in range(0, rays, BATCH):
         n = min(BATCH, rays - first)
         a, b, u, v = rng.random((4, n))
@@ -147,12 +152,13 @@ def emitted(scene: Scene, rays: int, rng: np.random.Generator) -> Iterator[tuple
         if isinstance(source, PlaneWave) or far:
             sine = np.sqrt(a) * np.sin(np.radians(source.angle) / 2) if far else np.zeros(n)
             d = np.array([sine * np.cos(2 * np.pi * b), sine * np.sin(2 * np.pi * b), np.sqrt(1 - sine**2)])
+            x, y = ((2 * u - 1) * rx, (2 * v - 1) * ry) if not round_ else (rx * np.sqrt(u) * np.cos(2 * np.pi * v),
+                                                                            rx * np.sqrt(u) * np.sin(2 * np.pi * v))
             if not far and source.profile is not None:
-                e = source.profile / source.profile.mean()
-                one = e[(u * e.shape[0]).astype(int), (v * e.shape[1]).astype(int)]
-            yield np.array([(2 * u - 1) * rx, (2 * v - 1) * ry, np.full(n, z_in)]) - d, d, one
+                one = _profile(source.profile, x / rx, y / ry) / mean
+            yield np.array([x, y, np.full(n, z_in)]) - d, d, one
             continue
-        cone = covering_cone(source, (rx, ry), z_in)
+        cone = covering_cone(source, (rx, ry), z_in, round_)
         if source.intensity == "lambertian":
             sine = np.sqrt(a) * np.sin(cone)
         else:  # even in the cosine, reckoned from 1
@@ -167,6 +173,12 @@ def emitted(scene: Scene, rays: int, rng: np.random.Generator) -> Iterator[tuple
             o = np.array(source.positions)[rng.choice(len(powers), n, p=powers / powers.sum())].T
         near = d[2] > 1e-6  # from 1 mm or less before the entrance: single precision knows no far origin
         yield o + d * np.where(near, np.maximum((z_in - o[2]) / np.where(near, d[2], 1) - 1, 0), 0), d, one
+
+
+def _profile(e: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Relative irradiance at points of [-1, 1]^2."""
+    i, j = (np.clip((0.5 * (c + 1) * k).astype(int), 0, k - 1) for c, k in zip((x, y), e.shape, strict=True))
+    return e[i, j]
 
 
 def _follow(mi, world, shapes, start: np.ndarray, direction: np.ndarray):
