@@ -12,6 +12,7 @@ pi L times a pixel's area is its power.  Lengths are mm, so radiance is W / (mm^
 
 from __future__ import annotations
 
+import itertools
 import math
 from pathlib import Path
 
@@ -34,6 +35,8 @@ SAMPLES = 256
 #: The collimated light starts so far before the entrance, mm, and the holder is so many lens widths wide.
 BEFORE, WIDE = 1.0, 50.0
 DEPTH = 4
+#: Corners of a round lens' holder.
+RING = 1024
 #: Points along an axis of a mesh that Mitsuba loads in seconds.
 QUICK = 2048
 
@@ -114,11 +117,15 @@ def _holder(lens: Lens, black: str) -> list[str]:
 
 
 def _round_holder(path: str | Path, radius: float, z: float, black: str) -> list[str]:
-    """A black ring around the entrance, in a mesh of its own."""
-    angle = np.linspace(0.0, 2.0 * np.pi, 4096, endpoint=False)
-    inner = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full_like(angle, z)], -1)
+    """A black ring around the entrance, in a mesh of its own: rings that widen, since single precision misses thin triangles."""
+    angle = np.linspace(0.0, 2.0 * np.pi, RING, endpoint=False)
+    inner = np.stack([np.cos(angle), np.sin(angle), np.full_like(angle, z)], -1) * [radius, radius, 1.0]
+    inner[:, :2] /= math.cos(math.pi / RING)  # around the circle, not within
+    widths = [1.0, 1.05, 1.25, 2.0, 6.0, WIDE]
+    parts = [_strip(inner * [a, a, 1.0], inner * [b, b, 1.0]) for a, b in itertools.pairwise(widths)]
+    faces = np.concatenate([f + k * 2 * RING for k, (_, f) in enumerate(parts)])
     file = companions(path, True)[2]
-    write_mesh(file, *_strip(inner, inner * [WIDE, WIDE, 1.0]), text=False)
+    write_mesh(file, np.concatenate([v for v, _ in parts]), faces, text=False)
     return [f'<shape type="ply" id="holder"><string name="filename" value="{file.name}"/>{black}</shape>']
 
 
