@@ -15,7 +15,8 @@ from caustic_cli.inverse.designer import Options
 from caustic_cli.inverse.schedule import LEAST_SPANS, Stage, coarse_to_fine, refinement, refinement_spans
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.scene import Offset, PlaneWave, Screen, Source, checks
-from caustic_cli.settings import SOURCES, build_source, index_of, with_defaults
+from caustic_cli.scene.light import RGB
+from caustic_cli.settings import SOURCES, build_screen, build_source, index_of, with_defaults
 
 DEFAULT_MAG = 3.0
 DEFAULT_MARGIN = 0.28  # table 6.1: the screen is 6.4 wide where the picture is 5
@@ -26,6 +27,7 @@ RAYS_PER_PIXEL = 9.0  # 750 x 750 rays on 250 x 250 pixels, tables D.1 and D.2
 SINGLE_STAGE_ITERATIONS = 1000  # thesis 6.2.1
 DRAFT_SECONDS, FINE_SECONDS = 8.0, 60.0  # time limits below and from which another quality is the better use of the time
 STEEPEST = 1.25  # least radius of a derived sphere, in half diagonals of the lens: slopes up to 1.3
+COLOR_GLASS = "N-BK7"  # of a coloured picture, unless glass or index is said: dispersion has to be known
 SOURCE_DISTANCE, SOURCE_WIDTH, SOURCE_GRID = 5.0, 0.2, (25, 25)  # in lens widths; the grid of fig. 6.4.1
 
 Settings = dict[str, dict[str, Any]]
@@ -46,7 +48,13 @@ def complete(given: Settings, aspect: float, *, mag: float | None = None, margin
         InputError: a value is out of range, or two contradict each other.
     """
     s = with_defaults(given)
+    if s["lens"].get("mirror", False) and "z" not in given.get("screen", {}):
+        s["screen"]["z"] = -s["screen"]["z"]
     lens, screen, target = s["lens"], s["screen"], s["target"]
+    if target.get("color", False):
+        s["source"].setdefault("wavelengths", list(RGB))
+        if "index" not in lens:
+            lens.setdefault("glass", COLOR_GLASS)
     if mag is not None:
         mag = checks.number("--mag", mag, 1e-3, 1e3)
     margin = checks.number("--margin", DEFAULT_MARGIN if margin is None else margin, 0.0, 100.0)
@@ -70,7 +78,7 @@ def complete(given: Settings, aspect: float, *, mag: float | None = None, margin
     if "resolution" not in screen:
         nx = width or DEFAULT_RESOLUTION
         screen["resolution"] = [nx, max(2, round(nx * screen["size"][1] / screen["size"][0]))]
-    Screen(tuple(screen["size"]), screen["z"], tuple(screen["resolution"]))
+    build_screen(s)
     _complete_lens(lens, screen, target, build_source(s))
     _complete_design(s, quality, rays)
     return s
@@ -103,15 +111,19 @@ def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[st
         lens.setdefault("wavelength", 587.5618)
     lens.setdefault("thickness", 5.0 * scale)
     lens.setdefault("height_range", [-scale, scale])
-    if screen["z"] <= lens["thickness"] + lens["height_range"][1]:
+    mirror = lens.get("mirror", False)
+    if mirror and screen["z"] >= lens["thickness"] + lens["height_range"][0]:
+        raise InputError(f"[screen] z must lie before the mirror, which begins at"
+                         f" {lens['thickness'] + lens['height_range'][0]:.4g} mm, got {screen['z']:g} mm")
+    if not mirror and screen["z"] <= lens["thickness"] + lens["height_range"][1]:
         raise InputError(f"[screen] z must lie behind the lens, which is up to"
                          f" {lens['thickness'] + lens['height_range'][1]:.4g} mm thick, got {screen['z']:g} mm")
     if "radius" not in lens:
         mag = tuple(t / w for t, w in zip(target["size"], lens["size"], strict=True))
         vergence = 0.0
         if not isinstance(source, PlaneWave) and source.nearest < lens["z_in"]:  # divergence at the surface, 1/mm
-            vergence = 1.0 / (lens["z_in"] - source.centre[2] + (lens["thickness"] - lens["z_in"]) / index)
-        radius = Offset.for_magnification(mag, index, screen["z"], lens["thickness"], vergence).radius
+            vergence = 1.0 / (lens["z_in"] - source.centre[2] + (lens["thickness"] - lens["z_in"]) / (1.0 if mirror else index))
+        radius = Offset.for_magnification(mag, -1.0 if mirror else index, screen["z"], lens["thickness"], vergence).radius
         if vergence:  # light from nearby may ask for more than a sphere over this aperture can do
             least = STEEPEST * math.hypot(*lens["size"]) / 2.0
             radius = [math.copysign(max(abs(r), least), r) for r in radius]
@@ -201,8 +213,7 @@ def build_stages(settings: Settings) -> list[Stage]:
     Raises:
         InputError: there are none, a value is out of range, or the last stage is not on the lens' own control net.
     """
-    screen = settings["screen"]
-    on = Screen(tuple(screen["size"]), screen["z"], tuple(screen["resolution"]))
+    on = build_screen(settings)
     stages = []
     for t in settings["design"].get("stages", []):
         f = filter_from(t["reconstruction"], t["filter_size"], on, t.get("alpha_per_mm2"), t.get("alpha_per_pixel2"))
@@ -228,4 +239,4 @@ def build_options(settings: Settings) -> Options:
         if not d[key] > 0:
             raise InputError(f"[design] {key} must be greater than 0 s, got {d[key]:g}")
     return Options(d["loss"], d["optimizer"], d["lr"], d["network"], d["initial"], d["preconditioner"],
-                   d["filter_target"], d["seed"], dtype, d["max_slope"])
+                   d["filter_target"], d["seed"], dtype, d["max_slope"], d["min_radius"])

@@ -39,8 +39,8 @@ def to_srgb(value: np.ndarray) -> np.ndarray:
 class Picture:
     """A target as it is kept in a project.
 
-    values: uint8 or uint16 codes in image order (rows from the top), or float64 irradiance in array order [i, j];
-    encoding: what the codes mean.
+    values: uint8 or uint16 codes in image order (rows from the top), uint8 (rows, columns, 3) in colour, or float64 irradiance in
+    array order [i, j], (3, n_x, n_y) in colour; encoding: what the codes mean.
     """
 
     values: np.ndarray
@@ -60,17 +60,17 @@ class Picture:
     @property
     def irradiance_shape(self) -> tuple[int, int]:
         """Cells along x and y."""
-        return self.values.shape if self.values.dtype == np.float64 else self.values.shape[::-1]
+        return self.values.shape[-2:] if self.values.dtype == np.float64 else self.values.shape[1::-1]
 
     def irradiance(self) -> np.ndarray:
-        """Linear irradiance (a, b), [i, j], float64; codes are scaled to [0, 1]."""
+        """Linear irradiance (a, b), [i, j], or (3, a, b) in colour, float64; codes are scaled to [0, 1]."""
         if self.values.dtype == np.float64:
             return self.values
         top = np.iinfo(self.values.dtype).max
         table = np.arange(top + 1) / top
         if self.encoding == "srgb":
             table = to_linear(table)
-        return np.ascontiguousarray(table[self.values][::-1].T)
+        return np.ascontiguousarray(np.moveaxis(table[self.values][::-1], (0, 1), (-1, -2)))
 
     def write(self, path: Path) -> None:
         """Write it losslessly; `path` ends in `suffix`."""
@@ -80,8 +80,8 @@ class Picture:
             _write_png(path, Image.fromarray(self.values))
 
 
-def read_picture(path: str | Path, linear: bool = False) -> Picture:
-    """The picture at `path`, reduced to one channel of luminance.
+def read_picture(path: str | Path, linear: bool = False, color: bool = False) -> Picture:
+    """The picture at `path`, reduced to one channel of luminance, or with `color` as red, green and blue of 8 bits each.
 
     8- and 16-bit grey codes are kept as they are.  Colour becomes luminance, alpha lies over black, a camera's
     orientation tag is obeyed.  A .npy array, and a floating-point image, is linear irradiance.
@@ -95,7 +95,7 @@ def read_picture(path: str | Path, linear: bool = False) -> Picture:
         if not stat.S_ISREG(mode):
             kind = "a directory" if stat.S_ISDIR(mode) else "not a regular file"
             raise InputError(f"{path}: is {kind}; {ACCEPTED}")
-        picture = _read_npy(path) if path.suffix.lower() == ".npy" else _read_image(path, linear)
+        picture = _read_npy(path, color) if path.suffix.lower() == ".npy" else _read_image(path, linear, color)
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file; {ACCEPTED}") from error
     except PermissionError as error:
@@ -117,7 +117,7 @@ def _check_size(path: Path, width: int, height: int) -> None:
         raise InputError(f"{path}: is {width} x {height} pixels; at most {MAX_PIXELS} pixels (8192 x 8192) are read")
 
 
-def _read_npy(path: Path) -> Picture:
+def _read_npy(path: Path, color: bool) -> Picture:
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except (FileNotFoundError, PermissionError):
@@ -126,9 +126,11 @@ def _read_npy(path: Path) -> Picture:
         raise InputError(f"{path}: is not a readable .npy array ({type(error).__name__}); {ACCEPTED}") from error
     if isinstance(array, np.lib.npyio.NpzFile):
         array.close()
-    if not isinstance(array, np.ndarray) or array.ndim != 2 or array.dtype.kind not in "fiub":
-        raise InputError(f"{path}: a .npy target must be a 2-D array of real numbers")
-    _check_size(path, *array.shape)
+    ours = isinstance(array, np.ndarray) and (array.ndim == 3 and len(array) == 3 if color else array.ndim == 2)
+    if not ours or array.dtype.kind not in "fiub":
+        shape = "an array (3, n_x, n_y)" if color else "a 2-D array"
+        raise InputError(f"{path}: a .npy target must be {shape} of real numbers")
+    _check_size(path, *array.shape[-2:])
     values = np.array(array, dtype=np.float64)
     if not np.isfinite(values).all():
         raise InputError(f"{path}: holds {int((~np.isfinite(values)).sum())} values that are NaN or infinite;"
@@ -140,7 +142,7 @@ def _read_npy(path: Path) -> Picture:
     return Picture(values, "linear")
 
 
-def _read_image(path: Path, linear: bool) -> Picture:
+def _read_image(path: Path, linear: bool, color: bool) -> Picture:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the size is checked below, in our words
@@ -157,6 +159,10 @@ def _read_image(path: Path, linear: bool) -> Picture:
     except Exception as error:  # what a broken file makes one of Pillow's many decoders stumble over may be anything
         raise InputError(f"{path}: is not an image that can be read ({type(error).__name__}); {ACCEPTED}") from error
     encoding = "linear" if linear else "srgb"
+    if color and image.mode != "F" and not image.mode.startswith("I"):
+        return Picture(_over_black(image, linear), encoding)
+    if color:
+        raise InputError(f"{path}: has no colours (mode {image.mode}); a colour image of 8 bits is needed")
     if image.mode == "F":
         values = np.asarray(image, dtype=np.float64)
         if not np.isfinite(values).all() or (values < 0).any():
@@ -171,6 +177,16 @@ def _read_image(path: Path, linear: bool) -> Picture:
     if image.mode in ("1", "L") and not transparent:
         return Picture(np.array(image.convert("L")), encoding)
     return Picture(_luminance(image, linear, transparent), encoding)
+
+
+def _over_black(image: Image.Image, linear: bool) -> np.ndarray:
+    """8-bit codes (rows, columns, 3) of a colour picture over black."""
+    codes = np.asarray(image.convert("RGBA"))
+    if codes[..., 3].min() == 255:
+        return codes[..., :3].copy()
+    table = np.arange(256) / 255.0
+    light = (table if linear else to_linear(table))[codes[..., :3]] * (codes[..., 3:] / 255.0)
+    return np.rint((light if linear else to_srgb(light)) * 255.0).astype(np.uint8)
 
 
 def _luminance(image: Image.Image, linear: bool, transparent: bool) -> np.ndarray:
@@ -190,10 +206,11 @@ def _luminance(image: Image.Image, linear: bool, transparent: bool) -> np.ndarra
 
 
 def write_image(path: str | Path, irradiance: np.ndarray, white: float, encoding: str) -> None:
-    """Write irradiance (n_x, n_y), [i, j], as an 8-bit grey PNG with `white` (and everything above) at 255."""
+    """Write irradiance (n_x, n_y), [i, j], as an 8-bit grey PNG with `white` (and everything above) at 255; (3, n_x, n_y), RGB."""
     value = np.clip(irradiance / white if white > 0 else np.zeros_like(irradiance), 0.0, 1.0)
     value = to_srgb(value) if encoding == "srgb" else value
-    _write_png(Path(path), Image.fromarray(np.rint(value * 255.0).astype(np.uint8).T[::-1].copy()))
+    codes = np.moveaxis(np.rint(value * 255.0).astype(np.uint8), (-1, -2), (0, 1))[::-1]
+    _write_png(Path(path), Image.fromarray(np.ascontiguousarray(codes)))
 
 
 def write_npy(path: str | Path, array: np.ndarray) -> None:

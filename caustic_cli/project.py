@@ -58,8 +58,9 @@ class Project:
                              " (caustic design makes one)")
         given = settings.read(path / TOML)
         try:
-            picture = _picture(path, given.get("target", {}).get("file", "target.png"),
-                               given.get("target", {}).get("encoding", "srgb") == "linear")
+            goal = given.get("target", {})
+            picture = _picture(path, goal.get("file", "target.png"), goal.get("encoding", "srgb") == "linear",
+                               goal.get("color", False))
             profile = given.get("source", {}).get("profile")
             full = complete(given, picture.aspect)
             build_stages(full), build_options(full)  # a project whose design is impossible is not opened for its lens either
@@ -87,9 +88,13 @@ class Project:
             raise InputError(settings.as_options(str(error), given)) from error
 
     def target(self, scene: Scene) -> np.ndarray:
-        """The picture on the scene's screen, (n_x, n_y)."""
-        t = self.settings["target"]
-        return target_on_screen(self.picture.irradiance(), tuple(t["size"]), scene.screen, t["flip"])
+        """The picture on the scene's screen, (n_x, n_y), or (3, n_x, n_y) of a coloured one."""
+        t, light = self.settings["target"], self.picture.irradiance()
+        if light.ndim == 3:
+            whole = target_on_screen(light.sum(0), tuple(t["size"]), scene.screen, t["flip"])
+            parts = [target_on_screen(c, tuple(t["size"]), scene.screen, t["flip"]) if c.any() else 0.0 * whole for c in light]
+            return np.stack(parts)
+        return target_on_screen(light, tuple(t["size"]), scene.screen, t["flip"])
 
     def load(self) -> Checkpoint:
         """The design so far."""
@@ -133,7 +138,7 @@ class Project:
         write_bytes((path or self.path) / TOML, settings.dump(self.settings).encode())
 
 
-def _picture(directory: Path, name: str, linear: bool) -> Picture:
+def _picture(directory: Path, name: str, linear: bool, color: bool = False) -> Picture:
     if name != Path(name).name or name in ("", ".", "..", TOML, CHECKPOINT, RENDER, REPORT):
         raise InputError(f"a picture's file must be the name of one within the project directory, got {name!r}")
-    return read_picture(directory / name, linear)
+    return read_picture(directory / name, linear, color)

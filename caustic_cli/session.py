@@ -24,11 +24,13 @@ from caustic_cli.errors import CausticError, InputError, Interrupted
 from caustic_cli.inverse import ranks
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.first import first_surface
+from caustic_cli.inverse.target import grey
 from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.picture import read_picture
 from caustic_cli.project import CHECKPOINT, RENDER, TOML, Project, is_project
 from caustic_cli.scene import Scene
 from caustic_cli.scene.source import blur_limit
+from caustic_cli.surfaces import SUFFIXES, onto, read_surface
 from caustic_cli.verdict import judge
 
 #: Part of a time limit that is left to the iterations, however long the start took.
@@ -55,7 +57,11 @@ def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: d
         names = [option for (_, key, option) in given if key in ("index", "glass")]
         if len(names) == 1:  # an option replaces what the configuration says
             del said["lens"]["glass" if names[0] == "--index" else "index"]
-    picture = read_picture(target, said.get("target", {}).get("encoding") == "linear")
+    goal = said.get("target", {})
+    picture = read_picture(target, goal.get("encoding") == "linear", goal.get("color", False))
+    if goal.get("color", False):
+        light = [float(c) for c in picture.irradiance().sum((1, 2))]
+        said.setdefault("source", {}).setdefault("weights", [c / sum(light) for c in light])
     if screen:
         height = screen[1] if len(screen) == 2 else screen[0] * picture.aspect
         said.setdefault("screen", {})["size"] = [screen[0], height]
@@ -83,6 +89,8 @@ def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: d
         if first is not None and _make_room(full, said, first):
             _designer(project, "cpu")
             first = _first_heights(project)
+        if first is not None:
+            first = _designer(project, "cpu")[0].within_limits(State(first))
     except InputError as error:  # about a project.toml that is not written yet
         raise InputError(settings.as_options(str(error).removeprefix(f"{path / TOML}: "), given)) from error
     place.settle(project, force)
@@ -116,7 +124,7 @@ def design(project: Project, first: torch.Tensor | None, device: str, say: Repor
 
 def _say_blur(scene: Scene, say: Reporter) -> None:
     """What no lens can do about an extended source, before time is spent on it."""
-    blur, pixel = blur_limit(scene.source, scene.lens.z_in, scene.screen.z - scene.lens.z_in), max(scene.screen.pixel)
+    blur, pixel = blur_limit(scene.source, scene.lens.z_in, abs(scene.screen.z - scene.lens.z_in)), max(scene.screen.pixel)
     if blur > 0:
         finer = f"; the picture's detail below that, {blur / pixel:.3g} pixels, is out of reach" if blur > pixel else ""
         say.say(f"the source's own size blurs every point over {blur:.3g} mm on the screen{finer}")
@@ -180,27 +188,29 @@ def _designer(project: Project, device: str) -> tuple[Designer, np.ndarray]:
 
 
 def _first_heights(project: Project) -> torch.Tensor | None:
-    """Heights of the transport start or of --start PROJECT on the first stage's net, or None for the offset surface.
+    """Heights of the transport start or of --start on the first stage's net, or None for the offset surface.
 
     Raises:
-        InputError: no such project, its lens is of another size, or transport cannot reach the picture.
+        InputError: no such project or surface, its lens is of another size, or transport cannot reach the picture.
     """
     start = project.settings["design"]["start"]
     if start == "offset":
         return None
     if start == "transport":
         designer, target = _designer(project, "cpu")
-        return first_surface(designer.scene, target, designer.field(0))
+        return first_surface(designer.scene, grey(target), designer.field(0))
+    net = _designer(project, "cpu")[0].field(0)
+    if Path(start).suffix.lower() in SUFFIXES and not Path(start).is_dir():
+        return onto(*read_surface(start, net.half_size), net)
     if not is_project(Path(start)):
-        raise InputError(f"[design] start must be transport, offset or a project directory, got {start!r}")
+        raise InputError("[design] start must be transport, offset, a project directory or a lens surface"
+                         f" ({', '.join(SUFFIXES)}), got {start!r}")
     other = Project.open(start)
     field, checkpoint = other.lens(other.scene())
     if other.settings["lens"]["size"] != project.settings["lens"]["size"]:
         raise InputError(f"[design] start: the lens of {start} is {other.settings['lens']['size']} mm, not"
                          f" {project.settings['lens']['size']} mm")
-    net = _designer(project, "cpu")[0].field(0)
-    tu, tv = (a.change_of_basis(b) for a, b in zip(field.spaces, net.spaces, strict=True))
-    return tu @ checkpoint.state.heights @ tv.T
+    return onto(field, checkpoint.state.heights, net)
 
 
 def _make_room(full: dict, said: dict, first: torch.Tensor) -> bool:
@@ -256,7 +266,7 @@ def _run(project: Project, designer: Designer, target: np.ndarray, state: State,
                         f" {s.rays:,} rays, blur {s.blur:g} px")
             _, _, loss, on_screen, _ = now.history[-1]
             show(f"stage {stage + 1}/{len(designer.stages)}",
-                 f"loss {loss * target.size:.4f}  on screen {on_screen:.1%}", now.total, total)
+                 f"loss {loss * grey(target).size:.4f}  on screen {on_screen:.1%}", now.total, total)
             if time.monotonic() - saved >= chosen["checkpoint_every"]:
                 saved = time.monotonic()  # before the writing, which takes its time too
                 keep(now)
@@ -266,6 +276,8 @@ def _run(project: Project, designer: Designer, target: np.ndarray, state: State,
         state = designer.run(state, iterations=chosen["iterations"], time_limit=limit, stop=lambda: bool(asked),
                              on_iteration=on_iteration)
         keep(state)
+        if not asked:
+            state.heights = designer.within_limits(state)
         if asked:
             raise Interrupted(f"interrupted after {state.total} iterations; {project.path / CHECKPOINT} is saved,"
                               f" caustic design --resume {project.path} goes on", 128 + asked[0])

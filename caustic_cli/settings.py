@@ -19,7 +19,7 @@ import tomli_w
 
 from caustic_cli import __version__
 from caustic_cli.errors import InputError
-from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen, Source, checks
+from caustic_cli.scene import Disc, Lens, Light, Offset, PlaneWave, Points, Scene, Screen, Source, checks
 from caustic_cli.scene.materials import D_LINE, refractive_index
 
 FORMAT_VERSION = 1
@@ -47,6 +47,9 @@ SCHEMA: dict[str, dict[str, Key]] = {
         "angle": Key("number", "degrees, disc at infinity (the sun: 0.533): full angle it is seen under"),
         "intensity": Key("text", "uniform in solid angle, or lambertian"),
         "aim": Key("flag", "sample rays on the lens, not all over the cone"),
+        "polarisation": Key("number", "degrees from +x, of linearly polarised light; without it, unpolarised"),
+        "wavelengths": Key("list", "nm, of the source's spectrum; dispersed by [lens] glass"),
+        "weights": Key("list", "relative power at each wavelength"),
     },
     "lens": {
         "size": Key("numbers", "mm, full width and height of the aperture"),
@@ -59,6 +62,11 @@ SCHEMA: dict[str, dict[str, Key]] = {
         "glass": Key("text", "material, instead of index"),
         "wavelength": Key("number", "nm, at which the glass is taken"),
         "fresnel": Key("text", "reflection losses: none, schlick or exact"),
+        "absorption": Key("number", "1/mm, a in exp(-a t) through t mm of glass (Beer-Lambert)"),
+        "roughness": Key("number", "standard deviation of the slopes of the exit's microfacets along an axis"),
+        "mirror": Key("flag", "the surface reflects; the screen stands on the source's side"),
+        "aperture": Key("text", "rectangle, or circle: the largest within size"),
+        "border": Key("number", "mm, width of a rim around the aperture, for the mount"),
         "control": Key("wholes", "control points of the finished lens"),
         "degree": Key("wholes", "spline degrees"),
         "knots_u": Key("list", "knot vector on [0, 1] along x"),
@@ -68,23 +76,27 @@ SCHEMA: dict[str, dict[str, Key]] = {
         "z": Key("number", "mm, from the lens' origin"),
         "size": Key("numbers", "mm, full width and height"),
         "resolution": Key("wholes", "pixels"),
+        "tilt": Key("numbers", "degrees, turned about its own middle along x, then along y"),
+        "shift": Key("numbers", "mm, of its middle from the axis"),
     },
     "target": {
         "file": Key("text", "the picture, in this directory"),
         "size": Key("numbers", "mm, width and height of the picture on the screen"),
         "encoding": Key("text", "of the picture's values: srgb or linear"),
         "flip": Key("text", "mirror the picture along x, y or xy; empty for none"),
+        "color": Key("flag", "red, green and blue apart, at the source's three wavelengths"),
     },
     "design": {
         "loss": Key("text", "weighted sum of rms (eq. 5.2.1), rms-light, throughput, diffusion, uniformity, laplacian, curvature"),
         "max_slope": Key("number", "limit of the surface's slope; 0 for none"),
+        "min_radius": Key("number", "mm, least radius of concave places (the tool's); 0 for any"),
         "optimizer": Key("text", "lbfgs or adam"),
         "lr": Key("number", "learning rate of adam"),
         "network": Key("text", "none, sparse or dense"),
         "initial": Key("text", "parameters at first: zero, uniform (+-1e-4) or random"),
         "preconditioner": Key("text", "none or laplacian"),
         "filter_target": Key("flag", "filter the target as the render is filtered"),
-        "start": Key("text", "transport, offset, or the project whose lens was the first surface"),
+        "start": Key("text", "transport, offset, or the project or file whose lens was the first surface"),
         "iterations": Key("whole", "in all; 0: what the stages say"),
         "time_limit": Key("number", "s; inf for none"),
         "checkpoint_every": Key("number", "s between checkpoints"),
@@ -113,7 +125,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "screen": {"z": 300.0},
     "target": {"encoding": "srgb", "flip": ""},
     "design": {"loss": "rms-light", "optimizer": "lbfgs", "lr": 1e-3, "network": "none", "initial": "zero",
-               "filter_target": True, "max_slope": 0.0, "iterations": 0, "time_limit": math.inf,
+               "filter_target": True, "max_slope": 0.0, "min_radius": 0.0, "iterations": 0, "time_limit": math.inf,
                "checkpoint_every": 10.0, "seed": 0, "dtype": "float32"},
 }
 SOURCES = ("plane", "point", "grid", "disc")
@@ -247,7 +259,9 @@ def build_lens(settings: dict[str, dict[str, Any]]) -> Lens:
     knots = (tuple(lens["knots_u"]), tuple(lens["knots_v"])) if "knots_u" in lens else None
     offset = Offset(lens["thickness"], tuple(lens["radius"]))
     return Lens(tuple(lens["size"]), lens["z_in"], index_of(lens), tuple(lens["control"]), tuple(lens["degree"]), knots,
-                lens["min_thickness"], offset, tuple(lens["height_range"]), lens["fresnel"])
+                lens["min_thickness"], offset, tuple(lens["height_range"]), lens["fresnel"], lens.get("absorption", 0.0),
+                lens.get("roughness", 0.0), lens.get("glass"), lens.get("mirror", False),
+                lens.get("aperture", "rectangle"), lens.get("border", 0.0))
 
 
 def build_source(settings: dict[str, dict[str, Any]], profile: np.ndarray | None = None, type: str | None = None) -> Source:
@@ -277,9 +291,21 @@ def build_source(settings: dict[str, dict[str, Any]], profile: np.ndarray | None
 
 def build_scene(settings: dict[str, dict[str, Any]], profile: np.ndarray | None = None) -> Scene:
     """The whole scene; `profile` is the source's irradiance if [source] names one."""
-    screen = settings["screen"]
-    return Scene(build_source(settings, profile), build_lens(settings),
-                 Screen(tuple(screen["size"]), screen["z"], tuple(screen["resolution"])))
+    return Scene(build_source(settings, profile), build_lens(settings), build_screen(settings), build_light(settings))
+
+
+def build_screen(settings: dict[str, dict[str, Any]]) -> Screen:
+    """The screen that the [screen] section describes."""
+    s = settings["screen"]
+    return Screen(tuple(s["size"]), s["z"], tuple(s["resolution"]), tuple(s.get("tilt", (0.0, 0.0))),
+                  tuple(s.get("shift", (0.0, 0.0))))
+
+
+def build_light(settings: dict[str, dict[str, Any]]) -> Light:
+    """Wavelengths and polarisation of the [source] section, whatever its type."""
+    s = settings["source"]
+    return Light(s.get("polarisation"), tuple(s.get("wavelengths", ())), tuple(s.get("weights", ())),
+                 color=settings["target"].get("color", False))
 
 
 def as_options(message: str, given) -> str:
@@ -317,9 +343,8 @@ def read(path: Path) -> dict[str, dict[str, Any]]:
             text = f.read(MAX_BYTES + 1)
         if len(text) > MAX_BYTES:
             raise InputError(f"{path}: is too large; a TOML file of at most {MAX_BYTES:,} bytes is read")
-        text = text.decode().replace("\r\n", "\n")
+        return parse(text.decode().replace("\r\n", "\n"), str(path))
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file; a TOML file is needed") from error
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read as text ({error}); a TOML file is needed") from error
-    return parse(text, str(path))

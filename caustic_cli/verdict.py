@@ -12,6 +12,7 @@ import torch
 
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.losses import parse
+from caustic_cli.inverse.target import grey
 from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.picture import write_image
@@ -41,7 +42,7 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
         return retrace(scene, field, heights, target, rays=FINAL_RAYS, device=device, seed=seed)
 
     exposure, figures = trace(state.heights)
-    likeness = not designer.options.max_slope and {name for _, name in parse(designer.options.loss)} <= LIKENESS
+    likeness = {name for _, name in parse(designer.options.loss)} <= LIKENESS
     if state.start is not None and likeness:
         start = designer.begun(state)
         first, began = trace(start)
@@ -52,8 +53,8 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
     image, encoding = exposure.image.cpu().numpy(), project.settings["target"]["encoding"]
     write_image(project.path / RENDER, image, white_level(image, target), encoding)
     history = np.array(state.history, dtype=float).reshape(-1, 5)
-    write_report(project.path / REPORT, target, image, _surface(field, state.heights), history, scene.lens, scene.screen,
-                 figures, encoding)
+    write_report(project.path / REPORT, grey(target), grey(image), _surface(field, state.heights), history, scene.lens,
+                 scene.screen, figures, encoding)
     return state, figures
 
 

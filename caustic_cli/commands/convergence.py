@@ -19,9 +19,9 @@ EXAMPLES = """Examples:
   caustic convergence flame.caustic --study design --seconds 20
 """
 
-STUDIES = ("intersection", "rays", "reconstruction", "precision", "design")
+STUDIES = ("intersection", "rays", "reconstruction", "precision", "effects", "design")
 #: What the progress of a study counts.
-UNITS = {"intersection": "evaluations", "design": "turns"}
+UNITS = {"intersection": "evaluations", "effects": "effects", "design": "turns"}
 
 
 def run(
@@ -29,7 +29,8 @@ def run(
                                                    " sphere a design begins from (intersection: the scene of the thesis' table"
                                                    " D.3; design: a bright disc).", show_default=False)] = None,
     study: Annotated[str, typer.Option(help="intersection: of rays and surface, by the thesis' triangle mesh and by Newton's"
-                                       " method; rays: samplers; reconstruction: filters; precision: float32 and float64; design:"
+                                       " method; rays: samplers; reconstruction: filters; precision: float32 and float64;"
+                                       " effects: each on and off; design:"
                                        " optimisers, networks and control nets.")] = "intersection",
     rays: Annotated[str | None, typer.Option(metavar="N", help="Rays of the largest setting; the reference takes 16 times as"
                                              " many.  Of intersection: rays intersected; of design: rays of a retrace."
@@ -64,10 +65,10 @@ def run(
         raise InputError(f"{output}: is a file; a directory for CSV, JSON and PNG is needed")
     device = options.start_torch(device, threads, say)
 
-    from caustic_cli.studies import intersection, report, training  # noqa: PLC0415
+    from caustic_cli.studies import effects, intersection, report, training  # noqa: PLC0415
 
     if output.is_dir():
-        plots = {"intersection": intersection.PLOTS, "design": training.PLOTS}.get(study)
+        plots = {"intersection": intersection.PLOTS, "design": training.PLOTS, "effects": effects.PLOTS}.get(study)
         report.refuse_foreign_files(report.paths_of(study, output, plots), force)
     opened = _open(project)
     with say.progress(None) as show:
@@ -88,8 +89,13 @@ def run(
             from caustic_cli.studies.convergence import run_study  # noqa: PLC0415
 
             scene, field, heights = opened[1:] if opened else sphere()
-            found = run_study(study, scene, field, heights.to(device), seed=seed or 0, max_rays=count,
-                              repeats=3 if repeats is None else repeats, dtype=precision, progress=tell)
+            if study == "effects":
+                options.compile_for(None, device, say)
+                found = effects.run_effects(scene, field, heights.to(device), rays=count, repeats=repeats, seed=seed or 0,
+                                            dtype=precision, progress=tell)
+            else:
+                found = run_study(study, scene, field, heights.to(device), seed=seed or 0, max_rays=count,
+                                  repeats=3 if repeats is None else repeats, dtype=precision, progress=tell)
     paths = report.write(found, output)
     rows = [(name, "no order could be fitted" if order is None
              else f"error ~ {found.against}^-{order.exponent:.2f} (+-{order.deviation:.2f})")

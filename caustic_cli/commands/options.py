@@ -38,6 +38,35 @@ Cone = Annotated[float | None, typer.Option(metavar="DEG", help="Half-angle of a
                                             " the lens]")]
 
 
+Polarisation = Annotated[float | None, typer.Option(metavar="DEG", help="The source is linearly polarised, so far from +x."
+                                                     "  [default: unpolarised]")]
+Wavelengths = Annotated[str | None, typer.Option(metavar="NM[:W],...", help="The source's spectrum: wavelengths and relative"
+                                                 " powers; a --glass refracts each by its own index.  [default: one wavelength]")]
+Absorption = Annotated[float | None, typer.Option(metavar="PER_MM", help="Absorption coefficient of the glass, 1/mm."
+                                                   "  [default: 0]")]
+Roughness = Annotated[float | None, typer.Option(metavar="SLOPE", help="Standard deviation of the slopes of the surface's"
+                                                 " microfacets, mm per mm.  [default: 0]")]
+ScreenTilt = Annotated[str | None, typer.Option(metavar="A,B", help="Turn the screen about its own x, then y, degrees."
+                                                "  [default: 0,0]")]
+ScreenShift = Annotated[str | None, typer.Option(metavar="X,Y", help="Move the screen's middle off the axis, mm.  [default: 0,0]")]
+
+
+def physics(polarisation: float | None, wavelengths: str | None, absorption: float | None, roughness: float | None,
+            tilt: str | None, shift: str | None) -> dict[tuple[str, str, str], object]:
+    """The options of effects as (section, key, option) -> value, without those that were not given."""
+    lines = [numbers("--wavelengths", part, (1, 2), ":") for part in wavelengths.split(",")] if wavelengths else None
+    given = {
+        ("source", "polarisation", "--polarisation"): polarisation,
+        ("source", "wavelengths", "--wavelengths"): lines and [line[0] for line in lines],
+        ("source", "weights", "--wavelengths"): lines and [line[1] if len(line) == 2 else 1.0 for line in lines],
+        ("lens", "absorption", "--absorption"): absorption,
+        ("lens", "roughness", "--roughness"): roughness,
+        ("screen", "tilt", "--screen-tilt"): list(numbers("--screen-tilt", tilt, (2,), ",")) if tilt else None,
+        ("screen", "shift", "--screen-shift"): list(numbers("--screen-shift", shift, (2,), ",")) if shift else None,
+    }
+    return {key: value for key, value in given.items() if value is not None}
+
+
 def source(kind: str | None, position: list[str] | None, size_: str | None, grid: str | None, angle: float | None,
            cone: float | None) -> dict[tuple[str, str, str], object]:
     """The source options as (section, key, option) -> value, without those that were not given."""
@@ -127,13 +156,13 @@ def start_torch(device: str, threads: int | None, say: Reporter):
 
 
 def compile_for(scene, device: str, say: Reporter) -> None:
-    """Have the CPU's kernels compiled that a scene needs beyond those of `start_torch`."""
+    """Have the CPU's kernels compiled that a scene needs beyond those of `start_torch`; None for any scene's."""
     import torch  # noqa: PLC0415
 
     from caustic_cli.optics.kernels import fused  # noqa: PLC0415
     from caustic_cli.scene import PlaneWave  # noqa: PLC0415
 
-    if fused(device) and not isinstance(scene.source, PlaneWave):
+    if fused(device) and (scene is None or not isinstance(scene.source, PlaneWave)):
         from caustic_cli.optics.kernels.functions import compile_ray_kernels  # noqa: PLC0415
 
         with say.patience("compiling the intersection kernels for this machine, once: about half a minute"):

@@ -17,6 +17,7 @@ from torch import Tensor
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse import ranks
 from caustic_cli.inverse.lbfgs import LBFGS
+from caustic_cli.inverse.limits import within_limits
 from caustic_cli.inverse.losses import NoLight, parse
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.parametrisation import INITIAL, NETWORKS, PRECONDITIONERS, Heights, parametrise
@@ -36,6 +37,7 @@ class Options:
     """How to look for the heights; the stages say with what.
 
     loss: weighted terms, see `losses`; max_slope: limit of the lens' slope, 0 for none;
+    min_radius: least radius of concave places, mm, 0 for any;
     optimizer, lr: lbfgs, or adam with its learning rate; network, initial, preconditioner:
     see `parametrisation`; filter_target: filter the target as the render is filtered; seed: of rays and networks;
     dtype: precision of the rays.
@@ -51,10 +53,12 @@ class Options:
     seed: int = 0
     dtype: torch.dtype = torch.float32
     max_slope: float = 0.0
+    min_radius: float = 0.0
 
     def __post_init__(self):
         parse(self.loss)
         checks.number("[design] max_slope", self.max_slope, 0.0)
+        checks.number("[design] min_radius", self.min_radius, 0.0)
         checks.choice("[design] network", self.network, NETWORKS)
         checks.choice("[design] initial", self.initial, INITIAL)
         checks.choice("[design] preconditioner", self.preconditioner, PRECONDITIONERS)
@@ -168,6 +172,15 @@ class Designer:
             state = self._next(state, k + 1)
         return state
 
+    def within_limits(self, state: State) -> Tensor:
+        """The state's heights, moved as little as the limits of slope and radius ask.
+
+        Raises:
+            CausticError: no surface near them obeys these.
+        """
+        return within_limits(self.field(state.stage), state.heights, self._bounds(self.stages[state.stage]),
+                             self.options.max_slope, self.options.min_radius)
+
     def _stage(self, state: State, k: int, limit: int, deadline: float, stop, on_iteration, origin: float) -> bool:
         """Iterate stage k in place.  True: the stage is done; False: the whole design ends here, for `state.reason`."""
         stage, final = self.stages[k], k == len(self.stages) - 1
@@ -210,7 +223,7 @@ class Designer:
             scene = replace(scene, source=stage.source)
         rays = rays_of(scene, stage.sampler, stage.rays, stream(o.seed, f"stage {k}"), self.device)
         return Objective(scene, self.field(k), rays, stage.filter, self.target, o.loss, blur=stage.blur,
-                         filter_target=o.filter_target, apron=stage.apron, max_slope=o.max_slope,
+                         filter_target=o.filter_target, apron=stage.apron, max_slope=o.max_slope, min_radius=o.min_radius,
                          oversample=stage.oversample, dtype=o.dtype)
 
     def _next(self, state: State, k: int) -> State:
@@ -233,9 +246,13 @@ class Designer:
         lens = replace(self.scene.lens, control=stage.control)
         x, y = HeightField.of(lens).control_xy()
         low, high = lens.height_bounds(x.numpy(), y.numpy())
-        if high.max() >= self.scene.screen.z:
+        screen = self.scene.screen
+        if lens.mirror and low.min() <= screen.z + screen.depth:
+            raise InputError(f"[screen] z must lie before the mirror, whose surface may reach {low.min():.4g} mm,"
+                             f" got {screen.z:g} mm")
+        if not lens.mirror and high.max() >= screen.z - screen.depth:
             raise InputError(f"[screen] z must lie behind the lens, whose surface may reach {high.max():.4g} mm,"
-                             f" got {self.scene.screen.z:g} mm")
+                             f" got {screen.z:g} mm")
         return torch.from_numpy(low), torch.from_numpy(high)
 
     @staticmethod

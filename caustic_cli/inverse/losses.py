@@ -116,3 +116,22 @@ class Loss:
             padded = torch.nn.functional.pad(residual[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
             residual = padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:] - 4.0 * residual
         return (residual * residual).sum() * self.target.numel()
+
+
+class ColorLoss:
+    """The root of the mean square over red, green and blue, each against its own target; a colour without light is left out.
+
+    Args:
+        target, region: (3, n_x, n_y); all others as of `Loss`.
+    """
+
+    def __init__(self, text: str, target: Tensor, blur: float, apron: int, region: Tensor):
+        lit = [k for k, t in enumerate(target) if float(t.sum()) > 0]
+        self.channels = [(k, Loss(text, target[k], blur, apron, region[k])) for k in lit]
+        self.target = self.channels[0][1].target
+
+    def __call__(self, image: Tensor, leaving: Tensor, penalty: Tensor | float = 0.0) -> Tensor:
+        """Loss of an image (3, n_x, n_y) by rays that carried `leaving` (3,): scalar, in units of eq. 5.2.1."""
+        losses = torch.stack([loss(image[k], leaving[k], penalty) for k, loss in self.channels])
+        square = (losses * losses).mean()
+        return square.sqrt() if float(square.detach()) > 0 else square

@@ -15,13 +15,13 @@ import torch
 from torch import Tensor
 
 from caustic_cli.inverse import ranks
-from caustic_cli.inverse.losses import PENALTIES, Loss, parse
+from caustic_cli.inverse.losses import PENALTIES, ColorLoss, Loss, parse
 from caustic_cli.inverse.penalties import Penalty
 from caustic_cli.optics.emission import Rays
 from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.shortage import smaller
-from caustic_cli.optics.tracing import PlaneTracer, RayTracer, tracer
+from caustic_cli.optics.tracing import BandTracer, PlaneTracer, RayTracer, StepTracer, tracers
 from caustic_cli.scene import Scene
 
 #: Rays traced at a time, and the number up to which the prepared chunks are kept from one evaluation to the next.
@@ -45,20 +45,20 @@ class Objective:
         field: spline spaces of the heights.
         sampler: the rays, the same at every evaluation.
         filter: reconstruction filter.
-        target: (n_x, n_y) irradiance on the scene's screen.
+        target: (n_x, n_y) irradiance on the scene's screen, or (3, n_x, n_y) of a coloured scene.
         loss: weighted terms, see `losses.parse`.
         blur: pixels, see `Loss`.
         filter_target: filter the target as the render is filtered.
         apron: pixels by which the screen is widened on every side, dark in the target: light that has left the screen
             is seen there and pulled back.
-        max_slope: limit of the lens' slope, 0 for none.
+        max_slope: limit of the lens' slope, 0 for none; min_radius: least radius of concave places, mm, 0 for any.
         oversample: the filter works on pixels so many times smaller along each axis, which are then added up: a render that
             is nearly a bincount, and yet smooth in the heights.
         dtype: precision of the rays.
     """
 
     def __init__(self, scene: Scene, field: HeightField, sampler: Rays, filter: Filter, target: Tensor, loss: str, *,
-                 blur: float = 0.0, filter_target: bool = True, apron: int = 0, max_slope: float = 0.0,
+                 blur: float = 0.0, filter_target: bool = True, apron: int = 0, max_slope: float = 0.0, min_radius: float = 0.0,
                  oversample: int = 1, dtype: torch.dtype = torch.float32):
         self.device = sampler.device
         screen = scene.screen.grown((apron, apron))
@@ -67,10 +67,11 @@ class Objective:
         wide = torch.nn.functional.pad(target.double().to(sampler.device), (apron, apron, apron, apron))
         smooth = wide
         if filter_target:
-            smooth = self._pool(filter.smooth(wide.repeat_interleave(oversample, 0).repeat_interleave(oversample, 1)))
-        self.loss = Loss(loss, smooth, blur, apron, wide > 0)
+            fine = wide.repeat_interleave(oversample, -2).repeat_interleave(oversample, -1)
+            smooth = self._pool(torch.stack([filter.smooth(c) for c in fine]) if scene.colored else filter.smooth(fine))
+        self.loss = (ColorLoss if scene.colored else Loss)(loss, smooth, blur, apron, wide > 0)
         minded = [(weight, name) for weight, name in parse(loss) if name in PENALTIES and weight > 0]
-        self.penalty = Penalty(scene, field, minded, max_slope, sampler.device)
+        self.penalty = Penalty(scene, field, minded, max_slope, sampler.device, min_radius)
         self.scene, self.field, self.sampler, self.dtype = scene, field, sampler, dtype
         self.chunk, self.kept = CHUNK, None
         if sampler.count <= KEPT_RAYS:
@@ -82,20 +83,18 @@ class Objective:
     @property
     def whole(self) -> bool:
         """Whether chunks keep their graphs: a kernel's holds the net or the surface at its rays, plain torch's every step."""
-        return self.kept is not None and (len(self.kept) == 1 or all(t.kernel is not None for t in self.kept))
+        return self.kept is not None and (len(self.kept) == 1 or all(getattr(t, "kernel", None) is not None for t in self.kept))
 
     def _pool(self, image: Tensor) -> Tensor:
         """Pixels of the screen from those of the render."""
-        k, (n, m) = self.oversample, image.shape
-        return image if k == 1 else image.view(n // k, k, m // k, k).sum((1, 3))
+        k, (*colors, n, m) = self.oversample, image.shape
+        return image if k == 1 else image.view(*colors, n // k, k, m // k, k).sum((-3, -1))
 
-    def _tracers(self) -> Iterator[PlaneTracer | RayTracer]:
+    def _tracers(self) -> Iterator[PlaneTracer | RayTracer | StepTracer | BandTracer]:
         """This rank's chunks, ready to be traced."""
-        (rank, count), traced = ranks.place(), None
+        rank, count = ranks.place()
         size = min(self.chunk, math.ceil(self.sampler.count / count)) if count > 1 else self.chunk
-        for rays in self.sampler.chunks(size, rank, count):
-            traced = tracer(self.scene, self.field, rays, self.dtype, traced)
-            yield traced
+        return tracers(self.scene, self.field, self.sampler, self.dtype, size, part=(rank, count))
 
     def __call__(self, heights: Tensor) -> Evaluation:
         """Value and gradient at heights (n, m) mm float64.
@@ -122,7 +121,7 @@ class Objective:
         heights.requires_grad_()
         penalty = self.penalty(heights) if self.penalty else torch.zeros((), device=self.device)
         image = torch.zeros(self.loss.target.shape, dtype=torch.float64, device=self.device)
-        leaving, parts = torch.zeros((), dtype=torch.float64, device=self.device), []
+        leaving, parts = image.new_zeros(image.shape[:-2]), []  # one for each colour
         with torch.set_grad_enabled(self.whole):
             for traced in self.kept or self._tracers():
                 part = self._see(traced, heights)
@@ -146,10 +145,10 @@ class Objective:
         if direct:
             gradient += direct[0]
         a = self.apron
-        inner = image.detach()[a : image.shape[0] - a, a : image.shape[1] - a]
+        inner = image.detach()[..., a : image.shape[-2] - a, a : image.shape[-1] - a]
         return Evaluation(float(loss.detach()), gradient, float(inner.sum()))
 
-    def _see(self, traced: PlaneTracer | RayTracer, heights: Tensor) -> tuple[Tensor, Tensor]:
+    def _see(self, traced, heights: Tensor) -> tuple[Tensor, Tensor]:
         """What a chunk adds to the image, and to the power that leaves the lens."""
         part = traced.expose(heights, self.screen, self.filter)
         return self._pool(part.image), part.leaving

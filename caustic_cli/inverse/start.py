@@ -18,6 +18,7 @@ sent to T + e, which a surface can do.
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 
@@ -30,7 +31,7 @@ from scipy.ndimage import gaussian_filter
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.laguerre import prices
 from caustic_cli.inverse.transport import Transport, corners, solve
-from caustic_cli.optics.interface import refract
+from caustic_cli.optics.interface import reflect, refract
 
 EVEN = 2.0  # cells over which e is smoothed: at a kink of phi the rays miss by the spline's own width, which is no error of T
 ENOUGH = 0.05  # pixels of e, root mean square, that are left alone
@@ -60,16 +61,17 @@ class Start:
 
 
 def surface(source, target, source_half, target_half, index, z_screen, thickness, directions=None, *, corrections=2,
-            **options) -> Start:
+            centre=(0.0, 0.0), **options) -> Start:
     """Exit surface of a lens that throws `target` on the screen.
 
     Args:
         source: irradiance of the exit surface, seen along z, (n, m), any unit.
         target: the picture, (k, l), any unit; half sizes in mm as for `transport.solve`.
-        index: of the glass; 1 outside.
+        index: of the glass, with 1 outside; -1 for a mirror.
         z_screen, thickness: the screen's plane and the surface's mean height, mm.
         directions: unit directions inside the glass at those corners, three (n + 1, m + 1) arrays, or None for (0, 0, 1).
         corrections: how often, at most, the picture is moved by what the rays miss and transported again.
+        centre: of the picture on the screen, mm.
         options: of `transport.solve`.
 
     Raises:
@@ -78,10 +80,12 @@ def surface(source, target, source_half, target_half, index, z_screen, thickness
     """
     began = time.perf_counter()
     shape = np.shape(source)
-    if not 1.0 < index <= 5.0:
+    mirror = index == -1.0
+    if not (mirror or 1.0 < index <= 5.0):
         raise InputError(f"index must be more than 1 and at most 5, got {index!r}")
-    if not (np.isfinite(z_screen) and np.isfinite(thickness) and z_screen > thickness):
-        raise InputError(f"the screen at {z_screen!r} mm must lie beyond the lens' height of {thickness!r} mm")
+    if not (np.isfinite(z_screen) and np.isfinite(thickness) and (z_screen < thickness if mirror else z_screen > thickness)):
+        where = "before the mirror's" if mirror else "beyond the lens'"
+        raise InputError(f"the screen at {z_screen!r} mm must lie {where} height of {thickness!r} mm")
     d = _directions(directions, (shape[0] + 1, shape[1] + 1))
     half = tuple(float(h) for h in source_half)
     map_ = solve(source, target, half, target_half, **options)
@@ -90,7 +94,7 @@ def surface(source, target, source_half, target_half, index, z_screen, thickness
     light = light[1:, 1:] + light[:-1, 1:] + light[1:, :-1] + light[:-1, :-1]
     light /= light.sum()
     pixel = [2.0 * h / s for h, s in zip(target_half, np.shape(target), strict=True)]
-    aim, shift = (map_.x, map_.y), np.zeros((2, *light.shape))
+    aim, shift = (map_.x + centre[0], map_.y + centre[1]), np.zeros((2, *light.shape))
     for again in range(corrections + 1):
         z = heights(map_, aim, x, y, d, index, z_screen, thickness)
         landing = land(z, x, y, d, index, z_screen)
@@ -102,7 +106,7 @@ def surface(source, target, source_half, target_half, index, z_screen, thickness
         shift += off
         moved, reach = _moved(np.asarray(target, dtype=np.float64), pixel, map_.potential, shift, x, y)
         map_ = solve(source, moved, half, reach, start=map_.potential, **{k: v for k, v in options.items() if k != "start"})
-        aim = map_.x + shift[0], map_.y + shift[1]
+        aim = map_.x + shift[0] + centre[0], map_.y + shift[1] + centre[1]
     return Start(z, *landing, miss, again, map_, time.perf_counter() - began)
 
 
@@ -143,7 +147,10 @@ def heights(map_: Transport, aim, x, y, d, index: float, z_screen: float, mean: 
     Args:
         map_: a map close to `aim` (two arrays, mm): its potential is taken as it is, and only the rest integrated.
         d, index, z_screen, mean: ray directions in the glass, its index, the screen's plane and the heights' mean, mm.
+
+    A mirror's normal is parallel to d - t, as if the index were 1, and t runs back.
     """
+    forward, n = math.copysign(1.0, index), abs(index)
     step = float(x[1, 0] - x[0, 0]), float(y[0, 1] - y[0, 0])
     scale = 1.0 / ((index - 1.0) * (z_screen - mean))
     main = scale * (map_.potential - 0.5 * (x * x + y * y))
@@ -152,10 +159,10 @@ def heights(map_: Transport, aim, x, y, d, index: float, z_screen: float, mean: 
     for _ in range(REPEATS):
         tx, ty, tz = aim[0] - x, aim[1] - y, z_screen - z
         length = np.sqrt(tx * tx + ty * ty + tz * tz)
-        lean = index * d[2] - tz / length  # N_z, up to a factor
-        if not ((index * (d[0] * tx + d[1] * ty + d[2] * tz) > length) & (tz > 0)).all():  # t . N > 0
+        lean = n * d[2] - tz / length  # N_z, up to a factor
+        if not ((index * (d[0] * tx + d[1] * ty + d[2] * tz) > forward * length) & (forward * tz > 0)).all():  # t . N > 0
             raise InputError("the picture cannot be reached by refraction: a smaller picture or a longer throw is needed")
-        rest = [(t / length - index * v) / lean - s for t, v, s in zip((tx, ty), d, slope, strict=False)]
+        rest = [(t / length - n * v) / lean - s for t, v, s in zip((tx, ty), d, slope, strict=False)]
         z = main + integrate(*rest, step)
         z += mean - z.mean()
     return z
@@ -184,6 +191,10 @@ def land(z: np.ndarray, x, y, d, index: float, z_screen: float) -> tuple[np.ndar
 def thrown(x, y, z, zx, zy, d, index: float, z_screen: float) -> tuple[np.ndarray, np.ndarray]:
     """Where rays d inside the glass land that leave it at (x, y, z) with slopes zx, zy; NaN where totally reflected."""
     d = [v if isinstance(v, float) else torch.from_numpy(v) for v in d]
-    (tx, ty, tz), passes, _, _ = refract(d, torch.from_numpy(zx), torch.from_numpy(zy), index)
+    slopes = torch.from_numpy(zx), torch.from_numpy(zy)
+    if index == -1.0:
+        (tx, ty, tz), passes = reflect(d, *slopes)[0], torch.ones_like(slopes[0], dtype=torch.bool)
+    else:
+        (tx, ty, tz), passes, _, _ = refract(d, *slopes, index)
     reach = np.where(passes.numpy(), (z_screen - z) / tz.numpy(), np.nan)
     return x + reach * tx.numpy(), y + reach * ty.numpy()

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -24,7 +24,8 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.bundle import Bundle
-from caustic_cli.optics.interface import reflectance
+from caustic_cli.optics.interface import reflectance, reflectances
+from caustic_cli.optics.polarisation import beyond, field_of, part_s
 from caustic_cli.optics.sampling import SAMPLERS, Sampler, numbers
 from caustic_cli.scene import PlaneWave, Points, Scene
 from caustic_cli.scene.source import covering_cone
@@ -56,6 +57,10 @@ class Emission:
         """Number of rays."""
         return self.shape[0] * self.shape[1] * len(self._points[0])
 
+    def through(self, scene: Scene) -> Emission:
+        """The same rays as another scene refracts them: of its own index and polarisation."""
+        return self if scene is self.scene else replace(self, scene=scene)
+
     @cached_property
     def _points(self) -> tuple[Tensor, Tensor]:
         """Positions (k, 3) mm, and parts of the power (k,)."""
@@ -80,7 +85,7 @@ class Emission:
 
     def _near(self, index: Tensor, u: Tensor, v: Tensor, a: Tensor | None = None, b: Tensor | None = None) -> Bundle:
         source, lens = self.scene.source, self.scene.lens
-        (rx, ry), cone = lens.half_size, covering_cone(source, lens.half_size, lens.z_in)
+        (rx, ry), cone = lens.half_size, covering_cone(source, lens.half_size, lens.z_in, lens.round)
         per, (positions, powers) = self.shape[0] * self.shape[1], self._points
         which = index // per
         part = powers[which] / per  # emitted by each ray
@@ -94,6 +99,8 @@ class Emission:
             lows, highs = [lows[0] - ex, lows[1] - ey], [highs[0] + ex, highs[1] + ey]
             x0, y0 = x0 + ex * a.sqrt() * torch.cos(2 * math.pi * b), y0 + ey * a.sqrt() * torch.sin(2 * math.pi * b)
         within = (lows[0] >= -rx) & (highs[0] <= rx) & (lows[1] >= -ry) & (highs[1] <= ry)
+        if lens.round:
+            within &= torch.maximum(-lows[0], highs[0]) ** 2 + torch.maximum(-lows[1], highs[1]) ** 2 <= rx * rx
         from_cone = within if source.aimed else torch.ones_like(within)
 
         lambertian = source.intensity == "lambertian"
@@ -117,30 +124,42 @@ class Emission:
 
         sx, sy = torch.where(from_cone, cx, ax), torch.where(from_cone, cy, ay)
         x, y = x0 + h * sx, y0 + h * sy
-        on_lens = (x.abs() <= rx) & (y.abs() <= ry)
+        on_lens = (x * x + y * y <= rx * rx) if lens.round else (x.abs() <= rx) & (y.abs() <= ry)
         share = torch.where(on_lens, torch.where(from_cone, part, aimed), torch.zeros_like(part))
         x, y = x.clamp(-rx, rx), y.clamp(-ry, ry)
         sx, sy = (x - x0) / h, (y - y0) / h  # rays that miss the lens stay finite; they carry nothing
         dz = 1.0 / torch.sqrt(1.0 + sx * sx + sy * sy)
-        return self._enter(x, y, sx * dz, sy * dz, dz, share, float(part.sum()))
+        return enter(self.scene, x, y, sx * dz, sy * dz, dz, share, float(part.sum()))
 
     def _far(self, u: Tensor, v: Tensor, a: Tensor, b: Tensor) -> Bundle:
         (rx, ry), half = self.scene.lens.half_size, math.radians(self.scene.source.angle) / 2.0
         sine = a.sqrt() * math.sin(half)  # even over the projected solid angle: an evenly bright disc
         dx, dy = sine * torch.cos(2 * math.pi * b), sine * torch.sin(2 * math.pi * b)
-        share = torch.full_like(u, 1.0 / self.count)
-        return self._enter((2.0 * u - 1.0) * rx, (2.0 * v - 1.0) * ry, dx, dy, torch.sqrt(1.0 - dx * dx - dy * dy), share,
-                           len(u) / self.count)
+        share, x, y = torch.full_like(u, 1.0 / self.count), (2.0 * u - 1.0) * rx, (2.0 * v - 1.0) * ry
+        if self.scene.lens.round:  # even over the disc
+            x, y = rx * u.sqrt() * torch.cos(2 * math.pi * v), rx * u.sqrt() * torch.sin(2 * math.pi * v)
+        return enter(self.scene, x, y, dx, dy, torch.sqrt(1.0 - dx * dx - dy * dy), share, len(u) / self.count)
 
-    def _enter(self, x: Tensor, y: Tensor, dx: Tensor, dy: Tensor, dz: Tensor, share: Tensor, emitted: float) -> Bundle:
-        """Through the flat entrance: Snell keeps n (d_x, d_y), Fresnel takes its part."""
-        lens = self.scene.lens
-        ux, uy = dx / lens.index, dy / lens.index
-        uz = torch.sqrt(1.0 - ux * ux - uy * uy)
-        reflected = reflectance(lens.fresnel, dz, uz, 1.0 / lens.index) * share
-        inside = share - reflected
-        arriving, lost = float(share.sum()), float(reflected.sum())
-        return Bundle(x, y, lens.z_in, ux, uy, uz, inside, {"missed_lens": emitted - arriving, "fresnel": lost})
+
+def enter(scene: Scene, x: Tensor, y: Tensor, dx: Tensor, dy: Tensor, dz: Tensor, share: Tensor, emitted: float) -> Bundle:
+    """Rays of unit directions through points of the flat entrance: Snell keeps n (d_x, d_y), Fresnel takes its part.
+
+    share: power of each that arrives there; emitted: of all at their source.
+    """
+    lens, n = scene.lens, scene.lens.inside
+    ux, uy = dx / n, dy / n
+    uz = torch.sqrt(1.0 - ux * ux - uy * uy)
+    kind, field = "none" if lens.mirror else lens.fresnel, None
+    if kind == "exact" and scene.light.polarisation is not None:
+        before, after, flat = (dx, dy, dz), (ux, uy, uz), (0.0, 0.0, 1.0)
+        e = field_of(scene.light.polarisation, before)
+        (rs, rp), s = reflectances(dz, uz, 1.0 / n), part_s(e, before, flat)
+        reflected, field = (s * rs + (1.0 - s) * rp) * share, beyond(e, before, after, flat, dz, uz, 1.0 / n)
+    else:
+        reflected = reflectance(kind, dz, uz, 1.0 / n) * share
+    arriving, lost = float(share.sum()), float(reflected.sum())
+    return Bundle(x, y, lens.z_in, ux, uy, uz, share - reflected, {"missed_lens": emitted - arriving, "fresnel": lost}, field,
+                  lens.half_size[0] if lens.round else None)
 
 
 Rays = Sampler | Emission
@@ -151,7 +170,7 @@ def rays_of(scene: Scene, kind: str, rays: int, seed: int = 0, device: str | tor
     aspect = scene.lens.size[0] / scene.lens.size[1]
     if isinstance(scene.source, PlaneWave):
         profile = None if scene.source.profile is None else torch.from_numpy(scene.source.profile)
-        return Sampler.of_size(kind, rays, aspect, seed=seed, profile=profile, device=device)
+        return Sampler.of_size(kind, rays, aspect, seed=seed, profile=profile, device=device, round=scene.lens.round)
     points = len(scene.source.positions) if isinstance(scene.source, Points) else 1
     each = max(1, round(rays / points))
     nu = max(1, min(each, round(math.sqrt(each * aspect))))

@@ -40,6 +40,19 @@ def refract(d, slope_x: Tensor, slope_y: Tensor, eta: float):
     return (eta * d[0] - gamma * slope_x, eta * d[1] - gamma * slope_y, eta * d[2] + gamma), passes, c, s
 
 
+def reflect(d, slope_x: Tensor, slope_y: Tensor):
+    """Unit directions reflected at a height field, d - 2 (d . N) / |N|^2 N: Snell's law with index -1.  And c = d . N."""
+    c = d[2] - d[0] * slope_x - d[1] * slope_y
+    twice = 2.0 * c / (1.0 + slope_x * slope_x + slope_y * slope_y)
+    return (d[0] + twice * slope_x, d[1] + twice * slope_y, d[2] - twice), c
+
+
+def reflectances(c, s, eta: float):
+    """(R_s, R_p), parts of s- and p-polarised power reflected, from c and s of `refract`: r_s^2, r_p^2 of `reflectance`."""
+    rs, rp = (eta * c - s) / (eta * c + s), (c - eta * s) / (c + eta * s)
+    return rs * rs, rp * rp
+
+
 def reflectance(kind: str, c, s, eta: float):
     """Part of the power reflected, from c and s of `refract` (any common factor): none, schlick or exact (unpolarised).
 
@@ -53,6 +66,5 @@ def reflectance(kind: str, c, s, eta: float):
         x = 1.0 - (s if eta > 1 else c)
         x2 = x * x
         return r0 + (1.0 - r0) * (x2 * x2 * x)
-    rs = (eta * c - s) / (eta * c + s)
-    rp = (c - eta * s) / (c + eta * s)
-    return 0.5 * (rs * rs + rp * rp)
+    rs, rp = reflectances(c, s, eta)
+    return 0.5 * (rs + rp)

@@ -107,7 +107,7 @@ def splat(x: Tensor, y: Tensor, weight: Tensor, screen: Screen, filter: Filter) 
     first, shares, inside = [], [], None
     for axis, at in ((0, x), (1, y)):
         n, r = screen.resolution[axis], filter.reach[axis]
-        at = (at + screen.half_size[axis]) / screen.pixel[axis]
+        at = (at - screen.low[axis]) / screen.pixel[axis]
         near = (at >= -r) & (at < n + r)  # False for NaN and infinity too, so that floor() below is always defined
         at = torch.where(near, at, torch.zeros_like(at))
         i0 = at.detach().floor()

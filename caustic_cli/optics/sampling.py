@@ -27,6 +27,8 @@ from caustic_cli.optics.kernels import fused
 SAMPLERS = ("grid", "lines", "stratified", "uniform", "sobol")
 #: Length of torch's Sobol sequence.
 SOBOL_RAYS = 1 << 30
+#: Largest of `normal_numbers`, whose uniform ones are at least 2^-33.
+LARGEST_NORMAL = math.sqrt(66.0 * math.log(2.0))
 _MASK = 0xFFFFFFFF
 
 
@@ -43,6 +45,13 @@ def random_numbers(seed: int, dimension: int, index: Tensor) -> Tensor:
     """Uniform numbers strictly inside (0, 1), float64, one for every int64 ray index: a pure function of its arguments."""
     low, high = index & _MASK, index >> 32
     return (_mix(_mix(low ^ key(seed, dimension)) + salt(dimension) + high & _MASK).double() + 0.5) * 2.0**-32
+
+
+def normal_numbers(seed: int, index: Tensor) -> tuple[Tensor, Tensor]:
+    """Two independent standard normal numbers, float64, for every int64 index (Box and Muller)."""
+    radius = torch.sqrt(-2.0 * torch.log(random_numbers(seed, 0, index)))
+    angle = 2.0 * math.pi * random_numbers(seed, 1, index)
+    return radius * torch.cos(angle), radius * torch.sin(angle)
 
 
 def key(seed: int, dimension: int) -> int:
@@ -122,6 +131,7 @@ class Sampler:
         shape: cells (nu, nv) along u and v; nu * nv rays.
         seed: of the random kinds.
         profile: relative irradiance (a, b) over the aperture, constant per cell, or None (eq. 4.2.3).
+        round: light comes through the circle inscribed in the aperture alone.
         device: where the samples live.
     """
 
@@ -130,6 +140,7 @@ class Sampler:
     seed: int = 0
     profile: Tensor | None = None
     device: str | torch.device = "cpu"
+    round: bool = False
 
     def __post_init__(self):
         if self.kind not in SAMPLERS:
@@ -146,19 +157,23 @@ class Sampler:
         """Number of rays."""
         return self.shape[0] * self.shape[1]
 
+    def through(self, _scene) -> Sampler:
+        """These rays again: on the exit surface, no index has bent them yet."""
+        return self
+
     def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[Sample]:
         """The rays in order, at most about `size` at a time; shares over all chunks sum to 1.
 
         With `step`, only every step-th chunk from number `first` on: the part of one of several processes.
         """
-        norm = 1.0 / self.count
-        if self.profile is not None:
+        norm, even = 1.0 / self.count, self.profile is None and not self.round
+        if not even:
             total = sum(float(self._irradiance(s).sum()) for s in self._points(size))
             if not total > 0:
                 raise InputError("[source] profile: every ray fell where it is black; use more rays")
             norm = 1.0 / total
         for s in self._points(size, first, step):
-            share = norm * self._irradiance(s) if self.profile is not None else torch.tensor(norm, dtype=torch.float64)
+            share = torch.tensor(norm, dtype=torch.float64) if even else norm * self._irradiance(s)
             yield Sample(s.u, s.v, s.tensor, share.to(self.device))
 
     def _points(self, size: int, first: int = 0, step: int = 1) -> Iterator[Sample]:
@@ -178,6 +193,13 @@ class Sampler:
             yield Sample(*numbers(self.kind, self.shape, self.seed, 2, a, min(a + size, self.count), self.device), False, one)
 
     def _irradiance(self, s: Sample) -> Tensor:
+        if self.round:
+            across, along = (2.0 * s.u - 1.0) ** 2, (2.0 * s.v - 1.0) ** 2
+            within = ((across[:, None] + along[None, :] if s.tensor else across + along) <= 1.0).double()
+            return within if self.profile is None else within * self._profile(s)
+        return self._profile(s)
+
+    def _profile(self, s: Sample) -> Tensor:
         profile = self.profile.to(self.device, torch.float64)
         a = (s.u * profile.shape[0]).long().clamp_max(profile.shape[0] - 1)
         b = (s.v * profile.shape[1]).long().clamp_max(profile.shape[1] - 1)

@@ -12,8 +12,8 @@ Powers are parts of what the source emits.  Nothing vanishes: image + every entr
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from enum import IntEnum
 from functools import cached_property
 
 import torch
@@ -26,47 +26,13 @@ from caustic_cli.optics.emission import Rays
 from caustic_cli.optics.heightfield import Evaluator, HeightField
 from caustic_cli.optics.interface import reflectance, refract
 from caustic_cli.optics.kernels import fused
-from caustic_cli.optics.reconstruction import Filter, splat
+from caustic_cli.optics.landing import LOSSES, Landing, Part, Status, collect
+from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.shortage import with_less
+from caustic_cli.optics.stepwise import SEQUENTIAL, Steps, StepTracer, needed
 from caustic_cli.optics.tolerances import PARALLEL
 from caustic_cli.scene import Lens, Scene, Screen
-
-LOSSES = ("missed_lens", "missed_surface", "total_internal_reflection", "fresnel", "absorbed", "off_screen")
-
-
-class Status(IntEnum):
-    """What became of a ray before the screen."""
-
-    OK = 0
-    TOTAL_INTERNAL_REFLECTION = 1
-    AWAY_FROM_SCREEN = 2
-    MISSED_SURFACE = 3
-
-
-@dataclass(frozen=True)
-class Landing:
-    """Rays on the screen's plane.
-
-    x, y (shape of the sample) mm; weight, the power each carries (0 where lost); status, a `Status` a ray;
-    lost, the power lost on the way, by name; leaving, the power that left the lens.
-    """
-
-    x: Tensor
-    y: Tensor
-    weight: Tensor
-    status: Tensor
-    lost: dict[str, Tensor]
-    leaving: Tensor
-
-
-@dataclass(frozen=True)
-class Part:
-    """What some rays contribute: image (n_x, n_y) and leaving (), differentiable; lost by name, not differentiable."""
-
-    image: Tensor
-    leaving: Tensor
-    lost: dict[str, Tensor]
 
 
 class PlaneTracer:
@@ -108,7 +74,7 @@ class PlaneTracer:
     def expose(self, heights: Tensor, screen: Screen, filter: Filter) -> Part:
         """Heights (n, m) mm float64 -> image and energy account on a screen; by the fused kernel on a CPU."""
         if self.kernel is None:
-            return _collect(self(heights, screen.z), screen, filter)
+            return collect(self(heights, screen.z), screen, filter)
         sag, reference = self._sag(heights)
         return Part(*self.kernel(sag, self.scene.lens, screen.z - reference, screen, filter))
 
@@ -149,7 +115,7 @@ class RayTracer:
     def expose(self, heights: Tensor, screen: Screen, filter: Filter) -> Part:
         """Heights (n, m) mm float64 -> image and energy account on a screen; by the fused kernel on a CPU."""
         if self.kernel is None:
-            return _collect(self(heights, screen.z), screen, filter)
+            return collect(self(heights, screen.z), screen, filter)
         part = Part(*self.kernel(heights, self.scene.lens, float(heights.detach().mean()), screen, filter))
         return Part(part.image, part.leaving, self._with_lost(part.lost))
 
@@ -158,9 +124,46 @@ class RayTracer:
         return {**lost, **{name: lost.get(name, 0.0) + value for name, value in self.bundle.lost.items()}}
 
 
-def tracer(scene: Scene, field: HeightField, rays: Sample | Bundle, dtype: torch.dtype, like=None) -> PlaneTracer | RayTracer:
-    """What traces some rays of the scene's source.  `like`: the tracer of the chunk before."""
+def tracer(scene: Scene, field: HeightField, rays: Sample | Bundle, dtype: torch.dtype, like=None,
+           steps: Steps = SEQUENTIAL) -> PlaneTracer | RayTracer | StepTracer:
+    """What traces some rays of the scene's source: `stepwise` only for what the sequential path does not know.
+
+    like: the tracer of the chunk before; steps: what to do beyond what the scene says.
+    """
+    if needed(scene, steps):
+        return StepTracer(scene, field, rays, dtype, steps)
     return (PlaneTracer if isinstance(rays, Sample) else RayTracer)(scene, field, rays, dtype, like)
+
+
+class BandTracer:
+    """A tracer of one of several bands, whose light is a part of the whole: images (n_x, n_y), or (3, n_x, n_y) with colours."""
+
+    def __init__(self, one: PlaneTracer | RayTracer | StepTracer, weight: float, channel: int | None):
+        self.one, self.weight, self.channel = one, weight, channel
+
+    def expose(self, heights: Tensor, screen: Screen, filter: Filter) -> Part:
+        """As of a tracer; of colours, leaving is (3,)."""
+        part, w = self.one.expose(heights, screen, filter), self.weight
+        image, leaving = w * part.image, w * part.leaving
+        if self.channel is not None:
+            image, leaving = (torch.stack([t if k == self.channel else torch.zeros_like(t) for k in range(3)])
+                              for t in (image, leaving))
+        return Part(image, leaving, {name: w * value for name, value in part.lost.items()})
+
+
+def tracers(scene: Scene, field: HeightField, sampler: Rays, dtype: torch.dtype, chunk: int,
+            steps: Steps = SEQUENTIAL,
+            part: tuple[int, int] = (0, 1)) -> Iterator[PlaneTracer | RayTracer | StepTracer | BandTracer]:
+    """Tracers of all rays of a sampler, chunk by chunk; of a scene with several bands, one after the other.
+
+    part: (k, n) takes every n-th chunk from number k on, what one of n processes traces.
+    """
+    bands = scene.bands
+    for band in bands:
+        traced = None
+        for rays in sampler.through(band.scene).chunks(chunk, *part):
+            traced = tracer(band.scene, field, rays, dtype, traced, steps)
+            yield traced if len(bands) == 1 else BandTracer(traced, band.weight, band.channel)
 
 
 def trace_plane(lens: Lens, evaluator: Evaluator, sag_net: Tensor, height: float, x, y, share, shape) -> Landing:
@@ -213,17 +216,12 @@ def carry(lens: Lens, incoming, sag: Tensor, slope_x: Tensor, slope_y: Tensor, x
     return Landing(x + path * direction[0], y + path * direction[1], weight, status, lost, leaving.sum())
 
 
-def _collect(landing: Landing, screen: Screen, filter: Filter) -> Part:
-    image, off = splat(landing.x, landing.y, landing.weight, screen, filter)
-    return Part(image, landing.leaving, {**landing.lost, "off_screen": landing.lost["off_screen"] + off})
-
-
 @dataclass(frozen=True)
 class Exposure:
     """An image and its energy account, as parts of the source's power.
 
-    image (n_x, n_y) float64, power per pixel; lost, all of LOSSES; leaving, what left the lens; rays, how many.
-    image.sum() + sum(lost.values()) = 1.
+    image (n_x, n_y) float64, power per pixel, or (3, n_x, n_y) with colours; lost, all of LOSSES; leaving, what left the lens;
+    rays, how many.  image.sum() + sum(lost.values()) = 1.
     """
 
     image: Tensor
@@ -233,7 +231,8 @@ class Exposure:
 
 
 def expose(scene: Scene, field: HeightField, heights: Tensor, sampler: Rays, filter: Filter | None = None,
-           dtype: torch.dtype = torch.float64, screen: Screen | None = None, chunk: int = 1 << 19) -> Exposure:
+           dtype: torch.dtype = torch.float64, screen: Screen | None = None, chunk: int = 1 << 19,
+           steps: Steps = SEQUENTIAL) -> Exposure:
     """Trace all rays of a sampler and collect them: the value of the one function every command asks about.
 
     Chunks are accumulated in float64, so neither memory nor rounding grows with the number of rays.  Where memory runs out,
@@ -245,22 +244,36 @@ def expose(scene: Scene, field: HeightField, heights: Tensor, sampler: Rays, fil
     """
     screen, filter = screen or scene.screen, filter or Filter()
     heights = heights.detach().to(sampler.device, torch.float64)
-    if float(heights.max()) >= screen.z:
-        raise InputError(f"[screen] z must lie behind the lens, whose surface reaches {float(heights.max()):.6g} mm,"
-                         f" got {screen.z:g} mm")
-    return with_less(lambda size: _expose(scene, field, heights, sampler, filter, dtype, screen, size), chunk)
+    check_room(scene, heights, screen)
+    return with_less(lambda size: _expose(scene, field, heights, sampler, filter, dtype, screen, size, steps), chunk)
 
 
 def _expose(scene: Scene, field: HeightField, heights: Tensor, sampler: Rays, filter: Filter, dtype: torch.dtype,
-            screen: Screen, chunk: int) -> Exposure:
-    image = torch.zeros(screen.resolution, dtype=torch.float64, device=sampler.device)
-    lost, leaving, traced = dict.fromkeys(LOSSES, 0.0), 0.0, None
+            screen: Screen, chunk: int, steps: Steps) -> Exposure:
+    shape = (3, *screen.resolution) if scene.colored else screen.resolution
+    image = torch.zeros(shape, dtype=torch.float64, device=sampler.device)
+    lost, leaving = dict.fromkeys(LOSSES, 0.0), 0.0
     with torch.no_grad():
-        for rays in sampler.chunks(chunk):
-            traced = tracer(scene, field, rays, dtype, traced)
+        for traced in tracers(scene, field, sampler, dtype, chunk, steps):
             part = traced.expose(heights, screen, filter)
             image += part.image
-            leaving += float(part.leaving)
+            leaving += float(part.leaving.sum())
             for name, value in part.lost.items():
                 lost[name] += float(value)
     return Exposure(image, lost, leaving, sampler.count)
+
+
+def check_room(scene: Scene, heights: Tensor, screen: Screen) -> None:
+    """Refuse a screen that the surface reaches, the corners of a tilted one included.
+
+    Raises:
+        InputError: saying how far the surface reaches.
+    """
+    lean = f" and its tilt takes it {screen.depth:.4g} mm nearer" if screen.depth else ""
+    if scene.lens.mirror:
+        if float(heights.min()) <= screen.z + screen.depth:
+            raise InputError(f"[screen] z must lie before the mirror, whose surface reaches {float(heights.min()):.6g} mm,"
+                             f" got {screen.z:g} mm{lean}")
+    elif float(heights.max()) >= screen.z - screen.depth:
+        raise InputError(f"[screen] z must lie behind the lens, whose surface reaches {float(heights.max()):.6g} mm,"
+                         f" got {screen.z:g} mm{lean}")

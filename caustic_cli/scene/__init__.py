@@ -1,14 +1,30 @@
 """What is there: lens, source, screen, materials.  Frozen, validated on construction, no light yet."""
 
+from __future__ import annotations
+
 from caustic_cli.scene.lens import Lens, Offset
+from caustic_cli.scene.light import Light
 from caustic_cli.scene.screen import Screen
 from caustic_cli.scene.source import Disc, PlaneWave, Points, Source
 
-__all__ = ["Disc", "Lens", "Offset", "PlaneWave", "Points", "Scene", "Screen", "Source"]
+__all__ = ["Band", "Disc", "Lens", "Light", "Offset", "PlaneWave", "Points", "Scene", "Screen", "Source"]
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 from caustic_cli.errors import InputError
+from caustic_cli.scene.materials import refractive_index
+
+
+@dataclass(frozen=True)
+class Band:
+    """Light that is traced in one go: a part of the source's power, with one index and one state of polarisation.
+
+    channel: of a coloured image, or None where the image has no colours.
+    """
+
+    scene: Scene
+    weight: float = 1.0
+    channel: int | None = None
 
 
 @dataclass(frozen=True)
@@ -22,12 +38,41 @@ class Scene:
     source: Source
     lens: Lens
     screen: Screen
+    light: Light = field(default_factory=Light)
 
     def __post_init__(self):
-        if self.screen.z <= self.lens.z_in:
+        if not self.lens.mirror and self.screen.z <= self.lens.z_in:
             raise InputError(
                 f"[screen] z must lie behind the lens (beyond z_in = {self.lens.z_in:g} mm), got {self.screen.z:g} mm"
             )
         if not isinstance(self.source, PlaneWave) and self.source.nearest >= self.lens.z_in:
             raise InputError(f"[source] position must lie before the lens (z below z_in = {self.lens.z_in:g} mm),"
                              f" got z = {self.source.nearest:g} mm")
+        if self.dispersive:
+            for wavelength in self.light.wavelengths:
+                refractive_index(self.lens.glass, wavelength)
+
+    @property
+    def dispersive(self) -> bool:
+        """Whether the source's wavelengths are refracted differently."""
+        return bool(self.light.wavelengths) and self.lens.glass is not None and not self.lens.mirror
+
+    @property
+    def colored(self) -> bool:
+        """Whether images keep red, green and blue apart: (3, n_x, n_y)."""
+        return self.light.color
+
+    @property
+    def bands(self) -> tuple[Band, ...]:
+        """What has to be traced apart, by wavelength and polarisation: the scene itself where one trace says it all."""
+        states = (0.0, 90.0) if self.light.tracked and self.light.polarisation is None else (self.light.polarisation,)
+        if not (self.dispersive or self.colored):
+            if len(states) == 1:
+                return (Band(self),)
+            return tuple(Band(replace(self, light=Light(state)), 1.0 / len(states)) for state in states)
+        bands = []
+        for k, (wavelength, part) in enumerate(zip(self.light.wavelengths, self.light.parts, strict=True)):
+            lens = replace(self.lens, index=refractive_index(self.lens.glass, wavelength)) if self.dispersive else self.lens
+            bands += [Band(replace(self, lens=lens, light=Light(state)), part / len(states), k if self.colored else None)
+                      for state in states]
+        return tuple(bands)

@@ -1,8 +1,9 @@
-"""The screen: a rectangle of pixels in the plane z = const."""
+"""The screen: a rectangle of pixels, in the plane z = const unless it is tilted."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 from caustic_cli.scene import checks
 
@@ -18,16 +19,22 @@ class Screen:
         size: full width and height (2 R_x, 2 R_y), mm.
         z: position, mm.
         resolution: pixels along x and y.
+        tilt: right-handed turns of the screen about its own middle, first about x, then about y, degrees.
+        shift: of its middle from the axis along x and y, mm.
     """
 
     size: tuple[float, float]
     z: float = 300.0
     resolution: tuple[int, int] = (250, 250)
+    tilt: tuple[float, float] = (0.0, 0.0)
+    shift: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self):
         checks.pair("[screen] size", self.size, lambda w, x: checks.number(w, x, 1e-6, 1e9))
         checks.number("[screen] z", self.z)
         checks.pair("[screen] resolution", self.resolution, lambda w, x: checks.whole(w, x, 2, MAX_RESOLUTION))
+        checks.pair("[screen] tilt", self.tilt, lambda w, x: checks.number(w, x, -85.0, 85.0))
+        checks.pair("[screen] shift", self.shift, lambda w, x: checks.number(w, x, -1e9, 1e9))
 
     @property
     def half_size(self) -> tuple[float, float]:
@@ -42,4 +49,21 @@ class Screen:
     def grown(self, pixels: tuple[int, int]) -> Screen:
         """The same screen with so many more pixels on each side."""
         (wx, wy), (nx, ny), (ax, ay) = self.pixel, self.resolution, pixels
-        return Screen((self.size[0] + 2 * ax * wx, self.size[1] + 2 * ay * wy), self.z, (nx + 2 * ax, ny + 2 * ay))
+        return replace(self, size=(self.size[0] + 2 * ax * wx, self.size[1] + 2 * ay * wy), resolution=(nx + 2 * ax, ny + 2 * ay))
+
+    @property
+    def low(self) -> tuple[float, float]:
+        """Its low edges along its own axes, counted from the foot of the optical axis, mm: -R + shift."""
+        return self.shift[0] - self.half_size[0], self.shift[1] - self.half_size[1]
+
+    @property
+    def axes(self) -> tuple[tuple[float, float, float], ...]:
+        """Unit vectors along its x and y, and its normal."""
+        (sa, ca), (sb, cb) = ((math.sin(t), math.cos(t)) for t in map(math.radians, self.tilt))
+        return (cb, 0.0, -sb), (sb * sa, ca, cb * sa), (sb * ca, -sa, cb * ca)
+
+    @property
+    def depth(self) -> float:
+        """How far a tilted screen reaches before and behind its middle, mm."""
+        along_x, along_y, _ = self.axes
+        return abs(along_x[2]) * self.half_size[0] + abs(along_y[2]) * self.half_size[1]

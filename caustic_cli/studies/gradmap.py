@@ -60,16 +60,18 @@ def gradient_image(scene: Scene, field: HeightField, heights: Tensor, control: t
                          f" more along both axes, got {filter.kind} of size {filter.size[0]} x {filter.size[1]}, under"
                          " which no pixel changes when a ray moves a little")
     heights = heights.detach().to(sampler.device, torch.float64)
-    total, traced = torch.zeros(scene.screen.resolution, dtype=torch.float64, device=sampler.device), None
-    for rays in sampler.chunks(chunk):
-        if isinstance(rays, Sample):
-            rays = _under(field, control, rays)
-            if not all(rays.shape):
-                continue
-        traced = tracer(scene, field, rays, dtype, traced)
-        with forward_ad.dual_level():
-            image = traced.expose(forward_ad.make_dual(heights, direction), scene.screen, filter).image
-            total += forward_ad.unpack_dual(image).tangent.double()
+    total = torch.zeros(scene.screen.resolution, dtype=torch.float64, device=sampler.device)
+    for band in scene.bands:
+        traced = None
+        for rays in sampler.through(band.scene).chunks(chunk):
+            if isinstance(rays, Sample):
+                rays = _under(field, control, rays)
+                if not all(rays.shape):
+                    continue
+            traced = tracer(band.scene, field, rays, dtype, traced)
+            with forward_ad.dual_level():
+                image = traced.expose(forward_ad.make_dual(heights, direction), scene.screen, filter).image
+                total += band.weight * forward_ad.unpack_dual(image).tangent.double()
     return total
 
 
@@ -81,7 +83,7 @@ def difference_step(scene: Scene, field: HeightField, control: tuple[int, int],
     """
     slope = field.slope_bound(_direction(field, control))  # 1/mm of slope per mm of height
     throw = scene.screen.z - scene.lens.z_in
-    return pixels * min(scene.screen.pixel) / ((scene.lens.index - 1.0) * throw * slope)
+    return pixels * min(scene.screen.pixel) / (abs((scene.lens.bend - 1.0) * throw) * slope)
 
 
 def finite_difference(scene: Scene, field: HeightField, heights: Tensor, control: tuple[int, int], *,
@@ -100,7 +102,8 @@ def finite_difference(scene: Scene, field: HeightField, heights: Tensor, control
     above, below = heights + step * direction, heights - step * direction
     distance = float((above - below)[tuple(control)])  # not 2 step: a height near 5 mm has only so many digits
     images = [expose(scene, field, h, sampler, filter).image for h in (above, below)]
-    return (images[0] - images[1]) / distance
+    difference = (images[0] - images[1]) / distance
+    return difference.sum(0) if scene.colored else difference
 
 
 @dataclass(frozen=True)

@@ -103,9 +103,10 @@ class Bench:
         return rays_of(self.scene, setting.sampler, setting.rays, seed, self.heights.device)
 
     def image(self, setting: Setting, seed: int) -> Tensor:
-        """The image that a setting makes with the rays of `seed`: (n_x, n_y) float64."""
-        return expose(self.scene, self.heightfield, self.heights, self.sampler(setting, seed), setting.filter,
-                      setting.dtype).image
+        """The image that a setting makes with the rays of `seed`: (n_x, n_y) float64, colours added up."""
+        found = expose(self.scene, self.heightfield, self.heights, self.sampler(setting, seed), setting.filter,
+                       setting.dtype).image
+        return found.sum(0) if self.scene.colored else found
 
     def reference(self, filter: Filter) -> Reference:
         """The image to compare with, through `filter`.

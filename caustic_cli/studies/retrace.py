@@ -14,6 +14,7 @@ from caustic_cli.optics.emission import Rays, rays_of
 from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import stream
+from caustic_cli.optics.stepwise import SEQUENTIAL, Steps
 from caustic_cli.optics.tracing import Exposure, expose
 from caustic_cli.scene import Scene, Screen
 from caustic_cli.studies.metrics import judge
@@ -45,7 +46,8 @@ class Converged:
 
 
 def converge(scene: Scene, field: HeightField, heights: Tensor, tolerance: float, *, rays: int, seed: int = 0,
-             screen: Screen | None = None, device: str = "cpu", dtype: torch.dtype = torch.float64) -> Converged:
+             screen: Screen | None = None, device: str = "cpu", dtype: torch.dtype = torch.float64,
+             steps: Steps = SEQUENTIAL) -> Converged:
     """Trace BATCHES independent sets of stratified rays, about `rays` in all, then more until the noise is at most `tolerance`.
 
     The relative RMS noise of the mean of B images J_k is sqrt(mean over pixels of var(J_k) / B) / mean(J).  Stratified rays
@@ -57,7 +59,7 @@ def converge(scene: Scene, field: HeightField, heights: Tensor, tolerance: float
     each, traced = max(1, rays // BATCHES), 0
     while True:
         parts = [expose(scene, field, heights, rays_of(scene, "stratified", each, stream(seed, f"batch {k}"), device), None, dtype,
-                        screen) for k in range(BATCHES)]
+                        screen, steps=steps) for k in range(BATCHES)]
         traced += sum(p.rays for p in parts)
         images = torch.stack([p.image for p in parts])
         mean = images.mean(0)
@@ -76,27 +78,32 @@ def converge(scene: Scene, field: HeightField, heights: Tensor, tolerance: float
                                f" error of {error:.2g}; fewer pixels or a larger tolerance need fewer")
 
 
-def retrace(scene: Scene, field: HeightField, heights: Tensor, target: np.ndarray, *, rays: int, seed: int = 0,
+def retrace(scene: Scene, field: HeightField, heights: Tensor, target: np.ndarray | None, *, rays: int, seed: int = 0,
             filter: Filter | None = None, screen: Screen | None = None, device: str = "cpu",
-            dtype: torch.dtype = torch.float64, tolerance: float | None = None) -> tuple[Exposure, dict]:
-    """Trace a lens with stratified rays of its own; with `tolerance`, as many as that asks for (`converge`).
+            dtype: torch.dtype = torch.float64, tolerance: float | None = None,
+            steps: Steps = SEQUENTIAL) -> tuple[Exposure, dict]:
+    """Trace a lens with stratified rays of its own; with `tolerance`, as many as that asks for (`converge`).  steps: of a plan.
 
     Returns:
         the exposure, reconstructed by `filter` (bincount unless given), and the figures of the JSON table, always by
         bincount, with the rays that were traced; with `tolerance` also error_estimate and rays_traced.
     """
     if tolerance is None:
-        counted = expose(scene, field, heights, sampler_for(scene, rays, seed, device), None, dtype, screen)
+        counted = expose(scene, field, heights, sampler_for(scene, rays, seed, device), None, dtype, screen, steps=steps)
         figures = judge(counted, target)
     else:
-        found = converge(scene, field, heights, tolerance, rays=rays, seed=seed, screen=screen, device=device, dtype=dtype)
+        found = converge(scene, field, heights, tolerance, rays=rays, seed=seed, screen=screen, device=device, dtype=dtype,
+                         steps=steps)
         counted = found.exposure
         figures = judge(counted, target) | {"error_estimate": found.error, "rays_traced": found.traced}
     if filter is None or filter.reach == (0, 0):
         return counted, figures
-    return expose(scene, field, heights, sampler_for(scene, counted.rays, seed, device), filter, dtype, screen), figures
+    return expose(scene, field, heights, sampler_for(scene, counted.rays, seed, device), filter, dtype, screen,
+                  steps=steps), figures
 
 
-def white_level(image: np.ndarray, target: np.ndarray) -> float:
-    """The irradiance drawn white: the target's maximum at the image's power, so both are exposed alike."""
+def white_level(image: np.ndarray, target: np.ndarray | None) -> float:
+    """The irradiance drawn white: the target's maximum at the image's power, so both are exposed alike; without one the image's."""
+    if target is None:
+        return float(image.max()) or 1.0
     return float(target.max() / target.sum() * image.sum())

@@ -136,7 +136,7 @@ def _splat(nets, rows, apart: bool, rays, lens: Lens, height: float, start, scre
         image (n_x, n_y) and the power leaving the lens (), float64, differentiable; what was lost, by name.
     """
     size = tuple(2 * r + 1 for r in filter.reach)
-    real = (lens.index, height, *screen.half_size, *screen.pixel, *filter.alpha, *start)
+    real = (lens.index, height, -screen.low[0], -screen.low[1], *screen.pixel, *filter.alpha, *start)
     slanted = rays[2].shape == rays[0].shape
     whole = (_FRESNEL[lens.fresnel], *screen.resolution, _KIND[filter.kind], *size, int(slanted))
     arguments = (*rays, np.array(real, np.float64), np.array(whole, np.int64))

@@ -1,0 +1,158 @@
+"""What the control net and the source prove about every ray of a scene, without tracing one.
+
+Notation
+    L           bound of |grad Z|: the derivative of a spline is a spline, and lies within the hull of its control net
+    phi         atan L, the most that the surface's normal leans from z
+    theta       the most that rays lean from z inside the lens
+    i, o        angles of incidence and refraction at the exit: i <= theta + phi, sin o = n sin i
+
+A ray leaves with at most theta + (o - i) from z, because refraction turns it more the larger i is.  Over a surface of slope L it
+cannot come down again if L tan of that is below 1.  A mirror sends it off -z by at most theta + 2 phi instead.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.interface import reflectance, reflectances
+from caustic_cli.optics.sampling import LARGEST_NORMAL
+from caustic_cli.scene import Disc, PlaneWave, Points, Scene
+from caustic_cli.scene.source import covering_cone
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """See above.  angles in rad; slope without unit; heights mm.
+
+    incidence: the most that rays lean from z before the entrance; inside: behind it; slope: of the surface; lean: that of the
+    microfacets' normals; index: the largest of all wavelengths; critical: n sin i, total reflection is impossible below 1; climb: L
+    times the tangent of the direction in which rays leave, a second meeting is impossible below 1; reach: how far rays get to the
+    aperture's edge, in parts of its half width, at the greatest height; ghost: part of the power that is reflected twice inside;
+    polarised: of unpolarised light, how much the exit's reflectance changes by what the entrance makes of s and p.
+    """
+
+    incidence: float
+    inside: float
+    slope: float
+    lean: float
+    index: float
+    critical: float
+    climb: float
+    reach: float
+    ghost: float
+    polarised: float
+
+
+def bounds_of(scene: Scene, field: HeightField, heights: Tensor) -> Bounds:
+    """Bounds that hold for every ray of a scene at these heights (n, m) mm."""
+    lens, indices = scene.lens, [band.scene.lens.inside for band in scene.bands]
+    least, most = min(indices), max(indices)
+    incidence = _incidence(scene)
+    inside = math.asin(min(1.0, math.sin(incidence) / least))
+    slope = field.slope_bound(heights)
+    lean = math.atan(slope + lens.roughness * LARGEST_NORMAL)
+    i = inside + lean
+    if lens.mirror:
+        critical, out = 0.0, inside + 2.0 * lean
+    else:
+        critical = most * math.sin(min(i, math.pi / 2.0))
+        out = inside + math.asin(critical) - i if critical < 1.0 else math.pi / 2.0
+    climb = slope * math.tan(out) if out < math.pi / 2.0 else (math.inf if slope > 0 else 0.0)
+    reach = _reach(scene, inside, float(heights.min()), float(heights.max()))
+    ghost, polarised = _ghost(scene, field, heights, inside, most), _polarised(incidence, critical, most)
+    return Bounds(incidence, inside, slope, lean, most, critical, climb, reach, ghost, polarised)
+
+
+def _incidence(scene: Scene) -> float:
+    """The most that rays to the aperture lean from z before the entrance, rad."""
+    source, lens = scene.source, scene.lens
+    if isinstance(source, PlaneWave):
+        return 0.0
+    if isinstance(source, Disc) and source.angle is not None:
+        return math.radians(source.angle) / 2.0
+    positions, extent = _places(source)
+    far = np.hypot(*(np.abs(positions[:, k]) + extent[k] + lens.half_size[k] for k in (0, 1)))
+    steepest = float(np.arctan2(far, lens.z_in - positions[:, 2]).max())
+    return min(covering_cone(source, lens.half_size, lens.z_in, lens.round), steepest)
+
+
+def _places(source: Points | Disc) -> tuple[np.ndarray, tuple[float, float]]:
+    """Positions (k, 3) and half widths about them, mm."""
+    if isinstance(source, Points):
+        return np.array(source.positions), (0.0, 0.0)
+    return np.array([source.position]), (source.size[0] / 2.0, source.size[1] / 2.0)
+
+
+def _polarised(incidence: float, critical: float, n: float) -> float:
+    """|T_s - T_p| / (T_s + T_p) at the entrance times |R_s - R_p| / 2 at the exit, both at the greatest angles."""
+    def split(sine: float, eta: float) -> tuple[float, float]:
+        c, s = (math.sqrt(max(0.0, 1.0 - v * v)) for v in (sine, eta * sine))
+        return reflectances(c, s, eta)
+
+    rs, rp = split(math.sin(incidence), 1.0 / n)
+    outer = split(critical / n, n) if critical < 1.0 else (1.0, 0.0)  # R_s - R_p is largest at the critical angle, below 1
+    return (rs - rp) / (2.0 - rs - rp) * (outer[0] - outer[1]) / 2.0
+
+
+def _reach(scene: Scene, inside: float, lowest: float, top: float) -> float:
+    """How far from the axis rays can be at the surface's greatest height, in half widths of the aperture; infinite where the
+    surface may dip below the entrance, which rays then never meet from below."""
+    source, lens = scene.source, scene.lens
+    if isinstance(source, PlaneWave):
+        return 1.0
+    if lowest < lens.z_in:
+        return math.inf
+    drift = (top - lens.z_in) * math.tan(inside)
+    if isinstance(source, Disc) and source.angle is not None:
+        return 1.0 + drift / min(lens.half_size)
+    (positions, extent), cone = _places(source), covering_cone(source, lens.half_size, lens.z_in, lens.round)
+    wide = (lens.z_in - positions[:, 2]) * math.tan(cone) if cone < math.pi / 2.0 else np.full(len(positions), math.inf)
+    if lens.round:
+        far = np.hypot(*(np.abs(positions[:, k]) + extent[k] for k in (0, 1))) + wide
+        return float((np.minimum(far, lens.half_size[0]) + drift).max()) / lens.half_size[0]
+    return max(float(((np.minimum(np.abs(positions[:, k]) + extent[k] + wide, r) + drift) / r).max())
+               for k, r in enumerate(lens.half_size))
+
+
+def _ghost(scene: Scene, field: HeightField, heights: Tensor, inside: float, n: float) -> float:
+    """Bound of the part of the power that is reflected at the exit and then at the entrance: a mean over the knot spans for even
+    light of a plane wave, their largest for other light."""
+    lens, kind = scene.lens, scene.lens.fresnel
+    if lens.mirror:
+        return 0.0
+    slope, area = _slopes(field, heights.detach().double().cpu())
+    lean = torch.atan(slope + lens.roughness * LARGEST_NORMAL)
+
+    def part(angle: Tensor) -> Tensor:
+        """Greatest reflectance up to an angle of incidence inside; unpolarised light's falls nowhere below that at 0 and rises."""
+        c = torch.cos(angle.clamp_max(math.pi / 2.0))
+        square = 1.0 - n * n * (1.0 - c * c)
+        s = square.clamp_min(0.0).sqrt()
+        if kind == "none":
+            value = torch.zeros_like(s)
+        elif scene.light.polarisation is not None or scene.light.tracked:
+            value = reflectances(c, s, n)[0]
+        else:
+            value = torch.maximum(reflectance(kind, c, s, n), torch.as_tensor(((n - 1.0) / (n + 1.0)) ** 2))
+        return torch.where(square > 0, value, torch.ones_like(value))
+
+    both = part(inside + lean) * part(inside + 2.0 * lean)
+    even = isinstance(scene.source, PlaneWave) and scene.source.profile is None
+    return float((both * area).sum() if even else both.max())
+
+
+def _slopes(field: HeightField, heights: Tensor) -> tuple[Tensor, Tensor]:
+    """Bound of |grad Z| on every knot span, and the span's part of the aperture: (spans along x, along y) each."""
+    (su, sv), (rx, ry) = field.spaces, field.half_size
+    gx, gy = (su.derivative_matrix() @ heights).abs() / (2 * rx), (heights @ sv.derivative_matrix().T).abs() / (2 * ry)
+    p, q = su.degree, sv.degree
+    along = [torch.nn.functional.max_pool2d(g[None, None], window, 1)[0, 0]
+             for g, window in ((gx, (p, q + 1)), (gy, (p + 1, q)))]
+    widths = [torch.diff(s.knots[s.degree : s.n + 1]).double() for s in (su, sv)]
+    return torch.hypot(*along), widths[0][:, None] * widths[1][None, :]

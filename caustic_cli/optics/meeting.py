@@ -1,0 +1,106 @@
+"""Where light meets the free-form surface that has met it before, with derivatives by the ray as well as by the heights.
+
+Such a ray starts wherever the surface sent it, so o and d depend on the heights.  Differentiated at a root t of
+f = o_z + t d_z - Z(o_x + t d_x, o_y + t d_y), everything that moves the ray moves the hit.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.kernels import fused
+from caustic_cli.optics.tolerances import LEAST_COSINE
+
+#: Steps of the search over a knot span: a dip under the surface narrower than that is not seen.  It carries little light, at
+#: grazing incidence.
+STEPS_PER_SPAN = 8
+#: Most steps of one search: five crossings of the largest net's diagonal would take more.
+MOST_STEPS = 1 << 16
+#: Halvings of a step: it is then shorter than a rounding of the lens' size.
+HALVINGS = 50
+
+
+@torch.no_grad()
+def again(field: HeightField, heights: Tensor, o, d, below: bool) -> tuple[Tensor, Tensor]:
+    """Next meeting with the surface of rays that start on it, by steps and bisection, in plain torch.
+
+    Args:
+        heights: (n, m) mm.
+        o: (x, y, z) of the start, (N,) float64 each, mm; d: unit directions.
+        below: whether the rays run under the surface, or above it.
+
+    Returns:
+        t (N,) mm, 0 where there is none; found (N,) bool.
+    """
+    h, side = heights.detach().double(), -1.0 if below else 1.0
+    o, d = ([c.detach().double() for c in v] for v in (o, d))
+    (rx, ry), (lowest, highest) = field.half_size, (float(h.min()), float(h.max()))
+    gx, gy = field.slope_bounds(h)
+    step = min(2.0 * r * float(torch.diff(s.knots).clamp_min(0.0)[torch.diff(s.knots) > 0].min())
+               for s, r in zip(field.spaces, (rx, ry), strict=True)) / STEPS_PER_SPAN
+    t_found, found = torch.zeros_like(o[0]), torch.zeros_like(o[0], dtype=torch.bool)
+    rise = side * d[2] - gx * d[0].abs() - gy * d[1].abs()  # where it is positive, no slope of the surface catches the ray
+    at = (rise <= 0).nonzero()[:, 0]
+    before = torch.full_like(t_found, 1e-3 * step)[at]
+
+    def height(at: Tensor, t: Tensor) -> Tensor:
+        x, y = (c[at] + t * v[at] for c, v in zip(o[:2], d[:2], strict=True))
+        inside = (x.abs() <= rx) & (y.abs() <= ry)
+        z = field.at(h, x.clamp(-rx, rx), y.clamp(-ry, ry), ((0, 0),))[0]
+        return torch.where(inside, side * (o[2][at] + t * d[2][at] - z), torch.full_like(t, torch.nan))
+
+    clear = height(at, before) > 0
+    at, before = at[clear], before[clear]
+    for _ in range(MOST_STEPS):
+        if not len(at):
+            break
+        after = before + step
+        f, z = height(at, after), o[2][at] + after * d[2][at]
+        through = f <= 0
+        if bool(through.any()):
+            here, low, high = at[through], before[through], after[through]
+            for _ in range(HALVINGS):
+                middle = 0.5 * (low + high)
+                clear = height(here, middle) > 0
+                low, high = torch.where(clear, middle, low), torch.where(clear, high, middle)
+            t_found[here], found[here] = high, True
+        climbs = side * d[2][at] > 0
+        gone = torch.isnan(f) | (climbs & ((z > highest) if side > 0 else (z < lowest)))
+        at, before = at[~through & ~gone], after[~through & ~gone]
+    return t_found, found
+
+
+def surface_at(field: HeightField, heights: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """z (mm), z_x, z_y at points (N,) mm, float64, linear in the heights; on a CPU by the kernels."""
+    if not (fused(x.device) and len(x)):
+        return tuple(field.at(heights, x, y))
+    from caustic_cli.optics.kernels.surface import FusedSurface, scattered_surface  # noqa: PLC0415
+
+    at = ((0.5 * (c.detach() / r + 1.0)).contiguous().numpy() for c, r in zip((x, y), field.half_size, strict=True))
+    return scattered_surface(FusedSurface(field.spaces, field.half_size), heights.double(), *at, torch.float64)
+
+
+def touch(field: HeightField, heights: Tensor, o, d, t: Tensor):
+    """The hit at distance t (N,), not differentiated, of rays o, d that may depend on the heights.
+
+    Returns:
+        (x, y, z) mm, slopes (z_x, z_y), and the distance, (N,) each, with their first derivatives in reverse mode.
+    """
+    moved, differentiate = [c + t * v for c, v in zip(o, d, strict=True)], torch.is_grad_enabled()
+    x, y = moved[0].detach(), moved[1].detach()
+    z, gx, gy = surface_at(field, heights, x, y)
+    if not differentiate:
+        return tuple(moved), (gx, gy), t
+    with torch.no_grad():
+        xx, xy, yy = field.at(heights, x, y, ((2, 0), (1, 1), (0, 2)))
+        flat = [v.detach() for v in d]
+        c = flat[2] - gx * flat[0] - gy * flat[1]
+        c = torch.where(c.abs() > LEAST_COSINE, c, torch.full_like(c, LEAST_COSINE))
+        slope = gx.detach(), gy.detach()
+    f = moved[2] - z - slope[0] * (moved[0] - x) - slope[1] * (moved[1] - y)
+    move = -(f - f.detach()) / c
+    hit = [m + move * v for m, v in zip(moved, flat, strict=True)]
+    ax, ay = hit[0] - x, hit[1] - y  # zeros that carry the derivative
+    return tuple(hit), (gx + xx * ax + xy * ay, gy + xy * ax + yy * ay), t + move

@@ -1,0 +1,59 @@
+"""Linearly polarised light through an interface, s and p apart.
+
+Notation
+    d, t    unit directions before and behind the interface;  N the normal of a height field, (-z_x, -z_y, 1)
+    E       unit vector of the field, normal to d
+    s, p    s = d x N / |d x N|, normal to the plane of incidence;  p = s x d within it
+
+Fresnel's amplitudes behind are t_s E_s and t_p E_p; light without retardation stays linearly polarised.  In normal incidence s
+and p are the same and any plane of incidence will do.  Born and Wolf, Principles of Optics, 1.5.2.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+#: |d x N|^2 below which a ray counts as normal to the surface: R_s and R_p then differ by less than any rounding.
+NORMAL = 1e-30
+
+
+def field_of(angle: float, d):
+    """E of light polarised along `angle` (degrees from +x) on the axis, in direction d: turned with it, without twist."""
+    a = math.radians(angle)
+    ax, ay = math.cos(a), math.sin(a)
+    along = (ax * d[0] + ay * d[1]) / (1.0 + d[2])
+    return ax - along * d[0], ay - along * d[1], -along * (1.0 + d[2])
+
+
+def part_s(e, d, normal):
+    """Part of the power that is s-polarised at an interface."""
+    s, square = _across(d, normal)
+    across = _dot(e, s)
+    return torch.where(square > NORMAL, across * across / square.clamp_min(NORMAL), torch.full_like(square, 0.5))
+
+
+def beyond(e, d, t, normal, c, s, eta: float):
+    """E behind an interface; c, s as of `interface.refract`."""
+    sx, square = _across(d, normal)
+    length = square.clamp_min(NORMAL).sqrt()
+    unit = tuple(v / length for v in sx)
+    es, ep = _dot(e, unit) * (2.0 * eta * c) / (eta * c + s), _dot(e, _cross(unit, d)) * (2.0 * eta * c) / (c + eta * s)
+    after = tuple(es * a + ep * b for a, b in zip(unit, _cross(unit, t), strict=True))
+    size = _dot(after, after).clamp_min(NORMAL).sqrt()
+    return tuple(torch.where(square > NORMAL, a / size, torch.as_tensor(b).to(size)) for a, b in zip(after, e, strict=True))
+
+
+def _across(d, normal):
+    s = _cross(d, normal)
+    square = _dot(s, s)
+    return s, torch.as_tensor(square)
+
+
+def _cross(a, b):
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

@@ -1,0 +1,214 @@
+"""What every effect costs, and what leaving it out does to the image, measured in one run.
+
+Notation
+    with, without   images of the same rays by plans that differ in one effect
+    cost            time of the one less that of the other, wall time of sampling, tracing and reconstruction
+    error           relative RMS between the two images, each over its own mean; power, light on the screen without less with
+
+Both plans take turns, round after round, so that a machine that slows down for a while slows both.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from caustic_cli import __version__
+from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.plan import EFFECTS, FREE, Effect, Plan, compile_plan
+from caustic_cli.optics.sampling import stream
+from caustic_cli.optics.stepwise import needed
+from caustic_cli.optics.tracing import Exposure, expose
+from caustic_cli.scene import Disc, Light, PlaneWave, Points, Scene, checks
+from caustic_cli.scene.materials import D_LINE, refractive_index
+from caustic_cli.studies.metrics import relative_rms
+from caustic_cli.studies.report import COLOURS, MARKERS, Study
+
+#: Rays of every image, and rounds, unless said: a few seconds for each effect on two cores.
+RAYS, REPEATS = 1 << 16, 3
+#: Amounts at which the study measures an effect that its scene does not have.
+SUN, SIZE, ABSORPTION, ROUGHNESS, TILT, SHIFT, GLASS, LINES = 0.533, 1.0, 0.01, 0.001, 10.0, 1.0, "N-BK7", (486.1, D_LINE, 656.3)
+
+COLUMNS = {
+    "series": "effect",
+    "on": "whether auto simulates it in this scene",
+    "why": "why, in this scene",
+    "bound": "the number that decides",
+    "limit": "what it is compared with",
+    "amount": "of the effect as measured here: the scene's own, or what was put in",
+    "error": "relative RMS between the image without and with it, each over its own mean",
+    "power": "light on the screen without it less with it, part of the source's power",
+    "seconds": "cost: time with it less time without, s; median of the rounds",
+    "seconds_min": "least of them, s",
+    "seconds_max": "most of them, s",
+    "whole": "time with it, s; median",
+}
+
+
+def measure(with_: Plan, without: Plan, field: HeightField, heights: Tensor, *, rays: int = RAYS, repeats: int = REPEATS,
+            seed: int = 0, dtype: torch.dtype = torch.float64) -> dict:
+    """Cost and error of the effect in which two plans differ: error, power, seconds, seconds_min, seconds_max, whole.
+
+    Where only the plan without it leaves the fused kernels, both are timed as steps: the cost is that of the effect alone.
+    """
+    if needed(without.scene, without.steps) and not needed(with_.scene, with_.steps):
+        with_ = replace(with_, steps=replace(with_.steps, plain=True))
+
+    def image(plan: Plan) -> tuple[Exposure, float]:
+        began = time.perf_counter()
+        sampler = rays_of(plan.scene, "stratified", rays, stream(seed, "effects"), heights.device)
+        found = expose(plan.scene, field, heights, sampler, None, dtype, steps=plan.steps)
+        if heights.is_cuda:
+            torch.cuda.synchronize()
+        return found, time.perf_counter() - began
+
+    images = [image(plan)[0].image.flatten(0, -2).cpu() for plan in (with_, without)]  # a round that only warms up
+    times = [(image(with_)[1], image(without)[1]) for _ in range(repeats)]
+    costs = [a - b for a, b in times]
+    return {"error": relative_rms(images[1], images[0]), "power": float(images[1].sum() - images[0].sum()),
+            "seconds": statistics.median(costs), "seconds_min": min(costs), "seconds_max": max(costs),
+            "whole": statistics.median(a for a, _ in times)}
+
+
+def explain(plan: Plan, scene: Scene, field: HeightField, heights: Tensor, *, rays: int = RAYS, seed: int = 0,
+            dtype: torch.dtype = torch.float64, repeats: int = REPEATS) -> list[dict]:
+    """A row for each effect of a plan of `scene`: name, on, why, bound, limit, cost_ms, error and power of leaving it out.
+
+    cost_ms of an effect that is off is what it would cost.  What the scene has nothing of has neither cost nor error; what cannot
+    be left out has no error (None).
+    """
+    rows = []
+    for effect in plan.effects:
+        row = {"name": effect.name, "on": effect.on, "why": effect.why, "bound": effect.bound, "limit": effect.limit}
+        if effect.fixed or not effect.present:
+            row |= {"cost_ms": 0.0, "error": None, "power": None} if effect.fixed and effect.on else \
+                {"cost_ms": 0.0, "error": 0.0, "power": 0.0}
+        else:
+            with_, without = (compile_plan(scene, field, heights, chosen)
+                              for chosen in (set(plan.simulated) | {effect.name}, set(plan.simulated) - {effect.name}))
+            found = measure(with_, without, field, heights, rays=rays, repeats=repeats, seed=seed, dtype=dtype)
+            cost = 0.0 if effect.name in FREE else 1e3 * found["seconds"]
+            row |= {"cost_ms": cost, "error": found["error"], "power": found["power"]}
+        rows.append(row)
+    return rows
+
+
+def table(rows: list[dict]) -> list[str]:
+    """The rows of `explain` as lines of text under their titles."""
+    def percent(value: float | None, form: str) -> str:
+        return "-" if value is None else format(value, form)
+
+    cells = [("effect", "", "cost", "error", "power", "why")]
+    for r in rows:
+        quiet = not r["on"] and r["cost_ms"] == 0.0
+        cells.append((r["name"], "on" if r["on"] else "off", "-" if quiet else f"{r['cost_ms']:+.1f} ms",
+                      "-" if quiet else percent(r["error"], ".2g"), "-" if quiet else percent(r["power"], "+.2%"), r["why"]))
+    widths = [max(len(row[k]) for row in cells) for k in range(5)]
+    return ["  ".join([*(f"{c:<{w}}" if k < 2 else f"{c:>{w}}" for k, (c, w) in enumerate(zip(row, widths, strict=False))), row[5]])
+            for row in cells]
+
+
+def run_effects(scene: Scene, field: HeightField, heights: Tensor, *, rays: int | None = None, repeats: int | None = None,
+                seed: int = 0, dtype: torch.dtype | None = None, progress: Callable[[int, int], None] | None = None) -> Study:
+    """Cost against error of every effect at a lens; what its scene lacks is put in, one effect at a time.
+
+    Raises:
+        InputError: numbers out of range.
+    """
+    rays = checks.whole("--rays", RAYS if rays is None else rays, 256, 1 << 32)
+    repeats = checks.whole("--repeats", REPEATS if repeats is None else repeats, 1, 1000)
+    heights = heights.detach().double()
+    plan, rows = compile_plan(scene, field, heights), []
+    for k, effect in enumerate(plan.effects):
+        found = _row(effect, plan, scene, field, heights, rays, repeats, seed, dtype or torch.float64)
+        if found is not None:
+            rows.append(found)
+        if progress is not None:
+            progress(k + 1, len(EFFECTS))
+    told = sorted((r for r in rows if r["on"]), key=lambda r: -r["error"])
+    advice = f"of what this scene has, {told[0]['series']} matters most ({told[0]['error']:.2g})" if told else \
+        "this scene calls for no effect"
+    unfounded = max((r["error"] for r in rows if not r["on"] and r["amount"] == "the scene's own"), default=0.0)
+    advice += f"; what auto leaves out of it changes the image by at most {unfounded:.2g}"
+    about = {"version": __version__, "seed": seed, "repeats": repeats, "rays": rays, "device": str(heights.device),
+             "reference_error": 0.0, "threads": torch.get_num_threads(),
+             "dtype": str(dtype or torch.float64).removeprefix("torch.")}
+    return Study("effects", COLUMNS, rows, {}, advice, about, "rays", PLOTS)
+
+
+def _row(effect: Effect, plan: Plan, scene: Scene, field: HeightField, heights: Tensor, rays: int, repeats: int, seed: int,
+         dtype: torch.dtype) -> dict | None:
+    name, amount, bare = effect.name, "the scene's own", None
+    if not effect.present:
+        put = _put(scene, name, heights)
+        if put is None:
+            return None
+        scene, bare, amount = put
+        plan = compile_plan(scene, field, heights)
+    elif effect.fixed:
+        return None
+    with_ = compile_plan(scene, field, heights, set(plan.simulated) | {name})
+    without = compile_plan(bare or scene, field, heights, None if bare else set(plan.simulated) - {name})
+    found = measure(with_, without, field, heights, rays=rays, repeats=repeats, seed=seed, dtype=dtype)
+    if name in FREE:
+        found |= dict.fromkeys(("seconds", "seconds_min", "seconds_max"), 0.0)
+    return {"series": name, "on": effect.on, "why": effect.why, "bound": effect.bound, "limit": effect.limit,
+            "amount": amount} | found
+
+
+def _put(scene: Scene, name: str, heights: Tensor) -> tuple[Scene, Scene | None, str] | None:
+    """The scene with an effect put in, the scene to compare it with (None: the same without it), and how much of it."""
+    lens, screen, s = scene.lens, scene.screen, scene.source
+    if name == "source-size":
+        if isinstance(s, PlaneWave):
+            return replace(scene, source=Disc(power=s.power, angle=SUN)), None, f"{SUN} degrees"
+        position, cone = s.centre, s.cone if isinstance(s, Points) else None
+        return replace(scene, source=Disc(position, (SIZE, SIZE), s.power, cone)), None, f"{SIZE:g} mm"
+    if name == "polarisation" and lens.fresnel == "exact" and not lens.mirror:
+        return replace(scene, light=replace(scene.light, polarisation=0.0)), None, "along x"
+    if name == "dispersion" and not lens.mirror:
+        glass = lens.glass or GLASS
+        lens = replace(lens, glass=glass, index=refractive_index(glass))
+        light = Light(scene.light.polarisation, LINES)
+        return replace(scene, lens=lens, light=light), None, f"{len(LINES)} wavelengths in {glass}"
+    if name == "absorption" and not lens.mirror:
+        return replace(scene, lens=replace(lens, absorption=ABSORPTION)), None, f"{ABSORPTION:g} per mm"
+    if name == "roughness":
+        return replace(scene, lens=replace(lens, roughness=ROUGHNESS)), None, f"slopes {ROUGHNESS:g}"
+    if name == "screen-tilt":
+        return replace(scene, screen=replace(screen, tilt=(0.0, TILT))), None, f"{TILT:g} degrees"
+    if name == "screen-shift":
+        return replace(scene, screen=replace(screen, shift=(SHIFT, 0.0))), None, f"{SHIFT:g} mm"
+    if name == "mirror":
+        z = 2.0 * float(heights.mean()) - screen.z
+        return Scene(s, replace(lens, mirror=True), replace(screen, z=z), scene.light), scene, f"the screen at {z:.4g} mm"
+    return None
+
+
+def draw_effects(study: Study, figure: Figure) -> None:
+    """Cost of every effect, and the error of leaving it out; filled where auto simulates it."""
+    figure.set_size_inches(8.4, 5.6)
+    axes = figure.add_subplot()
+    floor = 0.5 * min((r["error"] for r in study.rows if r["error"] > 1e-12), default=1.0)
+    for k, row in enumerate(study.rows):
+        colour, error = COLOURS[k % len(COLOURS)], max(row["error"], floor)
+        low, high = (1e3 * abs(row["seconds"] - row[f"seconds_{end}"]) for end in ("min", "max"))
+        axes.errorbar([1e3 * row["seconds"]], [error], xerr=[[low], [high]], linestyle="", color=colour, elinewidth=0.6,
+                      marker=MARKERS[k % len(MARKERS)], markerfacecolor=colour if row["on"] else "none",
+                      label=f"{row['series']}, {'on' if row['on'] else 'off'}, {row['amount']}")
+    axes.set(yscale="log", xlabel=f"cost (ms for {study.about['rays']:,} rays): median, least and most",
+             ylabel=f"relative RMS of leaving it out (least drawn: {floor:.1g})", title="effects: cost and error")
+    axes.set_xscale("symlog", linthresh=1.0)
+    axes.grid(which="major", linewidth=0.4)
+    figure.legend(loc="outside right upper", fontsize="x-small")
+
+
+#: Endings of the pictures' names, and what draws them.
+PLOTS = {"": draw_effects}

@@ -1,0 +1,361 @@
+"""Every effect against its closed form, the account of all of them together, and derivatives."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.interface import reflectances
+from caustic_cli.optics.meeting import again
+from caustic_cli.optics.reconstruction import Filter
+from caustic_cli.optics.sampling import Sampler
+from caustic_cli.optics.stepwise import Steps, StepTracer
+from caustic_cli.optics.tracing import BandTracer, check_room, expose, tracers
+from caustic_cli.scene import Disc, Lens, Light, Offset, PlaneWave, Points, Scene, Screen
+from caustic_cli.scene.materials import refractive_index
+
+N, R0 = 1.5, 0.04
+POINT = Points(((0.5, -0.3, -40.0),))
+
+
+def scene_of(source=None, *, degree=(2, 2), control=(9, 8), screen=None, light=None, **lens) -> Scene:
+    """A 10 x 8 mm lens about 3 mm thick, 60 mm before a screen of 16 x 14 mm."""
+    options = {"index": N, **lens}
+    return Scene(source or PlaneWave(), Lens((10.0, 8.0), 0.0, control=control, degree=degree, offset=Offset(3.0), **options),
+                 screen or Screen((16.0, 14.0), 60.0, (32, 28)), light or Light())
+
+
+def heights_through(scene: Scene, f) -> torch.Tensor:
+    """Heights of the spline that passes through f(x, y) over the control points; f itself where it is a spline of the degree."""
+    field = HeightField.of(scene.lens)
+    x, y = field.control_xy()
+    at = [torch.linalg.inv(s.matrix(s.greville)) for s in field.spaces]
+    return at[0] @ f(x[:, None], y[None, :]).expand(field.shape) @ at[1].T
+
+
+def bumpy(scene: Scene, bumps: float, seed: int = 0) -> torch.Tensor:
+    g = torch.Generator().manual_seed(seed)
+    return 3.0 + bumps * torch.randn(scene.lens.control, generator=g, dtype=torch.float64)
+
+
+def land(scene: Scene, heights: torch.Tensor, steps: Steps = Steps(plain=True), kind="grid", shape=(12, 10)):  # noqa: B008
+    """Landings of one chunk of a plane wave's rays, and the rays."""
+    (sample,) = Sampler(kind, shape).chunks()
+    return StepTracer(scene, HeightField.of(scene.lens), sample, torch.float64, steps)(heights), sample
+
+
+def shine(scene: Scene, heights: torch.Tensor, steps: Steps = Steps(), rays=4000, **options):  # noqa: B008
+    return expose(scene, HeightField.of(scene.lens), heights, rays_of(scene, "stratified", rays, 3), steps=steps, **options)
+
+
+def sloped(g):
+    return lambda x, y: 4.5 + g * x + 0 * y
+
+
+# Fresnel and polarisation
+
+
+def test_brewster():
+    """At tan i = 1 / n inside, p-polarised light passes whole, and R_s = ((n^2 - 1) / (n^2 + 1))^2."""
+    i = math.atan(1.0 / N)
+    c, s = math.cos(i), math.sqrt(1 - (N * math.sin(i)) ** 2)
+    rs, rp = reflectances(c, s, N)
+    assert rp == pytest.approx(0.0, abs=1e-30)
+    assert rs == pytest.approx(((N * N - 1) / (N * N + 1)) ** 2, rel=1e-13)
+    for angle, reflected in ((0.0, 0.0), (90.0, rs), (45.0, rs / 2.0)):
+        scene = scene_of(light=Light(angle))
+        (landing,), _ = land(scene, heights_through(scene, sloped(1.0 / N)))
+        assert float(landing.leaving) == pytest.approx((1 - R0) * (1 - reflected), rel=1e-12)
+
+
+@pytest.mark.parametrize("source", [None, POINT])
+def test_two_crossed_polarisations_are_unpolarised_light(source):
+    """Exactly so for a plane wave; a slanted entrance polarises, which the average of R_s and R_p at each surface does not know."""
+    heights = bumpy(scene_of(), 0.2)
+    images = [shine(scene_of(source, light=Light(a)), heights, rays=20_000).image for a in (20.0, 110.0)]
+    plain = shine(scene_of(source), heights, rays=20_000).image
+    tracked = shine(scene_of(source, light=Light(tracked=True)), heights, rays=20_000).image
+    difference = float((0.5 * (images[0] + images[1]) - plain).abs().sum())
+    assert float((0.5 * (images[0] + images[1]) - tracked).abs().sum()) < (1e-12 if source is None else 1e-4)
+    assert difference < (1e-12 if source is None else 1e-3)
+    assert source is None or difference > 1e-9
+    assert float((images[0] - images[1]).abs().sum()) > 1e-4
+
+
+def test_polarised_light_through_a_slanted_entrance():
+    """One ray in the x-z plane, p-polarised at entrance and exit of a plate: (1 - R_p)^2; s likewise."""
+    for angle, k in ((0.0, 1), (90.0, 0)):
+        scene = scene_of(Points(((-30.0, 0.0, -40.0),), cone=80.0), light=Light(angle))
+        sample = rays_of(scene, "grid", 40_000)
+        (bundle,) = sample.chunks()
+        one = (bundle.y.abs() < 0.02).nonzero()[:, 0][:5]
+        inside = [c[one] for c in (bundle.dx, bundle.dz)]
+        sin = N * inside[0] / torch.hypot(*inside)
+        rs_rp = reflectances(inside[1], torch.sqrt(1 - sin**2), N)
+        tracer = StepTracer(scene, HeightField.of(scene.lens), bundle, torch.float64)
+        (landing,) = tracer(bumpy(scene, 0.0))
+        unpolarised = next(rays_of(replace(scene, light=Light()), "grid", 40_000).chunks())
+        rs, rp = rs_rp
+        emitted = unpolarised.share[one] / (1 - 0.5 * (rs + rp))
+        torch.testing.assert_close(landing.weight[one], emitted * (1 - rs_rp[k]) ** 2, rtol=2e-3, atol=0)
+        assert float((rs - rp).min()) > 0.03
+
+
+# Glass
+
+
+@pytest.mark.parametrize("source", [None, POINT])
+def test_beer_lambert(source):
+    """A plate of thickness t: every ray is left with exp(-a t / cos)."""
+    a, t = 0.1, 3.0
+    clear, grey = (scene_of(source, absorption=x, fresnel="none") for x in (0.0, a))
+    (rays,) = rays_of(clear, "stratified", 500, 1).chunks()
+    field, heights = HeightField.of(clear.lens), torch.full((9, 8), t, dtype=torch.float64)
+    (before,), (after,) = (StepTracer(s, field, rays, torch.float64)(heights) for s in (clear, grey))
+    cosine = rays.dz if source else torch.ones_like(after.weight)
+    torch.testing.assert_close(after.weight, before.weight * torch.exp(-a * t / cosine), rtol=1e-12, atol=0)
+    assert float(after.lost["absorbed"]) == pytest.approx(float((before.weight - after.weight).sum()), rel=1e-12)
+
+
+def test_dispersion_of_a_prism():
+    """Every wavelength leaves a prism by its own sin b = n(lambda) sin a."""
+    lines, weights = (450.0, 550.0, 650.0), (1.0, 2.0, 1.0)
+    index = refractive_index("N-SF11")
+    scene = scene_of(light=Light(wavelengths=lines, weights=weights), glass="N-SF11", index=index)
+    a, heights = math.atan(0.2), heights_through(scene, sloped(0.2))
+    field = HeightField.of(scene.lens)
+    found = list(tracers(scene, field, Sampler("grid", (12, 10)), torch.float64, 1 << 20))
+    assert all(isinstance(t, BandTracer) for t in found)
+    assert [t.weight for t in found] == pytest.approx([0.25, 0.5, 0.25])
+    for line, band in zip(lines, found, strict=True):
+        x = (torch.arange(12).double() + 0.5) / 12 * 10.0 - 5.0
+        turn = math.asin(refractive_index("N-SF11", line) * math.sin(a)) - a
+        at = x + (60.0 - 4.5 - 0.2 * x) * math.tan(turn)
+        torch.testing.assert_close(band.one(heights).x, at[:, None].expand(12, 10), rtol=0, atol=1e-11)
+    parts = [replace(b.scene, light=Light()) for b in scene.bands]
+    whole = sum(w * shine(p, heights).image for w, p in zip((0.25, 0.5, 0.25), parts, strict=True))
+    torch.testing.assert_close(shine(scene, heights).image, whole, rtol=0, atol=1e-15)
+
+
+def test_roughness_spreads_by_throw_times_slope():
+    """A window of microfacets: landing points scatter by (throw (n - 1) sigma)^2 along either axis; 3 % of 40,000 rays' noise."""
+    sigma, scene = 1e-3, scene_of(roughness=1e-3)
+    for kind in ("grid", "stratified"):
+        (landing,), sample = land(scene, torch.full((9, 8), 3.0, dtype=torch.float64), kind=kind, shape=(200, 200))
+        x, y = (10 * sample.u - 5, 8 * sample.v - 4)
+        if sample.tensor:
+            x, y = x[:, None], y[None, :]
+        dx, dy = landing.x - x, landing.y - y
+        for d in (dx, dy):
+            assert float(d.var()) == pytest.approx((57.0 * (N - 1) * sigma) ** 2, rel=0.03)
+            assert abs(float(d.mean())) < 5 * float(d.std()) / 200
+        assert abs(float((dx * dy).mean())) < 5 * float(dx.var()) / 200
+
+
+# Mirror and screen
+
+
+def test_a_parabolic_mirror_has_a_focus():
+    """z = z_0 - r^2 / (4 f) sends a plane wave to the point f before its vertex."""
+    f, scene = 25.0, scene_of(screen=Screen((4.0, 4.0), -22.0, (8, 8)), mirror=True)
+    heights = heights_through(scene, lambda x, y: 3.0 - (x * x + y * y) / (4.0 * f))
+    (landing,), _ = land(scene, heights)
+    assert float(torch.hypot(landing.x, landing.y).max()) < 1e-12
+    assert float(landing.leaving) == pytest.approx(1.0, rel=1e-14)
+    away = replace(scene, screen=replace(scene.screen, z=-10.0))
+    (landing,), _ = land(away, heights)
+    assert float(torch.hypot(landing.x, landing.y).max()) > 1.0
+
+
+def test_an_elliptic_mirror_is_met_from_a_point():
+    """A plane mirror shows the source behind itself: a point 43 mm before it lights the screen as if from 86 mm away."""
+    scene = scene_of(Points(((0.0, 0.0, -40.0),)), screen=Screen((40.0, 40.0), -40.0, (8, 8)), mirror=True)
+    (bundle,) = rays_of(scene, "stratified", 300, 1).chunks()
+    (landing,) = StepTracer(scene, HeightField.of(scene.lens), bundle, torch.float64)(torch.full((9, 8), 3.0).double())
+    on = landing.weight > 0
+    assert int(on.sum()) > 200
+    torch.testing.assert_close(landing.x[on], 86.0 * (bundle.dx / bundle.dz)[on], rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("tilt", [(25.0, 0.0), (0.0, -35.0), (20.0, 40.0)])
+def test_a_tilted_screen(tilt):
+    """Rays along z: the plane through (s_x, s_y, z) with axes R e_x, R e_y, R = R_y R_x, met by 3 x 3 linear algebra."""
+    screen = Screen((30.0, 30.0), 60.0, (10, 10), tilt, (1.5, -2.0))
+    scene = scene_of(screen=screen)
+    (landing,), sample = land(scene, torch.full((9, 8), 3.0, dtype=torch.float64))
+    a, b = np.radians(tilt)
+    rx = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
+    ry = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
+    axes = ry @ rx
+    np.testing.assert_allclose(np.array(screen.axes).T, axes, atol=1e-15)
+    for i in (0, 5, 11):
+        for j in (0, 9):
+            start = np.array([float(10 * sample.u[i] - 5), float(8 * sample.v[j] - 4), 0.0])
+            # start + t z = middle + p axes_x + q axes_y
+            p, q, _ = np.linalg.solve(np.column_stack([axes[:, 0], axes[:, 1], [0, 0, -1.0]]), start - [1.5, -2.0, 60.0])
+            assert float(landing.x[i, j]) == pytest.approx(1.5 + p, abs=1e-11)
+            assert float(landing.y[i, j]) == pytest.approx(-2.0 + q, abs=1e-11)
+    assert screen.depth == pytest.approx(float(np.abs(axes[2, :2]) @ [15.0, 15.0]))
+
+
+@pytest.mark.parametrize("source", [None, POINT])
+def test_a_shifted_screen_sees_the_same_light_elsewhere(source, kernels):
+    """A shift of 3 x 2 pixels moves the image by as much; the fused path does it."""
+    scene = scene_of(source)
+    heights = bumpy(scene, 0.1)
+    moved = replace(scene, screen=replace(scene.screen, shift=(1.5, -1.0)))
+    filter = Filter("cosine", (3, 3))
+    here, there = (shine(s, heights, filter=filter).image for s in (scene, moved))
+    torch.testing.assert_close(there[:-3, 2:], here[3:, :-2], rtol=0, atol=1e-15)
+    assert float(here[3:, :-2].sum()) > 0.1
+
+
+def test_a_tilted_screen_that_cuts_into_the_lens_is_refused():
+    scene = scene_of(screen=Screen((16.0, 14.0), 9.0, (8, 8), (0.0, 60.0)))
+    with pytest.raises(ValueError, match=r"its tilt takes it 6\.928 mm nearer"):
+        check_room(scene, torch.full((9, 8), 3.0), scene.screen)
+
+
+# Detours
+
+
+@pytest.mark.parametrize("absorption", [0.0, 0.05])
+@pytest.mark.parametrize("source", [None, Points(((0.5, -0.3, -40.0),), cone=3.0)])
+def test_ghost_of_a_plate(source, absorption):
+    """Plane-parallel plate, normal incidence: (1 - R)^2 R^2 exp(-3 a t) more on the screen; in a narrow cone, nearly that."""
+    scene = scene_of(source, absorption=absorption, screen=Screen((40.0, 40.0), 60.0, (4, 4)))
+    heights = torch.full((9, 8), 3.0, dtype=torch.float64)
+    plain, ghostly = (shine(scene, heights, Steps(ghosts=g)) for g in (False, True))
+    more = float((ghostly.image - plain.image).sum())
+    exact = (1 - R0) ** 2 * R0**2 * math.exp(-9.0 * absorption)
+    assert more == pytest.approx(exact, rel=1e-12 if source is None else 1e-3)
+    assert more == pytest.approx(plain.lost["fresnel"] - ghostly.lost["fresnel"], rel=1e-9)
+
+
+def test_ghost_of_a_wedge():
+    """A wedge of angle a: the ghost meets the entrance at 2 a and the exit at 3 a, so it leaves at asin(n sin 3 a) - a."""
+    a = 0.05
+    scene = scene_of()
+    heights = heights_through(scene, sloped(math.tan(a)))
+    (_, ghost), sample = land(scene, heights, Steps(ghosts=True), shape=(41, 2))
+    x0 = (10 * sample.u - 5).numpy()[:, None]
+    z0 = 4.5 + math.tan(a) * x0
+    x1 = x0 + z0 * math.tan(2 * a)  # down to the entrance, turned towards the thick edge
+    x2 = (x1 + 4.5 * math.tan(2 * a)) / (1 - math.tan(a) * math.tan(2 * a))  # up again as far as the wedge
+    z2 = 4.5 + math.tan(a) * x2
+    out = math.asin(N * math.sin(3 * a)) - a
+    at = x2 + (60.0 - z2) * math.tan(out)
+    kept = (np.abs(x1) <= 5) & (np.abs(x2) <= 5)
+    x = ghost.x.reshape(41, 2).numpy()
+    np.testing.assert_allclose(np.where(kept, x, 0), np.where(kept, at, 0) + 0 * x, atol=1e-10)
+    assert kept.sum() > 30
+    weight = ghost.weight.reshape(41, 2).numpy()
+    assert (weight[~kept[:, 0]] == 0).all()
+
+    def r(i):
+        c, s = math.cos(i), math.sqrt(1 - (N * math.sin(i)) ** 2)
+        return sum(reflectances(c, s, N)) / 2
+
+    expected = (1 - R0) * r(a) * r(2 * a) * (1 - r(3 * a)) / 82
+    np.testing.assert_allclose(weight[kept[:, 0]], expected, rtol=1e-11)
+
+
+def cliff() -> tuple[Scene, torch.Tensor]:
+    """A ramp of slope 0.8 up to x = 0, a cliff of slope 4 up to x = 1, and a plateau: rays leaving the ramp run into the cliff."""
+    scene = scene_of(control=(11, 2), degree=(1, 1), screen=Screen((80.0, 20.0), 60.0, (40, 4)))
+    x = torch.linspace(-5, 5, 11, dtype=torch.float64)[:, None]
+    return scene, (5.0 + torch.where(x <= 0, 0.8 * x, (4.0 * x).clamp_max(4.0))).expand(11, 2)
+
+
+def test_a_ray_that_meets_the_surface_twice():
+    """The ray from x leaves at tangent 0.6 and meets z = 5 + 4 x' where (x' - x) / tan = 4 x' - 0.8 x."""
+    _, heights = cliff()
+    field = HeightField.of(cliff()[0].lens)
+    s = math.sqrt(1 - (N * N - 1) * 0.64)
+    tangent = (N - s) / (N * 0.64 + s) * 0.8
+    x = torch.tensor([-0.5, -0.2, -0.05, -4.0], dtype=torch.float64)
+    at, none = (0.8 * x - x / tangent) / (4.0 - 1.0 / tangent), torch.zeros_like(x)
+    length = math.hypot(1.0, tangent)
+    o, d = (x, none, 5.0 + 0.8 * x), (none + tangent / length, none, none + 1.0 / length)
+    t, found = again(field, heights, o, d, below=False)
+    assert found.tolist() == [True, True, True, False]
+    torch.testing.assert_close((x + t * d[0])[:3], at[:3], rtol=0, atol=1e-12)
+
+
+def test_second_meetings_are_taken_off_the_straight_light():
+    scene, heights = cliff()
+    straight, true = (shine(scene, heights, Steps(again=a, plain=True), rays=20_000) for a in (False, True))
+    assert float((straight.image - true.image).abs().sum()) > 0.02
+    for e in (straight, true):
+        assert float(e.image.sum()) + sum(e.lost.values()) == pytest.approx(1.0, abs=1e-12)
+
+
+# All together
+
+
+EVERYTHING = {"absorption": 0.02, "roughness": 0.01}
+SOURCES = [None, POINT, Disc((0.0, 0.0, -30.0), (2.0, 1.0))]
+
+
+@pytest.mark.parametrize("source", SOURCES)
+@pytest.mark.parametrize("bumps", [0.1, 1.5])
+def test_the_account_closes_and_all_is_finite(source, bumps):
+    """Image + losses = 1 to 1e-12 with every effect at once, with and without total reflection."""
+    light = Light(30.0, (450.0, 600.0), (1.0, 2.0))
+    scene = scene_of(source, light=light, glass="N-BK7", screen=Screen((16.0, 14.0), 60.0, (32, 28), (10.0, -20.0), (1.0, 0.5)),
+                     **EVERYTHING)
+    for steps in (Steps(), Steps(ghosts=True, again=True), Steps(reflects=False), Steps(entrance=False, intersect=False),
+                  Steps(general=True)):
+        if steps.general and source is not None:
+            continue
+        found = shine(scene, bumpy(scene, bumps), steps, rays=2000)
+        assert bool(torch.isfinite(found.image).all())
+        assert float(found.image.sum()) + sum(found.lost.values()) == pytest.approx(1.0, abs=1e-12)
+        assert bumps < 1 or found.lost["total_internal_reflection"] > 0.1 or not steps.reflects
+        assert found.lost["absorbed"] > 0.01
+
+
+@pytest.mark.parametrize("source", SOURCES)
+@pytest.mark.parametrize("bumps", [0.1, 1.0])
+def test_steps_without_effects_are_the_sequential_path(source, bumps):
+    scene, filter = scene_of(source), Filter("cosine", (3, 3))
+    heights = bumpy(scene, bumps)
+    a, b = (shine(scene, heights, steps, filter=filter) for steps in (Steps(), Steps(plain=True)))
+    torch.testing.assert_close(b.image, a.image, rtol=0, atol=1e-13)
+    assert b.lost == pytest.approx(a.lost, abs=1e-12)
+    assert b.leaving == pytest.approx(a.leaving, abs=1e-12)
+
+
+@pytest.mark.parametrize("case", ["lens", "point", "mirror", "cliff"])
+def test_gradients_against_differences(case, kernels):
+    """Central differences over a random direction; the smooth filter's third derivative leaves some 1e-7."""
+    steps = Steps(ghosts=True, again=True)
+    light = Light(30.0, (450.0, 600.0), (1.0, 2.0))
+    scene = scene_of(POINT if case == "point" else None, light=light, glass="N-BK7",
+                     screen=Screen((24.0, 24.0), 60.0, (12, 12), (10.0, -20.0), (1.0, 0.5)), **EVERYTHING)
+    heights, step = bumpy(scene, 0.15), 1e-6
+    if case == "mirror":
+        scene = scene_of(screen=Screen((24.0, 24.0), -40.0, (12, 12), (0.0, 10.0)), mirror=True)
+    if case == "cliff":
+        scene, heights = cliff()
+        scene = replace(scene, screen=Screen((80.0, 40.0), 60.0, (6, 4)))
+    field, filter = HeightField.of(scene.lens), Filter("cosine", (5, 3))
+    sampler = rays_of(scene, "stratified", 400, 5)
+    g = torch.Generator().manual_seed(1)
+    toward = torch.randn(scene.screen.resolution, generator=g, dtype=torch.float64)
+    along = torch.randn(heights.shape, generator=g, dtype=torch.float64)
+
+    def value(h: torch.Tensor) -> torch.Tensor:
+        parts = [t.expose(h, scene.screen, filter) for t in tracers(scene, field, sampler, torch.float64, 1 << 20, steps)]
+        return sum((p.image * toward).sum() for p in parts)
+
+    h = heights.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(value(h), h)
+    with torch.no_grad():
+        difference = float(value(heights + step * along) - value(heights - step * along)) / (2 * step)
+    assert float((gradient * along).sum()) == pytest.approx(difference, rel=2e-5)
+    assert abs(difference) > 1e-4
