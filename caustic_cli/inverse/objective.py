@@ -120,7 +120,8 @@ class Objective:
         ranks.share(heights)
         heights.requires_grad_()
         penalty = self.penalty(heights) if self.penalty else torch.zeros((), device=self.device)
-        image = torch.zeros(self.loss.target.shape, dtype=torch.float64, device=self.device)
+        shape = (3, *self.loss.target.shape) if self.scene.colored else self.loss.target.shape
+        image = torch.zeros(shape, dtype=torch.float64, device=self.device)
         leaving, parts = image.new_zeros(image.shape[:-2]), []  # one for each colour
         with torch.set_grad_enabled(self.whole):
             for traced in self.kept or self._tracers():
