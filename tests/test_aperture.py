@@ -223,7 +223,7 @@ def test_from_picture_to_files(tmp_path, monkeypatch, capfd, options):
     monkeypatch.setattr(session, "write_report", lambda *args: None)
     y, x = np.mgrid[0:24, 0:40]
     Image.fromarray((40 + 200 * np.exp(-((x - 14) ** 2 + (y - 9) ** 2) / 60.0)).astype(np.uint8)).save("wide.png")
-    text = f"design wide.png --resolution 40 --quality draft --control 35 --rays 60000 --json --quiet {options}"
+    text = f"design wide.png --resolution 40 --quality draft --control 35 --rays 30000 --iterations 4 --json --quiet {options}"
     assert cli.run(shlex.split(text)) == 0, capfd.readouterr().err
     figures = json.loads(capfd.readouterr().out)
     assert figures["relative_rms"] < 0.6 and figures["on_screen"] > 0.9
