@@ -16,7 +16,7 @@ import pytest
 import typer
 from PIL import Image
 
-from caustic_cli import __version__, cli, console, session
+from caustic_cli import __version__, cli, console, verdict
 from caustic_cli.commands.export import FORMATS
 
 COMMANDS = ("design", "render", "gradmap", "export", "convergence")
@@ -49,7 +49,7 @@ def designed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cli")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        patch.setattr(session, "FINAL_RAYS", 10_000)
+        patch.setattr(verdict, "FINAL_RAYS", 10_000)
         y, x = np.mgrid[0:24, 0:24]
         Image.fromarray((40 + 200 * np.exp(-((x - 8) ** 2 + (y - 9) ** 2) / 30.0)).astype(np.uint8)).save("blob.png")
         text = "design blob.png --resolution 24 --control 12 --rays 4000 --iterations 2 --quiet"
@@ -62,8 +62,8 @@ def here(designed, tmp_path, monkeypatch):
     folder = tmp_path / "here"
     shutil.copytree(designed, folder)
     monkeypatch.chdir(folder)
-    monkeypatch.setattr(session, "FINAL_RAYS", 10_000)
-    monkeypatch.setattr(session, "write_report", lambda *args: None)
+    monkeypatch.setattr(verdict, "FINAL_RAYS", 10_000)
+    monkeypatch.setattr(verdict, "write_report", lambda *args: None)
     return folder
 
 

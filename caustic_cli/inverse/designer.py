@@ -74,7 +74,8 @@ class State:
 
     stage, iteration: index of the stage and iterations done in it; total: iterations done in all; heights (n, m) mm
     float64, the lens so far; parameters, optimizer: tensors by name, empty when a stage has yet to begin; history:
-    rows (iteration, stage, loss, on_screen, seconds); seconds: spent so far; reason: why it ended, "" if it has not.
+    rows (iteration, stage, loss, on_screen, seconds); seconds: spent so far; reason: why it ended, "" if it has not; start
+    (n_0, m_0), the heights it began from, on the first stage's net.
     """
 
     heights: Tensor
@@ -86,6 +87,7 @@ class State:
     history: list[tuple[int, int, float, float, float]] = field(default_factory=list)
     seconds: float = 0.0
     reason: str = ""
+    start: Tensor | None = None
 
 
 class Designer:
@@ -118,7 +120,27 @@ class Designer:
     def begin(self, heights: Tensor | None = None) -> State:
         """A fresh state: the parametrisation's own beginning, or `heights` (n, m) mm on the first stage's net."""
         module = self._parametrise(0, heights)
-        return State(module().detach(), parameters=module.state_dict())
+        first = module().detach()
+        return State(first, parameters=module.state_dict(), start=first)
+
+    def begun(self, state: State) -> Tensor:
+        """The surface that the design began from, on the net of the stage it stands in (n, m), mm."""
+        tu, tv = (a.change_of_basis(b) for a, b in zip(self.field(0).spaces, self.field(state.stage).spaces, strict=True))
+        return tu @ state.start @ tv.T
+
+    def showing(self, state: State, heights: Tensor) -> State:
+        """A state whose lens is `heights`, although the optimiser stands elsewhere; `restored` undoes it."""
+        return replace(state, heights=heights, parameters=state.parameters or self._module(state).state_dict())
+
+    def restored(self, state: State) -> State:
+        """A saved state as the loop left it, see `showing`."""
+        return replace(state, heights=self._module(state)().detach()) if state.parameters else state
+
+    def _module(self, state: State) -> Heights:
+        module = self._parametrise(state.stage, state.heights if self.options.network == "none" else None)
+        if state.parameters:
+            module.load_state_dict(state.parameters)
+        return module
 
     def run(self, state: State, *, iterations: int = 0, time_limit: float = math.inf,
             stop: Callable[[], bool] = lambda: False, on_iteration: Callable[[State], None] = lambda s: None) -> State:
@@ -177,9 +199,7 @@ class Designer:
                 state.reason = "time limit"
                 return not final
             if method is None:
-                heights = self._parametrise(k, state.heights if self.options.network == "none" else None)
-                if state.parameters:
-                    heights.load_state_dict(state.parameters)
+                heights = self._module(state)
                 method = (_Adam if self.options.optimizer == "adam" else _Newtonlike)(
                     self._objective(k), heights, self.options.lr)
                 if state.optimizer:

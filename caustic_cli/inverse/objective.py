@@ -71,6 +71,9 @@ class Objective:
         self.penalty = Penalty(scene, field, minded, max_slope, sampler.device, min_radius)
         self.scene, self.field, self.sampler, self.dtype = scene, field, sampler, dtype
         self.kept = list(self._tracers()) if sampler.count <= KEPT_RAYS else None
+        # A kernel's graph holds the net or the surface at its rays, plain torch's every step on the way.
+        light = [getattr(t, "kernel", None) is not None for t in self.kept or ()]
+        self.whole = len(light) == 1 or (len(light) > 1 and all(light))
 
     def _pool(self, image: Tensor) -> Tensor:
         """Pixels of the screen from those of the render."""
@@ -85,16 +88,15 @@ class Objective:
 
         The loss sees rays through the image alone.  So the image is accumulated chunk by chunk, the loss gives its
         derivative by the image, and each chunk is traced again to pull that back: memory does not grow with rays.
-        A single chunk keeps its graph instead of being traced again.
+        Where there is little to keep, the graph is kept instead of tracing again.
         """
         heights = heights.detach().to(self.device).requires_grad_()
-        single = self.kept is not None and len(self.kept) == 1
         image, leaving, penalty = 0.0, 0.0, self.penalty(heights) if self.penalty else torch.zeros((), device=self.device)
-        with torch.set_grad_enabled(single):
+        with torch.set_grad_enabled(self.whole):
             for traced in self.kept or self._tracers():
                 part = traced.expose(heights, self.screen, self.filter)
                 image, leaving = image + self._pool(part.image).double(), leaving + part.leaving.double()
-        if single:
+        if self.whole:
             loss = self.loss(image, leaving, penalty)
             gradient = torch.autograd.grad(loss, heights)[0] if loss.requires_grad else torch.zeros_like(heights)
         else:
