@@ -44,7 +44,7 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
     exposure, figures = trace(state.heights)
     likeness = {name for _, name in parse(designer.options.loss)} <= LIKENESS
     if state.start is not None and likeness:
-        start = designer.begun(state)
+        start = designer.within_limits(replace(state, heights=designer.begun(state)))
         first, began = trace(start)
         if _worse(figures, began):
             state = replace(designer.showing(state, start), reason=f"{state.reason}; its start was better and is kept")

@@ -21,6 +21,7 @@ from caustic_cli.optics import curvature
 from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.project import Project
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
+from caustic_cli.studies import manufacture as manufacture_module
 from caustic_cli.studies.manufacture import manufacture
 
 ORDERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
@@ -39,6 +40,11 @@ def surface(shape, control=(40, 34), size=(10.0, 8.0), source=None, fresnel="exa
 def bowl(radius, centre=(0.0, 0.0)):
     """The inside of a sphere, concave towards the screen."""
     return lambda x, y: 3.0 + radius - torch.sqrt(radius**2 - (x - centre[0]) ** 2 - (y - centre[1]) ** 2)
+
+
+@pytest.fixture(autouse=True)
+def _few_rays(monkeypatch):
+    monkeypatch.setattr(manufacture_module, "RAYS", 10_000)
 
 
 # curvature
@@ -75,7 +81,7 @@ def samples(field, heights, n=1_000_000):
 
 @pytest.fixture(scope="module")
 def rough():
-    _, field, heights = make(control=(24, 20), size=(10.0, 8.0), relief=0.02)
+    _, field, heights = make(control=(14, 12), size=(10.0, 8.0), relief=0.02)
     return field, heights, (heights - 0.5, heights + 0.5)
 
 
@@ -84,7 +90,7 @@ def test_limits_are_obeyed_and_little_is_moved(rough):
     _, steep, bent = samples(field, heights, 100_000)
     slope, radius = 0.8 * steep, 1.5 / bent
     found = within_limits(field, heights, bounds, slope, radius)
-    _, steep_now, bent_now = samples(field, found)
+    _, steep_now, bent_now = samples(field, found, 200_000)
     assert steep_now <= slope and bent_now * radius <= 1
     assert steep_now > 0.9 * slope or bent_now * radius > 0.9
     assert 1e-4 < (found - heights).abs().max() < 0.02  # mm: the relief
@@ -106,7 +112,8 @@ def test_bounds_are_kept_meanwhile(rough):
     assert (found >= low).all()
 
 
-def test_limits_that_contradict_say_so(rough):
+def test_limits_that_contradict_say_so(rough, monkeypatch):
+    monkeypatch.setattr("caustic_cli.inverse.limits.STEPS", 20)
     field, heights, _ = rough
     with pytest.raises(CausticError, match="--max-slope"):
         within_limits(field, heights, (heights - 1e-6, heights + 1e-6), 1e-3)
@@ -115,7 +122,7 @@ def test_limits_that_contradict_say_so(rough):
 @pytest.mark.parametrize("radius", [0.0, 2.0, 200.0])
 def test_the_penalty_of_a_radius(radius, rough):
     field, heights, _ = rough
-    scene = make(control=(24, 20), size=(10.0, 8.0))[0]
+    scene = make(control=(14, 12), size=(10.0, 8.0))[0]
     penalty = Penalty(scene, field, [], 0.0, "cpu", radius)
     assert bool(penalty) == (radius > 0)
     z = heights.clone().requires_grad_()
@@ -134,9 +141,9 @@ def test_a_designed_lens_obeys_its_limits(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(verdict, "FINAL_RAYS", 10_000)
     monkeypatch.setattr(verdict, "write_report", lambda *args: None)
-    y, x = np.mgrid[0:32, 0:32]
-    Image.fromarray(np.where((x - 12) ** 2 + (y - 18) ** 2 < 60, 255, 60).astype(np.uint8)).save("dot.png")
-    base = "design dot.png --resolution 32 --quality draft --control 35 --rays 40000 --quiet "
+    y, x = np.mgrid[0:24, 0:24]
+    Image.fromarray(np.where((x - 9) ** 2 + (y - 13) ** 2 < 34, 255, 60).astype(np.uint8)).save("dot.png")
+    base = "design dot.png --resolution 24 --quality draft --control 35 --rays 20000 --iterations 3 --quiet "
     assert cli.run(shlex.split(base + "-o free")) == 0
     limits = "--min-thickness 5 --min-radius 12 --max-slope 0.05"
     assert cli.run(shlex.split(f"{base} -o bound {limits}")) == 0, capfd.readouterr().err
@@ -171,7 +178,7 @@ def test_report_of_a_bowl():
     assert f["smallest_concave_radius_mm"] == pytest.approx(radius, rel=1e-2) and f["tool_fits"]
     assert not manufacture(scene, field, heights, tool_radius=21.0)["tool_fits"]
     assert f["critical_angle_deg"] == pytest.approx(math.degrees(math.asin(1 / 1.5)))
-    assert f["steepest_incidence_deg"] == pytest.approx(math.degrees(math.atan(steep)), abs=0.1)
+    assert f["steepest_incidence_deg"] == pytest.approx(math.degrees(math.atan(steep)), abs=0.3)
     assert f["sharpness_limit_mm"] == 0
     json.dumps(f, allow_nan=False)
 
@@ -204,7 +211,7 @@ def test_report_of_other_light():
     f = manufacture(scene, field, heights)
     # the ray that just reaches the exit surface's corner: 20 tan(a) + 5 tan(b) = its radius, sin(a) = n sin(b)
     b = brentq(lambda b: 20 * math.tan(math.asin(1.5 * math.sin(b))) + 5 * math.tan(b) - math.hypot(5, 4), 0, 0.5)
-    assert 0.99 * math.degrees(b) < f["steepest_incidence_deg"] <= math.degrees(b)
+    assert 0.98 * math.degrees(b) < f["steepest_incidence_deg"] <= math.degrees(b)
     f = manufacture(Scene(Disc(angle=0.5), scene.lens, scene.screen), field, heights)
     assert f["sharpness_limit_mm"] == pytest.approx(300 * math.radians(0.5))
     assert f["sharpness_limit_pixels"] == pytest.approx(300 * math.radians(0.5) / 0.5)

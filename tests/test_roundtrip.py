@@ -11,6 +11,7 @@ import ast
 import re
 import sys
 import types
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -282,15 +283,28 @@ def test_step(tmp_path, lens, rays, capsys):
     assert error < 1e-9
 
 
-@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_step_is_closed(tmp_path, case):
+def shaped(made, aperture: str, border: float):
+    """The same lens with another outline."""
+    scene, *rest = made
+    return replace(scene, lens=replace(scene.lens, aperture=aperture, border=border)), *rest
+
+
+OUTLINES = [("rectangle", 0.0), ("rectangle", 1.5), ("circle", 0.0), ("circle", 1.5)]
+
+
+@pytest.mark.parametrize(("case", "outline"), [*((case, OUTLINES[0]) for case in CASES.values()),
+                                               *((CASES["square"], outline) for outline in OUTLINES[1:]),
+                                               (CASES["non-square net and aperture"], OUTLINES[1]),
+                                               (CASES["uneven knots"], OUTLINES[3])])
+def test_step_is_closed(tmp_path, case, outline):
     """Every edge is used once each way, every reference exists, and the corners of every loop follow one another."""
-    write_step(tmp_path / "lens.step", *make(**case))
+    write_step(tmp_path / "lens.step", *shaped(make(**case), *outline))
     entities = read_step(tmp_path / "lens.step")
     assert {int(r) for body in entities.values() for r in re.findall(r"#(\d+)", body)} <= set(entities)
     uses = []
     loops = [arguments(b)[1] for b in entities.values() if b.startswith("EDGE_LOOP")]
-    assert len(loops) == 6
+    sides, border = (2, 4)[outline[0] == "rectangle"], outline[1] > 0
+    assert len(loops) == 2 + sides + border * (sides + 2)
     for loop in loops:
         ends = []
         for oriented in loop:
@@ -299,7 +313,8 @@ def test_step_is_closed(tmp_path, case):
             uses.append((edge, way))
             ends.append((a, b) if way == "T" else (b, a))
         assert all(e[1] == n[0] for e, n in zip(ends, ends[1:] + ends[:1], strict=True))
-    assert len(uses) == len(set(uses)) == 24 and len({e for e, _ in uses}) == 12
+    edges = sides * (3 + 4 * border - border)
+    assert len(uses) == len(set(uses)) == 2 * edges and len({e for e, _ in uses}) == edges
 
 
 def test_step_in_opencascade(tmp_path, lens, rays, capsys):
@@ -307,14 +322,17 @@ def test_step_in_opencascade(tmp_path, lens, rays, capsys):
     control = pytest.importorskip("OCP.STEPControl", exc_type=ImportError)
     from OCP.BRep import BRep_Tool  # noqa: PLC0415
     from OCP.BRepCheck import BRepCheck_Analyzer  # noqa: PLC0415
+    from OCP.BRepGProp import BRepGProp  # noqa: PLC0415
     from OCP.Geom import Geom_BSplineSurface  # noqa: PLC0415
     from OCP.gp import gp_Pnt, gp_Vec  # noqa: PLC0415
+    from OCP.GProp import GProp_GProps  # noqa: PLC0415
     from OCP.TopAbs import TopAbs_FACE, TopAbs_ShapeEnum  # noqa: PLC0415
     from OCP.TopExp import TopExp_Explorer  # noqa: PLC0415
     from OCP.TopoDS import TopoDS  # noqa: PLC0415
 
-    for k, case in enumerate([*CASES.values(), CASE]):
-        scene, field, heights = made = make(**case)
+    cases = [shaped(make(**CASES["square"]), *outline) for outline in OUTLINES]
+    for k, made in enumerate([*cases, *(make(**case) for case in CASES.values()), lens]):
+        scene, field, heights = made
         path = tmp_path / f"{k}.step"
         write_step(path, *made)
         reader = control.STEPControl_Reader()
@@ -328,7 +346,11 @@ def test_step_in_opencascade(tmp_path, lens, rays, capsys):
             surfaces.append(BRep_Tool.Surface_s(face(explorer.Current())))
             explorer.Next()
         (surface,) = (s for s in surfaces if isinstance(s, Geom_BSplineSurface))
-        assert len(surfaces) == 6
+        assert len(surfaces) == [6, 11, 4, 7, *[6] * 9][k]
+        if k < len(cases):
+            found, (vertices, faces) = GProp_GProps(), closed_mesh(*made, samples=(201, 201))
+            BRepGProp.VolumePropertiesGK_s(shape, found, 1e-6)
+            assert found.Mass() == pytest.approx(signed_volume(vertices[faces]), rel=3e-5)
         net = np.array([[surface.Pole(i + 1, j + 1).Z() for j in range(field.shape[1])] for i in range(field.shape[0])])
         assert (net == heights.numpy()).all()
     found = []

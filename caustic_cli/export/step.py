@@ -1,7 +1,8 @@
 """The lens as an exact solid in a STEP file (ISO 10303-21, application protocol 214): entrance plane, exit B-spline, four sides.
 
 The exit surface's poles stand at the Greville abscissae with the control heights as they are, to the last bit; its borders are
-B-spline curves with the border's poles.  Each border lies in a plane x = const or y = const, which is a side.  mm.
+B-spline curves with the border's poles.  Each border lies in a plane x = const or y = const, which is a side.  Of a round lens
+the same surface is cut by a cylinder, along a curve through many points.  A border for the mount is a flange, as in `mesh`.  mm.
 
 A shell is described from the corners up: vertices, edge curves from vertex to vertex, loops of edges counter-clockwise around
 each face's outward normal, faces, shell, solid; then the product that readers look for.
@@ -10,18 +11,22 @@ each face's outward normal, faces, shell, solid; then the product that readers l
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
+from scipy.interpolate import make_interp_spline
 from torch import Tensor
 
 from caustic_cli import __version__
-from caustic_cli.export.mesh import refuse_open
+from caustic_cli.export.mesh import FLANGE, refuse_open
+from caustic_cli.export.surface import sample_grid
 from caustic_cli.export.text import CREATED
 from caustic_cli.files import atomic_path
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.heightfield import HeightField
-from caustic_cli.scene import Scene
+from caustic_cli.scene import Lens, Scene
 
 HEAD = f"""ISO-10303-21;
 HEADER;
@@ -34,6 +39,8 @@ DATA;
 TAIL = "ENDSEC;\nEND-ISO-10303-21;\n"
 #: mm within which vertices, edges and faces of this solid meet: all are exact.
 UNCERTAINTY = 1e-7
+#: The same where a round lens' rim is an interpolated curve, and the most points on half of it.
+ROUND_UNCERTAINTY, MOST_ON_RIM = 1e-6, 1 << 15
 
 
 class Entities:
@@ -52,13 +59,12 @@ class Entities:
     def direction(self, d) -> str:
         return self.add(f"DIRECTION('',{reals(d)})")
 
-    def vertex(self, p) -> str:
-        return self.add(f"VERTEX_POINT('',{self.point(p)})")
+    def placement(self, at, normal, along) -> str:
+        return self.add(f"AXIS2_PLACEMENT_3D('',{self.point(at)},{self.direction(normal)},{self.direction(along)})")
 
     def plane(self, at, normal, along) -> str:
         """A plane through `at` with its normal and x direction."""
-        place = self.add(f"AXIS2_PLACEMENT_3D('',{self.point(at)},{self.direction(normal)},{self.direction(along)})")
-        return self.add(f"PLANE('',{place})")
+        return self.add(f"PLANE('',{self.placement(at, normal, along)})")
 
     def line(self, a, b) -> str:
         """The straight line through a towards b."""
@@ -66,15 +72,31 @@ class Entities:
         vector = self.add(f"VECTOR('',{self.direction(step / np.linalg.norm(step))},1.)")
         return self.add(f"LINE('',{self.point(a)},{vector})")
 
+    def curve(self, degree: int, points: list[str], knots: np.ndarray) -> str:
+        return self.add(f"B_SPLINE_CURVE_WITH_KNOTS('',{degree},({','.join(points)}),.UNSPECIFIED.,.F.,.F.,"
+                        f"{','.join(_knots(knots))},.UNSPECIFIED.)")
+
     def edge(self, a: str, b: str, curve: str) -> str:
         return self.add(f"EDGE_CURVE('',{a},{b},{curve},.T.)")
 
-    def face(self, surface: str, edges: list[tuple[str, bool]]) -> str:
-        """A face whose outward normal is the surface's, inside a loop of edges, each as it is or reversed."""
+    def bound(self, edges: list[tuple[str, bool]], outer: bool = True) -> str:
+        """A loop of edges, each as it is or reversed."""
         loop = [self.add(f"ORIENTED_EDGE('',*,*,{edge},{'.T.' if forward else '.F.'})") for edge, forward in edges]
         closed = self.add(f"EDGE_LOOP('',({','.join(loop)}))")
-        bound = self.add(f"FACE_OUTER_BOUND('',{closed},.T.)")
-        return self.add(f"ADVANCED_FACE('',({bound}),{surface},.T.)")
+        return self.add(f"FACE_{'OUTER_' if outer else ''}BOUND('',{closed},.T.)")
+
+    def face(self, surface: str, *bounds: str) -> str:
+        """A face whose outward normal is the surface's, inside the first bound and outside the others."""
+        return self.add(f"ADVANCED_FACE('',({','.join(bounds)}),{surface},.T.)")
+
+
+@dataclass(frozen=True)
+class Loop:
+    """Corners (mm) and their vertices, counter-clockwise from +z, and the edge from each to the next, as it is or reversed."""
+
+    corners: list[np.ndarray]
+    vertices: list[str]
+    edges: list[tuple[str, bool]]
 
 
 def write_step(path: str | Path, scene: Scene, field: HeightField, heights: Tensor) -> None:
@@ -88,60 +110,124 @@ def write_step(path: str | Path, scene: Scene, field: HeightField, heights: Tens
     x, y = (c.numpy() for c in field.control_xy())
     x, y = np.broadcast_arrays(x[:, None], y[None, :])
     out = Entities()
-    solid = lens_solid(out, np.stack([x, y, net], -1), field.spaces, scene.lens.z_in)
-    _product(out, solid)
+    solid = lens_solid(out, scene.lens, field, heights, np.stack([x, y, net], -1))
+    _product(out, solid, ROUND_UNCERTAINTY if scene.lens.round else UNCERTAINTY)
     with atomic_path(path) as temporary, open(temporary, "w", encoding="ascii", newline="\n") as file:
         file.write(HEAD)
         file.writelines(out.lines)
         file.write(TAIL)
 
 
-def lens_solid(out: Entities, poles: np.ndarray, spaces: tuple[SplineSpace, SplineSpace], z_in: float) -> str:
-    """The solid under poles (n, m, 3) down to z_in; corners a, b, c, d are numbered counter-clockwise from +z."""
+def lens_solid(out: Entities, lens: Lens, field: HeightField, heights: Tensor, poles: np.ndarray) -> str:
+    """The solid under the surface with poles (n, m, 3)."""
+    su, sv = field.spaces
     points = [[out.point(p) for p in row] for row in poles]
-    su, sv = spaces
     control = ",".join("(" + ",".join(row) + ")" for row in points)
     exit_surface = out.add(f"B_SPLINE_SURFACE_WITH_KNOTS('',{su.degree},{sv.degree},({control}),.UNSPECIFIED.,.F.,.F.,.F.,"
-                           f"{','.join(_knots(su, sv))},.UNSPECIFIED.)")
-    ends = (0, 0), (-1, 0), (-1, -1), (0, -1)
-    tops = [poles[e] for e in ends]
-    feet = [np.array([*p[:2], z_in]) for p in tops]
-    top, foot = [out.vertex(p) for p in tops], [out.vertex(p) for p in feet]
-    borders = ([row[0] for row in points], su), (points[-1], sv), ([row[-1] for row in points], su), (points[0], sv)
-    rim, base, post = [], [], []
-    for k, (border, space) in enumerate(borders):
-        after = (k + 1) % 4
-        start, end = (k, after) if k < 2 else (after, k)  # the curve's own direction: along +x or +y
-        curve = out.add(f"B_SPLINE_CURVE_WITH_KNOTS('',{space.degree},({','.join(border)}),.UNSPECIFIED.,.F.,.F.,"
-                        f"{','.join(_knots(space))},.UNSPECIFIED.)")
-        rim.append((out.edge(top[start], top[end], curve), k < 2))
-        base.append((out.edge(foot[k], foot[after], out.line(feet[k], feet[after])), True))
-        post.append((out.edge(foot[k], top[k], out.line(feet[k], tops[k])), True))
-    outward = (0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0)
-    faces = [out.face(exit_surface, rim)]
-    for k, normal in enumerate(outward):  # along the foot, up, back along the rim, down
-        faces.append(out.face(out.plane(feet[k], normal, (0.0, 0.0, 1.0)),
-                              [base[k], post[(k + 1) % 4], _reversed(rim[k]), _reversed(post[k])]))
-    faces.append(out.face(out.plane(feet[0], (0.0, 0.0, -1.0), (1.0, 0.0, 0.0)), [_reversed(e) for e in base[::-1]]))
+                           f"{','.join(_knots(su.knots.numpy(), sv.knots.numpy()))},.UNSPECIFIED.)")
+    if lens.round:
+        rim, lowest = _round_rim(out, field, heights)
+    else:
+        grid = sample_grid(field, heights)
+        rim = _rim(out, poles, points, field.spaces)
+        lowest = min(float(edge.min()) for edge in (grid.z[0], grid.z[-1], grid.z[:, 0], grid.z[:, -1]))
+    faces, upper, z_in = [out.face(exit_surface, out.bound(rim.edges))], rim, lens.z_in
+    if lens.border > 0:
+        high = z_in + FLANGE * (lowest - z_in)
+        inner, upper = _flat(out, lens, 0.0, high), _flat(out, lens, lens.border, high)
+        faces += _walls(out, lens, rim, inner, 0.0)
+        flange = out.plane((0.0, 0.0, high), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
+        faces.append(out.face(flange, out.bound(upper.edges), out.bound(_reversed(inner.edges), False)))
+    foot = _flat(out, lens, lens.border, z_in)
+    faces += _walls(out, lens, upper, foot, lens.border)
+    entrance = out.plane((0.0, 0.0, z_in), (0.0, 0.0, -1.0), (1.0, 0.0, 0.0))
+    faces.append(out.face(entrance, out.bound(_reversed(foot.edges))))
     shell = out.add(f"CLOSED_SHELL('',({','.join(faces)}))")
     return out.add(f"MANIFOLD_SOLID_BREP('lens',{shell})")
 
 
-def _reversed(edge: tuple[str, bool]) -> tuple[str, bool]:
-    return edge[0], not edge[1]
+def _rim(out: Entities, poles: np.ndarray, points: list[list[str]], spaces: tuple[SplineSpace, SplineSpace]) -> Loop:
+    """The border of the whole surface: its border poles' curves."""
+    su, sv = spaces
+    corners = [poles[0, 0], poles[-1, 0], poles[-1, -1], poles[0, -1]]
+    vertices = [out.add(f"VERTEX_POINT('',{out.point(p)})") for p in corners]
+    borders = ([row[0] for row in points], su), (points[-1], sv), ([row[-1] for row in points], su), (points[0], sv)
+    edges = []
+    for k, (border, space) in enumerate(borders):
+        start, end = (k, (k + 1) % 4) if k < 2 else ((k + 1) % 4, k)  # the curve's own direction: along +x or +y
+        curve = out.curve(space.degree, border, space.knots.numpy())
+        edges.append((out.edge(vertices[start], vertices[end], curve), k < 2))
+    return Loop(corners, vertices, edges)
 
 
-def _product(out: Entities, solid: str) -> None:
+def _round_rim(out: Entities, field: HeightField, heights: Tensor) -> tuple[Loop, float]:
+    """The surface over the circle: two cubic curves through so many of its points that they stay within ROUND_UNCERTAINTY / 10;
+    and its least height, mm."""
+    radius, count, off = field.half_size[0], 8 * max(field.shape), np.inf
+
+    def on(t: np.ndarray) -> np.ndarray:
+        x, y = radius * np.cos(t), radius * np.sin(t)
+        z = field.at(heights, *map(torch.from_numpy, (x, y)), [(0, 0)])[0].numpy()
+        return np.stack([x, y, z], -1)
+
+    while off > 0.1 * ROUND_UNCERTAINTY and count <= MOST_ON_RIM:
+        lines = [np.linspace(k * np.pi, (k + 1) * np.pi, count + 1) for k in (0, 1)]
+        curves = [make_interp_spline(t, on(t)) for t in lines]
+        middle = [(0.5 * (t[1:] + t[:-1])) for t in lines]
+        off = max(float(np.abs(c(t) - on(t)).max()) for c, t in zip(curves, middle, strict=True))
+        count *= 2
+    corners = [on(np.array([0.0]))[0], on(np.array([np.pi]))[0]]
+    vertices = [out.add(f"VERTEX_POINT('',{out.point(p)})") for p in corners]
+    edges = [(out.edge(vertices[k], vertices[1 - k], out.curve(3, [out.point(p) for p in c.c], c.t)), True)
+             for k, c in enumerate(curves)]
+    return Loop(corners, vertices, edges), min(float(c.c[:, 2].min()) for c in curves)
+
+
+def _flat(out: Entities, lens: Lens, wider: float, z: float) -> Loop:
+    """The aperture's outline, `wider` mm around it, at z."""
+    rx, ry = (r + wider for r in lens.half_size)
+    flat = [(rx, 0.0), (-rx, 0.0)] if lens.round else [(-rx, -ry), (rx, -ry), (rx, ry), (-rx, ry)]
+    corners = [np.array([*p, z]) for p in flat]
+    vertices = [out.add(f"VERTEX_POINT('',{out.point(p)})") for p in corners]
+    around = corners[1:] + corners[:1]
+    if lens.round:
+        circle = out.add(f"CIRCLE('',{out.placement((0, 0, z), (0, 0, 1), (1, 0, 0))},{real(rx)})")
+    curves = [circle if lens.round else out.line(a, b) for a, b in zip(corners, around, strict=True)]
+    edges = [(out.edge(a, b, c), True) for a, b, c in zip(vertices, vertices[1:] + vertices[:1], curves, strict=True)]
+    return Loop(corners, vertices, edges)
+
+
+def _walls(out: Entities, lens: Lens, upper: Loop, lower: Loop, wider: float) -> list[str]:
+    """Upright faces between two loops: planes, or halves of a cylinder."""
+    posts = [(out.edge(a, b, out.line(p, q)), True)
+             for a, b, p, q in zip(lower.vertices, upper.vertices, lower.corners, upper.corners, strict=True)]
+    outward = (0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0)
+    if lens.round:
+        place = out.placement((0, 0, lower.corners[0][2]), (0, 0, 1), (1, 0, 0))
+        cylinder = out.add(f"CYLINDRICAL_SURFACE('',{place},{real(lens.half_size[0] + wider)})")
+    faces = []
+    for k, post in enumerate(posts):  # along the foot, up, back along the top, down
+        surface = cylinder if lens.round else out.plane(lower.corners[k], outward[k], (0.0, 0.0, 1.0))
+        back = _reversed([upper.edges[k]]) + _reversed([post])
+        faces.append(out.face(surface, out.bound([lower.edges[k], posts[(k + 1) % len(posts)], *back])))
+    return faces
+
+
+def _reversed(edges: list[tuple[str, bool]]) -> list[tuple[str, bool]]:
+    return [(edge, not forward) for edge, forward in edges[::-1]]
+
+
+def _product(out: Entities, solid: str, uncertainty: float) -> None:
     """Units, and the product whose shape the solid is."""
     millimetre = out.add("(LENGTH_UNIT()NAMED_UNIT(*)SI_UNIT(.MILLI.,.METRE.))")
     radian = out.add("(NAMED_UNIT(*)PLANE_ANGLE_UNIT()SI_UNIT($,.RADIAN.))")
     steradian = out.add("(NAMED_UNIT(*)SI_UNIT($,.STERADIAN.)SOLID_ANGLE_UNIT())")
-    near = out.add(f"UNCERTAINTY_MEASURE_WITH_UNIT(LENGTH_MEASURE({real(UNCERTAINTY)}),{millimetre},'distance_accuracy_value','')")
+    near = out.add(f"UNCERTAINTY_MEASURE_WITH_UNIT(LENGTH_MEASURE({real(uncertainty)}),{millimetre},'distance_accuracy_value','')")
     context = out.add("(GEOMETRIC_REPRESENTATION_CONTEXT(3)"
                       f"GLOBAL_UNCERTAINTY_ASSIGNED_CONTEXT(({near}))"
                       f"GLOBAL_UNIT_ASSIGNED_CONTEXT(({millimetre},{radian},{steradian}))"
                       "REPRESENTATION_CONTEXT('',''))")
-    origin = out.add(f"AXIS2_PLACEMENT_3D('',{out.point((0, 0, 0))},{out.direction((0, 0, 1))},{out.direction((1, 0, 0))})")
+    origin = out.placement((0, 0, 0), (0, 0, 1), (1, 0, 0))
     shape = out.add(f"ADVANCED_BREP_SHAPE_REPRESENTATION('lens',({origin},{solid}),{context})")
     application = out.add("APPLICATION_CONTEXT('automotive design')")
     out.add(f"APPLICATION_PROTOCOL_DEFINITION('international standard','automotive_design',2000,{application})")
@@ -154,9 +240,9 @@ def _product(out: Entities, solid: str) -> None:
     out.add(f"SHAPE_DEFINITION_REPRESENTATION({described},{shape})")
 
 
-def _knots(*spaces: SplineSpace) -> Iterator[str]:
-    """Multiplicities of every space, then their distinct knots."""
-    found = [np.unique(s.knots.numpy(), return_counts=True) for s in spaces]
+def _knots(*vectors: np.ndarray) -> Iterator[str]:
+    """Multiplicities of every knot vector, then their distinct knots."""
+    found = [np.unique(t, return_counts=True) for t in vectors]
     yield from (f"({','.join(map(str, counts))})" for _, counts in found)
     yield from (reals(values) for values, _ in found)
 

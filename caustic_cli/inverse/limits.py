@@ -53,7 +53,7 @@ def within_limits(field: HeightField, heights: Tensor, bounds: tuple[Tensor, Ten
         if over <= 0:
             return found
         if found is not heights:
-            room += 1.5 * over
+            room += max(1.5 * over, LEFT)
         found = _descend(_Limits(field, bounds, max_slope * (1.0 - room), min_radius / (1.0 - room), A_SPAN), found)
     if asked.excess(found) <= 0:
         return found
@@ -103,8 +103,8 @@ class _Limits:
             yield curvature.largest(zx, zy, *second) * self.radius - 1.0
 
     def violation(self, heights: Tensor) -> Tensor:
-        """Sum of squares of what exceeds; heights keep LEFT off their bounds, too."""
-        room = LEFT * self.scale
+        """Sum of squares of what exceeds; heights are asked to keep off their bounds, too, by more than is left in the end."""
+        room = 2.0 * LEFT * self.scale
         beyond = (self.low + room - heights) / self.scale, (heights - self.high + room) / self.scale
         return sum(term.clamp_min(0.0).square().sum() for term in (*self._shape(heights), *beyond))
 

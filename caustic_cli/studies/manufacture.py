@@ -28,7 +28,7 @@ from caustic_cli.scene.source import blur_limit
 #: Points looked at along each axis and a knot span, at most.
 MOST, A_SPAN = 2001, 4
 #: Rays of the sensitivities and of the angles inside the lens.
-RAYS = 200_000
+RAYS = 100_000
 #: Errors by which the sensitivities are found: of the throw, relative; of the index.
 STEP = 1e-4
 
