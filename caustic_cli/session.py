@@ -260,7 +260,7 @@ def _run(project: Project, designer: Designer, target: np.ndarray, state: State,
 
         keep(state)
         state = designer.run(state, iterations=chosen["iterations"], time_limit=limit, stop=lambda: bool(asked),
-                             on_iteration=on_iteration)
+                             on_iteration=on_iteration, notice=say.say)
         keep(state)
         if asked:
             raise Interrupted(f"interrupted after {state.total} iterations; {project.path / CHECKPOINT} is saved,"

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse.lbfgs import LBFGS
-from caustic_cli.inverse.losses import NoLight, parse
-from caustic_cli.inverse.objective import Objective
+from caustic_cli.inverse.losses import parse
+from caustic_cli.inverse.objective import Evaluation, Objective
 from caustic_cli.inverse.parametrisation import INITIAL, NETWORKS, PRECONDITIONERS, Heights, parametrise
 from caustic_cli.inverse.schedule import Stage
 from caustic_cli.optics.emission import rays_of
@@ -28,6 +28,9 @@ from caustic_cli.scene import Scene, checks
 OPTIMIZERS = ("lbfgs", "adam")
 #: A stage's flatness is judged over so many iterations.
 FLAT_SPAN = 10
+#: How often a step of Adam's is halved before it is given up: 2^-60 of it moves nothing in double precision.
+MOST_HALVINGS = 60
+NOT_FINITE = "the loss or its derivative is not finite for this lens; heights within a smaller height_range may help"
 
 
 @dataclass(frozen=True)
@@ -117,7 +120,8 @@ class Designer:
         return State(module().detach(), parameters=module.state_dict())
 
     def run(self, state: State, *, iterations: int = 0, time_limit: float = math.inf,
-            stop: Callable[[], bool] = lambda: False, on_iteration: Callable[[State], None] = lambda s: None) -> State:
+            stop: Callable[[], bool] = lambda: False, on_iteration: Callable[[State], None] = lambda s: None,
+            notice: Callable[[str], None] = lambda text: None) -> State:
         """Go on from `state` until the stages are done.
 
         Args:
@@ -125,9 +129,10 @@ class Designer:
             time_limit: seconds for this run; each stage gets its part.
             stop: asked after every iteration; True ends the run with the state whole.
             on_iteration: told after every iteration.
+            notice: told what a person should know, such as that a step had to be taken back.
 
         Raises:
-            CausticError: no light reaches the screen, or values stopped being finite.
+            CausticError: no light reaches the screen where a stage begins, or nothing there is finite.
         """
         began, before = time.monotonic(), state.seconds
         limit = iterations or sum(s.iterations for s in self.stages)
@@ -139,13 +144,13 @@ class Designer:
             deadline = began + time_limit
             if k < last and ahead and math.isfinite(time_limit):
                 deadline = began + time_limit * sum(costs[state.stage : k + 1]) / ahead
-            done = self._stage(state, k, limit, deadline, stop, on_iteration, began - before)
+            done = self._stage(state, k, limit, deadline, stop, on_iteration, notice, began - before)
             if not done or k == last:
                 break
             state = self._next(state, k + 1)
         return state
 
-    def _stage(self, state: State, k: int, limit: int, deadline: float, stop, on_iteration, origin: float) -> bool:
+    def _stage(self, state: State, k: int, limit: int, deadline: float, stop, on_iteration, notice, origin: float) -> bool:
         """Iterate stage k in place.  True: the stage is done; False: the whole design ends here, for `state.reason`."""
         stage, final = self.stages[k], k == len(self.stages) - 1
         cap = math.inf if final else stage.iterations
@@ -171,7 +176,12 @@ class Designer:
                     self._objective(k), heights, self.options.lr)
                 if state.optimizer:
                     method.load(state.optimizer)
-            if not method.step():
+            told = method.taken_back > 0
+            moved = method.step()
+            if method.taken_back and not told:
+                notice(f"stage {k + 1}, iteration {state.total + 1}: a step led to where no light reaches the screen or the loss is"
+                       " not finite; it was taken back and a shorter one tried, as any such step will be")
+            if not moved:
                 state.reason = "no progress"
                 return True
             state.heights = heights().detach()
@@ -226,22 +236,46 @@ class Designer:
 
 
 class _Adam:
-    """Adam on the loss itself, as the thesis runs it; `loss` and `on_screen` belong to the point before the step."""
+    """Adam on the loss itself, as the thesis runs it; `loss` and `on_screen` belong to the point before the step.
+
+    A step is looked at before it counts: where it leads to nothing finite, or to no light, half of it is tried, and so on, so
+    that what a checkpoint holds has always been evaluated.  `taken_back` counts such steps.
+    """
 
     def __init__(self, objective: Objective, heights: Heights, lr: float):
         self.objective, self.heights, self.loss, self.on_screen = objective, heights, math.inf, 0.0
         self.adam = torch.optim.Adam(heights.parameters(), lr=lr)
+        self.here: tuple[Tensor, Evaluation] | None = None
+        self.taken_back = 0
 
     def step(self) -> bool:
+        z, e = self.here or self._look()
+        before = [p.detach().clone() for p in self.heights.parameters()]
         self.adam.zero_grad()
-        z = self.heights()
-        e = self.objective(z.detach())
-        if not math.isfinite(e.loss) or not bool(torch.isfinite(e.gradient).all()):
-            raise CausticError("the loss stopped being finite; a smaller --lr may help")
         z.backward(e.gradient.to(z.device))
         self.adam.step()
-        self.loss, self.on_screen = e.loss, e.on_screen
-        return True
+        self.loss, self.on_screen, self.here = e.loss, e.on_screen, None
+        for halvings in range(MOST_HALVINGS):
+            try:
+                self.here = self._look()
+                return True
+            except CausticError:
+                self.taken_back += halvings == 0
+                for p, old in zip(self.heights.parameters(), before, strict=True):
+                    p.data = 0.5 * (p.data + old)
+        raise CausticError("no step along the gradient leads to a finite loss with light on the screen; a smaller --lr may help")
+
+    def _look(self) -> tuple[Tensor, Evaluation]:
+        """Heights, with their graph, and their evaluation.
+
+        Raises:
+            CausticError: something there is not finite, or no light reaches the screen.
+        """
+        z = self.heights()
+        e = self.objective(z.detach()) if bool(torch.isfinite(z).all()) else None
+        if e is None or not math.isfinite(e.loss) or not bool(torch.isfinite(e.gradient).all()):
+            raise CausticError(NOT_FINITE)
+        return z, e
 
     def state(self) -> dict[str, Tensor]:
         out = {}
@@ -266,6 +300,7 @@ class _Newtonlike:
         (self.parameter,) = heights.parameters()
         self.pixels = objective.loss.target.numel()
         self.seen: dict[float, float] = {}
+        self.taken_back = 0
         self.method = LBFGS(self._evaluate, self.parameter.detach().reshape(-1).clone())
         self.loss, self.on_screen = math.inf, 0.0
 
@@ -274,9 +309,12 @@ class _Newtonlike:
         z = self.heights()
         try:
             e = self.objective(z.detach())
-        except NoLight:
+            if not math.isfinite(e.loss) or not bool(torch.isfinite(e.gradient).all()):
+                raise CausticError(NOT_FINITE)
+        except CausticError:
             if self.method.f is None:
                 raise
+            self.taken_back += 1
             return math.inf, torch.zeros_like(x)  # a step too far: the line search turns back
         relative = e.loss * self.pixels
         (g,) = torch.autograd.grad(z, self.parameter, e.gradient.to(z.device) * (self.pixels * relative))

@@ -32,7 +32,6 @@ from caustic_cli.optics.sampling import SAMPLERS, Sampler, numbers
 from caustic_cli.scene import PlaneWave, Points, Scene
 from caustic_cli.scene.source import covering_cone
 
-
 #: A source whose foot is this many of its distances inside the aperture's edge is near: 1 - cos = 0.32 of a hemisphere misses.
 NEAR = 3.0
 #: Keeps the cosine squared of a ray along the entrance off 0; such a ray is clamped to the aperture.

@@ -6,8 +6,8 @@ ratio eta = n_in / n_out and c = d . N, the refracted unit direction is
     t = eta d + gamma N,    gamma = (1 - eta^2) / (s + eta c),    s = t . N = sqrt(|N|^2 (1 - eta^2) + eta^2 c^2),
 
 Snell's law (eq. 2.1.10) without normalising anything; a negative radicand is total internal reflection.  gamma is
-(s - eta c) / |N|^2 without its cancellation: an index close to 1 bends light by n - 1, of which a difference leaves nothing.  For a plane
-wave along +z inside a lens it is the closed form of 3.2 (thesis notes 1) with s = S.
+(s - eta c) / |N|^2 without its cancellation: an index close to 1 bends light by n - 1, of which a difference leaves nothing.
+For a plane wave along +z inside a lens it is the closed form of 3.2 (thesis notes 1) with s = S.
 """
 
 from __future__ import annotations
