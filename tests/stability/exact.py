@@ -76,14 +76,14 @@ def ours(kernels: str, dtype: torch.dtype, n: float, d, t, gx, gy, x, y) -> tupl
     one = torch.ones(1, count, dtype=dtype)
     if kernels == "fused":
         along = [functions._none(dtype)] * 2 if d is None else [functions._strided((c * one).numpy()) for c in d[:2]]
-        rays = tuple(functions._strided(a.numpy()) for a in (x, y)) + (*along, functions._strided(one.numpy()))
+        rays = (*(functions._strided(a.numpy()) for a in (x, y)), *along, functions._strided(one.numpy()))
         ones = np.ones((1, 1), x.numpy().dtype)
         image, leaving, _ = functions._splat(leaves, (np.zeros(1, np.int64), ones, ones), True, rays, lens, HEIGHT, (1.0, 0.0),
                                              SCREEN, FILTER, functions._Workspace())
     else:
         direction = (0.0, 0.0, 1.0) if d is None else tuple(c * one for c in d)
-        height = leaves[0] * direction[2]
-        landing = carry(lens, direction, height, *leaves[1:], x + leaves[0] * direction[0], y + leaves[0] * direction[1], one, HEIGHT)
+        x, y, z = (o + leaves[0] * c for o, c in zip((x, y, 0.0), direction, strict=True))
+        landing = carry(lens, direction, z, *leaves[1:], x, y, one, HEIGHT)
         image, leaving = splat(landing.x, landing.y, landing.weight, SCREEN, FILTER)[0], landing.leaving
     value = (image.double() * WEIGHTS).sum() + leaving.double() / 4
     if not value.requires_grad:
