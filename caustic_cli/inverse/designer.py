@@ -28,8 +28,8 @@ from caustic_cli.scene import Scene, checks
 OPTIMIZERS = ("lbfgs", "adam")
 #: A stage's flatness is judged over so many iterations.
 FLAT_SPAN = 10
-#: How often a step of Adam's is halved before it is given up: 2^-60 of it moves nothing in double precision.
-MOST_HALVINGS = 60
+#: How often a step of Adam's is halved before it is given up.
+MOST_HALVINGS = 200
 NOT_FINITE = "the loss or its derivative is not finite for this lens; heights within a smaller height_range may help"
 
 

@@ -48,7 +48,7 @@ def first_surface(scene: Scene, target: np.ndarray, field: HeightField, cells: i
         InputError: the picture is out of reach of refraction.
     """
     lens, half = scene.lens, scene.lens.half_size
-    shape = tuple(max(2, round(cells * r / max(half))) for r in half)
+    shape = tuple(max(3, round(cells * r / max(half))) for r in half)  # four corners carry a cubic
     x, y = corners(shape[0], half[0]), corners(shape[1], half[1])
     z = lens.offset.thickness + lens.offset.sag(x[:, None], y[None, :])
     mean, found = float(z.mean()), None
