@@ -15,6 +15,7 @@ crosses the frame's border.  Bincount has a derivative of 0 almost everywhere an
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,6 +39,8 @@ from caustic_cli.scene import Scene
 #: 0.05 mm): measured least, 2e-8, between 1e-4 and 1e-3.  The lower end, because the part d of the rays that crosses a
 #: kink of the truncated Gaussian is wrong by order 1.
 DIFFERENCE_PIXELS = 1e-4
+#: Least step, in parts of the largest height: ten thousand roundings.
+LEAST_STEP = 2e-12
 
 
 def gradient_image(scene: Scene, field: HeightField, heights: Tensor, control: tuple[int, int], *,
@@ -85,8 +88,12 @@ def difference_step(scene: Scene, field: HeightField, control: tuple[int, int],
 
 
 def _step(scene: Scene, field: HeightField, heights: Tensor, control: tuple[int, int]) -> float:
-    """`difference_step`, less where that would carry the lens half way to the screen: an index close to 1 bends next to nothing."""
-    return min(difference_step(scene, field, control), 0.5 * (scene.screen.z - float(heights.max())))
+    """`difference_step` within what the heights can tell apart and half the way to the screen.
+
+    An index close to 1 bends next to nothing, and a far screen magnifies what thick glass cannot hold.
+    """
+    least = LEAST_STEP * float(heights.abs().max())
+    return min(max(difference_step(scene, field, control), least), 0.5 * (scene.screen.z - float(heights.max())))
 
 
 def finite_difference(scene: Scene, field: HeightField, heights: Tensor, control: tuple[int, int], *,
@@ -133,6 +140,8 @@ def compare(gradient: Tensor, scene: Scene, field: HeightField, heights: Tensor,
     error = gradient.double() - reference
     scale, distance = float(reference.norm()), float(error.norm())
     relative = distance / scale if scale > 0 else (0.0 if distance == 0 else None)
+    if relative is not None and not math.isfinite(relative):
+        relative = None
     return Comparison(relative, float(error.abs().max()), step)
 
 
