@@ -31,6 +31,8 @@ from caustic_cli.scene.source import covering_cone
 CELLS = 256
 #: Newton steps for q; its function is concave, so from the greater of two lower bounds each step stays below the root.
 STEPS = 40
+#: How much higher a net may be than the surface it was interpolated from.
+OVERSHOOT = 2.0
 #: Surfaces solved for in turn where the light depends on the surface it meets.
 PASSES = 2
 
@@ -60,7 +62,9 @@ def first_surface(scene: Scene, target: np.ndarray, field: HeightField, cells: i
     spline = RectBivariateSpline(x, y, z)
     at = [torch.linalg.inv(s.matrix(s.greville)) for s in field.spaces]
     values = torch.from_numpy(spline(*(c.numpy() for c in field.control_xy())))
-    return at[0] @ values @ at[1].T
+    net = at[0] @ values @ at[1].T
+    # Through points, a spline of high degree over knots that repeat overshoots; one that has them as its net never does.
+    return net if float(net.max() - net.min()) <= OVERSHOOT * float(values.max() - values.min()) else values
 
 
 def _parallel(scene: Scene) -> bool:

@@ -118,12 +118,13 @@ def own_design(book: Book, name: str, picture: str, config: Path, quick: bool, *
     finish(book, name, project, figures, time.monotonic() - began)
 
 
-def scaled(config: Path, folder: Path, quick: bool) -> Path:
-    """6.4's configuration; with --quick a twentieth of its iterations and a fifth of its rays."""
+def scaled(name: str, folder: Path, quick: bool) -> Path:
+    """A configuration; with --quick a fifth of its rays, and for 6.4 a twentieth of the iterations."""
+    config = HERE / name
     if not quick:
         return config
     text = re.sub(r"^iterations = 200$", "iterations = 10", config.read_text(), flags=re.M)
-    path = folder / config.name
+    path = folder / name
     path.write_text(re.sub(r"^rays = (\d+)$", lambda m: f"rays = {int(m[1]) // 5}", text, flags=re.M))
     return path
 
@@ -156,18 +157,19 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     book = Book(folder, "quick" if quick else "full")
     gradients(book)
-    marks = (5, 15, 40) if quick else (50, 100, 1000)
+    marks = (40,) if quick else (50, 100, 1000)
     for pair in PAIRS:
-        thesis_design(book, f"tophat-{pair}", "tophat.png", HERE / f"tophat-{pair}.toml", marks)
+        thesis_design(book, f"tophat-{pair}", "tophat.png", scaled(f"tophat-{pair}.toml", folder, quick), marks)
     own_design(book, "own-tophat", "tophat.png", HERE / "tophat-none.toml", quick)
     for mag in MAGS:
         for picture in ("flame", "ball"):
             name = f"{picture}-mag{mag}"
-            thesis_design(book, name, f"{picture}.png", HERE / f"mag{mag}.toml", (30,) if quick else (1000,))
+            config = scaled(f"mag{mag}.toml", folder, quick)
+            thesis_design(book, name, f"{picture}.png", config, (30,) if quick else (1000,))
             own_design(book, f"own-{name}", f"{picture}.png", HERE / f"mag{mag}.toml", quick)
     intersection(book, quick)
-    point = scaled(HERE / "point.toml", folder, quick)
-    thesis_design(book, "point-grid", "flame.png", point, (10, 20) if quick else (200, 400))
+    point = scaled("point.toml", folder, quick)
+    thesis_design(book, "point-grid", "flame.png", point, (20,) if quick else (400,))
     own_design(book, "own-point", "flame.png", HERE / "point.toml", quick, "--source", "point")
     own_design(book, "own-point-grid", "flame.png", HERE / "point.toml", quick)
     rows = table(book)
