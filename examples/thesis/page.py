@@ -9,6 +9,7 @@ import matplotlib
 matplotlib.use("Agg")
 import numpy as np
 from matplotlib import pyplot as plt
+from matplotlib.ticker import NullFormatter
 from PIL import Image
 
 
@@ -44,6 +45,7 @@ def losses(axis, book, names: dict[str, str], title: str, pixels: float) -> None
         axis.semilogy(history[:, 0], history[:, 2] * pixels, lw=1.0, ls="--" if own else "-", label=label)
     axis.set_title(title, fontsize=8)
     axis.set_xlabel("iteration", fontsize=7)
+    axis.yaxis.set_minor_formatter(NullFormatter())
     axis.tick_params(labelsize=6)
     axis.grid(alpha=0.3, which="both")
     axis.legend(fontsize=5.5)
@@ -54,8 +56,8 @@ def draw(path: Path, book, rows: list[dict], pairs, mags, marks, pictures: Path)
     figure = plt.figure(figsize=(13.0, 27.0), layout="constrained")
     parts = figure.subfigures(6, 1, height_ratios=[2.6, 8.4, 9.2, 3.0, 3.2, 4.6])
     headings = ("6.1  Derivative of a render with respect to one control height (figure 6.1.1)",
-                "6.2.1  Circular top hat from a plane wave (figures 6.2.2 to 6.2.7)",
-                "6.2.2  Flame and faceted ball from a plane wave (figures 6.2.8 to 6.2.11)",
+                "6.2.1  Circular top hat from a plane wave (figures 6.2.2 to 6.2.7); above a render: relative RMS | light on the screen | time",
+                "6.2.2  Flame and faceted ball from a plane wave (figures 6.2.8 to 6.2.11); relief: heights without their best paraboloid",
                 "6.3  B-spline intersection (figure 6.2.14)",
                 "6.4  A point source, then a grid of them (figures 6.4.2 to 6.4.4)", "Loss, light, time")
     for part, heading in zip(parts, headings, strict=True):
@@ -91,8 +93,7 @@ def _tophat(part, book, pairs, marks, pictures) -> None:
     for row, pair in zip(grid, pairs, strict=False):
         found, about = book.arrays(f"tophat-{pair}"), book.rows[f"tophat-{pair}"]
         for axis, mark in zip(row, marks, strict=False):
-            show(axis, found[f"heights_{mark}"], f"heights, n = {mark}", "viridis")
-        row[0].set_ylabel(names[f"tophat-{pair}"], fontsize=7)
+            show(axis, found[f"heights_{mark}"], f"{names[f'tophat-{pair}'].replace(' network', '')}: heights, n = {mark}", "viridis")
         _image_and_error(row[-2:], found["image"], target, about)
     found, row = book.arrays("own-tophat"), grid[-1]
     for axis in row[: len(marks) - 1]:
@@ -125,7 +126,7 @@ def _pictures(part, book, mags, pictures) -> None:
                 found = book.arrays(key)
                 column = 2 * m + half
                 show(grid[2 * k, column], bright(found["image"]), f"{label}, mag {mag}\n{figures_of(book.rows[key])}", limit=1.0)
-                show(grid[2 * k + 1, column], _relief(found["heights"]), "lens, best paraboloid removed", "viridis")
+                show(grid[2 * k + 1, column], _relief(found["heights"]), "relief", "viridis")
 
 
 def _relief(heights: np.ndarray) -> np.ndarray:
@@ -161,7 +162,7 @@ def _point(part, book, pictures) -> None:
     for axis, key, label in zip(axes[1:4], ("point-grid", "own-point", "own-point-grid"),
                                 ("thesis: point, then grid", "our defaults: point", "our defaults: grid"), strict=True):
         show(axis, bright(book.arrays(key)["image"]), f"{label}\n{figures_of(book.rows[key])}", limit=1.0)
-    show(axes[4], _relief(book.arrays("point-grid")["heights"]), "thesis: lens, paraboloid removed", "viridis")
+    show(axes[4], _relief(book.arrays("point-grid")["heights"]), "thesis: relief", "viridis")
     losses(axes[5], book, {"point-grid": "thesis", "own-point-grid": "our defaults"}, "relative RMS", 100.0**2)
 
 

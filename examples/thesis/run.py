@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Every experiment of the thesis' chapter 6, and this tool's own defaults on the same scenes beside them.
 
-    python examples/thesis/run.py [--quick] [-o DIR]
+    python examples/thesis/run.py [--quick] [--threads N] [-o DIR]
 
 Writes DIR/thesis.png (one page, in the order of the thesis' figures), thesis.csv and thesis.json (loss, light, time), and every
 project.  --quick is a few dozen iterations of each, about five minutes on two cores; without it the iterations are the thesis',
@@ -28,11 +28,12 @@ PICTURES = HERE.parent
 #: Section 6.2.1: network and initial state.
 PAIRS = ("none", "sparse-uniform", "sparse-random", "dense-uniform", "dense-random")
 MAGS = (1, 3, 5)
+THREADS: list[str] = []
 
 
 def caustic(*arguments) -> dict:
     """One command of the tool; what --json says."""
-    command = [sys.executable, "-m", "caustic_cli", *map(str, arguments), "--json", "--quiet"]
+    command = [sys.executable, "-m", "caustic_cli", *map(str, arguments), "--json", "--quiet", *THREADS]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise SystemExit(f"{' '.join(command)}\n{done.stderr}")
@@ -152,7 +153,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--quick", action="store_true", help="a few dozen iterations of each, about five minutes")
     parser.add_argument("-o", "--out", type=Path, default=Path("thesis"), metavar="DIR", help="default: thesis")
+    parser.add_argument("--threads", type=int, metavar="N", help="of every command; default: all cores")
     options = parser.parse_args()
+    if options.threads:
+        THREADS[:] = ["--threads", str(options.threads)]
     quick, folder, began = options.quick, options.out, time.monotonic()
     folder.mkdir(parents=True, exist_ok=True)
     book = Book(folder, "quick" if quick else "full")
