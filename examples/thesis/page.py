@@ -56,8 +56,10 @@ def draw(path: Path, book, rows: list[dict], pairs, mags, marks, pictures: Path)
     figure = plt.figure(figsize=(13.0, 27.0), layout="constrained")
     parts = figure.subfigures(6, 1, height_ratios=[2.6, 8.4, 9.2, 3.0, 3.2, 4.6])
     headings = ("6.1  Derivative of a render with respect to one control height (figure 6.1.1)",
-                "6.2.1  Circular top hat from a plane wave (figures 6.2.2 to 6.2.7); above a render: relative RMS | light on the screen | time",
-                "6.2.2  Flame and faceted ball from a plane wave (figures 6.2.8 to 6.2.11); relief: heights without their best paraboloid",
+                "6.2.1  Circular top hat from a plane wave (figures 6.2.2 to 6.2.7)"
+                "\n(above a render: relative RMS | light on the screen | time)",
+                "6.2.2  Flame and faceted ball from a plane wave (figures 6.2.8 to 6.2.11)"
+                "\n(relief: heights without their best paraboloid)",
                 "6.3  B-spline intersection (figure 6.2.14)",
                 "6.4  A point source, then a grid of them (figures 6.4.2 to 6.4.4)", "Loss, light, time")
     for part, heading in zip(parts, headings, strict=True):
@@ -93,7 +95,8 @@ def _tophat(part, book, pairs, marks, pictures) -> None:
     for row, pair in zip(grid, pairs, strict=False):
         found, about = book.arrays(f"tophat-{pair}"), book.rows[f"tophat-{pair}"]
         for axis, mark in zip(row, marks, strict=False):
-            show(axis, found[f"heights_{mark}"], f"{names[f'tophat-{pair}'].replace(' network', '')}: heights, n = {mark}", "viridis")
+            title = names[f"tophat-{pair}"].replace(" network,", ",")
+            show(axis, found[f"heights_{mark}"], f"{title}: heights, n = {mark}", "viridis")
         _image_and_error(row[-2:], found["image"], target, about)
     found, row = book.arrays("own-tophat"), grid[-1]
     for axis in row[: len(marks) - 1]:
