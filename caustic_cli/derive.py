@@ -59,7 +59,7 @@ def complete(given: Settings, aspect: float, *, mag: float | None = None, margin
         mag = checks.number("--mag", mag, 1e-3, 1e3)
     margin = checks.number("--margin", DEFAULT_MARGIN if margin is None else margin, 0.0, 100.0)
     checks.pair("[lens] size", lens["size"], lambda w, x: checks.number(w, x, 1e-6, 1e6))
-    checks.number("[screen] z", screen["z"])
+    checks.number("[screen] z", screen["z"], -1e12, 1e12)
     if "size" in screen:
         checks.pair("[screen] size", screen["size"], lambda w, x: checks.number(w, x, 1e-6, 1e9))
     if "size" in target:

@@ -274,7 +274,7 @@ def _run(project: Project, designer: Designer, target: np.ndarray, state: State,
         keep(state)
         ranks.tell((project.settings, project.picture, project.profile, _on_cpu(state), limit))
         state = designer.run(state, iterations=chosen["iterations"], time_limit=limit, stop=lambda: bool(asked),
-                             on_iteration=on_iteration)
+                             on_iteration=on_iteration, notice=say.say)
         keep(state)
         if not asked:
             state.heights = designer.within_limits(state)

@@ -271,7 +271,7 @@ def build_source(settings: dict[str, dict[str, Any]], profile: np.ndarray | None
     """
     s = settings["source"]
     type = checks.choice("[source] type", type or s["type"], SOURCES)
-    checks.number("[source] power", s["power"], 0.0, open_low=True)  # before it is shared among points
+    checks.number("[source] power", s["power"], 0.0, checks.POWER, open_low=True)  # before it is shared among points
     if type == "plane":
         return PlaneWave(s["power"], profile)
     if "profile" in s and s["type"] != "plane":

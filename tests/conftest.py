@@ -16,6 +16,10 @@ settings.register_profile("caustic", derandomize=True, deadline=None, max_exampl
 settings.load_profile("caustic")
 
 
+def pytest_addoption(parser):
+    parser.addoption("--hard-cases", action="store_true", help="print what the tests of tests/stability measured, as Markdown")
+
+
 @pytest.fixture(params=["fused", "torch"])
 def kernels(request, monkeypatch) -> str:
     """Both ways of doing the same on a CPU: the fused kernels, and the plain-torch reference that other devices use."""

@@ -133,8 +133,8 @@ def test_rays_do_not_depend_on_chunks(kind):
     many = list(emission.chunks(77))
     assert len(many) > 10
     for name in ("x", "y", "dx", "dy", "dz", "share"):
-        # torch rounds powers and cosines in its vector loop and in its tail differently: an ulp
-        torch.testing.assert_close(torch.cat([getattr(b, name) for b in many]), getattr(one, name), rtol=1e-15, atol=1e-18)
+        # torch rounds tangents and cosines in its vector loop and in its tail differently: an ulp, of millimetres
+        torch.testing.assert_close(torch.cat([getattr(b, name) for b in many]), getattr(one, name), rtol=1e-14, atol=1e-14)
     assert sum(b.lost["missed_lens"] for b in many) == pytest.approx(one.lost["missed_lens"], abs=1e-14)
 
 

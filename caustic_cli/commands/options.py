@@ -166,7 +166,7 @@ def compile_for(scene, device: str, say: Reporter) -> None:
         from caustic_cli.optics.kernels.functions import compile_ray_kernels  # noqa: PLC0415
 
         with say.patience("compiling the intersection kernels for this machine, once: about half a minute"):
-            compile_ray_kernels(torch.float32, torch.float64)
+            compile_ray_kernels(torch.float64)
 
 
 def dtype_of(name: str):

@@ -16,12 +16,12 @@ from torch import Tensor
 
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse import ranks
-from caustic_cli.inverse.lbfgs import LBFGS
 from caustic_cli.inverse.limits import within_limits
-from caustic_cli.inverse.losses import NoLight, parse
+from caustic_cli.inverse.losses import parse
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.parametrisation import INITIAL, NETWORKS, PRECONDITIONERS, Heights, parametrise
 from caustic_cli.inverse.schedule import Stage
+from caustic_cli.inverse.steps import Adam, Newtonlike
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.optics.sampling import stream
@@ -144,7 +144,8 @@ class Designer:
         return module
 
     def run(self, state: State, *, iterations: int = 0, time_limit: float = math.inf,
-            stop: Callable[[], bool] = lambda: False, on_iteration: Callable[[State], None] = lambda s: None) -> State:
+            stop: Callable[[], bool] = lambda: False, on_iteration: Callable[[State], None] = lambda s: None,
+            notice: Callable[[str], None] = lambda text: None) -> State:
         """Go on from `state` until the stages are done.
 
         Args:
@@ -152,9 +153,10 @@ class Designer:
             time_limit: seconds for this run; each stage gets its part.
             stop: asked after every iteration; True ends the run with the state whole.
             on_iteration: told after every iteration.
+            notice: told what a person should know, such as that a step had to be taken back.
 
         Raises:
-            CausticError: no light reaches the screen, or values stopped being finite.
+            CausticError: no light reaches the screen where a stage begins, or nothing there is finite.
         """
         began, before = time.monotonic(), state.seconds
         limit = iterations or sum(s.iterations for s in self.stages)
@@ -166,7 +168,7 @@ class Designer:
             deadline = began + time_limit
             if k < last and ahead and math.isfinite(time_limit):
                 deadline = began + time_limit * sum(costs[state.stage : k + 1]) / ahead
-            done = self._stage(state, k, limit, deadline, stop, on_iteration, began - before)
+            done = self._stage(state, k, limit, deadline, stop, on_iteration, notice, began - before)
             if not done or k == last:
                 break
             state = self._next(state, k + 1)
@@ -181,7 +183,7 @@ class Designer:
         return within_limits(self.field(state.stage), state.heights, self._bounds(self.stages[state.stage]),
                              self.options.max_slope, self.options.min_radius)
 
-    def _stage(self, state: State, k: int, limit: int, deadline: float, stop, on_iteration, origin: float) -> bool:
+    def _stage(self, state: State, k: int, limit: int, deadline: float, stop, on_iteration, notice, origin: float) -> bool:
         """Iterate stage k in place.  True: the stage is done; False: the whole design ends here, for `state.reason`."""
         stage, final = self.stages[k], k == len(self.stages) - 1
         cap = math.inf if final else stage.iterations
@@ -202,11 +204,16 @@ class Designer:
                 return not final
             if method is None:
                 heights = self._module(state)
-                method = (_Adam if self.options.optimizer == "adam" else _Newtonlike)(
+                method = (Adam if self.options.optimizer == "adam" else Newtonlike)(
                     self._objective(k), heights, self.options.lr)
                 if state.optimizer:
                     method.load(state.optimizer)
-            if not method.step():
+            told = method.taken_back > 0
+            moved = method.step()
+            if method.taken_back and not told:
+                notice(f"stage {k + 1}, iteration {state.total + 1}: a step led to where no light reaches the screen or the loss is"
+                       " not finite; it was taken back and a shorter one tried, as any such step will be")
+            if not moved:
                 state.reason = "no progress"
                 return True
             state.heights = heights().detach()
@@ -262,78 +269,3 @@ class Designer:
             return False
         losses = [row[2] for row in state.history[-FLAT_SPAN - 1 :]]
         return losses[-1] > (1.0 - tolerance) * losses[0]
-
-
-class _Adam:
-    """Adam on the loss itself, as the thesis runs it; `loss` and `on_screen` belong to the point before the step."""
-
-    def __init__(self, objective: Objective, heights: Heights, lr: float):
-        self.objective, self.heights, self.loss, self.on_screen = objective, heights, math.inf, 0.0
-        self.adam = torch.optim.Adam(heights.parameters(), lr=lr)
-
-    def step(self) -> bool:
-        self.adam.zero_grad()
-        z = self.heights()
-        e = self.objective(z.detach())
-        if not math.isfinite(e.loss) or not bool(torch.isfinite(e.gradient).all()):
-            raise CausticError("the loss stopped being finite; a smaller --lr may help")
-        z.backward(e.gradient.to(z.device))
-        self.adam.step()
-        self.loss, self.on_screen = e.loss, e.on_screen
-        return True
-
-    def state(self) -> dict[str, Tensor]:
-        out = {}
-        for k, entry in self.adam.state_dict()["state"].items():
-            out |= {f"{k}.{name}": value for name, value in entry.items()}
-        return out
-
-    def load(self, state: dict[str, Tensor]) -> None:
-        whole = self.adam.state_dict()
-        whole["state"] = {}
-        for key, value in state.items():
-            k, name = key.split(".")
-            whole["state"].setdefault(int(k), {})[name] = value
-        self.adam.load_state_dict(whole)
-
-
-class _Newtonlike:
-    """L-BFGS on half the squared relative RMS, whose curvature near the minimum is that of a least-squares problem."""
-
-    def __init__(self, objective: Objective, heights: Heights, lr: float):
-        self.objective, self.heights = objective, heights
-        (self.parameter,) = heights.parameters()
-        self.pixels = objective.loss.target.numel()
-        self.seen: dict[float, float] = {}
-        self.method = LBFGS(self._evaluate, self.parameter.detach().reshape(-1).clone())
-        self.loss, self.on_screen = math.inf, 0.0
-
-    def _evaluate(self, x: Tensor) -> tuple[float, Tensor]:
-        self.parameter.data = x.view(self.parameter.shape)
-        z = self.heights()
-        try:
-            e = self.objective(z.detach())
-        except NoLight:
-            if self.method.f is None:
-                raise
-            return math.inf, torch.zeros_like(x)  # a step too far: the line search turns back
-        relative = e.loss * self.pixels
-        (g,) = torch.autograd.grad(z, self.parameter, e.gradient.to(z.device) * (self.pixels * relative))
-        value = 0.5 * relative * relative
-        self.seen[value] = e.on_screen
-        return value, g.reshape(-1)
-
-    def step(self) -> bool:
-        self.seen = {}
-        moved = self.method.step()
-        self.parameter.data = self.method.x.view(self.parameter.shape)
-        if self.method.f is not None:
-            self.loss = math.sqrt(2.0 * self.method.f) / self.pixels
-            self.on_screen = self.seen.get(self.method.f, self.on_screen)
-        return moved
-
-    def state(self) -> dict[str, Tensor]:
-        return self.method.state()
-
-    def load(self, state: dict[str, Tensor]) -> None:
-        self.method.load(state)

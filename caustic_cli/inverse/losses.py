@@ -108,7 +108,10 @@ class Loss:
             return (image * self.distance).sum() / (self.apron * leaving)
         if name == "uniformity":
             inside = image[self.region]
-            return inside.var(correction=0) / inside.mean().clamp_min(1e-300) ** 2
+            if not float(inside.detach().sum()) > 0:  # evenly dark is not what was asked for
+                raise NoLight("no light reaches the bright part of the picture, so there is nothing to make even; check throw,"
+                              " mag and screen size")
+            return (inside / inside.mean()).var(correction=0)
         residual = image / (total if name == "rms" else leaving) - self.target
         if self.blur is not None:
             residual = self.blur[0] @ residual @ self.blur[1].T

@@ -3,10 +3,11 @@
 A height field z(x, y) has the normal N = (-z_x, -z_y, 1), which can never vanish.  With a unit direction d, the
 ratio eta = n_in / n_out and c = d . N, the refracted unit direction is
 
-    t = eta d + (s - eta c) / |N|^2 N,    s = t . N = sqrt(|N|^2 (1 - eta^2) + eta^2 c^2),
+    t = eta d + gamma N,    gamma = (1 - eta^2) / (s + eta c),    s = t . N = sqrt(|N|^2 (1 - eta^2) + eta^2 c^2),
 
-Snell's law (eq. 2.1.10) without normalising anything; a negative radicand is total internal reflection.  For a plane
-wave along +z inside a lens it is the closed form of 3.2 (thesis notes 1) with s = S.
+Snell's law (eq. 2.1.10) without normalising anything; a negative radicand is total internal reflection.  gamma is
+(s - eta c) / |N|^2 without its cancellation: an index close to 1 bends light by n - 1, of which a difference leaves nothing.
+For a plane wave along +z inside a lens it is the closed form of 3.2 (thesis notes 1) with s = S.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ def refract(d, slope_x: Tensor, slope_y: Tensor, eta: float):
     radicand = norm2 + (eta * eta) * (c * c - norm2)
     passes = radicand > CRITICAL * norm2
     s = torch.where(passes, radicand, torch.ones_like(radicand)).sqrt()  # a masked argument keeps NaN out of gradients
-    gamma = (s - eta * c) / norm2
+    gamma = (1.0 - eta) * (1.0 + eta) / (s + eta * c)
     return (eta * d[0] - gamma * slope_x, eta * d[1] - gamma * slope_y, eta * d[2] + gamma), passes, c, s
 
 

@@ -15,7 +15,7 @@ aperture, that bisection takes over where a step leaves it.  For any other ray t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import torch
@@ -74,9 +74,10 @@ def meet(field: HeightField, heights: Tensor, bundle: Bundle,
     hit = status == Status.HIT
     t = torch.where(hit, t, torch.zeros_like(t))
     x, y = bundle.x + t * bundle.dx, bundle.y + t * bundle.dy
-    z, gx, gy = field.at(heights, x, y)
+    sag = heights.double() - heights.detach().double().mean()  # slopes of a sag that is small against the thickness keep all digits
+    z, gx, gy = field.at(sag, x, y)
     with torch.no_grad():
-        xx, xy, yy = field.at(heights, x, y, ((2, 0), (1, 1), (0, 2)))
+        xx, xy, yy = field.at(sag, x, y, ((2, 0), (1, 1), (0, 2)))
         cosine = (bundle.dz - gx * bundle.dx - gy * bundle.dy).clamp_min(LEAST_COSINE)
     # f(t; P) = 0: one Newton step from the root, whose value is 0 and whose derivative is that of the root.
     move = torch.where(hit, (z - z.detach()) / cosine, torch.zeros_like(t))
@@ -120,8 +121,10 @@ def _within(status: Tensor, t: Tensor, b: Bundle) -> Tensor:
 def reference(field: HeightField, heights: Tensor, bundle: Bundle) -> tuple[Tensor, Tensor]:
     """The same by Newton's method in plain torch."""
     h = heights.detach().double()
+    middle = h.mean()
+    h, b = h - middle, replace(bundle, z=bundle.z - float(middle))
     lowest, highest = float(h.min()), float(h.max())
-    (rx, ry), b = field.half_size, bundle
+    rx, ry = field.half_size
     inside = (b.x.abs() <= rx) & (b.y.abs() <= ry) & (b.dz > 0)
     dz = torch.where(inside, b.dz, torch.ones_like(b.dz))
     side = torch.minimum(*(torch.where(d == 0, torch.inf, torch.where(d > 0, r - o, r + o) / d.abs())

@@ -101,7 +101,8 @@ def splat(x: Tensor, y: Tensor, weight: Tensor, screen: Screen, filter: Filter) 
         weight: power of each ray; differentiable.
 
     Returns:
-        image (n_x, n_y), power per pixel; off_screen, the power that fell outside the frame.  They sum to weight.sum().
+        image (n_x, n_y), power per pixel; off_screen, the power that fell outside the frame; both float64.  They sum to
+        weight.sum().
     """
     x, y, weight = x.reshape(-1), y.reshape(-1), weight.reshape(-1)
     first, shares, inside = [], [], None
@@ -117,14 +118,14 @@ def splat(x: Tensor, y: Tensor, weight: Tensor, screen: Screen, filter: Filter) 
     kept = torch.where(inside, weight, torch.zeros_like(weight))
     (nx, ny), (rx, ry) = screen.resolution, filter.reach
     shape = (nx + 4 * rx, ny + 4 * ry)
-    padded = weight.new_zeros(shape[0] * shape[1])
+    padded = torch.zeros(shape[0] * shape[1], dtype=torch.float64, device=x.device)  # float32 stops counting at 2^24 rays
     for k in range(shares[0].shape[1]):
         at = ((first[0] + k) * shape[1] + first[1])[:, None] + torch.arange(shares[1].shape[1], device=x.device)
         part = (kept * shares[0][:, k])[:, None] * shares[1]
-        padded = padded.scatter_add(0, at.reshape(-1), part.reshape(-1))
+        padded = padded.scatter_add(0, at.reshape(-1), part.reshape(-1).double())
     padded = padded.view(shape)
     image = padded[2 * rx : 2 * rx + nx, 2 * ry : 2 * ry + ny]
-    outside = torch.where(inside, torch.zeros_like(weight), weight).sum()
+    outside = torch.where(inside, torch.zeros_like(weight), weight).sum(dtype=torch.float64)
     return image, outside + padding(padded, filter.reach)
 
 

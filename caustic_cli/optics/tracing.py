@@ -86,7 +86,8 @@ class PlaneTracer:
 class RayTracer:
     """Traces a bundle of rays through a lens; prepared once, called for any heights.  Arguments as of `PlaneTracer`.
 
-    Hits are found in float64 whatever `dtype` is.
+    Hits are found in float64 whatever `dtype` is, and the kernel stays there: a distance through thick glass has no digits of
+    float32 to spare for the sag.
     """
 
     def __init__(self, scene: Scene, field: HeightField, bundle: Bundle, dtype: torch.dtype, like: RayTracer | None = None):
@@ -95,7 +96,7 @@ class RayTracer:
         if fused(bundle.x.device):
             from caustic_cli.optics.kernels.functions import RayKernel  # noqa: PLC0415
 
-            self.kernel = RayKernel(field.spaces, field.half_size, bundle, dtype, None if like is None else like.kernel)
+            self.kernel = RayKernel(field.spaces, field.half_size, bundle, torch.float64, None if like is None else like.kernel)
 
     def __call__(self, heights: Tensor, screen_z: float | None = None) -> Landing:
         """Heights (n, m) mm float64 -> where the rays land at screen_z (default: the scene's): the plain-torch reference."""
@@ -108,7 +109,7 @@ class RayTracer:
         direction = tuple(c.to(d) for c in (b.dx, b.dy, b.dz))
         landing = carry(lens, direction, sag, gx.to(d), gy.to(d), (b.x + t * b.dx).to(d), (b.y + t * b.dy).to(d), inside,
                         z - reference)
-        lost = landing.lost | {"missed_surface": (b.share.to(d) - inside).sum()}
+        lost = landing.lost | {"missed_surface": _sum(b.share.to(d) - inside)}
         status = torch.where(hit, landing.status, int(Status.MISSED_SURFACE))
         return Landing(landing.x, landing.y, landing.weight, status, self._with_lost(lost), landing.leaving)
 
@@ -181,7 +182,7 @@ def trace_plane(lens: Lens, evaluator: Evaluator, sag_net: Tensor, height: float
     inside = emitted * (1.0 - entrance)
     # Plain floats where the plane wave's direction is constant: the products with 0 and 1 are never computed on rays.
     landing = carry(lens, (0.0, 0.0, 1.0), sag, slope_x, slope_y, x, y, inside, height)
-    lost = landing.lost | {"fresnel": (emitted - inside).sum() + landing.lost["fresnel"]}
+    lost = landing.lost | {"fresnel": _sum(emitted - inside) + landing.lost["fresnel"]}
     return Landing(landing.x, landing.y, landing.weight, landing.status, lost, landing.leaving)
 
 
@@ -208,12 +209,16 @@ def carry(lens: Lens, incoming, sag: Tensor, slope_x: Tensor, slope_y: Tensor, x
     status = torch.where(passes, int(Status.OK), int(Status.TOTAL_INTERNAL_REFLECTION))
     status = torch.where(passes & ~on_way, int(Status.AWAY_FROM_SCREEN), status)
     lost = {
-        "fresnel": torch.where(passes, inside * reflected, none).sum(),
-        "total_internal_reflection": torch.where(passes, none, inside).sum(),
-        "off_screen": torch.where(on_way, none, leaving).sum(),
+        "fresnel": _sum(torch.where(passes, inside - leaving, none)),
+        "total_internal_reflection": _sum(torch.where(passes, none, inside)),
+        "off_screen": _sum(torch.where(on_way, none, leaving)),
     }
     weight = torch.where(on_way, leaving, none)
-    return Landing(x + path * direction[0], y + path * direction[1], weight, status, lost, leaving.sum())
+    return Landing(x + path * direction[0], y + path * direction[1], weight, status, lost, _sum(leaving))
+
+
+def _sum(power: Tensor) -> Tensor:
+    return power.sum(dtype=torch.float64)
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,9 @@ from collections.abc import Sequence
 
 from caustic_cli.errors import InputError
 
+#: Largest height or thickness, mm, and power, W: squares and products of them stay far from the ends of float32.
+LENGTH, POWER = 1e9, 1e30
+
 
 def number(where: str, value, low: float = -math.inf, high: float = math.inf, *, open_low: bool = False) -> float:
     """`value` as a finite float in [low, high], or (low, high] with `open_low`.

@@ -38,7 +38,7 @@ class Offset:
     radius: tuple[float, float] = (math.inf, math.inf)
 
     def __post_init__(self):
-        checks.number("[lens] thickness", self.thickness)
+        checks.number("[lens] thickness", self.thickness, -checks.LENGTH, checks.LENGTH)
         for r in self.radius:
             if isinstance(r, bool) or not isinstance(r, int | float) or math.isnan(r) or r == 0:
                 raise InputError(f"[lens] radius must be a non-zero number or inf, got {r!r}")
@@ -121,7 +121,7 @@ class Lens:
 
     def __post_init__(self):
         checks.pair("[lens] size", self.size, lambda w, x: checks.number(w, x, 1e-6, 1e6))
-        checks.number("[lens] z_in", self.z_in)
+        checks.number("[lens] z_in", self.z_in, -checks.LENGTH, checks.LENGTH)
         checks.number("[lens] index", self.index, 1.0, 5.0, open_low=True)
         checks.pair("[lens] degree", self.degree, lambda w, x: checks.whole(w, x, 1, 15))
         least = iter(self.degree)
@@ -130,8 +130,9 @@ class Lens:
             for axis, t, n, p in zip("uv", self.knots, self.control, self.degree, strict=True):
                 if len(t) != n + p + 1:
                     raise InputError(f"[lens] knots_{axis} must have control + degree + 1 = {n + p + 1} entries, got {len(t)}")
-        checks.number("[lens] min_thickness", self.min_thickness, 0.0)
-        low, high = checks.pair("[lens] height_range", self.height_range, checks.number)
+        checks.number("[lens] min_thickness", self.min_thickness, 0.0, checks.LENGTH)
+        low, high = checks.pair("[lens] height_range", self.height_range,
+                                lambda w, x: checks.number(w, x, -checks.LENGTH, checks.LENGTH))
         if not low < high:
             raise InputError(f"[lens] height_range must ascend, got [{low:g}, {high:g}]")
         checks.choice("[lens] fresnel", self.fresnel, FRESNEL)

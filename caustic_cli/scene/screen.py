@@ -31,7 +31,7 @@ class Screen:
 
     def __post_init__(self):
         checks.pair("[screen] size", self.size, lambda w, x: checks.number(w, x, 1e-6, 1e9))
-        checks.number("[screen] z", self.z)
+        checks.number("[screen] z", self.z, -1e12, 1e12)
         checks.pair("[screen] resolution", self.resolution, lambda w, x: checks.whole(w, x, 2, MAX_RESOLUTION))
         checks.pair("[screen] tilt", self.tilt, lambda w, x: checks.number(w, x, -85.0, 85.0))
         checks.pair("[screen] shift", self.shift, lambda w, x: checks.number(w, x, -1e9, 1e9))

@@ -33,7 +33,7 @@ class PlaneWave:
     profile: np.ndarray | None = None
 
     def __post_init__(self):
-        checks.number("[source] power", self.power, 0.0, open_low=True)
+        checks.number("[source] power", self.power, 0.0, checks.POWER, open_low=True)
         if self.profile is not None:
             e = np.asarray(self.profile, dtype=float)
             if e.ndim != 2 or not np.isfinite(e).all() or (e < 0).any() or not e.sum() > 0:
@@ -72,7 +72,7 @@ class Points:
             raise InputError(f"[source] powers must be one for each of the {len(self.positions)} positions,"
                              f" got {len(self.powers)}")
         for power in self.powers:
-            checks.number("[source] powers", power, 0.0)
+            checks.number("[source] powers", power, 0.0, checks.POWER)
         if not sum(self.powers) > 0:
             raise InputError("[source] powers must not all be 0")
         _cone(self.cone)
@@ -132,7 +132,7 @@ class Disc:
     def __post_init__(self):
         _triple("[source] position", self.position)
         _extent(self.size)
-        checks.number("[source] power", self.power, 0.0, open_low=True)
+        checks.number("[source] power", self.power, 0.0, checks.POWER, open_low=True)
         _cone(self.cone)
         checks.choice("[source] intensity", self.intensity, INTENSITIES)
         if self.angle is not None:
@@ -190,4 +190,4 @@ def _extent(size) -> None:
 
 def _cone(cone: float | None) -> None:
     if cone is not None:
-        checks.number("[source] cone", cone, 0.0, 90.0, open_low=True)
+        checks.number("[source] cone", cone, 1e-9, 90.0)

@@ -15,6 +15,7 @@ crosses the frame's border.  Bincount has a derivative of 0 almost everywhere an
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,6 +39,8 @@ from caustic_cli.scene import Scene
 #: 0.05 mm): measured least, 2e-8, between 1e-4 and 1e-3.  The lower end, because the part d of the rays that crosses a
 #: kink of the truncated Gaussian is wrong by order 1.
 DIFFERENCE_PIXELS = 1e-4
+#: Least step, in parts of the largest height: ten thousand roundings.
+LEAST_STEP = 2e-12
 
 
 def gradient_image(scene: Scene, field: HeightField, heights: Tensor, control: tuple[int, int], *,
@@ -86,6 +89,15 @@ def difference_step(scene: Scene, field: HeightField, control: tuple[int, int],
     return pixels * min(scene.screen.pixel) / (abs((scene.lens.bend - 1.0) * throw) * slope)
 
 
+def _step(scene: Scene, field: HeightField, heights: Tensor, control: tuple[int, int]) -> float:
+    """`difference_step` within what the heights can tell apart and half the way to the screen.
+
+    An index close to 1 bends next to nothing, and a far screen magnifies what thick glass cannot hold.
+    """
+    least = LEAST_STEP * float(heights.abs().max())
+    return min(max(difference_step(scene, field, control), least), 0.5 * (scene.screen.z - float(heights.max())))
+
+
 def finite_difference(scene: Scene, field: HeightField, heights: Tensor, control: tuple[int, int], *,
                       sampler: Rays, filter: Filter, step: float | None = None) -> Tensor:
     """The same derivative by central differences of two float64 renders with the same rays: (n_x, n_y), per mm.
@@ -96,7 +108,7 @@ def finite_difference(scene: Scene, field: HeightField, heights: Tensor, control
     Args:
         step: half the distance between the two heights, mm; None for `difference_step`.
     """
-    step = difference_step(scene, field, control) if step is None else step
+    step = _step(scene, field, heights, control) if step is None else step
     direction = _direction(field, control).to(heights.device)
     heights = heights.detach().double()
     above, below = heights + step * direction, heights - step * direction
@@ -126,11 +138,13 @@ def compare(gradient: Tensor, scene: Scene, field: HeightField, heights: Tensor,
     A few 1e-8 are left with the cosine filter in float64; the truncated Gaussian has kinks (it is only C0), and leaves
     up to 1e-3 when one of the brightest rays meets one.
     """
-    step = difference_step(scene, field, control) if step is None else step
+    step = _step(scene, field, heights, control) if step is None else step
     reference = finite_difference(scene, field, heights, control, sampler=sampler, filter=filter, step=step)
     error = gradient.double() - reference
     scale, distance = float(reference.norm()), float(error.norm())
     relative = distance / scale if scale > 0 else (0.0 if distance == 0 else None)
+    if relative is not None and not math.isfinite(relative):
+        relative = None
     return Comparison(relative, float(error.abs().max()), step)
 
 

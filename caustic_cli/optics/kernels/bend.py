@@ -5,7 +5,7 @@ the kernels of `plane` by that file's time stamp alone: after editing here, touc
 
 Notation, a ray with slopes g = (z_x, z_y) at the exit surface, a = |g|^2, index n
     s       sqrt(1 - (n^2 - 1) a), cosine of refraction times |N|
-    m       (n - s) / (n a + s), so that the ray lands at x + h m g with h the height of the screen above the surface
+    m       (n^2 - 1) / (1 + n s), so that the ray lands at x + h m g with h the height of the screen above the surface
     R       reflectance of the exit surface
 """
 
@@ -29,7 +29,7 @@ SCRATCH = 5
 @njit(inline="always", **OPTIONS)
 def _s(a, n):
     """s, or 1 beyond the critical angle; and whether the ray passes."""
-    radicand = 1.0 - (n * n - 1.0) * a
+    radicand = 1.0 - (n - 1.0) * (n + 1.0) * a
     passes = radicand > CRITICAL * (1.0 + a)
     return math.sqrt(radicand if passes else 1.0), passes
 
@@ -38,17 +38,16 @@ def _s(a, n):
 def _m(a, n):
     """m and dm/da."""
     s, _ = _s(a, n)
-    under = 1.0 / (n * a + s)
-    m = (n - s) * under
-    ds = -0.5 * (n * n - 1.0) / s
-    return m, -(ds + m * (n + ds)) * under
+    under = 1.0 / (1.0 + n * s)
+    m = (n - 1.0) * (n + 1.0) * under
+    return m, 0.5 * (n - 1.0) * (n + 1.0) / s * n * m * under
 
 
 @njit(inline="always", **OPTIONS)
 def _reflected(fresnel, a, n):
     """R and dR/da."""
     s, _ = _s(a, n)
-    ds = -0.5 * (n * n - 1.0) / s
+    ds = -0.5 * (n - 1.0) * (n + 1.0) / s
     if fresnel == EXACT:
         us, up = 1.0 / (n + s), 1.0 / (1.0 + n * s)
         rs, rp = (n - s) * us, (1.0 - n * s) * up

@@ -1,8 +1,8 @@
 """Fused CPU kernel: refraction at the exit surface -> landing point -> splat, with its adjoint and its tangent.
 
 The function of `tracing.trace_plane` followed by `reconstruction.splat`, a row of rays at a time without storing anything
-between rows; both are the reference it is tested against.  Storage is float32 or float64, everything past the surface
-float64.
+between rows; both are the reference it is tested against.  Storage is float32 or float64 (float64 alone for rays of any
+direction), everything past the surface float64.
 
 Each of a fixed number of blocks of rows has an image of its own and they are added in order, so the result does not depend
 on timing, only on the number of blocks (the number of threads).  Only the scatter and the gather of pixels go ray by ray,

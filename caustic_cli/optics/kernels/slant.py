@@ -4,7 +4,7 @@ The same physics as `bend`, which knows that a plane wave's rays all run along z
 
 Notation, a ray with unit direction d inside the lens, slopes g at the hit, N = (-g_x, -g_y, 1), index n
     c, s    d . N and t . N with t the refracted unit direction; s = sqrt(|N|^2 (1 - n^2) + n^2 c^2)
-    gamma   (s - n c) / |N|^2, so that t = n d + gamma N
+    gamma   (1 - n^2) / (s + n c), so that t = n d + gamma N
     R       reflectance of the exit surface
     q       (h - sag) / t_z, length of the path to the screen
 
@@ -47,10 +47,10 @@ REFLECTED_POWER, MISSED_POWER = -1.0, -2.0
 @njit(inline="always", **OPTIONS)
 def _refract(dx, dy, gx, gy, n):
     """d_z, |N|^2, c, s, and whether the ray passes (s is 1 where it does not)."""
-    dz = math.sqrt(1.0 - dx * dx - dy * dy)
+    dz = math.sqrt(max(1.0 - dx * dx - dy * dy, 0.0))
     norm2 = 1.0 + gx * gx + gy * gy
     c = dz - dx * gx - dy * gy
-    radicand = norm2 + n * n * (c * c - norm2)
+    radicand = n * n * (c * c) - (n - 1.0) * (n + 1.0) * norm2
     passes = radicand > CRITICAL * norm2
     return dz, norm2, c, math.sqrt(radicand if passes else 1.0), passes
 
@@ -82,7 +82,7 @@ def aim(v, dx, dy, real, fresnel):
         t, gx, gy = v[REACH, j], v[GX, j], v[GY, j]
         dz, norm2, c, s, passes = _refract(dx[j], dy[j], gx, gy, n)
         reflected, _, _, _ = _reflected(fresnel, c, s, norm2, n)
-        gamma = (s - n * c) / norm2
+        gamma = (1.0 - n) * (1.0 + n) / (s + n * c)
         down = n * dz + gamma
         sag = start + t * dz
         path = (height - sag) / down
@@ -106,7 +106,7 @@ def pull(v, dx, dy, real, fresnel):
         _, r_c, r_s, r_norm2 = _reflected(fresnel, c, s, norm2, n)
         loss = -v[SHARE, j] * v[BY_POWER, j]
         by_c, by_s, by_norm2 = loss * r_c, loss * r_s, loss * r_norm2
-        gamma = (s - n * c) / norm2
+        gamma = (1.0 - n) * (1.0 + n) / (s + n * c)
         down = n * dz + gamma
         by_x, by_y, by_t = v[BY_PX, j], v[BY_PY, j], 0.0
         by_gx, by_gy = 0.0, 0.0
@@ -116,10 +116,9 @@ def pull(v, dx, dy, real, fresnel):
             by_t = by_x * dx[j] + by_y * dy[j] - by_path * dz / down
             by_gamma = -path * (gx * by_x + gy * by_y) - by_path * path / down
             by_gx, by_gy = -gamma * path * by_x, -gamma * path * by_y
-            by_s += by_gamma / norm2
-            by_c -= n * by_gamma / norm2
-            by_norm2 -= gamma * by_gamma / norm2
-        by_norm2 += by_s * (1.0 - n * n) / (2.0 * s)
+            by_s -= gamma * by_gamma / (s + n * c)
+            by_c -= n * gamma * by_gamma / (s + n * c)
+        by_norm2 += by_s * (1.0 - n) * (1.0 + n) / (2.0 * s)
         by_c += by_s * n * n * c / s
         v[T_SAG, j] = by_t
         v[T_GX, j] = by_gx + 2.0 * gx * by_norm2 - dx[j] * by_c
@@ -135,9 +134,9 @@ def push(v, dx, dy, real, fresnel):
         dz, norm2, c, s, _ = _refract(dx[j], dy[j], gx, gy, n)
         _, r_c, r_s, r_norm2 = _reflected(fresnel, c, s, norm2, n)
         d_norm2, dc = 2.0 * (gx * tx + gy * ty), -dx[j] * tx - dy[j] * ty
-        ds = (d_norm2 * (1.0 - n * n) / 2.0 + n * n * c * dc) / s
-        gamma = (s - n * c) / norm2
-        d_gamma = (ds - n * dc - gamma * d_norm2) / norm2
+        ds = (d_norm2 * (1.0 - n) * (1.0 + n) / 2.0 + n * n * c * dc) / s
+        gamma = (1.0 - n) * (1.0 + n) / (s + n * c)
+        d_gamma = -gamma * (ds + n * dc) / (s + n * c)
         down = n * dz + gamma
         path = (height - start - t * dz) / down
         d_path = -(dt * dz + path * d_gamma) / down

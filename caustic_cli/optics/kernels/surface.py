@@ -68,12 +68,20 @@ class _ScatteredSurface(torch.autograd.Function):
         return _ScatteredSurface.forward(tangent, *ctx.rest)
 
 
+def _sag(heights: Tensor) -> tuple[Tensor, float]:
+    """Heights (n, m) less their mean, float64, and the mean, mm: a sag small against the thickness keeps all its digits."""
+    h = heights.detach().double()
+    middle = float(h.mean())
+    return h - middle, middle
+
+
 class RayHits:
     """Where the rays of a bundle meet a height field: the fused form of `intersection.meet` by Newton's method."""
 
     def __init__(self, surface: FusedSurface, bundle: Bundle):
         self.surface = surface
         su, sv = surface.scale
+        self.z = bundle.z
         self.rays = tuple(t.double().contiguous().numpy() for t in
                           (bundle.x * su + 0.5, bundle.y * sv + 0.5, torch.full_like(bundle.x, bundle.z), bundle.dx * su,
                            bundle.dy * sv, bundle.dz))
@@ -85,11 +93,13 @@ class RayHits:
         return _Hits.apply(heights, self, dtype)
 
     def find(self, heights: Tensor, start: np.ndarray | None = None) -> np.ndarray:
-        """Fill t (mm) and status of every ray; returns the coefficients of the surface.
+        """Fill t (mm) and status of every ray; returns the coefficients of the surface, counted from the heights' mean.
 
         start: distances (N,) near which the hits are, infinite for none; None if that is not known.
         """
-        c, h = self.surface.coefficients(heights), heights.detach().double()
+        h, middle = _sag(heights)
+        c = self.surface.coefficients(h)
+        self.rays[2][:] = self.z - middle
         slopes = [float((a.space.derivative_matrix() @ x).abs().max()) for a, x in zip(self.surface.axes, (h, h.T), strict=True)]
         limits = (float(h.min()), float(h.max()))
         hit.intersect(*self.rays, np.empty(0) if start is None else start, limits, tuple(slopes), c, *self.surface.geometry,
@@ -123,7 +133,7 @@ class _Hits(torch.autograd.Function):
         surface = ctx.rays.surface
         grads = surface.workspace()
         hit.pull_back(*(g.contiguous().numpy() for g in by), *ctx.rays.rays, *(t.detach().numpy() for t in found),
-                      surface.coefficients(heights), *surface.geometry, *surface.scale, grads)
+                      surface.coefficients(_sag(heights)[0]), *surface.geometry, *surface.scale, grads)
         return surface.pull(grads).to(heights.dtype), None, None
 
     @staticmethod
@@ -132,5 +142,5 @@ class _Hits(torch.autograd.Function):
         surface = ctx.rays.surface
         out = [torch.empty(len(found[0]), dtype=ctx.dtype) for _ in range(3)]
         hit.push(surface.coefficients(tangent), *ctx.rays.rays, *(t.detach().numpy() for t in found),
-                 surface.coefficients(heights), *surface.geometry, *surface.scale, *(t.numpy() for t in out), blocks())
+                 surface.coefficients(_sag(heights)[0]), *surface.geometry, *surface.scale, *(t.numpy() for t in out), blocks())
         return tuple(out)

@@ -1,0 +1,130 @@
+"""The two ways to step downhill, on one objective and one parametrisation: Adam as the thesis runs it, and L-BFGS.
+
+Both look at a step before it counts, and take it back where it leads to nothing finite or to no light.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from caustic_cli.errors import CausticError
+from caustic_cli.inverse.lbfgs import LBFGS
+from caustic_cli.inverse.losses import NoLight
+from caustic_cli.inverse.objective import Evaluation, Objective
+from caustic_cli.inverse.parametrisation import Heights
+
+#: How often a step of Adam's is halved before it is given up.
+MOST_HALVINGS = 200
+
+
+class NotFinite(CausticError):
+    """A loss or a derivative that is not a finite number."""
+
+    def __init__(self):
+        super().__init__("the loss or its derivative is not finite for this lens; heights within a smaller height_range may help")
+
+
+class Adam:
+    """Adam on the loss itself, as the thesis runs it; `loss` and `on_screen` belong to the point before the step.
+
+    A step is looked at before it counts: where it leads to nothing finite, or to no light, half of it is tried, and so on, so
+    that what a checkpoint holds has always been evaluated.  `taken_back` counts such steps.
+    """
+
+    def __init__(self, objective: Objective, heights: Heights, lr: float):
+        self.objective, self.heights, self.loss, self.on_screen = objective, heights, math.inf, 0.0
+        self.adam = torch.optim.Adam(heights.parameters(), lr=lr)
+        self.here: tuple[Tensor, Evaluation] | None = None
+        self.taken_back = 0
+
+    def step(self) -> bool:
+        z, e = self.here or self._look()
+        before = [p.detach().clone() for p in self.heights.parameters()]
+        self.adam.zero_grad()
+        z.backward(e.gradient.to(z.device))
+        self.adam.step()
+        self.loss, self.on_screen, self.here = e.loss, e.on_screen, None
+        for halvings in range(MOST_HALVINGS):
+            try:
+                self.here = self._look()
+                return True
+            except (NoLight, NotFinite):
+                self.taken_back += halvings == 0
+                for p, old in zip(self.heights.parameters(), before, strict=True):
+                    p.data = 0.5 * (p.data + old)
+        raise CausticError("no step along the gradient leads to a finite loss with light on the screen; a smaller --lr may help")
+
+    def _look(self) -> tuple[Tensor, Evaluation]:
+        """Heights, with their graph, and their evaluation.
+
+        Raises:
+            NotFinite, NoLight: something there is not finite, or no light reaches the screen.
+        """
+        z = self.heights()
+        e = self.objective(z.detach()) if bool(torch.isfinite(z).all()) else None
+        if e is None or not math.isfinite(e.loss) or not bool(torch.isfinite(e.gradient).all()):
+            raise NotFinite
+        return z, e
+
+    def state(self) -> dict[str, Tensor]:
+        out = {}
+        for k, entry in self.adam.state_dict()["state"].items():
+            out |= {f"{k}.{name}": value for name, value in entry.items()}
+        return out
+
+    def load(self, state: dict[str, Tensor]) -> None:
+        whole = self.adam.state_dict()
+        whole["state"] = {}
+        for key, value in state.items():
+            k, name = key.split(".")
+            whole["state"].setdefault(int(k), {})[name] = value
+        self.adam.load_state_dict(whole)
+
+
+class Newtonlike:
+    """L-BFGS on half the squared relative RMS, whose curvature near the minimum is that of a least-squares problem."""
+
+    def __init__(self, objective: Objective, heights: Heights, lr: float):
+        self.objective, self.heights = objective, heights
+        (self.parameter,) = heights.parameters()
+        self.pixels = objective.loss.target.numel()
+        self.seen: dict[float, float] = {}
+        self.taken_back = 0
+        self.method = LBFGS(self._evaluate, self.parameter.detach().reshape(-1).clone())
+        self.loss, self.on_screen = math.inf, 0.0
+
+    def _evaluate(self, x: Tensor) -> tuple[float, Tensor]:
+        self.parameter.data = x.view(self.parameter.shape)
+        z = self.heights()
+        try:
+            e = self.objective(z.detach())
+            if not math.isfinite(e.loss) or not bool(torch.isfinite(e.gradient).all()):
+                raise NotFinite
+        except (NoLight, NotFinite):
+            if self.method.f is None:
+                raise
+            self.taken_back += 1
+            return math.inf, torch.zeros_like(x)  # a step too far: the line search turns back
+        relative = e.loss * self.pixels
+        (g,) = torch.autograd.grad(z, self.parameter, e.gradient.to(z.device) * (self.pixels * relative))
+        value = 0.5 * relative * relative
+        self.seen[value] = e.on_screen
+        return value, g.reshape(-1)
+
+    def step(self) -> bool:
+        self.seen = {}
+        moved = self.method.step()
+        self.parameter.data = self.method.x.view(self.parameter.shape)
+        if self.method.f is not None:
+            self.loss = math.sqrt(2.0 * self.method.f) / self.pixels
+            self.on_screen = self.seen.get(self.method.f, self.on_screen)
+        return moved
+
+    def state(self) -> dict[str, Tensor]:
+        return self.method.state()
+
+    def load(self, state: dict[str, Tensor]) -> None:
+        self.method.load(state)
