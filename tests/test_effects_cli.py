@@ -43,15 +43,6 @@ def run(capfd, *arguments, code=0):
     return json.loads(out) if code == 0 else err.strip()
 
 
-def edited(path, **changes):
-    """project.toml with keys section_key=value set."""
-    full = settings.read(path / "project.toml")
-    for name, value in changes.items():
-        section, _, key = name.partition("_")
-        full[section][key] = value
-    (path / "project.toml").write_text(settings.dump(full))
-
-
 def test_explain_and_effects(capfd, tmp_path):
     run(capfd, "design", "blob.png", *TINY)
     plain = run(capfd, "render", "blob.caustic", "--rays", "4000", "--npy", "plain.npy", "--quiet")

@@ -147,10 +147,10 @@ def _row(effect: Effect, plan: Plan, scene: Scene, field: HeightField, heights: 
          dtype: torch.dtype) -> dict | None:
     name, amount, bare = effect.name, "the scene's own", None
     if not effect.present:
-        put = _put(scene, name, heights)
-        if put is None:
+        made = put(scene, name, heights)
+        if made is None:
             return None
-        scene, bare, amount = put
+        scene, bare, amount = made
         plan = compile_plan(scene, field, heights)
     elif effect.fixed:
         return None
@@ -163,7 +163,7 @@ def _row(effect: Effect, plan: Plan, scene: Scene, field: HeightField, heights: 
             "amount": amount} | found
 
 
-def _put(scene: Scene, name: str, heights: Tensor) -> tuple[Scene, Scene | None, str] | None:
+def put(scene: Scene, name: str, heights: Tensor) -> tuple[Scene, Scene | None, str] | None:
     """The scene with an effect put in, the scene to compare it with (None: the same without it), and how much of it."""
     lens, screen, s = scene.lens, scene.screen, scene.source
     if name == "source-size":
