@@ -99,6 +99,13 @@ def test_every_option_is_an_effect(capfd, name):
     assert loss is None or again["lost"][loss] > 0.05
 
 
+def test_gradients_of_a_render_know_the_effects(capfd):
+    """Forward mode through the steps: as central differences say."""
+    run(capfd, "design", "blob.png", *TINY, "--absorption", "0.02", "--screen-tilt", "5,10", "--polarisation", "20")
+    found = run(capfd, "gradmap", "blob.caustic", "--control", "2,3", "--rays", "4000", "--check", "--quiet")
+    assert 0 < found["maps"][0]["check"]["relative_error"] < 1e-5
+
+
 def test_a_design_for_a_shifted_screen_hits_it(capfd):
     figures = run(capfd, "design", "blob.png", *TINY, "--screen-shift", "6,-4")
     assert figures["on_target"] > 0.85 * (1 - figures["lost"]["fresnel"])

@@ -96,7 +96,8 @@ def _polarised(incidence: float, critical: float, n: float) -> float:
 
     rs, rp = split(math.sin(incidence), 1.0 / n)
     outer = split(critical / n, n) if critical < 1.0 else (1.0, 0.0)  # R_s - R_p is largest at the critical angle, below 1
-    return (rs - rp) / (2.0 - rs - rp) * (outer[0] - outer[1]) / 2.0
+    passed = 2.0 - rs - rp  # 0 at grazing incidence, where all that enters may be of one polarisation
+    return ((rs - rp) / passed if passed > 0 else 1.0) * (outer[0] - outer[1]) / 2.0
 
 
 def _reach(scene: Scene, inside: float, lowest: float, top: float) -> float:

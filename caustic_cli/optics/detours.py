@@ -25,7 +25,7 @@ def ghost(lens: Lens, field: HeightField, beam: Beam, heights: Tensor, reference
     keep = beam.returned.detach().reshape(-1).nonzero()[:, 0]
     if not len(keep):
         return None
-    flat = [torch.broadcast_to(torch.as_tensor(c), beam.power.shape).reshape(-1)[keep].double()
+    flat = [torch.broadcast_to(torch.as_tensor(c, device=beam.power.device), beam.power.shape).reshape(-1)[keep].double()
             for c in (*beam.o, *beam.inward, *beam.g, beam.returned)]
     o, d, g, power = flat[:3], flat[3:6], flat[6:8], flat[8]
     totally = beam.totally.reshape(-1)[keep]
