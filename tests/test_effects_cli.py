@@ -53,7 +53,7 @@ def test_explain_and_effects(capfd, tmp_path):
     assert tuple(rows) == EFFECTS
     assert {k for k, row in rows.items() if row["on"]} == {"fresnel"}
     for row in rows.values():
-        assert set(row) == {"name", "on", "why", "bound", "limit", "cost_ms", "error", "power"} and row["why"]
+        assert set(row) == {"name", "on", "why", "bound", "limit", "cost_ms", "cost_ms_range", "error", "power"} and row["why"]
     assert rows["fresnel"]["power"] == pytest.approx(plain["lost"]["fresnel"], rel=0.02)
     for name in ("entrance", "intersection", "polarisation", "second-meeting", "total-reflection"):
         assert rows[name]["error"] < 1e-12, name

@@ -4,8 +4,9 @@
 
 The setting is table D.2's, see speed.py.  An iteration is image, loss and gradient.  The path that a plan has compiled takes turns
 with one put together by hand (`PlaneTracer` and nothing else), and with the same iteration of another CHECKOUT of this program, in
-a process of its own, if one is given: say, one from before there were effects.  The order within a round alternates.  Ratios are
-medians of the rounds' ratios, with their quartiles.
+a process of its own, if one is given: say, one from before there were effects.  The order within a round alternates.  Times are
+processor time of one thread, which other programs on the machine disturb least.  Ratios are medians of the rounds' ratios, with
+their quartiles.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ from pathlib import Path
 import torch
 from speed import BASE, Filter, Objective, PlaneTracer, Sampler, scene
 
-ROUNDS, EFFECT_ROUNDS = 80, 5
+ROUNDS, EFFECT_ROUNDS = 60, 3
+ONE = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
 
 
 def iteration(s=None, bare: bool = False):
@@ -40,9 +42,9 @@ def iteration(s=None, bare: bool = False):
 
 
 def timed(run) -> float:
-    began = time.perf_counter()
+    began = time.process_time()
     run()
-    return time.perf_counter() - began
+    return time.process_time() - began
 
 
 class Elsewhere:
@@ -51,7 +53,7 @@ class Elsewhere:
     def __init__(self, checkout: Path):
         paths = f"{checkout}{os.pathsep}{checkout / 'tests' / 'benchmarks'}"
         self.process = subprocess.Popen([sys.executable, __file__, "--worker"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                                        text=True, env={**os.environ, "PYTHONPATH": paths}, cwd=checkout)
+                                        text=True, env={**os.environ, "PYTHONPATH": paths, **ONE}, cwd=checkout)
 
     def __call__(self) -> float:
         self.process.stdin.write("go\n")
@@ -84,9 +86,8 @@ def main(checkout: Path | None) -> None:
     from caustic_cli.studies.effects import put, run_effects  # noqa: PLC0415
 
     own, field, heights = scene(BASE["control"], BASE["degree"], BASE["pixels"])
-    began = time.perf_counter()
+    compiling = timed(lambda: compile_plan(own, field, heights))
     plan = compile_plan(own, field, heights)
-    compiling = time.perf_counter() - began
     planned, bare = iteration(plan.scene), iteration(bare=True)
     work = {"by a plan": lambda: timed(planned), "bare": lambda: timed(bare)}
     other = Elsewhere(checkout.resolve()) if checkout else None
@@ -94,9 +95,9 @@ def main(checkout: Path | None) -> None:
         here = Elsewhere(Path(__file__).resolve().parents[2])
         work |= {"this program, own process": here, "other checkout": other}
     times = in_turns(work, ROUNDS)
-    out = [f"Table D.2's setting, {BASE['rays']:,} rays, {torch.get_num_threads()} threads, Python {platform.python_version()},"
+    out = [f"Table D.2's setting, {BASE['rays']:,} rays, one thread, Python {platform.python_version()},"
            f" torch {torch.__version__}; {ROUNDS} rounds. Compiling the plan, once: {1e3 * compiling:.1f} ms.", "",
-           "| iteration | ms, median | ratio of each round, median (quartiles) |", "| --- | --- | --- |"]
+           "| iteration | ms of processor time, median | ratio of each round, median (quartiles) |", "| --- | --- | --- |"]
     for name, base in (("bare", "bare"), ("by a plan", "bare"), ("other checkout", "other checkout"),
                        ("this program, own process", "other checkout")):
         if name in times:
@@ -113,8 +114,8 @@ def main(checkout: Path | None) -> None:
         times = in_turns({"changed": lambda run=changed: timed(run), "bare": lambda: timed(bare)}, EFFECT_ROUNDS)
         median = 1e3 * statistics.median(times["changed"])
         out.append(f"| {name}, {with_it[2]} | {median:.1f} | {ratio(times, 'changed', 'bare')} |")
-    study = run_effects(own, field, heights, rays=BASE["rays"], repeats=EFFECT_ROUNDS, dtype=torch.float32)
-    out += ["", "| effect | in this scene | measured with | cost of an image, ms | error of leaving it out | power |",
+    study = run_effects(own, field, heights, rays=BASE["rays"], repeats=EFFECT_ROUNDS)
+    out += ["", "| effect | in this scene | measured with | cost of a float64 image, ms | error of leaving it out | power |",
             "| --- | --- | --- | --- | --- | --- |"]
     out += [f"| {r['series']} | {'on' if r['on'] else 'off'} | {r['amount']} | {1e3 * r['seconds']:.1f} | {r['error']:.2g} |"
             f" {r['power']:+.2%} |" for r in study.rows]
@@ -132,6 +133,7 @@ def worker() -> None:
 
 
 if __name__ == "__main__":
+    torch.set_num_threads(1)
     if "--worker" in sys.argv:
         worker()
     else:
