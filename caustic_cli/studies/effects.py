@@ -2,8 +2,8 @@
 
 Notation
     with, without   images of the same rays by plans that differ in one effect
-    cost            least wall time of sampling, tracing and reconstruction with, less the least without: what else the machine
-                    does only ever adds to either
+    cost            least time of sampling, tracing and reconstruction with, less the least without: what else the machine does
+                    only ever adds to either.  Processor time of all threads, which that disturbs least; wall time on a GPU
     error           relative RMS between the two images, each over its own mean; power, light on the screen without less with
 
 Both plans take turns, round after round, so that a machine that slows down for a while slows both.
@@ -32,7 +32,7 @@ from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.report import COLOURS, MARKERS, Study
 
 #: Rays of every image, and rounds, unless said: a few seconds for each effect on two cores.
-RAYS, REPEATS = 1 << 16, 3
+RAYS, REPEATS = 1 << 16, 5
 #: Amounts at which the study measures an effect that its scene does not have.
 SUN, SIZE, ABSORPTION, ROUGHNESS, TILT, SHIFT, GLASS, LINES = 0.533, 1.0, 0.01, 0.001, 10.0, 1.0, "N-BK7", (486.1, D_LINE, 656.3)
 
@@ -61,13 +61,15 @@ def measure(with_: Plan, without: Plan, field: HeightField, heights: Tensor, *, 
     if needed(without.scene, without.steps) and not needed(with_.scene, with_.steps):
         with_ = replace(with_, steps=replace(with_.steps, plain=True))
 
+    clock = time.perf_counter if heights.is_cuda else time.process_time
+
     def image(plan: Plan) -> tuple[Exposure, float]:
-        began = time.perf_counter()
+        began = clock()
         sampler = rays_of(plan.scene, "stratified", rays, stream(seed, "effects"), heights.device)
         found = expose(plan.scene, field, heights, sampler, None, dtype, steps=plan.steps)
         if heights.is_cuda:
             torch.cuda.synchronize()
-        return found, time.perf_counter() - began
+        return found, clock() - began
 
     images = [image(plan)[0].image.flatten(0, -2).cpu() for plan in (with_, without)]  # a round that only warms up
     times = [(image(with_)[1], image(without)[1]) for _ in range(repeats)]
@@ -208,7 +210,7 @@ def draw_effects(study: Study, figure: Figure) -> None:
         axes.errorbar([1e3 * row["seconds"]], [error], xerr=[[low], [high]], linestyle="", color=colour, elinewidth=0.6,
                       marker=MARKERS[k % len(MARKERS)], markerfacecolor=colour if row["on"] else "none",
                       label=f"{row['series']}, {'on' if row['on'] else 'off'}, {row['amount']}")
-    axes.set(yscale="log", xlabel=f"cost (ms for {study.about['rays']:,} rays), and the rounds' range",
+    axes.set(yscale="log", xlabel=f"cost (ms of processor time for {study.about['rays']:,} rays), and the rounds' range",
              ylabel=f"relative RMS of leaving it out (least drawn: {floor:.1g})", title="effects: cost and error")
     axes.set_xscale("symlog", linthresh=1.0)
     axes.grid(which="major", linewidth=0.4)
