@@ -139,15 +139,20 @@ def run_effects(scene: Scene, field: HeightField, heights: Tensor, *, rays: int 
             rows.append(found)
         if progress is not None:
             progress(k + 1, len(EFFECTS))
-    told = sorted((r for r in rows if r["on"]), key=lambda r: -r["error"])
-    advice = f"of what this scene has, {told[0]['series']} matters most ({told[0]['error']:.2g})" if told else \
+    told = sorted((r for r in rows if r["on"]), key=_matters, reverse=True)
+    advice = f"of what this scene has, {told[0]['series']} matters most ({_matters(told[0]):.2g})" if told else \
         "this scene calls for no effect"
-    unfounded = max((r["error"] for r in rows if not r["on"] and r["amount"] == "the scene's own"), default=0.0)
-    advice += f"; what auto leaves out of it changes the image by at most {unfounded:.2g}"
+    unfounded = max((_matters(r) for r in rows if not r["on"] and r["amount"] == "the scene's own"), default=0.0)
+    advice += f"; what auto leaves out of it changes image or power by at most {unfounded:.2g}"
     about = {"version": __version__, "seed": seed, "repeats": repeats, "rays": rays, "device": str(heights.device),
              "reference_error": 0.0, "threads": torch.get_num_threads(),
              "dtype": str(dtype or torch.float64).removeprefix("torch.")}
     return Study("effects", COLUMNS, rows, {}, advice, about, "rays", PLOTS)
+
+
+def _matters(row: dict) -> float:
+    """What leaving an effect out changes: the larger of error and power."""
+    return max(row["error"], abs(row["power"]))
 
 
 def _row(effect: Effect, plan: Plan, scene: Scene, field: HeightField, heights: Tensor, rays: int, repeats: int, seed: int,
@@ -203,15 +208,15 @@ def draw_effects(study: Study, figure: Figure) -> None:
     """Cost of every effect, and the error of leaving it out; filled where auto simulates it."""
     figure.set_size_inches(8.4, 5.6)
     axes = figure.add_subplot()
-    floor = 0.5 * min((r["error"] for r in study.rows if r["error"] > 1e-12), default=1.0)
+    floor = 0.5 * min((_matters(r) for r in study.rows if _matters(r) > 1e-12), default=1.0)
     for k, row in enumerate(study.rows):
-        colour, error = COLOURS[k % len(COLOURS)], max(row["error"], floor)
+        colour, error = COLOURS[k % len(COLOURS)], max(_matters(row), floor)
         low, high = (1e3 * max(0.0, d) for d in (row["seconds"] - row["seconds_min"], row["seconds_max"] - row["seconds"]))
         axes.errorbar([1e3 * row["seconds"]], [error], xerr=[[low], [high]], linestyle="", color=colour, elinewidth=0.6,
-                      marker=MARKERS[k % len(MARKERS)], markerfacecolor=colour if row["on"] else "none",
+                      marker=MARKERS[(k + k // len(COLOURS)) % len(MARKERS)], markerfacecolor=colour if row["on"] else "none",
                       label=f"{row['series']}, {'on' if row['on'] else 'off'}, {row['amount']}")
     axes.set(yscale="log", xlabel=f"cost (ms of processor time for {study.about['rays']:,} rays), and the rounds' range",
-             ylabel=f"relative RMS of leaving it out (least drawn: {floor:.1g})", title="effects: cost and error")
+             ylabel=f"left out: relative RMS or change of power, the larger (least drawn: {floor:.1g})", title="effects: cost and error")
     axes.set_xscale("symlog", linthresh=1.0)
     axes.grid(which="major", linewidth=0.4)
     figure.legend(loc="outside right upper", fontsize="x-small")
