@@ -216,7 +216,8 @@ def draw_effects(study: Study, figure: Figure) -> None:
                       marker=MARKERS[(k + k // len(COLOURS)) % len(MARKERS)], markerfacecolor=colour if row["on"] else "none",
                       label=f"{row['series']}, {'on' if row['on'] else 'off'}, {row['amount']}")
     axes.set(yscale="log", xlabel=f"cost (ms of processor time for {study.about['rays']:,} rays), and the rounds' range",
-             ylabel=f"left out: relative RMS or change of power, the larger (least drawn: {floor:.1g})", title="effects: cost and error")
+             ylabel=f"left out: relative RMS or change of power, the larger (least drawn: {floor:.1g})",
+             title="effects: cost and error")
     axes.set_xscale("symlog", linthresh=1.0)
     axes.grid(which="major", linewidth=0.4)
     figure.legend(loc="outside right upper", fontsize="x-small")
