@@ -2,6 +2,7 @@
 
     /lens/heights             (n, m) float64, mm; attributes degree (2,)
     /lens/knots_u, knots_v    knot vectors on [0, 1]
+    /start                    (n_0, m_0) float64, mm: the heights it began from, on the first stage's net
     /state                    attributes stage, iteration, total, seconds, reason
     /state/parameters/*, /state/optimizer/*   tensors by name
     /history                  (iterations, 5): iteration, stage, loss (eq. 5.2.1), on_screen, seconds
@@ -56,6 +57,8 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
         f["lens/heights"] = state.heights.cpu().numpy()
         f["lens"].attrs["degree"] = [s.degree for s in spaces]
         f["lens/knots_u"], f["lens/knots_v"] = (s.knots.numpy() for s in spaces)
+        if state.start is not None:
+            f["start"] = state.start.cpu().numpy()
         group = f.create_group("state")
         for name in ("stage", "iteration", "total", "seconds", "reason"):
             group.attrs[name] = getattr(state, name)
@@ -90,7 +93,8 @@ def load(path: Path) -> Checkpoint:
                 **{name: {k: torch.from_numpy(np.asarray(v[()])) for k, v in group[name].items()}
                    for name in ("parameters", "optimizer")},
                 history=[(int(r[0]), int(r[1]), *map(float, r[2:])) for r in rows],
-                seconds=float(group.attrs["seconds"]), reason=str(group.attrs["reason"]))
+                seconds=float(group.attrs["seconds"]), reason=str(group.attrs["reason"]),
+                start=torch.from_numpy(f["start"][()]) if "start" in f else None)
             spaces = tuple(SplineSpace(int(p), torch.from_numpy(f[f"lens/knots_{axis}"][()]))
                            for p, axis in zip(f["lens"].attrs["degree"], "uv", strict=True))
             checkpoint = Checkpoint(state, spaces, json.loads(f.attrs["provenance"]), json.loads(f.attrs["results"]))

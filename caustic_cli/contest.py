@@ -13,6 +13,7 @@ from torch import Tensor
 from caustic_cli import settings
 from caustic_cli.derive import NETWORK_CONTROL, Settings, build_options, build_stages, complete
 from caustic_cli.inverse.designer import Designer, Options, State
+from caustic_cli.inverse.first import first_surface
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.schedule import Stage, coarse_to_fine
 from caustic_cli.inverse.target import target_on_screen
@@ -27,6 +28,7 @@ CELLS, DISC = 480, 0.8
 #: Knot spans of the control nets compared: all, half, and a quarter.
 PARTS = (1, 2, 4)
 ENDLESS = 10**9
+TRANSPORT = "lbfgs, from transport"
 
 
 class Turns(Designer):
@@ -52,8 +54,17 @@ class Entry:
     def __init__(self, series: str, stages: list[Stage], options: Options, scene: Scene, target: Tensor, device: str = "cpu"):
         self.series, self.optimizer, self.network = series, options.optimizer, options.network
         self.designer = Turns(scene, target, stages, options, device)
-        self.designer.run(self.designer.begin(), iterations=1)  # what the first iteration alone waits for
-        self.state, self.done, self.pixels = self.designer.begin(), False, target.numel()
+        self.designer.run(self._begin(target), iterations=1)  # what the first iteration alone waits for
+        self.state, self.done, self.pixels = self._begin(target), False, target.numel()
+        self.waited = self.state.seconds
+
+    def _begin(self, target: Tensor) -> State:
+        """The state before the first iteration, with the time its start took."""
+        if self.series != TRANSPORT:
+            return self.designer.begin()
+        began = time.monotonic()
+        first = first_surface(self.designer.scene, target.numpy(), self.designer.field(0))
+        return replace(self.designer.begin(first), seconds=time.monotonic() - began)
 
     @property
     def field(self) -> HeightField:
@@ -78,7 +89,7 @@ class Entry:
     @property
     def steps(self) -> list[float]:
         """Seconds of every iteration so far."""
-        return np.diff([0.0, *(row[4] for row in self.state.history)]).tolist()
+        return np.diff([self.waited, *(row[4] for row in self.state.history)]).tolist()
 
     @property
     def loss(self) -> float | None:
@@ -126,8 +137,9 @@ def plans(scene: Scene, full: Settings, dtype: torch.dtype | None = None,
           seed: int | None = None) -> list[tuple[str, list[Stage], Options]]:
     """What every contender for a target is called, and how it designs; dtype and seed replace those of the settings.
 
-    L-BFGS on the finished control net, on nets of half and a quarter of its knot spans, and coarse to fine; Adam on the heights
-    themselves and on the networks of the thesis, on its control net.  Rays, filter, apron and loss are those of the last stage.
+    L-BFGS on the finished control net, on nets of half and a quarter of its knot spans, coarse to fine, and from transport where
+    the design would begin there; Adam on the heights themselves and on the networks of the thesis, on its control net.  Rays,
+    filter, apron and loss are those of the last stage.
 
     Raises:
         InputError: a setting is out of range.
@@ -148,6 +160,8 @@ def plans(scene: Scene, full: Settings, dtype: torch.dtype | None = None,
         found.append(("lbfgs, coarse to fine", stages, newton))
     net = lens.control if lens.knots is not None else tuple(min(n, max(NETWORK_CONTROL, p + 1)) for n, p in
                                                            zip(lens.control, lens.degree, strict=True))
+    if full["design"]["start"] == "transport":
+        found.append((TRANSPORT, [replace(last, control=lens.control)], newton))
     adam = replace(options, optimizer="adam", initial="zero", preconditioner="none")
     for kind in ("none", "sparse", "dense"):
         if kind != "dense" or math.prod(net) <= NETWORK_CONTROL**2:  # weights: the square of the control points

@@ -235,4 +235,4 @@ def build_options(settings: Settings) -> Options:
                                                                               ("float32", "float64"))]
     checks.whole("[design] seed", d["seed"], 0, 2**31 - 1)
     return Options(d["loss"], d["optimizer"], d["lr"], d["network"], d["initial"], d["preconditioner"],
-                   d["filter_target"], d["seed"], dtype, d["max_slope"])
+                   d["filter_target"], d["seed"], dtype, d["max_slope"], d["min_radius"])

@@ -13,6 +13,7 @@ from caustic_cli.errors import InputError
 #: What marks a file as made by this program, so that it may be replaced.
 SOFTWARE = "caustic"
 MARK = SOFTWARE.encode()
+CREATED_BY = f"created by {SOFTWARE}"  # in a comment at the beginning of a text file
 NPY_HEADER = 256  # bytes; NumPy itself pads to 64 or 128
 
 
@@ -51,7 +52,7 @@ def write_bytes(path: str | Path, data: bytes) -> None:
 
 
 def is_ours(path: str | Path) -> bool:
-    """Whether this program made the file: by our mark in a PNG, .npy, .npz, STL or JSON; nothing else is ours."""
+    """Whether this program made the file: by our mark in a PNG, .npy, .npz, STL, JSON or text; nothing else is ours."""
     with open(path, "rb") as f:
         head = f.read(1024)
         size = os.path.getsize(path)
@@ -65,7 +66,7 @@ def is_ours(path: str | Path) -> bool:
         return tail.endswith(MARK)  # the archive's comment
     if MARK in head[:80] and size == 84 + 50 * int.from_bytes(head[80:84], "little"):
         return True  # the header of a binary STL
-    return b'"created_by": "' + MARK in head + tail
+    return b'"created_by": "' + MARK in head + tail or CREATED_BY.encode() + b" " in head
 
 
 def refuse_foreign(path: str | Path, force: bool = False) -> None:

@@ -24,17 +24,17 @@ from caustic_cli.derive import build_options, build_stages, complete
 from caustic_cli.errors import InputError, Interrupted
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.first import first_surface
+from caustic_cli.inverse.target import grey
 from caustic_cli.optics.heightfield import HeightField
-from caustic_cli.optics.sampling import Sample
-from caustic_cli.picture import read_picture, write_image
+from caustic_cli.picture import read_picture
 from caustic_cli.project import CHECKPOINT, RENDER, REPORT, TOML, Project, is_project
 from caustic_cli.scene import Scene
 from caustic_cli.scene.source import blur_limit
-from caustic_cli.studies.panels import write_report
-from caustic_cli.studies.retrace import FINAL_RAYS, retrace, white_level
+from caustic_cli.surfaces import SUFFIXES, onto, read_surface
+from caustic_cli.verdict import judge
 
-#: Points along each side of the aperture at which the report draws the surface.
-REPORT_SAMPLES = 401
+#: Part of a time limit that is left to the iterations, however long the start took.
+LEAST_PART = 0.25
 
 
 def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: dict, config: Path | None,
@@ -85,6 +85,8 @@ def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: d
         if first is not None and _make_room(full, said, first):
             _designer(project, "cpu")
             first = _first_heights(project)
+        if first is not None:
+            first = _designer(project, "cpu")[0].within_limits(State(first))
     except InputError as error:  # about a project.toml that is not written yet
         raise InputError(settings.as_options(str(error).removeprefix(f"{path / TOML}: "), given)) from error
     _make_directory(path, force)
@@ -127,6 +129,7 @@ def resume(project: Project, iterations: int | None, time_limit: float | None, d
     if tuple(state.heights.shape) != designer.stages[state.stage].control:
         raise InputError(f"{project.path / TOML}: stage {state.stage + 1} has control"
                          f" {list(designer.stages[state.stage].control)}, but the checkpoint {list(state.heights.shape)}")
+    state = designer.restored(state)
     if iterations is not None:
         project.settings["design"]["iterations"] = iterations
         project.write()
@@ -151,27 +154,29 @@ def _designer(project: Project, device: str) -> tuple[Designer, np.ndarray]:
 
 
 def _first_heights(project: Project) -> torch.Tensor | None:
-    """Heights of the transport start or of --start PROJECT on the first stage's net, or None for the offset surface.
+    """Heights of the transport start or of --start on the first stage's net, or None for the offset surface.
 
     Raises:
-        InputError: no such project, its lens is of another size, or transport cannot reach the picture.
+        InputError: no such project or surface, its lens is of another size, or transport cannot reach the picture.
     """
     start = project.settings["design"]["start"]
     if start == "offset":
         return None
     if start == "transport":
         designer, target = _designer(project, "cpu")
-        return first_surface(designer.scene, _grey(target), designer.field(0))
+        return first_surface(designer.scene, grey(target), designer.field(0))
+    net = _designer(project, "cpu")[0].field(0)
+    if Path(start).suffix.lower() in SUFFIXES and not Path(start).is_dir():
+        return onto(*read_surface(start, net.half_size), net)
     if not is_project(Path(start)):
-        raise InputError(f"[design] start must be transport, offset or a project directory, got {start!r}")
+        raise InputError("[design] start must be transport, offset, a project directory or a lens surface"
+                         f" ({', '.join(SUFFIXES)}), got {start!r}")
     other = Project.open(start)
     field, checkpoint = other.lens(other.scene())
     if other.settings["lens"]["size"] != project.settings["lens"]["size"]:
         raise InputError(f"[design] start: the lens of {start} is {other.settings['lens']['size']} mm, not"
                          f" {project.settings['lens']['size']} mm")
-    net = _designer(project, "cpu")[0].field(0)
-    tu, tv = (a.change_of_basis(b) for a, b in zip(field.spaces, net.spaces, strict=True))
-    return tu @ checkpoint.state.heights @ tv.T
+    return onto(field, checkpoint.state.heights, net)
 
 
 def _make_room(full: dict, said: dict, first: torch.Tensor) -> bool:
@@ -235,6 +240,7 @@ def _run(project: Project, designer: Designer, target: np.ndarray, state: State,
          iterations: int | None, time_limit: float | None, device: str) -> dict:
     chosen = project.settings["design"]
     limit = chosen["time_limit"] if time_limit is None else time_limit
+    limit = max(LEAST_PART * limit, limit - (time.monotonic() - began))  # what the start took counts too
     provenance = {
         "caustic": __version__, "torch": torch.__version__, "numpy": np.__version__, "device": device,
         "threads": torch.get_num_threads(), "seed": chosen["seed"],
@@ -257,7 +263,7 @@ def _run(project: Project, designer: Designer, target: np.ndarray, state: State,
                         f" {s.rays:,} rays, blur {s.blur:g} px")
             _, _, loss, on_screen, _ = now.history[-1]
             show(f"stage {stage + 1}/{len(designer.stages)}",
-                 f"loss {loss * _grey(target).size:.4f}  on screen {on_screen:.1%}", now.total, total)
+                 f"loss {loss * grey(target).size:.4f}  on screen {on_screen:.1%}", now.total, total)
             if time.monotonic() - saved >= chosen["checkpoint_every"]:
                 keep(now)
                 saved = time.monotonic()
@@ -266,40 +272,18 @@ def _run(project: Project, designer: Designer, target: np.ndarray, state: State,
         state = designer.run(state, iterations=chosen["iterations"], time_limit=limit, stop=lambda: bool(asked),
                              on_iteration=on_iteration)
         keep(state)
+        if not asked:
+            state.heights = designer.within_limits(state)
         if asked:
             raise Interrupted(f"interrupted after {state.total} iterations; {project.path / CHECKPOINT} is saved,"
                               f" caustic design --resume {project.path} goes on", 128 + asked[0])
-        figures = _judge(project, designer, target, state, device)
+        lens, figures = judge(project, designer, target, state, device)
         figures |= {"iterations": state.total, "seconds": time.monotonic() - began, "image": str(project.path / RENDER),
-                    "project": str(project.path), "reason": state.reason}
-        keep(state, figures)
+                    "project": str(project.path), "reason": lens.reason}
+        keep(lens, figures)
         if asked:
             raise Interrupted(f"interrupted when the design was done; {project.path} is whole", 128 + asked[0])
     return figures
-
-
-def _judge(project: Project, designer: Designer, target: np.ndarray, state: State, device: str) -> dict:
-    """Retrace the finished lens with rays of its own; write render.png and report.png."""
-    scene, field = designer.scene, designer.field(state.stage)
-    exposure, figures = retrace(scene, field, state.heights, target, rays=FINAL_RAYS, device=device,
-                                seed=project.settings["design"]["seed"])
-    image, encoding = exposure.image.cpu().numpy(), project.settings["target"]["encoding"]
-    write_image(project.path / RENDER, image, white_level(image, target), encoding)
-    history = np.array(state.history, dtype=float).reshape(-1, 5)
-    write_report(project.path / REPORT, _grey(target), _grey(image), _surface(field, state.heights), history, scene.lens,
-                 scene.screen, figures, encoding)
-    return figures
-
-
-def _grey(image: np.ndarray) -> np.ndarray:
-    """(n_x, n_y) of an image, the colours of a coloured one added up."""
-    return image if image.ndim == 2 else image.sum(0)
-
-
-def _surface(field: HeightField, heights: torch.Tensor) -> np.ndarray:
-    """The surface on an even grid over the aperture, mm."""
-    u = torch.linspace(0.0, 1.0, REPORT_SAMPLES, dtype=torch.float64)
-    return field.prepare(Sample(u, u, True, torch.ones(())), torch.float64)(heights)[0].numpy()
 
 
 @contextmanager

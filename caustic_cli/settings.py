@@ -64,6 +64,8 @@ SCHEMA: dict[str, dict[str, Key]] = {
         "absorption": Key("number", "1/mm, a in exp(-a t) through t mm of glass (Beer-Lambert)"),
         "roughness": Key("number", "standard deviation of the slopes of the exit's microfacets along an axis"),
         "mirror": Key("flag", "the surface reflects; the screen stands on the source's side"),
+        "aperture": Key("text", "rectangle, or circle: the largest within size"),
+        "border": Key("number", "mm, width of a rim around the aperture, for the mount"),
         "control": Key("wholes", "control points of the finished lens"),
         "degree": Key("wholes", "spline degrees"),
         "knots_u": Key("list", "knot vector on [0, 1] along x"),
@@ -86,13 +88,14 @@ SCHEMA: dict[str, dict[str, Key]] = {
     "design": {
         "loss": Key("text", "weighted sum of rms (eq. 5.2.1), rms-light, throughput, diffusion, uniformity, laplacian, curvature"),
         "max_slope": Key("number", "limit of the surface's slope; 0 for none"),
+        "min_radius": Key("number", "mm, least radius of concave places (the tool's); 0 for any"),
         "optimizer": Key("text", "lbfgs or adam"),
         "lr": Key("number", "learning rate of adam"),
         "network": Key("text", "none, sparse or dense"),
         "initial": Key("text", "parameters at first: zero, uniform (+-1e-4) or random"),
         "preconditioner": Key("text", "none or laplacian"),
         "filter_target": Key("flag", "filter the target as the render is filtered"),
-        "start": Key("text", "transport, offset, or the project whose lens was the first surface"),
+        "start": Key("text", "transport, offset, or the project or file whose lens was the first surface"),
         "iterations": Key("whole", "in all; 0: what the stages say"),
         "time_limit": Key("number", "s; inf for none"),
         "checkpoint_every": Key("number", "s between checkpoints"),
@@ -121,7 +124,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "screen": {"z": 300.0},
     "target": {"encoding": "srgb", "flip": ""},
     "design": {"loss": "rms-light", "optimizer": "lbfgs", "lr": 1e-3, "network": "none", "initial": "zero",
-               "filter_target": True, "max_slope": 0.0, "iterations": 0, "time_limit": math.inf,
+               "filter_target": True, "max_slope": 0.0, "min_radius": 0.0, "iterations": 0, "time_limit": math.inf,
                "checkpoint_every": 10.0, "seed": 0, "dtype": "float32"},
 }
 SOURCES = ("plane", "point", "grid", "disc")
@@ -247,7 +250,8 @@ def build_lens(settings: dict[str, dict[str, Any]]) -> Lens:
     offset = Offset(lens["thickness"], tuple(lens["radius"]))
     return Lens(tuple(lens["size"]), lens["z_in"], index_of(lens), tuple(lens["control"]), tuple(lens["degree"]), knots,
                 lens["min_thickness"], offset, tuple(lens["height_range"]), lens["fresnel"], lens.get("absorption", 0.0),
-                lens.get("roughness", 0.0), lens.get("glass"), lens.get("mirror", False))
+                lens.get("roughness", 0.0), lens.get("glass"), lens.get("mirror", False),
+                lens.get("aperture", "rectangle"), lens.get("border", 0.0))
 
 
 def build_source(settings: dict[str, dict[str, Any]], profile: np.ndarray | None = None, type: str | None = None) -> Source:

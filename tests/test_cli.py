@@ -16,7 +16,8 @@ import pytest
 import typer
 from PIL import Image
 
-from caustic_cli import __version__, cli, console, session
+from caustic_cli import __version__, cli, console, verdict
+from caustic_cli.commands.export import FORMATS
 
 COMMANDS = ("design", "render", "gradmap", "export", "convergence")
 SHARED_KEYS = {"loss", "relative_rms", "psnr_db", "ssim", "on_screen", "on_target", "lost", "rays", "iterations", "seconds",
@@ -48,7 +49,7 @@ def designed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cli")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        patch.setattr(session, "FINAL_RAYS", 10_000)
+        patch.setattr(verdict, "FINAL_RAYS", 10_000)
         y, x = np.mgrid[0:24, 0:24]
         Image.fromarray((40 + 200 * np.exp(-((x - 8) ** 2 + (y - 9) ** 2) / 30.0)).astype(np.uint8)).save("blob.png")
         text = "design blob.png --resolution 24 --control 12 --rays 4000 --iterations 2 --quiet"
@@ -61,8 +62,8 @@ def here(designed, tmp_path, monkeypatch):
     folder = tmp_path / "here"
     shutil.copytree(designed, folder)
     monkeypatch.chdir(folder)
-    monkeypatch.setattr(session, "FINAL_RAYS", 10_000)
-    monkeypatch.setattr(session, "write_report", lambda *args: None)
+    monkeypatch.setattr(verdict, "FINAL_RAYS", 10_000)
+    monkeypatch.setattr(verdict, "write_report", lambda *args: None)
     return folder
 
 
@@ -142,6 +143,16 @@ BAD = {
     "gradmap bincount": ("gradmap blob.caustic --reconstruction bincount", "bincount"),
     "export format": ("export blob.caustic --format moon", "--format"),
     "export samples": ("export blob.caustic --samples 0", "--samples"),
+    "export samples of a step": ("export blob.caustic --format step --samples 9", "--samples"),
+    "export tolerance": ("export blob.caustic --format stl --tolerance 0", "--tolerance"),
+    "export tolerance of a table": ("export blob.caustic --format zemax --tolerance 1", "--tolerance"),
+    "export script of a mesh": ("export blob.caustic --format ply --script", "--script"),
+    "export mesh over a foreign file": ("export blob.caustic --format mitsuba -o mine.xml", "--force"),
+    "start file": (DESIGN + "--start none.npz", "none.npz"),
+    "start text": (DESIGN + "--start notes.step", "notes.step"),
+    "render verify": ("render blob.caustic --verify moon", "--verify"),
+    "render verify elsewhere": ("render blob.caustic --verify mitsuba --screen-at 280", "--screen-at"),
+    "render no archive": ("render notes.npz", "notes.npz"),
     "export over the project": ("export blob.caustic -o blob.caustic/project.toml", "project.toml"),
     "render over the project": ("render blob.caustic --rays 1000 -o blob.caustic/project.toml", "project.toml"),
     "export over a foreign file": ("export blob.caustic -o blob.png", "--force"),
@@ -159,7 +170,8 @@ def hazards(here):
     """The files the rows of BAD name."""
     (here / "folder").mkdir()
     (here / "folder" / "mine.txt").write_text("mine")
-    (here / "notes.png").write_text("no picture")
+    for name in ("notes.png", "notes.step", "notes.npz", "mine-exit.ply"):
+        (here / name).write_text("no picture")
     whole = (here / "blob.png").read_bytes()
     (here / "cut.png").write_bytes(whole[: len(whole) // 2])
     Image.new("L", (9, 9)).save(here / "black.png")
@@ -237,6 +249,7 @@ def test_render_json(here, capfd, options):
 
 
 @pytest.mark.parametrize("text", ["gradmap blob.caustic --rays 2000", "export blob.caustic", "export blob.caustic --format stl",
+                                  "export blob.caustic --format mitsuba", "export blob.caustic --script",
                                   "convergence blob.caustic --rays 2000 --repeats 1 -o c",
                                   "convergence blob.caustic --study rays --rays 4000 --repeats 2 -o c",
                                   "convergence blob.caustic --study design --rays 2000 --seconds 0.05 -o c"])
@@ -256,7 +269,8 @@ def test_quiet_is_silent_and_stdout_is_for_results(here, capfd, text):
 
 @pytest.mark.parametrize("text", ["render blob.caustic --rays 1000 -o a.png --npy a.npy",
                                   "gradmap blob.caustic --rays 1000 -o b.png", "export blob.caustic",
-                                  "export blob.caustic --format stl",
+                                  *(f"export blob.caustic --format {name}" for name in FORMATS if name != "csv"),
+                                  "export blob.caustic --script",
                                   "convergence blob.caustic --study rays --rays 2000 --repeats 2"])
 def test_what_it_made_it_replaces_unasked(here, capfd, text):
     for _ in range(2):
@@ -307,6 +321,38 @@ def test_options_reach_project_toml(here, capfd, options, line):
     code, _, err = run(f"design blob.png -o n {resolution} --control 9 --rays 1000 --iterations 1 --quiet {options}", capfd)
     assert code == 0, err
     assert any(row.startswith(line) for row in (here / "n" / "project.toml").read_text().splitlines())
+
+
+# lenses from files
+
+
+@pytest.mark.parametrize("file", ["lens.npz", "lens.step", "lens.npy"])
+def test_a_design_begins_from_an_exported_lens(here, capfd, file):
+    """With next to no iterations it is that lens still."""
+    assert run("export blob.caustic -o lens.npz --samples 37 --quiet", capfd)[0] == 0
+    assert run("export blob.caustic --format step -o lens.step --quiet", capfd)[0] == 0
+    with np.load("lens.npz") as data:
+        surface = data["z"]
+        np.save("lens.npy", surface)
+    code, _, err = run(f"design blob.png -o again --start {file} --resolution 24 --control 12 --rays 4000 --iterations 1"
+                       " --lr 1e-9 --optimizer adam --quiet", capfd)
+    assert code == 0, err
+    assert run("export again -o again.npz --samples 37 --quiet", capfd)[0] == 0
+    with np.load("again.npz") as data:
+        assert data["control_points"].shape == (12, 12, 3)
+        assert np.abs(data["z"] - surface).max() < 1e-6  # mm
+        assert np.ptp(surface) > 0.1
+
+
+def test_an_archive_renders_like_its_project(here, capfd):
+    assert run("export blob.caustic -o lens.npz --quiet", capfd)[0] == 0
+    assert run("render blob.caustic --rays 9000 --npy a.npy --quiet", capfd)[0] == 0
+    code, out, err = run("render lens.npz --rays 9000 --npy b.npy --json --quiet", capfd)
+    assert (code, err) == (0, "")
+    figures = json.loads(out)
+    assert figures["image"] == "lens.png" and figures["relative_rms"] is None and figures["on_target"] is None
+    assert (np.load("a.npy") == np.load("b.npy")).all() and Path("lens.png").is_file()
+    assert run("render lens.npz --source point", capfd)[0] == 2
 
 
 # help and the process

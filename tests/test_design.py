@@ -14,7 +14,7 @@ import pytest
 import torch
 from PIL import Image
 
-from caustic_cli import checkpoint, cli, session
+from caustic_cli import checkpoint, cli, session, verdict
 
 TINY = ["--resolution", "24", "--control", "12", "--rays", "4000", "--quiet", "--threads", "1"]
 
@@ -26,8 +26,8 @@ def _here(tmp_path, monkeypatch):
     y, x = np.mgrid[0:24, 0:24]
     light = 40 + 200 * np.exp(-((x - 8) ** 2 + (y - 9) ** 2) / 30.0)
     Image.fromarray(light.astype(np.uint8)).save("blob.png")
-    monkeypatch.setattr(session, "FINAL_RAYS", 40_000)
-    monkeypatch.setattr(session, "write_report", lambda *args: None)
+    monkeypatch.setattr(verdict, "FINAL_RAYS", 40_000)
+    monkeypatch.setattr(verdict, "write_report", lambda *args: None)
 
 
 def design(capfd, *arguments, code=0) -> dict:
@@ -185,8 +185,8 @@ def test_threads_are_what_was_asked_for():
     """In a process of its own: the first design of a process must not differ from the next, whatever loads meanwhile."""
     program = f"""
 import torch
-from caustic_cli import cli, session
-session.FINAL_RAYS, session.write_report = 1000, lambda *args: None
+from caustic_cli import cli, verdict
+verdict.FINAL_RAYS, verdict.write_report = 1000, lambda *args: None
 for name in "ab":
     assert cli.run(["design", "blob.png", *{TINY!r}, "--iterations", "3", "-o", name]) == 0
     assert torch.get_num_threads() == 1, torch.get_num_threads()
@@ -208,6 +208,21 @@ def test_a_design_improves_the_picture(capfd, kind):
     assert last["relative_rms"] < 0.5 * first["relative_rms"]
     assert last["on_screen"] > 0.85  # the rest is reflected at the two surfaces
     assert last["ssim"] > first["ssim"] and last["psnr_db"] > first["psnr_db"]
+
+
+def test_a_design_is_never_worse_than_its_start(capfd):
+    """Steps far too long wreck a good start: it is kept, and the run still goes on from where the optimiser stands."""
+    options = [*TINY[:2], "--control", "35", *TINY[4:], "--start", "transport", "--optimizer", "adam", "--lr", "0.5"]
+    once = design(capfd, "blob.png", *options, "--iterations", 6, "-o", "once")
+    assert once["reason"] == "iterations; its start was better and is kept"
+    assert once["relative_rms"] == once["start_relative_rms"]
+    state = load("once").state
+    assert torch.equal(state.heights, state.start)
+    design(capfd, "blob.png", *options, "--iterations", 12, "-o", "whole")
+    design(capfd, "--resume", "once", "--iterations", 12, "--quiet", "--threads", 1)
+    assert_same(content("whole"), content("once"))
+    good = design(capfd, "blob.png", *TINY, "--start", "offset", "--iterations", 20, "-o", "good")
+    assert good["relative_rms"] < 0.5 * good["start_relative_rms"] and "start" not in good["reason"]
 
 
 def test_transport_begins_where_the_offset_ends(capfd):

@@ -13,7 +13,8 @@ from scipy.interpolate import BSpline, RectBivariateSpline
 from caustic_cli import __version__
 from caustic_cli.errors import InputError
 from caustic_cli.export.lighttools import write_lighttools
-from caustic_cli.export.stl import TRIANGLE, solid, write_stl
+from caustic_cli.export.mesh import closed_mesh
+from caustic_cli.export.stl import TRIANGLE, write_stl
 from caustic_cli.export.surface import STEPS_PER_SPAN, sample_grid
 from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.optics.sampling import Sample
@@ -293,7 +294,7 @@ def test_stl_encloses_the_lens(tmp_path):
     volume = exact_volume(load(tmp_path / "lens.npz"))
     error = []
     for samples in ((31, 61), (61, 121)):
-        vertices, faces = solid(sample_grid(field, heights, samples), scene.lens.z_in)
+        vertices, faces = closed_mesh(scene, field, heights, samples)
         error.append(signed_volume(vertices[faces]) / volume - 1)
     assert abs(error[0]) < 1e-3
     assert error[0] / error[1] == pytest.approx(4, rel=0.1)

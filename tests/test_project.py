@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from caustic_cli import checkpoint, cli, session
+from caustic_cli import checkpoint, cli, session, verdict
 from caustic_cli.checkpoint import Checkpoint
 from caustic_cli.console import Reporter
 from caustic_cli.errors import InputError
@@ -39,8 +39,8 @@ def designed(tmp_path_factory):
     np.save(folder / "blob.npy", np.exp(-((x[:, None] - 6) ** 2 + (x - 12) ** 2) / 20.0) + 0.1)
     (folder / "c.toml").write_text(CONFIG)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(session, "FINAL_RAYS", 10_000)
-        patch.setattr(session, "write_report", lambda *args: None)
+        patch.setattr(verdict, "FINAL_RAYS", 10_000)
+        patch.setattr(verdict, "write_report", lambda *args: None)
         project, first = session.begin(folder / "blob.npy", folder / "blob.caustic", {}, None, None, {}, folder / "c.toml", False)
         session.design(project, first, "cpu", Reporter(quiet=True), 0.0)
     return project.path
@@ -273,8 +273,8 @@ def test_an_output_never_replaces_what_the_project_is_made_of(copy, capfd, name)
 def test_a_profile_weights_the_light(designed, tmp_path, monkeypatch, capfd):
     """Only the aperture's +x half shines, so light arrives on that side only, and all of it is accounted for."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(session, "FINAL_RAYS", 10_000)
-    monkeypatch.setattr(session, "write_report", lambda *args: None)
+    monkeypatch.setattr(verdict, "FINAL_RAYS", 10_000)
+    monkeypatch.setattr(verdict, "write_report", lambda *args: None)
     profile = np.zeros((4, 3))
     profile[2:] = 1.0
     np.save("half.npy", profile)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from caustic_cli import cli, session, settings
+from caustic_cli import cli, session, settings, verdict
 from caustic_cli.derive import complete
 from caustic_cli.errors import InputError
 from caustic_cli.scene import Disc, Offset, Points
@@ -37,8 +37,8 @@ def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     y, x = np.mgrid[0:24, 0:24]
     Image.fromarray((40 + 200 * np.exp(-((x - 8) ** 2 + (y - 9) ** 2) / 30.0)).astype(np.uint8)).save("blob.png")
-    monkeypatch.setattr(session, "FINAL_RAYS", 40_000)
-    monkeypatch.setattr(session, "write_report", lambda *args: None)
+    monkeypatch.setattr(verdict, "FINAL_RAYS", 40_000)
+    monkeypatch.setattr(verdict, "write_report", lambda *args: None)
 
 
 def run(capfd, *arguments, code=0):

@@ -232,6 +232,20 @@ def test_the_contenders_of_a_project(small):
         training.run_training(scene, target, [entry], seconds=0.0)
 
 
+def test_transport_contends_where_a_design_would_begin_there():
+    full = complete({"screen": {"resolution": [24, 24]}, "lens": {"control": [35, 35]}}, 1.0, rays=5000)
+    scene = build_scene(full)
+    target = torch.from_numpy(contest.disc(scene, tuple(full["target"]["size"])))
+    entries = {plan[0]: contest.Entry(*plan, scene, target) for plan in contest.plans(scene, full)
+               if plan[0] in ("lbfgs, 35x35", contest.TRANSPORT)}
+    assert len(entries) == 2
+    for entry in entries.values():
+        entry.advance(0.0)
+    ahead, behind = entries[contest.TRANSPORT], entries["lbfgs, 35x35"]
+    assert ahead.loss < 0.5 * behind.loss
+    assert ahead.seconds - sum(ahead.steps) > 0 == pytest.approx(behind.seconds - sum(behind.steps))  # its start is not free
+
+
 def test_a_lens_with_knots_of_its_own_keeps_its_net(small):
     scene, _, full = small
     knots = SplineSpace.uniform(19, 3).knots.tolist()

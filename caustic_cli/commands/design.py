@@ -41,6 +41,10 @@ def run(
                                          " before it.")] = False,
     mag: Annotated[float | None, typer.Option(help="Width of the picture over width of the lens.  [default: 3]")] = None,
     lens_size: Annotated[Text, typer.Option(metavar="W[xH]", help="Lens aperture, mm.  [default: 10x10]")] = None,
+    aperture: Annotated[Text, typer.Option(metavar="rectangle|circle", help="Shape of the lens; a circle is as wide as --lens-size."
+                                           "  [default: rectangle]")] = None,
+    border: Annotated[float | None, typer.Option(metavar="MM", help="Width of a rim around the aperture, which exported solids have"
+                                                 " for their mount.  [default: 0]")] = None,
     throw: Annotated[float | None, typer.Option(help="Lens origin to screen, mm.  [default: 300]")] = None,
     screen_size: Annotated[Text, typer.Option(metavar="W[xH]", help="Screen, mm.  [default: picture plus margin]")] = None,
     resolution: Annotated[Text, typer.Option(metavar="N[xM]", help="Pixels over the whole screen; N alone counts across, rows"
@@ -53,13 +57,16 @@ def run(
     degree: Annotated[Text, typer.Option(metavar="P[xQ]", help="Spline degree, 1 to 15.  [default: 3]")] = None,
     min_thickness: Annotated[float | None, typer.Option(help="Least thickness of the lens, mm.  [default: 1]")] = None,
     max_slope: Annotated[float | None, typer.Option(help="Limit of the surface's slope, mm per mm.  [default: none]")] = None,
+    min_radius: Annotated[float | None, typer.Option(metavar="MM", help="Least radius of curvature of concave places, such as a"
+                                                     " tool's.  [default: any]")] = None,
     linear: Annotated[bool, typer.Option("--linear", help="Pixel values are irradiance as they are, not sRGB-encoded.")] = False,
     color: Annotated[bool, typer.Option("--color", help="Keep red, green and blue apart (611, 549, 464 nm), with the glass' index"
                                         " for each.  [default glass: N-BK7]")] = False,
     flip: Annotated[Text, typer.Option(metavar="x|y|xy", help="Mirror the picture, for a viewer on the lens' side.")] = None,
-    start: Annotated[Text, typer.Option(metavar="transport|offset|PROJECT", help="First surface: by optimal transport of the"
+    start: Annotated[Text, typer.Option(metavar="transport|offset|PROJECT|FILE", help="First surface: by optimal transport of the"
                                         " light to the picture, the sphere that follows from --mag, or the lens of another"
-                                        " project.  [default: transport; offset for a network, adam, several"
+                                        " project or of a file: .npz or .step as exported, .npy of heights in mm."
+                                        "  [default: transport; offset for a network, adam, several"
                                         " points or a small net]")] = None,
     quality: Annotated[Text, typer.Option(help="draft, standard or fine.  [default: standard]")] = None,
     rays: Annotated[Text, typer.Option(metavar="N", help="Rays of the last stage.  [default: by quality]")] = None,
@@ -93,12 +100,15 @@ def run(
         **options.physics(polarisation, wavelengths, absorption, roughness, screen_tilt, screen_shift),
         ("lens", "mirror", "--mirror"): mirror or None,
         ("lens", "size", "--lens-size"): lens_size and options.both(options.size("--lens-size", lens_size)),
+        ("lens", "aperture", "--aperture"): aperture,
+        ("lens", "border", "--border"): border,
         ("lens", "index", "--index"): index,
         ("lens", "glass", "--glass"): glass,
         ("lens", "control", "--control"): control and options.both(options.counts("--control", control)),
         ("lens", "degree", "--degree"): degree and options.both(options.counts("--degree", degree)),
         ("lens", "min_thickness", "--min-thickness"): min_thickness,
         ("design", "max_slope", "--max-slope"): max_slope,
+        ("design", "min_radius", "--min-radius"): min_radius,
         ("screen", "z", "--throw"): -throw if mirror and throw is not None else throw,
         ("target", "encoding", "--linear"): "linear" if linear else None,
         ("target", "flip", "--flip"): flip,

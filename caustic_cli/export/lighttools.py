@@ -31,8 +31,9 @@ def write_lighttools(path: str | Path, scene: Scene, field: HeightField, heights
     """Write the archive whole or not at all.
 
     Keys: points, normals (N, 3); shape (2,); x (nx,), y (ny,), z (nx, ny); lens_half_size (2,), z_in, refractive_index;
-    screen_half_size (2,), z_screen, resolution (2,); those of `_source`; control_points (n, m, 3) with x, y at the
-    Greville abscissae, degrees (2,), knots_u, knots_v on [0, 1]; unit, format_version, created_by.
+    screen_half_size (2,), z_screen, resolution (2,); those of `_source`; fresnel unless exact; aperture if a circle;
+    control_points (n, m, 3) with x, y at the Greville abscissae, degrees (2,), knots_u, knots_v on [0, 1]; unit,
+    format_version, created_by.
 
     Args:
         heights: (n, m) control heights, mm.
@@ -58,6 +59,8 @@ def write_lighttools(path: str | Path, scene: Scene, field: HeightField, heights
         "z_screen": _reals(scene.screen.z),
         "resolution": np.array(scene.screen.resolution, np.int64),
         **_source(scene),
+        **({"aperture": np.array("circle")} if scene.lens.round else {}),
+        **({} if scene.lens.fresnel == "exact" else {"fresnel": np.array(scene.lens.fresnel)}),
         "control_points": np.stack([x, y, heights.detach().double().cpu().numpy()], -1),
         "degrees": np.array([s.degree for s in field.spaces], np.int64),
         "knots_u": field.spaces[0].knots.numpy(),
@@ -87,7 +90,8 @@ def _source(scene: Scene) -> dict[str, np.ndarray]:
             "source_positions": _reals(np.zeros((0, 3)) if far else [source.position] if disc else source.positions),
             "source_power": _reals([source.power] if disc else source.powers),
             "cone_half_angle": _reals(source.angle / 2.0 if far else
-                                      np.degrees(covering_cone(source, scene.lens.half_size, scene.lens.z_in))),
+                                      np.degrees(covering_cone(source, scene.lens.half_size, scene.lens.z_in,
+                                                                   scene.lens.round))),
         }
         if far:
             return keys | {"source_angle": _reals(source.angle)}

@@ -3,7 +3,12 @@
 Notation
     u_a, v_b     grid lines on [0, 1], both ends included;  x_a = (2 u_a - 1) r_x,  y_b = (2 v_b - 1) r_y, mm
     z            heights z[a, b] at (x_a, y_b), mm, in the scene's coordinates
-    zx, zy       slopes dz/dx, dz/dy there
+    zx, zy, zxy  slopes dz/dx, dz/dy there, and d2z/dxdy, 1/mm
+    h            step of a triangulated grid, mm;  M_xx, M_xy, M_yy  bounds of the second derivatives, 1/mm
+
+A triangle with legs h along x and y leaves its surface by at most h^2 (M_xx + 2 M_xy + M_yy) / 8: by Taylor's formula the error
+at p is half the mean of (v - p)^T D2z (v - p) over the corners v, weighted by p's barycentric coordinates, and that mean of
+(v_x - p_x)^2 is at most h^2 / 4.
 
 Whoever reads such a grid lays a spline of their own through it.  That returns the designed surface only if every knot
 is a grid line: a not-a-knot bicubic through 4 steps a span gives a cubic lens back to rounding (1e-10 mm on a screen
@@ -12,6 +17,8 @@ is a grid line: a not-a-knot bicubic through 4 steps a span gives a cubic lens b
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,13 +40,14 @@ MAX_POINTS = 50_000_000
 
 @dataclass(frozen=True, eq=False)
 class SurfaceGrid:
-    """The surface on grid lines x (nx,), y (ny,) mm: z (nx, ny) mm, slopes zx, zy (nx, ny); all float64."""
+    """The surface on grid lines x (nx,), y (ny,) mm: z (nx, ny) mm, slopes zx, zy, twist zxy (nx, ny); all float64."""
 
     x: np.ndarray
     y: np.ndarray
     z: np.ndarray
     zx: np.ndarray
     zy: np.ndarray
+    zxy: np.ndarray
 
     @property
     def points(self) -> np.ndarray:
@@ -66,31 +74,80 @@ def sample_grid(field: HeightField, heights: Tensor, samples: tuple[int, int] | 
         InputError: fewer than 2 or more than `MAX_SAMPLES` samples along an axis, more than `MAX_POINTS` points, or
             heights that are not the field's.
     """
+    if samples is None:
+        return on_lines(field, heights, [_knot_lines(s, STEPS_PER_SPAN) for s in field.spaces])
+    counts = checks.pair("--samples", samples, lambda where, n: checks.whole(where, n, 2, MAX_SAMPLES))
+    return on_lines(field, heights, [torch.linspace(0.0, 1.0, n, dtype=torch.float64) for n in counts])
+
+
+def grid_within(field: HeightField, heights: Tensor, tolerance: float) -> SurfaceGrid:
+    """The same on equal steps in every knot span, so small that a triangulation is nowhere off by more than `tolerance` mm.
+
+    Raises:
+        InputError: that takes too many points.
+    """
+    h = step_within(field, heights, tolerance)
+    lines = [_knot_lines(s, (s.breaks.diff() * 2.0 * r / h).ceil().clamp(1, MAX_SAMPLES).long())
+             for s, r in zip(field.spaces, field.half_size, strict=True)]
+    return on_lines(field, heights, lines, f"--tolerance {tolerance:g}")
+
+
+def step_within(field: HeightField, heights: Tensor, tolerance: float) -> float:
+    """Largest step h, mm, of a triangulated grid with the knots among its lines that is off by at most `tolerance` mm."""
+    checks.number("--tolerance", tolerance, 0.0, open_low=True)
+    xx, xy, yy = second_derivative_bounds(field, heights)
+    bend = xx + 2.0 * xy + yy
+    return math.sqrt(8.0 * tolerance / bend) if bend > 0 else math.inf
+
+
+def second_derivative_bounds(field: HeightField, heights: Tensor) -> tuple[float, float, float]:
+    """Upper bounds of |z_xx|, |z_xy|, |z_yy| between knots, 1/mm, from the derivatives' control nets."""
+    (su, sv), (rx, ry), net = field.spaces, field.half_size, heights.detach().double().cpu()
+    u, v = _difference(net, su.knots, su.degree), _difference(net.T, sv.knots, sv.degree)
+    twist = _difference(u.T, sv.knots, sv.degree)
+    xx, yy = (_difference(d, s.knots[1:-1], s.degree - 1) for d, s in ((u, su), (v, sv)))
+    bounds = (xx, 4 * rx * rx), (twist, 4 * rx * ry), (yy, 4 * ry * ry)
+    return tuple(float(d.abs().max() / scale) if d.numel() else 0.0 for d, scale in bounds)
+
+
+def _difference(net: Tensor, knots: Tensor, p: int) -> Tensor:
+    """Control net (n - 1, k) of the derivative of a spline of degree p with control values (n, k), by its knots alone.
+
+    Where p knots coincide the derivative may jump; the jump itself is left out.
+    """
+    if p < 1:
+        return net[:0]
+    n = len(net)
+    step = (knots[p + 1 : p + n] - knots[1:n])[:, None]
+    return torch.where(step > 0, p * net.diff(dim=0) / step.clamp_min(1e-300), 0.0)
+
+
+def on_lines(field: HeightField, heights: Tensor, lines: Sequence[Tensor], asked: str = "--samples") -> SurfaceGrid:
+    """The surface on grid lines u (nx,), v (ny,) on [0, 1]; `asked`: what a refusal names.
+
+    Raises:
+        InputError: too many points, or heights that are not the field's.
+    """
     if tuple(heights.shape) != field.shape:
         raise InputError(f"control heights must have shape {field.shape}, got {tuple(heights.shape)}")
-    (su, sv), (rx, ry) = field.spaces, field.half_size
-    if samples is None:
-        u, v = _knot_lines(su), _knot_lines(sv)
-    else:
-        nx, ny = checks.pair("--samples", samples, lambda where, n: checks.whole(where, n, 2, MAX_SAMPLES))
-        u, v = (torch.linspace(0.0, 1.0, n, dtype=torch.float64) for n in (nx, ny))
+    (su, sv), (rx, ry), (u, v) = field.spaces, field.half_size, lines
     if max(len(u), len(v)) > MAX_SAMPLES or len(u) * len(v) > MAX_POINTS:
-        raise InputError(f"--samples must be at most {MAX_SAMPLES} along an axis and {MAX_POINTS:.0e} in all,"
+        raise InputError(f"{asked} must ask for at most {MAX_SAMPLES} points along an axis and {MAX_POINTS:.0e} in all,"
                          f" got {len(u)} x {len(v)}")
     net = heights.detach().to("cpu", torch.float64)
-    rows = _along(su, u, net)  # (nx, m)
-    z = _along(sv, v, rows.T).T
-    zx = _along(sv, v, _along(su, u, net, 1).T).T / (2.0 * rx)
-    zy = _along(sv, v, rows.T, 1).T / (2.0 * ry)
+    rows, slopes = _along(su, u, net), _along(su, u, net, 1) / (2.0 * rx)  # (nx, m)
+    z, zy = _along(sv, v, rows.T).T, _along(sv, v, rows.T, 1).T / (2.0 * ry)
+    zx, zxy = _along(sv, v, slopes.T).T, _along(sv, v, slopes.T, 1).T / (2.0 * ry)
     x, y = (2.0 * u - 1.0) * rx, (2.0 * v - 1.0) * ry
-    return SurfaceGrid(*(t.contiguous().numpy() for t in (x, y, z, zx, zy)))
+    return SurfaceGrid(*(t.contiguous().numpy() for t in (x, y, z, zx, zy, zxy)))
 
 
-def _knot_lines(space: SplineSpace) -> Tensor:
-    """Every distinct knot and the equal steps between them, ascending on [0, 1]: (steps (knots - 1) + 1,)."""
-    start, width = space.breaks[:-1, None], space.breaks.diff()[:, None]
-    step = torch.arange(STEPS_PER_SPAN, dtype=torch.float64) / STEPS_PER_SPAN
-    return torch.cat([(start + width * step).reshape(-1), space.breaks[-1:]])
+def _knot_lines(space: SplineSpace, steps: int | Tensor) -> Tensor:
+    """Every distinct knot and `steps` equal steps between them, the same number or one a span, ascending on [0, 1]."""
+    breaks = space.breaks.tolist()
+    counts = [steps] * (len(breaks) - 1) if isinstance(steps, int) else steps.tolist()
+    inner = [torch.arange(k, dtype=torch.float64) / k * (b - a) + a for a, b, k in zip(breaks, breaks[1:], counts, strict=False)]
+    return torch.cat([*inner, space.breaks[-1:]])
 
 
 def _along(space: SplineSpace, at: Tensor, net: Tensor, derivative: int = 0) -> Tensor:

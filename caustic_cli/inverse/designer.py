@@ -16,6 +16,7 @@ from torch import Tensor
 
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse.lbfgs import LBFGS
+from caustic_cli.inverse.limits import within_limits
 from caustic_cli.inverse.losses import NoLight, parse
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.parametrisation import INITIAL, NETWORKS, PRECONDITIONERS, Heights, parametrise
@@ -35,6 +36,7 @@ class Options:
     """How to look for the heights; the stages say with what.
 
     loss: weighted terms, see `losses`; max_slope: limit of the lens' slope, 0 for none;
+    min_radius: least radius of concave places, mm, 0 for any;
     optimizer, lr: lbfgs, or adam with its learning rate; network, initial, preconditioner:
     see `parametrisation`; filter_target: filter the target as the render is filtered; seed: of rays and networks;
     dtype: precision of the rays.
@@ -50,10 +52,12 @@ class Options:
     seed: int = 0
     dtype: torch.dtype = torch.float32
     max_slope: float = 0.0
+    min_radius: float = 0.0
 
     def __post_init__(self):
         parse(self.loss)
         checks.number("[design] max_slope", self.max_slope, 0.0)
+        checks.number("[design] min_radius", self.min_radius, 0.0)
         checks.choice("[design] network", self.network, NETWORKS)
         checks.choice("[design] initial", self.initial, INITIAL)
         checks.choice("[design] preconditioner", self.preconditioner, PRECONDITIONERS)
@@ -70,7 +74,8 @@ class State:
 
     stage, iteration: index of the stage and iterations done in it; total: iterations done in all; heights (n, m) mm
     float64, the lens so far; parameters, optimizer: tensors by name, empty when a stage has yet to begin; history:
-    rows (iteration, stage, loss, on_screen, seconds); seconds: spent so far; reason: why it ended, "" if it has not.
+    rows (iteration, stage, loss, on_screen, seconds); seconds: spent so far; reason: why it ended, "" if it has not; start
+    (n_0, m_0), the heights it began from, on the first stage's net.
     """
 
     heights: Tensor
@@ -82,6 +87,7 @@ class State:
     history: list[tuple[int, int, float, float, float]] = field(default_factory=list)
     seconds: float = 0.0
     reason: str = ""
+    start: Tensor | None = None
 
 
 class Designer:
@@ -114,7 +120,27 @@ class Designer:
     def begin(self, heights: Tensor | None = None) -> State:
         """A fresh state: the parametrisation's own beginning, or `heights` (n, m) mm on the first stage's net."""
         module = self._parametrise(0, heights)
-        return State(module().detach(), parameters=module.state_dict())
+        first = module().detach()
+        return State(first, parameters=module.state_dict(), start=first)
+
+    def begun(self, state: State) -> Tensor:
+        """The surface that the design began from, on the net of the stage it stands in (n, m), mm."""
+        tu, tv = (a.change_of_basis(b) for a, b in zip(self.field(0).spaces, self.field(state.stage).spaces, strict=True))
+        return tu @ state.start @ tv.T
+
+    def showing(self, state: State, heights: Tensor) -> State:
+        """A state whose lens is `heights`, although the optimiser stands elsewhere; `restored` undoes it."""
+        return replace(state, heights=heights, parameters=state.parameters or self._module(state).state_dict())
+
+    def restored(self, state: State) -> State:
+        """A saved state as the loop left it, see `showing`."""
+        return replace(state, heights=self._module(state)().detach()) if state.parameters else state
+
+    def _module(self, state: State) -> Heights:
+        module = self._parametrise(state.stage, state.heights if self.options.network == "none" else None)
+        if state.parameters:
+            module.load_state_dict(state.parameters)
+        return module
 
     def run(self, state: State, *, iterations: int = 0, time_limit: float = math.inf,
             stop: Callable[[], bool] = lambda: False, on_iteration: Callable[[State], None] = lambda s: None) -> State:
@@ -145,6 +171,15 @@ class Designer:
             state = self._next(state, k + 1)
         return state
 
+    def within_limits(self, state: State) -> Tensor:
+        """The state's heights, moved as little as the limits of slope and radius ask.
+
+        Raises:
+            CausticError: no surface near them obeys these.
+        """
+        return within_limits(self.field(state.stage), state.heights, self._bounds(self.stages[state.stage]),
+                             self.options.max_slope, self.options.min_radius)
+
     def _stage(self, state: State, k: int, limit: int, deadline: float, stop, on_iteration, origin: float) -> bool:
         """Iterate stage k in place.  True: the stage is done; False: the whole design ends here, for `state.reason`."""
         stage, final = self.stages[k], k == len(self.stages) - 1
@@ -164,9 +199,7 @@ class Designer:
                 state.reason = "time limit"
                 return not final
             if method is None:
-                heights = self._parametrise(k, state.heights if self.options.network == "none" else None)
-                if state.parameters:
-                    heights.load_state_dict(state.parameters)
+                heights = self._module(state)
                 method = (_Adam if self.options.optimizer == "adam" else _Newtonlike)(
                     self._objective(k), heights, self.options.lr)
                 if state.optimizer:
@@ -188,7 +221,7 @@ class Designer:
             scene = replace(scene, source=stage.source)
         rays = rays_of(scene, stage.sampler, stage.rays, stream(o.seed, f"stage {k}"), self.device)
         return Objective(scene, self.field(k), rays, stage.filter, self.target, o.loss, blur=stage.blur,
-                         filter_target=o.filter_target, apron=stage.apron, max_slope=o.max_slope,
+                         filter_target=o.filter_target, apron=stage.apron, max_slope=o.max_slope, min_radius=o.min_radius,
                          oversample=stage.oversample, dtype=o.dtype)
 
     def _next(self, state: State, k: int) -> State:

@@ -54,6 +54,8 @@ def first_surface(scene: Scene, target: np.ndarray, field: HeightField, cells: i
     mean, found = float(z.mean()), None
     for _ in range(1 if _parallel(scene) else PASSES):
         light, directions = _light(scene, x, y, z, shape)
+        if lens.round:
+            light = light * _part_within(x, y, half[0])
         found = start.surface(light, target, half, scene.screen.half_size, lens.bend, scene.screen.z, mean, directions,
                               centre=scene.screen.shift, start=None if found is None else found.transport.potential)
         z = found.heights
@@ -65,6 +67,13 @@ def first_surface(scene: Scene, target: np.ndarray, field: HeightField, cells: i
 
 def _parallel(scene: Scene) -> bool:
     return isinstance(scene.source, PlaneWave) or (isinstance(scene.source, Disc) and scene.source.angle is not None)
+
+
+def _part_within(x: np.ndarray, y: np.ndarray, radius: float, parts: int = 8) -> np.ndarray:
+    """Part of each cell between corners x, y that lies within a circle, from parts x parts points of it."""
+    fine = [np.linspace(c[0], c[-1], 2 * parts * (len(c) - 1) + 1)[1::2] for c in (x, y)]
+    inside = (fine[0][:, None] ** 2 + fine[1][None, :] ** 2 <= radius**2).astype(float)
+    return inside.reshape(len(x) - 1, parts, len(y) - 1, parts).mean((1, 3))
 
 
 def _light(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray, shape) -> tuple[np.ndarray, tuple | None]:
@@ -97,6 +106,7 @@ def _light(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray, shape) -> 
         power *= 1.0 - reflectance("exact", cosine, inside, 1.0 / n)
     if source.intensity == "lambertian":
         power *= cosine
-    power = np.where(q <= math.tan(min(covering_cone(source, lens.half_size, lens.z_in), 1.57079)) * (1 + 1e-9), power, 0.0)
+    cone = min(covering_cone(source, lens.half_size, lens.z_in, lens.round), 1.57079)
+    power = np.where(q <= math.tan(cone) * (1 + 1e-9), power, 0.0)
     light = 0.25 * (power[1:, 1:] + power[:-1, 1:] + power[1:, :-1] + power[:-1, :-1])
     return light, (sx * cosine / n, sy * cosine / n, inside)

@@ -109,13 +109,13 @@ class Loss:
         if name == "uniformity":
             inside = image[self.region]
             return inside.var(correction=0) / inside.mean().clamp_min(1e-300) ** 2
-        residual = (image / (total if name == "rms" else leaving) - self.target) * self.target.numel()
+        residual = image / (total if name == "rms" else leaving) - self.target
         if self.blur is not None:
             residual = self.blur[0] @ residual @ self.blur[1].T
         if name == "diffusion":
             padded = torch.nn.functional.pad(residual[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
             residual = padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:] - 4.0 * residual
-        return (residual * residual).mean()
+        return (residual * residual).sum() * self.target.numel()
 
 
 class ColorLoss:

@@ -48,14 +48,14 @@ class Objective:
         filter_target: filter the target as the render is filtered.
         apron: pixels by which the screen is widened on every side, dark in the target: light that has left the screen
             is seen there and pulled back.
-        max_slope: limit of the lens' slope, 0 for none.
+        max_slope: limit of the lens' slope, 0 for none; min_radius: least radius of concave places, mm, 0 for any.
         oversample: the filter works on pixels so many times smaller along each axis, which are then added up: a render that
             is nearly a bincount, and yet smooth in the heights.
         dtype: precision of the rays.
     """
 
     def __init__(self, scene: Scene, field: HeightField, sampler: Rays, filter: Filter, target: Tensor, loss: str, *,
-                 blur: float = 0.0, filter_target: bool = True, apron: int = 0, max_slope: float = 0.0,
+                 blur: float = 0.0, filter_target: bool = True, apron: int = 0, max_slope: float = 0.0, min_radius: float = 0.0,
                  oversample: int = 1, dtype: torch.dtype = torch.float32):
         self.device = sampler.device
         screen = scene.screen.grown((apron, apron))
@@ -68,9 +68,12 @@ class Objective:
             smooth = self._pool(torch.stack([filter.smooth(c) for c in fine]) if scene.colored else filter.smooth(fine))
         self.loss = (ColorLoss if scene.colored else Loss)(loss, smooth, blur, apron, wide > 0)
         minded = [(weight, name) for weight, name in parse(loss) if name in PENALTIES and weight > 0]
-        self.penalty = Penalty(scene, field, minded, max_slope, sampler.device)
+        self.penalty = Penalty(scene, field, minded, max_slope, sampler.device, min_radius)
         self.scene, self.field, self.sampler, self.dtype = scene, field, sampler, dtype
         self.kept = list(self._tracers()) if sampler.count <= KEPT_RAYS else None
+        # A kernel's graph holds the net or the surface at its rays, plain torch's every step on the way.
+        light = [getattr(t, "kernel", None) is not None for t in self.kept or ()]
+        self.whole = len(light) == 1 or (len(light) > 1 and all(light))
 
     def _pool(self, image: Tensor) -> Tensor:
         """Pixels of the screen from those of the render."""
@@ -85,16 +88,15 @@ class Objective:
 
         The loss sees rays through the image alone.  So the image is accumulated chunk by chunk, the loss gives its
         derivative by the image, and each chunk is traced again to pull that back: memory does not grow with rays.
-        A single chunk keeps its graph instead of being traced again.
+        Where there is little to keep, the graph is kept instead of tracing again.
         """
         heights = heights.detach().to(self.device).requires_grad_()
-        single = self.kept is not None and len(self.kept) == 1
         image, leaving, penalty = 0.0, 0.0, self.penalty(heights) if self.penalty else torch.zeros((), device=self.device)
-        with torch.set_grad_enabled(single):
+        with torch.set_grad_enabled(self.whole):
             for traced in self.kept or self._tracers():
                 part = traced.expose(heights, self.screen, self.filter)
                 image, leaving = image + self._pool(part.image).double(), leaving + part.leaving.double()
-        if single:
+        if self.whole:
             loss = self.loss(image, leaving, penalty)
             gradient = torch.autograd.grad(loss, heights)[0] if loss.requires_grad else torch.zeros_like(heights)
         else:

@@ -1,4 +1,4 @@
-"""What a design minds about the lens itself (thesis 6.4): bumps, and slopes beyond a limit.
+"""What a design minds about the lens itself (thesis 6.4): bumps, slopes beyond a limit, hollows too narrow for a tool.
 
 Notation
     d       departure of the surface from the offset, mm
@@ -7,6 +7,7 @@ Notation
     laplacian   root mean square of G (d_xx + d_yy): how much the lens magnifies unevenly
     curvature   root mean square of G sqrt(d_xx^2 + 2 d_xy^2 + d_yy^2): the bending energy of a thin plate
     slope       root mean square of 100 max(0, |grad z| / limit - 1)
+    radius      root mean square of 100 max(0, k r - 1), k the largest principal curvature, r the least concave radius
 
 Means are over the Greville abscissae of the control net.
 """
@@ -17,6 +18,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
+from caustic_cli.optics import curvature
 from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.scene import Scene
 
@@ -30,11 +32,14 @@ class Penalty:
         scene, field: the lens and the spline spaces of its heights.
         terms: (weight, name) of `losses.PENALTIES`.
         max_slope: limit of |grad z|, 0 for none.
+        min_radius: least radius of curvature of concave places, mm, 0 for any.
     """
 
     def __init__(self, scene: Scene, field: HeightField, terms: list[tuple[float, str]], max_slope: float = 0.0,
-                 device: str | torch.device = "cpu"):
-        self.terms, self.limit = terms, max_slope
+                 device: str | torch.device = "cpu", min_radius: float = 0.0):
+        self.terms, self.limit, self.radius = terms, max_slope, min_radius
+        if min_radius > 0 and min(s.degree for s in field.spaces) < 2:
+            raise InputError("[design] min_radius needs splines of degree 2 or more, which have a curvature")
         if terms and min(s.degree for s in field.spaces) < 2:
             raise InputError("[design] loss: laplacian and curvature need splines of degree 2 or more")
         (su, sv), (rx, ry) = field.spaces, field.half_size
@@ -46,7 +51,7 @@ class Penalty:
         self.gain = (scene.lens.bend - 1.0) * (scene.screen.z - offset.thickness)
 
     def __bool__(self) -> bool:
-        return bool(self.terms) or self.limit > 0
+        return bool(self.terms) or self.limit > 0 or self.radius > 0
 
     def __call__(self, heights: Tensor) -> Tensor:
         """Heights (n, m) mm -> sum of weighted squares, scalar."""
@@ -59,4 +64,7 @@ class Penalty:
             slope2 = (self.u[1] @ heights @ self.v[0]) ** 2 + (self.u[0] @ heights @ self.v[1]) ** 2
             excess = (slope2.clamp_min(1e-300).sqrt() / self.limit - 1.0).clamp_min(0.0)
             total = total + (STIFFNESS * excess).square().mean()
+        if self.radius > 0:
+            bent = curvature.largest(*(self.u[a] @ heights @ self.v[b] for a, b in curvature.ORDERS))
+            total = total + (STIFFNESS * (bent * self.radius - 1.0).clamp_min(0.0)).square().mean()
         return total

@@ -50,3 +50,8 @@ def target_on_screen(irradiance: np.ndarray, size: tuple[float, float], screen: 
     if not mean.sum() > 0:
         raise InputError("target is black all over: a picture with some light in it is needed")
     return np.ascontiguousarray(mean)
+
+
+def grey(image: np.ndarray) -> np.ndarray:
+    """(n_x, n_y) of an image, the colours of a coloured one (3, n_x, n_y) added up."""
+    return image if image.ndim == 2 else image.sum(0)

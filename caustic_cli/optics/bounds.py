@@ -78,7 +78,8 @@ def _incidence(scene: Scene) -> float:
         return math.radians(source.angle) / 2.0
     positions, extent = _places(source)
     far = np.hypot(*(np.abs(positions[:, k]) + extent[k] + lens.half_size[k] for k in (0, 1)))
-    return min(covering_cone(source, lens.half_size, lens.z_in), float(np.arctan2(far, lens.z_in - positions[:, 2]).max()))
+    steepest = float(np.arctan2(far, lens.z_in - positions[:, 2]).max())
+    return min(covering_cone(source, lens.half_size, lens.z_in, lens.round), steepest)
 
 
 def _places(source: Points | Disc) -> tuple[np.ndarray, tuple[float, float]]:
@@ -111,8 +112,11 @@ def _reach(scene: Scene, inside: float, lowest: float, top: float) -> float:
     drift = (top - lens.z_in) * math.tan(inside)
     if isinstance(source, Disc) and source.angle is not None:
         return 1.0 + drift / min(lens.half_size)
-    (positions, extent), cone = _places(source), covering_cone(source, lens.half_size, lens.z_in)
+    (positions, extent), cone = _places(source), covering_cone(source, lens.half_size, lens.z_in, lens.round)
     wide = (lens.z_in - positions[:, 2]) * math.tan(cone) if cone < math.pi / 2.0 else np.full(len(positions), math.inf)
+    if lens.round:
+        far = np.hypot(*(np.abs(positions[:, k]) + extent[k] for k in (0, 1))) + wide
+        return float((np.minimum(far, lens.half_size[0]) + drift).max()) / lens.half_size[0]
     return max(float(((np.minimum(np.abs(positions[:, k]) + extent[k] + wide, r) + drift) / r).max())
                for k, r in enumerate(lens.half_size))
 

@@ -13,7 +13,8 @@ class Bundle:
 
     share (N,): power each carries in, a part of what the source emits.  lost: what these rays' part of the source lost before
     the lens' inside, by name ("missed_lens", "fresnel"): with share it sums to the rays' part of the source.  field: unit vectors
-    (N,) of polarised light, see `polarisation`; None where that is not asked for.
+    (N,) of polarised light, see `polarisation`; None where that is not asked for.  radius: of a circular aperture, mm, beyond
+    which there is no surface; None where there is all of it.
     """
 
     x: Tensor
@@ -25,3 +26,4 @@ class Bundle:
     share: Tensor
     lost: dict[str, float]
     field: tuple[Tensor, Tensor, Tensor] | None = None
+    radius: float | None = None

@@ -33,14 +33,14 @@ def ghost(lens: Lens, field: HeightField, beam: Beam, heights: Tensor, reference
     down = d[2] < -PARALLEL
     back = torch.where(down, (lens.z_in - reference - o[2]) / torch.where(down, d[2], -torch.ones_like(d[2])), 0.0)
     x, y = o[0] + back * d[0], o[1] + back * d[1]
-    on = down & (x.abs() <= rx) & (y.abs() <= ry)
+    on = down & ((x * x + y * y <= rx * rx) if lens.round else (x.abs() <= rx) & (y.abs() <= ry))
     c = torch.where(on, -d[2], torch.ones_like(d[2]))
     outside = 1.0 - lens.index**2 * (1.0 - c * c)  # sin^2 by Snell's law at the flat entrance; below 0 it reflects all
     beyond = outside <= 0
     partly = reflectance(lens.fresnel, c, torch.where(beyond, torch.ones_like(outside), outside).sqrt(), lens.index)
     power = torch.where(on, power * torch.where(beyond, torch.ones_like(c), partly), 0.0)
     start = Bundle(x.detach().clamp(-rx, rx), y.detach().clamp(-ry, ry), lens.z_in, d[0].detach(), d[1].detach(),
-                   c.detach(), power.detach(), {})
+                   c.detach(), power.detach(), {}, radius=rx if lens.round else None)
     t, status = intersection.find(field, heights, start)
     on = on & (status == intersection.Status.HIT)
     t = torch.where(on, t, torch.zeros_like(t))

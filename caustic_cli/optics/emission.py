@@ -82,7 +82,7 @@ class Emission:
 
     def _near(self, index: Tensor, u: Tensor, v: Tensor, a: Tensor | None = None, b: Tensor | None = None) -> Bundle:
         source, lens = self.scene.source, self.scene.lens
-        (rx, ry), cone = lens.half_size, covering_cone(source, lens.half_size, lens.z_in)
+        (rx, ry), cone = lens.half_size, covering_cone(source, lens.half_size, lens.z_in, lens.round)
         per, (positions, powers) = self.shape[0] * self.shape[1], self._points
         which = index // per
         part = powers[which] / per  # emitted by each ray
@@ -96,6 +96,8 @@ class Emission:
             lows, highs = [lows[0] - ex, lows[1] - ey], [highs[0] + ex, highs[1] + ey]
             x0, y0 = x0 + ex * a.sqrt() * torch.cos(2 * math.pi * b), y0 + ey * a.sqrt() * torch.sin(2 * math.pi * b)
         within = (lows[0] >= -rx) & (highs[0] <= rx) & (lows[1] >= -ry) & (highs[1] <= ry)
+        if lens.round:
+            within &= torch.maximum(-lows[0], highs[0]) ** 2 + torch.maximum(-lows[1], highs[1]) ** 2 <= rx * rx
         from_cone = within if source.aimed else torch.ones_like(within)
 
         lambertian = source.intensity == "lambertian"
@@ -119,7 +121,7 @@ class Emission:
 
         sx, sy = torch.where(from_cone, cx, ax), torch.where(from_cone, cy, ay)
         x, y = x0 + h * sx, y0 + h * sy
-        on_lens = (x.abs() <= rx) & (y.abs() <= ry)
+        on_lens = (x * x + y * y <= rx * rx) if lens.round else (x.abs() <= rx) & (y.abs() <= ry)
         share = torch.where(on_lens, torch.where(from_cone, part, aimed), torch.zeros_like(part))
         x, y = x.clamp(-rx, rx), y.clamp(-ry, ry)
         sx, sy = (x - x0) / h, (y - y0) / h  # rays that miss the lens stay finite; they carry nothing
@@ -130,9 +132,10 @@ class Emission:
         (rx, ry), half = self.scene.lens.half_size, math.radians(self.scene.source.angle) / 2.0
         sine = a.sqrt() * math.sin(half)  # even over the projected solid angle: an evenly bright disc
         dx, dy = sine * torch.cos(2 * math.pi * b), sine * torch.sin(2 * math.pi * b)
-        share = torch.full_like(u, 1.0 / self.count)
-        return enter(self.scene, (2.0 * u - 1.0) * rx, (2.0 * v - 1.0) * ry, dx, dy, torch.sqrt(1.0 - dx * dx - dy * dy), share,
-                           len(u) / self.count)
+        share, x, y = torch.full_like(u, 1.0 / self.count), (2.0 * u - 1.0) * rx, (2.0 * v - 1.0) * ry
+        if self.scene.lens.round:  # even over the disc
+            x, y = rx * u.sqrt() * torch.cos(2 * math.pi * v), rx * u.sqrt() * torch.sin(2 * math.pi * v)
+        return enter(self.scene, x, y, dx, dy, torch.sqrt(1.0 - dx * dx - dy * dy), share, len(u) / self.count)
 
 
 def enter(scene: Scene, x: Tensor, y: Tensor, dx: Tensor, dy: Tensor, dz: Tensor, share: Tensor, emitted: float) -> Bundle:
@@ -152,7 +155,8 @@ def enter(scene: Scene, x: Tensor, y: Tensor, dx: Tensor, dy: Tensor, dz: Tensor
     else:
         reflected = reflectance(kind, dz, uz, 1.0 / n) * share
     arriving, lost = float(share.sum()), float(reflected.sum())
-    return Bundle(x, y, lens.z_in, ux, uy, uz, share - reflected, {"missed_lens": emitted - arriving, "fresnel": lost}, field)
+    return Bundle(x, y, lens.z_in, ux, uy, uz, share - reflected, {"missed_lens": emitted - arriving, "fresnel": lost}, field,
+                  lens.half_size[0] if lens.round else None)
 
 
 Rays = Sampler | Emission
@@ -163,7 +167,7 @@ def rays_of(scene: Scene, kind: str, rays: int, seed: int = 0, device: str | tor
     aspect = scene.lens.size[0] / scene.lens.size[1]
     if isinstance(scene.source, PlaneWave):
         profile = None if scene.source.profile is None else torch.from_numpy(scene.source.profile)
-        return Sampler.of_size(kind, rays, aspect, seed=seed, profile=profile, device=device)
+        return Sampler.of_size(kind, rays, aspect, seed=seed, profile=profile, device=device, round=scene.lens.round)
     points = len(scene.source.positions) if isinstance(scene.source, Points) else 1
     each = max(1, round(rays / points))
     nu = max(1, min(each, round(math.sqrt(each * aspect))))

@@ -95,7 +95,7 @@ def find(field: HeightField, heights: Tensor, bundle: Bundle, method: Method | N
         mesh = TriangleMesh(field, heights, *method.parts)
         start, missed, _ = mesh.intersect(b.x, b.y, torch.full_like(b.x, b.z), b.dx, b.dy, b.dz, method.recursive)
         if method.name == "mesh":
-            return torch.where(missed == 0, start, torch.zeros_like(start)), missed.long()
+            return torch.where(missed == 0, start, torch.zeros_like(start)), _within(missed.long(), start, b)
     if fused(b.x.device):
         from caustic_cli.optics.kernels.surface import FusedSurface, RayHits  # noqa: PLC0415
 
@@ -104,7 +104,16 @@ def find(field: HeightField, heights: Tensor, bundle: Bundle, method: Method | N
         return torch.from_numpy(hits.t), torch.from_numpy(hits.status).long()
     if start is not None:
         raise InputError("mesh+newton intersection runs on the CPU; use newton")
-    return reference(field, heights, bundle)
+    t, status = reference(field, heights, bundle)
+    return t, _within(status, t, b)
+
+
+def _within(status: Tensor, t: Tensor, b: Bundle) -> Tensor:
+    """`status` with hits beyond a circular aperture as what they are, rays that left by the side."""
+    if b.radius is None:
+        return status
+    beyond = (b.x + t * b.dx) ** 2 + (b.y + t * b.dy) ** 2 > b.radius**2
+    return torch.where(beyond & (status == Status.HIT), int(Status.MISSED), status)
 
 
 @torch.no_grad()

@@ -131,6 +131,7 @@ class Sampler:
         shape: cells (nu, nv) along u and v; nu * nv rays.
         seed: of the random kinds.
         profile: relative irradiance (a, b) over the aperture, constant per cell, or None (eq. 4.2.3).
+        round: light comes through the circle inscribed in the aperture alone.
         device: where the samples live.
     """
 
@@ -139,6 +140,7 @@ class Sampler:
     seed: int = 0
     profile: Tensor | None = None
     device: str | torch.device = "cpu"
+    round: bool = False
 
     def __post_init__(self):
         if self.kind not in SAMPLERS:
@@ -161,14 +163,14 @@ class Sampler:
 
     def chunks(self, size: int = 1 << 20) -> Iterator[Sample]:
         """The rays in order, at most about `size` at a time; shares over all chunks sum to 1."""
-        norm = 1.0 / self.count
-        if self.profile is not None:
+        norm, even = 1.0 / self.count, self.profile is None and not self.round
+        if not even:
             total = sum(float(self._irradiance(s).sum()) for s in self._points(size))
             if not total > 0:
                 raise InputError("[source] profile: every ray fell where it is black; use more rays")
             norm = 1.0 / total
         for s in self._points(size):
-            share = norm * self._irradiance(s) if self.profile is not None else torch.tensor(norm, dtype=torch.float64)
+            share = torch.tensor(norm, dtype=torch.float64) if even else norm * self._irradiance(s)
             yield Sample(s.u, s.v, s.tensor, share.to(self.device))
 
     def _points(self, size: int) -> Iterator[Sample]:
@@ -188,6 +190,13 @@ class Sampler:
             yield Sample(*numbers(self.kind, self.shape, self.seed, 2, a, min(a + size, self.count), self.device), False, one)
 
     def _irradiance(self, s: Sample) -> Tensor:
+        if self.round:
+            across, along = (2.0 * s.u - 1.0) ** 2, (2.0 * s.v - 1.0) ** 2
+            within = ((across[:, None] + along[None, :] if s.tensor else across + along) <= 1.0).double()
+            return within if self.profile is None else within * self._profile(s)
+        return self._profile(s)
+
+    def _profile(self, s: Sample) -> Tensor:
         profile = self.profile.to(self.device, torch.float64)
         a = (s.u * profile.shape[0]).long().clamp_max(profile.shape[0] - 1)
         b = (s.v * profile.shape[1]).long().clamp_max(profile.shape[1] - 1)

@@ -20,6 +20,8 @@ from caustic_cli.scene import checks
 #: Most control points along one axis: beyond it the dense basis matrices alone fill a workstation's memory.
 MAX_CONTROL = 4096
 FRESNEL = ("none", "schlick", "exact")
+#: circle: the largest that fits into the size; the spline goes on beyond it, but light and glass do not.
+APERTURES = ("rectangle", "circle")
 
 
 @dataclass(frozen=True)
@@ -95,6 +97,8 @@ class Lens:
         absorption: absorption coefficient a of the glass, 1/mm: exp(-a t) passes t mm (Beer-Lambert).
         roughness: standard deviation, along either axis, of the slopes of the exit's microfacets about the surface's own.
         glass: a name of `materials`, whose index changes with the wavelength; None for `index` at every wavelength.
+        aperture: one of APERTURES.
+        border: width of a dark rim around the aperture, which the exported solid has for its mount, mm.
         mirror: the surface reflects, the light comes through air, and `index`, `fresnel` and `absorption` mean nothing.
     """
 
@@ -112,6 +116,8 @@ class Lens:
     roughness: float = 0.0
     glass: str | None = None
     mirror: bool = False
+    aperture: str = "rectangle"
+    border: float = 0.0
 
     def __post_init__(self):
         checks.pair("[lens] size", self.size, lambda w, x: checks.number(w, x, 1e-6, 1e6))
@@ -131,11 +137,21 @@ class Lens:
         checks.choice("[lens] fresnel", self.fresnel, FRESNEL)
         checks.number("[lens] absorption", self.absorption, 0.0, 1e6)
         checks.number("[lens] roughness", self.roughness, 0.0, 1.0)
+        checks.choice("[lens] aperture", self.aperture, APERTURES)
+        checks.number("[lens] border", self.border, 0.0, 1e6)
+        if self.round and self.size[0] != self.size[1]:
+            raise InputError("[lens] size of a circular aperture must be its diameter, twice the same,"
+                             f" got {self.size[0]:g} x {self.size[1]:g}")
 
     @property
     def half_size(self) -> tuple[float, float]:
         """(r_x, r_y) mm."""
         return self.size[0] / 2.0, self.size[1] / 2.0
+
+    @property
+    def round(self) -> bool:
+        """Whether the aperture is a circle."""
+        return self.aperture == "circle"
 
     @property
     def inside(self) -> float:

@@ -167,14 +167,15 @@ def blur_limit(source: Source, z_in: float, throw: float) -> float:
     return 0.0
 
 
-def covering_cone(source: Points | Disc, half_size: tuple[float, float], z_in: float) -> float:
-    """Half-angle of the source's cone, rad: what it says, or the least that covers the aperture from all of the source."""
+def covering_cone(source: Points | Disc, half_size: tuple[float, float], z_in: float, round: bool = False) -> float:
+    """Half-angle of the source's cone, rad: what it says, or the least that covers the aperture, `round` or not, from all of it."""
     if source.cone is not None:
         return math.radians(source.cone)
     points = np.array(source.positions if isinstance(source, Points) else [source.position])
     extent = (0.0, 0.0) if isinstance(source, Points) else source.size
-    across = [np.abs(points[:, k]) + extent[k] / 2.0 + half_size[k] for k in (0, 1)]
-    return min((1.0 + SLACK) * float(np.arctan2(np.hypot(*across), z_in - points[:, 2]).max()), math.pi / 2.0)
+    across = [np.abs(points[:, k]) + extent[k] / 2.0 + (0.0 if round else half_size[k]) for k in (0, 1)]
+    farthest = np.hypot(*across) + (half_size[0] if round else 0.0)
+    return min((1.0 + SLACK) * float(np.arctan2(farthest, z_in - points[:, 2]).max()), math.pi / 2.0)
 
 
 def _triple(where: str, value) -> tuple[float, float, float]:

@@ -100,7 +100,7 @@ def judge(exposure: Exposure, target) -> dict:
 
     Args:
         exposure: a traced image; eq. 5.2.1 asks for bincount reconstruction.
-        target: (n_x, n_y), any scale.
+        target: (n_x, n_y), any scale, or None where there is none: what compares with it is None then.
 
     Returns:
         loss, relative_rms, psnr_db, ssim (None where undefined), on_screen, on_target, lost (name -> part of the
@@ -109,18 +109,16 @@ def judge(exposure: Exposure, target) -> dict:
     Of a coloured image, (3, n_x, n_y) like its target, the first four are means over the colours that the target has.
     """
     image = exposure.image
-    if image.ndim == 3:
+    if image.ndim == 3 and target is not None:
         parts = [judge(replace(exposure, image=i), t) for i, t in zip(image, target, strict=True) if t.sum() > 0]
         means = {k: None if None in (v := [p[k] for p in parts]) else math.fsum(v) / len(v) for k in _FIGURES}
         sums = {k: math.fsum(p[k] for p in parts) for k in ("on_screen", "on_target")}
         return means | sums | {k: parts[0][k] for k in ("lost", "rays")}
+    against = (loss, relative_rms, psnr_db, ssim)
     return {
-        "loss": loss(image, target),
-        "relative_rms": relative_rms(image, target),
-        "psnr_db": psnr_db(image, target),
-        "ssim": ssim(image, target),
+        **{figure.__name__: None if target is None else figure(image, target) for figure in against},
         "on_screen": float(_array(image).sum()),
-        "on_target": on_target(image, target),
+        "on_target": None if target is None else on_target(image, target),
         "lost": {name: float(value) for name, value in exposure.lost.items()},
         "rays": int(exposure.rays),
     }

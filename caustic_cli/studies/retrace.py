@@ -78,7 +78,7 @@ def converge(scene: Scene, field: HeightField, heights: Tensor, tolerance: float
                                f" error of {error:.2g}; fewer pixels or a larger tolerance need fewer")
 
 
-def retrace(scene: Scene, field: HeightField, heights: Tensor, target: np.ndarray, *, rays: int, seed: int = 0,
+def retrace(scene: Scene, field: HeightField, heights: Tensor, target: np.ndarray | None, *, rays: int, seed: int = 0,
             filter: Filter | None = None, screen: Screen | None = None, device: str = "cpu",
             dtype: torch.dtype = torch.float64, tolerance: float | None = None,
             steps: Steps = SEQUENTIAL) -> tuple[Exposure, dict]:
@@ -102,6 +102,8 @@ def retrace(scene: Scene, field: HeightField, heights: Tensor, target: np.ndarra
                   steps=steps), figures
 
 
-def white_level(image: np.ndarray, target: np.ndarray) -> float:
-    """The irradiance drawn white: the target's maximum at the image's power, so both are exposed alike."""
+def white_level(image: np.ndarray, target: np.ndarray | None) -> float:
+    """The irradiance drawn white: the target's maximum at the image's power, so both are exposed alike; without one the image's."""
+    if target is None:
+        return float(image.max()) or 1.0
     return float(target.max() / target.sum() * image.sum())

@@ -20,9 +20,9 @@ from caustic_cli.optics.tolerances import CRITICAL
 
 NONE, SCHLICK, EXACT = 0, 1, 2
 # Rows of a block's scratch of vectors: the surface, powers, landing points, derivatives, what turns the results of `shares`
-# into shares; five more for its own use.
+# into shares, the rays' points and powers; five more for its own use.
 SAG, GX, GY, POWER, PX, PY, PHI, BY_POWER, BY_PX, BY_PY, BY_A, T_SAG, T_GX, T_GY, T_POWER, REACH = range(16)
-OVER_X, OVER_Y, LEAN_X, LEAN_Y, VECTORS = range(16, 21)
+OVER_X, OVER_Y, LEAN_X, LEAN_Y, X, Y, SHARE, VECTORS = range(16, 24)
 SCRATCH = 5
 
 
@@ -60,6 +60,16 @@ def _reflected(fresnel, a, n):
         x4 = x * x * x * x
         return r0 + (1.0 - r0) * x4 * x, -5.0 * (1.0 - r0) * x4 * (ds - 0.5 * s / (1.0 + a)) * inverse
     return 0.0, 0.0
+
+
+@njit(**OPTIONS)
+def load(row, out):
+    """A row that may be one value repeated, as a vector: of anything but consecutive numbers the loops make no vectors."""
+    if row.strides[0] == 0:
+        out[:] = row[0]
+        return
+    for j in range(len(out)):
+        out[j] = row[j]
 
 
 @njit(**OPTIONS)
@@ -120,18 +130,18 @@ def _by_sag(reach, sag, gx, gy, by_px, by_py, height, out):
 
 
 @njit(**OPTIONS)
-def pull(vectors, share, real, whole):
+def pull(vectors, real, whole):
     """Derivatives by the surface, left in T_SAG, T_GX, T_GY, from those by power and pixel coordinates."""
     n, height, v = real[0], real[1], vectors
     inside = real[8]
-    _by_a(whole[0], v[SAG], v[GX], v[GY], share, v[BY_POWER], v[BY_PX], v[BY_PY], n, height, inside, v[BY_A])
+    _by_a(whole[0], v[SAG], v[GX], v[GY], v[SHARE], v[BY_POWER], v[BY_PX], v[BY_PY], n, height, inside, v[BY_A])
     _by_slope(v[REACH], v[GX], v[BY_PX], v[BY_A], v[T_GX])
     _by_slope(v[REACH], v[GY], v[BY_PY], v[BY_A], v[T_GY])
     _by_sag(v[REACH], v[SAG], v[GX], v[GY], v[BY_PX], v[BY_PY], height, v[T_SAG])
 
 
 @njit(**OPTIONS)
-def push(vectors, share, real, whole):
+def push(vectors, real, whole):
     """Tangents of power and pixel coordinates, left in T_POWER, BY_PX, BY_PY, along T_SAG, T_GX, T_GY."""
     n, height, v = real[0], real[1], vectors
     inside = real[8]
@@ -142,6 +152,6 @@ def push(vectors, share, real, whole):
         _, dr = _reflected(whole[0], a, n)
         h = height - v[SAG, j]
         change = -v[T_SAG, j] * m + h * dm * da
-        v[T_POWER, j] = -share[j] * inside * dr * da
+        v[T_POWER, j] = -v[SHARE, j] * inside * dr * da
         v[BY_PX, j] = (change * gx + h * m * tx) / real[4]
         v[BY_PY, j] = (change * gy + h * m * ty) / real[5]

@@ -14,6 +14,7 @@ from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.bundle import Bundle
 from caustic_cli.optics.interface import reflectance
 from caustic_cli.optics.kernels import bend, blocks, plane, points, shares
+from caustic_cli.optics.kernels.banded import AlongV
 from caustic_cli.optics.kernels.surface import FusedSurface, RayHits, scattered_surface
 from caustic_cli.optics.reconstruction import Filter, padding
 from caustic_cli.scene import Lens, Screen
@@ -63,7 +64,7 @@ class PlaneKernel:
             if like is not None and like.v is v:
                 self.along_v = like.along_v
             else:
-                self.along_v = tuple(m.to(dtype).T.contiguous() for m in (sv.matrix(v), sv.matrix(v, 1) / (2.0 * ry)))
+                self.along_v = AlongV(sv, v, 1.0 / (2.0 * ry), dtype)
             x, y, shape = u[:, None], v[None, :], (len(u), len(v))
         else:
             columns = min(ROW, len(u))
@@ -85,7 +86,7 @@ class PlaneKernel:
     def __call__(self, sag: Tensor, lens: Lens, height: float, screen: Screen, filter: Filter):
         """Control heights (n, m) relative to some plane, mm, and the screen's height above it, mm: see `_splat`."""
         if self.tensor:
-            net, net_y = (sag.to(self.dtype) @ m for m in self.along_v)  # (n, m_v)
+            net, net_y = self.along_v(sag.to(self.dtype))  # (n, m_v)
             nets = (net, net, net_y)
         else:
             nets = [t.view(self.shape) for t in scattered_surface(self.surface, sag, *self.points, self.dtype)]
@@ -141,6 +142,7 @@ def _splat(nets, rows, apart: bool, rays, lens: Lens, height: float, start, scre
     arguments = (*rays, np.array(real, np.float64), np.array(whole, np.int64))
     padded, leaving, ledger = _Image.apply(*nets, rows, apart, arguments, workspace)
     (nx, ny), (rx, ry) = screen.resolution, filter.reach
+    padded = padded[:, : ny + 4 * ry]  # beyond lies what rounds the scatter's steps up to four pixels
     image = padded[2 * rx : 2 * rx + nx, 2 * ry : 2 * ry + ny]
     lost = {"missed_surface": ledger[plane.MISSED]} if slanted else {}
     return image, leaving, lost | {"fresnel": ledger[plane.FRESNEL], "total_internal_reflection": ledger[plane.REFLECTED],
@@ -218,8 +220,9 @@ class _Image(torch.autograd.Function):
 def _images(arguments: tuple, workspace: _Workspace) -> tuple[np.ndarray, np.ndarray]:
     """Images and scratch of all blocks, to be overwritten."""
     x, whole, count = arguments[0], arguments[-1], blocks()
-    padded = (int(n + 2 * (v - 1)) for n, v in zip(whole[1:3], whole[4:6], strict=True))
-    return workspace("images", count, *padded), workspace("scratch", count, int(plane.scratch_rows(whole)), x.shape[1])
+    nx, ny = (int(n + 2 * (v - 1)) for n, v in zip(whole[1:3], whole[4:6], strict=True))
+    images = workspace("images", count, nx, ny + int(-whole[5] % 4))
+    return images, workspace("scratch", count, int(plane.scratch_rows(whole)), x.shape[1])
 
 
 def _arrays(*tensors: Tensor) -> list[np.ndarray]:

@@ -5,8 +5,8 @@ between rows; both are the reference it is tested against.  Storage is float32 o
 float64.
 
 Each of a fixed number of blocks of rows has an image of its own and they are added in order, so the result does not depend
-on timing, only on the number of blocks (the number of threads).  Only the scatter and the gather of pixels go ray by ray; the
-rest (`bend`, `shares`) goes a row at a time in vector instructions.
+on timing, only on the number of blocks (the number of threads).  Only the scatter and the gather of pixels go ray by ray,
+four pixels at a time; the rest (`rows`, `bend`, `shares`) goes a row at a time in vector instructions.
 """
 
 from __future__ import annotations
@@ -34,18 +34,23 @@ from caustic_cli.optics.kernels.bend import (
     REACH,
     SAG,
     SCRATCH,
+    SHARE,
     T_GX,
     T_GY,
     T_POWER,
     T_SAG,
     VECTORS,
+    X,
+    Y,
     fraction,
     landing,
+    load,
     powers,
     pull,
     push,
     reach,
 )
+from caustic_cli.optics.kernels.rows import combine, spread
 from caustic_cli.optics.kernels.shares import OPTIONS, shares
 
 FRESNEL, REFLECTED, OFF_SCREEN, LEAVING, MISSED, COLUMNS = range(6)  # of the ledger
@@ -57,14 +62,17 @@ def _aim(vectors, x, y, along_x, along_y, share, real, whole, sx, sy, dx, dy, sl
     """Powers, landing points and shares of one row, from its surface in `vectors`."""
     n, height, fresnel, kind = real[0], real[1], whole[0], whole[3]
     v, scratch = vectors, vectors[VECTORS:]
+    load(share, v[SHARE])
+    load(x, v[X])
+    load(y, v[Y])
     if whole[6]:
         v[REACH] = v[SAG]
-        slant.aim(v, x, y, along_x, along_y, share, real, fresnel)
+        slant.aim(v, along_x, along_y, real, fresnel)
     else:
-        powers(fresnel, v[GX], v[GY], share, n, real[8], v[POWER])
+        powers(fresnel, v[GX], v[GY], v[SHARE], n, real[8], v[POWER])
         reach(v[SAG], v[GX], v[GY], n, height, v[REACH])
-        landing(v[REACH], v[GX], x, real[2], real[4], v[PX])
-        landing(v[REACH], v[GY], y, real[3], real[5], v[PY])
+        landing(v[REACH], v[GX], v[X], real[2], real[4], v[PX])
+        landing(v[REACH], v[GY], v[Y], real[3], real[5], v[PY])
     if whole[4] > 1:
         fraction(v[PX], v[PHI])
     shares(kind, whole[4], real[6], v[PHI], sx, dx, v[OVER_X], v[LEAN_X], scratch, sloping)
@@ -74,13 +82,13 @@ def _aim(vectors, x, y, along_x, along_y, share, real, whole, sx, sy, dx, dy, sl
 
 
 @njit(**OPTIONS)
-def _scatter(vectors, share, real, whole, sx, sy, image, ledger, column):
+def _scatter(vectors, real, whole, sx, sy, image, ledger, column):
     """Add one row's rays to the padded image and the ledger.  column: (longest v,) scratch."""
     # Everything the loop needs is a local: after a store to the image the compiler would have to read an array again.
     passed, vx, vy, height = real[8], whole[4], whole[5], real[1]
     rx, ry = (vx - 1) // 2, (vy - 1) // 2
     low_x, low_y, high_x, high_y = float(-rx), float(-ry), float(whole[1] + rx), float(whole[2] + ry)
-    sag, power, px, py = vectors[SAG], vectors[POWER], vectors[PX], vectors[PY]
+    sag, share, power, px, py = vectors[SAG], vectors[SHARE], vectors[POWER], vectors[PX], vectors[PY]
     over_x, over_y = vectors[OVER_X], vectors[OVER_Y]
     lost_fresnel, lost_reflected, lost_off, lost_missed, leaving = 0.0, 0.0, 0.0, 0.0, 0.0
     for j in range(len(power)):
@@ -112,10 +120,19 @@ def _scatter(vectors, share, real, whole, sx, sy, image, ledger, column):
             continue
         for b in range(vy):
             column[b] = weight * sy[b, j]
+        i = UINT(i0)
         for a in range(vx):
-            part, row = sx[a, j], image[i0 + a, j0 : j0 + vy]
-            for b in range(vy):
-                row[b] += part * column[b]
+            part, k = sx[a, j], UINT(j0)
+            for b in range(0, len(column), 4):
+                b = UINT(b)
+                c0, c1, c2, c3 = column[b], column[b + ONE], column[b + TWO], column[b + UINT(3)]
+                p0, p1, p2, p3 = image[i, k], image[i, k + ONE], image[i, k + TWO], image[i, k + UINT(3)]
+                image[i, k] = p0 + part * c0
+                image[i, k + ONE] = p1 + part * c1
+                image[i, k + TWO] = p2 + part * c2
+                image[i, k + UINT(3)] = p3 + part * c3
+                k += UINT(4)
+            i += ONE
     ledger[FRESNEL] += lost_fresnel
     ledger[REFLECTED] += lost_reflected
     ledger[OFF_SCREEN] += lost_off
@@ -151,11 +168,24 @@ def _gather(vectors, real, whole, sx, sy, dx, dy, grad, grad_leaving, column, ti
             else:
                 for b in range(vy):
                     column[b], tilt[b] = sy[b, j], dy[b, j]
+                i = UINT(i0)
                 for a in range(vx):
-                    along, across, row = 0.0, 0.0, grad[i0 + a, j0 : j0 + vy]
-                    for b in range(vy):
-                        along += row[b] * column[b]
-                        across += row[b] * tilt[b]
+                    k = UINT(j0)
+                    a0, a1, a2, a3, t0, t1, t2, t3 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+                    for b in range(0, len(column), 4):
+                        b = UINT(b)
+                        g0, g1, g2, g3 = grad[i, k], grad[i, k + ONE], grad[i, k + TWO], grad[i, k + UINT(3)]
+                        a0 += g0 * column[b]
+                        a1 += g1 * column[b + ONE]
+                        a2 += g2 * column[b + TWO]
+                        a3 += g3 * column[b + UINT(3)]
+                        t0 += g0 * tilt[b]
+                        t1 += g1 * tilt[b + ONE]
+                        t2 += g2 * tilt[b + TWO]
+                        t3 += g3 * tilt[b + UINT(3)]
+                        k += UINT(4)
+                    i += ONE
+                    along, across = (a0 + a2) + (a1 + a3), (t0 + t2) + (t1 + t3)
                     value += sx[a, j] * along
                     along_x += dx[a, j] * along
                     along_y += sx[a, j] * across
@@ -189,49 +219,6 @@ def _scatter_tangent(vectors, real, whole, sx, sy, dx, dy, image):
             for b in range(vy):
                 image[i0 + a, j0 + b] += along * sy[b, j] + across * dy[b, j]
     return leaving
-
-
-@njit(**OPTIONS)
-def _add(weight, row, out):
-    for j in range(len(out)):
-        out[j] += weight * row[j]
-
-
-@njit(**OPTIONS)
-def _weighted(weights, net, first, out):
-    """Weighted sum of consecutive rows of a net, three at a time: a pass over `out` costs as much as the products."""
-    out[:] = 0.0
-    a, count = 0, len(weights)
-    while a + 2 < count:
-        p, q, r = net[first + a], net[first + a + 1], net[first + a + 2]
-        for j in range(len(out)):
-            out[j] += weights[a] * p[j] + weights[a + 1] * q[j] + weights[a + 2] * r[j]
-        a += 3
-    while a < count:
-        _add(weights[a], net[first + a], out)
-        a += 1
-
-
-@njit(**OPTIONS)
-def _combine(i, first, bu, du, net, net_x, net_y, sag, gx, gy):
-    """Row i of the surface from the nets already contracted along v: sag, dz/dx, dz/dy (b,)."""
-    _weighted(bu[i], net, first[i], sag)
-    _weighted(du[i], net_x, first[i], gx)
-    _weighted(bu[i], net_y, first[i], gy)
-
-
-@njit(**OPTIONS)
-def _spread(i, first, bu, du, by_sag, by_gx, by_gy, nets, apart):
-    """Adjoint of `_combine`: add the derivatives by row i to those by the nets (3, n, b)."""
-    for a in range(bu.shape[1]):
-        if apart:
-            _add(bu[i, a], by_sag, nets[0, first[i] + a])
-            _add(du[i, a], by_gx, nets[1, first[i] + a])
-        else:
-            value, slope, out = bu[i, a], du[i, a], nets[0, first[i] + a]
-            for j in range(len(out)):
-                out[j] += value * by_sag[j] + slope * by_gx[j]
-        _add(bu[i, a], by_gy, nets[2, first[i] + a])
 
 
 @njit(parallel=True, **OPTIONS)
@@ -281,11 +268,11 @@ def forward(images, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, al
     for block in prange(blocks):
         images[block] = 0.0
         v, sx, sy, _, _ = _cut(scratch[block], vx, vy)
-        column = np.empty(max(vx, vy))
+        column = np.zeros(vy + -vy % 4)
         for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-            _combine(i, first, bu, du, net, net_x, net_y, v[SAG], v[GX], v[GY])
+            combine(i, first, bu, du, net, net_x, net_y, v[SAG], v[GX], v[GY])
             _aim(v, x[i], y[i], along_x[i], along_y[i], share[i], real, whole, sx, sy, sx, sy, False)
-            _scatter(v, share[i], real, whole, sx, sy, images[block], ledgers[block], column)
+            _scatter(v, real, whole, sx, sy, images[block], ledgers[block], column)
     ledger = np.zeros(COLUMNS)
     for block in range(blocks):
         ledger += ledgers[block]
@@ -310,16 +297,16 @@ def backward(grad, grad_leaving, apart, nets, scratch, first, bu, du, net, net_x
         if not apart:
             nets[:, block] = 0.0
         v, sx, sy, dx, dy = _cut(scratch[block], vx, vy)
-        column, tilt = np.empty(max(vx, vy)), np.empty(max(vx, vy))
+        column, tilt = np.zeros(vy + -vy % 4), np.zeros(vy + -vy % 4)
         for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-            _combine(i, first, bu, du, net, net_x, net_y, v[SAG], v[GX], v[GY])
+            combine(i, first, bu, du, net, net_x, net_y, v[SAG], v[GX], v[GY])
             _aim(v, x[i], y[i], along_x[i], along_y[i], share[i], real, whole, sx, sy, dx, dy, True)
             _gather(v, real, whole, sx, sy, dx, dy, grad, grad_leaving, column, tilt)
             if whole[6]:
-                slant.pull(v, along_x[i], along_y[i], share[i], real, whole[0])
+                slant.pull(v, along_x[i], along_y[i], real, whole[0])
             else:
-                pull(v, share[i], real, whole)
-            _spread(i, first, bu, du, v[T_SAG], v[T_GX], v[T_GY], nets[:, np.int64(0) if apart else np.int64(block)],
+                pull(v, real, whole)
+            spread(i, first, bu, du, v[T_SAG], v[T_GX], v[T_GY], nets[:, np.int64(0) if apart else np.int64(block)],
                     apart)
     return _total(nets[0]), _total(nets[1]), _total(nets[2])
 
@@ -334,12 +321,12 @@ def tangent(t_net, t_net_x, t_net_y, images, scratch, first, bu, du, net, net_x,
         images[block] = 0.0
         v, sx, sy, dx, dy = _cut(scratch[block], vx, vy)
         for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-            _combine(i, first, bu, du, net, net_x, net_y, v[SAG], v[GX], v[GY])
-            _combine(i, first, bu, du, t_net, t_net_x, t_net_y, v[T_SAG], v[T_GX], v[T_GY])
+            combine(i, first, bu, du, net, net_x, net_y, v[SAG], v[GX], v[GY])
+            combine(i, first, bu, du, t_net, t_net_x, t_net_y, v[T_SAG], v[T_GX], v[T_GY])
             _aim(v, x[i], y[i], along_x[i], along_y[i], share[i], real, whole, sx, sy, dx, dy, True)
             if whole[6]:
-                slant.push(v, along_x[i], along_y[i], share[i], real, whole[0])
+                slant.push(v, along_x[i], along_y[i], real, whole[0])
             else:
-                push(v, share[i], real, whole)
+                push(v, real, whole)
             leaving[block] += _scatter_tangent(v, real, whole, sx, sy, dx, dy, images[block])
     return _total(images), leaving.sum()

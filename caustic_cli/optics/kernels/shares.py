@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
+from numba import config, njit
 
 BINCOUNT, GAUSSIAN, COSINE = 0, 1, 2
 #: Below this alpha (v/2)^2 the Gaussian's shares come from Taylor series, without cancellation.
@@ -21,6 +21,8 @@ TINY = 1e-3  # and below this from shorter ones
 #: Up to this alpha exp(-2 alpha q) stays within the reach of `_exp` and the recursion over pixels; above, plain exponentials.
 MODERATE = 2.0
 
+# Off by default in numba: it turns `plane`'s steps of four neighbouring pixels into vector instructions.
+config.SLP_VECTORIZE = 1
 OPTIONS = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
 
 

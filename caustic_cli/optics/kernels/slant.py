@@ -8,7 +8,7 @@ Notation, a ray with unit direction d inside the lens, slopes g at the hit, N = 
     R       reflectance of the exit surface
     q       (h - sag) / t_z, length of the path to the screen
 
-Rows of the vectors, before: REACH, the distance along the ray to its hit (mm; -1 for none), GX, GY.
+Rows of the vectors, before: REACH, the distance along the ray to its hit (mm; -1 for none), GX, GY, X, Y, SHARE.
 """
 
 from __future__ import annotations
@@ -30,10 +30,13 @@ from caustic_cli.optics.kernels.bend import (
     REACH,
     SAG,
     SCHLICK,
+    SHARE,
     T_GX,
     T_GY,
     T_POWER,
     T_SAG,
+    X,
+    Y,
 )
 from caustic_cli.optics.kernels.shares import OPTIONS
 from caustic_cli.optics.tolerances import CRITICAL, PARALLEL
@@ -71,11 +74,11 @@ def _reflected(fresnel, c, s, norm2, n):
 
 
 @njit(**OPTIONS)
-def aim(v, x, y, dx, dy, share, real, fresnel):
+def aim(v, dx, dy, real, fresnel):
     """Heights of the hits above the reference, powers and landing points in pixels."""
     n, height, start = real[0], real[1], real[9]
     over_x, over_y = 1.0 / real[4], 1.0 / real[5]
-    for j in range(len(share)):
+    for j in range(v.shape[1]):
         t, gx, gy = v[REACH, j], v[GX, j], v[GY, j]
         dz, norm2, c, s, passes = _refract(dx[j], dy[j], gx, gy, n)
         reflected, _, _, _ = _reflected(fresnel, c, s, norm2, n)
@@ -84,24 +87,24 @@ def aim(v, x, y, dx, dy, share, real, fresnel):
         sag = start + t * dz
         path = (height - sag) / down
         v[SAG, j] = sag if down > PARALLEL else height  # never arrives
-        power = share[j] * (1.0 - reflected) if passes else REFLECTED_POWER
+        power = v[SHARE, j] * (1.0 - reflected) if passes else REFLECTED_POWER
         v[POWER, j] = power if t >= 0.0 else MISSED_POWER
-        v[PX, j] = (x[j] + t * dx[j] + path * (n * dx[j] - gamma * gx) + real[2]) * over_x
-        v[PY, j] = (y[j] + t * dy[j] + path * (n * dy[j] - gamma * gy) + real[3]) * over_y
+        v[PX, j] = (v[X, j] + t * dx[j] + path * (n * dx[j] - gamma * gx) + real[2]) * over_x
+        v[PY, j] = (v[Y, j] + t * dy[j] + path * (n * dy[j] - gamma * gy) + real[3]) * over_y
 
 
 @njit(**OPTIONS)
-def pull(v, dx, dy, share, real, fresnel):
+def pull(v, dx, dy, real, fresnel):
     """Derivatives by the distance to the hit and the slopes there, left in T_SAG, T_GX, T_GY.  BY_PX, BY_PY: per mm."""
     n, height, start = real[0], real[1], real[9]
-    for j in range(len(share)):
+    for j in range(v.shape[1]):
         v[T_SAG, j], v[T_GX, j], v[T_GY, j] = 0.0, 0.0, 0.0
         if v[POWER, j] < 0.0:
             continue
         t, gx, gy = v[REACH, j], v[GX, j], v[GY, j]
         dz, norm2, c, s, _ = _refract(dx[j], dy[j], gx, gy, n)
         _, r_c, r_s, r_norm2 = _reflected(fresnel, c, s, norm2, n)
-        loss = -share[j] * v[BY_POWER, j]
+        loss = -v[SHARE, j] * v[BY_POWER, j]
         by_c, by_s, by_norm2 = loss * r_c, loss * r_s, loss * r_norm2
         gamma = (s - n * c) / norm2
         down = n * dz + gamma
@@ -124,10 +127,10 @@ def pull(v, dx, dy, share, real, fresnel):
 
 
 @njit(**OPTIONS)
-def push(v, dx, dy, share, real, fresnel):
+def push(v, dx, dy, real, fresnel):
     """Tangents of power and pixel coordinates, left in T_POWER, BY_PX, BY_PY, along T_SAG (the distance), T_GX, T_GY."""
     n, height, start = real[0], real[1], real[9]
-    for j in range(len(share)):
+    for j in range(v.shape[1]):
         t, gx, gy, dt, tx, ty = v[REACH, j], v[GX, j], v[GY, j], v[T_SAG, j], v[T_GX, j], v[T_GY, j]
         dz, norm2, c, s, _ = _refract(dx[j], dy[j], gx, gy, n)
         _, r_c, r_s, r_norm2 = _reflected(fresnel, c, s, norm2, n)
@@ -138,6 +141,6 @@ def push(v, dx, dy, share, real, fresnel):
         down = n * dz + gamma
         path = (height - start - t * dz) / down
         d_path = -(dt * dz + path * d_gamma) / down
-        v[T_POWER, j] = -share[j] * (r_c * dc + r_s * ds + r_norm2 * d_norm2)
+        v[T_POWER, j] = -v[SHARE, j] * (r_c * dc + r_s * ds + r_norm2 * d_norm2)
         v[BY_PX, j] = (dt * dx[j] + d_path * (n * dx[j] - gamma * gx) - path * (d_gamma * gx + gamma * tx)) / real[4]
         v[BY_PY, j] = (dt * dy[j] + d_path * (n * dy[j] - gamma * gy) - path * (d_gamma * gy + gamma * ty)) / real[5]

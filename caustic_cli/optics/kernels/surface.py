@@ -77,6 +77,7 @@ class RayHits:
         self.rays = tuple(t.double().contiguous().numpy() for t in
                           (bundle.x * su + 0.5, bundle.y * sv + 0.5, torch.full_like(bundle.x, bundle.z), bundle.dx * su,
                            bundle.dy * sv, bundle.dz))
+        self.radius = None if bundle.radius is None else bundle.radius * su
         self.t, self.status = np.zeros(len(bundle.x)), np.zeros(len(bundle.x), np.int8)
 
     def __call__(self, heights: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
@@ -93,6 +94,11 @@ class RayHits:
         limits = (float(h.min()), float(h.max()))
         hit.intersect(*self.rays, np.empty(0) if start is None else start, limits, tuple(slopes), c, *self.surface.geometry,
                       self.t, self.status, blocks())
+        if self.radius is not None:  # beyond a circular aperture there is the lens' side
+            x, y, _, dx, dy, _ = self.rays
+            beyond = (x - 0.5 + self.t * dx) ** 2 + (y - 0.5 + self.t * dy) ** 2 > self.radius**2
+            beyond &= self.status == 0
+            self.t[beyond], self.status[beyond] = 0.0, 1
         return c
 
 

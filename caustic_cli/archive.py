@@ -1,0 +1,63 @@
+"""The scene and the lens out of an exported `.npz`, so that it can be traced without its project."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from caustic_cli.errors import InputError
+from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.scene import Disc, Lens, PlaneWave, Points, Scene, Screen, Source
+from caustic_cli.surfaces import load_npz, surface_of
+
+
+def open_archive(path: str | Path) -> tuple[Scene, HeightField, Tensor]:
+    """Scene, spline spaces and control heights (n, m) mm of an archive made by `caustic export --format lighttools`.
+
+    Raises:
+        InputError: it cannot be read, something is missing, or something is out of range.
+    """
+    path = Path(path)
+    data = load_npz(path)
+    field, heights = surface_of(data, path)
+    try:
+        lens = Lens(size=tuple(2.0 * h for h in field.half_size), z_in=float(data["z_in"]), index=float(data["refractive_index"]),
+                    control=field.shape, degree=tuple(s.degree for s in field.spaces),
+                    knots=tuple(tuple(s.knots.tolist()) for s in field.spaces), fresnel=_text(data, "fresnel", "exact"),
+                    aperture=_text(data, "aperture", "rectangle"))
+        screen = Screen(tuple(2.0 * h for h in _reals(data, "screen_half_size", 2)), float(data["z_screen"]),
+                        tuple(int(n) for n in _reals(data, "resolution", 2)))
+        return Scene(_source(data), lens, screen), field, heights
+    except KeyError as error:
+        raise InputError(f"{path}: has no {error.args[0]}; an archive of caustic export --format lighttools is needed") from error
+    except (TypeError, ValueError, IndexError) as error:
+        raise InputError(f"{path}: holds something of the wrong shape or type ({error})") from error
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def _source(data: dict[str, np.ndarray]) -> Source:
+    kind, power = data["source_type"].item(), data["source_power"]
+    if kind == "plane":
+        return PlaneWave(float(power[0]), data.get("source_profile"))
+    if "source_angle" in data:
+        return Disc(power=float(power[0]), angle=float(data["source_angle"]))
+    options = {"cone": float(data["cone_half_angle"]), "intensity": data["source_intensity"].item()}
+    positions = [tuple(float(v) for v in p) for p in data["source_positions"]]
+    if kind == "disc":
+        return Disc(positions[0], tuple(_reals(data, "source_size", 2)), float(power[0]), **options)
+    if kind not in ("point", "grid"):
+        raise InputError(f"source_type must be plane, point, grid or disc, got {kind!r}")
+    return Points(tuple(positions), tuple(float(p) for p in power), kind=kind, **options)
+
+
+def _reals(data: dict[str, np.ndarray], key: str, count: int) -> list[float]:
+    if data[key].shape != (count,):
+        raise ValueError(f"{key} must be {count} numbers")
+    return [float(v) for v in data[key]]
+
+
+def _text(data: dict[str, np.ndarray], key: str, default: str) -> str:
+    return data[key].item() if key in data else default

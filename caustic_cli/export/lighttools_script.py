@@ -1,0 +1,185 @@
+"""What rebuilds the exported scene inside LightTools, beside the `.npz`: a Python script and a point block.
+
+    NAME.py        attaches to a running LightTools by COM (pywin32), builds lens, source, receiver and simulation from NAME.npz,
+                   runs it, and writes the illuminance as NAME-lighttools.npy, [i, j]
+    NAME.lts.txt   the two `restorePoints` blocks of a FreeformSolid in an `.lts` model, front and rear, x varying fastest,
+                   to be pasted into a model in place of its own: for those without COM
+
+Calls and block are those of working scripts and models of LightTools 8.5; neither has been run inside LightTools here.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from caustic_cli.errors import InputError
+from caustic_cli.export.surface import SurfaceGrid, sample_grid
+from caustic_cli.export.text import CREATED, real
+from caustic_cli.files import atomic_path, write_bytes
+from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.scene import Disc, PlaneWave, Scene
+
+#: Rows of the flat entrance along each axis: a plane needs no more.
+FLAT = 5
+#: Points in a line of the block.
+WRAP = 4
+
+SCRIPT = '''"""@CREATED@ for the model @NPZ@: run it on Windows while LightTools (8.5 or later) is open.
+
+    pip install pywin32 numpy
+    python @NAME@
+
+Builds the lens, its source, a receiver on the screen and the simulation in a new model; millimetres.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+HERE = Path(__file__).resolve().parent
+RAYS = int(float(sys.argv[1])) if len(sys.argv) > 1 else 1_000_000
+BEFORE = 1.0  # a plane wave starts so far before the entrance, mm
+SURFACE = ("LENS_MANAGER[1].COMPONENTS[Components].SOLID[{}].FREEFORM_PRIMITIVE[FreeformPrimitive_1]"
+           ".FREEFORM_SURFACE[{}]")
+MESH = "RECEIVER[screen].MESH[1]"
+
+
+def main():
+    import win32com.client
+
+    lens = dict(np.load(HERE / "@NPZ@", allow_pickle=False))
+    lt = win32com.client.Dispatch("LightTools.LTAPI4")  # attaches to the LightTools that runs
+    js = win32com.client.Dispatch("LTCOM64.JSNET")
+    for name in ("ShowDialogs", "ShowFileDialogBox", "ConfirmDeleteModel"):
+        lt.SetOption(name, 0)
+    lt.Begin()
+    js.NewV3D(lt)
+    build_lens(lt, lens)
+    build_source(lt, js, lens)
+    build_receiver(lt, js, lens)
+    lt.End()
+    simulate(lt, lens)
+
+
+def build_lens(lt, lens):
+    """A FreeformSolid between the flat entrance and the exit surface's points, u = x, v = y."""
+    (rx, ry), z_in = lens["lens_half_size"], float(lens["z_in"])
+    lt.Cmd("FreeformSolid XYZ 0,0,0 XYZ 0,0,1 XYZ 0,1,0")
+    name = got(lt.DbGet("SOLID[@Last]", "Name"))
+    x, y = (np.linspace(-r, r, @FLAT@) for r in (rx, ry))
+    front = np.stack(np.broadcast_arrays(x[:, None], y[None, :], z_in), -1)  # [nU][nV][3]
+    rear = lens["points"].reshape(*lens["shape"], 3)
+    for surface, grid in (("FrontSurface", front), ("RearSurface", rear)):
+        lt.SetFreeformSurfacePoints(SURFACE.format(name, surface), grid.tolist(), grid.shape[0], grid.shape[1])
+    lt.DbSet("SOLID[@Last]", "Name", "lens")
+    index = float(lens["refractive_index"])
+    if lt.DbSet("SOLID[lens]", "Refractive_Index", index):
+        print("please give the solid `lens` a material of index %.9g by hand" % index)
+
+
+def build_source(lt, js, lens):
+    """A plane wave as a collimated rectangle, points and discs aimed into their cone."""
+    kind, z_in = lens["source_type"].item(), float(lens["z_in"])
+    (rx, ry), cone = lens["lens_half_size"], float(lens["cone_half_angle"])
+    if kind == "plane":
+        place(lt, js, "light", (0.0, 0.0, z_in - BEFORE), (2 * rx, 2 * ry), float(lens["source_power"][0]), 0.0)
+        return
+    if "source_angle" in lens:
+        place(lt, js, "light", (0.0, 0.0, z_in - BEFORE), (2 * rx, 2 * ry), float(lens["source_power"][0]), cone)
+        return
+    size = lens.get("source_size", np.full(2, 1e-6))  # a point is a tiny square
+    for k, (position, power) in enumerate(zip(lens["source_positions"], lens["source_power"])):
+        place(lt, js, "light%d" % (k + 1), position, size, float(power), cone,
+              "Cosine" if lens["source_intensity"].item() == "lambertian" else "Uniform")
+
+
+def place(lt, js, name, position, size, power, cone, apodizer="Uniform"):
+    """A cube source whose +z face alone shines, so thin that it stands at `position`, into a cone of half-angle `cone`."""
+    x, y, z = (float(v) for v in position)
+    depth = 1e-6
+    js.MakeSourceSurfaceCube(lt, float(size[1]), float(size[0]), depth, name, 0, 0, 0, 1, 0, 0)
+    js.MoveVector(lt, name, x, y, z - depth / 2)
+    js.SetSourceAimSphere(lt, name, "Aim Region", "Yes", 0, 0, 0, max(cone, 1e-6))
+    js.SetSourcePower(lt, name, power, "watts", "Automatic")
+    lt.DbSet(name, "Direction_Apodizer_Type", apodizer)
+
+
+def build_receiver(lt, js, lens):
+    """The screen's pixels, without LightTools' smoothing, which is on by default."""
+    (sx, sy), z, (nx, ny) = lens["screen_half_size"], float(lens["z_screen"]), lens["resolution"]
+    js.MakeDummyPlane(lt, 0, 0, z, 0, 0, -1, "N", "Rectangular", float(2 * sx), float(2 * sy), "screen_plane")
+    js.MakeReceiver(lt, "screen_plane", "dummyplane", "screen")
+    for field, value in (("X_Dimension", int(nx)), ("Y_Dimension", int(ny)), ("Min_X_Bound", -float(sx)),
+                         ("Max_X_Bound", float(sx)), ("Min_Y_Bound", -float(sy)), ("Max_Y_Bound", float(sy)),
+                         ("Do_Noise_Reduction", "No")):
+        lt.DbSet(MESH, field, value)
+
+
+def simulate(lt, lens):
+    """Trace RAYS rays; the receiver's illuminance, W/mm2, as an array [i, j]."""
+    lt.DbSet("LENS_MANAGER[1].ILLUM_MANAGER[Illumination_Manager].SIMULATIONS[ForwardAll]", "MaxProgress", RAYS)
+    lt.Cmd("\\\\V3D BeginAllSimulations")
+    image = np.array(got(lt.GetMeshData(MESH, np.zeros(tuple(lens["resolution"])).tolist(), "CellValue")))
+    np.save(HERE / "@STEM@-lighttools.npy", image)
+    print("illuminance: sum %.9g, saved" % image.sum())
+
+
+def got(answer):
+    """The value of an answer (value, status) or (status, value), as LightTools gives them; status 0 is success."""
+    value, status = answer if isinstance(answer[1], int) else answer[::-1]
+    if status:
+        raise SystemExit("LightTools answered with status %s" % status)
+    return value
+
+
+if __name__ == "__main__":
+    main()
+'''
+
+
+def companions(path: str | Path) -> tuple[Path, Path]:
+    """The script and the point block beside an archive."""
+    path = Path(path)
+    return path.with_suffix(".py"), path.with_suffix(".lts.txt")
+
+
+def write_script(path: str | Path, scene: Scene, field: HeightField, heights: Tensor,
+                 samples: tuple[int, int] | None = None) -> None:
+    """Write script and block for the archive `path`, which `write_lighttools` wrote with the same arguments.
+
+    Raises:
+        InputError: a plane wave with a profile, which the script's source has not; or the files cannot be written.
+    """
+    path, source = Path(path), scene.source
+    if isinstance(source, PlaneWave) and source.profile is not None:
+        raise InputError("--script: its source is uniform, so one with a profile cannot be written")
+    if isinstance(source, Disc) and source.size[0] != source.size[1] and source.angle is None:
+        raise InputError("--script: its disc is round, so an elliptical one cannot be written")
+    if scene.lens.round:
+        raise InputError("--script: its freeform solid is a rectangle, so a circular aperture cannot be written")
+    script, block = companions(path)
+    words = {"@CREATED@": CREATED, "@NPZ@": path.name, "@NAME@": script.name, "@STEM@": path.stem, "@FLAT@": str(FLAT)}
+    text = SCRIPT
+    for word, value in words.items():
+        text = text.replace(word, value)
+    write_bytes(script, text.encode())
+    _write_block(block, scene, sample_grid(field, heights, samples))
+
+
+def _write_block(path: Path, scene: Scene, grid: SurfaceGrid) -> None:
+    x, y = (np.linspace(-r, r, FLAT) for r in scene.lens.half_size)
+    flat = np.stack(np.broadcast_arrays(x[:, None], y[None, :], scene.lens.z_in), -1)
+    with atomic_path(path) as temporary, open(temporary, "w", encoding="ascii", newline="\n") as file:
+        file.write(f"# {CREATED}; millimetres.  Replace the two restorePoints blocks of a FreeformSolid by these.\n")
+        for points, name in ((flat, "Front"), (grid.points.reshape(*grid.z.shape, 3), "Rear")):
+            nu, nv = points.shape[:2]
+            file.write(f"restorePoints:\nORAStartData;\n0 0 {nu} {nv} 0 0 {nu * nv} 0 0 0\n")
+            rows = points.swapaxes(0, 1).reshape(-1, 3)
+            for start in range(0, len(rows), WRAP):
+                file.write(" ".join(map(real, rows[start : start + WRAP].ravel())) + "\n")
+            file.write("0 1 4 CartesianMapper 1 0 0 0 0\nORAEndData;\nORAReadForeignData;\n"
+                       f"}} restore{name}: $FreeformSurface_{int(name == 'Rear')};\n")

@@ -1,0 +1,185 @@
+"""The lens as a closed, oriented triangle mesh: exit surface, walls along its border, flat entrance at z_in.
+
+Corners run counter-clockwise seen from outside.  What the mesh formats (STL, PLY, OBJ) are made of.
+
+The exit surface is a patch of nx x ny points.  Over a circle the square's lattice (a, b) is laid on the disc by P. Shirley and
+K. Chiu's concentric map (J. Graphics Tools 2(3), 1997): squares around the middle become circles,
+
+    where |a| >= |b|:  (x, y) = r a (cos t, sin t), t = pi b / (4 a);   elsewhere with x and a exchanged for y and b.
+
+Its edges and shorter diagonals are at most STRETCH steps long.  A triangle with edges up to L is off by at most L^2 |D2z| / 6.
+
+A border, for the mount, is a flange around the aperture, half as high as the surface's lowest point on it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from caustic_cli.errors import InputError
+from caustic_cli.export.surface import (
+    MAX_POINTS,
+    MAX_SAMPLES,
+    STEPS_PER_SPAN,
+    grid_within,
+    sample_grid,
+    second_derivative_bounds,
+)
+from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.scene import Lens, Scene, checks
+
+STRETCH = 1.28
+#: Height of the flange, as a part of the least height on the rim.
+FLANGE = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """The exit surface's points (nx, ny, 3) mm and unit normals towards +z (nx, ny, 3), float64, counter-clockwise from +z."""
+
+    points: np.ndarray
+    normals: np.ndarray
+
+
+def closed_mesh(scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None,
+                tolerance: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) float64 mm and faces (F, 3) int64 of the solid.
+
+    Args:
+        heights: (n, m) control heights, mm.
+        samples: (nx, ny) points on the exit surface, or None for a grid on the knots (`sample_grid`).
+        tolerance: mm, instead of samples: as many points as keep every triangle so close to the exit surface (chord error).
+
+    Raises:
+        InputError: samples and tolerance both; too few or too many points; or the surface reaches the entrance.
+    """
+    return solid(patch(scene.lens, field, heights, samples, tolerance).points, scene.lens)
+
+
+def patch(lens: Lens, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None,
+          tolerance: float | None = None) -> Patch:
+    """The exit surface within the aperture, by --samples or --tolerance as of `closed_mesh`.
+
+    Raises:
+        InputError: both were given, they ask for too few or too many points, or a tolerance for a round lens with kinks.
+    """
+    if samples is not None and tolerance is not None:
+        raise InputError("--samples and --tolerance both say how fine the mesh is: give one of them")
+    if lens.round:
+        return _round_patch(field, heights, _across(field, heights, samples, tolerance))
+    grid = sample_grid(field, heights, samples) if tolerance is None else grid_within(field, heights, tolerance)
+    return Patch(*(a.reshape(*grid.z.shape, 3) for a in (grid.points, grid.normals)))
+
+
+def _across(field: HeightField, heights: Tensor, samples: tuple[int, int] | None, tolerance: float | None) -> int:
+    """Points along a diameter of a round lens."""
+    if tolerance is None:
+        counts = samples or [STEPS_PER_SPAN * (len(s.breaks) - 1) + 1 for s in field.spaces]
+        n, asked = max(checks.pair("--samples", counts, lambda w, k: checks.whole(w, k, 2, MAX_SAMPLES))), "--samples"
+    else:
+        checks.number("--tolerance", tolerance, 0.0, open_low=True)
+        if any(int(torch.unique(s.knots[1:-1], return_counts=True)[1].max()) > s.degree for s in field.spaces) or \
+                min(s.degree for s in field.spaces) < 2:
+            raise InputError("--tolerance of a round mesh needs a surface without kinks; give --samples")
+        xx, xy, yy = second_derivative_bounds(field, heights)
+        bend, asked = (max(xx, yy) + xy) * STRETCH**2 / 6.0, f"--tolerance {tolerance:g}"
+        n = math.ceil(2.0 * max(field.half_size) * math.sqrt(bend / tolerance)) + 1 if bend > 0 else 2
+        n = max(n, 9)
+    if n > min(MAX_SAMPLES, math.isqrt(MAX_POINTS)):
+        raise InputError(f"{asked} must ask for at most {math.isqrt(MAX_POINTS)} points across a round lens, got {n}")
+    return n
+
+
+def _round_patch(field: HeightField, heights: Tensor, n: int) -> Patch:
+    line = torch.linspace(-1.0, 1.0, n, dtype=torch.float64)
+    line = 0.5 * (line - line.flip(0))  # symmetric to the last bit
+    a, b = torch.meshgrid(line, line, indexing="ij")
+    wide = a.abs() >= b.abs()
+    r, other = torch.where(wide, a, b), torch.where(wide, b, a)
+    angle = 0.25 * math.pi * other / torch.where(r == 0, torch.ones_like(r), r)
+    near, far = r * torch.cos(angle), r * torch.sin(angle)
+    x, y = (torch.where(wide, p, q) * field.half_size[0] for p, q in ((near, far), (far, near)))
+    points, normals = [], []
+    for i in range(0, n, 64):  # some rows at a time bound the memory
+        at = x[i : i + 64].reshape(-1), y[i : i + 64].reshape(-1)
+        z, zx, zy = field.at(heights, *at)
+        points.append(torch.stack([*at, z], -1))
+        normals.append(torch.nn.functional.normalize(torch.stack([-zx, -zy, torch.ones_like(z)], -1), dim=-1))
+    return Patch(*(torch.cat(parts).view(n, n, 3).numpy() for parts in (points, normals)))
+
+
+def triangles(points: np.ndarray) -> np.ndarray:
+    """Two triangles for every cell of points (nx, ny, 3), numbered row-major, along the shorter diagonal: (2 (nx-1) (ny-1), 3).
+
+    Over a rectangle both are as long, and it is the one from low to high x and y.
+    """
+    nx, ny = points.shape[:2]
+    number, flat = np.arange(nx * ny).reshape(nx, ny), points[..., :2]
+    a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]  # corners of every cell, from +z
+    up, down = (((flat[one] - flat[two]) ** 2).sum(-1) for one, two in ((np.s_[1:, 1:], np.s_[:-1, :-1]),
+                                                                        (np.s_[1:, :-1], np.s_[:-1, 1:])))
+    falling = (down < (1.0 - 1e-9) * up)[..., None]
+    first = np.where(falling, np.stack([a, b, d], -1), np.stack([a, b, c], -1))
+    second = np.where(falling, np.stack([b, c, d], -1), np.stack([a, c, d], -1))
+    return np.stack([first, second], 2).reshape(-1, 3)
+
+
+def rim_of(nx: int, ny: int) -> np.ndarray:
+    """Numbers of the border points of such a patch, once around, counter-clockwise from +z: (2 (nx + ny) - 4,)."""
+    number = np.arange(nx * ny).reshape(nx, ny)
+    return np.concatenate([number[:-1, 0], number[-1, :-1], number[:0:-1, -1], number[0, :0:-1]])
+
+
+def solid(points: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
+    """Closed triangle mesh of the lens under points (nx, ny, 3): vertices (V, 3) float64 mm, faces (F, 3) int64.
+
+    Loops of as many points as the rim has follow it outwards and down, joined by strips; a fan from its middle closes the
+    entrance.  So every edge belongs to exactly two triangles.
+
+    Raises:
+        InputError: the surface reaches the entrance, so that there is no solid.
+    """
+    refuse_open(float(points[..., 2].min()), lens.z_in)
+    nx, ny = points.shape[:2]
+    numbers, vertices = rim_of(nx, ny), [points.reshape(-1, 3)]
+    rim, faces, count = vertices[0][numbers], [triangles(points)], nx * ny
+    loops = [_at(rim, lens, 0.0, lens.z_in)]
+    if lens.border > 0:
+        high = flange_height(rim, lens.z_in)
+        loops = [_at(rim, lens, 0.0, high), _at(rim, lens, lens.border, high), _at(rim, lens, lens.border, lens.z_in)]
+    for loop in loops:
+        below = count + np.arange(len(rim))
+        after, after_below = np.roll(numbers, -1), np.roll(below, -1)
+        faces += [np.stack([below, after_below, after], -1), np.stack([below, after, numbers], -1)]
+        vertices.append(loop)
+        numbers, count = below, count + len(rim)
+    faces.append(np.stack([np.full_like(numbers, count), np.roll(numbers, -1), numbers], -1))
+    vertices.append(np.array([[0.0, 0.0, lens.z_in]]))
+    return np.concatenate(vertices), np.concatenate(faces)
+
+
+def flange_height(rim: np.ndarray, z_in: float) -> float:
+    """z of a border's upper face, mm, under rim points (k, 3): below all light that leaves."""
+    return z_in + FLANGE * (float(rim[:, 2].min()) - z_in)
+
+
+def _at(rim: np.ndarray, lens: Lens, wider: float, z: float) -> np.ndarray:
+    """The rim moved out by `wider` mm and to z."""
+    scale = [(r + wider) / r for r in lens.half_size]
+    return np.stack([rim[:, 0] * scale[0], rim[:, 1] * scale[1], np.full(len(rim), z)], -1)
+
+
+def refuse_open(least: float, z_in: float) -> None:
+    """Refuse a lens whose `least` height, mm, is not above the entrance.
+
+    Raises:
+        InputError: there is no solid.
+    """
+    if not least > z_in:
+        raise InputError(f"a solid needs its exit surface above the entrance at z_in = {z_in:g} mm everywhere,"
+                         f" got a least height of {least:.6g} mm; design with a larger min_thickness")

@@ -1,0 +1,175 @@
+"""The whole scene for Mitsuba 3: `NAME.xml`, to be run as `mitsuba NAME.xml`, and beside it its meshes, `NAME-exit.ply`,
+`NAME-sides.ply` and a round lens' `NAME-holder.ply` (binary, float64).
+
+    entrance, exit   the lens, smooth `dielectric`; the exit surface is a mesh with its normals at the vertices
+    sides, holder    black: what leaves by the sides or goes past the lens is lost, as in a render
+    screen           white and diffuse; a camera between lens and screen sees it mirrored back, as from behind
+    light            a plane wave as a collimated area, points as spots, a disc as a Lambertian area
+
+The integrator traces light (`ptracer`), four surfaces deep: entrance, exit, screen, camera.  With radiance L in the image,
+pi L times a pixel's area is its power.  Lengths are mm, so radiance is W / (mm^2 sr).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from caustic_cli.errors import InputError
+from caustic_cli.export.mesh import patch, refuse_open, rim_of, triangles
+from caustic_cli.export.ply import write_mesh
+from caustic_cli.export.surface import STEPS_PER_SPAN
+from caustic_cli.export.text import CREATED, real
+from caustic_cli.files import write_bytes
+from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.scene import Disc, Lens, PlaneWave, Scene
+from caustic_cli.scene.plain import beyond_plain
+from caustic_cli.scene.source import covering_cone
+
+#: Rays a pixel of the scene's own sampler, Mitsuba's `spp`.
+SAMPLES = 256
+#: The collimated light starts so far before the entrance, mm, and the holder is so many lens widths wide.
+BEFORE, WIDE = 1.0, 50.0
+DEPTH = 4
+#: Corners of a round lens' holder.
+RING = 1024
+#: Points along an axis of a mesh that Mitsuba loads in seconds.
+QUICK = 2048
+
+
+def companions(path: str | Path, round: bool = True) -> list[Path]:
+    """The meshes beside a scene file: of the exit surface, of the sides, and of a round lens' holder."""
+    path = Path(path)
+    return [path.with_name(f"{path.stem}-{name}.ply") for name in ("exit", "sides", "holder")[: 3 if round else 2]]
+
+
+def write_mitsuba(path: str | Path, scene: Scene, field: HeightField, heights: Tensor,
+                  samples: tuple[int, int] | None = None, tolerance: float | None = None, dark: bool = False) -> None:
+    """Write the meshes and then the scene.  Arguments as of `closed_mesh`; `dark`: without its light, whatever that is.
+
+    Raises:
+        InputError: as `closed_mesh`; a light that Mitsuba has no emitter for; or the files cannot be written there.
+    """
+    light, surface = [] if dark else _light(scene), patch(scene.lens, field, heights, samples, tolerance)
+    refuse_open(float(surface.points[..., 2].min()), scene.lens.z_in)
+    exit_mesh, sides = companions(path, False)
+    points, normals = (a.reshape(-1, 3) for a in (surface.points, surface.normals))
+    write_mesh(exit_mesh, points, triangles(surface.points), normals, text=False)
+    rim = points[rim_of(*surface.points.shape[:2])]
+    write_mesh(sides, *_strip(rim, rim * [1.0, 1.0, 0.0] + [0.0, 0.0, scene.lens.z_in]), text=False)
+    lens, screen, spin = scene.lens, scene.screen, '<rotate x="1" angle="180"/>'  # rectangles look to -z
+    glass = f'<bsdf type="dielectric"><float name="int_ior" value="{real(lens.index)}"/><float name="ext_ior" value="1"/></bsdf>'
+    black = '<bsdf type="diffuse"><rgb name="reflectance" value="0"/></bsdf>'
+    (rx, ry), (sx, sy) = lens.half_size, screen.half_size
+    flat, holder = ("disk", _round_holder(path, rx, lens.z_in, black)) if lens.round else ("rectangle", _holder(lens, black))
+    away = 0.9 * (screen.z - float(points[:, 2].max()))
+    width, height = screen.resolution[0], max(1, round(screen.resolution[0] * sy / sx))
+    lines = [
+        f"<!-- {CREATED}; millimetres -->", '<scene version="3.0.0">',
+        f'<integrator type="ptracer"><integer name="max_depth" value="{DEPTH}"/></integrator>',
+        '<sensor type="perspective">', '  <string name="fov_axis" value="x"/>',
+        f'  <float name="fov" value="{real(2.0 * math.degrees(math.atan2(sx, away)))}"/>',
+        f'  <float name="near_clip" value="{real(0.5 * away)}"/><float name="far_clip" value="{real(2.0 * away)}"/>',
+        f'  <transform name="to_world"><scale x="-1"/><translate z="{real(screen.z - away)}"/></transform>',
+        f'  <sampler type="independent"><integer name="sample_count" value="{SAMPLES}"/></sampler>',
+        f'  <film type="hdrfilm"><integer name="width" value="{width}"/><integer name="height" value="{height}"/>',
+        '    <string name="pixel_format" value="luminance"/><rfilter type="box"/></film>', "</sensor>",
+        f'<shape type="{flat}" id="entrance">', f"  {glass}",
+        f'  <transform name="to_world">{spin}<scale x="{real(rx)}" y="{real(ry)}"/>'
+        f'<translate z="{real(lens.z_in)}"/></transform>', "</shape>",
+        f'<shape type="ply" id="exit"><string name="filename" value="{exit_mesh.name}"/>{glass}</shape>',
+        f'<shape type="ply" id="sides"><string name="filename" value="{sides.name}"/>'
+        f'<boolean name="face_normals" value="true"/>{black}</shape>',
+        *holder,
+        '<shape type="rectangle" id="screen">', '  <bsdf type="diffuse"><rgb name="reflectance" value="1"/></bsdf>',
+        f'  <transform name="to_world">{spin}<scale x="{real(sx)}" y="{real(sy)}"/><translate z="{real(screen.z)}"/></transform>',
+        "</shape>", *light, "</scene>", "",
+    ]
+    write_bytes(path, "\n".join(lines).encode())
+
+
+def quick_samples(field: HeightField) -> tuple[int, int]:
+    """Samples along x and y for a mesh that loads quickly: four steps a knot span, or as many as `QUICK` allows."""
+    spans = [len(s.breaks) - 1 for s in field.spaces]
+    return tuple(min(STEPS_PER_SPAN, max(1, QUICK // k)) * k + 1 for k in spans)
+
+
+def _strip(top: np.ndarray, low: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Between two loops (k, 3), counter-clockwise from +z: vertices, and triangles seen from outside."""
+    high, below = np.arange(len(top)), len(top) + np.arange(len(low))
+    after, after_below = np.roll(high, -1), np.roll(below, -1)
+    return np.concatenate([top, low]), np.concatenate([np.stack([below, after_below, after], -1),
+                                                       np.stack([below, after, high], -1)])
+
+
+def _holder(lens: Lens, black: str) -> list[str]:
+    """Four black rectangles around the entrance."""
+    (rx, ry), wide, lines = lens.half_size, WIDE * max(lens.half_size), []
+    for cx, cy, hx, hy in ((-(rx + wide) / 2, 0, (wide - rx) / 2, wide), ((rx + wide) / 2, 0, (wide - rx) / 2, wide),
+                           (0, -(ry + wide) / 2, rx, (wide - ry) / 2), (0, (ry + wide) / 2, rx, (wide - ry) / 2)):
+        lines += [f'<shape type="rectangle">{black}', f'  <transform name="to_world"><scale x="{real(hx)}" y="{real(hy)}"/>'
+                  f'<translate x="{real(cx)}" y="{real(cy)}" z="{real(lens.z_in)}"/></transform>', "</shape>"]
+    return lines
+
+
+def _round_holder(path: str | Path, radius: float, z: float, black: str) -> list[str]:
+    """A black ring around the entrance, in a mesh of its own: rings that widen, since single precision misses thin triangles."""
+    angle = np.linspace(0.0, 2.0 * np.pi, RING, endpoint=False)
+    inner = np.stack([np.cos(angle), np.sin(angle), np.full_like(angle, z)], -1) * [radius, radius, 1.0]
+    inner[:, :2] /= math.cos(math.pi / RING)  # around the circle, not within
+    widths = [1.0, 1.05, 1.25, 2.0, 6.0, WIDE]
+    parts = [_strip(inner * [a, a, 1.0], inner * [b, b, 1.0]) for a, b in itertools.pairwise(widths)]
+    faces = np.concatenate([f + k * 2 * RING for k, (_, f) in enumerate(parts)])
+    file = companions(path, True)[2]
+    write_mesh(file, np.concatenate([v for v, _ in parts]), faces, text=False)
+    return [f'<shape type="ply" id="holder"><string name="filename" value="{file.name}"/>{black}</shape>']
+
+
+def _light(scene: Scene) -> list[str]:
+    """The emitters.
+
+    Raises:
+        InputError: Mitsuba has none like this.
+    """
+    source, lens = scene.source, scene.lens
+    if beyond_plain(scene):
+        raise InputError(f"--format mitsuba is written for clear lenses and straight screens, not {', '.join(beyond_plain(scene))}")
+    if isinstance(source, PlaneWave):
+        if source.profile is not None:
+            raise InputError("--format mitsuba: its collimated emitter is uniform, so a source with a profile cannot be written")
+        (rx, ry), area = lens.half_size, lens.size[0] * lens.size[1] * (math.pi / 4.0 if lens.round else 1.0)
+        radiance = real(source.power / area)
+        return [f'<shape type="{"disk" if lens.round else "rectangle"}" id="light">',
+                f'  <transform name="to_world"><scale x="{real(rx)}" y="{real(ry)}"/>'
+                f'<translate z="{real(lens.z_in - BEFORE)}"/></transform>',
+                f'  <emitter type="directionalarea"><rgb name="radiance" value="{radiance}"/></emitter>', "</shape>"]
+    cone = covering_cone(source, lens.half_size, lens.z_in, lens.round)
+    if not isinstance(source, Disc):
+        return _spots(source, cone)
+    if source.angle is not None or source.intensity != "lambertian" or source.cone is not None:
+        raise InputError("--format mitsuba: of discs only a Lambertian one without a cone of its own can be written, not one at"
+                         " infinity; render --verify mitsuba traces them all")
+    (wx, wy), (x, y, z) = source.size, source.position
+    radiance = source.power / (math.pi * math.pi * wx * wy / 4.0 * math.sin(cone) ** 2)  # its cone just covers the lens
+    return ['<shape type="disk" id="light">',
+            f'  <transform name="to_world"><scale x="{real(wx / 2)}" y="{real(wy / 2)}"/>'
+            f'<translate x="{real(x)}" y="{real(y)}" z="{real(z)}"/></transform>',
+            f'  <emitter type="area"><rgb name="radiance" value="{real(radiance)}"/></emitter>', "</shape>"]
+
+
+def _spots(source, cone: float) -> list[str]:
+    """A spot a point.  Mitsuba's fall off towards their rim, so they are even a little beyond the cone."""
+    if source.intensity != "uniform":
+        raise InputError("--format mitsuba: its spots shine evenly, so Lambertian points cannot be written")
+    lines, degrees = [], math.degrees(cone)
+    for (x, y, z), power in zip(source.positions, source.powers, strict=True):
+        intensity = power / (4.0 * math.pi * math.sin(cone / 2.0) ** 2)
+        lines += ['<emitter type="spot">',
+                  f'  <transform name="to_world"><translate x="{real(x)}" y="{real(y)}" z="{real(z)}"/></transform>',
+                  f'  <rgb name="intensity" value="{real(intensity)}"/><float name="beam_width" value="{real(degrees)}"/>'
+                  f'<float name="cutoff_angle" value="{real(degrees * (1.0 + 1e-4))}"/></emitter>']
+    return lines

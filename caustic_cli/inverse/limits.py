@@ -1,0 +1,123 @@
+"""The last word of a design on what a lens may not exceed: its surface is moved, as little as it takes, within all limits.
+
+While a design runs, limits of slope and concave radius are penalties: the picture may win a little over them.  Here rays have no
+say any more.  The sum of squares
+
+    max(0, |grad z| / slope - 1)^2 + max(0, k r - 1)^2 + max(0, (low - P) / scale)^2 + max(0, (P - high) / scale)^2
+
+over the surface is brought to zero by L-BFGS.  Slopes and largest principal curvatures k are those at some points a knot span, with
+a little room to spare for the places between, which grows until finer points obey too; P are the control heights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from caustic_cli.errors import CausticError
+from caustic_cli.inverse.lbfgs import LBFGS
+from caustic_cli.optics import curvature
+from caustic_cli.optics.bspline import SplineSpace
+from caustic_cli.optics.heightfield import HeightField
+
+#: Points a knot span at which limits are kept and at which that is checked in the end, and most along an axis.
+A_SPAN, CHECKED, MOST = 4, 10, 4001
+#: The part by which limits are kept tighter than asked at first, for the places between points, and how often more is tried.
+ROOM, TRIES = 2e-3, 6
+#: The part of a limit by which it may be exceeded where it is kept.
+LEFT = 1e-3
+STEPS = 400
+#: Points looked at together when checking, which bounds the memory.
+BLOCK = 4_000_000
+
+
+def within_limits(field: HeightField, heights: Tensor, bounds: tuple[Tensor, Tensor], max_slope: float = 0.0,
+                  min_radius: float = 0.0) -> Tensor:
+    """Heights (n, m) mm that obey all limits, as near to `heights` as a descent leaves them; the same where these do already.
+
+    Args:
+        bounds: least and largest height of each control point, mm.
+        max_slope: of |grad z|, 0 for none.
+        min_radius: least radius of curvature of concave places, mm, 0 for any.
+
+    Raises:
+        CausticError: no such surface was found.
+    """
+    if not (max_slope > 0 or min_radius > 0):
+        return heights
+    asked, found, room = _Limits(field, bounds, max_slope, min_radius, CHECKED), heights, LEFT + ROOM
+    for _ in range(TRIES):
+        over = asked.excess(found)
+        if over <= 0:
+            return found
+        if found is not heights:
+            room += 1.5 * over
+        found = _descend(_Limits(field, bounds, max_slope * (1.0 - room), min_radius / (1.0 - room), A_SPAN), found)
+    if asked.excess(found) <= 0:
+        return found
+    raise _none(asked.excess(found))
+
+
+def _descend(limits: _Limits, heights: Tensor) -> Tensor:
+    def evaluate(flat: Tensor) -> tuple[float, Tensor]:
+        z = flat.view(heights.shape).requires_grad_()
+        value = limits.violation(z)
+        (g,) = torch.autograd.grad(value, z)
+        return float(value.detach()), g.reshape(-1)
+
+    method = LBFGS(evaluate, heights.detach().double().reshape(-1).clone())
+    for _ in range(STEPS):
+        moved = method.step()
+        found = method.x.view(heights.shape)
+        if limits.excess(found) <= LEFT:
+            return found.clone()
+        if not moved:
+            break
+    raise _none(limits.excess(found))
+
+
+def _none(excess: float) -> CausticError:
+    return CausticError(f"no surface near the designed one obeys the limits: it still exceeds them by {excess:.1%};"
+                        " a larger --max-slope, a smaller --min-radius or --min-thickness may do")
+
+
+class _Limits:
+    """What exceeds the limits, on points (a, b) of an even grid with `a_span` of them a knot span."""
+
+    def __init__(self, field: HeightField, bounds: tuple[Tensor, Tensor], slope: float, radius: float, a_span: int):
+        self.low, self.high = bounds
+        self.slope, self.radius, self.scale = slope, radius, 1e-3 * max(field.half_size)
+        grids = [_grid(s, a_span) for s in field.spaces]
+        self.u, self.v = ([s.matrix(g, k) / (2.0 * r) ** k for k in range(3)]
+                          for s, g, r in zip(field.spaces, grids, field.half_size, strict=True))
+
+    def _shape(self, heights: Tensor, rows: slice = slice(None)) -> Iterator[Tensor]:
+        """Slopes and radii beyond their limits, as parts of these."""
+        need = curvature.ORDERS if self.radius > 0 else curvature.ORDERS[:2]
+        zx, zy, *second = (self.u[a][rows] @ heights @ self.v[b].T for a, b in need)
+        if self.slope > 0:
+            yield (zx * zx + zy * zy).clamp_min(1e-300).sqrt() / self.slope - 1.0
+        if self.radius > 0:
+            yield curvature.largest(zx, zy, *second) * self.radius - 1.0
+
+    def violation(self, heights: Tensor) -> Tensor:
+        """Sum of squares of what exceeds; heights keep LEFT off their bounds, too."""
+        room = LEFT * self.scale
+        beyond = (self.low + room - heights) / self.scale, (heights - self.high + room) / self.scale
+        return sum(term.clamp_min(0.0).square().sum() for term in (*self._shape(heights), *beyond))
+
+    @torch.no_grad()
+    def excess(self, heights: Tensor) -> float:
+        """The largest excess, 0 or less where all is obeyed."""
+        step = max(1, BLOCK // len(self.v[0]))
+        beyond = max(float((self.low - heights).max()), float((heights - self.high).max())) / self.scale
+        return max(beyond, *(float(term.max()) for start in range(0, len(self.u[0]), step)
+                             for term in self._shape(heights, slice(start, start + step))))
+
+
+def _grid(space: SplineSpace, a_span: int) -> Tensor:
+    """Even points on [0, 1]: all knots among them where these are equispaced."""
+    spans = len(space.breaks) - 1
+    return torch.linspace(0.0, 1.0, max(1, min(a_span, MOST // spans)) * spans + 1, dtype=torch.float64)

@@ -1,0 +1,160 @@
+"""What it takes to make a lens, and how well the optics must be kept: the figures of `render --report`.
+
+Lengths are mm, angles degrees.  The surface is looked at on a grid of some points a knot span, and bounded by its control net,
+which holds it: between the two lies the truth.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from caustic_cli.errors import InputError
+from caustic_cli.files import SOFTWARE, write_bytes
+from caustic_cli.optics import curvature, intersection
+from caustic_cli.optics.bspline import SplineSpace
+from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.sampling import Sample, stream
+from caustic_cli.optics.tracing import Landing, tracer
+from caustic_cli.scene import Scene
+from caustic_cli.scene.source import blur_limit
+
+#: Points looked at along each axis and a knot span, at most.
+MOST, A_SPAN = 2001, 4
+#: Rays of the sensitivities and of the angles inside the lens.
+RAYS = 200_000
+#: Errors by which the sensitivities are found: of the throw, relative; of the index.
+STEP = 1e-4
+
+
+def manufacture(scene: Scene, field: HeightField, heights: Tensor, tool_radius: float | None = None, seed: int = 0) -> dict:
+    """Figures for JSON; None where there is none (no concave place, a point source's blur is 0).
+
+    Keys: minimum_wall_mm and _bound_mm, from the flat entrance; stock_height_mm, what a blank must have; maximum_slope and _bound;
+    smallest_concave_radius_mm and where, (x, y) mm; tool_radius_mm and tool_fits if one was given; critical_angle_deg,
+    steepest_incidence_deg inside the lens and internal_reflection_margin_deg; sharpness_limit_mm and _pixels, of the source's
+    size; landing_mm_per_mm_throw and landing_mm_per_thousandth_index, root mean square over the light, and the errors that move the
+    light by one pixel, throw_error_of_a_pixel_mm and index_error_of_a_pixel.
+
+    Raises:
+        InputError: the tool's radius is not above 0.
+    """
+    if tool_radius is not None and not 0 < tool_radius < math.inf:
+        raise InputError(f"--tool-radius must be greater than 0 mm, got {tool_radius:g}")
+    lens, pixel = scene.lens, max(scene.screen.pixel)
+    z, *derivatives = sampled(field, heights, [_points(s) for s in field.spaces])
+    if lens.round:  # what lies beyond the circle takes the middle's place
+        (u, v) = (torch.linspace(-1.0, 1.0, n, dtype=torch.float64) for n in z.shape)
+        beyond, at = u[:, None] ** 2 + v[None, :] ** 2 > 1.0, tuple(n // 2 for n in z.shape)
+        z, *derivatives = (torch.where(beyond, t[at], t) for t in (z, *derivatives))
+    bends = curvature.largest(*derivatives)
+    bent, at = float(bends.max()), divmod(int(bends.argmax()), bends.shape[1])
+    where = [(2.0 * k / (n - 1) - 1.0) * r for k, n, r in zip(at, z.shape, field.half_size, strict=True)]
+    radius = 1.0 / bent if bent > 0 else None
+    found = {
+        "minimum_wall_mm": float(z.min()) - lens.z_in, "minimum_wall_bound_mm": float(heights.min()) - lens.z_in,
+        "stock_height_mm": float(z.max()) - lens.z_in,
+        "maximum_slope": float(torch.hypot(*derivatives[:2]).max()), "maximum_slope_bound": field.slope_bound(heights),
+        "smallest_concave_radius_mm": radius, "smallest_concave_radius_at_mm": where if radius else None,
+    }
+    if tool_radius is not None:
+        found |= {"tool_radius_mm": tool_radius, "tool_fits": radius is None or radius >= tool_radius}
+    critical, incidence = math.degrees(math.asin(1.0 / lens.index)), _steepest_incidence(scene, field, heights, seed)
+    blur = blur_limit(scene.source, lens.z_in, scene.screen.z - lens.z_in)
+    throw = STEP * scene.screen.z
+    by_throw = _moved(scene, scene, field, heights, seed, throw) / throw
+    other = replace(scene, lens=replace(lens, index=lens.index + STEP))
+    by_index = _moved(scene, other, field, heights, seed, 0.0) / STEP
+    return found | {
+        "critical_angle_deg": critical, "steepest_incidence_deg": incidence, "internal_reflection_margin_deg": critical - incidence,
+        "sharpness_limit_mm": blur, "sharpness_limit_pixels": blur / pixel,
+        "landing_mm_per_mm_throw": by_throw, "landing_mm_per_thousandth_index": 1e-3 * by_index,
+        "throw_error_of_a_pixel_mm": pixel / by_throw if by_throw > 0 else None,
+        "index_error_of_a_pixel": pixel / by_index if by_index > 0 else None,
+    }
+
+
+def _points(space: SplineSpace) -> int:
+    """Points along an axis, as many a knot span as there may be: equispaced knots, where cubics bend most, are among them."""
+    spans = len(space.breaks) - 1
+    return max(1, min(A_SPAN, MOST // spans)) * spans + 1
+
+
+def sampled(field: HeightField, heights: Tensor, shape) -> list[Tensor]:
+    """Heights and the derivatives of `curvature.ORDERS` on an even grid over the aperture, borders included: (n_x, n_y) each."""
+    (su, sv), (rx, ry), net = field.spaces, field.half_size, heights.detach().double().cpu()
+    u, v = (torch.linspace(0.0, 1.0, n, dtype=torch.float64) for n in shape)
+    rows = [su.matrix(u, k) @ net / (2.0 * rx) ** k for k in range(3)]
+    columns = [sv.matrix(v, k).T / (2.0 * ry) ** k for k in range(3)]
+    return [rows[a] @ columns[b] for a, b in ((0, 0), *curvature.ORDERS)]
+
+
+def _steepest_incidence(scene: Scene, field: HeightField, heights: Tensor, seed: int) -> float:
+    """Largest angle between the light inside the lens and the exit surface's normal, degrees."""
+    least = 1.0
+    for rays in _rays(scene, seed):
+        if isinstance(rays, Sample):  # along z
+            _, gx, gy = field.prepare(rays, torch.float64)(heights)
+            cosine = 1.0 / torch.sqrt(1.0 + gx * gx + gy * gy)
+        else:
+            _, gx, gy, found = intersection.meet(field, heights, rays)
+            cosine = (rays.dz - gx * rays.dx - gy * rays.dy) / torch.sqrt(1.0 + gx * gx + gy * gy)
+            cosine = cosine[(found == intersection.Status.HIT) & (rays.share > 0)]
+        if cosine.numel():
+            least = min(least, float(cosine.min()))
+    return math.degrees(math.acos(max(-1.0, least)))
+
+
+def _moved(scene: Scene, other: Scene, field: HeightField, heights: Tensor, seed: int, further: float) -> float:
+    """Root mean square distance on the screen, mm, between the same rays through two scenes, the second `further` mm away."""
+    total = power = 0.0
+    for one, two in zip(_landings(scene, field, heights, seed, 0.0), _landings(other, field, heights, seed, further), strict=True):
+        weight = torch.where(two.weight > 0, one.weight, 0.0)
+        total += float((weight * ((one.x - two.x) ** 2 + (one.y - two.y) ** 2)).nan_to_num(0.0).sum())
+        power += float(weight.sum())
+    return math.sqrt(total / power) if power > 0 else 0.0
+
+
+def _landings(scene: Scene, field: HeightField, heights: Tensor, seed: int, further: float) -> list[Landing]:
+    return [tracer(scene, field, rays, torch.float64)(heights, scene.screen.z + further) for rays in _rays(scene, seed)]
+
+
+def _rays(scene: Scene, seed: int):
+    return rays_of(scene, "stratified", RAYS, stream(seed, "report")).chunks(RAYS)
+
+
+def write_json(path: str | Path, figures: dict) -> None:
+    """`report.json`: the figures, beginning with who made it."""
+    write_bytes(path, (json.dumps({"created_by": SOFTWARE} | figures, indent=2, allow_nan=False) + "\n").encode())
+
+
+def rows(f: dict) -> list[tuple[str, str]]:
+    """The figures as a person reads them."""
+    radius, at = f["smallest_concave_radius_mm"], f["smallest_concave_radius_at_mm"]
+    concave = "nowhere concave" if radius is None else f"{radius:.4g} mm at ({at[0]:.3g}, {at[1]:.3g})"
+    if "tool_radius_mm" in f:
+        concave += f"; a tool of {f['tool_radius_mm']:g} mm {'fits' if f['tool_fits'] else 'DOES NOT FIT'}"
+
+    def of_a_pixel(key: str, unit: str) -> str:
+        return "" if f[key] is None else f"; one pixel at {f[key]:.3g}{unit}"
+
+    margin = f["internal_reflection_margin_deg"]
+    return [
+        ("minimum wall", f"{f['minimum_wall_mm']:.4f} mm (surely above {f['minimum_wall_bound_mm']:.4f})"),
+        ("stock height", f"{f['stock_height_mm']:.4f} mm"),
+        ("maximum slope", f"{f['maximum_slope']:.4f} (surely below {f['maximum_slope_bound']:.4f})"),
+        ("smallest concave radius", concave),
+        ("margin to internal reflection", f"{margin:.2f} degrees of {f['critical_angle_deg']:.2f}"
+                                          + ", LIGHT IS LOST" * (margin < 0)),
+        ("sharpness limit", f"{f['sharpness_limit_mm']:.3g} mm, {f['sharpness_limit_pixels']:.3g} pixels"),
+        ("throw wrong by 1 mm", f"light moves {f['landing_mm_per_mm_throw']:.3g} mm"
+                                f"{of_a_pixel('throw_error_of_a_pixel_mm', ' mm')}"),
+        ("index wrong by 0.001", f"light moves {f['landing_mm_per_thousandth_index']:.3g} mm"
+                                 f"{of_a_pixel('index_error_of_a_pixel', '')}"),
+    ]

@@ -1,0 +1,345 @@
+"""The same lens in Mitsuba 3, a light tracer that shares no line with this one: do the two images agree?
+
+Mitsuba loads the exported scene (`export --format mitsuba`) and sends independent rays through entrance and exit with its own
+intersections and its own `dielectric`, transmission chosen at both, weighted by its Fresnel factor; what reaches the screen is
+binned.  What leaves by the sides or passes the lens is lost, as in a render.
+
+Notation, of each pixel, or of `side` x `side` of them taken together so that enough rays are expected
+    M, R        power by Mitsuba and by the render, parts of the source's
+    s_M^2       variance of M: rays are independent, so the squares of their weights tell it
+    s_R^2       variance of R, from the scatter of BATCHES independent renders, pooled over 3 x 3
+    s_S         range of R over 3 x 3 times the part of a pixel by which TURN moves light on the screen: the mesh's own error
+    Z           (M - R) / sqrt(s_M^2 + s_R^2 + s_S^2)
+
+They agree if Z is noise: its mean square near 1, few beyond 3, none beyond LARGEST; if the power on the screen is the same; and if
+M is like R as it is and not flipped or turned.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from caustic_cli.errors import CausticError, InputError
+from caustic_cli.files import SOFTWARE, atomic_path
+from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.sampling import stream
+from caustic_cli.optics.tracing import expose
+from caustic_cli.scene import Disc, PlaneWave, Scene
+from caustic_cli.scene.plain import beyond_plain
+from caustic_cli.scene.source import covering_cone
+from caustic_cli.studies.retrace import BATCHES
+
+VARIANTS = ("llvm_ad_mono", "llvm_ad_rgb", "scalar_rgb")  # the scalar one works everywhere and takes minutes
+SHAPES = ("entrance", "exit", "screen")
+#: Rays at a time.
+BATCH = 1 << 20
+#: Angle, rad, by which normals interpolated within triangles may turn the light.
+TURN = 1e-5
+#: Least rays expected of a judged pixel, least part of the light on judged pixels, and most pixels along a side taken together.
+LEAST_RAYS, JUDGED, MOST = 25, 0.8, 32
+#: Part of normal values beyond 3 sigma; what the mean square may exceed 1 by, beside its own 3 sigma; largest |Z|.
+NORMAL, CHI2, LARGEST = 0.0027, 0.05, 7.0
+#: |Z| of the light on the screen, and the part of it that single precision may lose between triangles and at borders.
+LIGHT, LEAK = 4.0, 5e-5
+#: A flipped image may correlate better than the image itself by this much: symmetric pictures differ by noise alone.
+TIE = 1e-2
+
+
+def require_mitsuba(scene: Scene) -> None:
+    """Refuse before work begins what cannot be verified.
+
+    Raises:
+        InputError: Mitsuba is not installed, or the scene has what is not written for it, or other reflections than exact ones.
+    """
+    if find_spec("mitsuba") is None:
+        raise InputError("--verify mitsuba needs Mitsuba 3, which is not installed: pip install 'caustic-cli[verify]'")
+    if beyond_plain(scene):
+        raise InputError(f"--verify mitsuba traces clear lenses and straight screens, not {', '.join(beyond_plain(scene))}")
+    if scene.lens.fresnel != "exact":
+        raise InputError(f"--verify mitsuba knows exact Fresnel reflection only; [lens] fresnel is {scene.lens.fresnel}")
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """render, mitsuba, z: (n_x, n_y), z on taken-together pixels and NaN where too few rays are expected; figures for JSON."""
+
+    render: np.ndarray
+    mitsuba: np.ndarray
+    z: np.ndarray
+    figures: dict
+
+    @property
+    def agree(self) -> bool:
+        """Whether nothing but noise tells the two apart."""
+        return self.figures["agree"]
+
+
+def verify(path: Path, scene: Scene, field: HeightField, heights: Tensor, rays: int, seed: int = 0) -> Verdict:
+    """Trace the lens here and the exported scene at `path` in Mitsuba, with about `rays` rays each, and compare.
+
+    Raises:
+        CausticError: no variant of Mitsuba works on this machine, or no light reaches the screen.
+    """
+    variant = _choose_variant()
+    import mitsuba as mi  # noqa: PLC0415
+
+    mi.set_log_level(mi.LogLevel.Error)
+    world = mi.load_file(str(path))
+    image, squares = _trace(mi, world, scene, rays, seed)
+    renders = np.array([expose(scene, field, heights, rays_of(scene, "stratified", max(1, rays // BATCHES),
+                                                              stream(seed, f"verify {k}"))).image.numpy() for k in range(BATCHES)])
+    if not (renders.sum() > 0 and image.sum() > 0):
+        raise CausticError("no light reaches the screen, so there is nothing to verify")
+    shift = TURN * (scene.screen.z - scene.lens.z_in) / min(scene.screen.pixel)
+    return compare(renders, image, squares, rays, shift, {"mitsuba": mi.__version__, "variant": variant})
+
+
+def _choose_variant() -> str:
+    """Set the first variant that works here.
+
+    Tried in a process of its own: an LLVM older than Dr.Jit asks for does not raise, it aborts.  (A newer one is found with the
+    environment variable DRJIT_LIBLLVM_PATH.)
+    """
+    probe = ("import sys, mitsuba as mi, drjit as dr; mi.set_variant(sys.argv[1]);"
+             "print(dr.maximum(dr.arange(mi.Float, 9) if 'llvm' in mi.variant() else 1.0, 3.0))")
+    for variant in VARIANTS:
+        if subprocess.run([sys.executable, "-c", probe, variant], capture_output=True, check=False).returncode == 0:
+            import mitsuba as mi  # noqa: PLC0415
+
+            mi.set_variant(variant)
+            return variant
+    raise CausticError(f"--verify mitsuba: none of its variants {', '.join(VARIANTS)} works on this machine")
+
+
+# the light
+
+
+def _trace(mi, world, scene: Scene, rays: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Power per pixel [i, j], as a part of the source's, and the sums of the squares of what each ray brings."""
+    rng = np.random.default_rng([seed, 1])
+    shapes = {shape.id(): shape for shape in world.shapes()}
+    follow = _follow if "scalar" not in mi.variant() else _follow_scalar
+    image, squares = np.zeros((2, *scene.screen.resolution))
+    for start, direction, share in emitted(scene, rays, rng):
+        x, y, weight = follow(mi, world, shapes, start, direction)
+        image += _binned(x, y, weight * share, scene)
+        squares += _binned(x, y, (weight * share) ** 2, scene)
+    return image / rays, squares / rays**2
+
+
+def emitted(scene: Scene, rays: int, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Starts and directions (3, N) of independent rays, batch by batch, and what each carries: 1 on average over all of them."""
+    source, (rx, ry), z_in = scene.source, scene.lens.half_size, scene.lens.z_in
+    far, round_ = isinstance(source, Disc) and source.angle is not None, scene.lens.round
+    if getattr(source, "profile", None) is not None:
+        line = (np.arange(2000) + 0.5) / 1000 - 1
+        x, y = np.meshgrid(line, line, indexing="ij")
+        within = x * x + y * y <= 1 if round_ else np.ones_like(x, bool)
+        mean = _profile(source.profile, x[within], y[within]).mean()
+    for first in range(0, rays, BATCH):
+        n = min(BATCH, rays - first)
+        a, b, u, v = rng.random((4, n))
+        one = np.ones(n)
+        if isinstance(source, PlaneWave) or far:
+            sine = np.sqrt(a) * np.sin(np.radians(source.angle) / 2) if far else np.zeros(n)
+            d = np.array([sine * np.cos(2 * np.pi * b), sine * np.sin(2 * np.pi * b), np.sqrt(1 - sine**2)])
+            x, y = ((2 * u - 1) * rx, (2 * v - 1) * ry) if not round_ else (rx * np.sqrt(u) * np.cos(2 * np.pi * v),
+                                                                            rx * np.sqrt(u) * np.sin(2 * np.pi * v))
+            if not far and source.profile is not None:
+                one = _profile(source.profile, x / rx, y / ry) / mean
+            yield np.array([x, y, np.full(n, z_in)]) - d, d, one
+            continue
+        cone = covering_cone(source, (rx, ry), z_in, round_)
+        if source.intensity == "lambertian":
+            sine = np.sqrt(a) * np.sin(cone)
+        else:  # even in the cosine, reckoned from 1
+            drop = a * 2 * np.sin(cone / 2) ** 2
+            sine = np.sqrt(drop * (2 - drop))
+        d = np.array([sine * np.cos(2 * np.pi * b), sine * np.sin(2 * np.pi * b), np.sqrt(1 - sine**2)])
+        if isinstance(source, Disc):
+            wide, high = np.sqrt(u) * np.array(source.size)[:, None] / 2
+            o = np.array(source.position)[:, None] + np.array([wide * np.cos(2 * np.pi * v), high * np.sin(2 * np.pi * v), 0 * u])
+        else:
+            powers = np.array(source.powers)
+            o = np.array(source.positions)[rng.choice(len(powers), n, p=powers / powers.sum())].T
+        near = d[2] > 1e-6  # from 1 mm or less before the entrance: single precision knows no far origin
+        yield o + d * np.where(near, np.maximum((z_in - o[2]) / np.where(near, d[2], 1) - 1, 0), 0), d, one
+
+
+def _profile(e: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Relative irradiance at points of [-1, 1]^2."""
+    i, j = (np.clip((0.5 * (c + 1) * k).astype(int), 0, k - 1) for c, k in zip((x, y), e.shape, strict=True))
+    return e[i, j]
+
+
+def _follow(mi, world, shapes, start: np.ndarray, direction: np.ndarray):
+    """Landing x, y (mm) and weight of the rays, all at once; weight 0 where lost."""
+    ray = mi.Ray3f(mi.Point3f(*map(mi.Float, start)), mi.Vector3f(*map(mi.Float, direction)))
+    weight, active = mi.Float(1.0), mi.Bool(True)
+    for name in SHAPES:
+        hit = world.ray_intersect(ray, active)
+        active &= hit.is_valid() & (hit.shape == mi.ShapePtr(shapes[name]))
+        if name != "screen":
+            ray, passed = _refract(mi, hit, active)
+            weight *= passed
+    return np.array(hit.p.x), np.array(hit.p.y), np.where(np.array(active), np.array(weight), 0.0)
+
+
+def _follow_scalar(mi, world, _shapes, start: np.ndarray, direction: np.ndarray):
+    """The same, ray by ray."""
+    out = np.zeros((3, start.shape[1]))
+    for k in range(start.shape[1]):
+        ray, weight = mi.Ray3f(mi.Point3f(*start[:, k]), mi.Vector3f(*direction[:, k])), 1.0
+        for name in SHAPES:
+            hit = world.ray_intersect(ray)
+            if not hit.is_valid() or hit.shape.id() != name:
+                break
+            if name == "screen":
+                out[:, k] = hit.p.x, hit.p.y, weight
+            else:
+                ray, passed = _refract(mi, hit, True)
+                weight *= passed
+    return out
+
+
+def _refract(mi, hit, active):
+    """The transmitted ray and its share of the power, by Mitsuba's BSDF.
+
+    Component 1 of `dielectric` is transmission; chosen alone, its sample is the refracted direction and its weight the Fresnel
+    transmittance, 0 on total reflection.  Importance mode: power of light, not radiance scaled by the index.
+    """
+    context = mi.BSDFContext(mi.TransportMode.Importance)
+    context.component = 1
+    sample, weight = hit.bsdf().sample(context, hit, 0.5, mi.Point2f(0.5), active)
+    return hit.spawn_ray(hit.to_world(sample.wo)), weight[0]
+
+
+def _binned(x: np.ndarray, y: np.ndarray, value: np.ndarray, scene: Scene) -> np.ndarray:
+    """Sum of `value` per pixel [i, j]."""
+    (nx, ny), (sx, sy) = scene.screen.resolution, scene.screen.half_size
+    i, j = np.floor((x / sx + 1) * nx / 2), np.floor((y / sy + 1) * ny / 2)
+    inside = (i >= 0) & (i < nx) & (j >= 0) & (j < ny) & (value > 0)
+    at = (i[inside] * ny + j[inside]).astype(np.int64)
+    return np.bincount(at, value[inside], nx * ny).reshape(nx, ny)
+
+
+# the verdict
+
+
+def compare(renders: np.ndarray, image: np.ndarray, squares: np.ndarray, rays: int, shift: float = 0.0,
+            about: dict | None = None) -> Verdict:
+    """Z-scores of Mitsuba's image against several renders, and whether they are noise.
+
+    Args:
+        renders: (k, n_x, n_y), independent.
+        image, squares: (n_x, n_y), power and the sums of squares of what each of the `rays` rays brings.
+        shift: part of a pixel by which the light may be moved.
+        about: figures to begin with.
+    """
+    render = renders.mean(0)
+    per_ray, side = squares.sum() / image.sum(), 1
+    while side < MOST:
+        expected = _taken(render, side)
+        if expected[expected >= LEAST_RAYS * per_ray].sum() >= JUDGED * expected.sum():
+            break
+        side *= 2
+    z, spread = _z_scores(*(_taken(a, side) for a in (renders, image, squares)), rays, per_ray, shift / side)
+    some = z[np.isfinite(z)]
+    if not len(some):
+        raise CausticError(f"{rays:,} rays are too few to judge a single pixel by; --rays must be larger")
+    sums = renders.sum((1, 2))
+    noise = squares.sum() - image.sum() ** 2 / rays + sums.var(ddof=1) / len(sums) + (LEAK * render.sum()) ** 2
+    light = float((image.sum() - render.sum()) / noise**0.5)
+    chi2, beyond, largest = float(np.mean(some**2)), float(np.mean(abs(some) > 3)), float(abs(some).max())
+    turned = _turned(render)
+    own, other = _correlation(image, render), max(_correlation(image, t) for t in turned)
+    total, of_noise = _rms(image, render), _noise(image, squares, renders)
+    figures = {
+        **(about or {}), "rays": rays, "pixels": len(some), "pixel_side": side, "noise": float(spread),
+        "relative_rms": total, "noise_rms": of_noise, "relative_rms_beyond_noise": max(total**2 - of_noise**2, 0.0) ** 0.5,
+        "on_screen": float(image.sum()), "on_screen_render": float(render.sum()), "light_z": light,
+        "z_mean": float(some.mean()), "z_mean_square": chi2, "z_beyond_3": beyond, "z_largest": largest,
+        "correlation": own, "correlation_turned": other,
+    }
+    figures["agree"] = bool(
+        chi2 <= 1 + CHI2 + 3 * (2 / len(some)) ** 0.5 and beyond <= 2 * NORMAL + 3 * (NORMAL / len(some)) ** 0.5
+        and largest < LARGEST and abs(light) < LIGHT and own >= other - TIE)
+    return Verdict(render, image, np.repeat(np.repeat(z, side, 0), side, 1), figures)
+
+
+def _z_scores(renders: np.ndarray, image: np.ndarray, squares: np.ndarray, rays: int, per_ray: float, shift: float):
+    """Z of each pixel, NaN where too few rays are expected, and the mean noise of the others, relative."""
+    render, scatter = renders.mean(0), renders.var(0, ddof=1) / len(renders)
+    around = _around(render).sum(0)  # few renders tell a pixel's variance badly: as much a unit of light as its neighbours'
+    scatter = render * _around(scatter).sum(0) / np.where(around > 0, around, 1.0)
+    moved = shift * np.ptp(_around(render, "edge"), axis=0)
+    judged = render >= LEAST_RAYS * per_ray
+    each = np.where(image > 0, squares / np.where(image > 0, image, 1.0), per_ray)  # what a ray brings there
+    expected = (image + render) / 2  # the count itself would make a pixel that has too few look surer than it is
+    variance = np.where(judged, each * expected - expected**2 / rays + scatter + moved**2, 1.0)
+    z = np.where(judged, (image - render) / np.sqrt(variance), np.nan)
+    return z, np.mean(np.sqrt(variance[judged]) / render[judged]) if judged.any() else 0.0
+
+
+def _taken(a: np.ndarray, side: int) -> np.ndarray:
+    """Sums over side x side pixels of the last two axes; the last ones may be fewer, and are filled up with darkness."""
+    nx, ny = (-(-n // side) for n in a.shape[-2:])
+    pad = [(0, 0)] * (a.ndim - 2) + [(0, nx * side - a.shape[-2]), (0, ny * side - a.shape[-1])]
+    return np.pad(a, pad).reshape(*a.shape[:-2], nx, side, ny, side).sum((-3, -1))
+
+
+def _around(a: np.ndarray, mode: str = "constant") -> np.ndarray:
+    """The 3 x 3 pixels around each: (9, n_x, n_y)."""
+    padded = np.pad(a, 1, mode=mode)
+    return np.array([padded[i : i + a.shape[0], j : j + a.shape[1]] for i in range(3) for j in range(3)])
+
+
+def _turned(a: np.ndarray) -> list[np.ndarray]:
+    """The image flipped and turned, in all ways that keep its shape."""
+    flipped = [a[::-1], a[:, ::-1], a[::-1, ::-1]]
+    return flipped if a.shape[0] != a.shape[1] else flipped + [b.T for b in (a, *flipped)]
+
+
+def _correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Pearson's, over pixels."""
+    return float(np.corrcoef(a.ravel(), b.ravel())[0, 1]) if np.ptp(a) > 0 < np.ptp(b) else 0.0
+
+
+def _rms(a: np.ndarray, b: np.ndarray) -> float:
+    """Difference of two images, each over its own mean."""
+    return float(np.sqrt(np.mean((a / a.mean() - b / b.mean()) ** 2)))
+
+
+def _noise(image: np.ndarray, squares: np.ndarray, renders: np.ndarray) -> float:
+    """What noise alone makes of `_rms`."""
+    return float(np.sqrt(squares.mean() + renders.var(0, ddof=1).mean() / len(renders)) / image.mean())
+
+
+def write_panels(path: str | Path, verdict: Verdict, scene: Scene) -> None:
+    """A PNG: the render, Mitsuba's image, and their difference in standard deviations."""
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    figure = Figure(figsize=(14.4, 5.0), dpi=100, layout="constrained")
+    axes, (sx, sy) = figure.subplots(1, 3), scene.screen.half_size
+    white = np.quantile(verdict.render, 0.999) or 1.0
+    shown = {"extent": [-sx, sx, -sy, sy], "origin": "lower"}
+    for axis, image, title in zip(axes, (verdict.render, verdict.mitsuba), ("caustic", "Mitsuba 3"), strict=False):
+        axis.imshow(np.sqrt(np.clip(image / white, 0.0, 1.0)).T, cmap="gray", vmin=0, vmax=1, **shown)
+        axis.set(title=title, xlabel="x on the screen (mm)", ylabel="y (mm)")
+    z = verdict.z[: verdict.render.shape[0], : verdict.render.shape[1]]
+    drawn = axes[2].imshow(z.T, cmap="coolwarm", vmin=-4, vmax=4, **shown)
+    figure.colorbar(drawn, ax=axes[2], label="standard deviations")
+    f = verdict.figures
+    axes[2].set(title=f"Mitsuba - caustic: mean Z² {f['z_mean_square']:.3f}, {'agree' if f['agree'] else 'DISAGREE'}",
+                xlabel="x on the screen (mm)", ylabel="y (mm)")
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format="png", metadata={"Software": SOFTWARE})

@@ -1,0 +1,72 @@
+"""The verdict on a finished design: its lens retraced with rays of its own, beside the one it began from; render and report.
+
+What the optimiser saw is no judge of what it did: it learns its own rays and its own filter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from caustic_cli.inverse.designer import Designer, State
+from caustic_cli.inverse.losses import parse
+from caustic_cli.inverse.target import grey
+from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.sampling import Sample
+from caustic_cli.picture import write_image
+from caustic_cli.project import RENDER, REPORT, Project
+from caustic_cli.studies.panels import write_report
+from caustic_cli.studies.retrace import FINAL_RAYS, retrace, white_level
+
+#: Points along each side of the aperture at which the report draws the surface.
+REPORT_SAMPLES = 401
+#: Losses whose aim is the likeness itself; another may rightly pay for what it wants with likeness.
+LIKENESS = {"rms", "rms-light", "throughput"}
+#: From so many times the light on the screen, a lens may be less like its target than the start is.
+BRIGHTER = 1.01
+
+
+def judge(project: Project, designer: Designer, target: np.ndarray, state: State, device: str) -> tuple[State, dict]:
+    """Retrace the finished lens; write render.png and report.png.
+
+    Where nothing but likeness was asked for, a lens that is worse than what the design began from is replaced by that.
+
+    Returns:
+        the state with the lens that was kept, and its figures, with start_relative_rms where a start was retraced.
+    """
+    scene, field, seed = designer.scene, designer.field(state.stage), project.settings["design"]["seed"]
+
+    def trace(heights: torch.Tensor):
+        return retrace(scene, field, heights, target, rays=FINAL_RAYS, device=device, seed=seed)
+
+    exposure, figures = trace(state.heights)
+    likeness = {name for _, name in parse(designer.options.loss)} <= LIKENESS
+    if state.start is not None and likeness:
+        start = designer.begun(state)
+        first, began = trace(start)
+        if _worse(figures, began):
+            state = replace(designer.showing(state, start), reason=f"{state.reason}; its start was better and is kept")
+            exposure, figures = first, began
+        figures = figures | {"start_relative_rms": began["relative_rms"]}
+    image, encoding = exposure.image.cpu().numpy(), project.settings["target"]["encoding"]
+    write_image(project.path / RENDER, image, white_level(image, target), encoding)
+    history = np.array(state.history, dtype=float).reshape(-1, 5)
+    write_report(project.path / REPORT, grey(target), grey(image), _surface(field, state.heights), history, scene.lens,
+                 scene.screen, figures, encoding)
+    return state, figures
+
+
+def _worse(figures: dict, than: dict) -> bool:
+    """Whether a picture is less like its target without being brighter; a black one is worse than any other."""
+    if than["on_screen"] == 0:
+        return False
+    return figures["on_screen"] == 0 or (figures["relative_rms"] > than["relative_rms"]
+                                         and figures["on_screen"] < BRIGHTER * than["on_screen"])
+
+
+def _surface(field: HeightField, heights: torch.Tensor) -> np.ndarray:
+    """The surface on an even grid over the aperture, mm."""
+    u = torch.linspace(0.0, 1.0, REPORT_SAMPLES, dtype=torch.float64)
+    return field.prepare(Sample(u, u, True, torch.ones(())), torch.float64)(heights)[0].numpy()

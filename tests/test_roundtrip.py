@@ -1,0 +1,498 @@
+"""Every exported file, read back by what is not ours where there is such a reader, and traced again.
+
+The rays of a plane wave are sent through what was read with the closed form of a single refracting surface,
+    M(x) = x + (n - S) / (n |g|^2 + S) (z_screen - f) g,    S = sqrt(1 - (n^2 - 1) |g|^2),
+f and g being its height and slopes; they must land where the program's own tracer puts them.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+import types
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import torch
+from scipy.interpolate import BSpline, CubicHermiteSpline, RectBivariateSpline
+from test_export import CASES, make, signed_volume
+
+from caustic_cli.errors import InputError
+from caustic_cli.export.lighttools import write_lighttools
+from caustic_cli.export.lighttools_script import companions, write_script
+from caustic_cli.export.mesh import closed_mesh
+from caustic_cli.export.mitsuba import write_mitsuba
+from caustic_cli.export.obj import write_obj
+from caustic_cli.export.ply import write_ply
+from caustic_cli.export.points import write_csv, write_xyz
+from caustic_cli.export.step import write_step
+from caustic_cli.export.stl import write_stl
+from caustic_cli.export.surface import STEPS_PER_SPAN, sample_grid, second_derivative_bounds
+from caustic_cli.export.zemax import write_zemax
+from caustic_cli.files import is_ours
+from caustic_cli.optics.sampling import Sample
+from caustic_cli.optics.tracing import PlaneTracer
+from caustic_cli.scene import Disc, PlaneWave, Points, Scene
+from caustic_cli.surfaces import onto, read_surface
+
+LIMIT = 1e-3  # mm on a screen 300 mm away
+CASE = {"control": (22, 16), "size": (10.0, 8.0), "relief": 0.03}
+
+
+@pytest.fixture(scope="module")
+def lens():
+    return make(**CASE)
+
+
+@pytest.fixture(scope="module")
+def rays(lens):
+    """(x, y) on the lens, and where the program's tracer lands them."""
+    scene, field, heights = lens
+    u, v = np.random.default_rng(1).uniform(size=(2, 3000))
+    sample = Sample(torch.as_tensor(u), torch.as_tensor(v), False, torch.tensor(1 / 3000, dtype=torch.float64))
+    landing = PlaneTracer(scene, field, sample, torch.float64)(heights)
+    assert int(landing.status.sum()) == 0
+    x, y = (2 * u - 1) * field.half_size[0], (2 * v - 1) * field.half_size[1]
+    assert np.hypot(landing.x.numpy() - x, landing.y.numpy() - y).max() > 5  # mm: the lens does bend light
+    return x, y, landing.x.numpy(), landing.y.numpy()
+
+
+def off(scene, rays, f, gx, gy) -> float:
+    """Largest landing-point error, mm, of rays through a surface of height f and slopes gx, gy."""
+    x, y, lx, ly = rays
+    n, g2 = scene.lens.index, gx * gx + gy * gy
+    s = np.sqrt(1 - (n * n - 1) * g2)
+    reach = (n - s) / (n * g2 + s) * (scene.screen.z - f)
+    return float(np.hypot(x + reach * gx - lx, y + reach * gy - ly).max())
+
+
+def through(x, y, z, rays):
+    """Height and slopes at the rays of SciPy's bicubic spline through a grid."""
+    spline = RectBivariateSpline(x, y, z, kx=3, ky=3, s=0)
+    return [spline.ev(rays[0], rays[1], dx=a, dy=b) for a, b in ((0, 0), (1, 0), (0, 1))]
+
+
+def say(capsys, name: str, error: float) -> None:
+    with capsys.disabled():
+        print(f"\n  {name}: landing-point error {error:.2g} mm", end="")
+
+
+def grid_of(points):
+    """x, y, z[i, j] of points that fill a rectangular grid in any order."""
+    x, i = np.unique(points[:, 0], return_inverse=True)
+    y, j = np.unique(points[:, 1], return_inverse=True)
+    assert len(x) * len(y) == len(points) and len(np.unique(i * len(y) + j)) == len(points)
+    z = np.empty((len(x), len(y)))
+    z[i, j] = points[:, 2]
+    return x, y, z
+
+
+# grids
+
+
+def read_zemax(path):
+    """x, y ascending, and z, zx, zy, zxy (nx, ny) of a Grid Sag file, by its definition alone."""
+    raw = path.read_bytes()
+    assert raw.count(b"\n") == raw.count(b"\r\n")
+    lines = [line for line in raw.decode().splitlines() if not line.startswith("!")]
+    nx, ny, dx, dy, unit, xdec, ydec = (float(t) for t in lines[0].split())
+    nx, ny = int(nx), int(ny)
+    assert unit == xdec == ydec == 0 and min(nx, ny) >= 5
+    table = np.array([line.split() for line in lines[1:]], float)
+    assert table.shape == (nx * ny, 5) and not table[:, 4].any()
+    x, y = (np.arange(nx) - (nx - 1) / 2) * dx, (np.arange(ny) - (ny - 1) / 2) * dy
+    return x, y, *(table[:, k].reshape(ny, nx)[::-1].T for k in range(4))
+
+
+def hermite(x, y, z, zx, zy, zxy, at):
+    """Height and slopes at scattered points of the bicubic Hermite patches, by SciPy along x and then along y."""
+    out = []
+    for dx, dy in ((0, 0), (1, 0), (0, 1)):
+        values = []
+        for px, py in at:
+            f, fy = CubicHermiteSpline(x, z, zx)(px, dx), CubicHermiteSpline(x, zy, zxy)(px, dx)
+            values.append(CubicHermiteSpline(y, f, fy)(py, dy))
+        out.append(np.array(values))
+    return out
+
+
+def test_zemax(tmp_path, lens, rays, capsys):
+    scene, field, heights = lens
+    write_zemax(tmp_path / "lens.dat", *lens)
+    x, y, z, zx, zy, zxy = read_zemax(tmp_path / "lens.dat")
+    vertex = float(field.at(heights, *torch.zeros(2, 1, dtype=torch.float64), [(0, 0)])[0])
+    said = re.search(r"vertex (\S+) mm", (tmp_path / "lens.dat").read_text())
+    assert float(said[1]) == vertex - scene.lens.z_in
+    f, gx, gy = through(x, y, z, rays)
+    error = off(scene, rays, f + vertex, gx, gy)
+    say(capsys, "zemax, bicubic spline", error)
+    assert error < LIMIT
+    spline = RectBivariateSpline(x, y, z)
+    for column, (a, b), scale in ((zx, (1, 0), 1), (zy, (0, 1), 1), (zxy, (1, 1), 10)):
+        assert np.abs(spline(x, y, dx=a, dy=b) - column).max() < 1e-9 * scale
+    few = tuple(r[:60] for r in rays)
+    f, gx, gy = hermite(x, y, z, zx, zy, zxy, list(zip(*few[:2], strict=True)))
+    error = off(scene, few, f + vertex, gx, gy)
+    say(capsys, "zemax, Hermite patches", error)
+    assert error < 1e-8
+
+
+def test_zemax_refuses_fewer_than_five(tmp_path, lens):
+    with pytest.raises(InputError, match="at least 5"):
+        write_zemax(tmp_path / "lens.dat", *lens, samples=(4, 9))
+    assert not list(tmp_path.iterdir())
+
+
+def test_zemax_grids_are_even_though_knots_are_not(tmp_path):
+    write_zemax(tmp_path / "lens.dat", *make(**CASES["uneven knots"]))
+    x, *_ = read_zemax(tmp_path / "lens.dat")
+    assert len(x) == 4 * 5 + 1 and x[0] == -5 and x[-1] == 5
+
+
+def test_lighttools(tmp_path, lens, rays, capsys):
+    write_lighttools(tmp_path / "lens.npz", *lens)
+    with np.load(tmp_path / "lens.npz") as data:
+        error = off(lens[0], rays, *through(data["x"], data["y"], data["z"], rays))
+    say(capsys, "lighttools", error)
+    assert error < LIMIT
+
+
+@pytest.mark.parametrize(("write", "suffix", "options"), [(write_csv, "csv", {"delimiter": ",", "skiprows": 1}),
+                                                          (write_xyz, "xyz", {})])
+def test_points(tmp_path, lens, rays, capsys, write, suffix, options):
+    path = tmp_path / f"lens.{suffix}"
+    write(path, *lens)
+    points = np.loadtxt(path, **options)
+    grid = sample_grid(lens[1], lens[2], None)
+    ordered = grid.points.reshape(*grid.z.shape, 3).swapaxes(0, 1).reshape(-1, 3)
+    assert (points == ordered).all()  # the last bit, x fastest
+    error = off(lens[0], rays, *through(*grid_of(points), rays))
+    say(capsys, suffix, error)
+    assert error < LIMIT
+    assert is_ours(path) == (suffix == "xyz")
+    assert suffix == "xyz" or path.read_text().startswith("x_mm,y_mm,z_mm\n")
+
+
+# meshes
+
+
+@pytest.mark.parametrize(("write", "suffix"), [(write_stl, "stl"), (write_ply, "ply"), (write_obj, "obj")])
+def test_meshes(tmp_path, lens, rays, capsys, write, suffix):
+    """The mesh's vertices, laid under a spline; a facet's own normal would be another matter."""
+    trimesh = pytest.importorskip("trimesh")
+    path, (scene, field, heights) = tmp_path / f"lens.{suffix}", lens
+    # float32 corners: a grid half as fine as the default feels their rounding half as much, and still has every knot
+    write(path, *lens, samples=tuple(2 * (n - 3) + 1 for n in field.shape) if suffix == "stl" else None)
+    mesh = trimesh.load_mesh(path)
+    assert mesh.is_watertight and mesh.is_winding_consistent and mesh.is_volume and mesh.body_count == 1
+    assert mesh.volume == pytest.approx(signed_volume(np.array(mesh.triangles)), rel=1e-6) and mesh.volume > 0
+    inner = mesh.vertices[mesh.vertices[:, 2] > scene.lens.z_in]
+    x, y, z = grid_of(inner)
+    error = off(scene, rays, *through(x, y, z, rays))
+    say(capsys, suffix, error)
+    assert error < LIMIT
+    if suffix != "stl":
+        assert (z == sample_grid(field, heights, None).z).all()
+    assert is_ours(path)
+
+
+@pytest.mark.parametrize("case", [*CASES.values(), CASE], ids=[*CASES, "fine"])
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-3])
+def test_chord_error_is_what_tolerance_asks(case, tolerance):
+    """At random points of every triangle; and not by far finer than asked."""
+    scene, field, heights = make(**case)
+    vertices, faces = closed_mesh(scene, field, heights, tolerance=tolerance)
+    corners = vertices[faces]
+    corners = corners[(corners[..., 2] > scene.lens.z_in).all(1) & (np.ptp(corners[..., 2], axis=1) >= 0)]
+    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2]
+    corners = corners[area > 1e-12]  # the walls stand upright
+    rng = np.random.default_rng(2)
+    weights = rng.dirichlet((1, 1, 1), len(corners))
+    weights[:, :2] = np.where(rng.random((len(corners), 1)) < 0.5, 0.5, weights[:, :2])  # the middle of an edge is the worst
+    weights[:, 2] = 1 - weights[:, 0] - weights[:, 1]
+    points = np.einsum("ij,ijk->ik", weights, corners)
+    exact = field.at(heights, *torch.as_tensor(points[:, :2].T.copy()), [(0, 0)])[0].numpy()
+    error = np.abs(points[:, 2] - exact).max()
+    assert len(points) >= 2 and error <= tolerance * (1 + 1e-6)
+    if len(points) > 10_000:
+        assert error > 0.1 * tolerance
+
+
+def test_second_derivatives_stay_below_their_bounds(lens):
+    _, field, heights = lens
+    x, y = np.random.default_rng(3).uniform(-1, 1, (2, 20000))
+    at = [torch.as_tensor(c * r) for c, r in zip((x, y), field.half_size, strict=True)]
+    found = field.at(heights, *at, [(2, 0), (1, 1), (0, 2)])
+    for values, bound in zip(found, second_derivative_bounds(field, heights), strict=True):
+        assert 0.4 * bound < float(values.abs().max()) <= bound
+
+
+@pytest.mark.parametrize("tolerance", [0.0, -1.0, float("nan"), 1e-30])
+def test_refuses_absurd_tolerances(tolerance, lens):
+    with pytest.raises(InputError, match="--tolerance"):
+        closed_mesh(*lens, tolerance=tolerance)
+    with pytest.raises(InputError, match="one of them"):
+        closed_mesh(*lens, samples=(9, 9), tolerance=1e-3)
+
+
+# STEP
+
+
+def read_step(path):
+    """Entities by number, as text: enough of ISO 10303-21 for a test."""
+    text = path.read_text()
+    assert text.startswith("ISO-10303-21;\nHEADER;") and text.endswith("ENDSEC;\nEND-ISO-10303-21;\n")
+    return {int(n): body for n, body in re.findall(r"^#(\d+)=(.*);$", text, re.M)}
+
+
+def arguments(body):
+    """The arguments of an entity as nested tuples of numbers, references and words."""
+    text = re.sub(r"\.(\w+)\.", r"'\1'", body[body.index("(") :])
+    text = re.sub(r"#(\d+)", r"'#\1'", text.replace("$", "None").replace("*", "None"))
+    return ast.literal_eval(text.replace(")", ",)").replace("(,)", "()").replace(",,)", ",)"))
+
+
+def step_surface(entities):
+    """Degrees, poles (n, m, 3), knot vectors."""
+    (body,) = (b for b in entities.values() if b.startswith("B_SPLINE_SURFACE_WITH_KNOTS"))
+    _, p, q, net, *_, mu, mv, ku, kv, _ = arguments(body)
+    poles = np.array([[arguments(entities[int(r[1:])])[1] for r in row] for row in net])
+    return (p, q), poles, (np.repeat(ku, mu), np.repeat(kv, mv))
+
+
+def test_step(tmp_path, lens, rays, capsys):
+    scene, field, heights = lens
+    write_step(tmp_path / "lens.step", *lens)
+    (p, q), poles, (tu, tv) = step_surface(read_step(tmp_path / "lens.step"))
+    assert (poles[..., 2] == heights.numpy()).all() and (tu == field.spaces[0].knots.numpy()).all()
+    assert (tv == field.spaces[1].knots.numpy()).all()
+    x, y = (c.numpy() for c in field.control_xy())
+    assert (poles[..., 0] == x[:, None]).all() and (poles[..., 1] == y).all()
+    u, v = (0.5 * (c / r + 1) for c, r in zip(rays[:2], field.half_size, strict=True))
+    columns = [BSpline.design_matrix(c, t, k) for c, t, k in ((u, tu, p), (v, tv, q))]
+    slopes = [BSpline(t, np.eye(len(t) - k - 1), k)(c, 1) for c, t, k in ((u, tu, p), (v, tv, q))]
+    net = poles[..., 2]
+    f = np.einsum("ki,ij,kj->k", columns[0].toarray(), net, columns[1].toarray())
+    gx = np.einsum("ki,ij,kj->k", slopes[0], net, columns[1].toarray()) / scene.lens.size[0]
+    gy = np.einsum("ki,ij,kj->k", columns[0].toarray(), net, slopes[1]) / scene.lens.size[1]
+    error = off(scene, rays, f, gx, gy)
+    say(capsys, "step", error)
+    assert error < 1e-9
+
+
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_step_is_closed(tmp_path, case):
+    """Every edge is used once each way, every reference exists, and the corners of every loop follow one another."""
+    write_step(tmp_path / "lens.step", *make(**case))
+    entities = read_step(tmp_path / "lens.step")
+    assert {int(r) for body in entities.values() for r in re.findall(r"#(\d+)", body)} <= set(entities)
+    uses = []
+    loops = [arguments(b)[1] for b in entities.values() if b.startswith("EDGE_LOOP")]
+    assert len(loops) == 6
+    for loop in loops:
+        ends = []
+        for oriented in loop:
+            *_, edge, way = arguments(entities[int(oriented[1:])])
+            _, a, b, _, _ = arguments(entities[int(edge[1:])])
+            uses.append((edge, way))
+            ends.append((a, b) if way == "T" else (b, a))
+        assert all(e[1] == n[0] for e, n in zip(ends, ends[1:] + ends[:1], strict=True))
+    assert len(uses) == len(set(uses)) == 24 and len({e for e, _ in uses}) == 12
+
+
+def test_step_in_opencascade(tmp_path, lens, rays, capsys):
+    """Only where OpenCASCADE (cadquery-ocp) is installed: a valid solid, poles to the last bit, the volume, the rays."""
+    control = pytest.importorskip("OCP.STEPControl", exc_type=ImportError)
+    from OCP.BRep import BRep_Tool  # noqa: PLC0415
+    from OCP.BRepCheck import BRepCheck_Analyzer  # noqa: PLC0415
+    from OCP.Geom import Geom_BSplineSurface  # noqa: PLC0415
+    from OCP.gp import gp_Pnt, gp_Vec  # noqa: PLC0415
+    from OCP.TopAbs import TopAbs_FACE, TopAbs_ShapeEnum  # noqa: PLC0415
+    from OCP.TopExp import TopExp_Explorer  # noqa: PLC0415
+    from OCP.TopoDS import TopoDS  # noqa: PLC0415
+
+    for k, case in enumerate([*CASES.values(), CASE]):
+        scene, field, heights = made = make(**case)
+        path = tmp_path / f"{k}.step"
+        write_step(path, *made)
+        reader = control.STEPControl_Reader()
+        reader.ReadFile(str(path))
+        reader.TransferRoots()
+        shape = reader.OneShape()
+        assert BRepCheck_Analyzer(shape).IsValid() and shape.ShapeType() == TopAbs_ShapeEnum.TopAbs_SOLID
+        explorer, surfaces = TopExp_Explorer(shape, TopAbs_FACE), []
+        while explorer.More():
+            face = getattr(TopoDS, "Face_s", None) or TopoDS.Face
+            surfaces.append(BRep_Tool.Surface_s(face(explorer.Current())))
+            explorer.Next()
+        (surface,) = (s for s in surfaces if isinstance(s, Geom_BSplineSurface))
+        assert len(surfaces) == 6
+        net = np.array([[surface.Pole(i + 1, j + 1).Z() for j in range(field.shape[1])] for i in range(field.shape[0])])
+        assert (net == heights.numpy()).all()
+    found = []
+    for x, y in zip(*rays[:2], strict=True):
+        point, du, dv = gp_Pnt(), gp_Vec(), gp_Vec()
+        surface.D1((x / field.half_size[0] + 1) / 2, (y / field.half_size[1] + 1) / 2, point, du, dv)
+        found.append((point.Z(), du.Z() / du.X(), dv.Z() / dv.Y()))
+    error = off(scene, rays, *np.array(found).T)
+    say(capsys, "step in OpenCASCADE", error)
+    assert error < 1e-9
+
+
+# Mitsuba, LightTools
+
+
+def test_mitsuba_meshes(tmp_path, lens, rays, capsys):
+    trimesh = pytest.importorskip("trimesh")
+    write_mitsuba(tmp_path / "lens.xml", *lens)
+    root = ElementTree.fromstring((tmp_path / "lens.xml").read_text())
+    shapes = {s.get("id"): s for s in root.iter("shape")}
+    assert {"entrance", "exit", "sides", "screen", "light"} <= set(shapes)
+    exit_ = trimesh.load(tmp_path / shapes["exit"].find("string").get("value"), process=False)
+    error = off(lens[0], rays, *through(*grid_of(np.array(exit_.vertices)), rays))
+    say(capsys, "mitsuba, exit mesh", error)
+    assert error < LIMIT
+    grid = sample_grid(lens[1], lens[2], None)
+    assert np.abs(exit_.vertex_normals - grid.normals).max() < 1e-12
+    sides = trimesh.load(tmp_path / shapes["sides"].find("string").get("value"), process=False)
+    assert len(sides.faces) == 2 * (2 * sum(grid.z.shape) - 4)
+    assert (np.einsum("ij,ij->i", sides.face_normals, sides.triangles_center * [1, 1, 0]) > 0).all()  # outward
+
+
+@pytest.mark.parametrize("source", [Points(((0.0, 0.0, -50.0),), intensity="lambertian"), Disc(angle=0.5),
+                                    Disc(intensity="uniform"), PlaneWave(profile=np.ones((2, 2)))])
+def test_mitsuba_refuses_lights_it_has_not(tmp_path, lens, source):
+    with pytest.raises(InputError, match="mitsuba"):
+        write_mitsuba(tmp_path / "lens.xml", Scene(source, lens[0].lens, lens[0].screen), *lens[1:])
+    assert not list(tmp_path.iterdir())
+
+
+class FakeLightTools:
+    """Answers like the COM interface and remembers what it was told."""
+
+    def __init__(self):
+        self.calls = []
+
+    def __getattr__(self, name):
+        def call(*arguments):
+            self.calls.append((name, *arguments))
+            if name == "GetMeshData":
+                return 0, arguments[1]
+            return ("FreeformEntity_3", 0) if name == "DbGet" else 0
+        return call
+
+
+@pytest.mark.parametrize("source", [PlaneWave(), Points(((0.0, 1.0, -50.0), (2.0, 0.0, -60.0))), Disc(), Disc(angle=0.5)])
+def test_the_lighttools_script_builds_this_lens(tmp_path, lens, rays, source, monkeypatch, capsys):
+    scene = Scene(source, lens[0].lens, lens[0].screen)
+    path = tmp_path / "lens.npz"
+    write_lighttools(path, scene, *lens[1:])
+    write_script(path, scene, *lens[1:])
+    fake, client = FakeLightTools(), types.ModuleType("win32com.client")
+    client.Dispatch = lambda name: fake
+    package = types.ModuleType("win32com")
+    package.client = client
+    monkeypatch.setitem(sys.modules, "win32com", package)
+    monkeypatch.setitem(sys.modules, "win32com.client", client)
+    monkeypatch.setattr(sys, "argv", ["lens.py", "1e3"])
+    script = companions(path)[0]
+    exec(compile(script.read_text(), script, "exec"), {"__name__": "__main__", "__file__": str(script)})
+    calls = {name: [c[1:] for c in fake.calls if c[0] == name] for name in {c[0] for c in fake.calls}}
+    (front, rear) = calls["SetFreeformSurfacePoints"]
+    assert "FrontSurface" in front[0] and {p[2] for row in front[1] for p in row} == {scene.lens.z_in}
+    points = np.array(rear[1])
+    assert points.shape == (*rear[2:], 3)
+    error = off(scene, rays, *through(points[:, 0, 0], points[0, :, 1], points[..., 2], rays))
+    say(capsys, "lighttools script", error)
+    assert error < LIMIT
+    sources = 2 if isinstance(source, Points) else 1
+    assert len(calls["MakeSourceSurfaceCube"]) == len(calls["SetSourcePower"]) == sources
+    assert sum(c[2] for c in calls["SetSourcePower"]) == pytest.approx(1.0)
+    mesh = {c[1]: c[2] for c in calls["DbSet"]}
+    assert (mesh["X_Dimension"], mesh["Y_Dimension"], mesh["Max_X_Bound"], mesh["Do_Noise_Reduction"]) == (64, 50, 19.2, "No")
+    assert mesh["MaxProgress"] == 1000 and any("BeginAllSimulations" in c[0] for c in calls["Cmd"])
+    assert np.load(tmp_path / "lens-lighttools.npy").shape == (64, 50)
+    assert all(is_ours(p) for p in companions(path))
+
+
+def test_the_lighttools_block_holds_the_points(tmp_path, lens):
+    write_script(tmp_path / "lens.npz", *lens, samples=(9, 6))
+    text = companions(tmp_path / "lens.npz")[1].read_text()
+    blocks = re.findall(r"restorePoints:\nORAStartData;\n(.*?)\nORAEndData;\nORAReadForeignData;\n} restore(\w+):", text, re.S)
+    assert [name for _, name in blocks] == ["Front", "Rear"]
+    words = blocks[1][0].split()
+    assert words[:10] == ["0", "0", "9", "6", "0", "0", "54", "0", "0", "0"]
+    assert words[-8:] == ["1", "4", "CartesianMapper", "1", "0", "0", "0", "0"]
+    points = np.array(words[10:-9], float).reshape(6, 9, 3)
+    expected = sample_grid(lens[1], lens[2], (9, 6)).points.reshape(9, 6, 3).swapaxes(0, 1)
+    assert (points == expected).all()
+
+
+# all of them
+
+
+@pytest.mark.parametrize(("write", "name"), [
+    (write_lighttools, "a.npz"), (write_zemax, "a.dat"), (write_step, "a.step"), (write_stl, "a.stl"), (write_ply, "a.ply"),
+    (write_obj, "a.obj"), (write_csv, "a.csv"), (write_xyz, "a.xyz"), (write_mitsuba, "a.xml")])
+def test_bytes_repeat(tmp_path, write, name):
+    made = []
+    for folder in ("one", "two"):
+        (tmp_path / folder).mkdir()
+        write(tmp_path / folder / name, *make())
+        made.append({p.name: p.read_bytes() for p in (tmp_path / folder).iterdir()})
+    assert made[0] == made[1] and made[0]
+
+
+# and back
+
+
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+@pytest.mark.parametrize(("write", "name"), [(write_lighttools, "lens.npz"), (write_step, "lens.step")])
+def test_the_spline_comes_back_to_the_last_bit(tmp_path, case, write, name):
+    scene, field, heights = make(**case)
+    write(tmp_path / name, scene, field, heights)
+    again, net = read_surface(tmp_path / name, scene.lens.half_size)
+    assert (net == heights).all() and again.half_size == field.half_size
+    assert all((a.knots == b.knots).all() and a.degree == b.degree for a, b in zip(again.spaces, field.spaces, strict=True))
+    assert onto(again, net, field).allclose(heights, rtol=1e-12)
+
+
+def test_heights_on_the_knots_come_back(tmp_path, lens, rays, capsys):
+    scene, field, heights = lens
+    samples = tuple(STEPS_PER_SPAN * (n - 3) + 1 for n in field.shape)
+    np.save(tmp_path / "z.npy", sample_grid(field, heights, samples).z)
+    net = onto(*read_surface(tmp_path / "z.npy", scene.lens.half_size), field)
+    assert (net - heights).abs().max() < 1e-9
+    f, gx, gy = (t.numpy() for t in field.at(net, *map(torch.as_tensor, rays[:2])))
+    error = off(scene, rays, f, gx, gy)
+    say(capsys, "heights.npy", error)
+    assert error < 1e-6
+
+
+def test_readers_refuse(tmp_path, lens):
+    half = lens[0].lens.half_size
+    write_step(tmp_path / "lens.step", *lens)
+    write_lighttools(tmp_path / "lens.npz", *lens)
+    whole = (tmp_path / "lens.step").read_text()
+    texts = {"no.step": "no step", "inch.step": whole.replace("(.MILLI.,", "($,"), "cut.step": whole[: len(whole) // 9],
+             "bent.step": whole.replace("(-5.,-4.,", "(-5.1,-4.,", 1),
+             "two.step": whole.replace("ENDSEC;\nEND", re.search(r"#\d+=B_SPLINE_SURFACE.*", whole)[0] + "\nENDSEC;\nEND"),
+             "text.npz": "no archive", "lens.dxf": "no"}
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text)
+    np.savez(tmp_path / "other.npz", a=np.ones(3))
+    with np.load(tmp_path / "lens.npz") as data:
+        arrays = dict(data)
+    for name, change in {"shape.npz": {"control_points": arrays["control_points"][:-1]}, "degree.npz": {"degrees": np.ones(3)},
+                         "nan.npz": {"control_points": arrays["control_points"] * np.nan}}.items():
+        np.savez(tmp_path / name, **{**arrays, **change})
+    np.save(tmp_path / "flat.npy", np.ones(5))
+    names = [*texts, "other.npz", "shape.npz", "degree.npz", "nan.npz", "flat.npy", "missing.npz"]
+    for name in names:
+        with pytest.raises(InputError, match=name):
+            read_surface(tmp_path / name, half)
+    for name in ("lens.step", "lens.npz"):
+        with pytest.raises(InputError, match="lens-size"):
+            read_surface(tmp_path / name, (5.0, 5.0))
