@@ -351,6 +351,18 @@ def test_the_account_closes_and_all_is_finite(source, bumps):
 
 
 @pytest.mark.parametrize("source", SOURCES)
+def test_a_circular_aperture_with_detours(source):
+    """Steps equal the sequential path there too, and the account closes with everything on."""
+    scene = scene_of(source)
+    scene = replace(scene, lens=replace(scene.lens, size=(8.0, 8.0), aperture="circle"))
+    heights, filter = bumpy(scene, 0.6), Filter("cosine", (3, 3))
+    a, b = (shine(scene, heights, steps, filter=filter) for steps in (Steps(), Steps(plain=True)))
+    torch.testing.assert_close(b.image, a.image, rtol=0, atol=1e-13)
+    all_on = shine(replace(scene, lens=replace(scene.lens, **EVERYTHING)), heights, Steps(ghosts=True, again=True), rays=2000)
+    assert float(all_on.image.sum()) + sum(all_on.lost.values()) == pytest.approx(1.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("source", SOURCES)
 @pytest.mark.parametrize("bumps", [0.1, 1.0])
 def test_steps_without_effects_are_the_sequential_path(source, bumps):
     scene, filter = scene_of(source), Filter("cosine", (3, 3))

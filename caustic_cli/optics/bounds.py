@@ -144,7 +144,7 @@ def _ghost(scene: Scene, field: HeightField, heights: Tensor, inside: float, n: 
         return torch.where(square > 0, value, torch.ones_like(value))
 
     both = part(inside + lean) * part(inside + 2.0 * lean)
-    even = isinstance(scene.source, PlaneWave) and scene.source.profile is None
+    even = isinstance(scene.source, PlaneWave) and scene.source.profile is None and not lens.round
     return float((both * area).sum() if even else both.max())
 
 

@@ -57,7 +57,7 @@ def second_meeting(lens: Lens, field: HeightField, beam: Beam, heights: Tensor, 
     shape = beam.power.shape
     o, d = ([torch.broadcast_to(c, shape).reshape(-1).double() for c in v] for v in (beam.o, beam.d))
     o[2] = o[2] + reference
-    t, met = again(field, heights, o, d, below=lens.mirror)
+    t, met = again(field, heights, o, d, below=lens.mirror, round=lens.round)
     met &= beam.power.reshape(-1) > 0
     at = met.nonzero()[:, 0]
     if not len(at):
@@ -72,7 +72,7 @@ def second_meeting(lens: Lens, field: HeightField, beam: Beam, heights: Tensor, 
     d = tuple(-v for v in d)
     reflected = reflectance("none" if lens.fresnel == "none" else "exact", c, s, 1.0 / lens.index)
     inside = power * (1.0 - reflected)
-    t, through = again(field, heights, hit, d, below=True)
+    t, through = again(field, heights, hit, d, below=True, round=lens.round)
     out, arriving = _exit(lens, field, heights, reference, hit, d, t, torch.where(through, inside, 0.0), 0.0)
     out.lose("fresnel", power - inside)
     none = torch.zeros_like(inside)

@@ -23,7 +23,7 @@ HALVINGS = 50
 
 
 @torch.no_grad()
-def again(field: HeightField, heights: Tensor, o, d, below: bool) -> tuple[Tensor, Tensor]:
+def again(field: HeightField, heights: Tensor, o, d, below: bool, round: bool = False) -> tuple[Tensor, Tensor]:
     """Next meeting with the surface of rays that start on it, by steps and bisection, in plain torch.
 
     The slopes bound how fast a ray can come nearer, so its distance from the surface is a step that cannot miss it.
@@ -32,6 +32,7 @@ def again(field: HeightField, heights: Tensor, o, d, below: bool) -> tuple[Tenso
         heights: (n, m) mm.
         o: (x, y, z) of the start, (N,) float64 each, mm; d: unit directions.
         below: whether the rays run under the surface, or above it.
+        round: the surface ends at the circle inscribed in its aperture.
 
     Returns:
         t (N,) mm, 0 where there is none; found (N,) bool.
@@ -49,7 +50,7 @@ def again(field: HeightField, heights: Tensor, o, d, below: bool) -> tuple[Tenso
 
     def height(at: Tensor, t: Tensor) -> Tensor:
         x, y = (c[at] + t * v[at] for c, v in zip(o[:2], d[:2], strict=True))
-        inside = (x.abs() <= rx) & (y.abs() <= ry)
+        inside = (x * x + y * y <= rx * rx) if round else (x.abs() <= rx) & (y.abs() <= ry)
         z = field.at(h, x.clamp(-rx, rx), y.clamp(-ry, ry), ((0, 0),))[0]
         return torch.where(inside, side * (o[2][at] + t * d[2][at] - z), torch.full_like(t, torch.nan))
 
