@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-from caustic_cli import cli, session, settings
+from caustic_cli import cli, session, settings, verdict
 from caustic_cli.derive import complete
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.losses import Loss
@@ -31,8 +31,8 @@ def _here(tmp_path, monkeypatch):
     blob = (40 + 200 * np.exp(-((x - 8) ** 2 + (y - 9) ** 2) / 30.0)).astype(np.uint8)
     Image.fromarray(blob).save("blob.png")
     Image.fromarray(np.stack([blob, blob // 2, blob[::-1]], -1)).save("rgb.png")
-    monkeypatch.setattr(session, "FINAL_RAYS", 20_000)
-    monkeypatch.setattr(session, "write_report", lambda *args: None)
+    monkeypatch.setattr(verdict, "FINAL_RAYS", 20_000)
+    monkeypatch.setattr(verdict, "write_report", lambda *args: None)
     monkeypatch.setattr(study, "RAYS", 1000)
     monkeypatch.setattr(study, "REPEATS", 1)
 
