@@ -265,10 +265,10 @@ def test_ghost_of_a_wedge():
 
 
 def cliff() -> tuple[Scene, torch.Tensor]:
-    """A ramp of slope 0.8 up to x = 0, a cliff of slope 4 up to x = 1, and a plateau: rays leaving the ramp run into the cliff."""
+    """A ramp of slope 0.8 up to x = 0, a cliff of slope 4 up to x = 1, and down again: rays leaving the ramp run into the cliff."""
     scene = scene_of(control=(11, 2), degree=(1, 1), screen=Screen((80.0, 20.0), 60.0, (40, 4)))
     x = torch.linspace(-5, 5, 11, dtype=torch.float64)[:, None]
-    return scene, (5.0 + torch.where(x <= 0, 0.8 * x, (4.0 * x).clamp_max(4.0))).expand(11, 2)
+    return scene, (5.0 + torch.where(x <= 0, 0.8 * x, torch.minimum(4.0 * x, 4.8 - 0.8 * x))).expand(11, 2)
 
 
 def test_a_ray_that_meets_the_surface_twice():
@@ -284,6 +284,37 @@ def test_a_ray_that_meets_the_surface_twice():
     t, found = again(field, heights, o, d, below=False)
     assert found.tolist() == [True, True, True, False]
     torch.testing.assert_close((x + t * d[0])[:3], at[:3], rtol=0, atol=1e-12)
+
+
+def test_the_way_of_a_ray_that_meets_the_surface_twice():
+    """From the ramp into the cliff and out on its far side: Snell's law in vector form, by hand, in two dimensions."""
+    scene, heights = cliff()
+    (straight, late), sample = land(scene, heights, Steps(again=True), shape=(2000, 1))
+    x0 = (10 * sample.u - 5).numpy()
+    s = math.sqrt(1 - (N * N - 1) * 0.64)
+    tangent = (N - s) / (N * 0.64 + s) * 0.8
+    d, normal = np.array([tangent, 1.0]) / math.hypot(tangent, 1.0), np.array([-4.0, 1.0]) / math.sqrt(17.0)
+    cos_i = -d @ normal
+    t = d / N + (cos_i / N - math.sqrt(1 - (1 - cos_i**2) / N**2)) * normal
+    x1 = (0.8 * x0 - x0 / tangent) / (4.0 - 1.0 / tangent)  # on the cliff
+    x2 = x1 + (4.8 - 4.8 * x1) / (t[1] / t[0] + 0.8)  # where 5 + 4 x1 + (x2 - x1) t_z / t_x = 9.8 - 0.8 x2
+    a = math.atan(0.8)  # the normal leans forward by as much
+    inner = math.atan2(t[0], t[1]) - a
+    out = math.asin(N * math.sin(inner))
+    at = x2 + (60.0 - 9.8 + 0.8 * x2) * math.tan(out + a)
+    twice = (x0 < 0) & (x1 < 0.99) & (x2 > 1) & (x2 < 5)
+    assert twice.sum() > 50
+    assert (straight.weight.reshape(-1).numpy()[twice] == 0).all()
+    late_x, late_power = late.x.numpy(), late.weight.numpy()
+    found = [int(np.abs(late_x - x).argmin()) for x in at[twice]]
+    np.testing.assert_allclose(late_x[found], at[twice], atol=1e-9)
+
+    def r(cos_in, cos_out, eta):
+        return sum(reflectances(cos_in, cos_out, eta)) / 2
+
+    power = (1 - R0) * (1 - r(1.0, s, N)) / 2000
+    power *= (1 - r(cos_i, math.sqrt(1 - (1 - cos_i**2) / N**2), 1 / N)) * (1 - r(math.cos(inner), math.cos(out), N))
+    np.testing.assert_allclose(late_power[found], power, rtol=1e-10)
 
 
 def test_second_meetings_are_taken_off_the_straight_light():
@@ -317,6 +348,18 @@ def test_the_account_closes_and_all_is_finite(source, bumps):
         assert float(found.image.sum()) + sum(found.lost.values()) == pytest.approx(1.0, abs=1e-12)
         assert bumps < 1 or found.lost["total_internal_reflection"] > 0.1 or not steps.reflects
         assert found.lost["absorbed"] > 0.01
+
+
+@pytest.mark.parametrize("source", SOURCES)
+def test_a_circular_aperture_with_detours(source):
+    """Steps equal the sequential path there too, and the account closes with everything on."""
+    scene = scene_of(source)
+    scene = replace(scene, lens=replace(scene.lens, size=(8.0, 8.0), aperture="circle"))
+    heights, filter = bumpy(scene, 0.6), Filter("cosine", (3, 3))
+    a, b = (shine(scene, heights, steps, filter=filter) for steps in (Steps(), Steps(plain=True)))
+    torch.testing.assert_close(b.image, a.image, rtol=0, atol=1e-13)
+    all_on = shine(replace(scene, lens=replace(scene.lens, **EVERYTHING)), heights, Steps(ghosts=True, again=True), rays=2000)
+    assert float(all_on.image.sum()) + sum(all_on.lost.values()) == pytest.approx(1.0, abs=1e-12)
 
 
 @pytest.mark.parametrize("source", SOURCES)

@@ -97,7 +97,8 @@ def _polarised(incidence: float, critical: float, n: float) -> float:
 
     rs, rp = split(math.sin(incidence), 1.0 / n)
     outer = split(critical / n, n) if critical < 1.0 else (1.0, 0.0)  # R_s - R_p is largest at the critical angle, below 1
-    return (rs - rp) / (2.0 - rs - rp) * (outer[0] - outer[1]) / 2.0
+    passed = 2.0 - rs - rp  # 0 at grazing incidence, where all that enters may be of one polarisation
+    return ((rs - rp) / passed if passed > 0 else 1.0) * (outer[0] - outer[1]) / 2.0
 
 
 def _reach(scene: Scene, inside: float, lowest: float, top: float) -> float:
@@ -143,7 +144,7 @@ def _ghost(scene: Scene, field: HeightField, heights: Tensor, inside: float, n: 
         return torch.where(square > 0, value, torch.ones_like(value))
 
     both = part(inside + lean) * part(inside + 2.0 * lean)
-    even = isinstance(scene.source, PlaneWave) and scene.source.profile is None
+    even = isinstance(scene.source, PlaneWave) and scene.source.profile is None and not lens.round
     return float((both * area).sum() if even else both.max())
 
 

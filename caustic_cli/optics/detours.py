@@ -25,7 +25,7 @@ def ghost(lens: Lens, field: HeightField, beam: Beam, heights: Tensor, reference
     keep = beam.returned.detach().reshape(-1).nonzero()[:, 0]
     if not len(keep):
         return None
-    flat = [torch.broadcast_to(torch.as_tensor(c), beam.power.shape).reshape(-1)[keep].double()
+    flat = [torch.broadcast_to(torch.as_tensor(c, device=beam.power.device), beam.power.shape).reshape(-1)[keep].double()
             for c in (*beam.o, *beam.inward, *beam.g, beam.returned)]
     o, d, g, power = flat[:3], flat[3:6], flat[6:8], flat[8]
     totally = beam.totally.reshape(-1)[keep]
@@ -57,7 +57,7 @@ def second_meeting(lens: Lens, field: HeightField, beam: Beam, heights: Tensor, 
     shape = beam.power.shape
     o, d = ([torch.broadcast_to(c, shape).reshape(-1).double() for c in v] for v in (beam.o, beam.d))
     o[2] = o[2] + reference
-    t, met = again(field, heights, o, d, below=lens.mirror)
+    t, met = again(field, heights, o, d, below=lens.mirror, round=lens.round)
     met &= beam.power.reshape(-1) > 0
     at = met.nonzero()[:, 0]
     if not len(at):
@@ -72,7 +72,7 @@ def second_meeting(lens: Lens, field: HeightField, beam: Beam, heights: Tensor, 
     d = tuple(-v for v in d)
     reflected = reflectance("none" if lens.fresnel == "none" else "exact", c, s, 1.0 / lens.index)
     inside = power * (1.0 - reflected)
-    t, through = again(field, heights, hit, d, below=True)
+    t, through = again(field, heights, hit, d, below=True, round=lens.round)
     out, arriving = _exit(lens, field, heights, reference, hit, d, t, torch.where(through, inside, 0.0), 0.0)
     out.lose("fresnel", power - inside)
     none = torch.zeros_like(inside)

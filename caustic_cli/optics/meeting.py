@@ -13,23 +13,26 @@ from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.optics.kernels import fused
 from caustic_cli.optics.tolerances import LEAST_COSINE
 
-#: Steps of the search over a knot span: a dip under the surface narrower than that is not seen.  It carries little light, at
+#: Least steps of the search over a knot span: a dip under the surface narrower than that is not seen.  It carries little light, at
 #: grazing incidence.
-STEPS_PER_SPAN = 8
-#: Most steps of one search: five crossings of the largest net's diagonal would take more.
-MOST_STEPS = 1 << 16
+STEPS_PER_SPAN = 128
+#: Most steps of one search: a ray that crept along the whole diagonal of the largest net would need more.
+MOST_STEPS = 1 << 18
 #: Halvings of a step: it is then shorter than a rounding of the lens' size.
 HALVINGS = 50
 
 
 @torch.no_grad()
-def again(field: HeightField, heights: Tensor, o, d, below: bool) -> tuple[Tensor, Tensor]:
+def again(field: HeightField, heights: Tensor, o, d, below: bool, round: bool = False) -> tuple[Tensor, Tensor]:
     """Next meeting with the surface of rays that start on it, by steps and bisection, in plain torch.
+
+    The slopes bound how fast a ray can come nearer, so its distance from the surface is a step that cannot miss it.
 
     Args:
         heights: (n, m) mm.
         o: (x, y, z) of the start, (N,) float64 each, mm; d: unit directions.
         below: whether the rays run under the surface, or above it.
+        round: the surface ends at the circle inscribed in its aperture.
 
     Returns:
         t (N,) mm, 0 where there is none; found (N,) bool.
@@ -47,16 +50,17 @@ def again(field: HeightField, heights: Tensor, o, d, below: bool) -> tuple[Tenso
 
     def height(at: Tensor, t: Tensor) -> Tensor:
         x, y = (c[at] + t * v[at] for c, v in zip(o[:2], d[:2], strict=True))
-        inside = (x.abs() <= rx) & (y.abs() <= ry)
+        inside = (x * x + y * y <= rx * rx) if round else (x.abs() <= rx) & (y.abs() <= ry)
         z = field.at(h, x.clamp(-rx, rx), y.clamp(-ry, ry), ((0, 0),))[0]
         return torch.where(inside, side * (o[2][at] + t * d[2][at] - z), torch.full_like(t, torch.nan))
 
-    clear = height(at, before) > 0
-    at, before = at[clear], before[clear]
+    f_before = height(at, before)
+    clear = f_before > 0
+    at, before, f_before = at[clear], before[clear], f_before[clear]
     for _ in range(MOST_STEPS):
         if not len(at):
             break
-        after = before + step
+        after = before + torch.clamp_min(f_before / -rise[at], step)
         f, z = height(at, after), o[2][at] + after * d[2][at]
         through = f <= 0
         if bool(through.any()):
@@ -68,7 +72,8 @@ def again(field: HeightField, heights: Tensor, o, d, below: bool) -> tuple[Tenso
             t_found[here], found[here] = high, True
         climbs = side * d[2][at] > 0
         gone = torch.isnan(f) | (climbs & ((z > highest) if side > 0 else (z < lowest)))
-        at, before = at[~through & ~gone], after[~through & ~gone]
+        on = ~through & ~gone
+        at, before, f_before = at[on], after[on], f[on]
     return t_found, found
 
 

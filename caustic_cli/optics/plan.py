@@ -169,8 +169,8 @@ def _polarisation(scene: Scene, b: Bounds) -> Effect:
     if b.incidence == 0:
         return Effect("polarisation", False, "unpolarised light, which normal incidence leaves so", 0.0, NEGLIGIBLE)
     some = b.polarised > NEGLIGIBLE
-    return Effect("polarisation", some, "unpolarised light; that the entrance polarises some changes what the exit reflects by"
-                  f" {'up to' if some else 'at most'} {b.polarised:.2%}", b.polarised, NEGLIGIBLE)
+    return Effect("polarisation", some, "unpolarised light; what the entrance polarises changes what the exit reflects by"
+                  f" {'up to' if some else 'at most'} {b.polarised:.1e}", b.polarised, NEGLIGIBLE)
 
 
 def _dispersion(scene: Scene, _: Bounds) -> Effect:
@@ -205,8 +205,8 @@ def _missed(scene: Scene, b: Bounds) -> Effect:
         return Effect("missed-surface", False, f"no ray gets beyond {b.reach:.4g} of the aperture's half width", b.reach, 1.0)
     if math.isinf(b.reach):
         return Effect("missed-surface", True, "the surface may dip below the entrance", None, 1.0, fixed=True)
-    return Effect("missed-surface", True, f"rays may get to {b.reach:.4g} of the aperture's half width below the surface: a side"
-                  " of the lens takes them", b.reach, 1.0, fixed=True)
+    why = f"rays may get to {b.reach:.4g} of the aperture's half width: its side takes them"
+    return Effect("missed-surface", True, why, b.reach, 1.0, fixed=True)
 
 
 def _absorption(scene: Scene, _: Bounds) -> Effect:

@@ -168,7 +168,7 @@ class StepTracer:
         else:
             t, (rx, ry) = (reference - b.z) / b.dz, self.field.half_size
             x, y = b.x + t * b.dx, b.y + t * b.dy
-            hit = (x.abs() <= rx) & (y.abs() <= ry)
+            hit = (x * x + y * y <= rx * rx) if self.scene.lens.round else (x.abs() <= rx) & (y.abs() <= ry)
             x, y = x.clamp(-rx, rx), y.clamp(-ry, ry)
             z, gx, gy = surface_at(self.field, heights, x, y)
             z = z - reference

@@ -2,7 +2,8 @@
 
 Notation
     with, without   images of the same rays by plans that differ in one effect
-    cost            time of the one less that of the other, wall time of sampling, tracing and reconstruction
+    cost            least time of sampling, tracing and reconstruction with, less the least without: what else the machine does
+                    only ever adds to either.  Processor time of all threads, which that disturbs least; wall time on a GPU
     error           relative RMS between the two images, each over its own mean; power, light on the screen without less with
 
 Both plans take turns, round after round, so that a machine that slows down for a while slows both.
@@ -10,7 +11,6 @@ Both plans take turns, round after round, so that a machine that slows down for 
 
 from __future__ import annotations
 
-import statistics
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -32,7 +32,7 @@ from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.report import COLOURS, MARKERS, Study
 
 #: Rays of every image, and rounds, unless said: a few seconds for each effect on two cores.
-RAYS, REPEATS = 1 << 16, 3
+RAYS, REPEATS = 1 << 16, 5
 #: Amounts at which the study measures an effect that its scene does not have.
 SUN, SIZE, ABSORPTION, ROUGHNESS, TILT, SHIFT, GLASS, LINES = 0.533, 1.0, 0.01, 0.001, 10.0, 1.0, "N-BK7", (486.1, D_LINE, 656.3)
 
@@ -45,10 +45,10 @@ COLUMNS = {
     "amount": "of the effect as measured here: the scene's own, or what was put in",
     "error": "relative RMS between the image without and with it, each over its own mean",
     "power": "light on the screen without it less with it, part of the source's power",
-    "seconds": "cost: time with it less time without, s; median of the rounds",
-    "seconds_min": "least of them, s",
+    "seconds": "cost: least time with it less least time without, s",
+    "seconds_min": "least of the rounds' differences, s",
     "seconds_max": "most of them, s",
-    "whole": "time with it, s; median",
+    "whole": "least time with it, s",
 }
 
 
@@ -61,28 +61,30 @@ def measure(with_: Plan, without: Plan, field: HeightField, heights: Tensor, *, 
     if needed(without.scene, without.steps) and not needed(with_.scene, with_.steps):
         with_ = replace(with_, steps=replace(with_.steps, plain=True))
 
+    clock = time.perf_counter if heights.is_cuda else time.process_time
+
     def image(plan: Plan) -> tuple[Exposure, float]:
-        began = time.perf_counter()
+        began = clock()
         sampler = rays_of(plan.scene, "stratified", rays, stream(seed, "effects"), heights.device)
         found = expose(plan.scene, field, heights, sampler, None, dtype, steps=plan.steps)
         if heights.is_cuda:
             torch.cuda.synchronize()
-        return found, time.perf_counter() - began
+        return found, clock() - began
 
     images = [image(plan)[0].image.flatten(0, -2).cpu() for plan in (with_, without)]  # a round that only warms up
     times = [(image(with_)[1], image(without)[1]) for _ in range(repeats)]
-    costs = [a - b for a, b in times]
+    costs, least = [a - b for a, b in times], [min(column) for column in zip(*times, strict=True)]
     return {"error": relative_rms(images[1], images[0]), "power": float(images[1].sum() - images[0].sum()),
-            "seconds": statistics.median(costs), "seconds_min": min(costs), "seconds_max": max(costs),
-            "whole": statistics.median(a for a, _ in times)}
+            "seconds": least[0] - least[1], "seconds_min": min(costs), "seconds_max": max(costs), "whole": least[0]}
 
 
 def explain(plan: Plan, scene: Scene, field: HeightField, heights: Tensor, *, rays: int = RAYS, seed: int = 0,
             dtype: torch.dtype = torch.float64, repeats: int = REPEATS) -> list[dict]:
-    """A row for each effect of a plan of `scene`: name, on, why, bound, limit, cost_ms, error and power of leaving it out.
+    """A row for each effect of a plan of `scene`: name, on, why, bound, limit, cost_ms, cost_ms_range, error, power.
 
-    cost_ms of an effect that is off is what it would cost.  What the scene has nothing of has neither cost nor error; what cannot
-    be left out has no error (None).
+    error and power are those of leaving it out.  cost_ms of an effect that is off is what it would cost; cost_ms_range are the
+    extremes of the rounds' differences.  What the scene has nothing of has neither cost nor error; what cannot be left out has no
+    error (None).
     """
     rows = []
     for effect in plan.effects:
@@ -94,22 +96,27 @@ def explain(plan: Plan, scene: Scene, field: HeightField, heights: Tensor, *, ra
             with_, without = (compile_plan(scene, field, heights, chosen)
                               for chosen in (set(plan.simulated) | {effect.name}, set(plan.simulated) - {effect.name}))
             found = measure(with_, without, field, heights, rays=rays, repeats=repeats, seed=seed, dtype=dtype)
-            cost = 0.0 if effect.name in FREE else 1e3 * found["seconds"]
-            row |= {"cost_ms": cost, "error": found["error"], "power": found["power"]}
-        rows.append(row)
+            scale = 0.0 if effect.name in FREE else 1e3
+            cost, *extremes = (scale * found[k] for k in ("seconds", "seconds_min", "seconds_max"))
+            row |= {"cost_ms": cost, "cost_ms_range": extremes, "error": found["error"], "power": found["power"]}
+        rows.append({"cost_ms_range": [0.0, 0.0]} | row)
     return rows
 
 
 def table(rows: list[dict]) -> list[str]:
-    """The rows of `explain` as lines of text under their titles."""
-    def percent(value: float | None, form: str) -> str:
+    """The rows of `explain` as lines of text under their titles; a cost is 0 where the rounds do not agree on its sign."""
+    def number(value: float | None, form: str) -> str:
         return "-" if value is None else format(value, form)
+
+    def cost(row: dict) -> str:
+        low, high = row["cost_ms_range"]
+        return "0 ms" if low <= 0.0 <= high else f"{row['cost_ms']:+.1f} ms"
 
     cells = [("effect", "", "cost", "error", "power", "why")]
     for r in rows:
-        quiet = not r["on"] and r["cost_ms"] == 0.0
-        cells.append((r["name"], "on" if r["on"] else "off", "-" if quiet else f"{r['cost_ms']:+.1f} ms",
-                      "-" if quiet else percent(r["error"], ".2g"), "-" if quiet else percent(r["power"], "+.2%"), r["why"]))
+        quiet = not r["on"] and r["cost_ms_range"] == [0.0, 0.0]
+        cells.append((r["name"], "on" if r["on"] else "off", "-" if quiet else cost(r),
+                      "-" if quiet else number(r["error"], ".2g"), "-" if quiet else number(r["power"], "+.2%"), r["why"]))
     widths = [max(len(row[k]) for row in cells) for k in range(5)]
     return ["  ".join([*(f"{c:<{w}}" if k < 2 else f"{c:>{w}}" for k, (c, w) in enumerate(zip(row, widths, strict=False))), row[5]])
             for row in cells]
@@ -132,25 +139,30 @@ def run_effects(scene: Scene, field: HeightField, heights: Tensor, *, rays: int 
             rows.append(found)
         if progress is not None:
             progress(k + 1, len(EFFECTS))
-    told = sorted((r for r in rows if r["on"]), key=lambda r: -r["error"])
-    advice = f"of what this scene has, {told[0]['series']} matters most ({told[0]['error']:.2g})" if told else \
+    told = sorted((r for r in rows if r["on"]), key=_matters, reverse=True)
+    advice = f"of what this scene has, {told[0]['series']} matters most ({_matters(told[0]):.2g})" if told else \
         "this scene calls for no effect"
-    unfounded = max((r["error"] for r in rows if not r["on"] and r["amount"] == "the scene's own"), default=0.0)
-    advice += f"; what auto leaves out of it changes the image by at most {unfounded:.2g}"
+    unfounded = max((_matters(r) for r in rows if not r["on"] and r["amount"] == "the scene's own"), default=0.0)
+    advice += f"; what auto leaves out of it changes image or power by at most {unfounded:.2g}"
     about = {"version": __version__, "seed": seed, "repeats": repeats, "rays": rays, "device": str(heights.device),
              "reference_error": 0.0, "threads": torch.get_num_threads(),
              "dtype": str(dtype or torch.float64).removeprefix("torch.")}
     return Study("effects", COLUMNS, rows, {}, advice, about, "rays", PLOTS)
 
 
+def _matters(row: dict) -> float:
+    """What leaving an effect out changes: the larger of error and power."""
+    return max(row["error"], abs(row["power"]))
+
+
 def _row(effect: Effect, plan: Plan, scene: Scene, field: HeightField, heights: Tensor, rays: int, repeats: int, seed: int,
          dtype: torch.dtype) -> dict | None:
     name, amount, bare = effect.name, "the scene's own", None
     if not effect.present:
-        put = _put(scene, name, heights)
-        if put is None:
+        made = put(scene, name, heights)
+        if made is None:
             return None
-        scene, bare, amount = put
+        scene, bare, amount = made
         plan = compile_plan(scene, field, heights)
     elif effect.fixed:
         return None
@@ -163,7 +175,7 @@ def _row(effect: Effect, plan: Plan, scene: Scene, field: HeightField, heights: 
             "amount": amount} | found
 
 
-def _put(scene: Scene, name: str, heights: Tensor) -> tuple[Scene, Scene | None, str] | None:
+def put(scene: Scene, name: str, heights: Tensor) -> tuple[Scene, Scene | None, str] | None:
     """The scene with an effect put in, the scene to compare it with (None: the same without it), and how much of it."""
     lens, screen, s = scene.lens, scene.screen, scene.source
     if name == "source-size":
@@ -196,15 +208,16 @@ def draw_effects(study: Study, figure: Figure) -> None:
     """Cost of every effect, and the error of leaving it out; filled where auto simulates it."""
     figure.set_size_inches(8.4, 5.6)
     axes = figure.add_subplot()
-    floor = 0.5 * min((r["error"] for r in study.rows if r["error"] > 1e-12), default=1.0)
+    floor = 0.5 * min((_matters(r) for r in study.rows if _matters(r) > 1e-12), default=1.0)
     for k, row in enumerate(study.rows):
-        colour, error = COLOURS[k % len(COLOURS)], max(row["error"], floor)
-        low, high = (1e3 * abs(row["seconds"] - row[f"seconds_{end}"]) for end in ("min", "max"))
+        colour, error = COLOURS[k % len(COLOURS)], max(_matters(row), floor)
+        low, high = (1e3 * max(0.0, d) for d in (row["seconds"] - row["seconds_min"], row["seconds_max"] - row["seconds"]))
         axes.errorbar([1e3 * row["seconds"]], [error], xerr=[[low], [high]], linestyle="", color=colour, elinewidth=0.6,
-                      marker=MARKERS[k % len(MARKERS)], markerfacecolor=colour if row["on"] else "none",
+                      marker=MARKERS[(k + k // len(COLOURS)) % len(MARKERS)], markerfacecolor=colour if row["on"] else "none",
                       label=f"{row['series']}, {'on' if row['on'] else 'off'}, {row['amount']}")
-    axes.set(yscale="log", xlabel=f"cost (ms for {study.about['rays']:,} rays): median, least and most",
-             ylabel=f"relative RMS of leaving it out (least drawn: {floor:.1g})", title="effects: cost and error")
+    axes.set(yscale="log", xlabel=f"cost (ms of processor time for {study.about['rays']:,} rays), and the rounds' range",
+             ylabel=f"left out: relative RMS or change of power, the larger (least drawn: {floor:.1g})",
+             title="effects: cost and error")
     axes.set_xscale("symlog", linthresh=1.0)
     axes.grid(which="major", linewidth=0.4)
     figure.legend(loc="outside right upper", fontsize="x-small")

@@ -1,0 +1,224 @@
+"""Effects on the command line and in project.toml: --explain, --effects, --study effects, mirrors, colours."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from caustic_cli import cli, session, settings, verdict
+from caustic_cli.derive import complete
+from caustic_cli.errors import InputError
+from caustic_cli.inverse.losses import Loss
+from caustic_cli.inverse.objective import Objective
+from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.plan import EFFECTS
+from caustic_cli.optics.reconstruction import Filter
+from caustic_cli.picture import read_picture
+from caustic_cli.scene import Lens, Light, Offset, PlaneWave, Scene, Screen
+from caustic_cli.scene.light import RGB
+from caustic_cli.studies import effects as study
+
+TINY = ["--resolution", "24", "--control", "12", "--rays", "4000", "--quiet", "--threads", "1", "--iterations", "6"]
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    y, x = np.mgrid[0:24, 0:24]
+    blob = (40 + 200 * np.exp(-((x - 8) ** 2 + (y - 9) ** 2) / 30.0)).astype(np.uint8)
+    Image.fromarray(blob).save("blob.png")
+    Image.fromarray(np.stack([blob, blob // 2, blob[::-1]], -1)).save("rgb.png")
+    monkeypatch.setattr(verdict, "FINAL_RAYS", 20_000)
+    monkeypatch.setattr(verdict, "write_report", lambda *args: None)
+    monkeypatch.setattr(study, "RAYS", 1000)
+    monkeypatch.setattr(study, "REPEATS", 1)
+
+
+def run(capfd, *arguments, code=0):
+    assert cli.run([*map(str, arguments), "--json"]) == code
+    out, err = capfd.readouterr()
+    return json.loads(out) if code == 0 else err.strip()
+
+
+def test_explain_and_effects(capfd, tmp_path):
+    run(capfd, "design", "blob.png", *TINY)
+    plain = run(capfd, "render", "blob.caustic", "--rays", "4000", "--npy", "plain.npy", "--quiet")
+    assert "effects" not in plain
+    told = run(capfd, "render", "blob.caustic", "--rays", "4000", "--explain", "--quiet", "--npy", "told.npy")
+    assert np.array_equal(np.load("plain.npy"), np.load("told.npy"))
+    rows = {row["name"]: row for row in told["effects"]}
+    assert tuple(rows) == EFFECTS
+    assert {k for k, row in rows.items() if row["on"]} == {"fresnel"}
+    for row in rows.values():
+        assert set(row) == {"name", "on", "why", "bound", "limit", "cost_ms", "cost_ms_range", "error", "power"} and row["why"]
+    assert rows["fresnel"]["power"] == pytest.approx(plain["lost"]["fresnel"], rel=0.02)
+    for name in ("entrance", "intersection", "polarisation", "second-meeting", "total-reflection"):
+        assert rows[name]["error"] < 1e-12, name
+    assert 0 < rows["ghosts"]["bound"] < 0.01 and rows["ghosts"]["power"] < 0
+
+    run(capfd, "render", "blob.caustic", "--rays", "4000", "--effects", "fresnel", "--npy", "same.npy", "--quiet")
+    assert np.array_equal(np.load("plain.npy"), np.load("same.npy"))
+    bare = run(capfd, "render", "blob.caustic", "--rays", "4000", "--effects", "none", "--quiet")
+    assert bare["lost"]["fresnel"] == 0 and bare["on_screen"] > plain["on_screen"] + 0.05
+    both = run(capfd, "render", "blob.caustic", "--rays", "4000", "--effects", "fresnel,ghosts", "--quiet")
+    assert both["on_screen"] - plain["on_screen"] == pytest.approx(-rows["ghosts"]["power"], rel=0.2)
+    message = run(capfd, "render", "blob.caustic", "--effects", "fresnell", code=2)
+    assert message.startswith("caustic: --effects must be auto, none, or some of") and message.endswith("did you mean fresnel?")
+
+    assert cli.run(["render", "blob.caustic", "--rays", "4000", "--explain"]) == 0
+    out, err = capfd.readouterr()
+    assert not out and "effect" in err and "normal incidence on a flat entrance bends nothing" in err
+
+
+OPTIONS = {
+    "absorption": (["--absorption", "0.02"], "absorbed"),
+    "roughness": (["--roughness", "0.002"], None),
+    "polarisation": (["--polarisation", "30"], None),
+    "screen-tilt": (["--screen-tilt", "0,20"], None),
+    "screen-shift": (["--screen-shift", "1,-2"], None),
+    "source-size": (["--source-angle", "0.5"], None),
+}
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_every_option_is_an_effect(capfd, name):
+    """Given to render, and in a design: the effect is on, and project.toml keeps it."""
+    options, loss = OPTIONS[name]
+    run(capfd, "design", "blob.png", *TINY, "-o", "plain.caustic")
+    found = run(capfd, "render", "plain.caustic", "--rays", "4000", *options, "--explain", "--quiet")
+    row = next(r for r in found["effects"] if r["name"] == name)
+    assert row["on"] and row["error"] + abs(row["power"]) > 1e-5
+    assert loss is None or found["lost"][loss] > 0.05
+    figures = run(capfd, "design", "blob.png", *TINY, *options, "-o", "own.caustic")
+    again = run(capfd, "render", "own.caustic", "--rays", "4000", "--quiet")
+    assert again["on_screen"] == pytest.approx(figures["on_screen"], abs=0.03)
+    assert figures["on_screen"] + sum(figures["lost"].values()) == pytest.approx(1.0, abs=1e-9)
+    assert loss is None or again["lost"][loss] > 0.05
+
+
+def test_gradients_of_a_render_know_the_effects(capfd):
+    """Forward mode through the steps: as central differences say."""
+    run(capfd, "design", "blob.png", *TINY, "--absorption", "0.02", "--screen-tilt", "5,10", "--polarisation", "20")
+    found = run(capfd, "gradmap", "blob.caustic", "--control", "2,3", "--rays", "4000", "--check", "--quiet")
+    assert 0 < found["maps"][0]["check"]["relative_error"] < 1e-5
+
+
+def test_a_design_for_a_shifted_screen_hits_it(capfd):
+    figures = run(capfd, "design", "blob.png", *TINY, "--screen-shift", "6,-4")
+    assert figures["on_target"] > 0.85 * (1 - figures["lost"]["fresnel"])
+
+
+def test_a_mirror_is_designed_and_not_exported_as_a_lens(capfd):
+    figures = run(capfd, "design", "blob.png", "--mirror", *TINY)
+    assert figures["on_screen"] > 0.98 and figures["lost"]["fresnel"] == 0
+    toml = settings.read(session.Path("blob.caustic/project.toml"))
+    assert toml["lens"]["mirror"] and toml["screen"]["z"] == -300.0
+    lens = run(capfd, "design", "blob.png", *TINY, "-o", "lens.caustic")
+    assert figures["relative_rms"] < 1.2 * lens["relative_rms"]
+    assert "is a mirror" in run(capfd, "export", "blob.caustic", code=2)
+    assert "must lie before the mirror" in run(capfd, "render", "blob.caustic", "--screen-at", "20", code=2)
+
+
+def test_dispersion_of_a_glass_and_its_range(capfd):
+    run(capfd, "design", "blob.png", "--glass", "N-SF11", *TINY)
+    found = run(capfd, "render", "blob.caustic", "--rays", "4000", "--wavelengths", "450:2,550,650", "--explain", "--quiet")
+    row = next(r for r in found["effects"] if r["name"] == "dispersion")
+    assert row["on"] and row["error"] > 0.01 and "3 wavelengths in N-SF11" in row["why"]
+    assert "370 to 2500 nm" in run(capfd, "render", "blob.caustic", "--wavelengths", "300,550", code=2)
+    assert "--wavelengths must be" in run(capfd, "render", "blob.caustic", "--wavelengths", "red", code=2)
+
+
+def test_a_coloured_target(capfd):
+    figures = run(capfd, "design", "rgb.png", "--color", *TINY)
+    project = session.Project.open("rgb.caustic")
+    assert project.settings["source"]["wavelengths"] == list(RGB) and project.settings["lens"]["glass"] == "N-BK7"
+    light = project.picture.irradiance().sum((1, 2))
+    assert project.settings["source"]["weights"] == pytest.approx(list(light / light.sum()))
+    assert figures["on_screen"] + sum(figures["lost"].values()) == pytest.approx(1.0, abs=1e-9)
+    run(capfd, "render", "rgb.caustic", "--rays", "4000", "--npy", "out.npy", "-o", "out.png", "--quiet")
+    image = np.load("out.npy")
+    assert image.shape == (3, 24, 24) and shown_as("out.png").shape == (24, 24, 3)
+    np.testing.assert_allclose(image.sum((1, 2)), light / light.sum() * image.sum(), rtol=0.02)
+    assert not np.allclose(image[0] / image[0].sum(), image[2] / image[2].sum(), rtol=1e-3, atol=0)
+    shown = np.asarray(shown_as("out.png"), float)
+    likeness = [np.corrcoef(shown[..., k][::-1].T.ravel(), image[0].ravel())[0, 1] for k in (0, 2)]
+    assert likeness[0] > 0.8 and likeness[0] > likeness[1]
+    assert "an array (3, n_x, n_y)" in run(capfd, "design", _flat(), "--color", *TINY, code=2)
+
+
+def shown_as(path: str) -> np.ndarray:
+    with Image.open(path) as image:
+        return np.asarray(image)
+
+
+def _flat() -> str:
+    np.save("flat.npy", np.ones((8, 8)))
+    return "flat.npy"
+
+
+def test_colours_over_black(tmp_path):
+    """Alpha weighs the light, not the code; colours stay in place; an opaque picture is kept code by code."""
+    codes = np.zeros((2, 3, 4), np.uint8)
+    codes[0, 0], codes[1, 2] = (255, 0, 0, 255), (0, 0, 200, 128)
+    Image.fromarray(codes).save("a.png")
+    light = read_picture("a.png", color=True).irradiance()
+    assert light.shape == (3, 3, 2) and light[0, 0, 1] == 1.0
+    assert light[2, 2, 0] == pytest.approx(((200 / 255 + 0.055) / 1.055) ** 2.4 * 128 / 255, rel=0.02)
+    picture = read_picture("rgb.png", color=True)
+    assert np.array_equal(picture.values, shown_as("rgb.png")) and picture.aspect == 1.0
+
+
+def test_the_loss_of_colours_is_their_root_mean_square():
+    """Value by the three losses apart, gradient by differences; a colour without light counts for nothing."""
+    lens = Lens((10.0, 10.0), 0.0, 1.5168, (7, 7), (3, 3), offset=Offset(3.0), glass="N-SF11")
+    light = Light(wavelengths=RGB, weights=(1.0, 2.0, 0.0), color=True)
+    scene = Scene(PlaneWave(), lens, Screen((14.0, 14.0), 200.0, (10, 10)), light)
+    field, g = HeightField.of(lens), torch.Generator().manual_seed(0)
+    heights = 3.0 + 0.02 * torch.randn(7, 7, generator=g, dtype=torch.float64)
+    target = torch.rand(3, 10, 10, generator=g, dtype=torch.float64)
+    target[2] = 0.0
+    options = {"apron": 2, "oversample": 2, "dtype": torch.float64, "filter_target": False}
+    made = Objective(scene, field, rays_of(scene, "lines", 900), Filter("cosine", (3, 3)), target, "rms-light", **options)
+    apart = []
+    for k, band in enumerate(scene.bands[:2]):
+        one = Objective(band.scene, field, rays_of(band.scene, "lines", 900), Filter("cosine", (3, 3)), target[k], "rms-light",
+                        **options)
+        assert isinstance(one.loss, Loss)
+        apart.append(one(heights).loss)
+    found = made(heights)
+    assert found.loss == pytest.approx((sum(x * x for x in apart) / 2) ** 0.5, rel=1e-12)
+    along = torch.randn(7, 7, generator=g, dtype=torch.float64)
+    difference = (made(heights + 1e-6 * along).loss - made(heights - 1e-6 * along).loss) / 2e-6
+    assert float((found.gradient * along).sum()) == pytest.approx(difference, rel=1e-5)
+
+
+def test_the_study_of_effects(capfd, tmp_path):
+    found = run(capfd, "convergence", "--study", "effects", "--rays", "1000", "--repeats", "1", "--quiet", "-o", "out")
+    rows = {row["series"]: row for row in found["rows"]}
+    assert set(EFFECTS) == set(rows)
+    assert [row["on"] for row in rows.values()].count(True) == 1
+    for name in ("absorption", "roughness", "dispersion", "screen-tilt", "screen-shift", "source-size", "mirror"):
+        assert rows[name]["amount"] != "the scene's own" and rows[name]["error"] + abs(rows[name]["power"]) > 1e-7, name
+    assert rows["entrance"]["error"] < 1e-12
+    assert {p.suffix for p in (tmp_path / "out").iterdir()} == {".csv", ".json", ".png"}
+
+
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"lens_absorption": -1.0}, "[lens] absorption must be 0 to 1e+06, got -1"),
+    ({"lens_roughness": 2.0}, "[lens] roughness must be 0 to 1, got 2"),
+    ({"source_weights": [1.0]}, "[source] weights must be one for each of the 0 wavelengths, got 1"),
+    ({"source_polarisation": 1e9}, "[source] polarisation must be -360 to 360"),
+    ({"screen_tilt": [90.0, 0.0]}, "[screen] tilt must be -85 to 85, got 90"),
+    ({"target_color": True, "source_wavelengths": [500.0]}, "[source] wavelengths of a coloured picture are three"),
+])
+def test_bad_values_are_named(changes, message):
+    full = complete({}, 1.0)
+    for name, value in changes.items():
+        section, _, key = name.partition("_")
+        full[section][key] = value
+    with pytest.raises(InputError) as error:
+        settings.build_scene(full)
+    assert message in str(error.value)
