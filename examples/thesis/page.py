@@ -95,7 +95,7 @@ def _tophat(part, book, pairs, marks, pictures) -> None:
     for row, pair in zip(grid, pairs, strict=False):
         found, about = book.arrays(f"tophat-{pair}"), book.rows[f"tophat-{pair}"]
         for axis, mark in zip(row, marks, strict=False):
-            title = names[f"tophat-{pair}"].replace(" network,", ",")
+            title = names[f"tophat-{pair}"].replace("sparse network", "sparse").replace("dense network", "dense")
             show(axis, found[f"heights_{mark}"], f"{title}: heights, n = {mark}", "viridis")
         _image_and_error(row[-2:], found["image"], target, about)
     found, row = book.arrays("own-tophat"), grid[-1]
