@@ -24,11 +24,12 @@ from caustic_cli.errors import CausticError, InputError, Interrupted
 from caustic_cli.inverse import ranks
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.first import first_surface
+from caustic_cli.inverse.schedule import transport_cells
 from caustic_cli.inverse.target import grey
 from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.picture import read_picture
 from caustic_cli.project import CHECKPOINT, RENDER, TOML, Project, is_project
-from caustic_cli.scene import Scene
+from caustic_cli.scene import PlaneWave, Scene
 from caustic_cli.scene.source import blur_limit
 from caustic_cli.surfaces import SUFFIXES, onto, read_surface
 from caustic_cli.verdict import judge
@@ -198,7 +199,8 @@ def _first_heights(project: Project) -> torch.Tensor | None:
         return None
     if start == "transport":
         designer, target = _designer(project, "cpu")
-        return first_surface(designer.scene, grey(target), designer.field(0))
+        cells = transport_cells(designer.stages[-1].rays, not isinstance(designer.scene.source, PlaneWave))
+        return first_surface(designer.scene, grey(target), designer.field(0), cells)
     net = _designer(project, "cpu")[0].field(0)
     if Path(start).suffix.lower() in SUFFIXES and not Path(start).is_dir():
         return onto(*read_surface(start, net.half_size), net)

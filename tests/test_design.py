@@ -234,13 +234,13 @@ def test_transport_begins_where_the_offset_ends(capfd):
     assert "start = \"transport\"" in Path("moved/project.toml").read_text()
 
 
-@pytest.mark.parametrize("limit, control", [(5, 32), (20, 48), (90, 48)])
-def test_the_time_limit_chooses_the_quality(capfd, limit, control, monkeypatch):
+@pytest.mark.parametrize("limit, control, rays", [(5, 32, 40_000), (20, 48, 40_000), (90, 48, 256 * 24 * 24)])
+def test_the_time_limit_chooses_the_quality(capfd, limit, control, rays, monkeypatch):
     monkeypatch.setattr(session, "_run", lambda *args: {"lost": {}, "image": "", "reason": ""})
     design(capfd, "blob.png", "--resolution", "24", "--quiet", "--threads", "1", "--time-limit", limit, "-o", "p")
     stages = session.Project.open("p").settings["design"]["stages"]
     assert stages[-1]["control"] == [control + 3, control + 3]
-    assert stages[-1]["rays"] == 40_000 and len(stages) == {5: 1, 20: 2, 90: 3}[limit]
+    assert stages[-1]["rays"] == rays and len(stages) == {5: 1, 20: 2, 90: 3}[limit]
 
 
 def test_lbfgs_never_goes_uphill_within_a_stage(capfd):

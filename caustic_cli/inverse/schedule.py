@@ -76,42 +76,51 @@ def coarse_to_fine(control: tuple[int, int], degree: tuple[int, int], rays: int,
     return stages
 
 
-#: What a quality means after a transport start: knot spans per pixel and their most, rays a pixel, and the stages by sampler and
-#: iterations.  The first stage takes half the rays where others follow.
+#: What a quality means after a transport start: knot spans per pixel and their most; rays a pixel and pixels of the render to one
+#: of the screen, along each axis, in the last stage; and of each stage its part of the rays and its iterations.
 REFINEMENT = {
-    "draft": (1.0, 256, 16, (("lines", 12),)),
-    "standard": (2.0, 768, 64, (("lines", 8), ("lines", 12))),
-    "fine": (2.0, 768, 64, (("lines", 25), ("stratified", 30), ("stratified", 25))),
+    "draft": (1.0, 256, 16, 2, ((1.0, 14),)),
+    "standard": (2.0, 768, 64, 4, ((0.5, 8), (1.0, 24))),
+    "fine": (2.0, 768, 256, 4, ((0.125, 15), (0.25, 65), (1.0, 25))),
 }
+#: Source cells of the transport start along the lens: one to so many rays of the last stage, within bounds.
+RAYS_PER_CELL, LEAST_CELLS, MOST_CELLS = 4, 256, 1024
 LEAST_SPANS = 32
 LEAST_RAYS, MOST_RAYS = 40_000, 16_000_000
-OVERSAMPLE = 2
 
 
 def refinement_spans(pixels: int, quality: str) -> int:
     """Knot spans along each axis of the lens for a screen of so many pixels: finer than the picture."""
     checks.choice("--quality", quality, QUALITIES)
-    density, most, _, _ = REFINEMENT[quality]
+    density, most, *_ = REFINEMENT[quality]
     return min(most, max(LEAST_SPANS, round(density * pixels)))
+
+
+def transport_cells(rays: int, scattered: bool) -> int:
+    """Source cells along the lens of a transport start that so many rays refine.
+
+    What a cell leaves bright or dark shows as stripes where the picture is dark, and takes many iterations to smooth.
+    """
+    return min(MOST_CELLS, max(LEAST_CELLS, round(math.sqrt(rays * (4 if scattered else 1)) / RAYS_PER_CELL)))
 
 
 def refinement(control: tuple[int, int], rays: int | None, resolution: tuple[int, int], quality: str = "standard",
                filter: Filter | None = None, scattered: bool = False) -> list[Stage]:
     """The default stages after a transport start, whose surface has every scale right already: full detail at once.
 
-    Each stage traces rays of its own, because an optimiser learns the ones it sees.
+    Rays stand in a regular grid: under a smooth filter, which the render's finer pixels leave narrow, such sums are far more exact
+    than those over random rays, whose noise a lens learns.
 
     Args:
         rays: of the last stage, None for what the quality says.
-        scattered: the source's rays have to be intersected one by one: take a quarter of them, stratified.
+        scattered: the source's rays have to be intersected one by one: take a quarter of them.
     """
     checks.choice("--quality", quality, QUALITIES)
-    _, _, each, plan = REFINEMENT[quality]
+    _, _, each, finer, plan = REFINEMENT[quality]
     rays = rays or min(MOST_RAYS, max(LEAST_RAYS, each * resolution[0] * resolution[1] // (4 if scattered else 1)))
     filter, apron = filter or Filter("cosine", (3, 3)), math.ceil(0.04 * max(resolution))
     stages = []
-    for k, (sampler, iterations) in enumerate(plan):
-        some = max(1, rays // 2) if k == 0 < len(plan) - 1 else rays
-        stages.append(Stage(control, some, "stratified" if scattered else sampler, filter, 0.0, apron, iterations,
-                            oversample=OVERSAMPLE))
+    for part, iterations in plan:
+        stages.append(Stage(control, max(1, round(part * rays)), "grid", filter, 0.0, apron,
+                            iterations, oversample=finer))
     return stages

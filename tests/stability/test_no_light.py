@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from caustic_cli import cli, session
+from caustic_cli import cli, verdict
 from caustic_cli.checkpoint import load
 from caustic_cli.errors import CausticError
 from caustic_cli.inverse import designer
@@ -171,8 +171,8 @@ def test_where_nothing_begins_it_stops_with_a_sentence():
 @pytest.fixture
 def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(session, "FINAL_RAYS", 10_000)
-    monkeypatch.setattr(session, "write_report", lambda *args: None)
+    monkeypatch.setattr(verdict, "FINAL_RAYS", 10_000)
+    monkeypatch.setattr(verdict, "write_report", lambda *args: None)
     np.save("spot.npy", np.eye(12))
     return tmp_path
 

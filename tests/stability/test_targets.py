@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from caustic_cli import cli, session
+from caustic_cli import cli, verdict
 from caustic_cli.checkpoint import load
 from caustic_cli.inverse.first import first_surface
 from caustic_cli.inverse.objective import Objective
@@ -83,8 +83,8 @@ def test_transport_start(name, source):
 def test_designs_of_extreme_pictures_write_finite_files(tmp_path, monkeypatch, capfd):
     """The whole command: zeros and one bright pixel as 8-bit and 16-bit images and as .npy."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(session, "FINAL_RAYS", 10_000)
-    monkeypatch.setattr(session, "write_report", lambda *args: None)
+    monkeypatch.setattr(verdict, "FINAL_RAYS", 10_000)
+    monkeypatch.setattr(verdict, "write_report", lambda *args: None)
     spot = np.zeros((N, N))
     spot[4, 11] = 1.0
     Image.fromarray((255 * spot).astype(np.uint8)).save("spot8.png")
