@@ -76,17 +76,18 @@ def coarse_to_fine(control: tuple[int, int], degree: tuple[int, int], rays: int,
     return stages
 
 
-#: What a quality means after a transport start: knot spans per pixel and their most; rays a pixel and pixels of the render to one
-#: of the screen, along each axis, in the last stage; and of each stage its part of the rays and its iterations.
+#: What a quality means after a transport start: knot spans per pixel and their most; rays a pixel in the last stage and their most;
+#: pixels of the render to one of the screen, along each axis, where so many rays fall there; and of each stage its part of the rays
+#: and its iterations.
 REFINEMENT = {
-    "draft": (1.0, 256, 16, 2, ((1.0, 14),)),
-    "standard": (2.0, 768, 64, 4, ((0.5, 8), (1.0, 24))),
-    "fine": (2.0, 768, 256, 4, ((0.125, 15), (0.25, 65), (1.0, 25))),
+    "draft": (1.0, 256, 16, 1_000_000, 2, ((1.0, 14),)),
+    "standard": (2.0, 768, 64, 4_000_000, 4, ((0.5, 8), (1.0, 24))),
+    "fine": (2.0, 768, 256, 16_000_000, 4, ((0.125, 15), (0.25, 65), (1.0, 25))),
 }
 #: Source cells of the transport start along the lens: one to so many rays of the last stage, within bounds.
 RAYS_PER_CELL, LEAST_CELLS, MOST_CELLS = 4, 256, 1024
 LEAST_SPANS = 32
-LEAST_RAYS, MOST_RAYS = 40_000, 16_000_000
+LEAST_RAYS = 40_000
 
 
 def refinement_spans(pixels: int, quality: str) -> int:
@@ -116,8 +117,10 @@ def refinement(control: tuple[int, int], rays: int | None, resolution: tuple[int
         scattered: the source's rays have to be intersected one by one: take a quarter of them.
     """
     checks.choice("--quality", quality, QUALITIES)
-    _, _, each, finer, plan = REFINEMENT[quality]
-    rays = rays or min(MOST_RAYS, max(LEAST_RAYS, each * resolution[0] * resolution[1] // (4 if scattered else 1)))
+    _, _, each, most, finer, plan = REFINEMENT[quality]
+    pixels = resolution[0] * resolution[1]
+    rays = rays or max(LEAST_RAYS, min(most, each * pixels) // (4 if scattered else 1))
+    finer = max(1, min(finer, math.isqrt(rays // pixels)))
     filter, apron = filter or Filter("cosine", (3, 3)), math.ceil(0.04 * max(resolution))
     stages = []
     for part, iterations in plan:
