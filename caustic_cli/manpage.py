@@ -1,4 +1,4 @@
-"""The manual page, from the commands themselves: `python -m caustic_cli.manpage > man/caustic.1`.
+"""The manual pages, from the commands themselves: `python -m caustic_cli.manpage man` writes caustic.1 and one for each command.
 
 Options and their help come from the parser, so they cannot differ from `--help`; the sections around them are below.
 """
@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import re
 import sys
+from pathlib import Path
 
 from caustic_cli import __version__
 from caustic_cli.cli import parser
+from caustic_cli.files import write_bytes
 
 HEAD = r""".TH CAUSTIC 1 "" "caustic {version}" "User Commands"
 .SH NAME
@@ -108,11 +110,29 @@ def build() -> str:
     return "".join(parts) + TAIL
 
 
+def pages() -> dict[str, str]:
+    """All pages by file name: the whole program, and each command alone."""
+    return {"caustic.1": build()} | {f"caustic-{name}.1": _page(name, command) for name, command in parser().commands.items()}
+
+
+def _page(name: str, command) -> str:
+    summary = _plain((command.help or "").split(".")[0])
+    examples = "\n".join(line.strip().replace("\\", "\\e").replace("-", "\\-") for line in (command.epilog or "").splitlines()
+                         if line.strip().startswith("caustic"))
+    options = _command(name, command).split("\n", 2)[2]
+    return (f'.TH CAUSTIC-{name.upper()} 1 "" "caustic {__version__}" "User Commands"\n.SH NAME\ncaustic\\-{name} \\- {summary}\n'
+            f".SH SYNOPSIS\n.B caustic {name}\n{_plain(_usage(command))} [OPTIONS]\n.SH DESCRIPTION\n{_plain(command.help or '')}\n"
+            f".SH OPTIONS\n{options}.SH EXAMPLES\n.nf\n{examples}\n.fi\n.SH SEE ALSO\n.BR caustic (1)\n"
+            "tells of files, orientation, exit status and environment.\n")
+
+
+def _usage(command) -> str:
+    return " ".join((p.metavar or p.name.upper()) for p in command.params if p.param_type_name == "argument")
+
+
 def _command(name: str, command) -> str:
-    arguments = [p for p in command.params if p.param_type_name == "argument"]
     flags = [p for p in command.params if p.param_type_name == "option"]
-    usage = " ".join((p.metavar or p.name.upper()) for p in arguments)
-    lines = [f".SS caustic {name} {_plain(usage)} [OPTIONS]", _plain(command.help or "")]
+    lines = [f".SS caustic {name} {_plain(_usage(command))} [OPTIONS]", _plain(command.help or "")]
     for p in flags:
         names = ", ".join(_plain(o) for o in sorted([*p.opts, *p.secondary_opts], key=len, reverse=True))
         value = "" if p.is_flag else " \\fI" + _plain(p.metavar or p.name.upper()) + "\\fR"
@@ -128,4 +148,7 @@ def _plain(text: str) -> str:
 
 
 if __name__ == "__main__":
-    sys.stdout.write(build())
+    if len(sys.argv) != 2:
+        raise SystemExit("usage: python -m caustic_cli.manpage DIRECTORY")
+    for file, page in pages().items():
+        write_bytes(Path(sys.argv[1]) / file, page.encode())
