@@ -26,8 +26,8 @@ from caustic_cli.optics.heightfield import HeightField
 A_SPAN, CHECKED, MOST = 4, 10, 4001
 #: The part by which limits are kept tighter than asked at first, for the places between points, and how often more is tried.
 ROOM, TRIES = 2e-3, 6
-#: The part of a limit by which it may be exceeded where it is kept.
-LEFT = 1e-3
+#: The part of a limit by which it may be exceeded where it is kept, and by which the checked points must stay below it.
+LEFT, SPARE = 1e-3, 1e-3
 STEPS = 400
 #: Points looked at together when checking, which bounds the memory.
 BLOCK = 4_000_000
@@ -47,7 +47,8 @@ def within_limits(field: HeightField, heights: Tensor, bounds: tuple[Tensor, Ten
     """
     if not (max_slope > 0 or min_radius > 0):
         return heights
-    asked, found, room = _Limits(field, bounds, max_slope, min_radius, CHECKED), heights, LEFT + ROOM
+    asked = _Limits(field, bounds, max_slope * (1.0 - SPARE), min_radius / (1.0 - SPARE), CHECKED)
+    found, room = heights, LEFT + ROOM
     for _ in range(TRIES):
         over = asked.excess(found)
         if over <= 0:
