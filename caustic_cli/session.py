@@ -86,10 +86,11 @@ def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: d
             return replace(same[0], found=same[1]), None
         place.check(path, force)  # before the transport, which may take a minute
         _designer(project, "cpu")  # builds and so checks scene, target, stages, options
-        first = _first_heights(project)
+        fixed = "thickness" in said.get("lens", {})
+        first = _first_heights(project, lifted=fixed)
         if first is not None and _make_room(full, said, first):
             _designer(project, "cpu")
-            first = _first_heights(project)
+            first = _first_heights(project, lifted=fixed)
         if first is not None:
             first = _designer(project, "cpu")[0].within_limits(State(first))
     except InputError as error:  # about a project.toml that is not written yet
@@ -139,7 +140,7 @@ def resume(project: Project, iterations: int | None, time_limit: float | None, d
         designer, target = _designer(project, device)
         begun = (project.path / CHECKPOINT).exists()  # if not, it was killed before its first checkpoint
         before = project.load() if begun else None
-        state = before.state if begun else designer.begin(_first_heights(project))
+        state = before.state if begun else designer.begin(_first_heights(project, lifted=True))
         if state.stage >= len(designer.stages):
             raise InputError(f"{project.path / TOML}: has {len(designer.stages)} stages, but the checkpoint stands in stage"
                              f" {state.stage + 1}")
@@ -188,8 +189,10 @@ def _designer(project: Project, device: str) -> tuple[Designer, np.ndarray]:
     return Designer(scene, torch.from_numpy(target), stages, chosen, device), target
 
 
-def _first_heights(project: Project) -> torch.Tensor | None:
+def _first_heights(project: Project, lifted: bool) -> torch.Tensor | None:
     """Heights of the transport start or of --start on the first stage's net, or None for the offset surface.
+
+    lifted: raise a transport start that would reach below the least thickness, which the user fixed: light follows slopes.
 
     Raises:
         InputError: no such project or surface, its lens is of another size, or transport cannot reach the picture.
@@ -200,7 +203,10 @@ def _first_heights(project: Project) -> torch.Tensor | None:
     if start == "transport":
         designer, target = _designer(project, "cpu")
         cells = transport_cells(designer.stages[-1].rays, not isinstance(designer.scene.source, PlaneWave))
-        return first_surface(designer.scene, grey(target), designer.field(0), cells)
+        found = first_surface(designer.scene, grey(target), designer.field(0), cells)
+        lens = designer.scene.lens
+        short = lens.z_in + lens.min_thickness - float(found.min())
+        return found + 1.01 * short if lifted and short > 0 else found
     net = _designer(project, "cpu")[0].field(0)
     if Path(start).suffix.lower() in SUFFIXES and not Path(start).is_dir():
         return onto(*read_surface(start, net.half_size), net)

@@ -234,6 +234,15 @@ def test_transport_begins_where_the_offset_ends(capfd):
     assert "start = \"transport\"" in Path("moved/project.toml").read_text()
 
 
+def test_a_start_that_a_fixed_thickness_would_cut_is_lifted(capfd):
+    Path("thin.toml").write_text("[lens]\nthickness = 0.0\nmin_thickness = 0.0\n")
+    options = ["--resolution", "24", "--control", "35", "--rays", "40000", "--quiet", "--threads", "1", "--iterations", 1]
+    thin = design(capfd, "blob.png", "--config", "thin.toml", *options, "-o", "thin")
+    free = design(capfd, "blob.png", *options, "-o", "free")
+    assert thin["start_relative_rms"] < 1.2 * free["start_relative_rms"]
+    assert 0 < float(load("thin").state.heights.min()) < 0.1
+
+
 @pytest.mark.parametrize("limit, control, rays", [(5, 32, 40_000), (20, 48, 40_000), (90, 48, 256 * 24 * 24)])
 def test_the_time_limit_chooses_the_quality(capfd, limit, control, rays, monkeypatch):
     monkeypatch.setattr(session, "_run", lambda *args: {"lost": {}, "image": "", "reason": ""})
