@@ -286,6 +286,24 @@ def test_a_ray_that_meets_the_surface_twice():
     torch.testing.assert_close((x + t * d[0])[:3], at[:3], rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("below", [False, True])
+@pytest.mark.parametrize("round_", [False, True])
+def test_second_meetings_by_kernel_and_by_reference(below, round_, monkeypatch):
+    """The same distances to 1e-12 mm on a wild surface, and some of either kind of ray: 3000 of them, 500 and more each."""
+    scene = replace(scene_of(), lens=replace(scene_of().lens, size=(10.0, 10.0)))
+    heights, field, random = bumpy(scene, 2.0), HeightField.of(scene.lens), np.random.default_rng(5)
+    angle, lean = random.uniform(0, 2 * math.pi, 3000), random.uniform(0.5, 1.5, 3000)
+    d = np.stack([np.sin(lean) * np.cos(angle), np.sin(lean) * np.sin(angle), np.cos(lean) * random.choice([-1, 1], 3000)])
+    x, y = (torch.from_numpy(random.uniform(-3.5, 3.5, 3000)) for _ in range(2))
+    o = x, y, field.at(heights, x, y)[0]
+    t, found = again(field, heights, o, tuple(torch.from_numpy(d)), below, round_)
+    monkeypatch.setenv("CAUSTIC_KERNELS", "torch")
+    other, found_too = again(field, heights, o, tuple(torch.from_numpy(d)), below, round_)
+    assert bool((found == found_too).all())
+    assert 500 < int(found.sum()) < 2500
+    torch.testing.assert_close(t, other, rtol=0, atol=1e-12)
+
+
 def test_the_way_of_a_ray_that_meets_the_surface_twice():
     """From the ramp into the cliff and out on its far side: Snell's law in vector form, by hand, in two dimensions."""
     scene, heights = cliff()

@@ -24,7 +24,7 @@ HALVINGS = 50
 
 @torch.no_grad()
 def again(field: HeightField, heights: Tensor, o, d, below: bool, round: bool = False) -> tuple[Tensor, Tensor]:
-    """Next meeting with the surface of rays that start on it, by steps and bisection, in plain torch.
+    """Next meeting with the surface of rays that start on it, by steps and bisection.
 
     The slopes bound how fast a ray can come nearer, so its distance from the surface is a step that cannot miss it.
 
@@ -37,13 +37,25 @@ def again(field: HeightField, heights: Tensor, o, d, below: bool, round: bool = 
     Returns:
         t (N,) mm, 0 where there is none; found (N,) bool.
     """
-    h, side = heights.detach().double(), -1.0 if below else 1.0
+    h = heights.detach().double()
     o, d = ([c.detach().double() for c in v] for v in (o, d))
-    (rx, ry), (lowest, highest) = field.half_size, (float(h.min()), float(h.max()))
+    step = min(2.0 * r * float(torch.diff(s.breaks).min()) for s, r in zip(field.spaces, field.half_size, strict=True))
+    step /= STEPS_PER_SPAN
+    if not (fused(h.device) and len(o[0])):
+        t = reference(field, h, o, d, below, round, step)
+    else:
+        from caustic_cli.optics.kernels.surface import FusedSurface, next_meetings  # noqa: PLC0415
+
+        t = next_meetings(FusedSurface(field.spaces, field.half_size), h, o, d, below, round, step, HALVINGS, MOST_STEPS)
+    return t, t > 0
+
+
+@torch.no_grad()
+def reference(field: HeightField, h: Tensor, o, d, below: bool, round: bool, step: float) -> Tensor:
+    """The same distances in plain torch, from float64; `step` mm is the least one."""
+    side, (rx, ry), (lowest, highest) = -1.0 if below else 1.0, field.half_size, (float(h.min()), float(h.max()))
     gx, gy = field.slope_bounds(h)
-    step = min(2.0 * r * float(torch.diff(s.knots).clamp_min(0.0)[torch.diff(s.knots) > 0].min())
-               for s, r in zip(field.spaces, (rx, ry), strict=True)) / STEPS_PER_SPAN
-    t_found, found = torch.zeros_like(o[0]), torch.zeros_like(o[0], dtype=torch.bool)
+    t_found, reached = torch.zeros_like(o[0]), torch.zeros_like(o[0])
     rise = side * d[2] - gx * d[0].abs() - gy * d[1].abs()  # where it is positive, no slope of the surface catches the ray
     at = (rise <= 0).nonzero()[:, 0]
     before = torch.full_like(t_found, 1e-3 * step)[at]
@@ -63,18 +75,19 @@ def again(field: HeightField, heights: Tensor, o, d, below: bool, round: bool = 
         after = before + torch.clamp_min(f_before / -rise[at], step)
         f, z = height(at, after), o[2][at] + after * d[2][at]
         through = f <= 0
-        if bool(through.any()):
-            here, low, high = at[through], before[through], after[through]
-            for _ in range(HALVINGS):
-                middle = 0.5 * (low + high)
-                clear = height(here, middle) > 0
-                low, high = torch.where(clear, middle, low), torch.where(clear, high, middle)
-            t_found[here], found[here] = high, True
+        reached[at[through]], t_found[at[through]] = before[through], after[through]
         climbs = side * d[2][at] > 0
         gone = torch.isnan(f) | (climbs & ((z > highest) if side > 0 else (z < lowest)))
         on = ~through & ~gone
         at, before, f_before = at[on], after[on], f[on]
-    return t_found, found
+    here = t_found.nonzero()[:, 0]
+    low, high = reached[here], t_found[here]
+    for _ in range(HALVINGS if len(here) else 0):
+        middle = 0.5 * (low + high)
+        clear = height(here, middle) > 0
+        low, high = torch.where(clear, middle, low), torch.where(clear, high, middle)
+    t_found[here] = high
+    return t_found
 
 
 def surface_at(field: HeightField, heights: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:

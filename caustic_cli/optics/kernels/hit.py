@@ -162,6 +162,44 @@ def intersect(ou, ov, oz, du, dv, dz, start, limits, slopes, c, bu, mu, wu, bv, 
 
 
 @njit(parallel=True, **_OPTIONS)
+def intersect_again(ou, ov, oz, du, dv, dz, side, limits, slopes, round_, step, halvings, most, c, bu, mu, wu, bv, mv, wv, t,
+                    blocks):
+    """Next meetings of rays (N,) that start on the surface, into t (N,), 0 for none: the search of `meeting.reference`.
+
+    side: 1 above the surface, -1 under it; limits, slopes: as in `intersect`; round_: the surface ends at the circle inscribed
+    in its aperture; step, halvings, most: least step (mm), bisections of the last one and most steps.
+    """
+    count, highest = len(ou), limits[1] if side > 0.0 else -limits[0]
+    for block in prange(blocks):
+        for k in range(block * count // blocks, (block + 1) * count // blocks):
+            t[k] = 0.0
+            rise = side * dz[k] - slopes[0] * abs(du[k]) - slopes[1] * abs(dv[k])
+            if rise > 0.0:  # no slope of the surface catches the ray
+                continue
+            before, after, f = 0.0, 1e-3 * step, 0.0
+            for probe in range(most):
+                u, v, z = ou[k] + after * du[k], ov[k] + after * dv[k], oz[k] + after * dz[k]
+                across = (u - 0.5) ** 2 + (v - 0.5) ** 2 if round_ else max(abs(u - 0.5), abs(v - 0.5)) ** 2
+                if not across <= 0.25 or (side * dz[k] > 0.0 and side * z > highest):
+                    break
+                f = side * (z - _value(c, u, v, bu, mu, wu, bv, mv, wv)[0])
+                if f <= 0.0:
+                    if probe > 0:
+                        t[k] = after
+                    break
+                before, after = after, after + max(f / -rise, step)
+            if t[k] > 0.0:
+                for _ in range(halvings):
+                    middle = 0.5 * (before + after)
+                    z = _value(c, ou[k] + middle * du[k], ov[k] + middle * dv[k], bu, mu, wu, bv, mv, wv)[0]
+                    if side * (oz[k] + middle * dz[k] - z) > 0.0:
+                        before = middle
+                    else:
+                        after = middle
+                t[k] = after
+
+
+@njit(parallel=True, **_OPTIONS)
 def slopes_at(ou, ov, oz, du, dv, dz, t, status, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y, reach, gx, gy, blocks):
     """Distances to the hits (-1 for none) and dz/dx, dz/dy there into reach, gx, gy (N,)."""
     count = len(ou)

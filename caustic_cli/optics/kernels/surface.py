@@ -26,6 +26,11 @@ class FusedSurface:
         """(n, m) mm -> the polynomial of every span product, (I, J, p + 1, q + 1) float64."""
         return spline.coefficients(heights.detach().double().contiguous().numpy(), *self.linear)
 
+    def slope_bounds(self, heights: Tensor) -> tuple[float, float]:
+        """Bounds of |Z_u| and |Z_v| over [0, 1]^2, mm, from the control nets of the derivatives."""
+        return tuple(float((a.space.derivative_matrix() @ h).abs().max())
+                     for a, h in zip(self.axes, (heights, heights.T), strict=True))
+
     def workspace(self) -> np.ndarray:
         """Derivatives by the coefficients, a set for each block, to be overwritten."""
         shape = (blocks(), *(len(a.first) for a in self.axes), *(a.matrices.shape[1] for a in self.axes))
@@ -75,6 +80,19 @@ def _sag(heights: Tensor) -> tuple[Tensor, float]:
     return h - middle, middle
 
 
+def next_meetings(surface: FusedSurface, heights: Tensor, o, d, below: bool, round: bool, step: float, halvings: int,
+                  most: int) -> Tensor:
+    """The fused form of `meeting.reference`: distances (N,) mm, 0 for none."""
+    h, middle = _sag(heights)
+    rays = (o[0] * surface.scale[0] + 0.5, o[1] * surface.scale[1] + 0.5, o[2] - middle,
+            d[0] * surface.scale[0], d[1] * surface.scale[1], d[2])
+    t = np.empty(len(o[0]))
+    hit.intersect_again(*(c.contiguous().numpy() for c in rays), -1.0 if below else 1.0, (float(h.min()), float(h.max())),
+                        surface.slope_bounds(h), round, step, halvings, most, surface.coefficients(h), *surface.geometry, t,
+                        blocks())
+    return torch.from_numpy(t)
+
+
 class RayHits:
     """Where the rays of a bundle meet a height field: the fused form of `intersection.meet` by Newton's method."""
 
@@ -100,9 +118,8 @@ class RayHits:
         h, middle = _sag(heights)
         c = self.surface.coefficients(h)
         self.rays[2][:] = self.z - middle
-        slopes = [float((a.space.derivative_matrix() @ x).abs().max()) for a, x in zip(self.surface.axes, (h, h.T), strict=True)]
-        limits = (float(h.min()), float(h.max()))
-        hit.intersect(*self.rays, np.empty(0) if start is None else start, limits, tuple(slopes), c, *self.surface.geometry,
+        limits, slopes = (float(h.min()), float(h.max())), self.surface.slope_bounds(h)
+        hit.intersect(*self.rays, np.empty(0) if start is None else start, limits, slopes, c, *self.surface.geometry,
                       self.t, self.status, blocks())
         if self.radius is not None:  # beyond a circular aperture there is the lens' side
             x, y, _, dx, dy, _ = self.rays
