@@ -10,8 +10,10 @@ from __future__ import annotations
 import pytest
 import torch
 
+from caustic_cli import firstrun
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.kernels import banded, plane, spline
 from caustic_cli.optics.kernels import shares as kernel_shares
 from caustic_cli.optics.kernels.functions import PlaneKernel
 from caustic_cli.optics.reconstruction import Filter, splat
@@ -177,3 +179,24 @@ def test_series_and_recursion_meet():
         a, b = (next(exposures(scene(), heights(), Filter("gaussian", (3, 3), (alpha, alpha)), "lines"))[0]
                 for alpha in (border * (1 - 1e-12), border * (1 + 1e-12)))
         torch.testing.assert_close(a, b, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_first_run_compiles_what_designs_and_renders_use(dtype):
+    """A kernel that is called in another way than it was compiled ahead for would be compiled again, half a minute each time."""
+    for part in firstrun.PARTS:
+        firstrun.compile_part(part)
+    kernels = (plane.forward, plane.backward, spline.evaluate, spline.pull_back, banded._contract, banded._spread)
+    ahead = [list(kernel.signatures) for kernel in kernels]
+    for kind, rays in (("lines", 900), ("stratified", 1500), ("uniform", 900), ("uniform", 1)):
+        image, *_ = next(exposures(scene("schlick"), heights().requires_grad_(), FILTERS[-1], kind, dtype, rays))
+        image.sum().backward()
+    assert [list(kernel.signatures) for kernel in kernels] == ahead
+
+
+def test_parts_of_the_first_run_are_shared_out():
+    for processes in range(1, 5):
+        shares = firstrun.shares(processes)
+        assert sorted(part for share in shares for part in share) == sorted(firstrun.PARTS)
+        assert len(shares) == processes
+        assert all(shares)

@@ -148,10 +148,13 @@ def start_torch(device: str, threads: int | None, say: Reporter):
     from caustic_cli.optics.kernels import fused  # noqa: PLC0415
 
     if fused(device):
+        from caustic_cli import firstrun  # noqa: PLC0415
         from caustic_cli.optics.kernels.functions import compile_kernels  # noqa: PLC0415
 
-        with say.patience("compiling the ray kernels for this machine, once: about half a minute"):
-            compile_kernels(torch.float32, torch.float64)
+        with say.patience("compiling the kernels for this machine, once: about a minute"):
+            if not firstrun.kept():
+                firstrun.compile_side_by_side()
+            compile_kernels(*firstrun.DTYPES)
     return device
 
 

@@ -6,6 +6,8 @@ refracts, carries to the screen and splats.
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -67,12 +69,11 @@ class PlaneKernel:
                 self.along_v = AlongV(sv, v, 1.0 / (2.0 * ry), dtype)
             x, y, shape = u[:, None], v[None, :], (len(u), len(v))
         else:
-            columns = min(ROW, len(u))
-            short = -len(u) % columns  # rays without power fill the last row
+            shape = _layout(len(u))
+            short = shape[0] * shape[1] - len(u)  # rays without power fill the last row
             if short:
                 share = torch.nn.functional.pad(share.expand(len(u)), (0, short))
                 u, v = (torch.nn.functional.pad(t, (0, short), value=0.5) for t in (u, v))
-            shape = (len(u) // columns, columns)
             self.first = torch.arange(shape[0])
             self.bu = self.du = torch.ones(shape[0], 1, dtype=dtype)
             self.points = (u.numpy(), v.numpy())
@@ -111,9 +112,8 @@ class RayKernel:
         self.surface = FusedSurface(spaces, half_size) if like is None else like.surface
         self.workspace = _Workspace() if like is None else like.workspace
         self.hits, self.z = RayHits(self.surface, bundle), bundle.z
-        columns = min(ROW, count)
-        self.short = -count % columns
-        self.shape = ((count + self.short) // columns, columns)
+        self.shape = _layout(count)
+        self.short = self.shape[0] * self.shape[1] - count
         rows = [torch.nn.functional.pad(t.to(dtype), (0, self.short)).view(self.shape)
                 for t in (bundle.x, bundle.y, bundle.dx, bundle.dy, bundle.share)]  # rays without power fill the last row
         self.rays = tuple(_strided(t.numpy()) for t in rows)
@@ -135,11 +135,7 @@ def _splat(nets, rows, apart: bool, rays, lens: Lens, height: float, start, scre
     Returns:
         image (n_x, n_y) and the power leaving the lens (), float64, differentiable; what was lost, by name.
     """
-    size = tuple(2 * r + 1 for r in filter.reach)
-    real = (lens.index, height, -screen.low[0], -screen.low[1], *screen.pixel, *filter.alpha, *start)
-    slanted = rays[2].shape == rays[0].shape
-    whole = (_FRESNEL[lens.fresnel], *screen.resolution, _KIND[filter.kind], *size, int(slanted))
-    arguments = (*rays, np.array(real, np.float64), np.array(whole, np.int64))
+    slanted, arguments = _arguments(rays, lens, height, start, screen, filter)
     padded, leaving, ledger = _Image.apply(*nets, rows, apart, arguments, workspace)
     (nx, ny), (rx, ry) = screen.resolution, filter.reach
     padded = padded[:, : ny + 4 * ry]  # beyond lies what rounds the scatter's steps up to four pixels
@@ -149,9 +145,24 @@ def _splat(nets, rows, apart: bool, rays, lens: Lens, height: float, start, scre
                                    "off_screen": ledger[plane.OFF_SCREEN] + padding(padded.detach(), filter.reach)}
 
 
+def _arguments(rays, lens: Lens, height: float, start, screen: Screen, filter: Filter) -> tuple[bool, tuple]:
+    """Whether rays are slanted, and what `plane` takes after the nets."""
+    size = tuple(2 * r + 1 for r in filter.reach)
+    real = (lens.index, height, -screen.low[0], -screen.low[1], *screen.pixel, *filter.alpha, *start)
+    slanted = rays[2].shape == rays[0].shape
+    whole = (_FRESNEL[lens.fresnel], *screen.resolution, _KIND[filter.kind], *size, int(slanted))
+    return slanted, (*rays, np.array(real, np.float64), np.array(whole, np.int64))
+
+
 def _none(dtype: torch.dtype) -> np.ndarray:
     """What stands for directions where all rays run along z."""
     return _strided(np.zeros((2, 2), torch.empty((), dtype=dtype).numpy().dtype))
+
+
+def _layout(count: int) -> tuple[int, int]:
+    """Rows and columns for so many scattered rays: at least two rows, because one alone is always contiguous, see `_strided`."""
+    rows = max(2, -(-count // ROW))
+    return rows, -(-count // rows)
 
 
 def _strided(array: np.ndarray) -> np.ndarray:
@@ -165,14 +176,48 @@ def _strided(array: np.ndarray) -> np.ndarray:
 
 def compile_kernels(*dtypes: torch.dtype) -> None:
     """Have the kernels ready for rays of these precisions: from numba's cache, or compiled for this machine."""
+    compile_surface(*dtypes)
+    compile_splat(*dtypes)
+    compile_adjoint(*dtypes)
+
+
+def compile_surface(*dtypes: torch.dtype) -> None:
+    """What gives the surface at rays of a plane wave, and its adjoint."""
+    space, at = SplineSpace.uniform(4, 3), torch.linspace(0.0, 1.0, ROW, dtype=torch.float64)
+    for dtype in dtypes:
+        heights = torch.zeros(4, 4, dtype=dtype, requires_grad=True)
+        net, slope = AlongV(space, at, 0.5, dtype)(heights)
+        found = scattered_surface(FusedSurface((space, space), (1.0, 1.0)), heights, at.numpy(), at.numpy(), dtype)
+        sum(t.sum() for t in (net, slope, *found)).backward()
+
+
+def compile_splat(*dtypes: torch.dtype) -> None:
+    """What bends, carries and splats the rays."""
+    for example in _examples(dtypes):
+        _Image.apply(*example)
+
+
+def compile_adjoint(*dtypes: torch.dtype) -> None:
+    """The adjoint of `compile_splat`'s kernel."""
+    for *nets, rows, apart, arguments, workspace in _examples(dtypes):
+        image = torch.from_numpy(_images(arguments, workspace)[0][0])
+        context = SimpleNamespace(saved_tensors=nets, rows=rows, apart=apart, arguments=arguments, workspace=workspace)
+        _Image.backward(context, image, torch.ones((), dtype=torch.float64), None)
+
+
+def _examples(dtypes):
+    """What `_Image` takes, for a few rays of each kind."""
     space, at = SplineSpace.uniform(4, 3), torch.linspace(0.0, 1.0, 2 * ROW, dtype=torch.float64)
     share, screen = torch.tensor(0.25, dtype=torch.float64), Screen((10.0, 10.0), 10.0, (4, 4))
     for dtype in dtypes:
         for tensor in (True, False):
             points = at[:2] if tensor else at
             kernel = PlaneKernel((space, space), (1.0, 1.0), points, points, tensor, share, dtype)
-            sag = torch.zeros(4, 4, dtype=dtype, requires_grad=True)
-            kernel(sag, Lens(index=1.5), 10.0, screen, Filter("cosine", (3, 3)))[0].sum().backward()
+            net = torch.zeros((4, 2) if tensor else kernel.shape, dtype=dtype)
+            x, y, shares_ = kernel.rays
+            rays = (x, y, _none(dtype), _none(dtype), shares_)
+            _, arguments = _arguments(rays, Lens(index=1.5), 10.0, (1.0, 0.0), screen, Filter("cosine", (3, 3)))
+            yield net, net, net, kernel.rows, not tensor, arguments, kernel.workspace
 
 
 def compile_ray_kernels(*dtypes: torch.dtype) -> None:
