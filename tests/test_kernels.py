@@ -7,6 +7,7 @@ float32 surface, so it is compared with the float64 reference of the same rounde
 
 from __future__ import annotations
 
+import numba
 import pytest
 import torch
 
@@ -200,3 +201,9 @@ def test_parts_of_the_first_run_are_shared_out():
         assert sorted(part for share in shares for part in share) == sorted(firstrun.PARTS)
         assert len(shares) == processes
         assert all(shares)
+
+
+def test_threads_are_not_those_of_tbb():
+    """Whose parallel loops start more slowly the more of them there were; numba takes it first where it is installed."""
+    next(exposures(scene("schlick"), heights(), FILTERS[0], "lines"))
+    assert numba.threading_layer() in ("omp", "workqueue")

@@ -24,15 +24,14 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 
-import numba
 import numpy as np
-import torch
 from scipy import ndimage
 from scipy.interpolate import RectBivariateSpline
 
 from caustic_cli.errors import InputError
 from caustic_cli.inverse import laguerre
 from caustic_cli.inverse.multigrid import Multigrid, matrix
+from caustic_cli.optics.kernels import blocks
 
 FINE = 4  # raster points a source cell, along each axis
 LEAST = 128  # raster points along an axis
@@ -108,7 +107,7 @@ def solve(source, target, source_half, target_half, *, start=None, smooth=1.5, t
         InputError: a density that is not 2-D, not finite, negative or black, or a size that is not positive.
     """
     began = time.perf_counter()
-    numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))  # --threads decides both
+    blocks()  # --threads decides over numba's too
     f, g = _density("source", source), _density("target", target)
     (a, b), (c, d) = _halves("source", source_half), _halves("target", target_half)
     if not 0.5 <= smooth <= 16:

@@ -66,7 +66,7 @@ def state(project: Path) -> tuple[np.ndarray, np.ndarray]:
 def finish(book: Book, name: str, project: Path, figures: dict, seconds: float, **more: np.ndarray) -> None:
     """Retrace a designed lens and note what it does."""
     image = project / "render.npy"
-    seen = caustic("render", project, "--rays", "1e6", "--npy", image, "--force")
+    seen = caustic("render", project, "--rays", "4e6", "--npy", image, "--force")
     heights, history = state(project)
     about = {"relative_rms": seen["relative_rms"], "loss": seen["loss"], "on_screen": seen["on_screen"],
              "fresnel": seen["lost"]["fresnel"], "iterations": figures["iterations"], "seconds": seconds}

@@ -275,7 +275,8 @@ def forward(images, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, al
             _scatter(v, real, whole, sx, sy, images[block], ledgers[block], column)
     ledger = np.zeros(COLUMNS)
     for block in range(blocks):
-        ledger += ledgers[block]
+        for name in range(COLUMNS):
+            ledger[name] += ledgers[block, name]
     return _total(images), ledger
 
 

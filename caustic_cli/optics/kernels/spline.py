@@ -70,9 +70,12 @@ def pull_coefficients(grads, n, m, first_u, mu, first_v, mv):
     for i in prange(len(mu)):
         total, part = np.empty((p, q)), np.empty((p, q))
         for j in range(len(mv)):
-            total[:] = grads[0, i, j]
-            for block in range(1, len(grads)):
-                total += grads[block, i, j]
+            for a in range(p):
+                for b in range(q):
+                    value = 0.0
+                    for block in range(len(grads)):
+                        value += grads[block, i, j, a, b]
+                    total[a, b] = value
             for a in range(p):
                 for b in range(q):
                     value = 0.0
@@ -88,7 +91,8 @@ def pull_coefficients(grads, n, m, first_u, mu, first_v, mv):
     out = np.zeros((n, m))
     for i in range(len(mu)):
         for a in range(p):
-            out[first_u[i] + a] += rows[i, a]
+            for j in range(m):  # not a sum of rows, which would be a parallel loop of its own each time
+                out[first_u[i] + a, j] += rows[i, a, j]
     return out
 
 
