@@ -4,7 +4,7 @@
     python examples/thesis/run.py [--quick] [--threads N] [-o DIR]
 
 Writes DIR/thesis.png (one page, in the order of the thesis' figures), thesis.csv and thesis.json (loss, light, time), and every
-project.  --quick is a few dozen iterations of each, about eight minutes on two cores; without it the iterations are the thesis',
+project.  --quick is a few dozen iterations of each, about ten minutes on two cores; without it the iterations are the thesis',
 half an hour.  What is done already is not done again.  Only the command line and the files it documents are used.
 """
 
@@ -151,7 +151,7 @@ def table(book: Book) -> list[dict]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--quick", action="store_true", help="a few dozen iterations of each, about eight minutes")
+    parser.add_argument("--quick", action="store_true", help="a few dozen iterations of each, about ten minutes")
     parser.add_argument("-o", "--out", type=Path, default=Path("thesis"), metavar="DIR", help="default: thesis")
     parser.add_argument("--threads", type=int, metavar="N", help="of every command; default: all cores")
     options = parser.parse_args()
