@@ -8,7 +8,7 @@ import numpy as np
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Disc, Lens, PlaneWave, Points, Scene, Screen, Source
 from caustic_cli.surfaces import load_npz, surface_of
 

@@ -17,7 +17,7 @@ from caustic_cli.inverse.first import first_surface
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.schedule import Stage, coarse_to_fine
 from caustic_cli.inverse.target import target_on_screen
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.project import Project
 from caustic_cli.scene import Scene
 

@@ -17,7 +17,7 @@ from caustic_cli.derive import Settings, build_options, build_stages, complete
 from caustic_cli.errors import InputError
 from caustic_cli.files import write_bytes
 from caustic_cli.inverse.target import target_on_screen
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.picture import Picture, read_picture
 from caustic_cli.scene import Scene
 

@@ -26,7 +26,7 @@ from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.first import first_surface
 from caustic_cli.inverse.schedule import transport_cells
 from caustic_cli.inverse.target import grey
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.picture import read_picture
 from caustic_cli.project import CHECKPOINT, RENDER, TOML, Project, is_project
 from caustic_cli.scene import PlaneWave, Scene

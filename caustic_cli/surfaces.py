@@ -16,7 +16,7 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene.lens import MAX_CONTROL
 
 #: Kinds of file, by suffix.

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.interface import reflectances
 from caustic_cli.optics.meeting import again
 from caustic_cli.optics.reconstruction import Filter

@@ -9,7 +9,7 @@ import torch
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.emission import Emission, rays_of
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.tracing import expose
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.scene.source import blur_limit, covering_cone

@@ -16,7 +16,7 @@ from caustic_cli.export.lighttools import write_lighttools
 from caustic_cli.export.mesh import closed_mesh
 from caustic_cli.export.stl import TRIANGLE, write_stl
 from caustic_cli.export.surface import STEPS_PER_SPAN, sample_grid
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.tracing import PlaneTracer
 from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen

@@ -6,7 +6,7 @@ import torch
 from PIL import Image
 
 from caustic_cli.errors import InputError
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter, splat
 from caustic_cli.optics.sampling import SAMPLERS, Sampler
 from caustic_cli.optics.tracing import PlaneTracer

@@ -14,7 +14,7 @@ from torch.autograd import forward_ad
 from caustic_cli.optics import intersection
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.bundle import Bundle
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.intersection import Method, Status
 from caustic_cli.optics.kernels.surface import FusedSurface, RayHits
 

@@ -13,7 +13,7 @@ import torch
 
 from caustic_cli import firstrun
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.kernels import banded, plane, spline
 from caustic_cli.optics.kernels import shares as kernel_shares
 from caustic_cli.optics.kernels.functions import PlaneKernel

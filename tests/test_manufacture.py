@@ -18,7 +18,7 @@ from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse.limits import within_limits
 from caustic_cli.inverse.penalties import Penalty
 from caustic_cli.optics import curvature
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.project import Project
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies import manufacture as manufacture_module

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.bspline import SplineSpace, Surface
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.kernels import mesh as kernel
 from caustic_cli.optics.mesh import TriangleMesh, boxes_of, vertices_of
 

@@ -12,7 +12,7 @@ from caustic_cli.inverse import objective as module
 from caustic_cli.inverse.losses import Loss
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.penalties import Penalty
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.tracing import expose

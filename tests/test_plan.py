@@ -10,7 +10,7 @@ from test_effects import POINT, bumpy, cliff, heights_through, scene_of, shine, 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.bounds import bounds_of
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.meeting import again
 from caustic_cli.optics.plan import EFFECTS, FREE, NEGLIGIBLE, compile_plan, parse_effects
 from caustic_cli.optics.reconstruction import Filter

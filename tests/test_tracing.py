@@ -10,7 +10,7 @@ import torch.autograd.forward_ad as fwd
 from scipy.interpolate import BSpline
 
 from caustic_cli.errors import InputError
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import SAMPLERS, Sampler
 from caustic_cli.optics.tracing import LOSSES, PlaneTracer, Status, expose

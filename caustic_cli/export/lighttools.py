@@ -19,7 +19,7 @@ from torch import Tensor
 from caustic_cli import __version__
 from caustic_cli.export.surface import sample_grid
 from caustic_cli.files import MARK, atomic_path
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Disc, PlaneWave, Scene
 from caustic_cli.scene.source import covering_cone
 

@@ -19,7 +19,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.export.surface import SurfaceGrid, sample_grid
 from caustic_cli.export.text import CREATED, real
 from caustic_cli.files import atomic_path, write_bytes
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Disc, PlaneWave, Scene
 
 #: Rows of the flat entrance along each axis: a plane needs no more.

@@ -30,7 +30,7 @@ from caustic_cli.export.surface import (
     sample_grid,
     second_derivative_bounds,
 )
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Lens, Scene, checks
 
 STRETCH = 1.28

@@ -25,7 +25,7 @@ from caustic_cli.export.ply import write_mesh
 from caustic_cli.export.surface import STEPS_PER_SPAN
 from caustic_cli.export.text import CREATED, real
 from caustic_cli.files import write_bytes
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Disc, Lens, PlaneWave, Scene
 from caustic_cli.scene.plain import beyond_plain
 from caustic_cli.scene.source import covering_cone

@@ -25,7 +25,7 @@ from caustic_cli.export.surface import sample_grid
 from caustic_cli.export.text import CREATED
 from caustic_cli.files import atomic_path
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Lens, Scene
 
 HEAD = f"""ISO-10303-21;

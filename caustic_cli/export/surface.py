@@ -27,7 +27,7 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import checks
 
 #: Equal steps per knot span of the default grid.  With 2 a not-a-knot bicubic is exact already; with 4 a natural one,

@@ -22,7 +22,7 @@ from caustic_cli.export.surface import STEPS_PER_SPAN, sample_grid
 from caustic_cli.export.text import CREATED, real, rows
 from caustic_cli.files import atomic_path
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 
 #: Fewest points along an axis that OpticStudio takes.

@@ -22,7 +22,7 @@ from torch import Tensor
 from caustic_cli.inverse import start
 from caustic_cli.inverse.target import overlap
 from caustic_cli.inverse.transport import corners
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.interface import reflectance
 from caustic_cli.scene import Disc, PlaneWave, Scene
 from caustic_cli.scene.source import covering_cone

@@ -20,7 +20,7 @@ from caustic_cli.errors import CausticError
 from caustic_cli.inverse.lbfgs import LBFGS
 from caustic_cli.optics import curvature
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 
 #: Points a knot span at which limits are kept and at which that is checked in the end, and most along an axis.
 A_SPAN, CHECKED, MOST = 4, 10, 4001

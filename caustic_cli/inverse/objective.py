@@ -18,10 +18,11 @@ from caustic_cli.inverse import ranks
 from caustic_cli.inverse.losses import PENALTIES, ColorLoss, Loss, parse
 from caustic_cli.inverse.penalties import Penalty
 from caustic_cli.optics.emission import Rays
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.shortage import smaller
-from caustic_cli.optics.tracing import BandTracer, PlaneTracer, RayTracer, StepTracer, tracers
+from caustic_cli.optics.system import EXIT
+from caustic_cli.optics.trace import Parameters, Tracer, tracers
 from caustic_cli.scene import Scene
 
 #: Rays traced at a time, and the number up to which the prepared chunks are kept from one evaluation to the next.
@@ -30,11 +31,17 @@ CHUNK, KEPT_RAYS = 1 << 20, 1 << 22
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Loss (units of eq. 5.2.1), its gradient over the heights (n, m) per mm, and the part of the light on the screen."""
+    """Loss (units of eq. 5.2.1), its gradients over the heights of each surface (n, m) per mm, and the part of the light on the
+    screen."""
 
     loss: float
-    gradient: Tensor
+    gradients: dict[str, Tensor]
     on_screen: float
+
+    @property
+    def gradient(self) -> Tensor:
+        """That of a lens' exit."""
+        return self.gradients[EXIT]
 
 
 class Objective:
@@ -70,8 +77,8 @@ class Objective:
             fine = wide.repeat_interleave(oversample, -2).repeat_interleave(oversample, -1)
             smooth = self._pool(torch.stack([filter.smooth(c) for c in fine]) if scene.colored else filter.smooth(fine))
         self.loss = (ColorLoss if scene.colored else Loss)(loss, smooth, blur, apron, wide > 0)
-        minded = [(weight, name) for weight, name in parse(loss) if name in PENALTIES and weight > 0]
-        self.penalty = Penalty(scene, field, minded, max_slope, sampler.device, min_radius)
+        terms = [(weight, name) for weight, name in parse(loss) if name in PENALTIES and weight > 0]
+        self.penalty = Penalty(scene, field, terms, max_slope, sampler.device, min_radius)
         self.scene, self.field, self.sampler, self.dtype = scene, field, sampler, dtype
         self.chunk, self.kept = CHUNK, None
         if sampler.count <= KEPT_RAYS:
@@ -82,22 +89,27 @@ class Objective:
 
     @property
     def whole(self) -> bool:
-        """Whether chunks keep their graphs: a kernel's holds the net or the surface at its rays, plain torch's every step."""
-        return self.kept is not None and (len(self.kept) == 1 or all(getattr(t, "kernel", None) is not None for t in self.kept))
+        """Whether chunks keep their graphs: a fused kernel's holds the net or the surface at its rays, a trace by stages every
+        ray after each of them."""
+        return self.kept is not None and (sum(t.fused is None for t in self.kept) <= 1)
 
     def _pool(self, image: Tensor) -> Tensor:
         """Pixels of the screen from those of the render."""
         k, (*colors, n, m) = self.oversample, image.shape
         return image if k == 1 else image.view(*colors, n // k, k, m // k, k).sum((-3, -1))
 
-    def _tracers(self) -> Iterator[PlaneTracer | RayTracer | StepTracer | BandTracer]:
+    def _tracers(self) -> Iterator[Tracer]:
         """This rank's chunks, ready to be traced."""
         rank, count = ranks.place()
         size = min(self.chunk, math.ceil(self.sampler.count / count)) if count > 1 else self.chunk
         return tracers(self.scene, self.field, self.sampler, self.dtype, size, part=(rank, count))
 
     def __call__(self, heights: Tensor) -> Evaluation:
-        """Value and gradient at heights (n, m) mm float64.
+        """`evaluate` at the heights (n, m) mm float64 of a lens' exit."""
+        return self.evaluate({EXIT: heights})
+
+    def evaluate(self, parameters: Parameters) -> Evaluation:
+        """Value and gradients at heights {name of a surface: (n, m) mm float64}.
 
         The loss sees rays through the image alone.  So the image is accumulated chunk by chunk, the loss gives its
         derivative by the image, and each chunk is traced again to pull that back: memory does not grow with rays.
@@ -108,48 +120,53 @@ class Objective:
         """
         while True:
             try:
-                return self._evaluate(heights)
+                return self._evaluate(parameters)
             except (MemoryError, RuntimeError) as error:
                 if ranks.place()[1] > 1:  # the others wait for this chunk's image
                     raise
                 problem = error.with_traceback(None)  # which would hold all that was allocated
             self.chunk, self.kept = smaller(self.chunk, problem), None
 
-    def _evaluate(self, heights: Tensor) -> Evaluation:
-        heights = heights.detach().to(self.device).clone()
-        ranks.share(heights)
-        heights.requires_grad_()
-        penalty = self.penalty(heights) if self.penalty else torch.zeros((), device=self.device)
+    def _evaluate(self, given: Parameters) -> Evaluation:
+        parameters = {name: heights.detach().to(self.device).clone() for name, heights in given.items()}
+        for heights in parameters.values():
+            ranks.share(heights)
+            heights.requires_grad_()
+        leaves = list(parameters.values())
+        penalty = self.penalty(parameters[EXIT]) if self.penalty else torch.zeros((), device=self.device)
         shape = (3, *self.loss.target.shape) if self.scene.colored else self.loss.target.shape
         image = torch.zeros(shape, dtype=torch.float64, device=self.device)
         leaving, parts = image.new_zeros(image.shape[:-2]), []  # one for each colour
         with torch.set_grad_enabled(self.whole):
             for traced in self.kept or self._tracers():
-                part = self._see(traced, heights)
+                part = self._see(traced, parameters)
                 image, leaving = image + part[0].detach().double(), leaving + part[1].detach().double()
                 if self.whole:
                     parts.append(part)
         ranks.add(image, leaving)
         image, leaving = image.requires_grad_(), leaving.requires_grad_()
         loss = self.loss(image, leaving, penalty)
-        wanted = (image, leaving, heights) if penalty.requires_grad else (image, leaving)
+        wanted = [image, leaving, *leaves] if penalty.requires_grad else [image, leaving]
         by_image, by_leaving, *direct = torch.autograd.grad(loss, wanted, allow_unused=True)
-        gradient = torch.zeros_like(heights)
-        for part in parts or (self._see(traced, heights) for traced in self.kept or self._tracers()):
+        gradients = [torch.zeros_like(heights) for heights in leaves]
+        for part in parts or (self._see(traced, parameters) for traced in self.kept or self._tracers()):
             # Whole pixels, and what leaves a lens without reflections, do not depend on the heights at all.
             pulls = [(value, by.to(value.dtype)) for value, by in zip(part, (by_image, by_leaving), strict=True)
                      if value.requires_grad and by is not None]
             if pulls:
                 values, by = zip(*pulls, strict=True)
-                gradient += torch.autograd.grad(values, heights, by)[0]
-        ranks.add(gradient)
-        if direct:
-            gradient += direct[0]
+                for gradient, more in zip(gradients, torch.autograd.grad(values, leaves, by, allow_unused=True), strict=True):
+                    if more is not None:
+                        gradient += more
+        ranks.add(*gradients)
+        for gradient, more in zip(gradients, direct or [None] * len(gradients), strict=True):
+            if more is not None:
+                gradient += more
         a = self.apron
         inner = image.detach()[..., a : image.shape[-2] - a, a : image.shape[-1] - a]
-        return Evaluation(float(loss.detach()), gradient, float(inner.sum()))
+        return Evaluation(float(loss.detach()), dict(zip(parameters, gradients, strict=True)), float(inner.sum()))
 
-    def _see(self, traced, heights: Tensor) -> tuple[Tensor, Tensor]:
+    def _see(self, traced: Tracer, parameters: Parameters) -> tuple[Tensor, Tensor]:
         """What a chunk adds to the image, and to the power that leaves the lens."""
-        part = traced.expose(heights, self.screen, self.filter)
+        part = traced.expose(parameters, self.screen, self.filter)
         return self._pool(part.image), part.leaving

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics import curvature
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 
 STIFFNESS = 100.0

@@ -31,7 +31,8 @@ from scipy.ndimage import gaussian_filter
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.laguerre import prices
 from caustic_cli.inverse.transport import Transport, corners, solve
-from caustic_cli.optics.interface import reflect, refract
+from caustic_cli.optics.backends import backend_for
+from caustic_cli.optics.system import IDENTITY
 
 EVEN = 2.0  # cells over which e is smoothed: at a kink of phi the rays miss by the spline's own width, which is no error of T
 ENOUGH = 0.05  # pixels of e, root mean square, that are left alone
@@ -190,11 +191,13 @@ def land(z: np.ndarray, x, y, d, index: float, z_screen: float) -> tuple[np.ndar
 
 def thrown(x, y, z, zx, zy, d, index: float, z_screen: float) -> tuple[np.ndarray, np.ndarray]:
     """Where rays d inside the glass land that leave it at (x, y, z) with slopes zx, zy; NaN where totally reflected."""
-    d = [v if isinstance(v, float) else torch.from_numpy(v) for v in d]
-    slopes = torch.from_numpy(zx), torch.from_numpy(zy)
-    if index == -1.0:
-        (tx, ty, tz), passes = reflect(d, *slopes)[0], torch.ones_like(slopes[0], dtype=torch.bool)
-    else:
-        (tx, ty, tz), passes, _, _ = refract(d, *slopes, index)
-    reach = np.where(passes.numpy(), (z_screen - z) / tz.numpy(), np.nan)
-    return x + reach * tx.numpy(), y + reach * ty.numpy()
+    shape, backend = z.shape, backend_for("cpu")
+
+    def flat(value):
+        return value if isinstance(value, float) else torch.from_numpy(np.ascontiguousarray(np.broadcast_to(value, shape))).view(-1)
+
+    origin, slopes, mirror = [flat(c) for c in (x, y, z)], (flat(zx), flat(zy)), index == -1.0
+    out = backend.interact(tuple(map(flat, d)), slopes, torch.ones(z.size, dtype=torch.float64), eta=1.0 if mirror else index,
+                           reflects=mirror, fresnel="none")
+    landing = backend.land(tuple(origin), out.direction, (0.0, 0.0, z_screen), IDENTITY, -1.0 if mirror else 1.0)[:2]
+    return tuple(torch.where(out.passes, c, torch.nan).view(shape).numpy() for c in landing)

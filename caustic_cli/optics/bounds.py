@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.interface import reflectance, reflectances
 from caustic_cli.optics.sampling import LARGEST_NORMAL
 from caustic_cli.scene import Disc, PlaneWave, Points, Scene

@@ -26,9 +26,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.optics.bundle import Bundle
-from caustic_cli.optics.interface import reflectance, reflectances
-from caustic_cli.optics.polarisation import beyond, field_of, part_s
+from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import SAMPLERS, Sampler, numbers
 from caustic_cli.scene import PlaneWave, Points, Scene
 from caustic_cli.scene.source import covering_cone
@@ -65,10 +63,6 @@ class Emission:
         """Number of rays."""
         return self.shape[0] * self.shape[1] * len(self._points[0])
 
-    def through(self, scene: Scene) -> Emission:
-        """The same rays as another scene refracts them: of its own index and polarisation."""
-        return self if scene is self.scene else replace(self, scene=scene)
-
     @cached_property
     def _points(self) -> tuple[Tensor, Tensor]:
         """Positions (k, 3) mm, and parts of the power (k,)."""
@@ -79,7 +73,7 @@ class Emission:
         one = torch.ones(1, dtype=torch.float64, device=self.device)
         return torch.tensor([source.position], dtype=torch.float64, device=self.device), one
 
-    def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[Bundle]:
+    def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[RayState]:
         """The rays in order, at most `size` at a time; their shares and what they lost sum to 1 over all chunks.
 
         With `step`, only every step-th chunk from number `first` on: the part of one of several processes.
@@ -91,7 +85,7 @@ class Emission:
             draws = numbers(self.kind, self.shape, self.seed, dimensions, start, stop, self.device)
             yield self._far(*draws) if far else self._near(torch.arange(start, stop, device=self.device), *draws)
 
-    def _near(self, index: Tensor, u: Tensor, v: Tensor, a: Tensor | None = None, b: Tensor | None = None) -> Bundle:
+    def _near(self, index: Tensor, u: Tensor, v: Tensor, a: Tensor | None = None, b: Tensor | None = None) -> RayState:
         source, lens = self.scene.source, self.scene.lens
         (rx, ry), cone = lens.half_size, covering_cone(source, lens.half_size, lens.z_in, lens.round)
         per, (positions, powers) = self.shape[0] * self.shape[1], self._points
@@ -141,37 +135,24 @@ class Emission:
         x, y = x.clamp(-rx, rx), y.clamp(-ry, ry)
         sx, sy = (x - x0) / h, (y - y0) / h  # rays that miss the lens stay finite; they carry nothing
         dz = 1.0 / torch.sqrt(1.0 + sx * sx + sy * sy)
-        return enter(self.scene, x, y, sx * dz, sy * dz, dz, share, float(part.sum()))
+        return at_pupil(self.scene.pupil, x, y, sx * dz, sy * dz, dz, share, float(part.sum()))
 
-    def _far(self, u: Tensor, v: Tensor, a: Tensor, b: Tensor) -> Bundle:
+    def _far(self, u: Tensor, v: Tensor, a: Tensor, b: Tensor) -> RayState:
         (rx, ry), half = self.scene.lens.half_size, math.radians(self.scene.source.angle) / 2.0
         sine = a.sqrt() * math.sin(half)  # even over the projected solid angle: an evenly bright disc
         dx, dy = sine * torch.cos(2 * math.pi * b), sine * torch.sin(2 * math.pi * b)
         share, x, y = torch.full_like(u, 1.0 / self.count), (2.0 * u - 1.0) * rx, (2.0 * v - 1.0) * ry
         if self.scene.lens.round:  # even over the disc
             x, y = rx * u.sqrt() * torch.cos(2 * math.pi * v), rx * u.sqrt() * torch.sin(2 * math.pi * v)
-        return enter(self.scene, x, y, dx, dy, torch.sqrt(1.0 - dx * dx - dy * dy), share, len(u) / self.count)
+        return at_pupil(self.scene.pupil, x, y, dx, dy, torch.sqrt(1.0 - dx * dx - dy * dy), share, len(u) / self.count)
 
 
-def enter(scene: Scene, x: Tensor, y: Tensor, dx: Tensor, dy: Tensor, dz: Tensor, share: Tensor, emitted: float) -> Bundle:
-    """Rays of unit directions through points of the flat entrance: Snell keeps n (d_x, d_y), Fresnel takes its part.
+def at_pupil(pupil, x: Tensor, y: Tensor, dx: Tensor, dy: Tensor, dz: Tensor, power: Tensor, emitted: float) -> RayState:
+    """Rays of unit directions through points of the pupil.
 
-    share: power of each that arrives there; emitted: of all at their source.
+    power: of each that arrives there; emitted: of all at their source.
     """
-    lens, n = scene.lens, scene.lens.inside
-    ux, uy = dx / n, dy / n
-    uz = torch.sqrt(1.0 - ux * ux - uy * uy)
-    kind, field = "none" if lens.mirror else lens.fresnel, None
-    if kind == "exact" and scene.light.polarisation is not None:
-        before, after, flat = (dx, dy, dz), (ux, uy, uz), (0.0, 0.0, 1.0)
-        e = field_of(scene.light.polarisation, before)
-        (rs, rp), s = reflectances(dz, uz, 1.0 / n), part_s(e, before, flat)
-        reflected, field = (s * rs + (1.0 - s) * rp) * share, beyond(e, before, after, flat, dz, uz, 1.0 / n)
-    else:
-        reflected = reflectance(kind, dz, uz, 1.0 / n) * share
-    arriving, lost = float(share.sum()), float(reflected.sum())
-    return Bundle(x, y, lens.z_in, ux, uy, uz, share - reflected, {"missed_lens": emitted - arriving, "fresnel": lost}, field,
-                  lens.half_size[0] if lens.round else None)
+    return RayState((x, y, pupil.z), (dx, dy, dz), power, lost={"missed_lens": emitted - float(power.sum())})
 
 
 def _even_angle(low: Tensor, high: Tensor, width: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:

@@ -8,14 +8,87 @@ ratio eta = n_in / n_out and c = d . N, the refracted unit direction is
 Snell's law (eq. 2.1.10) without normalising anything; a negative radicand is total internal reflection.  gamma is
 (s - eta c) / |N|^2 without its cancellation: an index close to 1 bends light by n - 1, of which a difference leaves nothing.
 For a plane wave along +z inside a lens it is the closed form of 3.2 (thesis notes 1) with s = S.
+
+Light that meets the surface from above (side -1) does what light from below does at the surface's mirror image in z = 0.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
+from caustic_cli.optics.polarisation import part_s
 from caustic_cli.optics.tolerances import CRITICAL
+
+
+class Departure(NamedTuple):
+    """Rays as they leave a surface: unit directions, the power they carry on, and whether they leave at all (False: total internal
+    reflection, power 0, a direction that is finite and means nothing)."""
+
+    direction: tuple
+    power: Tensor
+    passes: Tensor
+
+
+def interact(direction, slopes, power: Tensor, *, eta: float, reflects: bool, fresnel: str, polarised=None,
+             side: float = 1.0) -> Departure:
+    """Refract or reflect rays of N at a height field.
+
+    Args:
+        direction: unit directions, three tensors (N,) or plain floats, with side d . N > 0.
+        slopes: z_x, z_y at the hits, tensors or plain floats.
+        power: (N,).
+        eta: n_in / n_out.
+        reflects: a mirror, which keeps all power; otherwise the part is refracted that `fresnel` leaves.
+        fresnel: none, schlick or exact.
+        polarised: unit vectors of the field of linearly polarised light, as `direction`; None for unpolarised light.
+        side: +1 for rays from below the surface, -1 from above.
+    """
+    if side < 0:
+        flipped = interact((direction[0], direction[1], -direction[2]), [-g for g in slopes], power, eta=eta, reflects=reflects,
+                           fresnel=fresnel,
+                           polarised=None if polarised is None else (polarised[0], polarised[1], -polarised[2]))
+        tx, ty, tz = flipped.direction
+        return Departure((tx, ty, -tz), flipped.power, flipped.passes)
+    gx, gy = slopes
+    if reflects:
+        return Departure(reflect(direction, gx, gy)[0], power, torch.ones_like(power, dtype=torch.bool))
+    if isinstance(gx, float) and gx == 0.0 and gy == 0.0:
+        return _flat(direction, power, eta, fresnel, polarised)
+    out, passes, c, s = refract(direction, gx, gy, eta)
+    reflected = _reflected(direction, (-gx, -gy, 1.0), c, s, eta, fresnel, polarised)
+    return Departure(out, torch.where(passes, power * (1.0 - reflected), torch.zeros_like(power)), passes)
+
+
+def _flat(direction, power: Tensor, eta: float, fresnel: str, polarised) -> Departure:
+    """At z = const Snell's law keeps n (d_x, d_y)."""
+    dx, dy, dz = direction
+    tx, ty = (d / (1.0 / eta) for d in (dx, dy))
+    square = 1.0 - tx * tx - ty * ty
+    if not isinstance(square, Tensor):
+        square = torch.tensor(square, dtype=power.dtype, device=power.device)
+    passes = square > CRITICAL
+    tz = torch.where(passes, square, torch.ones_like(square)).sqrt()
+    dz_ = dz if isinstance(dz, Tensor) else torch.tensor(dz, dtype=power.dtype, device=power.device)
+    reflected = _reflected(direction, (0.0, 0.0, 1.0), dz_, tz, eta, fresnel, polarised)
+    left = torch.where(passes, power - reflected * power, torch.zeros_like(power))
+    if not isinstance(dx, Tensor) and not isinstance(dz, Tensor):  # one direction for all rays stays one
+        return Departure((tx, ty, float(tz)), left, passes.expand(power.shape))
+    return Departure((tx, ty, tz), left, passes)
+
+
+def _reflected(direction, normal, c, s, eta: float, fresnel: str, polarised):
+    """Part of the power reflected, of light polarised or not."""
+    if polarised is not None and fresnel == "exact":
+        (rs, rp), part = reflectances(c, s, eta), part_s(polarised, direction, normal)
+        return part * rs + (1.0 - part) * rp
+    length = 1.0
+    if fresnel == "schlick":
+        gx, gy = normal[0], normal[1]
+        length = (1.0 + gx * gx + gy * gy) ** 0.5
+    return reflectance(fresnel, c / length, s / length, eta)
 
 
 def refract(d, slope_x: Tensor, slope_y: Tensor, eta: float):

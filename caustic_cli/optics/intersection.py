@@ -1,48 +1,50 @@
-"""Where a ray meets the height field, and its derivatives by the implicit function theorem (thesis 4.3.2).
+"""Where a ray meets a surface, and its derivatives by the implicit function theorem (thesis 4.3.2).
 
-Notation
-    o, d    the ray's start and unit direction inside the lens, mm
-    f(t)    o_z + t d_z - Z(o_x + t d_x, o_y + t d_y), negative below the surface (eq. 4.3.3)
-    c       f'(t) = d_z - Z_x d_x - Z_y d_y, at the hit the cosine of incidence times |N|
-    L       bound of |Z_x d_x| + |Z_y d_y| from the derivative's control net, which holds the derivative in its convex hull
+Notation, in the frame of the surface
+    o, d    the ray's start and unit direction, mm
+    side    +1 for rays that meet the surface from below, -1 from above
+    f(t)    side (o_z + t d_z - Z(o_x + t d_x, o_y + t d_y)), negative before the crossing (eq. 4.3.3)
+    c       d_z - Z_x d_x - Z_y d_y, f'(t) up to the side: at the hit the cosine of incidence times |N|
+    L       bound of |Z_x d_x| + |Z_y d_y|; a spline's is that of the derivative's control net, which holds it in its convex hull
 
-A ray with L < d_z meets the surface once.  Newton's iteration then runs inside a bracket, from the control net's hull and the
-aperture, that bisection takes over where a step leaves it.  For any other ray the first root is isolated before that.
+A ray with L < |d_z| meets the surface once.  Newton's iteration then runs inside a bracket, from the hull and the aperture, that
+bisection takes over where a step leaves it.  For any other ray the first root is isolated before that.
 
-`reference` is plain torch, and the path for other devices; `kernels.hit` is its fused form.  The thesis' triangle mesh is in
-`mesh`.  At the hit, f(t; P) = 0 gives dt/dP = N_i N_j / c, whatever found t: no iteration is ever differentiated.
+`reference` is plain torch, for any surface and device; `kernels.hit` is its fused form for B-splines.  The thesis' triangle mesh is
+in `mesh`.  At the hit f(t; P, o, d) = 0 gives every derivative of t (`attach`), whatever found it: no iteration is ever
+differentiated.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntEnum
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
-from caustic_cli.errors import InputError
-from caustic_cli.optics.bundle import Bundle
-from caustic_cli.optics.heightfield import HeightField
-from caustic_cli.optics.kernels import fused
-from caustic_cli.optics.mesh import TriangleMesh
 from caustic_cli.optics.tolerances import FEW_ULP, FINEST, LEAST_COSINE, MOST_PROBES, MOST_STEPS
 from caustic_cli.scene import checks
+
+if TYPE_CHECKING:
+    from caustic_cli.optics.surfaces.base import Hit, Surface
 
 METHODS = ("newton", "mesh", "mesh+newton")
 
 
 class Status(IntEnum):
-    """What became of a ray inside the lens."""
+    """What became of a ray on its way to a surface."""
 
     HIT = 0
-    MISSED = 1  # it leaves the aperture below the surface: the lens' side absorbs it
+    MISSED = 1  # it leaves the aperture before the surface: the lens' side absorbs it
     UNRESOLVED = 2  # the search gave up; counted as missed
 
 
 @dataclass(frozen=True)
 class Method:
-    """How hits are found.
+    """How hits with a B-spline are found.
 
     Args:
         name: newton, mesh, or mesh+newton, which begins Newton's iteration at the mesh's hit.
@@ -58,92 +60,112 @@ class Method:
         checks.choice("intersection method", self.name, METHODS)
 
 
-def meet(field: HeightField, heights: Tensor, bundle: Bundle,
-         method: Method | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """First hits of a bundle.
+def meet_any(surface: Surface, heights: Tensor | None, origin, direction, side: float, radius: float | None = None) -> Hit:
+    """`Surface.meet` for any surface, in plain torch."""
+    from caustic_cli.optics.surfaces.base import Hit  # noqa: PLC0415 - surfaces know intersections
 
-    Args:
-        heights: (n, m) control heights, mm.
-        method: None for Newton's, which decides ray by ray, from the surface's slopes, whether it has to isolate the root.
+    t, status = reference(surface, heights, origin, direction, side, radius)
+    found = status == Status.HIT
+    t, gx, gy = attach(surface, heights, origin, direction, t, found)
+    return Hit(t, gx, gy, found)
 
-    Returns:
-        t, distance to the hit (mm; -1 for none), dz/dx and dz/dy there, all (N,) float64, differentiable once in either mode by
-        the heights; status (N,), a `Status` each.  Where a mesh found t, these are those of the surface above that point.
+
+def attach(surface: Surface, heights: Tensor | None, origin, direction, t: Tensor, found: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """t (N,) mm of hits, not differentiated, and the slopes there: with their first derivatives by everything, in either mode.
+
+    One Newton step from the root, whose value is 0 and whose derivative is that of the root.  Where nothing was found all are 0.
     """
-    t, status = find(field, heights, bundle, method)
-    hit = status == Status.HIT
-    t = torch.where(hit, t, torch.zeros_like(t))
-    x, y = bundle.x + t * bundle.dx, bundle.y + t * bundle.dy
-    sag = heights.double() - heights.detach().double().mean()  # slopes of a sag that is small against the thickness keep all digits
-    z, gx, gy = field.at(sag, x, y)
+    sag, middle = surface.centred(heights)
+    (ox, oy, oz), (dx, dy, dz) = origin, direction
+    t = torch.where(found, t, torch.zeros_like(t)).double()
+    x, y, z_ray = ox + t * dx, oy + t * dy, (oz - middle) + t * dz
+    at = tuple(_primal(torch.as_tensor(c)).double().expand(t.shape) for c in (x, y))
+    inside = tuple(c.clamp(-r, r) for c, r in zip(at, surface.half_size, strict=True))
+    z, gx, gy = spline_or_any(surface, sag, *inside)
+    if not torch.is_grad_enabled():
+        return t, torch.where(found, gx, torch.zeros_like(t)), torch.where(found, gy, torch.zeros_like(t))
     with torch.no_grad():
-        xx, xy, yy = field.at(sag, x, y, ((2, 0), (1, 1), (0, 2)))
-        cosine = (bundle.dz - gx * bundle.dx - gy * bundle.dy).clamp_min(LEAST_COSINE)
-    # f(t; P) = 0: one Newton step from the root, whose value is 0 and whose derivative is that of the root.
-    move = torch.where(hit, (z - z.detach()) / cosine, torch.zeros_like(t))
+        zxx, zxy, zyy = surface.at(sag if sag is None else sag.detach(), *inside, ((2, 0), (1, 1), (0, 2)))
+        sx, sy = _primal(gx), _primal(gy)
+        fx, fy, fz = (_primal(torch.as_tensor(c)) for c in direction)
+        c = fz - sx * fx - sy * fy
+        c = torch.where(c.abs() > LEAST_COSINE, c, torch.full_like(c, LEAST_COSINE))
+    f = z_ray - z - sx * (x - at[0]) - sy * (y - at[1])
+    move = torch.where(found, -(f - _primal(f)) / c, torch.zeros_like(t))
+    ax, ay = (x - at[0]) + move * fx, (y - at[1]) + move * fy  # zeros that carry the derivative
     none = torch.zeros_like(t)
-    gx = torch.where(hit, gx + (xx * bundle.dx + xy * bundle.dy) * move, none)
-    gy = torch.where(hit, gy + (xy * bundle.dx + yy * bundle.dy) * move, none)
-    return torch.where(hit, t + move, none - 1.0), gx, gy, status
+    return (t + move, torch.where(found, gx + zxx * ax + zxy * ay, none), torch.where(found, gy + zxy * ax + zyy * ay, none))
+
+
+def _primal(value: Tensor) -> Tensor:
+    """The value alone, without derivatives of either mode."""
+    return forward_ad.unpack_dual(value).primal.detach()
+
+
+def spline_or_any(surface: Surface, heights: Tensor | None, x: Tensor, y: Tensor) -> list[Tensor]:
+    """Z, Z_x, Z_y at fixed points, linear in the heights; of a B-spline by the backend of its device."""
+    from caustic_cli.optics.backends import backend_for  # noqa: PLC0415
+    from caustic_cli.optics.surfaces.heightfield import HeightField  # noqa: PLC0415
+
+    if isinstance(surface, HeightField):
+        return list(backend_for(x.device).spline_at(surface, heights, x, y))
+    return surface.at(heights, x, y)
 
 
 @torch.no_grad()
-def find(field: HeightField, heights: Tensor, bundle: Bundle, method: Method | None = None) -> tuple[Tensor, Tensor]:
-    """t (N,) float64 of the first hit of every ray, and its status (N,); on a CPU by the kernels."""
-    method, b = method or Method(), bundle
-    start = None
-    if method.name != "newton":
-        mesh = TriangleMesh(field, heights, *method.parts)
-        start, missed, _ = mesh.intersect(b.x, b.y, torch.full_like(b.x, b.z), b.dx, b.dy, b.dz, method.recursive)
-        if method.name == "mesh":
-            return torch.where(missed == 0, start, torch.zeros_like(start)), _within(missed.long(), start, b)
-    if fused(b.x.device):
-        from caustic_cli.optics.kernels.surface import FusedSurface, RayHits  # noqa: PLC0415
+def find(field, heights: Tensor, origin, direction, method: Method | None = None,
+         radius: float | None = None) -> tuple[Tensor, Tensor]:
+    """t (N,) float64 of the first hit, from below, of rays with a B-spline, and its `Status` (N,), by a method."""
+    from caustic_cli.optics.backends import backend_for  # noqa: PLC0415
 
-        hits = RayHits(FusedSurface(field.spaces, field.half_size), bundle)
-        hits.find(heights, None if start is None else start.numpy())
-        return torch.from_numpy(hits.t), torch.from_numpy(hits.status).long()
-    if start is not None:
-        raise InputError("mesh+newton intersection runs on the CPU; use newton")
-    t, status = reference(field, heights, bundle)
-    return t, _within(status, t, b)
+    return backend_for(heights.device).find(field, heights, origin, direction, method or Method(), radius)
 
 
-def _within(status: Tensor, t: Tensor, b: Bundle) -> Tensor:
+def within(status: Tensor, t: Tensor, origin, direction, radius: float | None) -> Tensor:
     """`status` with hits beyond a circular aperture as what they are, rays that left by the side."""
-    if b.radius is None:
+    if radius is None:
         return status
-    beyond = (b.x + t * b.dx) ** 2 + (b.y + t * b.dy) ** 2 > b.radius**2
+    beyond = (origin[0] + t * direction[0]) ** 2 + (origin[1] + t * direction[1]) ** 2 > radius**2
     return torch.where(beyond & (status == Status.HIT), int(Status.MISSED), status)
 
 
 @torch.no_grad()
-def reference(field: HeightField, heights: Tensor, bundle: Bundle) -> tuple[Tensor, Tensor]:
-    """The same by Newton's method in plain torch."""
-    h = heights.detach().double()
-    middle = h.mean()
-    h, b = h - middle, replace(bundle, z=bundle.z - float(middle))
-    lowest, highest = float(h.min()), float(h.max())
-    rx, ry = field.half_size
-    inside = (b.x.abs() <= rx) & (b.y.abs() <= ry) & (b.dz > 0)
-    dz = torch.where(inside, b.dz, torch.ones_like(b.dz))
-    side = torch.minimum(*(torch.where(d == 0, torch.inf, torch.where(d > 0, r - o, r + o) / d.abs())
-                           for o, d, r in ((b.x, b.dx, rx), (b.y, b.dy, ry))))
-    low = ((lowest - b.z) / dz).clamp_min(0.0)
-    top = (highest - b.z) / dz
-    high, closed = torch.minimum(side, top), top < side
+def reference(surface: Surface, heights: Tensor | None, origin, direction, side: float = 1.0,
+              radius: float | None = None) -> tuple[Tensor, Tensor]:
+    """Distances t (N,) to first hits and their `Status`, by Newton's method in plain torch."""
+    h, middle = surface.centred(None if heights is None else heights.detach())
+    tensors = [torch.as_tensor(c).detach().double() for c in (*origin, *direction)]
+    ox, oy, oz, dx, dy, dz = torch.broadcast_tensors(*tensors)
+    oz, dz = side * (oz - middle), side * dz
+    low_z, high_z = sorted(side * z for z in surface.hull(h))
+    rx, ry = surface.half_size
+    ahead = dz > 0
+    dz = torch.where(ahead, dz, torch.ones_like(dz))
+    enter, leave = torch.zeros_like(dz), torch.full_like(dz, torch.inf)
+    for o, d, r in ((ox, dx, rx), (oy, dy, ry)):  # where the ray is over the aperture
+        near = torch.where(d == 0, torch.where(o.abs() <= r, -torch.inf, torch.inf), (torch.where(d > 0, -r, r) - o) / d)
+        far = torch.where(d == 0, torch.inf, (torch.where(d > 0, r, -r) - o) / d)
+        near = torch.where(o.abs() <= r, torch.full_like(near, -torch.inf), near)
+        enter, leave = torch.maximum(enter, near), torch.minimum(leave, far)
+    low, top = torch.maximum((low_z - oz) / dz, enter), (high_z - oz) / dz
+    high, closed = torch.minimum(leave, top), top < leave
+    possible = ahead & (low <= high) & torch.isfinite(low)
+    low = torch.where(possible, low, torch.zeros_like(low))
+    high = torch.where(possible, high, torch.zeros_like(high))
 
     def f(t: Tensor, of: Tensor | slice = slice(None)) -> tuple[Tensor, Tensor]:
-        dx, dy, dz_ = b.dx[of], b.dy[of], dz[of]
-        z, zx, zy = field.at(h, b.x[of] + t * dx, b.y[of] + t * dy)
-        return b.z + t * dz_ - z, dz_ - zx * dx - zy * dy
+        x, y = ox[of] + t * dx[of], oy[of] + t * dy[of]
+        if rx < torch.inf:
+            x, y = x.clamp(-rx, rx), y.clamp(-ry, ry)
+        z, zx, zy = surface.at(h, x, y)
+        return oz[of] + t * dz[of] - side * z, dz[of] - side * (zx * dx[of] + zy * dy[of])
 
     f_low = f(low)[0]
-    status = torch.where(inside & (low <= high), int(Status.HIT), int(Status.MISSED))
+    status = torch.where(possible, int(Status.HIT), int(Status.MISSED))
     at_once = f_low >= 0
-    status = torch.where(at_once & (low == 0) & (f_low > 0), int(Status.MISSED), status)
-    bound = field.slope_bounds(h)
-    slope = bound[0] * b.dx.abs() + bound[1] * b.dy.abs()
+    status = torch.where(at_once & (low <= enter) & (f_low > 0), int(Status.MISSED), status)
+    bound = surface.slope_bounds(h)
+    slope = bound[0] * dx.abs() + bound[1] * dy.abs()
     unsafe = ((slope >= dz) & (status == Status.HIT) & ~at_once).nonzero()[:, 0]
     if len(unsafe):
         found = _first_brackets(lambda t, of: f(t, unsafe[of])[0], low[unsafe], high[unsafe], f_low[unsafe],
@@ -151,9 +173,9 @@ def reference(field: HeightField, heights: Tensor, bundle: Bundle) -> tuple[Tens
         low, high = low.index_copy(0, unsafe, found[0]), high.index_copy(0, unsafe, found[1])
         status = status.index_copy(0, unsafe, found[2])
         closed = closed.index_fill(0, unsafe, True)
-    size = max(abs(lowest), abs(highest), abs(b.z))
-    close, narrow = FEW_ULP * size, FEW_ULP * high.clamp_min(size)
-    t = torch.where(at_once, low, ((0.5 * (lowest + highest) - b.z) / dz).clamp(low, high))
+    size = torch.maximum(oz.abs(), torch.full_like(oz, max(abs(low_z), abs(high_z))))
+    close, narrow = FEW_ULP * size, FEW_ULP * torch.maximum(high, size)
+    t = torch.where(at_once, low, ((0.5 * (low_z + high_z) - oz) / dz).clamp(low, high))
     busy = (status == Status.HIT) & ~at_once
     reaches = closed | (f(torch.where(busy, high, low))[0] >= 0)
     status = torch.where(busy & ~reaches, int(Status.MISSED), status)
@@ -168,7 +190,8 @@ def reference(field: HeightField, heights: Tensor, bundle: Bundle) -> tuple[Tens
         after = t - step
         after = torch.where((after > low) & (after < high), after, 0.5 * (low + high))
         t = torch.where(busy, after, t)
-    return t, torch.where(busy, int(Status.UNRESOLVED), status)
+    status = torch.where(busy, int(Status.UNRESOLVED), status)
+    return t, within(status, t, (ox, oy), (dx, dy), radius)
 
 
 def _first_brackets(f, low: Tensor, high: Tensor, f_low: Tensor, rise: Tensor, fall: Tensor):

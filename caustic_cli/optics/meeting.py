@@ -9,9 +9,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.heightfield import HeightField
-from caustic_cli.optics.kernels import fused
-from caustic_cli.optics.tolerances import LEAST_COSINE
+from caustic_cli.optics.backends import backend_for
+from caustic_cli.optics.intersection import attach
+from caustic_cli.optics.surfaces import HeightField
 
 #: Least steps of the search over a knot span: a dip under the surface narrower than that is not seen.  It carries little light, at
 #: grazing incidence.
@@ -41,12 +41,7 @@ def again(field: HeightField, heights: Tensor, o, d, below: bool, round: bool = 
     o, d = ([c.detach().double() for c in v] for v in (o, d))
     step = min(2.0 * r * float(torch.diff(s.breaks).min()) for s, r in zip(field.spaces, field.half_size, strict=True))
     step /= STEPS_PER_SPAN
-    if not (fused(h.device) and len(o[0])):
-        t = reference(field, h, o, d, below, round, step)
-    else:
-        from caustic_cli.optics.kernels.surface import FusedSurface, next_meetings  # noqa: PLC0415
-
-        t = next_meetings(FusedSurface(field.spaces, field.half_size), h, o, d, below, round, step, HALVINGS, MOST_STEPS)
+    t = backend_for(h.device).next_meetings(field, h, o, d, below, round, step)
     return t, t > 0
 
 
@@ -90,35 +85,11 @@ def reference(field: HeightField, h: Tensor, o, d, below: bool, round: bool, ste
     return t_found
 
 
-def surface_at(field: HeightField, heights: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """z (mm), z_x, z_y at points (N,) mm, float64, linear in the heights; on a CPU by the kernels."""
-    if not (fused(x.device) and len(x)):
-        return tuple(field.at(heights, x, y))
-    from caustic_cli.optics.kernels.surface import FusedSurface, scattered_surface  # noqa: PLC0415
-
-    at = ((0.5 * (c.detach() / r + 1.0)).contiguous().numpy() for c, r in zip((x, y), field.half_size, strict=True))
-    return scattered_surface(FusedSurface(field.spaces, field.half_size), heights.double(), *at, torch.float64)
-
-
 def touch(field: HeightField, heights: Tensor, o, d, t: Tensor):
     """The hit at distance t (N,), not differentiated, of rays o, d that may depend on the heights.
 
     Returns:
-        (x, y, z) mm, slopes (z_x, z_y), and the distance, (N,) each, with their first derivatives in reverse mode.
+        (x, y, z) mm, slopes (z_x, z_y), and the distance, (N,) each, with their first derivatives.
     """
-    moved, differentiate = [c + t * v for c, v in zip(o, d, strict=True)], torch.is_grad_enabled()
-    x, y = moved[0].detach(), moved[1].detach()
-    z, gx, gy = surface_at(field, heights, x, y)
-    if not differentiate:
-        return tuple(moved), (gx, gy), t
-    with torch.no_grad():
-        xx, xy, yy = field.at(heights, x, y, ((2, 0), (1, 1), (0, 2)))
-        flat = [v.detach() for v in d]
-        c = flat[2] - gx * flat[0] - gy * flat[1]
-        c = torch.where(c.abs() > LEAST_COSINE, c, torch.full_like(c, LEAST_COSINE))
-        slope = gx.detach(), gy.detach()
-    f = moved[2] - z - slope[0] * (moved[0] - x) - slope[1] * (moved[1] - y)
-    move = -(f - f.detach()) / c
-    hit = [m + move * v for m, v in zip(moved, flat, strict=True)]
-    ax, ay = hit[0] - x, hit[1] - y  # zeros that carry the derivative
-    return tuple(hit), (gx + xx * ax + xy * ay, gy + xy * ax + yy * ay), t + move
+    t, gx, gy = attach(field, heights, o, d, t, torch.ones_like(t, dtype=torch.bool))
+    return tuple(c + t * v for c, v in zip(o, d, strict=True)), (gx, gy), t

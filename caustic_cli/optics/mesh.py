@@ -10,7 +10,7 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.kernels import blocks
 
 #: Boxes are wider than the control net by this part of the largest height: rounding in the vertices, at degree 15.

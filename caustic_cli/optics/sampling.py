@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.optics.kernels import fused
+from caustic_cli.optics.backends import backend_for
 
 SAMPLERS = ("grid", "lines", "stratified", "uniform", "sobol")
 #: Length of torch's Sobol sequence.
@@ -90,18 +90,20 @@ def numbers(kind: str, shape: tuple[int, int], seed: int, dimensions: int, start
         if kind == "lines":
             du, dv = random_numbers(seed, 0, turn * nu + i), random_numbers(seed, 1, turn * nv + j)
         first = [(i + du) / nu, (j + dv) / nv]
-    elif fused(device):
-        from caustic_cli.optics.kernels.functions import scattered_points  # noqa: PLC0415
-
-        first = list(scattered_points([key(seed, d) for d in (0, 1)], [salt(0), salt(1)], start, stop, nu, nv,
-                                      kind == "stratified"))
     else:
-        du, dv = random_numbers(seed, 0, k), random_numbers(seed, 1, k)
-        if kind == "stratified":
-            cell = k % (nu * nv)
-            du, dv = (cell // nv + du) / nu, (cell % nv + dv) / nv
-        first = [du, dv]
+        first = backend_for(device).scatter(seed, start, stop, shape, kind == "stratified", device)
     return first + [random_numbers(seed, d, k) for d in range(2, dimensions)]
+
+
+def spread(seed: int, start: int, stop: int, shape: tuple[int, int], stratified: bool,
+           device: str | torch.device) -> list[Tensor]:
+    """Random u, v (stop - start,) of rays start..stop, anywhere, or one in each of nu x nv cells over and over."""
+    k, (nu, nv) = torch.arange(start, stop, device=device), shape
+    du, dv = random_numbers(seed, 0, k), random_numbers(seed, 1, k)
+    if stratified:
+        cell = k % (nu * nv)
+        du, dv = (cell // nv + du) / nu, (cell % nv + dv) / nv
+    return [du, dv]
 
 
 @dataclass(frozen=True)
@@ -156,10 +158,6 @@ class Sampler:
     def count(self) -> int:
         """Number of rays."""
         return self.shape[0] * self.shape[1]
-
-    def through(self, _scene) -> Sampler:
-        """These rays again: on the exit surface, no index has bent them yet."""
-        return self
 
     def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[Sample]:
         """The rays in order, at most about `size` at a time; shares over all chunks sum to 1.

@@ -7,7 +7,7 @@ from caustic_cli.scene.light import Light
 from caustic_cli.scene.screen import Screen
 from caustic_cli.scene.source import Disc, PlaneWave, Points, Source
 
-__all__ = ["Band", "Disc", "Lens", "Light", "Offset", "PlaneWave", "Points", "Scene", "Screen", "Source"]
+__all__ = ["Band", "Disc", "Lens", "Light", "Offset", "PlaneWave", "Points", "Pupil", "Scene", "Screen", "Source"]
 
 from dataclasses import dataclass, field, replace
 
@@ -25,6 +25,15 @@ class Band:
     scene: Scene
     weight: float = 1.0
     channel: int | None = None
+
+
+@dataclass(frozen=True)
+class Pupil:
+    """The aperture that sources light: half widths mm, z mm, and whether it is a circle."""
+
+    half_size: tuple[float, float]
+    z: float
+    round: bool = False
 
 
 @dataclass(frozen=True)
@@ -51,6 +60,11 @@ class Scene:
         if self.dispersive:
             for wavelength in self.light.wavelengths:
                 refractive_index(self.lens.glass, wavelength)
+
+    @property
+    def pupil(self) -> Pupil:
+        """The lens' entrance."""
+        return Pupil(self.lens.half_size, self.lens.z_in, self.lens.round)
 
     @property
     def dispersive(self) -> bool:

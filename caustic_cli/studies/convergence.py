@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli import __version__
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import SAMPLERS
 from caustic_cli.scene import Scene, checks

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from caustic_cli import __version__
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.plan import EFFECTS, FREE, Effect, Plan, compile_plan
 from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.stepwise import needed

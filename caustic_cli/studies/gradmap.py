@@ -28,10 +28,11 @@ from torch.autograd import forward_ad
 from caustic_cli.errors import InputError
 from caustic_cli.files import SOFTWARE, atomic_path
 from caustic_cli.optics.emission import Rays
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sample
-from caustic_cli.optics.tracing import expose, tracer
+from caustic_cli.optics.system import EXIT, System
+from caustic_cli.optics.trace import Tracer, expose
 from caustic_cli.scene import Scene
 
 #: Pixels by which a central difference may move a landing point.  With d pixels the relative error is of order d^2 (the
@@ -65,15 +66,15 @@ def gradient_image(scene: Scene, field: HeightField, heights: Tensor, control: t
     heights = heights.detach().to(sampler.device, torch.float64)
     total = torch.zeros(scene.screen.resolution, dtype=torch.float64, device=sampler.device)
     for band in scene.bands:
-        traced = None
-        for rays in sampler.through(band.scene).chunks(chunk):
+        system, traced = System.of(band.scene, field), None
+        for rays in sampler.chunks(chunk):
             if isinstance(rays, Sample):
                 rays = _under(field, control, rays)
                 if not all(rays.shape):
                     continue
-            traced = tracer(band.scene, field, rays, dtype, traced)
+            traced = Tracer(system, rays, dtype, like=traced)
             with forward_ad.dual_level():
-                image = traced.expose(forward_ad.make_dual(heights, direction), scene.screen, filter).image
+                image = traced.expose({EXIT: forward_ad.make_dual(heights, direction)}, scene.screen, filter).image
                 total += band.weight * forward_ad.unpack_dual(image).tangent.double()
     return total
 

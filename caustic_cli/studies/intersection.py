@@ -33,7 +33,7 @@ from caustic_cli.errors import CausticError
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.bundle import Bundle
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.intersection import Method, Status, find
 from caustic_cli.optics.kernels.surface import FusedSurface, RayHits
 from caustic_cli.scene import PlaneWave, Points, Scene, checks

@@ -19,7 +19,7 @@ from caustic_cli.files import SOFTWARE, write_bytes
 from caustic_cli.optics import curvature, intersection
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.sampling import Sample, stream
 from caustic_cli.optics.tracing import Landing, tracer
 from caustic_cli.scene import Scene

@@ -10,12 +10,13 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import CausticError
+from caustic_cli.optics.effects import NO_REQUESTS, Requests
 from caustic_cli.optics.emission import Rays, rays_of
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.image import Image
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import stream
-from caustic_cli.optics.stepwise import SEQUENTIAL, Steps
-from caustic_cli.optics.tracing import Exposure, expose
+from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Scene, Screen
 from caustic_cli.studies.metrics import judge
 
@@ -40,14 +41,14 @@ class Converged:
     traced: rays spent in all, those of the attempts before it included.
     """
 
-    exposure: Exposure
+    exposure: Image
     error: float
     traced: int
 
 
 def converge(scene: Scene, field: HeightField, heights: Tensor, tolerance: float, *, rays: int, seed: int = 0,
              screen: Screen | None = None, device: str = "cpu", dtype: torch.dtype = torch.float64,
-             steps: Steps = SEQUENTIAL) -> Converged:
+             requests: Requests = NO_REQUESTS) -> Converged:
     """Trace BATCHES independent sets of stratified rays, about `rays` in all, then more until the noise is at most `tolerance`.
 
     The relative RMS noise of the mean of B images J_k is sqrt(mean over pixels of var(J_k) / B) / mean(J).  Stratified rays
@@ -59,7 +60,7 @@ def converge(scene: Scene, field: HeightField, heights: Tensor, tolerance: float
     each, traced = max(1, rays // BATCHES), 0
     while True:
         parts = [expose(scene, field, heights, rays_of(scene, "stratified", each, stream(seed, f"batch {k}"), device), None, dtype,
-                        screen, steps=steps) for k in range(BATCHES)]
+                        screen, requests=requests) for k in range(BATCHES)]
         traced += sum(p.rays for p in parts)
         images = torch.stack([p.image for p in parts])
         mean = images.mean(0)
@@ -69,7 +70,7 @@ def converge(scene: Scene, field: HeightField, heights: Tensor, tolerance: float
         if error <= tolerance:
             lost = {name: math.fsum(p.lost[name] for p in parts) / BATCHES for name in parts[0].lost}
             leaving = math.fsum(p.leaving for p in parts) / BATCHES
-            return Converged(Exposure(mean, lost, leaving, sum(p.rays for p in parts)), error, traced)
+            return Converged(Image(mean, lost, leaving, sum(p.rays for p in parts)), error, traced)
         more = max(1.3, 1.1 * (error / tolerance) ** (4.0 / 3.0))
         foreseen = each * more if each > mean.numel() else 0.0  # too few rays a pixel foretell nothing
         each = int(each * min(32.0, more))
@@ -81,25 +82,25 @@ def converge(scene: Scene, field: HeightField, heights: Tensor, tolerance: float
 def retrace(scene: Scene, field: HeightField, heights: Tensor, target: np.ndarray | None, *, rays: int, seed: int = 0,
             filter: Filter | None = None, screen: Screen | None = None, device: str = "cpu",
             dtype: torch.dtype = torch.float64, tolerance: float | None = None,
-            steps: Steps = SEQUENTIAL) -> tuple[Exposure, dict]:
-    """Trace a lens with stratified rays of its own; with `tolerance`, as many as that asks for (`converge`).  steps: of a plan.
+            requests: Requests = NO_REQUESTS) -> tuple[Image, dict]:
+    """Trace a lens with stratified rays of its own; with `tolerance`, as many as that asks for (`converge`).  requests: of a plan.
 
     Returns:
         the exposure, reconstructed by `filter` (bincount unless given), and the figures of the JSON table, always by
         bincount, with the rays that were traced; with `tolerance` also error_estimate and rays_traced.
     """
     if tolerance is None:
-        counted = expose(scene, field, heights, sampler_for(scene, rays, seed, device), None, dtype, screen, steps=steps)
+        counted = expose(scene, field, heights, sampler_for(scene, rays, seed, device), None, dtype, screen, requests=requests)
         figures = judge(counted, target)
     else:
         found = converge(scene, field, heights, tolerance, rays=rays, seed=seed, screen=screen, device=device, dtype=dtype,
-                         steps=steps)
+                         requests=requests)
         counted = found.exposure
         figures = judge(counted, target) | {"error_estimate": found.error, "rays_traced": found.traced}
     if filter is None or filter.reach == (0, 0):
         return counted, figures
     return expose(scene, field, heights, sampler_for(scene, counted.rays, seed, device), filter, dtype, screen,
-                  steps=steps), figures
+                  requests=requests), figures
 
 
 def white_level(image: np.ndarray, target: np.ndarray | None) -> float:

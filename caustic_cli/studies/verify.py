@@ -30,7 +30,7 @@ from torch import Tensor
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.files import SOFTWARE, atomic_path
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.tracing import expose
 from caustic_cli.scene import Disc, PlaneWave, Scene

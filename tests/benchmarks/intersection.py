@@ -23,7 +23,7 @@ import torch
 
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.bundle import Bundle
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.kernels.surface import FusedSurface, RayHits
 
 RAYS, ROUNDS, HALF = 2_000_000, 9, 5.0

@@ -22,7 +22,7 @@ from pathlib import Path
 import torch
 
 from caustic_cli.inverse.objective import Objective
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.tracing import PlaneTracer

@@ -5,7 +5,7 @@ import pytest
 import torch
 from exact import SCREEN
 
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.kernels import functions
 from caustic_cli.optics.reconstruction import Filter, splat
 from caustic_cli.optics.sampling import Sampler

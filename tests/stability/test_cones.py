@@ -12,7 +12,7 @@ import torch
 from exact import mp
 
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.intersection import Status, meet
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.tracing import expose, tracer

@@ -8,7 +8,7 @@ import torch
 from exact import exactly, mp, ours
 
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.intersection import meet
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler

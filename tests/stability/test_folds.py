@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.tracing import expose, tracer

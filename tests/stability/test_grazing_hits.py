@@ -14,7 +14,7 @@ from scipy.interpolate import BSpline
 
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.bundle import Bundle
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.intersection import Status, find, meet
 
 FIELD = HeightField((SplineSpace.uniform(43, 3), SplineSpace.uniform(4, 3)), (4.0, 1.0))

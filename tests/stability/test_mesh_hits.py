@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.mesh import TriangleMesh
 
 FIELD = HeightField((SplineSpace.uniform(7, 3), SplineSpace.uniform(6, 2)), (1.0, 1.0))

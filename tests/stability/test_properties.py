@@ -12,7 +12,7 @@ from caustic_cli.inverse.losses import NoLight
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.optics.bundle import Bundle
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.tracing import expose, tracer

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.heightfield import HeightField
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.kernels.surface import FusedSurface, scattered_surface
 from caustic_cli.optics.sampling import Sample
 

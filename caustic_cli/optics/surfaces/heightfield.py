@@ -17,13 +17,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.sampling import Sample
+from caustic_cli.optics.surfaces.base import FIRST, Hit, Surface
 from caustic_cli.scene import Lens
 
 
 @dataclass(frozen=True, eq=False)
-class HeightField:
+class HeightField(Surface):
     """Spline spaces over an aperture of half widths (r_x, r_y) mm."""
 
     spaces: tuple[SplineSpace, SplineSpace]
@@ -60,8 +62,7 @@ class HeightField:
         du, dv = su.basis(sample.u, 1)[1] / (2 * rx), sv.basis(sample.v, 1)[1] / (2 * ry)
         return _ScatteredEvaluator(i * sv.n + j, sv.n, *(b.to(dtype) for b in (bu, du, bv, dv)))
 
-    def at(self, heights: Tensor, x: Tensor, y: Tensor,
-           orders: Sequence[tuple[int, int]] = ((0, 0), (1, 0), (0, 1))) -> list[Tensor]:
+    def at(self, heights: Tensor, x: Tensor, y: Tensor, orders: Sequence[tuple[int, int]] = FIRST) -> list[Tensor]:
         """Derivatives of these orders by x and y at points (N,) mm, each (N,) float64, mm^(1 - a - b); linear in the heights."""
         (su, sv), (rx, ry), flat = self.spaces, self.half_size, heights.double().reshape(-1)
         u, v, out = 0.5 * (x / rx + 1.0), 0.5 * (y / ry + 1.0), []
@@ -80,6 +81,19 @@ class HeightField:
         h = heights.detach().double().cpu()
         return (float((su.derivative_matrix() @ h).abs().max() / (2 * rx)),
                 float((h @ sv.derivative_matrix().T).abs().max() / (2 * ry)))
+
+    def hull(self, heights: Tensor) -> tuple[float, float]:
+        """Least and largest control height: the surface lies in the hull of its net."""
+        return float(heights.min()), float(heights.max())
+
+    def centred(self, heights: Tensor) -> tuple[Tensor, float]:
+        """Heights less their mean, and the mean: a sag small against the thickness keeps all its digits."""
+        middle = float(heights.detach().double().mean())
+        return heights.double() - middle, middle
+
+    def meet(self, heights: Tensor, origin, direction, side: float, radius: float | None = None) -> Hit:
+        """As of any surface, by the kernels of the device's backend."""
+        return backend_for(heights.device).meet_spline(self, heights, origin, direction, side, radius)
 
     def slope_bound(self, heights: Tensor) -> float:
         """An upper bound of |grad z|."""

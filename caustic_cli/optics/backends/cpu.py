@@ -1,0 +1,108 @@
+"""Stages by compiled kernels, on a CPU: float64 whatever is asked, which costs no more here.
+
+What has no kernel, or no rays, is done by the reference.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from caustic_cli.optics import intersection
+from caustic_cli.optics.backends.reference import Torch, _by_mesh
+from caustic_cli.optics.interface import Departure
+from caustic_cli.optics.kernels import functions, points
+from caustic_cli.optics.kernels.grid import GridSurface
+from caustic_cli.optics.kernels.interact import interact
+from caustic_cli.optics.kernels.land import land
+from caustic_cli.optics.kernels.rayhits import hits_of_rays
+from caustic_cli.optics.kernels.splat import splat_rays
+from caustic_cli.optics.kernels.surface import FusedSurface, RayHits, next_meetings, scattered_surface
+from caustic_cli.optics.meeting import HALVINGS, MOST_STEPS
+from caustic_cli.optics.reconstruction import Filter
+from caustic_cli.optics.sampling import Sample, key, salt
+from caustic_cli.optics.surfaces.base import Hit
+from caustic_cli.scene import Screen
+
+
+class Numba(Torch):
+    """See the package."""
+
+    name = "numba"
+
+    def precision(self, dtype: torch.dtype) -> torch.dtype:
+        """float64."""
+        return torch.float64
+
+    def scatter(self, seed: int, start: int, stop: int, shape: tuple[int, int], stratified: bool,
+                device: torch.device | str) -> list[Tensor]:
+        """As the reference."""
+        return list(functions.scattered_points([key(seed, d) for d in (0, 1)], [salt(0), salt(1)], start, stop, *shape, stratified))
+
+    def spline_on(self, field, sample: Sample, dtype: torch.dtype):
+        """As the reference; rows of a tensor product of points from nets contracted along v."""
+        if sample.tensor:
+            return GridSurface(field.spaces, field.half_size, sample.u, sample.v)
+        surface, u, v = FusedSurface(field.spaces, field.half_size), sample.u.contiguous().numpy(), sample.v.contiguous().numpy()
+        return lambda sag: scattered_surface(surface, sag, u, v)
+
+    def spline_at(self, field, heights: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """As the reference."""
+        if not len(x):
+            return super().spline_at(field, heights, x, y)
+        at = ((0.5 * (c / r + 1.0)).contiguous().numpy() for c, r in zip((x, y), field.half_size, strict=True))
+        return scattered_surface(FusedSurface(field.spaces, field.half_size), heights.double(), *at)
+
+    def meet_spline(self, field, heights: Tensor, origin, direction, side: float, radius: float | None) -> Hit:
+        """As the reference."""
+        rays = [torch.as_tensor(c, dtype=torch.float64) for c in (*origin, *direction)]
+        rays = [c.contiguous() for c in torch.broadcast_tensors(*rays)]
+        if not rays[0].numel():
+            return super().meet_spline(field, heights, origin, direction, side, radius)
+        return Hit(*hits_of_rays(FusedSurface(field.spaces, field.half_size), heights, tuple(rays[:3]), tuple(rays[3:]), side=side,
+                                 radius=radius))
+
+    def meet_fixed(self, field, origin, direction, radius: float | None):
+        """As the reference; what does not depend on the heights is prepared."""
+        hits = RayHits(FusedSurface(field.spaces, field.half_size), origin, direction, radius)
+
+        def meet(heights: Tensor) -> Hit:
+            t, gx, gy = hits(heights)
+            found = t.detach() >= 0
+            return Hit(torch.where(found, t, torch.zeros_like(t)), gx, gy, found)
+
+        return meet
+
+    def find(self, field, heights: Tensor, origin, direction, method: intersection.Method,
+             radius: float | None) -> tuple[Tensor, Tensor]:
+        """As the reference."""
+        start, found = _by_mesh(field, heights, origin, direction, method, radius)
+        if found is not None:
+            return found
+        hits = RayHits(FusedSurface(field.spaces, field.half_size), origin, direction, radius)
+        hits.find(heights, None if start is None else np.ascontiguousarray(start.numpy()))
+        return torch.from_numpy(hits.t), torch.from_numpy(hits.status).long()
+
+    def next_meetings(self, field, heights: Tensor, origin, direction, below: bool, round: bool, step: float) -> Tensor:
+        """As the reference."""
+        if not len(origin[0]):
+            return super().next_meetings(field, heights, origin, direction, below, round, step)
+        return next_meetings(FusedSurface(field.spaces, field.half_size), heights, origin, direction, below, round, step, HALVINGS,
+                             MOST_STEPS)
+
+    def interact(self, direction, slopes, power: Tensor, *, eta: float, reflects: bool, fresnel: str, polarised=None,
+                 side: float = 1.0) -> Departure:
+        """As the reference; constant slopes are left to it."""
+        if not isinstance(slopes[0], Tensor):
+            return super().interact(direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, polarised=polarised,
+                                    side=side)
+        return Departure(*interact(direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, field=polarised))
+
+    def land(self, origin, direction, point, axes, forward: float) -> tuple[Tensor, Tensor, Tensor]:
+        """As the reference."""
+        return land(origin, direction, point, axes, forward)
+
+    def splat(self, x: Tensor, y: Tensor, weight: Tensor, screen: Screen, filter: Filter) -> tuple[Tensor, Tensor]:
+        """As the reference."""
+        return splat_rays(x, y, weight, screen, filter)

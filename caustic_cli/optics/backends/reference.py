@@ -1,0 +1,124 @@
+"""Every stage of a trace in plain torch: the reference for all other backends, and the backend of devices without one."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from caustic_cli.errors import InputError
+from caustic_cli.optics import intersection
+from caustic_cli.optics.interface import Departure, interact
+from caustic_cli.optics.reconstruction import Filter, splat
+from caustic_cli.optics.sampling import Sample, spread
+from caustic_cli.optics.surfaces.base import Hit
+from caustic_cli.optics.tolerances import PARALLEL
+from caustic_cli.scene import Screen
+
+
+class Torch:
+    """See the package."""
+
+    name = "torch"
+
+    def precision(self, dtype: torch.dtype) -> torch.dtype:
+        """The precision in which rays asked for in `dtype` are traced."""
+        return dtype
+
+    def scatter(self, seed: int, start: int, stop: int, shape: tuple[int, int], stratified: bool,
+                device: torch.device | str) -> list[Tensor]:
+        """Random points u, v of the unit square for rays start..stop, `stratified` in cells: see `sampling`."""
+        return spread(seed, start, stop, shape, stratified, device)
+
+    def spline_on(self, field, sample: Sample, dtype: torch.dtype):
+        """A function of sags (n, m) mm: height (mm) and slopes at the points of a sample, (N,) each in `dtype`."""
+        evaluate = field.prepare(sample, dtype)
+        return lambda sag: tuple(v.reshape(-1) for v in evaluate(sag.to(dtype)))
+
+    def spline_at(self, field, heights: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Height and slopes at fixed points (N,) mm, float64, linear in the heights."""
+        return tuple(field.at(heights, x, y))
+
+    def meet_spline(self, field, heights: Tensor, origin, direction, side: float, radius: float | None) -> Hit:
+        """`Surface.meet` of a B-spline."""
+        return intersection.meet_any(field, heights, origin, direction, side, radius)
+
+    def meet_fixed(self, field, origin, direction, radius: float | None):
+        """A function of heights (n, m) mm: `Hit`s from below of rays that do not depend on them."""
+        return lambda heights: intersection.meet_any(field, heights, origin, direction, 1.0, radius)
+
+    def find(self, field, heights: Tensor, origin, direction, method: intersection.Method,
+             radius: float | None) -> tuple[Tensor, Tensor]:
+        """`intersection.find`."""
+        start, found = _by_mesh(field, heights, origin, direction, method, radius)
+        if found is not None:
+            return found
+        if start is not None:
+            raise InputError("mesh+newton intersection runs on the CPU; use newton")
+        return intersection.reference(field, heights, origin, direction, 1.0, radius)
+
+    def next_meetings(self, field, heights: Tensor, origin, direction, below: bool, round: bool, step: float) -> Tensor:
+        """Distances (N,) mm to the next meeting of rays that start on a B-spline, 0 for none: see `meeting.again`."""
+        from caustic_cli.optics.meeting import reference  # noqa: PLC0415 - meetings know backends
+
+        return reference(field, heights, origin, direction, below, round, step)
+
+    def interact(self, direction, slopes, power: Tensor, *, eta: float, reflects: bool, fresnel: str, polarised=None,
+                 side: float = 1.0) -> Departure:
+        """What a surface does to rays: `interface.interact`."""
+        return interact(direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, polarised=polarised, side=side)
+
+    def land(self, origin, direction, point, axes, forward: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Rays to a plane.
+
+        Args:
+            point, axes: a point of the plane, mm, and unit vectors along its x and y and along its normal.
+            forward: +1 for rays that arrive along the normal, -1 against it.
+
+        Returns:
+            x, y (N,) mm from `point` along the plane's axes, and whether the rays get there; those that do not stay where they are.
+        """
+        away = [p - o for p, o in zip(point, origin, strict=True)]
+        along, up, normal = axes
+        distance, speed = _dot(away, normal), torch.as_tensor(_dot(direction, normal))
+        arrives = forward * speed > PARALLEL
+        path = distance / torch.where(arrives, speed, torch.ones_like(speed))
+        on_way = arrives & (path > 0)
+        path = torch.where(on_way, path, torch.zeros_like(path))
+        x, y = (path * _dot(direction, a) - _dot(away, a) for a in (along, up))
+        return x, y, on_way
+
+    def splat(self, x: Tensor, y: Tensor, weight: Tensor, screen: Screen, filter: Filter) -> tuple[Tensor, Tensor]:
+        """`reconstruction.splat`."""
+        return splat(x, y, weight, screen, filter)
+
+    def plane_image(self, *_, **__) -> None:
+        """No fused kernel for rays of a plane wave on a B-spline."""
+        return
+
+    def ray_image(self, *_, **__) -> None:
+        """No fused kernel for other rays."""
+        return
+
+
+def _by_mesh(field, heights, origin, direction, method: intersection.Method, radius):
+    """Where the mesh has the hits (None: not asked for), and (t, status) if that is the whole method."""
+    if method.name == "newton":
+        return None, None
+    from caustic_cli.optics.mesh import TriangleMesh  # noqa: PLC0415
+
+    mesh, rays = TriangleMesh(field, heights, *method.parts), torch.broadcast_tensors(*map(torch.as_tensor, (*origin, *direction)))
+    start, missed, _ = mesh.intersect(*(c.double() for c in rays), method.recursive)
+    if method.name == "mesh":
+        t = torch.where(missed == 0, start, torch.zeros_like(start))
+        return start, (t, intersection.within(missed.long(), start, origin, direction, radius))
+    return start, None
+
+
+def _dot(a, b):
+    """Sum over three components, of which zeros and ones of plain floats cost nothing."""
+    total = 0.0
+    for u, v in zip(a, b, strict=True):
+        if isinstance(v, float) and v == 0.0 or isinstance(u, float) and u == 0.0:
+            continue
+        total = total + (u if isinstance(v, float) and v == 1.0 else u * v)
+    return total

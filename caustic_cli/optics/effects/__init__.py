@@ -1,0 +1,27 @@
+"""Effects: one file each, here in the sequence in which light meets them."""
+
+from __future__ import annotations
+
+from caustic_cli.optics.effects.absorption import Absorption
+from caustic_cli.optics.effects.base import NEGLIGIBLE, NO_REQUESTS, Action, Effect, Requests, Amount, Verdict
+from caustic_cli.optics.effects.dispersion import Dispersion
+from caustic_cli.optics.effects.entrance import Entrance
+from caustic_cli.optics.effects.fresnel import Fresnel
+from caustic_cli.optics.effects.ghosts import Ghosts
+from caustic_cli.optics.effects.intersection import Intersection
+from caustic_cli.optics.effects.mirror import Mirror
+from caustic_cli.optics.effects.missed_surface import MissedSurface
+from caustic_cli.optics.effects.polarisation import Polarisation
+from caustic_cli.optics.effects.roughness import Roughness
+from caustic_cli.optics.effects.screen_shift import ScreenShift
+from caustic_cli.optics.effects.screen_tilt import ScreenTilt
+from caustic_cli.optics.effects.second_meeting import SecondMeeting
+from caustic_cli.optics.effects.source_size import SourceSize
+from caustic_cli.optics.effects.total_reflection import TotalReflection
+
+EFFECTS: tuple[Effect, ...] = (
+    SourceSize(), Polarisation(), Dispersion(), Entrance(), Intersection(), MissedSurface(), Absorption(), Roughness(), Fresnel(),
+    TotalReflection(), Mirror(), SecondMeeting(), Ghosts(), ScreenTilt(), ScreenShift(),
+)
+
+__all__ = ["EFFECTS", "NEGLIGIBLE", "NO_REQUESTS", "Action", "Effect", "Requests", "Amount", "Verdict"]

@@ -1,0 +1,50 @@
+"""Absorption in glass: exp(-a t) passes t mm (Beer-Lambert)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from caustic_cli.optics.effects.base import Action, Effect, Requests, Amount, Verdict
+from caustic_cli.scene import Scene
+
+#: Coefficient that is measured where there is none, 1/mm.
+AMOUNT = 0.01
+
+
+class Absorption(Effect):
+    """Left out, the glass is clear."""
+
+    name = "absorption"
+
+    def judge(self, scene: Scene, bounds) -> Verdict:
+        """By the coefficient."""
+        a = 0.0 if scene.lens.mirror else scene.lens.absorption
+        return Verdict(self.name, a > 0, f"the glass absorbs {a:g} per mm" if a > 0 else "the glass is clear", a, 0.0, present=a > 0)
+
+    def without(self, scene: Scene) -> Scene:
+        """Clear glass."""
+        return replace(scene, lens=replace(scene.lens, absorption=0.0)) if scene.lens.absorption else scene
+
+    def sample(self, scene: Scene, heights: Tensor) -> Amount | None:
+        """A little."""
+        if scene.lens.mirror:
+            return None
+        return Amount(replace(scene, lens=replace(scene.lens, absorption=AMOUNT)), None, f"{AMOUNT:g} per mm")
+
+    def action(self, system, requests: Requests) -> Action | None:
+        """In every medium that absorbs."""
+        return Absorb() if any(medium.absorption for medium in system.media()) else None
+
+
+class Absorb(Action):
+    """Takes its part on the way to every surface."""
+
+    def arrive(self, m) -> None:
+        """After `length` mm."""
+        if m.absorption:
+            before = m.state.power
+            m.state.power = before * torch.exp(-m.absorption * m.length)
+            m.state.lose("absorbed", (before - m.state.power).detach())

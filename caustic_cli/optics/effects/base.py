@@ -1,0 +1,125 @@
+"""What an effect is: why a scene calls for it or not, what it does to rays, how it is left out, and how its cost is measured.
+
+A new effect is one file with a subclass of `Effect`, and its line in the registry of this package.  Most effects are either told
+by the numbers of a scene (absorption: the coefficient), so that leaving them out is another scene, or by a request to the trace
+(ghosts), which no number of a scene says.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from caustic_cli.optics.rays import RayState
+from caustic_cli.scene import Scene
+
+if TYPE_CHECKING:
+    from caustic_cli.optics.bounds import Bounds
+    from caustic_cli.optics.surfaces import Hit
+    from caustic_cli.optics.system import System
+    from caustic_cli.optics.trace import Meeting, Tracer
+
+#: Ghost light below this part of the source's power is left out: the other effects' own models are no better than that.
+NEGLIGIBLE = 0.01
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What was decided of an effect in a scene.
+
+    name: of the effect; on: whether it is simulated; why: one clause; bound, limit: the number that decides and what it is compared
+    with, or None; fixed: without it there is no image of this scene; present: False where the scene has nothing of it.
+    """
+
+    name: str
+    on: bool
+    why: str
+    bound: float | None = None
+    limit: float | None = None
+    fixed: bool = False
+    present: bool = True
+
+
+@dataclass(frozen=True)
+class Requests:
+    """What a trace is asked beyond what its system says: names of effects to simulate, and to leave out where they matter."""
+
+    on: frozenset[str] = frozenset()
+    off: frozenset[str] = frozenset()
+
+    @classmethod
+    def to(cls, *on: str, without: tuple[str, ...] = ()) -> Requests:
+        """Requests by names."""
+        return cls(frozenset(on), frozenset(without))
+
+
+NO_REQUESTS = Requests()
+
+
+@dataclass(frozen=True)
+class Amount:
+    """An amount of an effect at which a study measures it: the scene with it, the scene to compare it with (None: the same
+    without it), and the amount in words."""
+
+    scene: Scene
+    bare: Scene | None
+    amount: str
+
+
+class Action:
+    """What an effect does to rays in one trace; a `Meeting`'s fields are read and changed in place."""
+
+    #: Whether `detour` adds light that goes another way.
+    detours = False
+
+    def meet(self, meeting: Meeting, origin, direction, heights: Tensor | None) -> Hit | None:
+        """Another way to meet the surface, from rays in its frame; None for the usual one."""
+        return None
+
+    def arrive(self, meeting: Meeting) -> None:
+        """At the surface, before Snell's law."""
+
+    def depart(self, meeting: Meeting) -> None:
+        """Behind the surface."""
+
+    def detour(self, tracer: Tracer, parameters, meetings: list[Meeting]) -> list[RayState]:
+        """Light behind the last element that has not gone straight on; takes it off what is in `meetings`' states and accounts."""
+        return []
+
+
+class Effect:
+    """One effect; see the package for the sequence."""
+
+    name: str
+    #: It costs nothing that could be saved: a mask of every path, or an addend in a sum.
+    free = False
+
+    def judge(self, scene: Scene, bounds: Bounds) -> Verdict:
+        """Whether a scene calls for it, and why."""
+        raise NotImplementedError
+
+    def without(self, scene: Scene) -> Scene:
+        """The scene with nothing of it."""
+        return scene
+
+    def within(self, scene: Scene) -> Scene:
+        """The scene with it, where it was asked for."""
+        return scene
+
+    def request(self, scene: Scene, on: bool, bounds: Bounds) -> Requests:
+        """What to ask of the trace for the effect to be on, or off."""
+        return NO_REQUESTS
+
+    def sample(self, scene: Scene, heights: Tensor) -> Amount | None:
+        """An amount to measure in a scene that has nothing of it; None where there is none."""
+        return None
+
+    def prepare(self, system: System, rays: RayState, requests: Requests) -> RayState:
+        """Rays of the source as the effect would have them."""
+        return rays
+
+    def action(self, system: System, requests: Requests) -> Action | None:
+        """What it does to rays in a trace of this system; None for nothing."""
+        return None

@@ -1,0 +1,45 @@
+"""Dispersion: every wavelength has its own index."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from torch import Tensor
+
+from caustic_cli.optics.effects.base import Effect, Amount, Verdict
+from caustic_cli.scene import Light, Scene
+from caustic_cli.scene.materials import D_LINE, refractive_index
+
+#: What is measured where there is none.
+GLASS, LINES = "N-BK7", (486.1, D_LINE, 656.3)
+
+
+class Dispersion(Effect):
+    """Left out, all wavelengths have the lens' index."""
+
+    name = "dispersion"
+
+    def judge(self, scene: Scene, bounds) -> Verdict:
+        """On where several wavelengths meet a glass."""
+        if scene.dispersive:
+            indices = [band.scene.lens.index for band in scene.bands]
+            return Verdict(self.name, True, f"{len(scene.light.wavelengths)} wavelengths in {scene.lens.glass}, whose index goes from"
+                           f" {min(indices):.5f} to {max(indices):.5f}", max(indices) - min(indices), 0.0)
+        why = "one wavelength" if not scene.light.wavelengths else "a mirror treats all wavelengths alike" if scene.lens.mirror \
+            else "the lens has one index for all wavelengths"
+        return Verdict(self.name, False, why, 0.0, 0.0, present=False)
+
+    def without(self, scene: Scene) -> Scene:
+        """One index."""
+        if not scene.dispersive:
+            return scene
+        light = scene.light if scene.light.color else replace(scene.light, wavelengths=(), weights=())
+        return replace(scene, lens=replace(scene.lens, glass=None), light=light)
+
+    def sample(self, scene: Scene, heights: Tensor) -> Amount | None:
+        """Three lines in the lens' glass, or a common one."""
+        if scene.lens.mirror:
+            return None
+        glass = scene.lens.glass or GLASS
+        lens = replace(scene.lens, glass=glass, index=refractive_index(glass))
+        return Amount(replace(scene, lens=lens, light=Light(scene.light.polarisation, LINES)), None, f"{len(LINES)} wavelengths in {glass}")

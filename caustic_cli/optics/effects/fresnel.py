@@ -1,0 +1,31 @@
+"""Fresnel's losses by reflection at every surface of glass."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from caustic_cli.optics.effects.base import Effect, Verdict
+from caustic_cli.scene import Scene
+
+
+class Fresnel(Effect):
+    """Left out, surfaces are perfectly coated."""
+
+    name = "fresnel"
+
+    def judge(self, scene: Scene, b) -> Verdict:
+        """On unless the scene says otherwise."""
+        if scene.lens.mirror:
+            return Verdict(self.name, False, "a mirror is taken to reflect all light", present=False)
+        if scene.lens.fresnel == "none":
+            return Verdict(self.name, False, "fresnel = none: perfectly coated", 0.0, 0.0)
+        normal = ((b.index - 1.0) / (b.index + 1.0)) ** 2
+        return Verdict(self.name, True, f"each surface reflects {normal:.2%} of normal light; {scene.lens.fresnel}", normal, 0.0)
+
+    def without(self, scene: Scene) -> Scene:
+        """Perfectly coated."""
+        return scene if scene.lens.fresnel == "none" else replace(scene, lens=replace(scene.lens, fresnel="none"))
+
+    def within(self, scene: Scene) -> Scene:
+        """By the exact formulas."""
+        return replace(scene, lens=replace(scene.lens, fresnel="exact")) if scene.lens.fresnel == "none" else scene

@@ -1,0 +1,68 @@
+"""Ghosts: light reflected at one surface and again at one before it, which then goes through after all.
+
+The thesis takes it for negligible; here it is measured.  Light that is reflected twice is followed, for every pair of refracting
+elements i < j: returned at j, back through those between, returned at i, and on through all that follow.  Each reflects as Fresnel's
+or Schlick's formula says, for unpolarised light.  Microfacets are met on the straight way only.  What a ghost carries out of the
+system is taken off what had been lost at j.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from caustic_cli.optics.effects.base import NEGLIGIBLE, NO_REQUESTS, Action, Effect, Requests, Verdict
+from caustic_cli.optics.rays import RayState
+from caustic_cli.scene import Scene
+
+
+class Ghosts(Effect):
+    """Left out, light that is reflected inside is lost."""
+
+    name = "ghosts"
+
+    def judge(self, scene: Scene, b) -> Verdict:
+        """By a bound of the power that is reflected twice."""
+        if scene.lens.mirror:
+            return Verdict(self.name, False, "there is no glass", present=False)
+        if b.ghost <= NEGLIGIBLE:
+            return Verdict(self.name, False, f"at most {b.ghost:.2%} of the power is reflected twice", b.ghost, NEGLIGIBLE)
+        return Verdict(self.name, True, f"up to {b.ghost:.2%} of the power may be reflected twice", b.ghost, NEGLIGIBLE)
+
+    def request(self, scene: Scene, on: bool, bounds) -> Requests:
+        """To trace them."""
+        return Requests.to(self.name) if on and not scene.lens.mirror else NO_REQUESTS
+
+    def action(self, system, requests: Requests) -> Action | None:
+        """Between refracting elements."""
+        return Reflections() if self.name in requests.on and sum(not e.reflects for e in system.elements) > 1 else None
+
+
+class Reflections(Action):
+    """One bundle of rays for each pair of elements."""
+
+    detours = True
+
+    def detour(self, tracer, parameters, meetings) -> list[RayState]:
+        """The ghosts behind the last element."""
+        found, elements = [], tracer.system.elements
+        heights = [parameters.get(e.name) for e in elements]
+        for j, m in enumerate(meetings):
+            if m.reflects or not bool((m.arriving > m.departing).any()):
+                continue
+            totally = ~m.passes
+            for i in range(j - 1, -1, -1):
+                if elements[i].reflects:  # a folded path is not gone back over
+                    break
+                ghost = replace(m.returned(), lost={}, status=None, polarised=None)
+                for k in range(j - 1, i, -1):
+                    ghost = tracer.cross(k, ghost, heights[k], forward=False, straight=False).state
+                ghost = tracer.cross(i, ghost, heights[i], forward=False, straight=False).returned()
+                for k in range(i + 1, len(elements)):
+                    ghost = tracer.cross(k, ghost, heights[k], straight=False).state
+                with torch.no_grad():
+                    of_total = torch.where(totally, ghost.power, torch.zeros_like(ghost.power)).sum(dtype=torch.float64)
+                    lost = {"total_internal_reflection": -of_total, "fresnel": of_total - ghost.power.sum(dtype=torch.float64)}
+                found.append(replace(ghost, lost=lost))
+        return found

@@ -1,0 +1,67 @@
+"""The point where a ray meets the free-form surface, which is not the one above the point where it entered."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from caustic_cli.optics.effects.base import NO_REQUESTS, Action, Effect, Requests, Verdict
+from caustic_cli.optics.effects.entrance import general
+from caustic_cli.optics.rays import RayState
+from caustic_cli.optics.surfaces import HeightField, Hit
+from caustic_cli.scene import Scene
+
+
+class Intersection(Effect):
+    """Left out, rays leave where they cross the surface's mean height."""
+
+    name = "intersection"
+
+    def judge(self, scene: Scene, b) -> Verdict:
+        """On where rays run slanted inside the lens."""
+        if scene.source.collimated:
+            return Verdict(self.name, False, "rays of a plane wave are sampled on the surface itself", 0.0, 0.0)
+        angle = math.degrees(b.inside)
+        return Verdict(self.name, True, f"rays cross the lens at up to {angle:.3g} degrees", angle, 0.0)
+
+    def request(self, scene: Scene, on: bool, bounds) -> Requests:
+        """Of a plane wave, to be intersected; of others, not to be."""
+        if on == scene.source.collimated:
+            return Requests.to(self.name) if on else Requests.to(without=(self.name,))
+        return NO_REQUESTS
+
+    def prepare(self, system, rays: RayState, requests: Requests) -> RayState:
+        """A plane wave's rays as any others."""
+        return general(rays) if self.name in requests.on else rays
+
+    def action(self, system, requests: Requests) -> Action | None:
+        """Meets the mean plane instead."""
+        return MeanPlane() if self.name in requests.off else None
+
+
+class MeanPlane(Action):
+    """A B-spline met where rays cross its mean height, with the height and the slopes that it has there."""
+
+    def meet(self, m, origin, direction, heights: Tensor | None) -> Hit | None:
+        """The height there is what the ray goes on from; no time passes between it and the mean plane."""
+        surface = m.element.surface
+        if not isinstance(surface, HeightField):
+            return None
+        sag, mean = surface.centred(heights)
+        t = (mean - origin[2]) / direction[2]
+        x, y = (o + t * d for o, d in zip(origin[:2], direction[:2], strict=True))
+        (rx, ry), found = surface.half_size, m.element.aperture.holds(x, y)
+        from caustic_cli.optics.intersection import spline_or_any  # noqa: PLC0415
+
+        z, gx, gy = spline_or_any(surface, sag, x.detach().clamp(-rx, rx), y.detach().clamp(-ry, ry))
+        m.lift = torch.where(found, z, torch.zeros_like(z))
+        t = torch.where(found, t, torch.zeros_like(t))
+        return Hit(t, gx, gy, found)
+
+    def arrive(self, m) -> None:
+        """Onto the surface above or below."""
+        if getattr(m, "lift", None) is not None:
+            x, y, z = m.state.origin
+            m.state.origin = (x, y, z + m.lift)

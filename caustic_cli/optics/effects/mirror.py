@@ -1,0 +1,28 @@
+"""A free-form surface that reflects."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from torch import Tensor
+
+from caustic_cli.optics.effects.base import Effect, Amount, Verdict
+from caustic_cli.scene import Scene
+
+
+class Mirror(Effect):
+    """Part of what the element is: it cannot be left out."""
+
+    name = "mirror"
+
+    def judge(self, scene: Scene, bounds) -> Verdict:
+        """As the scene says."""
+        if scene.lens.mirror:
+            return Verdict(self.name, True, "the surface is a mirror", fixed=True)
+        return Verdict(self.name, False, "the surface is glass", fixed=True, present=False)
+
+    def sample(self, scene: Scene, heights: Tensor) -> Amount:
+        """The same surface as a mirror, with the screen as far before it."""
+        z = 2.0 * float(heights.mean()) - scene.screen.z
+        lens, screen = replace(scene.lens, mirror=True), replace(scene.screen, z=z)
+        return Amount(Scene(scene.source, lens, screen, scene.light), scene, f"the screen at {z:.4g} mm")

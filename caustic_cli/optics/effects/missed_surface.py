@@ -1,0 +1,26 @@
+"""Rays that leave the lens by its side before they meet the exit."""
+
+from __future__ import annotations
+
+import math
+
+from caustic_cli.optics.effects.base import Effect, Verdict
+from caustic_cli.scene import Scene
+
+
+class MissedSurface(Effect):
+    """A mask that every path has."""
+
+    name = "missed-surface"
+    free = True
+
+    def judge(self, scene: Scene, b) -> Verdict:
+        """By how far rays get at the surface's greatest height."""
+        if scene.source.collimated:
+            return Verdict(self.name, False, "every ray of a plane wave is on the surface", b.reach, 1.0)
+        if b.reach <= 1.0:
+            return Verdict(self.name, False, f"no ray gets beyond {b.reach:.4g} of the aperture's half width", b.reach, 1.0)
+        if math.isinf(b.reach):
+            return Verdict(self.name, True, "the surface may dip below the entrance", None, 1.0, fixed=True)
+        why = f"rays may get to {b.reach:.4g} of the aperture's half width: its side takes them"
+        return Verdict(self.name, True, why, b.reach, 1.0, fixed=True)

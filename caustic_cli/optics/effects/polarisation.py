@@ -1,0 +1,88 @@
+"""Linear polarisation: what a surface reflects of s- and of p-polarised light, see `optics.polarisation`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from caustic_cli.optics.effects.base import NEGLIGIBLE, Action, Effect, Requests, Amount, Verdict
+from caustic_cli.optics.interface import refract
+from caustic_cli.optics.polarisation import beyond, field_of
+from caustic_cli.optics.rays import RayState
+from caustic_cli.scene import Scene
+
+
+class Polarisation(Effect):
+    """Left out, every surface reflects the mean of s and p."""
+
+    name = "polarisation"
+
+    def judge(self, scene: Scene, b) -> Verdict:
+        """On for polarised light, and where what the entrance polarises changes what the exit reflects."""
+        light, lens = scene.light, scene.lens
+        if lens.mirror or lens.fresnel != "exact":
+            why = "a mirror reflects all light alike" if lens.mirror else f"fresnel = {lens.fresnel} knows no polarisation"
+            return Verdict(self.name, False, why, present=False)
+        if light.polarisation is not None:
+            return Verdict(self.name, True, f"the source is polarised at {light.polarisation:g} degrees")
+        if b.incidence == 0:
+            return Verdict(self.name, False, "unpolarised light, which normal incidence leaves so", 0.0, NEGLIGIBLE)
+        some = b.polarised > NEGLIGIBLE
+        return Verdict(self.name, some, "unpolarised light; what the entrance polarises changes what the exit reflects by"
+                       f" {'up to' if some else 'at most'} {b.polarised:.1e}", b.polarised, NEGLIGIBLE)
+
+    def without(self, scene: Scene) -> Scene:
+        """Unpolarised light."""
+        light = scene.light
+        return scene if light.polarisation is None else replace(scene, light=replace(light, polarisation=None))
+
+    def within(self, scene: Scene) -> Scene:
+        """Unpolarised light as two crossed polarisations."""
+        return scene if scene.light.polarisation is not None else replace(scene, light=replace(scene.light, tracked=True))
+
+    def sample(self, scene: Scene, heights: Tensor) -> Amount | None:
+        """Along x."""
+        if scene.lens.fresnel != "exact" or scene.lens.mirror:
+            return None
+        return Amount(replace(scene, light=replace(scene.light, polarisation=0.0)), None, "along x")
+
+    def prepare(self, system, rays: RayState, requests: Requests) -> RayState:
+        """Rays with a field."""
+        angle = system.light.polarisation
+        if angle is None or not any(e.fresnel == "exact" and not e.reflects for e in system.elements):
+            return rays
+        return replace(rays, polarised=field_of(angle, rays.direction))
+
+    def action(self, system, requests: Requests) -> Action | None:
+        """Carries the field through surfaces that are followed by others."""
+        return Carry() if system.light.polarisation is not None and len(system.elements) > 1 else None
+
+
+class Carry(Action):
+    """The field behind a surface."""
+
+    def depart(self, m) -> None:
+        """Fresnel's amplitudes, or a perfect mirror's."""
+        state, last = m.state, m.index == len(m.tracer.system.elements) - 1
+        if state.polarised is None or (last and m.forward):
+            return
+        pose = m.element.pose
+        from caustic_cli.optics.trace import turned, turned_back  # noqa: PLC0415 - the trace knows effects
+
+        e, flip = turned(pose, state.polarised), m.side
+        d = (m.incoming[0], m.incoming[1], flip * m.incoming[2])
+        e = (e[0], e[1], flip * e[2])
+        gx, gy = (flip * g for g in m.slopes)
+        normal = (-gx, -gy, 1.0)
+        if m.reflects:
+            norm2 = 1.0 + gx * gx + gy * gy
+            across = 2.0 * (e[2] - e[0] * gx - e[1] * gy) / norm2
+            e = (across * normal[0] - e[0], across * normal[1] - e[1], across * normal[2] - e[2])
+        else:
+            gx, gy = (torch.as_tensor(g, dtype=state.power.dtype, device=state.power.device) for g in (gx, gy))
+            d = state.full(d)
+            t, _, c, s = refract(d, gx, gy, m.n_in / m.n_out)
+            e = beyond(state.full(e), d, t, normal, c, s, m.n_in / m.n_out)
+        state.polarised = turned_back(pose, (e[0], e[1], flip * e[2]))

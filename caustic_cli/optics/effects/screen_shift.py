@@ -1,0 +1,34 @@
+"""A screen whose middle is off the axis."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from torch import Tensor
+
+from caustic_cli.optics.effects.base import Effect, Amount, Verdict
+from caustic_cli.scene import Scene
+
+#: Distance that is measured where there is none, mm.
+AMOUNT = 1.0
+
+
+class ScreenShift(Effect):
+    """Left out, the screen is on the axis."""
+
+    name = "screen-shift"
+    free = True
+
+    def judge(self, scene: Scene, bounds) -> Verdict:
+        """By the distances."""
+        (a, b), some = scene.screen.shift, any(scene.screen.shift)
+        return Verdict(self.name, some, f"the screen is shifted by {a:g} and {b:g} mm" if some else "the screen is on the axis",
+                       max(abs(a), abs(b)), 0.0, present=some)
+
+    def without(self, scene: Scene) -> Scene:
+        """On the axis."""
+        return replace(scene, screen=replace(scene.screen, shift=(0.0, 0.0))) if any(scene.screen.shift) else scene
+
+    def sample(self, scene: Scene, heights: Tensor) -> Amount:
+        """Along x."""
+        return Amount(replace(scene, screen=replace(scene.screen, shift=(AMOUNT, 0.0))), None, f"{AMOUNT:g} mm")

@@ -1,0 +1,33 @@
+"""A screen that is turned about its own middle."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from torch import Tensor
+
+from caustic_cli.optics.effects.base import Effect, Amount, Verdict
+from caustic_cli.scene import Scene
+
+#: Angle that is measured where there is none, degrees.
+AMOUNT = 10.0
+
+
+class ScreenTilt(Effect):
+    """Left out, the screen is upright."""
+
+    name = "screen-tilt"
+
+    def judge(self, scene: Scene, bounds) -> Verdict:
+        """By the angles."""
+        (a, b), some = scene.screen.tilt, any(scene.screen.tilt)
+        return Verdict(self.name, some, f"the screen is tilted by {a:g} and {b:g} degrees" if some else "the screen is upright",
+                       max(abs(a), abs(b)), 0.0, present=some)
+
+    def without(self, scene: Scene) -> Scene:
+        """Upright."""
+        return replace(scene, screen=replace(scene.screen, tilt=(0.0, 0.0))) if any(scene.screen.tilt) else scene
+
+    def sample(self, scene: Scene, heights: Tensor) -> Amount:
+        """About y."""
+        return Amount(replace(scene, screen=replace(scene.screen, tilt=(0.0, AMOUNT))), None, f"{AMOUNT:g} degrees")

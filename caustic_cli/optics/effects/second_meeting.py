@@ -1,0 +1,85 @@
+"""Rays that leave a surface and meet it again: caught by a slope, they go through the glass, or off the mirror, once more.
+
+The thesis takes it for negligible; here it is measured, at the last surface of a system, once for every ray.  Each surface reflects
+as Fresnel's or Schlick's formula says, for unpolarised light; microfacets are met on the straight way only.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+
+from caustic_cli.optics.effects.base import NO_REQUESTS, Action, Effect, Requests, Verdict
+from caustic_cli.optics.meeting import again, touch
+from caustic_cli.optics.rays import RayState
+from caustic_cli.optics.surfaces import HeightField
+from caustic_cli.scene import Scene
+
+
+class SecondMeeting(Effect):
+    """Left out, rays go straight on."""
+
+    name = "second-meeting"
+
+    def judge(self, scene: Scene, b) -> Verdict:
+        """By whether a slope can catch a ray."""
+        if b.climb < 1.0:
+            return Verdict(self.name, False, f"slopes up to {b.slope:.3g} are {b.climb:.3g} of what rays leaving climb at", b.climb, 1.0)
+        return Verdict(self.name, True, f"slopes up to {b.slope:.3g} may catch a ray that has left",
+                       b.climb if math.isfinite(b.climb) else None, 1.0)
+
+    def request(self, scene: Scene, on: bool, bounds) -> Requests:
+        """To look for them."""
+        return Requests.to(self.name) if on else NO_REQUESTS
+
+    def action(self, system, requests: Requests) -> Action | None:
+        """At a last surface that is a B-spline."""
+        return Again() if self.name in requests.on and isinstance(system.elements[-1].surface, HeightField) else None
+
+
+class Again(Action):
+    """Takes rays that meet the last surface again off the straight light."""
+
+    detours = True
+
+    def detour(self, tracer, parameters, meetings) -> list[RayState]:
+        """What becomes of them, behind the surface."""
+        from caustic_cli.optics.trace import out_of, turned, turned_back  # noqa: PLC0415 - the trace knows effects
+
+        m = meetings[-1]
+        element, state, side = m.element, m.state, m.side
+        surface, pose, heights = element.surface, element.pose, parameters[element.name]
+        round_, interact = element.aperture.round, tracer.backend.interact
+        full = state.full((*m.local, *turned(pose, state.direction)))
+        full = [c.double() for c in full]
+        t, met = again(surface, heights, full[:3], full[3:], below=(side > 0) == m.reflects, round=round_)
+        met = met & (state.power > 0)
+        at = met.nonzero()[:, 0]
+        if not len(at):
+            return []
+        power = state.power.double()[at]
+        state.power = torch.where(met, torch.zeros_like(state.power), state.power)
+        d = [c[at] for c in full[3:]]
+        o, g, _ = touch(surface, heights, [c[at] for c in full[:3]], d, t[at])
+
+        def leaving(o, d, power, account: dict) -> list[RayState]:
+            return [replace(state, origin=out_of(pose, o, state.datum), direction=turned_back(pose, d), power=power, path=0.0,
+                            polarised=None, status=None, lost={k: v.detach().sum() for k, v in account.items()}, sample=None)]
+
+        if m.reflects:
+            d = interact(d, g, power, eta=1.0, reflects=True, fresnel=element.fresnel, side=side).direction
+            return leaving(o, d, power, {})
+        eta, fresnel = m.n_in / m.n_out, element.fresnel
+        entered = interact(d, g, power, eta=1.0 / eta, reflects=False, fresnel=fresnel, side=-side)
+        t, through = again(surface, heights, o, entered.direction, below=side > 0, round=round_)
+        none = torch.zeros_like(power)
+        o, g, t = touch(surface, heights, o, entered.direction, t)
+        arriving = torch.where(through, entered.power, none)
+        kept = arriving * torch.exp(-m.absorption * t) if m.absorption else arriving
+        out = interact(entered.direction, g, kept, eta=eta, reflects=False, fresnel=fresnel, side=side)
+        return leaving(o, out.direction, out.power, {
+            "fresnel": torch.where(entered.passes, power - entered.power, none) + torch.where(out.passes, kept - out.power, none),
+            "missed_surface": entered.power - arriving, "absorbed": arriving - kept,
+            "total_internal_reflection": torch.where(out.passes, none, kept) + torch.where(entered.passes, none, power)})

@@ -1,0 +1,56 @@
+"""Total internal reflection beyond the critical angle."""
+
+from __future__ import annotations
+
+import torch
+
+from caustic_cli.optics.effects.base import NO_REQUESTS, Action, Effect, Requests, Verdict
+from caustic_cli.optics.tolerances import PARALLEL
+from caustic_cli.scene import Scene
+
+
+class TotalReflection(Effect):
+    """Left out, light beyond the critical angle leaves along the surface."""
+
+    name = "total-reflection"
+    free = True
+
+    def judge(self, scene: Scene, b) -> Verdict:
+        """By n sin i at the steepest place of the surface."""
+        if scene.lens.mirror:
+            return Verdict(self.name, False, "a mirror has no critical angle", present=False)
+        if b.critical < 1.0:
+            return Verdict(self.name, False, f"n sin i <= {b.critical:.4g} at slopes up to {b.slope:.3g}", b.critical, 1.0)
+        return Verdict(self.name, True, f"n sin i may reach {b.critical:.4g} at slopes up to {b.slope:.3g}", b.critical, 1.0)
+
+    def request(self, scene: Scene, on: bool, bounds) -> Requests:
+        """To do without, where it may happen."""
+        return NO_REQUESTS if on or bounds.critical < 1.0 else Requests.to(without=(self.name,))
+
+    def action(self, system, requests: Requests) -> Action | None:
+        """Sends reflected light on."""
+        return Grazing() if self.name in requests.off else None
+
+
+class Grazing(Action):
+    """Light that would be reflected leaves along the surface, with what Fresnel's formulas leave of it at grazing angles."""
+
+    def depart(self, m) -> None:
+        """Along the surface, in the plane of incidence."""
+        if m.reflects or not m.straight or bool(m.passes.all()) or not isinstance(m.slopes[0], torch.Tensor):
+            return
+        from caustic_cli.optics.trace import turned, turned_back  # noqa: PLC0415 - the trace knows effects
+
+        d, g, pose = m.incoming, m.slopes, m.element.pose
+        c = (d[2] - d[0] * g[0] - d[1] * g[1]) / (1.0 + g[0] * g[0] + g[1] * g[1])
+        along = d[0] + c * g[0], d[1] + c * g[1], d[2] - c
+        length = torch.sqrt(along[0] ** 2 + along[1] ** 2 + along[2] ** 2).clamp_min(PARALLEL)
+        out = turned(pose, m.state.direction)
+        m.state.direction = turned_back(pose, tuple(torch.where(m.passes, o, v / length) for o, v in zip(out, along, strict=True)))
+        fresnel = 0.0 if m.element.fresnel == "none" else 1.0  # at grazing incidence all is reflected
+        back = torch.where(m.passes, torch.zeros_like(m.arriving), m.arriving)
+        m.state.power = m.state.power + (1.0 - fresnel) * back
+        moved = back.detach().sum(dtype=torch.float64)
+        m.state.lose("total_internal_reflection", -moved)
+        m.state.lose("fresnel", fresnel * moved)
+        m.passes = torch.ones_like(m.passes)

@@ -1,0 +1,11 @@
+"""Surfaces that rays meet: one file each, all of `base.Surface`."""
+
+from __future__ import annotations
+
+from caustic_cli.optics.surfaces.base import Hit, Surface
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.surfaces.nurbs import Nurbs
+from caustic_cli.optics.surfaces.plane import Plane
+from caustic_cli.optics.surfaces.sphere import Sphere
+
+__all__ = ["HeightField", "Hit", "Nurbs", "Plane", "Sphere", "Surface"]

@@ -1,0 +1,75 @@
+"""What a surface is to light: a height field z = Z(x, y) in its own frame, which rays meet from either side.
+
+Notation, in the frame of the surface
+    o, d    a ray's origin and unit direction
+    side    +1 for rays that meet the surface from below (d_z > 0), -1 from above
+    f(t)    side (o_z + t d_z - Z(o_x + t d_x, o_y + t d_y)), negative before the ray has crossed the surface
+    g       (Z_x, Z_y), slopes;  N = (-g_x, -g_y, 1)
+
+A new kind of surface is one file with a subclass of `Surface` that says where the surface is (`at`) and between which bounds
+(`hull`, `slope_bounds`); intersections and their derivatives then come from `intersection`.  One with a closed form, or with
+kernels, overrides `meet`.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from torch import Tensor
+
+#: Orders of derivatives by (x, y): value and slopes, and second derivatives.
+FIRST, SECOND = ((0, 0), (1, 0), (0, 1)), ((2, 0), (1, 1), (0, 2))
+
+
+class Hit(NamedTuple):
+    """Where rays meet a surface: distance t along them (mm, 0 where they do not), slopes there, and whether they do; (N,) each.
+
+    Slopes are plain floats where they are the same for every ray.
+    """
+
+    t: Tensor
+    gx: Tensor | float
+    gy: Tensor | float
+    found: Tensor
+
+
+class Surface(ABC):
+    """A surface z = Z(x, y) over the plane, or over a rectangle of half widths `half_size` mm about the origin.
+
+    shape: of the heights that shape it, (n, m), or None where nothing is free; methods take None for heights then.
+    """
+
+    shape: tuple[int, int] | None = None
+    half_size: tuple[float, float] = (math.inf, math.inf)
+    #: Whether all of it lies in one plane z = const: light along the axis then goes straight on.
+    flat = False
+
+    @abstractmethod
+    def at(self, heights: Tensor | None, x: Tensor, y: Tensor, orders: Sequence[tuple[int, int]] = FIRST) -> list[Tensor]:
+        """Derivatives of these orders by x and y at points (N,) mm: (N,) float64 each, mm^(1 - a - b); of points outside
+        `half_size` those of the nearest point inside."""
+
+    @abstractmethod
+    def hull(self, heights: Tensor | None) -> tuple[float, float]:
+        """Heights between which the whole surface lies, mm."""
+
+    @abstractmethod
+    def slope_bounds(self, heights: Tensor | None) -> tuple[float, float]:
+        """Upper bounds of |Z_x| and |Z_y|."""
+
+    def centred(self, heights: Tensor | None) -> tuple[Tensor | None, float]:
+        """Heights of the same surface moved to where its numbers are small, and by how far it was higher, mm."""
+        return heights, 0.0
+
+    def meet(self, heights: Tensor | None, origin, direction, side: float, radius: float | None = None) -> Hit:
+        """First meetings of rays (N,), mm, unit directions with side d_z > 0; differentiable by heights, origins and directions.
+
+        Args:
+            radius: the surface ends at this distance from its middle, mm; None where it does not.
+        """
+        from caustic_cli.optics.intersection import meet_any  # noqa: PLC0415 - intersection knows surfaces
+
+        return meet_any(self, heights, origin, direction, side, radius)

@@ -1,0 +1,40 @@
+"""The plane z = 0."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from caustic_cli.optics.surfaces.base import FIRST, Hit, Surface
+from caustic_cli.optics.tolerances import PARALLEL
+
+
+@dataclass(frozen=True)
+class Plane(Surface):
+    """z = 0 in its own frame; its element's pose places and tilts it."""
+
+    flat = True
+
+    def at(self, heights: None, x: Tensor, y: Tensor, orders=FIRST) -> list[Tensor]:
+        """0 everywhere."""
+        return [torch.zeros_like(x) for _ in orders]
+
+    def hull(self, heights: None) -> tuple[float, float]:
+        """(0, 0)."""
+        return 0.0, 0.0
+
+    def slope_bounds(self, heights: None) -> tuple[float, float]:
+        """(0, 0)."""
+        return 0.0, 0.0
+
+    def meet(self, heights: None, origin, direction, side: float, radius: float | None = None) -> Hit:
+        """t = -o_z / d_z; the slopes are the number 0."""
+        (ox, oy, oz), (dx, dy, dz) = origin, direction
+        ahead = torch.as_tensor(side * dz, dtype=ox.dtype, device=ox.device) > PARALLEL
+        t = torch.where(ahead, -oz / torch.where(ahead, torch.as_tensor(dz).to(ox), 1.0), torch.zeros_like(ox))
+        found = ahead & (t >= 0)
+        if radius is not None:
+            found = found & ((ox + t * dx) ** 2 + (oy + t * dy) ** 2 <= radius * radius)
+        return Hit(torch.where(found, t, torch.zeros_like(t)), 0.0, 0.0, found)

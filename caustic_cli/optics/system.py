@@ -1,0 +1,251 @@
+"""A sequential optical system: sources, then surfaces in the order in which light meets them, then screens.
+
+    System   = sources + (Element, ...) + screens
+    Element  = Surface + Aperture + refract or reflect + Medium behind it + Pose
+
+Lengths are mm, angles degrees.  An element's frame has its origin at `Pose.position` and its z axis along the nominal direction
+of light, but for its tilt.  Light comes from air (`before`); behind an element that reflects lies the medium before it.
+
+Heights that shape its surfaces are no part of a system: `trace` takes them as {name of the element: (n, m) tensor, mm}.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+from caustic_cli.errors import InputError
+from caustic_cli.optics.surfaces import HeightField, Plane, Surface
+from caustic_cli.scene import Light, PlaneWave, Pupil, Scene, Screen, Source, checks
+from caustic_cli.scene.lens import FRESNEL
+from caustic_cli.scene.materials import refractive_index
+
+INTERACTIONS = ("refract", "reflect")
+#: Names of the elements of a one-lens scene.
+ENTRANCE, EXIT = "entrance", "exit"
+IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+Axes = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+
+
+@dataclass(frozen=True)
+class Medium:
+    """What light runs through.
+
+    Args:
+        index: refractive index; of a glass, that of rays without a wavelength.
+        absorption: coefficient a, 1/mm: exp(-a t) passes t mm (Beer-Lambert).
+        glass: a name of `materials`, whose index changes with the wavelength; None for `index` at every wavelength.
+    """
+
+    index: float = 1.0
+    absorption: float = 0.0
+    glass: str | None = None
+
+    def __post_init__(self):
+        checks.number("index", self.index, 1.0, 5.0)
+        checks.number("absorption", self.absorption, 0.0, 1e6)
+
+    def index_at(self, wavelength: float | None) -> float:
+        """Refractive index at a wavelength, nm."""
+        return self.index if self.glass is None or wavelength is None else refractive_index(self.glass, wavelength)
+
+
+AIR = Medium()
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where an element stands: its origin, mm, and right-handed turns first about its x, then about its y axis, degrees."""
+
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    tilt: tuple[float, float] = (0.0, 0.0)
+
+    @cached_property
+    def axes(self) -> Axes:
+        """Unit vectors along its x, y and z."""
+        if not any(self.tilt):
+            return IDENTITY
+        (sa, ca), (sb, cb) = ((math.sin(t), math.cos(t)) for t in map(math.radians, self.tilt))
+        return (cb, 0.0, -sb), (sb * sa, ca, cb * sa), (sb * ca, -sa, cb * ca)
+
+    @property
+    def upright(self) -> bool:
+        """Whether nothing is tilted."""
+        return not any(self.tilt)
+
+
+@dataclass(frozen=True)
+class Aperture:
+    """The part of a surface that light may pass: a rectangle or a circle about the element's axis; infinite for all of it.
+
+    Args:
+        half_size: half widths of the rectangle, mm; radius twice of a circle.
+        round: a circle.
+    """
+
+    half_size: tuple[float, float] = (math.inf, math.inf)
+    round: bool = False
+
+    def __post_init__(self):
+        if self.round and self.half_size[0] != self.half_size[1]:
+            raise InputError(f"half_size of a circular aperture must be its radius, twice the same, got {self.half_size}")
+
+    @property
+    def radius(self) -> float | None:
+        """Of a circle, mm; None of a rectangle."""
+        return self.half_size[0] if self.round else None
+
+    def holds(self, x, y):
+        """Whether points lie within it."""
+        (rx, ry) = self.half_size
+        if self.round:
+            return x * x + y * y <= rx * rx
+        return (x.abs() <= rx) & (y.abs() <= ry)
+
+
+@dataclass(frozen=True)
+class Element:
+    """One surface of a system, see above.
+
+    Args:
+        name: of the element and of its surface's heights.
+        interaction: refract or reflect.
+        behind: the medium behind it; nothing where it reflects.
+        fresnel: losses by reflection where it refracts: none, schlick or exact.
+        roughness: standard deviation, along either axis, of the slopes of its microfacets about the surface's own.
+    """
+
+    name: str
+    surface: Surface
+    aperture: Aperture = field(default_factory=Aperture)
+    interaction: str = "refract"
+    behind: Medium = AIR
+    pose: Pose = field(default_factory=Pose)
+    fresnel: str = "exact"
+    roughness: float = 0.0
+
+    def __post_init__(self):
+        checks.choice("interaction", self.interaction, INTERACTIONS)
+        checks.choice("fresnel", self.fresnel, FRESNEL)
+        checks.number("roughness", self.roughness, 0.0, 1.0)
+
+    @property
+    def reflects(self) -> bool:
+        """Whether it is a mirror."""
+        return self.interaction == "reflect"
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A screen anywhere: `screen` says its size, pixels and shift, `pose` where its middle stands and which way it looks."""
+
+    screen: Screen
+    pose: Pose
+
+
+@dataclass(frozen=True)
+class System:
+    """A sequential system; see above.
+
+    Args:
+        sources: all shine at once, each with its own power.
+        elements: in the order in which light meets them.
+        screens: each collects all light that gets to its plane, as if the others were not there.
+        before: the medium before the first element.
+        lit: the pupil that the sources light; None for the first element's aperture.
+
+    Raises:
+        InputError: no element or source, two of one name, or a first aperture that is infinite.
+    """
+
+    sources: tuple[Source, ...]
+    elements: tuple[Element, ...]
+    screens: tuple[Screen | Placed, ...] = ()
+    light: Light = field(default_factory=Light)
+    before: Medium = AIR
+    lit: Pupil | None = None
+
+    def __post_init__(self):
+        if not self.elements or not self.sources:
+            raise InputError("a system needs at least one source and one element")
+        names = [e.name for e in self.elements]
+        if len(set(names)) < len(names):
+            raise InputError(f"elements must have names of their own, got {', '.join(names)}")
+        if not all(map(math.isfinite, self.pupil.half_size)):
+            raise InputError(f"the first element, {names[0]}, must have an aperture: sources shine into it")
+
+    @classmethod
+    def of(cls, scene: Scene, surface: HeightField | None = None) -> System:
+        """A one-lens scene: a flat entrance and a B-spline exit, or a B-spline mirror."""
+        lens = scene.lens
+        surface = surface or HeightField.of(lens)
+        aperture = Aperture(lens.half_size, lens.round)
+        if lens.mirror:
+            elements = (Element(EXIT, surface, aperture, "reflect", roughness=lens.roughness),)
+        else:
+            elements = (Element(ENTRANCE, Plane(), aperture, behind=Medium(lens.index, lens.absorption, lens.glass),
+                                pose=Pose((0.0, 0.0, lens.z_in)), fresnel=lens.fresnel),
+                        Element(EXIT, surface, aperture, fresnel=lens.fresnel, roughness=lens.roughness))
+        return cls((scene.source,), elements, (scene.screen,), scene.light, lit=scene.pupil)
+
+    @property
+    def pupil(self) -> Pupil:
+        """What the sources light."""
+        if self.lit is not None:
+            return self.lit
+        first = self.elements[0]
+        return Pupil(first.aperture.half_size, first.pose.position[2], first.aperture.round)
+
+    @property
+    def free(self) -> dict[str, tuple[int, int]]:
+        """Shapes of the heights of every surface that has some, by name."""
+        return {e.name: e.surface.shape for e in self.elements if e.surface.shape is not None}
+
+    def media(self) -> tuple[Medium, ...]:
+        """The medium before each element, and behind the last."""
+        media = [self.before]
+        for element in self.elements:
+            media.append(media[-1] if element.reflects else element.behind)
+        return tuple(media)
+
+    def sides(self) -> tuple[float, ...]:
+        """From which side the axis meets each element: +1 from below, -1 from above; and 0 for one that it runs along.
+
+        The axis goes along +z, straight on at every refraction, and off every mirror as a ray at its vertex.
+        """
+        axis, sides = (0.0, 0.0, 1.0), []
+        for element in self.elements:
+            normal = element.pose.axes[2]
+            cosine = sum(a * b for a, b in zip(axis, normal, strict=True))
+            sides.append(math.copysign(1.0, cosine) if cosine else 0.0)
+            if element.reflects:
+                axis = tuple(a - 2.0 * cosine * b for a, b in zip(axis, normal, strict=True))
+        return tuple(sides)
+
+    @property
+    def axis(self) -> tuple[float, float, float]:
+        """Direction of the axis behind the last element."""
+        axis = (0.0, 0.0, 1.0)
+        for element in self.elements:
+            if element.reflects:
+                normal = element.pose.axes[2]
+                cosine = sum(a * b for a, b in zip(axis, normal, strict=True))
+                axis = tuple(a - 2.0 * cosine * b for a, b in zip(axis, normal, strict=True))
+        return axis
+
+    @property
+    def parts(self) -> tuple[float, ...]:
+        """Each source's part of all power."""
+        total = math.fsum(s.power for s in self.sources)
+        return tuple(s.power / total for s in self.sources)
+
+    def with_source(self, source: Source) -> System:
+        """The same system in another light."""
+        return replace(self, sources=(source,))
+
+
+def plane_wave(power: float = 1.0) -> tuple[Source, ...]:
+    """The usual source of a system: light along +z through its first aperture."""
+    return (PlaneWave(power),)

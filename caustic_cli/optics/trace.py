@@ -1,0 +1,441 @@
+"""Light through a sequential system, from the sources to the screens: one walk over the elements (thesis 4.3.1).
+
+    trace(system, rays, {surface name: heights}) = fold over the elements of  meet -> arrive -> interact -> depart
+    image = splat(land(trace(...)))
+
+    meet      intersect the rays with the element's surface, in its own frame
+    arrive    what effects do on the way there and at the surface: absorption, roughness
+    interact  Snell and Fresnel, or a mirror
+    depart    what effects do behind it
+    detours   light that goes another way than straight on, after the walk: ghosts, second meetings
+
+Elements before the first surface that a design may shape do not depend on any heights: they are walked once, when a `Tracer` is made.
+What follows is *lowered* where it is one B-spline, upright, between the rays and an upright screen, with no effect but Snell's and
+Fresnel's: that runs as one fused kernel (`_lowered` is the only place that knows).  All else goes through the stages of the
+device's backend.
+
+Powers are parts of what the sources emit.  Nothing vanishes: image + every entry of `lost` = 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from caustic_cli.errors import InputError
+from caustic_cli.optics.backends import backend_for
+from caustic_cli.optics.effects import EFFECTS, NO_REQUESTS, Action, Requests
+from caustic_cli.optics.emission import Rays
+from caustic_cli.optics.image import Image
+from caustic_cli.optics.rays import LOSSES, RayState, Status
+from caustic_cli.optics.reconstruction import Filter
+from caustic_cli.optics.sampling import Sample
+from caustic_cli.optics.shortage import with_less
+from caustic_cli.optics.surfaces import HeightField, Hit
+from caustic_cli.optics.system import EXIT, IDENTITY, Element, Placed, Pose, System
+from caustic_cli.scene import Scene, Screen
+
+Parameters = Mapping[str, Tensor]
+
+
+@dataclass
+class Meeting:
+    """Rays at one element: what effects see and change.
+
+    tracer, index, element: whose and which; forward: whether light runs in the system's own direction; side: from which the
+    surface is met; n_in, n_out: refractive indices before and behind, in the light's direction; reflects; state: the rays, at the
+    surface (origins in the system's frame, directions before it until `depart`, behind it from then on); local: their points in
+    the element's frame; incoming: directions before it, in that frame; slopes: of the surface there; length: of the way to it, mm;
+    arriving, departing: power before and after the interaction; passes: of the interaction; straight: whether this is the walk
+    itself, not a detour.
+    """
+
+    tracer: Tracer
+    index: int
+    element: Element
+    forward: bool
+    side: float
+    n_in: float
+    n_out: float
+    reflects: bool
+    straight: bool
+    state: RayState
+    local: tuple = ()
+    incoming: tuple = ()
+    slopes: tuple = ()
+    length: Tensor | float = 0.0
+    arriving: Tensor | None = None
+    departing: Tensor | None = None
+    passes: Tensor | None = None
+
+    @property
+    def absorption(self) -> float:
+        """Absorption coefficient of the medium on the way to the surface, 1/mm."""
+        return self.tracer.media[self.index if self.forward else self.index + 1].absorption
+
+    def returned(self) -> RayState:
+        """The light that this refracting element reflects, at its surface."""
+        found = self.tracer.backend.interact(self.incoming, self.slopes, self.arriving, eta=1.0, reflects=True,
+                                             fresnel=self.element.fresnel, side=self.side)
+        return replace(self.state, direction=turned_back(self.element.pose, found.direction), power=self.arriving - self.departing,
+                       lost={}, sample=None)
+
+
+class Tracer:
+    """Traces some rays through a system; prepared once, called for any heights.
+
+    Args:
+        system: what is traced; of its sources only the rays' own matters.
+        rays: on the pupil, before the first element: points of it that a plane wave comes through, or any others.
+        dtype: precision of the ray arithmetic, where the backend has more than one.  Rays meet surfaces in float64 in any case.
+        requests: what a plan says of effects beyond what the system itself says.
+        like: the tracer of the chunk before through the same system, whose prepared arrays serve again where they are the same.
+        weight, channel: part of the power that this light is of the whole, and the colour of the image that it goes into.
+        lower: False goes by stages even where a fused kernel does the same.
+        track: keep what became of every ray (`RayState.status`).
+    """
+
+    def __init__(self, system: System, rays: Sample | RayState, dtype: torch.dtype = torch.float64,
+                 requests: Requests = NO_REQUESTS, like: Tracer | None = None, *, weight: float = 1.0, channel: int | None = None,
+                 lower: bool = True, track: bool = False):
+        self.system, self.requests, self.weight, self.channel, self.track = system, requests, weight, channel, track
+        self.media, self.sides = system.media(), system.sides()
+        pupil = system.pupil
+        state = rays if isinstance(rays, RayState) else RayState.on_axis(rays, pupil.half_size, pupil.z)
+        state = replace(state, lost=dict(state.lost))
+        self.backend = backend_for(state.power.device)
+        self.dtype = self.backend.precision(dtype)
+        for effect in EFFECTS:
+            state = effect.prepare(system, state, requests)
+        made = (effect.action(system, requests) for effect in EFFECTS)
+        self.actions: tuple[Action, ...] = tuple(a for a in made if a is not None)
+        self.recorded = any(a.detours for a in self.actions)
+        self.before: list[Meeting] = []
+        self.first = 0
+        with torch.no_grad():
+            while self.first < len(system.elements) and system.elements[self.first].surface.shape is None:
+                meeting = self.cross(self.first, state, None)
+                self.before.append(meeting)
+                state, self.first = meeting.state, self.first + 1
+        self.start = state
+        self.meets = self._prepared()
+        self.fused = self._lowered(like) if lower else None
+
+    def __call__(self, parameters: Parameters) -> list[RayState]:
+        """Heights {name: (n, m) mm float64} -> rays behind the last element: those that went straight on, then those of detours."""
+        state, meetings = self.start, list(self.before)
+        for k in range(self.first, len(self.system.elements)):
+            meeting = self.cross(k, state, parameters.get(self.system.elements[k].name))
+            state = meeting.state
+            if self.recorded:
+                meetings.append(meeting)
+        states = [state]
+        for action in self.actions:
+            if action.detours:
+                states += action.detour(self, parameters, meetings)
+        return states
+
+    def land(self, parameters: Parameters, screen: Screen | Placed) -> list[RayState]:
+        """The same on a screen: x and y of their origins are the screen's own coordinates, mm."""
+        return [self.onto(state, screen) for state in self(parameters)]
+
+    def expose(self, parameters: Parameters, screen: Screen | Placed, filter: Filter) -> Image:
+        """Heights {name: (n, m) mm float64} -> image and energy account on a screen."""
+        if self.fused is not None and isinstance(screen, Screen) and not any(screen.tilt):
+            image, leaving, lost = self.fused(parameters[self.system.elements[-1].name], screen, filter)
+            for name, value in self.start.lost.items():
+                lost[name] = lost.get(name, 0.0) + value
+        else:
+            image, leaving, lost = 0.0, 0.0, {}
+            for ray in self.land(parameters, screen):
+                part, off = self.backend.splat(*ray.origin[:2], ray.power, screen if isinstance(screen, Screen) else screen.screen,
+                                               filter)
+                image, leaving = image + part, leaving + ray.leaving
+                ray.lose("off_screen", off)
+                for name, value in ray.lost.items():
+                    lost[name] = lost.get(name, 0.0) + (value.detach() if isinstance(value, Tensor) else value)
+        return self._weighed(image, leaving, lost)
+
+    def _weighed(self, image: Tensor, leaving: Tensor, lost: dict) -> Image:
+        w = self.weight
+        if w != 1.0:
+            image, leaving, lost = w * image, w * leaving, {name: w * value for name, value in lost.items()}
+        if self.channel is not None:
+            image, leaving = (torch.stack([t if k == self.channel else torch.zeros_like(t) for k in range(3)])
+                              for t in (image, leaving))
+        return Image(image, leaving, lost, self.start.count)
+
+    # One element.
+
+    def cross(self, k: int, state: RayState, heights: Tensor | None, *, forward: bool = True, reflects: bool | None = None,
+              straight: bool = True) -> Meeting:
+        """Rays to element k and behind it.
+
+        Args:
+            heights: of its surface, None where it has none.
+            forward: in the system's own direction, or back.
+            reflects: None for what the element does.
+            straight: whether this is the walk itself, or a detour.
+        """
+        element = self.system.elements[k]
+        n = [medium.index_at(state.wavelength) for medium in self.media[k : k + 2]]
+        side = self.sides[k] if forward else -self.sides[k]
+        m = Meeting(self, k, element, forward, side, *(n if forward else n[::-1]),
+                    element.reflects if reflects is None else reflects, straight, state)
+        self._meet(m, heights)
+        for action in self.actions:
+            action.arrive(m)
+        m.arriving = m.state.power
+        m.departing = m.state.power = self._interact(m)
+        for action in self.actions:
+            action.depart(m)
+        return m
+
+    def _meet(self, m: Meeting, heights: Tensor | None) -> None:
+        """Carry the rays of a meeting to the surface."""
+        k, element = m.index, m.element
+        started = m.state is getattr(self, "start", None)
+        if k == self.first and m.forward and heights is not None:
+            datum = element.pose.position[2] + element.surface.centred(heights)[1]
+            state = m.state.counted_from(datum)
+        else:
+            state = replace(m.state, lost=dict(m.state.lost))
+        prepared = self.meets if started else None
+        o, d = into(element.pose, state.origin, state.direction, state.datum)
+        if k == 0 and m.forward and self.system.lit is None and not element.surface.flat:
+            o, state = self._backed_up(o, d, state, element, heights)
+        hit = next((h for a in self.actions if (h := a.meet(m, o, d, heights)) is not None), None)
+        if hit is None:
+            hit = prepared(heights) if prepared else element.surface.meet(heights, o, d, m.side, element.aperture.radius)
+        t = hit.t
+        if state.power.dtype != self.dtype:  # the first surface is met in float64 whatever follows
+            t, hit = t.to(self.dtype), Hit(hit.t.to(self.dtype), *(g.to(self.dtype) if isinstance(g, Tensor) else g for g in hit[1:3]),
+                                           hit.found)
+            state = state.to(self.dtype)
+            o, d = ([c.to(self.dtype) if isinstance(c, Tensor) else c for c in v] for v in (o, d))
+        m.local, m.incoming, m.slopes, m.length = advanced(o, d, t), tuple(d), (hit.gx, hit.gy), t
+        found = hit.found
+        if prepared is None and not self._at_pupil(m):
+            covers = element.aperture.half_size == element.surface.half_size and not element.aperture.round
+            if not covers:
+                found = found & element.aperture.holds(*m.local[:2])
+        if prepared is None or state.sample is None:
+            kept = torch.where(found, state.power, torch.zeros_like(state.power))
+            state.lose("missed_surface", (state.power - kept).detach())
+            if self.track:
+                state.mark(~found & (state.power > 0) if k else ~found, Status.MISSED_SURFACE)
+            state.power = kept
+        state.origin = out_of(element.pose, m.local, state.datum)
+        state.path = state.path + m.n_in * t
+        m.state = state
+
+    def _interact(self, m: Meeting) -> Tensor:
+        """Change the directions, and give the power that goes on."""
+        state, element = m.state, m.element
+        polarised = None
+        if state.polarised is not None:
+            polarised = turned(element.pose, state.polarised)
+        found = self.backend.interact(m.incoming, m.slopes, m.arriving, eta=m.n_in / m.n_out, reflects=m.reflects,
+                                      fresnel=element.fresnel, polarised=polarised, side=m.side)
+        m.passes = found.passes
+        state.direction = turned_back(element.pose, found.direction)
+        if not m.reflects:
+            with torch.no_grad():
+                gone = m.arriving - found.power
+                everything = found.power.new_zeros(()) if bool(found.passes.all()) else torch.where(found.passes, 0.0, gone).sum(
+                    dtype=torch.float64)
+                state.lose("fresnel", gone.sum(dtype=torch.float64) - everything)
+                state.lose("total_internal_reflection", everything)
+            if self.track:
+                state.mark(~found.passes & (m.arriving > 0), Status.TOTAL_INTERNAL_REFLECTION)
+        if not any(isinstance(c, Tensor) for c in state.direction) and state.direction == (0.0, 0.0, 1.0):
+            return found.power
+        state.sample = None
+        return found.power
+
+    def _at_pupil(self, m: Meeting) -> bool:
+        """Whether the rays stand on this flat first element as they come from their source, which has left out all that miss it."""
+        e, pupil = m.element, self.system.pupil
+        return (m.index == 0 and m.forward and e.surface.flat and e.pose.upright and e.pose.position == (0.0, 0.0, pupil.z)
+                and e.aperture.half_size == pupil.half_size and e.aperture.round == pupil.round)
+
+    def _backed_up(self, o, d, state: RayState, element: Element, heights) -> tuple[tuple, RayState]:
+        """Rays of a pupil that the first surface reaches through, from before it."""
+        low = element.surface.hull(heights)[0]
+        back = max(0.0, float(torch.as_tensor(o[2]).max()) - low)
+        if back == 0.0:
+            return o, state
+        way = -back * (1.0 + 1e-9) / d[2]
+        moved = tuple(torch.as_tensor(c + way * v, dtype=torch.float64).expand(state.power.shape) for c, v in zip(o, d, strict=True))
+        return moved, replace(state, path=state.path + self.media[0].index_at(state.wavelength) * way)
+
+    def _prepared(self):
+        """How the rays of `start` meet the first free surface: a function of its heights to `Hit`s; None for the general way."""
+        if self.first == len(self.system.elements) or self.requests.off & {"intersection"}:
+            return None
+        element, start = self.system.elements[self.first], self.start
+        surface, pupil = element.surface, self.system.pupil
+        if not isinstance(surface, HeightField) or self.sides[self.first] < 0 or not element.pose.upright:
+            return None
+        if self.first == 0 and self.system.lit is None and start.sample is None:
+            return None
+        px, py, pz = element.pose.position
+        centred = (px, py) == (0.0, 0.0)
+        on_axis = start.sample is not None and start.direction == (0.0, 0.0, 1.0)
+        if on_axis and centred and surface.half_size == pupil.half_size:
+            evaluate = self.backend.spline_on(surface, start.sample, self.dtype)
+
+            def sampled(heights: Tensor) -> Hit:
+                sag, gx, gy = evaluate(surface.centred(heights)[0])
+                below = start.origin[2] - pz - float(heights.detach().double().mean()) - start.datum
+                return Hit(sag - below, gx, gy, torch.ones((), dtype=torch.bool, device=sag.device).expand(sag.shape))
+
+            return sampled
+        full = start.full((*start.origin, *start.direction))
+        origin = (full[0] - px, full[1] - py, full[2] + (start.datum - pz))
+        return self.backend.meet_fixed(surface, origin, full[3:], element.aperture.radius)
+
+    def _lowered(self, like: Tracer | None):
+        """The rest of the system as one fused kernel, a function of heights, screen and filter; None where it is none such."""
+        if self.first != len(self.system.elements) - 1 or self.actions or self.track or self.start.polarised is not None:
+            return None
+        element = self.system.elements[-1]
+        surface, start, m = element.surface, self.start, self.media
+        plain = (isinstance(surface, HeightField) and not element.reflects and element.pose == Pose() and self.sides[-1] > 0
+                 and element.aperture.half_size == surface.half_size and isinstance(start.origin[2], float)
+                 and self.system.pupil.half_size == surface.half_size and (self.system.lit is not None or self.first > 0))
+        if not plain:
+            return None
+        eta = m[-2].index_at(start.wavelength) / m[-1].index_at(start.wavelength)
+        before = None if like is None else like.fused
+        if start.sample is not None and start.direction == (0.0, 0.0, 1.0):
+            return self.backend.plane_image(surface, start, eta, element.fresnel, before)
+        return self.backend.ray_image(surface, start, eta, element.fresnel, element.aperture.radius, before)
+
+    def onto(self, state: RayState, screen: Screen | Placed) -> RayState:
+        """Rays straight on to a screen's plane; x and y of their origins are the screen's own coordinates, mm."""
+        if isinstance(screen, Placed):
+            axes, middle, shift = screen.pose.axes, screen.pose.position, screen.screen.shift
+        else:
+            axes = screen.axes if any(screen.tilt) else IDENTITY
+            shift = screen.shift
+            middle = (*shift, screen.z) if any(screen.tilt) else (0.0, 0.0, screen.z)
+        point = (middle[0], middle[1], middle[2] - state.datum)
+        along = sum(a * b for a, b in zip(self.system.axis, axes[2], strict=True))
+        x, y, on_way = self.backend.land(state.origin, state.direction, point, axes, 1.0 if along >= 0 else -1.0)
+        if isinstance(screen, Screen) and any(screen.tilt):
+            x, y = x + shift[0], y + shift[1]
+        weight = torch.where(on_way, state.power, torch.zeros_like(state.power))
+        out = replace(state, origin=(x, y, 0.0), power=weight, lost=dict(state.lost), leaving=state.power.sum(dtype=torch.float64))
+        out.lose("off_screen", (state.power - weight).detach())
+        if self.track:
+            out.mark(~on_way, Status.AWAY_FROM_SCREEN)
+        return out
+
+
+def into(pose: Pose, origin, direction, datum: float) -> tuple[tuple, tuple]:
+    """Origins and directions in an element's frame."""
+    px, py, pz = pose.position
+    moved = (_less(origin[0], px), _less(origin[1], py), _less(origin[2], pz - datum))
+    return turned(pose, moved), turned(pose, direction)
+
+
+def out_of(pose: Pose, point, datum: float) -> tuple:
+    """Points of an element's frame in that of the system."""
+    px, py, pz = pose.position
+    x, y, z = turned_back(pose, point)
+    return _less(x, -px), _less(y, -py), _less(z, datum - pz)
+
+
+def turned(pose: Pose, vector) -> tuple:
+    """A vector in an element's frame."""
+    if pose.upright:
+        return tuple(vector)
+    return tuple(sum(c * a for c, a in zip(vector, axis, strict=True)) for axis in pose.axes)
+
+
+def turned_back(pose: Pose, vector) -> tuple:
+    """A vector of an element's frame in that of the system."""
+    if pose.upright:
+        return tuple(vector)
+    return tuple(sum(c * axis[k] for c, axis in zip(vector, pose.axes, strict=True)) for k in range(3))
+
+
+def advanced(origin, direction, t: Tensor) -> tuple:
+    """o + t d; where d is a plain 0, o itself."""
+    return tuple(o if isinstance(d, float) and d == 0.0 else o + (t if isinstance(d, float) and d == 1.0 else t * d)
+                 for o, d in zip(origin, direction, strict=True))
+
+
+def _less(value, shift: float):
+    return value if shift == 0.0 else value - shift
+
+
+def trace(system: System, rays: Sample | RayState, parameters: Parameters, **options) -> list[RayState]:
+    """Rays behind the last element of a system: those that went straight on, then those of detours.  options: of a `Tracer`."""
+    return Tracer(system, rays, **options)(parameters)
+
+
+def tracers(scene: Scene, field: HeightField, sampler: Rays, dtype: torch.dtype, chunk: int, requests: Requests = NO_REQUESTS,
+            part: tuple[int, int] = (0, 1), **options) -> Iterator[Tracer]:
+    """Tracers of all rays of a sampler through a one-lens scene, chunk by chunk; of several bands, one after the other.
+
+    part: (k, n) takes every n-th chunk from number k on, what one of n processes traces.
+    """
+    bands = scene.bands
+    for band in bands:
+        system, traced = System.of(band.scene, field), None
+        for rays in sampler.chunks(chunk, *part):
+            traced = Tracer(system, rays, dtype, requests, traced, weight=band.weight, channel=band.channel, **options)
+            yield traced
+
+
+def expose(scene: Scene, field: HeightField, heights: Tensor, sampler: Rays, filter: Filter | None = None,
+           dtype: torch.dtype = torch.float64, screen: Screen | None = None, chunk: int = 1 << 19,
+           requests: Requests = NO_REQUESTS) -> Image:
+    """Trace all rays of a sampler and collect them: the value of the one function every command asks about.
+
+    Chunks are accumulated in float64, so neither memory nor rounding grows with the number of rays.  Where memory runs out,
+    smaller ones are tried.
+
+    Raises:
+        InputError: the lens reaches the screen.
+        CausticError: out of memory.
+    """
+    screen, filter = screen or scene.screen, filter or Filter()
+    heights = heights.detach().to(sampler.device, torch.float64)
+    check_room(scene, heights, screen)
+    shape = (3, *screen.resolution) if scene.colored else screen.resolution
+
+    def traced_by(size: int) -> Image:
+        image = torch.zeros(shape, dtype=torch.float64, device=sampler.device)
+        lost, leaving = dict.fromkeys(LOSSES, 0.0), 0.0
+        with torch.no_grad():
+            for traced in tracers(scene, field, sampler, dtype, size, requests):
+                part = traced.expose({EXIT: heights}, screen, filter)
+                image += part.image
+                leaving += float(part.leaving.sum())
+                for name, value in part.lost.items():
+                    lost[name] += float(value)
+        return Image(image, leaving, lost, sampler.count)
+
+    return with_less(traced_by, chunk)
+
+
+def check_room(scene: Scene, heights: Tensor, screen: Screen) -> None:
+    """Refuse a screen that the surface reaches, the corners of a tilted one included.
+
+    Raises:
+        InputError: saying how far the surface reaches.
+    """
+    lean = f" and its tilt takes it {screen.depth:.4g} mm nearer" if screen.depth else ""
+    if scene.lens.mirror:
+        if float(heights.min()) <= screen.z + screen.depth:
+            raise InputError(f"[screen] z must lie before the mirror, whose surface reaches {float(heights.min()):.6g} mm,"
+                             f" got {screen.z:g} mm{lean}")
+    elif float(heights.max()) >= screen.z - screen.depth:
+        raise InputError(f"[screen] z must lie behind the lens, whose surface reaches {float(heights.max()):.6g} mm,"
+                         f" got {screen.z:g} mm{lean}")
