@@ -50,7 +50,7 @@ class _Contraction(torch.autograd.Function):
 
     @staticmethod
     def jvp(ctx, tangent, _):
-        return _Contraction.forward(tangent, ctx.along)
+        return _Contraction.apply(tangent.detach(), ctx.along)  # within torch.func numbers are within reach only so
 
 
 @njit(parallel=True, **_OPTIONS)

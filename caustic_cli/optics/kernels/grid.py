@@ -1,0 +1,94 @@
+"""The height field on a grid of points: heights -> z and its slopes, with kernels, adjoint and tangent.
+
+The fused form of `heightfield.HeightField.prepare` for a tensor product of points: the net is contracted along v once, and each
+row of points then combines p + 1 rows of it, where a product with the whole collocation matrix would take all.
+
+Notation
+    P           heights (n, m) mm;  B_u, B_v the basis values at the points u (a,) and v (b,)
+    Q, Q_y      P B_v^T and P B_v'^T / (2 r_y), (n, b)
+    z, zx, zy   B_u Q, B_u' Q / (2 r_x), B_u Q_y, each (a, b)
+
+by_v is the derivative of whatever is differentiated by v.  Numba caches the kernels by this file's time stamp alone: after editing
+rows.py, touch it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numba import njit, prange
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from caustic_cli.optics.bspline import SplineSpace
+from caustic_cli.optics.kernels import blocks
+from caustic_cli.optics.kernels.banded import AlongV
+from caustic_cli.optics.kernels.rows import combine, spread
+from caustic_cli.optics.kernels.shares import OPTIONS
+
+
+class GridSurface:
+    """What does not depend on the heights.
+
+    Args:
+        spaces, half_size: of the height field; half widths in mm.
+        u, v: (a,), (b,) parameters of the points, which are all pairs of them.
+    """
+
+    def __init__(self, spaces: tuple[SplineSpace, SplineSpace], half_size: tuple[float, float], u: Tensor, v: Tensor):
+        (su, sv), (rx, ry) = spaces, half_size
+        first, bu = su.basis(u)
+        du = su.basis(u, 1)[1] / (2.0 * rx)
+        self.rows = (first.numpy(), bu.double().contiguous().numpy(), du.double().contiguous().numpy())
+        self.along_v = AlongV(sv, v, 1.0 / (2.0 * ry), torch.float64)
+
+    def __call__(self, heights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Heights (n, m) mm float64 -> z mm, dz/dx, dz/dy, each (a b,) float64, linear in the heights."""
+        return _Rows.apply(*self.along_v(heights), self.rows)
+
+
+@njit(parallel=True, **OPTIONS)
+def _combine(net, net_y, first, bu, du, z, zx, zy, blocks):
+    """z and slopes (a, b)."""
+    for block in prange(blocks):
+        for i in range(block * len(z) // blocks, (block + 1) * len(z) // blocks):
+            combine(i, first, bu, du, net, net, net_y, z[i], zx[i], zy[i])
+
+
+@njit(parallel=True, **OPTIONS)
+def _spread(by_z, by_zx, by_zy, first, bu, du, nets):
+    """Adjoint of `_combine`: derivatives by both nets; nets (3, blocks, n, b) are overwritten, and added in order."""
+    rows, blocks = len(by_z), nets.shape[1]
+    for block in prange(blocks):
+        nets[:, block] = 0.0
+        for i in range(block * rows // blocks, (block + 1) * rows // blocks):
+            spread(i, first, bu, du, by_z[i], by_zx[i], by_zy[i], nets[:, block], False)
+    for block in range(1, blocks):
+        nets[:, 0] += nets[:, block]
+
+
+class _Rows(torch.autograd.Function):
+    """Q, Q_y and the rows' basis values -> z and slopes, (a b,)."""
+
+    @staticmethod
+    def forward(net: Tensor, net_y: Tensor, rows: tuple):
+        shape = len(rows[0]), net.shape[1]
+        out = [torch.empty(shape[0] * shape[1], dtype=torch.float64) for _ in range(3)]
+        nets = (t.detach().contiguous().numpy() for t in (net, net_y))
+        _combine(*nets, *rows, *(t.numpy().reshape(shape) for t in out), blocks())
+        return tuple(out)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        ctx.shape, ctx.rows = inputs[0].shape, inputs[2]
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *by):
+        nets, shape = np.empty((3, blocks(), *ctx.shape)), (len(ctx.rows[0]), ctx.shape[1])
+        _spread(*(b.contiguous().numpy().reshape(shape) for b in by), *ctx.rows, nets)
+        return torch.from_numpy(nets[0, 0]), torch.from_numpy(nets[2, 0]), None
+
+    @staticmethod
+    def jvp(ctx, net, net_y, _):
+        return _Rows.apply(net.detach(), net_y.detach(), ctx.rows)  # within torch.func numbers are within reach only so

@@ -1,0 +1,201 @@
+"""The stage from a surface on to a plane: the landing points of straight rays, with kernels, adjoint and tangent.
+
+Rays are float64 components, see `stage`; the reference is the last step of `stepwise.StepTracer`.
+
+Notation, a ray from o in direction d, a plane through p with unit vectors a (along), b (up) and n (normal)
+    v       d . n; the ray arrives where forward v > PARALLEL, forward being 1, or -1 for light that comes back from a mirror
+    k       (p - o) . n / v, length of the path; the ray is on its way where it arrives and k > 0, and k is 0 where it is not
+    r       (o - p) + k d
+    x, y    r . a and r . b
+
+by_v is the derivative of whatever is differentiated by v, and d_v the derivative of v along a direction.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numba import njit, prange
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from caustic_cli.optics.kernels import blocks
+from caustic_cli.optics.kernels.shares import OPTIONS
+from caustic_cli.optics.kernels.stage import BATCH, components, given, keep, kept, load, new, store, tangent, wanted
+from caustic_cli.optics.tolerances import PARALLEL
+
+OX, OY, OZ, DX, DY, DZ, K, OVER, ON_WAY, X, Y, BY_OX, BY_OY, BY_OZ, BY_DX, BY_DY, BY_DZ, ROWS = range(18)
+
+Vector = tuple[float, float, float]
+
+
+class Plane(NamedTuple):
+    """Where the kernels take rays to: p, a, b and n by components, and `forward`."""
+
+    px: float
+    py: float
+    pz: float
+    ax: float
+    ay: float
+    az: float
+    bx: float
+    by: float
+    bz: float
+    nx: float
+    ny: float
+    nz: float
+    forward: float
+
+
+def land(origin, direction, point: Vector, axes: tuple[Vector, Vector, Vector], forward: float):
+    """Where rays meet a plane.
+
+    Args:
+        origin, direction: by components, each a tensor (N,) float64 or a number for all rays, at least one of them a tensor.
+        point: of the plane, where its coordinates are 0.
+        axes: unit vectors along its x and y, and its normal.
+        forward: 1 for rays that arrive with d . normal > 0, -1 for those that arrive against it.
+
+    Returns:
+        x, y: (N,) in the plane; of rays that are not on their way to it those of their origin, and meaningless.
+        on_way: (N,) bool.
+    """
+    plane = Plane(*(float(c) for vector in (point, *axes) for c in vector), float(forward))
+    return _Landing.apply(*origin, *direction, plane)
+
+
+@njit(inline="always", **OPTIONS)
+def _path(ray, start, count, plane, v):
+    """k, 1 / v, and 1 or 0 for whether the ray is on its way, into a batch's scratch."""
+    for i in range(6):
+        load(ray[i], start, count, v[i])
+    px, py, pz, nx, ny, nz, forward = plane.px, plane.py, plane.pz, plane.nx, plane.ny, plane.nz, plane.forward
+    for j in range(count):
+        speed = v[DX, j] * nx + v[DY, j] * ny + v[DZ, j] * nz
+        away = (px - v[OX, j]) * nx + (py - v[OY, j]) * ny + (pz - v[OZ, j]) * nz
+        arrives = forward * speed > PARALLEL
+        over = 1.0 / (speed if arrives else 1.0)
+        k = away * over
+        on_way = arrives & (k > 0.0)
+        v[K, j], v[OVER, j], v[ON_WAY, j] = k if on_way else 0.0, over, 1.0 if on_way else 0.0
+
+
+@njit(**OPTIONS)
+def _land_some(begin, end, ray, plane, x, y, on_way):
+    v, (px, py, pz, ax, ay, az, bx, by, bz, _, _, _, _) = np.empty((ROWS, BATCH)), plane
+    for start in range(begin, end, BATCH):
+        count = min(BATCH, end - start)
+        _path(ray, start, count, plane, v)
+        for j in range(count):
+            k = v[K, j]
+            rx, ry, rz = (v[OX, j] - px) + k * v[DX, j], (v[OY, j] - py) + k * v[DY, j], (v[OZ, j] - pz) + k * v[DZ, j]
+            v[X, j], v[Y, j] = rx * ax + ry * ay + rz * az, rx * bx + ry * by + rz * bz
+        store(v[X], start, count, x)
+        store(v[Y], start, count, y)
+        batch = on_way[start : start + count]
+        for j in range(count):
+            batch[j] = v[ON_WAY, j] > 0.0
+
+
+@njit(parallel=True, **OPTIONS)
+def _land(ray, plane, x, y, on_way, blocks):
+    """x, y and on_way (N,), from ray: o and d, six components."""
+    count = len(x)
+    for block in prange(blocks):
+        _land_some(block * count // blocks, (block + 1) * count // blocks, ray, plane, x, y, on_way)
+
+
+@njit(**OPTIONS)
+def _pull_some(begin, end, ray, plane, given, out):
+    v, (_, _, _, ax, ay, az, bx, by, bz, nx, ny, nz, _) = np.empty((ROWS, BATCH)), plane
+    for start in range(begin, end, BATCH):
+        count = min(BATCH, end - start)
+        _path(ray, start, count, plane, v)
+        load(given[0], start, count, v[X])
+        load(given[1], start, count, v[Y])
+        for j in range(count):
+            k, x, y = v[K, j], v[X, j], v[Y, j]
+            # x and y
+            rx, ry, rz = x * ax + y * bx, x * ay + y * by, x * az + y * bz
+            # r
+            by_k = rx * v[DX, j] + ry * v[DY, j] + rz * v[DZ, j]
+            # k
+            by_away = by_k * v[OVER, j] if v[ON_WAY, j] > 0.0 else 0.0
+            v[BY_OX, j], v[BY_OY, j], v[BY_OZ, j] = rx - by_away * nx, ry - by_away * ny, rz - by_away * nz
+            v[BY_DX, j], v[BY_DY, j], v[BY_DZ, j] = k * v[BY_OX, j], k * v[BY_OY, j], k * v[BY_OZ, j]
+        for i in range(6):
+            store(v[BY_OX + i], start, count, out[i])
+
+
+@njit(parallel=True, **OPTIONS)
+def _land_adjoint(ray, plane, given, out, count, blocks):
+    """Derivatives by the ray's components into `out`, from those by x and y."""
+    for block in prange(blocks):
+        _pull_some(block * count // blocks, (block + 1) * count // blocks, ray, plane, given, out)
+
+
+@njit(**OPTIONS)
+def _push_some(begin, end, ray, plane, along, out):
+    v, (_, _, _, ax, ay, az, bx, by, bz, nx, ny, nz, _) = np.empty((ROWS, BATCH)), plane
+    for start in range(begin, end, BATCH):
+        count = min(BATCH, end - start)
+        _path(ray, start, count, plane, v)
+        for i in range(6):
+            load(along[i], start, count, v[BY_OX + i])
+        for j in range(count):
+            k = v[K, j]
+            # the hit moves as the point at a fixed k does, and along d back into the plane
+            rx, ry, rz = v[BY_OX, j] + k * v[BY_DX, j], v[BY_OY, j] + k * v[BY_DY, j], v[BY_OZ, j] + k * v[BY_DZ, j]
+            d_k = -(rx * nx + ry * ny + rz * nz) * v[OVER, j] * v[ON_WAY, j]
+            rx, ry, rz = rx + d_k * v[DX, j], ry + d_k * v[DY, j], rz + d_k * v[DZ, j]
+            v[X, j], v[Y, j] = rx * ax + ry * ay + rz * az, rx * bx + ry * by + rz * bz
+        store(v[X], start, count, out[0])
+        store(v[Y], start, count, out[1])
+
+
+@njit(parallel=True, **OPTIONS)
+def _land_tangent(ray, plane, along, out, count, blocks):
+    """Derivatives of x and y into `out` along `along`, six components."""
+    for block in prange(blocks):
+        _push_some(block * count // blocks, (block + 1) * count // blocks, ray, plane, along, out)
+
+
+class _Landing(torch.autograd.Function):
+    """o and d by components, and the plane -> x, y and whether the ray is on its way."""
+
+    @staticmethod
+    def forward(ox, oy, oz, dx, dy, dz, plane: Plane):
+        ray = (ox, oy, oz, dx, dy, dz)
+        count = _count(ray)
+        (x, y), on_way = new(2, count), np.empty(count, np.bool_)
+        _land(components(ray), plane, x, y, on_way, blocks())
+        return tuple(torch.from_numpy(a) for a in (x, y, on_way))
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        *ray, ctx.plane = inputs
+        ctx.count = _count(ray)
+        keep(ctx, ray)
+        ctx.mark_non_differentiable(output[2])
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, by_x, by_y, _):
+        out = wanted(ctx, 6, ctx.count)
+        _land_adjoint(components(kept(ctx)), ctx.plane, components((by_x, by_y)), out, ctx.count, blocks())
+        return *given(ctx, out), None
+
+    @staticmethod
+    def jvp(ctx, *along):
+        def push(ray, along):
+            out = new(2, ctx.count)
+            _land_tangent(ray, ctx.plane, along, out, ctx.count, blocks())
+            return out
+
+        return *tangent(ctx, along, push), None
+
+
+def _count(ray) -> int:
+    return next(len(c) for c in ray if isinstance(c, Tensor))

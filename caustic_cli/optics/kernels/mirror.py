@@ -1,0 +1,107 @@
+"""CPU kernels for light reflected at a smooth surface, with adjoint and tangent.
+
+Rays are float64 components, see `stage`; the reference is `interface.reflect`.
+
+Notation, a ray with unit direction d and slopes g of the surface at its hit; N = (-g_x, -g_y, 1)
+    h       1 / |N|^2
+    m       2 (d . N) h
+    t       d - m N, the same from both sides of the surface
+
+by_v is the derivative of whatever is differentiated by v, and d_v the derivative of v along a direction.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+from caustic_cli.optics.kernels.shares import OPTIONS
+from caustic_cli.optics.kernels.stage import BATCH, load, store
+
+DX, DY, DZ, GX, GY, BY_TX, BY_TY, BY_TZ, BY_DX, BY_DY, BY_DZ, BY_GX, BY_GY, ROWS = range(14)
+
+
+@njit(inline="always", **OPTIONS)
+def _m(v, j):
+    """h and m of ray j."""
+    gx, gy = v[GX, j], v[GY, j]
+    h = 1.0 / (1.0 + gx * gx + gy * gy)
+    return h, 2.0 * (v[DZ, j] - v[DX, j] * gx - v[DY, j] * gy) * h
+
+
+@njit(**OPTIONS)
+def _reflect_some(begin, end, ray, t):
+    v = np.empty((ROWS, BATCH))
+    for start in range(begin, end, BATCH):
+        count = min(BATCH, end - start)
+        for i in range(5):
+            load(ray[i], start, count, v[i])
+        for j in range(count):
+            _, m = _m(v, j)
+            v[BY_TX, j], v[BY_TY, j], v[BY_TZ, j] = v[DX, j] + m * v[GX, j], v[DY, j] + m * v[GY, j], v[DZ, j] - m
+        for i in range(3):
+            store(v[BY_TX + i], start, count, t[i])
+
+
+@njit(parallel=True, **OPTIONS)
+def reflect(ray, t, blocks):
+    """Directions t, three components, from ray: d and g, five components."""
+    count = len(t[0])
+    for block in prange(blocks):
+        _reflect_some(block * count // blocks, (block + 1) * count // blocks, ray, t)
+
+
+@njit(**OPTIONS)
+def _pull_some(begin, end, ray, given, out):
+    v = np.empty((ROWS, BATCH))
+    for start in range(begin, end, BATCH):
+        count = min(BATCH, end - start)
+        for i in range(5):
+            load(ray[i], start, count, v[i])
+        for i in range(3):
+            load(given[i], start, count, v[BY_TX + i])
+        for j in range(count):
+            (h, m), gx, gy, tx, ty = _m(v, j), v[GX, j], v[GY, j], v[BY_TX, j], v[BY_TY, j]
+            # t
+            by_m = gx * tx + gy * ty - v[BY_TZ, j]
+            # m
+            by_c, by_norm2 = 2.0 * h * by_m, -m * h * by_m
+            # d . N and |N|^2
+            v[BY_DX, j], v[BY_DY, j], v[BY_DZ, j] = tx - by_c * gx, ty - by_c * gy, v[BY_TZ, j] + by_c
+            v[BY_GX, j] = m * tx - by_c * v[DX, j] + 2.0 * gx * by_norm2
+            v[BY_GY, j] = m * ty - by_c * v[DY, j] + 2.0 * gy * by_norm2
+        for i in range(5):
+            store(v[BY_DX + i], start, count, out[i])
+
+
+@njit(parallel=True, **OPTIONS)
+def reflect_adjoint(ray, given, out, count, blocks):
+    """Derivatives by the ray's components into `out`, from those by t, three components."""
+    for block in prange(blocks):
+        _pull_some(block * count // blocks, (block + 1) * count // blocks, ray, given, out)
+
+
+@njit(**OPTIONS)
+def _push_some(begin, end, ray, along, out):
+    v = np.empty((ROWS, BATCH))
+    for start in range(begin, end, BATCH):
+        count = min(BATCH, end - start)
+        for i in range(5):
+            load(ray[i], start, count, v[i])
+            load(along[i], start, count, v[BY_DX + i])
+        for j in range(count):
+            (h, m), gx, gy, ux, uy = _m(v, j), v[GX, j], v[GY, j], v[BY_GX, j], v[BY_GY, j]
+            d_c = v[BY_DZ, j] - v[BY_DX, j] * gx - v[BY_DY, j] * gy - v[DX, j] * ux - v[DY, j] * uy
+            d_m = 2.0 * h * (d_c - m * (gx * ux + gy * uy))
+            v[BY_TX, j] = v[BY_DX, j] + d_m * gx + m * ux
+            v[BY_TY, j] = v[BY_DY, j] + d_m * gy + m * uy
+            v[BY_TZ, j] = v[BY_DZ, j] - d_m
+        for i in range(3):
+            store(v[BY_TX + i], start, count, out[i])
+
+
+@njit(parallel=True, **OPTIONS)
+def reflect_tangent(ray, along, out, count, blocks):
+    """Derivatives of t into `out` along `along`, five components."""
+    for block in prange(blocks):
+        _push_some(block * count // blocks, (block + 1) * count // blocks, ray, along, out)

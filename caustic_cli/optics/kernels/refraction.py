@@ -1,0 +1,273 @@
+"""CPU kernels for light that passes a smooth surface: Snell's law and Fresnel's, with adjoint and tangent.
+
+Rays are float64 components, see `stage`; the reference is `interface` with `polarisation.part_s`.  A ray may run along the
+surface's normal or, with d . N < 0, against it: the law knows no sides, so such a ray is refracted with -N for N.
+
+Notation, a ray with unit direction d, power P, and slopes g of the surface at its hit; N = (-g_x, -g_y, 1), eta = n_in / n_out
+    sigma   1 where d . N >= 0, else -1;  sigma N is the normal along which light passes
+    c       sigma (d . N) >= 0
+    s       sqrt(|N|^2 + eta^2 (c^2 - |N|^2)), the same product behind; 1, without derivatives, where light is totally reflected
+    gamma   sigma (1 - eta^2) / (s + eta c)
+    t       eta d + gamma N, the direction behind
+    w, q    d x N and |w|^2;  a = E . w for the field's unit vector E
+    f       a^2 / q, the s-polarised part; 1/2 in normal incidence and for light without polarisation
+    R       f R_s + (1 - f) R_p with R_s = ((eta c - s) / (eta c + s))^2, R_p = ((c - eta s) / (c + eta s))^2 (exact), or
+            R_0 + (1 - R_0) (1 - k)^5 with k = s / |N| if eta > 1, else c / |N| (schlick)
+    P'      P (1 - R); 0 where light is totally reflected
+
+by_v is the derivative of whatever is differentiated by v, and d_v the derivative of v along a direction.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit, prange
+
+from caustic_cli.optics.kernels.bend import EXACT, SCHLICK
+from caustic_cli.optics.kernels.shares import OPTIONS
+from caustic_cli.optics.kernels.stage import BATCH, load, store
+from caustic_cli.optics.polarisation import NORMAL
+from caustic_cli.optics.tolerances import CRITICAL
+
+# Rows of a batch's scratch: the ray, what its refraction is made of, R and its derivatives, the derivatives that come and go.
+DX, DY, DZ, GX, GY, P, EX, EY, EZ = range(9)
+NORM2, C, SIDE, S, PASSES, F, R, R_C, R_S, R_NORM2, R_F = range(9, 20)
+BY_TX, BY_TY, BY_TZ, BY_AFTER, BY_F, BY_DX, BY_DY, BY_DZ, BY_GX, BY_GY, BY_P, BY_EX, BY_EY, BY_EZ, ROWS = range(20, 35)
+
+
+class Interface(NamedTuple):
+    """What the kernels know of a surface: n_in / n_out, kind of Fresnel losses, whether they heed the field's direction."""
+
+    eta: float
+    fresnel: int
+    polarised: bool
+
+
+@njit(inline="always", **OPTIONS)
+def _load(ray, start, count, v):
+    for i in range(9):
+        load(ray[i], start, count, v[i])
+
+
+@njit(inline="always", **OPTIONS)
+def _snell(v, count, eta):
+    """|N|^2, c, sigma, s, and 1 or 0 for whether light passes."""
+    for j in range(count):
+        gx, gy = v[GX, j], v[GY, j]
+        norm2 = 1.0 + gx * gx + gy * gy
+        along = v[DZ, j] - v[DX, j] * gx - v[DY, j] * gy
+        c = abs(along)
+        radicand = norm2 + (eta * eta) * (c * c - norm2)
+        passes = radicand > CRITICAL * norm2
+        v[NORM2, j], v[C, j], v[SIDE, j] = norm2, c, 1.0 if along >= 0.0 else -1.0
+        v[S, j], v[PASSES, j] = math.sqrt(radicand if passes else 1.0), 1.0 if passes else 0.0
+
+
+@njit(inline="always", **OPTIONS)
+def _across(v, j):
+    """w, a and q of ray j."""
+    dx, dy, dz, gx, gy = v[DX, j], v[DY, j], v[DZ, j], v[GX, j], v[GY, j]
+    wx, wy, wz = dy + dz * gy, -dz * gx - dx, dy * gx - dx * gy
+    return wx, wy, wz, v[EX, j] * wx + v[EY, j] * wy + v[EZ, j] * wz, wx * wx + wy * wy + wz * wz
+
+
+@njit(inline="always", **OPTIONS)
+def _part(v, count, polarised):
+    """f."""
+    for j in range(count):
+        v[F, j] = 0.5
+    if polarised:
+        for j in range(count):
+            _, _, _, a, q = _across(v, j)
+            v[F, j] = a * a / max(q, NORMAL) if q > NORMAL else 0.5
+
+
+@njit(inline="always", **OPTIONS)
+def _reflectance(v, count, eta, fresnel):
+    """R and its derivatives by c, s, |N|^2 and f."""
+    if fresnel == EXACT:
+        for j in range(count):
+            c, s, f = v[C, j], v[S, j], v[F, j]
+            us, up = 1.0 / (eta * c + s), 1.0 / (c + eta * s)
+            rs, rp = (eta * c - s) * us, (c - eta * s) * up
+            by_ratio = 4.0 * eta * (f * rs * us * us + (1.0 - f) * rp * up * up)
+            v[R, j], v[R_F, j] = f * rs * rs + (1.0 - f) * rp * rp, rs * rs - rp * rp
+            v[R_C, j], v[R_S, j], v[R_NORM2, j] = by_ratio * s, -by_ratio * c, 0.0
+    elif fresnel == SCHLICK:
+        r0, front = ((eta - 1.0) / (eta + 1.0)) ** 2, 0.0 if eta > 1.0 else 1.0
+        for j in range(count):
+            over = 1.0 / math.sqrt(v[NORM2, j])
+            k = (front * v[C, j] + (1.0 - front) * v[S, j]) * over
+            x = 1.0 - k
+            x4 = x * x * x * x
+            by_k = -5.0 * (1.0 - r0) * x4
+            v[R, j], v[R_F, j] = r0 + (1.0 - r0) * x4 * x, 0.0
+            v[R_C, j], v[R_S, j], v[R_NORM2, j] = front * by_k * over, (1.0 - front) * by_k * over, -0.5 * by_k * k * over * over
+    else:
+        for j in range(count):
+            v[R, j], v[R_C, j], v[R_S, j], v[R_NORM2, j], v[R_F, j] = 0.0, 0.0, 0.0, 0.0, 0.0
+
+
+@njit(inline="always", **OPTIONS)
+def _prepare(v, count, surface):
+    _snell(v, count, surface.eta)
+    _part(v, count, surface.polarised)
+    _reflectance(v, count, surface.eta, surface.fresnel)
+
+
+@njit(**OPTIONS)
+def _refract_some(begin, end, ray, surface, t, after, passes):
+    v, eta = np.empty((ROWS, BATCH)), surface.eta
+    for start in range(begin, end, BATCH):
+        count = min(BATCH, end - start)
+        _load(ray, start, count, v)
+        _prepare(v, count, surface)
+        for j in range(count):
+            gamma = v[SIDE, j] * (1.0 - eta) * (1.0 + eta) / (v[S, j] + eta * v[C, j])
+            v[BY_TX, j] = eta * v[DX, j] - gamma * v[GX, j]
+            v[BY_TY, j] = eta * v[DY, j] - gamma * v[GY, j]
+            v[BY_TZ, j] = eta * v[DZ, j] + gamma
+            v[BY_AFTER, j] = v[P, j] * (1.0 - v[R, j]) if v[PASSES, j] > 0.0 else 0.0
+        for i in range(3):
+            store(v[BY_TX + i], start, count, t[i])
+        store(v[BY_AFTER], start, count, after)
+        batch = passes[start : start + count]
+        for j in range(count):
+            batch[j] = v[PASSES, j] > 0.0
+
+
+@njit(parallel=True, **OPTIONS)
+def refract(ray, surface, t, after, passes, blocks):
+    """Directions t, powers `after` and whether light passes (N,), from ray: d, g, P and E, nine components."""
+    count = len(after)
+    for block in prange(blocks):
+        _refract_some(block * count // blocks, (block + 1) * count // blocks, ray, surface, t, after, passes)
+
+
+@njit(inline="always", **OPTIONS)
+def _pull(v, count, eta):
+    """Adjoint but for f, whose derivative is left in BY_F."""
+    for j in range(count):
+        passes, side, c, s, gx, gy = v[PASSES, j], v[SIDE, j], v[C, j], v[S, j], v[GX, j], v[GY, j]
+        tx, ty, tz, by_after = v[BY_TX, j], v[BY_TY, j], v[BY_TZ, j], passes * v[BY_AFTER, j]
+        # P'
+        by_r = -v[P, j] * by_after
+        v[BY_P, j] = (1.0 - v[R, j]) * by_after
+        # R
+        v[BY_F, j], by_c, by_s, by_norm2 = by_r * v[R_F, j], by_r * v[R_C, j], by_r * v[R_S, j], by_r * v[R_NORM2, j]
+        # t
+        under = 1.0 / (s + eta * c)
+        gamma = side * (1.0 - eta) * (1.0 + eta) * under
+        by_gamma = tz - gx * tx - gy * ty
+        # gamma
+        by_s -= gamma * by_gamma * under
+        by_c -= eta * gamma * by_gamma * under
+        # s
+        by_radicand = 0.5 * passes * by_s / s
+        by_norm2 += by_radicand * (1.0 - eta) * (1.0 + eta)
+        by_c += by_radicand * 2.0 * eta * eta * c
+        # c and |N|^2
+        by_c *= side
+        v[BY_DX, j] = eta * tx - by_c * gx
+        v[BY_DY, j] = eta * ty - by_c * gy
+        v[BY_DZ, j] = eta * tz + by_c
+        v[BY_GX, j] = 2.0 * gx * by_norm2 - by_c * v[DX, j] - gamma * tx
+        v[BY_GY, j] = 2.0 * gy * by_norm2 - by_c * v[DY, j] - gamma * ty
+
+
+@njit(inline="always", **OPTIONS)
+def _pull_part(v, count):
+    """Adjoint of f."""
+    for j in range(count):
+        wx, wy, wz, a, q = _across(v, j)
+        over = 1.0 / max(q, NORMAL)
+        # f
+        by_a = 2.0 * a * over * v[BY_F, j] if q > NORMAL else 0.0
+        by_q = -0.5 * by_a * a * over
+        # a and q
+        v[BY_EX, j], v[BY_EY, j], v[BY_EZ, j] = by_a * wx, by_a * wy, by_a * wz
+        bx, by, bz = by_a * v[EX, j] + 2.0 * by_q * wx, by_a * v[EY, j] + 2.0 * by_q * wy, by_a * v[EZ, j] + 2.0 * by_q * wz
+        # w
+        v[BY_DX, j] -= by + v[GY, j] * bz
+        v[BY_DY, j] += bx + v[GX, j] * bz
+        v[BY_DZ, j] += v[GY, j] * bx - v[GX, j] * by
+        v[BY_GX, j] += v[DY, j] * bz - v[DZ, j] * by
+        v[BY_GY, j] += v[DZ, j] * bx - v[DX, j] * bz
+
+
+@njit(**OPTIONS)
+def _pull_some(begin, end, ray, surface, given, out):
+    v = np.empty((ROWS, BATCH))
+    for start in range(begin, end, BATCH):
+        count = min(BATCH, end - start)
+        _load(ray, start, count, v)
+        for i in range(4):
+            load(given[i], start, count, v[BY_TX + i])
+        _prepare(v, count, surface)
+        _pull(v, count, surface.eta)
+        if surface.polarised:
+            _pull_part(v, count)
+        for i in range(9):
+            store(v[BY_DX + i], start, count, out[i])
+
+
+@njit(parallel=True, **OPTIONS)
+def refract_adjoint(ray, surface, given, out, count, blocks):
+    """Derivatives by the ray's components into `out`, from those by t and P', four components."""
+    for block in prange(blocks):
+        _pull_some(block * count // blocks, (block + 1) * count // blocks, ray, surface, given, out)
+
+
+@njit(inline="always", **OPTIONS)
+def _push(v, count, eta, polarised):
+    """Tangents of t and P', left in their rows, from those of the ray, in the rows of its derivatives."""
+    if polarised:
+        for j in range(count):
+            dx, dy, dz, gx, gy = v[BY_DX, j], v[BY_DY, j], v[BY_DZ, j], v[BY_GX, j], v[BY_GY, j]
+            wx, wy, wz, a, q = _across(v, j)
+            ux, uy = dy + dz * v[GY, j] + v[DZ, j] * gy, -dz * v[GX, j] - v[DZ, j] * gx - dx
+            uz = dy * v[GX, j] + v[DY, j] * gx - dx * v[GY, j] - v[DX, j] * gy
+            d_a = v[BY_EX, j] * wx + v[BY_EY, j] * wy + v[BY_EZ, j] * wz + v[EX, j] * ux + v[EY, j] * uy + v[EZ, j] * uz
+            over = 1.0 / max(q, NORMAL)
+            v[BY_F, j] = 2.0 * a * over * (d_a - a * over * (wx * ux + wy * uy + wz * uz)) if q > NORMAL else 0.0
+    else:
+        for j in range(count):
+            v[BY_F, j] = 0.0
+    for j in range(count):
+        passes, side, c, s, gx, gy = v[PASSES, j], v[SIDE, j], v[C, j], v[S, j], v[GX, j], v[GY, j]
+        dx, dy, dz, tx, ty = v[BY_DX, j], v[BY_DY, j], v[BY_DZ, j], v[BY_GX, j], v[BY_GY, j]
+        d_norm2 = 2.0 * (gx * tx + gy * ty)
+        d_c = side * (dz - dx * gx - dy * gy - v[DX, j] * tx - v[DY, j] * ty)
+        d_s = passes * (0.5 * (1.0 - eta) * (1.0 + eta) * d_norm2 + eta * eta * c * d_c) / s
+        under = 1.0 / (s + eta * c)
+        gamma = side * (1.0 - eta) * (1.0 + eta) * under
+        d_gamma = -gamma * under * (d_s + eta * d_c)
+        d_r = v[R_C, j] * d_c + v[R_S, j] * d_s + v[R_NORM2, j] * d_norm2 + v[R_F, j] * v[BY_F, j]
+        v[BY_TX, j] = eta * dx - d_gamma * gx - gamma * tx
+        v[BY_TY, j] = eta * dy - d_gamma * gy - gamma * ty
+        v[BY_TZ, j] = eta * dz + d_gamma
+        v[BY_AFTER, j] = passes * (v[BY_P, j] * (1.0 - v[R, j]) - v[P, j] * d_r)
+
+
+@njit(**OPTIONS)
+def _push_some(begin, end, ray, surface, along, out):
+    v = np.empty((ROWS, BATCH))
+    for start in range(begin, end, BATCH):
+        count = min(BATCH, end - start)
+        _load(ray, start, count, v)
+        for i in range(9):
+            load(along[i], start, count, v[BY_DX + i])
+        _prepare(v, count, surface)
+        _push(v, count, surface.eta, surface.polarised)
+        for i in range(4):
+            store(v[BY_TX + i], start, count, out[i])
+
+
+@njit(parallel=True, **OPTIONS)
+def refract_tangent(ray, surface, along, out, count, blocks):
+    """Derivatives of t and P' into `out` along `along`, nine components."""
+    for block in prange(blocks):
+        _push_some(block * count // blocks, (block + 1) * count // blocks, ray, surface, along, out)

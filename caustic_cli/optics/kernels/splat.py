@@ -1,0 +1,336 @@
+"""The stage on the screen: landing points into an image, with kernels, adjoint and tangent.
+
+The fused form of `reconstruction.splat` for float64 rays.  Each of a fixed number of blocks of rays has an image of its own and
+they are added in order, so the result does not depend on timing, only on the number of blocks (the number of threads).  Only the
+scatter and the gather of pixels go ray by ray; the rest goes a row of rays at a time in vector instructions.
+
+Notation, in pixels (w = 1)
+    p           landing coordinate, 0 at the frame's low edge, one for x and one for y;  phi = p - floor(p)
+    v           filter size;  r = (v - 1) / 2
+    a_k, o      what `shares` gives: the share of pixel floor(p) - r + k is a_k o, so that they sum to 1
+    a'_k, l     and its derivative by p is (a'_k - a_k l) o
+    W           weight of a ray;  G the derivatives by the padded image's pixels
+    image       sum over rays of W o_x o_y a_i a_j on the frame padded by 2 r, less its padding
+
+by_v is the derivative of whatever is differentiated by v, and d_v the derivative of v along a direction.  Numba caches the kernels
+by this file's time stamp alone: after editing shares.py, touch it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numba import njit, prange
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from caustic_cli.optics.kernels import blocks
+from caustic_cli.optics.kernels.shares import BINCOUNT, COSINE, GAUSSIAN, OPTIONS, shares
+from caustic_cli.optics.kernels.stage import component, components, given, keep, kept, load, store, tangent, wanted
+from caustic_cli.optics.reconstruction import Filter, padding
+from caustic_cli.scene import Screen
+
+_KIND = {"bincount": BINCOUNT, "gaussian": GAUSSIAN, "cosine": COSINE}
+#: Rays in a row.
+ROW = 512
+# Rows of a block's scratch; then what `shares` works in, then shares and slopes along x and y.
+PX, PY, W, PHI, OVER_X, OVER_Y, LEAN_X, LEAN_Y, BY_X, BY_Y, BY_W, VECTORS = range(12)
+SCRATCH = 5
+UINT = np.uintp  # an unsigned index is never taken to count from the end
+ONE, TWO, THREE, FOUR = (UINT(k) for k in (1, 2, 3, 4))
+
+
+class Frame(NamedTuple):
+    """What the kernels know of screen and filter: pixels, low edges and sizes of a pixel in mm; kind, sizes and alphas."""
+
+    pixels_x: int
+    pixels_y: int
+    low_x: float
+    low_y: float
+    wide_x: float
+    wide_y: float
+    kind: int
+    size_x: int
+    size_y: int
+    alpha_x: float
+    alpha_y: float
+
+
+def splat_rays(x: Tensor, y: Tensor, weight: Tensor, screen: Screen, filter: Filter) -> tuple[Tensor, Tensor]:
+    """Accumulate rays into an image.
+
+    Args:
+        x, y: landing points on the screen's plane, mm, (N,) float64; a bincount's derivative by them is 0.
+        weight: power of each ray, (N,) float64.
+
+    Returns:
+        image (n_x, n_y), power per pixel; off_screen, the power that fell outside the frame; both float64 and differentiable.
+    """
+    sizes = tuple(2 * r + 1 for r in filter.reach)
+    frame = Frame(*screen.resolution, *map(float, screen.low), *map(float, screen.pixel), _KIND[filter.kind], *sizes,
+                  *map(float, filter.alpha))
+    padded, outside = _Splat.apply(x, y, weight, frame)
+    (nx, ny), (rx, ry) = screen.resolution, filter.reach
+    padded = padded[:, : ny + 4 * ry]  # beyond lies what rounds the scatter's steps up to four pixels
+    return padded[2 * rx : 2 * rx + nx, 2 * ry : 2 * ry + ny], outside + padding(padded, filter.reach)
+
+
+@njit(**OPTIONS)
+def _cut(frame):
+    """A block's scratch: vectors, shares along x and y, their slopes; a column of shares and one of slopes, in steps of four."""
+    v = np.zeros((VECTORS + SCRATCH, ROW))
+    vx, vy = frame.size_x, frame.size_y
+    long = vy + -vy % 4
+    return v, np.empty((vx, ROW)), np.empty((vy, ROW)), np.empty((vx, ROW)), np.empty((vy, ROW)), np.zeros(long), np.zeros(long)
+
+
+@njit(**OPTIONS)
+def _pixels(x, low, wide, count, out):
+    for j in range(count):
+        out[j] = (x[j] - low) / wide
+
+
+@njit(**OPTIONS)
+def _fraction(p, out):
+    for j in range(len(out)):
+        out[j] = p[j] - math.floor(p[j])
+
+
+@njit(**OPTIONS)
+def _aim(x, y, weight, start, count, frame, v, sx, sy, dx, dy, sloping):
+    """Pixel coordinates, weights and shares of one row of rays."""
+    load(x, start, count, v[PX])
+    load(y, start, count, v[PY])
+    load(weight, start, count, v[W])
+    _pixels(v[PX], frame.low_x, frame.wide_x, count, v[PX])
+    _pixels(v[PY], frame.low_y, frame.wide_y, count, v[PY])
+    _fraction(v[PX], v[PHI])
+    shares(frame.kind, frame.size_x, frame.alpha_x, v[PHI], sx, dx, v[OVER_X], v[LEAN_X], v[VECTORS:], sloping)
+    _fraction(v[PY], v[PHI])
+    shares(frame.kind, frame.size_y, frame.alpha_y, v[PHI], sy, dy, v[OVER_Y], v[LEAN_Y], v[VECTORS:], sloping)
+
+
+@njit(inline="always", **OPTIONS)
+def _limits(frame):
+    """r along x and y, and the least and the first too large coordinate of a ray that reaches into the frame."""
+    rx, ry = (frame.size_x - 1) // 2, (frame.size_y - 1) // 2
+    return rx, ry, float(-rx), float(-ry), float(frame.pixels_x + rx), float(frame.pixels_y + ry)
+
+
+@njit(**OPTIONS)
+def _scatter(v, count, frame, sx, sy, image, column):
+    """Add one row's rays to the padded image; returns the weight of those outside."""
+    # Everything the loop needs is a local: after a store to the image the compiler would have to read an array again.
+    vx, vy = frame.size_x, frame.size_y
+    rx, ry, low_x, low_y, high_x, high_y = _limits(frame)
+    px, py, weights, over_x, over_y = v[PX], v[PY], v[W], v[OVER_X], v[OVER_Y]
+    outside = 0.0
+    for j in range(count):
+        x, y, weight = px[j], py[j], weights[j]
+        if not (x >= low_x and x < high_x and y >= low_y and y < high_y):  # False for NaN too
+            outside += weight
+            continue
+        weight *= over_x[j] * over_y[j]
+        i, k = UINT(math.floor(x) + rx), UINT(math.floor(y) + ry)
+        if vx == 3 and vy == 3:
+            b0, b1, b2 = sy[0, j], sy[1, j], sy[2, j]
+            for a in range(3):
+                part = weight * sx[a, j]
+                image[i, k] += part * b0
+                image[i, k + ONE] += part * b1
+                image[i, k + TWO] += part * b2
+                i += ONE
+            continue
+        if vx == 1 and vy == 1:
+            image[i, k] += weight
+            continue
+        for b in range(vy):
+            column[b] = weight * sy[b, j]
+        for a in range(vx):
+            part, at = sx[a, j], k
+            for b in range(0, len(column), 4):
+                b = UINT(b)
+                c0, c1, c2, c3 = column[b], column[b + ONE], column[b + TWO], column[b + THREE]
+                p0, p1, p2, p3 = image[i, at], image[i, at + ONE], image[i, at + TWO], image[i, at + THREE]
+                image[i, at] = p0 + part * c0
+                image[i, at + ONE] = p1 + part * c1
+                image[i, at + TWO] = p2 + part * c2
+                image[i, at + THREE] = p3 + part * c3
+                at += FOUR
+            i += ONE
+    return outside
+
+
+@njit(parallel=True, **OPTIONS)
+def _total(images):
+    """Sum over blocks, in order."""
+    total = np.empty(images.shape[1:])
+    for i in prange(images.shape[1]):
+        total[i] = images[0, i]
+        for block in range(1, images.shape[0]):
+            for j in range(images.shape[2]):
+                total[i, j] += images[block, i, j]
+    return total
+
+
+@njit(parallel=True, **OPTIONS)
+def _splat(x, y, weight, frame, images):
+    """Padded image and the weight outside; images, one for each block, are overwritten."""
+    rows, blocks = -(-len(x) // ROW), len(images)
+    outside = np.zeros(blocks)
+    for block in prange(blocks):
+        images[block] = 0.0
+        v, sx, sy, dx, dy, column, _ = _cut(frame)
+        for i in range(block * rows // blocks, (block + 1) * rows // blocks):
+            count = min(ROW, len(x) - i * ROW)
+            _aim(x, y, weight, i * ROW, count, frame, v, sx, sy, dx, dy, False)
+            outside[block] += _scatter(v, count, frame, sx, sy, images[block], column)
+    return _total(images), outside
+
+
+@njit(**OPTIONS)
+def _gather(v, count, frame, sx, sy, dx, dy, grad, by_outside, column, tilt):
+    """Derivatives by each ray's landing point (per mm) and weight, from those by the padded image and the weight outside.
+
+    sum G a_i a_j, sum G a'_i a_j and sum G a_i a'_j over the pixels first; then what normalises the shares; then W and p.
+    """
+    vx, vy, per_x, per_y = frame.size_x, frame.size_y, 1.0 / frame.wide_x, 1.0 / frame.wide_y
+    rx, ry, low_x, low_y, high_x, high_y = _limits(frame)
+    px, py, weights, by_x, by_y, by_w = v[PX], v[PY], v[W], v[BY_X], v[BY_Y], v[BY_W]
+    over_x, over_y, lean_x, lean_y = v[OVER_X], v[OVER_Y], v[LEAN_X], v[LEAN_Y]
+    for j in range(count):
+        x, y = px[j], py[j]
+        if not (x >= low_x and x < high_x and y >= low_y and y < high_y):
+            by_x[j], by_y[j], by_w[j] = 0.0, 0.0, by_outside
+            continue
+        value, along_x, along_y = 0.0, 0.0, 0.0
+        i, k = UINT(math.floor(x) + rx), UINT(math.floor(y) + ry)
+        if vx == 3 and vy == 3:
+            b0, b1, b2, d0, d1, d2 = sy[0, j], sy[1, j], sy[2, j], dy[0, j], dy[1, j], dy[2, j]
+            for a in range(3):
+                g0, g1, g2 = grad[i, k], grad[i, k + ONE], grad[i, k + TWO]
+                i += ONE
+                along = g0 * b0 + g1 * b1 + g2 * b2
+                value += sx[a, j] * along
+                along_x += dx[a, j] * along
+                along_y += sx[a, j] * (g0 * d0 + g1 * d1 + g2 * d2)
+        elif vx == 1 and vy == 1:
+            value = grad[i, k]
+        else:
+            for b in range(vy):
+                column[b], tilt[b] = sy[b, j], dy[b, j]
+            for a in range(vx):
+                at = k
+                a0, a1, a2, a3, t0, t1, t2, t3 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+                for b in range(0, len(column), 4):
+                    b = UINT(b)
+                    g0, g1, g2, g3 = grad[i, at], grad[i, at + ONE], grad[i, at + TWO], grad[i, at + THREE]
+                    a0 += g0 * column[b]
+                    a1 += g1 * column[b + ONE]
+                    a2 += g2 * column[b + TWO]
+                    a3 += g3 * column[b + THREE]
+                    t0 += g0 * tilt[b]
+                    t1 += g1 * tilt[b + ONE]
+                    t2 += g2 * tilt[b + TWO]
+                    t3 += g3 * tilt[b + THREE]
+                    at += FOUR
+                i += ONE
+                along, across = (a0 + a2) + (a1 + a3), (t0 + t2) + (t1 + t3)
+                value += sx[a, j] * along
+                along_x += dx[a, j] * along
+                along_y += sx[a, j] * across
+        over = over_x[j] * over_y[j]
+        by_x[j] = per_x * weights[j] * over * (along_x - value * lean_x[j])
+        by_y[j] = per_y * weights[j] * over * (along_y - value * lean_y[j])
+        by_w[j] = over * value
+
+
+@njit(parallel=True, **OPTIONS)
+def _splat_adjoint(x, y, weight, frame, grad, by_outside, out, blocks):
+    """Derivatives by x, y and weight into `out`, from those by the padded image and the weight outside."""
+    rows = -(-len(x) // ROW)
+    for block in prange(blocks):
+        v, sx, sy, dx, dy, column, tilt = _cut(frame)
+        for i in range(block * rows // blocks, (block + 1) * rows // blocks):
+            count = min(ROW, len(x) - i * ROW)
+            _aim(x, y, weight, i * ROW, count, frame, v, sx, sy, dx, dy, True)
+            _gather(v, count, frame, sx, sy, dx, dy, grad, by_outside, column, tilt)
+            for k in range(3):
+                store(v[BY_X + k], i * ROW, count, out[k])
+
+
+@njit(**OPTIONS)
+def _scatter_tangent(v, count, frame, sx, sy, dx, dy, image):
+    """Add the tangent of one row's image, with d_x, d_y and d_W in BY_X, BY_Y and BY_W; returns that of the weight outside."""
+    vx, vy, outside = frame.size_x, frame.size_y, 0.0
+    rx, ry, low_x, low_y, high_x, high_y = _limits(frame)
+    for j in range(count):
+        x, y, change = v[PX, j], v[PY, j], v[BY_W, j]
+        if not (x >= low_x and x < high_x and y >= low_y and y < high_y):
+            outside += change
+            continue
+        i, k = math.floor(x) + rx, math.floor(y) + ry
+        over = v[OVER_X, j] * v[OVER_Y, j]
+        move_x, move_y = over * v[W, j] * v[BY_X, j] / frame.wide_x, over * v[W, j] * v[BY_Y, j] / frame.wide_y
+        change = over * change - move_x * v[LEAN_X, j] - move_y * v[LEAN_Y, j]
+        for a in range(vx):
+            along, across = change * sx[a, j] + move_x * dx[a, j], move_y * sx[a, j]
+            for b in range(vy):
+                image[i + a, k + b] += along * sy[b, j] + across * dy[b, j]
+    return outside
+
+
+@njit(parallel=True, **OPTIONS)
+def _splat_tangent(x, y, weight, frame, along, images):
+    """Derivatives of the padded image and of the weight outside along d_x, d_y and d_W."""
+    rows, blocks = -(-len(x) // ROW), len(images)
+    outside = np.zeros(blocks)
+    for block in prange(blocks):
+        images[block] = 0.0
+        v, sx, sy, dx, dy, _, _ = _cut(frame)
+        for i in range(block * rows // blocks, (block + 1) * rows // blocks):
+            count = min(ROW, len(x) - i * ROW)
+            _aim(x, y, weight, i * ROW, count, frame, v, sx, sy, dx, dy, True)
+            for k in range(3):
+                load(along[k], i * ROW, count, v[BY_X + k])
+            outside[block] += _scatter_tangent(v, count, frame, sx, sy, dx, dy, images[block])
+    return _total(images), outside
+
+
+def _shape(frame: Frame) -> tuple[int, int]:
+    """Of a padded image, with room for the scatter's last step of four pixels."""
+    return frame.pixels_x + 2 * (frame.size_x - 1), frame.pixels_y + 2 * (frame.size_y - 1) + -frame.size_y % 4
+
+
+class _Splat(torch.autograd.Function):
+    """x, y, weight and the frame -> padded image, the weight outside ()."""
+
+    @staticmethod
+    def forward(x, y, weight, frame: Frame):
+        image, outside = _splat(*components((x, y, weight)), frame, np.empty((blocks(), *_shape(frame))))
+        return torch.from_numpy(image), torch.tensor(outside.sum(), dtype=torch.float64)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        *rays, ctx.frame = inputs
+        keep(ctx, rays)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, by_image, by_outside):
+        rays, frame = components(kept(ctx)), ctx.frame
+        out = wanted(ctx, 3, len(rays[0]))
+        grad = np.zeros(_shape(frame)) if by_image is None else component(by_image)
+        _splat_adjoint(*rays, frame, grad, 0.0 if by_outside is None else float(by_outside), out, blocks())
+        return *given(ctx, out), None
+
+    @staticmethod
+    def jvp(ctx, *along):
+        def push(rays, along):
+            image, outside = _splat_tangent(*rays, ctx.frame, along, np.empty((blocks(), *_shape(ctx.frame))))
+            return image, np.array(outside.sum())
+
+        return tangent(ctx, along, push)

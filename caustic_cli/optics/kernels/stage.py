@@ -1,0 +1,108 @@
+"""What the stages of a trace have in common: rays by components, a batch at a time, and derivatives only where they are wanted.
+
+A component of all rays is an array (N,), or (1,) where it is one number for all: both compile to the same kernel.  A derivative
+that nobody wants is an array (0,).  Kernels copy a batch of rays into rows of a small scratch that stays in the first cache, and
+loop over these rows: their distances are known when compiling, so the loops turn into vector instructions without any check for
+overlaps.  Everything is float64.
+
+Numba caches the kernels of each stage by that file's time stamp alone: after editing here, touch interact.py and land.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from numba import njit
+from torch import Tensor
+
+from caustic_cli.optics.kernels.shares import OPTIONS
+
+#: Rays in a batch: thirty rows of them fill the first cache.
+BATCH = 128
+
+
+@njit(inline="always", **OPTIONS)
+def load(component, start, count, out):
+    """A batch of one component into a row."""
+    if len(component) == 1:
+        for j in range(count):
+            out[j] = component[0]
+    else:
+        batch = component[start : start + count]
+        for j in range(count):
+            out[j] = batch[j]
+
+
+@njit(inline="always", **OPTIONS)
+def store(row, start, count, component):
+    """A row into a batch of one component, if that is wanted."""
+    if len(component):
+        batch = component[start : start + count]
+        for j in range(count):
+            batch[j] = row[j]
+
+
+def component(value: Tensor | float | None) -> np.ndarray:
+    """(N,) of a tensor, (1,) of a number; None stands for 0."""
+    if isinstance(value, Tensor):
+        return value.detach().contiguous().numpy()
+    return np.array([0.0 if value is None else value], np.float64)
+
+
+def components(values) -> tuple[np.ndarray, ...]:
+    """Several of them."""
+    return tuple(component(v) for v in values)
+
+
+def keep(ctx, values: tuple) -> None:
+    """Keep components for both modes of differentiation: tensors where torch wants them, numbers beside them."""
+    tensors = [v if isinstance(v, Tensor) else None for v in values]
+    ctx.save_for_backward(*tensors)
+    ctx.save_for_forward(*tensors)
+    ctx.numbers = [None if isinstance(v, Tensor) else v for v in values]
+    ctx.set_materialize_grads(False)
+
+
+def kept(ctx) -> tuple:
+    """The components that `keep` kept."""
+    return tuple(n if t is None else t for t, n in zip(ctx.saved_tensors, ctx.numbers, strict=True))
+
+
+def wanted(ctx, values: int, count: int) -> tuple[np.ndarray, ...]:
+    """Where the derivatives by the first so many inputs go."""
+    return tuple(np.empty(count if need else 0) for need in ctx.needs_input_grad[:values])
+
+
+def new(values: int, count: int) -> tuple[np.ndarray, ...]:
+    """Room for so many components."""
+    return tuple(np.empty(count) for _ in range(values))
+
+
+class _Apart(torch.autograd.Function):
+    """A function of arrays that torch does not look into."""
+
+    @staticmethod
+    def forward(function: Callable, *values):
+        return tuple(torch.from_numpy(a) for a in function(components(values)))
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        pass
+
+
+def tangent(ctx, along: tuple, push: Callable) -> tuple[Tensor, ...]:
+    """The outputs' tangents: arrays that `push` returns, given arrays of the kept components and of as many of `along`.
+
+    By way of a function of its own, because within torch.func a tensor's numbers are within reach only there.
+    """
+    values = kept(ctx)
+    count = len(values)
+    every = (v.detach() if isinstance(v, Tensor) else v for v in (*values, *along[:count]))
+    return _Apart.apply(lambda arrays: push(arrays[:count], arrays[count:]), *every)
+
+
+def given(ctx, arrays: tuple[np.ndarray, ...]) -> list[Tensor | None]:
+    """The derivatives that are wanted, as tensors."""
+    return [torch.from_numpy(a) if need else None for a, need in zip(arrays, ctx.needs_input_grad, strict=False)]
