@@ -86,7 +86,7 @@ class Emission:
             yield self._far(*draws) if far else self._near(torch.arange(start, stop, device=self.device), *draws)
 
     def _near(self, index: Tensor, u: Tensor, v: Tensor, a: Tensor | None = None, b: Tensor | None = None) -> RayState:
-        source, lens = self.scene.source, self.scene.lens
+        source, lens = self.scene.source, self.scene.pupil
         (rx, ry), cone = lens.half_size, covering_cone(source, lens.half_size, lens.z_in, lens.round)
         per, (positions, powers) = self.shape[0] * self.shape[1], self._points
         which = index // per

@@ -241,11 +241,12 @@ class System:
         total = math.fsum(s.power for s in self.sources)
         return tuple(s.power / total for s in self.sources)
 
+    @property
+    def source(self) -> Source:
+        """The first source."""
+        return self.sources[0]
+
     def with_source(self, source: Source) -> System:
         """The same system in another light."""
         return replace(self, sources=(source,))
 
-
-def plane_wave(power: float = 1.0) -> tuple[Source, ...]:
-    """The usual source of a system: light along +z through its first aperture."""
-    return (PlaneWave(power),)

@@ -94,18 +94,19 @@ class Tracer:
         requests: what a plan says of effects beyond what the system itself says.
         like: the tracer of the chunk before through the same system, whose prepared arrays serve again where they are the same.
         weight, channel: part of the power that this light is of the whole, and the colour of the image that it goes into.
+        wavelength: nm, at which glasses refract; None for the indices that media give.
         lower: False goes by stages even where a fused kernel does the same.
         track: keep what became of every ray (`RayState.status`).
     """
 
     def __init__(self, system: System, rays: Sample | RayState, dtype: torch.dtype = torch.float64,
                  requests: Requests = NO_REQUESTS, like: Tracer | None = None, *, weight: float = 1.0, channel: int | None = None,
-                 lower: bool = True, track: bool = False):
+                 wavelength: float | None = None, lower: bool = True, track: bool = False):
         self.system, self.requests, self.weight, self.channel, self.track = system, requests, weight, channel, track
         self.media, self.sides = system.media(), system.sides()
         pupil = system.pupil
         state = rays if isinstance(rays, RayState) else RayState.on_axis(rays, pupil.half_size, pupil.z)
-        state = replace(state, lost=dict(state.lost))
+        state = replace(state, lost=dict(state.lost), wavelength=wavelength)
         self.backend = backend_for(state.power.device)
         self.dtype = self.backend.precision(dtype)
         for effect in EFFECTS:
@@ -148,15 +149,20 @@ class Tracer:
             image, leaving, lost = self.fused(parameters[self.system.elements[-1].name], screen, filter)
             for name, value in self.start.lost.items():
                 lost[name] = lost.get(name, 0.0) + value
-        else:
-            image, leaving, lost = 0.0, 0.0, {}
-            for ray in self.land(parameters, screen):
-                part, off = self.backend.splat(*ray.origin[:2], ray.power, screen if isinstance(screen, Screen) else screen.screen,
-                                               filter)
-                image, leaving = image + part, leaving + ray.leaving
-                ray.lose("off_screen", off)
-                for name, value in ray.lost.items():
-                    lost[name] = lost.get(name, 0.0) + (value.detach() if isinstance(value, Tensor) else value)
+            return self._weighed(image, leaving, lost)
+        return self.collect(self(parameters), screen, filter)
+
+    def collect(self, states: list[RayState], screen: Screen | Placed, filter: Filter) -> Image:
+        """Image and energy account on a screen of rays behind the last element."""
+        image, leaving, lost = 0.0, 0.0, {}
+        for state in states:
+            ray = self.onto(state, screen)
+            frame = screen if isinstance(screen, Screen) else screen.screen
+            part, off = self.backend.splat(*ray.origin[:2], ray.power, frame, filter)
+            image, leaving = image + part, leaving + ray.leaving
+            ray.lose("off_screen", off)
+            for name, value in ray.lost.items():
+                lost[name] = lost.get(name, 0.0) + (value.detach() if isinstance(value, Tensor) else value)
         return self._weighed(image, leaving, lost)
 
     def _weighed(self, image: Tensor, leaving: Tensor, lost: dict) -> Image:
@@ -411,18 +417,67 @@ def expose(scene: Scene, field: HeightField, heights: Tensor, sampler: Rays, fil
     shape = (3, *screen.resolution) if scene.colored else screen.resolution
 
     def traced_by(size: int) -> Image:
-        image = torch.zeros(shape, dtype=torch.float64, device=sampler.device)
-        lost, leaving = dict.fromkeys(LOSSES, 0.0), 0.0
-        with torch.no_grad():
-            for traced in tracers(scene, field, sampler, dtype, size, requests):
-                part = traced.expose({EXIT: heights}, screen, filter)
-                image += part.image
-                leaving += float(part.leaving.sum())
-                for name, value in part.lost.items():
-                    lost[name] += float(value)
-        return Image(image, leaving, lost, sampler.count)
+        parts = tracers(scene, field, sampler, dtype, size, requests)
+        return _total(parts, {EXIT: heights}, [screen], [shape], filter, sampler.count, sampler.device)[0]
 
     return with_less(traced_by, chunk)
+
+
+def render(system: System, parameters: Parameters, rays: int, filter: Filter | None = None, *, kind: str = "stratified",
+           seed: int = 0, device: str | torch.device = "cpu", dtype: torch.dtype = torch.float64, chunk: int = 1 << 19,
+           requests: Requests = NO_REQUESTS) -> list[Image]:
+    """The image on every screen of a system, from about `rays` rays of every source at every wavelength.
+
+    Args:
+        parameters: heights {name: (n, m) mm} of every surface that has some.
+        kind: of sampler, see `sampling`.
+
+    Raises:
+        InputError: heights are missing, unknown or of another shape.
+        CausticError: out of memory.
+    """
+    shapes = {name: tuple(heights.shape) for name, heights in parameters.items()}
+    if shapes != system.free:
+        raise InputError(f"a system's heights must be {system.free}, got {shapes}")
+    parameters = {name: heights.detach().to(device, torch.float64) for name, heights in parameters.items()}
+    samplers = [rays_of(system.with_source(s), kind, rays, seed, device) for s in system.sources]
+    screens = [s.screen if isinstance(s, Placed) else s for s in system.screens]
+
+    def traced_by(size: int) -> list[Image]:
+        parts = (t for sampler, part in zip(samplers, system.parts, strict=True)
+                 for t in system_tracers(system, sampler, part, dtype, size, requests))
+        return _total(parts, parameters, system.screens, [s.resolution for s in screens], filter or Filter(),
+                      sum(s.count for s in samplers), device)
+
+    return with_less(traced_by, chunk)
+
+
+def system_tracers(system: System, sampler: Rays, part: float, dtype: torch.dtype, chunk: int,
+                   requests: Requests = NO_REQUESTS) -> Iterator[Tracer]:
+    """Tracers of all rays of one of a system's sources, `part` of all power, at every wavelength, chunk by chunk."""
+    lines = zip(system.light.wavelengths, system.light.parts, strict=True) if system.light.wavelengths else [(None, 1.0)]
+    for wavelength, weight in lines:
+        traced = None
+        for rays in sampler.chunks(chunk):
+            traced = Tracer(system, rays, dtype, requests, traced, weight=part * weight, wavelength=wavelength)
+            yield traced
+
+
+def _total(parts: Iterator[Tracer], parameters: Parameters, screens, shapes, filter: Filter, rays: int,
+           device: str | torch.device) -> list[Image]:
+    """Sums over tracers, without derivatives: one image for each screen; rays are walked once for all."""
+    images = [torch.zeros(shape, dtype=torch.float64, device=device) for shape in shapes]
+    accounts, leaving = [dict.fromkeys(LOSSES, 0.0) for _ in screens], [0.0] * len(images)
+    with torch.no_grad():
+        for traced in parts:
+            states = traced(parameters) if len(images) > 1 else None
+            for k, screen in enumerate(screens):
+                part = traced.expose(parameters, screen, filter) if states is None else traced.collect(states, screen, filter)
+                images[k] += part.image
+                leaving[k] += float(part.leaving.sum())
+                for name, value in part.lost.items():
+                    accounts[k][name] += float(value)
+    return [Image(*of, rays) for of in zip(images, leaving, accounts, strict=True)]
 
 
 def check_room(scene: Scene, heights: Tensor, screen: Screen) -> None:
