@@ -18,7 +18,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.optics.bounds import Bounds, bounds_of
 from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.optics.stepwise import SEQUENTIAL, Steps
-from caustic_cli.scene import Disc, PlaneWave, Points, Scene
+from caustic_cli.scene import Scene
 
 #: Ghost light below this part of the source's power is left out: the other effects' own models are no better than that.
 NEGLIGIBLE = 0.01
@@ -102,7 +102,7 @@ def _without(scene: Scene, on: dict[str, bool]) -> Scene:
     """The scene with nothing of what is off, and something of what is on."""
     source, lens, screen, light = scene.source, scene.lens, scene.screen, scene.light
     if not on["source-size"]:
-        source = _centre(scene)
+        source = source.pointlike()
     if not on["fresnel"]:
         lens = replace(lens, fresnel="none")
     elif lens.fresnel == "none":
@@ -126,18 +126,8 @@ def _without(scene: Scene, on: dict[str, bool]) -> Scene:
     return scene if same else Scene(*parts)
 
 
-def _centre(scene: Scene):
-    """The source without its extent."""
-    s = scene.source
-    if isinstance(s, Disc):
-        return PlaneWave(s.power) if s.angle is not None else Points((s.position,), (s.power,), s.cone, s.intensity, s.aimed)
-    if isinstance(s, Points) and len(s.positions) > 1:
-        return Points((s.centre,), (s.power,), s.cone, s.intensity, s.aimed)
-    return s
-
-
 def _steps(scene: Scene, on: dict[str, bool], bounds: Bounds) -> Steps:
-    plane = isinstance(scene.source, PlaneWave)
+    plane = scene.source.collimated
     steps = Steps(ghosts=on["ghosts"] and not scene.lens.mirror, again=on["second-meeting"],
                   general=plane and (on["entrance"] or on["intersection"]),
                   entrance=plane or on["entrance"], intersect=plane or on["intersection"],
@@ -146,17 +136,9 @@ def _steps(scene: Scene, on: dict[str, bool], bounds: Bounds) -> Steps:
 
 
 def _source_size(scene: Scene, _: Bounds) -> Effect:
-    s = scene.source
-    if isinstance(s, Disc):
-        angle = s.angle
-        if angle is None:
-            angle = 2.0 * math.degrees(math.atan2(max(s.size) / 2.0, scene.lens.z_in - s.position[2]))
-        why = f"the lens sees the source under {angle:.3g} degrees"
-        return Effect("source-size", angle > 0, why, angle, 0.0, present=angle > 0)
-    if isinstance(s, Points) and len(s.positions) > 1:
-        return Effect("source-size", True, f"the source is {len(s.positions)} points", float(len(s.positions)), 1.0)
-    return Effect("source-size", False, "a plane wave has one direction" if isinstance(s, PlaneWave) else "the source is a point",
-                  0.0, 0.0, present=False)
+    s, z_in = scene.source, scene.lens.z_in
+    bound, limit = (float(len(s.points()[0])), 1.0) if s.several else (s.apparent_angle(z_in), 0.0)
+    return Effect("source-size", s.extended, s.extent_words(z_in), bound, limit, present=s.extended)
 
 
 def _polarisation(scene: Scene, b: Bounds) -> Effect:
@@ -185,21 +167,21 @@ def _dispersion(scene: Scene, _: Bounds) -> Effect:
 
 def _entrance(scene: Scene, b: Bounds) -> Effect:
     angle = math.degrees(b.incidence)
-    if isinstance(scene.source, PlaneWave) or scene.lens.mirror or angle == 0:
+    if scene.source.collimated or scene.lens.mirror or angle == 0:
         why = "there is no glass before a mirror" if scene.lens.mirror else "normal incidence on a flat entrance bends nothing"
-        return Effect("entrance", not isinstance(scene.source, PlaneWave) and not scene.lens.mirror, why, angle, 0.0)
+        return Effect("entrance", not scene.source.collimated and not scene.lens.mirror, why, angle, 0.0)
     return Effect("entrance", True, f"rays meet the entrance at up to {angle:.3g} degrees", angle, 0.0)
 
 
 def _intersection(scene: Scene, b: Bounds) -> Effect:
-    if isinstance(scene.source, PlaneWave):
+    if scene.source.collimated:
         return Effect("intersection", False, "rays of a plane wave are sampled on the surface itself", 0.0, 0.0)
     angle = math.degrees(b.inside)
     return Effect("intersection", True, f"rays cross the lens at up to {angle:.3g} degrees", angle, 0.0)
 
 
 def _missed(scene: Scene, b: Bounds) -> Effect:
-    if isinstance(scene.source, PlaneWave):
+    if scene.source.collimated:
         return Effect("missed-surface", False, "every ray of a plane wave is on the surface", b.reach, 1.0)
     if b.reach <= 1.0:
         return Effect("missed-surface", False, f"no ray gets beyond {b.reach:.4g} of the aperture's half width", b.reach, 1.0)

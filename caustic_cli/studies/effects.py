@@ -26,7 +26,7 @@ from caustic_cli.optics.plan import EFFECTS, FREE, Effect, Plan, compile_plan
 from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.stepwise import needed
 from caustic_cli.optics.tracing import Exposure, expose
-from caustic_cli.scene import Disc, Light, PlaneWave, Points, Scene, checks
+from caustic_cli.scene import Disc, Light, Scene, checks
 from caustic_cli.scene.materials import D_LINE, refractive_index
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.report import COLOURS, MARKERS, Study
@@ -179,10 +179,9 @@ def put(scene: Scene, name: str, heights: Tensor) -> tuple[Scene, Scene | None, 
     """The scene with an effect put in, the scene to compare it with (None: the same without it), and how much of it."""
     lens, screen, s = scene.lens, scene.screen, scene.source
     if name == "source-size":
-        if isinstance(s, PlaneWave):
+        if s.distant:
             return replace(scene, source=Disc(power=s.power, angle=SUN)), None, f"{SUN} degrees"
-        position, cone = s.centre, s.cone if isinstance(s, Points) else None
-        return replace(scene, source=Disc(position, (SIZE, SIZE), s.power, cone)), None, f"{SIZE:g} mm"
+        return replace(scene, source=Disc(s.centre, (SIZE, SIZE), s.power, s.cone)), None, f"{SIZE:g} mm"
     if name == "polarisation" and lens.fresnel == "exact" and not lens.mirror:
         return replace(scene, light=replace(scene.light, polarisation=0.0)), None, "along x"
     if name == "dispersion" and not lens.mirror:

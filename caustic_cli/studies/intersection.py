@@ -36,7 +36,7 @@ from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.optics.intersection import Method, Status, find
 from caustic_cli.optics.kernels.surface import FusedSurface, RayHits
-from caustic_cli.scene import PlaneWave, Points, Scene, checks
+from caustic_cli.scene import Points, Scene, checks
 from caustic_cli.studies.fit import Order, order
 from caustic_cli.studies.measurement import haste
 from caustic_cli.studies.report import Study, draw_front, plain_ticks, spread, styles
@@ -108,8 +108,8 @@ def of_lens(scene: Scene, field: HeightField, heights: Tensor, rays: int | None 
     Raises:
         CausticError: no ray enters the lens.
     """
-    source = f"{len(scene.source.positions)} points" if isinstance(scene.source, Points) else "the disc"
-    if isinstance(scene.source, PlaneWave):
+    source = scene.source.label
+    if scene.source.collimated:
         away = AWAY * max(scene.lens.size)
         scene = replace(scene, source=Points(((0.0, 0.0, scene.lens.z_in - away),)))
         source = f"a point on the axis, {away:g} mm before the lens, as rays along z need no search"

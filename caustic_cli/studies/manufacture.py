@@ -23,7 +23,6 @@ from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.optics.sampling import Sample, stream
 from caustic_cli.optics.tracing import Landing, tracer
 from caustic_cli.scene import Scene
-from caustic_cli.scene.source import blur_limit
 
 #: Points looked at along each axis and a knot span, at most.
 MOST, A_SPAN = 2001, 4
@@ -66,7 +65,7 @@ def manufacture(scene: Scene, field: HeightField, heights: Tensor, tool_radius: 
     if tool_radius is not None:
         found |= {"tool_radius_mm": tool_radius, "tool_fits": radius is None or radius >= tool_radius}
     critical, incidence = math.degrees(math.asin(1.0 / lens.index)), _steepest_incidence(scene, field, heights, seed)
-    blur = blur_limit(scene.source, lens.z_in, scene.screen.z - lens.z_in)
+    blur = scene.source.blur(lens.z_in, scene.screen.z - lens.z_in)
     throw = STEP * scene.screen.z
     by_throw = _moved(scene, scene, field, heights, seed, throw) / throw
     other = replace(scene, lens=replace(lens, index=lens.index + STEP))

@@ -1,6 +1,4 @@
-"""The rays of a scene's source, up to the inside of the lens' flat entrance (thesis 4.2, 4.3.1).
-
-Nothing here depends on the heights, so a design does it once.
+"""Rays of sources that stand before the lens: points, and what has an extent about them (thesis 4.2.2).
 
 Notation, a source point at distance h before the entrance plane
     theta   angle of a ray to +z; theta_c half-angle of the cone
@@ -18,20 +16,15 @@ few rays are wasted either way.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from caustic_cli.errors import InputError
 from caustic_cli.optics.bundle import Bundle
-from caustic_cli.optics.interface import reflectance, reflectances
-from caustic_cli.optics.polarisation import beyond, field_of, part_s
-from caustic_cli.optics.sampling import SAMPLERS, Sampler, numbers
-from caustic_cli.scene import PlaneWave, Points, Scene
-from caustic_cli.scene.source import covering_cone
+from caustic_cli.optics.emission.base import Emission
+from caustic_cli.optics.emission.enter import enter
 
 #: A source whose foot is this many of its distances inside the aperture's edge is near: 1 - cos = 0.32 of a hemisphere misses.
 NEAR = 3.0
@@ -39,75 +32,37 @@ NEAR = 3.0
 TINY = 1e-300
 
 
-@dataclass(frozen=True, eq=False)
-class Emission:
-    """All rays of points or of a disc.
-
-    Args:
-        scene: its source is not a plane wave.
-        kind: sampler, one of `sampling.SAMPLERS`.
-        shape: cells (nu, nv) for each point; every one sends out as many rays.
-        seed, device: as of a `Sampler`.
-    """
-
-    scene: Scene
-    kind: str
-    shape: tuple[int, int]
-    seed: int = 0
-    device: str | torch.device = "cpu"
-
-    def __post_init__(self):
-        if self.kind not in SAMPLERS:
-            raise InputError(f"sampler must be one of {', '.join(SAMPLERS)}, got {self.kind!r}")
-
-    @property
-    def count(self) -> int:
-        """Number of rays."""
-        return self.shape[0] * self.shape[1] * len(self._points[0])
-
-    def through(self, scene: Scene) -> Emission:
-        """The same rays as another scene refracts them: of its own index and polarisation."""
-        return self if scene is self.scene else replace(self, scene=scene)
+class Near(Emission):
+    """Rays of the positions of a source; those of a source with an extent start aside of them."""
 
     @cached_property
     def _points(self) -> tuple[Tensor, Tensor]:
         """Positions (k, 3) mm, and parts of the power (k,)."""
         source = self.scene.source
-        if isinstance(source, Points):
-            powers = torch.tensor(source.powers, dtype=torch.float64, device=self.device)
-            return torch.tensor(source.positions, dtype=torch.float64, device=self.device), powers / powers.sum()
-        one = torch.ones(1, dtype=torch.float64, device=self.device)
-        return torch.tensor([source.position], dtype=torch.float64, device=self.device), one
+        powers = torch.tensor(source.powers, dtype=torch.float64, device=self.device)
+        return torch.from_numpy(source.points()[0]).to(self.device), powers / powers.sum()
 
-    def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[Bundle]:
-        """The rays in order, at most `size` at a time; their shares and what they lost sum to 1 over all chunks.
+    def _aside(self, *draws: Tensor) -> tuple[Tensor, Tensor]:
+        """Where about its position each ray starts, mm along x and y, of the draws beyond the first two."""
+        raise NotImplementedError
 
-        With `step`, only every step-th chunk from number `first` on: the part of one of several processes.
-        """
-        far = not isinstance(self.scene.source, Points) and self.scene.source.angle is not None
-        for start in range(first * size, self.count, step * size):
-            stop = min(start + size, self.count)
-            dimensions = 2 if isinstance(self.scene.source, Points) else 4
-            draws = numbers(self.kind, self.shape, self.seed, dimensions, start, stop, self.device)
-            yield self._far(*draws) if far else self._near(torch.arange(start, stop, device=self.device), *draws)
-
-    def _near(self, index: Tensor, u: Tensor, v: Tensor, a: Tensor | None = None, b: Tensor | None = None) -> Bundle:
+    def _bundle(self, start: int, u: Tensor, v: Tensor, *aside: Tensor) -> Bundle:
         source, lens = self.scene.source, self.scene.lens
-        (rx, ry), cone = lens.half_size, covering_cone(source, lens.half_size, lens.z_in, lens.round)
+        (rx, ry), cone = lens.half_size, source.cone_over(lens.half_size, lens.z_in, lens.round)
         per, (positions, powers) = self.shape[0] * self.shape[1], self._points
-        which = index // per
+        which = torch.arange(start, start + len(u), device=self.device) // per
         part = powers[which] / per  # emitted by each ray
         x0, y0, z0 = positions[which].unbind(1)
-        h, ex, ey = lens.z_in - z0, 0.0, 0.0
+        h, (ex, ey) = lens.z_in - z0, source.extent
         radius = h * math.tan(cone) if cone < math.pi / 2 else torch.full_like(h, math.inf)
         lows = [x0 - radius, y0 - radius]
         highs = [x0 + radius, y0 + radius]
         # From the source's foot to the edge of the lens.
         room = rx - torch.hypot(x0, y0) if lens.round else torch.minimum(rx - x0.abs(), ry - y0.abs())
-        if a is not None:  # a point of the ellipse
-            ex, ey = source.size[0] / 2.0, source.size[1] / 2.0
+        if aside:
             lows, highs = [lows[0] - ex, lows[1] - ey], [highs[0] + ex, highs[1] + ey]
-            x0, y0 = x0 + ex * a.sqrt() * torch.cos(2 * math.pi * b), y0 + ey * a.sqrt() * torch.sin(2 * math.pi * b)
+            across, along = self._aside(*aside)
+            x0, y0 = x0 + across, y0 + along
         within = (lows[0] >= -rx) & (highs[0] <= rx) & (lows[1] >= -ry) & (highs[1] <= ry)
         if lens.round:
             within &= torch.maximum(-lows[0], highs[0]) ** 2 + torch.maximum(-lows[1], highs[1]) ** 2 <= rx * rx
@@ -143,35 +98,15 @@ class Emission:
         dz = 1.0 / torch.sqrt(1.0 + sx * sx + sy * sy)
         return enter(self.scene, x, y, sx * dz, sy * dz, dz, share, float(part.sum()))
 
-    def _far(self, u: Tensor, v: Tensor, a: Tensor, b: Tensor) -> Bundle:
-        (rx, ry), half = self.scene.lens.half_size, math.radians(self.scene.source.angle) / 2.0
-        sine = a.sqrt() * math.sin(half)  # even over the projected solid angle: an evenly bright disc
-        dx, dy = sine * torch.cos(2 * math.pi * b), sine * torch.sin(2 * math.pi * b)
-        share, x, y = torch.full_like(u, 1.0 / self.count), (2.0 * u - 1.0) * rx, (2.0 * v - 1.0) * ry
-        if self.scene.lens.round:  # even over the disc
-            x, y = rx * u.sqrt() * torch.cos(2 * math.pi * v), rx * u.sqrt() * torch.sin(2 * math.pi * v)
-        return enter(self.scene, x, y, dx, dy, torch.sqrt(1.0 - dx * dx - dy * dy), share, len(u) / self.count)
 
+class NearDisc(Near):
+    """Rays of ellipses, whose half axes are the source's extent."""
 
-def enter(scene: Scene, x: Tensor, y: Tensor, dx: Tensor, dy: Tensor, dz: Tensor, share: Tensor, emitted: float) -> Bundle:
-    """Rays of unit directions through points of the flat entrance: Snell keeps n (d_x, d_y), Fresnel takes its part.
+    dimensions: ClassVar[int] = 4
 
-    share: power of each that arrives there; emitted: of all at their source.
-    """
-    lens, n = scene.lens, scene.lens.inside
-    ux, uy = dx / n, dy / n
-    uz = torch.sqrt(1.0 - ux * ux - uy * uy)
-    kind, field = "none" if lens.mirror else lens.fresnel, None
-    if kind == "exact" and scene.light.polarisation is not None:
-        before, after, flat = (dx, dy, dz), (ux, uy, uz), (0.0, 0.0, 1.0)
-        e = field_of(scene.light.polarisation, before)
-        (rs, rp), s = reflectances(dz, uz, 1.0 / n), part_s(e, before, flat)
-        reflected, field = (s * rs + (1.0 - s) * rp) * share, beyond(e, before, after, flat, dz, uz, 1.0 / n)
-    else:
-        reflected = reflectance(kind, dz, uz, 1.0 / n) * share
-    arriving, lost = float(share.sum()), float(reflected.sum())
-    return Bundle(x, y, lens.z_in, ux, uy, uz, share - reflected, {"missed_lens": emitted - arriving, "fresnel": lost}, field,
-                  lens.half_size[0] if lens.round else None)
+    def _aside(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+        (ex, ey), turn = self.scene.source.extent, 2 * math.pi * b
+        return ex * a.sqrt() * torch.cos(turn), ey * a.sqrt() * torch.sin(turn)
 
 
 def _even_angle(low: Tensor, high: Tensor, width: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
@@ -200,16 +135,4 @@ def _even_sine(low: Tensor, high: Tensor, width: Tensor, part: Tensor) -> tuple[
     return (sine + step) / torch.sqrt(left), way
 
 
-Rays = Sampler | Emission
-
-
-def rays_of(scene: Scene, kind: str, rays: int, seed: int = 0, device: str | torch.device = "cpu") -> Rays:
-    """About `rays` rays of the scene's source, at least one for each of its points."""
-    aspect = scene.lens.size[0] / scene.lens.size[1]
-    if isinstance(scene.source, PlaneWave):
-        profile = None if scene.source.profile is None else torch.from_numpy(scene.source.profile)
-        return Sampler.of_size(kind, rays, aspect, seed=seed, profile=profile, device=device, round=scene.lens.round)
-    points = len(scene.source.positions) if isinstance(scene.source, Points) else 1
-    each = max(1, round(rays / points))
-    nu = max(1, min(each, round(math.sqrt(each * aspect))))
-    return Emission(scene, kind, (nu, max(1, round(each / nu))), seed, device)
+EMISSIONS = {"point": Near.of_size, "grid": Near.of_size, "disc": NearDisc.of_size}
