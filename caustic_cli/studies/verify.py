@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -33,14 +32,13 @@ from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.tracing import expose
-from caustic_cli.scene import Scene, Source
+from caustic_cli.scene import Scene
 from caustic_cli.scene.plain import beyond_plain
+from caustic_cli.studies.drawn import KINDS, emitted
 from caustic_cli.studies.retrace import BATCHES
 
 VARIANTS = ("llvm_ad_mono", "llvm_ad_rgb", "scalar_rgb")  # the scalar one works everywhere and takes minutes
 SHAPES = ("entrance", "exit", "screen")
-#: Rays at a time.
-BATCH = 1 << 20
 #: Angle, rad, by which normals interpolated within triangles may turn the light.
 TURN = 1e-5
 #: Least rays expected of a judged pixel, least part of the light on judged pixels, and most pixels along a side taken together.
@@ -63,7 +61,7 @@ def require_mitsuba(scene: Scene) -> None:
         raise InputError("--verify mitsuba needs Mitsuba 3, which is not installed: pip install 'caustic-cli[verify]'")
     if beyond_plain(scene):
         raise InputError(f"--verify mitsuba traces clear lenses and straight screens, not {', '.join(beyond_plain(scene))}")
-    if scene.source.kind not in ("plane", *STARTS):
+    if scene.source.kind not in KINDS:
         raise InputError(f"--verify mitsuba knows no source of type {scene.source.kind}")
     if scene.lens.fresnel != "exact":
         raise InputError(f"--verify mitsuba knows exact Fresnel reflection only; [lens] fresnel is {scene.lens.fresnel}")
@@ -135,62 +133,6 @@ def _trace(mi, world, scene: Scene, rays: int, seed: int) -> tuple[np.ndarray, n
         image += _binned(x, y, weight * share, scene)
         squares += _binned(x, y, (weight * share) ** 2, scene)
     return image / rays, squares / rays**2
-
-
-def emitted(scene: Scene, rays: int, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Starts and directions (3, N) of independent rays, batch by batch, and what each carries: 1 on average over all of them."""
-    source, (rx, ry), z_in = scene.source, scene.lens.half_size, scene.lens.z_in
-    round_ = scene.lens.round
-    if source.profile is not None:
-        line = (np.arange(2000) + 0.5) / 1000 - 1
-        x, y = np.meshgrid(line, line, indexing="ij")
-        within = x * x + y * y <= 1 if round_ else np.ones_like(x, bool)
-        mean = _profile(source.profile, x[within], y[within]).mean()
-    for first in range(0, rays, BATCH):
-        n = min(BATCH, rays - first)
-        a, b, u, v = rng.random((4, n))
-        one = np.ones(n)
-        if source.distant:
-            sine = np.sqrt(a) * np.sin(source.half_angle)
-            d = np.array([sine * np.cos(2 * np.pi * b), sine * np.sin(2 * np.pi * b), np.sqrt(1 - sine**2)])
-            x, y = ((2 * u - 1) * rx, (2 * v - 1) * ry) if not round_ else (rx * np.sqrt(u) * np.cos(2 * np.pi * v),
-                                                                            rx * np.sqrt(u) * np.sin(2 * np.pi * v))
-            if source.profile is not None:
-                one = _profile(source.profile, x / rx, y / ry) / mean
-            yield np.array([x, y, np.full(n, z_in)]) - d, d, one
-            continue
-        cone = source.cone_over((rx, ry), z_in, round_)
-        if source.intensity == "lambertian":
-            sine = np.sqrt(a) * np.sin(cone)
-        else:  # even in the cosine, reckoned from 1
-            drop = a * 2 * np.sin(cone / 2) ** 2
-            sine = np.sqrt(drop * (2 - drop))
-        d = np.array([sine * np.cos(2 * np.pi * b), sine * np.sin(2 * np.pi * b), np.sqrt(1 - sine**2)])
-        o = STARTS[source.kind](source, u, v, rng)
-        near = d[2] > 1e-6  # from 1 mm or less before the entrance: single precision knows no far origin
-        yield o + d * np.where(near, np.maximum((z_in - o[2]) / np.where(near, d[2], 1) - 1, 0), 0), d, one
-
-
-def _on_points(source: Source, u: np.ndarray, _v: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """(3, N): one of the points each, as often as its power asks for."""
-    positions, parts = source.points()
-    return positions[rng.choice(len(parts), len(u), p=parts)].T
-
-
-def _on_disc(source: Source, u: np.ndarray, v: np.ndarray, _rng: np.random.Generator) -> np.ndarray:
-    """(3, N): even over the ellipse."""
-    wide, high = np.sqrt(u) * np.array(source.extent)[:, None]
-    return source.points()[0].T + np.array([wide * np.cos(2 * np.pi * v), high * np.sin(2 * np.pi * v), 0 * u])
-
-
-#: Where rays of a near source of each kind start.
-STARTS = {"point": _on_points, "grid": _on_points, "disc": _on_disc}
-
-
-def _profile(e: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Relative irradiance at points of [-1, 1]^2."""
-    i, j = (np.clip((0.5 * (c + 1) * k).astype(int), 0, k - 1) for c, k in zip((x, y), e.shape, strict=True))
-    return e[i, j]
 
 
 def _follow(mi, world, shapes, start: np.ndarray, direction: np.ndarray):
