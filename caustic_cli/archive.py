@@ -39,18 +39,38 @@ def open_archive(path: str | Path) -> tuple[Scene, HeightField, Tensor]:
 
 
 def _source(data: dict[str, np.ndarray]) -> Source:
-    kind, power = data["source_type"].item(), data["source_power"]
-    if kind == "plane":
-        return PlaneWave(float(power[0]), data.get("source_profile"))
-    if "source_angle" in data:
-        return Disc(power=float(power[0]), angle=float(data["source_angle"]))
-    options = {"cone": float(data["cone_half_angle"]), "intensity": data["source_intensity"].item()}
-    positions = [tuple(float(v) for v in p) for p in data["source_positions"]]
-    if kind == "disc":
-        return Disc(positions[0], tuple(_reals(data, "source_size", 2)), float(power[0]), **options)
-    if kind not in ("point", "grid"):
+    kind = data["source_type"].item()
+    if kind not in _READERS:
         raise InputError(f"source_type must be plane, point, grid or disc, got {kind!r}")
-    return Points(tuple(positions), tuple(float(p) for p in power), kind=kind, **options)
+    return _READERS[kind](data)
+
+
+def _plane(data: dict[str, np.ndarray]) -> PlaneWave:
+    return PlaneWave(float(data["source_power"][0]), data.get("source_profile"))
+
+
+def _points(data: dict[str, np.ndarray]) -> Points:
+    powers = data["source_power"]
+    return Points(_positions(data), tuple(float(p) for p in powers), kind=data["source_type"].item(), **_shining(data))
+
+
+def _disc(data: dict[str, np.ndarray]) -> Disc:
+    power = float(data["source_power"][0])
+    if "source_angle" in data:
+        return Disc(power=power, angle=float(data["source_angle"]))
+    return Disc(_positions(data)[0], tuple(_reals(data, "source_size", 2)), power, **_shining(data))
+
+
+#: What makes a source of its keys in the archive, by its kind: see `export/lighttools.py`.
+_READERS = {"plane": _plane, "point": _points, "grid": _points, "disc": _disc}
+
+
+def _positions(data: dict[str, np.ndarray]) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(float(v) for v in p) for p in data["source_positions"])
+
+
+def _shining(data: dict[str, np.ndarray]) -> dict[str, object]:
+    return {"cone": float(data["cone_half_angle"]), "intensity": data["source_intensity"].item()}
 
 
 def _reals(data: dict[str, np.ndarray], key: str, count: int) -> list[float]:

@@ -14,9 +14,9 @@ from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Options
 from caustic_cli.inverse.schedule import LEAST_SPANS, Stage, coarse_to_fine, refinement, refinement_spans
 from caustic_cli.optics.reconstruction import Filter
-from caustic_cli.scene import Offset, PlaneWave, Screen, Source, checks
+from caustic_cli.scene import Offset, Screen, Source, checks, sources
 from caustic_cli.scene.light import RGB
-from caustic_cli.settings import SOURCES, build_screen, build_source, index_of, with_defaults
+from caustic_cli.settings import DEFAULTS, build_screen, build_source, index_of, with_defaults
 
 DEFAULT_MAG = 3.0
 DEFAULT_MARGIN = 0.28  # table 6.1: the screen is 6.4 wide where the picture is 5
@@ -28,7 +28,6 @@ SINGLE_STAGE_ITERATIONS = 1000  # thesis 6.2.1
 DRAFT_SECONDS, FINE_SECONDS = 8.0, 60.0  # time limits below and from which another quality is the better use of the time
 STEEPEST = 1.25  # least radius of a derived sphere, in half diagonals of the lens: slopes up to 1.3
 COLOR_GLASS = "N-BK7"  # of a coloured picture, unless glass or index is said: dispersion has to be known
-SOURCE_DISTANCE, SOURCE_WIDTH, SOURCE_GRID = 5.0, 0.2, (25, 25)  # in lens widths; the grid of fig. 6.4.1
 
 Settings = dict[str, dict[str, Any]]
 
@@ -79,27 +78,24 @@ def complete(given: Settings, aspect: float, *, mag: float | None = None, margin
         nx = width or DEFAULT_RESOLUTION
         screen["resolution"] = [nx, max(2, round(nx * screen["size"][1] / screen["size"][0]))]
     build_screen(s)
-    _complete_lens(lens, screen, target, build_source(s))
-    _complete_design(s, quality, rays)
+    source = build_source(s)
+    _complete_lens(lens, screen, target, source)
+    _complete_design(s, source, quality, rays)
     return s
 
 
 def _complete_source(source: dict[str, Any], lens: dict[str, Any], stages: list[str]) -> None:
-    """Where a source stands and how large it is, if not said: five lens widths before it, a fifth of one wide.
+    """What the types of source in use need and nobody said, without what none of them has: a plane wave has no intensity.
 
-    `stages`: the types that stages name, "" for the source's own; they need these keys of a plane wave too.
+    `stages`: the types that stages name, "" for the source's own; they need their keys too.
     """
-    width = max(lens["size"])
-    checks.choice("[source] type", source["type"], SOURCES)
-    for type in filter(None, stages):
-        checks.choice("[[design.stages]] source", type, SOURCES)
-    if {source["type"], *stages} - {"plane", ""}:
-        source.setdefault("position", [[0.0, 0.0, lens["z_in"] - SOURCE_DISTANCE * width]])
-        source.setdefault("size", [SOURCE_WIDTH * width] * 2)
-        source.setdefault("grid", list(SOURCE_GRID))
-    else:
-        for key in ("intensity", "aim"):  # a plane wave has neither
-            source.pop(key, None)
+    types = [sources.type_of(source["type"])]
+    types += [sources.type_of(type, "[[design.stages]] source") for type in stages if type]
+    for type in types:
+        for key, value in type.defaults(lens).items():
+            source.setdefault(key, value)
+    for key in set(DEFAULTS["source"]).difference(sources.COMMON, *(type.keys for type in types)):
+        source.pop(key)
 
 
 def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[str, Any], source: Source) -> None:
@@ -121,7 +117,7 @@ def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[st
     if "radius" not in lens:
         mag = tuple(t / w for t, w in zip(target["size"], lens["size"], strict=True))
         vergence = 0.0
-        if not isinstance(source, PlaneWave) and source.nearest < lens["z_in"]:  # divergence at the surface, 1/mm
+        if source.nearest < lens["z_in"]:  # divergence at the surface, 1/mm; 0 from infinity
             vergence = 1.0 / (lens["z_in"] - source.centre[2] + (lens["thickness"] - lens["z_in"]) / (1.0 if mirror else index))
         radius = Offset.for_magnification(mag, -1.0 if mirror else index, screen["z"], lens["thickness"], vergence).radius
         if vergence:  # light from nearby may ask for more than a sphere over this aperture can do
@@ -130,20 +126,18 @@ def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[st
         lens["radius"] = list(radius)
 
 
-def _complete_design(s: Settings, quality: str | None, rays: int | None) -> None:
+def _complete_design(s: Settings, source: Source, quality: str | None, rays: int | None) -> None:
     lens, screen, design, given = s["lens"], s["screen"], s["design"], quality
     degree = tuple(checks.whole("[lens] degree", p, 1, 15) for p in lens["degree"])
     plain = design["network"] == "none" and design["optimizer"] == "lbfgs"
     held = "control" not in lens or min(n - p for n, p in zip(lens["control"], degree, strict=True)) >= LEAST_SPANS
-    source = s["source"]
-    several = source["type"] == "point" and len(source["position"]) > 1
-    design.setdefault("start", "transport" if plain and held and not several else "offset")
+    design.setdefault("start", "transport" if plain and held and not source.apart else "offset")
     if design["start"] == "transport" and design["network"] != "none":
         raise InputError("[design] start transport gives a surface, which a network cannot begin from; use start offset, or"
                          " network none")
     quality = quality or _quality(design["time_limit"])
-    # One point's transport is right at every scale at once, if the net can hold it; otherwise from coarse to fine.
-    moved = plain and held and design["start"] != "offset" and not several and source["type"] in ("plane", "point")
+    # Sharp light's transport is right at every scale at once, if the net can hold it; otherwise from coarse to fine.
+    moved = plain and held and design["start"] != "offset" and source.sharp
     if "control" not in lens:
         spans = refinement_spans(max(screen["resolution"]), quality) if moved else DEFAULT_SPANS
         lens["control"] = ([spans + p for p in degree] if design["network"] == "none" else [NETWORK_CONTROL] * 2)
@@ -152,10 +146,10 @@ def _complete_design(s: Settings, quality: str | None, rays: int | None) -> None
         if given or rays:
             raise InputError("--quality and --rays shape the default stages, but the configuration brings [[design.stages]]"
                              " of its own: change them there")
-        design["stages"] = [_complete_stage(stage, s) for stage in design["stages"]]
+        design["stages"] = [_complete_stage(stage, s, _sampler(source)) for stage in design["stages"]]
         return
     nx, ny = screen["resolution"]
-    sampler, base = _sampler(s), min(4_000_000, max(40_000, int(RAYS_PER_PIXEL * nx * ny)))
+    sampler, base = _sampler(source), min(4_000_000, max(40_000, int(RAYS_PER_PIXEL * nx * ny)))
     if moved:
         stages = refinement(tuple(lens["control"]), rays, (nx, ny), quality, scattered=sampler != "lines")
     elif plain and "knots_u" not in lens:
@@ -174,9 +168,9 @@ def _quality(time_limit: float) -> str:
     return "draft" if time_limit < DRAFT_SECONDS else "fine" if FINE_SECONDS <= time_limit < math.inf else "standard"
 
 
-def _sampler(s: Settings) -> str:
+def _sampler(source: Source) -> str:
     """A tensor product of rays makes a plane wave cheap; others are intersected one by one."""
-    return "lines" if s["source"]["type"] == "plane" else "stratified"
+    return "lines" if source.collimated else "stratified"
 
 
 def _stage_table(stage: Stage) -> dict[str, Any]:
@@ -186,9 +180,9 @@ def _stage_table(stage: Stage) -> dict[str, Any]:
             "oversample": stage.oversample}
 
 
-def _complete_stage(table: dict[str, Any], s: Settings) -> dict[str, Any]:
+def _complete_stage(table: dict[str, Any], s: Settings, sampler: str) -> dict[str, Any]:
     nx, ny = s["screen"]["resolution"]
-    base = {"control": list(s["lens"]["control"]), "rays": int(RAYS_PER_PIXEL * nx * ny), "sampler": _sampler(s),
+    base = {"control": list(s["lens"]["control"]), "rays": int(RAYS_PER_PIXEL * nx * ny), "sampler": sampler,
             "reconstruction": "cosine", "filter_size": [3, 3], "blur": 0.0, "apron": 0,
             "iterations": SINGLE_STAGE_ITERATIONS, "tolerance": 0.0, "oversample": 1}
     return {**base, **table}

@@ -19,7 +19,7 @@ from caustic_cli.files import write_bytes
 from caustic_cli.inverse.target import target_on_screen
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.picture import Picture, read_picture
-from caustic_cli.scene import Scene
+from caustic_cli.scene import Scene, sources
 
 TOML, CHECKPOINT, RENDER, REPORT = "project.toml", "checkpoints.h5", "render.png", "report.png"
 
@@ -80,7 +80,7 @@ class Project:
         for (section, key, _), value in given.items():
             changed[section][key] = value
         settings.refuse_unused(changed["source"], given)
-        if changed["source"]["type"] != "plane":
+        if changed["source"]["type"] not in sources.used_by("profile"):
             changed["source"].pop("profile", None)
         try:
             return settings.build_scene(complete(changed, self.picture.aspect), profile)

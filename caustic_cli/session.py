@@ -29,8 +29,7 @@ from caustic_cli.inverse.target import grey
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.picture import read_picture
 from caustic_cli.project import CHECKPOINT, RENDER, TOML, Project, is_project
-from caustic_cli.scene import PlaneWave, Scene
-from caustic_cli.scene.source import blur_limit
+from caustic_cli.scene import Scene
 from caustic_cli.surfaces import SUFFIXES, onto, read_surface
 from caustic_cli.verdict import judge
 
@@ -126,7 +125,7 @@ def design(project: Project, first: torch.Tensor | None, device: str, say: Repor
 
 def _say_blur(scene: Scene, say: Reporter) -> None:
     """What no lens can do about an extended source, before time is spent on it."""
-    blur, pixel = blur_limit(scene.source, scene.lens.z_in, abs(scene.screen.z - scene.lens.z_in)), max(scene.screen.pixel)
+    blur, pixel = scene.source.blur(scene.lens.z_in, abs(scene.screen.z - scene.lens.z_in)), max(scene.screen.pixel)
     if blur > 0:
         finer = f"; the picture's detail below that, {blur / pixel:.3g} pixels, is out of reach" if blur > pixel else ""
         say.say(f"the source's own size blurs every point over {blur:.3g} mm on the screen{finer}")
@@ -202,7 +201,7 @@ def _first_heights(project: Project, lifted: bool) -> torch.Tensor | None:
         return None
     if start == "transport":
         designer, target = _designer(project, "cpu")
-        cells = transport_cells(designer.stages[-1].rays, not isinstance(designer.scene.source, PlaneWave))
+        cells = transport_cells(designer.stages[-1].rays, not designer.scene.source.collimated)
         found = first_surface(designer.scene, grey(target), designer.field(0), cells)
         lens = designer.scene.lens
         short = lens.z_in + lens.min_thickness - float(found.min())

@@ -19,7 +19,7 @@ import tomli_w
 
 from caustic_cli import __version__
 from caustic_cli.errors import InputError
-from caustic_cli.scene import Disc, Lens, Light, Offset, PlaneWave, Points, Scene, Screen, Source, checks
+from caustic_cli.scene import Lens, Light, Offset, Scene, Screen, Source, checks, sources
 from caustic_cli.scene.materials import D_LINE, refractive_index
 
 FORMAT_VERSION = 1
@@ -36,7 +36,7 @@ class Key:
 
 SCHEMA: dict[str, dict[str, Key]] = {
     "source": {
-        "type": Key("text", "plane (as wide as the lens), point, grid (of points) or disc"),
+        "type": Key("text", sources.in_words()),
         "power": Key("number", "W, of all: through the aperture, or into the cone"),
         "profile": Key("text", "plane: file here with the relative irradiance over the aperture"),
         "position": Key("points", "mm; point: one or several [x, y, z]; grid, disc: the centre"),
@@ -47,6 +47,7 @@ SCHEMA: dict[str, dict[str, Key]] = {
         "angle": Key("number", "degrees, disc at infinity (the sun: 0.533): full angle it is seen under"),
         "intensity": Key("text", "uniform in solid angle, or lambertian"),
         "aim": Key("flag", "sample rays on the lens, not all over the cone"),
+        **{key: Key(*spec) for key, spec in sources.own_keys().items()},
         "polarisation": Key("number", "degrees from +x, of linearly polarised light; without it, unpolarised"),
         "wavelengths": Key("list", "nm, of the source's spectrum; dispersed by [lens] glass"),
         "weights": Key("list", "relative power at each wavelength"),
@@ -128,9 +129,6 @@ DEFAULTS: dict[str, dict[str, Any]] = {
                "filter_target": True, "max_slope": 0.0, "min_radius": 0.0, "iterations": 0, "time_limit": math.inf,
                "checkpoint_every": 10.0, "seed": 0, "dtype": "float32"},
 }
-SOURCES = ("plane", "point", "grid", "disc")
-USED_BY: dict[str, tuple[str, ...]] = {"position": SOURCES[1:], "size": SOURCES[2:], "grid": ("grid",), "cone": SOURCES[1:],
-                                       "angle": ("disc",)}
 DEFAULT_INDEX = 1.5443  # table D.2
 
 
@@ -270,23 +268,11 @@ def build_source(settings: dict[str, dict[str, Any]], profile: np.ndarray | None
     A key that the type has no use for is left alone, so that stages may change the type.
     """
     s = settings["source"]
-    type = checks.choice("[source] type", type or s["type"], SOURCES)
+    made, lit = sources.type_of(type or s["type"]), sources.used_by("profile")
     checks.number("[source] power", s["power"], 0.0, checks.POWER, open_low=True)  # before it is shared among points
-    if type == "plane":
-        return PlaneWave(s["power"], profile)
-    if "profile" in s and s["type"] != "plane":
-        raise InputError(f"[source] profile belongs to type plane, got type {s['type']}")
-    options = {"cone": s.get("cone"), "intensity": s["intensity"], "aimed": s["aim"]}
-    positions = [tuple(p) for p in s["position"]]
-    if type == "point":
-        powers = s.get("powers", [1.0] * len(positions))
-        total = math.fsum(powers)
-        return Points(tuple(positions), tuple(s["power"] * p / total for p in powers) if total > 0 else tuple(powers), **options)
-    if len(positions) != 1 and "angle" not in s:
-        raise InputError(f"[source] position of a {type} is its centre, one [x, y, z], got {len(positions)}")
-    if type == "grid":
-        return Points.grid(positions[0], tuple(s["size"]), tuple(s["grid"]), s["power"], **options)
-    return Disc(positions[0], tuple(s["size"]), s["power"], angle=s.get("angle"), **options)
+    if "profile" in s and not {made.name, s["type"]} & set(lit):
+        raise InputError(f"[source] profile belongs to type {_either(lit)}, got type {s['type']}")
+    return made.from_settings(s, profile)
 
 
 def build_scene(settings: dict[str, dict[str, Any]], profile: np.ndarray | None = None) -> Scene:
@@ -324,16 +310,20 @@ def refuse_unused(source: dict[str, Any], given, stages: Sequence[str | None] = 
         InputError: naming the option.
     """
     types = {source["type"], *stages} - {None}
-    options = {key: option for section, key, option in given if section == "source" and key in USED_BY}
+    options = {key: option for section, key, option in given if section == "source" and sources.used_by(key)}
     for key, option in options.items():
-        if not types & set(USED_BY[key]):
-            *others, last = USED_BY[key]
-            wanted = f"{', '.join(others)} or {last}" if others else last
-            raise InputError(f"{option} belongs to --source {wanted}, got {source['type']}")
-    if types == {"disc"} and "angle" in source:
+        if not types & set(sources.used_by(key)):
+            raise InputError(f"{option} belongs to --source {_either(sources.used_by(key))}, got {source['type']}")
+    if len(types) == 1 and types <= set(sources.names()):
+        idle = sources.type_of(*types).idle(source)
         for key, option in options.items():
-            if key != "angle":
-                raise InputError(f"{option} has no meaning for a disc at infinity, which is an angle wide (--source-angle)")
+            if key in idle:
+                raise InputError(f"{option} {idle[key]}")
+
+
+def _either(names: Sequence[str]) -> str:
+    *others, last = names
+    return f"{', '.join(others)} or {last}" if others else last
 
 
 def read(path: Path) -> dict[str, dict[str, Any]]:

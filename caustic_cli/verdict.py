@@ -13,8 +13,8 @@ import torch
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.losses import parse
 from caustic_cli.inverse.target import grey
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.sampling import Sample
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.picture import write_image
 from caustic_cli.project import RENDER, REPORT, Project
 from caustic_cli.studies.panels import write_report

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from caustic_cli.optics.tracing import RayTracer, expose
 from PIL import Image
 from test_export import make, signed_volume
 from test_verify import NAMES, SOURCES, scene_with
@@ -22,9 +23,7 @@ from caustic_cli.export.mitsuba import companions, write_mitsuba
 from caustic_cli.inverse.first import first_surface
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.sampling import Sample
-from caustic_cli.optics.tracing import RayTracer, expose
 from caustic_cli.scene import Lens, PlaneWave, Points, Scene
-from caustic_cli.scene.source import covering_cone
 from caustic_cli.studies import verify
 
 
@@ -52,8 +51,8 @@ def test_bad_outlines_are_refused(change):
 
 def test_a_cone_that_covers_a_circle():
     source = Points(((3.0, 4.0, -20.0),))
-    assert np.tan(covering_cone(source, (6.0, 6.0), 0.0, True)) * 20 == pytest.approx(5 + 6)
-    assert np.tan(covering_cone(source, (6.0, 6.0), 0.0)) * 20 == pytest.approx(np.hypot(9, 10))
+    assert np.tan(source.cone_over((6.0, 6.0), 0.0, True)) * 20 == pytest.approx(5 + 6)
+    assert np.tan(source.cone_over((6.0, 6.0), 0.0)) * 20 == pytest.approx(np.hypot(9, 10))
 
 
 # light

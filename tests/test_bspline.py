@@ -11,8 +11,8 @@ from scipy.interpolate import BSpline
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.bspline import MAX_DEGREE, SplineSpace, Surface
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.sampling import Sample
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Lens
 
 DEGREES = range(1, MAX_DEGREE + 1)

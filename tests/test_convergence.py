@@ -11,9 +11,9 @@ from PIL import Image
 
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.files import is_ours
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import SAMPLERS
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
 from caustic_cli.studies.convergence import FILTERS, run_study
 from caustic_cli.studies.fit import order, pareto

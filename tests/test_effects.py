@@ -6,15 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from caustic_cli.optics.stepwise import Steps, StepTracer
+from caustic_cli.optics.tracing import BandTracer, check_room, expose, tracers
 
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.interface import reflectances
 from caustic_cli.optics.meeting import again
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
-from caustic_cli.optics.stepwise import Steps, StepTracer
-from caustic_cli.optics.tracing import BandTracer, check_room, expose, tracers
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Disc, Lens, Light, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.scene.materials import refractive_index
 

@@ -13,9 +13,9 @@ from caustic_cli.errors import InputError
 from caustic_cli.inverse.losses import Loss
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.plan import EFFECTS
 from caustic_cli.optics.reconstruction import Filter
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.picture import read_picture
 from caustic_cli.scene import Lens, Light, Offset, PlaneWave, Scene, Screen
 from caustic_cli.scene.light import RGB

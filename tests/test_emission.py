@@ -6,13 +6,12 @@ import math
 
 import pytest
 import torch
+from caustic_cli.optics.tracing import expose
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.emission import Emission, rays_of
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.tracing import expose
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
-from caustic_cli.scene.source import blur_limit, covering_cone
 
 LENS = Lens(size=(10.0, 8.0), control=(8, 7), z_in=0.0, index=1.5, fresnel="none")
 
@@ -195,7 +194,7 @@ def test_impossible_sources_are_refused(source, message):
 
 def test_the_covering_cone_reaches_every_corner():
     source = Points(((2.0, 1.0, -6.0),))
-    assert math.tan(covering_cone(source, (5.0, 4.0), 0.0)) * 6.0 == pytest.approx(math.hypot(7.0, 5.0))
+    assert math.tan(source.cone_over((5.0, 4.0), 0.0)) * 6.0 == pytest.approx(math.hypot(7.0, 5.0))
     assert bool((whole(source).share > 0).all())
 
 
@@ -204,7 +203,7 @@ def test_the_covering_cone_reaches_every_corner():
     (Disc((0.0, 0.0, -50.0), (5.0, 2.0)), 30.0), (Points.grid((0.0, 0.0, -50.0), (2.0, 1.0), (5, 5)), 12.0),
 ])
 def test_the_blur_of_an_extended_source(source, expected):
-    assert blur_limit(source, 0.0, 300.0) == pytest.approx(expected)
+    assert source.blur(0.0, 300.0) == pytest.approx(expected)
 
 
 def test_the_blur_is_what_a_pinhole_s_worth_of_lens_shows():
@@ -214,4 +213,4 @@ def test_the_blur_is_what_a_pinhole_s_worth_of_lens_shows():
     flat = torch.full((4, 4), 0.05, dtype=torch.float64)
     image = expose(here, HeightField.of(lens), flat, rays_of(here, "stratified", 200_000)).image
     lit = (image.sum(1) > 0).nonzero()[:, 0]
-    assert float(lit[-1] - lit[0] + 1) * 0.1 == pytest.approx(blur_limit(here.source, 0.0, 300.0), rel=0.05)
+    assert float(lit[-1] - lit[0] + 1) * 0.1 == pytest.approx(here.source.blur(0.0, 300.0), rel=0.05)

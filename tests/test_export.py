@@ -8,6 +8,7 @@ import zipfile
 import numpy as np
 import pytest
 import torch
+from caustic_cli.optics.tracing import PlaneTracer
 from scipy.interpolate import BSpline, RectBivariateSpline
 
 from caustic_cli import __version__
@@ -16,9 +17,8 @@ from caustic_cli.export.lighttools import write_lighttools
 from caustic_cli.export.mesh import closed_mesh
 from caustic_cli.export.stl import TRIANGLE, write_stl
 from caustic_cli.export.surface import STEPS_PER_SPAN, sample_grid
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.sampling import Sample
-from caustic_cli.optics.tracing import PlaneTracer
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
 
 UNEVEN = (0.0, 0.0, 0.0, 0.0, 0.11, 0.2, 0.2, 0.55, 0.83, 1.0, 1.0, 1.0, 1.0)  # cubic, one double knot

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 import torch
+from caustic_cli.optics.tracing import PlaneTracer
 from PIL import Image
 
 from caustic_cli.errors import InputError
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter, splat
 from caustic_cli.optics.sampling import SAMPLERS, Sampler
-from caustic_cli.optics.tracing import PlaneTracer
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Lens, PlaneWave, Scene, Screen
 from caustic_cli.studies.gradmap import compare, difference_step, finite_difference, gradient_image, plot_gradient
 

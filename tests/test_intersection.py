@@ -7,16 +7,16 @@ import math
 import numpy as np
 import pytest
 import torch
+from caustic_cli.optics.bundle import Bundle
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.autograd import forward_ad
 
 from caustic_cli.optics import intersection
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.bundle import Bundle
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.intersection import Method, Status
 from caustic_cli.optics.kernels.surface import FusedSurface, RayHits
+from caustic_cli.optics.surfaces.heightfield import HeightField
 
 
 def bundle(x, y, z, dx, dy, dz):

@@ -10,16 +10,16 @@ from __future__ import annotations
 import numba
 import pytest
 import torch
+from caustic_cli.optics.tracing import PlaneTracer, trace_plane
 
 from caustic_cli import firstrun
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.kernels import banded, plane, spline
 from caustic_cli.optics.kernels import shares as kernel_shares
 from caustic_cli.optics.kernels.functions import PlaneKernel
 from caustic_cli.optics.reconstruction import Filter, splat
 from caustic_cli.optics.sampling import Sampler
-from caustic_cli.optics.tracing import PlaneTracer, trace_plane
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Lens, PlaneWave, Scene, Screen
 
 FILTERS = [Filter(), *(Filter("cosine", (v, w)) for v, w in ((3, 3), (1, 5), (11, 3), (15, 15))),

@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.bspline import SplineSpace, Surface
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.kernels import mesh as kernel
 from caustic_cli.optics.mesh import TriangleMesh, boxes_of, vertices_of
+from caustic_cli.optics.surfaces.heightfield import HeightField
 
 UNEVEN = torch.tensor([0, 0, 0, 0, 0.3, 0.3, 0.55, 0.55, 0.55, 0.9, 1, 1, 1, 1], dtype=torch.float64)
 FIELDS = {

@@ -6,16 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from caustic_cli.optics.tracing import expose
 
 from caustic_cli.errors import CausticError
 from caustic_cli.inverse import objective as module
 from caustic_cli.inverse.losses import Loss
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.penalties import Penalty
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
-from caustic_cli.optics.tracing import expose
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
 
 pytestmark = pytest.mark.usefixtures("kernels")

@@ -5,17 +5,17 @@ from dataclasses import replace
 
 import pytest
 import torch
+from caustic_cli.optics.stepwise import SEQUENTIAL, Steps, StepTracer, needed
+from caustic_cli.optics.tracing import PlaneTracer, tracer
 from test_effects import POINT, bumpy, cliff, heights_through, scene_of, shine, sloped
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.bounds import bounds_of
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.meeting import again
 from caustic_cli.optics.plan import EFFECTS, FREE, NEGLIGIBLE, compile_plan, parse_effects
 from caustic_cli.optics.reconstruction import Filter
-from caustic_cli.optics.stepwise import SEQUENTIAL, Steps, StepTracer, needed
-from caustic_cli.optics.tracing import PlaneTracer, tracer
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Disc, Light, Points, Screen
 
 SMOOTH = Filter("cosine", (3, 3))

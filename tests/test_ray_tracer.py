@@ -6,13 +6,13 @@ import math
 
 import pytest
 import torch
+from caustic_cli.optics.tracing import LOSSES, RayTracer, expose, tracer
 from torch.autograd import forward_ad
 
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
-from caustic_cli.optics.tracing import LOSSES, RayTracer, expose, tracer
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Disc, Lens, Points, Scene, Screen
 
 SCREEN = Screen((40.0, 30.0), 25.0, (40, 30))

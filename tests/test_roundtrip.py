@@ -17,6 +17,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import torch
+from caustic_cli.optics.tracing import PlaneTracer
 from scipy.interpolate import BSpline, CubicHermiteSpline, RectBivariateSpline
 from test_export import CASES, make, signed_volume
 
@@ -34,7 +35,6 @@ from caustic_cli.export.surface import STEPS_PER_SPAN, sample_grid, second_deriv
 from caustic_cli.export.zemax import write_zemax
 from caustic_cli.files import is_ours
 from caustic_cli.optics.sampling import Sample
-from caustic_cli.optics.tracing import PlaneTracer
 from caustic_cli.scene import Disc, PlaneWave, Points, Scene
 from caustic_cli.surfaces import onto, read_surface
 

@@ -11,7 +11,6 @@ import torch
 from torch.autograd import forward_ad
 
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.optics.interface import reflect, reflectance, reflectances, refract
 from caustic_cli.optics.kernels import mirror, refraction
 from caustic_cli.optics.kernels.grid import GridSurface
@@ -21,6 +20,7 @@ from caustic_cli.optics.kernels.splat import splat_rays
 from caustic_cli.optics.polarisation import field_of, part_s
 from caustic_cli.optics.reconstruction import Filter, splat
 from caustic_cli.optics.sampling import Sample
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.tolerances import PARALLEL
 from caustic_cli.scene import Screen
 

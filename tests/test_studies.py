@@ -14,8 +14,8 @@ from caustic_cli.derive import complete
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.files import is_ours
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.intersection import find
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.settings import build_scene
 from caustic_cli.studies import intersection, training

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 import torch.autograd.forward_ad as fwd
+from caustic_cli.optics.tracing import LOSSES, PlaneTracer, Status, expose
 from scipy.interpolate import BSpline
 
 from caustic_cli.errors import InputError
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import SAMPLERS, Sampler
-from caustic_cli.optics.tracing import LOSSES, PlaneTracer, Status, expose
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
 from caustic_cli.scene.lens import FRESNEL
 

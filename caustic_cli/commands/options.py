@@ -163,9 +163,8 @@ def compile_for(scene, device: str, say: Reporter) -> None:
     import torch  # noqa: PLC0415
 
     from caustic_cli.optics.kernels import fused  # noqa: PLC0415
-    from caustic_cli.scene import PlaneWave  # noqa: PLC0415
 
-    if fused(device) and (scene is None or not isinstance(scene.source, PlaneWave)):
+    if fused(device) and (scene is None or not scene.source.collimated):
         from caustic_cli.optics.kernels.functions import compile_ray_kernels  # noqa: PLC0415
 
         with say.patience("compiling the intersection kernels for this machine, once: about half a minute"):

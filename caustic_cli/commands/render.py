@@ -141,7 +141,7 @@ def run(
         scene = replace(scene, screen=screen)
         plan = compile_plan(scene, field, heights, wanted)
         exposure, figures = retrace(plan.scene, field, heights, target, rays=count, filter=filter, device=device, seed=seed,
-                                    dtype=precision, tolerance=tolerance, steps=plan.steps)
+                                    dtype=precision, tolerance=tolerance, requests=plan.requests)
     except InputError as error:
         raise InputError(str(error).replace("[screen] z", "--screen-at") if screen_at is not None else str(error)) from error
     image = exposure.image.cpu().numpy()

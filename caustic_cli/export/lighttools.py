@@ -17,11 +17,11 @@ import numpy as np
 from torch import Tensor
 
 from caustic_cli import __version__
+from caustic_cli.errors import InputError
 from caustic_cli.export.surface import sample_grid
 from caustic_cli.files import MARK, atomic_path
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.scene import Disc, PlaneWave, Scene
-from caustic_cli.scene.source import covering_cone
+from caustic_cli.scene import Scene
 
 FORMAT_VERSION = 1
 
@@ -81,30 +81,41 @@ def _source(scene: Scene) -> dict[str, np.ndarray]:
     `source_power` (k,), of each position; (1,), through the aperture, for a plane wave or a disc at infinity.  `source_profile`
     (a, b), the relative irradiance over the aperture [i, j], is there only when a wave is not uniform; `source_size` (2,) mm
     or `source_angle` (full, degrees) only for a disc; `source_intensity` where there is a cone.
+
+    Raises:
+        InputError: the archive knows no source of this type.
     """
     source = scene.source
-    if not isinstance(source, PlaneWave):
-        disc, far = isinstance(source, Disc), isinstance(source, Disc) and source.angle is not None
-        keys = {
-            "source_type": np.array(source.kind),
-            "source_positions": _reals(np.zeros((0, 3)) if far else [source.position] if disc else source.positions),
-            "source_power": _reals([source.power] if disc else source.powers),
-            "cone_half_angle": _reals(source.angle / 2.0 if far else
-                                      np.degrees(covering_cone(source, scene.lens.half_size, scene.lens.z_in,
-                                                                   scene.lens.round))),
-        }
-        if far:
-            return keys | {"source_angle": _reals(source.angle)}
-        return keys | {"source_intensity": np.array(source.intensity)} | ({"source_size": _reals(source.size)} if disc else {})
-    keys = {
-        "source_type": np.array("plane"),
-        "source_positions": np.zeros((0, 3)),
-        "source_power": _reals([source.power]),
-        "cone_half_angle": _reals(0.0),
+    if source.kind not in _KEYS:
+        raise InputError(f"--format lighttools knows no source of type {source.kind}")
+    return {
+        "source_type": np.array(source.kind),
+        "source_positions": source.points()[0],
+        "source_power": _reals(source.powers),
+        **_KEYS[source.kind](scene),
     }
-    if source.profile is not None:
-        keys["source_profile"] = _reals(source.profile)
-    return keys
+
+
+def _of_plane(scene: Scene) -> dict[str, np.ndarray]:
+    profile = scene.source.profile
+    return {"cone_half_angle": _reals(0.0)} | ({} if profile is None else {"source_profile": _reals(profile)})
+
+
+def _of_points(scene: Scene) -> dict[str, np.ndarray]:
+    source, lens = scene.source, scene.lens
+    return {"cone_half_angle": _reals(np.degrees(source.cone_over(lens.half_size, lens.z_in, lens.round))),
+            "source_intensity": np.array(source.intensity)}
+
+
+def _of_disc(scene: Scene) -> dict[str, np.ndarray]:
+    source = scene.source
+    if source.distant:
+        return {"cone_half_angle": _reals(source.angle / 2.0), "source_angle": _reals(source.angle)}
+    return _of_points(scene) | {"source_size": _reals(source.size)}
+
+
+#: What else the archive says of a source, by its kind.
+_KEYS = {"plane": _of_plane, "point": _of_points, "grid": _of_points, "disc": _of_disc}
 
 
 def _reals(value) -> np.ndarray:

@@ -20,7 +20,7 @@ from caustic_cli.export.surface import SurfaceGrid, sample_grid
 from caustic_cli.export.text import CREATED, real
 from caustic_cli.files import atomic_path, write_bytes
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.scene import Disc, PlaneWave, Scene
+from caustic_cli.scene import Scene
 
 #: Rows of the flat entrance along each axis: a plane needs no more.
 FLAT = 5
@@ -155,9 +155,9 @@ def write_script(path: str | Path, scene: Scene, field: HeightField, heights: Te
         InputError: a plane wave with a profile, which the script's source has not; or the files cannot be written.
     """
     path, source = Path(path), scene.source
-    if isinstance(source, PlaneWave) and source.profile is not None:
+    if source.profile is not None:
         raise InputError("--script: its source is uniform, so one with a profile cannot be written")
-    if isinstance(source, Disc) and source.size[0] != source.size[1] and source.angle is None:
+    if source.extent[0] != source.extent[1]:
         raise InputError("--script: its disc is round, so an elliptical one cannot be written")
     if scene.lens.round:
         raise InputError("--script: its freeform solid is a rectangle, so a circular aperture cannot be written")

@@ -26,9 +26,8 @@ from caustic_cli.export.surface import STEPS_PER_SPAN
 from caustic_cli.export.text import CREATED, real
 from caustic_cli.files import write_bytes
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.scene import Disc, Lens, PlaneWave, Scene
+from caustic_cli.scene import Lens, Scene
 from caustic_cli.scene.plain import beyond_plain
-from caustic_cli.scene.source import covering_cone
 
 #: Rays a pixel of the scene's own sampler, Mitsuba's `spp`.
 SAMPLES = 256
@@ -135,25 +134,33 @@ def _light(scene: Scene) -> list[str]:
     Raises:
         InputError: Mitsuba has none like this.
     """
-    source, lens = scene.source, scene.lens
     if beyond_plain(scene):
         raise InputError(f"--format mitsuba is written for clear lenses and straight screens, not {', '.join(beyond_plain(scene))}")
-    if isinstance(source, PlaneWave):
-        if source.profile is not None:
-            raise InputError("--format mitsuba: its collimated emitter is uniform, so a source with a profile cannot be written")
-        (rx, ry), area = lens.half_size, lens.size[0] * lens.size[1] * (math.pi / 4.0 if lens.round else 1.0)
-        radiance = real(source.power / area)
-        return [f'<shape type="{"disk" if lens.round else "rectangle"}" id="light">',
-                f'  <transform name="to_world"><scale x="{real(rx)}" y="{real(ry)}"/>'
-                f'<translate z="{real(lens.z_in - BEFORE)}"/></transform>',
-                f'  <emitter type="directionalarea"><rgb name="radiance" value="{radiance}"/></emitter>', "</shape>"]
-    cone = covering_cone(source, lens.half_size, lens.z_in, lens.round)
-    if not isinstance(source, Disc):
-        return _spots(source, cone)
-    if source.angle is not None or source.intensity != "lambertian" or source.cone is not None:
+    if scene.source.kind not in _EMITTERS:
+        raise InputError(f"--format mitsuba knows no source of type {scene.source.kind}")
+    return _EMITTERS[scene.source.kind](scene)
+
+
+def _collimated(scene: Scene) -> list[str]:
+    """A plane wave: an area as wide as the lens."""
+    source, lens = scene.source, scene.lens
+    if source.profile is not None:
+        raise InputError("--format mitsuba: its collimated emitter is uniform, so a source with a profile cannot be written")
+    (rx, ry), area = lens.half_size, lens.size[0] * lens.size[1] * (math.pi / 4.0 if lens.round else 1.0)
+    radiance = real(source.power / area)
+    return [f'<shape type="{"disk" if lens.round else "rectangle"}" id="light">',
+            f'  <transform name="to_world"><scale x="{real(rx)}" y="{real(ry)}"/>'
+            f'<translate z="{real(lens.z_in - BEFORE)}"/></transform>',
+            f'  <emitter type="directionalarea"><rgb name="radiance" value="{radiance}"/></emitter>', "</shape>"]
+
+
+def _area(scene: Scene) -> list[str]:
+    """A disc that shines on everything."""
+    source, lens = scene.source, scene.lens
+    if source.distant or source.intensity != "lambertian" or source.cone is not None:
         raise InputError("--format mitsuba: of discs only a Lambertian one without a cone of its own can be written, not one at"
                          " infinity; render --verify mitsuba traces them all")
-    (wx, wy), (x, y, z) = source.size, source.position
+    (wx, wy), (x, y, z), cone = source.size, source.position, source.cone_over(lens.half_size, lens.z_in, lens.round)
     radiance = source.power / (math.pi * math.pi * wx * wy / 4.0 * math.sin(cone) ** 2)  # its cone just covers the lens
     return ['<shape type="disk" id="light">',
             f'  <transform name="to_world"><scale x="{real(wx / 2)}" y="{real(wy / 2)}"/>'
@@ -161,10 +168,12 @@ def _light(scene: Scene) -> list[str]:
             f'  <emitter type="area"><rgb name="radiance" value="{real(radiance)}"/></emitter>', "</shape>"]
 
 
-def _spots(source, cone: float) -> list[str]:
+def _spots(scene: Scene) -> list[str]:
     """A spot a point.  Mitsuba's fall off towards their rim, so they are even a little beyond the cone."""
+    source, lens = scene.source, scene.lens
     if source.intensity != "uniform":
         raise InputError("--format mitsuba: its spots shine evenly, so Lambertian points cannot be written")
+    cone = source.cone_over(lens.half_size, lens.z_in, lens.round)
     lines, degrees = [], math.degrees(cone)
     for (x, y, z), power in zip(source.positions, source.powers, strict=True):
         intensity = power / (4.0 * math.pi * math.sin(cone / 2.0) ** 2)
@@ -173,3 +182,7 @@ def _spots(source, cone: float) -> list[str]:
                   f'  <rgb name="intensity" value="{real(intensity)}"/><float name="beam_width" value="{real(degrees)}"/>'
                   f'<float name="cutoff_angle" value="{real(degrees * (1.0 + 1e-4))}"/></emitter>']
     return lines
+
+
+#: The emitters of a source, by its kind.
+_EMITTERS = {"plane": _collimated, "point": _spots, "grid": _spots, "disc": _area}

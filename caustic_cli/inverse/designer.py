@@ -23,8 +23,8 @@ from caustic_cli.inverse.parametrisation import INITIAL, NETWORKS, PRECONDITIONE
 from caustic_cli.inverse.schedule import Stage
 from caustic_cli.inverse.steps import Adam, Newtonlike
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.sampling import stream
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene, checks
 
 OPTIMIZERS = ("lbfgs", "adam")

@@ -22,10 +22,9 @@ from torch import Tensor
 from caustic_cli.inverse import start
 from caustic_cli.inverse.target import overlap
 from caustic_cli.inverse.transport import corners
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.interface import reflectance
-from caustic_cli.scene import Disc, PlaneWave, Scene
-from caustic_cli.scene.source import covering_cone
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.scene import Scene
 
 #: Source cells along the lens' longer side: a picture of 250 x 250 pixels is resolved, and they are cheap.
 CELLS = 256
@@ -54,7 +53,7 @@ def first_surface(scene: Scene, target: np.ndarray, field: HeightField, cells: i
     x, y = corners(shape[0], half[0]), corners(shape[1], half[1])
     z = lens.offset.thickness + lens.offset.sag(x[:, None], y[None, :])
     mean, found = float(z.mean()), None
-    for _ in range(1 if _parallel(scene) else PASSES):
+    for _ in range(1 if scene.source.distant else PASSES):
         light, directions = _light(scene, x, y, z, shape)
         if lens.round:
             light = light * _part_within(x, y, half[0])
@@ -69,10 +68,6 @@ def first_surface(scene: Scene, target: np.ndarray, field: HeightField, cells: i
     return net if float(net.max() - net.min()) <= OVERSHOOT * float(values.max() - values.min()) else values
 
 
-def _parallel(scene: Scene) -> bool:
-    return isinstance(scene.source, PlaneWave) or (isinstance(scene.source, Disc) and scene.source.angle is not None)
-
-
 def _part_within(x: np.ndarray, y: np.ndarray, radius: float, parts: int = 8) -> np.ndarray:
     """Part of each cell between corners x, y that lies within a circle, from parts x parts points of it."""
     fine = [np.linspace(c[0], c[-1], 2 * parts * (len(c) - 1) + 1)[1::2] for c in (x, y)]
@@ -83,8 +78,8 @@ def _part_within(x: np.ndarray, y: np.ndarray, radius: float, parts: int = 8) ->
 def _light(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray, shape) -> tuple[np.ndarray, tuple | None]:
     """Power in the cells between corners x, y, and the unit directions inside the glass there (None for along z)."""
     source, lens = scene.source, scene.lens
-    if _parallel(scene):
-        profile = getattr(source, "profile", None)
+    if source.distant:
+        profile = source.profile
         if profile is None:
             return np.ones(shape), None
         for axis in (0, 1):  # the profile's cells, averaged over these
@@ -113,7 +108,7 @@ def _light(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray, shape) -> 
         power *= 1.0 - reflectance("exact", cosine, inside, 1.0 / n)
     if source.intensity == "lambertian":
         power *= cosine
-    cone = min(covering_cone(source, lens.half_size, lens.z_in, lens.round), 1.57079)
+    cone = min(source.cone_over(lens.half_size, lens.z_in, lens.round), 1.57079)
     power = np.where(q <= math.tan(cone) * (1 + 1e-9), power, 0.0)
     light = 0.25 * (power[1:, 1:] + power[:-1, 1:] + power[1:, :-1] + power[:-1, :-1])
     return light, (sx * cosine / n, sy * cosine / n, inside)

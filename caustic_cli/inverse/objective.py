@@ -18,9 +18,9 @@ from caustic_cli.inverse import ranks
 from caustic_cli.inverse.losses import PENALTIES, ColorLoss, Loss, parse
 from caustic_cli.inverse.penalties import Penalty
 from caustic_cli.optics.emission import Rays
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.shortage import smaller
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT
 from caustic_cli.optics.trace import Parameters, Tracer, tracers
 from caustic_cli.scene import Scene

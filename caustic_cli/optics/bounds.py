@@ -19,11 +19,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.interface import reflectance, reflectances
 from caustic_cli.optics.sampling import LARGEST_NORMAL
-from caustic_cli.scene import Disc, PlaneWave, Points, Scene
-from caustic_cli.scene.source import covering_cone
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -72,21 +71,12 @@ def bounds_of(scene: Scene, field: HeightField, heights: Tensor) -> Bounds:
 def _incidence(scene: Scene) -> float:
     """The most that rays to the aperture lean from z before the entrance, rad."""
     source, lens = scene.source, scene.lens
-    if isinstance(source, PlaneWave):
-        return 0.0
-    if isinstance(source, Disc) and source.angle is not None:
-        return math.radians(source.angle) / 2.0
-    positions, extent = _places(source)
+    if source.distant:
+        return source.half_angle
+    positions, extent = source.points()[0], source.extent
     far = np.hypot(*(np.abs(positions[:, k]) + extent[k] + lens.half_size[k] for k in (0, 1)))
     steepest = float(np.arctan2(far, lens.z_in - positions[:, 2]).max())
-    return min(covering_cone(source, lens.half_size, lens.z_in, lens.round), steepest)
-
-
-def _places(source: Points | Disc) -> tuple[np.ndarray, tuple[float, float]]:
-    """Positions (k, 3) and half widths about them, mm."""
-    if isinstance(source, Points):
-        return np.array(source.positions), (0.0, 0.0)
-    return np.array([source.position]), (source.size[0] / 2.0, source.size[1] / 2.0)
+    return min(source.cone_over(lens.half_size, lens.z_in, lens.round), steepest)
 
 
 def _polarised(incidence: float, critical: float, n: float) -> float:
@@ -105,14 +95,14 @@ def _reach(scene: Scene, inside: float, lowest: float, top: float) -> float:
     """How far from the axis rays can be at the surface's greatest height, in half widths of the aperture; infinite where the
     surface may dip below the entrance, which rays then never meet from below."""
     source, lens = scene.source, scene.lens
-    if isinstance(source, PlaneWave):
+    if source.collimated:
         return 1.0
     if lowest < lens.z_in:
         return math.inf
     drift = (top - lens.z_in) * math.tan(inside)
-    if isinstance(source, Disc) and source.angle is not None:
+    if source.distant:
         return 1.0 + drift / min(lens.half_size)
-    (positions, extent), cone = _places(source), covering_cone(source, lens.half_size, lens.z_in, lens.round)
+    positions, extent, cone = source.points()[0], source.extent, source.cone_over(lens.half_size, lens.z_in, lens.round)
     wide = (lens.z_in - positions[:, 2]) * math.tan(cone) if cone < math.pi / 2.0 else np.full(len(positions), math.inf)
     if lens.round:
         far = np.hypot(*(np.abs(positions[:, k]) + extent[k] for k in (0, 1))) + wide
@@ -144,7 +134,7 @@ def _ghost(scene: Scene, field: HeightField, heights: Tensor, inside: float, n: 
         return torch.where(square > 0, value, torch.ones_like(value))
 
     both = part(inside + lean) * part(inside + 2.0 * lean)
-    even = isinstance(scene.source, PlaneWave) and scene.source.profile is None and not lens.round
+    even = scene.source.collimated and scene.source.profile is None and not lens.round
     return float((both * area).sum() if even else both.max())
 
 

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.kernels import blocks
+from caustic_cli.optics.surfaces.heightfield import HeightField
 
 #: Boxes are wider than the control net by this part of the largest height: rounding in the vertices, at degree 15.
 PADDING = 256 * 2.0**-52

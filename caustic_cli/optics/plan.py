@@ -72,6 +72,5 @@ def compile_plan(scene: Scene, field: HeightField, heights: Tensor, wanted: Iter
     traced, requests = scene, NO_REQUESTS
     for effect, verdict in zip(EFFECTS, verdicts, strict=True):
         traced = effect.within(traced) if verdict.on else effect.without(traced)
-        asked = effect.request(scene, verdict.on, bounds)
-        requests = Requests(requests.on | asked.on, requests.off | asked.off) if asked != NO_REQUESTS else requests
+        requests |= effect.request(scene, verdict.on, bounds)
     return Plan(tuple(verdicts), traced, requests)

@@ -17,7 +17,7 @@ from functools import cached_property
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.surfaces import HeightField, Plane, Surface
-from caustic_cli.scene import Light, PlaneWave, Pupil, Scene, Screen, Source, checks
+from caustic_cli.scene import Light, Pupil, Scene, Screen, Source, checks
 from caustic_cli.scene.lens import FRESNEL
 from caustic_cli.scene.materials import refractive_index
 

@@ -28,7 +28,7 @@ from torch import Tensor
 from caustic_cli.errors import InputError
 from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.effects import EFFECTS, NO_REQUESTS, Action, Requests
-from caustic_cli.optics.emission import Rays
+from caustic_cli.optics.emission import Rays, rays_of
 from caustic_cli.optics.image import Image
 from caustic_cli.optics.rays import LOSSES, RayState, Status
 from caustic_cli.optics.reconstruction import Filter
@@ -95,13 +95,12 @@ class Tracer:
         like: the tracer of the chunk before through the same system, whose prepared arrays serve again where they are the same.
         weight, channel: part of the power that this light is of the whole, and the colour of the image that it goes into.
         wavelength: nm, at which glasses refract; None for the indices that media give.
-        lower: False goes by stages even where a fused kernel does the same.
         track: keep what became of every ray (`RayState.status`).
     """
 
     def __init__(self, system: System, rays: Sample | RayState, dtype: torch.dtype = torch.float64,
                  requests: Requests = NO_REQUESTS, like: Tracer | None = None, *, weight: float = 1.0, channel: int | None = None,
-                 wavelength: float | None = None, lower: bool = True, track: bool = False):
+                 wavelength: float | None = None, track: bool = False):
         self.system, self.requests, self.weight, self.channel, self.track = system, requests, weight, channel, track
         self.media, self.sides = system.media(), system.sides()
         pupil = system.pupil
@@ -123,7 +122,7 @@ class Tracer:
                 state, self.first = meeting.state, self.first + 1
         self.start = state
         self.meets = self._prepared()
-        self.fused = self._lowered(like) if lower else None
+        self.fused = None if requests.stages else self._lowered(like)
 
     def __call__(self, parameters: Parameters) -> list[RayState]:
         """Heights {name: (n, m) mm float64} -> rays behind the last element: those that went straight on, then those of detours."""
@@ -138,6 +137,15 @@ class Tracer:
             if action.detours:
                 states += action.detour(self, parameters, meetings)
         return states
+
+    @torch.no_grad()
+    def exit_of(self, parameters: Parameters) -> tuple[tuple, tuple, Tensor]:
+        """How rays arrive at the last element, in its frame: slopes of the surface there, directions, powers."""
+        state, last = self.start, len(self.system.elements) - 1
+        for k in range(self.first, last + 1):
+            meeting = self.cross(k, state, parameters.get(self.system.elements[k].name))
+            state = meeting.state
+        return meeting.slopes, meeting.incoming, meeting.arriving
 
     def land(self, parameters: Parameters, screen: Screen | Placed) -> list[RayState]:
         """The same on a screen: x and y of their origins are the screen's own coordinates, mm."""
@@ -378,6 +386,12 @@ def advanced(origin, direction, t: Tensor) -> tuple:
 
 def _less(value, shift: float):
     return value if shift == 0.0 else value - shift
+
+
+def is_lowered(scene: Scene, field: HeightField, requests: Requests = NO_REQUESTS) -> bool:
+    """Whether the light of a scene goes to its screen by a fused kernel."""
+    few = next(iter(rays_of(scene, "grid", 4).chunks()))
+    return not any(scene.screen.tilt) and Tracer(System.of(scene, field), few, requests=requests).fused is not None
 
 
 def trace(system: System, rays: Sample | RayState, parameters: Parameters, **options) -> list[RayState]:

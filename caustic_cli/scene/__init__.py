@@ -5,7 +5,7 @@ from __future__ import annotations
 from caustic_cli.scene.lens import Lens, Offset
 from caustic_cli.scene.light import Light
 from caustic_cli.scene.screen import Screen
-from caustic_cli.scene.source import Disc, PlaneWave, Points, Source
+from caustic_cli.scene.sources import Disc, PlaneWave, Points, Source
 
 __all__ = ["Band", "Disc", "Lens", "Light", "Offset", "PlaneWave", "Points", "Pupil", "Scene", "Screen", "Source"]
 
@@ -54,7 +54,7 @@ class Scene:
             raise InputError(
                 f"[screen] z must lie behind the lens (beyond z_in = {self.lens.z_in:g} mm), got {self.screen.z:g} mm"
             )
-        if not isinstance(self.source, PlaneWave) and self.source.nearest >= self.lens.z_in:
+        if self.source.nearest >= self.lens.z_in:
             raise InputError(f"[source] position must lie before the lens (z below z_in = {self.lens.z_in:g} mm),"
                              f" got z = {self.source.nearest:g} mm")
         if self.dispersive:

@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 
 from caustic_cli import __version__
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import SAMPLERS
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene, checks
 from caustic_cli.studies.fit import Order, order
 from caustic_cli.studies.measurement import REFERENCE_SEED, Bench, Reference, Setting, haste

@@ -20,21 +20,22 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from caustic_cli import __version__
+from caustic_cli.optics.effects import EFFECTS, Requests, Verdict
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.plan import EFFECTS, FREE, Effect, Plan, compile_plan
+from caustic_cli.optics.image import Image
+from caustic_cli.optics.plan import Plan, compile_plan
 from caustic_cli.optics.sampling import stream
-from caustic_cli.optics.stepwise import needed
-from caustic_cli.optics.tracing import Exposure, expose
-from caustic_cli.scene import Disc, Light, PlaneWave, Points, Scene, checks
-from caustic_cli.scene.materials import D_LINE, refractive_index
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.trace import expose, is_lowered
+from caustic_cli.scene import Scene, checks
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.report import COLOURS, MARKERS, Study
 
 #: Rays of every image, and rounds, unless said: a few seconds for each effect on two cores.
 RAYS, REPEATS = 1 << 16, 5
-#: Amounts at which the study measures an effect that its scene does not have.
-SUN, SIZE, ABSORPTION, ROUGHNESS, TILT, SHIFT, GLASS, LINES = 0.533, 1.0, 0.01, 0.001, 10.0, 1.0, "N-BK7", (486.1, D_LINE, 656.3)
+BY_NAME = {effect.name: effect for effect in EFFECTS}
+#: Whether an effect costs nothing that could be saved.
+FREE = {effect.name: effect.free for effect in EFFECTS}
 
 COLUMNS = {
     "series": "effect",
@@ -56,17 +57,17 @@ def measure(with_: Plan, without: Plan, field: HeightField, heights: Tensor, *, 
             seed: int = 0, dtype: torch.dtype = torch.float64) -> dict:
     """Cost and error of the effect in which two plans differ: error, power, seconds, seconds_min, seconds_max, whole.
 
-    Where only the plan without it leaves the fused kernels, both are timed as steps: the cost is that of the effect alone.
+    Where only the plan without it leaves the fused kernels, both are timed by stages: the cost is that of the effect alone.
     """
-    if needed(without.scene, without.steps) and not needed(with_.scene, with_.steps):
-        with_ = replace(with_, steps=replace(with_.steps, plain=True))
+    if is_lowered(with_.scene, field, with_.requests) and not is_lowered(without.scene, field, without.requests):
+        with_ = replace(with_, requests=with_.requests | Requests(stages=True))
 
     clock = time.perf_counter if heights.is_cuda else time.process_time
 
-    def image(plan: Plan) -> tuple[Exposure, float]:
+    def image(plan: Plan) -> tuple[Image, float]:
         began = clock()
         sampler = rays_of(plan.scene, "stratified", rays, stream(seed, "effects"), heights.device)
-        found = expose(plan.scene, field, heights, sampler, None, dtype, steps=plan.steps)
+        found = expose(plan.scene, field, heights, sampler, None, dtype, requests=plan.requests)
         if heights.is_cuda:
             torch.cuda.synchronize()
         return found, clock() - began
@@ -96,7 +97,7 @@ def explain(plan: Plan, scene: Scene, field: HeightField, heights: Tensor, *, ra
             with_, without = (compile_plan(scene, field, heights, chosen)
                               for chosen in (set(plan.simulated) | {effect.name}, set(plan.simulated) - {effect.name}))
             found = measure(with_, without, field, heights, rays=rays, repeats=repeats, seed=seed, dtype=dtype)
-            scale = 0.0 if effect.name in FREE else 1e3
+            scale = 0.0 if FREE[effect.name] else 1e3
             cost, *extremes = (scale * found[k] for k in ("seconds", "seconds_min", "seconds_max"))
             row |= {"cost_ms": cost, "cost_ms_range": extremes, "error": found["error"], "power": found["power"]}
         rows.append({"cost_ms_range": [0.0, 0.0]} | row)
@@ -155,53 +156,24 @@ def _matters(row: dict) -> float:
     return max(row["error"], abs(row["power"]))
 
 
-def _row(effect: Effect, plan: Plan, scene: Scene, field: HeightField, heights: Tensor, rays: int, repeats: int, seed: int,
+def _row(effect: Verdict, plan: Plan, scene: Scene, field: HeightField, heights: Tensor, rays: int, repeats: int, seed: int,
          dtype: torch.dtype) -> dict | None:
     name, amount, bare = effect.name, "the scene's own", None
     if not effect.present:
-        made = put(scene, name, heights)
+        made = BY_NAME[name].sample(scene, heights)
         if made is None:
             return None
-        scene, bare, amount = made
+        scene, bare, amount = made.scene, made.bare, made.words
         plan = compile_plan(scene, field, heights)
     elif effect.fixed:
         return None
     with_ = compile_plan(scene, field, heights, set(plan.simulated) | {name})
     without = compile_plan(bare or scene, field, heights, None if bare else set(plan.simulated) - {name})
     found = measure(with_, without, field, heights, rays=rays, repeats=repeats, seed=seed, dtype=dtype)
-    if name in FREE:
+    if FREE[name]:
         found |= dict.fromkeys(("seconds", "seconds_min", "seconds_max"), 0.0)
     return {"series": name, "on": effect.on, "why": effect.why, "bound": effect.bound, "limit": effect.limit,
             "amount": amount} | found
-
-
-def put(scene: Scene, name: str, heights: Tensor) -> tuple[Scene, Scene | None, str] | None:
-    """The scene with an effect put in, the scene to compare it with (None: the same without it), and how much of it."""
-    lens, screen, s = scene.lens, scene.screen, scene.source
-    if name == "source-size":
-        if isinstance(s, PlaneWave):
-            return replace(scene, source=Disc(power=s.power, angle=SUN)), None, f"{SUN} degrees"
-        position, cone = s.centre, s.cone if isinstance(s, Points) else None
-        return replace(scene, source=Disc(position, (SIZE, SIZE), s.power, cone)), None, f"{SIZE:g} mm"
-    if name == "polarisation" and lens.fresnel == "exact" and not lens.mirror:
-        return replace(scene, light=replace(scene.light, polarisation=0.0)), None, "along x"
-    if name == "dispersion" and not lens.mirror:
-        glass = lens.glass or GLASS
-        lens = replace(lens, glass=glass, index=refractive_index(glass))
-        light = Light(scene.light.polarisation, LINES)
-        return replace(scene, lens=lens, light=light), None, f"{len(LINES)} wavelengths in {glass}"
-    if name == "absorption" and not lens.mirror:
-        return replace(scene, lens=replace(lens, absorption=ABSORPTION)), None, f"{ABSORPTION:g} per mm"
-    if name == "roughness":
-        return replace(scene, lens=replace(lens, roughness=ROUGHNESS)), None, f"slopes {ROUGHNESS:g}"
-    if name == "screen-tilt":
-        return replace(scene, screen=replace(screen, tilt=(0.0, TILT))), None, f"{TILT:g} degrees"
-    if name == "screen-shift":
-        return replace(scene, screen=replace(screen, shift=(SHIFT, 0.0))), None, f"{SHIFT:g} mm"
-    if name == "mirror":
-        z = 2.0 * float(heights.mean()) - screen.z
-        return Scene(s, replace(lens, mirror=True), replace(screen, z=z), scene.light), scene, f"the screen at {z:.4g} mm"
-    return None
 
 
 def draw_effects(study: Study, figure: Figure) -> None:

@@ -28,9 +28,9 @@ from torch.autograd import forward_ad
 from caustic_cli.errors import InputError
 from caustic_cli.files import SOFTWARE, atomic_path
 from caustic_cli.optics.emission import Rays
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sample
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer, expose
 from caustic_cli.scene import Scene

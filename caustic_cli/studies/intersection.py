@@ -30,13 +30,15 @@ from torch import Tensor
 
 from caustic_cli import __version__
 from caustic_cli.errors import CausticError
+from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.bundle import Bundle
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.intersection import Method, Status, find
-from caustic_cli.optics.kernels.surface import FusedSurface, RayHits
-from caustic_cli.scene import PlaneWave, Points, Scene, checks
+from caustic_cli.optics.rays import RayState
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import System
+from caustic_cli.optics.trace import Tracer
+from caustic_cli.scene import Points, Scene, checks
 from caustic_cli.studies.fit import Order, order
 from caustic_cli.studies.measurement import haste
 from caustic_cli.studies.report import Study, draw_front, plain_ticks, spread, styles
@@ -81,7 +83,7 @@ class Case:
 
     field: HeightField
     heights: Tensor
-    rays: Bundle
+    rays: RayState
     source: str
 
 
@@ -97,9 +99,9 @@ def table_d3(rays: int | None = None, seed: int = 0) -> Case:
     a, b = torch.rand(2, rays or RAYS, generator=generator, dtype=torch.float64)
     w = 2.0 * math.sin(CONE / 2.0) ** 2 * a  # 1 - cos of the angle to the axis
     sine, zero = torch.sqrt(w * (2.0 - w)), torch.zeros_like(w)
-    bundle = Bundle(zero, zero, -DEPTH, sine * torch.cos(2 * math.pi * b), sine * torch.sin(2 * math.pi * b), 1.0 - w,
-                    torch.full_like(w, 1.0 / len(w)), {})
-    return Case(field, heights, bundle, f"table D.3: a point {DEPTH:g} mm below the surface, cone {CONE:g} rad")
+    direction = sine * torch.cos(2 * math.pi * b), sine * torch.sin(2 * math.pi * b), 1.0 - w
+    rays = RayState((zero, zero, -DEPTH), direction, torch.full_like(w, 1.0 / len(w)))
+    return Case(field, heights, rays, f"table D.3: a point {DEPTH:g} mm below the surface, cone {CONE:g} rad")
 
 
 def of_lens(scene: Scene, field: HeightField, heights: Tensor, rays: int | None = None, seed: int = 0) -> Case:
@@ -108,18 +110,19 @@ def of_lens(scene: Scene, field: HeightField, heights: Tensor, rays: int | None 
     Raises:
         CausticError: no ray enters the lens.
     """
-    source = f"{len(scene.source.positions)} points" if isinstance(scene.source, Points) else "the disc"
-    if isinstance(scene.source, PlaneWave):
+    source = scene.source.label
+    if scene.source.collimated:
         away = AWAY * max(scene.lens.size)
         scene = replace(scene, source=Points(((0.0, 0.0, scene.lens.z_in - away),)))
         source = f"a point on the axis, {away:g} mm before the lens, as rays along z need no search"
     sampler = rays_of(scene, "uniform", rays or RAYS, seed)
-    bundle = next(iter(sampler.chunks(sampler.count)))
-    inside = bundle.share > 0
+    entered = Tracer(System.of(scene, field), next(iter(sampler.chunks(sampler.count)))).start
+    inside = entered.power > 0
     if not bool(inside.any()):
         raise CausticError("no ray enters the lens, so there is nothing to intersect; check source position and cone")
-    bundle = replace(bundle, **{k: getattr(bundle, k)[inside].contiguous() for k in ("x", "y", "dx", "dy", "dz", "share")})
-    return Case(field, heights.detach().double().cpu(), bundle, source)
+    (x, y, z), direction = entered.origin, tuple(c[inside].contiguous() for c in entered.direction)
+    rays = RayState((x[inside].contiguous(), y[inside].contiguous(), z), direction, entered.power[inside].contiguous())
+    return Case(field, heights.detach().double().cpu(), rays, source)
 
 
 def exact_heights(field: HeightField, heights: Tensor, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -153,13 +156,13 @@ def reference(case: Case) -> tuple[np.ndarray, np.ndarray, float]:
     Raises:
         CausticError: no ray meets the surface.
     """
-    t, status = find(case.field, case.heights, case.rays)
+    t, status = find(case.field, case.heights, case.rays.origin, case.rays.direction)
     hit = (status == Status.HIT).numpy()
     if not hit.any():
         raise CausticError("no ray meets the surface, so there are no hits to study")
-    b = case.rays
-    _, zx, zy = case.field.at(case.heights, b.x + t * b.dx, b.y + t * b.dy)
-    cosine = torch.where(status == Status.HIT, b.dz - zx * b.dx - zy * b.dy, torch.ones_like(t)).numpy()
+    (x, y, _), (dx, dy, dz) = case.rays.origin, case.rays.direction
+    _, zx, zy = case.field.at(case.heights, x + t * dx, y + t * dy)
+    cosine = torch.where(status == Status.HIT, dz - zx * dx - zy * dy, torch.ones_like(t)).numpy()
     t = t.numpy().astype(np.longdouble)
     for _ in range(2):
         t = t - _above(case, t) / cosine
@@ -168,8 +171,8 @@ def reference(case: Case) -> tuple[np.ndarray, np.ndarray, float]:
 
 def _above(case: Case, t: np.ndarray) -> np.ndarray:
     """f(t) (N,), mm: how high above the surface the rays are at t (N,) longdouble."""
-    x, y, dx, dy, dz = (getattr(case.rays, k).numpy().astype(np.longdouble) for k in ("x", "y", "dx", "dy", "dz"))
-    return case.rays.z + t * dz - exact_heights(case.field, case.heights, x + t * dx, y + t * dy)
+    x, y, dx, dy, dz = (c.numpy().astype(np.longdouble) for c in (*case.rays.origin[:2], *case.rays.direction))
+    return case.rays.origin[2] + t * dz - exact_heights(case.field, case.heights, x + t * dx, y + t * dy)
 
 
 def settings_of(field: HeightField, most: int | None = None) -> list[tuple[str, int | None]]:
@@ -196,12 +199,12 @@ def run_intersection(case: Case, *, seed: int = 0, repeats: int | None = None, m
     settings = settings_of(case.field, most)
     total, done = len(settings) * (1 + repeats), 0
     truth, hit, residual = reference(case)
-    hits = RayHits(FusedSurface(case.field.spaces, case.field.half_size), case.rays)
+    prepared = backend_for("cpu").finder(case.field, case.rays.origin, case.rays.direction)
     rows, times = [], [[] for _ in settings]
     for k in range(-1, repeats):  # the first round is for the errors and warms the machine up
         for i, (series, n) in enumerate(settings):
             start = time.perf_counter()
-            t, status = _evaluate(case, hits, series, n)
+            t, status = _evaluate(case, prepared, series, n)
             times[i].append(time.perf_counter() - start)
             if k < 0:
                 rows.append({"series": series, "n_u": n, **_errors(case, t, status, truth, hit)})
@@ -214,7 +217,7 @@ def run_intersection(case: Case, *, seed: int = 0, repeats: int | None = None, m
     parts = [row["n_u"] for row in mesh]
     orders = {f"mesh, {name}": order(parts, [row[column] for row in mesh]) for name, column in FITTED.items()}
     newton, at_equal = next(row for row in rows if row["series"] == "newton"), seconds_at(mesh, EQUAL)
-    about = {"version": __version__, "source": case.source, "seed": seed, "repeats": repeats, "rays": len(case.rays.x),
+    about = {"version": __version__, "source": case.source, "seed": seed, "repeats": repeats, "rays": case.rays.count,
              "control": list(case.field.shape), "degree": [s.degree for s in case.field.spaces], "dtype": "float64",
              "device": "cpu", "threads": torch.get_num_threads(), "reference": "newton in float64, two steps in longdouble",
              "reference_bits": int(np.finfo(np.longdouble).nmant) + 1, "reference_error": residual,
@@ -224,12 +227,11 @@ def run_intersection(case: Case, *, seed: int = 0, repeats: int | None = None, m
                  "n_u", PLOTS)
 
 
-def _evaluate(case: Case, hits: RayHits, series: str, n: int | None) -> tuple[Tensor, Tensor]:
-    """t (N,) and status (N,) as one setting finds them."""
+def _evaluate(case: Case, prepared: Callable, series: str, n: int | None) -> tuple[Tensor, Tensor]:
+    """t (N,) and status (N,) as one setting finds them; Newton's method has its rays prepared, as in a design."""
     if n is None:
-        hits.find(case.heights)
-        return torch.from_numpy(hits.t), torch.from_numpy(hits.status)
-    return find(case.field, case.heights, case.rays, Method(series.removesuffix(FLAT), (n, n), not series.endswith(FLAT)))
+        return prepared(case.heights)
+    return find(case.field, case.heights, case.rays.origin, case.rays.direction, Method(series.removesuffix(FLAT), (n, n), not series.endswith(FLAT)))
 
 
 def _errors(case: Case, t: Tensor, status: Tensor, truth: np.ndarray, hit: np.ndarray) -> dict:

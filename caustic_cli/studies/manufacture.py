@@ -16,14 +16,15 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.files import SOFTWARE, write_bytes
-from caustic_cli.optics import curvature, intersection
+from caustic_cli.optics import curvature
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.rays import RayState
+from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.sampling import Sample, stream
-from caustic_cli.optics.tracing import Landing, tracer
+from caustic_cli.optics.system import EXIT, System
+from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Scene
-from caustic_cli.scene.source import blur_limit
 
 #: Points looked at along each axis and a knot span, at most.
 MOST, A_SPAN = 2001, 4
@@ -66,7 +67,7 @@ def manufacture(scene: Scene, field: HeightField, heights: Tensor, tool_radius: 
     if tool_radius is not None:
         found |= {"tool_radius_mm": tool_radius, "tool_fits": radius is None or radius >= tool_radius}
     critical, incidence = math.degrees(math.asin(1.0 / lens.index)), _steepest_incidence(scene, field, heights, seed)
-    blur = blur_limit(scene.source, lens.z_in, scene.screen.z - lens.z_in)
+    blur = scene.source.blur(lens.z_in, scene.screen.z - lens.z_in)
     throw = STEP * scene.screen.z
     by_throw = _moved(scene, scene, field, heights, seed, throw) / throw
     other = replace(scene, lens=replace(lens, index=lens.index + STEP))
@@ -97,15 +98,11 @@ def sampled(field: HeightField, heights: Tensor, shape) -> list[Tensor]:
 
 def _steepest_incidence(scene: Scene, field: HeightField, heights: Tensor, seed: int) -> float:
     """Largest angle between the light inside the lens and the exit surface's normal, degrees."""
-    least = 1.0
+    least, system = 1.0, System.of(scene, field)
     for rays in _rays(scene, seed):
-        if isinstance(rays, Sample):  # along z
-            _, gx, gy = field.prepare(rays, torch.float64)(heights)
-            cosine = 1.0 / torch.sqrt(1.0 + gx * gx + gy * gy)
-        else:
-            _, gx, gy, found = intersection.meet(field, heights, rays)
-            cosine = (rays.dz - gx * rays.dx - gy * rays.dy) / torch.sqrt(1.0 + gx * gx + gy * gy)
-            cosine = cosine[(found == intersection.Status.HIT) & (rays.share > 0)]
+        traced = Tracer(system, rays)
+        (gx, gy), (dx, dy, dz), power = traced.exit_of({EXIT: heights})
+        cosine = ((dz - gx * dx - gy * dy) / torch.sqrt(1.0 + gx * gx + gy * gy))[power > 0]
         if cosine.numel():
             least = min(least, float(cosine.min()))
     return math.degrees(math.acos(max(-1.0, least)))
@@ -115,14 +112,16 @@ def _moved(scene: Scene, other: Scene, field: HeightField, heights: Tensor, seed
     """Root mean square distance on the screen, mm, between the same rays through two scenes, the second `further` mm away."""
     total = power = 0.0
     for one, two in zip(_landings(scene, field, heights, seed, 0.0), _landings(other, field, heights, seed, further), strict=True):
-        weight = torch.where(two.weight > 0, one.weight, 0.0)
-        total += float((weight * ((one.x - two.x) ** 2 + (one.y - two.y) ** 2)).nan_to_num(0.0).sum())
+        weight = torch.where(two.power > 0, one.power, 0.0)
+        apart = sum((a - b) ** 2 for a, b in zip(one.origin[:2], two.origin[:2], strict=True))
+        total += float((weight * apart).nan_to_num(0.0).sum())
         power += float(weight.sum())
     return math.sqrt(total / power) if power > 0 else 0.0
 
 
-def _landings(scene: Scene, field: HeightField, heights: Tensor, seed: int, further: float) -> list[Landing]:
-    return [tracer(scene, field, rays, torch.float64)(heights, scene.screen.z + further) for rays in _rays(scene, seed)]
+def _landings(scene: Scene, field: HeightField, heights: Tensor, seed: int, further: float) -> list[RayState]:
+    system, screen = System.of(scene, field), replace(scene.screen, z=scene.screen.z + further)
+    return [Tracer(system, rays).land({EXIT: heights}, screen)[0] for rays in _rays(scene, seed)]
 
 
 def _rays(scene: Scene, seed: int):

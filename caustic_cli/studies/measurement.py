@@ -25,8 +25,8 @@ from torch import Tensor
 
 from caustic_cli.errors import CausticError
 from caustic_cli.optics.emission import Rays, rays_of
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Scene
 from caustic_cli.studies.metrics import relative_rms

@@ -30,7 +30,7 @@ from scipy.ndimage import gaussian_filter
 from caustic_cli.errors import InputError
 
 if TYPE_CHECKING:
-    from caustic_cli.optics.tracing import Exposure
+    from caustic_cli.optics.image import Image
 
 #: Window of Wang et al.: standard deviation and half width in pixels, and their two stabilising constants.
 SSIM_SIGMA, SSIM_RADIUS, SSIM_K1, SSIM_K2 = 1.5, 5, 0.01, 0.03
@@ -95,7 +95,7 @@ def on_target(image, target) -> float:
     return float(image[target > 0].sum())
 
 
-def judge(exposure: Exposure, target) -> dict:
+def judge(exposure: Image, target) -> dict:
     """The figures that `render --json` and `design --json` share, ready for `json.dumps(..., allow_nan=False)`.
 
     Args:

@@ -13,9 +13,9 @@ from caustic_cli.errors import CausticError
 from caustic_cli.optics.effects import NO_REQUESTS, Requests
 from caustic_cli.optics.emission import Rays, rays_of
 from caustic_cli.optics.image import Image
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import stream
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Scene, Screen
 from caustic_cli.studies.metrics import judge

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -30,18 +29,16 @@ from torch import Tensor
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.files import SOFTWARE, atomic_path
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.sampling import stream
-from caustic_cli.optics.tracing import expose
-from caustic_cli.scene import Disc, PlaneWave, Scene
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.trace import expose
+from caustic_cli.scene import Scene
 from caustic_cli.scene.plain import beyond_plain
-from caustic_cli.scene.source import covering_cone
+from caustic_cli.studies.drawn import KINDS, emitted
 from caustic_cli.studies.retrace import BATCHES
 
 VARIANTS = ("llvm_ad_mono", "llvm_ad_rgb", "scalar_rgb")  # the scalar one works everywhere and takes minutes
 SHAPES = ("entrance", "exit", "screen")
-#: Rays at a time.
-BATCH = 1 << 20
 #: Angle, rad, by which normals interpolated within triangles may turn the light.
 TURN = 1e-5
 #: Least rays expected of a judged pixel, least part of the light on judged pixels, and most pixels along a side taken together.
@@ -64,6 +61,8 @@ def require_mitsuba(scene: Scene) -> None:
         raise InputError("--verify mitsuba needs Mitsuba 3, which is not installed: pip install 'caustic-cli[verify]'")
     if beyond_plain(scene):
         raise InputError(f"--verify mitsuba traces clear lenses and straight screens, not {', '.join(beyond_plain(scene))}")
+    if scene.source.kind not in KINDS:
+        raise InputError(f"--verify mitsuba knows no source of type {scene.source.kind}")
     if scene.lens.fresnel != "exact":
         raise InputError(f"--verify mitsuba knows exact Fresnel reflection only; [lens] fresnel is {scene.lens.fresnel}")
 
@@ -134,51 +133,6 @@ def _trace(mi, world, scene: Scene, rays: int, seed: int) -> tuple[np.ndarray, n
         image += _binned(x, y, weight * share, scene)
         squares += _binned(x, y, (weight * share) ** 2, scene)
     return image / rays, squares / rays**2
-
-
-def emitted(scene: Scene, rays: int, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Starts and directions (3, N) of independent rays, batch by batch, and what each carries: 1 on average over all of them."""
-    source, (rx, ry), z_in = scene.source, scene.lens.half_size, scene.lens.z_in
-    far, round_ = isinstance(source, Disc) and source.angle is not None, scene.lens.round
-    if getattr(source, "profile", None) is not None:
-        line = (np.arange(2000) + 0.5) / 1000 - 1
-        x, y = np.meshgrid(line, line, indexing="ij")
-        within = x * x + y * y <= 1 if round_ else np.ones_like(x, bool)
-        mean = _profile(source.profile, x[within], y[within]).mean()
-    for first in range(0, rays, BATCH):
-        n = min(BATCH, rays - first)
-        a, b, u, v = rng.random((4, n))
-        one = np.ones(n)
-        if isinstance(source, PlaneWave) or far:
-            sine = np.sqrt(a) * np.sin(np.radians(source.angle) / 2) if far else np.zeros(n)
-            d = np.array([sine * np.cos(2 * np.pi * b), sine * np.sin(2 * np.pi * b), np.sqrt(1 - sine**2)])
-            x, y = ((2 * u - 1) * rx, (2 * v - 1) * ry) if not round_ else (rx * np.sqrt(u) * np.cos(2 * np.pi * v),
-                                                                            rx * np.sqrt(u) * np.sin(2 * np.pi * v))
-            if not far and source.profile is not None:
-                one = _profile(source.profile, x / rx, y / ry) / mean
-            yield np.array([x, y, np.full(n, z_in)]) - d, d, one
-            continue
-        cone = covering_cone(source, (rx, ry), z_in, round_)
-        if source.intensity == "lambertian":
-            sine = np.sqrt(a) * np.sin(cone)
-        else:  # even in the cosine, reckoned from 1
-            drop = a * 2 * np.sin(cone / 2) ** 2
-            sine = np.sqrt(drop * (2 - drop))
-        d = np.array([sine * np.cos(2 * np.pi * b), sine * np.sin(2 * np.pi * b), np.sqrt(1 - sine**2)])
-        if isinstance(source, Disc):
-            wide, high = np.sqrt(u) * np.array(source.size)[:, None] / 2
-            o = np.array(source.position)[:, None] + np.array([wide * np.cos(2 * np.pi * v), high * np.sin(2 * np.pi * v), 0 * u])
-        else:
-            powers = np.array(source.powers)
-            o = np.array(source.positions)[rng.choice(len(powers), n, p=powers / powers.sum())].T
-        near = d[2] > 1e-6  # from 1 mm or less before the entrance: single precision knows no far origin
-        yield o + d * np.where(near, np.maximum((z_in - o[2]) / np.where(near, d[2], 1) - 1, 0), 0), d, one
-
-
-def _profile(e: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Relative irradiance at points of [-1, 1]^2."""
-    i, j = (np.clip((0.5 * (c + 1) * k).astype(int), 0, k - 1) for c, k in zip((x, y), e.shape, strict=True))
-    return e[i, j]
 
 
 def _follow(mi, world, shapes, start: np.ndarray, direction: np.ndarray):

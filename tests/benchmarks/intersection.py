@@ -20,11 +20,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import torch
+from caustic_cli.optics.bundle import Bundle
 
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.bundle import Bundle
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.kernels.surface import FusedSurface, RayHits
+from caustic_cli.optics.surfaces.heightfield import HeightField
 
 RAYS, ROUNDS, HALF = 2_000_000, 9, 5.0
 

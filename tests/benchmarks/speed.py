@@ -20,12 +20,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+from caustic_cli.optics.tracing import PlaneTracer
 
 from caustic_cli.inverse.objective import Objective
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
-from caustic_cli.optics.tracing import PlaneTracer
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
 
 SCREEN = Screen((38.4, 38.4), 300.0, (250, 250))

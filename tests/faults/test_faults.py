@@ -15,9 +15,9 @@ from caustic_cli import checkpoint, cli, files, place, session, verdict
 from caustic_cli.errors import CausticError
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.optics import shortage, tracing
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.project import Project
 from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
 

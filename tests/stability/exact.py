@@ -9,10 +9,10 @@ from __future__ import annotations
 import mpmath as mp
 import numpy as np
 import torch
+from caustic_cli.optics.tracing import carry
 
 from caustic_cli.optics.kernels import functions
 from caustic_cli.optics.reconstruction import Filter, splat
-from caustic_cli.optics.tracing import carry
 from caustic_cli.scene import Lens, Screen
 
 mp.mp.dps = 60

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 import torch
+from caustic_cli.optics.tracing import expose, tracer
 from exact import SCREEN
 
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.kernels import functions
 from caustic_cli.optics.reconstruction import Filter, splat
 from caustic_cli.optics.sampling import Sampler
-from caustic_cli.optics.tracing import expose, tracer
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Lens, PlaneWave, Scene, Screen
 
 MORE = 1_000_000

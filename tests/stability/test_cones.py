@@ -9,13 +9,13 @@ import math
 import numpy as np
 import pytest
 import torch
+from caustic_cli.optics.tracing import expose, tracer
 from exact import mp
 
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.intersection import Status, meet
 from caustic_cli.optics.reconstruction import Filter
-from caustic_cli.optics.tracing import expose, tracer
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Disc, Lens, PlaneWave, Points, Scene, Screen
 
 CONES = [1e-6, 1e-4, 1e-2, 1.0, 30.0, 60.0, 80.0, 89.0, 89.999]

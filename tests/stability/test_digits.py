@@ -5,14 +5,14 @@ import math
 import numpy as np
 import pytest
 import torch
+from caustic_cli.optics.tracing import PlaneTracer, expose, tracer
 from exact import exactly, mp, ours
 
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.intersection import meet
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
-from caustic_cli.optics.tracing import PlaneTracer, expose, tracer
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Disc, Lens, PlaneWave, Points, Scene, Screen
 
 

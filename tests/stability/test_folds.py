@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import torch
+from caustic_cli.optics.tracing import expose, tracer
 
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
-from caustic_cli.optics.tracing import expose, tracer
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Lens, PlaneWave, Scene, Screen
 
 LENS = Lens(size=(2.0, 2.0), control=(5, 2), degree=(4, 1), index=1.5, fresnel="none")

@@ -10,12 +10,12 @@ import math
 import numpy as np
 import pytest
 import torch
+from caustic_cli.optics.bundle import Bundle
 from scipy.interpolate import BSpline
 
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.bundle import Bundle
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.intersection import Status, find, meet
+from caustic_cli.optics.surfaces.heightfield import HeightField
 
 FIELD = HeightField((SplineSpace.uniform(43, 3), SplineSpace.uniform(4, 3)), (4.0, 1.0))
 COUNT, Z = 400, -0.3

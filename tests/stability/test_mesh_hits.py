@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.mesh import TriangleMesh
+from caustic_cli.optics.surfaces.heightfield import HeightField
 
 FIELD = HeightField((SplineSpace.uniform(7, 3), SplineSpace.uniform(6, 2)), (1.0, 1.0))
 HEIGHTS = 2.0 + 0.3 * torch.rand(7, 6, generator=torch.Generator().manual_seed(5), dtype=torch.float64)

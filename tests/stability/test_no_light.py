@@ -7,6 +7,7 @@ import shlex
 import numpy as np
 import pytest
 import torch
+from caustic_cli.optics.tracing import expose
 
 from caustic_cli import cli, verdict
 from caustic_cli.checkpoint import load
@@ -17,10 +18,9 @@ from caustic_cli.inverse.losses import LOSSES, Loss, NoLight
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.schedule import Stage
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
-from caustic_cli.optics.tracing import expose
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies.metrics import judge
 

@@ -5,17 +5,17 @@ from dataclasses import replace
 
 import pytest
 import torch
+from caustic_cli.optics.bundle import Bundle
+from caustic_cli.optics.tracing import expose, tracer
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from caustic_cli.inverse.losses import NoLight
 from caustic_cli.inverse.objective import Objective
-from caustic_cli.optics.bundle import Bundle
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sample
-from caustic_cli.optics.tracing import expose, tracer
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Disc, Lens, PlaneWave, Points, Scene, Screen
 
 CLOSE = {torch.float64: 1e-12, torch.float32: 3e-6}

@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 import torch
+from caustic_cli.optics.tracing import carry
 from exact import FILTER, SCREEN, exactly, mp, ours
 
 from caustic_cli.optics.kernels import functions
 from caustic_cli.optics.reconstruction import Filter, splat
-from caustic_cli.optics.tracing import carry
 from caustic_cli.scene import Lens
 
 N = 1.5

@@ -12,9 +12,9 @@ import pytest
 import torch
 
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.kernels.surface import FusedSurface, scattered_surface
 from caustic_cli.optics.sampling import Sample
+from caustic_cli.optics.surfaces.heightfield import HeightField
 
 SHARE = torch.ones((), dtype=torch.float64)
 

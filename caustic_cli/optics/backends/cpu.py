@@ -12,7 +12,7 @@ from torch import Tensor
 from caustic_cli.optics import intersection
 from caustic_cli.optics.backends.reference import Torch, _by_mesh
 from caustic_cli.optics.interface import Departure
-from caustic_cli.optics.kernels import functions, points
+from caustic_cli.optics.kernels import functions
 from caustic_cli.optics.kernels.grid import GridSurface
 from caustic_cli.optics.kernels.interact import interact
 from caustic_cli.optics.kernels.land import land
@@ -83,6 +83,16 @@ class Numba(Torch):
         hits = RayHits(FusedSurface(field.spaces, field.half_size), origin, direction, radius)
         hits.find(heights, None if start is None else np.ascontiguousarray(start.numpy()))
         return torch.from_numpy(hits.t), torch.from_numpy(hits.status).long()
+
+    def finder(self, field, origin, direction):
+        """As the reference."""
+        hits = RayHits(FusedSurface(field.spaces, field.half_size), origin, direction, None)
+
+        def find(heights: Tensor) -> tuple[Tensor, Tensor]:
+            hits.find(heights)
+            return torch.from_numpy(hits.t), torch.from_numpy(hits.status)
+
+        return find
 
     def next_meetings(self, field, heights: Tensor, origin, direction, below: bool, round: bool, step: float) -> Tensor:
         """As the reference."""

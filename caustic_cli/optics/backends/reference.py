@@ -56,6 +56,10 @@ class Torch:
             raise InputError("mesh+newton intersection runs on the CPU; use newton")
         return intersection.reference(field, heights, origin, direction, 1.0, radius)
 
+    def finder(self, field, origin, direction):
+        """`find` by Newton's method for rays known beforehand: a function of heights."""
+        return lambda heights: intersection.reference(field, heights, origin, direction)
+
     def next_meetings(self, field, heights: Tensor, origin, direction, below: bool, round: bool, step: float) -> Tensor:
         """Distances (N,) mm to the next meeting of rays that start on a B-spline, 0 for none: see `meeting.again`."""
         from caustic_cli.optics.meeting import reference  # noqa: PLC0415 - meetings know backends
@@ -118,7 +122,7 @@ def _dot(a, b):
     """Sum over three components, of which zeros and ones of plain floats cost nothing."""
     total = 0.0
     for u, v in zip(a, b, strict=True):
-        if isinstance(v, float) and v == 0.0 or isinstance(u, float) and u == 0.0:
+        if (isinstance(v, float) and v == 0.0) or (isinstance(u, float) and u == 0.0):
             continue
         total = total + (u if isinstance(v, float) and v == 1.0 else u * v)
     return total

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from caustic_cli.optics.effects.absorption import Absorption
-from caustic_cli.optics.effects.base import NEGLIGIBLE, NO_REQUESTS, Action, Effect, Requests, Amount, Verdict
+from caustic_cli.optics.effects.base import NEGLIGIBLE, NO_REQUESTS, Action, Amount, Effect, Requests, Verdict
 from caustic_cli.optics.effects.dispersion import Dispersion
 from caustic_cli.optics.effects.entrance import Entrance
 from caustic_cli.optics.effects.fresnel import Fresnel
@@ -24,4 +24,4 @@ EFFECTS: tuple[Effect, ...] = (
     TotalReflection(), Mirror(), SecondMeeting(), Ghosts(), ScreenTilt(), ScreenShift(),
 )
 
-__all__ = ["EFFECTS", "NEGLIGIBLE", "NO_REQUESTS", "Action", "Effect", "Requests", "Amount", "Verdict"]
+__all__ = ["EFFECTS", "NEGLIGIBLE", "NO_REQUESTS", "Action", "Amount", "Effect", "Requests", "Verdict"]

@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import Action, Effect, Requests, Amount, Verdict
+from caustic_cli.optics.effects.base import Action, Amount, Effect, Requests, Verdict
 from caustic_cli.scene import Scene
 
 #: Coefficient that is measured where there is none, 1/mm.

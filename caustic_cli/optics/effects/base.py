@@ -44,15 +44,21 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Requests:
-    """What a trace is asked beyond what its system says: names of effects to simulate, and to leave out where they matter."""
+    """What a trace is asked beyond what its system says: names of effects to simulate, and to leave out where they matter; and
+    whether to go by stages even where a fused kernel does the same."""
 
     on: frozenset[str] = frozenset()
     off: frozenset[str] = frozenset()
+    stages: bool = False
 
     @classmethod
-    def to(cls, *on: str, without: tuple[str, ...] = ()) -> Requests:
+    def to(cls, *on: str, without: tuple[str, ...] = (), stages: bool = False) -> Requests:
         """Requests by names."""
-        return cls(frozenset(on), frozenset(without))
+        return cls(frozenset(on), frozenset(without), stages)
+
+    def __or__(self, other: Requests) -> Requests:
+        """Both."""
+        return Requests(self.on | other.on, self.off | other.off, self.stages or other.stages)
 
 
 NO_REQUESTS = Requests()
@@ -65,7 +71,7 @@ class Amount:
 
     scene: Scene
     bare: Scene | None
-    amount: str
+    words: str
 
 
 class Action:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import Effect, Amount, Verdict
+from caustic_cli.optics.effects.base import Amount, Effect, Verdict
 from caustic_cli.scene import Light, Scene
 from caustic_cli.scene.materials import D_LINE, refractive_index
 

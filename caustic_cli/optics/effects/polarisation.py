@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import NEGLIGIBLE, Action, Effect, Requests, Amount, Verdict
+from caustic_cli.optics.effects.base import NEGLIGIBLE, Action, Amount, Effect, Requests, Verdict
 from caustic_cli.optics.interface import refract
 from caustic_cli.optics.polarisation import beyond, field_of
 from caustic_cli.optics.rays import RayState

@@ -11,7 +11,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import Action, Effect, Requests, Amount, Verdict
+from caustic_cli.optics.effects.base import Action, Amount, Effect, Requests, Verdict
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import normal_numbers
 from caustic_cli.scene import Scene

@@ -1,6 +1,4 @@
-"""The rays of a scene's source, up to the inside of the lens' flat entrance (thesis 4.2, 4.3.1).
-
-Nothing here depends on the heights, so a design does it once.
+"""Rays of sources that stand before the lens: points, and what has an extent about them (thesis 4.2.2).
 
 Notation, a source point at distance h before the entrance plane
     theta   angle of a ray to +z; theta_c half-angle of the cone
@@ -18,18 +16,14 @@ few rays are wasted either way.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from caustic_cli.errors import InputError
+from caustic_cli.optics.emission.base import Emission
 from caustic_cli.optics.rays import RayState
-from caustic_cli.optics.sampling import SAMPLERS, Sampler, numbers
-from caustic_cli.scene import PlaneWave, Points, Scene
-from caustic_cli.scene.source import covering_cone
 
 #: A source whose foot is this many of its distances inside the aperture's edge is near: 1 - cos = 0.32 of a hemisphere misses.
 NEAR = 3.0
@@ -37,73 +31,39 @@ NEAR = 3.0
 TINY = 1e-300
 
 
-@dataclass(frozen=True, eq=False)
-class Emission:
-    """All rays of points or of a disc.
-
-    Args:
-        scene: its source is not a plane wave.
-        kind: sampler, one of `sampling.SAMPLERS`.
-        shape: cells (nu, nv) for each point; every one sends out as many rays.
-        seed, device: as of a `Sampler`.
-    """
-
-    scene: Scene
-    kind: str
-    shape: tuple[int, int]
-    seed: int = 0
-    device: str | torch.device = "cpu"
-
-    def __post_init__(self):
-        if self.kind not in SAMPLERS:
-            raise InputError(f"sampler must be one of {', '.join(SAMPLERS)}, got {self.kind!r}")
-
-    @property
-    def count(self) -> int:
-        """Number of rays."""
-        return self.shape[0] * self.shape[1] * len(self._points[0])
+class Near(Emission):
+    """Rays of the positions of a source; those of a source with an extent start aside of them."""
 
     @cached_property
     def _points(self) -> tuple[Tensor, Tensor]:
         """Positions (k, 3) mm, and parts of the power (k,)."""
         source = self.scene.source
-        if isinstance(source, Points):
-            powers = torch.tensor(source.powers, dtype=torch.float64, device=self.device)
-            return torch.tensor(source.positions, dtype=torch.float64, device=self.device), powers / powers.sum()
-        one = torch.ones(1, dtype=torch.float64, device=self.device)
-        return torch.tensor([source.position], dtype=torch.float64, device=self.device), one
+        powers = torch.tensor(source.powers, dtype=torch.float64, device=self.device)
+        return torch.from_numpy(source.points()[0]).to(self.device), powers / powers.sum()
 
-    def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[RayState]:
-        """The rays in order, at most `size` at a time; their shares and what they lost sum to 1 over all chunks.
+    def _aside(self, *draws: Tensor) -> tuple[Tensor, Tensor]:
+        """Where about its position each ray starts, mm along x and y, of the draws beyond the first two."""
+        raise NotImplementedError
 
-        With `step`, only every step-th chunk from number `first` on: the part of one of several processes.
-        """
-        far = not isinstance(self.scene.source, Points) and self.scene.source.angle is not None
-        for start in range(first * size, self.count, step * size):
-            stop = min(start + size, self.count)
-            dimensions = 2 if isinstance(self.scene.source, Points) else 4
-            draws = numbers(self.kind, self.shape, self.seed, dimensions, start, stop, self.device)
-            yield self._far(*draws) if far else self._near(torch.arange(start, stop, device=self.device), *draws)
-
-    def _near(self, index: Tensor, u: Tensor, v: Tensor, a: Tensor | None = None, b: Tensor | None = None) -> RayState:
-        source, lens = self.scene.source, self.scene.pupil
-        (rx, ry), cone = lens.half_size, covering_cone(source, lens.half_size, lens.z_in, lens.round)
+    def _drawn(self, start: int, u: Tensor, v: Tensor, *aside: Tensor) -> RayState:
+        source, pupil = self.scene.source, self.scene.pupil
+        (rx, ry), cone = pupil.half_size, source.cone_over(pupil.half_size, pupil.z, pupil.round)
         per, (positions, powers) = self.shape[0] * self.shape[1], self._points
-        which = index // per
+        which = torch.arange(start, start + len(u), device=self.device) // per
         part = powers[which] / per  # emitted by each ray
         x0, y0, z0 = positions[which].unbind(1)
-        h, ex, ey = lens.z_in - z0, 0.0, 0.0
+        h, (ex, ey) = pupil.z - z0, source.extent
         radius = h * math.tan(cone) if cone < math.pi / 2 else torch.full_like(h, math.inf)
         lows = [x0 - radius, y0 - radius]
         highs = [x0 + radius, y0 + radius]
         # From the source's foot to the edge of the lens.
-        room = rx - torch.hypot(x0, y0) if lens.round else torch.minimum(rx - x0.abs(), ry - y0.abs())
-        if a is not None:  # a point of the ellipse
-            ex, ey = source.size[0] / 2.0, source.size[1] / 2.0
+        room = rx - torch.hypot(x0, y0) if pupil.round else torch.minimum(rx - x0.abs(), ry - y0.abs())
+        if aside:
             lows, highs = [lows[0] - ex, lows[1] - ey], [highs[0] + ex, highs[1] + ey]
-            x0, y0 = x0 + ex * a.sqrt() * torch.cos(2 * math.pi * b), y0 + ey * a.sqrt() * torch.sin(2 * math.pi * b)
+            across, along = self._aside(*aside)
+            x0, y0 = x0 + across, y0 + along
         within = (lows[0] >= -rx) & (highs[0] <= rx) & (lows[1] >= -ry) & (highs[1] <= ry)
-        if lens.round:
+        if pupil.round:
             within &= torch.maximum(-lows[0], highs[0]) ** 2 + torch.maximum(-lows[1], highs[1]) ** 2 <= rx * rx
         from_cone = within | (room >= max(ex, ey) + NEAR * h) if source.aimed else torch.ones_like(within)
 
@@ -130,29 +90,22 @@ class Emission:
 
         sx, sy = torch.where(from_cone, cx, ax), torch.where(from_cone, cy, ay)
         x, y = x0 + h * sx, y0 + h * sy
-        on_lens = (x * x + y * y <= rx * rx) if lens.round else (x.abs() <= rx) & (y.abs() <= ry)
+        on_lens = (x * x + y * y <= rx * rx) if pupil.round else (x.abs() <= rx) & (y.abs() <= ry)
         share = torch.where(on_lens, torch.where(from_cone, part, aimed), torch.zeros_like(part))
         x, y = x.clamp(-rx, rx), y.clamp(-ry, ry)
         sx, sy = (x - x0) / h, (y - y0) / h  # rays that miss the lens stay finite; they carry nothing
         dz = 1.0 / torch.sqrt(1.0 + sx * sx + sy * sy)
-        return at_pupil(self.scene.pupil, x, y, sx * dz, sy * dz, dz, share, float(part.sum()))
-
-    def _far(self, u: Tensor, v: Tensor, a: Tensor, b: Tensor) -> RayState:
-        (rx, ry), half = self.scene.lens.half_size, math.radians(self.scene.source.angle) / 2.0
-        sine = a.sqrt() * math.sin(half)  # even over the projected solid angle: an evenly bright disc
-        dx, dy = sine * torch.cos(2 * math.pi * b), sine * torch.sin(2 * math.pi * b)
-        share, x, y = torch.full_like(u, 1.0 / self.count), (2.0 * u - 1.0) * rx, (2.0 * v - 1.0) * ry
-        if self.scene.lens.round:  # even over the disc
-            x, y = rx * u.sqrt() * torch.cos(2 * math.pi * v), rx * u.sqrt() * torch.sin(2 * math.pi * v)
-        return at_pupil(self.scene.pupil, x, y, dx, dy, torch.sqrt(1.0 - dx * dx - dy * dy), share, len(u) / self.count)
+        return self._at_pupil(x, y, (sx * dz, sy * dz, dz), share, float(part.sum()))
 
 
-def at_pupil(pupil, x: Tensor, y: Tensor, dx: Tensor, dy: Tensor, dz: Tensor, power: Tensor, emitted: float) -> RayState:
-    """Rays of unit directions through points of the pupil.
+class NearDisc(Near):
+    """Rays of ellipses, whose half axes are the source's extent."""
 
-    power: of each that arrives there; emitted: of all at their source.
-    """
-    return RayState((x, y, pupil.z), (dx, dy, dz), power, lost={"missed_lens": emitted - float(power.sum())})
+    dimensions: ClassVar[int] = 4
+
+    def _aside(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+        (ex, ey), turn = self.scene.source.extent, 2 * math.pi * b
+        return ex * a.sqrt() * torch.cos(turn), ey * a.sqrt() * torch.sin(turn)
 
 
 def _even_angle(low: Tensor, high: Tensor, width: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
@@ -181,16 +134,4 @@ def _even_sine(low: Tensor, high: Tensor, width: Tensor, part: Tensor) -> tuple[
     return (sine + step) / torch.sqrt(left), way
 
 
-Rays = Sampler | Emission
-
-
-def rays_of(scene: Scene, kind: str, rays: int, seed: int = 0, device: str | torch.device = "cpu") -> Rays:
-    """About `rays` rays of the scene's source, at least one for each of its points."""
-    aspect = scene.lens.size[0] / scene.lens.size[1]
-    if isinstance(scene.source, PlaneWave):
-        profile = None if scene.source.profile is None else torch.from_numpy(scene.source.profile)
-        return Sampler.of_size(kind, rays, aspect, seed=seed, profile=profile, device=device, round=scene.lens.round)
-    points = len(scene.source.positions) if isinstance(scene.source, Points) else 1
-    each = max(1, round(rays / points))
-    nu = max(1, min(each, round(math.sqrt(each * aspect))))
-    return Emission(scene, kind, (nu, max(1, round(each / nu))), seed, device)
+EMISSIONS = {"point": Near.of_size, "grid": Near.of_size, "disc": NearDisc.of_size}

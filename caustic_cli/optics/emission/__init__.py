@@ -1,0 +1,47 @@
+"""The rays of a source, up to the pupil of the system that it lights (thesis 4.2, 4.3.1), and the ways of drawing them.
+
+A source says by name, `Source.emission`, how its rays are drawn.  A new way is a file here, which names it in EMISSIONS: what makes
+about so many rays, mostly `of_size` of a class of `Emission`; it is found by itself.
+"""
+
+from __future__ import annotations
+
+import pkgutil
+from collections.abc import Callable
+from importlib import import_module
+
+import torch
+
+from caustic_cli.errors import InputError
+from caustic_cli.optics.emission.base import Emission, Lit
+from caustic_cli.optics.sampling import Sampler
+
+__all__ = ["Emission", "Lit", "Rays", "rays_of", "register"]
+
+Rays = Sampler | Emission
+#: what is lit, sampler, number of rays, seed, device -> rays.
+Maker = Callable[[Lit, str, int, int, str | torch.device], Rays]
+
+_MAKERS: dict[str, Maker] = {}
+
+
+def register(name: str, maker: Maker) -> None:
+    """Make a way of drawing rays known to the sources that name it."""
+    _MAKERS[name] = maker
+
+
+def rays_of(scene: Lit, kind: str, rays: int, seed: int = 0, device: str | torch.device = "cpu") -> Rays:
+    """About `rays` rays of the source of a scene or system, at least one for each of its points.
+
+    Raises:
+        InputError: nobody has said how such a source's rays are drawn, or there is no such sampler.
+    """
+    name = scene.source.emission
+    if name not in _MAKERS:
+        raise InputError(f"[source] type {scene.source.kind} has no rays: no emission is registered as {name!r}")
+    return _MAKERS[name](scene, kind, rays, seed, device)
+
+
+for _module in pkgutil.iter_modules(__path__):
+    for _name, _maker in getattr(import_module(f"{__name__}.{_module.name}"), "EMISSIONS", {}).items():
+        register(_name, _maker)

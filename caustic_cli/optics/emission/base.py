@@ -1,0 +1,92 @@
+"""What all rays have in common that are drawn on the pupil, the aperture that a source lights (thesis 4.2, 4.3.1).
+
+Nothing here depends on the heights, so a design does it once.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar, Protocol
+
+import torch
+from torch import Tensor
+
+from caustic_cli.errors import InputError
+from caustic_cli.optics.rays import RayState
+from caustic_cli.optics.sampling import SAMPLERS, numbers
+from caustic_cli.scene import Pupil, Source
+
+
+class Lit(Protocol):
+    """What a source lights: a one-lens scene, or a system."""
+
+    @property
+    def source(self) -> Source:
+        """Where the light comes from."""
+
+    @property
+    def pupil(self) -> Pupil:
+        """The aperture that it is meant for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Emission:
+    """All rays of a source that is not collimated; a class of its own says how they are drawn.
+
+    Args:
+        scene: what is lit, by a source of the kind that the class draws.
+        kind: sampler, one of `sampling.SAMPLERS`.
+        shape: cells (nu, nv) for each of its points, or for a distant source; every one sends out as many rays.
+        seed, device: as of a `Sampler`.
+
+    dimensions: numbers in [0, 1] that a ray is drawn from; the first two fill the cells.
+    """
+
+    scene: Lit
+    kind: str
+    shape: tuple[int, int]
+    seed: int = 0
+    device: str | torch.device = "cpu"
+
+    dimensions: ClassVar[int] = 2
+
+    def __post_init__(self):
+        if self.kind not in SAMPLERS:
+            raise InputError(f"sampler must be one of {', '.join(SAMPLERS)}, got {self.kind!r}")
+
+    @classmethod
+    def of_size(cls, scene: Lit, kind: str, rays: int, seed: int = 0, device: str | torch.device = "cpu") -> Emission:
+        """About `rays` rays in cells as nearly square as whole numbers allow, at least one for each of its points."""
+        aspect, each = scene.pupil.half_size[0] / scene.pupil.half_size[1], max(1, round(rays / _starts(scene)))
+        nu = max(1, min(each, round(math.sqrt(each * aspect))))
+        return cls(scene, kind, (nu, max(1, round(each / nu))), seed, device)
+
+    @cached_property
+    def count(self) -> int:
+        """Number of rays."""
+        return self.shape[0] * self.shape[1] * _starts(self.scene)
+
+    def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[RayState]:
+        """The rays in order, at most `size` at a time; their powers and what they lost sum to 1 over all chunks.
+
+        With `step`, only every step-th chunk from number `first` on: the part of one of several processes.
+        """
+        for start in range(first * size, self.count, step * size):
+            stop = min(start + size, self.count)
+            yield self._drawn(start, *numbers(self.kind, self.shape, self.seed, self.dimensions, start, stop, self.device))
+
+    def _drawn(self, start: int, *draws: Tensor) -> RayState:
+        """Rays from number `start` on, one for each of the draws: `dimensions` tensors (N,)."""
+        raise NotImplementedError
+
+    def _at_pupil(self, x: Tensor, y: Tensor, direction: tuple[Tensor, Tensor, Tensor], power: Tensor, emitted: float) -> RayState:
+        """Rays through points of the pupil, mm, with the power of each that arrives there; emitted: of all at their source."""
+        return RayState((x, y, self.scene.pupil.z), direction, power, lost={"missed_lens": emitted - float(power.sum())})
+
+
+def _starts(scene: Lit) -> int:
+    """Positions of the source; a distant one counts as one."""
+    return max(1, len(scene.source.points()[0]))

@@ -1,0 +1,18 @@
+"""Rays of a plane wave: samples of the aperture, since normal incidence on a flat entrance bends nothing."""
+
+from __future__ import annotations
+
+import torch
+
+from caustic_cli.optics.emission.base import Lit
+from caustic_cli.optics.sampling import Sampler
+
+
+def parallel(scene: Lit, kind: str, rays: int, seed: int = 0, device: str | torch.device = "cpu") -> Sampler:
+    """About `rays` rays along +z over the aperture, weighted by the source's profile if it has one."""
+    profile = None if scene.source.profile is None else torch.from_numpy(scene.source.profile)
+    return Sampler.of_size(kind, rays, scene.pupil.half_size[0] / scene.pupil.half_size[1], seed=seed, profile=profile, device=device,
+                           round=scene.pupil.round)
+
+
+EMISSIONS = {"plane": parallel}

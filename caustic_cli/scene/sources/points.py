@@ -1,0 +1,126 @@
+"""Point sources: one or several, or a grid of them that stands for an extended source (thesis 4.2.2)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from caustic_cli.errors import InputError
+from caustic_cli.scene import checks
+from caustic_cli.scene.sources import ranges
+from caustic_cli.scene.sources.base import Source
+from caustic_cli.scene.sources.section import SourceType, Table, middle, positions, shining, standing
+
+#: Most point sources at once.
+MAX_POINTS = 1_000_000
+
+
+@dataclass(frozen=True)
+class Points(Source):
+    """Point sources, each with a position and a power, that shine into a cone about +z.
+
+    Args:
+        positions: (x, y, z) of each, mm.
+        powers: emitted into the cone by each, W; None for 1 W shared equally.
+        cone: half-angle of the cone, degrees; None for the narrowest that covers the lens from every position.
+        intensity: uniform or lambertian.
+        aimed: rays are sampled where they meet the lens, with the weights that this asks for; otherwise all over the cone.
+        kind: point, or grid for points that stand for an extended source.
+    """
+
+    positions: tuple[tuple[float, float, float], ...]
+    powers: tuple[float, ...] | None = None
+    cone: float | None = None
+    intensity: str = "uniform"
+    aimed: bool = True
+    kind: str = "point"
+
+    def __post_init__(self):
+        if not 1 <= len(self.positions) <= MAX_POINTS:
+            raise InputError(f"[source] position must name 1 to {MAX_POINTS:,} points, got {len(self.positions)}")
+        for position in self.positions:
+            ranges.position(position)
+        if self.powers is None:
+            object.__setattr__(self, "powers", (1.0 / len(self.positions),) * len(self.positions))
+        if len(self.powers) != len(self.positions):
+            raise InputError(f"[source] powers must be one for each of the {len(self.positions)} positions,"
+                             f" got {len(self.powers)}")
+        for power in self.powers:
+            checks.number("[source] powers", power, 0.0, checks.POWER)
+        if not sum(self.powers) > 0:
+            raise InputError("[source] powers must not all be 0")
+        ranges.cone(self.cone)
+        ranges.intensity(self.intensity)
+
+    @classmethod
+    def grid(cls, centre: Sequence[float], size: tuple[float, float], shape: tuple[int, int], power: float = 1.0,
+             **options) -> Points:
+        """shape = (N, M) equispaced points on a rectangle of full width and height `size` mm, borders included (fig. 6.4.1)."""
+        centre = ranges.position(centre)
+        ranges.size(size)
+        checks.pair("[source] grid", shape, lambda w, n: checks.whole(w, n, 1, 1000))
+        xs, ys = (np.linspace(-w / 2.0, w / 2.0, n) if n > 1 else np.zeros(1) for w, n in zip(size, shape, strict=True))
+        places = tuple((centre[0] + float(x), centre[1] + float(y), centre[2]) for x in xs for y in ys)
+        return cls(places, (power / len(places),) * len(places), kind="grid", **options)
+
+    @property
+    def power(self) -> float:
+        """Of all, W."""
+        return math.fsum(self.powers)
+
+    def points(self) -> tuple[np.ndarray, np.ndarray]:
+        """As of a source."""
+        powers = np.array(self.powers, dtype=float)
+        return np.array(self.positions, dtype=float), powers / powers.sum()
+
+    @property
+    def several(self) -> bool:
+        """As of a source, without an array of them."""
+        return len(self.positions) > 1
+
+    @property
+    def apart(self) -> bool:
+        """Points in places of their own; a grid is one source."""
+        return self.several and self.kind == "point"
+
+    @property
+    def sharp(self) -> bool:
+        """One point; a grid's type is an extended source."""
+        return self.kind == "point" and not self.several
+
+    @property
+    def label(self) -> str:
+        """As of a source."""
+        return f"{len(self.positions)} points"
+
+    def extent_words(self, z_in: float) -> str:
+        """As of a source."""
+        return f"the source is {len(self.positions)} points" if self.several else "the source is a point"
+
+    def blur(self, z_in: float, throw: float) -> float:
+        """As of a source; points in places of their own blur nothing, each makes a sharp picture."""
+        return super().blur(z_in, throw) if self.kind == "grid" else 0.0
+
+    def pointlike(self) -> Source:
+        """One point in the middle of all."""
+        return Points((self.centre,), (self.power,), self.cone, self.intensity, self.aimed) if self.several else self
+
+
+def _points(table: Table, _profile) -> Points:
+    places = positions(table)
+    parts = table.get("powers", [1.0] * len(places))
+    total = math.fsum(parts)
+    return Points(places, tuple(table["power"] * p / total for p in parts) if total > 0 else tuple(parts), **shining(table))
+
+
+def _grid(table: Table, _profile) -> Points:
+    return Points.grid(middle(table, "grid"), tuple(table["size"]), tuple(table["grid"]), table["power"], **shining(table))
+
+
+TYPES = (
+    SourceType("point", "point", ("position", "powers", "cone", "intensity", "aim"), _points, standing),
+    SourceType("grid", "grid (of points)", ("position", "size", "grid", "cone", "intensity", "aim"), _grid, standing),
+)

@@ -1,0 +1,78 @@
+"""The [source] section of project.toml: which types there are of it, the keys that each uses, and the reading of those they share.
+
+A type of source is registered by a `SourceType`; everything that depends on the name of a type is looked up there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from caustic_cli.errors import InputError
+from caustic_cli.scene.sources.base import Source
+
+Table = Mapping[str, Any]
+#: Keys of every source: the name of its type, and its power, W.
+COMMON = ("type", "power")
+#: Of a source that stands somewhere, if not said: how far before the lens, how wide, in lens widths; the grid of fig. 6.4.1.
+DISTANCE, WIDTH, GRID = 5.0, 0.2, (25, 25)
+
+
+def nothing(_lens: Table) -> dict[str, Any]:
+    """Defaults of a type that needs none."""
+    return {}
+
+
+def none_idle(_table: Table) -> dict[str, str]:
+    """Idle keys of a type that uses all of its keys always."""
+    return {}
+
+
+@dataclass(frozen=True)
+class SourceType:
+    """A type of source as [source] describes it.
+
+    name: [source] type; note: the name with what has to be said about it in a line; keys: of the section that it uses besides
+    COMMON; from_settings: makes it of the complete section and of the profile's irradiance, if one is named; defaults: of its keys,
+    from the [lens] section; idle: of a section, keys of the type that mean nothing beside the others, and why; own: keys of the
+    section that no other type has, each with its kind and comment as of `settings.Key`.
+    """
+
+    name: str
+    note: str
+    keys: tuple[str, ...]
+    from_settings: Callable[[Table, np.ndarray | None], Source]
+    defaults: Callable[[Table], dict[str, Any]] = nothing
+    idle: Callable[[Table], dict[str, str]] = none_idle
+    own: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+
+
+def standing(lens: Table) -> dict[str, Any]:
+    """Where a source stands and how large it is: the same for all types that stand somewhere, so that a type may be changed."""
+    width = max(lens["size"])
+    return {"position": [[0.0, 0.0, lens["z_in"] - DISTANCE * width]], "size": [WIDTH * width] * 2, "grid": list(GRID)}
+
+
+def shining(table: Table) -> dict[str, Any]:
+    """How a source that stands somewhere shines, as arguments of its class."""
+    return {"cone": table.get("cone"), "intensity": table["intensity"], "aimed": table["aim"]}
+
+
+def positions(table: Table) -> tuple[tuple[float, float, float], ...]:
+    """All positions of the section."""
+    return tuple(tuple(p) for p in table["position"])
+
+
+def middle(table: Table, name: str) -> tuple[float, float, float]:
+    """The one position of a type that has a centre; a source at infinity has none, so nobody counts them.
+
+    Raises:
+        InputError: there are several.
+    """
+    found = positions(table)
+    if len(found) != 1 and "angle" not in table:
+        raise InputError(f"[source] position of a {name} is its centre, one [x, y, z], got {len(found)}")
+    return found[0]

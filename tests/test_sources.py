@@ -1,0 +1,291 @@
+"""What sources say of themselves, against hand values; no other file asks for their class; a source from outside."""
+
+import ast
+import math
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from caustic_cli.optics.tracing import expose
+from test_export import make
+
+import caustic_cli
+from caustic_cli import settings
+from caustic_cli.derive import complete
+from caustic_cli.errors import InputError
+from caustic_cli.export.lighttools import write_lighttools
+from caustic_cli.export.mitsuba import write_mitsuba
+from caustic_cli.optics import emission
+from caustic_cli.optics.bounds import bounds_of
+from caustic_cli.optics.emission.near import Near
+from caustic_cli.optics.plan import compile_plan
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen, Source, sources
+from caustic_cli.scene.sources.section import SourceType
+from caustic_cli.studies import verify
+
+PACKAGE = Path(caustic_cli.__file__).parent
+INF = math.inf
+#: Source: kind, collimated, distant, half angle (degrees), nearest, centre, power, extent, several, extended, apart, sharp.
+FACTS = {
+    "plane": (PlaneWave(2.0), ("plane", True, True, 0.0, -INF, (0, 0, -INF), 2.0, (0, 0), False, False, False, True)),
+    "point": (Points(((1.0, 2.0, -5.0),), (3.0,)),
+              ("point", False, False, 0.0, -5.0, (1, 2, -5), 3.0, (0, 0), False, False, False, True)),
+    "points": (Points(((0.0, 0.0, -5.0), (4.0, 0.0, -9.0)), (1.0, 3.0)),
+               ("point", False, False, 0.0, -5.0, (3, 0, -8), 4.0, (0, 0), True, True, True, False)),
+    "grid": (Points.grid((1.0, 0.0, -5.0), (2.0, 4.0), (3, 2), 6.0),
+             ("grid", False, False, 0.0, -5.0, (1, 0, -5), 6.0, (0, 0), True, True, False, False)),
+    "grid of one": (Points.grid((1.0, 0.0, -5.0), (2.0, 4.0), (1, 1)),
+                    ("grid", False, False, 0.0, -5.0, (1, 0, -5), 1.0, (0, 0), False, False, False, False)),
+    "disc": (Disc((1.0, 0.0, -8.0), (4.0, 3.0), 2.0),
+             ("disc", False, False, 0.0, -8.0, (1, 0, -8), 2.0, (2, 1.5), False, True, False, False)),
+    "disc of no size": (Disc((1.0, 0.0, -8.0), (0.0, 0.0)),
+                        ("disc", False, False, 0.0, -8.0, (1, 0, -8), 1.0, (0, 0), False, False, False, False)),
+    "sun": (Disc(angle=0.5, power=2.0), ("disc", False, True, 0.25, -INF, (0, 0, -INF), 2.0, (0, 0), False, True, False, False)),
+}
+
+
+@pytest.mark.parametrize("name", FACTS)
+def test_the_facts_of_every_source(name):
+    s, (kind, collimated, distant, half, nearest, centre, power, extent, several, extended, apart, sharp) = FACTS[name]
+    assert isinstance(s, Source)
+    assert (s.kind, s.collimated, s.distant, s.nearest) == (kind, collimated, distant, nearest)
+    assert (s.several, s.extended, s.apart, s.sharp) == (several, extended, apart, sharp)
+    assert s.half_angle == pytest.approx(math.radians(half)) and s.power == pytest.approx(power)
+    assert s.centre == pytest.approx(centre) and s.extent == extent
+    positions, parts = s.points()
+    assert positions.shape == (len(parts), 3) and len(parts) == (0 if distant else len(s.powers))
+    assert sum(s.powers) == pytest.approx(power)
+    if not distant:
+        assert parts.sum() == pytest.approx(1.0) and parts * power == pytest.approx(np.array(s.powers))
+        assert positions[:, 2].max() == nearest
+
+
+def test_positions_and_parts():
+    positions, parts = FACTS["points"][0].points()
+    assert positions.tolist() == [[0, 0, -5], [4, 0, -9]] and parts.tolist() == [0.25, 0.75]
+    positions, parts = FACTS["disc"][0].points()
+    assert positions.tolist() == [[1, 0, -8]] and parts.tolist() == [1.0]
+
+
+@pytest.mark.parametrize(("name", "tangent", "round_"), [
+    ("point", math.hypot(6, 6) / 5, (math.hypot(1, 2) + 5) / 5),
+    ("points", math.hypot(5, 4) / 5, 1.0),  # the nearer; the other asks for hypot(9, 4) / 9, and for 9 / 9
+    ("grid", math.hypot(7, 6) / 5, (math.hypot(2, 2) + 5) / 5),
+    ("disc", math.hypot(8, 5.5) / 8, (math.hypot(3, 1.5) + 5) / 8),
+])
+def test_the_cone_over_a_lens(name, tangent, round_):
+    """Half size 5 x 4; round, of radius 5."""
+    s = FACTS[name][0]
+    assert math.tan(s.cone_over((5.0, 4.0), 0.0)) == pytest.approx(tangent)
+    assert math.tan(s.cone_over((5.0, 5.0), 0.0, True)) == pytest.approx(round_)
+    assert Disc(cone=30.0).cone_over((5.0, 4.0), 0.0) == pytest.approx(math.pi / 6)
+
+
+@pytest.mark.parametrize(("name", "angle", "blur"), [
+    ("plane", 0.0, 0.0), ("point", 0.0, 0.0), ("points", None, 0.0), ("grid", None, 100.0 * 4 / 5), ("grid of one", 0.0, 0.0),
+    ("disc", 2.0 * math.degrees(math.atan(2 / 8)), 100.0 * 4 / 8), ("disc of no size", 0.0, 0.0),
+    ("sun", 0.5, 100.0 * math.radians(0.5)),
+])
+def test_what_extent_does(name, angle, blur):
+    s = FACTS[name][0]
+    assert s.blur(0.0, 100.0) == pytest.approx(blur)
+    if angle is not None:
+        assert s.apparent_angle(0.0) == pytest.approx(angle)
+
+
+def test_sources_without_their_extent():
+    plane, point = FACTS["plane"][0], FACTS["point"][0]
+    assert plane.pointlike() is plane and point.pointlike() is point
+    sun = FACTS["sun"][0].pointlike()
+    assert isinstance(sun, PlaneWave) and sun.power == 2.0
+    assert FACTS["disc"][0].pointlike() == Points(((1.0, 0.0, -8.0),), (2.0,), None, "lambertian")
+    assert FACTS["points"][0].pointlike() == Points(((3.0, 0.0, -8.0),), (4.0,))
+    for s, _ in FACTS.values():
+        assert not s.pointlike().extended
+        assert s.extent_words(0.0)
+
+
+def test_the_types_and_their_keys():
+    assert sources.names() == ("plane", "point", "grid", "disc")
+    assert sources.used_by("position") == ("point", "grid", "disc") and sources.used_by("profile") == ("plane",)
+    assert sources.used_by("size") == ("grid", "disc") and sources.used_by("grid") == ("grid",)
+    assert sources.used_by("polarisation") == ()  # of any light
+    known = set(settings.SCHEMA["source"])
+    for name in sources.names():
+        assert {*sources.type_of(name).keys, *sources.COMMON} <= known
+    with pytest.raises(InputError, match=r"\[source\] type must be one of plane, point, grid, disc, got 'sun'"):
+        sources.type_of("sun")
+
+
+def test_the_emission_of_every_source_is_known():
+    for s, _ in FACTS.values():
+        lens = Lens(size=(10.0, 8.0), control=(8, 7))
+        assert emission.rays_of(Scene(s, lens, Screen((40.0, 32.0), 100.0)), "stratified", 100).count >= 80
+
+
+def classes_asked_for(tree: ast.AST) -> set[str]:
+    """Names in the second argument of every isinstance and issubclass, and in every pattern of a match."""
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ("isinstance", "issubclass"):
+            asked = node.args[1]
+        elif isinstance(node, ast.MatchClass):
+            asked = node.cls
+        else:
+            continue
+        found |= {n.id for n in ast.walk(asked) if isinstance(n, ast.Name)} | {
+            n.attr for n in ast.walk(asked) if isinstance(n, ast.Attribute)}
+    return found
+
+
+def test_the_reader_of_isinstance_sees_all_forms():
+    text = "isinstance(a, Disc)\nisinstance(b.c, (PlaneWave, x))\nisinstance(d, Points | None)\nisinstance(e, scene.Ring)"
+    assert {"Disc", "PlaneWave", "Points", "Ring"} <= classes_asked_for(ast.parse(text))
+
+
+def test_no_other_file_asks_for_the_class_of_a_source():
+    files = [p for p in PACKAGE.rglob("*.py") if p.parent not in (PACKAGE / "scene" / "sources", PACKAGE / "optics" / "emission")]
+    assert len(files) > 90
+    wrong = {str(p.relative_to(PACKAGE)): found for p in files
+             if (found := classes_asked_for(ast.parse(p.read_text("utf-8"))) & {"PlaneWave", "Points", "Disc"})}
+    assert not wrong
+
+
+@dataclass(frozen=True)
+class Ring(Source):
+    """Points evenly around a circle: all that a type of source has to say."""
+
+    middle: tuple[float, float, float]
+    width: float
+    power: float = 1.0
+    count: int = 12
+
+    kind = "ring"
+
+    def points(self):
+        turn = 2.0 * np.pi * np.arange(self.count) / self.count
+        radius = self.width / 2.0
+        positions = self.middle + np.stack([radius * np.cos(turn), radius * np.sin(turn), 0.0 * turn], -1)
+        return positions, np.full(self.count, 1.0 / self.count)
+
+    def pointlike(self):
+        return Points((self.middle,), (self.power,))
+
+
+@pytest.fixture
+def ring(monkeypatch):
+    """A type of source that the package does not know, registered for one test."""
+    monkeypatch.setattr(sources, "_TYPES", dict(sources._TYPES))
+    monkeypatch.setattr(emission, "_MAKERS", dict(emission._MAKERS))
+
+    def build(table, profile):
+        return Ring(tuple(table["position"][0]), table["size"][0], table["power"])
+
+    sources.register(SourceType("ring", "ring (of points)", ("position", "size"), build,
+                                lambda lens: {"position": [[0.0, 0.0, -20.0]], "size": [3.0, 3.0]}))
+    emission.register("ring", Near.of_size)
+
+
+def test_a_source_from_outside(ring, kernels, tmp_path):
+    """Through the registries alone: out of [source], into a plan, onto the screen, and out of every export in one sentence."""
+    full = complete({"source": {"type": "ring", "power": 2.0}, "lens": {"control": [8, 7]}}, 1.0)
+    assert full["source"]["position"] == [[0.0, 0.0, -20.0]] and full["design"]["stages"][-1]["sampler"] == "stratified"
+    assert "intensity" not in full["source"] and 'type = "ring"' in settings.dump(full)
+    source = settings.build_source(full)
+    assert isinstance(source, Ring) and source.power == 2.0 and source.nearest == -20.0
+    assert source.centre == pytest.approx((0.0, 0.0, -20.0)) and source.powers == pytest.approx((1 / 6,) * 12)
+    settings.refuse_unused(full["source"], [("source", "size", "--source-size")])
+    with pytest.raises(InputError, match="--cone belongs to --source point, grid or disc, got ring"):
+        settings.refuse_unused(full["source"], [("source", "cone", "--cone")])
+
+    lens = Lens(size=(10.0, 8.0), control=(8, 7), index=1.5, offset=Offset(5.0, (-40.0, -40.0)))
+    scene, field = Scene(source, lens, Screen((12.0, 12.0), 60.0, (20, 16))), HeightField.of(lens)
+    x, y = field.control_xy()
+    heights = 5.0 + torch.from_numpy(lens.offset.sag(x[:, None].numpy(), y[None, :].numpy()))
+    exposure = expose(scene, field, heights, emission.rays_of(scene, "stratified", 30_000, seed=3))
+    assert float(exposure.image.sum()) > 0.05
+    assert float(exposure.image.sum()) + sum(exposure.lost.values()) == pytest.approx(1.0, abs=1e-12)
+    grid = Points(tuple(map(tuple, source.points()[0])))  # the same as points that the package knows
+    same = expose(Scene(grid, lens, scene.screen), field, heights,
+                  emission.rays_of(Scene(grid, lens, scene.screen), "stratified", 30_000, seed=3))
+    torch.testing.assert_close(exposure.image, same.image, rtol=1e-12, atol=1e-15)
+
+    plan = compile_plan(scene, field, heights)
+    assert plan["source-size"].on and plan.scene.source is source
+    assert compile_plan(scene, field, heights, ()).scene.source == Points(((0.0, 0.0, -20.0),), (2.0,))
+    steepest = math.atan((1.5 + math.hypot(5.0, 4.0)) / 20.0)  # never more
+    assert 0.9 * steepest < bounds_of(scene, field, heights).incidence <= steepest
+    for write, name in ((write_mitsuba, "lens.xml"), (write_lighttools, "lens.npz")):
+        with pytest.raises(InputError, match="knows no source of type ring"):
+            write(tmp_path / name, scene, field, heights)
+    assert not list(tmp_path.iterdir())
+
+
+SPOKES = '''"""Points on a circle, as many as [source] spokes says."""
+from dataclasses import dataclass
+import numpy as np
+from caustic_cli.scene.sources.base import Source
+from caustic_cli.scene.sources.section import SourceType
+
+@dataclass(frozen=True)
+class Spokes(Source):
+    count: int
+    power: float
+    kind = "spokes"
+
+    def points(self):
+        turn = 2.0 * np.pi * np.arange(self.count) / self.count
+        return np.stack([np.cos(turn), np.sin(turn), 0.0 * turn - 20.0], -1), np.full(self.count, 1.0 / self.count)
+
+TYPES = (SourceType("spokes", "spokes", ("spokes",), lambda table, profile: Spokes(table["spokes"], table["power"]),
+                    lambda lens: {"spokes": 5}, own={"spokes": ("whole", "how many")}),)
+'''
+DRAWN = '''"""The rays of spokes."""
+from caustic_cli.optics.emission.near import Near
+
+EMISSIONS = {"spokes": Near.of_size}
+'''
+USED = '''
+import torch
+from caustic_cli import settings
+from caustic_cli.derive import complete
+from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.tracing import expose
+
+full = complete(settings.parse('[source]\\ntype = "spokes"\\nspokes = 7\\n[lens]\\ncontrol = [8, 8]', "here"), 1.0)
+again = settings.parse(settings.dump(full), "there")
+scene = settings.build_scene(again)
+rays = rays_of(scene, "stratified", 6300)
+exposure = expose(scene, HeightField.of(scene.lens), torch.full((8, 8), 5.0, dtype=torch.float64), rays)
+assert abs(float(exposure.image.sum()) + sum(exposure.lost.values()) - 1.0) < 1e-12
+print(scene.source.kind, len(scene.source.powers), rays.count, again["source"]["spokes"])
+'''
+
+
+def test_two_new_files_are_a_new_type_of_source(tmp_path):
+    """Nothing else is touched: a copy of the package with a file of data and a file of rays knows the type and its key."""
+    shutil.copytree(PACKAGE, tmp_path / "caustic_cli", ignore=shutil.ignore_patterns("__pycache__"))
+    (tmp_path / "caustic_cli/scene/sources/spokes.py").write_text(SPOKES)
+    (tmp_path / "caustic_cli/optics/emission/spokes.py").write_text(DRAWN)
+    done = subprocess.run([sys.executable, "-c", USED], cwd=tmp_path, capture_output=True, text=True, check=False,
+                          env={**os.environ, "CAUSTIC_KERNELS": "torch", "PYTHONPATH": str(tmp_path)})
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["spokes", "7", "6300", "7"]
+
+
+def test_a_kind_that_others_do_not_know_is_refused_in_a_sentence(ring, monkeypatch):
+    scene = Scene(Ring((0.0, 0.0, -20.0), 3.0), make()[0].lens, Screen((10.0, 10.0)))
+    monkeypatch.setattr(verify, "find_spec", lambda name: True)
+    with pytest.raises(InputError, match="--verify mitsuba knows no source of type ring"):
+        verify.require_mitsuba(scene)
+    monkeypatch.delitem(emission._MAKERS, "ring")
+    with pytest.raises(InputError, match="type ring has no rays"):
+        emission.rays_of(scene, "stratified", 10)
