@@ -17,7 +17,7 @@ def rotation(tilt) -> np.ndarray:
     return about_y @ about_x
 
 
-def meet(o, d, surface, position, tilt, far=400.0):
+def meet(o, d, surface, position, tilt, far=20.0):
     """Points (N, 3) where rays (N, 3) cross z = surface(x, y) of a frame, and unit normals there, by bisection over [0, far] mm."""
     turn = rotation(tilt)
     lo, ld = (o - position) @ turn, d @ turn

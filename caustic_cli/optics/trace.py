@@ -219,7 +219,7 @@ class Tracer:
             state = replace(m.state, lost=dict(m.state.lost))
         prepared = self.meets if started else None
         o, d = into(element.pose, state.origin, state.direction, state.datum)
-        if k == 0 and m.forward and self.system.lit is None and not element.surface.flat:
+        if k == 0 and m.forward and prepared is None and self.system.lit is None and not element.surface.flat:
             o, state = self._backed_up(o, d, state, element, heights)
         hit = next((h for a in self.actions if (h := a.meet(m, o, d, heights)) is not None), None)
         if hit is None:

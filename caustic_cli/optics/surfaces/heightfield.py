@@ -84,7 +84,8 @@ class HeightField(Surface):
 
     def hull(self, heights: Tensor) -> tuple[float, float]:
         """Least and largest control height: the surface lies in the hull of its net."""
-        return float(heights.min()), float(heights.max())
+        low, high = torch.aminmax(heights.detach())
+        return float(low), float(high)
 
     def centred(self, heights: Tensor) -> tuple[Tensor, float]:
         """Heights less their mean, and the mean: a sag small against the thickness keeps all its digits."""

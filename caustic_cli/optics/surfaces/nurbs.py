@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
@@ -65,7 +66,8 @@ class Nurbs(Surface):
 
     def hull(self, heights: Tensor) -> tuple[float, float]:
         """Least and largest control height: positive weights keep the surface between them."""
-        return float(heights.min()), float(heights.max())
+        low, high = torch.aminmax(heights.detach())
+        return float(low), float(high)
 
     def slope_bounds(self, heights: Tensor) -> tuple[float, float]:
         """|Z_x| <= (|(A - m W)_x| + |z - m| |W_x|) / W with m the middle of the hull, each from its control net."""
