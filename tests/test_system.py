@@ -159,7 +159,7 @@ def tilted() -> tuple[System, dict]:
 @pytest.mark.parametrize("make", [lambda: biconvex(40.0, -60.0, 4.0), prism_and_lens, doublet, tilted],
                          ids=["biconvex", "prism", "two lenses", "tilted"])
 def test_rays_against_an_independent_tracer(make):
-    """Landing points to 1e-8 mm and optical path lengths: bisection, and normals by differences, leave that much."""
+    """Landing points to 1e-7 mm and optical path lengths to 1e-9: normals by differences across the knots of a quadratic leave that."""
     system, heights = make()
     (rx, ry), rng = system.pupil.half_size, np.random.default_rng(2)
     x, y = (rng.uniform(-0.4 * r, 0.4 * r, 60) for r in (rx, ry))
@@ -175,7 +175,7 @@ def test_rays_against_an_independent_tracer(make):
         elements.append((in_numpy(e.surface, heights.get(e.name)), e.pose.position, e.pose.tilt, *what))
     o, d, path = walk(np.stack([x, y, np.full(60, z)], 1), np.tile([0.0, 0.0, 1.0], (60, 1)), elements)
     assert bool((landed.statuses() == 0).all())
-    np.testing.assert_allclose(np.stack([c.numpy() for c in landed.origin[:2]], 1), onto(o, d, (0, 0, system.screens[0].z)), atol=1e-8)
+    np.testing.assert_allclose(np.stack([c.numpy() for c in landed.origin[:2]], 1), onto(o, d, (0, 0, system.screens[0].z)), atol=1e-7)
     np.testing.assert_allclose(out.path.numpy(), path, atol=1e-9)
 
 
