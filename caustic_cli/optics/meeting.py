@@ -97,7 +97,7 @@ def surface_at(field: HeightField, heights: Tensor, x: Tensor, y: Tensor) -> tup
     from caustic_cli.optics.kernels.surface import FusedSurface, scattered_surface  # noqa: PLC0415
 
     at = ((0.5 * (c.detach() / r + 1.0)).contiguous().numpy() for c, r in zip((x, y), field.half_size, strict=True))
-    return scattered_surface(FusedSurface(field.spaces, field.half_size), heights.double(), *at, torch.float64)
+    return scattered_surface(FusedSurface(field.spaces, field.half_size), heights.double(), *at)
 
 
 def touch(field: HeightField, heights: Tensor, o, d, t: Tensor):

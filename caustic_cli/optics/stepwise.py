@@ -28,7 +28,7 @@ from caustic_cli.optics.detours import ghost, second_meeting
 from caustic_cli.optics.emission import enter
 from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.optics.interface import reflect, reflectance, reflectances, refract
-from caustic_cli.optics.kernels import fused
+from caustic_cli.optics.kernels import fused, precision
 from caustic_cli.optics.landing import Landing, Part, Status, collect
 from caustic_cli.optics.meeting import surface_at
 from caustic_cli.optics.polarisation import field_of, part_s
@@ -75,6 +75,7 @@ class StepTracer:
     """Traces rays by the steps that a scene needs; arguments as of `tracing.PlaneTracer`."""
 
     def __init__(self, scene: Scene, field: HeightField, rays: Sample | Bundle, dtype: torch.dtype, steps: Steps = SEQUENTIAL):
+        dtype = precision(dtype, (rays.u if isinstance(rays, Sample) else rays.x).device)
         self.scene, self.field, self.dtype, self.options = scene, field, dtype, steps
         lens = scene.lens
         if isinstance(rays, Sample) and steps.general:
@@ -104,11 +105,11 @@ class StepTracer:
             surface = FusedSurface(field.spaces, field.half_size)
             if isinstance(rays, Sample):
                 u, v = rays.u.contiguous().numpy(), rays.v.contiguous().numpy()
-                return lambda sag: scattered_surface(surface, sag, u, v, dtype)
+                return lambda sag: scattered_surface(surface, sag, u, v)
             hits = RayHits(surface, rays)
 
             def met(heights: Tensor) -> tuple:
-                found = hits(heights, torch.float64)
+                found = hits(heights)
                 return *found, found[0].detach() >= 0
 
             return met

@@ -25,7 +25,7 @@ from caustic_cli.optics.bundle import Bundle
 from caustic_cli.optics.emission import Rays
 from caustic_cli.optics.heightfield import Evaluator, HeightField
 from caustic_cli.optics.interface import reflectance, refract
-from caustic_cli.optics.kernels import fused
+from caustic_cli.optics.kernels import fused, precision
 from caustic_cli.optics.landing import LOSSES, Landing, Part, Status, collect
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sample
@@ -42,18 +42,18 @@ class PlaneTracer:
         scene: source, lens and screen.
         field: the exit surface's spline spaces.
         sample: the rays.
-        dtype: precision of the ray arithmetic.  Heights are float64 and enter relative to their mean, so float32 rays
-            see sag, not thickness.
+        dtype: precision of the ray arithmetic where the kernels, which know float64 only, do not do it.  Heights are float64
+            and enter relative to their mean, so float32 rays see sag, not thickness.
         like: the tracer of the chunk before, whose basis values along v are taken over where they are the same.
     """
 
     def __init__(self, scene: Scene, field: HeightField, sample: Sample, dtype: torch.dtype, like: PlaneTracer | None = None):
-        self.scene, self.field, self.sample, self.dtype = scene, field, sample, dtype
+        self.scene, self.field, self.sample, self.dtype = scene, field, sample, precision(dtype, sample.u.device)
         self.kernel = None
         if fused(sample.u.device):
             from caustic_cli.optics.kernels.functions import PlaneKernel  # noqa: PLC0415
 
-            self.kernel = PlaneKernel(field.spaces, field.half_size, sample.u, sample.v, sample.tensor, sample.share, dtype,
+            self.kernel = PlaneKernel(field.spaces, field.half_size, sample.u, sample.v, sample.tensor, sample.share,
                                       None if like is None else like.kernel)
 
     @cached_property
@@ -86,17 +86,16 @@ class PlaneTracer:
 class RayTracer:
     """Traces a bundle of rays through a lens; prepared once, called for any heights.  Arguments as of `PlaneTracer`.
 
-    Hits are found in float64 whatever `dtype` is, and the kernel stays there: a distance through thick glass has no digits of
-    float32 to spare for the sag.
+    Hits are found in float64 whatever `dtype` is: a distance through thick glass has no digits of float32 to spare for the sag.
     """
 
     def __init__(self, scene: Scene, field: HeightField, bundle: Bundle, dtype: torch.dtype, like: RayTracer | None = None):
-        self.scene, self.field, self.bundle, self.dtype = scene, field, bundle, dtype
+        self.scene, self.field, self.bundle, self.dtype = scene, field, bundle, precision(dtype, bundle.x.device)
         self.kernel = None
         if fused(bundle.x.device):
             from caustic_cli.optics.kernels.functions import RayKernel  # noqa: PLC0415
 
-            self.kernel = RayKernel(field.spaces, field.half_size, bundle, torch.float64, None if like is None else like.kernel)
+            self.kernel = RayKernel(field.spaces, field.half_size, bundle, None if like is None else like.kernel)
 
     def __call__(self, heights: Tensor, screen_z: float | None = None) -> Landing:
         """Heights (n, m) mm float64 -> where the rays land at screen_z (default: the scene's): the plain-torch reference."""

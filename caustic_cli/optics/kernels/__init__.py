@@ -5,7 +5,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+from collections.abc import Iterator
 
 import torch
 
@@ -13,6 +15,25 @@ import torch
 def fused(device: torch.device | str) -> bool:
     """Whether arrays on `device` are handled by the kernels."""
     return torch.device(device).type == "cpu" and os.environ.get("CAUSTIC_KERNELS", "") != "torch"
+
+
+@contextlib.contextmanager
+def plain() -> Iterator[None]:
+    """Rays prepared meanwhile go by the plain-torch reference."""
+    before = os.environ.get("CAUSTIC_KERNELS")
+    os.environ["CAUSTIC_KERNELS"] = "torch"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["CAUSTIC_KERNELS"]
+        else:
+            os.environ["CAUSTIC_KERNELS"] = before
+
+
+def precision(dtype: torch.dtype, device: torch.device | str) -> torch.dtype:
+    """Of rays on `device` for which `dtype` was asked: the kernels' arithmetic is float64, in which they are no slower."""
+    return torch.float64 if fused(device) else dtype
 
 
 #: numba's threads are OpenMP's, as torch's are.  By itself it takes TBB first, whose parallel loops started ever more slowly here:
