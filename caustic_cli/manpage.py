@@ -88,6 +88,10 @@ The same for the options that most commands share.
 .B CAUSTIC_KERNELS
 "torch" runs the plain-torch reference instead of the compiled kernels.
 .TP
+.B NUMBA_CACHE_DIR
+Directory to keep the compiled kernels in; default: caustic in XDG_CACHE_HOME or in ~/.cache. Where nothing can be written there, it
+is a directory of the user's own among the temporary files. What has not been used for 30 days is removed.
+.TP
 .B NO_COLOR
 Set to anything: no colour.
 .SH EXAMPLES

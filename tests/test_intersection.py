@@ -196,7 +196,7 @@ def test_always_finite_and_on_the_surface(seed, size, p, widest):
 
 
 def meet_fused(f, heights, rays):
-    return RayHits(FusedSurface(f.spaces, f.half_size), rays)(heights, torch.float64)
+    return RayHits(FusedSurface(f.spaces, f.half_size), rays)(heights)
 
 
 @pytest.mark.parametrize("meet", [lambda *a: intersection.meet(*a)[:3], meet_fused], ids=["reference", "kernel"])

@@ -19,7 +19,8 @@ Force = Annotated[bool, typer.Option("--force", help="Replace what is in the way
 Seed = Annotated[int | None, typer.Option(envvar="CAUSTIC_SEED", help="Seed of every random number; the same seed gives the same"
                                           " bytes.  [default: 0]")]
 Device = Annotated[str, typer.Option(envvar="CAUSTIC_DEVICE", help="auto, cpu or cuda.")]
-Dtype = Annotated[str | None, typer.Option(envvar="CAUSTIC_DTYPE", help="Precision of the rays: float32 or float64.")]
+Dtype = Annotated[str | None, typer.Option(envvar="CAUSTIC_DTYPE", help="Precision of the rays: float32 or float64. The CPU's"
+                                           " kernels are float64 always.")]
 Threads = Annotated[int | None, typer.Option(envvar="CAUSTIC_THREADS", help="Threads to use; default: all cores.")]
 Progress = Annotated[str, typer.Option(envvar="CAUSTIC_PROGRESS", metavar="auto|json", help="json: everything on stderr but errors"
                                        " is JSON, one object a line, and the work's progress is among it.")]
@@ -145,30 +146,26 @@ def start_torch(device: str, threads: int | None, say: Reporter):
     if device == "cuda" and not torch.cuda.is_available():
         raise InputError("--device cuda: no CUDA device is at hand here; use auto or cpu")
     device = "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
-    from caustic_cli.optics.kernels import fused  # noqa: PLC0415
+    from caustic_cli.optics.backends import backend_for  # noqa: PLC0415
 
-    if fused(device):
+    if backend_for(device).compiled:
         from caustic_cli import firstrun  # noqa: PLC0415
-        from caustic_cli.optics.kernels.functions import compile_kernels  # noqa: PLC0415
 
-        with say.patience("compiling the kernels for this machine, once: about a minute"):
+        with say.patience("compiling the kernels for this machine, once: about twenty seconds"):
             if not firstrun.kept():
                 firstrun.compile_side_by_side()
-            compile_kernels(*firstrun.DTYPES)
+            backend_for(device).compile_plane()
     return device
 
 
 def compile_for(scene, device: str, say: Reporter) -> None:
     """Have the CPU's kernels compiled that a scene needs beyond those of `start_torch`; None for any scene's."""
-    import torch  # noqa: PLC0415
+    from caustic_cli.optics.backends import backend_for  # noqa: PLC0415
 
-    from caustic_cli.optics.kernels import fused  # noqa: PLC0415
-
-    if fused(device) and (scene is None or not scene.source.collimated):
-        from caustic_cli.optics.kernels.functions import compile_ray_kernels  # noqa: PLC0415
-
-        with say.patience("compiling the intersection kernels for this machine, once: about half a minute"):
-            compile_ray_kernels(torch.float64)
+    backend = backend_for(device)
+    if backend.compiled and (scene is None or not scene.source.collimated):
+        with say.patience("compiling the intersection kernels for this machine, once: about ten seconds"):
+            backend.compile_rays()
 
 
 def dtype_of(name: str):

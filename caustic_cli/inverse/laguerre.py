@@ -13,13 +13,13 @@ missed, which adds at most a quarter of its square to either area.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
 
-FAST = {"cache": True, "error_model": "numpy", "nogil": True}
+from caustic_cli.optics.kernels.jit import njit, prange
+
 MISSED = 16  # cuts added to a cell after those of its neighbours on the raster
 
 
-@njit(**FAST)
+@njit(nogil=True)
 def _line(y, f, n, x, value, place, hull):
     """value[r] = max_j<n (x[r] y[j] - f[j]), place[r] the index; y and x ascend, f may be infinite."""
     top = 0
@@ -55,7 +55,7 @@ def _line(y, f, n, x, value, place, hull):
         place[r] = hull[k]
 
 
-@njit(parallel=True, **FAST)
+@njit(parallel=True, nogil=True)
 def envelope(psi, rows, first, y2, x1, x2):
     """phi and the site that attains it on a raster.
 
@@ -87,7 +87,7 @@ def envelope(psi, rows, first, y2, x1, x2):
     return phi, site
 
 
-@njit(parallel=True, **FAST)
+@njit(parallel=True, nogil=True)
 def prices(phi, rows, first, y2, x1, x2):
     """The Legendre transform back: psi_p = max over the raster of x . y_p - phi(x), (N,), and where: index i m + j, (N,)."""
     n, m, k = len(x1), len(x2), len(rows)
@@ -107,7 +107,7 @@ def prices(phi, rows, first, y2, x1, x2):
     return psi, at
 
 
-@njit(**FAST)
+@njit(nogil=True)
 def _join(p, q, head, link, end, degree, count):
     """Note the border of p and q, unless it is known; half-borders 2 e and 2 e + 1 belong to the two sides."""
     a, b = (p, q) if degree[p] <= degree[q] else (q, p)
@@ -123,7 +123,7 @@ def _join(p, q, head, link, end, degree, count):
     return count + 2
 
 
-@njit(**FAST)
+@njit(entry=True, nogil=True)
 def borders(site, sites):
     """Neighbours in a raster of cells, as linked lists of half-borders.
 
@@ -134,7 +134,7 @@ def borders(site, sites):
     head, degree = np.full(sites, -1, np.int32), np.zeros(sites, np.int32)
     room = 16 * sites + 64
     link, end = np.empty(room, np.int32), np.empty(room, np.int32)
-    count = 0
+    count = np.int64(0)  # of a type: for a constant `_join` would be compiled once more
     for i in range(n):
         for j in range(m):
             p = site[i, j]
@@ -150,7 +150,7 @@ def borders(site, sites):
     return head, link[:count], end[:count], degree
 
 
-@njit(**FAST)
+@njit(nogil=True)
 def _clip(px, py, owner, n, ax, ay, c, q, qx, qy, qowner):
     """The part of a convex polygon where ax x + ay y <= c; side k runs from vertex k to k + 1 and has an owner."""
     out = 0
@@ -168,7 +168,7 @@ def _clip(px, py, owner, n, ax, ay, c, q, qx, qy, qowner):
     return out
 
 
-@njit(**FAST)
+@njit(nogil=True)
 def density(f, x, y, a, b):
     """Bilinear value at (x, y) of the cell values f over [-a, a] x [-b, b]."""
     n, m = f.shape
@@ -180,7 +180,7 @@ def density(f, x, y, a, b):
     return (f[i, j] * (1 - u) + f[i1, j] * u) * (1 - v) + (f[i, j1] * (1 - u) + f[i1, j1] * u) * v
 
 
-@njit(**FAST)
+@njit(entry=True, nogil=True)
 def sampled(f, x1, x2, a, b):
     """Bilinear values of f on a raster, (n, m); (1, 1) where f is one constant."""
     if f.size == 1:
@@ -192,7 +192,7 @@ def sampled(f, x1, x2, a, b):
     return out
 
 
-@njit(**FAST)
+@njit(nogil=True)
 def _means(site, values, sites):
     """Mean of raster values in each cell, (N,)."""
     total, count = np.zeros(sites), np.zeros(sites)
@@ -205,7 +205,7 @@ def _means(site, values, sites):
     return total / np.maximum(count, 1.0)
 
 
-@njit(**FAST)
+@njit(nogil=True)
 def _cells(low, high, psi, y1, y2, site, head, link, end, degree, f, level, a, b, mass, weight):
     """`cells` for the sites low..high."""
     room, flat = 0, f.size == 1
@@ -221,7 +221,7 @@ def _cells(low, high, psi, y1, y2, site, head, link, end, degree, f, level, a, b
         px[0], px[1], px[2], px[3] = -a, a, a, -a
         py[0], py[1], py[2], py[3] = -b, -b, b, b
         po[:4] = -1
-        n, e = 4, head[p]
+        n, e = np.int64(4), head[p]  # of types, as -1 below: for constants `_clip` would be compiled twice more
         while e >= 0 and n > 0:
             q = end[e]
             n = _clip(px, py, po, n, y1[q] - y1[p], y2[q] - y2[p], psi[q] - psi[p], e, qx, qy, qo)
@@ -234,7 +234,7 @@ def _cells(low, high, psi, y1, y2, site, head, link, end, degree, f, level, a, b
             q, k = site[i, j], k + 1
             ax, ay, c = y1[q] - y1[p], y2[q] - y2[p], psi[q] - psi[p]
             if q != p and ax * px[k - 1] + ay * py[k - 1] - c > 1e-9 * abs(c):
-                n = _clip(px, py, po, n, ax, ay, c, -1, qx, qy, qo)
+                n = _clip(px, py, po, n, ax, ay, c, np.int32(-1), qx, qy, qo)
                 px, py, po, qx, qy, qo = qx, qy, qo, px, py, po
                 k, missed = 0, missed + 1
         area = 0.0
@@ -252,7 +252,7 @@ def _cells(low, high, psi, y1, y2, site, head, link, end, degree, f, level, a, b
                 weight[po[k]] = g * length / np.hypot(y1[q] - y1[p], y2[q] - y2[p])
 
 
-@njit(parallel=True, **FAST)
+@njit(parallel=True, nogil=True)
 def cells(psi, y1, y2, site, head, link, end, degree, f, values, a, b):
     """Mass of every cell and d(mass) across every border.
 

@@ -11,13 +11,13 @@ All sums run in a fixed order, so a result does not depend on threads.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-FAST = {"cache": True, "error_model": "numpy", "nogil": True}
+from caustic_cli.optics.kernels.jit import njit
+
 STRONG, OVER, SMALLEST, LEVELS = 0.25, 1.6, 60, 10
 
 
-@njit(**FAST)
+@njit(entry=True, nogil=True)
 def matrix(head, link, end, weight, mass, goal, missing, touched, bond):
     """The derivative of cells' masses by prices, negated: start, column, entry off the diagonal in CSR form, and the diagonal.
 
@@ -61,7 +61,7 @@ def matrix(head, link, end, weight, mass, goal, missing, touched, bond):
     return start, column[:used].copy(), entry[:used].copy(), diagonal
 
 
-@njit(**FAST)
+@njit(entry=True, nogil=True)
 def _aggregate(start, column, entry):
     """Aggregate of each node (n,), and how many there are."""
     n = len(start) - 1
@@ -88,7 +88,7 @@ def _aggregate(start, column, entry):
     return group, count
 
 
-@njit(**FAST)
+@njit(entry=True, nogil=True)
 def _coarsen(start, column, entry, diagonal, group, count):
     """The matrix summed over aggregates."""
     n = len(start) - 1
@@ -122,7 +122,7 @@ def _coarsen(start, column, entry, diagonal, group, count):
     return c_start, c_column[:used].copy(), c_entry[:used].copy(), c_diagonal
 
 
-@njit(**FAST)
+@njit(entry=True, nogil=True)
 def _sweep(start, column, entry, diagonal, r, x, backward):
     """One Gauss-Seidel sweep on A x = r."""
     n = len(x)
@@ -134,7 +134,7 @@ def _sweep(start, column, entry, diagonal, r, x, backward):
         x[i] = s / diagonal[i]
 
 
-@njit(**FAST)
+@njit(entry=True, nogil=True)
 def _residual(start, column, entry, diagonal, r, x):
     out = np.empty(len(x))
     for i in range(len(x)):
@@ -145,7 +145,7 @@ def _residual(start, column, entry, diagonal, r, x):
     return out
 
 
-@njit(**FAST)
+@njit(entry=True, nogil=True)
 def _down(group, count, r):
     out = np.zeros(count)
     for i in range(len(r)):

@@ -73,10 +73,9 @@ def _flat(direction, power: Tensor, eta: float, fresnel: str, polarised) -> Depa
     tz = torch.where(passes, square, torch.ones_like(square)).sqrt()
     dz_ = dz if isinstance(dz, Tensor) else torch.tensor(dz, dtype=power.dtype, device=power.device)
     reflected = _reflected(direction, (0.0, 0.0, 1.0), dz_, tz, eta, fresnel, polarised)
-    left = torch.where(passes, power - reflected * power, torch.zeros_like(power))
-    if not isinstance(dx, Tensor) and not isinstance(dz, Tensor):  # one direction for all rays stays one
-        return Departure((tx, ty, float(tz)), left, passes.expand(power.shape))
-    return Departure((tx, ty, tz), left, passes)
+    if not any(isinstance(c, Tensor) for c in direction):  # one direction for all rays stays one
+        return Departure((tx, ty, float(tz)), torch.where(passes, power * (1.0 - reflected), torch.zeros_like(power)), passes)
+    return Departure((tx, ty, tz), torch.where(passes, power - reflected * power, torch.zeros_like(power)), passes)
 
 
 def _reflected(direction, normal, c, s, eta: float, fresnel: str, polarised):

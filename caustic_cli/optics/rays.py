@@ -13,6 +13,7 @@ are then never computed.  Sources emit such rays, every element hands them on, s
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 
@@ -61,11 +62,18 @@ class RayState:
     @property
     def count(self) -> int:
         """Number of rays."""
-        return self.power.numel()
+        return self.power.numel() if self.sample is None else math.prod(self.sample.shape)
 
-    def lose(self, name: str, power: Tensor | float) -> None:
-        """Enter power, of each ray or in all, in the account."""
-        amount = power.sum(dtype=torch.float64) if isinstance(power, Tensor) else power
+    def total(self, power: Tensor) -> Tensor:
+        """Power of all rays together: of a number that all of them carry, so many times that."""
+        return power.sum(dtype=torch.float64) if power.ndim else power.double() * self.count
+
+    def lose(self, name: str, power: Tensor) -> None:
+        """Enter power of each ray in the account."""
+        self.book(name, self.total(power))
+
+    def book(self, name: str, amount: Tensor | float) -> None:
+        """Enter an amount of power in the account."""
         self.lost[name] = self.lost.get(name, 0.0) + amount
 
     def mark(self, where: Tensor, status: Status) -> None:
@@ -102,9 +110,16 @@ class RayState:
     @classmethod
     def on_axis(cls, sample: Sample, half_size: tuple[float, float], z: float) -> RayState:
         """Rays along +z through the points of a sample of an aperture of half widths `half_size` at z, mm."""
-        (rx, ry), shape = half_size, sample.shape
+        (rx, ry) = half_size
         x, y = (2.0 * sample.u - 1.0) * rx, (2.0 * sample.v - 1.0) * ry
         if sample.tensor:
-            x, y = x[:, None].expand(shape).reshape(-1), y[None, :].expand(shape).reshape(-1)
-        power = torch.broadcast_to(sample.share, shape).reshape(-1)
-        return cls((x, y, z), (0.0, 0.0, 1.0), power, sample=sample)
+            x, y = x[:, None], y[None, :]
+        return cls((x, y, z), (0.0, 0.0, 1.0), sample.share, sample=sample)
+
+    def spread(self) -> RayState:
+        """The same with x, y and power (N,): those of a sample are kept as rows, columns and a number until a ray goes its own way."""
+        if self.sample is None:
+            return self
+        shape = self.sample.shape
+        x, y, power = (torch.broadcast_to(c, shape).reshape(-1) for c in (*self.origin[:2], self.power))
+        return replace(self, origin=(x, y, self.origin[2]), power=power, lost=dict(self.lost))

@@ -168,7 +168,7 @@ class Tracer:
             frame = screen if isinstance(screen, Screen) else screen.screen
             part, off = self.backend.splat(*ray.origin[:2], ray.power, frame, filter)
             image, leaving = image + part, leaving + ray.leaving
-            ray.lose("off_screen", off)
+            ray.book("off_screen", off)
             for name, value in ray.lost.items():
                 lost[name] = lost.get(name, 0.0) + (value.detach() if isinstance(value, Tensor) else value)
         return self._weighed(image, leaving, lost)
@@ -218,6 +218,11 @@ class Tracer:
         else:
             state = replace(m.state, lost=dict(m.state.lost))
         prepared = self.meets if started else None
+        if self._at_pupil(m):
+            o, d = into(element.pose, state.origin, state.direction, state.datum)
+            m.state, m.local, m.incoming, m.slopes = state, tuple(o), tuple(d), (0.0, 0.0)
+            return
+        state = state.spread()
         o, d = into(element.pose, state.origin, state.direction, state.datum)
         if k == 0 and m.forward and prepared is None and self.system.lit is None and not element.surface.flat:
             o, state = self._backed_up(o, d, state, element, heights)
@@ -232,7 +237,7 @@ class Tracer:
             o, d = ([c.to(self.dtype) if isinstance(c, Tensor) else c for c in v] for v in (o, d))
         m.local, m.incoming, m.slopes, m.length = advanced(o, d, t), tuple(d), (hit.gx, hit.gy), t
         found = hit.found
-        if prepared is None and not self._at_pupil(m):
+        if prepared is None:
             covers = element.aperture.half_size == element.surface.half_size and not element.aperture.round
             if not covers:
                 found = found & element.aperture.holds(*m.local[:2])
@@ -259,10 +264,12 @@ class Tracer:
         if not m.reflects:
             with torch.no_grad():
                 gone = m.arriving - found.power
-                everything = found.power.new_zeros(()) if bool(found.passes.all()) else torch.where(found.passes, 0.0, gone).sum(
-                    dtype=torch.float64)
-                state.lose("fresnel", gone.sum(dtype=torch.float64) - everything)
-                state.lose("total_internal_reflection", everything)
+                if bool(found.passes.all()):
+                    state.lose("fresnel", gone)
+                else:
+                    totally = torch.where(found.passes, torch.zeros_like(gone), gone)
+                    state.lose("fresnel", gone - totally)
+                    state.lose("total_internal_reflection", totally)
             if self.track:
                 state.mark(~found.passes & (m.arriving > 0), Status.TOTAL_INTERNAL_REFLECTION)
         if not any(isinstance(c, Tensor) for c in state.direction) and state.direction == (0.0, 0.0, 1.0):
@@ -308,7 +315,8 @@ class Tracer:
                 return Hit(sag - below, gx, gy, torch.ones((), dtype=torch.bool, device=sag.device).expand(sag.shape))
 
             return sampled
-        full = start.full((*start.origin, *start.direction))
+        spread = start.spread()
+        full = spread.full((*spread.origin, *spread.direction))
         origin = (full[0] - px, full[1] - py, full[2] + (start.datum - pz))
         return self.backend.meet_fixed(surface, origin, full[3:], element.aperture.radius)
 

@@ -2,7 +2,8 @@
 
     rays            samplers x numbers of rays, bincount: how fast does each kind of ray converge
     reconstruction  filters x numbers of rays: what blur costs in bias and saves in noise
-    precision       float32 against float64 on the same rays: is single precision enough here
+    precision       float32 against float64 on the same rays: is single precision enough here; both in plain torch, since the
+                    CPU's kernels know float64 only
 
 A bincount image has noise only.  For n independent rays its error is sqrt(N / n) on N evenly lit pixels, order 1/2;
 with one ray in each of n cells only the cells on a pixel's border contribute, which gives order 3/4 once there are
@@ -17,6 +18,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli import __version__
+from caustic_cli.optics.backends import plain
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import SAMPLERS
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -130,7 +132,10 @@ def study_reconstruction(bench: Bench, dtype: torch.dtype) -> Study:
 
 
 def study_precision(bench: Bench, _dtype) -> Study:
-    """Both precisions on the same rays: how far apart their images are, beside how wrong either is."""
+    """Both precisions on the same rays: how far apart their images are, beside how wrong either is.
+
+    Both rows of a pair go by plain torch, so that they differ in nothing else: the CPU's kernels know float64 only.
+    """
     settings = [Setting(f"{kind} {_name(dtype)}", kind, bench.max_rays >> k, Filter(), dtype)
                 for k in (4, 2, 0) for kind in SAMPLERS for dtype in (torch.float64, torch.float32)]
     bench.plan(settings)
@@ -140,21 +145,22 @@ def study_precision(bench: Bench, _dtype) -> Study:
         difference = relative_rms(image, before) if s.dtype == torch.float32 else None
         return {"error": truth.error_of(image), "difference": difference}
 
-    rows = bench.measure(settings, figures)
+    with plain():
+        rows = bench.measure(settings, figures)
     for double, single in zip(rows[::2], rows[1::2], strict=True):
         double |= {"dtype": "float64", "speedup": None}
         single |= {"dtype": "float32", "speedup": double["seconds"] / single["seconds"]}
     columns = _COMMON | {
         "dtype": "precision of the rays",
         "difference": "relative RMS between the float32 and the float64 image of the same rays",
-        "speedup": "time of float64 over time of float32",
+        "speedup": "time of float64 over time of float32, both in plain torch",
     } | _TIMES
     largest = rows[-2 * len(SAMPLERS) :]
     worst = max(largest[1::2], key=lambda row: row["difference"] / max(row["error"], truth.error))
     verdict = "float32 is enough" if worst["difference"] <= NEGLIGIBLE * worst["error"] else "use float64"
     advice = (f"float32 changes the image of {worst['rays']} {worst['sampler']} rays by {worst['difference']:.2g},"
-              f" where the rays leave an error of {worst['error']:.2g}, and is {worst['speedup']:.2g} times as fast:"
-              f" {verdict}{haste(rows)}")
+              f" where the rays leave an error of {worst['error']:.2g}, and is {worst['speedup']:.2g} times as fast"
+              f" in plain torch: {verdict}{haste(rows)}")
     return Study("precision", columns, rows, _orders(bench, rows), advice, _about(bench, None, truth))
 
 

@@ -4,7 +4,8 @@
 
 Every figure is a median over rounds in which the settings take turns, so that a change in the machine's speed meets all of them;
 ratios are medians of the ratios within a round.  The setting is table D.2's: 562,500 rays, 50 x 50 control net of degree 10,
-250 x 250 pixels, a Gaussian filter of 3 x 3 with alpha = 1 / cm^2, float32.
+250 x 250 pixels, a Gaussian filter of 3 x 3 with alpha = 1 / cm^2; the kernels in float64, plain torch in
+float32.
 """
 
 from __future__ import annotations

@@ -91,7 +91,7 @@ def test_values_and_slopes(p, kind, dtype, compare):
     found = {
         "tensor": [a[:, 0] for a in field.prepare(Sample(u, v[:1], True, SHARE), dtype)(net.to(dtype))[:2]],
         "scattered": field.prepare(Sample(u, v, False, SHARE), dtype)(net.to(dtype))[:2],
-        "kernel": scattered_surface(FusedSurface((s, flat), half), net, u.numpy(), v.numpy(), dtype)[:2],
+        "kernel": scattered_surface(FusedSurface((s, flat), half), net, u.numpy(), v.numpy())[:2],
     }
     eps = torch.finfo(dtype).eps
     worst = 0.0
@@ -126,7 +126,7 @@ def test_derivatives_by_the_heights_are_the_transpose(p, kind, dtype):
     heights = torch.rand(s.n, s.n, generator=g, dtype=torch.float64)
     by = torch.rand(2, len(u), generator=g, dtype=torch.float64).to(dtype)
     for call in (lambda h: HeightField((s, s), (1.0, 1.0)).prepare(Sample(u, v, False, SHARE), dtype)(h.to(dtype)),
-                 lambda h: scattered_surface(FusedSurface((s, s), (1.0, 1.0)), h, u.numpy(), v.numpy(), dtype)):
+                 lambda h: scattered_surface(FusedSurface((s, s), (1.0, 1.0)), h, u.numpy(), v.numpy())):
         leaf = heights.clone().requires_grad_()
         z, zx, _ = call(leaf)
         (pulled,) = torch.autograd.grad((z * by[0]).sum() + 1e-3 * (zx * by[1]).sum(), leaf)

@@ -13,7 +13,9 @@ CAUSTIC_KERNELS=torch asks for the reference.
 
 from __future__ import annotations
 
+import contextlib
 import os
+from collections.abc import Iterator
 from functools import cache
 
 import torch
@@ -23,6 +25,20 @@ def backend_for(device: torch.device | str):
     """The backend for tensors on `device`."""
     plain = torch.device(device).type != "cpu" or os.environ.get("CAUSTIC_KERNELS", "") == "torch"
     return _made("torch" if plain else "numba")
+
+
+@contextlib.contextmanager
+def plain() -> Iterator[None]:
+    """Rays prepared meanwhile go by the plain-torch reference."""
+    before = os.environ.get("CAUSTIC_KERNELS")
+    os.environ["CAUSTIC_KERNELS"] = "torch"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["CAUSTIC_KERNELS"]
+        else:
+            os.environ["CAUSTIC_KERNELS"] = before
 
 
 @cache

@@ -20,6 +20,7 @@ from caustic_cli.optics.kernels.rayhits import hits_of_rays
 from caustic_cli.optics.kernels.splat import splat_rays
 from caustic_cli.optics.kernels.surface import FusedSurface, RayHits, next_meetings, scattered_surface
 from caustic_cli.optics.meeting import HALVINGS, MOST_STEPS
+from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sample, key, salt
 from caustic_cli.optics.surfaces.base import Hit
@@ -30,6 +31,15 @@ class Numba(Torch):
     """See the package."""
 
     name = "numba"
+    compiled = True
+
+    def compile_plane(self) -> None:
+        """Have ready what a plane wave's rays need: from the files kept, or compiled for this machine."""
+        functions.compile_kernels()
+
+    def compile_rays(self) -> None:
+        """The same for rays of any direction."""
+        functions.compile_ray_kernels()
 
     def precision(self, dtype: torch.dtype) -> torch.dtype:
         """float64."""
@@ -116,3 +126,40 @@ class Numba(Torch):
     def splat(self, x: Tensor, y: Tensor, weight: Tensor, screen: Screen, filter: Filter) -> tuple[Tensor, Tensor]:
         """As the reference."""
         return splat_rays(x, y, weight, screen, filter)
+
+    def plane_image(self, field, rays: RayState, eta: float, fresnel: str, like: PlaneImage | None) -> PlaneImage:
+        """The fused kernel of a plane wave's rays on a B-spline: a function of heights, screen and filter."""
+        return PlaneImage(field, rays, eta, fresnel, like)
+
+    def ray_image(self, field, rays: RayState, eta: float, fresnel: str, radius: float | None, like: RayImage | None) -> RayImage:
+        """The fused kernel of any rays below a B-spline."""
+        return RayImage(field, rays, eta, fresnel, radius, like)
+
+
+class PlaneImage:
+    """See `Numba.plane_image`; like: that of the chunk before, whose basis values along v serve again where they are the same."""
+
+    def __init__(self, field, rays: RayState, eta: float, fresnel: str, like: PlaneImage | None):
+        s = rays.sample
+        self.interface = eta, fresnel
+        self.kernel = functions.PlaneKernel(field.spaces, field.half_size, s.u, s.v, s.tensor, rays.power,
+                                            like.kernel if isinstance(like, PlaneImage) else None)
+
+    def __call__(self, heights: Tensor, screen: Screen, filter: Filter) -> tuple[Tensor, Tensor, dict]:
+        """Image, power that leaves the surface, and what was lost there."""
+        reference = float(heights.detach().mean())
+        return self.kernel(heights - reference, *self.interface, screen.z - reference, screen, filter)
+
+
+class RayImage:
+    """See `Numba.ray_image`; like: as of `PlaneImage`."""
+
+    def __init__(self, field, rays: RayState, eta: float, fresnel: str, radius: float | None, like: RayImage | None):
+        self.interface = eta, fresnel
+        x, y, *direction = (c.contiguous() for c in rays.full((*rays.origin[:2], *rays.direction)))
+        self.kernel = functions.RayKernel(field.spaces, field.half_size, (x, y, rays.origin[2] + rays.datum), direction, rays.power,
+                                          radius, like.kernel if isinstance(like, RayImage) else None)
+
+    def __call__(self, heights: Tensor, screen: Screen, filter: Filter) -> tuple[Tensor, Tensor, dict]:
+        """Image, power that leaves the surface, and what was lost there."""
+        return self.kernel(heights, *self.interface, float(heights.detach().mean()), screen, filter)

@@ -19,6 +19,8 @@ class Torch:
     """See the package."""
 
     name = "torch"
+    #: Whether something has to be compiled before the first trace.
+    compiled = False
 
     def precision(self, dtype: torch.dtype) -> torch.dtype:
         """The precision in which rays asked for in `dtype` are traced."""

@@ -52,5 +52,5 @@ class Unbent(Action):
 
 def general(rays: RayState) -> RayState:
     """Rays that forget that they stand on a sample of the aperture: they are put through every step of the general way."""
-    origin = (rays.origin[0], rays.origin[1], rays.origin[2])
-    return replace(rays, origin=origin, direction=rays.full(rays.direction), sample=None)
+    rays = rays.spread()
+    return replace(rays, direction=rays.full(rays.direction), sample=None)

@@ -1,18 +1,10 @@
-"""Fused CPU kernels behind the functions of `optics`, each tested against its plain-torch reference.
-
-`fused(device)` says whether they are used: on the CPU, unless CAUSTIC_KERNELS=torch asks for the reference.
-"""
+"""CPU kernels behind the stages of a trace, each tested against its plain-torch reference; `backends.cpu` calls them."""
 
 from __future__ import annotations
 
 import os
 
 import torch
-
-
-def fused(device: torch.device | str) -> bool:
-    """Whether arrays on `device` are handled by the kernels."""
-    return torch.device(device).type == "cpu" and os.environ.get("CAUSTIC_KERNELS", "") != "torch"
 
 
 #: numba's threads are OpenMP's, as torch's are.  By itself it takes TBB first, whose parallel loops started ever more slowly here:

@@ -7,26 +7,24 @@ was half of an iteration.
 from __future__ import annotations
 
 import torch
-from numba import njit, prange
 from torch import Tensor
 
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels import blocks
-
-_OPTIONS = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
+from caustic_cli.optics.kernels.jit import FAST, njit, prange
 
 
 class AlongV:
     """Basis values at points v (b,), and derivatives times `scale`, for nets (n, m) whose second axis is `space`'s."""
 
-    def __init__(self, space: SplineSpace, v: Tensor, scale: float, dtype: torch.dtype):
+    def __init__(self, space: SplineSpace, v: Tensor, scale: float):
         first, values = space.basis(v)
         slopes = space.basis(v, 1)[1] * scale
         self.size = space.n
-        self.arrays = (first.numpy(), *(t.to(dtype).contiguous().numpy() for t in (values, slopes)))
+        self.arrays = (first.numpy(), *(t.contiguous().numpy() for t in (values, slopes)))
 
     def __call__(self, net: Tensor) -> tuple[Tensor, Tensor]:
-        """Net (n, m) -> the spline's values and scaled derivatives along v at every point: (n, b) each, differentiable."""
+        """Net (n, m) float64 -> the spline's values and scaled derivatives along v at every point: (n, b) each, differentiable."""
         blocks()
         return _Contraction.apply(net, self)
 
@@ -34,7 +32,7 @@ class AlongV:
 class _Contraction(torch.autograd.Function):
     @staticmethod
     def forward(net: Tensor, along: AlongV):
-        out = [torch.empty(len(net), len(along.arrays[0]), dtype=net.dtype) for _ in range(2)]
+        out = [torch.empty(len(net), len(along.arrays[0]), dtype=torch.float64) for _ in range(2)]
         _contract(net.detach().contiguous().numpy(), *along.arrays, *(t.numpy() for t in out))
         return tuple(out)
 
@@ -44,7 +42,7 @@ class _Contraction(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, by_value, by_slope):
-        out = torch.zeros(len(by_value), ctx.along.size, dtype=by_value.dtype)
+        out = torch.zeros(len(by_value), ctx.along.size, dtype=torch.float64)
         _spread(by_value.contiguous().numpy(), by_slope.contiguous().numpy(), *ctx.along.arrays, out.numpy())
         return out, None
 
@@ -53,7 +51,7 @@ class _Contraction(torch.autograd.Function):
         return _Contraction.apply(tangent.detach(), ctx.along)  # within torch.func numbers are within reach only so
 
 
-@njit(parallel=True, **_OPTIONS)
+@njit(parallel=True, **FAST)
 def _contract(net, first, values, slopes, out, out_slope):
     for i in prange(len(net)):
         row, to, to_slope = net[i], out[i], out_slope[i]
@@ -65,7 +63,7 @@ def _contract(net, first, values, slopes, out, out_slope):
             to[j], to_slope[j] = value, slope
 
 
-@njit(parallel=True, **_OPTIONS)
+@njit(parallel=True, **FAST)
 def _spread(by_value, by_slope, first, values, slopes, out):
     for i in prange(len(out)):
         to, value, slope = out[i], by_value[i], by_slope[i]

@@ -1,7 +1,6 @@
 """A row of rays refracted at the exit surface and carried to the screen, with derivatives, for the CPU kernels.
 
-Every loop writes one array from a few others, which is what lets the compiler turn it into vector instructions.  Numba caches
-the kernels of `plane` by that file's time stamp alone: after editing here, touch plane.py.
+Every loop writes one array from a few others, which is what lets the compiler turn it into vector instructions.
 
 Notation, a ray with slopes g = (z_x, z_y) at the exit surface, a = |g|^2, index n
     s       sqrt(1 - (n^2 - 1) a), cosine of refraction times |N|
@@ -13,9 +12,7 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
-from caustic_cli.optics.kernels.shares import OPTIONS
+from caustic_cli.optics.kernels.jit import FAST, njit
 from caustic_cli.optics.tolerances import CRITICAL
 
 NONE, SCHLICK, EXACT = 0, 1, 2
@@ -26,7 +23,7 @@ OVER_X, OVER_Y, LEAN_X, LEAN_Y, X, Y, SHARE, VECTORS = range(16, 24)
 SCRATCH = 5
 
 
-@njit(inline="always", **OPTIONS)
+@njit(inline="always", **FAST)
 def _s(a, n):
     """s, or 1 beyond the critical angle; and whether the ray passes."""
     radicand = 1.0 - (n - 1.0) * (n + 1.0) * a
@@ -34,7 +31,7 @@ def _s(a, n):
     return math.sqrt(radicand if passes else 1.0), passes
 
 
-@njit(inline="always", **OPTIONS)
+@njit(inline="always", **FAST)
 def _m(a, n):
     """m and dm/da."""
     s, _ = _s(a, n)
@@ -43,7 +40,7 @@ def _m(a, n):
     return m, 0.5 * (n - 1.0) * (n + 1.0) / s * n * m * under
 
 
-@njit(inline="always", **OPTIONS)
+@njit(inline="always", **FAST)
 def _reflected(fresnel, a, n):
     """R and dR/da."""
     s, _ = _s(a, n)
@@ -61,7 +58,7 @@ def _reflected(fresnel, a, n):
     return 0.0, 0.0
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def load(row, out):
     """A row that may be one value repeated, as a vector: of anything but consecutive numbers the loops make no vectors."""
     if row.strides[0] == 0:
@@ -71,17 +68,17 @@ def load(row, out):
         out[j] = row[j]
 
 
-@njit(**OPTIONS)
-def powers(fresnel, gx, gy, share, n, inside, out):
+@njit(**FAST)
+def powers(fresnel, gx, gy, share, n, out):
     """Power of each ray behind the lens; -1 where it is totally reflected."""
     for j in range(len(out)):
         a = gx[j] * gx[j] + gy[j] * gy[j]
         _, passes = _s(a, n)
         reflected, _ = _reflected(fresnel, a, n)
-        out[j] = share[j] * inside * (1.0 - reflected) if passes else -1.0
+        out[j] = share[j] * (1.0 - reflected) if passes else -1.0
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def reach(sag, gx, gy, n, height, out):
     """h m: how far a ray of unit slope is carried, mm."""
     for j in range(len(out)):
@@ -89,68 +86,66 @@ def reach(sag, gx, gy, n, height, out):
         out[j] = (height - sag[j]) * m
 
 
-@njit(**OPTIONS)
-def landing(reach, slope, x, half, pixel, out):
+@njit(**FAST)
+def landing(reach, slope, x, low, pixel, out):
     """Landing points in pixels along the axis of `slope`."""
     inverse = 1.0 / pixel
     for j in range(len(out)):
-        out[j] = (x[j] + reach[j] * slope[j] + half) * inverse
+        out[j] = (x[j] + reach[j] * slope[j] - low) * inverse
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def fraction(p, out):
     for j in range(len(out)):
         out[j] = p[j] - math.floor(p[j])
 
 
-@njit(**OPTIONS)
-def _by_a(fresnel, sag, gx, gy, share, by_power, by_px, by_py, n, height, inside, out):
+@njit(**FAST)
+def _by_a(fresnel, sag, gx, gy, share, by_power, by_px, by_py, n, height, out):
     """Derivative by a = |g|^2, by way of the landing point and of the reflectance; 0 where totally reflected."""
     for j in range(len(out)):
         a = gx[j] * gx[j] + gy[j] * gy[j]
         _, passes = _s(a, n)
         _, dm = _m(a, n)
         _, dr = _reflected(fresnel, a, n)
-        value = (height - sag[j]) * dm * (by_px[j] * gx[j] + by_py[j] * gy[j]) - by_power[j] * share[j] * inside * dr
+        value = (height - sag[j]) * dm * (by_px[j] * gx[j] + by_py[j] * gy[j]) - by_power[j] * share[j] * dr
         out[j] = value if passes else 0.0
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _by_slope(reach, slope, by_p, by_a, out):
     for j in range(len(out)):
         out[j] = reach[j] * by_p[j] + 2.0 * slope[j] * by_a[j]
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _by_sag(reach, sag, gx, gy, by_px, by_py, height, out):
     for j in range(len(out)):  # reach / h = m; nothing lands where h is not positive
         h = height - sag[j]
         out[j] = -reach[j] / (h if h > 0.0 else 1.0) * (by_px[j] * gx[j] + by_py[j] * gy[j])
 
 
-@njit(**OPTIONS)
-def pull(vectors, real, whole):
+@njit(**FAST)
+def pull(vectors, exit_):
     """Derivatives by the surface, left in T_SAG, T_GX, T_GY, from those by power and pixel coordinates."""
-    n, height, v = real[0], real[1], vectors
-    inside = real[8]
-    _by_a(whole[0], v[SAG], v[GX], v[GY], v[SHARE], v[BY_POWER], v[BY_PX], v[BY_PY], n, height, inside, v[BY_A])
+    n, height, v = exit_.index, exit_.height, vectors
+    _by_a(exit_.fresnel, v[SAG], v[GX], v[GY], v[SHARE], v[BY_POWER], v[BY_PX], v[BY_PY], n, height, v[BY_A])
     _by_slope(v[REACH], v[GX], v[BY_PX], v[BY_A], v[T_GX])
     _by_slope(v[REACH], v[GY], v[BY_PY], v[BY_A], v[T_GY])
     _by_sag(v[REACH], v[SAG], v[GX], v[GY], v[BY_PX], v[BY_PY], height, v[T_SAG])
 
 
-@njit(**OPTIONS)
-def push(vectors, real, whole):
+@njit(**FAST)
+def push(vectors, exit_, frame):
     """Tangents of power and pixel coordinates, left in T_POWER, BY_PX, BY_PY, along T_SAG, T_GX, T_GY."""
-    n, height, v = real[0], real[1], vectors
-    inside = real[8]
+    n, height, v = exit_.index, exit_.height, vectors
     for j in range(v.shape[1]):
         gx, gy, tx, ty = v[GX, j], v[GY, j], v[T_GX, j], v[T_GY, j]
         a, da = gx * gx + gy * gy, 2.0 * (gx * tx + gy * ty)
         m, dm = _m(a, n)
-        _, dr = _reflected(whole[0], a, n)
+        _, dr = _reflected(exit_.fresnel, a, n)
         h = height - v[SAG, j]
         change = -v[T_SAG, j] * m + h * dm * da
-        v[T_POWER, j] = -v[SHARE, j] * inside * dr * da
-        v[BY_PX, j] = (change * gx + h * m * tx) / real[4]
-        v[BY_PY, j] = (change * gy + h * m * ty) / real[5]
+        v[T_POWER, j] = -v[SHARE, j] * dr * da
+        v[BY_PX, j] = (change * gx + h * m * tx) / frame.pixel_x
+        v[BY_PY, j] = (change * gy + h * m * ty) / frame.pixel_y

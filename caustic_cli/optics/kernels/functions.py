@@ -1,25 +1,22 @@
 """The kernels as differentiable torch functions: reverse mode by the written adjoint, forward mode by the tangent.
 
 A surface at the rays (along a tensor product of points, at scattered points, at the rays' hits) feeds one kernel that
-refracts, carries to the screen and splats.
+refracts, carries to the screen and splats.  All in float64, whatever precision the plain-torch reference would take.
 """
 
 from __future__ import annotations
-
-from types import SimpleNamespace
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.bundle import Bundle
-from caustic_cli.optics.interface import reflectance
 from caustic_cli.optics.kernels import bend, blocks, plane, points, shares
+from caustic_cli.optics.kernels.arguments import Exit, Frame, Splat
 from caustic_cli.optics.kernels.banded import AlongV
 from caustic_cli.optics.kernels.surface import FusedSurface, RayHits, scattered_surface
 from caustic_cli.optics.reconstruction import Filter, padding
-from caustic_cli.scene import Lens, Screen
+from caustic_cli.scene import Screen
 
 _FRESNEL = {"none": bend.NONE, "schlick": bend.SCHLICK, "exact": bend.EXACT}
 _KIND = {"bincount": shares.BINCOUNT, "gaussian": shares.GAUSSIAN, "cosine": shares.COSINE}
@@ -43,99 +40,96 @@ ROW = 1024
 
 
 class PlaneKernel:
-    """The fused form of a height field at the rays of a plane wave, `tracing.trace_plane` and `reconstruction.splat`.
+    """The fused form of a height field at the rays of a plane wave, `interface.interact`, landing and `reconstruction.splat`.
 
     Args:
         spaces, half_size: of the height field; half widths in mm.
         u, v: the rays' parameters; with `tensor` all pairs of them, else pairwise.
-        share: part of the source's power per ray, scalar or of the rays' shape.
-        dtype: of everything stored.
+        power: of each ray below the surface, scalar or of the rays' shape.
         like: the kernel of another sample, whose basis values along v serve again where v is the same tensor, and whose
             workspace serves both.
     """
 
-    def __init__(self, spaces, half_size, u: Tensor, v: Tensor, tensor: bool, share: Tensor, dtype: torch.dtype,
-                 like: PlaneKernel | None = None):
+    def __init__(self, spaces, half_size, u: Tensor, v: Tensor, tensor: bool, power: Tensor, like: PlaneKernel | None = None):
         (su, sv), (rx, ry) = spaces, half_size
-        self.dtype, self.tensor, self.v = dtype, tensor, v
+        self.tensor, self.v = tensor, v
         self.workspace = _Workspace() if like is None else like.workspace
         if tensor:
             self.first, bu = su.basis(u)
-            du = su.basis(u, 1)[1] / (2.0 * rx)
-            self.bu, self.du = (b.to(dtype).contiguous() for b in (bu, du))
+            self.bu, self.du = bu.contiguous(), (su.basis(u, 1)[1] / (2.0 * rx)).contiguous()
             if like is not None and like.v is v:
                 self.along_v = like.along_v
             else:
-                self.along_v = AlongV(sv, v, 1.0 / (2.0 * ry), dtype)
+                self.along_v = AlongV(sv, v, 1.0 / (2.0 * ry))
             x, y, shape = u[:, None], v[None, :], (len(u), len(v))
         else:
             shape = _layout(len(u))
             short = shape[0] * shape[1] - len(u)  # rays without power fill the last row
             if short:
-                share = torch.nn.functional.pad(share.expand(len(u)), (0, short))
+                power = torch.nn.functional.pad(power.expand(len(u)), (0, short))
                 u, v = (torch.nn.functional.pad(t, (0, short), value=0.5) for t in (u, v))
             self.first = torch.arange(shape[0])
-            self.bu = self.du = torch.ones(shape[0], 1, dtype=dtype)
+            self.bu = self.du = torch.ones(shape[0], 1, dtype=torch.float64)
             self.points = (u.numpy(), v.numpy())
             self.surface = FusedSurface(spaces, half_size) if like is None else like.surface
-            x, y, share = u.view(shape), v.view(shape), share.view(shape) if share.ndim else share
+            x, y, power = u.view(shape), v.view(shape), power.view(shape) if power.ndim else power
         self.shape = shape
-        coordinates = ((2.0 * x - 1.0) * rx, (2.0 * y - 1.0) * ry, share)
-        self.rays = tuple(_strided(np.broadcast_to(t.to(dtype).numpy(), shape)) for t in coordinates)
+        coordinates = ((2.0 * x - 1.0) * rx, (2.0 * y - 1.0) * ry, power)
+        self.rays = tuple(_strided(np.broadcast_to(t.double().numpy(), shape)) for t in coordinates)
         self.rows = (self.first.numpy(), self.bu.numpy(), self.du.numpy())
 
-    def __call__(self, sag: Tensor, lens: Lens, height: float, screen: Screen, filter: Filter):
-        """Control heights (n, m) relative to some plane, mm, and the screen's height above it, mm: see `_splat`."""
+    def __call__(self, sag: Tensor, eta: float, fresnel: str, height: float, screen: Screen, filter: Filter):
+        """Control heights (n, m) float64 relative to some plane, mm, and the screen's height above it, mm: see `_splat`."""
         if self.tensor:
-            net, net_y = self.along_v(sag.to(self.dtype))  # (n, m_v)
+            net, net_y = self.along_v(sag)  # (n, m_v)
             nets = (net, net, net_y)
         else:
-            nets = [t.view(self.shape) for t in scattered_surface(self.surface, sag, *self.points, self.dtype)]
-        passed = 1.0 - reflectance(lens.fresnel, 1.0, 1.0, 1.0 / lens.index)  # the entrance, at normal incidence
-        x, y, share = self.rays
-        rays = (x, y, _none(self.dtype), _none(self.dtype), share)
-        return _splat(nets, self.rows, not self.tensor, rays, lens, height, (passed, 0.0), screen, filter, self.workspace)
+            nets = [t.view(self.shape) for t in scattered_surface(self.surface, sag, *self.points)]
+        x, y, power = self.rays
+        rays = (x, y, _none(), _none(), power)
+        return _splat(nets, self.rows, not self.tensor, rays, (eta, fresnel), height, 0.0, screen, filter, self.workspace)
 
 
 class RayKernel:
-    """The fused form of `intersection`, `tracing.carry` and `reconstruction.splat` for rays of any direction.
+    """The fused form of `intersection`, `interface.interact`, landing and `reconstruction.splat` for rays of any direction.
 
     Args:
         spaces, half_size: of the height field; half widths in mm.
-        bundle: the rays inside the lens, at its entrance.
-        dtype: of everything stored; hits are always found in float64.
+        origin, direction, power: of the rays below the surface; z of all origins is one number, mm.
+        radius: of a circular aperture, mm, or None.
         like: the kernel of another bundle through the same field, whose workspace serves both.
     """
 
-    def __init__(self, spaces, half_size, bundle: Bundle, dtype: torch.dtype, like: RayKernel | None = None):
-        self.dtype, count = dtype, len(bundle.x)
+    def __init__(self, spaces, half_size, origin, direction, power: Tensor, radius: float | None,
+                 like: RayKernel | None = None):
+        count = len(power)
         self.surface = FusedSurface(spaces, half_size) if like is None else like.surface
         self.workspace = _Workspace() if like is None else like.workspace
-        self.hits, self.z = RayHits(self.surface, bundle), bundle.z
+        self.hits, self.z = RayHits(self.surface, origin, direction, radius), origin[2]
         self.shape = _layout(count)
         self.short = self.shape[0] * self.shape[1] - count
-        rows = [torch.nn.functional.pad(t.to(dtype), (0, self.short)).view(self.shape)
-                for t in (bundle.x, bundle.y, bundle.dx, bundle.dy, bundle.share)]  # rays without power fill the last row
+        rows = [torch.nn.functional.pad(t.double(), (0, self.short)).view(self.shape)
+                for t in (*origin[:2], *direction[:2], power)]  # rays without power fill the last row
         self.rays = tuple(_strided(t.numpy()) for t in rows)
-        ones = np.ones((self.shape[0], 1), torch.empty((), dtype=dtype).numpy().dtype)
+        ones = np.ones((self.shape[0], 1))
         self.rows = (np.arange(self.shape[0]), ones, ones)
 
-    def __call__(self, heights: Tensor, lens: Lens, reference: float, screen: Screen, filter: Filter):
+    def __call__(self, heights: Tensor, eta: float, fresnel: str, reference: float, screen: Screen, filter: Filter):
         """Control heights (n, m) mm float64; `reference` is where the screen's height is counted from, mm: see `_splat`."""
-        found = self.hits(heights, self.dtype)
+        found = self.hits(heights)
         nets = [torch.nn.functional.pad(t, (0, self.short)).view(self.shape) for t in found]
-        return _splat(nets, self.rows, True, self.rays, lens, screen.z - reference, (1.0, self.z - reference), screen, filter,
+        return _splat(nets, self.rows, True, self.rays, (eta, fresnel), screen.z - reference, self.z - reference, screen, filter,
                       self.workspace)
 
 
-def _splat(nets, rows, apart: bool, rays, lens: Lens, height: float, start, screen: Screen, filter: Filter,
-           workspace: _Workspace) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-    """Call the kernel.  start: part of the power that passes the entrance, and height at which slanted rays begin, mm.
+def _splat(nets, rows, apart: bool, rays, interface: tuple[float, str], height: float, start: float, screen: Screen,
+           filter: Filter, workspace: _Workspace) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+    """Call the kernel.  interface: n_in / n_out and the kind of Fresnel losses; start: height at which slanted rays begin, mm.
 
     Returns:
         image (n_x, n_y) and the power leaving the lens (), float64, differentiable; what was lost, by name.
     """
-    slanted, arguments = _arguments(rays, lens, height, start, screen, filter)
+    slanted, arguments = _arguments(rays, interface, height, start, screen, filter)
     padded, leaving, ledger = _Image.apply(*nets, rows, apart, arguments, workspace)
     (nx, ny), (rx, ry) = screen.resolution, filter.reach
     padded = padded[:, : ny + 4 * ry]  # beyond lies what rounds the scatter's steps up to four pixels
@@ -145,18 +139,19 @@ def _splat(nets, rows, apart: bool, rays, lens: Lens, height: float, start, scre
                                    "off_screen": ledger[plane.OFF_SCREEN] + padding(padded.detach(), filter.reach)}
 
 
-def _arguments(rays, lens: Lens, height: float, start, screen: Screen, filter: Filter) -> tuple[bool, tuple]:
+def _arguments(rays, interface: tuple[float, str], height: float, start: float, screen: Screen, filter: Filter) -> tuple[bool, tuple]:
     """Whether rays are slanted, and what `plane` takes after the nets."""
-    size = tuple(2 * r + 1 for r in filter.reach)
-    real = (lens.index, height, -screen.low[0], -screen.low[1], *screen.pixel, *filter.alpha, *start)
+    eta, fresnel = interface
     slanted = rays[2].shape == rays[0].shape
-    whole = (_FRESNEL[lens.fresnel], *screen.resolution, _KIND[filter.kind], *size, int(slanted))
-    return slanted, (*rays, np.array(real, np.float64), np.array(whole, np.int64))
+    exit_ = Exit(float(eta), _FRESNEL[fresnel], int(slanted), float(start), float(height))
+    frame = Frame(*map(int, screen.resolution), *map(float, screen.low), *map(float, screen.pixel))
+    splat = Splat(_KIND[filter.kind], *(int(2 * r + 1) for r in filter.reach), *map(float, filter.alpha))
+    return slanted, (*rays, exit_, frame, splat)
 
 
-def _none(dtype: torch.dtype) -> np.ndarray:
+def _none() -> np.ndarray:
     """What stands for directions where all rays run along z."""
-    return _strided(np.zeros((2, 2), torch.empty((), dtype=dtype).numpy().dtype))
+    return _strided(np.zeros((2, 2)))
 
 
 def _layout(count: int) -> tuple[int, int]:
@@ -174,59 +169,50 @@ def _strided(array: np.ndarray) -> np.ndarray:
     return array
 
 
-def compile_kernels(*dtypes: torch.dtype) -> None:
-    """Have the kernels ready for rays of these precisions: from numba's cache, or compiled for this machine."""
-    compile_surface(*dtypes)
-    compile_splat(*dtypes)
-    compile_adjoint(*dtypes)
+def compile_kernels() -> None:
+    """Have the kernels ready for a plane wave's rays: from the files kept, or compiled for this machine."""
+    compile_surface()
+    compile_splat()
+    compile_adjoint()
 
 
-def compile_surface(*dtypes: torch.dtype) -> None:
+def compile_surface() -> None:
     """What gives the surface at rays of a plane wave, and its adjoint."""
     space, at = SplineSpace.uniform(4, 3), torch.linspace(0.0, 1.0, ROW, dtype=torch.float64)
-    for dtype in dtypes:
-        heights = torch.zeros(4, 4, dtype=dtype, requires_grad=True)
-        net, slope = AlongV(space, at, 0.5, dtype)(heights)
-        found = scattered_surface(FusedSurface((space, space), (1.0, 1.0)), heights, at.numpy(), at.numpy(), dtype)
-        sum(t.sum() for t in (net, slope, *found)).backward()
+    heights = torch.zeros(4, 4, dtype=torch.float64, requires_grad=True)
+    net, slope = AlongV(space, at, 0.5)(heights)
+    found = scattered_surface(FusedSurface((space, space), (1.0, 1.0)), heights, at.numpy(), at.numpy())
+    sum(t.sum() for t in (net, slope, *found)).backward()
 
 
-def compile_splat(*dtypes: torch.dtype) -> None:
+def compile_splat() -> None:
     """What bends, carries and splats the rays."""
-    for example in _examples(dtypes):
-        _Image.apply(*example)
+    _Image.apply(*_example())
 
 
-def compile_adjoint(*dtypes: torch.dtype) -> None:
+def compile_adjoint() -> None:
     """The adjoint of `compile_splat`'s kernel."""
-    for *nets, rows, apart, arguments, workspace in _examples(dtypes):
-        image = torch.from_numpy(_images(arguments, workspace)[0][0])
-        context = SimpleNamespace(saved_tensors=nets, rows=rows, apart=apart, arguments=arguments, workspace=workspace)
-        _Image.backward(context, image, torch.ones((), dtype=torch.float64), None)
+    *nets, rows, apart, arguments, workspace = _example()
+    _adjoint(torch.zeros(_images(arguments, workspace)[0].shape[1:], dtype=torch.float64), 1.0, nets, rows, apart, arguments,
+             workspace)
 
 
-def _examples(dtypes):
-    """What `_Image` takes, for a few rays of each kind."""
-    space, at = SplineSpace.uniform(4, 3), torch.linspace(0.0, 1.0, 2 * ROW, dtype=torch.float64)
-    share, screen = torch.tensor(0.25, dtype=torch.float64), Screen((10.0, 10.0), 10.0, (4, 4))
-    for dtype in dtypes:
-        for tensor in (True, False):
-            points = at[:2] if tensor else at
-            kernel = PlaneKernel((space, space), (1.0, 1.0), points, points, tensor, share, dtype)
-            net = torch.zeros((4, 2) if tensor else kernel.shape, dtype=dtype)
-            x, y, shares_ = kernel.rays
-            rays = (x, y, _none(dtype), _none(dtype), shares_)
-            _, arguments = _arguments(rays, Lens(index=1.5), 10.0, (1.0, 0.0), screen, Filter("cosine", (3, 3)))
-            yield net, net, net, kernel.rows, not tensor, arguments, kernel.workspace
+def _example() -> tuple:
+    """What `_Image` takes, for a few rays."""
+    space, at = SplineSpace.uniform(4, 3), torch.linspace(0.0, 1.0, 2, dtype=torch.float64)
+    kernel = PlaneKernel((space, space), (1.0, 1.0), at, at, True, torch.tensor(0.25, dtype=torch.float64))
+    (x, y, share), net = kernel.rays, torch.zeros(4, 2, dtype=torch.float64)
+    _, arguments = _arguments((x, y, _none(), _none(), share), (1.5, "exact"), 10.0, 0.0, Screen((10.0, 10.0), 10.0, (4, 4)),
+                              Filter("cosine", (3, 3)))
+    return net, net, net, kernel.rows, False, arguments, kernel.workspace
 
 
-def compile_ray_kernels(*dtypes: torch.dtype) -> None:
+def compile_ray_kernels() -> None:
     """Have the kernels ready for rays of any direction, as `compile_kernels` does for a plane wave's."""
     space, one, none = SplineSpace.uniform(4, 3), torch.ones(2, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
-    for dtype in dtypes:
-        kernel = RayKernel((space, space), (1.0, 1.0), Bundle(none, none, 0.0, none, none, one, one, {}), dtype)
-        heights = torch.ones(4, 4, dtype=torch.float64, requires_grad=True)
-        kernel(heights, Lens(index=1.5), 0.0, Screen((10.0, 10.0), 10.0, (4, 4)), Filter("cosine", (3, 3)))[0].sum().backward()
+    kernel = RayKernel((space, space), (1.0, 1.0), (none, none, 0.0), (none, none, one), one, None)
+    heights = torch.ones(4, 4, dtype=torch.float64, requires_grad=True)
+    kernel(heights, 1.5, "exact", 0.0, Screen((10.0, 10.0), 10.0, (4, 4)), Filter("cosine", (3, 3)))[0].sum().backward()
 
 
 class _Image(torch.autograd.Function):
@@ -234,8 +220,10 @@ class _Image(torch.autograd.Function):
 
     @staticmethod
     def forward(net: Tensor, net_x: Tensor, net_y: Tensor, rows: tuple, apart: bool, arguments: tuple, workspace: _Workspace):
-        image, ledger = plane.forward(*_images(arguments, workspace), *rows, *_arrays(net, net_x, net_y), *arguments)
-        return torch.from_numpy(image), torch.tensor(ledger[plane.LEAVING], dtype=torch.float64), torch.from_numpy(ledger)
+        images, scratch = _images(arguments, workspace)
+        ledger = plane.forward(images, scratch, *rows, *_arrays(net, net_x, net_y), *arguments)
+        leaving = torch.tensor(ledger[plane.LEAVING], dtype=torch.float64)
+        return torch.from_numpy(plane.total(images)), leaving, torch.from_numpy(ledger)
 
     @staticmethod
     def setup_context(ctx, inputs, output):
@@ -246,28 +234,33 @@ class _Image(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, by_image, by_leaving, _):
-        nets = ctx.saved_tensors
-        scratch = _images(ctx.arguments, ctx.workspace)[1]
-        sums = ctx.workspace("nets", 3, 1 if ctx.apart else len(scratch), *nets[0].shape)
-        grads = plane.backward(by_image.contiguous().numpy(), float(by_leaving), ctx.apart, sums, scratch, *ctx.rows,
-                               *_arrays(*nets), *ctx.arguments)
-        return *(torch.from_numpy(g).to(n.dtype) for g, n in zip(grads, nets, strict=True)), None, None, None, None
+        sums = _adjoint(by_image, float(by_leaving), ctx.saved_tensors, ctx.rows, ctx.apart, ctx.arguments, ctx.workspace)
+        return *(torch.from_numpy(plane.total(s)) for s in sums), None, None, None, None
 
     @staticmethod
     def jvp(ctx, *tangents):
         nets = ctx.saved_tensors
         along = [torch.zeros_like(n) if t is None else t for t, n in zip(tangents[:3], nets, strict=True)]
-        image, leaving = plane.tangent(*_arrays(*along), *_images(ctx.arguments, ctx.workspace), *ctx.rows, *_arrays(*nets),
-                                       *ctx.arguments)
-        return torch.from_numpy(image), torch.tensor(leaving, dtype=torch.float64), None
+        images, scratch = _images(ctx.arguments, ctx.workspace)
+        leaving = plane.tangent(*_arrays(*along), images, scratch, *ctx.rows, *_arrays(*nets), *ctx.arguments)
+        return torch.from_numpy(plane.total(images)), torch.tensor(leaving, dtype=torch.float64), None
+
+
+def _adjoint(by_image: Tensor, by_leaving: float, nets, rows: tuple, apart: bool, arguments: tuple,
+             workspace: _Workspace) -> np.ndarray:
+    """Derivatives by the three nets (n, b), a sum for each block: (3, blocks, n, b), or (3, 1, n, b) with `apart`."""
+    scratch = _images(arguments, workspace)[1]
+    sums = workspace("nets", 3, 1 if apart else len(scratch), *nets[0].shape)
+    plane.backward(by_image.contiguous().numpy(), by_leaving, apart, sums, scratch, *rows, *_arrays(*nets), *arguments)
+    return sums
 
 
 def _images(arguments: tuple, workspace: _Workspace) -> tuple[np.ndarray, np.ndarray]:
     """Images and scratch of all blocks, to be overwritten."""
-    x, whole, count = arguments[0], arguments[-1], blocks()
-    nx, ny = (int(n + 2 * (v - 1)) for n, v in zip(whole[1:3], whole[4:6], strict=True))
-    images = workspace("images", count, nx, ny + int(-whole[5] % 4))
-    return images, workspace("scratch", count, int(plane.scratch_rows(whole)), x.shape[1])
+    x, *_, frame, splat = arguments
+    count, nx, ny = blocks(), frame.pixels_x + 2 * (splat.size_x - 1), frame.pixels_y + 2 * (splat.size_y - 1)
+    images = workspace("images", count, nx, ny + -splat.size_y % 4)
+    return images, workspace("scratch", count, plane.scratch_rows(splat), x.shape[1])
 
 
 def _arrays(*tensors: Tensor) -> list[np.ndarray]:

@@ -12,9 +12,9 @@ the first root is isolated before that.  At the hit, f(t; P) = 0 gives dt/dP = (
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
 
-from caustic_cli.optics.kernels.spline import _OPTIONS, curvatures, jet, piece, push_powers
+from caustic_cli.optics.kernels.jit import FAST, njit, prange
+from caustic_cli.optics.kernels.spline import curvatures, jet, piece, push_powers
 from caustic_cli.optics.tolerances import FEW_ULP, FINEST, LEAST_COSINE, MOST_PROBES, MOST_STEPS
 
 HIT, MISSED, UNRESOLVED = 0, 1, 2
@@ -22,7 +22,7 @@ HIT, MISSED, UNRESOLVED = 0, 1, 2
 NEAR = 1e-3
 
 
-@njit(inline="always", **_OPTIONS)
+@njit(inline="always", **FAST)
 def _value(c, u, v, bu, mu, wu, bv, mv, wv):
     """Z, Z_u, Z_v at (u, v)."""
     i, j = piece(u, bu), piece(v, bv)
@@ -30,7 +30,7 @@ def _value(c, u, v, bu, mu, wu, bv, mv, wv):
     return z, z_xi * wu[i], z_eta * wv[j]
 
 
-@njit(inline="always", **_OPTIONS)
+@njit(inline="always", **FAST)
 def _leaves(o, d):
     """The t at which a coordinate leaves [0, 1]."""
     if d > 0.0:
@@ -38,7 +38,7 @@ def _leaves(o, d):
     return o / -d if d < 0.0 else np.inf
 
 
-@njit(**_OPTIONS)
+@njit(**FAST)
 def _first_bracket(low, high, f_low, ray, slope, c, bu, mu, wu, bv, mv, wv):
     """(a, b, found): f(a) < 0 <= f(b) around the first root in [low, high], or none (found 0), or undecided (2).
 
@@ -65,7 +65,7 @@ def _first_bracket(low, high, f_low, ray, slope, c, bu, mu, wu, bv, mv, wv):
     return a, high, 2
 
 
-@njit(**_OPTIONS)
+@njit(**FAST)
 def _bracket_around(start, low, high, ray, c, bu, mu, wu, bv, mv, wv):
     """(a, b, found): the narrowest of ever wider intervals around `start` with f(a) < 0 <= f(b), inside [low, high]."""
     ou, ov, oz, du, dv, dz = ray
@@ -81,7 +81,7 @@ def _bracket_around(start, low, high, ray, c, bu, mu, wu, bv, mv, wv):
         reach *= 4.0
 
 
-@njit(**_OPTIONS)
+@njit(**FAST)
 def _root(ray, start, limits, slope, c, bu, mu, wu, bv, mv, wv):
     """(t, status) of the first hit.  limits: least and largest height; start: near which it is, negative if not known."""
     ou, ov, oz, du, dv, dz = ray
@@ -142,7 +142,7 @@ def _root(ray, start, limits, slope, c, bu, mu, wu, bv, mv, wv):
     return t, UNRESOLVED
 
 
-@njit(parallel=True, **_OPTIONS)
+@njit(parallel=True, **FAST)
 def intersect(ou, ov, oz, du, dv, dz, start, limits, slopes, c, bu, mu, wu, bv, mv, wv, t, status, blocks):
     """First hits of rays (N,) into t and status (N,).
 
@@ -161,7 +161,7 @@ def intersect(ou, ov, oz, du, dv, dz, start, limits, slopes, c, bu, mu, wu, bv, 
             t[k], status[k] = _root(ray, begin, limits, slope, c, bu, mu, wu, bv, mv, wv)
 
 
-@njit(parallel=True, **_OPTIONS)
+@njit(parallel=True, **FAST)
 def intersect_again(ou, ov, oz, du, dv, dz, side, limits, slopes, round_, step, halvings, most, c, bu, mu, wu, bv, mv, wv, t,
                     blocks):
     """Next meetings of rays (N,) that start on the surface, into t (N,), 0 for none: the search of `meeting.reference`.
@@ -199,7 +199,7 @@ def intersect_again(ou, ov, oz, du, dv, dz, side, limits, slopes, round_, step, 
                 t[k] = after
 
 
-@njit(parallel=True, **_OPTIONS)
+@njit(parallel=True, **FAST)
 def slopes_at(ou, ov, oz, du, dv, dz, t, status, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y, reach, gx, gy, blocks):
     """Distances to the hits (-1 for none) and dz/dx, dz/dy there into reach, gx, gy (N,)."""
     count = len(ou)
@@ -211,7 +211,7 @@ def slopes_at(ou, ov, oz, du, dv, dz, t, status, c, bu, mu, wu, bv, mv, wv, scal
                 reach[k], gx[k], gy[k] = t[k], a * scale_x, b * scale_y
 
 
-@njit(inline="always", **_OPTIONS)
+@njit(inline="always", **FAST)
 def _bends(t, ou, ov, du, dv, c, bu, mu, wu, bv, mv, wv):
     """Where a hit lies in its span product; d(Z_u)/dt and d(Z_v)/dt along the ray."""
     u, v = ou + t * du, ov + t * dv
@@ -222,7 +222,7 @@ def _bends(t, ou, ov, du, dv, c, bu, mu, wu, bv, mv, wv):
     return i, j, xi, eta, uu * du + uv * dv, uv * du + vv * dv
 
 
-@njit(parallel=True, **_OPTIONS)
+@njit(parallel=True, **FAST)
 def pull_back(by_t, by_gx, by_gy, ou, ov, oz, du, dv, dz, t, gx, gy, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y, grads):
     """Adjoint of the hits: derivatives by the coefficients (blocks, I, J, p + 1, q + 1), overwritten.
 
@@ -243,7 +243,7 @@ def pull_back(by_t, by_gx, by_gy, ou, ov, oz, du, dv, dz, t, gx, gy, c, bu, mu, 
             push_powers(grad, i, j, xi, eta, by_z, by_u * wu[i], by_v * wv[j], powers)
 
 
-@njit(parallel=True, **_OPTIONS)
+@njit(parallel=True, **FAST)
 def push(change, ou, ov, oz, du, dv, dz, t, gx, gy, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y, out_t, out_x, out_y, blocks):
     """Tangents of the hits' distances and slopes along the coefficients `change`, into out_t, out_x, out_y (N,)."""
     count = len(t)

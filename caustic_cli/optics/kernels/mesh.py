@@ -22,14 +22,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
 
-OPTIONS = {"cache": True, "error_model": "numpy"}
+from caustic_cli.optics.kernels.jit import njit, prange
+
 HIT, MISSED = 0, 1
 DEPTH = 32  # levels of rectangles above single knot span products
 
 
-@njit(**OPTIONS)
+@njit()
 def _time(line, o, d):
     """When a grid line is crossed.  A ray along the lines has passed those up to its own, and never meets the others."""
     if d != 0.0:
@@ -37,13 +37,13 @@ def _time(line, o, d):
     return -math.inf if line <= o else math.inf
 
 
-@njit(**OPTIONS)
+@njit()
 def _part(t, o, d, line, inverse):
     """Where in the cell above `line`, from 0 to 1, the ray is at time t."""
     return min(max((o + t * d - line) * inverse, 0.0), 1.0)
 
 
-@njit(**OPTIONS)
+@njit()
 def _locate(t, closed, o, d, lines, inverse, low, high):
     """Cell low..high - 1 the ray is in at time t: lines crossed at t itself are behind it if `closed`."""
     k = low
@@ -64,7 +64,7 @@ def _locate(t, closed, o, d, lines, inverse, low, high):
     return k
 
 
-@njit(**OPTIONS)
+@njit()
 def _height(a, b, i, j, z):
     """T at parts a, b of cell i, j: for the ray's first point, the only one that no other cell shares."""
     if a + b <= 1.0:
@@ -72,13 +72,13 @@ def _height(a, b, i, j, z):
     return z[i + 1, j + 1] + (1.0 - a) * (z[i, j + 1] - z[i + 1, j + 1]) + (1.0 - b) * (z[i + 1, j] - z[i + 1, j + 1])
 
 
-@njit(**OPTIONS)
+@njit()
 def _root(ta, fa, tb, fb):
     """The zero of the linear function through fa < 0 <= fb."""
     return min(ta + (tb - ta) * (fa / (fa - fb)), tb)
 
 
-@njit(**OPTIONS)
+@njit()
 def _walk(ray, first, cells, gx, gy, hx, hy, z):
     """Time of the hit inside a knot span product, infinite without; and the number of triangles on the way.
 
@@ -143,7 +143,7 @@ def _walk(ray, first, cells, gx, gy, hx, hy, z):
             ty = _time(gy[j + over], oy, dy)
 
 
-@njit(**OPTIONS)
+@njit()
 def _meets(lo, hi, oz, dz, low, high):
     """Whether the ray meets a box's heights between two times; the edges belong to it."""
     if not lo <= hi:
@@ -152,7 +152,7 @@ def _meets(lo, hi, oz, dz, low, high):
     return min(a, b) <= high and max(a, b) >= low
 
 
-@njit(**OPTIONS)
+@njit()
 def _flat(ray, first, end, gx, gy, hx, hy, z, nu, nv, low, high):
     """Every knot span product's box, in the order in which a path can meet them."""
     ox, oy, oz, dx, dy, dz = ray
@@ -172,7 +172,7 @@ def _flat(ray, first, end, gx, gy, hx, hy, z, nu, nv, low, high):
     return math.inf, total
 
 
-@njit(**OPTIONS)
+@njit()
 def _descend(ray, first, end, gx, gy, hx, hy, z, nu, nv, rows, cols, tree, levels, nodes, times):
     """From all knot span products down to single ones, in four at a time, those that the path meets first on top."""
     ox, oy, oz, dx, dy, dz = ray
@@ -211,7 +211,7 @@ def _descend(ray, first, end, gx, gy, hx, hy, z, nu, nv, rows, cols, tree, level
     return math.inf, total
 
 
-@njit(**OPTIONS)
+@njit()
 def _grid(breaks, n):
     """Grid lines, and the reciprocal widths of the cells above them."""
     lines = np.empty((len(breaks) - 1) * n + 1)
@@ -222,7 +222,7 @@ def _grid(breaks, n):
     return lines, 1.0 / (lines[1:] - lines[:-1])
 
 
-@njit(**OPTIONS)
+@njit()
 def _pyramid(low, high):
     """Lowest and highest of 2^l x 2^l boxes: tree (., 2), and of each level l its beginning there and its columns."""
     rows, cols, count = low.shape[0], low.shape[1], 1
@@ -244,13 +244,13 @@ def _pyramid(low, high):
     return tree, levels
 
 
-@njit(**OPTIONS)
+@njit()
 def _inward(o, d, last, width):
     """A ray along the aperture's far border belongs to the cells along it."""
     return np.nextafter(last, last - width) if d == 0.0 and o == last else o
 
 
-@njit(parallel=True, **OPTIONS)
+@njit(parallel=True)
 def intersect(x, y, z, dx, dy, dz, xs, ys, n_u, n_v, vertices, low, high, recursive, blocks):
     """Times t (N,) of the rays' hits, infinite without; status (N,) int8; triangles tested (N,) int32.
 

@@ -1,8 +1,7 @@
 """Fused CPU kernel: refraction at the exit surface -> landing point -> splat, with its adjoint and its tangent.
 
 The function of `tracing.trace_plane` followed by `reconstruction.splat`, a row of rays at a time without storing anything
-between rows; both are the reference it is tested against.  Storage is float32 or float64 (float64 alone for rays of any
-direction), everything past the surface float64.
+between rows; both are the reference it is tested against.  All of it in float64: float32 was no faster.
 
 Each of a fixed number of blocks of rows has an image of its own and they are added in order, so the result does not depend
 on timing, only on the number of blocks (the number of threads).  Only the scatter and the gather of pixels go ray by ray,
@@ -14,9 +13,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
 
 from caustic_cli.optics.kernels import slant
+from caustic_cli.optics.kernels.arguments import Splat
 from caustic_cli.optics.kernels.bend import (
     BY_POWER,
     BY_PX,
@@ -50,56 +49,56 @@ from caustic_cli.optics.kernels.bend import (
     push,
     reach,
 )
+from caustic_cli.optics.kernels.jit import FAST, njit, prange
 from caustic_cli.optics.kernels.rows import combine, spread
-from caustic_cli.optics.kernels.shares import OPTIONS, shares
+from caustic_cli.optics.kernels.shares import shares
 
 FRESNEL, REFLECTED, OFF_SCREEN, LEAVING, MISSED, COLUMNS = range(6)  # of the ledger
 UINT, ONE, TWO = np.uintp, np.uintp(1), np.uintp(2)  # an unsigned index is never taken to count from the end
 
 
-@njit(**OPTIONS)
-def _aim(vectors, x, y, along_x, along_y, share, real, whole, sx, sy, dx, dy, sloping):
+@njit(**FAST)
+def _aim(vectors, x, y, along_x, along_y, share, exit_, frame, splat, sx, sy, dx, dy, sloping):
     """Powers, landing points and shares of one row, from its surface in `vectors`."""
-    n, height, fresnel, kind = real[0], real[1], whole[0], whole[3]
+    n, height, fresnel = exit_.index, exit_.height, exit_.fresnel
     v, scratch = vectors, vectors[VECTORS:]
     load(share, v[SHARE])
     load(x, v[X])
     load(y, v[Y])
-    if whole[6]:
-        v[REACH] = v[SAG]
-        slant.aim(v, along_x, along_y, real, fresnel)
+    if exit_.slanted:
+        for j in range(v.shape[1]):  # a slice assigned to a slice would compile the message for shapes that differ
+            v[REACH, j] = v[SAG, j]
+        slant.aim(v, along_x, along_y, exit_, frame)
     else:
-        powers(fresnel, v[GX], v[GY], v[SHARE], n, real[8], v[POWER])
+        powers(fresnel, v[GX], v[GY], v[SHARE], n, v[POWER])
         reach(v[SAG], v[GX], v[GY], n, height, v[REACH])
-        landing(v[REACH], v[GX], v[X], real[2], real[4], v[PX])
-        landing(v[REACH], v[GY], v[Y], real[3], real[5], v[PY])
-    if whole[4] > 1:
+        landing(v[REACH], v[GX], v[X], frame.low_x, frame.pixel_x, v[PX])
+        landing(v[REACH], v[GY], v[Y], frame.low_y, frame.pixel_y, v[PY])
+    if splat.size_x > 1:
         fraction(v[PX], v[PHI])
-    shares(kind, whole[4], real[6], v[PHI], sx, dx, v[OVER_X], v[LEAN_X], scratch, sloping)
-    if whole[5] > 1:
+    shares(splat.kind, splat.size_x, splat.alpha_x, v[PHI], sx, dx, v[OVER_X], v[LEAN_X], scratch, sloping)
+    if splat.size_y > 1:
         fraction(v[PY], v[PHI])
-    shares(kind, whole[5], real[7], v[PHI], sy, dy, v[OVER_Y], v[LEAN_Y], scratch, sloping)
+    shares(splat.kind, splat.size_y, splat.alpha_y, v[PHI], sy, dy, v[OVER_Y], v[LEAN_Y], scratch, sloping)
 
 
-@njit(**OPTIONS)
-def _scatter(vectors, real, whole, sx, sy, image, ledger, column):
+@njit(**FAST)
+def _scatter(vectors, exit_, frame, splat, sx, sy, image, ledger, column):
     """Add one row's rays to the padded image and the ledger.  column: (longest v,) scratch."""
     # Everything the loop needs is a local: after a store to the image the compiler would have to read an array again.
-    passed, vx, vy, height = real[8], whole[4], whole[5], real[1]
+    vx, vy, height = splat.size_x, splat.size_y, exit_.height
     rx, ry = (vx - 1) // 2, (vy - 1) // 2
-    low_x, low_y, high_x, high_y = float(-rx), float(-ry), float(whole[1] + rx), float(whole[2] + ry)
+    low_x, low_y, high_x, high_y = float(-rx), float(-ry), float(frame.pixels_x + rx), float(frame.pixels_y + ry)
     sag, share, power, px, py = vectors[SAG], vectors[SHARE], vectors[POWER], vectors[PX], vectors[PY]
     over_x, over_y = vectors[OVER_X], vectors[OVER_Y]
     lost_fresnel, lost_reflected, lost_off, lost_missed, leaving = 0.0, 0.0, 0.0, 0.0, 0.0
     for j in range(len(power)):
         emitted, weight = share[j], power[j]
         if weight < 0.0:
-            inside = emitted * passed
-            lost_fresnel += emitted - inside
             if weight == slant.MISSED_POWER:
-                lost_missed += inside
+                lost_missed += emitted
             else:
-                lost_reflected += inside
+                lost_reflected += emitted
             continue
         lost_fresnel += emitted - weight
         leaving += weight
@@ -140,12 +139,12 @@ def _scatter(vectors, real, whole, sx, sy, image, ledger, column):
     ledger[MISSED] += lost_missed
 
 
-@njit(**OPTIONS)
-def _gather(vectors, real, whole, sx, sy, dx, dy, grad, grad_leaving, column, tilt):
+@njit(**FAST)
+def _gather(vectors, exit_, frame, splat, sx, sy, dx, dy, grad, grad_leaving, column, tilt):
     """Derivatives by each ray's power and pixel coordinates, from those by the padded image."""
-    vx, vy, height, scale_x, scale_y = whole[4], whole[5], real[1], 1.0 / real[4], 1.0 / real[5]
+    vx, vy, height, scale_x, scale_y = splat.size_x, splat.size_y, exit_.height, 1.0 / frame.pixel_x, 1.0 / frame.pixel_y
     rx, ry = (vx - 1) // 2, (vy - 1) // 2
-    low_x, low_y, high_x, high_y = float(-rx), float(-ry), float(whole[1] + rx), float(whole[2] + ry)
+    low_x, low_y, high_x, high_y = float(-rx), float(-ry), float(frame.pixels_x + rx), float(frame.pixels_y + ry)
     sag, power, px, py = vectors[SAG], vectors[POWER], vectors[PX], vectors[PY]
     by_power, by_px, by_py = vectors[BY_POWER], vectors[BY_PX], vectors[BY_PY]
     over_x, over_y, lean_x, lean_y = vectors[OVER_X], vectors[OVER_Y], vectors[LEAN_X], vectors[LEAN_Y]
@@ -195,13 +194,13 @@ def _gather(vectors, real, whole, sx, sy, dx, dy, grad, grad_leaving, column, ti
         by_power[j], by_px[j], by_py[j] = grad_leaving + value, along_x * weight * scale_x, along_y * weight * scale_y
 
 
-@njit(**OPTIONS)
-def _scatter_tangent(vectors, real, whole, sx, sy, dx, dy, image):
+@njit(**FAST)
+def _scatter_tangent(vectors, exit_, frame, splat, sx, sy, dx, dy, image):
     """Add the tangent of one row's image; returns the leaving power's."""
-    vx, vy = whole[4], whole[5]
+    vx, vy = splat.size_x, splat.size_y
     rx, ry = (vx - 1) // 2, (vy - 1) // 2
-    low_x, low_y, high_x, high_y = float(-rx), float(-ry), float(whole[1] + rx), float(whole[2] + ry)
-    v, leaving, height = vectors, 0.0, real[1]
+    low_x, low_y, high_x, high_y = float(-rx), float(-ry), float(frame.pixels_x + rx), float(frame.pixels_y + ry)
+    v, leaving, height = vectors, 0.0, exit_.height
     for j in range(v.shape[1]):
         weight, change = v[POWER, j], v[T_POWER, j]
         if weight < 0.0:
@@ -221,24 +220,25 @@ def _scatter_tangent(vectors, real, whole, sx, sy, dx, dy, image):
     return leaving
 
 
-@njit(parallel=True, **OPTIONS)
-def _total(images):
+@njit(parallel=True, **FAST)
+def total(images):
     """Sum over blocks, in order."""
-    total = np.empty(images.shape[1:])
+    out = np.empty(images.shape[1:])
     for i in prange(images.shape[1]):
-        total[i] = images[0, i]
+        for j in range(images.shape[2]):
+            out[i, j] = images[0, i, j]
         for block in range(1, images.shape[0]):
             for j in range(images.shape[2]):
-                total[i, j] += images[block, i, j]
-    return total
+                out[i, j] += images[block, i, j]
+    return out
 
 
-def scratch_rows(whole) -> int:
+def scratch_rows(splat: Splat) -> int:
     """Rows of ray vectors that a block works in."""
-    return VECTORS + SCRATCH + 2 * (whole[4] + whole[5])
+    return VECTORS + SCRATCH + 2 * (splat.size_x + splat.size_y)
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _cut(scratch, vx, vy):
     """A block's scratch as vectors, shares along x and y, their slopes."""
     a = VECTORS + SCRATCH
@@ -246,9 +246,9 @@ def _cut(scratch, vx, vy):
     return scratch[:a], scratch[a:b], scratch[b:c], scratch[c:d], scratch[d:]
 
 
-@njit(parallel=True, **OPTIONS)
-def forward(images, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, share, real, whole):
-    """Padded image (n_x + 4 r_x, n_y + 4 r_y) and the ledger (COLUMNS,), power by what became of it.
+@njit(parallel=True, **FAST)
+def forward(images, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, share, exit_, frame, splat):
+    """The ledger (COLUMNS,), power by what became of it; the blocks' images, whose `total` is the padded one, fill `images`.
 
     The surface comes by rows.  Row i of the sag is sum_k bu[i, k] net[first[i] + k], of dz/dx the same with du and net_x,
     of dz/dy with bu and net_y.  first (a,) int64; bu, du (a, p + 1); nets (n, b); x, y mm and share, parts of the
@@ -257,13 +257,11 @@ def forward(images, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, al
     images (blocks, n_x + 4 r_x, n_y + 4 r_y) and scratch (blocks, `scratch_rows`, b) are overwritten; they set the number of
     blocks.
 
-    real: index, height of the screen above the sag's zero, half width and height of the screen and of a pixel (mm), alpha
-    along x and y (per pixel squared), part of the power that passes the entrance, height at which slanted rays start.  whole:
-    kind of Fresnel losses, pixels along x and y, kind of filter, its sizes, and 1 for slanted rays: `along_x` and `along_y`
-    (a, b) are then their directions' components, and instead of the sag comes the distance along them to the surface.
+    exit_, frame, splat: an `Exit`, a `Frame` and a `Splat`.  Of slanted rays `along_x` and `along_y` (a, b) are their
+    directions' components, and instead of the sag comes the distance along them to the surface.
     """
     rows, blocks = len(x), len(images)
-    vx, vy = whole[4], whole[5]
+    vx, vy = splat.size_x, splat.size_y
     ledgers = np.zeros((blocks, COLUMNS))
     for block in prange(blocks):
         images[block] = 0.0
@@ -271,27 +269,27 @@ def forward(images, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, al
         column = np.zeros(vy + -vy % 4)
         for i in range(block * rows // blocks, (block + 1) * rows // blocks):
             combine(i, first, bu, du, net, net_x, net_y, v[SAG], v[GX], v[GY])
-            _aim(v, x[i], y[i], along_x[i], along_y[i], share[i], real, whole, sx, sy, sx, sy, False)
-            _scatter(v, real, whole, sx, sy, images[block], ledgers[block], column)
+            _aim(v, x[i], y[i], along_x[i], along_y[i], share[i], exit_, frame, splat, sx, sy, sx, sy, False)
+            _scatter(v, exit_, frame, splat, sx, sy, images[block], ledgers[block], column)
     ledger = np.zeros(COLUMNS)
     for block in range(blocks):
         for name in range(COLUMNS):
             ledger[name] += ledgers[block, name]
-    return _total(images), ledger
+    return ledger
 
 
-@njit(parallel=True, **OPTIONS)
-def backward(grad, grad_leaving, apart, nets, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, share, real,
-             whole):
-    """Adjoint of `forward`: derivatives by the three nets (n, b) float64, from those by the padded image and leaving power.
+@njit(parallel=True, **FAST)
+def backward(grad, grad_leaving, apart, nets, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, share, exit_,
+             frame, splat):
+    """Adjoint of `forward`: derivatives by the three nets, from those by the padded image and leaving power.
+
+    nets (3, 1 if apart else blocks, n, b) are overwritten: the `total` of each is the derivative by a net (n, b).
 
     apart: no two rows share a row of the nets, so that one sum serves all blocks.  Otherwise net_x is taken to be net
-    itself, and the sum of both derivatives comes as the first.
-
-    nets (3, 1 if apart else blocks, n, b) and scratch as in `forward` are overwritten.
+    itself, and the sum of both derivatives comes as the first.  scratch: overwritten, as in `forward`.
     """
     rows, blocks = len(x), len(scratch)
-    vx, vy = whole[4], whole[5]
+    vx, vy = splat.size_x, splat.size_y
     if apart:
         nets[:] = 0.0
     for block in prange(blocks):
@@ -301,22 +299,22 @@ def backward(grad, grad_leaving, apart, nets, scratch, first, bu, du, net, net_x
         column, tilt = np.zeros(vy + -vy % 4), np.zeros(vy + -vy % 4)
         for i in range(block * rows // blocks, (block + 1) * rows // blocks):
             combine(i, first, bu, du, net, net_x, net_y, v[SAG], v[GX], v[GY])
-            _aim(v, x[i], y[i], along_x[i], along_y[i], share[i], real, whole, sx, sy, dx, dy, True)
-            _gather(v, real, whole, sx, sy, dx, dy, grad, grad_leaving, column, tilt)
-            if whole[6]:
-                slant.pull(v, along_x[i], along_y[i], real, whole[0])
+            _aim(v, x[i], y[i], along_x[i], along_y[i], share[i], exit_, frame, splat, sx, sy, dx, dy, True)
+            _gather(v, exit_, frame, splat, sx, sy, dx, dy, grad, grad_leaving, column, tilt)
+            if exit_.slanted:
+                slant.pull(v, along_x[i], along_y[i], exit_)
             else:
-                pull(v, real, whole)
+                pull(v, exit_)
             spread(i, first, bu, du, v[T_SAG], v[T_GX], v[T_GY], nets[:, np.int64(0) if apart else np.int64(block)],
                     apart)
-    return _total(nets[0]), _total(nets[1]), _total(nets[2])
 
 
-@njit(parallel=True, **OPTIONS)
-def tangent(t_net, t_net_x, t_net_y, images, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, share, real, whole):
-    """Derivative of `forward` along (t_net, t_net_x, t_net_y): the padded image's tangent, and the leaving power's."""
+@njit(parallel=True, **FAST)
+def tangent(t_net, t_net_x, t_net_y, images, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, share, exit_,
+            frame, splat):
+    """Derivative of `forward` along (t_net, t_net_x, t_net_y): the leaving power's; the `total` of `images` is the image's."""
     rows, blocks = len(x), len(images)
-    vx, vy = whole[4], whole[5]
+    vx, vy = splat.size_x, splat.size_y
     leaving = np.zeros(blocks)
     for block in prange(blocks):
         images[block] = 0.0
@@ -324,10 +322,13 @@ def tangent(t_net, t_net_x, t_net_y, images, scratch, first, bu, du, net, net_x,
         for i in range(block * rows // blocks, (block + 1) * rows // blocks):
             combine(i, first, bu, du, net, net_x, net_y, v[SAG], v[GX], v[GY])
             combine(i, first, bu, du, t_net, t_net_x, t_net_y, v[T_SAG], v[T_GX], v[T_GY])
-            _aim(v, x[i], y[i], along_x[i], along_y[i], share[i], real, whole, sx, sy, dx, dy, True)
-            if whole[6]:
-                slant.push(v, along_x[i], along_y[i], real, whole[0])
+            _aim(v, x[i], y[i], along_x[i], along_y[i], share[i], exit_, frame, splat, sx, sy, dx, dy, True)
+            if exit_.slanted:
+                slant.push(v, along_x[i], along_y[i], exit_, frame)
             else:
-                push(v, real, whole)
-            leaving[block] += _scatter_tangent(v, real, whole, sx, sy, dx, dy, images[block])
-    return _total(images), leaving.sum()
+                push(v, exit_, frame)
+            leaving[block] += _scatter_tangent(v, exit_, frame, splat, sx, sy, dx, dy, images[block])
+    change = 0.0
+    for block in range(blocks):
+        change += leaving[block]
+    return change

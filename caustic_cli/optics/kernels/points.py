@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
 
-_OPTIONS = {"cache": True, "error_model": "numpy"}
+from caustic_cli.optics.kernels.jit import njit, prange
+
 _M = np.uint64(0xFFFFFFFF)
 
 
-@njit(inline="always", **_OPTIONS)
+@njit(inline="always")
 def _mix(x):
     x ^= x >> np.uint64(16)
     x = (x * np.uint64(0x7FEB352D)) & _M
@@ -18,13 +18,13 @@ def _mix(x):
     return x ^ (x >> np.uint64(16))
 
 
-@njit(inline="always", **_OPTIONS)
+@njit(inline="always")
 def _number(key, salt, index):
     """A uniform number strictly inside (0, 1): see sampling.random_numbers."""
     return (float(_mix((_mix((index & _M) ^ key) + salt + (index >> np.uint64(32))) & _M)) + 0.5) * 2.0**-32
 
 
-@njit(parallel=True, **_OPTIONS)
+@njit(parallel=True)
 def scatter(keys, salts, start, stop, nu, nv, stratified):
     """Points u, v (stop - start,) of rays start..stop; stratified in nu x nv cells over and over, or independent."""
     u, v = np.empty(stop - start), np.empty(stop - start)

@@ -1,22 +1,17 @@
-"""A row of the surface from nets contracted along v, and the adjoint, for the CPU kernels.
-
-Numba caches the kernels of `plane` by that file's time stamp alone: after editing here, touch plane.py.
-"""
+"""A row of the surface from nets contracted along v, and the adjoint, for the CPU kernels."""
 
 from __future__ import annotations
 
-from numba import njit
-
-from caustic_cli.optics.kernels.shares import OPTIONS
+from caustic_cli.optics.kernels.jit import FAST, njit
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _add(weight, row, out):
     for j in range(len(out)):
         out[j] += weight * row[j]
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _weighted(weights, net, first, out):
     """Weighted sum of consecutive rows of a net, three at a time: a pass over `out` costs as much as the products."""
     out[:] = 0.0
@@ -31,7 +26,7 @@ def _weighted(weights, net, first, out):
         a += 1
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def combine(i, first, bu, du, net, net_x, net_y, sag, gx, gy):
     """Row i of the surface from the nets already contracted along v: sag, dz/dx, dz/dy (b,)."""
     _weighted(bu[i], net, first[i], sag)
@@ -39,7 +34,7 @@ def combine(i, first, bu, du, net, net_x, net_y, sag, gx, gy):
     _weighted(bu[i], net_y, first[i], gy)
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def spread(i, first, bu, du, by_sag, by_gx, by_gy, nets, apart):
     """Adjoint of `combine`: add the derivatives by row i to those by the nets (3, n, b)."""
     for a in range(bu.shape[1]):

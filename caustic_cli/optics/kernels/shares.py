@@ -2,8 +2,6 @@
 
 Every loop writes one array from a few others, which is what lets the compiler turn it into vector instructions.
 
-Numba caches the kernels of `plane` by that file's time stamp alone: after editing here, touch plane.py.
-
 Notation, in pixels: v filter size, r = (v - 1) / 2, phi sub-pixel position, q = 1/2 - phi, d = k - r + q the distance from
 the centre of pixel k = 0..v - 1.  A Gaussian on the integer lattice needs two exponentials, whatever v.
 """
@@ -12,7 +10,7 @@ from __future__ import annotations
 
 import math
 
-from numba import config, njit
+from caustic_cli.optics.kernels.jit import FAST, njit
 
 BINCOUNT, GAUSSIAN, COSINE = 0, 1, 2
 #: Below this alpha (v/2)^2 the Gaussian's shares come from Taylor series, without cancellation.
@@ -21,12 +19,9 @@ TINY = 1e-3  # and below this from shorter ones
 #: Up to this alpha exp(-2 alpha q) stays within the reach of `_exp` and the recursion over pixels; above, plain exponentials.
 MODERATE = 2.0
 
-# Off by default in numba: it turns `plane`'s steps of four neighbouring pixels into vector instructions.
-config.SLP_VECTORIZE = 1
-OPTIONS = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
 
 
-@njit(inline="always", **OPTIONS)
+@njit(inline="always", **FAST)
 def _exp(x):
     """exp(x) for |x| <= 2: exp(x / 8)^8, relative error about 1e-14, without a branch."""
     z = 0.125 * x
@@ -37,7 +32,7 @@ def _exp(x):
     return e * e
 
 
-@njit(inline="always", **OPTIONS)
+@njit(inline="always", **FAST)
 def _sine(x):
     """sin(x) for |x| <= pi / 3 by its Taylor series: the first term left out is 4e-15."""
     y = x * x
@@ -45,7 +40,7 @@ def _sine(x):
     return x * (1.0 - y * (1 / 6.0) * (1.0 - y * (1 / 20.0) * (1.0 - y * (1 / 42.0) * (1.0 - y * (1 / 72.0) * s))))
 
 
-@njit(inline="always", **OPTIONS)
+@njit(inline="always", **FAST)
 def _cosine(x):
     """cos(x) for |x| <= pi / 3 by its Taylor series: the first term left out is 3e-16."""
     y = x * x
@@ -54,7 +49,7 @@ def _cosine(x):
     return 1.0 - y * (1 / 2.0) * (1.0 - y * (1 / 12.0) * (1.0 - y * (1 / 30.0) * c))
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _scaled(by, phi, v, out):
     """out[j] = by f(by phi') for the cosine filter's two functions: out[0] cosines, out[1] sines of theta q, over v."""
     for j in range(len(phi)):
@@ -63,7 +58,7 @@ def _scaled(by, phi, v, out):
         out[1, j] = _sine(by * (0.5 - phi[j])) / v
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _raised_cosine(phi, v, out, slope, scratch, sloping):
     theta = 2.0 * math.pi / v
     _scaled(theta, phi, v, scratch)
@@ -74,13 +69,13 @@ def _raised_cosine(phi, v, out, slope, scratch, sloping):
             _mix(0.0, theta * s, theta * c, scratch[0], scratch[1], slope[k])
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _mix(constant, a, b, x, y, out):
     for j in range(len(out)):
         out[j] = constant + a * x[j] + b * y[j]
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _short_series(phi, offset, square, alpha, out):
     """`_series` where its arguments are below TINY."""
     for j in range(len(phi)):
@@ -91,7 +86,7 @@ def _short_series(phi, offset, square, alpha, out):
         out[j] = room * p * (1.0 - y * (1.0 - y * (1 / 2.0) * (1.0 - y * (1 / 3.0))))
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _series(phi, offset, square, alpha, out):
     """A pixel's share of a very wide Gaussian, over alpha exp(-alpha (v/2)^2); the series' arguments are below SMALL."""
     for j in range(len(phi)):
@@ -104,7 +99,7 @@ def _series(phi, offset, square, alpha, out):
         out[j] = room * p * (1.0 - y * (1.0 - y * (1 / 2.0) * (1.0 - y * (1 / 3.0) * e)))
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _series_slope(phi, offset, alpha, out):
     for j in range(len(phi)):
         d = offset - phi[j]
@@ -113,7 +108,7 @@ def _series_slope(phi, offset, alpha, out):
         out[j] = 2.0 * d * (1.0 - y * (1.0 - y * (1 / 2.0) * (1.0 - y * (1 / 3.0) * e)))
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _recursion(phi, v, alpha, out, slope, scratch, sloping):
     """Shares over exp(-alpha q^2): exp(-alpha (d^2 - q^2)) follows from pixel to pixel."""
     r = (v - 1) // 2
@@ -142,19 +137,19 @@ def _recursion(phi, v, alpha, out, slope, scratch, sloping):
             _lean(phi, k, alpha, rise, slope[r + k])
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _above(value, edge, out):
     for j in range(len(out)):
         out[j] = max(value[j] - edge[j], 0.0)
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _lean(phi, k, alpha, value, out):
     for j in range(len(out)):
         out[j] = 2.0 * alpha * (0.5 - phi[j] + k) * value[j]
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _exponentials(phi, v, alpha, out, slope, sloping):
     """Shares over exp(-alpha q^2) of a narrow Gaussian, whose recursion would overflow."""
     for k in range(v):
@@ -167,7 +162,7 @@ def _exponentials(phi, v, alpha, out, slope, sloping):
                 slope[k, j] = 2.0 * alpha * d * e
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _sum(rows, out):
     if len(rows) == 3:
         a, b, c = rows[0], rows[1], rows[2]
@@ -181,13 +176,13 @@ def _sum(rows, out):
             out[j] += row[j]
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _level(value, over, lean, slope):
     for j in range(len(slope)):
         slope[j] -= value[j] * over[j] * lean[j]
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def shares(kind, v, alpha, phi, out, slope, over, lean, scratch, sloping):
     """Shares of rays at sub-pixel positions phi (b,), up to a factor: out (v, b), the share is out * over.
 

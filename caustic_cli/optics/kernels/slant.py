@@ -15,8 +15,6 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
 from caustic_cli.optics.kernels.bend import (
     BY_POWER,
     BY_PX,
@@ -38,13 +36,13 @@ from caustic_cli.optics.kernels.bend import (
     X,
     Y,
 )
-from caustic_cli.optics.kernels.shares import OPTIONS
+from caustic_cli.optics.kernels.jit import FAST, njit
 from caustic_cli.optics.tolerances import CRITICAL, PARALLEL
 
 REFLECTED_POWER, MISSED_POWER = -1.0, -2.0
 
 
-@njit(inline="always", **OPTIONS)
+@njit(inline="always", **FAST)
 def _refract(dx, dy, gx, gy, n):
     """d_z, |N|^2, c, s, and whether the ray passes (s is 1 where it does not)."""
     dz = math.sqrt(max(1.0 - dx * dx - dy * dy, 0.0))
@@ -55,7 +53,7 @@ def _refract(dx, dy, gx, gy, n):
     return dz, norm2, c, math.sqrt(radicand if passes else 1.0), passes
 
 
-@njit(inline="always", **OPTIONS)
+@njit(inline="always", **FAST)
 def _reflected(fresnel, c, s, norm2, n):
     """R and its derivatives by c, s and |N|^2."""
     if fresnel == EXACT:
@@ -73,11 +71,11 @@ def _reflected(fresnel, c, s, norm2, n):
     return 0.0, 0.0, 0.0, 0.0
 
 
-@njit(**OPTIONS)
-def aim(v, dx, dy, real, fresnel):
+@njit(**FAST)
+def aim(v, dx, dy, exit_, frame):
     """Heights of the hits above the reference, powers and landing points in pixels."""
-    n, height, start = real[0], real[1], real[9]
-    over_x, over_y = 1.0 / real[4], 1.0 / real[5]
+    n, fresnel, height, start = exit_.index, exit_.fresnel, exit_.height, exit_.start
+    over_x, over_y = 1.0 / frame.pixel_x, 1.0 / frame.pixel_y
     for j in range(v.shape[1]):
         t, gx, gy = v[REACH, j], v[GX, j], v[GY, j]
         dz, norm2, c, s, passes = _refract(dx[j], dy[j], gx, gy, n)
@@ -89,14 +87,14 @@ def aim(v, dx, dy, real, fresnel):
         v[SAG, j] = sag if down > PARALLEL else height  # never arrives
         power = v[SHARE, j] * (1.0 - reflected) if passes else REFLECTED_POWER
         v[POWER, j] = power if t >= 0.0 else MISSED_POWER
-        v[PX, j] = (v[X, j] + t * dx[j] + path * (n * dx[j] - gamma * gx) + real[2]) * over_x
-        v[PY, j] = (v[Y, j] + t * dy[j] + path * (n * dy[j] - gamma * gy) + real[3]) * over_y
+        v[PX, j] = (v[X, j] + t * dx[j] + path * (n * dx[j] - gamma * gx) - frame.low_x) * over_x
+        v[PY, j] = (v[Y, j] + t * dy[j] + path * (n * dy[j] - gamma * gy) - frame.low_y) * over_y
 
 
-@njit(**OPTIONS)
-def pull(v, dx, dy, real, fresnel):
+@njit(**FAST)
+def pull(v, dx, dy, exit_):
     """Derivatives by the distance to the hit and the slopes there, left in T_SAG, T_GX, T_GY.  BY_PX, BY_PY: per mm."""
-    n, height, start = real[0], real[1], real[9]
+    n, fresnel, height, start = exit_.index, exit_.fresnel, exit_.height, exit_.start
     for j in range(v.shape[1]):
         v[T_SAG, j], v[T_GX, j], v[T_GY, j] = 0.0, 0.0, 0.0
         if v[POWER, j] < 0.0:
@@ -125,10 +123,10 @@ def pull(v, dx, dy, real, fresnel):
         v[T_GY, j] = by_gy + 2.0 * gy * by_norm2 - dy[j] * by_c
 
 
-@njit(**OPTIONS)
-def push(v, dx, dy, real, fresnel):
+@njit(**FAST)
+def push(v, dx, dy, exit_, frame):
     """Tangents of power and pixel coordinates, left in T_POWER, BY_PX, BY_PY, along T_SAG (the distance), T_GX, T_GY."""
-    n, height, start = real[0], real[1], real[9]
+    n, fresnel, height, start = exit_.index, exit_.fresnel, exit_.height, exit_.start
     for j in range(v.shape[1]):
         t, gx, gy, dt, tx, ty = v[REACH, j], v[GX, j], v[GY, j], v[T_SAG, j], v[T_GX, j], v[T_GY, j]
         dz, norm2, c, s, _ = _refract(dx[j], dy[j], gx, gy, n)
@@ -141,5 +139,5 @@ def push(v, dx, dy, real, fresnel):
         path = (height - start - t * dz) / down
         d_path = -(dt * dz + path * d_gamma) / down
         v[T_POWER, j] = -v[SHARE, j] * (r_c * dc + r_s * ds + r_norm2 * d_norm2)
-        v[BY_PX, j] = (dt * dx[j] + d_path * (n * dx[j] - gamma * gx) - path * (d_gamma * gx + gamma * tx)) / real[4]
-        v[BY_PY, j] = (dt * dy[j] + d_path * (n * dy[j] - gamma * gy) - path * (d_gamma * gy + gamma * ty)) / real[5]
+        v[BY_PX, j] = (dt * dx[j] + d_path * (n * dx[j] - gamma * gx) - path * (d_gamma * gx + gamma * tx)) / frame.pixel_x
+        v[BY_PY, j] = (dt * dy[j] + d_path * (n * dy[j] - gamma * gy) - path * (d_gamma * gy + gamma * ty)) / frame.pixel_y

@@ -16,11 +16,9 @@ import math
 
 import numpy as np
 import torch
-from numba import njit, prange
 
 from caustic_cli.optics.bspline import SplineSpace
-
-_OPTIONS = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
+from caustic_cli.optics.kernels.jit import FAST, njit, prange
 
 
 class Axis:
@@ -39,7 +37,7 @@ class Axis:
         self.geometry = (breaks.numpy(), middle.numpy(), (1.0 / width).numpy())
 
 
-@njit(parallel=True, **_OPTIONS)
+@njit(parallel=True, **FAST)
 def coefficients(heights, first_u, mu, first_v, mv):
     """(n, m) control heights -> (I, J, p + 1, q + 1)."""
     p, q = mu.shape[1], mv.shape[1]
@@ -62,7 +60,7 @@ def coefficients(heights, first_u, mu, first_v, mv):
     return out
 
 
-@njit(parallel=True, **_OPTIONS)
+@njit(parallel=True, **FAST)
 def pull_coefficients(grads, n, m, first_u, mu, first_v, mv):
     """Adjoint of `coefficients`: derivatives (blocks, I, J, p + 1, q + 1), added in order of the blocks -> (n, m)."""
     p, q = mu.shape[1], mv.shape[1]
@@ -96,7 +94,7 @@ def pull_coefficients(grads, n, m, first_u, mu, first_v, mv):
     return out
 
 
-@njit(inline="always", **_OPTIONS)
+@njit(inline="always", **FAST)
 def piece(x, breaks):
     """The piece that holds x; the outermost ones also hold what lies beyond."""
     last = len(breaks) - 2  # guess from equal spans, then walk: at once right on an equispaced knot vector
@@ -108,7 +106,7 @@ def piece(x, breaks):
     return i
 
 
-@njit(inline="always", **_OPTIONS)
+@njit(inline="always", **FAST)
 def jet(c, i, j, xi, eta):
     """z and its derivatives by xi and eta."""
     p, q = c.shape[2], c.shape[3]
@@ -124,7 +122,7 @@ def jet(c, i, j, xi, eta):
     return z, z_xi, z_eta
 
 
-@njit(inline="always", **_OPTIONS)
+@njit(inline="always", **FAST)
 def curvatures(c, i, j, xi, eta):
     """Second derivatives of z by xi xi, xi eta, eta eta."""
     p, q = c.shape[2], c.shape[3]
@@ -144,7 +142,7 @@ def curvatures(c, i, j, xi, eta):
     return 2.0 * half_xi, mixed, 2.0 * half_eta
 
 
-@njit(inline="always", **_OPTIONS)
+@njit(inline="always", **FAST)
 def push_powers(grad, i, j, xi, eta, by_z, by_xi, by_eta, powers):
     """Adjoint of `jet`: add to the derivatives (I, J, p + 1, q + 1) by the coefficients.  powers: scratch (2, q + 1)."""
     p, q = grad.shape[2], grad.shape[3]
@@ -163,7 +161,7 @@ def push_powers(grad, i, j, xi, eta, by_z, by_xi, by_eta, powers):
         power *= xi
 
 
-@njit(parallel=True, **_OPTIONS)
+@njit(parallel=True, **FAST)
 def evaluate(u, v, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y, z, zx, zy, blocks):
     """Height and slopes at points (u, v) (N,) into z, zx, zy (N,): breaks, middles, one over widths of the pieces."""
     count = len(u)
@@ -174,7 +172,7 @@ def evaluate(u, v, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y, z, zx, zy, block
             z[k], zx[k], zy[k] = value, along * wu[i] * scale_x, across * wv[j] * scale_y
 
 
-@njit(parallel=True, **_OPTIONS)
+@njit(parallel=True, **FAST)
 def pull_back(u, v, gz, gx, gy, bu, mu, wu, bv, mv, wv, scale_x, scale_y, grads):
     """Adjoint of `evaluate`: derivatives by the coefficients into grads (blocks, I, J, p + 1, q + 1), overwritten."""
     count, blocks = len(u), len(grads)

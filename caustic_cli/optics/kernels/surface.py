@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.bundle import Bundle
 from caustic_cli.optics.kernels import blocks, hit, spline
 
 
@@ -43,15 +42,15 @@ class FusedSurface:
         return torch.from_numpy(spline.pull_coefficients(grads, *self.shape, *self.linear))
 
 
-def scattered_surface(surface: FusedSurface, heights: Tensor, u: np.ndarray, v: np.ndarray, dtype: torch.dtype):
-    """Heights (n, m) mm, points in [0, 1]^2 (N,) -> z mm, dz/dx, dz/dy (N,) in `dtype`, linear in the heights."""
-    return _ScatteredSurface.apply(heights, surface, u, v, dtype)
+def scattered_surface(surface: FusedSurface, heights: Tensor, u: np.ndarray, v: np.ndarray):
+    """Heights (n, m) mm, points in [0, 1]^2 (N,) -> z mm, dz/dx, dz/dy (N,) float64, linear in the heights."""
+    return _ScatteredSurface.apply(heights, surface, u, v)
 
 
 class _ScatteredSurface(torch.autograd.Function):
     @staticmethod
-    def forward(heights: Tensor, surface: FusedSurface, u: np.ndarray, v: np.ndarray, dtype: torch.dtype):
-        out = [torch.empty(len(u), dtype=dtype) for _ in range(3)]
+    def forward(heights: Tensor, surface: FusedSurface, u: np.ndarray, v: np.ndarray):
+        out = [torch.empty(len(u), dtype=torch.float64) for _ in range(3)]
         spline.evaluate(u, v, surface.coefficients(heights), *surface.geometry, *surface.scale, *(t.numpy() for t in out),
                         blocks())
         return tuple(out)
@@ -63,10 +62,10 @@ class _ScatteredSurface(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, *by):
-        surface, u, v, _ = ctx.rest
+        surface, u, v = ctx.rest
         grads = surface.workspace()
         spline.pull_back(u, v, *(g.contiguous().numpy() for g in by), *surface.geometry, *surface.scale, grads)
-        return surface.pull(grads).to(ctx.heights_dtype), None, None, None, None
+        return surface.pull(grads).to(ctx.heights_dtype), None, None, None
 
     @staticmethod
     def jvp(ctx, tangent, *_):
@@ -106,9 +105,9 @@ class RayHits:
         self.radius = None if bundle.radius is None else bundle.radius * su
         self.t, self.status = np.zeros(len(bundle.x)), np.zeros(len(bundle.x), np.int8)
 
-    def __call__(self, heights: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
-        """Heights (n, m) mm -> distance along each ray to its hit (mm; -1 for none), dz/dx and dz/dy there, (N,) in `dtype`."""
-        return _Hits.apply(heights, self, dtype)
+    def __call__(self, heights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Heights (n, m) mm -> distance along each ray to its hit (mm; -1 for none), dz/dx and dz/dy there, (N,) float64."""
+        return _Hits.apply(heights, self)
 
     def find(self, heights: Tensor, start: np.ndarray | None = None) -> np.ndarray:
         """Fill t (mm) and status of every ray; returns the coefficients of the surface, counted from the heights' mean.
@@ -131,16 +130,16 @@ class RayHits:
 
 class _Hits(torch.autograd.Function):
     @staticmethod
-    def forward(heights: Tensor, rays: RayHits, dtype: torch.dtype):
+    def forward(heights: Tensor, rays: RayHits):
         c = rays.find(heights)
-        out = [torch.empty(len(rays.t), dtype=dtype) for _ in range(3)]
+        out = [torch.empty(len(rays.t), dtype=torch.float64) for _ in range(3)]
         hit.slopes_at(*rays.rays, rays.t, rays.status, c, *rays.surface.geometry, *rays.surface.scale,
                       *(t.numpy() for t in out), blocks())
         return tuple(out)
 
     @staticmethod
     def setup_context(ctx, inputs, output):
-        heights, ctx.rays, ctx.dtype = inputs
+        heights, ctx.rays = inputs
         ctx.save_for_backward(heights, *output)
         ctx.save_for_forward(heights, *output)
 
@@ -151,13 +150,13 @@ class _Hits(torch.autograd.Function):
         grads = surface.workspace()
         hit.pull_back(*(g.contiguous().numpy() for g in by), *ctx.rays.rays, *(t.detach().numpy() for t in found),
                       surface.coefficients(_sag(heights)[0]), *surface.geometry, *surface.scale, grads)
-        return surface.pull(grads).to(heights.dtype), None, None
+        return surface.pull(grads).to(heights.dtype), None
 
     @staticmethod
     def jvp(ctx, tangent, *_):
         heights, *found = ctx.saved_tensors
         surface = ctx.rays.surface
-        out = [torch.empty(len(found[0]), dtype=ctx.dtype) for _ in range(3)]
+        out = [torch.empty(len(found[0]), dtype=torch.float64) for _ in range(3)]
         hit.push(surface.coefficients(tangent), *ctx.rays.rays, *(t.detach().numpy() for t in found),
                  surface.coefficients(_sag(heights)[0]), *surface.geometry, *surface.scale, *(t.numpy() for t in out), blocks())
         return tuple(out)

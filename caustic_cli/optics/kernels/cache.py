@@ -1,0 +1,117 @@
+"""Where the compiled kernels are kept: a directory of their own for each state of their sources.
+
+Numba keys what it keeps by the time stamp of the one file that a function stands in, so that an edit of a function or a constant
+of another file, which is compiled into it, would go unnoticed.  Here every state of all the kernels' files, together with the
+versions of numba and Python, has its own directory `caustic-<hash>` below the first of
+
+    NUMBA_CACHE_DIR, where the user wants numba's files;
+    XDG_CACHE_HOME/caustic, by default ~/.cache/caustic: one for each user, which leaves an installation as it was packed and
+    serves one that the user may not write to;
+    caustic-<user> in the system's directory for temporary files, if it is this user's alone: numba unpickles what it finds there.
+
+that can be written to.  If none can, kernels are compiled anew in every process.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import platform
+import re
+import shutil
+import stat
+import tempfile
+import time
+from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+PACKAGE = Path(__file__).resolve().parents[2]
+PREFIX, DIGITS = "caustic-", 20
+#: In each directory, touched on every use of it: its age tells how long the directory has not been needed.
+USED = "last-used"
+KEPT_DAYS = 30.0
+
+
+def sources(package: Path = PACKAGE) -> list[Path]:
+    """The files that compiled code is made of: all of the kernels', others that define some, and their constants."""
+    own = package / "optics" / "kernels"
+    found = {p for p in package.rglob("*.py") if own in p.parents or b"njit" in p.read_bytes()}
+    return sorted(found | {package / "optics" / "tolerances.py"})
+
+
+def name(package: Path = PACKAGE) -> str:
+    """Of the directory for the present state of the sources."""
+    state = hashlib.sha256()
+    for path in sources(package):
+        state.update(f"{path.relative_to(package).as_posix()}\0".encode())
+        state.update(hashlib.sha256(path.read_bytes()).digest())
+    for part in ("numba", "llvmlite", "numpy"):
+        with contextlib.suppress(PackageNotFoundError):
+            state.update(f"{part} {version(part)}\0".encode())
+    state.update(f"{platform.python_implementation()} {platform.python_version()} {platform.machine()}".encode())
+    return PREFIX + state.hexdigest()[:DIGITS]
+
+
+def bases() -> Iterator[Path]:
+    """Where the directory may be, the best first."""
+    asked, common = os.environ.get("NUMBA_CACHE_DIR"), os.environ.get("XDG_CACHE_HOME")
+    if asked:
+        yield Path(asked)
+    elif common and Path(common).is_absolute():  # the XDG Base Directory Specification asks for others to be ignored
+        yield Path(common) / "caustic"
+    else:
+        with contextlib.suppress(RuntimeError):  # no HOME, and nobody of this number among the users
+            yield Path.home() / ".cache" / "caustic"
+    with contextlib.suppress(OSError):  # no directory for temporary files either
+        if private(path := Path(tempfile.gettempdir()) / f"{PREFIX}{os.getuid() if hasattr(os, 'getuid') else 'user'}"):
+            yield path
+
+
+def private(path: Path) -> bool:
+    """Whether a directory is this user's alone to write to, made if it is not there."""
+    with contextlib.suppress(FileExistsError):
+        path.mkdir(mode=0o700)
+    state = path.lstat()
+    if not stat.S_ISDIR(state.st_mode):
+        return False
+    return not hasattr(os, "getuid") or (state.st_uid == os.getuid() and not state.st_mode & 0o022)
+
+
+def writable(path: Path) -> bool:
+    """Whether files can be kept in a directory, made with those above it if it is not there; leaves `USED` in it."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):  # of a name of its own: another process may be asking the same
+            (path / USED).touch()
+    except OSError:
+        return False
+    return True
+
+
+def choose() -> Path | None:
+    """The directory to keep compiled code in; None if there is none that can be written to."""
+    own = name()
+    for base in bases():
+        if writable(base / own):
+            return base / own
+    return None
+
+
+def tidy(directory: Path, days: float = KEPT_DAYS) -> None:
+    """Remove the neighbours of a directory that are such directories too and were not used for so long."""
+    ours, before = re.compile(f"{PREFIX}[0-9a-f]{{{DIGITS}}}"), time.time() - days * 86400.0
+    with contextlib.suppress(OSError):  # whatever cannot be read or removed stays: another process may be removing it
+        for path in list(directory.parent.iterdir()):
+            used = path / USED
+            if path == directory or not ours.fullmatch(path.name) or path.is_symlink() or not used.is_file():
+                continue
+            if used.stat().st_mtime < before:
+                shutil.rmtree(path, ignore_errors=True)
+
+
+#: Of this process, found once.
+DIRECTORY = choose()
+if DIRECTORY is not None:
+    tidy(DIRECTORY)
