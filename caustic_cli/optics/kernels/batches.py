@@ -18,8 +18,17 @@ is the last one, and f is not evaluated once more to see it; the slopes at t are
 first steps take the terms of second order alone.
 
 What is not plain, ray by ray, goes to `hit._root`, which decides: rays that start outside or above, that may meet the surface more
-than once (L >= d_z), that leave by the side, that do not converge.  A ray's hit is a function of the ray and of the heights, and no
-other ray's; sums over rays run in an order that these and the number of blocks decide.
+than once (L >= d_z), that leave by the side, that do not converge.  What is found is a function of the rays, the heights and the
+number of blocks, not of what was found before; which rays share a batch changes a hit by a rounding at most.
+
+At the hit, f(t; P, o, d) = 0 gives, with the point's move m = do + t dd at fixed t and the surface's change dZ there,
+
+    dt = (dZ + Z_x m_x + Z_y m_y - m_z) / c,    dZ_x = (dZ)_x + Z_xx (m_x + d_x dt) + Z_xy (m_y + d_y dt),
+
+whatever method found t.  In reverse, where a loss L has the derivatives L_t, L_gx, L_gy by distance and slopes,
+
+    X = Z_xx L_gx + Z_xy L_gy,  Y = Z_xy L_gx + Z_yy L_gy,    L_Z = (L_t + X d_x + Y d_y) / c,
+    L_o = (X + L_Z Z_x, Y + L_Z Z_y, -L_Z),    L_d = t L_o.
 """
 
 from __future__ import annotations
@@ -31,10 +40,10 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from caustic_cli.optics.kernels.hit import HIT, MISSED, _leaves, _root, _value
-from caustic_cli.optics.kernels.spline import _OPTIONS, curvatures, piece, push_powers
+from caustic_cli.optics.kernels.spline import _OPTIONS, curvatures, jet, piece, push_powers
 from caustic_cli.optics.tolerances import FEW_ULP, LEAST_COSINE
 
-#: Rays of a batch: enough to fill the CPU's vectors several times over, few enough for all of its rows to stay in the nearest cache.
+#: Rays of a batch: enough to fill the vectors several times over, few enough for sums over them to stay in registers.
 LANES = 32
 #: Rays sorted at a time, in the next cache; and the largest box of span products that they may hit.
 TILE, BOX = 4096, 16_384
@@ -46,8 +55,6 @@ ALONE = 64
 TURNS, FIRST_STEPS, STEPS = 4, 2, 5
 #: So far beyond its span product, in its widths, a polynomial is still evaluated; and so near the border hits are `_root`'s.
 BEYOND, MARGIN = 0.02, 1e-12
-#: Sums over a batch, whose order is left to the compiler.
-_SUMS = {**_OPTIONS, "fastmath": {"contract", "nsz", "reassoc"}}
 
 # Where the rows of a batch's scratch begin, LANES numbers each: the rays, where they are in the span product, Horner's scheme,
 # Newton's step; in the adjoint slopes, and derivatives by distance, slopes, height and start.
@@ -55,8 +62,10 @@ OU, OV, OZ, DU, DV, DZ, T, XI, ETA, ROW, SLOPE, HALF, Z, Z_XI, Z_ETA, H_XI, MIXE
     0, 22 * LANES, LANES)
 GX, GY, BY_T, BY_U, BY_V, BY_Z, BY_X, BY_Y = range(22 * LANES, 30 * LANES, LANES)
 ROWS = 30
-# Sizes of the scratch of Horner's scheme, for value and slopes, and for second derivatives.
-JET, BEND = 7 * LANES, 11 * LANES
+# Sizes of the scratch of Horner's scheme, for value and slopes, and for second derivatives; sums kept apart of each of 8
+# coefficients.
+JET, BEND, WIDE = 7 * LANES, 11 * LANES, 8
+PATCH = 8 * WIDE
 
 
 @intrinsic
@@ -380,39 +389,49 @@ def _tables(w, p, q, table):
             w[ROW + k], w[SLOPE + k] = power * eta, slope * eta + power
 
 
-@njit(**_SUMS)
-def _gather(table, p, q, total):
-    """Add the sums over the lanes that `_tables` describes to total (p', q')."""
+@njit(**_OPTIONS)
+def _add(table, p, q, sums):
+    """Add what `_tables` describes to sums, of every WIDE-th lane: (p' / 2, q' / 4, 8, WIDE), 2 x 4 coefficients at a time."""
     pp, qq = (p + 1) // 2 * 2, (q + 3) // 4 * 4
+    s = carray(_stack(PATCH), (PATCH,))
     for a in range(0, pp, 2):
         for b in range(0, qq, 4):
-            a0, a1 = table[a * LANES : (a + 1) * LANES], table[(a + 1) * LANES : (a + 2) * LANES]
-            at = (pp + b) * LANES
-            e0, e1 = table[at : at + LANES], table[at + LANES : at + 2 * LANES]
-            e2, e3 = table[at + 2 * LANES : at + 3 * LANES], table[at + 3 * LANES : at + 4 * LANES]
-            at = (pp + qq + b) * LANES
-            d0, d1 = table[at : at + LANES], table[at + LANES : at + 2 * LANES]
-            d2, d3 = table[at + 2 * LANES : at + 3 * LANES], table[at + 3 * LANES : at + 4 * LANES]
-            at = (pp + 2 * qq + a) * LANES
-            f0, f1 = table[at : at + LANES], table[at + LANES : at + 2 * LANES]
-            s0, s1, s2, s3, s4, s5, s6, s7 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            for k in range(LANES):
-                s0 += a0[k] * e0[k] + f0[k] * d0[k]
-                s1 += a0[k] * e1[k] + f0[k] * d1[k]
-                s2 += a0[k] * e2[k] + f0[k] * d2[k]
-                s3 += a0[k] * e3[k] + f0[k] * d3[k]
-                s4 += a1[k] * e0[k] + f1[k] * d0[k]
-                s5 += a1[k] * e1[k] + f1[k] * d1[k]
-                s6 += a1[k] * e2[k] + f1[k] * d2[k]
-                s7 += a1[k] * e3[k] + f1[k] * d3[k]
-            total[a, b] += s0
-            total[a, b + 1] += s1
-            total[a, b + 2] += s2
-            total[a, b + 3] += s3
-            total[a + 1, b] += s4
-            total[a + 1, b + 1] += s5
-            total[a + 1, b + 2] += s6
-            total[a + 1, b + 3] += s7
+            at_a, at_e, at_d, at_c = a * LANES, (pp + b) * LANES, (pp + qq + b) * LANES, (pp + 2 * qq + a) * LANES
+            for m in range(PATCH):
+                s[m] = 0.0
+            for k in range(0, LANES, WIDE):
+                for m in range(WIDE):
+                    v = k + m
+                    a0, a1, c0, c1 = table[at_a + v], table[at_a + LANES + v], table[at_c + v], table[at_c + LANES + v]
+                    e0, e1, e2, e3 = (table[at_e + v], table[at_e + LANES + v], table[at_e + 2 * LANES + v],
+                                      table[at_e + 3 * LANES + v])
+                    d0, d1, d2, d3 = (table[at_d + v], table[at_d + LANES + v], table[at_d + 2 * LANES + v],
+                                      table[at_d + 3 * LANES + v])
+                    s[m] += a0 * e0 + c0 * d0
+                    s[WIDE + m] += a0 * e1 + c0 * d1
+                    s[2 * WIDE + m] += a0 * e2 + c0 * d2
+                    s[3 * WIDE + m] += a0 * e3 + c0 * d3
+                    s[4 * WIDE + m] += a1 * e0 + c1 * d0
+                    s[5 * WIDE + m] += a1 * e1 + c1 * d1
+                    s[6 * WIDE + m] += a1 * e2 + c1 * d2
+                    s[7 * WIDE + m] += a1 * e3 + c1 * d3
+            to = (a // 2 * (qq // 4) + b // 4) * PATCH
+            for m in range(PATCH):
+                sums[to + m] += s[m]
+
+
+@njit(**_OPTIONS)
+def _finish(sums, grad, i, j):
+    """Add the sums over all lanes to the derivatives (I, J, p + 1, q + 1), and begin anew."""
+    p, q = grad.shape[2], grad.shape[3]
+    wide = (q + 3) // 4
+    for a in range(p):
+        for b in range(q):
+            to, total = (a // 2 * wide + b // 4) * PATCH + (a % 2 * 4 + b % 4) * WIDE, 0.0
+            for m in range(WIDE):
+                total += sums[to + m]
+            grad[i, j, a, b] += total
+    sums[:] = 0.0
 
 
 @njit(parallel=True, **_OPTIONS)
@@ -429,7 +448,7 @@ def pull_back(met, where, by_t, by_gx, by_gy, ou, ov, du, dv, dz, t, gx, gy, c, 
         w, grad, powers = np.zeros(ROWS * LANES), grads[block], np.empty((2, q))
         grad[:] = 0.0
         pp, qq = (p + 1) // 2 * 2, (q + 3) // 4 * 4
-        table, total = np.zeros(2 * (pp + qq) * LANES), np.zeros((pp, qq))
+        table, sums = np.zeros(2 * (pp + qq) * LANES), np.zeros(pp * qq * WIDE)
         begin, stop = block * count // blocks, (block + 1) * count // blocks
         summed = False
         while begin < stop:
@@ -481,12 +500,39 @@ def pull_back(met, where, by_t, by_gx, by_gy, ou, ov, du, dv, dz, t, gx, gy, c, 
                     by_ox[r], by_oy[r], by_oz[r] = w[BY_X + k], w[BY_Y + k], -w[BY_Z + k]
             if nets:
                 _tables(w, p, q, table)
-                _gather(table, p, q, total)
-                summed = True
-                if end == stop or where[end] != where[begin]:
-                    for k in range(p):
-                        for m in range(q):
-                            grad[a, b, k, m] += total[k, m]
-                    total[:] = 0.0
-                    summed = False
+                _add(table, p, q, sums)
+                summed = end < stop and where[end] == where[begin]
+                if not summed:
+                    _finish(sums, grad, a, b)
             begin = end
+
+
+@njit(parallel=True, **_OPTIONS)
+def push(change, move_x, move_y, move_z, met, where, ou, ov, du, dv, dz, t, gx, gy, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y,
+         out_t, out_x, out_y, blocks):
+    """Tangents of the distances and slopes that `meet` found, into out_t, out_x, out_y (N,).
+
+    change: of the coefficients; move_x, move_y, move_z (N,): of the rays' points that hit, at fixed t, mm; either may be empty.
+    """
+    count, wide = len(t), len(bv) - 1
+    nets, moves = change.shape[0] > 0, len(move_x) > 0
+    for block in prange(blocks):
+        for k in range(block * count // blocks, (block + 1) * count // blocks):
+            r = met[k]
+            out_t[r], out_x[r], out_y[r] = 0.0, 0.0, 0.0
+            if where[k] < 0:
+                continue
+            i, j = where[k] // wide, where[k] % wide
+            xi, eta = (ou[r] + t[r] * du[r] - mu[i]) * wu[i], (ov[r] + t[r] * dv[r] - mv[j]) * wv[j]
+            uu, uv, vv = curvatures(c, i, j, xi, eta)
+            uu, uv, vv = uu * wu[i] * wu[i], uv * wu[i] * wv[j], vv * wv[j] * wv[j]
+            z, zu, zv, x, y = 0.0, 0.0, 0.0, 0.0, 0.0
+            if nets:
+                z, zu, zv = jet(change, i, j, xi, eta)
+            if moves:
+                x, y = move_x[r], move_y[r]
+                z += gx[r] * x + gy[r] * y - move_z[r]
+            along = z / max(dz[r] - gx[r] * du[r] / scale_x - gy[r] * dv[r] / scale_y, LEAST_COSINE)
+            u, v = x * scale_x + along * du[r], y * scale_y + along * dv[r]
+            out_t[r] = along
+            out_x[r], out_y[r] = (zu * wu[i] + uu * u + uv * v) * scale_x, (zv * wv[j] + uv * u + vv * v) * scale_y

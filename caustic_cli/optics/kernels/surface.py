@@ -169,9 +169,10 @@ class _Hits(torch.autograd.Function):
 
     @staticmethod
     def jvp(ctx, tangent, *_):
-        heights, *found = ctx.saved_tensors[:4]
-        surface = ctx.rays.surface
-        out = [torch.empty(len(found[0]), dtype=ctx.dtype) for _ in range(3)]
-        hit.push(surface.coefficients(tangent), *ctx.rays.rays, *(t.detach().numpy() for t in found),
-                 surface.coefficients(_sag(heights)[0]), *surface.geometry, *surface.scale, *(t.numpy() for t in out), blocks())
-        return *out, None, None
+        heights, *found, met, where = ctx.saved_tensors
+        surface, (ou, ov, _, *directions), none = ctx.rays.surface, ctx.rays.rays, np.empty(0)
+        out = [torch.empty(len(met), dtype=torch.float64) for _ in range(3)]
+        batches.push(surface.coefficients(tangent), none, none, none, met.numpy(), where.numpy(), ou, ov, *directions,
+                     *(t.detach().double().numpy() for t in found), surface.coefficients(_sag(heights)[0]), *surface.geometry,
+                     *surface.scale, *(t.numpy() for t in out), blocks())
+        return *(t.to(ctx.dtype) for t in out), None, None
