@@ -279,8 +279,8 @@ class Tracer:
 
     def _at_pupil(self, m: Meeting) -> bool:
         """Whether the rays stand on this flat first element as they come from their source, which has left out all that miss it."""
-        e, pupil = m.element, self.system.pupil
-        return (m.index == 0 and m.forward and e.surface.flat and e.pose.upright and e.pose.position == (0.0, 0.0, pupil.z)
+        e, pupil, z = m.element, self.system.pupil, m.state.origin[2]
+        return (m.index == 0 and isinstance(z, float) and z + m.state.datum == pupil.z and m.forward and e.surface.flat and e.pose.upright and e.pose.position == (0.0, 0.0, pupil.z)
                 and e.aperture.half_size == pupil.half_size and e.aperture.round == pupil.round)
 
     def _backed_up(self, o, d, state: RayState, element: Element, heights) -> tuple[tuple, RayState]:

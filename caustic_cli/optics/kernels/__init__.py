@@ -6,7 +6,6 @@ import os
 
 import torch
 
-
 #: numba's threads are OpenMP's, as torch's are.  By itself it takes TBB first, whose parallel loops started ever more slowly here:
 #: in 26 microseconds at first, in 500 after 20,000 of them; OpenMP's in 3 throughout.
 THREADING = ["omp", "workqueue", "tbb"]

@@ -16,15 +16,14 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numba import njit, prange
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels import blocks
 from caustic_cli.optics.kernels.banded import AlongV
+from caustic_cli.optics.kernels.jit import FAST, njit, prange
 from caustic_cli.optics.kernels.rows import combine, spread
-from caustic_cli.optics.kernels.shares import OPTIONS
 
 
 class GridSurface:
@@ -47,7 +46,7 @@ class GridSurface:
         return _Rows.apply(*self.along_v(heights), self.rows)
 
 
-@njit(parallel=True, **OPTIONS)
+@njit(parallel=True, **FAST)
 def _combine(net, net_y, first, bu, du, z, zx, zy, blocks):
     """z and slopes (a, b)."""
     for block in prange(blocks):
@@ -55,7 +54,7 @@ def _combine(net, net_y, first, bu, du, z, zx, zy, blocks):
             combine(i, first, bu, du, net, net, net_y, z[i], zx[i], zy[i])
 
 
-@njit(parallel=True, **OPTIONS)
+@njit(parallel=True, **FAST)
 def _spread(by_z, by_zx, by_zy, first, bu, du, nets):
     """Adjoint of `_combine`: derivatives by both nets; nets (3, blocks, n, b) are overwritten, and added in order."""
     rows, blocks = len(by_z), nets.shape[1]

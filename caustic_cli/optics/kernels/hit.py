@@ -1,4 +1,4 @@
-"""CPU kernels: where rays meet the height field, with derivatives by the implicit function theorem (thesis 4.3.2).
+"""CPU kernels: where rays meet the height field, ray by ray (thesis 4.3.2).
 
 Notation, in (u, v, z)-space (eq. 4.3.2)
     f(t) = o_z + t d_z - Z(o_u + t d_u, o_v + t d_v), negative below the surface
@@ -6,7 +6,7 @@ Notation, in (u, v, z)-space (eq. 4.3.2)
     L    bound of |Z_u| |d_u| + |Z_v| |d_v| from the derivative's control net: d_z - L <= c <= d_z + L
 
 A ray with L < d_z meets the surface once: Newton's iteration inside a bracket that bisection takes over.  For any other one
-the first root is isolated before that.  At the hit, f(t; P) = 0 gives dt/dP = (N_i N_j) / c, whatever method found t.
+the first root is isolated before that.  `batches` takes the plain rays of a bundle together, and differentiates.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from __future__ import annotations
 import numpy as np
 
 from caustic_cli.optics.kernels.jit import FAST, njit, prange
-from caustic_cli.optics.kernels.spline import curvatures, jet, piece, push_powers
-from caustic_cli.optics.tolerances import FEW_ULP, FINEST, LEAST_COSINE, MOST_PROBES, MOST_STEPS
+from caustic_cli.optics.kernels.spline import jet, piece
+from caustic_cli.optics.tolerances import FEW_ULP, FINEST, MOST_PROBES, MOST_STEPS
 
 HIT, MISSED, UNRESOLVED = 0, 1, 2
 #: A hit is looked for at first within this part of the way through the box from where a mesh has it.
@@ -197,63 +197,3 @@ def intersect_again(ou, ov, oz, du, dv, dz, side, limits, slopes, round_, step, 
                     else:
                         after = middle
                 t[k] = after
-
-
-@njit(parallel=True, **FAST)
-def slopes_at(ou, ov, oz, du, dv, dz, t, status, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y, reach, gx, gy, blocks):
-    """Distances to the hits (-1 for none) and dz/dx, dz/dy there into reach, gx, gy (N,)."""
-    count = len(ou)
-    for block in prange(blocks):
-        for k in range(block * count // blocks, (block + 1) * count // blocks):
-            reach[k], gx[k], gy[k] = -1.0, 0.0, 0.0
-            if status[k] == HIT:
-                _, a, b = _value(c, ou[k] + t[k] * du[k], ov[k] + t[k] * dv[k], bu, mu, wu, bv, mv, wv)
-                reach[k], gx[k], gy[k] = t[k], a * scale_x, b * scale_y
-
-
-@njit(inline="always", **FAST)
-def _bends(t, ou, ov, du, dv, c, bu, mu, wu, bv, mv, wv):
-    """Where a hit lies in its span product; d(Z_u)/dt and d(Z_v)/dt along the ray."""
-    u, v = ou + t * du, ov + t * dv
-    i, j = piece(u, bu), piece(v, bv)
-    xi, eta = (u - mu[i]) * wu[i], (v - mv[j]) * wv[j]
-    uu, uv, vv = curvatures(c, i, j, xi, eta)
-    uu, uv, vv = uu * wu[i] * wu[i], uv * wu[i] * wv[j], vv * wv[j] * wv[j]
-    return i, j, xi, eta, uu * du + uv * dv, uv * du + vv * dv
-
-
-@njit(parallel=True, **FAST)
-def pull_back(by_t, by_gx, by_gy, ou, ov, oz, du, dv, dz, t, gx, gy, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y, grads):
-    """Adjoint of the hits: derivatives by the coefficients (blocks, I, J, p + 1, q + 1), overwritten.
-
-    by_*: derivatives by distance and slopes (N,); t, gx, gy: what `slopes_at` found.
-    """
-    count, blocks = len(t), len(grads)
-    for block in prange(blocks):
-        grad = grads[block]
-        grad[:] = 0.0
-        powers = np.empty((2, grad.shape[3]))
-        for k in range(block * count // blocks, (block + 1) * count // blocks):
-            if t[k] < 0.0:
-                continue
-            i, j, xi, eta, along_u, along_v = _bends(t[k], ou[k], ov[k], du[k], dv[k], c, bu, mu, wu, bv, mv, wv)
-            cosine = max(dz[k] - gx[k] * du[k] / scale_x - gy[k] * dv[k] / scale_y, LEAST_COSINE)
-            by_u, by_v = by_gx[k] * scale_x, by_gy[k] * scale_y
-            by_z = (by_t[k] + by_u * along_u + by_v * along_v) / cosine
-            push_powers(grad, i, j, xi, eta, by_z, by_u * wu[i], by_v * wv[j], powers)
-
-
-@njit(parallel=True, **FAST)
-def push(change, ou, ov, oz, du, dv, dz, t, gx, gy, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y, out_t, out_x, out_y, blocks):
-    """Tangents of the hits' distances and slopes along the coefficients `change`, into out_t, out_x, out_y (N,)."""
-    count = len(t)
-    for block in prange(blocks):
-        for k in range(block * count // blocks, (block + 1) * count // blocks):
-            out_t[k], out_x[k], out_y[k] = 0.0, 0.0, 0.0
-            if t[k] < 0.0:
-                continue
-            i, j, xi, eta, along_u, along_v = _bends(t[k], ou[k], ov[k], du[k], dv[k], c, bu, mu, wu, bv, mv, wv)
-            z, z_xi, z_eta = jet(change, i, j, xi, eta)
-            move = z / max(dz[k] - gx[k] * du[k] / scale_x - gy[k] * dv[k] / scale_y, LEAST_COSINE)
-            out_t[k] = move
-            out_x[k], out_y[k] = (z_xi * wu[i] + along_u * move) * scale_x, (z_eta * wv[j] + along_v * move) * scale_y

@@ -17,12 +17,11 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numba import njit, prange
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.kernels import blocks
-from caustic_cli.optics.kernels.shares import OPTIONS
+from caustic_cli.optics.kernels.jit import FAST, njit, prange
 from caustic_cli.optics.kernels.stage import BATCH, components, given, keep, kept, load, new, store, tangent, wanted
 from caustic_cli.optics.tolerances import PARALLEL
 
@@ -66,7 +65,7 @@ def land(origin, direction, point: Vector, axes: tuple[Vector, Vector, Vector], 
     return _Landing.apply(*origin, *direction, plane)
 
 
-@njit(inline="always", **OPTIONS)
+@njit(inline="always", **FAST)
 def _path(ray, start, count, plane, v):
     """k, 1 / v, and 1 or 0 for whether the ray is on its way, into a batch's scratch."""
     for i in range(6):
@@ -82,7 +81,7 @@ def _path(ray, start, count, plane, v):
         v[K, j], v[OVER, j], v[ON_WAY, j] = k if on_way else 0.0, over, 1.0 if on_way else 0.0
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _land_some(begin, end, ray, plane, x, y, on_way):
     v, (px, py, pz, ax, ay, az, bx, by, bz, _, _, _, _) = np.empty((ROWS, BATCH)), plane
     for start in range(begin, end, BATCH):
@@ -99,7 +98,7 @@ def _land_some(begin, end, ray, plane, x, y, on_way):
             batch[j] = v[ON_WAY, j] > 0.0
 
 
-@njit(parallel=True, **OPTIONS)
+@njit(parallel=True, **FAST)
 def _land(ray, plane, x, y, on_way, blocks):
     """x, y and on_way (N,), from ray: o and d, six components."""
     count = len(x)
@@ -107,7 +106,7 @@ def _land(ray, plane, x, y, on_way, blocks):
         _land_some(block * count // blocks, (block + 1) * count // blocks, ray, plane, x, y, on_way)
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _pull_some(begin, end, ray, plane, given, out):
     v, (_, _, _, ax, ay, az, bx, by, bz, nx, ny, nz, _) = np.empty((ROWS, BATCH)), plane
     for start in range(begin, end, BATCH):
@@ -129,14 +128,14 @@ def _pull_some(begin, end, ray, plane, given, out):
             store(v[BY_OX + i], start, count, out[i])
 
 
-@njit(parallel=True, **OPTIONS)
+@njit(parallel=True, **FAST)
 def _land_adjoint(ray, plane, given, out, count, blocks):
     """Derivatives by the ray's components into `out`, from those by x and y."""
     for block in prange(blocks):
         _pull_some(block * count // blocks, (block + 1) * count // blocks, ray, plane, given, out)
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _push_some(begin, end, ray, plane, along, out):
     v, (_, _, _, ax, ay, az, bx, by, bz, nx, ny, nz, _) = np.empty((ROWS, BATCH)), plane
     for start in range(begin, end, BATCH):
@@ -155,7 +154,7 @@ def _push_some(begin, end, ray, plane, along, out):
         store(v[Y], start, count, out[1])
 
 
-@njit(parallel=True, **OPTIONS)
+@njit(parallel=True, **FAST)
 def _land_tangent(ray, plane, along, out, count, blocks):
     """Derivatives of x and y into `out` along `along`, six components."""
     for block in prange(blocks):

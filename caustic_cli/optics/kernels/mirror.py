@@ -13,15 +13,14 @@ by_v is the derivative of whatever is differentiated by v, and d_v the derivativ
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
 
-from caustic_cli.optics.kernels.shares import OPTIONS
+from caustic_cli.optics.kernels.jit import FAST, njit, prange
 from caustic_cli.optics.kernels.stage import BATCH, load, store
 
 DX, DY, DZ, GX, GY, BY_TX, BY_TY, BY_TZ, BY_DX, BY_DY, BY_DZ, BY_GX, BY_GY, ROWS = range(14)
 
 
-@njit(inline="always", **OPTIONS)
+@njit(inline="always", **FAST)
 def _m(v, j):
     """h and m of ray j."""
     gx, gy = v[GX, j], v[GY, j]
@@ -29,7 +28,7 @@ def _m(v, j):
     return h, 2.0 * (v[DZ, j] - v[DX, j] * gx - v[DY, j] * gy) * h
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _reflect_some(begin, end, ray, t):
     v = np.empty((ROWS, BATCH))
     for start in range(begin, end, BATCH):
@@ -43,7 +42,7 @@ def _reflect_some(begin, end, ray, t):
             store(v[BY_TX + i], start, count, t[i])
 
 
-@njit(parallel=True, **OPTIONS)
+@njit(parallel=True, **FAST)
 def reflect(ray, t, blocks):
     """Directions t, three components, from ray: d and g, five components."""
     count = len(t[0])
@@ -51,7 +50,7 @@ def reflect(ray, t, blocks):
         _reflect_some(block * count // blocks, (block + 1) * count // blocks, ray, t)
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _pull_some(begin, end, ray, given, out):
     v = np.empty((ROWS, BATCH))
     for start in range(begin, end, BATCH):
@@ -74,14 +73,14 @@ def _pull_some(begin, end, ray, given, out):
             store(v[BY_DX + i], start, count, out[i])
 
 
-@njit(parallel=True, **OPTIONS)
+@njit(parallel=True, **FAST)
 def reflect_adjoint(ray, given, out, count, blocks):
     """Derivatives by the ray's components into `out`, from those by t, three components."""
     for block in prange(blocks):
         _pull_some(block * count // blocks, (block + 1) * count // blocks, ray, given, out)
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _push_some(begin, end, ray, along, out):
     v = np.empty((ROWS, BATCH))
     for start in range(begin, end, BATCH):
@@ -100,7 +99,7 @@ def _push_some(begin, end, ray, along, out):
             store(v[BY_TX + i], start, count, out[i])
 
 
-@njit(parallel=True, **OPTIONS)
+@njit(parallel=True, **FAST)
 def reflect_tangent(ray, along, out, count, blocks):
     """Derivatives of t into `out` along `along`, five components."""
     for block in prange(blocks):

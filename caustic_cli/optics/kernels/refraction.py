@@ -24,10 +24,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
 
 from caustic_cli.optics.kernels.bend import EXACT, SCHLICK
-from caustic_cli.optics.kernels.shares import OPTIONS
+from caustic_cli.optics.kernels.jit import FAST, njit, prange
 from caustic_cli.optics.kernels.stage import BATCH, load, store
 from caustic_cli.optics.polarisation import NORMAL
 from caustic_cli.optics.tolerances import CRITICAL
@@ -46,13 +45,13 @@ class Interface(NamedTuple):
     polarised: bool
 
 
-@njit(inline="always", **OPTIONS)
+@njit(inline="always", **FAST)
 def _load(ray, start, count, v):
     for i in range(9):
         load(ray[i], start, count, v[i])
 
 
-@njit(inline="always", **OPTIONS)
+@njit(inline="always", **FAST)
 def _snell(v, count, eta):
     """|N|^2, c, sigma, s, and 1 or 0 for whether light passes."""
     for j in range(count):
@@ -66,7 +65,7 @@ def _snell(v, count, eta):
         v[S, j], v[PASSES, j] = math.sqrt(radicand if passes else 1.0), 1.0 if passes else 0.0
 
 
-@njit(inline="always", **OPTIONS)
+@njit(inline="always", **FAST)
 def _across(v, j):
     """w, a and q of ray j."""
     dx, dy, dz, gx, gy = v[DX, j], v[DY, j], v[DZ, j], v[GX, j], v[GY, j]
@@ -74,7 +73,7 @@ def _across(v, j):
     return wx, wy, wz, v[EX, j] * wx + v[EY, j] * wy + v[EZ, j] * wz, wx * wx + wy * wy + wz * wz
 
 
-@njit(inline="always", **OPTIONS)
+@njit(inline="always", **FAST)
 def _part(v, count, polarised):
     """f."""
     for j in range(count):
@@ -85,7 +84,7 @@ def _part(v, count, polarised):
             v[F, j] = a * a / max(q, NORMAL) if q > NORMAL else 0.5
 
 
-@njit(inline="always", **OPTIONS)
+@njit(inline="always", **FAST)
 def _reflectance(v, count, eta, fresnel):
     """R and its derivatives by c, s, |N|^2 and f."""
     if fresnel == EXACT:
@@ -111,14 +110,14 @@ def _reflectance(v, count, eta, fresnel):
             v[R, j], v[R_C, j], v[R_S, j], v[R_NORM2, j], v[R_F, j] = 0.0, 0.0, 0.0, 0.0, 0.0
 
 
-@njit(inline="always", **OPTIONS)
+@njit(inline="always", **FAST)
 def _prepare(v, count, surface):
     _snell(v, count, surface.eta)
     _part(v, count, surface.polarised)
     _reflectance(v, count, surface.eta, surface.fresnel)
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _refract_some(begin, end, ray, surface, t, after, passes):
     v, eta = np.empty((ROWS, BATCH)), surface.eta
     for start in range(begin, end, BATCH):
@@ -139,7 +138,7 @@ def _refract_some(begin, end, ray, surface, t, after, passes):
             batch[j] = v[PASSES, j] > 0.0
 
 
-@njit(parallel=True, **OPTIONS)
+@njit(parallel=True, **FAST)
 def refract(ray, surface, t, after, passes, blocks):
     """Directions t, powers `after` and whether light passes (N,), from ray: d, g, P and E, nine components."""
     count = len(after)
@@ -147,7 +146,7 @@ def refract(ray, surface, t, after, passes, blocks):
         _refract_some(block * count // blocks, (block + 1) * count // blocks, ray, surface, t, after, passes)
 
 
-@njit(inline="always", **OPTIONS)
+@njit(inline="always", **FAST)
 def _pull(v, count, eta):
     """Adjoint but for f, whose derivative is left in BY_F."""
     for j in range(count):
@@ -178,7 +177,7 @@ def _pull(v, count, eta):
         v[BY_GY, j] = 2.0 * gy * by_norm2 - by_c * v[DY, j] - gamma * ty
 
 
-@njit(inline="always", **OPTIONS)
+@njit(inline="always", **FAST)
 def _pull_part(v, count):
     """Adjoint of f."""
     for j in range(count):
@@ -198,7 +197,7 @@ def _pull_part(v, count):
         v[BY_GY, j] += v[DZ, j] * bx - v[DX, j] * bz
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _pull_some(begin, end, ray, surface, given, out):
     v = np.empty((ROWS, BATCH))
     for start in range(begin, end, BATCH):
@@ -214,14 +213,14 @@ def _pull_some(begin, end, ray, surface, given, out):
             store(v[BY_DX + i], start, count, out[i])
 
 
-@njit(parallel=True, **OPTIONS)
+@njit(parallel=True, **FAST)
 def refract_adjoint(ray, surface, given, out, count, blocks):
     """Derivatives by the ray's components into `out`, from those by t and P', four components."""
     for block in prange(blocks):
         _pull_some(block * count // blocks, (block + 1) * count // blocks, ray, surface, given, out)
 
 
-@njit(inline="always", **OPTIONS)
+@njit(inline="always", **FAST)
 def _push(v, count, eta, polarised):
     """Tangents of t and P', left in their rows, from those of the ray, in the rows of its derivatives."""
     if polarised:
@@ -252,7 +251,7 @@ def _push(v, count, eta, polarised):
         v[BY_AFTER, j] = passes * (v[BY_P, j] * (1.0 - v[R, j]) - v[P, j] * d_r)
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _push_some(begin, end, ray, surface, along, out):
     v = np.empty((ROWS, BATCH))
     for start in range(begin, end, BATCH):
@@ -266,7 +265,7 @@ def _push_some(begin, end, ray, surface, along, out):
             store(v[BY_TX + i], start, count, out[i])
 
 
-@njit(parallel=True, **OPTIONS)
+@njit(parallel=True, **FAST)
 def refract_tangent(ray, surface, along, out, count, blocks):
     """Derivatives of t and P' into `out` along `along`, nine components."""
     for block in prange(blocks):

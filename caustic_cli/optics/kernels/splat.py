@@ -23,12 +23,12 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numba import njit, prange
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.kernels import blocks
-from caustic_cli.optics.kernels.shares import BINCOUNT, COSINE, GAUSSIAN, OPTIONS, shares
+from caustic_cli.optics.kernels.jit import FAST, njit, prange
+from caustic_cli.optics.kernels.shares import BINCOUNT, COSINE, GAUSSIAN, shares
 from caustic_cli.optics.kernels.stage import component, components, given, keep, kept, load, store, tangent, wanted
 from caustic_cli.optics.reconstruction import Filter, padding
 from caustic_cli.scene import Screen
@@ -78,7 +78,7 @@ def splat_rays(x: Tensor, y: Tensor, weight: Tensor, screen: Screen, filter: Fil
     return padded[2 * rx : 2 * rx + nx, 2 * ry : 2 * ry + ny], outside + padding(padded, filter.reach)
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _cut(frame):
     """A block's scratch: vectors, shares along x and y, their slopes; a column of shares and one of slopes, in steps of four."""
     v = np.zeros((VECTORS + SCRATCH, ROW))
@@ -87,19 +87,19 @@ def _cut(frame):
     return v, np.empty((vx, ROW)), np.empty((vy, ROW)), np.empty((vx, ROW)), np.empty((vy, ROW)), np.zeros(long), np.zeros(long)
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _pixels(x, low, wide, count, out):
     for j in range(count):
         out[j] = (x[j] - low) / wide
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _fraction(p, out):
     for j in range(len(out)):
         out[j] = p[j] - math.floor(p[j])
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _aim(x, y, weight, start, count, frame, v, sx, sy, dx, dy, sloping):
     """Pixel coordinates, weights and shares of one row of rays."""
     load(x, start, count, v[PX])
@@ -113,14 +113,14 @@ def _aim(x, y, weight, start, count, frame, v, sx, sy, dx, dy, sloping):
     shares(frame.kind, frame.size_y, frame.alpha_y, v[PHI], sy, dy, v[OVER_Y], v[LEAN_Y], v[VECTORS:], sloping)
 
 
-@njit(inline="always", **OPTIONS)
+@njit(inline="always", **FAST)
 def _limits(frame):
     """r along x and y, and the least and the first too large coordinate of a ray that reaches into the frame."""
     rx, ry = (frame.size_x - 1) // 2, (frame.size_y - 1) // 2
     return rx, ry, float(-rx), float(-ry), float(frame.pixels_x + rx), float(frame.pixels_y + ry)
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _scatter(v, count, frame, sx, sy, image, column):
     """Add one row's rays to the padded image; returns the weight of those outside."""
     # Everything the loop needs is a local: after a store to the image the compiler would have to read an array again.
@@ -164,7 +164,7 @@ def _scatter(v, count, frame, sx, sy, image, column):
     return outside
 
 
-@njit(parallel=True, **OPTIONS)
+@njit(parallel=True, **FAST)
 def _total(images):
     """Sum over blocks, in order."""
     total = np.empty(images.shape[1:])
@@ -176,7 +176,7 @@ def _total(images):
     return total
 
 
-@njit(parallel=True, **OPTIONS)
+@njit(parallel=True, **FAST)
 def _splat(x, y, weight, frame, images):
     """Padded image and the weight outside; images, one for each block, are overwritten."""
     rows, blocks = -(-len(x) // ROW), len(images)
@@ -191,7 +191,7 @@ def _splat(x, y, weight, frame, images):
     return _total(images), outside
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _gather(v, count, frame, sx, sy, dx, dy, grad, by_outside, column, tilt):
     """Derivatives by each ray's landing point (per mm) and weight, from those by the padded image and the weight outside.
 
@@ -248,7 +248,7 @@ def _gather(v, count, frame, sx, sy, dx, dy, grad, by_outside, column, tilt):
         by_w[j] = over * value
 
 
-@njit(parallel=True, **OPTIONS)
+@njit(parallel=True, **FAST)
 def _splat_adjoint(x, y, weight, frame, grad, by_outside, out, blocks):
     """Derivatives by x, y and weight into `out`, from those by the padded image and the weight outside."""
     rows = -(-len(x) // ROW)
@@ -262,7 +262,7 @@ def _splat_adjoint(x, y, weight, frame, grad, by_outside, out, blocks):
                 store(v[BY_X + k], i * ROW, count, out[k])
 
 
-@njit(**OPTIONS)
+@njit(**FAST)
 def _scatter_tangent(v, count, frame, sx, sy, dx, dy, image):
     """Add the tangent of one row's image, with d_x, d_y and d_W in BY_X, BY_Y and BY_W; returns that of the weight outside."""
     vx, vy, outside = frame.size_x, frame.size_y, 0.0
@@ -283,7 +283,7 @@ def _scatter_tangent(v, count, frame, sx, sy, dx, dy, image):
     return outside
 
 
-@njit(parallel=True, **OPTIONS)
+@njit(parallel=True, **FAST)
 def _splat_tangent(x, y, weight, frame, along, images):
     """Derivatives of the padded image and of the weight outside along d_x, d_y and d_W."""
     rows, blocks = -(-len(x) // ROW), len(images)

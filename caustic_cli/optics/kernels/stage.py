@@ -14,16 +14,15 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
-from caustic_cli.optics.kernels.shares import OPTIONS
+from caustic_cli.optics.kernels.jit import FAST, njit
 
 #: Rays in a batch: thirty rows of them fill the first cache.
 BATCH = 128
 
 
-@njit(inline="always", **OPTIONS)
+@njit(inline="always", **FAST)
 def load(component, start, count, out):
     """A batch of one component into a row."""
     if len(component) == 1:
@@ -35,7 +34,7 @@ def load(component, start, count, out):
             out[j] = batch[j]
 
 
-@njit(inline="always", **OPTIONS)
+@njit(inline="always", **FAST)
 def store(row, start, count, component):
     """A row into a batch of one component, if that is wanted."""
     if len(component):

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.kernels import blocks, hit, spline
+from caustic_cli.optics.kernels import batches, blocks, hit, spline
 
 
 class FusedSurface:
@@ -93,70 +93,89 @@ def next_meetings(surface: FusedSurface, heights: Tensor, o, d, below: bool, rou
 
 
 class RayHits:
-    """Where the rays of a bundle meet a height field: the fused form of `intersection.meet` by Newton's method."""
+    """Where rays known beforehand meet a height field from below: the fused form of `intersection.reference`.
 
-    def __init__(self, surface: FusedSurface, bundle: Bundle):
+    Args:
+        origin, direction: (N,) float64 each, mm, inside the aperture, and unit vectors; z of the origins may be one number.
+        radius: of a circular aperture, mm, or None.
+    """
+
+    def __init__(self, surface: FusedSurface, origin, direction, radius: float | None):
         self.surface = surface
-        su, sv = surface.scale
-        self.z = bundle.z
+        (x, y, self.z), (dx, dy, dz), (su, sv) = origin, direction, surface.scale
+        if isinstance(self.z, Tensor):
+            self.z = self.z.double().numpy()
         self.rays = tuple(t.double().contiguous().numpy() for t in
-                          (bundle.x * su + 0.5, bundle.y * sv + 0.5, torch.full_like(bundle.x, bundle.z), bundle.dx * su,
-                           bundle.dy * sv, bundle.dz))
-        self.radius = None if bundle.radius is None else bundle.radius * su
-        self.t, self.status = np.zeros(len(bundle.x)), np.zeros(len(bundle.x), np.int8)
+                          (x * su + 0.5, y * sv + 0.5, torch.empty_like(x), dx * su, dy * sv, dz))
+        self.radius = np.inf if radius is None else radius
+        self.t, self.status = np.zeros(len(x)), np.zeros(len(x), np.int8)
+        self.order, used = batches.order(*self.rays[:2], surface.geometry[0], surface.geometry[3])
+        self.batched = len(x) >= batches.CROWD * used
 
     def __call__(self, heights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Heights (n, m) mm -> distance along each ray to its hit (mm; -1 for none), dz/dx and dz/dy there, (N,) float64."""
-        return _Hits.apply(heights, self)
+        return _Hits.apply(heights, self)[:3]
 
     def find(self, heights: Tensor, start: np.ndarray | None = None) -> np.ndarray:
         """Fill t (mm) and status of every ray; returns the coefficients of the surface, counted from the heights' mean.
 
         start: distances (N,) near which the hits are, infinite for none; None if that is not known.
         """
-        h, middle = _sag(heights)
-        c = self.surface.coefficients(h)
-        self.rays[2][:] = self.z - middle
-        limits, slopes = (float(h.min()), float(h.max())), self.surface.slope_bounds(h)
-        hit.intersect(*self.rays, np.empty(0) if start is None else start, limits, slopes, c, *self.surface.geometry,
-                      self.t, self.status, blocks())
-        if self.radius is not None:  # beyond a circular aperture there is the lens' side
-            x, y, _, dx, dy, _ = self.rays
-            beyond = (x - 0.5 + self.t * dx) ** 2 + (y - 0.5 + self.t * dy) ** 2 > self.radius**2
-            beyond &= self.status == 0
-            self.t[beyond], self.status[beyond] = 0.0, 1
+        if start is None:
+            c, self.status, reach, *_ = self.search(heights)
+            self.t = np.maximum(reach, 0.0)
+            return c
+        c, limits, slopes = self._shape(heights)
+        hit.intersect(*self.rays, start, limits, slopes, c, *self.surface.geometry, self.t, self.status, blocks())
+        x, y = ((o - 0.5 + self.t * d) / s for o, d, s in zip(self.rays[:2], self.rays[3:5], self.surface.scale, strict=True))
+        beyond = (x * x + y * y > self.radius**2) & (self.status == 0)  # there is the lens' side
+        self.t[beyond], self.status[beyond] = 0.0, 1
         return c
+
+    def search(self, heights: Tensor) -> tuple[np.ndarray, ...]:
+        """Coefficients of the surface, and what `batches.meet` finds."""
+        c, *bounds = self._shape(heights)
+        out = batches.found(len(self.t))
+        batches.meet(self.order, self.batched, *self.rays, *bounds, self.radius, c, *self.surface.geometry, *self.surface.scale,
+                     *out, blocks())
+        return c, *out
+
+    def _shape(self, heights: Tensor) -> tuple:
+        """Coefficients counted from the heights' mean, from which the rays then start; limits and slopes, as of `batches.meet`."""
+        h, middle = _sag(heights)
+        self.rays[2][:] = self.z - middle
+        return self.surface.coefficients(h), (float(h.min()), float(h.max())), self.surface.slope_bounds(h)
 
 
 class _Hits(torch.autograd.Function):
     @staticmethod
     def forward(heights: Tensor, rays: RayHits):
-        c = rays.find(heights)
-        out = [torch.empty(len(rays.t), dtype=torch.float64) for _ in range(3)]
-        hit.slopes_at(*rays.rays, rays.t, rays.status, c, *rays.surface.geometry, *rays.surface.scale,
-                      *(t.numpy() for t in out), blocks())
-        return tuple(out)
+        _, _, *out = rays.search(heights)
+        return tuple(torch.from_numpy(a) for a in out)
 
     @staticmethod
     def setup_context(ctx, inputs, output):
         heights, ctx.rays = inputs
         ctx.save_for_backward(heights, *output)
         ctx.save_for_forward(heights, *output)
+        ctx.mark_non_differentiable(*output[3:])
 
     @staticmethod
     def backward(ctx, *by):
-        heights, *found = ctx.saved_tensors
-        surface = ctx.rays.surface
-        grads = surface.workspace()
-        hit.pull_back(*(g.contiguous().numpy() for g in by), *ctx.rays.rays, *(t.detach().numpy() for t in found),
-                      surface.coefficients(_sag(heights)[0]), *surface.geometry, *surface.scale, grads)
+        heights, *found, met, where = ctx.saved_tensors
+        surface, (ou, ov, _, *directions) = ctx.rays.surface, ctx.rays.rays
+        grads, none = surface.workspace(), np.empty(0)
+        batches.pull_back(met.numpy(), where.numpy(), *(g.contiguous().numpy() for g in by[:3]), ou, ov, *directions,
+                          *(t.detach().numpy() for t in found), surface.coefficients(_sag(heights)[0]), *surface.geometry,
+                          *surface.scale, grads, none, none, none)
         return surface.pull(grads).to(heights.dtype), None
 
     @staticmethod
     def jvp(ctx, tangent, *_):
-        heights, *found = ctx.saved_tensors
-        surface = ctx.rays.surface
-        out = [torch.empty(len(found[0]), dtype=torch.float64) for _ in range(3)]
-        hit.push(surface.coefficients(tangent), *ctx.rays.rays, *(t.detach().numpy() for t in found),
-                 surface.coefficients(_sag(heights)[0]), *surface.geometry, *surface.scale, *(t.numpy() for t in out), blocks())
-        return tuple(out)
+        heights, *found, met, where = ctx.saved_tensors
+        surface, (ou, ov, _, *directions), none = ctx.rays.surface, ctx.rays.rays, np.empty(0)
+        out = [torch.empty(len(met), dtype=torch.float64) for _ in range(3)]
+        batches.push(surface.coefficients(tangent), none, none, none, met.numpy(), where.numpy(), ou, ov, *directions,
+                     *(t.detach().numpy() for t in found), surface.coefficients(_sag(heights)[0]), *surface.geometry,
+                     *surface.scale, *(t.numpy() for t in out), blocks())
+        return *out, None, None

@@ -1,0 +1,539 @@
+"""CPU kernels: hits of rays, and their adjoint, by batches of rays that meet the same polynomial of the height field.
+
+    z = sum_ab c[i, j, a, b] xi^a eta^b    in the knot-span product (i, j), as in `spline`
+
+Ray by ray, every one fetches the (p + 1)(q + 1) coefficients of its own span product.  LANES rays of one span product share them:
+Horner's scheme then runs over the rays in its inner loop, without branches, as wide as the CPU's vectors are.  To find such rays
+
+    order   sorts the rays once, by where they start;
+    _group  sorts a tile of them, as often as need be, by where they hit.
+
+Newton's iteration runs in all lanes of a batch at once.  From t it goes to t' = t - f / c, and with
+
+    H_uu, H_uv, H_vv   bounds of |Z_uu|, |Z_uv|, |Z_vv| in the span product, from the coefficients
+    B = H_uu d_u^2 + 2 H_uv |d_u d_v| + H_vv d_v^2 >= |f''|    (f as in `hit`)
+
+Taylor's formula leaves |t' - t*| <= B (t - t*)^2 / 2c there.  So the step that is known to end within a rounding of the root t*
+is the last one, and f is not evaluated once more to see it; the slopes at t are those at t' where the same bounds say so.  The
+first steps take the terms of second order alone.
+
+What is not plain, ray by ray, goes to `hit._root`, which decides: rays that start outside or above, that may meet the surface more
+than once (L >= d_z), that leave by the side, that do not converge.  What is found is a function of the rays, the heights and the
+number of blocks, not of what was found before; which rays share a batch changes a hit by a rounding at most.
+
+At the hit, f(t; P, o, d) = 0 gives, with the point's move m = do + t dd at fixed t and the surface's change dZ there,
+
+    dt = (dZ + Z_x m_x + Z_y m_y - m_z) / c,    dZ_x = (dZ)_x + Z_xx (m_x + d_x dt) + Z_xy (m_y + d_y dt),
+
+whatever method found t.  In reverse, where a loss L has the derivatives L_t, L_gx, L_gy by distance and slopes,
+
+    X = Z_xx L_gx + Z_xy L_gy,  Y = Z_xy L_gx + Z_yy L_gy,    L_Z = (L_t + X d_x + Y d_y) / c,
+    L_o = (X + L_Z Z_x, Y + L_Z Z_y, -L_Z),    L_d = t L_o.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from llvmlite import ir
+from numba import carray, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from caustic_cli.optics.kernels.hit import HIT, MISSED, _leaves, _root, _value
+from caustic_cli.optics.kernels.jit import FAST, njit, prange
+from caustic_cli.optics.kernels.spline import curvatures, jet, piece, push_powers
+from caustic_cli.optics.tolerances import FEW_ULP, LEAST_COSINE
+
+#: Rays of a batch: enough to fill the vectors several times over, few enough for sums over them to stay in registers.
+LANES = 32
+#: Rays sorted at a time, in the next cache; and the largest box of span products that they may hit.
+TILE, BOX = 4096, 16_384
+#: Rays in a span product below which a batch is not worth its empty lanes, in a tile and on average.
+FEWEST, CROWD = 4, 8
+#: Rays times (p + q + 2) below which a batch's sums take longer than the rays' own, one by one.
+ALONE = 64
+#: Times that rays are handed to the next span product, steps with the terms of second order and with all terms.
+TURNS, FIRST_STEPS, STEPS = 4, 2, 5
+#: So far beyond its span product, in its widths, a polynomial is still evaluated; and so near the border hits are `_root`'s.
+BEYOND, MARGIN = 0.02, 1e-12
+
+# Where the rows of a batch's scratch begin, LANES numbers each: the rays, where they are in the span product, Horner's scheme,
+# Newton's step; in the adjoint slopes, and derivatives by distance, slopes, height and start.
+OU, OV, OZ, DU, DV, DZ, T, XI, ETA, ROW, SLOPE, HALF, Z, Z_XI, Z_ETA, H_XI, MIXED, H_ETA, G_U, G_V, BUSY, DONE = range(
+    0, 22 * LANES, LANES)
+GX, GY, BY_T, BY_U, BY_V, BY_Z, BY_X, BY_Y = range(22 * LANES, 30 * LANES, LANES)
+ROWS = 30
+# Sizes of the scratch of Horner's scheme, for value and slopes, and for second derivatives; sums kept apart of each of 8
+# coefficients.
+JET, BEND, WIDE = 7 * LANES, 11 * LANES, 8
+PATCH = 8 * WIDE
+
+
+@intrinsic
+def _stack(typing_context, size):
+    """Pointer to `size` numbers on the stack.  No array can lie there as well, so that sums over them stay in registers."""
+    if not isinstance(size, types.IntegerLiteral):
+        return None
+
+    def generate(context, builder, signature, arguments):
+        return cgutils.alloca_once(builder, ir.DoubleType(), size=size.literal_value)
+
+    return types.CPointer(types.float64)(size), generate
+
+
+@njit(**FAST)
+def order(u, v, bu, bv):
+    """Rays (N,) in order of the span products where they start, and how many of these there are."""
+    count, wide = len(u), len(bv) - 1
+    at, ends = np.empty(count, np.int32), np.zeros((len(bu) - 1) * wide + 1, np.int32)
+    for k in range(count):
+        at[k] = piece(u[k], bu) * wide + piece(v[k], bv)
+        ends[at[k] + 1] += 1
+    used = 0
+    for k in range(1, len(ends)):
+        used += ends[k] > 0
+        ends[k] += ends[k - 1]
+    out = np.empty(count, np.int32)
+    for k in range(count):
+        out[ends[at[k]]] = k
+        ends[at[k]] += 1
+    return out, used
+
+
+@njit(**FAST)
+def _group(some, count, key, low, high, ends, out):
+    """The first `count` of `some` in order of their keys, which lie from `low` to `high`, into `out`."""
+    ends[: high - low + 2] = 0
+    for k in range(count):
+        ends[key[some[k]] - low + 1] += 1
+    for k in range(1, high - low + 2):
+        ends[k] += ends[k - 1]
+    for k in range(count):
+        at = key[some[k]] - low
+        out[ends[at]] = some[k]
+        ends[at] += 1
+
+
+@njit(**FAST)
+def _bounds(c, i, j):
+    """Bounds of |z_xi xi|, |z_xi eta| and |z_eta eta| in a span product."""
+    p, q = c.shape[2], c.shape[3]
+    xx, xy, yy, power_a = 0.0, 0.0, 0.0, 1.0
+    for a in range(p):
+        power = power_a
+        for b in range(q):
+            size = abs(c[i, j, a, b]) * power
+            xx += 4.0 * a * (a - 1) * size
+            xy += 4.0 * a * b * size
+            yy += 4.0 * b * (b - 1) * size
+            power *= 0.5
+        power_a *= 0.5
+    return xx, xy, yy
+
+
+@njit(**FAST)
+def _jets(w, c, i, j):
+    """`spline.jet` in all lanes, from XI and ETA to Z, Z_XI and Z_ETA."""
+    p, q = c.shape[2], c.shape[3]
+    s = carray(_stack(JET), (JET,))
+    for k in range(LANES):
+        s[k], s[LANES + k] = w[XI + k], w[ETA + k]
+        s[4 * LANES + k], s[5 * LANES + k], s[6 * LANES + k] = 0.0, 0.0, 0.0
+    for a in range(p - 1, -1, -1):
+        top = c[i, j, a, q - 1]
+        for k in range(LANES):
+            s[2 * LANES + k], s[3 * LANES + k] = top, 0.0
+        for b in range(q - 2, -1, -1):
+            one = c[i, j, a, b]
+            for k in range(LANES):
+                eta, row = s[LANES + k], s[2 * LANES + k]
+                s[3 * LANES + k] = s[3 * LANES + k] * eta + row
+                s[2 * LANES + k] = row * eta + one
+        for k in range(LANES):
+            xi, z = s[k], s[4 * LANES + k]
+            s[5 * LANES + k] = s[5 * LANES + k] * xi + z
+            s[4 * LANES + k] = z * xi + s[2 * LANES + k]
+            s[6 * LANES + k] = s[6 * LANES + k] * xi + s[3 * LANES + k]
+    for k in range(LANES):
+        w[Z + k], w[Z_XI + k], w[Z_ETA + k] = s[4 * LANES + k], s[5 * LANES + k], s[6 * LANES + k]
+
+
+@njit(**FAST)
+def _curvatures(w, c, i, j):
+    """`spline.curvatures` in all lanes, from XI and ETA to H_XI, MIXED and H_ETA; the first and last are halves."""
+    p, q = c.shape[2], c.shape[3]
+    s = carray(_stack(BEND), (BEND,))
+    for k in range(LANES):
+        s[k], s[LANES + k] = w[XI + k], w[ETA + k]
+        s[5 * LANES + k], s[6 * LANES + k], s[7 * LANES + k] = 0.0, 0.0, 0.0
+        s[8 * LANES + k], s[9 * LANES + k], s[10 * LANES + k] = 0.0, 0.0, 0.0
+    for a in range(p - 1, -1, -1):
+        top = c[i, j, a, q - 1]
+        for k in range(LANES):
+            s[2 * LANES + k], s[3 * LANES + k], s[4 * LANES + k] = top, 0.0, 0.0
+        for b in range(q - 2, -1, -1):
+            one = c[i, j, a, b]
+            for k in range(LANES):
+                eta, row, slope = s[LANES + k], s[2 * LANES + k], s[3 * LANES + k]
+                s[4 * LANES + k] = s[4 * LANES + k] * eta + slope
+                s[3 * LANES + k] = slope * eta + row
+                s[2 * LANES + k] = row * eta + one
+        for k in range(LANES):
+            xi, z, z_xi, z_eta = s[k], s[5 * LANES + k], s[6 * LANES + k], s[8 * LANES + k]
+            s[7 * LANES + k] = s[7 * LANES + k] * xi + z_xi
+            s[6 * LANES + k] = z_xi * xi + z
+            s[5 * LANES + k] = z * xi + s[2 * LANES + k]
+            s[9 * LANES + k] = s[9 * LANES + k] * xi + z_eta
+            s[8 * LANES + k] = z_eta * xi + s[3 * LANES + k]
+            s[10 * LANES + k] = s[10 * LANES + k] * xi + s[4 * LANES + k]
+    for k in range(LANES):
+        w[H_XI + k], w[MIXED + k], w[H_ETA + k] = s[7 * LANES + k], s[9 * LANES + k], s[10 * LANES + k]
+
+
+@njit(**FAST)
+def _settle(w, size, c, i, j, ends_u, ends_v, mi, wi, mj, wj, scale_x, scale_y):
+    """Newton's iteration in all lanes, from T; DONE where it has converged in this span product, whose ends those are.
+
+    Returns in how many lanes it has not.
+    """
+    p, q = c.shape[2], c.shape[3]
+    xx, xy, yy = _bounds(c, i, j)
+    xx, xy, yy = xx * wi * wi, xy * wi * wj, yy * wj * wj
+    c0, c1, c2, c3 = c[i, j, 0, 0], c[i, j, 1, 0], c[i, j, 0, 1], c[i, j, 1, 1]
+    c4, c5 = c[i, j, 2, 0] if p > 2 else 0.0, c[i, j, 0, 2] if q > 2 else 0.0
+    for _ in range(FIRST_STEPS):
+        for k in range(LANES):
+            t, du, dv, dz = w[T + k], w[DU + k], w[DV + k], w[DZ + k]
+            xi, eta = (w[OU + k] + t * du - mi) * wi, (w[OV + k] + t * dv - mj) * wj
+            z = c0 + xi * (c1 + xi * c4 + eta * c3) + eta * (c2 + eta * c5)
+            slope = dz - (c1 + 2.0 * xi * c4 + eta * c3) * (wi * du) - (c2 + 2.0 * eta * c5 + xi * c3) * (wj * dv)
+            w[T + k] = t - (w[OZ + k] + t * dz - z) / max(slope, 0.5 * dz)
+    for k in range(LANES):
+        w[BUSY + k], w[DONE + k] = 1.0, 0.0
+    for _ in range(STEPS):
+        for k in range(LANES):
+            t = w[T + k]
+            xi, eta = (w[OU + k] + t * w[DU + k] - mi) * wi, (w[OV + k] + t * w[DV + k] - mj) * wj
+            w[BUSY + k] = w[BUSY + k] if max(abs(xi), abs(eta)) <= 0.5 + BEYOND else 0.0
+            w[XI + k], w[ETA + k] = xi, eta
+        _jets(w, c, i, j)
+        left = 0
+        for k in range(LANES):
+            t, du, dv, dz, busy = w[T + k], w[DU + k], w[DV + k], w[DZ + k], w[BUSY + k] > 0.0
+            zu, zv = w[Z_XI + k] * wi, w[Z_ETA + k] * wj
+            slope = dz - zu * du - zv * dv
+            step = (w[OZ + k] + t * dz - w[Z + k]) / slope
+            u, v = abs(du), abs(dv)
+            narrow = FEW_ULP * max(size, t)
+            bend = xx * u * u + 2.0 * xy * u * v + yy * v * v
+            turn = max((xx * u + xy * v) * scale_x, (xy * u + yy * v) * scale_y)
+            near = max(narrow, min(np.sqrt(0.5 * narrow * slope / bend), FEW_ULP / turn))
+            done = busy and abs(step) <= near and slope > 0.0
+            w[T + k] = t - step if busy else t
+            w[G_U + k] = zu if busy else w[G_U + k]
+            w[G_V + k] = zv if busy else w[G_V + k]
+            w[DONE + k] = 1.0 if done else w[DONE + k]
+            w[BUSY + k] = 1.0 if busy and not done else 0.0
+            left += 1 if busy and not done else 0
+        if left == 0:
+            break
+    left = 0
+    for k in range(LANES):
+        t = w[T + k]
+        u, v = w[OU + k] + t * w[DU + k], w[OV + k] + t * w[DV + k]
+        within = (u >= ends_u[0]) & (u < ends_u[1]) & (v >= ends_v[0]) & (v < ends_v[1]) & (t > MARGIN * size)
+        within &= (min(u, v) > MARGIN) & (max(u, v) < 1.0 - MARGIN) & (w[DONE + k] > 0.0)
+        w[DONE + k] = 1.0 if within else 0.0
+        left += 0 if within else 1
+    return left
+
+
+def found(count: int) -> tuple[np.ndarray, ...]:
+    """What `meet` finds of that many rays, to be written: status, reach, gx, gy, met, where."""
+    return (np.empty(count, np.int8), *(np.empty(count) for _ in range(3)), *(np.empty(count, np.int32) for _ in range(2)))
+
+
+@njit(inline="always", **FAST)
+def _guess(ou, ov, oz, du, dv, dz, middle, thick, c, bu, mu, wu, bv, mv, wv):
+    """About where a ray hits: on the plane through the middle of the hull, or where that is too rough, on planes below it."""
+    t = max((middle - oz) / dz, 0.0)
+    i, j = piece(ou + t * du, bu), piece(ov + t * dv, bv)
+    if thick * abs(du) * wu[i] < 0.1 * dz and thick * abs(dv) * wv[j] < 0.1 * dz:
+        return t, i, j
+    most = min(_leaves(ou, du), _leaves(ov, dv))
+    for _ in range(2):
+        t = min(max(t, 0.0), most)
+        i, j = piece(ou + t * du, bu), piece(ov + t * dv, bv)
+        xi, eta = (ou + t * du - mu[i]) * wu[i], (ov + t * dv - mv[j]) * wv[j]
+        z = c[i, j, 0, 0] + c[i, j, 1, 0] * xi + c[i, j, 0, 1] * eta
+        slope = dz - c[i, j, 1, 0] * wu[i] * du - c[i, j, 0, 1] * wv[j] * dv
+        t -= (oz + t * dz - z) / max(slope, 0.5 * dz)
+    t = min(max(t, 0.0), most)
+    return t, piece(ou + t * du, bu), piece(ov + t * dv, bv)
+
+
+@njit(parallel=True, **FAST)
+def meet(order, batched, ou, ov, oz, du, dv, dz, limits, slopes, round_, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y, status,
+         reach, gx, gy, met, where, blocks):
+    """First hits of rays (N,): status, distances (-1 for none), dz/dx and dz/dy there into status, reach, gx, gy.
+
+    order (N,): of the rays; batched: whether to look for batches; limits: least and largest control height; slopes: bounds of
+    |Z_u| and |Z_v|; round_: radius of a circular aperture, mm, or infinite.  met (N,): the rays in the order in which they were
+    met, where (N,): the span products where they hit, counted row by row, -1 for none.
+    """
+    count, wide = len(ou), len(bv) - 1
+    size, middle, thick = max(abs(limits[0]), abs(limits[1])), 0.5 * (limits[0] + limits[1]), 0.5 * (limits[1] - limits[0])
+    for block in prange(blocks):
+        w, ends = np.empty(ROWS * LANES), np.empty(BOX + 2, np.int32)
+        start, at, key = np.empty(TILE), np.empty(TILE, np.int32), np.empty(TILE, np.int32)
+        some, together, alone = np.empty(TILE, np.int32), np.empty(TILE, np.int32), np.empty(TILE, np.int32)
+        first, stop = block * count // blocks, (block + 1) * count // blocks
+        to = first
+        while first < stop:
+            last, left, lone, low, high = min(first + TILE, stop), 0, 0, np.int32(2**31 - 1), np.int32(0)
+            for k in range(first, last):
+                r = order[k]
+                u, v, safe = ou[r], ov[r], slopes[0] * abs(du[r]) + slopes[1] * abs(dv[r]) < dz[r]
+                if not (batched and safe and u >= 0.0 and u <= 1.0 and v >= 0.0 and v <= 1.0):
+                    alone[lone] = r
+                    lone += 1
+                    continue
+                t, i, j = _guess(u, v, oz[r], du[r], dv[r], dz[r], middle, thick, c, bu, mu, wu, bv, mv, wv)
+                start[left], at[left], some[left], key[left] = t, r, left, i * wide + j
+                low, high = min(low, key[left]), max(high, key[left])
+                left += 1
+            for _ in range(TURNS):
+                if left < FEWEST or high - low >= BOX:
+                    break
+                _group(some, left, key, low, high, ends, together)
+                begin, some_end, left, low, high = 0, left, 0, np.int32(2**31 - 1), np.int32(0)
+                while begin < some_end:
+                    piece_ = key[together[begin]]
+                    end, most = begin + 1, min(begin + LANES, some_end)
+                    while end < most and key[together[end]] == piece_:
+                        end += 1
+                    if end - begin < FEWEST:
+                        for k in range(begin, end):
+                            alone[lone] = at[together[k]]
+                            lone += 1
+                        begin = end
+                        continue
+                    a, b = piece_ // wide, piece_ % wide
+                    for k in range(LANES):
+                        s = together[min(begin + k, end - 1)]
+                        r = at[s]
+                        w[OU + k], w[OV + k], w[OZ + k], w[T + k] = ou[r], ov[r], oz[r], start[s]
+                        w[DU + k], w[DV + k], w[DZ + k] = du[r], dv[r], dz[r]
+                    _settle(w, size, c, a, b, (bu[a], bu[a + 1]), (bv[b], bv[b + 1]), mu[a], wu[a], mv[b], wv[b], scale_x, scale_y)
+                    for k in range(end - begin):
+                        s, t = together[begin + k], w[T + k]
+                        r = at[s]
+                        if w[DONE + k] > 0.0:
+                            met[to], where[to] = r, piece_
+                            status[r], reach[r], gx[r], gy[r] = HIT, t, w[G_U + k] * scale_x, w[G_V + k] * scale_y
+                            to += 1
+                            continue
+                        start[s] = t
+                        key[s] = piece(w[OU + k] + t * w[DU + k], bu) * wide + piece(w[OV + k] + t * w[DV + k], bv)
+                        low, high = min(low, key[s]), max(high, key[s])
+                        some[left] = s
+                        left += 1
+                    begin = end
+            for k in range(left):
+                alone[lone] = at[some[k]]
+                lone += 1
+            for k in range(lone):
+                r = alone[k]
+                slope = slopes[0] * abs(du[r]) + slopes[1] * abs(dv[r])
+                t, status[r] = _root((ou[r], ov[r], oz[r], du[r], dv[r], dz[r]), -1.0, limits, slope, c, bu, mu, wu, bv, mv, wv)
+                met[to], where[to], reach[r], gx[r], gy[r] = r, -1, -1.0, 0.0, 0.0
+                if status[r] == HIT:
+                    u, v = ou[r] + t * du[r], ov[r] + t * dv[r]
+                    _, zu, zv = _value(c, u, v, bu, mu, wu, bv, mv, wv)
+                    where[to], reach[r], gx[r], gy[r] = piece(u, bu) * wide + piece(v, bv), t, zu * scale_x, zv * scale_y
+                to += 1
+            if round_ < np.inf:  # beyond a circular aperture there is the lens' side
+                for k in range(first, last):
+                    r = met[k]
+                    x, y = (ou[r] - 0.5 + reach[r] * du[r]) / scale_x, (ov[r] - 0.5 + reach[r] * dv[r]) / scale_y
+                    if status[r] == HIT and x * x + y * y > round_ * round_:
+                        where[k], status[r], reach[r], gx[r], gy[r] = -1, MISSED, -1.0, 0.0, 0.0
+            first = last
+
+
+@njit(**FAST)
+def _tables(w, p, q, table):
+    """Tables (2 p' + 2 q', LANES), p' and q' up to a multiple of 2 and 4: the sum over lanes of by_z z + by_xi z_xi + by_eta z_eta,
+
+    differentiated by c[a, b], is that of A_a E_b + C_a D_b with E_b = eta^b, D_b = b eta^(b-1), A_a = by_z xi^a + by_xi a xi^(a-1),
+    C_a = by_eta xi^a.  by_z, by_xi, by_eta: BY_Z, BY_U, BY_V.
+    """
+    pp, qq = (p + 1) // 2 * 2, (q + 3) // 4 * 4
+    ea, ed, ec = pp * LANES, (pp + qq) * LANES, (pp + 2 * qq) * LANES
+    for k in range(LANES):
+        w[ROW + k], w[SLOPE + k] = 1.0, 0.0
+    for a in range(p):
+        at = a * LANES
+        for k in range(LANES):
+            power, slope, xi = w[ROW + k], w[SLOPE + k], w[XI + k]
+            table[at + k] = w[BY_Z + k] * power + w[BY_U + k] * slope
+            table[ec + at + k] = w[BY_V + k] * power
+            w[ROW + k], w[SLOPE + k] = power * xi, slope * xi + power
+    for k in range(LANES):
+        w[ROW + k], w[SLOPE + k] = 1.0, 0.0
+    for b in range(q):
+        at = b * LANES
+        for k in range(LANES):
+            power, slope, eta = w[ROW + k], w[SLOPE + k], w[ETA + k]
+            table[ea + at + k] = power
+            table[ed + at + k] = slope
+            w[ROW + k], w[SLOPE + k] = power * eta, slope * eta + power
+
+
+@njit(**FAST)
+def _add(table, p, q, sums):
+    """Add what `_tables` describes to sums, of every WIDE-th lane: (p' / 2, q' / 4, 8, WIDE), 2 x 4 coefficients at a time."""
+    pp, qq = (p + 1) // 2 * 2, (q + 3) // 4 * 4
+    s = carray(_stack(PATCH), (PATCH,))
+    for a in range(0, pp, 2):
+        for b in range(0, qq, 4):
+            at_a, at_e, at_d, at_c = a * LANES, (pp + b) * LANES, (pp + qq + b) * LANES, (pp + 2 * qq + a) * LANES
+            for m in range(PATCH):
+                s[m] = 0.0
+            for k in range(0, LANES, WIDE):
+                for m in range(WIDE):
+                    v = k + m
+                    a0, a1, c0, c1 = table[at_a + v], table[at_a + LANES + v], table[at_c + v], table[at_c + LANES + v]
+                    e0, e1, e2, e3 = (table[at_e + v], table[at_e + LANES + v], table[at_e + 2 * LANES + v],
+                                      table[at_e + 3 * LANES + v])
+                    d0, d1, d2, d3 = (table[at_d + v], table[at_d + LANES + v], table[at_d + 2 * LANES + v],
+                                      table[at_d + 3 * LANES + v])
+                    s[m] += a0 * e0 + c0 * d0
+                    s[WIDE + m] += a0 * e1 + c0 * d1
+                    s[2 * WIDE + m] += a0 * e2 + c0 * d2
+                    s[3 * WIDE + m] += a0 * e3 + c0 * d3
+                    s[4 * WIDE + m] += a1 * e0 + c1 * d0
+                    s[5 * WIDE + m] += a1 * e1 + c1 * d1
+                    s[6 * WIDE + m] += a1 * e2 + c1 * d2
+                    s[7 * WIDE + m] += a1 * e3 + c1 * d3
+            to = (a // 2 * (qq // 4) + b // 4) * PATCH
+            for m in range(PATCH):
+                sums[to + m] += s[m]
+
+
+@njit(**FAST)
+def _finish(sums, grad, i, j):
+    """Add the sums over all lanes to the derivatives (I, J, p + 1, q + 1), and begin anew."""
+    p, q = grad.shape[2], grad.shape[3]
+    wide = (q + 3) // 4
+    for a in range(p):
+        for b in range(q):
+            to, total = (a // 2 * wide + b // 4) * PATCH + (a % 2 * 4 + b % 4) * WIDE, 0.0
+            for m in range(WIDE):
+                total += sums[to + m]
+            grad[i, j, a, b] += total
+    sums[:] = 0.0
+
+
+@njit(parallel=True, **FAST)
+def pull_back(met, where, by_t, by_gx, by_gy, ou, ov, du, dv, dz, t, gx, gy, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y, grads,
+              by_ox, by_oy, by_oz):
+    """Adjoint of `meet`: derivatives by the coefficients (blocks, I, J, p + 1, q + 1), overwritten, and by the rays' starts.
+
+    by_*: derivatives by distance and slopes (N,); met, where, t, gx, gy: as `meet` found them, t its reach; grads may have no
+    coefficients, and by_ox, by_oy, by_oz (N,), per mm, no rays, if these are not asked for.
+    """
+    count, blocks, p, q, wide = len(t), len(grads), c.shape[2], c.shape[3], len(bv) - 1
+    nets, starts = grads.shape[1] > 0, len(by_ox) > 0
+    for block in prange(blocks):
+        w, grad, powers = np.zeros(ROWS * LANES), grads[block], np.empty((2, q))
+        grad[:] = 0.0
+        pp, qq = (p + 1) // 2 * 2, (q + 3) // 4 * 4
+        table, sums = np.zeros(2 * (pp + qq) * LANES), np.zeros(pp * qq * WIDE)
+        begin, stop = block * count // blocks, (block + 1) * count // blocks
+        summed = False
+        while begin < stop:
+            if where[begin] < 0:
+                if starts:
+                    by_ox[met[begin]], by_oy[met[begin]], by_oz[met[begin]] = 0.0, 0.0, 0.0
+                begin += 1
+                continue
+            end, most, a, b = begin + 1, min(begin + LANES, stop), where[begin] // wide, where[begin] % wide
+            while end < most and where[end] == where[begin]:
+                end += 1
+            wi, wj, mi, mj = wu[a], wv[b], mu[a], mv[b]
+            if not summed and (end - begin) * (p + q) < ALONE:
+                for k in range(begin, end):
+                    r = met[k]
+                    xi, eta = (ou[r] + t[r] * du[r] - mi) * wi, (ov[r] + t[r] * dv[r] - mj) * wj
+                    xx, xy, yy = curvatures(c, a, b, xi, eta)
+                    xx, xy, yy = xx * wi * wi, xy * wi * wj, yy * wj * wj
+                    by_u, by_v = by_gx[r] * scale_x, by_gy[r] * scale_y
+                    by_x, by_y = by_u * xx + by_v * xy, by_u * xy + by_v * yy
+                    cosine = max(dz[r] - gx[r] * du[r] / scale_x - gy[r] * dv[r] / scale_y, LEAST_COSINE)
+                    by_z = (by_t[r] + by_x * du[r] + by_y * dv[r]) / cosine
+                    if nets:
+                        push_powers(grad, a, b, xi, eta, by_z, by_u * wi, by_v * wj, powers)
+                    if starts:
+                        by_ox[r], by_oy[r], by_oz[r] = by_x * scale_x + by_z * gx[r], by_y * scale_y + by_z * gy[r], -by_z
+                begin = end
+                continue
+            for k in range(LANES):
+                r, here = met[min(begin + k, end - 1)], 1.0 if k < end - begin else 0.0
+                w[OU + k], w[OV + k], w[T + k], w[GX + k], w[GY + k] = ou[r], ov[r], t[r], gx[r], gy[r]
+                w[DU + k], w[DV + k], w[DZ + k] = du[r], dv[r], dz[r]
+                w[BY_T + k], w[BY_U + k], w[BY_V + k] = here * by_t[r], here * by_gx[r], here * by_gy[r]
+            for k in range(LANES):
+                w[XI + k] = (w[OU + k] + w[T + k] * w[DU + k] - mi) * wi
+                w[ETA + k] = (w[OV + k] + w[T + k] * w[DV + k] - mj) * wj
+            _curvatures(w, c, a, b)
+            for k in range(LANES):
+                xx, xy, yy = 2.0 * w[H_XI + k] * wi * wi, w[MIXED + k] * wi * wj, 2.0 * w[H_ETA + k] * wj * wj
+                by_u, by_v = w[BY_U + k] * scale_x, w[BY_V + k] * scale_y
+                by_x, by_y = by_u * xx + by_v * xy, by_u * xy + by_v * yy
+                cosine = max(w[DZ + k] - w[GX + k] / scale_x * w[DU + k] - w[GY + k] / scale_y * w[DV + k], LEAST_COSINE)
+                by_z = (w[BY_T + k] + by_x * w[DU + k] + by_y * w[DV + k]) / cosine
+                w[BY_Z + k], w[BY_U + k], w[BY_V + k] = by_z, by_u * wi, by_v * wj
+                w[BY_X + k], w[BY_Y + k] = by_x * scale_x + by_z * w[GX + k], by_y * scale_y + by_z * w[GY + k]
+            if starts:
+                for k in range(end - begin):
+                    r = met[begin + k]
+                    by_ox[r], by_oy[r], by_oz[r] = w[BY_X + k], w[BY_Y + k], -w[BY_Z + k]
+            if nets:
+                _tables(w, p, q, table)
+                _add(table, p, q, sums)
+                summed = end < stop and where[end] == where[begin]
+                if not summed:
+                    _finish(sums, grad, a, b)
+            begin = end
+
+
+@njit(parallel=True, **FAST)
+def push(change, move_x, move_y, move_z, met, where, ou, ov, du, dv, dz, t, gx, gy, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y,
+         out_t, out_x, out_y, blocks):
+    """Tangents of the distances and slopes that `meet` found, into out_t, out_x, out_y (N,).
+
+    change: of the coefficients; move_x, move_y, move_z (N,): of the rays' points that hit, at fixed t, mm; either may be empty.
+    """
+    count, wide = len(t), len(bv) - 1
+    nets, moves = change.shape[0] > 0, len(move_x) > 0
+    for block in prange(blocks):
+        for k in range(block * count // blocks, (block + 1) * count // blocks):
+            r = met[k]
+            out_t[r], out_x[r], out_y[r] = 0.0, 0.0, 0.0
+            if where[k] < 0:
+                continue
+            i, j = where[k] // wide, where[k] % wide
+            xi, eta = (ou[r] + t[r] * du[r] - mu[i]) * wu[i], (ov[r] + t[r] * dv[r] - mv[j]) * wv[j]
+            uu, uv, vv = curvatures(c, i, j, xi, eta)
+            uu, uv, vv = uu * wu[i] * wu[i], uv * wu[i] * wv[j], vv * wv[j] * wv[j]
+            z, zu, zv, x, y = 0.0, 0.0, 0.0, 0.0, 0.0
+            if nets:
+                z, zu, zv = jet(change, i, j, xi, eta)
+            if moves:
+                x, y = move_x[r], move_y[r]
+                z += gx[r] * x + gy[r] * y - move_z[r]
+            along = z / max(dz[r] - gx[r] * du[r] / scale_x - gy[r] * dv[r] / scale_y, LEAST_COSINE)
+            u, v = x * scale_x + along * du[r], y * scale_y + along * dv[r]
+            out_t[r] = along
+            out_x[r], out_y[r] = (zu * wu[i] + uu * u + uv * v) * scale_x, (zv * wv[j] + uv * u + vv * v) * scale_y

@@ -1,0 +1,159 @@
+"""Where rays of any origin meet a height field, differentiable by the rays as well as by the heights.
+
+Of `surface.RayHits`, rays begin inside the aperture and below the surface, wherever a source puts them once and for all.  Behind
+another surface their origin o and direction d depend on that surface, and o may lie beyond this one's aperture: a long way off, a
+ray comes in at an angle.  So each is first taken to where it enters the
+
+    box    aperture x [a little below the least control height, infinity)
+
+and t is counted from o nevertheless.  The search and the derivatives are those of `batches`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from caustic_cli.optics.kernels import batches, blocks
+from caustic_cli.optics.kernels.jit import FAST, njit, prange
+from caustic_cli.optics.kernels.surface import FusedSurface, _sag
+
+#: What the box's floor lies below the least height, in heights of the hull and in widths of the aperture.
+BELOW = 0.01, 1e-3
+
+
+def hits_of_rays(surface: FusedSurface, heights: Tensor, origin: tuple[Tensor, Tensor, Tensor],
+                 direction: tuple[Tensor, Tensor, Tensor], *, side: float = 1.0, radius: float | None = None,
+                 rectangle: bool = True) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """First hits of rays, in the surface's own frame.
+
+    Args:
+        heights: (n, m) mm.
+        origin, direction: (N,) float64 each, mm, and unit vectors; side * d_z > 0, any other ray misses.
+        side: 1 for rays from below, -1 for rays from above.
+        radius: hits farther than this from the axis (mm) do not count; None for no such limit.
+        rectangle: the surface goes on beyond `radius`, to the edges of its net, and stops the light there.  If not, it ends at
+            `radius`, and rays pass through where there is none; which needs a radius.
+
+    Returns:
+        t, mm, 0 where there is no hit; dz/dx, dz/dy there; found, bool.  (N,) each; t and slopes are differentiable once, in either
+        mode, by heights, origin and direction.  A ray that starts on the surface or beyond it misses.
+    """
+    if not rectangle and radius is None:
+        raise ValueError("a surface that is not a rectangle needs a radius")
+    limit = np.inf if radius is None else float(radius)
+    if side > 0:
+        return _HitsOfRays.apply(heights, *origin, *direction, surface, limit, rectangle)[:4]
+    (ox, oy, oz), (dx, dy, dz) = origin, direction
+    t, gx, gy, found, *_ = _HitsOfRays.apply(-heights, ox, oy, -oz, dx, dy, -dz, surface, limit, rectangle)
+    return t, -gx, -gy, found
+
+
+@njit(inline="always", **FAST)
+def _stretch(o, d, first, last):
+    """The part of [first, last] in which o + t d lies in [0, 1]."""
+    if d > 0.0:
+        return max(first, -o / d), min(last, (1.0 - o) / d)
+    if d < 0.0:
+        return max(first, (1.0 - o) / d), min(last, -o / d)
+    return (first, last) if o >= 0.0 and o <= 1.0 else (np.inf, -np.inf)
+
+
+@njit(parallel=True, **FAST)
+def enter(ou, ov, oz, du, dv, dz, floor, circle, scale_x, scale_y, way, blocks):
+    """Take rays (N,) to where they enter the box, ou, ov, oz overwritten; way (N,): how far that is.
+
+    floor: of the box, mm; circle: radius of the aperture, mm, or infinite.  A ray that never enters is put beside the aperture.
+    """
+    count = len(ou)
+    for block in prange(blocks):
+        for k in range(block * count // blocks, (block + 1) * count // blocks):
+            first, last = _stretch(ou[k], du[k], 0.0, np.inf)
+            first, last = _stretch(ov[k], dv[k], first, last)
+            if circle < np.inf:
+                x, y, dx, dy = (ou[k] - 0.5) / scale_x, (ov[k] - 0.5) / scale_y, du[k] / scale_x, dv[k] / scale_y
+                a, b, beyond = dx * dx + dy * dy, x * dx + y * dy, x * x + y * y - circle * circle
+                root = b * b - a * beyond
+                if root >= 0.0 and a > 0.0:  # the roots by sums without cancellation
+                    far = -b - np.sqrt(root) if b > 0.0 else -b + np.sqrt(root)
+                    one, two = far / a, beyond / far if far != 0.0 else 0.0
+                    first, last = max(first, min(one, two)), min(last, max(one, two))
+                elif beyond > 0.0:
+                    last = -np.inf
+            way[k] = 0.0
+            if not (first <= last and dz[k] > 0.0):
+                ou[k] = -1.0
+                continue
+            t = max(first, min((floor - oz[k]) / dz[k], last))
+            if t > 0.0:
+                ou[k], ov[k] = min(max(ou[k] + t * du[k], 0.0), 1.0), min(max(ov[k] + t * dv[k], 0.0), 1.0)
+                oz[k] += t * dz[k]
+                way[k] = t
+
+
+def _rays(surface: FusedSurface, o, d) -> tuple[np.ndarray, ...]:
+    """o, d mm -> o_u, o_v, o_z, d_u, d_v, d_z, float64."""
+    (su, sv), (ox, oy, oz), (dx, dy, dz) = surface.scale, o, d
+    return tuple(c.detach().double().contiguous().numpy() for c in (ox * su + 0.5, oy * sv + 0.5, oz, dx * su, dy * sv, dz))
+
+
+class _HitsOfRays(torch.autograd.Function):
+    @staticmethod
+    def forward(heights: Tensor, ox: Tensor, oy: Tensor, oz: Tensor, dx: Tensor, dy: Tensor, dz: Tensor, surface: FusedSurface,
+                radius: float, rectangle: bool):
+        h, middle = _sag(heights)
+        low, high = float(h.min()), float(h.max())
+        rays, way, n = _rays(surface, (ox, oy, oz - middle), (dx, dy, dz)), np.empty(len(ox)), blocks()
+        floor = low - max(BELOW[0] * (high - low), BELOW[1] / min(surface.scale))
+        enter(*rays, floor, np.inf if rectangle else radius, *surface.scale, way, n)
+        order, used = batches.order(*rays[:2], surface.geometry[0], surface.geometry[3])
+        status, *out = batches.found(len(way))
+        top = high + 1e-6 * (high - low)  # above what touches the hull's top, by whatever rounding
+        batches.meet(order, len(way) >= batches.CROWD * used, *rays, (low, top), surface.slope_bounds(h), radius,
+                     surface.coefficients(h), *surface.geometry, *surface.scale, status, *out, n)
+        reach, gx, gy, met, where = (torch.from_numpy(a) for a in out)
+        t = torch.from_numpy(way) + reach
+        found = torch.from_numpy(status == batches.HIT) & (t > 0.0)
+        zero = torch.zeros((), dtype=torch.float64)
+        where = torch.where(found[met], where, -1)
+        return *(torch.where(found, c, zero) for c in (t, gx, gy)), found, met, where
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        *tensors, ctx.surface, _, _ = inputs
+        ctx.save_for_backward(*tensors, *output)
+        ctx.save_for_forward(*tensors, *output)
+        ctx.mark_non_differentiable(*output[3:])
+
+    @staticmethod
+    def backward(ctx, *by):
+        heights, ox, oy, oz, dx, dy, dz, t, gx, gy, _, met, where = ctx.saved_tensors
+        surface, wanted = ctx.surface, ctx.needs_input_grad
+        ou, ov, _, *directions = _rays(surface, (ox, oy, oz), (dx, dy, dz))
+        c = surface.coefficients(_sag(heights)[0])
+        grads = surface.workspace() if wanted[0] else np.empty((blocks(), 0, *c.shape[1:]))
+        starts = [torch.empty(len(t) if any(wanted[1:7]) else 0, dtype=torch.float64) for _ in range(3)]
+        batches.pull_back(met.numpy(), where.numpy(), *(b.double().contiguous().numpy() for b in by[:3]), ou, ov, *directions,
+                          *(a.detach().numpy() for a in (t, gx, gy)), c, *surface.geometry, *surface.scale, grads,
+                          *(a.numpy() for a in starts))
+        out = [surface.pull(grads).to(heights.dtype) if wanted[0] else None]
+        out += [a if w else None for a, w in zip(starts, wanted[1:4], strict=True)]
+        out += [t * a if w else None for a, w in zip(starts, wanted[4:7], strict=True)]
+        return *out, None, None, None
+
+    @staticmethod
+    def jvp(ctx, *tangents):
+        heights, ox, oy, oz, dx, dy, dz, t, gx, gy, _, met, where = ctx.saved_tensors
+        surface, by_heights, moves = ctx.surface, tangents[0], [np.empty(0)] * 3
+        ou, ov, _, *directions = _rays(surface, (ox, oy, oz), (dx, dy, dz))
+        c = surface.coefficients(_sag(heights)[0])
+        change = np.empty((0, *c.shape[1:])) if by_heights is None else surface.coefficients(by_heights)
+        if any(m is not None for m in tangents[1:7]):
+            none = torch.zeros_like(t)
+            starts, turns = ([none if m is None else m for m in tangents[k : k + 3]] for k in (1, 4))
+            moves = [(o + t.detach() * d).detach().double().contiguous().numpy() for o, d in zip(starts, turns, strict=True)]
+        out = [torch.empty_like(t) for _ in range(3)]
+        batches.push(change, *moves, met.numpy(), where.numpy(), ou, ov, *directions, *(a.detach().numpy() for a in (t, gx, gy)), c,
+                     *surface.geometry, *surface.scale, *(a.numpy() for a in out), blocks())
+        return *out, None, None, None
