@@ -117,6 +117,7 @@ class Numba(Torch):
         if not isinstance(slopes[0], Tensor):
             return super().interact(direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, polarised=polarised,
                                     side=side)
+        direction, polarised = _components(direction), None if polarised is None else _components(polarised)
         return Departure(*interact(direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, field=polarised))
 
     def land(self, origin, direction, point, axes, forward: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -134,6 +135,11 @@ class Numba(Torch):
     def ray_image(self, field, rays: RayState, eta: float, fresnel: str, radius: float | None, like: RayImage | None) -> RayImage:
         """The fused kernel of any rays below a B-spline."""
         return RayImage(field, rays, eta, fresnel, radius, like)
+
+
+def _components(vector) -> tuple:
+    """Components as tensors (N,) or plain floats."""
+    return tuple(float(c) if isinstance(c, Tensor) and c.ndim == 0 else c for c in vector)
 
 
 class PlaneImage:

@@ -81,7 +81,7 @@ def _stack(typing_context, size):
     return types.CPointer(types.float64)(size), generate
 
 
-@njit(**FAST)
+@njit(entry=True, **FAST)
 def order(u, v, bu, bv):
     """Rays (N,) in order of the span products where they start, and how many of these there are."""
     count, wide = len(u), len(bv) - 1

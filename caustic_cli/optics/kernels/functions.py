@@ -139,7 +139,8 @@ def _splat(nets, rows, apart: bool, rays, interface: tuple[float, str], height: 
                                    "off_screen": ledger[plane.OFF_SCREEN] + padding(padded.detach(), filter.reach)}
 
 
-def _arguments(rays, interface: tuple[float, str], height: float, start: float, screen: Screen, filter: Filter) -> tuple[bool, tuple]:
+def _arguments(rays, interface: tuple[float, str], height: float, start: float, screen: Screen,
+               filter: Filter) -> tuple[bool, tuple]:
     """Whether rays are slanted, and what `plane` takes after the nets."""
     eta, fresnel = interface
     slanted = rays[2].shape == rays[0].shape

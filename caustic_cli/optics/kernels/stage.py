@@ -4,8 +4,6 @@ A component of all rays is an array (N,), or (1,) where it is one number for all
 that nobody wants is an array (0,).  Kernels copy a batch of rays into rows of a small scratch that stays in the first cache, and
 loop over these rows: their distances are known when compiling, so the loops turn into vector instructions without any check for
 overlaps.  Everything is float64.
-
-Numba caches the kernels of each stage by that file's time stamp alone: after editing here, touch interact.py and land.py.
 """
 
 from __future__ import annotations
