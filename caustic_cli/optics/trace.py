@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -121,7 +122,6 @@ class Tracer:
                 self.before.append(meeting)
                 state, self.first = meeting.state, self.first + 1
         self.start = state
-        self.meets = self._prepared()
         self.fused = None if requests.stages else self._lowered(like)
 
     def __call__(self, parameters: Parameters) -> list[RayState]:
@@ -293,7 +293,8 @@ class Tracer:
         moved = tuple(torch.as_tensor(c + way * v, dtype=torch.float64).expand(state.power.shape) for c, v in zip(o, d, strict=True))
         return moved, replace(state, path=state.path + self.media[0].index_at(state.wavelength) * way)
 
-    def _prepared(self):
+    @cached_property
+    def meets(self):
         """How the rays of `start` meet the first free surface: a function of its heights to `Hit`s; None for the general way."""
         if self.first == len(self.system.elements) or self.requests.off & {"intersection"}:
             return None
