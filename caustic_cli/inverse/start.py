@@ -32,7 +32,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.inverse.laguerre import prices
 from caustic_cli.inverse.transport import Transport, corners, solve
 from caustic_cli.optics.backends import backend_for
-from caustic_cli.optics.system import IDENTITY
+from caustic_cli.optics.frames import IDENTITY
 
 EVEN = 2.0  # cells over which e is smoothed: at a kink of phi the rays miss by the spline's own width, which is no error of T
 ENOUGH = 0.05  # pixels of e, root mean square, that are left alone

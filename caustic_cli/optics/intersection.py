@@ -19,17 +19,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from caustic_cli.optics.backends import backend_for
+from caustic_cli.optics.surfaces.base import Hit, Surface
 from caustic_cli.optics.tolerances import FEW_ULP, FINEST, LEAST_COSINE, MOST_PROBES, MOST_STEPS
 from caustic_cli.scene import checks
-
-if TYPE_CHECKING:
-    from caustic_cli.optics.surfaces.base import Hit, Surface
 
 METHODS = ("newton", "mesh", "mesh+newton")
 
@@ -62,8 +60,6 @@ class Method:
 
 def meet_any(surface: Surface, heights: Tensor | None, origin, direction, side: float, radius: float | None = None) -> Hit:
     """`Surface.meet` for any surface, in plain torch."""
-    from caustic_cli.optics.surfaces.base import Hit  # noqa: PLC0415 - surfaces know intersections
-
     t, status = reference(surface, heights, origin, direction, side, radius)
     found = status == Status.HIT
     t, gx, gy = attach(surface, heights, origin, direction, t, found)
@@ -81,7 +77,7 @@ def attach(surface: Surface, heights: Tensor | None, origin, direction, t: Tenso
     x, y, z_ray = ox + t * dx, oy + t * dy, (oz - middle) + t * dz
     at = tuple(_primal(torch.as_tensor(c)).double().expand(t.shape) for c in (x, y))
     inside = tuple(c.clamp(-r, r) for c, r in zip(at, surface.half_size, strict=True))
-    z, gx, gy = spline_or_any(surface, sag, *inside)
+    z, gx, gy = surface.evaluate(sag, *inside)
     if not torch.is_grad_enabled():
         return t, torch.where(found, gx, torch.zeros_like(t)), torch.where(found, gy, torch.zeros_like(t))
     with torch.no_grad():
@@ -102,22 +98,10 @@ def _primal(value: Tensor) -> Tensor:
     return forward_ad.unpack_dual(value).primal.detach()
 
 
-def spline_or_any(surface: Surface, heights: Tensor | None, x: Tensor, y: Tensor) -> list[Tensor]:
-    """Z, Z_x, Z_y at fixed points, linear in the heights; of a B-spline by the backend of its device."""
-    from caustic_cli.optics.backends import backend_for  # noqa: PLC0415
-    from caustic_cli.optics.surfaces.heightfield import HeightField  # noqa: PLC0415
-
-    if isinstance(surface, HeightField):
-        return list(backend_for(x.device).spline_at(surface, heights, x, y))
-    return surface.at(heights, x, y)
-
-
 @torch.no_grad()
 def find(field, heights: Tensor, origin, direction, method: Method | None = None,
          radius: float | None = None) -> tuple[Tensor, Tensor]:
     """t (N,) float64 of the first hit, from below, of rays with a B-spline, and its `Status` (N,), by a method."""
-    from caustic_cli.optics.backends import backend_for  # noqa: PLC0415
-
     return backend_for(heights.device).find(field, heights, origin, direction, method or Method(), radius)
 
 

@@ -117,7 +117,7 @@ class RayState:
         return cls((x, y, z), (0.0, 0.0, 1.0), sample.share, sample=sample)
 
     def spread(self) -> RayState:
-        """The same with x, y and power (N,): those of a sample are kept as rows, columns and a number until a ray goes its own way."""
+        """The same with x, y and power (N,): of a sample they are rows, columns and a number until rays go their own ways."""
         if self.sample is None:
             return self
         shape = self.sample.shape

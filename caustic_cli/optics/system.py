@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 from caustic_cli.errors import InputError
+from caustic_cli.optics.frames import Pose
 from caustic_cli.optics.surfaces import HeightField, Plane, Surface
 from caustic_cli.scene import Light, Pupil, Scene, Screen, Source, checks
 from caustic_cli.scene.lens import FRESNEL
@@ -24,9 +24,6 @@ from caustic_cli.scene.materials import refractive_index
 INTERACTIONS = ("refract", "reflect")
 #: Names of the elements of a one-lens scene.
 ENTRANCE, EXIT = "entrance", "exit"
-IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-
-Axes = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 
 
 @dataclass(frozen=True)
@@ -53,27 +50,6 @@ class Medium:
 
 
 AIR = Medium()
-
-
-@dataclass(frozen=True)
-class Pose:
-    """Where an element stands: its origin, mm, and right-handed turns first about its x, then about its y axis, degrees."""
-
-    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    tilt: tuple[float, float] = (0.0, 0.0)
-
-    @cached_property
-    def axes(self) -> Axes:
-        """Unit vectors along its x, y and z."""
-        if not any(self.tilt):
-            return IDENTITY
-        (sa, ca), (sb, cb) = ((math.sin(t), math.cos(t)) for t in map(math.radians, self.tilt))
-        return (cb, 0.0, -sb), (sb * sa, ca, cb * sa), (sb * ca, -sa, cb * ca)
-
-    @property
-    def upright(self) -> bool:
-        """Whether nothing is tilted."""
-        return not any(self.tilt)
 
 
 @dataclass(frozen=True)

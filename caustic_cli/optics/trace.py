@@ -9,7 +9,8 @@
     depart    what effects do behind it
     detours   light that goes another way than straight on, after the walk: ghosts, second meetings
 
-Elements before the first surface that a design may shape do not depend on any heights: they are walked once, when a `Tracer` is made.
+Elements before the first surface that a design may shape do not depend on any heights: they are walked once, when a `Tracer` is
+made.
 What follows is *lowered* where it is one B-spline, upright, between the rays and an upright screen, with no effect but Snell's and
 Fresnel's: that runs as one fused kernel (`_lowered` is the only place that knows).  All else goes through the stages of the
 device's backend.
@@ -30,13 +31,14 @@ from caustic_cli.errors import InputError
 from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.effects import EFFECTS, NO_REQUESTS, Action, Requests
 from caustic_cli.optics.emission import Rays, rays_of
+from caustic_cli.optics.frames import IDENTITY, Pose, advanced, into, out_of, turned, turned_back
 from caustic_cli.optics.image import Image
 from caustic_cli.optics.rays import LOSSES, RayState, Status
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.shortage import with_less
 from caustic_cli.optics.surfaces import HeightField, Hit
-from caustic_cli.optics.system import EXIT, IDENTITY, Element, Placed, Pose, System
+from caustic_cli.optics.system import EXIT, Element, Placed, System
 from caustic_cli.scene import Scene, Screen
 
 Parameters = Mapping[str, Tensor]
@@ -210,45 +212,37 @@ class Tracer:
 
     def _meet(self, m: Meeting, heights: Tensor | None) -> None:
         """Carry the rays of a meeting to the surface."""
-        k, element = m.index, m.element
-        started = m.state is getattr(self, "start", None)
-        if k == self.first and m.forward and heights is not None:
-            datum = element.pose.position[2] + element.surface.centred(heights)[1]
-            state = m.state.counted_from(datum)
-        else:
-            state = replace(m.state, lost=dict(m.state.lost))
-        prepared = self.meets if started else None
+        element = m.element
+        prepared = self.meets if m.state is getattr(self, "start", None) else None  # for the rays that it was prepared for
+        state = replace(m.state, lost=dict(m.state.lost))
+        if m.index == self.first and m.forward and heights is not None:
+            state = state.counted_from(element.pose.position[2] + element.surface.centred(heights)[1])
         if self._at_pupil(m):
             o, d = into(element.pose, state.origin, state.direction, state.datum)
-            m.state, m.local, m.incoming, m.slopes = state, tuple(o), tuple(d), (0.0, 0.0)
+            m.state, m.local, m.incoming, m.slopes = state, o, d, (0.0, 0.0)
             return
         state = state.spread()
         o, d = into(element.pose, state.origin, state.direction, state.datum)
-        if k == 0 and m.forward and prepared is None and self.system.lit is None and not element.surface.flat:
+        if m.index == 0 and m.forward and prepared is None and self.system.lit is None and not element.surface.flat:
             o, state = self._backed_up(o, d, state, element, heights)
         hit = next((h for a in self.actions if (h := a.meet(m, o, d, heights)) is not None), None)
         if hit is None:
             hit = prepared(heights) if prepared else element.surface.meet(heights, o, d, m.side, element.aperture.radius)
-        t = hit.t
         if state.power.dtype != self.dtype:  # the first surface is met in float64 whatever follows
-            t, hit = t.to(self.dtype), Hit(hit.t.to(self.dtype), *(g.to(self.dtype) if isinstance(g, Tensor) else g for g in hit[1:3]),
-                                           hit.found)
-            state = state.to(self.dtype)
-            o, d = ([c.to(self.dtype) if isinstance(c, Tensor) else c for c in v] for v in (o, d))
-        m.local, m.incoming, m.slopes, m.length = advanced(o, d, t), tuple(d), (hit.gx, hit.gy), t
-        found = hit.found
-        if prepared is None:
-            covers = element.aperture.half_size == element.surface.half_size and not element.aperture.round
-            if not covers:
-                found = found & element.aperture.holds(*m.local[:2])
-        if prepared is None or state.sample is None:
+            state, hit = state.to(self.dtype), Hit(*(_cast(c, self.dtype) for c in hit[:3]), hit.found)
+            o, d = (tuple(_cast(c, self.dtype) for c in v) for v in (o, d))
+        m.local, m.incoming, m.slopes, m.length = advanced(o, d, hit.t), d, (hit.gx, hit.gy), hit.t
+        if prepared is None or state.sample is None:  # a sample stands on the surface
+            found, aperture = hit.found, element.aperture
+            if prepared is None and (aperture.round or aperture.half_size != element.surface.half_size):
+                found = found & aperture.holds(*m.local[:2])
             kept = torch.where(found, state.power, torch.zeros_like(state.power))
             state.lose("missed_surface", (state.power - kept).detach())
             if self.track:
-                state.mark(~found & (state.power > 0) if k else ~found, Status.MISSED_SURFACE)
+                state.mark(~found, Status.MISSED_SURFACE)
             state.power = kept
         state.origin = out_of(element.pose, m.local, state.datum)
-        state.path = state.path + m.n_in * t
+        state.path = state.path + m.n_in * hit.t
         m.state = state
 
     def _interact(self, m: Meeting) -> Tensor:
@@ -280,8 +274,10 @@ class Tracer:
     def _at_pupil(self, m: Meeting) -> bool:
         """Whether the rays stand on this flat first element as they come from their source, which has left out all that miss it."""
         e, pupil, z = m.element, self.system.pupil, m.state.origin[2]
-        return (m.index == 0 and isinstance(z, float) and z + m.state.datum == pupil.z and m.forward and e.surface.flat and e.pose.upright and e.pose.position == (0.0, 0.0, pupil.z)
-                and e.aperture.half_size == pupil.half_size and e.aperture.round == pupil.round)
+        if m.index or not m.forward or not isinstance(z, float) or z + m.state.datum != pupil.z:
+            return False
+        return (e.surface.flat and e.pose.upright and e.pose.position == (0.0, 0.0, pupil.z)
+                and (e.aperture.half_size, e.aperture.round) == (pupil.half_size, pupil.round))
 
     def _backed_up(self, o, d, state: RayState, element: Element, heights) -> tuple[tuple, RayState]:
         """Rays of a pupil that the first surface reaches through, from before it."""
@@ -290,8 +286,9 @@ class Tracer:
         if back == 0.0:
             return o, state
         way = -back * (1.0 + 1e-9) / d[2]
-        moved = tuple(torch.as_tensor(c + way * v, dtype=torch.float64).expand(state.power.shape) for c, v in zip(o, d, strict=True))
-        return moved, replace(state, path=state.path + self.media[0].index_at(state.wavelength) * way)
+        moved = (torch.as_tensor(c + way * v, dtype=torch.float64) for c, v in zip(o, d, strict=True))
+        path = state.path + self.media[0].index_at(state.wavelength) * way
+        return tuple(c.expand(state.power.shape) for c in moved), replace(state, path=path)
 
     @cached_property
     def meets(self):
@@ -359,42 +356,8 @@ class Tracer:
         return out
 
 
-def into(pose: Pose, origin, direction, datum: float) -> tuple[tuple, tuple]:
-    """Origins and directions in an element's frame."""
-    px, py, pz = pose.position
-    moved = (_less(origin[0], px), _less(origin[1], py), _less(origin[2], pz - datum))
-    return turned(pose, moved), turned(pose, direction)
-
-
-def out_of(pose: Pose, point, datum: float) -> tuple:
-    """Points of an element's frame in that of the system."""
-    px, py, pz = pose.position
-    x, y, z = turned_back(pose, point)
-    return _less(x, -px), _less(y, -py), _less(z, datum - pz)
-
-
-def turned(pose: Pose, vector) -> tuple:
-    """A vector in an element's frame."""
-    if pose.upright:
-        return tuple(vector)
-    return tuple(sum(c * a for c, a in zip(vector, axis, strict=True)) for axis in pose.axes)
-
-
-def turned_back(pose: Pose, vector) -> tuple:
-    """A vector of an element's frame in that of the system."""
-    if pose.upright:
-        return tuple(vector)
-    return tuple(sum(c * axis[k] for c, axis in zip(vector, pose.axes, strict=True)) for k in range(3))
-
-
-def advanced(origin, direction, t: Tensor) -> tuple:
-    """o + t d; where d is a plain 0, o itself."""
-    return tuple(o if isinstance(d, float) and d == 0.0 else o + (t if isinstance(d, float) and d == 1.0 else t * d)
-                 for o, d in zip(origin, direction, strict=True))
-
-
-def _less(value, shift: float):
-    return value if shift == 0.0 else value - shift
+def _cast(value, dtype: torch.dtype):
+    return value.to(dtype) if isinstance(value, Tensor) else value
 
 
 def is_lowered(scene: Scene, field: HeightField, requests: Requests = NO_REQUESTS) -> bool:

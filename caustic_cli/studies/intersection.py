@@ -231,7 +231,8 @@ def _evaluate(case: Case, prepared: Callable, series: str, n: int | None) -> tup
     """t (N,) and status (N,) as one setting finds them; Newton's method has its rays prepared, as in a design."""
     if n is None:
         return prepared(case.heights)
-    return find(case.field, case.heights, case.rays.origin, case.rays.direction, Method(series.removesuffix(FLAT), (n, n), not series.endswith(FLAT)))
+    method = Method(series.removesuffix(FLAT), (n, n), not series.endswith(FLAT))
+    return find(case.field, case.heights, case.rays.origin, case.rays.direction, method)
 
 
 def _errors(case: Case, t: Tensor, status: Tensor, truth: np.ndarray, hit: np.ndarray) -> dict:

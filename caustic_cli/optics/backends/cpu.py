@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.optics import intersection
-from caustic_cli.optics.backends.reference import Torch, _by_mesh
+from caustic_cli.optics.backends.reference import Torch, by_mesh
 from caustic_cli.optics.interface import Departure
 from caustic_cli.optics.kernels import functions
 from caustic_cli.optics.kernels.grid import GridSurface
@@ -87,7 +87,7 @@ class Numba(Torch):
     def find(self, field, heights: Tensor, origin, direction, method: intersection.Method,
              radius: float | None) -> tuple[Tensor, Tensor]:
         """As the reference."""
-        start, found = _by_mesh(field, heights, origin, direction, method, radius)
+        start, found = by_mesh(field, heights, origin, direction, method, radius)
         if found is not None:
             return found
         hits = RayHits(FusedSurface(field.spaces, field.half_size), origin, direction, radius)

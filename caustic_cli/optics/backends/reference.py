@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.optics import intersection
+from caustic_cli.optics import intersection, meeting
 from caustic_cli.optics.interface import Departure, interact
+from caustic_cli.optics.mesh import TriangleMesh
 from caustic_cli.optics.reconstruction import Filter, splat
 from caustic_cli.optics.sampling import Sample, spread
 from caustic_cli.optics.surfaces.base import Hit
@@ -51,7 +52,7 @@ class Torch:
     def find(self, field, heights: Tensor, origin, direction, method: intersection.Method,
              radius: float | None) -> tuple[Tensor, Tensor]:
         """`intersection.find`."""
-        start, found = _by_mesh(field, heights, origin, direction, method, radius)
+        start, found = by_mesh(field, heights, origin, direction, method, radius)
         if found is not None:
             return found
         if start is not None:
@@ -64,9 +65,7 @@ class Torch:
 
     def next_meetings(self, field, heights: Tensor, origin, direction, below: bool, round: bool, step: float) -> Tensor:
         """Distances (N,) mm to the next meeting of rays that start on a B-spline, 0 for none: see `meeting.again`."""
-        from caustic_cli.optics.meeting import reference  # noqa: PLC0415 - meetings know backends
-
-        return reference(field, heights, origin, direction, below, round, step)
+        return meeting.reference(field, heights, origin, direction, below, round, step)
 
     def interact(self, direction, slopes, power: Tensor, *, eta: float, reflects: bool, fresnel: str, polarised=None,
                  side: float = 1.0) -> Departure:
@@ -106,12 +105,10 @@ class Torch:
         return
 
 
-def _by_mesh(field, heights, origin, direction, method: intersection.Method, radius):
+def by_mesh(field, heights, origin, direction, method: intersection.Method, radius):
     """Where the mesh has the hits (None: not asked for), and (t, status) if that is the whole method."""
     if method.name == "newton":
         return None, None
-    from caustic_cli.optics.mesh import TriangleMesh  # noqa: PLC0415
-
     mesh, rays = TriangleMesh(field, heights, *method.parts), torch.broadcast_tensors(*map(torch.as_tensor, (*origin, *direction)))
     start, missed, _ = mesh.intersect(*(c.double() for c in rays), method.recursive)
     if method.name == "mesh":

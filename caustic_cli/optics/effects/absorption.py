@@ -22,7 +22,8 @@ class Absorption(Effect):
     def judge(self, scene: Scene, bounds) -> Verdict:
         """By the coefficient."""
         a = 0.0 if scene.lens.mirror else scene.lens.absorption
-        return Verdict(self.name, a > 0, f"the glass absorbs {a:g} per mm" if a > 0 else "the glass is clear", a, 0.0, present=a > 0)
+        why = f"the glass absorbs {a:g} per mm" if a > 0 else "the glass is clear"
+        return Verdict(self.name, a > 0, why, a, 0.0, present=a > 0)
 
     def without(self, scene: Scene) -> Scene:
         """Clear glass."""

@@ -23,8 +23,9 @@ class Dispersion(Effect):
         """On where several wavelengths meet a glass."""
         if scene.dispersive:
             indices = [band.scene.lens.index for band in scene.bands]
-            return Verdict(self.name, True, f"{len(scene.light.wavelengths)} wavelengths in {scene.lens.glass}, whose index goes from"
-                           f" {min(indices):.5f} to {max(indices):.5f}", max(indices) - min(indices), 0.0)
+            why = (f"{len(scene.light.wavelengths)} wavelengths in {scene.lens.glass}, whose index goes from {min(indices):.5f} to"
+                   f" {max(indices):.5f}")
+            return Verdict(self.name, True, why, max(indices) - min(indices), 0.0)
         why = "one wavelength" if not scene.light.wavelengths else "a mirror treats all wavelengths alike" if scene.lens.mirror \
             else "the lens has one index for all wavelengths"
         return Verdict(self.name, False, why, 0.0, 0.0, present=False)
@@ -42,4 +43,5 @@ class Dispersion(Effect):
             return None
         glass = scene.lens.glass or GLASS
         lens = replace(scene.lens, glass=glass, index=refractive_index(glass))
-        return Amount(replace(scene, lens=lens, light=Light(scene.light.polarisation, LINES)), None, f"{len(LINES)} wavelengths in {glass}")
+        dispersed = replace(scene, lens=lens, light=Light(scene.light.polarisation, LINES))
+        return Amount(dispersed, None, f"{len(LINES)} wavelengths in {glass}")

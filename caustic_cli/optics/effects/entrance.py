@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 
 from caustic_cli.optics.effects.base import NO_REQUESTS, Action, Effect, Requests, Verdict
+from caustic_cli.optics.frames import turned_back
 from caustic_cli.optics.rays import RayState
 from caustic_cli.scene import Scene
 
@@ -45,8 +46,6 @@ class Unbent(Action):
     def depart(self, m) -> None:
         """Directions as they came."""
         if m.index == 0 and m.forward:
-            from caustic_cli.optics.trace import turned_back  # noqa: PLC0415 - the trace knows effects
-
             m.state.direction = turned_back(m.element.pose, m.incoming)
 
 

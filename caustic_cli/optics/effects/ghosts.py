@@ -1,9 +1,9 @@
 """Ghosts: light reflected at one surface and again at one before it, which then goes through after all.
 
 The thesis takes it for negligible; here it is measured.  Light that is reflected twice is followed, for every pair of refracting
-elements i < j: returned at j, back through those between, returned at i, and on through all that follow.  Each reflects as Fresnel's
-or Schlick's formula says, for unpolarised light.  Microfacets are met on the straight way only.  What a ghost carries out of the
-system is taken off what had been lost at j.
+elements i < j: returned at j, back through those between, returned at i, and on through all that follow.  Each reflects as
+Fresnel's or Schlick's formula says, for unpolarised light.  Microfacets are met on the straight way only.  What a ghost carries
+out of the system is taken off what had been lost at j.
 """
 
 from __future__ import annotations

@@ -53,9 +53,7 @@ class MeanPlane(Action):
         t = (mean - origin[2]) / direction[2]
         x, y = (o + t * d for o, d in zip(origin[:2], direction[:2], strict=True))
         (rx, ry), found = surface.half_size, m.element.aperture.holds(x, y)
-        from caustic_cli.optics.intersection import spline_or_any  # noqa: PLC0415
-
-        z, gx, gy = spline_or_any(surface, sag, x.detach().clamp(-rx, rx), y.detach().clamp(-ry, ry))
+        z, gx, gy = surface.evaluate(sag, x.detach().clamp(-rx, rx), y.detach().clamp(-ry, ry))
         m.lift = torch.where(found, z, torch.zeros_like(z))
         t = torch.where(found, t, torch.zeros_like(t))
         return Hit(t, gx, gy, found)

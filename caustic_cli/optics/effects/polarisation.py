@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.optics.effects.base import NEGLIGIBLE, Action, Amount, Effect, Requests, Verdict
+from caustic_cli.optics.frames import turned, turned_back
 from caustic_cli.optics.interface import refract
 from caustic_cli.optics.polarisation import beyond, field_of
 from caustic_cli.optics.rays import RayState
@@ -69,8 +70,6 @@ class Carry(Action):
         if state.polarised is None or (last and m.forward):
             return
         pose = m.element.pose
-        from caustic_cli.optics.trace import turned, turned_back  # noqa: PLC0415 - the trace knows effects
-
         e, flip = turned(pose, state.polarised), m.side
         d = (m.incoming[0], m.incoming[1], flip * m.incoming[2])
         e = (e[0], e[1], flip * e[2])

@@ -32,7 +32,8 @@ class Roughness(Effect):
     def judge(self, scene: Scene, bounds) -> Verdict:
         """By the facets' standard deviation."""
         r = scene.lens.roughness
-        return Verdict(self.name, r > 0, f"microfacets of slopes {r:g}" if r > 0 else "the surface is smooth", r, 0.0, present=r > 0)
+        why = f"microfacets of slopes {r:g}" if r > 0 else "the surface is smooth"
+        return Verdict(self.name, r > 0, why, r, 0.0, present=r > 0)
 
     def without(self, scene: Scene) -> Scene:
         """A smooth surface."""

@@ -12,6 +12,7 @@ from dataclasses import replace
 import torch
 
 from caustic_cli.optics.effects.base import NO_REQUESTS, Action, Effect, Requests, Verdict
+from caustic_cli.optics.frames import out_of, turned, turned_back
 from caustic_cli.optics.meeting import again, touch
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.surfaces import HeightField
@@ -26,7 +27,8 @@ class SecondMeeting(Effect):
     def judge(self, scene: Scene, b) -> Verdict:
         """By whether a slope can catch a ray."""
         if b.climb < 1.0:
-            return Verdict(self.name, False, f"slopes up to {b.slope:.3g} are {b.climb:.3g} of what rays leaving climb at", b.climb, 1.0)
+            why = f"slopes up to {b.slope:.3g} are {b.climb:.3g} of what rays leaving climb at"
+            return Verdict(self.name, False, why, b.climb, 1.0)
         return Verdict(self.name, True, f"slopes up to {b.slope:.3g} may catch a ray that has left",
                        b.climb if math.isfinite(b.climb) else None, 1.0)
 
@@ -46,8 +48,6 @@ class Again(Action):
 
     def detour(self, tracer, parameters, meetings) -> list[RayState]:
         """What becomes of them, behind the surface."""
-        from caustic_cli.optics.trace import out_of, turned, turned_back  # noqa: PLC0415 - the trace knows effects
-
         m = meetings[-1]
         element, state, side = m.element, m.state, m.side
         surface, pose, heights = element.surface, element.pose, parameters[element.name]

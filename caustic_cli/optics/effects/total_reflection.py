@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from caustic_cli.optics.effects.base import NO_REQUESTS, Action, Effect, Requests, Verdict
+from caustic_cli.optics.frames import turned, turned_back
 from caustic_cli.optics.tolerances import PARALLEL
 from caustic_cli.scene import Scene
 
@@ -39,8 +40,6 @@ class Grazing(Action):
         """Along the surface, in the plane of incidence."""
         if m.reflects or not m.straight or bool(m.passes.all()) or not isinstance(m.slopes[0], torch.Tensor):
             return
-        from caustic_cli.optics.trace import turned, turned_back  # noqa: PLC0415 - the trace knows effects
-
         d, g, pose = m.incoming, m.slopes, m.element.pose
         c = (d[2] - d[0] * g[0] - d[1] * g[1]) / (1.0 + g[0] * g[0] + g[1] * g[1])
         along = d[0] + c * g[0], d[1] + c * g[1], d[2] - c

@@ -11,8 +11,8 @@ from caustic_cli.optics.sampling import Sampler
 def parallel(scene: Lit, kind: str, rays: int, seed: int = 0, device: str | torch.device = "cpu") -> Sampler:
     """About `rays` rays along +z over the aperture, weighted by the source's profile if it has one."""
     profile = None if scene.source.profile is None else torch.from_numpy(scene.source.profile)
-    return Sampler.of_size(kind, rays, scene.pupil.half_size[0] / scene.pupil.half_size[1], seed=seed, profile=profile, device=device,
-                           round=scene.pupil.round)
+    (rx, ry), round_ = scene.pupil.half_size, scene.pupil.round
+    return Sampler.of_size(kind, rays, rx / ry, seed=seed, profile=profile, device=device, round=round_)
 
 
 EMISSIONS = {"plane": parallel}

@@ -18,9 +18,6 @@ from caustic_cli.optics.kernels.surface import FusedSurface, RayHits, scattered_
 from caustic_cli.optics.reconstruction import Filter, padding
 from caustic_cli.scene import Screen
 
-_FRESNEL = {"none": bend.NONE, "schlick": bend.SCHLICK, "exact": bend.EXACT}
-_KIND = {"bincount": shares.BINCOUNT, "gaussian": shares.GAUSSIAN, "cosine": shares.COSINE}
-
 
 class _Workspace:
     """Arrays that the kernels overwrite, kept from one call to the next."""
@@ -144,9 +141,9 @@ def _arguments(rays, interface: tuple[float, str], height: float, start: float, 
     """Whether rays are slanted, and what `plane` takes after the nets."""
     eta, fresnel = interface
     slanted = rays[2].shape == rays[0].shape
-    exit_ = Exit(float(eta), _FRESNEL[fresnel], int(slanted), float(start), float(height))
+    exit_ = Exit(float(eta), bend.FRESNEL[fresnel], int(slanted), float(start), float(height))
     frame = Frame(*map(int, screen.resolution), *map(float, screen.low), *map(float, screen.pixel))
-    splat = Splat(_KIND[filter.kind], *(int(2 * r + 1) for r in filter.reach), *map(float, filter.alpha))
+    splat = Splat(shares.KINDS[filter.kind], *(int(2 * r + 1) for r in filter.reach), *map(float, filter.alpha))
     return slanted, (*rays, exit_, frame, splat)
 
 

@@ -12,10 +12,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.kernels import blocks, mirror, refraction
-from caustic_cli.optics.kernels.bend import EXACT, NONE, SCHLICK
+from caustic_cli.optics.kernels.bend import FRESNEL
 from caustic_cli.optics.kernels.stage import components, given, keep, kept, new, tangent, wanted
-
-_FRESNEL = {"none": NONE, "schlick": SCHLICK, "exact": EXACT}
 
 
 def interact(direction, slopes, power: Tensor, *, eta: float, reflects: bool, fresnel: str, field=None):
@@ -40,7 +38,7 @@ def interact(direction, slopes, power: Tensor, *, eta: float, reflects: bool, fr
     if reflects:
         return _Mirror.apply(*direction, *slopes), power, torch.ones(power.shape, dtype=torch.bool)
     polarised = field is not None and fresnel == "exact"
-    surface = refraction.Interface(float(eta), _FRESNEL[fresnel], polarised)
+    surface = refraction.Interface(float(eta), FRESNEL[fresnel], polarised)
     *t, after, passes = _Refraction.apply(*direction, *slopes, power, *(field if polarised else (0.0, 0.0, 0.0)), surface)
     return tuple(t), after, passes
 

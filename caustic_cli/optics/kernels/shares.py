@@ -13,6 +13,8 @@ import math
 from caustic_cli.optics.kernels.jit import FAST, njit
 
 BINCOUNT, GAUSSIAN, COSINE = 0, 1, 2
+#: Filters of `reconstruction` by name.
+KINDS = {"bincount": BINCOUNT, "gaussian": GAUSSIAN, "cosine": COSINE}
 #: Below this alpha (v/2)^2 the Gaussian's shares come from Taylor series, without cancellation.
 SMALL = 0.05
 TINY = 1e-3  # and below this from shorter ones

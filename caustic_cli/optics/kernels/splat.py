@@ -28,12 +28,11 @@ from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.kernels import blocks
 from caustic_cli.optics.kernels.jit import FAST, njit, prange
-from caustic_cli.optics.kernels.shares import BINCOUNT, COSINE, GAUSSIAN, shares
+from caustic_cli.optics.kernels.shares import KINDS, shares
 from caustic_cli.optics.kernels.stage import component, components, given, keep, kept, load, store, tangent, wanted
 from caustic_cli.optics.reconstruction import Filter, padding
 from caustic_cli.scene import Screen
 
-_KIND = {"bincount": BINCOUNT, "gaussian": GAUSSIAN, "cosine": COSINE}
 #: Rays in a row.
 ROW = 512
 # Rows of a block's scratch; then what `shares` works in, then shares and slopes along x and y.
@@ -70,7 +69,7 @@ def splat_rays(x: Tensor, y: Tensor, weight: Tensor, screen: Screen, filter: Fil
         image (n_x, n_y), power per pixel; off_screen, the power that fell outside the frame; both float64 and differentiable.
     """
     sizes = tuple(2 * r + 1 for r in filter.reach)
-    frame = Frame(*screen.resolution, *map(float, screen.low), *map(float, screen.pixel), _KIND[filter.kind], *sizes,
+    frame = Frame(*screen.resolution, *map(float, screen.low), *map(float, screen.pixel), KINDS[filter.kind], *sizes,
                   *map(float, filter.alpha))
     padded, outside = _Splat.apply(x, y, weight, frame)
     (nx, ny), (rx, ry) = screen.resolution, filter.reach

@@ -60,6 +60,10 @@ class Surface(ABC):
     def slope_bounds(self, heights: Tensor | None) -> tuple[float, float]:
         """Upper bounds of |Z_x| and |Z_y|."""
 
+    def evaluate(self, heights: Tensor | None, x: Tensor, y: Tensor) -> list[Tensor]:
+        """Z, Z_x, Z_y at points (N,) mm that no derivative goes to: (N,) float64 each."""
+        return self.at(heights, x, y)
+
     def centred(self, heights: Tensor | None) -> tuple[Tensor | None, float]:
         """Heights of the same surface moved to where its numbers are small, and by how far it was higher, mm."""
         return heights, 0.0

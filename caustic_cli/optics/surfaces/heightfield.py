@@ -92,6 +92,10 @@ class HeightField(Surface):
         middle = float(heights.detach().double().mean())
         return heights.double() - middle, middle
 
+    def evaluate(self, heights: Tensor, x: Tensor, y: Tensor) -> list[Tensor]:
+        """As of any surface, by the kernels of the device's backend; linear in the heights."""
+        return list(backend_for(x.device).spline_at(self, heights, x, y))
+
     def meet(self, heights: Tensor, origin, direction, side: float, radius: float | None = None) -> Hit:
         """As of any surface, by the kernels of the device's backend."""
         return backend_for(heights.device).meet_spline(self, heights, origin, direction, side, radius)

@@ -1,0 +1,76 @@
+"""Frames of elements: where they stand, and rays seen from there.
+
+A vector is a tuple of three components, tensors (N,) or plain floats.  Points have z counted from `datum`, a height in the frame of
+the system; in an element's own frame they are counted from its origin.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+from torch import Tensor
+
+IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+Axes = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where an element stands: its origin, mm, and right-handed turns first about its x, then about its y axis, degrees."""
+
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    tilt: tuple[float, float] = (0.0, 0.0)
+
+    @cached_property
+    def axes(self) -> Axes:
+        """Unit vectors along its x, y and z."""
+        if not any(self.tilt):
+            return IDENTITY
+        (sa, ca), (sb, cb) = ((math.sin(t), math.cos(t)) for t in map(math.radians, self.tilt))
+        return (cb, 0.0, -sb), (sb * sa, ca, cb * sa), (sb * ca, -sa, cb * ca)
+
+    @property
+    def upright(self) -> bool:
+        """Whether nothing is tilted."""
+        return not any(self.tilt)
+
+
+def into(pose: Pose, origin, direction, datum: float) -> tuple[tuple, tuple]:
+    """Origins and directions in an element's frame."""
+    px, py, pz = pose.position
+    moved = (_less(origin[0], px), _less(origin[1], py), _less(origin[2], pz - datum))
+    return turned(pose, moved), turned(pose, direction)
+
+
+def out_of(pose: Pose, point, datum: float) -> tuple:
+    """Points of an element's frame in that of the system."""
+    px, py, pz = pose.position
+    x, y, z = turned_back(pose, point)
+    return _less(x, -px), _less(y, -py), _less(z, datum - pz)
+
+
+def turned(pose: Pose, vector) -> tuple:
+    """A vector in an element's frame."""
+    if pose.upright:
+        return tuple(vector)
+    return tuple(sum(c * a for c, a in zip(vector, axis, strict=True)) for axis in pose.axes)
+
+
+def turned_back(pose: Pose, vector) -> tuple:
+    """A vector of an element's frame in that of the system."""
+    if pose.upright:
+        return tuple(vector)
+    return tuple(sum(c * axis[k] for c, axis in zip(vector, pose.axes, strict=True)) for k in range(3))
+
+
+def advanced(origin, direction, t: Tensor) -> tuple:
+    """o + t d; where d is a plain 0, o itself."""
+    return tuple(o if isinstance(d, float) and d == 0.0 else o + (t if isinstance(d, float) and d == 1.0 else t * d)
+                 for o, d in zip(origin, direction, strict=True))
+
+
+def _less(value, shift: float):
+    return value if shift == 0.0 else value - shift
