@@ -25,7 +25,7 @@ from caustic_cli.optics.bundle import Bundle
 from caustic_cli.optics.emission import Rays
 from caustic_cli.optics.heightfield import Evaluator, HeightField
 from caustic_cli.optics.interface import reflectance, refract
-from caustic_cli.optics.kernels import fused, precision
+from caustic_cli.optics.kernels import fused
 from caustic_cli.optics.landing import LOSSES, Landing, Part, Status, collect
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sample
@@ -42,13 +42,13 @@ class PlaneTracer:
         scene: source, lens and screen.
         field: the exit surface's spline spaces.
         sample: the rays.
-        dtype: precision of the ray arithmetic where the kernels, which know float64 only, do not do it.  Heights are float64
-            and enter relative to their mean, so float32 rays see sag, not thickness.
+        dtype: precision of the plain-torch reference; the kernels know float64 only.  Heights are float64 and enter relative
+            to their mean, so float32 rays see sag, not thickness.
         like: the tracer of the chunk before, whose basis values along v are taken over where they are the same.
     """
 
     def __init__(self, scene: Scene, field: HeightField, sample: Sample, dtype: torch.dtype, like: PlaneTracer | None = None):
-        self.scene, self.field, self.sample, self.dtype = scene, field, sample, precision(dtype, sample.u.device)
+        self.scene, self.field, self.sample, self.dtype = scene, field, sample, dtype
         self.kernel = None
         if fused(sample.u.device):
             from caustic_cli.optics.kernels.functions import PlaneKernel  # noqa: PLC0415
@@ -63,7 +63,8 @@ class PlaneTracer:
 
     def __call__(self, heights: Tensor, screen_z: float | None = None) -> Landing:
         """Heights (n, m) mm float64 -> where the rays land at screen_z (default: the scene's): the plain-torch reference."""
-        sag, reference = self._sag(heights)
+        reference = float(heights.detach().mean())
+        sag = (heights - reference).to(self.dtype)
         z = self.scene.screen.z if screen_z is None else screen_z
         (rx, ry), s = self.field.half_size, self.sample
         x, y = ((2.0 * s.u - 1.0) * rx).to(self.dtype), ((2.0 * s.v - 1.0) * ry).to(self.dtype)
@@ -75,12 +76,8 @@ class PlaneTracer:
         """Heights (n, m) mm float64 -> image and energy account on a screen; by the fused kernel on a CPU."""
         if self.kernel is None:
             return collect(self(heights, screen.z), screen, filter)
-        sag, reference = self._sag(heights)
-        return Part(*self.kernel(sag, self.scene.lens, screen.z - reference, screen, filter))
-
-    def _sag(self, heights: Tensor) -> tuple[Tensor, float]:
         reference = float(heights.detach().mean())
-        return (heights - reference).to(self.dtype), reference
+        return Part(*self.kernel(heights - reference, self.scene.lens, screen.z - reference, screen, filter))
 
 
 class RayTracer:
@@ -90,7 +87,7 @@ class RayTracer:
     """
 
     def __init__(self, scene: Scene, field: HeightField, bundle: Bundle, dtype: torch.dtype, like: RayTracer | None = None):
-        self.scene, self.field, self.bundle, self.dtype = scene, field, bundle, precision(dtype, bundle.x.device)
+        self.scene, self.field, self.bundle, self.dtype = scene, field, bundle, dtype
         self.kernel = None
         if fused(bundle.x.device):
             from caustic_cli.optics.kernels.functions import RayKernel  # noqa: PLC0415
