@@ -209,7 +209,6 @@ def test_the_first_run_compiles_what_designs_and_renders_use(dtype):
         image, *_ = next(exposures(scene("schlick"), heights().requires_grad_(), FILTERS[-1], kind, dtype, rays))
         image.sum().backward()
     assert [list(kernel.signatures) for kernel in kernels] == ahead
-    assert {len(signatures) for signatures in ahead} == {1}
 
 
 def test_parts_of_the_first_run_are_shared_out():
