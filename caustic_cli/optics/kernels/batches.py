@@ -65,7 +65,7 @@ OU, OV, OZ, DU, DV, DZ, T, XI, ETA, ROW, SLOPE, HALF, Z, Z_XI, Z_ETA, H_XI, MIXE
 GX, GY, BY_T, BY_U, BY_V, BY_Z, BY_X, BY_Y = range(22 * LANES, 30 * LANES, LANES)
 ROWS = 30
 # Sizes of the scratch of Horner's scheme, for value and slopes, and for second derivatives; and of powers.
-JET, BEND, POWERS = 7 * LANES, 11 * LANES, 7 * LANES
+JET, BEND, POWERS = 7 * LANES, 11 * LANES, 6 * LANES
 
 
 @intrinsic
@@ -373,23 +373,29 @@ def _tables(w, p, q, table):
     for k in range(LANES):
         s[k], s[LANES + k], s[2 * LANES + k], s[3 * LANES + k] = w[XI + k], w[BY_Z + k], w[BY_U + k], w[BY_V + k]
         s[4 * LANES + k], s[5 * LANES + k] = 1.0, 0.0
-    for at in range(0, p * LANES, LANES):
+    for at in range(0, pp * LANES, 2 * LANES):  # two rows in one loop: shorter ones are unrolled ray by ray, not made vectors
+        a0, a1 = table[at : at + LANES], table[at + LANES : at + 2 * LANES]
+        c0, c1 = table[ec + at : ec + at + LANES], table[ec + at + LANES : ec + at + 2 * LANES]
         for k in range(LANES):
-            power, slope, xi = s[4 * LANES + k], s[5 * LANES + k], s[k]
-            table[at + k] = s[LANES + k] * power + s[2 * LANES + k] * slope
+            xi, by_z, by_xi, by_eta, power, slope = (s[k], s[LANES + k], s[2 * LANES + k], s[3 * LANES + k], s[4 * LANES + k],
+                                                     s[5 * LANES + k])
+            a0[k], c0[k] = by_z * power + by_xi * slope, by_eta * power
+            slope = slope * xi + power
+            power *= xi
+            a1[k], c1[k] = by_z * power + by_xi * slope, by_eta * power
             s[4 * LANES + k], s[5 * LANES + k] = power * xi, slope * xi + power
-            s[6 * LANES + k] = s[3 * LANES + k] * power
-        for k in range(LANES):
-            table[ec + at + k] = s[6 * LANES + k]
     for k in range(LANES):
         s[k], s[4 * LANES + k], s[5 * LANES + k] = w[ETA + k], 1.0, 0.0
-    for at in range(0, q * LANES, LANES):
+    for at in range(0, qq * LANES, 2 * LANES):
+        e0, e1 = table[ea + at : ea + at + LANES], table[ea + at + LANES : ea + at + 2 * LANES]
+        d0, d1 = table[ed + at : ed + at + LANES], table[ed + at + LANES : ed + at + 2 * LANES]
         for k in range(LANES):
-            table[ea + at + k] = s[4 * LANES + k]
-        for k in range(LANES):
-            power, slope = s[4 * LANES + k], s[5 * LANES + k]
-            table[ed + at + k] = slope
-            s[4 * LANES + k], s[5 * LANES + k] = power * s[k], slope * s[k] + power
+            eta, power, slope = s[k], s[4 * LANES + k], s[5 * LANES + k]
+            e0[k], d0[k] = power, slope
+            slope = slope * eta + power
+            power *= eta
+            e1[k], d1[k] = power, slope
+            s[4 * LANES + k], s[5 * LANES + k] = power * eta, slope * eta + power
 
 
 @njit(**_SUMS)
