@@ -54,6 +54,8 @@ FEWEST, CROWD = 4, 8
 ALONE = 64
 #: Times that rays are handed to the next span product, steps with the terms of second order and with all terms.
 TURNS, FIRST_STEPS, STEPS = 4, 2, 5
+#: Sums over a batch, whose order is left to the compiler.
+_SUMS = {"fastmath": {"contract", "nsz", "reassoc"}}
 #: So far beyond its span product, in its widths, a polynomial is still evaluated; and so near the border hits are `_root`'s.
 BEYOND, MARGIN = 0.02, 1e-12
 
@@ -63,10 +65,8 @@ OU, OV, OZ, DU, DV, DZ, T, XI, ETA, ROW, SLOPE, HALF, Z, Z_XI, Z_ETA, H_XI, MIXE
     0, 22 * LANES, LANES)
 GX, GY, BY_T, BY_U, BY_V, BY_Z, BY_X, BY_Y = range(22 * LANES, 30 * LANES, LANES)
 ROWS = 30
-# Sizes of the scratch of Horner's scheme, for value and slopes, and for second derivatives; sums kept apart of each of 8
-# coefficients.
-JET, BEND, WIDE = 7 * LANES, 11 * LANES, 8
-PATCH = 8 * WIDE
+# Sizes of the scratch of Horner's scheme, for value and slopes, and for second derivatives; and of powers.
+JET, BEND, POWERS = 7 * LANES, 11 * LANES, 6 * LANES
 
 
 @intrinsic
@@ -370,69 +370,68 @@ def _tables(w, p, q, table):
     """
     pp, qq = (p + 1) // 2 * 2, (q + 3) // 4 * 4
     ea, ed, ec = pp * LANES, (pp + qq) * LANES, (pp + 2 * qq) * LANES
+    s = carray(_stack(POWERS), (POWERS,))
     for k in range(LANES):
-        w[ROW + k], w[SLOPE + k] = 1.0, 0.0
-    for a in range(p):
-        at = a * LANES
+        s[k], s[LANES + k], s[2 * LANES + k], s[3 * LANES + k] = w[XI + k], w[BY_Z + k], w[BY_U + k], w[BY_V + k]
+        s[4 * LANES + k], s[5 * LANES + k] = 1.0, 0.0
+    for at in range(0, pp * LANES, 2 * LANES):  # two rows in one loop: shorter ones are unrolled ray by ray, not made vectors
+        a0, a1 = table[at : at + LANES], table[at + LANES : at + 2 * LANES]
+        c0, c1 = table[ec + at : ec + at + LANES], table[ec + at + LANES : ec + at + 2 * LANES]
         for k in range(LANES):
-            power, slope, xi = w[ROW + k], w[SLOPE + k], w[XI + k]
-            table[at + k] = w[BY_Z + k] * power + w[BY_U + k] * slope
-            table[ec + at + k] = w[BY_V + k] * power
-            w[ROW + k], w[SLOPE + k] = power * xi, slope * xi + power
+            xi, by_z, by_xi, by_eta, power, slope = (s[k], s[LANES + k], s[2 * LANES + k], s[3 * LANES + k], s[4 * LANES + k],
+                                                     s[5 * LANES + k])
+            a0[k], c0[k] = by_z * power + by_xi * slope, by_eta * power
+            slope = slope * xi + power
+            power *= xi
+            a1[k], c1[k] = by_z * power + by_xi * slope, by_eta * power
+            s[4 * LANES + k], s[5 * LANES + k] = power * xi, slope * xi + power
     for k in range(LANES):
-        w[ROW + k], w[SLOPE + k] = 1.0, 0.0
-    for b in range(q):
-        at = b * LANES
+        s[k], s[4 * LANES + k], s[5 * LANES + k] = w[ETA + k], 1.0, 0.0
+    for at in range(0, qq * LANES, 2 * LANES):
+        e0, e1 = table[ea + at : ea + at + LANES], table[ea + at + LANES : ea + at + 2 * LANES]
+        d0, d1 = table[ed + at : ed + at + LANES], table[ed + at + LANES : ed + at + 2 * LANES]
         for k in range(LANES):
-            power, slope, eta = w[ROW + k], w[SLOPE + k], w[ETA + k]
-            table[ea + at + k] = power
-            table[ed + at + k] = slope
-            w[ROW + k], w[SLOPE + k] = power * eta, slope * eta + power
+            eta, power, slope = s[k], s[4 * LANES + k], s[5 * LANES + k]
+            e0[k], d0[k] = power, slope
+            slope = slope * eta + power
+            power *= eta
+            e1[k], d1[k] = power, slope
+            s[4 * LANES + k], s[5 * LANES + k] = power * eta, slope * eta + power
 
 
-@njit(**FAST)
-def _add(table, p, q, sums):
-    """Add what `_tables` describes to sums, of every WIDE-th lane: (p' / 2, q' / 4, 8, WIDE), 2 x 4 coefficients at a time."""
+@njit(**_SUMS)
+def _gather(table, p, q, total):
+    """Add the sums over the lanes that `_tables` describes to total (p', q')."""
     pp, qq = (p + 1) // 2 * 2, (q + 3) // 4 * 4
-    s = carray(_stack(PATCH), (PATCH,))
     for a in range(0, pp, 2):
         for b in range(0, qq, 4):
-            at_a, at_e, at_d, at_c = a * LANES, (pp + b) * LANES, (pp + qq + b) * LANES, (pp + 2 * qq + a) * LANES
-            for m in range(PATCH):
-                s[m] = 0.0
-            for k in range(0, LANES, WIDE):
-                for m in range(WIDE):
-                    v = k + m
-                    a0, a1, c0, c1 = table[at_a + v], table[at_a + LANES + v], table[at_c + v], table[at_c + LANES + v]
-                    e0, e1, e2, e3 = (table[at_e + v], table[at_e + LANES + v], table[at_e + 2 * LANES + v],
-                                      table[at_e + 3 * LANES + v])
-                    d0, d1, d2, d3 = (table[at_d + v], table[at_d + LANES + v], table[at_d + 2 * LANES + v],
-                                      table[at_d + 3 * LANES + v])
-                    s[m] += a0 * e0 + c0 * d0
-                    s[WIDE + m] += a0 * e1 + c0 * d1
-                    s[2 * WIDE + m] += a0 * e2 + c0 * d2
-                    s[3 * WIDE + m] += a0 * e3 + c0 * d3
-                    s[4 * WIDE + m] += a1 * e0 + c1 * d0
-                    s[5 * WIDE + m] += a1 * e1 + c1 * d1
-                    s[6 * WIDE + m] += a1 * e2 + c1 * d2
-                    s[7 * WIDE + m] += a1 * e3 + c1 * d3
-            to = (a // 2 * (qq // 4) + b // 4) * PATCH
-            for m in range(PATCH):
-                sums[to + m] += s[m]
-
-
-@njit(**FAST)
-def _finish(sums, grad, i, j):
-    """Add the sums over all lanes to the derivatives (I, J, p + 1, q + 1), and begin anew."""
-    p, q = grad.shape[2], grad.shape[3]
-    wide = (q + 3) // 4
-    for a in range(p):
-        for b in range(q):
-            to, total = (a // 2 * wide + b // 4) * PATCH + (a % 2 * 4 + b % 4) * WIDE, 0.0
-            for m in range(WIDE):
-                total += sums[to + m]
-            grad[i, j, a, b] += total
-    sums[:] = 0.0
+            a0, a1 = table[a * LANES : (a + 1) * LANES], table[(a + 1) * LANES : (a + 2) * LANES]
+            at = (pp + b) * LANES
+            e0, e1 = table[at : at + LANES], table[at + LANES : at + 2 * LANES]
+            e2, e3 = table[at + 2 * LANES : at + 3 * LANES], table[at + 3 * LANES : at + 4 * LANES]
+            at = (pp + qq + b) * LANES
+            d0, d1 = table[at : at + LANES], table[at + LANES : at + 2 * LANES]
+            d2, d3 = table[at + 2 * LANES : at + 3 * LANES], table[at + 3 * LANES : at + 4 * LANES]
+            at = (pp + 2 * qq + a) * LANES
+            f0, f1 = table[at : at + LANES], table[at + LANES : at + 2 * LANES]
+            s0, s1, s2, s3, s4, s5, s6, s7 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            for k in range(LANES):
+                s0 += a0[k] * e0[k] + f0[k] * d0[k]
+                s1 += a0[k] * e1[k] + f0[k] * d1[k]
+                s2 += a0[k] * e2[k] + f0[k] * d2[k]
+                s3 += a0[k] * e3[k] + f0[k] * d3[k]
+                s4 += a1[k] * e0[k] + f1[k] * d0[k]
+                s5 += a1[k] * e1[k] + f1[k] * d1[k]
+                s6 += a1[k] * e2[k] + f1[k] * d2[k]
+                s7 += a1[k] * e3[k] + f1[k] * d3[k]
+            total[a, b] += s0
+            total[a, b + 1] += s1
+            total[a, b + 2] += s2
+            total[a, b + 3] += s3
+            total[a + 1, b] += s4
+            total[a + 1, b + 1] += s5
+            total[a + 1, b + 2] += s6
+            total[a + 1, b + 3] += s7
 
 
 @njit(parallel=True, **FAST)
@@ -449,7 +448,7 @@ def pull_back(met, where, by_t, by_gx, by_gy, ou, ov, du, dv, dz, t, gx, gy, c, 
         w, grad, powers = np.zeros(ROWS * LANES), grads[block], np.empty((2, q))
         grad[:] = 0.0
         pp, qq = (p + 1) // 2 * 2, (q + 3) // 4 * 4
-        table, sums = np.zeros(2 * (pp + qq) * LANES), np.zeros(pp * qq * WIDE)
+        table, total = np.zeros(2 * (pp + qq) * LANES), np.zeros((pp, qq))
         begin, stop = block * count // blocks, (block + 1) * count // blocks
         summed = False
         while begin < stop:
@@ -501,10 +500,13 @@ def pull_back(met, where, by_t, by_gx, by_gy, ou, ov, du, dv, dz, t, gx, gy, c, 
                     by_ox[r], by_oy[r], by_oz[r] = w[BY_X + k], w[BY_Y + k], -w[BY_Z + k]
             if nets:
                 _tables(w, p, q, table)
-                _add(table, p, q, sums)
+                _gather(table, p, q, total)
                 summed = end < stop and where[end] == where[begin]
                 if not summed:
-                    _finish(sums, grad, a, b)
+                    for k in range(p):
+                        for m in range(q):
+                            grad[a, b, k, m] += total[k, m]
+                    total[:] = 0.0
             begin = end
 
 

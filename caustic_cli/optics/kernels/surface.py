@@ -111,6 +111,8 @@ class RayHits:
         self.t, self.status = np.zeros(len(x)), np.zeros(len(x), np.int8)
         self.order, used = batches.order(*self.rays[:2], surface.geometry[0], surface.geometry[3])
         self.batched = len(x) >= batches.CROWD * used
+        if not self.batched:
+            self.order = np.arange(len(x), dtype=np.int32)
 
     def __call__(self, heights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Heights (n, m) mm -> distance along each ray to its hit (mm; -1 for none), dz/dx and dz/dy there, (N,) float64."""
