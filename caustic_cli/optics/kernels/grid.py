@@ -39,7 +39,7 @@ class GridSurface:
         first, bu = su.basis(u)
         du = su.basis(u, 1)[1] / (2.0 * rx)
         self.rows = (first.numpy(), bu.double().contiguous().numpy(), du.double().contiguous().numpy())
-        self.along_v = AlongV(sv, v, 1.0 / (2.0 * ry), torch.float64)
+        self.along_v = AlongV(sv, v, 1.0 / (2.0 * ry))
 
     def __call__(self, heights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Heights (n, m) mm float64 -> z mm, dz/dx, dz/dy, each (a b,) float64, linear in the heights."""
