@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from caustic_cli.optics.bundle import Bundle
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.autograd import forward_ad
@@ -16,13 +15,14 @@ from caustic_cli.optics import intersection
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.intersection import Method, Status
 from caustic_cli.optics.kernels.surface import FusedSurface, RayHits
+from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.surfaces.heightfield import HeightField
 
 
 def bundle(x, y, z, dx, dy, dz):
     x, y, dx, dy, dz = (torch.as_tensor(a, dtype=torch.float64) for a in (x, y, dx, dy, dz))
     length = torch.sqrt(dx * dx + dy * dy + dz * dz)
-    return Bundle(x, y, z, dx / length, dy / length, dz / length, torch.ones_like(x), {})
+    return RayState((x, y, z), (dx / length, dy / length, dz / length), torch.ones_like(x))
 
 
 def field(n=9, m=8, degrees=(3, 2), half=(5.0, 4.0), repeat=False):
@@ -45,12 +45,16 @@ def fan(count, widest, seed=0, half=(5.0, 4.0), z=0.0):
 
 
 def find_fused(f, heights, rays, start=None):
-    hits = RayHits(FusedSurface(f.spaces, f.half_size), rays)
+    hits = RayHits(FusedSurface(f.spaces, f.half_size), rays.origin, rays.direction, None)
     hits.find(heights, start)
     return torch.from_numpy(hits.t.copy()), torch.from_numpy(hits.status.astype(np.int64))
 
 
-FINDERS = {"reference": intersection.reference, "kernel": find_fused}
+def find_plainly(f, heights, rays):
+    return intersection.reference(f, heights, rays.origin, rays.direction)
+
+
+FINDERS = {"reference": find_plainly, "kernel": find_fused}
 
 
 @pytest.fixture(params=FINDERS)
@@ -58,8 +62,13 @@ def find(request):
     return FINDERS[request.param]
 
 
+def along_rays(rays, t):
+    return tuple(o + t * d for o, d in zip(rays.origin, rays.direction, strict=True))
+
+
 def residual(f, heights, rays, t):
-    return rays.z + t * rays.dz - f.at(heights, rays.x + t * rays.dx, rays.y + t * rays.dy)[0]
+    x, y, z = along_rays(rays, t)
+    return z - f.at(heights, x, y)[0]
 
 
 @pytest.mark.parametrize("degrees", [(1, 1), (3, 2), (5, 5), (10, 10), (15, 2)])
@@ -71,24 +80,22 @@ def test_hits_lie_on_the_surface(find, degrees, repeat):
     hit = status == Status.HIT
     assert 1000 < int(hit.sum()) < 3000
     assert not bool((status == Status.UNRESOLVED).any())
-    x, y = rays.x + t * rays.dx, rays.y + t * rays.dy
+    x, y, _ = along_rays(rays, t)
     on = (x.abs() <= 5 + 1e-9) & (y.abs() <= 4 + 1e-9)
     assert bool(on[hit].all())
     assert float(residual(f, heights, rays, t)[hit & on].abs().max()) < 4e-15 * 4
     # What misses leaves by the side, below the surface.
-    side = torch.minimum((5 - rays.x * rays.dx.sign()) / rays.dx.abs(), (4 - rays.y * rays.dy.sign()) / rays.dy.abs())
+    side = torch.minimum(*((r - o * d.sign()) / d.abs() for r, o, d in zip((5, 4), rays.origin, rays.direction, strict=False)))
     missed = status == Status.MISSED
     assert int(missed.sum()) > 10
-    inner = side[missed] * (1 - 1e-9)
-    z = f.at(heights, rays.x[missed] + inner * rays.dx[missed], rays.y[missed] + inner * rays.dy[missed])[0]
-    assert bool((rays.z + inner * rays.dz[missed] - z < 1e-7).all())
+    assert bool((residual(f, heights, rays, side * (1 - 1e-9))[missed] < 1e-7).all())
 
 
 def test_kernel_and_reference_find_the_same():
     f = field()
     for size in (0.02, 0.3, 1.0):
         heights, rays = bumpy(f, size), fan(2000, 1.3, 1)
-        (a, sa), (b, sb) = intersection.reference(f, heights, rays), find_fused(f, heights, rays)
+        (a, sa), (b, sb) = find_plainly(f, heights, rays), find_fused(f, heights, rays)
         assert bool((sa == sb).all())
         hit = sa == Status.HIT
         assert int(hit.sum()) > 100
@@ -97,14 +104,14 @@ def test_kernel_and_reference_find_the_same():
 
 def first_by_marching(f, heights, rays, steps=20_001):
     """The first sign change on a fine grid of distances, from the values alone."""
-    top = float(heights.max()) - rays.z
+    top = float(heights.max()) - rays.origin[2]
     s = torch.linspace(0, 1, steps, dtype=torch.float64)
-    out = torch.full_like(rays.x, math.inf)
-    for k in range(len(rays.x)):
-        t = s * top / rays.dz[k]
-        x, y = rays.x[k] + t * rays.dx[k], rays.y[k] + t * rays.dy[k]
+    out = torch.full_like(rays.origin[0], math.inf)
+    for k in range(len(rays.origin[0])):
+        t = s * top / rays.direction[2][k]
+        x, y = rays.origin[0][k] + t * rays.direction[0][k], rays.origin[1][k] + t * rays.direction[1][k]
         inside = (x.abs() <= f.half_size[0]) & (y.abs() <= f.half_size[1])
-        value = rays.z + t * rays.dz[k] - f.at(heights, x.clamp(-5, 5), y.clamp(-4, 4))[0]
+        value = rays.origin[2] + t * rays.direction[2][k] - f.at(heights, x.clamp(-5, 5), y.clamp(-4, 4))[0]
         above = (inside & (value >= 0)).nonzero()
         if len(above):
             out[k] = t[above[0, 0]]
@@ -119,7 +126,7 @@ def test_the_first_of_several_roots_is_found(find):
     reference = first_by_marching(f, heights, rays)
     hit = status == Status.HIT
     both = hit & torch.isfinite(reference)
-    step = (float(heights.max()) / rays.dz) / 20_000
+    step = (float(heights.max()) / rays.direction[2]) / 20_000
     assert int(both.sum()) > 60
     # a bump narrower than the march's step may be found that the march stepped over, never the other way round
     assert bool((t[both] <= reference[both] + 1e-9).all())
@@ -131,7 +138,8 @@ def test_several_roots_do_occur_above():
     f = field(17, 16)
     slopes = f.slope_bounds(bumpy(f, 0.8))
     rays = fan(150, 1.45, 3)
-    assert float(((slopes[0] * rays.dx.abs() + slopes[1] * rays.dy.abs()) > rays.dz).double().mean()) > 0.5
+    dx, dy, dz = rays.direction
+    assert float(((slopes[0] * dx.abs() + slopes[1] * dy.abs()) > dz).double().mean()) > 0.5
 
 
 @pytest.mark.parametrize("x, y", [(0.0, 0.0), (5.0, 4.0), (-5.0, 4.0), (5.0, 0.0), (1.25, -1.0)])
@@ -142,7 +150,7 @@ def test_a_plane_is_hit_where_geometry_says(find, x, y):
     rays = bundle([x] * 3, [y] * 3, 0.0, [0.0, -0.02 * np.sign(x), 0.0], [0.0, 0.0, -0.03 * np.sign(y)], [1.0] * 3)
     t, status = find(f, heights, rays)
     assert bool((status == Status.HIT).all())
-    exact = (3.0 + 0.1 * x - 0.05 * y) / (rays.dz - 0.1 * rays.dx + 0.05 * rays.dy)
+    exact = (3.0 + 0.1 * x - 0.05 * y) / (rays.direction[2] - 0.1 * rays.direction[0] + 0.05 * rays.direction[1])
     torch.testing.assert_close(t, exact, rtol=4e-15, atol=0)
 
 
@@ -169,7 +177,7 @@ def test_a_surface_that_lies_on_the_floor_of_its_hull(find):
     rays = fan(500, 0.5, half=(1.0, 1.0))
     t, status = find(f, heights, rays)
     assert bool((status == Status.HIT).all())
-    torch.testing.assert_close(t, 2.0 / rays.dz, rtol=4e-15, atol=0)
+    torch.testing.assert_close(t, 2.0 / rays.direction[2], rtol=4e-15, atol=0)
 
 
 def test_what_cannot_hit_is_missed(find):
@@ -196,15 +204,23 @@ def test_always_finite_and_on_the_surface(seed, size, p, widest):
 
 
 def meet_fused(f, heights, rays):
-    return RayHits(FusedSurface(f.spaces, f.half_size), rays)(heights)
+    return RayHits(FusedSurface(f.spaces, f.half_size), rays.origin, rays.direction, None)(heights)
 
 
-@pytest.mark.parametrize("meet", [lambda *a: intersection.meet(*a)[:3], meet_fused], ids=["reference", "kernel"])
+def meet_plainly(f, heights, rays):
+    return intersection.meet_any(f, heights, rays.origin, rays.direction, 1.0)[:3]
+
+
+def meet_from_anywhere(f, heights, rays):
+    return f.meet(heights, rays.origin, rays.direction, 1.0)[:3]
+
+
+@pytest.mark.parametrize("meet", [meet_plainly, meet_fused, meet_from_anywhere], ids=["reference", "kernel", "surface"])
 def test_derivatives_by_the_implicit_function_theorem(meet):
     """Against central differences, in both modes, on a surface steep enough to matter."""
     f = field()
     heights, rays = bumpy(f, 0.15), fan(40, 0.9, 5)
-    status = intersection.find(f, heights, rays)[1]
+    status = intersection.find(f, heights, rays.origin, rays.direction)[1]
     g = torch.Generator().manual_seed(7)
     along = torch.randn(f.shape, generator=g, dtype=torch.float64)
     with forward_ad.dual_level():
@@ -217,7 +233,7 @@ def test_derivatives_by_the_implicit_function_theorem(meet):
     for tangent, a, b in zip(tangents, up, down, strict=True):
         torch.testing.assert_close(tangent[hit], ((a - b) / (2 * step))[hit], rtol=1e-6, atol=1e-7)
         assert float(tangent[~hit].abs().sum()) == 0.0
-    by = [torch.randn(len(rays.x), generator=g, dtype=torch.float64) for _ in range(3)]
+    by = [torch.randn(len(rays.origin[0]), generator=g, dtype=torch.float64) for _ in range(3)]
     leaf = heights.clone().requires_grad_()
     (pulled,) = torch.autograd.grad(meet(f, leaf, rays), leaf, by)
     assert float((pulled * along).sum()) == pytest.approx(float(sum((b * t).sum() for b, t in zip(by, tangents, strict=True))),
@@ -229,14 +245,14 @@ def test_derivatives_equal_those_of_unrolled_newton():
     f = field()
     heights, rays = bumpy(f, 0.05), fan(30, 0.4, 5)
     leaf = heights.clone().requires_grad_()
-    status = intersection.find(f, heights, rays)[1]
+    status = intersection.find(f, heights, rays.origin, rays.direction)[1]
     hit = status == Status.HIT
-    t = torch.full_like(rays.x, 2.0)
+    t = torch.full_like(rays.origin[0], 2.0)
     for _ in range(8):
-        z, zx, zy = f.at(leaf, rays.x + t * rays.dx, rays.y + t * rays.dy)
-        t = t - (rays.z + t * rays.dz - z) / (rays.dz - zx * rays.dx - zy * rays.dy)
+        z, zx, zy = f.at(leaf, rays.origin[0] + t * rays.direction[0], rays.origin[1] + t * rays.direction[1])
+        t = t - (rays.origin[2] + t * rays.direction[2] - z) / (rays.direction[2] - zx * rays.direction[0] - zy * rays.direction[1])
     (unrolled,) = torch.autograd.grad(t[hit].sum(), leaf, retain_graph=True)
-    (implicit,) = torch.autograd.grad(intersection.meet(f, leaf, rays)[0][hit].sum(), leaf)
+    (implicit,) = torch.autograd.grad(f.meet(leaf, rays.origin, rays.direction, 1.0).t[hit].sum(), leaf)
     torch.testing.assert_close(implicit, unrolled, rtol=1e-11, atol=1e-12)
 
 
@@ -247,13 +263,13 @@ def test_derivatives_equal_those_of_unrolled_newton():
 def test_mesh_and_newton_agree_on_what_is_hit(size):
     f = field(17, 16)
     heights, rays = bumpy(f, size), fan(4000, 0.8 if size < 0.1 else 1.3, 4)
-    exact, status = intersection.find(f, heights, rays)
+    exact, status = intersection.find(f, heights, rays.origin, rays.direction)
     hit = status == Status.HIT
     assert 1000 < int(hit.sum()) < 4000
     errors = []
     for parts in (4, 16):
-        mesh, by_mesh = intersection.find(f, heights, rays, Method("mesh", (parts, parts)))
-        both, by_both = intersection.find(f, heights, rays, Method("mesh+newton", (parts, parts)))
+        mesh, by_mesh = intersection.find(f, heights, rays.origin, rays.direction, Method("mesh", (parts, parts)))
+        both, by_both = intersection.find(f, heights, rays.origin, rays.direction, Method("mesh+newton", (parts, parts)))
         assert float((by_mesh == status).double().mean()) > 0.98  # rays near the rim, and grazing ones, may differ
         met = hit & (by_both == Status.HIT)
         assert float((by_both == by_mesh).double().mean()) > 0.98
@@ -269,8 +285,9 @@ def test_the_derivative_at_a_mesh_hit_tends_to_the_implicit_one():
     heights, rays = bumpy(f, 0.05), fan(300, 0.4, 5)
     leaf, found = heights.clone().requires_grad_(), {}
     for name in ("newton", "mesh+newton", "mesh"):
-        t, gx, gy, status = intersection.meet(f, leaf, rays, Method(name, (32, 32)))
+        t, status = intersection.find(f, leaf, rays.origin, rays.direction, Method(name, (32, 32)))
         hit = status == Status.HIT
+        t, gx, gy = intersection.attach(f, leaf, rays.origin, rays.direction, t, hit)
         (found[name],) = torch.autograd.grad((t + gx - 2 * gy)[hit].sum(), leaf)
     torch.testing.assert_close(found["mesh+newton"], found["newton"], rtol=1e-10, atol=1e-10)
     assert 0 < float((found["mesh"] - found["newton"]).norm() / found["newton"].norm()) < 1e-3

@@ -10,9 +10,9 @@ from __future__ import annotations
 import numba
 import pytest
 import torch
-from caustic_cli.optics.tracing import PlaneTracer, trace_plane
 
 from caustic_cli import firstrun
+from caustic_cli.optics.backends import backend_for, plain
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels import banded, plane, spline
 from caustic_cli.optics.kernels import shares as kernel_shares
@@ -20,6 +20,8 @@ from caustic_cli.optics.kernels.functions import PlaneKernel
 from caustic_cli.optics.reconstruction import Filter, splat
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import EXIT, IDENTITY, System
+from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Lens, PlaneWave, Scene, Screen
 
 FILTERS = [Filter(), *(Filter("cosine", (v, w)) for v, w in ((3, 3), (1, 5), (11, 3), (15, 15))),
@@ -27,6 +29,7 @@ FILTERS = [Filter(), *(Filter("cosine", (v, w)) for v, w in ((3, 3), (1, 5), (11
                (3, 3, 0.0, 0.0), (3, 3, 2.6e-6, 1e-4), (3, 5, 0.01, 0.02), (11, 11, 0.03, 0.001), (5, 11, 0.3, 1.9),
                (3, 3, 2.1, 30.0), (3, 7, 100.0, 700.0), (1, 3, 1.0, 1.0)))]
 SCREEN = Screen((6.0, 4.0), 40.0, (31, 20))
+ACCOUNT = ("fresnel", "total_internal_reflection", "off_screen")
 
 
 def scene(fresnel: str = "exact", degree=(3, 2)) -> Scene:
@@ -42,13 +45,19 @@ def exposures(scene: Scene, z: torch.Tensor, filter: Filter, kind: str, dtype=to
     """(image, leaving, lost) by kernel and by reference, differentiable, of the same rays."""
     field = HeightField.of(scene.lens)
     (sample,) = Sampler.of_size(kind, rays, seed=3).chunks()
-    tracer = PlaneTracer(scene, field, sample, dtype)
-    part = tracer.expose(z, scene.screen, filter)
-    yield part.image, part.leaving, {k: float(v.detach()) for k, v in part.lost.items()}
-    landing = tracer(z)
-    image, off = splat(landing.x, landing.y, landing.weight, scene.screen, filter)
-    lost = {k: float(v.detach()) for k, v in landing.lost.items()}
+    tracer = Tracer(System.of(scene, field), sample, dtype)
+    part = tracer.expose({EXIT: z}, scene.screen, filter)
+    yield part.image, part.leaving, entries(part.lost)
+    with plain():
+        (landing,) = Tracer(System.of(scene, field), sample, dtype).land({EXIT: z}, scene.screen)
+    image, off = splat(*landing.origin[:2], landing.power, scene.screen, filter)
+    lost = entries(landing.lost)
     yield image, landing.leaving, {**lost, "off_screen": lost["off_screen"] + float(off.detach())}
+
+
+def entries(lost) -> dict[str, float]:
+    """An account in numbers, with what a path may leave out because it is 0."""
+    return dict.fromkeys(ACCOUNT, 0.0) | {k: float(torch.as_tensor(v).detach()) for k, v in lost.items()}
 
 
 @pytest.mark.parametrize("kind", ["lines", "stratified"])
@@ -76,16 +85,17 @@ def test_forward_mode_is_the_transpose_of_reverse_mode(filter, kind, rough):
     """<y, J v> = <J' y, v>; with rough 0.5 some rays are totally reflected and some miss the screen."""
     field = HeightField.of(scene().lens)
     (sample,) = Sampler.of_size(kind, 1500, seed=3).chunks()
-    tracer = PlaneTracer(scene(), field, sample, torch.float64)
+    tracer = Tracer(System.of(scene(), field), sample)
+    assert tracer.fused is not None
     z, v = heights(rough=rough), heights(seed=7) - 5.0
     y = torch.randn(SCREEN.resolution, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     with torch.autograd.forward_ad.dual_level():
-        part = tracer.expose(torch.autograd.forward_ad.make_dual(z, v), SCREEN, filter)
+        part = tracer.expose({EXIT: torch.autograd.forward_ad.make_dual(z, v)}, SCREEN, filter)
         image = torch.autograd.forward_ad.unpack_dual(part.image).tangent
         leaving = torch.autograd.forward_ad.unpack_dual(part.leaving).tangent
     forward = float((y * image).sum() + 0.3 * leaving)
     z.requires_grad_()
-    part = tracer.expose(z, SCREEN, filter)
+    part = tracer.expose({EXIT: z}, SCREEN, filter)
     (gradient,) = torch.autograd.grad((y * part.image).sum() + 0.3 * part.leaving, z)
     scale = float((y.abs() * image.abs()).sum() + 0.3 * leaving.abs())
     assert scale > 1e-4
@@ -150,7 +160,7 @@ def test_landing_on_borders():
             space = SplineSpace.uniform(4, 3)
             share = torch.tensor(0.25, dtype=torch.float64)
             kernel = PlaneKernel((space, space), (2.0, 1.5), at, at, True, share)
-            image, _, lost = kernel(torch.zeros(4, 4, dtype=torch.float64), Lens(index=1.5, fresnel="none"), 10.0, SCREEN, filter)
+            image, _, lost = kernel(torch.zeros(4, 4, dtype=torch.float64), 1.5, "none", 10.0, SCREEN, filter)
             x, y = (2.0 * at - 1.0) * 2.0, (2.0 * at - 1.0) * 1.5
             grid = [t.reshape(-1) for t in torch.meshgrid(x, y, indexing="ij")]
             expected, off = splat(*grid, torch.full((4,), 0.25, dtype=torch.float64), SCREEN, filter)
@@ -164,16 +174,21 @@ def test_points_on_knots_are_evaluated_in_the_right_span():
     space = SplineSpace(3, knots)
     u = torch.tensor([0.0, 0.25, 0.5, 0.75, 1.0, 0.5 - 1e-16, 0.1], dtype=torch.float64)
     field = HeightField((space, space), (2.0, 2.0))
-    lens = Lens(size=(4.0, 4.0), control=(9, 9))
     net = heights((9, 9), 0.05)
     share = torch.full((7,), 1.0 / 7.0, dtype=torch.float64)
     kernel = PlaneKernel(field.spaces, field.half_size, u, u.flip(0).contiguous(), False, share)
     sample = next(Sampler("uniform", (7, 1)).chunks())
     sample = type(sample)(u, u.flip(0).contiguous(), False, share)
-    landing = trace_plane(lens, field.prepare(sample, torch.float64), net - 5.0, 35.0, (2 * u - 1) * 2.0,
-                          (2 * u.flip(0) - 1) * 2.0, share, (7,))
-    expected, _ = splat(landing.x, landing.y, landing.weight, SCREEN, Filter("cosine", (5, 5)))
-    image, _, _ = kernel(net - 5.0, lens, 35.0, SCREEN, Filter("cosine", (5, 5)))
+    sag, *slopes = field.prepare(sample, torch.float64)(net - 5.0)
+    eta = Lens().index
+    with plain():
+        reference = backend_for("cpu")
+    out = reference.interact((0.0, 0.0, 1.0), slopes, share, eta=eta, reflects=False, fresnel="exact")
+    at = (2 * u - 1) * 2.0, (2 * u.flip(0) - 1) * 2.0, sag
+    x, y, on_way = reference.land(at, out.direction, (0.0, 0.0, 35.0), IDENTITY, 1.0)
+    assert bool(on_way.all())
+    expected, _ = splat(x, y, out.power, SCREEN, Filter("cosine", (5, 5)))
+    image, _, _ = kernel(net - 5.0, eta, "exact", 35.0, SCREEN, Filter("cosine", (5, 5)))
     torch.testing.assert_close(image, expected, rtol=0, atol=1e-13)
 
 

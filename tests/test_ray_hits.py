@@ -13,12 +13,11 @@ from torch.autograd import forward_ad
 
 from caustic_cli.optics import intersection
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.bundle import Bundle
-from caustic_cli.optics.heightfield import HeightField
 from caustic_cli.optics.intersection import Status
 from caustic_cli.optics.kernels import batches
 from caustic_cli.optics.kernels.rayhits import hits_of_rays
 from caustic_cli.optics.kernels.surface import FusedSurface, RayHits
+from caustic_cli.optics.surfaces.heightfield import HeightField
 
 HALF = (5.0, 4.0)
 
@@ -38,8 +37,8 @@ def fan(count, widest, seed=0, spread=1.0, z=0.0):
     return origin, [torch.sin(theta) * torch.cos(phi), torch.sin(theta) * torch.sin(phi), torch.cos(theta)]
 
 
-def bundle(origin, direction, radius=None):
-    return Bundle(origin[0], origin[1], float(origin[2][0]), *direction, torch.ones_like(origin[0]), {}, None, radius)
+def hits_of(fused, origin, direction, radius=None):
+    return RayHits(fused, (*origin[:2], float(origin[2][0])), direction, radius)
 
 
 # batches
@@ -49,20 +48,21 @@ def bundle(origin, direction, radius=None):
 @pytest.mark.parametrize("widest, radius", [(0.01, None), (0.7, 3.5), (1.4, None)])
 def test_batches_find_what_single_rays_find(degrees, widest, radius):
     _, fused, heights = surface(20, 17, degrees)
-    rays = bundle(*fan(20_000, widest), radius)
-    hits = RayHits(fused, rays)
+    rays = fan(20_000, widest)
+    hits = hits_of(fused, *rays, radius)
     assert hits.batched
-    together = [t.clone() for t in hits(heights, torch.float64)]
+    together = [t.clone() for t in hits(heights)]
     hits.find(heights)
     status = torch.from_numpy(hits.status.copy())
     hits.batched = False
-    alone = hits(heights, torch.float64)
+    alone = hits(heights)
     hits.find(heights)
     assert bool((status == torch.from_numpy(hits.status)).all())
     hit = status == Status.HIT
     assert 0.3 < float(hit.double().mean()) <= 1.0
     assert bool((together[0][~hit] == -1).all())
-    cosine = (rays.dz - alone[1] * rays.dx - alone[2] * rays.dy)[hit]
+    dx, dy, dz = rays[1]
+    cosine = (dz - alone[1] * dx - alone[2] * dy)[hit]
     close = 1e-14 / cosine.clamp_max(1.0)
     assert bool(((together[0] - alone[0])[hit].abs() <= close).all())
     for a, b in zip(together[1:], alone[1:], strict=True):
@@ -72,10 +72,10 @@ def test_batches_find_what_single_rays_find(degrees, widest, radius):
 def test_grazing_and_steep_rays_are_not_batched():
     """Where L >= d_z there may be several roots; the reference isolates the first."""
     field, fused, heights = surface(9, 8, (3, 3), 0.6)
-    rays = bundle(*fan(2000, 1.5))
-    hits = RayHits(fused, rays)
+    rays = fan(2000, 1.5)
+    hits = hits_of(fused, *rays)
     hits.find(heights)
-    t, status = intersection.reference(field, heights, rays)
+    t, status = intersection.reference(field, heights, *rays)
     assert hits.batched
     assert bool((torch.from_numpy(hits.status) == status).all())
     hit = status == Status.HIT
@@ -87,17 +87,17 @@ def test_grazing_and_steep_rays_are_not_batched():
 def test_adjoint_of_batches(degrees, batched):
     """Against torch's own derivatives of one Newton step, and the tangents."""
     field, fused, heights = surface(14, 15, degrees)
-    rays, g = bundle(*fan(3000, 0.6)), torch.Generator().manual_seed(1)
-    hits = RayHits(fused, rays)
+    rays, g = fan(3000, 0.6), torch.Generator().manual_seed(1)
+    hits = hits_of(fused, *rays)
     hits.batched = batched
     by = [torch.randn(3000, generator=g, dtype=torch.float64) for _ in range(3)]
     leaf = heights.clone().requires_grad_()
-    (fast,) = torch.autograd.grad(hits(leaf, torch.float64), leaf, by)
-    (plain,) = torch.autograd.grad(intersection.meet(field, leaf, rays)[:3], leaf, by)
+    (fast,) = torch.autograd.grad(hits(leaf), leaf, by)
+    (plain,) = torch.autograd.grad(intersection.meet_any(field, leaf, *rays, 1.0)[:3], leaf, by)
     assert float((fast - plain).norm() / plain.norm()) < 1e-12
     along = torch.randn(field.shape, generator=g, dtype=torch.float64)
     with forward_ad.dual_level():
-        tangents = [forward_ad.unpack_dual(t).tangent for t in hits(forward_ad.make_dual(heights, along), torch.float64)]
+        tangents = [forward_ad.unpack_dual(t).tangent for t in hits(forward_ad.make_dual(heights, along))]
     forward = float(sum((a * b).sum() for a, b in zip(by, tangents, strict=True)))
     assert float((fast * along).sum()) == pytest.approx(forward, rel=1e-11)
 
@@ -106,19 +106,19 @@ def test_hits_depend_on_nothing_but_ray_and_heights():
     """Not on what was traced before, bit by bit; to a rounding, neither on the order of the rays nor on the number of threads."""
     _, fused, heights = surface(20, 17, (10, 10))
     origin, direction = fan(20_000, 0.5)
-    hits = RayHits(fused, bundle(origin, direction))
-    first = hits(heights, torch.float64)
-    hits(heights + 1.0, torch.float64)
-    for a, b in zip(first, hits(heights, torch.float64), strict=True):
+    hits = hits_of(fused, origin, direction)
+    first = hits(heights)
+    hits(heights + 1.0)
+    for a, b in zip(first, hits(heights), strict=True):
         assert bool((a == b).all())
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(3 - min(before, 2))
-        again = hits(heights, torch.float64)
+        again = hits(heights)
     finally:
         torch.set_num_threads(before)
     turn = torch.randperm(20_000, generator=torch.Generator().manual_seed(0))
-    turned = RayHits(fused, bundle([c[turn] for c in origin], [c[turn] for c in direction]))(heights, torch.float64)
+    turned = hits_of(fused, [c[turn] for c in origin], [c[turn] for c in direction])(heights)
     for a, b, c in zip(first, again, turned, strict=True):
         assert float((a - b).abs().max()) < 1e-13  # a ray in a group of few is met alone
         assert float((a[turn] - c).abs().max()) < 1e-13
