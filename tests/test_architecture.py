@@ -48,7 +48,7 @@ IMPORTS = {module_name(p): imports_in(ast.parse(p.read_text("utf-8")), module_na
 
 
 def part_of(module: str) -> str:
-    """`optics` for caustic_cli.optics.tracing, `files` for caustic_cli.files, "" for the package itself."""
+    """`optics` for caustic_cli.optics.trace, `files` for caustic_cli.files, "" for the package itself."""
     return [*module.split("."), ""][1]
 
 
@@ -59,10 +59,10 @@ def own(imported: set[str]) -> set[str]:
 
 
 def test_the_reader_of_imports_sees_all_forms():
-    source = ("import a.b\ndef f():\n    from caustic_cli.optics import tracing\n"
+    source = ("import a.b\ndef f():\n    from caustic_cli.optics import trace\n"
               "    from . import x\n    from ..scene.lens import Lens\n")
     found = imports_in(ast.parse(source), "caustic_cli.inverse.losses", False)
-    assert {"a.b", "caustic_cli.optics.tracing", "caustic_cli.inverse.x", "caustic_cli.scene.lens"} <= found
+    assert {"a.b", "caustic_cli.optics.trace", "caustic_cli.inverse.x", "caustic_cli.scene.lens"} <= found
     assert "caustic_cli.inverse.x" in imports_in(ast.parse("from . import x"), "caustic_cli.inverse", True)
 
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from caustic_cli.optics.tracing import expose
 
 from caustic_cli.errors import CausticError
 from caustic_cli.inverse import objective as module
@@ -16,6 +15,7 @@ from caustic_cli.inverse.penalties import Penalty
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
 
 pytestmark = pytest.mark.usefixtures("kernels")
