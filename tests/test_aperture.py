@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from caustic_cli.optics.tracing import RayTracer, expose
 from PIL import Image
 from test_export import make, signed_volume
 from test_verify import NAMES, SOURCES, scene_with
@@ -22,7 +21,10 @@ from caustic_cli.export.mesh import FLANGE, closed_mesh, patch, rim_of
 from caustic_cli.export.mitsuba import companions, write_mitsuba
 from caustic_cli.inverse.first import first_surface
 from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.rays import Status
 from caustic_cli.optics.sampling import Sample
+from caustic_cli.optics.system import EXIT, System
+from caustic_cli.optics.trace import Tracer, expose
 from caustic_cli.scene import Lens, PlaneWave, Points, Scene
 from caustic_cli.studies import verify
 
@@ -67,10 +69,10 @@ def test_no_light_beyond_the_circle_and_the_account_closes(source, kernels):
             x, y = ((2 * c - 1) * r for c, r in zip((rays.u, rays.v), field.half_size, strict=True))
             power = rays.share.expand(x.shape)
         else:
-            x, y, power = rays.x, rays.y, rays.share
-            hits = RayTracer(scene, field, rays, torch.float64)(heights)
-            beyond = hits.status == 3
-            assert not float(hits.weight[beyond].abs().sum()) > 0
+            (x, y, _), power = rays.origin, rays.power
+            (hits,) = Tracer(System.of(scene, field), rays, track=True).land({EXIT: heights}, scene.screen)
+            beyond = hits.statuses() == Status.MISSED_SURFACE
+            assert not float(hits.power[beyond].abs().sum()) > 0
         shares += float(power.sum())
         assert not float(power[x * x + y * y > 16.0].sum()) > 0
     assert 0.2 < shares <= 1 + 1e-12
@@ -114,14 +116,18 @@ def test_gradients_of_a_round_lens(kernels):
     """What lies beyond the circle has none; what lies within has that of differences."""
     scene, field, heights = round_with(SOURCES[2])
     (bundle,) = rays_of(scene, "stratified", 4000, 1).chunks()
-    traced = RayTracer(scene, field, bundle, torch.float64)
+    traced = Tracer(System.of(scene, field), bundle)
+
+    def value(net):
+        (landed,) = traced.land({EXIT: net}, scene.screen)
+        return (landed.power * (landed.origin[0] + 0.3 * landed.origin[1])).sum()
+
     net = heights.clone().requires_grad_()
-    landing = traced(net)
-    (g,) = torch.autograd.grad((landing.weight * (landing.x + 0.3 * landing.y)).sum(), net)
+    (g,) = torch.autograd.grad(value(net), net)
     assert float(g[0, 0].abs()) < 1e-3 * float(g.abs().max())
     step = torch.zeros_like(heights)
     step[4, 4] = 1e-6
-    values = [float((w.weight * (w.x + 0.3 * w.y)).sum()) for w in (traced(heights + step), traced(heights - step))]
+    values = [float(value(heights + step)), float(value(heights - step))]
     assert float(g[4, 4]) == pytest.approx((values[0] - values[1]) / 2e-6, rel=1e-3)
 
 

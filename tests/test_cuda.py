@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 import torch
-from caustic_cli.optics.tracing import expose
 
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")

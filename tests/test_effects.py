@@ -6,20 +6,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from caustic_cli.optics.stepwise import Steps, StepTracer
-from caustic_cli.optics.tracing import BandTracer, check_room, expose, tracers
 
+from caustic_cli.optics.effects import NO_REQUESTS, Requests
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.interface import reflectances
 from caustic_cli.optics.meeting import again
+from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import EXIT, System
+from caustic_cli.optics.trace import Tracer, check_room, expose, tracers
 from caustic_cli.scene import Disc, Lens, Light, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.scene.materials import refractive_index
 
 N, R0 = 1.5, 0.04
 POINT = Points(((0.5, -0.3, -40.0),))
+DETOURS, STAGES = Requests.to("ghosts", "second-meeting"), Requests(stages=True)
 
 
 def scene_of(source=None, *, degree=(2, 2), control=(9, 8), screen=None, light=None, **lens) -> Scene:
@@ -42,14 +45,31 @@ def bumpy(scene: Scene, bumps: float, seed: int = 0) -> torch.Tensor:
     return 3.0 + bumps * torch.randn(scene.lens.control, generator=g, dtype=torch.float64)
 
 
-def land(scene: Scene, heights: torch.Tensor, steps: Steps = Steps(plain=True), kind="grid", shape=(12, 10)):  # noqa: B008
-    """Landings of one chunk of a plane wave's rays, and the rays."""
+def traced_through(scene: Scene, rays, requests: Requests = NO_REQUESTS) -> Tracer:
+    return Tracer(System.of(scene, HeightField.of(scene.lens)), rays, requests=requests)
+
+
+def land(scene: Scene, heights: torch.Tensor, requests: Requests = NO_REQUESTS, kind="grid", shape=(12, 10)):
+    """One chunk of a plane wave's rays on the screen, and the rays."""
     (sample,) = Sampler(kind, shape).chunks()
-    return StepTracer(scene, HeightField.of(scene.lens), sample, torch.float64, steps)(heights), sample
+    return traced_through(scene, sample, requests).land({EXIT: heights}, scene.screen), sample
 
 
-def shine(scene: Scene, heights: torch.Tensor, steps: Steps = Steps(), rays=4000, **options):  # noqa: B008
-    return expose(scene, HeightField.of(scene.lens), heights, rays_of(scene, "stratified", rays, 3), steps=steps, **options)
+def places(state: RayState, shape: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Where rays landed, in the shape of their sample."""
+    return state.origin[0].view(shape), state.origin[1].view(shape)
+
+
+def shine(scene: Scene, heights: torch.Tensor, requests: Requests = NO_REQUESTS, rays=4000, **options):
+    return expose(scene, HeightField.of(scene.lens), heights, rays_of(scene, "stratified", rays, 3), requests=requests, **options)
+
+
+def reflected(kind: str, inside: float, outside: float) -> float:
+    """Part of the power that glass of index N reflects, by the textbook's formulas in the angles on its two sides; not at 0."""
+    if kind == "schlick":
+        return R0 + (1 - R0) * (1 - math.cos(outside)) ** 5
+    less, more = inside - outside, inside + outside
+    return 0.5 * ((math.sin(less) / math.sin(more)) ** 2 + (math.tan(less) / math.tan(more)) ** 2)
 
 
 def sloped(g):
@@ -66,10 +86,10 @@ def test_brewster():
     rs, rp = reflectances(c, s, N)
     assert rp == pytest.approx(0.0, abs=1e-30)
     assert rs == pytest.approx(((N * N - 1) / (N * N + 1)) ** 2, rel=1e-13)
-    for angle, reflected in ((0.0, 0.0), (90.0, rs), (45.0, rs / 2.0)):
+    for angle, part in ((0.0, 0.0), (90.0, rs), (45.0, rs / 2.0)):
         scene = scene_of(light=Light(angle))
         (landing,), _ = land(scene, heights_through(scene, sloped(1.0 / N)))
-        assert float(landing.leaving) == pytest.approx((1 - R0) * (1 - reflected), rel=1e-12)
+        assert float(landing.leaving) == pytest.approx((1 - R0) * (1 - part), rel=1e-12)
 
 
 @pytest.mark.parametrize("source", [None, POINT])
@@ -91,17 +111,18 @@ def test_polarised_light_through_a_slanted_entrance():
     for angle, k in ((0.0, 1), (90.0, 0)):
         scene = scene_of(Points(((-30.0, 0.0, -40.0),), cone=80.0), light=Light(angle))
         sample = rays_of(scene, "grid", 40_000)
-        (bundle,) = sample.chunks()
-        one = (bundle.y.abs() < 0.02).nonzero()[:, 0][:5]
-        inside = [c[one] for c in (bundle.dx, bundle.dz)]
+        (rays,) = sample.chunks()
+        one = (rays.origin[1].abs() < 0.02).nonzero()[:, 0][:5]
+        traced = traced_through(scene, rays)
+        inside = [traced.start.direction[k][one] for k in (0, 2)]
         sin = N * inside[0] / torch.hypot(*inside)
         rs_rp = reflectances(inside[1], torch.sqrt(1 - sin**2), N)
-        tracer = StepTracer(scene, HeightField.of(scene.lens), bundle, torch.float64)
-        (landing,) = tracer(bumpy(scene, 0.0))
-        unpolarised = next(rays_of(replace(scene, light=Light()), "grid", 40_000).chunks())
+        (landing,) = traced.land({EXIT: bumpy(scene, 0.0)}, scene.screen)
         rs, rp = rs_rp
-        emitted = unpolarised.share[one] / (1 - 0.5 * (rs + rp))
-        torch.testing.assert_close(landing.weight[one], emitted * (1 - rs_rp[k]) ** 2, rtol=2e-3, atol=0)
+        emitted = rays.power[one]
+        unpolarised = traced_through(replace(scene, light=Light()), rays).start.power[one]
+        torch.testing.assert_close(unpolarised, emitted * (1 - 0.5 * (rs + rp)), rtol=1e-12, atol=0)
+        torch.testing.assert_close(landing.power[one], emitted * (1 - rs_rp[k]) ** 2, rtol=2e-3, atol=0)
         assert float((rs - rp).min()) > 0.03
 
 
@@ -114,11 +135,11 @@ def test_beer_lambert(source):
     a, t = 0.1, 3.0
     clear, grey = (scene_of(source, absorption=x, fresnel="none") for x in (0.0, a))
     (rays,) = rays_of(clear, "stratified", 500, 1).chunks()
-    field, heights = HeightField.of(clear.lens), torch.full((9, 8), t, dtype=torch.float64)
-    (before,), (after,) = (StepTracer(s, field, rays, torch.float64)(heights) for s in (clear, grey))
-    cosine = rays.dz if source else torch.ones_like(after.weight)
-    torch.testing.assert_close(after.weight, before.weight * torch.exp(-a * t / cosine), rtol=1e-12, atol=0)
-    assert float(after.lost["absorbed"]) == pytest.approx(float((before.weight - after.weight).sum()), rel=1e-12)
+    heights = torch.full((9, 8), t, dtype=torch.float64)
+    (before,), (after,) = (traced_through(s, rays).land({EXIT: heights}, s.screen) for s in (clear, grey))
+    cosine = traced_through(clear, rays).start.direction[2] if source else torch.ones_like(after.power)
+    torch.testing.assert_close(after.power, before.power * torch.exp(-a * t / cosine), rtol=1e-12, atol=0)
+    assert float(after.lost["absorbed"]) == pytest.approx(float((before.power - after.power).sum()), rel=1e-12)
 
 
 def test_dispersion_of_a_prism():
@@ -129,13 +150,14 @@ def test_dispersion_of_a_prism():
     a, heights = math.atan(0.2), heights_through(scene, sloped(0.2))
     field = HeightField.of(scene.lens)
     found = list(tracers(scene, field, Sampler("grid", (12, 10)), torch.float64, 1 << 20))
-    assert all(isinstance(t, BandTracer) for t in found)
+    assert [t.media[1].index_at(t.start.wavelength) for t in found] == [refractive_index("N-SF11", line) for line in lines]
     assert [t.weight for t in found] == pytest.approx([0.25, 0.5, 0.25])
     for line, band in zip(lines, found, strict=True):
         x = (torch.arange(12).double() + 0.5) / 12 * 10.0 - 5.0
         turn = math.asin(refractive_index("N-SF11", line) * math.sin(a)) - a
         at = x + (60.0 - 4.5 - 0.2 * x) * math.tan(turn)
-        torch.testing.assert_close(band.one(heights).x, at[:, None].expand(12, 10), rtol=0, atol=1e-11)
+        landed = places(band.land({EXIT: heights}, scene.screen)[0], (12, 10))
+        torch.testing.assert_close(landed[0], at[:, None].expand(12, 10), rtol=0, atol=1e-11)
     parts = [replace(b.scene, light=Light()) for b in scene.bands]
     whole = sum(w * shine(p, heights).image for w, p in zip((0.25, 0.5, 0.25), parts, strict=True))
     torch.testing.assert_close(shine(scene, heights).image, whole, rtol=0, atol=1e-15)
@@ -149,7 +171,7 @@ def test_roughness_spreads_by_throw_times_slope():
         x, y = (10 * sample.u - 5, 8 * sample.v - 4)
         if sample.tensor:
             x, y = x[:, None], y[None, :]
-        dx, dy = landing.x - x, landing.y - y
+        dx, dy = (there - here for there, here in zip(places(landing, sample.shape), (x, y), strict=True))
         for d in (dx, dy):
             assert float(d.var()) == pytest.approx((57.0 * (N - 1) * sigma) ** 2, rel=0.03)
             assert abs(float(d.mean())) < 5 * float(d.std()) / 200
@@ -164,21 +186,22 @@ def test_a_parabolic_mirror_has_a_focus():
     f, scene = 25.0, scene_of(screen=Screen((4.0, 4.0), -22.0, (8, 8)), mirror=True)
     heights = heights_through(scene, lambda x, y: 3.0 - (x * x + y * y) / (4.0 * f))
     (landing,), _ = land(scene, heights)
-    assert float(torch.hypot(landing.x, landing.y).max()) < 1e-12
+    assert float(torch.hypot(*landing.origin[:2]).max()) < 1e-12
     assert float(landing.leaving) == pytest.approx(1.0, rel=1e-14)
     away = replace(scene, screen=replace(scene.screen, z=-10.0))
     (landing,), _ = land(away, heights)
-    assert float(torch.hypot(landing.x, landing.y).max()) > 1.0
+    assert float(torch.hypot(*landing.origin[:2]).max()) > 1.0
 
 
 def test_an_elliptic_mirror_is_met_from_a_point():
     """A plane mirror shows the source behind itself: a point 43 mm before it lights the screen as if from 86 mm away."""
     scene = scene_of(Points(((0.0, 0.0, -40.0),)), screen=Screen((40.0, 40.0), -40.0, (8, 8)), mirror=True)
-    (bundle,) = rays_of(scene, "stratified", 300, 1).chunks()
-    (landing,) = StepTracer(scene, HeightField.of(scene.lens), bundle, torch.float64)(torch.full((9, 8), 3.0).double())
-    on = landing.weight > 0
+    (rays,) = rays_of(scene, "stratified", 300, 1).chunks()
+    (landing,) = traced_through(scene, rays).land({EXIT: torch.full((9, 8), 3.0).double()}, scene.screen)
+    on = landing.power > 0
     assert int(on.sum()) > 200
-    torch.testing.assert_close(landing.x[on], 86.0 * (bundle.dx / bundle.dz)[on], rtol=1e-11, atol=1e-11)
+    dx, _, dz = rays.direction
+    torch.testing.assert_close(landing.origin[0][on], 86.0 * (dx / dz)[on], rtol=1e-11, atol=1e-11)
 
 
 @pytest.mark.parametrize("tilt", [(25.0, 0.0), (0.0, -35.0), (20.0, 40.0)])
@@ -187,6 +210,7 @@ def test_a_tilted_screen(tilt):
     screen = Screen((30.0, 30.0), 60.0, (10, 10), tilt, (1.5, -2.0))
     scene = scene_of(screen=screen)
     (landing,), sample = land(scene, torch.full((9, 8), 3.0, dtype=torch.float64))
+    x, y = places(landing, sample.shape)
     a, b = np.radians(tilt)
     rx = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
     ry = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
@@ -197,8 +221,8 @@ def test_a_tilted_screen(tilt):
             start = np.array([float(10 * sample.u[i] - 5), float(8 * sample.v[j] - 4), 0.0])
             # start + t z = middle + p axes_x + q axes_y
             p, q, _ = np.linalg.solve(np.column_stack([axes[:, 0], axes[:, 1], [0, 0, -1.0]]), start - [1.5, -2.0, 60.0])
-            assert float(landing.x[i, j]) == pytest.approx(1.5 + p, abs=1e-11)
-            assert float(landing.y[i, j]) == pytest.approx(-2.0 + q, abs=1e-11)
+            assert float(x[i, j]) == pytest.approx(1.5 + p, abs=1e-11)
+            assert float(y[i, j]) == pytest.approx(-2.0 + q, abs=1e-11)
     assert screen.depth == pytest.approx(float(np.abs(axes[2, :2]) @ [15.0, 15.0]))
 
 
@@ -229,19 +253,46 @@ def test_ghost_of_a_plate(source, absorption):
     """Plane-parallel plate, normal incidence: (1 - R)^2 R^2 exp(-3 a t) more on the screen; in a narrow cone, nearly that."""
     scene = scene_of(source, absorption=absorption, screen=Screen((40.0, 40.0), 60.0, (4, 4)))
     heights = torch.full((9, 8), 3.0, dtype=torch.float64)
-    plain, ghostly = (shine(scene, heights, Steps(ghosts=g)) for g in (False, True))
+    plain, ghostly = (shine(scene, heights, requests) for requests in (NO_REQUESTS, Requests.to("ghosts")))
     more = float((ghostly.image - plain.image).sum())
     exact = (1 - R0) ** 2 * R0**2 * math.exp(-9.0 * absorption)
     assert more == pytest.approx(exact, rel=1e-12 if source is None else 1e-3)
     assert more == pytest.approx(plain.lost["fresnel"] - ghostly.lost["fresnel"], rel=1e-9)
 
 
-def test_ghost_of_a_wedge():
+@pytest.mark.parametrize("fresnel", ["exact", "schlick"])
+def test_ghost_of_a_slanted_plate(fresnel):
+    """Light that meets a plane-parallel plate at i leaves (1 - R)^2 R^2 of itself as a ghost, 2 t tan r beside the straight light.
+
+    At 35 degrees Schlick's formula and Fresnel's are a quarter apart.
+    """
+    scene = scene_of(Points(((-30.0, 0.0, -40.0),)), fresnel=fresnel, screen=Screen((200.0, 200.0), 60.0, (4, 4)))
+    (rays,) = rays_of(scene, "stratified", 300, 1).chunks()
+    heights = torch.full((9, 8), 3.0, dtype=torch.float64)
+    straight, ghost = traced_through(scene, rays, Requests.to("ghosts")).land({EXIT: heights}, scene.screen)
+    (x, y, _), (dx, dy, _) = rays.origin, rays.direction
+    checked, sin = 0, torch.hypot(dx, dy)
+    for k in range(len(x)):
+        out = math.asin(float(sin[k]))
+        inside, turn = math.asin(math.sin(out) / N), [float(c[k] / sin[k]) for c in (dx, dy)]
+        r, tangent = reflected(fresnel, inside, out), math.tan(inside)
+        ways = [(float(x[k]) + 3.0 * m * tangent * turn[0], float(y[k]) + 3.0 * m * tangent * turn[1]) for m in (1, 2, 3)]
+        if all(abs(p) <= 5 and abs(q) <= 4 for p, q in ways):
+            assert float(straight.power[k]) == pytest.approx(float(rays.power[k]) * (1 - r) ** 2, rel=1e-12)
+            assert float(ghost.power[k]) == pytest.approx(float(rays.power[k]) * (1 - r) ** 2 * r**2, rel=1e-11)
+            assert float(ghost.origin[0][k]) == pytest.approx(ways[2][0] + 57.0 * math.tan(out) * turn[0], abs=1e-10)
+            other = reflected({"exact": "schlick", "schlick": "exact"}[fresnel], inside, out)
+            checked += abs(other / r - 1.0) > 0.05
+    assert checked > 50
+
+
+@pytest.mark.parametrize(("fresnel", "a", "whole"), [("exact", 0.05, 30), ("schlick", 0.05, 30), ("exact", 0.15, 25),
+                                                     ("schlick", 0.15, 25)])
+def test_ghost_of_a_wedge(fresnel, a, whole):
     """A wedge of angle a: the ghost meets the entrance at 2 a and the exit at 3 a, so it leaves at asin(n sin 3 a) - a."""
-    a = 0.05
-    scene = scene_of()
+    scene = scene_of(fresnel=fresnel)
     heights = heights_through(scene, sloped(math.tan(a)))
-    (_, ghost), sample = land(scene, heights, Steps(ghosts=True), shape=(41, 2))
+    (_, ghost), sample = land(scene, heights, Requests.to("ghosts"), shape=(41, 2))
     x0 = (10 * sample.u - 5).numpy()[:, None]
     z0 = 4.5 + math.tan(a) * x0
     x1 = x0 + z0 * math.tan(2 * a)  # down to the entrance, turned towards the thick edge
@@ -250,15 +301,14 @@ def test_ghost_of_a_wedge():
     out = math.asin(N * math.sin(3 * a)) - a
     at = x2 + (60.0 - z2) * math.tan(out)
     kept = (np.abs(x1) <= 5) & (np.abs(x2) <= 5)
-    x = ghost.x.reshape(41, 2).numpy()
+    x = ghost.origin[0].reshape(41, 2).numpy()
     np.testing.assert_allclose(np.where(kept, x, 0), np.where(kept, at, 0) + 0 * x, atol=1e-10)
-    assert kept.sum() > 30
-    weight = ghost.weight.reshape(41, 2).numpy()
+    assert kept.sum() > whole
+    weight = ghost.power.reshape(41, 2).numpy()
     assert (weight[~kept[:, 0]] == 0).all()
 
     def r(i):
-        c, s = math.cos(i), math.sqrt(1 - (N * math.sin(i)) ** 2)
-        return sum(reflectances(c, s, N)) / 2
+        return reflected(fresnel, i, math.asin(N * math.sin(i)))
 
     expected = (1 - R0) * r(a) * r(2 * a) * (1 - r(3 * a)) / 82
     np.testing.assert_allclose(weight[kept[:, 0]], expected, rtol=1e-11)
@@ -304,10 +354,12 @@ def test_second_meetings_by_kernel_and_by_reference(below, round_, monkeypatch):
     torch.testing.assert_close(t, other, rtol=0, atol=1e-12)
 
 
-def test_the_way_of_a_ray_that_meets_the_surface_twice():
+@pytest.mark.parametrize("fresnel", ["exact", "schlick"])
+def test_the_way_of_a_ray_that_meets_the_surface_twice(fresnel):
     """From the ramp into the cliff and out on its far side: Snell's law in vector form, by hand, in two dimensions."""
     scene, heights = cliff()
-    (straight, late), sample = land(scene, heights, Steps(again=True), shape=(2000, 1))
+    scene = replace(scene, lens=replace(scene.lens, fresnel=fresnel))
+    (straight, late), sample = land(scene, heights, Requests.to("second-meeting"), shape=(2000, 1))
     x0 = (10 * sample.u - 5).numpy()
     s = math.sqrt(1 - (N * N - 1) * 0.64)
     tangent = (N - s) / (N * 0.64 + s) * 0.8
@@ -322,22 +374,20 @@ def test_the_way_of_a_ray_that_meets_the_surface_twice():
     at = x2 + (60.0 - 9.8 + 0.8 * x2) * math.tan(out + a)
     twice = (x0 < 0) & (x1 < 0.99) & (x2 > 1) & (x2 < 5)
     assert twice.sum() > 50
-    assert (straight.weight.reshape(-1).numpy()[twice] == 0).all()
-    late_x, late_power = late.x.numpy(), late.weight.numpy()
+    assert (straight.power.numpy()[twice] == 0).all()
+    late_x, late_power = late.origin[0].numpy(), late.power.numpy()
     found = [int(np.abs(late_x - x).argmin()) for x in at[twice]]
     np.testing.assert_allclose(late_x[found], at[twice], atol=1e-9)
 
-    def r(cos_in, cos_out, eta):
-        return sum(reflectances(cos_in, cos_out, eta)) / 2
-
-    power = (1 - R0) * (1 - r(1.0, s, N)) / 2000
-    power *= (1 - r(cos_i, math.sqrt(1 - (1 - cos_i**2) / N**2), 1 / N)) * (1 - r(math.cos(inner), math.cos(out), N))
+    first, met = math.asin(N * math.sin(a)), math.acos(cos_i)
+    power = (1 - R0) * (1 - reflected(fresnel, a, first)) / 2000
+    power *= (1 - reflected(fresnel, math.asin(math.sin(met) / N), met)) * (1 - reflected(fresnel, inner, out))
     np.testing.assert_allclose(late_power[found], power, rtol=1e-10)
 
 
 def test_second_meetings_are_taken_off_the_straight_light():
     scene, heights = cliff()
-    straight, true = (shine(scene, heights, Steps(again=a, plain=True), rays=20_000) for a in (False, True))
+    straight, true = (shine(scene, heights, r, rays=20_000) for r in (STAGES, STAGES | Requests.to("second-meeting")))
     assert float((straight.image - true.image).abs().sum()) > 0.02
     for e in (straight, true):
         assert float(e.image.sum()) + sum(e.lost.values()) == pytest.approx(1.0, abs=1e-12)
@@ -357,35 +407,35 @@ def test_the_account_closes_and_all_is_finite(source, bumps):
     light = Light(30.0, (450.0, 600.0), (1.0, 2.0))
     scene = scene_of(source, light=light, glass="N-BK7", screen=Screen((16.0, 14.0), 60.0, (32, 28), (10.0, -20.0), (1.0, 0.5)),
                      **EVERYTHING)
-    for steps in (Steps(), Steps(ghosts=True, again=True), Steps(reflects=False), Steps(entrance=False, intersect=False),
-                  Steps(general=True)):
-        if steps.general and source is not None:
+    for requests in (NO_REQUESTS, DETOURS, Requests.to(without=("total-reflection",)),
+                     Requests.to(without=("entrance", "intersection")), Requests.to("entrance", "intersection")):
+        if "entrance" in requests.on and source is not None:
             continue
-        found = shine(scene, bumpy(scene, bumps), steps, rays=2000)
+        found = shine(scene, bumpy(scene, bumps), requests, rays=2000)
         assert bool(torch.isfinite(found.image).all())
         assert float(found.image.sum()) + sum(found.lost.values()) == pytest.approx(1.0, abs=1e-12)
-        assert bumps < 1 or found.lost["total_internal_reflection"] > 0.1 or not steps.reflects
+        assert bumps < 1 or found.lost["total_internal_reflection"] > 0.1 or "total-reflection" in requests.off
         assert found.lost["absorbed"] > 0.01
 
 
 @pytest.mark.parametrize("source", SOURCES)
 def test_a_circular_aperture_with_detours(source):
-    """Steps equal the sequential path there too, and the account closes with everything on."""
+    """Stages equal the fused kernels there too, and the account closes with everything on."""
     scene = scene_of(source)
     scene = replace(scene, lens=replace(scene.lens, size=(8.0, 8.0), aperture="circle"))
     heights, filter = bumpy(scene, 0.6), Filter("cosine", (3, 3))
-    a, b = (shine(scene, heights, steps, filter=filter) for steps in (Steps(), Steps(plain=True)))
+    a, b = (shine(scene, heights, requests, filter=filter) for requests in (NO_REQUESTS, STAGES))
     torch.testing.assert_close(b.image, a.image, rtol=0, atol=1e-13)
-    all_on = shine(replace(scene, lens=replace(scene.lens, **EVERYTHING)), heights, Steps(ghosts=True, again=True), rays=2000)
+    all_on = shine(replace(scene, lens=replace(scene.lens, **EVERYTHING)), heights, DETOURS, rays=2000)
     assert float(all_on.image.sum()) + sum(all_on.lost.values()) == pytest.approx(1.0, abs=1e-12)
 
 
 @pytest.mark.parametrize("source", SOURCES)
 @pytest.mark.parametrize("bumps", [0.1, 1.0])
-def test_steps_without_effects_are_the_sequential_path(source, bumps):
+def test_stages_without_effects_are_the_fused_kernels(source, bumps):
     scene, filter = scene_of(source), Filter("cosine", (3, 3))
     heights = bumpy(scene, bumps)
-    a, b = (shine(scene, heights, steps, filter=filter) for steps in (Steps(), Steps(plain=True)))
+    a, b = (shine(scene, heights, requests, filter=filter) for requests in (NO_REQUESTS, STAGES))
     torch.testing.assert_close(b.image, a.image, rtol=0, atol=1e-13)
     assert b.lost == pytest.approx(a.lost, abs=1e-12)
     assert b.leaving == pytest.approx(a.leaving, abs=1e-12)
@@ -394,7 +444,6 @@ def test_steps_without_effects_are_the_sequential_path(source, bumps):
 @pytest.mark.parametrize("case", ["lens", "point", "mirror", "cliff"])
 def test_gradients_against_differences(case, kernels):
     """Central differences over a random direction; the smooth filter's third derivative leaves some 1e-7."""
-    steps = Steps(ghosts=True, again=True)
     light = Light(30.0, (450.0, 600.0), (1.0, 2.0))
     scene = scene_of(POINT if case == "point" else None, light=light, glass="N-BK7",
                      screen=Screen((24.0, 24.0), 60.0, (12, 12), (10.0, -20.0), (1.0, 0.5)), **EVERYTHING)
@@ -411,7 +460,7 @@ def test_gradients_against_differences(case, kernels):
     along = torch.randn(heights.shape, generator=g, dtype=torch.float64)
 
     def value(h: torch.Tensor) -> torch.Tensor:
-        parts = [t.expose(h, scene.screen, filter) for t in tracers(scene, field, sampler, torch.float64, 1 << 20, steps)]
+        parts = [t.expose({EXIT: h}, scene.screen, filter) for t in tracers(scene, field, sampler, torch.float64, 1 << 20, DETOURS)]
         return sum((p.image * toward).sum() for p in parts)
 
     h = heights.clone().requires_grad_()

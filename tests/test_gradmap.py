@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 import torch
-from caustic_cli.optics.tracing import PlaneTracer
 from PIL import Image
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.reconstruction import Filter, splat
 from caustic_cli.optics.sampling import SAMPLERS, Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import EXIT, System
+from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Lens, PlaneWave, Scene, Screen
 from caustic_cli.studies.gradmap import compare, difference_step, finite_difference, gradient_image, plot_gradient
 
@@ -50,8 +51,8 @@ def test_dot_product_identity_with_reverse_mode(kind, filter):
     sampler = Sampler(kind, (60, 50), seed=1)
     leaf = heights.clone().requires_grad_()
     (sample,) = sampler.chunks()
-    landing = PlaneTracer(scene, field, sample, torch.float64)(leaf)
-    image = splat(landing.x, landing.y, landing.weight, scene.screen, filter)[0]
+    (landed,) = Tracer(System.of(scene, field), sample).land({EXIT: leaf}, scene.screen)
+    image = splat(*landed.origin[:2], landed.power, scene.screen, filter)[0]
     for seed, control in enumerate([(4, 3), (0, 7), (8, 0), (2, 5)]):
         y = torch.randn(image.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
         (pulled,) = torch.autograd.grad(image, leaf, y, retain_graph=True)
@@ -112,9 +113,9 @@ def test_difference_step_moves_rays_by_that_part_of_a_pixel():
     moved = heights.clone()
     moved[4, 3] += step
     (sample,) = Sampler("grid", (80, 80)).chunks()
-    a, b = (PlaneTracer(scene, field, sample, torch.float64)(h) for h in (heights, moved))
-    wx, wy = scene.screen.pixel
-    most = max(float((a.x - b.x).abs().max()) / wx, float((a.y - b.y).abs().max()) / wy)
+    traced = Tracer(System.of(scene, field), sample)
+    (a,), (b,) = (traced.land({EXIT: h}, scene.screen) for h in (heights, moved))
+    most = max(float((a.origin[k] - b.origin[k]).abs().max()) / scene.screen.pixel[k] for k in (0, 1))
     assert 0.001 < most < 0.011
 
 

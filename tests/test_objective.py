@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from caustic_cli.optics.tracing import expose
 
 from caustic_cli.errors import CausticError
 from caustic_cli.inverse import objective as module
@@ -16,7 +15,9 @@ from caustic_cli.inverse.penalties import Penalty
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
+from caustic_cli.optics.trace import expose
+from caustic_cli.scene import Lens, Light, Offset, PlaneWave, Scene, Screen
+from caustic_cli.scene.materials import refractive_index
 
 pytestmark = pytest.mark.usefixtures("kernels")
 
@@ -177,6 +178,45 @@ def test_bins_without_fresnel_have_a_slope_of_zero(chunk, monkeypatch):
     assert evaluation.gradient.shape == (7, 6)
     assert not evaluation.gradient.any()
     assert objective(scene=scene)(heights()).gradient.any()
+
+
+@pytest.mark.parametrize("fresnel", ["none", "exact"])
+@pytest.mark.parametrize("kind", ["lines", "stratified"])
+def test_three_wavelengths_keep_their_graphs(kind, fresnel, kernels):
+    """In a glass that disperses; and the derivative by all heights is the weighted sum of those of each wavelength alone.
+
+    By the kernels the chunks of all three keep their graphs; plain torch would hold every ray after every stage, so it traces again.
+    """
+    lines, weights = (450.0, 550.0, 650.0), (1.0, 2.0, 1.0)
+    lens = replace(LENS, glass="N-SF11", index=refractive_index("N-SF11"), fresnel=fresnel)
+    scene = replace(SCENE, lens=lens, light=Light(wavelengths=lines, weights=weights))
+    sampler, z, towards = Sampler(kind, (40, 36), 1), heights(), torch.randn(12, 9, dtype=torch.float64)
+    assert [band.weight for band in scene.bands] == pytest.approx([0.25, 0.5, 0.25])
+    assert len({band.scene.lens.index for band in scene.bands}) == 3
+    made = Objective(scene, FIELD, sampler, COSINE, disc(), "rms-light", dtype=torch.float64)
+    assert made.whole == (kernels == "fused") and len(made.kept) == 3
+
+    class Linear(torch.nn.Module):
+        """A loss whose derivative by the image is the same everywhere, so that those of wavelengths add up."""
+
+        target = made.loss.target
+
+        def forward(self, image, leaving, penalty):
+            return (image * towards).sum() + 3.0 * leaving + penalty
+
+    def gradient(of: Scene) -> torch.Tensor:
+        one = Objective(of, FIELD, sampler, COSINE, disc(), "rms-light", dtype=torch.float64)
+        assert one.whole
+        one.loss = Linear()
+        return one(z).gradient
+
+    apart = sum(band.weight * gradient(band.scene) for band in scene.bands)
+    value = made(z)
+    along = torch.randn(z.shape, dtype=torch.float64)
+    difference = (made(z + 1e-6 * along).loss - made(z - 1e-6 * along).loss) / 2e-6
+    assert float((value.gradient * along).sum()) == pytest.approx(difference, rel=1e-6)
+    made.loss = Linear()
+    torch.testing.assert_close(made(z).gradient, apart, rtol=0, atol=1e-13 * float(apart.abs().max()))
 
 
 def test_heights_are_left_alone():

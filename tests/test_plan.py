@@ -5,17 +5,17 @@ from dataclasses import replace
 
 import pytest
 import torch
-from caustic_cli.optics.stepwise import SEQUENTIAL, Steps, StepTracer, needed
-from caustic_cli.optics.tracing import PlaneTracer, tracer
-from test_effects import POINT, bumpy, cliff, heights_through, scene_of, shine, sloped
+from test_effects import DETOURS, POINT, STAGES, bumpy, cliff, heights_through, scene_of, shine, sloped, traced_through
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.bounds import bounds_of
+from caustic_cli.optics.effects import EFFECTS, NEGLIGIBLE, NO_REQUESTS, Requests
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.meeting import again
-from caustic_cli.optics.plan import EFFECTS, FREE, NEGLIGIBLE, compile_plan, parse_effects
+from caustic_cli.optics.plan import compile_plan, parse_effects
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.trace import is_lowered
 from caustic_cli.scene import Disc, Light, Points, Screen
 
 SMOOTH = Filter("cosine", (3, 3))
@@ -28,7 +28,7 @@ def plan_of(scene, heights, wanted=None):
 
 
 def image_of(plan, heights, rays=3000):
-    return shine(plan.scene, heights, plan.steps, rays, filter=SMOOTH)
+    return shine(plan.scene, heights, plan.requests, rays, filter=SMOOTH)
 
 
 @pytest.mark.parametrize("source", SOURCES)
@@ -65,7 +65,7 @@ def test_no_ray_breaks_a_proof(source, bumps):
     for seed in range(4):
         heights = bumpy(scene, bumps, seed)
         bounds, plan = bounds_of(scene, field, heights), plan_of(scene, heights)
-        plain, ghostly = (shine(scene, heights, Steps(ghosts=g, plain=True), rays=1000) for g in (False, True))
+        plain, ghostly = (shine(scene, heights, r, rays=1000) for r in (STAGES, STAGES | Requests.to("ghosts")))
         if not plan["total-reflection"].on:
             assert plain.lost["total_internal_reflection"] == 0.0
             proven += 1
@@ -75,12 +75,11 @@ def test_no_ray_breaks_a_proof(source, bumps):
         back = [e.lost["fresnel"] + e.lost["total_internal_reflection"] for e in (plain, ghostly)]
         assert back[0] - back[1] <= bounds.ghost
         (rays,) = rays_of(scene, "stratified", 1000, seed).chunks()
-        traced = StepTracer(scene, field, rays, torch.float64)
-        beam = None
-        for step in traced.steps:
-            beam = step(beam, heights, 0.0)
-        alive = (beam.power > 0).reshape(-1)
-        o, d = ([torch.broadcast_to(torch.as_tensor(c), beam.power.shape).reshape(-1)[alive] for c in v] for v in (beam.o, beam.d))
+        traced = traced_through(scene, rays)
+        assert traced.first == len(traced.system.elements) - 1
+        meeting = traced.cross(traced.first, traced.start, heights)
+        alive = meeting.state.power > 0
+        o, d = ([c[alive] for c in meeting.state.full(v)] for v in (meeting.local, meeting.state.direction))
         if not plan["second-meeting"].on:
             _, found = again(field, heights, o, d, below=False)
             assert not bool(found.any())
@@ -108,7 +107,7 @@ def test_what_a_scene_has_is_simulated():
     scene, heights = cliff()
     plan = plan_of(scene, heights)
     assert {"second-meeting", "ghosts", "total-reflection"} <= set(plan.simulated)
-    assert plan.steps == Steps(ghosts=True, again=True)
+    assert plan.requests == DETOURS
     scene = scene_of(POINT, light=Light(10.0, (500.0, 600.0)), glass="PMMA", screen=Screen((16.0, 14.0), 60.0, (8, 8), (0.0, 5.0),
                      (1.0, 0.0)), absorption=0.01, roughness=0.001)
     plan = plan_of(scene, bumpy(scene, 0.1))
@@ -122,15 +121,18 @@ def test_what_a_scene_has_is_simulated():
     assert plan_of(mirror, heights_through(mirror, lambda x, y: 3.0 + 0.2 * x * x + 0 * y))["second-meeting"].on
 
 
-def test_a_plane_wave_without_effects_runs_the_bare_path():
-    """The plan of the default scene is the scene itself and no step: the tracer is the very one of the sequential path."""
+def test_a_plane_wave_without_effects_runs_the_bare_path(monkeypatch):
+    """The plan of the default scene is the scene itself and no request: its tracer is the fused kernel, without effects."""
+    monkeypatch.setenv("CAUSTIC_KERNELS", "")
     scene = scene_of()
     heights = bumpy(scene, 0.1)
     plan = plan_of(scene, heights)
-    assert plan.scene is scene and plan.steps is SEQUENTIAL and not needed(plan.scene, plan.steps)
+    assert plan.scene is scene and plan.requests == NO_REQUESTS
+    assert is_lowered(plan.scene, HeightField.of(scene.lens), plan.requests)
     assert plan.simulated == ("fresnel",)
     (sample,) = rays_of(scene, "lines", 100).chunks()
-    assert type(tracer(plan.scene, HeightField.of(scene.lens), sample, torch.float64, steps=plan.steps)) is PlaneTracer
+    traced = traced_through(plan.scene, sample, plan.requests)
+    assert type(traced.fused).__name__ == "PlaneImage" and traced.actions == () and not traced.recorded
 
 
 @pytest.mark.parametrize("source", [None, POINT, Disc((0.0, 0.0, -30.0), (2.0, 1.0)), Disc(angle=1.0)])
@@ -145,7 +147,7 @@ def test_overrides(source):
     assert set(bare.simulated) == fixed
     assert bare.scene.lens.absorption == 0 and bare.scene.lens.fresnel == "none" and len(bare.scene.bands) == 1
     assert plan_of(scene, heights, auto.simulated).scene == auto.scene
-    for name in EFFECTS:
+    for name in (effect.name for effect in EFFECTS):
         one = plan_of(scene, heights, {name})
         assert set(one.simulated) == {name} | fixed or auto[name].fixed
         found = image_of(one, heights, 500)
@@ -174,5 +176,7 @@ def test_names():
     assert parse_effects("fresnel, total_reflection") == {"fresnel", "total-reflection"}
     with pytest.raises(InputError, match="did you mean ghosts"):
         parse_effects("ghost")
-    assert set(FREE) < set(EFFECTS)
-    assert replace(SEQUENTIAL, plain=True) != SEQUENTIAL
+    names = [effect.name for effect in EFFECTS]
+    assert len(set(names)) == len(names) == 15
+    assert {effect.name for effect in EFFECTS if effect.free} == {"missed-surface", "total-reflection", "screen-shift"}
+    assert replace(NO_REQUESTS, stages=True) == STAGES != NO_REQUESTS

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from caustic_cli.optics.tracing import expose
 from test_export import make
 
 import caustic_cli
@@ -26,6 +25,7 @@ from caustic_cli.optics.bounds import bounds_of
 from caustic_cli.optics.emission.near import Near
 from caustic_cli.optics.plan import compile_plan
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen, Source, sources
 from caustic_cli.scene.sources.section import SourceType
 from caustic_cli.studies import verify
@@ -258,7 +258,7 @@ from caustic_cli import settings
 from caustic_cli.derive import complete
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.tracing import expose
+from caustic_cli.optics.trace import expose
 
 full = complete(settings.parse('[source]\\ntype = "spokes"\\nspokes = 7\\n[lens]\\ncontrol = [8, 8]', "here"), 1.0)
 again = settings.parse(settings.dump(full), "there")

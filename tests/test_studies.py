@@ -68,13 +68,14 @@ def test_the_scene_is_that_of_table_d3():
     b = case.rays
     assert case.field.shape == (15, 15) and case.field.half_size == (5.0, 5.0)
     assert [s.degree for s in case.field.spaces] == [3, 3]
-    assert len(b.x) == 25_000 and float(b.x.abs().max()) == float(b.y.abs().max()) == 0.0 and b.z == -6.0
-    torch.testing.assert_close(b.dx**2 + b.dy**2 + b.dz**2, torch.ones_like(b.x), rtol=0, atol=1e-15)
-    cosines = b.dz.numpy()
+    assert len(b.power) == 25_000 and b.origin[2] == -6.0
+    assert [len(c) for c in b.origin[:2]] == [25_000] * 2 and not any(bool(c.any()) for c in b.origin[:2])
+    torch.testing.assert_close(sum(c**2 for c in b.direction), torch.ones_like(b.power), rtol=0, atol=1e-15)
+    cosines = b.direction[2].numpy()
     assert cosines.min() >= np.cos(0.8)
     # even over the solid angle: the cosine is uniform in [cos 0.8, 1]; standard error of its mean 0.0876 / sqrt(25000)
     assert cosines.mean() == pytest.approx((1 + np.cos(0.8)) / 2, abs=4 * 0.0876 / np.sqrt(25_000))
-    assert float(b.share.sum()) == pytest.approx(1.0, abs=1e-12)
+    assert float(b.power.sum()) == pytest.approx(1.0, abs=1e-12)
     x, y = case.field.control_xy()
     assert float(case.heights[0, 7]) == pytest.approx(np.sqrt(81 - 25) - 9, abs=1e-14)
     assert float((torch.sqrt(81 - x[:, None] ** 2 - y**2) - 9 - case.heights).abs().max()) == 0.0
@@ -146,7 +147,7 @@ def test_a_plane_wave_gives_way_to_a_point():
     case = intersection.of_lens(*lens(), rays=2000)
     assert "50 mm before the lens" in case.source
     b = case.rays
-    assert 1900 < len(b.x) < 2100 and b.z == 0.0 and float(b.dz.max()) < 1.0
+    assert 1900 < b.count < 2100 and b.origin[2] == 0.0 and float(b.direction[2].max()) < 1.0
     study = intersection.run_intersection(case, repeats=1, most=8)
     assert study.about["source"] == case.source
     assert study.orders["mesh, mean z-error"].exponent == pytest.approx(2.0, abs=0.15)
@@ -156,7 +157,7 @@ def test_a_plane_wave_gives_way_to_a_point():
 
 def test_a_source_of_its_own_is_kept():
     case = intersection.of_lens(*lens(Points(((1.0, 0.0, -20.0), (-1.0, 0.0, -20.0)))), rays=1000)
-    assert "2 points" in case.source and float((case.rays.share > 0).double().mean()) == 1.0
+    assert "2 points" in case.source and float((case.rays.power > 0).double().mean()) == 1.0
     with pytest.raises(CausticError, match="no ray enters the lens"):
         intersection.of_lens(*lens(Points(((400.0, 0.0, -1.0),), cone=1.0)), rays=1000)
 

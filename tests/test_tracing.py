@@ -7,13 +7,15 @@ import numpy as np
 import pytest
 import torch
 import torch.autograd.forward_ad as fwd
-from caustic_cli.optics.tracing import LOSSES, PlaneTracer, Status, expose
 from scipy.interpolate import BSpline
 
 from caustic_cli.errors import InputError
+from caustic_cli.optics.rays import LOSSES, RayState, Status
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import SAMPLERS, Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import EXIT, System
+from caustic_cli.optics.trace import Tracer, expose
 from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
 from caustic_cli.scene.lens import FRESNEL
 
@@ -39,8 +41,15 @@ def single_sample(kind: str, shape: tuple[int, int], seed: int = 0):
     return sample
 
 
-def land(scene: Scene, heights: torch.Tensor, sample, dtype=torch.float64):
-    return PlaneTracer(scene, HeightField.of(scene.lens), sample, dtype)(heights)
+def land(scene: Scene, heights: torch.Tensor, sample, dtype=torch.float64) -> RayState:
+    """Rays on the screen, (N,): by the stages of the device's backend."""
+    (state,) = Tracer(System.of(scene, HeightField.of(scene.lens)), sample, dtype, track=True).land({EXIT: heights}, scene.screen)
+    return state
+
+
+def place(state: RayState, sample) -> tuple[torch.Tensor, torch.Tensor]:
+    """Where rays landed, in the shape of their sample."""
+    return state.origin[0].view(sample.shape), state.origin[1].view(sample.shape)
 
 
 def closed_form(scene: Scene, heights: torch.Tensor, u: np.ndarray, v: np.ndarray):
@@ -75,12 +84,12 @@ def test_landing_points_are_the_closed_form(kind, degree, index, bumps):
                 else (sample.u.numpy(), sample.v.numpy()))
         x, y, square = closed_form(scene, heights, u, v)
         landing = land(scene, heights, sample)
-        status = landing.status.reshape(-1).numpy()
+        status = landing.statuses().numpy()
         clear = np.abs(square) > 1e-3
         np.testing.assert_array_equal(status[clear], np.where(square > 0, Status.OK, Status.TOTAL_INTERNAL_REFLECTION)[clear])
         keep = clear & (square > 0)
-        np.testing.assert_allclose(landing.x.reshape(-1).numpy()[keep], x[keep], rtol=0, atol=1e-10)
-        np.testing.assert_allclose(landing.y.reshape(-1).numpy()[keep], y[keep], rtol=0, atol=1e-10)
+        np.testing.assert_allclose(landing.origin[0].numpy()[keep], x[keep], rtol=0, atol=1e-10)
+        np.testing.assert_allclose(landing.origin[1].numpy()[keep], y[keep], rtol=0, atol=1e-10)
         checked += int(keep.sum())
         assert bumps < 1 or int((~keep).sum()) > 100
     assert checked > 1000
@@ -91,8 +100,9 @@ def test_flat_lens_is_a_window():
     scene = scene_of()
     sample = single_sample("lines", (20, 15))
     landing = land(scene, heights_of(scene, 0.0), sample)
-    torch.testing.assert_close(landing.x, (10 * sample.u - 5)[:, None].expand(20, 15), rtol=0, atol=1e-12)
-    torch.testing.assert_close(landing.y, (8 * sample.v - 4)[None, :].expand(20, 15), rtol=0, atol=1e-12)
+    x, y = place(landing, sample)
+    torch.testing.assert_close(x, (10 * sample.u - 5)[:, None].expand(20, 15), rtol=0, atol=1e-12)
+    torch.testing.assert_close(y, (8 * sample.v - 4)[None, :].expand(20, 15), rtol=0, atol=1e-12)
     r = 0.04  # ((1.5 - 1) / (1.5 + 1))^2
     assert float(landing.leaving) == pytest.approx((1 - r) ** 2, rel=1e-13)
     assert float(landing.lost["fresnel"]) == pytest.approx(r + (1 - r) * r, rel=1e-13)
@@ -113,14 +123,14 @@ def test_prism_by_trigonometry(slope):
         landing = land(scene, heights, sample)
         r0 = 0.0 if kind == "none" else 0.04
         if slope > 1:
-            assert bool((landing.status == Status.TOTAL_INTERNAL_REFLECTION).all())
+            assert bool((landing.statuses() == Status.TOTAL_INTERNAL_REFLECTION).all())
             assert float(landing.lost["total_internal_reflection"]) == pytest.approx(1 - r0, rel=1e-13)
-            assert not landing.weight.any()
+            assert not landing.power.any()
             continue
         b = math.asin(index * math.sin(a))
         start = 10 * sample.u - 5
-        torch.testing.assert_close(landing.x, start + (51 - slope * start) * math.tan(b - a), rtol=0, atol=1e-11)
-        torch.testing.assert_close(landing.y, 8 * sample.v - 4, rtol=0, atol=1e-12)
+        torch.testing.assert_close(landing.origin[0], start + (51 - slope * start) * math.tan(b - a), rtol=0, atol=1e-11)
+        torch.testing.assert_close(landing.origin[1], 8 * sample.v - 4, rtol=0, atol=1e-12)
         exact = 0.5 * ((math.sin(a - b) / math.sin(a + b)) ** 2 + (math.tan(a - b) / math.tan(a + b)) ** 2)
         reflected = {"none": 0.0, "exact": exact, "schlick": r0 + (1 - r0) * (1 - math.cos(b)) ** 5}[kind]
         assert float(landing.leaving) == pytest.approx((1 - r0) * (1 - reflected), rel=1e-12)
@@ -136,11 +146,11 @@ def test_concave_sphere_spreads_light_by_the_magnification():
         x, y = (a.numpy() for a in HeightField.of(lens).control_xy())
         heights = torch.from_numpy(offset.thickness + offset.sag(x[:, None], y[None, :]))
         sample = single_sample("grid", (16, 16))
-        landing = land(scene, heights, sample)
+        landed = place(land(scene, heights, sample), sample)
         # away from the rim, where the knots crowd: control points on the sphere shift the spline in height only
         x, y = (mag * 0.2 * (2 * at - 1)[1:-1] for at in (sample.u, sample.v))
-        torch.testing.assert_close(landing.x[1:-1], x[:, None].expand(14, 16), rtol=0, atol=3e-5)
-        torch.testing.assert_close(landing.y[:, 1:-1], y[None, :].expand(16, 14), rtol=0, atol=3e-5)
+        torch.testing.assert_close(landed[0][1:-1], x[:, None].expand(14, 16), rtol=0, atol=3e-5)
+        torch.testing.assert_close(landed[1][:, 1:-1], y[None, :].expand(16, 14), rtol=0, atol=3e-5)
 
 
 LENSES = {"gentle": 0.02, "off the screen": 0.4, "totally reflecting": 1.3}
@@ -190,10 +200,10 @@ def test_status_tells_what_became_of_a_ray():
     space_u, space_v = HeightField.of(scene.lens).spaces
     z = ((space_u.matrix(sample.u) @ heights) * space_v.matrix(sample.v)).sum(1).numpy()
     expected = np.where(square <= 0, Status.TOTAL_INTERNAL_REFLECTION, np.where(z >= 3.3, Status.AWAY_FROM_SCREEN, Status.OK))
-    np.testing.assert_array_equal(landing.status.numpy(), expected)
+    np.testing.assert_array_equal(landing.statuses().numpy(), expected)
     assert min(np.bincount(expected, minlength=3)) > 100
-    assert bool(((landing.weight > 0) == (landing.status == Status.OK)).all())
-    total = landing.weight.sum() + sum(landing.lost.values())
+    assert bool(((landing.power > 0) == (landing.statuses() == Status.OK)).all())
+    total = landing.power.sum() + sum(landing.lost.values())
     assert float(total) == pytest.approx(1.0, abs=1e-12)
 
 
@@ -257,25 +267,31 @@ def test_exposure_does_not_depend_on_threads():
 
 
 @pytest.mark.parametrize("kind", ["lines", "stratified"])
-def test_float32_landing_error(kind):
+def test_float32_landing_error(kind, kernels):
     """A bound by counting roundings of size eps = 2^-24.
 
     A slope is a sum of control heights over knot distances: each of height, basis value and product is rounded.  Refraction adds
     four roundings of numbers near 1, times the slope.  The throw multiplies both.  Heights enter relative to their mean: the
-    thickness of 3000 mm would cost 1e4 times more (hard case 4).
+    thickness of 3000 mm would cost 1e4 times more (hard case 4).  The kernels know float64 alone.
     """
     lens = Lens((10.0, 8.0), 0.0, 1.5, (30, 25), (3, 3), offset=Offset(3000.0))
     scene, field = Scene(PlaneWave(), lens, Screen((30.0, 30.0), 3300.0, (10, 10))), HeightField.of(lens)
     sample = single_sample(kind, (60, 60))
     heights = 3000.0 + 0.02 * torch.randn(30, 25, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     exact, rounded = land(scene, heights, sample), land(scene, heights, sample, torch.float32)
-    assert bool((exact.status == Status.OK).all())
-    assert torch.equal(exact.status, rounded.status)
-    assert rounded.x.dtype == torch.float32
+    assert bool((exact.statuses() == Status.OK).all())
+    assert torch.equal(exact.statuses(), rounded.statuses())
+    (x, y), (x_rounded, y_rounded) = exact.origin[:2], rounded.origin[:2]
+    if kernels == "fused":
+        assert x_rounded.dtype == torch.float64
+        assert torch.equal(x, x_rounded)
+        assert torch.equal(y, y_rounded)
+        return
+    assert x_rounded.dtype == torch.float32
     eps, sag, knot_distance = 2.0**-24, float((heights - 3000.0).abs().max()), 8.0 / 22
     slope_error = 3 * eps * 2 * sag / knot_distance
-    bound = 300.0 * (slope_error + 4 * eps * field.slope_bound(heights)) + 4 * eps * float(exact.x.abs().max())
-    worst = max(float((exact.x - rounded.x).abs().max()), float((exact.y - rounded.y).abs().max()))
+    bound = 300.0 * (slope_error + 4 * eps * field.slope_bound(heights)) + 4 * eps * float(x.abs().max())
+    worst = max(float((x - x_rounded).abs().max()), float((y - y_rounded).abs().max()))
     assert bound < 1e-4  # mm: a thousandth of a pixel of 0.1 mm
     assert bound / 20 < worst < bound
 
@@ -320,10 +336,10 @@ def test_scaling_every_length_changes_nothing(factor):
 def exposed(scene: Scene, sampler: Sampler, f: Filter):
     """heights -> image and power leaving the lens, differentiable, float64."""
     (sample,) = sampler.chunks()
-    tracer = PlaneTracer(scene, HeightField.of(scene.lens), sample, torch.float64)
+    tracer = Tracer(System.of(scene, HeightField.of(scene.lens)), sample)
 
     def both(heights: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        part = tracer.expose(heights, scene.screen, f)
+        part = tracer.expose({EXIT: heights}, scene.screen, f)
         return part.image, part.leaving
 
     return both
@@ -346,8 +362,8 @@ def test_gradcheck_of_the_image(kind, fresnel):
     scene = replace(scene, screen=replace(scene.screen, z=10.0))
     heights = heights_of(scene, 1.1, seed=2).requires_grad_()
     landing = land(scene, heights.detach(), single_sample(kind, (6, 5), 1))
-    assert int((landing.status == Status.OK).sum()) > 15
-    assert int((landing.status == Status.TOTAL_INTERNAL_REFLECTION).sum()) > 1
+    assert int((landing.statuses() == Status.OK).sum()) > 15
+    assert int((landing.statuses() == Status.TOTAL_INTERNAL_REFLECTION).sum()) > 1
     both = exposed(scene, Sampler(kind, (6, 5), 1), Filter("cosine", (3, 3)))
     if fresnel == "none":  # the power that leaves the lens is constant then
         assert torch.autograd.gradcheck(lambda h: both(h)[0], (heights,), eps=1e-7, atol=1e-6, rtol=1e-5, check_forward_ad=True)

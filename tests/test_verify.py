@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from caustic_cli.optics.tracing import expose
 from test_export import make
 
 from caustic_cli import cli
@@ -15,6 +14,7 @@ from caustic_cli.errors import CausticError, InputError
 from caustic_cli.export.lighttools import write_lighttools
 from caustic_cli.export.mitsuba import write_mitsuba
 from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Disc, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies import verify
 

@@ -136,7 +136,7 @@ sys.path.insert(0, {here!r})
 import speed, torch
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.optics.sampling import Sampler
-from caustic_cli.optics.tracing import expose
+from caustic_cli.optics.trace import expose
 from caustic_cli.optics.reconstruction import Filter
 s, field, heights = speed.scene(50, 3, 250)
 began = time.perf_counter()

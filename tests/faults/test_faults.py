@@ -14,7 +14,7 @@ from PIL import Image
 from caustic_cli import checkpoint, cli, files, place, session, verdict
 from caustic_cli.errors import CausticError
 from caustic_cli.inverse.objective import Objective
-from caustic_cli.optics import shortage, tracing
+from caustic_cli.optics import shortage, trace
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -187,16 +187,17 @@ FIELD = HeightField.of(LENS)
 
 def scarce(monkeypatch, most: int) -> list:
     """Let there be memory for `most` rays at a time, as torch says it on a CPU; the sizes that were tried."""
-    tried, whole = [], tracing.tracer
+    tried, whole = [], trace.Tracer
 
-    def tracer(scene, field, rays, *rest):
-        tried.append(int(np.prod(rays.shape)))
-        if tried[-1] > most:
-            raise RuntimeError("[enforce fail at alloc_cpu.cpp:121] data. DefaultCPUAllocator: can't allocate memory: you tried"
-                               " to allocate 8388608 bytes. Error code 12 (Cannot allocate memory)")
-        return whole(scene, field, rays, *rest)
+    class Tracer(whole):
+        def __init__(self, system, rays, *rest, **options):
+            tried.append(int(np.prod(rays.shape)))
+            if tried[-1] > most:
+                raise RuntimeError("[enforce fail at alloc_cpu.cpp:121] data. DefaultCPUAllocator: can't allocate memory: you tried"
+                                   " to allocate 8388608 bytes. Error code 12 (Cannot allocate memory)")
+            super().__init__(system, rays, *rest, **options)
 
-    monkeypatch.setattr(tracing, "tracer", tracer)
+    monkeypatch.setattr(trace, "Tracer", Tracer)
     return tried
 
 
@@ -205,13 +206,13 @@ def test_fewer_rays_at_a_time_are_tried_when_memory_runs_out(kind, monkeypatch):
     sampler, z = Sampler(kind, (200, 200), 1), 3.0 + 0.1 * torch.randn(7, 6, dtype=torch.float64)
     target = torch.rand(12, 9, dtype=torch.float64)
     make = lambda: Objective(SCENE, FIELD, sampler, Filter("cosine", (3, 3)), target, "rms", dtype=torch.float64)  # noqa: E731
-    plenty, image = make()(z), tracing.expose(SCENE, FIELD, z, sampler).image
+    plenty, image = make()(z), trace.expose(SCENE, FIELD, z, sampler).image
     tried = scarce(monkeypatch, 20_000)
     found = make()(z)
     assert max(tried) == 40_000 and min(tried) <= 20_000
     tried.clear()
     assert found.loss == pytest.approx(plenty.loss, rel=1e-12) and torch.allclose(found.gradient, plenty.gradient, rtol=1e-9)
-    assert torch.allclose(tracing.expose(SCENE, FIELD, z, sampler).image, image, rtol=1e-12)
+    assert torch.allclose(trace.expose(SCENE, FIELD, z, sampler).image, image, rtol=1e-12)
     assert max(tried) == 40_000 and min(tried) <= 20_000
 
 

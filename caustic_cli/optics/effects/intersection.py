@@ -47,7 +47,7 @@ class MeanPlane(Action):
     def meet(self, m, origin, direction, heights: Tensor | None) -> Hit | None:
         """The height there is what the ray goes on from; no time passes between it and the mean plane."""
         surface = m.element.surface
-        if not isinstance(surface, HeightField):
+        if not isinstance(surface, HeightField) or m.state.sample is not None:  # a plane wave's rays stand on the surface itself
             return None
         sag, mean = surface.centred(heights)
         t = (mean - origin[2]) / direction[2]
