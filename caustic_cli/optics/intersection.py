@@ -58,9 +58,9 @@ class Method:
         checks.choice("intersection method", self.name, METHODS)
 
 
-def meet_any(surface: Surface, heights: Tensor | None, origin, direction, side: float, radius: float | None = None) -> Hit:
+def meet_any(surface: Surface, heights: Tensor | None, origin, direction, side: float) -> Hit:
     """`Surface.meet` for any surface, in plain torch."""
-    t, status = reference(surface, heights, origin, direction, side, radius)
+    t, status = reference(surface, heights, origin, direction, side)
     found = status == Status.HIT
     t, gx, gy = attach(surface, heights, origin, direction, t, found)
     return Hit(t, gx, gy, found)

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from caustic_cli.errors import InputError
 from caustic_cli.optics.frames import Pose
 from caustic_cli.optics.surfaces import HeightField, Plane, Surface
-from caustic_cli.scene import Light, Pupil, Scene, Screen, Source, checks
+from caustic_cli.scene import Aperture, Light, Pupil, Scene, Screen, Source, checks
 from caustic_cli.scene.lens import FRESNEL
 from caustic_cli.scene.materials import refractive_index
 
@@ -50,35 +50,6 @@ class Medium:
 
 
 AIR = Medium()
-
-
-@dataclass(frozen=True)
-class Aperture:
-    """The part of a surface that light may pass: a rectangle or a circle about the element's axis; infinite for all of it.
-
-    Args:
-        half_size: half widths of the rectangle, mm; radius twice of a circle.
-        round: a circle.
-    """
-
-    half_size: tuple[float, float] = (math.inf, math.inf)
-    round: bool = False
-
-    def __post_init__(self):
-        if self.round and self.half_size[0] != self.half_size[1]:
-            raise InputError(f"half_size of a circular aperture must be its radius, twice the same, got {self.half_size}")
-
-    @property
-    def radius(self) -> float | None:
-        """Of a circle, mm; None of a rectangle."""
-        return self.half_size[0] if self.round else None
-
-    def holds(self, x, y):
-        """Whether points lie within it."""
-        (rx, ry) = self.half_size
-        if self.round:
-            return x * x + y * y <= rx * rx
-        return (x.abs() <= rx) & (y.abs() <= ry)
 
 
 @dataclass(frozen=True)

@@ -227,14 +227,14 @@ class Tracer:
             o, state = self._backed_up(o, d, state, element, heights)
         hit = next((h for a in self.actions if (h := a.meet(m, o, d, heights)) is not None), None)
         if hit is None:
-            hit = prepared(heights) if prepared else element.surface.meet(heights, o, d, m.side, element.aperture.radius)
+            hit = prepared(heights) if prepared else element.surface.meet(heights, o, d, m.side)
         if state.power.dtype != self.dtype:  # the first surface is met in float64 whatever follows
             state, hit = state.to(self.dtype), Hit(*(_cast(c, self.dtype) for c in hit[:3]), hit.found)
             o, d = (tuple(_cast(c, self.dtype) for c in v) for v in (o, d))
         m.local, m.incoming, m.slopes, m.length = advanced(o, d, hit.t), d, (hit.gx, hit.gy), hit.t
         if prepared is None or state.sample is None:  # a sample stands on the surface
             found, aperture = hit.found, element.aperture
-            if prepared is None and (aperture.round or aperture.half_size != element.surface.half_size):
+            if aperture.round or aperture.half_size != element.surface.half_size:
                 found = found & aperture.holds(*m.local[:2])
             kept = torch.where(found, state.power, torch.zeros_like(state.power))
             state.lose("missed_surface", (state.power - kept).detach())
@@ -316,7 +316,7 @@ class Tracer:
         spread = start.spread()
         full = spread.full((*spread.origin, *spread.direction))
         origin = (full[0] - px, full[1] - py, full[2] + (start.datum - pz))
-        return self.backend.meet_fixed(surface, origin, full[3:], element.aperture.radius)
+        return self.backend.meet_fixed(surface, origin, full[3:])
 
     def _lowered(self, like: Tracer | None):
         """The rest of the system as one fused kernel, a function of heights, screen and filter; None where it is none such."""

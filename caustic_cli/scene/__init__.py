@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from caustic_cli.scene.aperture import Aperture, Pupil
 from caustic_cli.scene.lens import Lens, Offset
 from caustic_cli.scene.light import Light
 from caustic_cli.scene.screen import Screen
 from caustic_cli.scene.sources import Disc, PlaneWave, Points, Source
 
-__all__ = ["Band", "Disc", "Lens", "Light", "Offset", "PlaneWave", "Points", "Pupil", "Scene", "Screen", "Source"]
+__all__ = ["Aperture", "Band", "Disc", "Lens", "Light", "Offset", "PlaneWave", "Points", "Pupil", "Scene", "Screen", "Source"]
 
 from dataclasses import dataclass, field, replace
 
@@ -25,15 +26,6 @@ class Band:
     scene: Scene
     weight: float = 1.0
     channel: int | None = None
-
-
-@dataclass(frozen=True)
-class Pupil:
-    """The aperture that sources light: half widths mm, z mm, and whether it is a circle."""
-
-    half_size: tuple[float, float]
-    z: float
-    round: bool = False
 
 
 @dataclass(frozen=True)

@@ -64,18 +64,17 @@ class Numba(Torch):
         at = ((0.5 * (c / r + 1.0)).contiguous().numpy() for c, r in zip((x, y), field.half_size, strict=True))
         return scattered_surface(FusedSurface(field.spaces, field.half_size), heights.double(), *at)
 
-    def meet_spline(self, field, heights: Tensor, origin, direction, side: float, radius: float | None) -> Hit:
+    def meet_spline(self, field, heights: Tensor, origin, direction, side: float) -> Hit:
         """As the reference."""
         rays = [torch.as_tensor(c, dtype=torch.float64) for c in (*origin, *direction)]
         rays = [c.contiguous() for c in torch.broadcast_tensors(*rays)]
         if not rays[0].numel():
-            return super().meet_spline(field, heights, origin, direction, side, radius)
-        return Hit(*hits_of_rays(FusedSurface(field.spaces, field.half_size), heights, tuple(rays[:3]), tuple(rays[3:]), side=side,
-                                 radius=radius))
+            return super().meet_spline(field, heights, origin, direction, side)
+        return Hit(*hits_of_rays(FusedSurface(field.spaces, field.half_size), heights, tuple(rays[:3]), tuple(rays[3:]), side=side))
 
-    def meet_fixed(self, field, origin, direction, radius: float | None):
+    def meet_fixed(self, field, origin, direction):
         """As the reference; what does not depend on the heights is prepared."""
-        hits = RayHits(FusedSurface(field.spaces, field.half_size), origin, direction, radius)
+        hits = RayHits(FusedSurface(field.spaces, field.half_size), origin, direction, None)
 
         def meet(heights: Tensor) -> Hit:
             t, gx, gy = hits(heights)

@@ -41,13 +41,13 @@ class Torch:
         """Height and slopes at fixed points (N,) mm, float64, linear in the heights."""
         return tuple(field.at(heights, x, y))
 
-    def meet_spline(self, field, heights: Tensor, origin, direction, side: float, radius: float | None) -> Hit:
+    def meet_spline(self, field, heights: Tensor, origin, direction, side: float) -> Hit:
         """`Surface.meet` of a B-spline."""
-        return intersection.meet_any(field, heights, origin, direction, side, radius)
+        return intersection.meet_any(field, heights, origin, direction, side)
 
-    def meet_fixed(self, field, origin, direction, radius: float | None):
+    def meet_fixed(self, field, origin, direction):
         """A function of heights (n, m) mm: `Hit`s from below of rays that do not depend on them."""
-        return lambda heights: intersection.meet_any(field, heights, origin, direction, 1.0, radius)
+        return lambda heights: intersection.meet_any(field, heights, origin, direction, 1.0)
 
     def find(self, field, heights: Tensor, origin, direction, method: intersection.Method,
              radius: float | None) -> tuple[Tensor, Tensor]:

@@ -52,7 +52,8 @@ class MeanPlane(Action):
         sag, mean = surface.centred(heights)
         t = (mean - origin[2]) / direction[2]
         x, y = (o + t * d for o, d in zip(origin[:2], direction[:2], strict=True))
-        (rx, ry), found = surface.half_size, m.element.aperture.holds(x, y)
+        (rx, ry) = surface.half_size
+        found = (x.abs() <= rx) & (y.abs() <= ry)
         z, gx, gy = surface.evaluate(sag, x.detach().clamp(-rx, rx), y.detach().clamp(-ry, ry))
         m.lift = torch.where(found, z, torch.zeros_like(z))
         t = torch.where(found, t, torch.zeros_like(t))

@@ -68,12 +68,8 @@ class Surface(ABC):
         """Heights of the same surface moved to where its numbers are small, and by how far it was higher, mm."""
         return heights, 0.0
 
-    def meet(self, heights: Tensor | None, origin, direction, side: float, radius: float | None = None) -> Hit:
-        """First meetings of rays (N,), mm, unit directions with side d_z > 0; differentiable by heights, origins and directions.
-
-        Args:
-            radius: the surface ends at this distance from its middle, mm; None where it does not.
-        """
+    def meet(self, heights: Tensor | None, origin, direction, side: float) -> Hit:
+        """First meetings of rays (N,), mm, unit directions with side d_z > 0; differentiable by heights, origins and directions."""
         from caustic_cli.optics.intersection import meet_any  # noqa: PLC0415 - intersection knows surfaces
 
-        return meet_any(self, heights, origin, direction, side, radius)
+        return meet_any(self, heights, origin, direction, side)

@@ -96,9 +96,9 @@ class HeightField(Surface):
         """As of any surface, by the kernels of the device's backend; linear in the heights."""
         return list(backend_for(x.device).spline_at(self, heights, x, y))
 
-    def meet(self, heights: Tensor, origin, direction, side: float, radius: float | None = None) -> Hit:
+    def meet(self, heights: Tensor, origin, direction, side: float) -> Hit:
         """As of any surface, by the kernels of the device's backend."""
-        return backend_for(heights.device).meet_spline(self, heights, origin, direction, side, radius)
+        return backend_for(heights.device).meet_spline(self, heights, origin, direction, side)
 
     def slope_bound(self, heights: Tensor) -> float:
         """An upper bound of |grad z|."""

@@ -29,12 +29,11 @@ class Plane(Surface):
         """(0, 0)."""
         return 0.0, 0.0
 
-    def meet(self, heights: None, origin, direction, side: float, radius: float | None = None) -> Hit:
+    def meet(self, heights: None, origin, direction, side: float) -> Hit:
         """t = -o_z / d_z; the slopes are the number 0."""
-        (ox, oy, oz), (dx, dy, dz) = origin, direction
+        oz, dz = torch.as_tensor(origin[2]), direction[2]
+        ox = next((c for c in origin if isinstance(c, Tensor)), oz)
         ahead = torch.as_tensor(side * dz, dtype=ox.dtype, device=ox.device) > PARALLEL
         t = torch.where(ahead, -oz / torch.where(ahead, torch.as_tensor(dz).to(ox), 1.0), torch.zeros_like(ox))
         found = ahead & (t >= 0)
-        if radius is not None:
-            found = found & ((ox + t * dx) ** 2 + (oy + t * dy) ** 2 <= radius * radius)
         return Hit(torch.where(found, t, torch.zeros_like(t)), 0.0, 0.0, found)

@@ -64,7 +64,7 @@ class Sphere(Surface):
         sine = min(self.reach * abs(self.curvature), EQUATOR) if math.isfinite(self.radius) else 0.0
         return (sine / math.sqrt(1.0 - sine * sine),) * 2
 
-    def meet(self, heights: None, origin, direction, side: float, radius: float | None = None) -> Hit:
+    def meet(self, heights: None, origin, direction, side: float) -> Hit:
         """The closed form, from either side."""
         (ox, oy, oz), (dx, dy, dz), k = origin, direction, self.curvature
         big_f = k * (ox * ox + oy * oy + oz * oz) - 2.0 * oz
@@ -76,8 +76,6 @@ class Sphere(Surface):
         x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
         cosine = 1.0 - k * z  # towards the vertex's half; 0 at the equator
         found = met & (t >= 0) & (cosine > math.sqrt(1.0 - EQUATOR**2)) & (side * (dz * cosine - k * (x * dx + y * dy)) > 0)
-        if radius is not None:
-            found = found & (x * x + y * y <= radius * radius)
         none, one = torch.zeros_like(t), torch.ones_like(t)
         cosine = torch.where(found, cosine, one)
         return Hit(torch.where(found, t, none), torch.where(found, k * x / cosine, none),
