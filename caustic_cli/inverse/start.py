@@ -194,7 +194,8 @@ def thrown(x, y, z, zx, zy, d, index: float, z_screen: float) -> tuple[np.ndarra
     shape, backend = z.shape, backend_for("cpu")
 
     def flat(value):
-        return value if isinstance(value, float) else torch.from_numpy(np.array(np.broadcast_to(value, shape))).view(-1)  # a copy: broadcast arrays are read-only
+        # a copy: what NumPy broadcasts is read-only, which tensors cannot be
+        return value if isinstance(value, float) else torch.from_numpy(np.array(np.broadcast_to(value, shape), order="C")).view(-1)
 
     origin, slopes, mirror = [flat(c) for c in (x, y, z)], (flat(zx), flat(zy)), index == -1.0
     out = backend.interact(tuple(map(flat, d)), slopes, torch.ones(z.size, dtype=torch.float64), eta=1.0 if mirror else index,
