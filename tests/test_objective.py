@@ -185,7 +185,7 @@ def test_bins_without_fresnel_have_a_slope_of_zero(chunk, monkeypatch):
 def test_three_wavelengths_keep_their_graphs(kind, fresnel, kernels):
     """In a glass that disperses; and the derivative by all heights is the weighted sum of those of each wavelength alone.
 
-    By the kernels the chunks of all three keep their graphs; plain torch would hold every ray after every stage, so it traces again.
+    By kernels the chunks of all three keep their graphs; plain torch would hold every ray after every stage, so it traces again.
     """
     lines, weights = (450.0, 550.0, 650.0), (1.0, 2.0, 1.0)
     lens = replace(LENS, glass="N-SF11", index=refractive_index("N-SF11"), fresnel=fresnel)

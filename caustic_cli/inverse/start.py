@@ -196,7 +196,7 @@ def thrown(x, y, z, zx, zy, d, index: float, z_screen: float) -> tuple[np.ndarra
     def flat(value):
         if isinstance(value, float):
             return value
-        return torch.from_numpy(np.array(np.broadcast_to(value, shape))).view(-1)  # a copy: broadcast arrays are read-only
+        return torch.from_numpy(np.array(np.broadcast_to(value, shape), order="C")).view(-1)  # a copy: tensors cannot be read-only
 
     origin, slopes, mirror = [flat(c) for c in (x, y, z)], (flat(zx), flat(zy)), index == -1.0
     out = backend.interact(tuple(map(flat, d)), slopes, torch.ones(z.size, dtype=torch.float64), eta=1.0 if mirror else index,

@@ -70,7 +70,7 @@ def converge(scene: Scene, field: HeightField, heights: Tensor, tolerance: float
         if error <= tolerance:
             lost = {name: math.fsum(p.lost[name] for p in parts) / BATCHES for name in parts[0].lost}
             leaving = math.fsum(p.leaving for p in parts) / BATCHES
-            return Converged(Image(mean, lost, leaving, sum(p.rays for p in parts)), error, traced)
+            return Converged(Image(mean, leaving, lost, sum(p.rays for p in parts)), error, traced)
         more = max(1.3, 1.1 * (error / tolerance) ** (4.0 / 3.0))
         foreseen = each * more if each > mean.numel() else 0.0  # too few rays a pixel foretell nothing
         each = int(each * min(32.0, more))

@@ -3,8 +3,9 @@
     python tests/benchmarks/effects.py [CHECKOUT]      about three minutes on two cores; writes results/effects.md
 
 The setting is table D.2's, see speed.py.  An iteration is image, loss and gradient.  The path that a plan has compiled takes turns
-with one put together by hand (`PlaneTracer` and nothing else), and with the same iteration of another CHECKOUT of this program, in
-a process of its own, if one is given: say, one from before there were effects.  The order within a round alternates.  Times are
+with one put together by hand (a `Tracer` lowered to the fused kernel, and nothing else), and with the same iteration of another
+CHECKOUT of this program, in a process of its own with that checkout's own benchmark, if one is given: say, one from before there
+were effects.  The order within a round alternates.  Times are
 processor time of one thread, which other programs on the machine disturb least.  Ratios are medians of the rounds' ratios, with
 their quartiles.
 """
@@ -20,7 +21,7 @@ import time
 from pathlib import Path
 
 import torch
-from speed import BASE, Filter, Objective, PlaneTracer, Sampler, scene
+from speed import BASE, Filter, Objective, Sampler, scene
 
 ROUNDS, EFFECT_ROUNDS = 60, 3
 ONE = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
@@ -33,11 +34,14 @@ def iteration(s=None, bare: bool = False):
     f = Filter(BASE["kind"], (BASE["filter"],) * 2, (BASE["alpha"],) * 2)
     target = torch.rand((250, 250), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     from caustic_cli.optics.emission import rays_of  # noqa: PLC0415
+    from caustic_cli.optics.system import System  # noqa: PLC0415
+    from caustic_cli.optics.trace import Tracer  # noqa: PLC0415
 
     made = Objective(s, field, rays_of(s, "grid", BASE["rays"]), f, target, "rms-light")
     if bare:
         (sample,) = Sampler.of_size("grid", BASE["rays"]).chunks()
-        made.kept = [PlaneTracer(s, field, sample, torch.float32)]
+        made.kept = [Tracer(System.of(s, field), sample, torch.float32)]
+        assert made.kept[0].fused is not None
     return lambda: made(heights)
 
 
@@ -48,12 +52,14 @@ def timed(run) -> float:
 
 
 class Elsewhere:
-    """The same iteration in another process, of the program in `checkout`."""
+    """The same iteration in another process, of the program in `checkout`, as its own copy of this file does it."""
 
     def __init__(self, checkout: Path):
-        paths = f"{checkout}{os.pathsep}{checkout / 'tests' / 'benchmarks'}"
-        self.process = subprocess.Popen([sys.executable, __file__, "--worker"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                                        text=True, env={**os.environ, "PYTHONPATH": paths, **ONE}, cwd=checkout)
+        benchmarks = checkout / "tests" / "benchmarks"
+        paths = f"{checkout}{os.pathsep}{benchmarks}"
+        self.process = subprocess.Popen([sys.executable, str(benchmarks / "effects.py"), "--worker"], stdin=subprocess.PIPE,
+                                        stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": paths, **ONE},
+                                        cwd=checkout)
 
     def __call__(self) -> float:
         self.process.stdin.write("go\n")
@@ -82,8 +88,9 @@ def ratio(times: dict, name: str, base: str) -> str:
 
 
 def main(checkout: Path | None) -> None:
-    from caustic_cli.optics.plan import EFFECTS, compile_plan  # noqa: PLC0415
-    from caustic_cli.studies.effects import put, run_effects  # noqa: PLC0415
+    from caustic_cli.optics.effects import EFFECTS  # noqa: PLC0415
+    from caustic_cli.optics.plan import compile_plan  # noqa: PLC0415
+    from caustic_cli.studies.effects import run_effects  # noqa: PLC0415
 
     own, field, heights = scene(BASE["control"], BASE["degree"], BASE["pixels"])
     compiling = timed(lambda: compile_plan(own, field, heights))
@@ -106,14 +113,14 @@ def main(checkout: Path | None) -> None:
         other.close()
         here.close()
     out += ["", "| effect put in | iteration, ms | ratio to bare |", "| --- | --- | --- |"]
-    for name in EFFECTS:
-        with_it = put(own, name, heights)
-        if with_it is None or name == "mirror":
+    for effect in EFFECTS:
+        with_it = effect.sample(own, heights)
+        if with_it is None or effect.name == "mirror":
             continue
-        changed = iteration(with_it[0])
+        changed = iteration(with_it.scene)
         times = in_turns({"changed": lambda run=changed: timed(run), "bare": lambda: timed(bare)}, EFFECT_ROUNDS)
         median = 1e3 * statistics.median(times["changed"])
-        out.append(f"| {name}, {with_it[2]} | {median:.1f} | {ratio(times, 'changed', 'bare')} |")
+        out.append(f"| {effect.name}, {with_it.words} | {median:.1f} | {ratio(times, 'changed', 'bare')} |")
     study = run_effects(own, field, heights, rays=BASE["rays"], repeats=EFFECT_ROUNDS)
     out += ["", "| effect | in this scene | measured with | cost of a float64 image, ms | error of leaving it out | power |",
             "| --- | --- | --- | --- | --- | --- |"]

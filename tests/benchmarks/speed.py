@@ -21,12 +21,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from caustic_cli.optics.tracing import PlaneTracer
 
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import EXIT, System
+from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
 
 SCREEN = Screen((38.4, 38.4), 300.0, (250, 250))
@@ -62,12 +63,12 @@ def forward(kernels: str, **setting):
     f = Filter(setting["kind"], (setting["filter"],) * 2, (setting["alpha"],) * 2)
     os.environ["CAUSTIC_KERNELS"] = kernels
     (sample,) = Sampler.of_size("grid", setting["rays"]).chunks()
-    tracer = PlaneTracer(s, field, sample, torch.float32)
+    tracer = Tracer(System.of(s, field), sample, torch.float32)
     os.environ["CAUSTIC_KERNELS"] = ""
 
     def run():
         with torch.no_grad():
-            tracer.expose(heights, s.screen, f)
+            tracer.expose({EXIT: heights}, s.screen, f)
 
     return run
 
