@@ -194,7 +194,7 @@ def thrown(x, y, z, zx, zy, d, index: float, z_screen: float) -> tuple[np.ndarra
     shape, backend = z.shape, backend_for("cpu")
 
     def flat(value):
-        return value if isinstance(value, float) else torch.from_numpy(np.ascontiguousarray(np.broadcast_to(value, shape))).view(-1)
+        return value if isinstance(value, float) else torch.from_numpy(np.broadcast_to(value, shape).flatten())
 
     origin, slopes, mirror = [flat(c) for c in (x, y, z)], (flat(zx), flat(zy)), index == -1.0
     out = backend.interact(tuple(map(flat, d)), slopes, torch.ones(z.size, dtype=torch.float64), eta=1.0 if mirror else index,
