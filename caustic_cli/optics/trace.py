@@ -286,7 +286,7 @@ class Tracer:
     def _backed_up(self, o, d, state: RayState, element: Element, heights) -> tuple[tuple, RayState]:
         """Rays of a pupil that the first surface reaches through, from before it."""
         low = element.surface.hull(heights)[0]
-        back = max(0.0, float(torch.as_tensor(o[2]).max()) - low)
+        back = max(0.0, float(torch.as_tensor(o[2], dtype=torch.float64).max()) - low)
         if back == 0.0:
             return o, state
         way = -back * (1.0 + 1e-9) / d[2]

@@ -85,7 +85,8 @@ class Torch:
         """
         away = [p - o for p, o in zip(point, origin, strict=True)]
         along, up, normal = axes
-        distance, speed = _dot(away, normal), torch.as_tensor(_dot(direction, normal))
+        distance, speed = _dot(away, normal), _dot(direction, normal)
+        speed = speed if isinstance(speed, Tensor) else torch.tensor(speed, dtype=torch.float64, device=distance.device)
         arrives = forward * speed > PARALLEL
         path = distance / torch.where(arrives, speed, torch.ones_like(speed))
         on_way = arrives & (path > 0)
@@ -112,8 +113,8 @@ def _by_mesh(field, heights, origin, direction, method: intersection.Method, rad
         return None, None
     from caustic_cli.optics.mesh import TriangleMesh  # noqa: PLC0415
 
-    mesh, rays = TriangleMesh(field, heights, *method.parts), torch.broadcast_tensors(*map(torch.as_tensor, (*origin, *direction)))
-    start, missed, _ = mesh.intersect(*(c.double() for c in rays), method.recursive)
+    mesh, rays = TriangleMesh(field, heights, *method.parts), [torch.as_tensor(c, dtype=torch.float64) for c in (*origin, *direction)]
+    start, missed, _ = mesh.intersect(*torch.broadcast_tensors(*rays), method.recursive)
     if method.name == "mesh":
         t = torch.where(missed == 0, start, torch.zeros_like(start))
         return start, (t, intersection.within(missed.long(), start, origin, direction, radius))
