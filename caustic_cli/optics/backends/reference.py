@@ -86,7 +86,7 @@ class Torch:
         away = [p - o for p, o in zip(point, origin, strict=True)]
         along, up, normal = axes
         distance, speed = _dot(away, normal), _dot(direction, normal)
-        speed = speed if isinstance(speed, Tensor) else torch.tensor(speed, dtype=torch.float64, device=distance.device)
+        speed = speed if isinstance(speed, Tensor) else torch.tensor(speed, dtype=torch.float64)
         arrives = forward * speed > PARALLEL
         path = distance / torch.where(arrives, speed, torch.ones_like(speed))
         on_way = arrives & (path > 0)
