@@ -10,9 +10,9 @@ import torch
 from caustic_cli.optics.effects import NO_REQUESTS, Requests
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.interface import reflectances
-from caustic_cli.optics.meeting import again
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.reconstruction import Filter
+from caustic_cli.optics.reintersection import again
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT, System

@@ -6,11 +6,12 @@ import math
 
 import pytest
 import torch
-from caustic_cli.optics.tracing import expose
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.emission import Emission, rays_of
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import System
+from caustic_cli.optics.trace import Tracer, expose
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
 
 LENS = Lens(size=(10.0, 8.0), control=(8, 7), z_in=0.0, index=1.5, fresnel="none")
@@ -21,8 +22,10 @@ def scene(source, lens=LENS):
 
 
 def whole(source, kind="stratified", rays=40_000, lens=LENS, **options):
-    (bundle,) = rays_of(scene(source, lens), kind, rays, **options).chunks()
-    return bundle
+    """Rays inside the lens."""
+    here = scene(source, lens)
+    (drawn,) = rays_of(here, kind, rays, **options).chunks()
+    return Tracer(System.of(here), drawn).start
 
 
 def rectangle(rx, ry, h):
@@ -36,36 +39,36 @@ def test_a_point_sends_the_lens_the_solid_angle_it_covers(kind, aimed):
     source = Points(((0.0, 0.0, -6.0),), cone=60.0, aimed=aimed)
     bundle = whole(source, kind)
     part = rectangle(5.0, 4.0, 6.0) / (4.0 * math.pi * math.sin(math.radians(30.0)) ** 2)
-    assert float(bundle.share.sum()) == pytest.approx(part, abs=0.012 if kind == "uniform" or not aimed else 2e-3)
-    assert float(bundle.share.sum()) + sum(bundle.lost.values()) == pytest.approx(1.0, abs=1e-13)
+    assert float(bundle.power.sum()) == pytest.approx(part, abs=0.012 if kind == "uniform" or not aimed else 2e-3)
+    assert float(bundle.power.sum()) + sum(bundle.lost.values()) == pytest.approx(1.0, abs=1e-13)
     if aimed:
-        assert bool((bundle.share > 0).all())  # none wasted
+        assert bool((bundle.power > 0).all())  # none wasted
 
 
 def test_a_cone_within_the_lens_is_sampled_itself():
     bundle = whole(Points(((0.5, -0.5, -6.0),), cone=20.0))
-    torch.testing.assert_close(bundle.share, torch.full_like(bundle.share, 1.0 / len(bundle.share)))
+    torch.testing.assert_close(bundle.power, torch.full_like(bundle.power, 1.0 / len(bundle.power)))
     assert bundle.lost["missed_lens"] == pytest.approx(0.0, abs=1e-13)
-    sine = torch.hypot(bundle.dx, bundle.dy) * 1.5  # Snell at the flat entrance
+    sine = torch.hypot(bundle.direction[0], bundle.direction[1]) * 1.5  # Snell at the flat entrance
     assert float(sine.max()) <= math.sin(math.radians(20.0)) * (1 + 1e-12)
     assert float((1 - torch.sqrt(1 - sine**2)).mean()) == pytest.approx(math.sin(math.radians(10.0)) ** 2, rel=1e-3)
 
 
 def test_lambertian_light_is_even_in_sine_squared():
     bundle = whole(Points(((0.0, 0.0, -6.0),), cone=30.0, intensity="lambertian"))
-    sine2 = (bundle.dx**2 + bundle.dy**2) * 1.5**2
+    sine2 = (bundle.direction[0]**2 + bundle.direction[1]**2) * 1.5**2
     assert float(sine2.mean()) == pytest.approx(0.5 * math.sin(math.radians(30.0)) ** 2, rel=1e-3)
-    part = float(whole(Points(((0.0, 0.0, -6.0),), cone=60.0, intensity="lambertian")).share.sum())
-    cone = float(whole(Points(((0.0, 0.0, -6.0),), cone=60.0, intensity="lambertian", aimed=False)).share.sum())
+    part = float(whole(Points(((0.0, 0.0, -6.0),), cone=60.0, intensity="lambertian")).power.sum())
+    cone = float(whole(Points(((0.0, 0.0, -6.0),), cone=60.0, intensity="lambertian", aimed=False)).power.sum())
     assert part == pytest.approx(cone, abs=5e-3)
-    assert part > float(whole(Points(((0.0, 0.0, -6.0),), cone=60.0)).share.sum())
+    assert part > float(whole(Points(((0.0, 0.0, -6.0),), cone=60.0)).power.sum())
 
 
 @pytest.mark.parametrize("half", [1e-6, 1e-4, 0.27])
 def test_narrow_cones_keep_their_digits(half):
     """1 - cos theta from sin^2(theta / 2): hard case 3."""
     bundle = whole(Points(((0.0, 0.0, -6.0),), cone=half))
-    tangent = torch.hypot(bundle.x, bundle.y) / 6.0
+    tangent = torch.hypot(bundle.origin[0], bundle.origin[1]) / 6.0
     assert float(tangent.max() / math.tan(math.radians(half))) == pytest.approx(1.0, abs=1e-2)
     assert float((tangent**2).mean() / math.tan(math.radians(half)) ** 2) == pytest.approx(0.5, rel=1e-3)
 
@@ -73,20 +76,20 @@ def test_narrow_cones_keep_their_digits(half):
 def test_rays_point_away_from_the_source():
     source = Points(((1.0, -2.0, -7.0), (-3.0, 0.0, -5.0)), (1.0, 3.0))
     bundle = whole(source, rays=2000)
-    first = torch.arange(len(bundle.x)) < len(bundle.x) // 2
+    first = torch.arange(len(bundle.origin[0])) < len(bundle.origin[0]) // 2
     for mine, (x, y, z) in zip((first, ~first), source.positions, strict=True):
-        dx, dy = bundle.dx[mine] * 1.5, bundle.dy[mine] * 1.5
+        dx, dy = bundle.direction[0][mine] * 1.5, bundle.direction[1][mine] * 1.5
         dz = torch.sqrt(1 - dx**2 - dy**2)
-        torch.testing.assert_close(x - z * dx / dz, bundle.x[mine])
-        torch.testing.assert_close(y - z * dy / dz, bundle.y[mine])
-    torch.testing.assert_close(bundle.dx**2 + bundle.dy**2 + bundle.dz**2, torch.ones_like(bundle.dx))
+        torch.testing.assert_close(x - z * dx / dz, bundle.origin[0][mine])
+        torch.testing.assert_close(y - z * dy / dz, bundle.origin[1][mine])
+    torch.testing.assert_close(sum(d**2 for d in bundle.direction), torch.ones_like(bundle.power))
 
 
 def test_powers_are_shared_as_asked():
     source = Points(((0.0, 0.0, -6.0), (0.0, 0.0, -6.0)), (1.0, 3.0), cone=20.0)
     bundle = whole(source, rays=2000)
-    half = len(bundle.share) // 2
-    assert float(bundle.share[half:].sum() / bundle.share[:half].sum()) == pytest.approx(3.0)
+    half = len(bundle.power) // 2
+    assert float(bundle.power[half:].sum() / bundle.power[:half].sum()) == pytest.approx(3.0)
 
 
 def test_a_grid_is_equispaced_with_its_borders():
@@ -99,30 +102,30 @@ def test_a_grid_is_equispaced_with_its_borders():
 
 def test_a_disc_shines_from_all_of_itself():
     bundle = whole(Disc((0.5, 0.0, -8.0), (2.0, 1.0), cone=70.0), rays=200_000)
-    dz = torch.sqrt(1 - (bundle.dx**2 + bundle.dy**2) * 1.5**2)
-    x = bundle.x - 8.0 * bundle.dx * 1.5 / dz
-    y = bundle.y - 8.0 * bundle.dy * 1.5 / dz
+    dz = torch.sqrt(1 - (bundle.direction[0]**2 + bundle.direction[1]**2) * 1.5**2)
+    x = bundle.origin[0] - 8.0 * bundle.direction[0] * 1.5 / dz
+    y = bundle.origin[1] - 8.0 * bundle.direction[1] * 1.5 / dz
     inside = ((x - 0.5) / 1.0) ** 2 + (y / 0.5) ** 2
     assert 0.999 < float(inside.max()) < 1.0 + 1e-9
     # power from each point of the ellipse is even up to what the lens' rim takes away
-    weight = bundle.share / bundle.share.sum()
+    weight = bundle.power / bundle.power.sum()
     assert float((weight * inside).sum()) == pytest.approx(0.5, abs=0.02)
 
 
 def test_a_disc_without_size_is_a_point():
     point = whole(Points(((0.0, 0.0, -8.0),), cone=60.0, intensity="lambertian"))
     disc = whole(Disc((0.0, 0.0, -8.0), (0.0, 0.0), cone=60.0))
-    torch.testing.assert_close(point.share, disc.share)
-    torch.testing.assert_close(point.dx, disc.dx)
+    torch.testing.assert_close(point.power, disc.power)
+    torch.testing.assert_close(point.direction[0], disc.direction[0])
 
 
 def test_the_sun_fills_its_angle_evenly():
     bundle = whole(Disc(angle=0.533))
     half = math.radians(0.533) / 2
-    sine = torch.hypot(bundle.dx, bundle.dy) * 1.5
+    sine = torch.hypot(bundle.direction[0], bundle.direction[1]) * 1.5
     assert float(sine.max()) == pytest.approx(math.sin(half), rel=1e-3)
     assert float((sine**2).mean()) == pytest.approx(0.5 * math.sin(half) ** 2, rel=1e-2)
-    assert float(bundle.share.sum()) == pytest.approx(1.0)
+    assert float(bundle.power.sum()) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("kind", ["stratified", "uniform", "sobol", "lines", "grid"])
@@ -131,9 +134,10 @@ def test_rays_do_not_depend_on_chunks(kind):
     (one,) = emission.chunks()
     many = list(emission.chunks(77))
     assert len(many) > 10
-    for name in ("x", "y", "dx", "dy", "dz", "share"):
+    assert {b.origin[2] for b in many} == {one.origin[2]}
+    for part in zip(*((*b.origin[:2], *b.direction, b.power) for b in (one, *many)), strict=True):
         # torch rounds tangents and cosines in its vector loop and in its tail differently: an ulp, of millimetres
-        torch.testing.assert_close(torch.cat([getattr(b, name) for b in many]), getattr(one, name), rtol=1e-14, atol=1e-14)
+        torch.testing.assert_close(torch.cat(part[1:]), part[0], rtol=1e-14, atol=1e-14)
     assert sum(b.lost["missed_lens"] for b in many) == pytest.approx(one.lost["missed_lens"], abs=1e-14)
 
 
@@ -195,7 +199,7 @@ def test_impossible_sources_are_refused(source, message):
 def test_the_covering_cone_reaches_every_corner():
     source = Points(((2.0, 1.0, -6.0),))
     assert math.tan(source.cone_over((5.0, 4.0), 0.0)) * 6.0 == pytest.approx(math.hypot(7.0, 5.0))
-    assert bool((whole(source).share > 0).all())
+    assert bool((whole(source).power > 0).all())
 
 
 @pytest.mark.parametrize("source, expected", [

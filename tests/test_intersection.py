@@ -12,11 +12,14 @@ from hypothesis import strategies as st
 from torch.autograd import forward_ad
 
 from caustic_cli.optics import intersection
+from caustic_cli.optics.backends.reference import Torch
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.intersection import Method, Status
 from caustic_cli.optics.kernels.surface import FusedSurface, RayHits
 from caustic_cli.optics.rays import RayState
+from caustic_cli.optics.surfaces import Plane
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import IDENTITY
 
 
 def bundle(x, y, z, dx, dy, dz):
@@ -254,6 +257,24 @@ def test_derivatives_equal_those_of_unrolled_newton():
     (unrolled,) = torch.autograd.grad(t[hit].sum(), leaf, retain_graph=True)
     (implicit,) = torch.autograd.grad(f.meet(leaf, rays.origin, rays.direction, 1.0).t[hit].sum(), leaf)
     torch.testing.assert_close(implicit, unrolled, rtol=1e-11, atol=1e-12)
+
+
+def test_numbers_that_all_rays_share_keep_their_digits():
+    """Heights and directions as plain numbers give what tensors of them give: on a spline, on a plane, and landing."""
+    f = field()
+    heights, x, y = bumpy(f, 0.05), torch.linspace(-2, 2, 9, dtype=torch.float64), torch.full((9,), 0.3, dtype=torch.float64)
+    numbers = -0.3, math.sin(0.1) / 3, math.sin(0.2)
+    z, direction = numbers[0], (*numbers[1:], math.sqrt(1.0 - sum(c * c for c in numbers[1:])))
+    spread = tuple(torch.full_like(x, c) for c in direction)
+    for by_numbers, by_tensors in (
+            (intersection.meet_any(f, heights, (x, y, z), direction, 1.0),
+             intersection.meet_any(f, heights, (x, y, torch.full_like(x, z)), spread, 1.0)),
+            (Plane().meet(None, (x, y, z), direction, 1.0), Plane().meet(None, (x, y, torch.full_like(x, z)), spread, 1.0)),
+            (Torch().land((x, y, z), direction, (0.0, 0.0, 40.0), IDENTITY, 1.0),
+             Torch().land((x, y, torch.full_like(x, z)), spread, (0.0, 0.0, 40.0), IDENTITY, 1.0))):
+        for a, b in zip(by_numbers[:2], by_tensors[:2], strict=True):
+            torch.testing.assert_close(torch.as_tensor(a, dtype=torch.float64).expand(9), torch.as_tensor(b).double().expand(9),
+                                       rtol=4e-15, atol=4e-15)
 
 
 # the three methods

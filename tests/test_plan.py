@@ -11,9 +11,9 @@ from caustic_cli.errors import InputError
 from caustic_cli.optics.bounds import bounds_of
 from caustic_cli.optics.effects import EFFECTS, NEGLIGIBLE, NO_REQUESTS, Requests
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.meeting import again
 from caustic_cli.optics.plan import compile_plan, parse_effects
 from caustic_cli.optics.reconstruction import Filter
+from caustic_cli.optics.reintersection import again
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import is_lowered
 from caustic_cli.scene import Disc, Light, Points, Screen

@@ -6,13 +6,15 @@ import math
 
 import pytest
 import torch
-from caustic_cli.optics.tracing import LOSSES, RayTracer, expose, tracer
 from torch.autograd import forward_ad
 
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.rays import LOSSES
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import EXIT, System
+from caustic_cli.optics.trace import Tracer, expose
 from caustic_cli.scene import Disc, Lens, Points, Scene, Screen
 
 SCREEN = Screen((40.0, 30.0), 25.0, (40, 30))
@@ -82,20 +84,21 @@ def test_forward_mode_is_the_transpose_and_both_match_differences(kernels, monke
     monkeypatch.setenv("CAUSTIC_KERNELS", kernels)
     scene, field, heights = setup("point", size=0.05)
     (bundle,) = rays_of(scene, "stratified", 3000, 3).chunks()
-    trace, filter = RayTracer(scene, field, bundle, torch.float64), Filter("cosine", (3, 3))
+    trace, filter = Tracer(System.of(scene, field), bundle), Filter("cosine", (3, 3))
+    assert (trace.fused is not None) == (kernels == "")
     g = torch.Generator().manual_seed(5)
     along = torch.randn(heights.shape, generator=g, dtype=torch.float64)
     by = torch.randn(SCREEN.resolution, generator=g, dtype=torch.float64)
     with forward_ad.dual_level():
-        part = trace.expose(forward_ad.make_dual(heights, along), SCREEN, filter)
+        part = trace.expose({EXIT: forward_ad.make_dual(heights, along)}, SCREEN, filter)
         image, leaving = (forward_ad.unpack_dual(t).tangent for t in (part.image, part.leaving))
     leaf = heights.clone().requires_grad_()
-    part = trace.expose(leaf, SCREEN, filter)
+    part = trace.expose({EXIT: leaf}, SCREEN, filter)
     (pulled,) = torch.autograd.grad((part.image * by).sum() + 3.0 * part.leaving, leaf)
     forward = float((image * by).sum() + 3.0 * leaving)
     assert float((pulled * along).sum()) == pytest.approx(forward, rel=1e-10)
     step = 1e-7
-    up, down = (trace.expose(heights + s * along, SCREEN, filter) for s in (step, -step))
+    up, down = (trace.expose({EXIT: heights + s * along}, SCREEN, filter) for s in (step, -step))
     difference = ((up.image - down.image) * by).sum() + 3.0 * (up.leaving - down.leaving)
     assert float(difference / (2 * step)) == pytest.approx(forward, rel=1e-5)
 
@@ -108,22 +111,23 @@ def test_one_ray_by_hand():
     heights = (4.0 + 0.1 * x)[:, None].expand(4, 4).contiguous()
     scene = Scene(Points(((0.0, 0.0, -10.0),), cone=30.0), lens, Screen((200.0, 200.0), 50.0, (20, 20)))
     (bundle,) = rays_of(scene, "uniform", 50, 2).chunks()
-    landing = RayTracer(scene, field, bundle, torch.float64)(heights)
-    for k in range(len(bundle.x)):
-        azimuth = math.atan2(float(bundle.dy[k]), float(bundle.dx[k]))
-        if abs(math.sin(azimuth)) > 0.3 or float(landing.weight[k]) == 0:
+    trace = Tracer(System.of(scene, field), bundle)
+    (landing,), (x0, y0, _), (dx, dy, dz) = trace.land({EXIT: heights}, scene.screen), trace.start.origin, trace.start.direction
+    for k in range(len(x0)):
+        azimuth = math.atan2(float(dy[k]), float(dx[k]))
+        if abs(math.sin(azimuth)) > 0.3 or float(landing.power[k]) == 0:
             continue
         # trace by vectors, normalising everything: an independent form of the same law
-        d = torch.stack([bundle.dx[k], bundle.dy[k], bundle.dz[k]])
-        t = (4.0 + 0.1 * bundle.x[k]) / (d[2] - 0.1 * d[0])
-        hit = torch.stack([bundle.x[k], bundle.y[k], torch.zeros(())]) + t * d
+        d = torch.stack([dx[k], dy[k], dz[k]])
+        t = (4.0 + 0.1 * x0[k]) / (d[2] - 0.1 * d[0])
+        hit = torch.stack([x0[k], y0[k], torch.zeros(())]) + t * d
         normal = torch.tensor([-0.1, 0.0, 1.0], dtype=torch.float64) / math.hypot(0.1, 1.0)
         inside = float(d @ normal)
         tangential = 1.5 * (d - inside * normal)
         out = tangential + math.sqrt(1.0 - float(tangential @ tangential)) * normal
         landed = hit + (50.0 - hit[2]) / out[2] * out
-        assert float(landing.x[k]) == pytest.approx(float(landed[0]), rel=1e-12, abs=1e-12)
-        assert float(landing.y[k]) == pytest.approx(float(landed[1]), rel=1e-12, abs=1e-12)
+        assert float(landing.origin[0][k]) == pytest.approx(float(landed[0]), rel=1e-12, abs=1e-12)
+        assert float(landing.origin[1][k]) == pytest.approx(float(landed[1]), rel=1e-12, abs=1e-12)
 
 
 def test_chunks_add_up():
@@ -135,7 +139,7 @@ def test_chunks_add_up():
     target = torch.rand(SCREEN.resolution, dtype=torch.float64)
     objective = Objective(scene, field, rays, Filter("cosine", (3, 3)), target, "rms", dtype=torch.float64)
     whole = objective(heights)
-    objective.kept = [tracer(scene, field, b, torch.float64) for b in rays.chunks(700)]
+    objective.kept = [Tracer(System.of(scene, field), b) for b in rays.chunks(700)]
     assert len(objective.kept) > 5
     again = objective(heights)
     assert again.loss == pytest.approx(whole.loss, rel=1e-12)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -55,7 +56,8 @@ def ray(x: float, y: float = 0.0, z: float = -1.0) -> RayState:
 
 
 def biconvex(r1: float, r2: float, thickness: float, **options) -> tuple[System, dict]:
-    elements = (Element("front", FIELD, FLAT, behind=GLASS), Element("back", WIDE, Aperture((9.0, 9.0)), pose=Pose((0, 0, thickness))))
+    back = Element("back", WIDE, Aperture((9.0, 9.0)), pose=Pose((0, 0, thickness)))
+    elements = (Element("front", FIELD, FLAT, behind=GLASS), back)
     return System((PlaneWave(),), elements, (SCREEN,), **options), {"front": parabola(FIELD, r1), "back": parabola(WIDE, r2)}
 
 
@@ -159,7 +161,8 @@ def tilted() -> tuple[System, dict]:
 @pytest.mark.parametrize("make", [lambda: biconvex(40.0, -60.0, 4.0), prism_and_lens, doublet, tilted],
                          ids=["biconvex", "prism", "two lenses", "tilted"])
 def test_rays_against_an_independent_tracer(make):
-    """Landing points to 1e-7 mm and optical path lengths to 1e-9: normals by differences across the knots of a quadratic leave that."""
+    """Landing points to 1e-7 mm and optical path lengths to 1e-9: normals by differences across the knots of a quadratic leave
+    that."""
     system, heights = make()
     (rx, ry), rng = system.pupil.half_size, np.random.default_rng(2)
     x, y = (rng.uniform(-0.4 * r, 0.4 * r, 60) for r in (rx, ry))
@@ -175,7 +178,8 @@ def test_rays_against_an_independent_tracer(make):
         elements.append((in_numpy(e.surface, heights.get(e.name)), e.pose.position, e.pose.tilt, *what))
     o, d, path = walk(np.stack([x, y, np.full(60, z)], 1), np.tile([0.0, 0.0, 1.0], (60, 1)), elements)
     assert bool((landed.statuses() == 0).all())
-    np.testing.assert_allclose(np.stack([c.numpy() for c in landed.origin[:2]], 1), onto(o, d, (0, 0, system.screens[0].z)), atol=1e-7)
+    found = np.stack([c.numpy() for c in landed.origin[:2]], 1)
+    np.testing.assert_allclose(found, onto(o, d, (0, 0, system.screens[0].z)), atol=1e-7)
     np.testing.assert_allclose(out.path.numpy(), path, atol=1e-9)
 
 
@@ -205,7 +209,8 @@ def folded() -> tuple[System, dict]:
                         pose=Pose((0, 0, 20.0), (0.0, 45.0))))
     heights = {"front": parabola(FIELD, 30.0), "back": parabola(WIDE, -45.0),
                "fold": bumpy(FIELD, 0.02, 5) + parabola(elements[2].surface, 400.0)}
-    return System((PlaneWave(),), elements, (Placed(Screen((20.0, 20.0), 0.0, (20, 20)), Pose((-40.0, 0, 20.0), (0, -90.0))),)), heights
+    aside = Placed(Screen((20.0, 20.0), 0.0, (20, 20)), Pose((-40.0, 0, 20.0), (0, -90.0)))
+    return System((PlaneWave(),), elements, (aside,)), heights
 
 
 SYSTEMS["folded"] = folded
@@ -258,7 +263,7 @@ def test_gradients_of_every_surface(name, detours):
 
         def value(p) -> torch.Tensor:
             part = traced.expose(p, screen, filter)
-            return (part.image * by).sum() + 3.0 * part.leaving  # noqa: B023
+            return (part.image * by).sum() + 3.0 * part.leaving
 
         leaves = {k: h.clone().requires_grad_() for k, h in heights.items()}
         gradients = torch.autograd.grad(value(leaves), list(leaves.values()))
@@ -271,7 +276,7 @@ def test_gradients_of_every_surface(name, detours):
         with torch.no_grad():
             here, steps = float(value(heights)), (2e-5, 1e-5, 5e-6)
             rest = [abs(float(value({k: h + e * along[k] for k, h in heights.items()})) - here - e * slope) for e in steps]
-        orders = [math.log2(a / b) for a, b in zip(rest, rest[1:], strict=False)]
+        orders = [math.log2(a / b) for a, b in pairwise(rest)]
         assert all(1.8 < o < 2.2 for o in orders) or max(rest) < 1e-9 * size * steps[0], (free, rest)
 
 

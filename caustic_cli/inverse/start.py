@@ -194,9 +194,7 @@ def thrown(x, y, z, zx, zy, d, index: float, z_screen: float) -> tuple[np.ndarra
     shape, backend = z.shape, backend_for("cpu")
 
     def flat(value):
-        if isinstance(value, float):
-            return value
-        return torch.from_numpy(np.array(np.broadcast_to(value, shape), order="C")).view(-1)  # a copy: tensors cannot be read-only
+        return value if isinstance(value, float) else torch.from_numpy(np.broadcast_to(value, shape).flatten())
 
     origin, slopes, mirror = [flat(c) for c in (x, y, z)], (flat(zx), flat(zy)), index == -1.0
     out = backend.interact(tuple(map(flat, d)), slopes, torch.ones(z.size, dtype=torch.float64), eta=1.0 if mirror else index,

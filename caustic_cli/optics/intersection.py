@@ -75,7 +75,7 @@ def attach(surface: Surface, heights: Tensor | None, origin, direction, t: Tenso
     (ox, oy, oz), (dx, dy, dz) = origin, direction
     t = torch.where(found, t, torch.zeros_like(t)).double()
     x, y, z_ray = ox + t * dx, oy + t * dy, (oz - middle) + t * dz
-    at = tuple(_primal(torch.as_tensor(c)).double().expand(t.shape) for c in (x, y))
+    at = tuple(_primal(torch.as_tensor(c, dtype=torch.float64)).expand(t.shape) for c in (x, y))
     inside = tuple(c.clamp(-r, r) for c, r in zip(at, surface.half_size, strict=True))
     z, gx, gy = surface.evaluate(sag, *inside)
     if not torch.is_grad_enabled():
@@ -83,7 +83,7 @@ def attach(surface: Surface, heights: Tensor | None, origin, direction, t: Tenso
     with torch.no_grad():
         zxx, zxy, zyy = surface.at(sag if sag is None else sag.detach(), *inside, ((2, 0), (1, 1), (0, 2)))
         sx, sy = _primal(gx), _primal(gy)
-        fx, fy, fz = (_primal(torch.as_tensor(c)) for c in direction)
+        fx, fy, fz = (_primal(torch.as_tensor(c, dtype=torch.float64)) for c in direction)
         c = fz - sx * fx - sy * fy
         c = torch.where(c.abs() > LEAST_COSINE, c, torch.full_like(c, LEAST_COSINE))
     f = z_ray - z - sx * (x - at[0]) - sy * (y - at[1])
@@ -118,7 +118,7 @@ def reference(surface: Surface, heights: Tensor | None, origin, direction, side:
               radius: float | None = None) -> tuple[Tensor, Tensor]:
     """Distances t (N,) to first hits and their `Status`, by Newton's method in plain torch."""
     h, middle = surface.centred(None if heights is None else heights.detach())
-    tensors = [torch.as_tensor(c).detach().double() for c in (*origin, *direction)]
+    tensors = [torch.as_tensor(c, dtype=torch.float64).detach() for c in (*origin, *direction)]
     ox, oy, oz, dx, dy, dz = torch.broadcast_tensors(*tensors)
     oz, dz = side * (oz - middle), side * dz
     low_z, high_z = sorted(side * z for z in surface.hull(h))

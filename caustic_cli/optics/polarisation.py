@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 
 import torch
+from torch import Tensor
 
 #: |d x N|^2 below which a ray counts as normal to the surface: R_s and R_p then differ by less than any rounding.
 NORMAL = 1e-30
@@ -42,13 +43,14 @@ def beyond(e, d, t, normal, c, s, eta: float):
     es, ep = _dot(e, unit) * (2.0 * eta * c) / (eta * c + s), _dot(e, _cross(unit, d)) * (2.0 * eta * c) / (c + eta * s)
     after = tuple(es * a + ep * b for a, b in zip(unit, _cross(unit, t), strict=True))
     size = _dot(after, after).clamp_min(NORMAL).sqrt()
-    return tuple(torch.where(square > NORMAL, a / size, torch.as_tensor(b).to(size)) for a, b in zip(after, e, strict=True))
+    before = (torch.as_tensor(b, dtype=size.dtype, device=size.device) for b in e)
+    return tuple(torch.where(square > NORMAL, a / size, b) for a, b in zip(after, before, strict=True))
 
 
 def _across(d, normal):
     s = _cross(d, normal)
     square = _dot(s, s)
-    return s, torch.as_tensor(square)
+    return s, square if isinstance(square, Tensor) else torch.tensor(square, dtype=torch.float64)
 
 
 def _cross(a, b):

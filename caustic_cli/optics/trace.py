@@ -20,8 +20,8 @@ Powers are parts of what the sources emit.  Nothing vanishes: image + every entr
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from functools import cached_property
 
 import torch
@@ -33,6 +33,7 @@ from caustic_cli.optics.effects import EFFECTS, NO_REQUESTS, Action, Requests
 from caustic_cli.optics.emission import Rays, rays_of
 from caustic_cli.optics.frames import IDENTITY, Pose, advanced, into, out_of, turned, turned_back
 from caustic_cli.optics.image import Image
+from caustic_cli.optics.meeting import Meeting, Parameters
 from caustic_cli.optics.rays import LOSSES, RayState, Status
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sample
@@ -40,51 +41,6 @@ from caustic_cli.optics.shortage import with_less
 from caustic_cli.optics.surfaces import HeightField, Hit
 from caustic_cli.optics.system import EXIT, Element, Placed, System
 from caustic_cli.scene import Scene, Screen
-
-Parameters = Mapping[str, Tensor]
-
-
-@dataclass
-class Meeting:
-    """Rays at one element: what effects see and change.
-
-    tracer, index, element: whose and which; forward: whether light runs in the system's own direction; side: from which the
-    surface is met; n_in, n_out: refractive indices before and behind, in the light's direction; reflects; state: the rays, at the
-    surface (origins in the system's frame, directions before it until `depart`, behind it from then on); local: their points in
-    the element's frame; incoming: directions before it, in that frame; slopes: of the surface there; length: of the way to it, mm;
-    arriving, departing: power before and after the interaction; passes: of the interaction; straight: whether this is the walk
-    itself, not a detour.
-    """
-
-    tracer: Tracer
-    index: int
-    element: Element
-    forward: bool
-    side: float
-    n_in: float
-    n_out: float
-    reflects: bool
-    straight: bool
-    state: RayState
-    local: tuple = ()
-    incoming: tuple = ()
-    slopes: tuple = ()
-    length: Tensor | float = 0.0
-    arriving: Tensor | None = None
-    departing: Tensor | None = None
-    passes: Tensor | None = None
-
-    @property
-    def absorption(self) -> float:
-        """Absorption coefficient of the medium on the way to the surface, 1/mm."""
-        return self.tracer.media[self.index if self.forward else self.index + 1].absorption
-
-    def returned(self) -> RayState:
-        """The light that this refracting element reflects, at its surface."""
-        found = self.tracer.backend.interact(self.incoming, self.slopes, self.arriving, eta=1.0, reflects=True,
-                                             fresnel=self.element.fresnel, side=self.side)
-        return replace(self.state, direction=turned_back(self.element.pose, found.direction), power=self.arriving - self.departing,
-                       lost={}, sample=None)
 
 
 class Tracer:
@@ -282,7 +238,7 @@ class Tracer:
     def _backed_up(self, o, d, state: RayState, element: Element, heights) -> tuple[tuple, RayState]:
         """Rays of a pupil that the first surface reaches through, from before it."""
         low = element.surface.hull(heights)[0]
-        back = max(0.0, float(torch.as_tensor(o[2]).max()) - low)
+        back = max(0.0, float(torch.as_tensor(o[2], dtype=torch.float64).max()) - low)
         if back == 0.0:
             return o, state
         way = -back * (1.0 + 1e-9) / d[2]

@@ -9,11 +9,12 @@ from __future__ import annotations
 import mpmath as mp
 import numpy as np
 import torch
-from caustic_cli.optics.tracing import carry
 
+from caustic_cli.optics.backends import backend_for, plain
 from caustic_cli.optics.kernels import functions
 from caustic_cli.optics.reconstruction import Filter, splat
-from caustic_cli.scene import Lens, Screen
+from caustic_cli.optics.system import IDENTITY
+from caustic_cli.scene import Screen
 
 mp.mp.dps = 60
 HEIGHT = 10.0
@@ -64,27 +65,49 @@ def exactly(n: float, d, t: float, gx: float, gy: float, x: float, y: float):
     return read(n, d, t, gx, gy, x, y), *((a - b) / (2 * step) for a, b in sides)
 
 
+def carried(direction, slopes, power, start, eta: float, height: float, fresnel: str = "exact"):
+    """Rays from the exit surface to the screen in plain torch: x, y, power that arrives, and all that leaves the surface.
+
+    direction: before it; start: x, y and z of the hits, mm; z counted as the screen's height.
+    """
+    with plain():
+        stages = backend_for("cpu")
+    out = stages.interact(direction, slopes, power, eta=eta, reflects=False, fresnel=fresnel)
+    x, y, on_way = stages.land(start, out.direction, (0.0, 0.0, height), IDENTITY, 1.0)
+    return x, y, torch.where(on_way, out.power, torch.zeros_like(out.power)), out.power.sum(dtype=torch.float64)
+
+
+def splatted(nets, x, y, directions, power, fresnel: str, eta: float, filter: Filter):
+    """Rays from the exit surface to the screen by the fused kernel: image, power that leaves, what is lost.
+
+    nets: distances along the rays (or heights) and slopes, (1, N); directions: x and y of them, None for a plane wave.
+    """
+    along = [functions._none()] * 2 if directions is None else [functions._strided(c.numpy()) for c in directions]
+    rays = (*(functions._strided(a.numpy()) for a in (x, y)), *along, functions._strided(power.numpy()))
+    ones = np.ones((1, 1))
+    return functions._splat(nets, (np.zeros(1, np.int64), ones, ones), True, rays, (eta, fresnel), HEIGHT, 0.0, SCREEN, filter,
+                            functions._Workspace())
+
+
 def ours(kernels: str, dtype: torch.dtype, n: float, d, t, gx, gy, x, y) -> tuple[float, np.ndarray]:
     """L of all rays together, and its derivatives (3, N).  d: one direction, None for a plane wave; others (N,) arrays.
 
-    The kernel takes rays of any direction in float64 alone.
+    The kernel is float64 alone: it takes a plane wave's numbers rounded to `dtype`, and others as they are.
     """
-    dtype = torch.float64 if d is not None and kernels == "fused" else dtype
-    leaves = [torch.tensor(np.asarray(a, float)[None, :]).to(dtype).requires_grad_() for a in (t, gx, gy)]
-    lens, count = Lens(index=n), leaves[0].shape[1]
-    x, y = (torch.tensor(np.broadcast_to(np.asarray(a, float), (1, count)).copy()).to(dtype) for a in (x, y))
+    rounded = torch.float64 if d is not None and kernels == "fused" else dtype
+    dtype = torch.float64 if kernels == "fused" else dtype
+    leaves = [torch.tensor(np.asarray(a, float)[None, :]).to(rounded).to(dtype).requires_grad_() for a in (t, gx, gy)]
+    count = leaves[0].shape[1]
+    x, y = (torch.tensor(np.broadcast_to(np.asarray(a, float), (1, count)).copy()).to(rounded).to(dtype) for a in (x, y))
     one = torch.ones(1, count, dtype=dtype)
     if kernels == "fused":
-        along = [functions._none(dtype)] * 2 if d is None else [functions._strided((c * one).numpy()) for c in d[:2]]
-        rays = (*(functions._strided(a.numpy()) for a in (x, y)), *along, functions._strided(one.numpy()))
-        ones = np.ones((1, 1), x.numpy().dtype)
-        image, leaving, _ = functions._splat(leaves, (np.zeros(1, np.int64), ones, ones), True, rays, lens, HEIGHT, (1.0, 0.0),
-                                             SCREEN, FILTER, functions._Workspace())
+        along = None if d is None else [c * one for c in d[:2]]
+        image, leaving, _ = splatted(leaves, x, y, along, one, "exact", n, FILTER)
     else:
         direction = (0.0, 0.0, 1.0) if d is None else tuple(c * one for c in d)
-        x, y, z = (o + leaves[0] * c for o, c in zip((x, y, 0.0), direction, strict=True))
-        landing = carry(lens, direction, z, *leaves[1:], x, y, one, HEIGHT)
-        image, leaving = splat(landing.x, landing.y, landing.weight, SCREEN, FILTER)[0], landing.leaving
+        start = tuple(o + leaves[0] * c for o, c in zip((x, y, 0.0), direction, strict=True))
+        x, y, power, leaving = carried(direction, leaves[1:], one, start, n, HEIGHT)
+        image = splat(x, y, power, SCREEN, FILTER)[0]
     value = (image.double() * WEIGHTS).sum() + leaving.double() / 4
     if not value.requires_grad:
         return float(value), np.zeros((3, count))

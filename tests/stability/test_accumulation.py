@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 import torch
-from caustic_cli.optics.tracing import expose, tracer
-from exact import SCREEN
+from exact import SCREEN, splatted
 
-from caustic_cli.optics.kernels import functions
 from caustic_cli.optics.reconstruction import Filter, splat
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import EXIT, System
+from caustic_cli.optics.trace import Tracer, expose
 from caustic_cli.scene import Lens, PlaneWave, Scene, Screen
 
 MORE = 1_000_000
@@ -24,11 +24,8 @@ def test_1e8_unit_weights_into_one_pixel(kernels, compare):
     if kernels == "torch":
         image, off = splat(at, at, weights, SCREEN, Filter())
     else:
-        rays = (*(functions._strided(a.numpy()) for a in (at, at)), *[functions._none(torch.float32)] * 2,
-                functions._strided(weights.numpy()))
-        ones, level = np.ones((1, 1), np.float32), torch.zeros_like(at)
-        image, _, lost = functions._splat([level] * 3, (np.zeros(1, np.int64), ones, ones), True, rays, Lens(fresnel="none"), 10.0,
-                                          (1.0, 0.0), SCREEN, Filter(), functions._Workspace())
+        at, weights = at.double(), weights.double()
+        image, _, lost = splatted([torch.zeros_like(at)] * 3, at, at, None, weights, "none", Lens().index, Filter())
         off = lost["off_screen"]
     assert float(off) == 0.0 and int((image > 0).sum()) == 1
     compare("1e8 unit weights into one pixel", "the pixel, relative", 1.0 - naive / 100.0 / MORE,
@@ -67,7 +64,7 @@ def test_derivatives_add_up_too(kernels, dtype):
     (sample,) = Sampler("grid", (600, 600)).chunks()
     leaf = torch.zeros(2, 2, dtype=torch.float64, requires_grad=True)
     tilted = leaf + torch.tensor([[-1e-9], [1e-9]], dtype=torch.float64)
-    image = tracer(scene, field, sample, dtype).expose(tilted, screen, Filter("cosine", (3, 3))).image
+    image = Tracer(System.of(scene, field), sample, dtype).expose({EXIT: tilted}, screen, Filter("cosine", (3, 3))).image
     (by,) = torch.autograd.grad(image[5:, :].sum().double(), leaf)  # beyond x = 1 mm, in the middle of the light
     moved = float(by[1].sum() - by[0].sum())  # by a slope of 2 / 4
     closed = 0.25 * (1.5 - 1.0) * 10.0 * 2.0 / 4.0  # irradiance 1/4 per mm of x, (n - 1) T times the slope

@@ -9,13 +9,13 @@ import math
 import numpy as np
 import pytest
 import torch
-from caustic_cli.optics.tracing import expose, tracer
 from exact import mp
 
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.intersection import Status, meet
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import EXIT, System
+from caustic_cli.optics.trace import Tracer, expose
 from caustic_cli.scene import Disc, Lens, PlaneWave, Points, Scene, Screen
 
 CONES = [1e-6, 1e-4, 1e-2, 1.0, 30.0, 60.0, 80.0, 89.0, 89.999]
@@ -27,11 +27,11 @@ def scene(distance: float, *, lens: Lens | None = None, **source) -> Scene:
 
 
 def arriving(scene: Scene, count: int = 10_000) -> float:
-    bundles = list(rays_of(scene, "stratified", count, 1).chunks())
+    bundles = [Tracer(System.of(scene), b).start for b in rays_of(scene, "stratified", count, 1).chunks()]  # inside the lens
     for b in bundles:
-        assert all(bool(torch.isfinite(a).all()) for a in (b.x, b.y, b.dx, b.dy, b.dz, b.share))
-        assert float(b.share.min()) >= 0 and float(b.dz.min()) > 0
-    total = math.fsum(float(b.share.sum()) for b in bundles)
+        assert all(bool(torch.isfinite(a).all()) for a in (*b.origin[:2], *b.direction, b.power))
+        assert float(b.power.min()) >= 0 and float(b.direction[2].min()) > 0
+    total = math.fsum(float(b.power.sum()) for b in bundles)
     assert total + math.fsum(b.lost["missed_lens"] for b in bundles) == pytest.approx(1.0, abs=1e-12)
     return total
 
@@ -83,13 +83,13 @@ def test_power_from_any_distance(distance, intensity, compare):
 def test_directions_from_far_off_the_axis(aside):
     """Every ray points from the source to where it meets the lens, to the last digits of its direction."""
     s = Scene(Points(((aside, -2.0 * aside, -50.0),), cone=90.0), Lens(size=(10.0, 8.0)), Screen((10.0, 10.0)))
-    (b,) = rays_of(s, "stratified", 500, 1).chunks()
-    checked = 0
-    for k in range(0, len(b.x), 50):
-        dx, dy = mp.mpf(float(b.x[k])) - aside, mp.mpf(float(b.y[k])) + 2 * aside
+    b = Tracer(System.of(s), next(rays_of(s, "stratified", 500, 1).chunks())).start
+    (x, y, _), checked = b.origin, 0
+    for k in range(0, len(x), 50):
+        dx, dy = mp.mpf(float(x[k])) - aside, mp.mpf(float(y[k])) + 2 * aside
         length = mp.sqrt(dx * dx + dy * dy + 2500)
-        for found, exact in ((b.dx[k], dx / length / s.lens.index), (b.dy[k], dy / length / s.lens.index)):
-            assert abs(float(found) - float(exact)) < 1e-15
+        for found, exact in zip(b.direction[:2], (dx / length / s.lens.index, dy / length / s.lens.index), strict=True):
+            assert abs(float(found[k]) - float(exact)) < 1e-15
             checked += 1
     assert checked >= 20
 
@@ -108,17 +108,17 @@ def test_from_afar_a_point_is_a_plane_wave(kernels, dtype, compare):
     for source in (PlaneWave(), Points(((0.0, 0.0, -1e6),))):
         s, leaf = Scene(source, lens, screen), heights.clone().requires_grad_()
         (rays,) = rays_of(s, "stratified", 4000, 5).chunks()
-        image = tracer(s, field, rays, dtype).expose(leaf, screen, Filter("cosine", (3, 3))).image.double()
+        image = Tracer(System.of(s, field), rays, dtype).expose({EXIT: leaf}, screen, Filter("cosine", (3, 3))).image.double()
         (by,) = torch.autograd.grad((image / image.sum().detach() * weights).sum(), leaf)
         out.append((image.detach() / image.detach().sum(), by))
     value, slope = (float((a - b).norm() / a.norm()) for a, b in zip(*out, strict=True))
     # the wave's own curvature, 5e-6 rad over a throw of 57 mm, is 3e-4 mm on pixels of 1 mm
     assert value < 2e-3
     assert slope < 1e-2
-    t, _, _, status = meet(field, heights, rays)
-    hit = status == Status.HIT
+    inside = Tracer(System.of(s, field), rays).start
+    t, _, _, hit = field.meet(heights, inside.origin, inside.direction, 1.0)
     assert int(hit.sum()) > 2000
-    x, y, z = (o + t * d for o, d in ((rays.x, rays.dx), (rays.y, rays.dy), (rays.z, rays.dz)))
+    x, y, z = (o + t * d for o, d in zip(inside.origin, inside.direction, strict=True))
     off = (z - field.at(heights, x, y)[0])[hit].abs().max()
     far, depth = torch.tensor(-1e6, dtype=torch.float32), z[hit].float()
     naive = (far + (depth - far) - depth).abs().max()

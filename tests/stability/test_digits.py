@@ -5,14 +5,14 @@ import math
 import numpy as np
 import pytest
 import torch
-from caustic_cli.optics.tracing import PlaneTracer, expose, tracer
 from exact import exactly, mp, ours
 
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.intersection import meet
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import EXIT, System
+from caustic_cli.optics.trace import Tracer, expose
 from caustic_cli.scene import Disc, Lens, PlaneWave, Points, Scene, Screen
 
 
@@ -67,7 +67,8 @@ def test_thickness_large_against_sag(thickness, source, kernels, dtype, compare)
             s = Scene(Points(((0.0, 0.0, z_in - 10.0 * thickness),)), s.lens, s.screen)
         (rays,) = rays_of(s, "stratified", 900, 2).chunks()
         leaf = (sag + base).requires_grad_()
-        part = tracer(s, field, rays, torch.float64 if base == 0.0 else dtype).expose(leaf, s.screen, Filter("cosine", (3, 3)))
+        part = Tracer(System.of(s, field), rays, torch.float64 if base == 0.0 else dtype).expose(
+            {EXIT: leaf}, s.screen, Filter("cosine", (3, 3)))
         image = part.image.double()
         (by,) = torch.autograd.grad((image * weights).sum(), leaf)
         out.append((image.detach(), by))
@@ -86,11 +87,10 @@ def test_slopes_of_hits_do_not_see_the_thickness(kernels):
     field = HeightField.of(lens)
     sag = (1e-4 * torch.rand(9, 9, dtype=torch.float64) * 2.0**33).round() * 2.0**-33
     s = Scene(Disc(angle=1e-6), lens, Screen((3.0, 3.0), 2e6))
-    (b,) = rays_of(s, "stratified", 400, 2).chunks()
-    _, gx, gy, status = meet(field, sag + 1e6, b)
-    t = (1e6 + 5e-5) / b.dz
-    expected = field.at(sag, b.x + t * b.dx, b.y + t * b.dy, ((1, 0), (0, 1)))
-    hit = status == 0
+    b = Tracer(System.of(s, field), next(rays_of(s, "stratified", 400, 2).chunks())).start
+    _, gx, gy, hit = field.meet(sag + 1e6, b.origin, b.direction, 1.0)
+    t = (1e6 + 5e-5) / b.direction[2]
+    expected = field.at(sag, *(o + t * d for o, d in zip(b.origin[:2], b.direction[:2], strict=True)), ((1, 0), (0, 1)))
     assert int(hit.sum()) > 300
     for a, e in zip((gx, gy), expected, strict=True):
         assert float((a - e)[hit].abs().max()) < 1e-9 * float(e.abs().max())
@@ -106,7 +106,8 @@ def test_lengths_from_nanometres_to_kilometres(scale, kernels, dtype):
         g = torch.Generator().manual_seed(4)
         leaf = (k * (3.0 + 0.2 * torch.rand(7, 6, generator=g, dtype=torch.float64))).requires_grad_()
         (rays,) = rays_of(Scene(Points(((1.0 * k, 0.0, -30.0 * k),)), lens, screen), "stratified", 900, 2).chunks()
-        part = tracer(Scene(PlaneWave(), lens, screen), field, rays, dtype).expose(leaf, screen, Filter("cosine", (3, 3)))
+        system = System.of(Scene(PlaneWave(), lens, screen), field)
+        part = Tracer(system, rays, dtype).expose({EXIT: leaf}, screen, Filter("cosine", (3, 3)))
         (by,) = torch.autograd.grad((part.image * torch.linspace(0, 1, 100).view(10, 10)).sum(), leaf)
         out.append((part.image.detach().double(), by * k))
     close = 1e-4 if dtype == torch.float32 else 1e-9
@@ -122,7 +123,8 @@ def test_shortest_normals_and_steepest(kernels, dtype):
     (sample,) = Sampler("grid", (9, 9)).chunks()
     for slope in (0.0, 1e-300, 1e-40, 1e-8, 1.0, 1e4, 1e8):
         leaf = (slope * x)[:, None].expand(4, 4).contiguous().requires_grad_()
-        part = PlaneTracer(Scene(PlaneWave(), lens, screen), field, sample, dtype).expose(leaf, screen, Filter("cosine", (3, 3)))
+        system = System.of(Scene(PlaneWave(), lens, screen), field)
+        part = Tracer(system, sample, dtype).expose({EXIT: leaf}, screen, Filter("cosine", (3, 3)))
         value = (part.image * torch.rand(4, 4)).sum() + part.leaving
         if value.requires_grad:
             (by,) = torch.autograd.grad(value, leaf)

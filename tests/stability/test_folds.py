@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 import torch
-from caustic_cli.optics.tracing import expose, tracer
 
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import EXIT, System
+from caustic_cli.optics.trace import Tracer, expose
 from caustic_cli.scene import Lens, PlaneWave, Scene, Screen
 
 LENS = Lens(size=(2.0, 2.0), control=(5, 2), degree=(4, 1), index=1.5, fresnel="none")
@@ -72,13 +73,14 @@ def test_derivatives_at_a_fold(kernels, dtype):
     weights = torch.rand(24, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     leaf = heights().requires_grad_()
     scene = Scene(PlaneWave(), LENS, SCREEN)
-    image = tracer(scene, FIELD, sample, dtype).expose(leaf, SCREEN, filter).image
+    image = Tracer(System.of(scene, FIELD), sample, dtype).expose({EXIT: leaf}, SCREEN, filter).image
     (by,) = torch.autograd.grad((image.double() * weights).sum(), leaf)
-    exactly = tracer(scene, FIELD, sample, torch.float64)
+    exactly = Tracer(System.of(scene, FIELD), sample, torch.float64)
     for i, j in ((0, 0), (2, 1), (3, 0)):
         step = torch.zeros(5, 2, dtype=torch.float64)
         step[i, j] = 1e-6
-        up, down = (float((exactly.expose(heights() + s * step, SCREEN, filter).image.double() * weights).sum()) for s in (1, -1))
+        moved = (exactly.expose({EXIT: heights() + s * step}, SCREEN, filter).image for s in (1, -1))
+        up, down = (float((image.double() * weights).sum()) for image in moved)
         size = float(by.abs().max())
         assert abs((up - down) / 2e-6 - float(by[i, j])) < (2e-3 if dtype == torch.float32 else 1e-5) * size
 
@@ -91,7 +93,8 @@ def test_all_rays_into_one_point(focus, kernels, dtype):
     x, y = field.control_xy()
     leaf = (focus / (2.0 * 0.5 * 50.0) * (x[:, None] ** 2 + y**2)).requires_grad_()
     (sample,) = Sampler("grid", (20, 20)).chunks()
-    part = tracer(Scene(PlaneWave(), lens, screen), field, sample, dtype).expose(leaf, screen, Filter("cosine", (3, 3)))
+    system = System.of(Scene(PlaneWave(), lens, screen), field)
+    part = Tracer(system, sample, dtype).expose({EXIT: leaf}, screen, Filter("cosine", (3, 3)))
     (by,) = torch.autograd.grad((part.image * torch.linspace(0, 1, 25).view(5, 5)).sum(), leaf)
     assert float(part.image.detach().sum()) == pytest.approx(1.0, abs=1e-6)
     assert float(part.image.detach()[1:4, 1:4].sum()) == pytest.approx(1.0, abs=1e-6)

@@ -10,11 +10,11 @@ import math
 import numpy as np
 import pytest
 import torch
-from caustic_cli.optics.bundle import Bundle
 from scipy.interpolate import BSpline
 
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.intersection import Status, find, meet
+from caustic_cli.optics.intersection import Status, find
+from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.surfaces.heightfield import HeightField
 
 FIELD = HeightField((SplineSpace.uniform(43, 3), SplineSpace.uniform(4, 3)), (4.0, 1.0))
@@ -26,11 +26,11 @@ def surface(slope: float = 0.63) -> torch.Tensor:
     return (slope / math.pi * torch.sin(math.pi * x)).double()[:, None].expand(43, 4).contiguous()
 
 
-def rays(angle: float) -> Bundle:
+def rays(angle: float) -> RayState:
     z = torch.full((COUNT,), math.cos(math.radians(angle)), dtype=torch.float64)
     x = torch.linspace(-3.9, 1.0, COUNT, dtype=torch.float64)
     none = torch.zeros_like(x)
-    return Bundle(x, none + 0.1, Z, torch.sqrt(1.0 - z * z), none, z, none + 1.0 / COUNT, {})
+    return RayState((x, none + 0.1, Z), (torch.sqrt(1.0 - z * z), none, z), none + 1.0 / COUNT)
 
 
 def spline(heights: torch.Tensor) -> BSpline:
@@ -41,7 +41,7 @@ def spline(heights: torch.Tensor) -> BSpline:
 def marched(slope: float, angle: float) -> tuple[np.ndarray, np.ndarray]:
     """First roots (infinite for none), and how far each is from being a matter of rounding."""
     z, b = spline(surface(slope)), rays(angle)
-    x, dx, dz = b.x.numpy()[:, None], b.dx.numpy()[:, None], b.dz.numpy()[:, None]
+    x, dx, dz = b.origin[0].numpy()[:, None], b.direction[0].numpy()[:, None], b.direction[2].numpy()[:, None]
     t = np.linspace(0.0, 1.0, 10_001)[None, :] * (4.0 - x) / dx
     f = Z + t * dz - z(np.minimum(x + t * dx, 4.0))
     first = (f >= 0).argmax(1)
@@ -56,9 +56,9 @@ def marched(slope: float, angle: float) -> tuple[np.ndarray, np.ndarray]:
     return np.where(hit, high, np.inf), margin
 
 
-def newton(z: BSpline, b: Bundle) -> np.ndarray:
+def newton(z: BSpline, b: RayState) -> np.ndarray:
     """What the textbook does: Newton's method from the mean plane."""
-    x, dx, dz = b.x.numpy(), b.dx.numpy(), b.dz.numpy()
+    x, dx, dz = b.origin[0].numpy(), b.direction[0].numpy(), b.direction[2].numpy()
     t, slope = -Z / dz, z.derivative()
     for _ in range(50):
         at = np.clip(x + t * dx, -4.0, 4.0)
@@ -73,7 +73,7 @@ def test_the_first_of_several_roots(angle, kernels, compare):
     expected, margin = marched(0.63, angle)
     clear = margin > 1e-5
     assert clear.sum() > 0.8 * COUNT and np.isfinite(expected[clear]).sum() > 200
-    t, status = find(FIELD, heights, b)
+    t, status = find(FIELD, heights, b.origin, b.direction)
     found = np.where(status.numpy() == Status.HIT, t.numpy(), np.inf)
     assert not (status == Status.UNRESOLVED).any()
     wrong = ~np.isclose(found, expected, rtol=1e-9, atol=1e-9)
@@ -89,10 +89,10 @@ def test_derivatives_at_the_hits(angle, kernels, compare):
     z = spline(heights)
     expected, margin = marched(0.63, angle)
     leaf = heights.clone().requires_grad_()
-    t, gx, _, status = meet(FIELD, leaf, b)
-    use = np.isfinite(expected) & (margin > 1e-5) & (status.numpy() == Status.HIT)
-    x = b.x.numpy() + np.where(use, expected, 0.0) * b.dx.numpy()
-    c = b.dz.numpy() - z.derivative()(x) * b.dx.numpy()
+    t, gx, _, hit = FIELD.meet(leaf, b.origin, b.direction, 1.0)
+    use = np.isfinite(expected) & (margin > 1e-5) & hit.numpy()
+    x = b.origin[0].numpy() + np.where(use, expected, 0.0) * b.direction[0].numpy()
+    c = b.direction[2].numpy() - z.derivative()(x) * b.direction[0].numpy()
     use &= c > 1e-3
     assert use.sum() > 150
     keep = torch.from_numpy(use)
@@ -101,7 +101,7 @@ def test_derivatives_at_the_hits(angle, kernels, compare):
     basis = BSpline.design_matrix(x[use], knots, 3).toarray()
     slopes = np.stack([BSpline(knots, e, 3).derivative()(x[use]) for e in np.eye(43)], 1)
     move = basis / c[use, None]
-    total = move + 0.1 * (slopes + z.derivative(2)(x[use])[:, None] * b.dx.numpy()[use, None] * move)
+    total = move + 0.1 * (slopes + z.derivative(2)(x[use])[:, None] * b.direction[0].numpy()[use, None] * move)
     along_y = BSpline.design_matrix(np.array([0.1]), 2.0 * FIELD.spaces[1].knots.numpy() - 1.0, 3).toarray()
     exact = total.sum(0)[:, None] * along_y
     error = np.linalg.norm(by.numpy() - exact) / np.linalg.norm(exact)
@@ -120,7 +120,7 @@ def test_gentle_slopes_are_proved_safe_and_steep_ones_are_not(kernels):
         heights = surface(slope)
         bound = FIELD.slope_bounds(heights)[0]
         expected, margin = marched(slope, 75.0)
-        t, status = find(FIELD, heights, b)
+        t, status = find(FIELD, heights, b.origin, b.direction)
         clear = (margin > 1e-5) & np.isfinite(expected)
         assert (status.numpy()[clear] == Status.HIT).all()
         assert np.abs(t.numpy()[clear] - expected[clear]).max() < 1e-9

@@ -7,7 +7,6 @@ import shlex
 import numpy as np
 import pytest
 import torch
-from caustic_cli.optics.tracing import expose
 
 from caustic_cli import cli, verdict
 from caustic_cli.checkpoint import load
@@ -21,6 +20,8 @@ from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import EXIT
+from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies.metrics import judge
 
@@ -113,7 +114,8 @@ class Holes(Objective):
         if self.how == "dark":
             raise NoLight("no light reaches the screen")
         nan = torch.full_like(e.gradient, math.nan)
-        return type(e)(math.nan, nan, 0.0) if self.how == "nan" else type(e)(e.loss, nan, e.on_screen)
+        by = {EXIT: nan}
+        return type(e)(math.nan, by, 0.0) if self.how == "nan" else type(e)(e.loss, by, e.on_screen)
 
 
 @pytest.mark.parametrize("how", ["nan", "gradient", "dark"])

@@ -5,17 +5,18 @@ from dataclasses import replace
 
 import pytest
 import torch
-from caustic_cli.optics.bundle import Bundle
-from caustic_cli.optics.tracing import expose, tracer
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from caustic_cli.inverse.losses import NoLight
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import EXIT, System
+from caustic_cli.optics.trace import Tracer, expose
 from caustic_cli.scene import Disc, Lens, PlaneWave, Points, Scene, Screen
 
 CLOSE = {torch.float64: 1e-12, torch.float32: 3e-6}
@@ -85,20 +86,24 @@ def test_finite_and_energy_closes(kernel, dtype, monkeypatch):
     assert sum(seen) > examples / 6 and len(seen) > 0.6 * examples
 
 
-def mirrored(scene: Scene, heights: torch.Tensor, rays: Sample | Bundle):
+def mirrored(scene: Scene, heights: torch.Tensor, rays: Sample | RayState):
     """The scene, its heights and its rays in a mirror, x -> -x."""
     source = scene.source
     if isinstance(source, Points):
         source = replace(source, positions=tuple((-x, y, z) for x, y, z in source.positions))
     if isinstance(source, Disc):
         source = replace(source, position=(-source.position[0], *source.position[1:]))
-    rays = replace(rays, u=1.0 - rays.u) if isinstance(rays, Sample) else replace(rays, x=-rays.x, dx=-rays.dx)
+    if isinstance(rays, Sample):
+        rays = replace(rays, u=1.0 - rays.u)
+    else:
+        (x, *at), (dx, *towards) = rays.origin, rays.direction
+        rays = replace(rays, origin=(-x, *at), direction=(-dx, *towards))
     return replace(scene, source=source), heights.flip(0), rays
 
 
 def image_and_slope(scene, heights, rays, filter, dtype, weights):
     leaf = heights.clone().requires_grad_()
-    part = tracer(scene, HeightField.of(scene.lens), rays, dtype).expose(leaf, scene.screen, filter)
+    part = Tracer(System.of(scene), rays, dtype).expose({EXIT: leaf}, scene.screen, filter)
     value = (part.image.double() * weights).sum() + part.leaving.double()
     by = torch.autograd.grad(value, leaf)[0] if value.requires_grad else torch.zeros_like(leaf)
     return part.image.detach().double(), by

@@ -5,12 +5,9 @@ import math
 import numpy as np
 import pytest
 import torch
-from caustic_cli.optics.tracing import carry
-from exact import FILTER, SCREEN, exactly, mp, ours
+from exact import FILTER, SCREEN, carried, exactly, mp, ours, splatted
 
-from caustic_cli.optics.kernels import functions
 from caustic_cli.optics.reconstruction import Filter, splat
-from caustic_cli.scene import Lens
 
 N = 1.5
 TILTS = [10.0**-k for k in range(1, 16)]
@@ -53,12 +50,8 @@ def direct(kernels: str, dtype, x, y, filter: Filter, weights=None):
     if kernels == "torch":
         image, off = splat(x, y, one, SCREEN, filter)
         return image, float(off)
-    none = torch.zeros_like(x)
-    rays = tuple(functions._strided(a.numpy()) for a in (x, y))
-    along, ones = [functions._none(dtype)] * 2, np.ones((1, 1), x.numpy().dtype)
-    rays, lens = (*rays, *along, functions._strided(one.numpy())), Lens(index=N, fresnel="none")
-    image, _, lost = functions._splat([none] * 3, (np.zeros(1, np.int64), ones, ones), True, rays, lens, 10.0, (1.0, 0.0), SCREEN,
-                                      filter, functions._Workspace())
+    x, y, one = x.double(), y.double(), one.double()
+    image, _, lost = splatted([torch.zeros_like(x)] * 3, x, y, None, one, "none", N, filter)
     return image, float(lost["off_screen"])
 
 
@@ -98,9 +91,9 @@ def test_far_landing_has_no_derivative(dtype):
     """A screen 1e12 mm away and slopes of 1e6: coordinates up to 1e18, nothing on the screen, no NaN in the derivative."""
     leaf = torch.linspace(-1e6, 1e6, 40, dtype=dtype).view(1, -1).requires_grad_()
     none = torch.zeros_like(leaf)
-    landing = carry(Lens(index=1.0001), (0.0, 0.0, 1.0), none, 1e-5 * leaf, none, none, none, none + 1.0, 1e12)
-    image, off = splat(landing.x, landing.y, landing.weight, SCREEN, FILTER)
-    (by,) = torch.autograd.grad((image * torch.rand(image.shape)).sum() + landing.leaving, leaf)
+    x, y, power, leaving = carried((0.0, 0.0, 1.0), (1e-5 * leaf, none), none + 1.0, (none, none, none), 1.0001, 1e12)
+    image, off = splat(x, y, power, SCREEN, FILTER)
+    (by,) = torch.autograd.grad((image * torch.rand(image.shape)).sum() + leaving, leaf)
     assert bool(torch.isfinite(by).all()) and float(off.detach()) > 10
 
 

@@ -7,7 +7,6 @@ import shlex
 import numpy as np
 import pytest
 import torch
-from caustic_cli.optics.tracing import expose
 from PIL import Image
 
 from caustic_cli import cli, verdict
@@ -19,6 +18,7 @@ from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Lens, PlaneWave, Points, Scene, Screen
 
 N = 16

@@ -2,7 +2,7 @@
 
 Stages, each with its adjoint and tangent
     spline_on, spline_at      a B-spline's height and slopes at the points of a sample, or at points
-    meet_fixed, meet_spline   where rays meet a B-spline: rays known beforehand, or rays that depend on what came before
+    meet, meet_spline, meet_fixed   where rays meet any surface, a B-spline, or a B-spline if they are known beforehand
     interact                  Snell, Fresnel, or a mirror
     land                      to a plane
     splat                     onto pixels
@@ -17,8 +17,12 @@ import contextlib
 import os
 from collections.abc import Iterator
 from functools import cache
+from importlib import import_module
 
 import torch
+
+#: Name -> module and class, looked up when they are needed: they know surfaces, which know this, and numba is slow to load.
+BACKENDS = {"torch": ("reference", "Torch"), "numba": ("cpu", "Numba")}
 
 
 def backend_for(device: torch.device | str):
@@ -43,10 +47,5 @@ def plain() -> Iterator[None]:
 
 @cache
 def _made(name: str):
-    if name == "torch":
-        from caustic_cli.optics.backends.reference import Torch  # noqa: PLC0415 - backends know surfaces, surfaces this
-
-        return Torch()
-    from caustic_cli.optics.backends.cpu import Numba  # noqa: PLC0415 - numba is slow to load
-
-    return Numba()
+    module, kind = BACKENDS[name]
+    return getattr(import_module(f"{__name__}.{module}"), kind)()

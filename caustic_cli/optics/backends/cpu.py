@@ -19,9 +19,9 @@ from caustic_cli.optics.kernels.land import land
 from caustic_cli.optics.kernels.rayhits import hits_of_rays
 from caustic_cli.optics.kernels.splat import splat_rays
 from caustic_cli.optics.kernels.surface import FusedSurface, RayHits, next_meetings, scattered_surface
-from caustic_cli.optics.meeting import HALVINGS, MOST_STEPS
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.reconstruction import Filter
+from caustic_cli.optics.reintersection import HALVINGS, MOST_STEPS
 from caustic_cli.optics.sampling import Sample, key, salt
 from caustic_cli.optics.surfaces.base import Hit
 from caustic_cli.scene import Screen

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.optics import intersection, meeting
+from caustic_cli.optics import intersection, reintersection
 from caustic_cli.optics.interface import Departure, interact
 from caustic_cli.optics.mesh import TriangleMesh
 from caustic_cli.optics.reconstruction import Filter, splat
@@ -41,6 +41,10 @@ class Torch:
         """Height and slopes at fixed points (N,) mm, float64, linear in the heights."""
         return tuple(field.at(heights, x, y))
 
+    def meet(self, surface, heights: Tensor | None, origin, direction, side: float) -> Hit:
+        """`Surface.meet` of any surface."""
+        return intersection.meet_any(surface, heights, origin, direction, side)
+
     def meet_spline(self, field, heights: Tensor, origin, direction, side: float) -> Hit:
         """`Surface.meet` of a B-spline."""
         return intersection.meet_any(field, heights, origin, direction, side)
@@ -64,8 +68,8 @@ class Torch:
         return lambda heights: intersection.reference(field, heights, origin, direction)
 
     def next_meetings(self, field, heights: Tensor, origin, direction, below: bool, round: bool, step: float) -> Tensor:
-        """Distances (N,) mm to the next meeting of rays that start on a B-spline, 0 for none: see `meeting.again`."""
-        return meeting.reference(field, heights, origin, direction, below, round, step)
+        """Distances (N,) mm to the next meeting of rays that start on a B-spline, 0 for none: see `reintersection.again`."""
+        return reintersection.reference(field, heights, origin, direction, below, round, step)
 
     def interact(self, direction, slopes, power: Tensor, *, eta: float, reflects: bool, fresnel: str, polarised=None,
                  side: float = 1.0) -> Departure:
@@ -84,7 +88,8 @@ class Torch:
         """
         away = [p - o for p, o in zip(point, origin, strict=True)]
         along, up, normal = axes
-        distance, speed = _dot(away, normal), torch.as_tensor(_dot(direction, normal))
+        distance, speed = _dot(away, normal), _dot(direction, normal)
+        speed = speed if isinstance(speed, Tensor) else torch.tensor(speed, dtype=torch.float64)
         arrives = forward * speed > PARALLEL
         path = distance / torch.where(arrives, speed, torch.ones_like(speed))
         on_way = arrives & (path > 0)
@@ -109,8 +114,9 @@ def by_mesh(field, heights, origin, direction, method: intersection.Method, radi
     """Where the mesh has the hits (None: not asked for), and (t, status) if that is the whole method."""
     if method.name == "newton":
         return None, None
-    mesh, rays = TriangleMesh(field, heights, *method.parts), torch.broadcast_tensors(*map(torch.as_tensor, (*origin, *direction)))
-    start, missed, _ = mesh.intersect(*(c.double() for c in rays), method.recursive)
+    mesh = TriangleMesh(field, heights, *method.parts)
+    rays = [torch.as_tensor(c, dtype=torch.float64) for c in (*origin, *direction)]
+    start, missed, _ = mesh.intersect(*torch.broadcast_tensors(*rays), method.recursive)
     if method.name == "mesh":
         t = torch.where(missed == 0, start, torch.zeros_like(start))
         return start, (t, intersection.within(missed.long(), start, origin, direction, radius))

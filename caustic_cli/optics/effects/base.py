@@ -8,18 +8,15 @@ by the numbers of a scene (absorption: the coefficient), so that leaving them ou
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from torch import Tensor
 
+from caustic_cli.optics.bounds import Bounds
+from caustic_cli.optics.meeting import Meeting, Parameters, Walker
 from caustic_cli.optics.rays import RayState
+from caustic_cli.optics.surfaces import Hit
+from caustic_cli.optics.system import System
 from caustic_cli.scene import Scene
-
-if TYPE_CHECKING:
-    from caustic_cli.optics.bounds import Bounds
-    from caustic_cli.optics.surfaces import Hit
-    from caustic_cli.optics.system import System
-    from caustic_cli.optics.trace import Meeting, Tracer
 
 #: Ghost light below this part of the source's power is left out: the other effects' own models are no better than that.
 NEGLIGIBLE = 0.01
@@ -90,7 +87,7 @@ class Action:
     def depart(self, meeting: Meeting) -> None:
         """Behind the surface."""
 
-    def detour(self, tracer: Tracer, parameters, meetings: list[Meeting]) -> list[RayState]:
+    def detour(self, tracer: Walker, parameters: Parameters, meetings: list[Meeting]) -> list[RayState]:
         """Light behind the last element that has not gone straight on; takes it off what is in `meetings`' states and accounts."""
         return []
 

@@ -13,8 +13,8 @@ import torch
 
 from caustic_cli.optics.effects.base import NO_REQUESTS, Action, Effect, Requests, Verdict
 from caustic_cli.optics.frames import out_of, turned, turned_back
-from caustic_cli.optics.meeting import again, touch
 from caustic_cli.optics.rays import RayState
+from caustic_cli.optics.reintersection import again, touch
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.scene import Scene
 

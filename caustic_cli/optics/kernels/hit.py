@@ -164,7 +164,7 @@ def intersect(ou, ov, oz, du, dv, dz, start, limits, slopes, c, bu, mu, wu, bv, 
 @njit(parallel=True, **FAST)
 def intersect_again(ou, ov, oz, du, dv, dz, side, limits, slopes, round_, step, halvings, most, c, bu, mu, wu, bv, mv, wv, t,
                     blocks):
-    """Next meetings of rays (N,) that start on the surface, into t (N,), 0 for none: the search of `meeting.reference`.
+    """Next meetings of rays (N,) that start on the surface, into t (N,), 0 for none: the search of `reintersection.reference`.
 
     side: 1 above the surface, -1 under it; limits, slopes: as in `intersect`; round_: the surface ends at the circle inscribed
     in its aperture; step, halvings, most: least step (mm), bisections of the last one and most steps.

@@ -81,7 +81,7 @@ def _sag(heights: Tensor) -> tuple[Tensor, float]:
 
 def next_meetings(surface: FusedSurface, heights: Tensor, o, d, below: bool, round: bool, step: float, halvings: int,
                   most: int) -> Tensor:
-    """The fused form of `meeting.reference`: distances (N,) mm, 0 for none."""
+    """The fused form of `reintersection.reference`: distances (N,) mm, 0 for none."""
     h, middle = _sag(heights)
     rays = (o[0] * surface.scale[0] + 0.5, o[1] * surface.scale[1] + 0.5, o[2] - middle,
             d[0] * surface.scale[0], d[1] * surface.scale[1], d[2])

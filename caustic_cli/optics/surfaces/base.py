@@ -18,7 +18,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
+
+from caustic_cli.optics.backends import backend_for
 
 #: Orders of derivatives by (x, y): value and slopes, and second derivatives.
 FIRST, SECOND = ((0, 0), (1, 0), (0, 1)), ((2, 0), (1, 1), (0, 2))
@@ -70,6 +73,5 @@ class Surface(ABC):
 
     def meet(self, heights: Tensor | None, origin, direction, side: float) -> Hit:
         """First meetings of rays (N,), mm, unit directions with side d_z > 0; differentiable by heights, origins and directions."""
-        from caustic_cli.optics.intersection import meet_any  # noqa: PLC0415 - intersection knows surfaces
-
-        return meet_any(self, heights, origin, direction, side)
+        (device,) = {c.device for c in (*origin, *direction) if isinstance(c, Tensor)} or {torch.device("cpu")}
+        return backend_for(device).meet(self, heights, origin, direction, side)

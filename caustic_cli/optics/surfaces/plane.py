@@ -33,7 +33,8 @@ class Plane(Surface):
         """t = -o_z / d_z; the slopes are the number 0."""
         oz, dz = torch.as_tensor(origin[2]), direction[2]
         ox = next((c for c in origin if isinstance(c, Tensor)), oz)
-        ahead = torch.as_tensor(side * dz, dtype=ox.dtype, device=ox.device) > PARALLEL
-        t = torch.where(ahead, -oz / torch.where(ahead, torch.as_tensor(dz).to(ox), 1.0), torch.zeros_like(ox))
+        dz = torch.as_tensor(dz, dtype=ox.dtype, device=ox.device)
+        ahead = side * dz > PARALLEL
+        t = torch.where(ahead, -oz / torch.where(ahead, dz, torch.ones_like(dz)), torch.zeros_like(ox))
         found = ahead & (t >= 0)
         return Hit(torch.where(found, t, torch.zeros_like(t)), 0.0, 0.0, found)
