@@ -43,7 +43,8 @@ def beyond(e, d, t, normal, c, s, eta: float):
     es, ep = _dot(e, unit) * (2.0 * eta * c) / (eta * c + s), _dot(e, _cross(unit, d)) * (2.0 * eta * c) / (c + eta * s)
     after = tuple(es * a + ep * b for a, b in zip(unit, _cross(unit, t), strict=True))
     size = _dot(after, after).clamp_min(NORMAL).sqrt()
-    return tuple(torch.where(square > NORMAL, a / size, torch.as_tensor(b, dtype=size.dtype, device=size.device)) for a, b in zip(after, e, strict=True))
+    before = (torch.as_tensor(b, dtype=size.dtype, device=size.device) for b in e)
+    return tuple(torch.where(square > NORMAL, a / size, b) for a, b in zip(after, before, strict=True))
 
 
 def _across(d, normal):

@@ -113,7 +113,8 @@ def _by_mesh(field, heights, origin, direction, method: intersection.Method, rad
         return None, None
     from caustic_cli.optics.mesh import TriangleMesh  # noqa: PLC0415
 
-    mesh, rays = TriangleMesh(field, heights, *method.parts), [torch.as_tensor(c, dtype=torch.float64) for c in (*origin, *direction)]
+    mesh = TriangleMesh(field, heights, *method.parts)
+    rays = [torch.as_tensor(c, dtype=torch.float64) for c in (*origin, *direction)]
     start, missed, _ = mesh.intersect(*torch.broadcast_tensors(*rays), method.recursive)
     if method.name == "mesh":
         t = torch.where(missed == 0, start, torch.zeros_like(start))

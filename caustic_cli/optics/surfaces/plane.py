@@ -33,7 +33,8 @@ class Plane(Surface):
         """t = -o_z / d_z; the slopes are the number 0."""
         (ox, oy, oz), (dx, dy, dz) = origin, direction
         ahead = torch.as_tensor(side * dz, dtype=ox.dtype, device=ox.device) > PARALLEL
-        t = torch.where(ahead, -oz / torch.where(ahead, torch.as_tensor(dz, dtype=ox.dtype, device=ox.device), 1.0), torch.zeros_like(ox))
+        dz = torch.as_tensor(dz, dtype=ox.dtype, device=ox.device)
+        t = torch.where(ahead, -oz / torch.where(ahead, dz, 1.0), torch.zeros_like(ox))
         found = ahead & (t >= 0)
         if radius is not None:
             found = found & ((ox + t * dx) ** 2 + (oy + t * dy) ** 2 <= radius * radius)
