@@ -8,7 +8,6 @@ import zipfile
 import numpy as np
 import pytest
 import torch
-from caustic_cli.optics.tracing import PlaneTracer
 from scipy.interpolate import BSpline, RectBivariateSpline
 
 from caustic_cli import __version__
@@ -19,6 +18,8 @@ from caustic_cli.export.stl import TRIANGLE, write_stl
 from caustic_cli.export.surface import STEPS_PER_SPAN, sample_grid
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import EXIT, System
+from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
 
 UNEVEN = (0.0, 0.0, 0.0, 0.0, 0.11, 0.2, 0.2, 0.55, 0.83, 1.0, 1.0, 1.0, 1.0)  # cubic, one double knot
@@ -199,11 +200,11 @@ def test_retraced_from_the_cloud_alone_light_lands_where_the_tracer_puts_it(tmp_
     reach = (n - s) / (n * g2 + s) * (float(data["z_screen"]) - f)
 
     sample = Sample(torch.as_tensor(u), torch.as_tensor(v), False, torch.tensor(1 / 2000, dtype=torch.float64))
-    landing = PlaneTracer(scene, field, sample, torch.float64)(heights)
-    assert int(landing.status.sum()) == 0
-    spread = np.hypot(landing.x.numpy() - x, landing.y.numpy() - y)
+    (landing,) = Tracer(System.of(scene, field), sample, track=True).land({EXIT: heights}, scene.screen)
+    assert int(landing.statuses().sum()) == 0
+    spread = np.hypot(landing.origin[0].numpy() - x, landing.origin[1].numpy() - y)
     assert spread.max() > 5  # mm: the lens does bend light
-    assert np.hypot(landing.x.numpy() - (x + reach * gx), landing.y.numpy() - (y + reach * gy)).max() < 1e-6
+    assert np.hypot(landing.origin[0].numpy() - (x + reach * gx), landing.origin[1].numpy() - (y + reach * gy)).max() < 1e-6
 
 
 def test_archive_bytes_do_not_depend_on_the_day(tmp_path, monkeypatch):

@@ -6,11 +6,12 @@ import math
 import numpy as np
 import pytest
 import torch
-from caustic_cli.optics.tracing import LOSSES, expose
 
 from caustic_cli.errors import InputError
+from caustic_cli.optics.rays import LOSSES
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Lens, PlaneWave, Scene, Screen
 from caustic_cli.studies import metrics
 

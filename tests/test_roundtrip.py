@@ -17,7 +17,6 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import torch
-from caustic_cli.optics.tracing import PlaneTracer
 from scipy.interpolate import BSpline, CubicHermiteSpline, RectBivariateSpline
 from test_export import CASES, make, signed_volume
 
@@ -35,6 +34,8 @@ from caustic_cli.export.surface import STEPS_PER_SPAN, sample_grid, second_deriv
 from caustic_cli.export.zemax import write_zemax
 from caustic_cli.files import is_ours
 from caustic_cli.optics.sampling import Sample
+from caustic_cli.optics.system import EXIT, System
+from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Disc, PlaneWave, Points, Scene
 from caustic_cli.surfaces import onto, read_surface
 
@@ -53,11 +54,11 @@ def rays(lens):
     scene, field, heights = lens
     u, v = np.random.default_rng(1).uniform(size=(2, 3000))
     sample = Sample(torch.as_tensor(u), torch.as_tensor(v), False, torch.tensor(1 / 3000, dtype=torch.float64))
-    landing = PlaneTracer(scene, field, sample, torch.float64)(heights)
-    assert int(landing.status.sum()) == 0
+    (landing,) = Tracer(System.of(scene, field), sample, track=True).land({EXIT: heights}, scene.screen)
+    assert int(landing.statuses().sum()) == 0
     x, y = (2 * u - 1) * field.half_size[0], (2 * v - 1) * field.half_size[1]
-    assert np.hypot(landing.x.numpy() - x, landing.y.numpy() - y).max() > 5  # mm: the lens does bend light
-    return x, y, landing.x.numpy(), landing.y.numpy()
+    assert np.hypot(landing.origin[0].numpy() - x, landing.origin[1].numpy() - y).max() > 5  # mm: the lens does bend light
+    return x, y, landing.origin[0].numpy(), landing.origin[1].numpy()
 
 
 def off(scene, rays, f, gx, gy) -> float:

@@ -8,8 +8,7 @@ Notation
     Q, Q_y      P B_v^T and P B_v'^T / (2 r_y), (n, b)
     z, zx, zy   B_u Q, B_u' Q / (2 r_x), B_u Q_y, each (a, b)
 
-by_v is the derivative of whatever is differentiated by v.  Numba caches the kernels by this file's time stamp alone: after editing
-rows.py, touch it.
+by_v is the derivative of whatever is differentiated by v.
 """
 
 from __future__ import annotations

@@ -12,8 +12,7 @@ Notation, in pixels (w = 1)
     W           weight of a ray;  G the derivatives by the padded image's pixels
     image       sum over rays of W o_x o_y a_i a_j on the frame padded by 2 r, less its padding
 
-by_v is the derivative of whatever is differentiated by v, and d_v the derivative of v along a direction.  Numba caches the kernels
-by this file's time stamp alone: after editing shares.py, touch it.
+by_v is the derivative of whatever is differentiated by v, and d_v the derivative of v along a direction.
 """
 
 from __future__ import annotations

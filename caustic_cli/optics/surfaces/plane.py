@@ -31,10 +31,9 @@ class Plane(Surface):
 
     def meet(self, heights: None, origin, direction, side: float) -> Hit:
         """t = -o_z / d_z; the slopes are the number 0."""
-        oz, dz = torch.as_tensor(origin[2]), direction[2]
-        ox = next((c for c in origin if isinstance(c, Tensor)), oz)
-        dz = torch.as_tensor(dz, dtype=ox.dtype, device=ox.device)
+        like = next(c for c in (*origin, *direction) if isinstance(c, Tensor))
+        oz, dz = (torch.as_tensor(c, dtype=like.dtype, device=like.device) for c in (origin[2], direction[2]))
         ahead = side * dz > PARALLEL
-        t = torch.where(ahead, -oz / torch.where(ahead, dz, torch.ones_like(dz)), torch.zeros_like(ox))
+        t = torch.where(ahead, -oz / torch.where(ahead, dz, torch.ones_like(dz)), torch.zeros_like(like))
         found = ahead & (t >= 0)
         return Hit(torch.where(found, t, torch.zeros_like(t)), 0.0, 0.0, found)
