@@ -14,12 +14,12 @@ from torch.autograd import forward_ad
 from caustic_cli.optics import intersection
 from caustic_cli.optics.backends.reference import Torch
 from caustic_cli.optics.bspline import SplineSpace
+from caustic_cli.optics.frames import IDENTITY
 from caustic_cli.optics.intersection import Method, Status
 from caustic_cli.optics.kernels.surface import FusedSurface, RayHits
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.surfaces import Plane
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import IDENTITY
 
 
 def bundle(x, y, z, dx, dy, dz):

@@ -14,13 +14,14 @@ import torch
 from caustic_cli import firstrun
 from caustic_cli.optics.backends import backend_for, plain
 from caustic_cli.optics.bspline import SplineSpace
+from caustic_cli.optics.frames import IDENTITY
 from caustic_cli.optics.kernels import banded, plane, spline
 from caustic_cli.optics.kernels import shares as kernel_shares
 from caustic_cli.optics.kernels.functions import PlaneKernel
 from caustic_cli.optics.reconstruction import Filter, splat
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import EXIT, IDENTITY, System
+from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Lens, PlaneWave, Scene, Screen
 

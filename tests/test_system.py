@@ -15,13 +15,14 @@ from caustic_cli.errors import InputError
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.bspline import Surface as ParametricSurface
 from caustic_cli.optics.effects import EFFECTS, Requests
+from caustic_cli.optics.frames import Pose
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces import HeightField, Nurbs, Plane, Sphere
-from caustic_cli.optics.system import Aperture, Element, Medium, Placed, Pose, System
+from caustic_cli.optics.system import Element, Medium, Placed, System
 from caustic_cli.optics.trace import Tracer, render, trace
-from caustic_cli.scene import Light, PlaneWave, Points, Screen
+from caustic_cli.scene import Aperture, Light, PlaneWave, Points, Screen
 
 pytestmark = pytest.mark.usefixtures("kernels")
 

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 
 from caustic_cli.optics.backends import backend_for, plain
+from caustic_cli.optics.frames import IDENTITY
 from caustic_cli.optics.kernels import functions
 from caustic_cli.optics.reconstruction import Filter, splat
-from caustic_cli.optics.system import IDENTITY
 from caustic_cli.scene import Screen
 
 mp.mp.dps = 60
