@@ -155,13 +155,13 @@ def run(
                 raise InputError(f"--resume goes on with a project as it is, so {', '.join(names)} cannot be given;"
                                  " --iterations and --time-limit can, and project.toml can be edited")
             project = session.find(target, out)
-            options.compile_for(project.scene(), device, say)
+            options.compile_for(project.scene(), device, say, gradient=True)
             figures = session.resume(project, iterations, time_limit, device, say, began)
         else:
             with say.patience("solving the transport of the light to the picture; the first time, its kernels are compiled, which"
                               " takes about half a minute"):
                 project, first = session.begin(target, out, given, screen, pixels, shaped, config, force)
-            options.compile_for(project.scene(), device, say)
+            options.compile_for(project.scene(), device, say, gradient=True)
             figures = session.design(project, first, device, say, began)
     say.table(str(project.path), [*console.figures_rows(figures), ("ended by", figures["reason"])])
     if json:

@@ -158,14 +158,30 @@ def start_torch(device: str, threads: int | None, say: Reporter):
     return device
 
 
-def compile_for(scene, device: str, say: Reporter) -> None:
-    """Have the CPU's kernels compiled that a scene needs beyond those of `start_torch`; None for any scene's."""
+def compile_for(scene, device: str, say: Reporter, requests=None, gradient: bool = False) -> None:
+    """Have the CPU's kernels compiled that the light of a scene needs beyond those of `start_torch`.
+
+    Args:
+        scene: None for whatever any scene may need.
+        requests: of a plan, or None.
+        gradient: derivatives are needed too.
+    """
     from caustic_cli.optics.backends import backend_for  # noqa: PLC0415
 
-    backend = backend_for(device)
-    if backend.compiled and (scene is None or not scene.source.collimated):
-        with say.patience("compiling the intersection kernels for this machine, once: about ten seconds"):
-            backend.compile_rays()
+    if not backend_for(device).compiled:
+        return
+    from caustic_cli.optics.effects import NO_REQUESTS, Requests  # noqa: PLC0415
+    from caustic_cli.optics.trace import warm_up  # noqa: PLC0415
+    from caustic_cli.scene import Lens, PlaneWave, Points, Scene, Screen  # noqa: PLC0415
+
+    wanted = [(scene, requests or NO_REQUESTS)]
+    if scene is None:
+        lens, screen = Lens(), Screen((30.0, 30.0))
+        wanted = [(Scene(Points(((0.0, 0.0, -50.0),)), lens, screen), NO_REQUESTS),
+                  (Scene(PlaneWave(), lens, screen), Requests(stages=True))]
+    with say.patience("compiling the kernels that this scene needs, once: about half a minute"):
+        for one, asked in wanted:
+            warm_up(one, asked, gradient)
 
 
 def dtype_of(name: str):

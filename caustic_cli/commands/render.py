@@ -129,7 +129,6 @@ def run(
         from caustic_cli.studies.verify import require_mitsuba  # noqa: PLC0415
 
         require_mitsuba(scene)
-    options.compile_for(scene if wanted is None and not explain else None, device, say)
     screen = scene.screen
     if screen_at is not None:
         screen = replace(screen, z=screen_at)
@@ -140,6 +139,7 @@ def run(
     try:
         scene = replace(scene, screen=screen)
         plan = compile_plan(scene, field, heights, wanted)
+        options.compile_for(None if explain else plan.scene, device, say, plan.requests)
         exposure, figures = retrace(plan.scene, field, heights, target, rays=count, filter=filter, device=device, seed=seed,
                                     dtype=precision, tolerance=tolerance, requests=plan.requests)
     except InputError as error:

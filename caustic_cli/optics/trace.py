@@ -322,6 +322,23 @@ def is_lowered(scene: Scene, field: HeightField, requests: Requests = NO_REQUEST
     return not any(scene.screen.tilt) and Tracer(System.of(scene, field), few, requests=requests).fused is not None
 
 
+def warm_up(scene: Scene, requests: Requests = NO_REQUESTS, gradient: bool = False) -> None:
+    """Trace a few rays of a scene, so that whatever its light needs is compiled; net and pixels are few.
+
+    gradient: the adjoints too.
+    """
+    lens = replace(scene.lens, control=(4, 4), degree=(3, 3), knots=None)
+    scene, field = replace(scene, lens=lens), HeightField.of(lens)
+    heights = torch.full((4, 4), lens.offset.thickness, dtype=torch.float64, requires_grad=gradient)
+    screen = replace(scene.screen, resolution=(4, 4))
+    with torch.set_grad_enabled(gradient):
+        for kind in ("lines", "stratified") if scene.source.collimated else ("stratified",):
+            traced = next(tracers(scene, field, rays_of(scene, kind, 16), torch.float64, 1 << 10, requests))
+            image = traced.expose({EXIT: heights}, screen, Filter("cosine", (3, 3)))
+            if gradient:
+                (image.image.sum() + image.leaving.sum()).backward()
+
+
 def trace(system: System, rays: Sample | RayState, parameters: Parameters, **options) -> list[RayState]:
     """Rays behind the last element of a system: those that went straight on, then those of detours.  options: of a `Tracer`."""
     return Tracer(system, rays, **options)(parameters)

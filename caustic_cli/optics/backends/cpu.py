@@ -37,10 +37,6 @@ class Numba(Torch):
         """Have ready what a plane wave's rays need: from the files kept, or compiled for this machine."""
         functions.compile_kernels()
 
-    def compile_rays(self) -> None:
-        """The same for rays of any direction."""
-        functions.compile_ray_kernels()
-
     def precision(self, dtype: torch.dtype) -> torch.dtype:
         """float64."""
         return torch.float64
