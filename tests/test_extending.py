@@ -221,43 +221,46 @@ SURFACE = Addition(3, new={"optics/surfaces/paraboloid.py": '''
     assert float(torch.hypot(*rays.origin[:2]).max()) < 1e-10 and abs(float(rays.power.sum()) - 1) < 1e-12
 """)
 
-SOURCE = Addition(3, new={"scene/sources/pair.py": '''
-    """Two points side by side."""
+SOURCE = Addition(3, new={"scene/sources/spokes.py": '''\
+"""Points on a circle, as many as [source] spokes says."""
+from dataclasses import dataclass
+import numpy as np
+from caustic_cli.scene.sources.base import Source
+from caustic_cli.scene.sources.section import SourceType
 
-    from __future__ import annotations
+@dataclass(frozen=True)
+class Spokes(Source):
+    count: int
+    power: float
+    kind = "spokes"
 
-    from dataclasses import dataclass
+    def points(self):
+        turn = 2.0 * np.pi * np.arange(self.count) / self.count
+        return np.stack([np.cos(turn), np.sin(turn), 0.0 * turn - 20.0], -1), np.full(self.count, 1.0 / self.count)
 
-    import numpy as np
+TYPES = (SourceType("spokes", "spokes", ("spokes",), lambda table, profile: Spokes(table["spokes"], table["power"]),
+                    lambda lens: {"spokes": 5}, own={"spokes": ("whole", "how many")}),)
+''', "optics/emission/spokes.py": '''\
+"""The rays of spokes."""
+from caustic_cli.optics.emission.near import Near
 
-    from caustic_cli.scene.sources.base import Source
+EMISSIONS = {"spokes": Near.of_size}
+'''}, used='''
+import torch
+from caustic_cli import settings
+from caustic_cli.derive import complete
+from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.trace import expose
 
-
-    @dataclass(frozen=True)
-    class Pair(Source):
-        """At (-x, 0, z) and (x, 0, z), mm."""
-
-        x: float
-        z: float
-        power: float = 1.0
-
-        kind = "pair"
-        emission = "point"
-
-        def points(self):
-            """Both, alike."""
-            return np.array([[-self.x, 0.0, self.z], [self.x, 0.0, self.z]]), np.array([0.5, 0.5])
-'''}, used="""
-    import torch
-    from caustic_cli.optics.emission import rays_of
-    from caustic_cli.optics.surfaces import HeightField
-    from caustic_cli.optics.trace import expose
-    from caustic_cli.scene import Lens, Scene, Screen
-    from caustic_cli.scene.sources.pair import Pair
-    scene = Scene(Pair(2.0, -40.0), Lens(control=(6, 6)), Screen((60.0, 60.0), 60.0, (8, 8)))
-    image = expose(scene, HeightField.of(scene.lens), torch.full((6, 6), 5.0).double(), rays_of(scene, "stratified", 400))
-    assert abs(float(image.image.sum()) + sum(image.lost.values()) - 1) < 1e-12 and float(image.image.sum()) > 0.1
-""")
+full = complete(settings.parse('[source]\\ntype = "spokes"\\nspokes = 7\\n[lens]\\ncontrol = [8, 8]', "here"), 1.0)
+again = settings.parse(settings.dump(full), "there")
+scene = settings.build_scene(again)
+rays = rays_of(scene, "stratified", 6300)
+exposure = expose(scene, HeightField.of(scene.lens), torch.full((8, 8), 5.0, dtype=torch.float64), rays)
+assert abs(float(exposure.image.sum()) + sum(exposure.lost.values()) - 1.0) < 1e-12
+assert (scene.source.kind, len(scene.source.powers), rays.count, again["source"]["spokes"]) == ("spokes", 7, 6300, 7)
+''')
 
 ADDITIONS = {"a reconstruction filter": FILTER, "an export format": EXPORT, "an effect": EFFECT, "a surface": SURFACE,
              "a source": SOURCE}

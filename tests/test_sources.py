@@ -2,10 +2,6 @@
 
 import ast
 import math
-import os
-import shutil
-import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -226,59 +222,6 @@ def test_a_source_from_outside(ring, kernels, tmp_path):
         with pytest.raises(InputError, match="knows no source of type ring"):
             write(tmp_path / name, scene, field, heights)
     assert not list(tmp_path.iterdir())
-
-
-SPOKES = '''"""Points on a circle, as many as [source] spokes says."""
-from dataclasses import dataclass
-import numpy as np
-from caustic_cli.scene.sources.base import Source
-from caustic_cli.scene.sources.section import SourceType
-
-@dataclass(frozen=True)
-class Spokes(Source):
-    count: int
-    power: float
-    kind = "spokes"
-
-    def points(self):
-        turn = 2.0 * np.pi * np.arange(self.count) / self.count
-        return np.stack([np.cos(turn), np.sin(turn), 0.0 * turn - 20.0], -1), np.full(self.count, 1.0 / self.count)
-
-TYPES = (SourceType("spokes", "spokes", ("spokes",), lambda table, profile: Spokes(table["spokes"], table["power"]),
-                    lambda lens: {"spokes": 5}, own={"spokes": ("whole", "how many")}),)
-'''
-DRAWN = '''"""The rays of spokes."""
-from caustic_cli.optics.emission.near import Near
-
-EMISSIONS = {"spokes": Near.of_size}
-'''
-USED = '''
-import torch
-from caustic_cli import settings
-from caustic_cli.derive import complete
-from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.trace import expose
-
-full = complete(settings.parse('[source]\\ntype = "spokes"\\nspokes = 7\\n[lens]\\ncontrol = [8, 8]', "here"), 1.0)
-again = settings.parse(settings.dump(full), "there")
-scene = settings.build_scene(again)
-rays = rays_of(scene, "stratified", 6300)
-exposure = expose(scene, HeightField.of(scene.lens), torch.full((8, 8), 5.0, dtype=torch.float64), rays)
-assert abs(float(exposure.image.sum()) + sum(exposure.lost.values()) - 1.0) < 1e-12
-print(scene.source.kind, len(scene.source.powers), rays.count, again["source"]["spokes"])
-'''
-
-
-def test_two_new_files_are_a_new_type_of_source(tmp_path):
-    """Nothing else is touched: a copy of the package with a file of data and a file of rays knows the type and its key."""
-    shutil.copytree(PACKAGE, tmp_path / "caustic_cli", ignore=shutil.ignore_patterns("__pycache__"))
-    (tmp_path / "caustic_cli/scene/sources/spokes.py").write_text(SPOKES)
-    (tmp_path / "caustic_cli/optics/emission/spokes.py").write_text(DRAWN)
-    done = subprocess.run([sys.executable, "-c", USED], cwd=tmp_path, capture_output=True, text=True, check=False,
-                          env={**os.environ, "CAUSTIC_KERNELS": "torch", "PYTHONPATH": str(tmp_path)})
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == ["spokes", "7", "6300", "7"]
 
 
 def test_a_kind_that_others_do_not_know_is_refused_in_a_sentence(ring, monkeypatch):
