@@ -48,8 +48,8 @@ from caustic_cli.optics.tolerances import FEW_ULP, LEAST_COSINE
 LANES = 32
 #: Rays sorted at a time, in the next cache; and the largest box of span products that they may hit.
 TILE, BOX = 4096, 16_384
-#: Rays in a span product below which a batch is not worth its empty lanes, in a tile and on average.
-FEWEST, CROWD = 4, 8
+#: A batch is not worth its empty lanes below so many rays times coefficients, in a tile, and rays in a span product, on average.
+FEWEST, CROWD = 64, 8
 #: Rays times (p + q + 2) below which a batch's sums take longer than the rays' own, one by one.
 ALONE = 64
 #: Times that rays are handed to the next span product, steps with the terms of second order and with all terms.
@@ -58,6 +58,8 @@ TURNS, FIRST_STEPS, STEPS = 4, 2, 5
 _SUMS = {"fastmath": {"contract", "nsz", "reassoc"}}
 #: So far beyond its span product, in its widths, a polynomial is still evaluated; and so near the border hits are `_root`'s.
 BEYOND, MARGIN = 0.02, 1e-12
+#: An unsigned index is never taken to count from the end.
+UINT = np.uintp
 
 # Where the rows of a batch's scratch begin, LANES numbers each: the rays, where they are in the span product, Horner's scheme,
 # Newton's step; in the adjoint slopes, and derivatives by distance, slopes, height and start.
@@ -191,14 +193,13 @@ def _curvatures(w, c, i, j):
 
 
 @njit(**FAST)
-def _settle(w, size, c, i, j, ends_u, ends_v, mi, wi, mj, wj, scale_x, scale_y):
+def _settle(w, size, c, i, j, bounds, ends_u, ends_v, mi, wi, mj, wj, scale_x, scale_y):
     """Newton's iteration in all lanes, from T; DONE where it has converged in this span product, whose ends those are.
 
-    Returns in how many lanes it has not.
+    bounds: of the span product, as of `_bounds`.  Returns in how many lanes it has not.
     """
     p, q = c.shape[2], c.shape[3]
-    xx, xy, yy = _bounds(c, i, j)
-    xx, xy, yy = xx * wi * wi, xy * wi * wj, yy * wj * wj
+    xx, xy, yy = bounds[0] * wi * wi, bounds[1] * wi * wj, bounds[2] * wj * wj
     c0, c1, c2, c3 = c[i, j, 0, 0], c[i, j, 1, 0], c[i, j, 0, 1], c[i, j, 1, 1]
     c4, c5 = c[i, j, 2, 0] if p > 2 else 0.0, c[i, j, 0, 2] if q > 2 else 0.0
     for _ in range(FIRST_STEPS):
@@ -224,11 +225,11 @@ def _settle(w, size, c, i, j, ends_u, ends_v, mi, wi, mj, wj, scale_x, scale_y):
             slope = dz - zu * du - zv * dv
             step = (w[OZ + k] + t * dz - w[Z + k]) / slope
             u, v = abs(du), abs(dv)
-            narrow = FEW_ULP * max(size, t)
+            narrow, size_ = FEW_ULP * max(size, t), abs(step)
             bend = xx * u * u + 2.0 * xy * u * v + yy * v * v
             turn = max((xx * u + xy * v) * scale_x, (xy * u + yy * v) * scale_y)
-            near = max(narrow, min(np.sqrt(0.5 * narrow * slope / bend), FEW_ULP / turn))
-            done = busy and abs(step) <= near and slope > 0.0
+            near = (size_ <= narrow) | ((step * step * bend <= 0.5 * narrow * slope) & (size_ * turn <= FEW_ULP))
+            done = busy and near and slope > 0.0
             w[T + k] = t - step if busy else t
             w[G_U + k] = zu if busy else w[G_U + k]
             w[G_V + k] = zv if busy else w[G_V + k]
@@ -283,6 +284,7 @@ def meet(order, batched, ou, ov, oz, du, dv, dz, limits, slopes, round_, c, bu, 
     """
     count, wide = len(ou), len(bv) - 1
     size, middle, thick = max(abs(limits[0]), abs(limits[1])), 0.5 * (limits[0] + limits[1]), 0.5 * (limits[1] - limits[0])
+    fewest = max(1, FEWEST // (c.shape[2] * c.shape[3]))
     for block in prange(blocks):
         w, ends = np.empty(ROWS * LANES), np.empty(BOX + 2, np.int32)
         start, at, key = np.empty(TILE), np.empty(TILE, np.int32), np.empty(TILE, np.int32)
@@ -292,7 +294,7 @@ def meet(order, batched, ou, ov, oz, du, dv, dz, limits, slopes, round_, c, bu, 
         while first < stop:
             last, left, lone, low, high = min(first + TILE, stop), 0, 0, np.int32(2**31 - 1), np.int32(0)
             for k in range(first, last):
-                r = order[k]
+                r = UINT(order[k])
                 u, v, safe = ou[r], ov[r], slopes[0] * abs(du[r]) + slopes[1] * abs(dv[r]) < dz[r]
                 if not (batched and safe and u >= 0.0 and u <= 1.0 and v >= 0.0 and v <= 1.0):
                     alone[lone] = r
@@ -303,31 +305,35 @@ def meet(order, batched, ou, ov, oz, du, dv, dz, limits, slopes, round_, c, bu, 
                 low, high = min(low, key[left]), max(high, key[left])
                 left += 1
             for _ in range(TURNS):
-                if left < FEWEST or high - low >= BOX:
+                if left < fewest or high - low >= BOX:
                     break
                 _group(some, left, key, low, high, ends, together)
                 begin, some_end, left, low, high = 0, left, 0, np.int32(2**31 - 1), np.int32(0)
+                known, bounds = np.int32(-1), (0.0, 0.0, 0.0)
                 while begin < some_end:
                     piece_ = key[together[begin]]
                     end, most = begin + 1, min(begin + LANES, some_end)
                     while end < most and key[together[end]] == piece_:
                         end += 1
-                    if end - begin < FEWEST:
+                    if end - begin < fewest:
                         for k in range(begin, end):
                             alone[lone] = at[together[k]]
                             lone += 1
                         begin = end
                         continue
                     a, b = piece_ // wide, piece_ % wide
+                    if piece_ != known:
+                        known, bounds = piece_, _bounds(c, a, b)
                     for k in range(LANES):
                         s = together[min(begin + k, end - 1)]
-                        r = at[s]
+                        r = UINT(at[s])
                         w[OU + k], w[OV + k], w[OZ + k], w[T + k] = ou[r], ov[r], oz[r], start[s]
                         w[DU + k], w[DV + k], w[DZ + k] = du[r], dv[r], dz[r]
-                    _settle(w, size, c, a, b, (bu[a], bu[a + 1]), (bv[b], bv[b + 1]), mu[a], wu[a], mv[b], wv[b], scale_x, scale_y)
+                    _settle(w, size, c, a, b, bounds, (bu[a], bu[a + 1]), (bv[b], bv[b + 1]), mu[a], wu[a], mv[b], wv[b], scale_x,
+                            scale_y)
                     for k in range(end - begin):
                         s, t = together[begin + k], w[T + k]
-                        r = at[s]
+                        r = UINT(at[s])
                         if w[DONE + k] > 0.0:
                             met[to], where[to] = r, piece_
                             status[r], reach[r], gx[r], gy[r] = HIT, t, w[G_U + k] * scale_x, w[G_V + k] * scale_y

@@ -65,9 +65,12 @@ def load(row, out):
     """A row that may be one value repeated, as a vector: of anything but consecutive numbers the loops make no vectors."""
     if row.strides[0] == 0:
         out[:] = row[0]
-        return
-    for j in range(len(out)):
-        out[j] = row[j]
+    elif row.strides[0] == 8:  # a distance known when compiling: this copy is one of vectors
+        for j in range(len(out)):
+            out[j] = row[j]
+    else:
+        for j in range(len(out)):
+            out[j] = row[j]
 
 
 @njit(**FAST)

@@ -102,19 +102,22 @@ class RayKernel:
         count = len(power)
         self.surface = FusedSurface(spaces, half_size) if like is None else like.surface
         self.workspace = _Workspace() if like is None else like.workspace
-        self.hits, self.z = RayHits(self.surface, origin, direction, radius), origin[2]
         self.shape = _layout(count)
-        self.short = self.shape[0] * self.shape[1] - count
-        rows = [torch.nn.functional.pad(t.double(), (0, self.short)).view(self.shape)
-                for t in (*origin[:2], *direction[:2], power)]  # rays without power fill the last row
-        self.rays = tuple(_strided(t.numpy()) for t in rows)
+        short = self.shape[0] * self.shape[1] - count
+        # The image is a sum, so the rays come in the order in which their hits are found; without power they fill the last row.
+        order = torch.from_numpy(self.surface.order(*origin[:2])[0]).long()
+        order = torch.cat([order, order[-1:].expand(short)])
+        x, y, *direction = (t.double()[order] for t in (*origin[:2], *direction))
+        power = power.double()[order]
+        power[count:] = 0.0
+        self.hits, self.z = RayHits(self.surface, (x, y, origin[2]), direction, radius), origin[2]
+        self.rays = tuple(_strided(t.view(self.shape).numpy()) for t in (x, y, *direction[:2], power))
         ones = np.ones((self.shape[0], 1))
         self.rows = (np.arange(self.shape[0]), ones, ones)
 
     def __call__(self, heights: Tensor, eta: float, fresnel: str, reference: float, screen: Screen, filter: Filter):
         """Control heights (n, m) mm float64; `reference` is where the screen's height is counted from, mm: see `_splat`."""
-        found = self.hits(heights)
-        nets = [torch.nn.functional.pad(t, (0, self.short)).view(self.shape) for t in found]
+        nets = [t.view(self.shape) for t in self.hits(heights)]
         return _splat(nets, self.rows, True, self.rays, (eta, fresnel), screen.z - reference, self.z - reference, screen, filter,
                       self.workspace)
 
@@ -233,7 +236,8 @@ class _Image(torch.autograd.Function):
     @staticmethod
     def backward(ctx, by_image, by_leaving, _):
         sums = _adjoint(by_image, float(by_leaving), ctx.saved_tensors, ctx.rows, ctx.apart, ctx.arguments, ctx.workspace)
-        return *(torch.from_numpy(plane.total(s)) for s in sums), None, None, None, None
+        nets = (torch.from_numpy(s[0] if ctx.apart else plane.total(s)) for s in sums)
+        return *nets, None, None, None, None
 
     @staticmethod
     def jvp(ctx, *tangents):
@@ -247,8 +251,8 @@ class _Image(torch.autograd.Function):
 def _adjoint(by_image: Tensor, by_leaving: float, nets, rows: tuple, apart: bool, arguments: tuple,
              workspace: _Workspace) -> np.ndarray:
     """Derivatives by the three nets (n, b), a sum for each block: (3, blocks, n, b), or (3, 1, n, b) with `apart`."""
-    scratch = _images(arguments, workspace)[1]
-    sums = workspace("nets", 3, 1 if apart else len(scratch), *nets[0].shape)
+    scratch, shape = _images(arguments, workspace)[1], nets[0].shape
+    sums = np.empty((3, 1, *shape)) if apart else workspace("nets", 3, len(scratch), *shape)
     plane.backward(by_image.contiguous().numpy(), by_leaving, apart, sums, scratch, *rows, *_arrays(*nets), *arguments)
     return sums
 

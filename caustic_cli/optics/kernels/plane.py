@@ -58,22 +58,34 @@ UINT, ONE, TWO = np.uintp, np.uintp(1), np.uintp(2)  # an unsigned index is neve
 
 
 @njit(**FAST)
-def _aim(vectors, x, y, along_x, along_y, share, exit_, frame, splat, sx, sy, dx, dy, sloping):
-    """Powers, landing points and shares of one row, from its surface in `vectors`."""
-    n, height, fresnel = exit_.index, exit_.height, exit_.fresnel
-    v, scratch = vectors, vectors[VECTORS:]
-    load(share, v[SHARE])
-    load(x, v[X])
-    load(y, v[Y])
+def _bend(vectors, i, surface, rays, exit_, frame):
+    """The surface, powers and landing points of row i."""
+    v, (first, bu, du, net, net_x, net_y), (x, y, _, _, share) = vectors, surface, rays
     if exit_.slanted:
-        for j in range(v.shape[1]):  # a slice assigned to a slice would compile the message for shapes that differ
-            v[REACH, j] = v[SAG, j]
-        slant.aim(v, along_x, along_y, exit_, frame)
-    else:
-        powers(fresnel, v[GX], v[GY], v[SHARE], n, v[POWER])
-        reach(v[SAG], v[GX], v[GY], n, height, v[REACH])
-        landing(v[REACH], v[GX], v[X], frame.low_x, frame.pixel_x, v[PX])
-        landing(v[REACH], v[GY], v[Y], frame.low_y, frame.pixel_y, v[PY])
+        slant.aim(v, _slanted(i, surface, rays), x[i], y[i], exit_, frame)
+        return
+    combine(i, first, bu, du, net, net_x, net_y, v[SAG], v[GX], v[GY])
+    load(share[i], v[SHARE])
+    load(x[i], v[X])
+    load(y[i], v[Y])
+    n, height, fresnel = exit_.index, exit_.height, exit_.fresnel
+    powers(fresnel, v[GX], v[GY], v[SHARE], n, v[POWER])
+    reach(v[SAG], v[GX], v[GY], n, height, v[REACH])
+    landing(v[REACH], v[GX], v[X], frame.low_x, frame.pixel_x, v[PX])
+    landing(v[REACH], v[GY], v[Y], frame.low_y, frame.pixel_y, v[PY])
+
+
+@njit(inline="always", **FAST)
+def _slanted(i, surface, rays):
+    """Row i as `slant` takes it: slanted rays have a surface of their own each, and no row of it is a sum."""
+    (_, _, _, net, net_x, net_y), (_, _, along_x, along_y, share) = surface, rays
+    return net[i], net_x[i], net_y[i], along_x[i], along_y[i], share[i]
+
+
+@njit(**FAST)
+def _share(vectors, splat, sx, sy, dx, dy, sloping):
+    """Shares of one row's rays among pixels."""
+    v, scratch = vectors, vectors[VECTORS:]
     if splat.size_x > 1:
         fraction(v[PX], v[PHI])
     shares(splat.kind, splat.size_x, splat.alpha_x, v[PHI], sx, dx, v[OVER_X], v[LEAN_X], scratch, sloping)
@@ -258,7 +270,8 @@ def forward(images, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, al
     blocks.
 
     exit_, frame, splat: an `Exit`, a `Frame` and a `Splat`.  Of slanted rays `along_x` and `along_y` (a, b) are their
-    directions' components, and instead of the sag comes the distance along them to the surface.
+    directions' components, and instead of the sag comes the distance along them to the surface; each has a net's number to
+    itself, (a, b), whatever first, bu and du are.
     """
     rows, blocks = len(x), len(images)
     vx, vy = splat.size_x, splat.size_y
@@ -268,8 +281,8 @@ def forward(images, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, al
         v, sx, sy, _, _ = _cut(scratch[block], vx, vy)
         column = np.zeros(vy + -vy % 4)
         for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-            combine(i, first, bu, du, net, net_x, net_y, v[SAG], v[GX], v[GY])
-            _aim(v, x[i], y[i], along_x[i], along_y[i], share[i], exit_, frame, splat, sx, sy, sx, sy, False)
+            _bend(v, i, (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share), exit_, frame)
+            _share(v, splat, sx, sy, sx, sy, False)
             _scatter(v, exit_, frame, splat, sx, sy, images[block], ledgers[block], column)
     ledger = np.zeros(COLUMNS)
     for block in range(blocks):
@@ -290,7 +303,7 @@ def backward(grad, grad_leaving, apart, nets, scratch, first, bu, du, net, net_x
     """
     rows, blocks = len(x), len(scratch)
     vx, vy = splat.size_x, splat.size_y
-    if apart:
+    if apart and not exit_.slanted:
         nets[:] = 0.0
     for block in prange(blocks):
         if not apart:
@@ -298,13 +311,14 @@ def backward(grad, grad_leaving, apart, nets, scratch, first, bu, du, net, net_x
         v, sx, sy, dx, dy = _cut(scratch[block], vx, vy)
         column, tilt = np.zeros(vy + -vy % 4), np.zeros(vy + -vy % 4)
         for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-            combine(i, first, bu, du, net, net_x, net_y, v[SAG], v[GX], v[GY])
-            _aim(v, x[i], y[i], along_x[i], along_y[i], share[i], exit_, frame, splat, sx, sy, dx, dy, True)
+            _bend(v, i, (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share), exit_, frame)
+            _share(v, splat, sx, sy, dx, dy, True)
             _gather(v, exit_, frame, splat, sx, sy, dx, dy, grad, grad_leaving, column, tilt)
             if exit_.slanted:
-                slant.pull(v, along_x[i], along_y[i], exit_)
-            else:
-                pull(v, exit_)
+                slant.pull(v, _slanted(i, (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share)), exit_,
+                           nets[0, 0, i], nets[1, 0, i], nets[2, 0, i])
+                continue
+            pull(v, exit_)
             spread(i, first, bu, du, v[T_SAG], v[T_GX], v[T_GY], nets[:, np.int64(0) if apart else np.int64(block)],
                     apart)
 
@@ -320,12 +334,13 @@ def tangent(t_net, t_net_x, t_net_y, images, scratch, first, bu, du, net, net_x,
         images[block] = 0.0
         v, sx, sy, dx, dy = _cut(scratch[block], vx, vy)
         for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-            combine(i, first, bu, du, net, net_x, net_y, v[SAG], v[GX], v[GY])
-            combine(i, first, bu, du, t_net, t_net_x, t_net_y, v[T_SAG], v[T_GX], v[T_GY])
-            _aim(v, x[i], y[i], along_x[i], along_y[i], share[i], exit_, frame, splat, sx, sy, dx, dy, True)
+            _bend(v, i, (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share), exit_, frame)
+            _share(v, splat, sx, sy, dx, dy, True)
             if exit_.slanted:
-                slant.push(v, along_x[i], along_y[i], exit_, frame)
+                slant.push(v, _slanted(i, (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share)),
+                           (t_net[i], t_net_x[i], t_net_y[i]), exit_, frame)
             else:
+                combine(i, first, bu, du, t_net, t_net_x, t_net_y, v[T_SAG], v[T_GX], v[T_GY])
                 push(v, exit_, frame)
             leaving[block] += _scatter_tangent(v, exit_, frame, splat, sx, sy, dx, dy, images[block])
     change = 0.0

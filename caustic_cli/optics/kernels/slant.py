@@ -1,45 +1,73 @@
 """A row of rays of any direction, refracted at their hits and carried to the screen, with derivatives, for the CPU kernels.
 
-The same physics as `bend`, which knows that a plane wave's rays all run along z.
+The same physics as `bend`, which knows that a plane wave's rays all run along z.  Rays are copied into rows of a small scratch, a
+batch at a time, for the reason that `stage` gives; what a ray has lost its way to is masked, not branched around.
 
 Notation, a ray with unit direction d inside the lens, slopes g at the hit, N = (-g_x, -g_y, 1), index n
-    c, s    d . N and t . N with t the refracted unit direction; s = sqrt(|N|^2 (1 - n^2) + n^2 c^2)
+    c, s    d . N and t . N with t the refracted unit direction; s = sqrt(|N|^2 (1 - n^2) + n^2 c^2), 1 if light is reflected
     gamma   (1 - n^2) / (s + n c), so that t = n d + gamma N
     R       reflectance of the exit surface
     q       (h - sag) / t_z, length of the path to the screen
 
-Rows of the vectors, before: REACH, the distance along the ray to its hit (mm; -1 for none), GX, GY, X, Y, SHARE.
+In, beside the directions: the distances along the rays to their hits (mm; -1 for none), dz/dx and dz/dy there, x and y where the
+rays begin, and their powers.  Out, in rows of `bend`'s vectors: SAG, POWER, PX, PY, SHARE.
 """
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from caustic_cli.optics.kernels.bend import (
     BY_POWER,
     BY_PX,
     BY_PY,
     EXACT,
-    GX,
-    GY,
     POWER,
     PX,
     PY,
-    REACH,
     SAG,
     SCHLICK,
     SHARE,
-    T_GX,
-    T_GY,
     T_POWER,
-    T_SAG,
-    X,
-    Y,
+    load,
 )
 from caustic_cli.optics.kernels.jit import FAST, njit
+from caustic_cli.optics.kernels.stage import BATCH
 from caustic_cli.optics.tolerances import CRITICAL, PARALLEL
 
 REFLECTED_POWER, MISSED_POWER = -1.0, -2.0
+# Rows of a batch's scratch: the ray, what comes out, what is differentiated by it, and derivatives by the hit.
+REACH, GX, GY, DX, DY, PART, X, Y, OUT_SAG, OUT_POWER, OUT_PX, OUT_PY, BY_REACH, BY_GX, BY_GY, ROWS = range(16)
+
+
+@njit(inline="always", **FAST)
+def _copy(row, start, count, out):
+    """A batch of a row of consecutive numbers."""
+    batch = row[start : start + count]
+    for j in range(count):
+        out[j] = batch[j]
+
+
+@njit(inline="always", **FAST)
+def _put(row, start, count, out):
+    """A batch back into such a row."""
+    batch = out[start : start + count]
+    for j in range(count):
+        batch[j] = row[j]
+
+
+@njit(inline="always", **FAST)
+def _load(w, start, count, ray):
+    """Distances, slopes, directions and powers of a batch."""
+    reach, gx, gy, dx, dy, share = ray
+    _copy(reach, start, count, w[REACH])
+    _copy(gx, start, count, w[GX])
+    _copy(gy, start, count, w[GY])
+    load(dx[start : start + count], w[DX][:count])
+    load(dy[start : start + count], w[DY][:count])
+    load(share[start : start + count], w[PART][:count])
 
 
 @njit(inline="always", **FAST)
@@ -71,67 +99,102 @@ def _reflected(fresnel, c, s, norm2, n):
     return 0.0, 0.0, 0.0, 0.0
 
 
-@njit(**FAST)
-def aim(v, dx, dy, exit_, frame):
-    """Heights of the hits above the reference, powers and landing points in pixels."""
+@njit(inline="always", **FAST)
+def _aim(w, count, exit_, frame):
     n, fresnel, height, start = exit_.index, exit_.fresnel, exit_.height, exit_.start
     over_x, over_y = 1.0 / frame.pixel_x, 1.0 / frame.pixel_y
-    for j in range(v.shape[1]):
-        t, gx, gy = v[REACH, j], v[GX, j], v[GY, j]
-        dz, norm2, c, s, passes = _refract(dx[j], dy[j], gx, gy, n)
+    for j in range(count):
+        t, gx, gy, dx, dy = w[REACH, j], w[GX, j], w[GY, j], w[DX, j], w[DY, j]
+        dz, norm2, c, s, passes = _refract(dx, dy, gx, gy, n)
         reflected, _, _, _ = _reflected(fresnel, c, s, norm2, n)
         gamma = (1.0 - n) * (1.0 + n) / (s + n * c)
         down = n * dz + gamma
         sag = start + t * dz
         path = (height - sag) / down
-        v[SAG, j] = sag if down > PARALLEL else height  # never arrives
-        power = v[SHARE, j] * (1.0 - reflected) if passes else REFLECTED_POWER
-        v[POWER, j] = power if t >= 0.0 else MISSED_POWER
-        v[PX, j] = (v[X, j] + t * dx[j] + path * (n * dx[j] - gamma * gx) - frame.low_x) * over_x
-        v[PY, j] = (v[Y, j] + t * dy[j] + path * (n * dy[j] - gamma * gy) - frame.low_y) * over_y
+        power = w[PART, j] * (1.0 - reflected) if passes else REFLECTED_POWER
+        w[OUT_SAG, j] = sag if down > PARALLEL else height  # never arrives
+        w[OUT_POWER, j] = power if t >= 0.0 else MISSED_POWER
+        w[OUT_PX, j] = (w[X, j] + t * dx + path * (n * dx - gamma * gx) - frame.low_x) * over_x
+        w[OUT_PY, j] = (w[Y, j] + t * dy + path * (n * dy - gamma * gy) - frame.low_y) * over_y
 
 
 @njit(**FAST)
-def pull(v, dx, dy, exit_):
-    """Derivatives by the distance to the hit and the slopes there, left in T_SAG, T_GX, T_GY.  BY_PX, BY_PY: per mm."""
+def aim(v, ray, x, y, exit_, frame):
+    """Heights of the hits above the reference, powers and landing points in pixels, and the rays' powers below, in SHARE.
+
+    ray: distances, dz/dx, dz/dy, d_x, d_y and powers.
+    """
+    w = np.empty((ROWS, BATCH))
+    for start in range(0, v.shape[1], BATCH):
+        count = min(BATCH, v.shape[1] - start)
+        _load(w, start, count, ray)
+        load(x[start : start + count], w[X][:count])
+        load(y[start : start + count], w[Y][:count])
+        _aim(w, count, exit_, frame)
+        _put(w[OUT_SAG], start, count, v[SAG])
+        _put(w[OUT_POWER], start, count, v[POWER])
+        _put(w[OUT_PX], start, count, v[PX])
+        _put(w[OUT_PY], start, count, v[PY])
+        _put(w[PART], start, count, v[SHARE])
+
+
+@njit(inline="always", **FAST)
+def _pull(w, count, exit_):
     n, fresnel, height, start = exit_.index, exit_.fresnel, exit_.height, exit_.start
-    for j in range(v.shape[1]):
-        v[T_SAG, j], v[T_GX, j], v[T_GY, j] = 0.0, 0.0, 0.0
-        if v[POWER, j] < 0.0:
-            continue
-        t, gx, gy = v[REACH, j], v[GX, j], v[GY, j]
-        dz, norm2, c, s, _ = _refract(dx[j], dy[j], gx, gy, n)
+    for j in range(count):
+        t, gx, gy, dx, dy = w[REACH, j], w[GX, j], w[GY, j], w[DX, j], w[DY, j]
+        dz, norm2, c, s, _ = _refract(dx, dy, gx, gy, n)
         _, r_c, r_s, r_norm2 = _reflected(fresnel, c, s, norm2, n)
-        loss = -v[SHARE, j] * v[BY_POWER, j]
+        loss = -w[PART, j] * w[OUT_POWER, j]
         by_c, by_s, by_norm2 = loss * r_c, loss * r_s, loss * r_norm2
-        gamma = (1.0 - n) * (1.0 + n) / (s + n * c)
+        under = 1.0 / (s + n * c)
+        gamma = (1.0 - n) * (1.0 + n) * under
         down = n * dz + gamma
-        by_x, by_y, by_t = v[BY_PX, j], v[BY_PY, j], 0.0
-        by_gx, by_gy = 0.0, 0.0
-        if down > PARALLEL:
-            path = (height - start - t * dz) / down
-            by_path = by_x * (n * dx[j] - gamma * gx) + by_y * (n * dy[j] - gamma * gy)
-            by_t = by_x * dx[j] + by_y * dy[j] - by_path * dz / down
-            by_gamma = -path * (gx * by_x + gy * by_y) - by_path * path / down
-            by_gx, by_gy = -gamma * path * by_x, -gamma * path * by_y
-            by_s -= gamma * by_gamma / (s + n * c)
-            by_c -= n * gamma * by_gamma / (s + n * c)
-        by_norm2 += by_s * (1.0 - n) * (1.0 + n) / (2.0 * s)
-        by_c += by_s * n * n * c / s
-        v[T_SAG, j] = by_t
-        v[T_GX, j] = by_gx + 2.0 * gx * by_norm2 - dx[j] * by_c
-        v[T_GY, j] = by_gy + 2.0 * gy * by_norm2 - dy[j] * by_c
+        arrives = down > PARALLEL
+        over = 1.0 / (down if arrives else 1.0)
+        by_x, by_y = w[OUT_PX, j] if arrives else 0.0, w[OUT_PY, j] if arrives else 0.0
+        path = (height - start - t * dz) * over
+        by_path = by_x * (n * dx - gamma * gx) + by_y * (n * dy - gamma * gy)
+        by_gamma = -path * (gx * by_x + gy * by_y) - by_path * path * over
+        by_s -= gamma * by_gamma * under
+        by_c -= n * gamma * by_gamma * under
+        by_s /= s
+        by_norm2 += by_s * (1.0 - n) * (1.0 + n) * 0.5
+        by_c += by_s * n * n * c
+        lit = w[OUT_SAG, j] >= 0.0
+        by_reach = by_x * dx + by_y * dy - by_path * dz * over
+        by_gx = 2.0 * gx * by_norm2 - gamma * path * by_x - dx * by_c
+        by_gy = 2.0 * gy * by_norm2 - gamma * path * by_y - dy * by_c
+        w[BY_REACH, j], w[BY_GX, j], w[BY_GY, j] = by_reach if lit else 0.0, by_gx if lit else 0.0, by_gy if lit else 0.0
 
 
 @njit(**FAST)
-def push(v, dx, dy, exit_, frame):
-    """Tangents of power and pixel coordinates, left in T_POWER, BY_PX, BY_PY, along T_SAG (the distance), T_GX, T_GY."""
+def pull(v, ray, exit_, by_reach, by_gx, by_gy):
+    """Derivatives by the distance to the hit and the slopes there.  BY_PX, BY_PY of v: per mm."""
+    w = np.empty((ROWS, BATCH))
+    for start in range(0, v.shape[1], BATCH):
+        count = min(BATCH, v.shape[1] - start)
+        _load(w, start, count, ray)
+        _copy(v[POWER], start, count, w[OUT_SAG])
+        _copy(v[BY_POWER], start, count, w[OUT_POWER])
+        _copy(v[BY_PX], start, count, w[OUT_PX])
+        _copy(v[BY_PY], start, count, w[OUT_PY])
+        _pull(w, count, exit_)
+        _put(w[BY_REACH], start, count, by_reach)
+        _put(w[BY_GX], start, count, by_gx)
+        _put(w[BY_GY], start, count, by_gy)
+
+
+@njit(**FAST)
+def push(v, ray, along, exit_, frame):
+    """Tangents of power and pixel coordinates, left in T_POWER, BY_PX, BY_PY; along: those of distance and slopes."""
     n, fresnel, height, start = exit_.index, exit_.fresnel, exit_.height, exit_.start
     for j in range(v.shape[1]):
-        t, gx, gy, dt, tx, ty = v[REACH, j], v[GX, j], v[GY, j], v[T_SAG, j], v[T_GX, j], v[T_GY, j]
-        dz, norm2, c, s, _ = _refract(dx[j], dy[j], gx, gy, n)
+        t, gx, gy, dt, tx, ty = ray[0][j], ray[1][j], ray[2][j], along[0][j], along[1][j], along[2][j]
+        dx, dy = ray[3][j], ray[4][j]
+        dz, norm2, c, s, _ = _refract(dx, dy, gx, gy, n)
         _, r_c, r_s, r_norm2 = _reflected(fresnel, c, s, norm2, n)
-        d_norm2, dc = 2.0 * (gx * tx + gy * ty), -dx[j] * tx - dy[j] * ty
+        d_norm2, dc = 2.0 * (gx * tx + gy * ty), -dx * tx - dy * ty
         ds = (d_norm2 * (1.0 - n) * (1.0 + n) / 2.0 + n * n * c * dc) / s
         gamma = (1.0 - n) * (1.0 + n) / (s + n * c)
         d_gamma = -gamma * (ds + n * dc) / (s + n * c)
@@ -139,5 +202,5 @@ def push(v, dx, dy, exit_, frame):
         path = (height - start - t * dz) / down
         d_path = -(dt * dz + path * d_gamma) / down
         v[T_POWER, j] = -v[SHARE, j] * (r_c * dc + r_s * ds + r_norm2 * d_norm2)
-        v[BY_PX, j] = (dt * dx[j] + d_path * (n * dx[j] - gamma * gx) - path * (d_gamma * gx + gamma * tx)) / frame.pixel_x
-        v[BY_PY, j] = (dt * dy[j] + d_path * (n * dy[j] - gamma * gy) - path * (d_gamma * gy + gamma * ty)) / frame.pixel_y
+        v[BY_PX, j] = (dt * dx + d_path * (n * dx - gamma * gx) - path * (d_gamma * gx + gamma * tx)) / frame.pixel_x
+        v[BY_PY, j] = (dt * dy + d_path * (n * dy - gamma * gy) - path * (d_gamma * gy + gamma * ty)) / frame.pixel_y

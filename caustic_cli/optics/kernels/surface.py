@@ -25,6 +25,11 @@ class FusedSurface:
         """(n, m) mm -> the polynomial of every span product, (I, J, p + 1, q + 1) float64."""
         return spline.coefficients(heights.detach().double().contiguous().numpy(), *self.linear)
 
+    def order(self, x: Tensor, y: Tensor) -> tuple[np.ndarray, int]:
+        """Points (N,), mm, in order of their span products, and how many of these there are."""
+        u, v = ((c.double() * s + 0.5).contiguous().numpy() for c, s in zip((x, y), self.scale, strict=True))
+        return batches.order(u, v, self.geometry[0], self.geometry[3])
+
     def slope_bounds(self, heights: Tensor) -> tuple[float, float]:
         """Bounds of |Z_u| and |Z_v| over [0, 1]^2, mm, from the control nets of the derivatives."""
         return tuple(float((a.space.derivative_matrix() @ h).abs().max())
@@ -109,7 +114,7 @@ class RayHits:
                           (x * su + 0.5, y * sv + 0.5, torch.empty_like(x), dx * su, dy * sv, dz))
         self.radius = np.inf if radius is None else radius
         self.t, self.status = np.zeros(len(x)), np.zeros(len(x), np.int8)
-        self.order, used = batches.order(*self.rays[:2], surface.geometry[0], surface.geometry[3])
+        self.order, used = surface.order(x, y)
         self.batched = len(x) >= batches.CROWD * used
         if not self.batched:
             self.order = np.arange(len(x), dtype=np.int32)
