@@ -7,7 +7,7 @@ by the numbers of a scene (absorption: the coefficient), so that leaving them ou
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from torch import Tensor
 
@@ -126,3 +126,20 @@ class Effect:
     def action(self, system: System, requests: Requests) -> Action | None:
         """What it does to rays in a trace of this system; None for nothing."""
         return None
+
+
+class GeneralWay(Effect):
+    """An effect that rays of a plane wave do not need, but can be put through; that others go through, unless it is left out."""
+
+    def request(self, scene: Scene, on: bool, bounds: Bounds) -> Requests:
+        """Of a plane wave, to go by the general way; of others, not to."""
+        if on == scene.source.collimated:
+            return Requests.to(self.name) if on else Requests.to(without=(self.name,))
+        return NO_REQUESTS
+
+    def prepare(self, system: System, rays: RayState, requests: Requests) -> RayState:
+        """A plane wave's rays as any others: they forget that they stand on a sample of the aperture."""
+        if self.name not in requests.on:
+            return rays
+        rays = rays.spread()
+        return replace(rays, direction=rays.full(rays.direction), sample=None)

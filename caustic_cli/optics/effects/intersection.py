@@ -7,14 +7,12 @@ import math
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import NO_REQUESTS, Action, Effect, Requests, Verdict
-from caustic_cli.optics.effects.entrance import general
-from caustic_cli.optics.rays import RayState
+from caustic_cli.optics.effects.base import Action, GeneralWay, Requests, Verdict
 from caustic_cli.optics.surfaces import HeightField, Hit
 from caustic_cli.scene import Scene
 
 
-class Intersection(Effect):
+class Intersection(GeneralWay):
     """Left out, rays leave where they cross the surface's mean height."""
 
     name = "intersection"
@@ -25,16 +23,6 @@ class Intersection(Effect):
             return Verdict(self.name, False, "rays of a plane wave are sampled on the surface itself", 0.0, 0.0)
         angle = math.degrees(b.inside)
         return Verdict(self.name, True, f"rays cross the lens at up to {angle:.3g} degrees", angle, 0.0)
-
-    def request(self, scene: Scene, on: bool, bounds) -> Requests:
-        """Of a plane wave, to be intersected; of others, not to be."""
-        if on == scene.source.collimated:
-            return Requests.to(self.name) if on else Requests.to(without=(self.name,))
-        return NO_REQUESTS
-
-    def prepare(self, system, rays: RayState, requests: Requests) -> RayState:
-        """A plane wave's rays as any others."""
-        return general(rays) if self.name in requests.on else rays
 
     def action(self, system, requests: Requests) -> Action | None:
         """Meets the mean plane instead."""

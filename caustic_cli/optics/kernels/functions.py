@@ -208,14 +208,6 @@ def _example() -> tuple:
     return net, net, net, kernel.rows, False, arguments, kernel.workspace
 
 
-def compile_ray_kernels() -> None:
-    """Have the kernels ready for rays of any direction, as `compile_kernels` does for a plane wave's."""
-    space, one, none = SplineSpace.uniform(4, 3), torch.ones(2, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
-    kernel = RayKernel((space, space), (1.0, 1.0), (none, none, 0.0), (none, none, one), one, None)
-    heights = torch.ones(4, 4, dtype=torch.float64, requires_grad=True)
-    kernel(heights, 1.5, "exact", 0.0, Screen((10.0, 10.0), 10.0, (4, 4)), Filter("cosine", (3, 3)))[0].sum().backward()
-
-
 class _Image(torch.autograd.Function):
     """Three nets (n, b), and how `plane.forward` is to use them -> padded image, power leaving the lens (), ledger."""
 
