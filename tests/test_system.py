@@ -93,7 +93,7 @@ def test_a_lens_behind_a_prism():
     system, heights = prism_and_lens(apex)
     turn = math.asin(FLINT * math.sin(math.radians(apex))) - math.radians(apex)
     rays = ray(0.0)
-    behind = Tracer(system, rays).before[-1].state
+    behind = Tracer(system, rays).start
     direction = [float(torch.as_tensor(c)) for c in behind.direction]
     assert math.atan2(abs(direction[0]), direction[2]) == pytest.approx(turn, abs=1e-13)
     focus = 14.0 + 40.0 - 4.0 / N  # from the back side, of a lens that is flat there

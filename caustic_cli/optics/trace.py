@@ -77,7 +77,8 @@ class Tracer:
         with torch.no_grad():
             while self.first < len(system.elements) and system.elements[self.first].surface.shape is None:
                 meeting = self.cross(self.first, state, None)
-                self.before.append(meeting)
+                if self.recorded:
+                    self.before.append(meeting)
                 state, self.first = meeting.state, self.first + 1
         self.start = state
         self.fused = None if requests.stages else self._lowered(like)
@@ -85,8 +86,7 @@ class Tracer:
     def __call__(self, parameters: Parameters) -> list[RayState]:
         """Heights {name: (n, m) mm float64} -> rays behind the last element: those that went straight on, then those of detours."""
         state, meetings = self.start, list(self.before)
-        for k in range(self.first, len(self.system.elements)):
-            meeting = self.cross(k, state, parameters.get(self.system.elements[k].name))
+        for meeting in self._walk(parameters):
             state = meeting.state
             if self.recorded:
                 meetings.append(meeting)
@@ -96,14 +96,19 @@ class Tracer:
                 states += action.detour(self, parameters, meetings)
         return states
 
+    def _walk(self, parameters: Parameters) -> Iterator[Meeting]:
+        """Straight on, from the first free surface to the last element."""
+        state = self.start
+        for k in range(self.first, len(self.system.elements)):
+            meeting = self.cross(k, state, parameters.get(self.system.elements[k].name))
+            yield meeting
+            state = meeting.state
+
     @torch.no_grad()
     def exit_of(self, parameters: Parameters) -> tuple[tuple, tuple, Tensor]:
-        """How rays arrive at the last element, in its frame: slopes of the surface there, directions, powers."""
-        state, last = self.start, len(self.system.elements) - 1
-        for k in range(self.first, last + 1):
-            meeting = self.cross(k, state, parameters.get(self.system.elements[k].name))
-            state = meeting.state
-        return meeting.slopes, meeting.incoming, meeting.arriving
+        """How rays arrive at the last element, whose surface is free, in its frame: slopes there, directions, powers."""
+        *_, last = self._walk(parameters)
+        return last.slopes, last.incoming, last.arriving
 
     def land(self, parameters: Parameters, screen: Screen | Placed) -> list[RayState]:
         """The same on a screen: x and y of their origins are the screen's own coordinates, mm."""

@@ -20,16 +20,9 @@ class SourceSize(Effect):
 
     def judge(self, scene: Scene, bounds) -> Verdict:
         """By the angle under which the lens sees a disc, or the number of points."""
-        s = scene.source
-        if s.kind == "disc":
-            angle = s.apparent_angle(scene.lens.z_in)
-            return Verdict(self.name, angle > 0, f"the lens sees the source under {angle:.3g} degrees", angle, 0.0,
-                           present=angle > 0)
-        if s.several:
-            count = len(s.points()[0])
-            return Verdict(self.name, True, f"the source is {count} points", float(count), 1.0)
-        why = "a plane wave has one direction" if s.collimated else "the source is a point"
-        return Verdict(self.name, False, why, 0.0, 0.0, present=False)
+        s, z_in = scene.source, scene.lens.z_in
+        bound, limit = (float(len(s.points()[0])), 1.0) if s.several else (s.apparent_angle(z_in), 0.0)
+        return Verdict(self.name, s.extended, s.extent_words(z_in), bound, limit, present=s.extended)
 
     def without(self, scene: Scene) -> Scene:
         """From the middle of the source."""
@@ -38,7 +31,6 @@ class SourceSize(Effect):
     def sample(self, scene: Scene, heights: Tensor) -> Amount:
         """The sun, or a small disc."""
         s = scene.source
-        if s.collimated:
+        if s.distant:
             return Amount(replace(scene, source=Disc(power=s.power, angle=SUN)), None, f"{SUN} degrees")
-        cone = getattr(s, "cone", None) if s.kind != "disc" else None
-        return Amount(replace(scene, source=Disc(s.centre, (SIZE, SIZE), s.power, cone)), None, f"{SIZE:g} mm")
+        return Amount(replace(scene, source=Disc(s.centre, (SIZE, SIZE), s.power, s.cone)), None, f"{SIZE:g} mm")
