@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from caustic_cli.console import Reporter
-from caustic_cli.errors import InputError
+from caustic_cli.errors import InputError, is_shortage
 
 Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", envvar="CAUSTIC_QUIET", help="Say nothing on stderr but errors.")]
@@ -180,8 +180,12 @@ def compile_for(scene, device: str, say: Reporter, requests=None, gradient: bool
         wanted = [(Scene(Points(((0.0, 0.0, -50.0),)), lens, screen), NO_REQUESTS),
                   (Scene(PlaneWave(), lens, screen), Requests(stages=True))]
     with say.patience("compiling the kernels that this scene needs, once: about half a minute"):
-        for one, asked in wanted:
-            warm_up(one, asked, gradient)
+        try:
+            for one, asked in wanted:
+                warm_up(one, asked, gradient)
+        except (MemoryError, RuntimeError) as problem:
+            if not is_shortage(problem):  # the work itself knows what to do about that, and compiles what it needs
+                raise
 
 
 def dtype_of(name: str):
