@@ -484,7 +484,7 @@ def pull_back(met, where, by_t, by_gx, by_gy, ou, ov, du, dv, dz, t, gx, gy, c, 
                 begin = end
                 continue
             for k in range(LANES):
-                r, here = met[min(begin + k, end - 1)], 1.0 if k < end - begin else 0.0
+                r, here = UINT(met[min(begin + k, end - 1)]), 1.0 if k < end - begin else 0.0
                 w[OU + k], w[OV + k], w[T + k], w[GX + k], w[GY + k] = ou[r], ov[r], t[r], gx[r], gy[r]
                 w[DU + k], w[DV + k], w[DZ + k] = du[r], dv[r], dz[r]
                 w[BY_T + k], w[BY_U + k], w[BY_V + k] = here * by_t[r], here * by_gx[r], here * by_gy[r]

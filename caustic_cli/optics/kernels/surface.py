@@ -157,8 +157,8 @@ class RayHits:
 class _Hits(torch.autograd.Function):
     @staticmethod
     def forward(heights: Tensor, rays: RayHits):
-        _, _, *out = rays.search(heights)
-        return tuple(torch.from_numpy(a) for a in out)
+        c, _, *out = rays.search(heights)
+        return *(torch.from_numpy(a) for a in out), torch.from_numpy(c)
 
     @staticmethod
     def setup_context(ctx, inputs, output):
@@ -169,20 +169,20 @@ class _Hits(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, *by):
-        heights, *found, met, where = ctx.saved_tensors
+        heights, *found, met, where, c = ctx.saved_tensors
         surface, (ou, ov, _, *directions) = ctx.rays.surface, ctx.rays.rays
         grads, none = surface.workspace(), np.empty(0)
         batches.pull_back(met.numpy(), where.numpy(), *(g.contiguous().numpy() for g in by[:3]), ou, ov, *directions,
-                          *(t.detach().numpy() for t in found), surface.coefficients(_sag(heights)[0]), *surface.geometry,
-                          *surface.scale, grads, none, none, none)
+                          *(t.detach().numpy() for t in found), c.numpy(), *surface.geometry, *surface.scale, grads, none, none,
+                          none)
         return surface.pull(grads).to(heights.dtype), None
 
     @staticmethod
     def jvp(ctx, tangent, *_):
-        heights, *found, met, where = ctx.saved_tensors
+        _, *found, met, where, c = ctx.saved_tensors
         surface, (ou, ov, _, *directions), none = ctx.rays.surface, ctx.rays.rays, np.empty(0)
         out = [torch.empty(len(met), dtype=torch.float64) for _ in range(3)]
         batches.push(surface.coefficients(tangent), none, none, none, met.numpy(), where.numpy(), ou, ov, *directions,
-                     *(t.detach().numpy() for t in found), surface.coefficients(_sag(heights)[0]), *surface.geometry,
-                     *surface.scale, *(t.numpy() for t in out), blocks())
-        return *out, None, None
+                     *(t.detach().numpy() for t in found), c.numpy(), *surface.geometry, *surface.scale,
+                     *(t.numpy() for t in out), blocks())
+        return *out, None, None, None
