@@ -7,10 +7,11 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from parametric import Surface
 from scipy.interpolate import BSpline
 
 from caustic_cli.errors import InputError
-from caustic_cli.optics.bspline import MAX_DEGREE, SplineSpace, Surface
+from caustic_cli.optics.bspline import MAX_DEGREE, SplineSpace
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Lens

@@ -14,9 +14,10 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from parametric import Surface
 
 from caustic_cli.errors import InputError
-from caustic_cli.optics.bspline import SplineSpace, Surface
+from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels import mesh as kernel
 from caustic_cli.optics.mesh import TriangleMesh, boxes_of, vertices_of
 from caustic_cli.optics.surfaces.heightfield import HeightField

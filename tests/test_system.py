@@ -8,12 +8,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
+from parametric import Surface as ParametricSurface
 from sequential import onto, walk
 from torch.autograd import forward_ad
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.bspline import Surface as ParametricSurface
 from caustic_cli.optics.effects import EFFECTS, Requests
 from caustic_cli.optics.frames import Pose
 from caustic_cli.optics.rays import RayState
