@@ -40,7 +40,7 @@ from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.shortage import with_less
 from caustic_cli.optics.surfaces import HeightField, Hit
 from caustic_cli.optics.system import EXIT, Element, Placed, System
-from caustic_cli.scene import Scene, Screen
+from caustic_cli.scene import Light, PlaneWave, Points, Scene, Screen
 
 
 class Tracer:
@@ -328,12 +328,14 @@ def is_lowered(scene: Scene, field: HeightField, requests: Requests = NO_REQUEST
 
 
 def warm_up(scene: Scene, requests: Requests = NO_REQUESTS, gradient: bool = False) -> None:
-    """Trace a few rays of a scene, so that whatever its light needs is compiled; net and pixels are few.
+    """Trace a few rays of a scene, so that whatever its light needs is compiled; net and pixels are few, and a plane wave or a point
+    stands for the source.
 
     gradient: the adjoints too.
     """
     lens = replace(scene.lens, control=(4, 4), degree=(3, 3), knots=None)
-    scene, field = replace(scene, lens=lens), HeightField.of(lens)
+    source = PlaneWave() if scene.source.collimated else Points(((0.0, 0.0, lens.z_in - 5.0 * max(lens.size)),))
+    scene, field = Scene(source, lens, scene.screen, Light(scene.light.polarisation)), HeightField.of(lens)
     heights = torch.full((4, 4), lens.offset.thickness, dtype=torch.float64, requires_grad=gradient)
     screen = replace(scene.screen, resolution=(4, 4))
     with torch.set_grad_enabled(gradient):
