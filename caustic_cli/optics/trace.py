@@ -328,8 +328,9 @@ def is_lowered(scene: Scene, field: HeightField, requests: Requests = NO_REQUEST
 
 
 def warm_up(scene: Scene, requests: Requests = NO_REQUESTS, gradient: bool = False) -> None:
-    """Trace a few rays of a scene, so that whatever its light needs is compiled; net and pixels are few, and a plane wave or a point
-    stands for the source.
+    """Trace a few rays of a scene, so that whatever its light needs is compiled.
+
+    The net and the pixels are few, and a plane wave or a point stands for the source.
 
     gradient: the adjoints too.
     """
