@@ -13,6 +13,7 @@ from PIL import Image
 from caustic_cli import checkpoint, cli, verdict
 from caustic_cli.inverse import ranks
 from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.sampling import Sample
 from caustic_cli.scene import Lens, Offset, PlaneWave, Points, Scene, Screen
 
 DRIVER = """
@@ -82,8 +83,7 @@ def test_the_ranks_chunks_are_all_rays_once(source, kind, count):
     def shares(chunks):
         out = []
         for c in chunks:
-            shape = c.shape if hasattr(c, "shape") else c.share.shape
-            out.append(torch.broadcast_to(c.share, shape).reshape(-1))
+            out.append(torch.broadcast_to(c.share, c.shape).reshape(-1) if isinstance(c, Sample) else c.power)
         return torch.cat(out) if out else torch.zeros(0, dtype=torch.float64)
 
     whole = shares(rays.chunks(130))
