@@ -31,7 +31,7 @@ from scipy.ndimage import gaussian_filter
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.laguerre import prices
 from caustic_cli.inverse.transport import Transport, corners, solve
-from caustic_cli.optics.backends import backend_for
+from caustic_cli.optics.backends.reference import Torch
 from caustic_cli.optics.frames import IDENTITY
 
 EVEN = 2.0  # cells over which e is smoothed: at a kink of phi the rays miss by the spline's own width, which is no error of T
@@ -191,7 +191,7 @@ def land(z: np.ndarray, x, y, d, index: float, z_screen: float) -> tuple[np.ndar
 
 def thrown(x, y, z, zx, zy, d, index: float, z_screen: float) -> tuple[np.ndarray, np.ndarray]:
     """Where rays d inside the glass land that leave it at (x, y, z) with slopes zx, zy; NaN where totally reflected."""
-    shape, backend = z.shape, backend_for("cpu")
+    shape, backend = z.shape, Torch()  # too few rays to wait for a compiler
 
     def flat(value):
         return value if isinstance(value, float) else torch.from_numpy(np.broadcast_to(value, shape).flatten())

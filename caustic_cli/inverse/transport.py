@@ -240,7 +240,7 @@ def _sites(pyramid: list, least: float) -> _Sites:
 
 
 def _prices(phi: np.ndarray, sites: _Sites, raster: list) -> np.ndarray:
-    return laguerre.prices(phi, *sites.lines, *raster)[0]
+    return laguerre.prices(np.ascontiguousarray(phi), *sites.lines, *raster)[0]
 
 
 def _resampled(potential, shape: tuple[int, int], half: tuple[float, float], raster: list) -> np.ndarray:

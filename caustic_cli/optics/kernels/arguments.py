@@ -12,13 +12,12 @@ from typing import NamedTuple
 class Exit(NamedTuple):
     """The exit surface, and the screen beyond it.
 
-    index: before it over that behind it; fresnel: kind of Fresnel losses, as in `bend`; slanted: 1 for rays of any direction, 0
-    for those along z; start: height at which slanted rays begin, height: of the screen, mm, both above the zero of the sag.
+    index: before it over that behind it; fresnel: kind of Fresnel losses, as in `bend`; start: height at which slanted rays begin,
+    height: of the screen, mm, both above the zero of the sag.
     """
 
     index: float
     fresnel: int
-    slanted: int
     start: float
     height: float
 

@@ -83,7 +83,7 @@ class PlaneKernel:
         else:
             nets = [t.view(self.shape) for t in scattered_surface(self.surface, sag, *self.points)]
         x, y, power = self.rays
-        rays = (x, y, _none(), _none(), power)
+        rays = (x, y, _NONE, _NONE, power)
         return _splat(nets, self.rows, not self.tensor, rays, (eta, fresnel), height, 0.0, screen, filter, self.workspace)
 
 
@@ -143,16 +143,11 @@ def _arguments(rays, interface: tuple[float, str], height: float, start: float, 
                filter: Filter) -> tuple[bool, tuple]:
     """Whether rays are slanted, and what `plane` takes after the nets."""
     eta, fresnel = interface
-    slanted = rays[2].shape == rays[0].shape
-    exit_ = Exit(float(eta), bend.FRESNEL[fresnel], int(slanted), float(start), float(height))
+    slanted = rays[2] is not _NONE
+    exit_ = Exit(float(eta), bend.FRESNEL[fresnel], float(start), float(height))
     frame = Frame(*map(int, screen.resolution), *map(float, screen.low), *map(float, screen.pixel))
     splat = Splat(shares.KINDS[filter.kind], *(int(2 * r + 1) for r in filter.reach), *map(float, filter.alpha))
-    return slanted, (*rays, exit_, frame, splat)
-
-
-def _none() -> np.ndarray:
-    """What stands for directions where all rays run along z."""
-    return _strided(np.zeros((2, 2)))
+    return slanted, (*rays, exit_, frame, splat, True if slanted else None)
 
 
 def _layout(count: int) -> tuple[int, int]:
@@ -168,6 +163,10 @@ def _strided(array: np.ndarray) -> np.ndarray:
         wide[:, :-1] = array
         array = np.broadcast_to(wide[:, :-1], array.shape)
     return array
+
+
+#: What stands for directions where all rays run along z.
+_NONE = _strided(np.zeros((2, 2)))
 
 
 def compile_kernels() -> None:
@@ -203,7 +202,7 @@ def _example() -> tuple:
     space, at = SplineSpace.uniform(4, 3), torch.linspace(0.0, 1.0, 2, dtype=torch.float64)
     kernel = PlaneKernel((space, space), (1.0, 1.0), at, at, True, torch.tensor(0.25, dtype=torch.float64))
     (x, y, share), net = kernel.rays, torch.zeros(4, 2, dtype=torch.float64)
-    _, arguments = _arguments((x, y, _none(), _none(), share), (1.5, "exact"), 10.0, 0.0, Screen((10.0, 10.0), 10.0, (4, 4)),
+    _, arguments = _arguments((x, y, _NONE, _NONE, share), (1.5, "exact"), 10.0, 0.0, Screen((10.0, 10.0), 10.0, (4, 4)),
                               Filter("cosine", (3, 3)))
     return net, net, net, kernel.rows, False, arguments, kernel.workspace
 
@@ -251,7 +250,7 @@ def _adjoint(by_image: Tensor, by_leaving: float, nets, rows: tuple, apart: bool
 
 def _images(arguments: tuple, workspace: _Workspace) -> tuple[np.ndarray, np.ndarray]:
     """Images and scratch of all blocks, to be overwritten."""
-    x, *_, frame, splat = arguments
+    x, *_, frame, splat, _ = arguments
     count, nx, ny = blocks(), frame.pixels_x + 2 * (splat.size_x - 1), frame.pixels_y + 2 * (splat.size_y - 1)
     images = workspace("images", count, nx, ny + -splat.size_y % 4)
     return images, workspace("scratch", count, plane.scratch_rows(splat), x.shape[1])

@@ -58,10 +58,10 @@ UINT, ONE, TWO = np.uintp, np.uintp(1), np.uintp(2)  # an unsigned index is neve
 
 
 @njit(**FAST)
-def _bend(vectors, i, surface, rays, exit_, frame):
+def _bend(vectors, i, surface, rays, exit_, frame, slanted):
     """The surface, powers and landing points of row i."""
     v, (first, bu, du, net, net_x, net_y), (x, y, _, _, share) = vectors, surface, rays
-    if exit_.slanted:
+    if slanted is not None:
         slant.aim(v, _slanted(i, surface, rays), x[i], y[i], exit_, frame)
         return
     combine(i, first, bu, du, net, net_x, net_y, v[SAG], v[GX], v[GY])
@@ -259,7 +259,8 @@ def _cut(scratch, vx, vy):
 
 
 @njit(parallel=True, **FAST)
-def forward(images, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, share, exit_, frame, splat):
+def forward(images, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, share, exit_, frame, splat,
+            slanted):
     """The ledger (COLUMNS,), power by what became of it; the blocks' images, whose `total` is the padded one, fill `images`.
 
     The surface comes by rows.  Row i of the sag is sum_k bu[i, k] net[first[i] + k], of dz/dx the same with du and net_x,
@@ -271,7 +272,8 @@ def forward(images, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, al
 
     exit_, frame, splat: an `Exit`, a `Frame` and a `Splat`.  Of slanted rays `along_x` and `along_y` (a, b) are their
     directions' components, and instead of the sag comes the distance along them to the surface; each has a net's number to
-    itself, (a, b), whatever first, bu and du are.
+    itself, (a, b), whatever first, bu and du are.  slanted: True for such rays, None for those along z, whose kernel is compiled
+    without them.
     """
     rows, blocks = len(x), len(images)
     vx, vy = splat.size_x, splat.size_y
@@ -281,7 +283,7 @@ def forward(images, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, al
         v, sx, sy, _, _ = _cut(scratch[block], vx, vy)
         column = np.zeros(vy + -vy % 4)
         for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-            _bend(v, i, (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share), exit_, frame)
+            _bend(v, i, (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share), exit_, frame, slanted)
             _share(v, splat, sx, sy, sx, sy, False)
             _scatter(v, exit_, frame, splat, sx, sy, images[block], ledgers[block], column)
     ledger = np.zeros(COLUMNS)
@@ -293,7 +295,7 @@ def forward(images, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, al
 
 @njit(parallel=True, **FAST)
 def backward(grad, grad_leaving, apart, nets, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, share, exit_,
-             frame, splat):
+             frame, splat, slanted):
     """Adjoint of `forward`: derivatives by the three nets, from those by the padded image and leaving power.
 
     nets (3, 1 if apart else blocks, n, b) are overwritten: the `total` of each is the derivative by a net (n, b).
@@ -303,7 +305,7 @@ def backward(grad, grad_leaving, apart, nets, scratch, first, bu, du, net, net_x
     """
     rows, blocks = len(x), len(scratch)
     vx, vy = splat.size_x, splat.size_y
-    if apart and not exit_.slanted:
+    if apart and slanted is None:
         nets[:] = 0.0
     for block in prange(blocks):
         if not apart:
@@ -311,10 +313,10 @@ def backward(grad, grad_leaving, apart, nets, scratch, first, bu, du, net, net_x
         v, sx, sy, dx, dy = _cut(scratch[block], vx, vy)
         column, tilt = np.zeros(vy + -vy % 4), np.zeros(vy + -vy % 4)
         for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-            _bend(v, i, (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share), exit_, frame)
+            _bend(v, i, (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share), exit_, frame, slanted)
             _share(v, splat, sx, sy, dx, dy, True)
             _gather(v, exit_, frame, splat, sx, sy, dx, dy, grad, grad_leaving, column, tilt)
-            if exit_.slanted:
+            if slanted is not None:
                 slant.pull(v, _slanted(i, (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share)), exit_,
                            nets[0, 0, i], nets[1, 0, i], nets[2, 0, i])
                 continue
@@ -325,7 +327,7 @@ def backward(grad, grad_leaving, apart, nets, scratch, first, bu, du, net, net_x
 
 @njit(parallel=True, **FAST)
 def tangent(t_net, t_net_x, t_net_y, images, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, share, exit_,
-            frame, splat):
+            frame, splat, slanted):
     """Derivative of `forward` along (t_net, t_net_x, t_net_y): the leaving power's; the `total` of `images` is the image's."""
     rows, blocks = len(x), len(images)
     vx, vy = splat.size_x, splat.size_y
@@ -334,9 +336,9 @@ def tangent(t_net, t_net_x, t_net_y, images, scratch, first, bu, du, net, net_x,
         images[block] = 0.0
         v, sx, sy, dx, dy = _cut(scratch[block], vx, vy)
         for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-            _bend(v, i, (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share), exit_, frame)
+            _bend(v, i, (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share), exit_, frame, slanted)
             _share(v, splat, sx, sy, dx, dy, True)
-            if exit_.slanted:
+            if slanted is not None:
                 slant.push(v, _slanted(i, (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share)),
                            (t_net[i], t_net_x[i], t_net_y[i]), exit_, frame)
             else:
