@@ -272,8 +272,7 @@ def forward(images, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, al
 
     exit_, frame, splat: an `Exit`, a `Frame` and a `Splat`.  Of slanted rays `along_x` and `along_y` (a, b) are their
     directions' components, and instead of the sag comes the distance along them to the surface; each has a net's number to
-    itself, (a, b), whatever first, bu and du are.  slanted: True for such rays, None for those along z, whose kernel is compiled
-    without them.
+    itself, (a, b), whatever first, bu and du are.  slanted: True for them, None for rays along z, which are compiled apart.
     """
     rows, blocks = len(x), len(images)
     vx, vy = splat.size_x, splat.size_y
