@@ -82,7 +82,7 @@ def splatted(nets, x, y, directions, power, fresnel: str, eta: float, filter: Fi
 
     nets: distances along the rays (or heights) and slopes, (1, N); directions: x and y of them, None for a plane wave.
     """
-    along = [functions._none()] * 2 if directions is None else [functions._strided(c.numpy()) for c in directions]
+    along = [functions._NONE] * 2 if directions is None else [functions._strided(c.numpy()) for c in directions]
     rays = (*(functions._strided(a.numpy()) for a in (x, y)), *along, functions._strided(power.numpy()))
     ones = np.ones((1, 1))
     return functions._splat(nets, (np.zeros(1, np.int64), ones, ones), True, rays, (eta, fresnel), HEIGHT, 0.0, SCREEN, filter,
