@@ -386,6 +386,8 @@ def test_bad_systems_are_refused_in_a_sentence():
         System((PlaneWave(),), (Element("a", Plane(), FLAT), Element("a", Plane())))
     with pytest.raises(InputError, match="must have an aperture"):
         System((PlaneWave(),), (Element("a", Plane()),))
+    with pytest.raises(InputError, match="b must face the light"):
+        System((PlaneWave(),), (Element("a", Plane(), FLAT), Element("b", Plane(), pose=Pose((0, 0, 5.0), (90.0, 0.0)))))
     with pytest.raises(InputError, match="heights must be"):
         render(biconvex(40.0, -60.0, 4.0)[0], {}, 10)
     with pytest.raises(InputError, match="refract, reflect"):

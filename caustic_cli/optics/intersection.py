@@ -25,7 +25,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from caustic_cli.optics.backends import backend_for
-from caustic_cli.optics.surfaces.base import Hit, Surface
+from caustic_cli.optics.surfaces.base import SECOND, Hit, Surface
 from caustic_cli.optics.tolerances import FEW_ULP, FINEST, LEAST_COSINE, MOST_PROBES, MOST_STEPS
 from caustic_cli.scene import checks
 
@@ -81,7 +81,7 @@ def attach(surface: Surface, heights: Tensor | None, origin, direction, t: Tenso
     if not torch.is_grad_enabled():
         return t, torch.where(found, gx, torch.zeros_like(t)), torch.where(found, gy, torch.zeros_like(t))
     with torch.no_grad():
-        zxx, zxy, zyy = surface.at(sag if sag is None else sag.detach(), *inside, ((2, 0), (1, 1), (0, 2)))
+        zxx, zxy, zyy = surface.at(sag if sag is None else sag.detach(), *inside, SECOND)
         sx, sy = _primal(gx), _primal(gy)
         fx, fy, fz = (_primal(torch.as_tensor(c, dtype=torch.float64)) for c in direction)
         c = fz - sx * fx - sy * fy

@@ -41,7 +41,8 @@ class Meeting:
     surface is met; n_in, n_out: refractive indices before and behind, in the light's direction; reflects; state: the rays, at the
     surface (origins in the system's frame, directions before it until `depart`, behind it from then on); local: their points in
     the element's frame; incoming: directions before it, in that frame; slopes: of the surface there; length: of the way to it, mm;
-    arriving, departing: power before and after the interaction; passes: of the interaction; straight: whether this is the walk
+    lift: how far above the met point the rays go on, mm, where an effect says so; arriving, departing: power before and
+    after the interaction; passes: of the interaction; straight: whether this is the walk
     itself, not a detour.
     """
 
@@ -59,6 +60,7 @@ class Meeting:
     incoming: tuple = ()
     slopes: tuple = ()
     length: Tensor | float = 0.0
+    lift: Tensor | None = None
     arriving: Tensor | None = None
     departing: Tensor | None = None
     passes: Tensor | None = None

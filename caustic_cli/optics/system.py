@@ -17,6 +17,7 @@ from dataclasses import dataclass, field, replace
 from caustic_cli.errors import InputError
 from caustic_cli.optics.frames import Pose
 from caustic_cli.optics.surfaces import HeightField, Plane, Surface
+from caustic_cli.optics.tolerances import PARALLEL
 from caustic_cli.scene import Aperture, Light, Pupil, Scene, Screen, Source, checks
 from caustic_cli.scene.lens import FRESNEL
 from caustic_cli.scene.materials import refractive_index
@@ -104,7 +105,7 @@ class System:
         lit: the pupil that the sources light; None for the first element's aperture.
 
     Raises:
-        InputError: no element or source, two of one name, or a first aperture that is infinite.
+        InputError: no element or source, two of one name, a first aperture that is infinite, or an element along the axis.
     """
 
     sources: tuple[Source, ...]
@@ -122,6 +123,9 @@ class System:
             raise InputError(f"elements must have names of their own, got {', '.join(names)}")
         if not all(map(math.isfinite, self.pupil.half_size)):
             raise InputError(f"the first element, {names[0]}, must have an aperture: sources shine into it")
+        for name, cosine in zip(names, self._along()[0], strict=True):
+            if abs(cosine) < PARALLEL:
+                raise InputError(f"element {name} must face the light: the axis runs along its surface")
 
     @classmethod
     def of(cls, scene: Scene, surface: HeightField | None = None) -> System:
@@ -157,30 +161,28 @@ class System:
             media.append(media[-1] if element.reflects else element.behind)
         return tuple(media)
 
-    def sides(self) -> tuple[float, ...]:
-        """From which side the axis meets each element: +1 from below, -1 from above; and 0 for one that it runs along.
+    def _along(self) -> tuple[list[float], tuple[float, float, float]]:
+        """Cosines between the axis and each element's own z, and the axis' direction behind the last.
 
         The axis goes along +z, straight on at every refraction, and off every mirror as a ray at its vertex.
         """
-        axis, sides = (0.0, 0.0, 1.0), []
+        axis, cosines = (0.0, 0.0, 1.0), []
         for element in self.elements:
             normal = element.pose.axes[2]
             cosine = sum(a * b for a, b in zip(axis, normal, strict=True))
-            sides.append(math.copysign(1.0, cosine) if cosine else 0.0)
+            cosines.append(cosine)
             if element.reflects:
                 axis = tuple(a - 2.0 * cosine * b for a, b in zip(axis, normal, strict=True))
-        return tuple(sides)
+        return cosines, axis
+
+    def sides(self) -> tuple[float, ...]:
+        """From which side the axis meets each element: +1 from below, -1 from above."""
+        return tuple(math.copysign(1.0, cosine) for cosine in self._along()[0])
 
     @property
     def axis(self) -> tuple[float, float, float]:
         """Direction of the axis behind the last element."""
-        axis = (0.0, 0.0, 1.0)
-        for element in self.elements:
-            if element.reflects:
-                normal = element.pose.axes[2]
-                cosine = sum(a * b for a, b in zip(axis, normal, strict=True))
-                axis = tuple(a - 2.0 * cosine * b for a, b in zip(axis, normal, strict=True))
-        return axis
+        return self._along()[1]
 
     @property
     def parts(self) -> tuple[float, ...]:

@@ -10,10 +10,9 @@
     detours   light that goes another way than straight on, after the walk: ghosts, second meetings
 
 Elements before the first surface that a design may shape do not depend on any heights: they are walked once, when a `Tracer` is
-made.
-What follows is *lowered* where it is one B-spline, upright, between the rays and an upright screen, with no effect but Snell's and
-Fresnel's: that runs as one fused kernel (`_lowered` is the only place that knows).  All else goes through the stages of the
-device's backend.
+made.  What follows is *lowered* where it is one B-spline, upright, between the rays and an upright screen, with no effect but
+Snell's and Fresnel's: that runs as one fused kernel (`_lowered` is the only place that knows).  All else goes through the stages
+of the device's backend.
 
 Powers are parts of what the sources emit.  Nothing vanishes: image + every entry of `lost` = 1.
 """

@@ -108,7 +108,7 @@ class Numba(Torch):
 
     def interact(self, direction, slopes, power: Tensor, *, eta: float, reflects: bool, fresnel: str, polarised=None,
                  side: float = 1.0) -> Departure:
-        """As the reference; constant slopes are left to it."""
+        """As the reference, which does constant slopes itself; the kernel tells the side by the sign of d . N."""
         if not isinstance(slopes[0], Tensor):
             return super().interact(direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, polarised=polarised,
                                     side=side)

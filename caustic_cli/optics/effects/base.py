@@ -7,6 +7,7 @@ by the numbers of a scene (absorption: the coefficient), so that leaving them ou
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 
 from torch import Tensor
@@ -92,16 +93,16 @@ class Action:
         return []
 
 
-class Effect:
+class Effect(ABC):
     """One effect; see the package for the sequence."""
 
     name: str
     #: It costs nothing that could be saved: a mask of every path, or an addend in a sum.
     free = False
 
+    @abstractmethod
     def judge(self, scene: Scene, bounds: Bounds) -> Verdict:
         """Whether a scene calls for it, and why."""
-        raise NotImplementedError
 
     def without(self, scene: Scene) -> Scene:
         """The scene with nothing of it."""

@@ -49,6 +49,6 @@ class MeanPlane(Action):
 
     def arrive(self, m) -> None:
         """Onto the surface above or below."""
-        if getattr(m, "lift", None) is not None:
+        if m.lift is not None:
             x, y, z = m.state.origin
             m.state.origin = (x, y, z + m.lift)

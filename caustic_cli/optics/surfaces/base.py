@@ -52,8 +52,7 @@ class Surface(ABC):
 
     @abstractmethod
     def at(self, heights: Tensor | None, x: Tensor, y: Tensor, orders: Sequence[tuple[int, int]] = FIRST) -> list[Tensor]:
-        """Derivatives of these orders by x and y at points (N,) mm: (N,) float64 each, mm^(1 - a - b); of points outside
-        `half_size` those of the nearest point inside."""
+        """Derivatives of these orders by x and y at points (N,) mm within `half_size`: (N,) float64 each, mm^(1 - a - b)."""
 
     @abstractmethod
     def hull(self, heights: Tensor | None) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""The exit surface as a height field over the aperture: z(x, y) = sum_ij P_ij N_i(u) N_j(v) (thesis 4.1).
+"""A B-spline height field over a rectangle: z(x, y) = sum_ij P_ij N_i(u) N_j(v) (thesis 4.1).
 
 The control points stand at the Greville abscissae, so (u, v) -> (x, y) is linear, x = (2u - 1) r_x, and a ray of a
 plane wave needs no intersection: it is sampled on the surface itself.
