@@ -72,13 +72,13 @@ class Tracer:
         self.actions: tuple[Action, ...] = tuple(a for a in made if a is not None)
         self.recorded = any(a.detours for a in self.actions)
         self.before: list[Meeting] = []
-        self.first = 0
+        self.first, self._behind = 0, None
         with torch.no_grad():
             while self.first < len(system.elements) and system.elements[self.first].surface.shape is None:
                 meeting = self.cross(self.first, state, None)
                 if self.recorded:
                     self.before.append(meeting)
-                state, self.first = meeting.state, self.first + 1
+                state, self.first, self._behind = meeting.state, self.first + 1, meeting
         self.start = state
         self.fused = None if requests.stages else self._lowered(like)
 
@@ -103,10 +103,14 @@ class Tracer:
             yield meeting
             state = meeting.state
 
+    def last(self, parameters: Parameters) -> Meeting:
+        """The rays at the last element, behind which they have gone straight on."""
+        return next(reversed([self._behind, *self._walk(parameters)]))
+
     @torch.no_grad()
     def exit_of(self, parameters: Parameters) -> tuple[tuple, tuple, Tensor]:
         """How rays arrive at the last element, whose surface is free, in its frame: slopes there, directions, powers."""
-        *_, last = self._walk(parameters)
+        last = self.last(parameters)
         return last.slopes, last.incoming, last.arriving
 
     def land(self, parameters: Parameters, screen: Screen | Placed) -> list[RayState]:

@@ -1,0 +1,122 @@
+"""Points of a source, each of which is coherent light of its own: rays through given points of the pupil.
+
+A mode's rays carry its optical path length from the source, and a density: its part of the source's power per mm^2 of the pupil.
+Near points shine into the source's cone, uniform in solid angle or Lambertian (see `near`); a distant one lights all the pupil.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from caustic_cli.optics.emission.base import Lit
+from caustic_cli.optics.rays import RayState
+from caustic_cli.optics.sampling import Sample
+
+#: Turn between one point of a disc and the next, rad: such a spiral fills it evenly.
+GOLDEN = math.pi * (3.0 - math.sqrt(5.0))
+
+
+@dataclass(frozen=True)
+class Mode:
+    """One point of the source of what is lit.
+
+    position: mm, of a near source; of a distant one the unit vector along which its light runs; part: of the source's power.
+    """
+
+    scene: Lit
+    position: tuple[float, float, float]
+    part: float
+
+    def through(self, u: Tensor, v: Tensor, index: float = 1.0) -> RayState:
+        """Rays through points (N,) of the pupil, u and v in [0, 1] over its rectangle; index: of the medium before it.
+
+        Their power is a density, per mm^2.
+        """
+        source, pupil = self.scene.source, self.scene.pupil
+        if source.collimated:
+            state = RayState.on_axis(Sample(u, v, False, torch.ones_like(u)), pupil.half_size, pupil.z)
+            return replace(state, power=self._even(u, v))
+        (rx, ry), (px, py, pz) = pupil.half_size, self.position
+        x, y = (2.0 * u - 1.0) * rx, (2.0 * v - 1.0) * ry
+        if source.distant:
+            return RayState((x, y, pupil.z), tuple(torch.full_like(x, c) for c in self.position), self._even(u, v),
+                            path=index * (px * x + py * y))
+        dx, dy, h = x - px, y - py, pupil.z - pz
+        r = torch.sqrt(dx * dx + dy * dy + h * h)
+        cone = source.cone_over(pupil.half_size, pupil.z, pupil.round)
+        cosine = h / r
+        if source.intensity == "lambertian":
+            intensity = cosine / (math.pi * math.sin(cone) ** 2)
+        else:
+            intensity = torch.full_like(r, 1.0 / (4.0 * math.pi * math.sin(cone / 2.0) ** 2))
+        lit = cosine >= math.cos(cone) * (1.0 - 4.0 * torch.finfo(torch.float64).eps)
+        power = torch.where(lit, self.part * intensity * cosine / (r * r), torch.zeros_like(r))
+        return RayState((x, y, pupil.z), (dx / r, dy / r, cosine), power, path=index * r)
+
+    def _even(self, u: Tensor, v: Tensor) -> Tensor:
+        """Density of light from infinity, which a profile may shape."""
+        pupil, profile = self.scene.pupil, self.scene.source.profile
+        (rx, ry) = pupil.half_size
+        area = math.pi * rx * ry if pupil.round else 4.0 * rx * ry
+        if profile is None:
+            return torch.full_like(u, self.part / area)
+        table = torch.as_tensor(np.asarray(profile), dtype=torch.float64, device=u.device)
+        a, b = ((c * n).long().clamp(0, n - 1) for c, n in zip((u, v), table.shape, strict=True))
+        inside = torch.ones_like(table)
+        if pupil.round:
+            x, y = (2.0 * (torch.arange(n).to(table) + 0.5) / n - 1.0 for n in table.shape)
+            inside = (x[:, None] ** 2 + y[None, :] ** 2 <= 1.0).double()
+        return self.part / area * table[a, b] / ((table * inside).sum() / inside.sum())
+
+
+def middle(scene: Lit) -> Mode:
+    """The whole source, gathered in its middle."""
+    source = scene.source
+    return Mode(scene, (0.0, 0.0, 1.0) if source.distant else source.centre, 1.0)
+
+
+def edges(scene: Lit) -> list[Mode]:
+    """Its outermost points along x and y, of no power: what they do differently says whether they may be taken for shifted ones."""
+    source = scene.source
+    if source.distant:
+        s = math.sin(source.half_angle)
+        ways = ((1, 0), (-1, 0), (0, 1), (0, -1)) if s else ()
+        return [Mode(scene, (a * s, b * s, math.sqrt(1.0 - s * s)), 0.0) for a, b in ways]
+    if not source.extended:
+        return []
+    at, (ex, ey) = source.points()[0], source.extent
+    found = []
+    for k, e in ((0, ex), (1, ey)):
+        for sign in (1.0, -1.0):
+            point = at[np.argmax(sign * at[:, k])].copy()
+            point[k] += sign * e
+            found.append(Mode(scene, tuple(map(float, point)), 0.0))
+    return found
+
+
+def modes(scene: Lit, each: int) -> list[Mode]:
+    """The source as points: `each` in place of every position that has an extent, evenly over its ellipse."""
+    source = scene.source
+    if source.distant:
+        s = math.sin(source.half_angle)
+        spread = _even_disc(each) if s else [(0.0, 0.0)]
+        found = []
+        for a, b in spread:
+            dx, dy = s * a, s * b
+            found.append(Mode(scene, (dx, dy, math.sqrt(1.0 - dx * dx - dy * dy)), 1.0 / len(spread)))
+        return found
+    (ex, ey), (positions, parts) = source.extent, source.points()
+    spread = _even_disc(each) if max(ex, ey) > 0 else [(0.0, 0.0)]
+    return [Mode(scene, (float(x + ex * a), float(y + ey * b), float(z)), float(part) / len(spread))
+            for (x, y, z), part in zip(positions, parts, strict=True) for a, b in spread]
+
+
+def _even_disc(count: int) -> list[tuple[float, float]]:
+    """Points of the unit disc, each for the same area of it: Vogel's spiral."""
+    radii = [math.sqrt((k + 0.5) / count) for k in range(count)]
+    return [(r * math.cos(k * GOLDEN), r * math.sin(k * GOLDEN)) for k, r in enumerate(radii)]

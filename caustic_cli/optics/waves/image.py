@@ -1,0 +1,281 @@
+"""The wave image: what diffraction makes of the light on a screen.
+
+Every wavelength and every point of the source is coherent in itself; their powers are added.  A source with an extent that only
+shifts the image of its middle, to within a part of what the image shows anyway, is taken as that image spread by the source's own;
+otherwise as so many points.
+
+What rays carry through the system counts: Fresnel's losses, absorption, dispersion, polarisation.  Light that does not go straight
+on (ghosts, second meetings, rough surfaces) is no part of it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from caustic_cli.errors import CausticError
+from caustic_cli.optics.emission.coherent import Mode, edges, middle, modes
+from caustic_cli.optics.meeting import Parameters
+from caustic_cli.optics.surfaces import HeightField
+from caustic_cli.optics.system import EXIT, Placed, System
+from caustic_cli.optics.waves.propagation import TURN, cells, power_in_pieces, power_on_pixels, ramp
+from caustic_cli.optics.waves.receiver import Plane, Receiver, receiver_of
+from caustic_cli.optics.waves.resolution import WHITE_LINES, white
+from caustic_cli.optics.waves.sampling import Sampling, memory_free
+from caustic_cli.optics.waves.spread import Spread, spread_by
+from caustic_cli.optics.waves.tilted import power_on_tilted
+from caustic_cli.optics.waves.wavefront import Optics, Survey, Wavefront, distance_of, survey, wavefront
+from caustic_cli.scene import Light, Scene, Screen
+from caustic_cli.scene.materials import refractive_index
+
+NM = 1e-6
+#: Nodes at which rays are traced: to a knot span of the finest surface, and least along an axis.
+A_SPAN, LEAST_NODES = 3, 384
+#: The screen and so much of it on each side are watched, at most, where light lands beside it.
+BESIDE = 0.5
+#: Points that stand for an extended source where its image is not simply spread.
+EACH = 24
+
+
+@dataclass(frozen=True)
+class Line:
+    """Light of one wavelength: nm, its part of the power, the system for it, the wavelength that media are asked for (None where
+    the system has it already), and the channel of a coloured image."""
+
+    wavelength: float
+    part: float
+    system: System
+    label: float | None = None
+    channel: int | None = None
+
+
+@dataclass(frozen=True)
+class WaveImage:
+    """Power on pixels (n_x, n_y), or (3, n_x, n_y) with colours, and what reached the screen's plane, as parts of the source's.
+
+    image: float64, differentiable where the heights were; leaving: power of all light behind the system; off_screen: of what of
+    it lands beside the pixels; wavelengths: nm; points: of the source that were taken; spread_error: by how much taking an extended
+    source's image as spread misplaces light, mm; samples: along each axis of the largest transform.
+    """
+
+    image: Tensor
+    leaving: float
+    off_screen: float
+    wavelengths: tuple[float, ...]
+    points: int
+    spread_error: float
+    samples: tuple[int, int]
+
+
+def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | None = None) -> list[Line]:
+    """The light of a scene by wavelength and polarisation: its own, or these with equal parts; white where it has none."""
+    found, own, systems = [], scene.light.wavelengths, {}
+    if wavelengths is not None or not own:
+        given = wavelengths or white(WHITE_LINES)
+        parts, channels = [1.0 / len(given)] * len(given), [None] * len(given)
+    else:
+        given, parts = own, scene.light.parts
+        channels = list(range(len(given))) if scene.colored else [None] * len(given)
+    states = (0.0, 90.0) if scene.light.tracked and scene.light.polarisation is None else (scene.light.polarisation,)
+    for wavelength, part, channel in zip(given, parts, channels, strict=True):
+        lens = replace(scene.lens, roughness=0.0)
+        if lens.glass is not None and not lens.mirror:
+            lens = replace(lens, index=refractive_index(lens.glass, wavelength))
+        for state in states:
+            if (lens.index, state) not in systems:  # light of one index and polarisation goes the same ways
+                one = replace(scene, lens=lens, light=Light(state))
+                systems[lens.index, state] = System.of(one, field)
+            found.append(Line(wavelength, part / len(states), systems[lens.index, state], None, channel))
+    return found
+
+
+def lines_of_system(system: System) -> list[Line]:
+    """The same of any system, whose sources are taken one by one."""
+    given = system.light.wavelengths or white(WHITE_LINES)
+    parts = system.light.parts if system.light.wavelengths else (1.0 / len(given),) * len(given)
+    return [Line(wavelength, share * part, system.with_source(source), wavelength)
+            for source, share in zip(system.sources, system.parts, strict=True)
+            for wavelength, part in zip(given, parts, strict=True)]
+
+
+def wave_image(scene: Scene, field: HeightField, heights: Tensor, *, wavelengths: tuple[float, ...] | None = None,
+               screen: Screen | None = None, finer: float = 1.0, dtype: torch.dtype = torch.float32) -> WaveImage:
+    """The wave image of a one-lens scene at heights (n, m) mm; differentiable by them.
+
+    Args:
+        wavelengths: nm, in equal parts, instead of the scene's; a scene without any has white light.
+        finer: samples more than are needed by so many times along each axis, on both planes.
+        dtype: of the field; paths are float64.
+
+    Raises:
+        CausticError: no light reaches the screen, light crosses itself within the lens, or memory is short.
+    """
+    lines = lines_of(scene, field, wavelengths)
+    return image_of(lines, {EXIT: heights.double()}, screen or scene.screen, finer=finer, dtype=dtype)
+
+
+def image_of(lines: list[Line], parameters: Parameters, screen: Screen | Placed, *, finer: float = 1.0,
+             dtype: torch.dtype = torch.float32) -> WaveImage:
+    """The wave image of lines of light on one screen; see `wave_image`."""
+    return Imager.of(lines, parameters, receiver_of(lines[0].system, screen), finer,
+                      any(h.requires_grad for h in parameters.values())).expose(lines, parameters, dtype)
+
+
+def _alike(lines: list[Line]) -> list[list[Line]]:
+    """Lines whose light goes the same ways, together; the shortest wavelength first, which asks for the most."""
+    groups: dict[tuple, list[Line]] = {}
+    for line in sorted(lines, key=lambda k: k.wavelength):
+        groups.setdefault((id(line.system), line.label), []).append(line)
+    return list(groups.values())
+
+
+@dataclass(frozen=True)
+class Imager:
+    """What the images of several lines and modes have in common: where their light is watched, and how finely."""
+
+    receiver: Receiver
+    plane: Plane
+    seen: Survey
+    sampling: Sampling
+    spread: Spread | None
+    nodes: tuple[int, int]
+    single: bool
+    exact: bool = False
+
+    @classmethod
+    def of(cls, lines: list[Line], parameters: Parameters, receiver: Receiver, finer: float = 1.0,
+           exact: bool = False) -> Imager:
+        """Look where the light goes, and choose samples for it.  exact: see `wavefront`.
+
+        Raises:
+            CausticError: see `wave_image`.
+        """
+        line = min(lines, key=lambda k: k.wavelength)
+        system = line.system
+        plane = receiver.plane(system.axis)
+        distance = distance_of(system, parameters, plane)
+        optics = Optics(system, middle(system), parameters, line.wavelength * NM, line.label, plane, distance)
+        seen = survey(optics)
+        lengths = tuple(k.wavelength * NM / optics.index for k in lines)
+        blur = math.sqrt(max(lengths) * distance * seen.magnification)
+        spread = spread_by(optics, edges(system), seen, max(blur, *receiver.pixel)) if system.source.extended else None
+        outer = [mode for mode in edges(system)] if system.source.extended else []
+        low, high = receiver.extent(plane)
+        light, landing = seen.light, [list(low), list(high)]
+        for other in [seen] + [survey(replace(optics, mode=m)) for m in outer]:
+            light = tuple(tuple(w(a[k], b[k]) for k in (0, 1)) for w, a, b in
+                          ((min, light[0], other.light[0]), (max, light[1], other.light[1])))
+            for k in (0, 1):
+                room = BESIDE * (high[k] - low[k])
+                landing[0][k] = min(landing[0][k], max(other.landing[0][k], low[k] - room))
+                landing[1][k] = max(landing[1][k], min(other.landing[1][k], high[k] + room))
+        sampling = Sampling.of(light, tuple(map(tuple, landing)), receiver.pixel, distance, lengths, finer)
+        spans = [len(s.breaks) - 1 for e in system.elements if isinstance(e.surface, HeightField) for s in e.surface.spaces]
+        nodes = tuple(min(n, max(LEAST_NODES, A_SPAN * max(spans, default=0))) for n in sampling.count)
+        return cls(receiver, plane, seen, sampling, spread, nodes, spread is not None or not system.source.extended, exact)
+
+    def expose(self, lines: list[Line], parameters: Parameters, dtype: torch.dtype = torch.float32) -> WaveImage:
+        """The wave image of such lines, at heights {name: (n, m) mm} close to those that samples were chosen for."""
+        colours = [line.channel for line in lines if line.channel is not None]
+        images: dict[int | None, Tensor] = {}
+        leaving = 0.0
+        for group in _alike(lines):
+            for mode in self.modes(group[0].system):
+                front = self.front(group[0], mode, parameters)
+                for line in group:
+                    part, power = self.image(line, front, dtype)
+                    images[line.channel] = images.get(line.channel, 0.0) + line.part * part
+                    leaving += line.part * power
+        dark = torch.zeros(self.receiver.resolution, dtype=torch.float64)
+        image = torch.stack([images.get(k, dark) for k in range(3)]) if colours else images[None]
+        return WaveImage(image, leaving, leaving - float(image.detach().sum()),
+                         tuple(dict.fromkeys(line.wavelength for line in lines)), len(self.modes(lines[0].system)),
+                         self.spread.error if self.spread else 0.0, self.sampling.padded)
+
+    def modes(self, system: System) -> list[Mode]:
+        """Points that the source is taken as."""
+        if self.single:
+            return [middle(system)]
+        positions = max(1, len(system.source.points()[0]))
+        return modes(system, max(4, EACH // positions))
+
+    def optics(self, line: Line, mode: Mode, parameters: Parameters) -> Optics:
+        """What makes a wavefront of one of them."""
+        return Optics(line.system, mode, parameters, line.wavelength * NM, line.label, self.plane, self.sampling.distance)
+
+    def front(self, line: Line, mode: Mode, parameters: Parameters, sensitive: bool = False) -> Wavefront:
+        """The light of a mode behind the lens, on `nodes`."""
+        optics, s = self.optics(line, mode, parameters), self.sampling
+        step = tuple(d * n / m for d, n, m in zip(s.step, s.count, self.nodes, strict=True))
+        seen = self.seen if self.single else survey(optics)
+        return wavefront(optics, seen, s.low, step, self.nodes, sensitive, self.exact)
+
+    def watched(self, front: Wavefront, length: float) -> Wavefront:
+        """The part of it that lands where its transform at a wavelength in mm reaches."""
+        return front.within(self.sampling.middle, tuple(length * self.sampling.distance / d for d in self.sampling.step))
+
+    def masks(self, line: Line, device: torch.device, dtype: torch.dtype, sub: int = 1,
+              beside: tuple[int, int] = (0, 0)) -> tuple[Tensor, Tensor]:
+        """Which samples fall on which pixels along each axis; `sub` pixels for one of the screen's, and so many of these beside."""
+        length = line.wavelength * NM / self.index(line)
+        first, spacing, found = self.sampling.first(length), self.sampling.spacing(length), []
+        for k in (0, 1):
+            width = self.receiver.pixel[k] / sub
+            found.append(cells(self._low(k) - beside[k] * width, width, sub * self.receiver.resolution[k] + 2 * beside[k], first[k],
+                               spacing[k], self.sampling.padded[k], device).to(dtype))
+        return tuple(found)
+
+    def _low(self, k: int) -> float:
+        return self.receiver.extent(self.plane)[0][k]
+
+    @staticmethod
+    def index(line: Line) -> float:
+        """Of the medium before the screen."""
+        return line.system.media()[-1].index_at(line.label)
+
+    def image(self, line: Line, whole: Wavefront, dtype: torch.dtype) -> tuple[Tensor, float]:
+        """Power on the pixels of the light of one mode at one wavelength, float64, and that of all of it."""
+        s, k0, length = self.sampling, TURN / (line.wavelength * NM), line.wavelength * NM / self.index(line)
+        front, device = self.watched(whole, length), whole.path.device
+        if not self.receiver.across(line.system.axis):
+            return power_on_tilted(self.receiver, self.plane, s, front, k0, length, dtype)
+        sub, beside = (1, (0, 0)) if self.spread is None else self.spread.grid(self.receiver.pixel)
+        rows, columns = self.masks(line, device, dtype, sub, beside)
+        across, along = ramp(s, length, 0, device), ramp(s, length, 1, device)
+        wide = 8 if dtype == torch.float32 else 16
+        pieces = s.pieces(wide)
+        if pieces == 1:
+            self._check_memory(wide)
+            path, root, lit = front.on(s.low, s.step, s.count)
+            phase = torch.remainder(k0 * path + across[:, None] + along[None, :], TURN).to(dtype)
+            power = (root.square() * lit).sum()
+            amplitude = root * lit
+            amplitude = (amplitude * (power / amplitude.square().sum()).sqrt()).to(dtype)
+            found = power_on_pixels(phase, amplitude, s.padded, rows, columns).double()
+        else:
+            sums = [0.0, 0.0]
+
+            def field(part: slice) -> Tensor:
+                path, root, lit = front.on(s.low, s.step, s.count, part)
+                sums[0] += float((root.square() * lit).sum()) / pieces
+                sums[1] += float((root * lit).square().sum()) / pieces
+                phase = torch.remainder(k0 * path + across[part, None] + along[None, :], TURN).to(dtype)
+                return torch.polar((root * lit).to(dtype), phase)
+
+            with torch.no_grad():
+                found, _ = power_in_pieces(field, s, pieces, rows, columns)
+            power = torch.tensor(sums[0], dtype=torch.float64)
+            found = found * (sums[0] / sums[1])
+        if self.spread is not None:
+            found = self.spread(found, self.receiver.pixel, sub, beside)
+        return found, float(power.detach())
+
+    def _check_memory(self, wide: int) -> None:
+        n, m = self.sampling.count
+        needed = 4 * wide * self.sampling.samples + 48 * n * m + 160 * self.nodes[0] * self.nodes[1]
+        if needed > memory_free():
+            raise CausticError(f"a wave image of this scene takes about {needed / 2**30:.1f} GiB of memory, and"
+                               f" {memory_free() / 2**30:.1f} GiB are free: fewer pixels, a smaller screen or lens need less")

@@ -1,0 +1,104 @@
+"""The plane on which a wave image is taken, as frame, middle and pixels; and the plane across the axis through its middle.
+
+Notation
+    e1, e2, e3  unit vectors along the plane and normal to it, e3 along the light's way
+    Z           distance of the plane along e3 from the system's origin, mm
+    X, Y        coordinates on it along e1, e2, mm
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from caustic_cli.errors import InputError
+from caustic_cli.optics.frames import IDENTITY, Axes
+from caustic_cli.optics.system import Placed, System
+from caustic_cli.scene import Screen
+
+#: Cosine between a screen's normal and the axis from which it counts as lying across it.
+ACROSS = 1.0 - 1e-12
+#: Least cosine between a screen's normal and the axis: closer to grazing, light beside the axis runs along the screen.
+LEAST_COSINE = 0.08
+
+Vector = tuple[float, float, float]
+
+
+def dot(a: Vector, b: Vector) -> float:
+    """Scalar product."""
+    return sum(x * y for x, y in zip(a, b, strict=True))
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A plane across the light's way: its frame (e1, e2, e3) and Z, mm; see above."""
+
+    axes: Axes
+    z: float
+
+
+@dataclass(frozen=True)
+class Receiver:
+    """A screen's pixels in space.
+
+    middle: a point of its plane, mm; axes: along its x, along its y, normal to it; low: its low edges counted from there along
+    both, mm; pixel: widths, mm; resolution: pixels along x and y.
+    """
+
+    middle: Vector
+    axes: Axes
+    low: tuple[float, float]
+    pixel: tuple[float, float]
+    resolution: tuple[int, int]
+
+    @classmethod
+    def of(cls, screen: Screen | Placed) -> Receiver:
+        """A scene's or a system's screen."""
+        if isinstance(screen, Placed):
+            inner = screen.screen
+            return cls(screen.pose.position, screen.pose.axes, inner.low, inner.pixel, inner.resolution)
+        if not any(screen.tilt):
+            return cls((0.0, 0.0, screen.z), IDENTITY, screen.low, screen.pixel, screen.resolution)
+        rx, ry = screen.half_size
+        return cls((*screen.shift, screen.z), screen.axes, (-rx, -ry), screen.pixel, screen.resolution)
+
+    def plane(self, axis: Vector) -> Plane:
+        """The plane through its middle across the axis; its own where it lies so."""
+        u, _, n = self.axes
+        if abs(dot(n, axis)) >= ACROSS:
+            return Plane(self.axes, dot(self.middle, n))
+        along = tuple(a - dot(u, axis) * b for a, b in zip(u, axis, strict=True))
+        size = math.sqrt(dot(along, along))
+        e1 = tuple(a / size for a in along)
+        e2 = (axis[1] * e1[2] - axis[2] * e1[1], axis[2] * e1[0] - axis[0] * e1[2], axis[0] * e1[1] - axis[1] * e1[0])
+        return Plane((e1, e2, axis), dot(self.middle, axis))
+
+    def across(self, axis: Vector) -> bool:
+        """Whether it lies across the axis."""
+        return abs(dot(self.axes[2], axis)) >= ACROSS
+
+    def corners(self) -> list[Vector]:
+        """Its four corners in space, mm."""
+        (u, v, _), found = self.axes, []
+        for a in (0, self.resolution[0]):
+            for b in (0, self.resolution[1]):
+                x, y = self.low[0] + a * self.pixel[0], self.low[1] + b * self.pixel[1]
+                found.append(tuple(m + x * p + y * q for m, p, q in zip(self.middle, u, v, strict=True)))
+        return found
+
+    def extent(self, plane: Plane) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Where it lies on a plane seen along the plane's normal: lows and highs of X and Y, mm."""
+        at = [[dot(c, e) for e in plane.axes[:2]] for c in self.corners()]
+        return tuple(min(c[k] for c in at) for k in (0, 1)), tuple(max(c[k] for c in at) for k in (0, 1))
+
+
+def receiver_of(system: System, screen: Screen | Placed) -> Receiver:
+    """The receiver of one of a system's screens.
+
+    Raises:
+        InputError: it stands along the light.
+    """
+    found = Receiver.of(screen)
+    if abs(dot(found.axes[2], system.axis)) < LEAST_COSINE:
+        raise InputError("[screen] tilt leaves the screen along the light, where no wave image can be taken")
+    return found

@@ -1,0 +1,111 @@
+"""Wave images on tilted screens: planes across the light, one behind the other, each seen where the screen passes through it.
+
+Notation, at a plane at distance L_k whose light comes from feet x (see `wavefront`)
+    U, U_x      fields on the plane of u and of x u
+    P           (X |U|^2 - Re(conj(U) U_x)) / L, power times its mean slope: the transverse flux
+    d           P / |U|^2 of the light as a whole, by the mean map of feet to landing points
+
+A point of the screen at height z over the plane takes |U|^2 and P where its light passes the plane, at X - z d, and gets
+(|U|^2 n_z + P . n) per area, n the screen's normal.  Planes are so close that the light's departure from the mean map moves by less
+than STEP of what the image shows in between.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from caustic_cli.errors import CausticError
+from caustic_cli.optics.waves.propagation import TURN, ramp
+from caustic_cli.optics.waves.receiver import Plane, Receiver, dot
+from caustic_cli.optics.waves.sampling import Sampling
+from caustic_cli.optics.waves.wavefront import Wavefront
+
+#: Part of a pixel by which light may move between planes; most planes; points along each axis of a pixel.
+STEP, MOST_PLANES, A_PIXEL = 0.2, 400, 4
+
+
+def power_on_tilted(r: Receiver, plane: Plane, s: Sampling, front: Wavefront, k0: float, length: float,
+                    dtype: torch.dtype) -> tuple[Tensor, float]:
+    """Power on a tilted screen's pixels of one wavefront, float64, and that of all its light.
+
+    Raises:
+        CausticError: too many planes.
+    """
+    e1, e2, e3 = plane.axes
+    device = front.path.device
+    u, v = (r.low[k] + r.pixel[k] * (torch.arange(A_PIXEL * r.resolution[k], dtype=torch.float64, device=device) + 0.5) / A_PIXEL
+            for k in (0, 1))
+    x, y, z = (dot(r.middle, e) + dot(r.axes[0], e) * u[:, None] + dot(r.axes[1], e) * v[None, :] for e in (e1, e2, e3))
+    z = z - plane.z  # beyond the plane through the screen's middle
+    facing = dot(r.axes[2], e3)
+    nx, ny, nz = (math.copysign(1.0, facing) * dot(r.axes[2], e) for e in (e1, e2, e3))
+
+    path, root, lit = front.on(s.low, s.step, s.count)
+    amplitude = root * lit
+    power = (root.square() * lit).sum()
+    amplitude = amplitude * (power / amplitude.square().sum()).sqrt()
+    foot = [s.low[k] + s.step[k] * (torch.arange(s.count[k], dtype=torch.float64, device=device) + 0.5) for k in (0, 1)]
+    maps = _mean_map(front, s.distance)  # slopes qx, qy of the light that lands at X, Y: a + b X
+    depth = float(z.abs().max())
+    residual = max(m[2] for m in maps)
+    planes = max(1, math.ceil(2.0 * depth * residual / (2.0 * STEP * min(r.pixel))))
+    if planes > MOST_PLANES:
+        raise CausticError(f"a wave image of this tilted screen needs {planes} planes, at most {MOST_PLANES} are made: less tilt or"
+                           " larger pixels need fewer")
+    image = torch.zeros(u.numel(), v.numel(), dtype=torch.float64, device=device)
+    height = 2.0 * depth / planes
+    for k in range(planes):
+        at = -depth + (k + 0.5) * height
+        here = (z - at).abs() <= 0.5 * height * (1.0 + 1e-12)
+        if not bool(here.any()):
+            continue
+        image = image + _through(replace(s, distance=s.distance + at), path, amplitude, foot, maps, (x, y, z - at), (nx, ny, nz),
+                                 here, k0, length, dtype)
+    cell = r.pixel[0] * r.pixel[1] / A_PIXEL**2
+    n, m = r.resolution
+    return image.view(n, A_PIXEL, m, A_PIXEL).sum((1, 3)) * cell, float(power.detach())
+
+
+def _through(s, path, amplitude, foot, maps, point, normal, here, k0, length, dtype) -> Tensor:
+    """Power per area of the screen's points near one plane, 0 elsewhere."""
+    phase = torch.remainder(k0 * path + ramp(s, length, 0, path.device)[:, None] + ramp(s, length, 1, path.device)[None, :],
+                            TURN).to(dtype)
+    u = torch.polar(amplitude.to(dtype), phase)
+    moments = (u, u * foot[0].to(dtype)[:, None], u * foot[1].to(dtype)[None, :])
+    fields = [torch.fft.fft2(w, s=s.padded, norm="ortho") for w in moments]
+    (dx, dy), (x0, y0) = s.spacing(length), s.first(length)
+    x, y, z = point
+    grid_x, grid_y = (c0 + d * torch.arange(n, dtype=dtype, device=path.device)
+                      for c0, d, n in zip((x0, y0), (dx, dy), s.padded, strict=True))
+    density = (fields[0].real.square() + fields[0].imag.square()) / (dx * dy)
+    flux = [(grid * density - (fields[0].conj() * moved).real / (dx * dy)) / s.distance
+            for grid, moved in ((grid_x[:, None], fields[1]), (grid_y[None, :], fields[2]))]
+    total = density * normal[2] + flux[0] * normal[0] + flux[1] * normal[1]
+    qx, qy = ((a + b * c) for (a, b, _), c in zip(maps, (x, y), strict=True))
+    at_x, at_y = (x - z * qx - x0) / dx, (y - z * qy - y0) / dy
+    n, m = s.padded
+    spots = torch.stack([2.0 * at_y[here] / (m - 1) - 1.0, 2.0 * at_x[here] / (n - 1) - 1.0], -1).to(dtype)
+    seen = torch.nn.functional.grid_sample(total[None, None], spots[None, None], mode="bicubic", align_corners=True)[0, 0, 0]
+    return torch.zeros_like(x).masked_scatter(here, seen.double())
+
+
+@torch.no_grad()
+def _mean_map(front: Wavefront, distance: float) -> list[tuple[float, float, float]]:
+    """For each axis (a, b, rest): light that lands at X has the slope a + b X, give or take rest."""
+    weight, found = front.density, []
+    n, m = weight.shape
+    foot = (front.low[0] + front.step[0] * (torch.arange(n).to(weight) + 0.5))[:, None].expand(n, m), \
+        (front.low[1] + front.step[1] * (torch.arange(m).to(weight) + 0.5))[None, :].expand(n, m)
+    lit = weight > 0
+    for big, x in zip((front.big_x, front.big_y), foot, strict=True):
+        q, c, w = ((big - x) / distance)[lit], big[lit], weight[lit] / weight[lit].sum()
+        mean_q, mean_c = float((w * q).sum()), float((w * c).sum())
+        spread = float((w * (c - mean_c) ** 2).sum())
+        b = float((w * (q - mean_q) * (c - mean_c)).sum()) / spread if spread > 0 else 0.0
+        a = mean_q - b * mean_c
+        found.append((a, b, float((q - a - b * c).abs().max())))
+    return found

@@ -1,0 +1,340 @@
+"""The light behind a lens as a field: path and density on a plane, from an exact ray trace.
+
+Notation, of a ray that lands on the screen's plane
+    X       where it lands, mm (two components)
+    q       its direction's components along the plane
+    V       optical path length from the source to X, mm
+    L       distance of the screen from the last surface's middle, mm; n index of the medium behind it
+    x       X - L q, the foot of the ray
+    v       V - n L (1 + q^2 / 2), path of the foot
+
+Fresnel's integral lets a ray from x of slope q land at x + L q after the path n L (1 + q^2 / 2).  Given as a function of its foot,
+light therefore lands exactly where the trace says and with its exact path, at any angle.  Feet lie within micrometres to tenths of
+a millimetre of where the rays leave the surface.  What is approximate is that light on that short way goes by rays: good where the
+Fresnel scale of the way is small against the relief.
+
+The field is wanted on an even grid of feet.  Rays are moved on the pupil until their feet are there (Newton's method, with the mean
+stretch for a slope), and what is left, e, is taken into account to first order: by Fermat's principle v(x) = v + n q . e up to e^2.
+The derivative by the heights is that at fixed x, as it should be, with rays held on the pupil.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from caustic_cli.errors import CausticError
+from caustic_cli.optics.effects import Requests
+from caustic_cli.optics.emission.coherent import Mode
+from caustic_cli.optics.meeting import Meeting, Parameters
+from caustic_cli.optics.system import System
+from caustic_cli.optics.trace import Tracer
+from caustic_cli.optics.waves.receiver import Plane, dot
+
+#: Points along each side of the pupil from which extents are found.
+SURVEY = 65
+#: Feet are sought until the path that this leaves out is below this part of a wavelength, at most so often.
+LEFT, TRIES = 1e-3, 12
+#: The same where it has to be exact: derivatives see the misses of feet to first order.
+LEFT_EXACT = 1e-9
+#: Rays traced at a time.
+CHUNK = 1 << 19
+#: The part of the light that may lie where rays have crossed before the plane of the feet.
+CROSSED = 1e-3
+STAGES = Requests.to(stages=True)
+#: Part of what is watched on the screen over which light beyond it is left out.
+SOFT = 0.02
+#: Points of the interpolation between nodes along an axis.
+POINTS = 6
+
+
+@dataclass
+class Feet:
+    """Rays by their feet, (N,) each: x, y, path v, directions qx, qy, landing X, Y, power (density on the pupil), and the Meeting
+    with the last surface in the dict `last` if asked for."""
+
+    x: Tensor
+    y: Tensor
+    path: Tensor
+    qx: Tensor
+    qy: Tensor
+    big_x: Tensor
+    big_y: Tensor
+    power: Tensor
+
+
+@dataclass(frozen=True)
+class Optics:
+    """What makes one wavefront of the light of one point of a source.
+
+    wavelength: mm; label: nm, at which media are asked for their index, None where the system says it; plane: of the screen;
+    distance: L, mm.
+    """
+
+    system: System
+    mode: Mode
+    parameters: Parameters
+    wavelength: float
+    label: float | None
+    plane: Plane
+    distance: float
+
+    @property
+    def index(self) -> float:
+        """Of the medium behind the last element."""
+        return self.system.media()[-1].index_at(self.label)
+
+    def meetings(self, u: Tensor, v: Tensor) -> Meeting:
+        """Rays through points (N,) of the pupil, up to behind the last element."""
+        rays = self.mode.through(u, v, self.system.before.index_at(self.label))
+        return Tracer(self.system, rays, requests=STAGES, wavelength=self.label).last(self.parameters)
+
+    def feet(self, u: Tensor, v: Tensor) -> Feet:
+        """The same by their feet."""
+        parts = []
+        step = len(u) if torch.is_grad_enabled() else CHUNK
+        for start in range(0, len(u), step):
+            parts.append(self.footed(self.meetings(u[start : start + step], v[start : start + step])))
+        if len(parts) == 1:
+            return parts[0]
+        return Feet(*(torch.cat([getattr(p, name) for p in parts]) for name in Feet.__dataclass_fields__))
+
+    def footed(self, m: Meeting) -> Feet:
+        """Rays behind the last element by their feet."""
+        state, (e1, e2, e3) = m.state.spread(), self.plane.axes
+        o, d = state.full((state.origin[0], state.origin[1], state.origin[2] + state.datum)), state.full(state.direction)
+        qx, qy, qz = (sum(a * b for a, b in zip(d, e, strict=True)) for e in (e1, e2, e3))
+        t = (self.plane.z - sum(a * b for a, b in zip(o, e3, strict=True))) / qz
+        ahead = (t > 0) & torch.isfinite(t)
+        t = torch.where(ahead, t, torch.zeros_like(t))
+        big_x, big_y = (sum(a * b for a, b in zip(o, e, strict=True)) + t * q for e, q in ((e1, qx), (e2, qy)))
+        n, far = self.index, self.distance
+        path = state.path + n * t - n * far * (1.0 + 0.5 * (qx * qx + qy * qy))
+        power = torch.where(ahead, state.power, torch.zeros_like(state.power))
+        return Feet(big_x - far * qx, big_y - far * qy, path, qx, qy, big_x, big_y, power)
+
+
+def distance_of(system: System, parameters: Parameters, plane: Plane) -> float:
+    """L: of a plane from the middle of the last surface, mm."""
+    last = system.elements[-1]
+    x, y, z = last.pose.position
+    if last.surface.shape is not None:
+        middle, normal = float(parameters[last.name].detach().double().mean()), last.pose.axes[2]
+        x, y, z = (c + middle * a for c, a in zip((x, y, z), normal, strict=True))
+    return abs(plane.z - dot((x, y, z), plane.axes[2]))
+
+
+@dataclass(frozen=True)
+class Survey:
+    """Where light goes, from few rays: lows and highs of feet and of landing points, mm, and the mean stretch from the pupil's
+    u and v, in [0, 1], to feet: x = offset + scale u along each axis; magnification, root of the mean area of landing points over
+    that of feet, or 0 where light has no extent."""
+
+    light: tuple
+    landing: tuple
+    offset: tuple[float, float]
+    scale: tuple[float, float]
+    magnification: float
+
+
+@torch.no_grad()
+def survey(optics: Optics) -> Survey:
+    """Look where the light of a mode goes.
+
+    Raises:
+        CausticError: nowhere.
+    """
+    line = torch.linspace(0.0, 1.0, SURVEY, dtype=torch.float64, device=_device(optics))
+    u, v = (c.reshape(-1) for c in torch.meshgrid(line, line, indexing="ij"))
+    f = optics.feet(u, v)
+    lit = f.power > 0
+    pupil = optics.mode.scene.pupil
+    if pupil.round:
+        lit &= (2.0 * u - 1.0) ** 2 + (2.0 * v - 1.0) ** 2 <= 1.0 + 1e-12
+    if int(lit.sum()) < 16:
+        raise CausticError("no light reaches the screen, so it has no wave image")
+    light, landing = (tuple(tuple(float(getattr(c[lit], w)()) for c in pair) for w in ("min", "max"))
+                      for pair in ((f.x, f.y), (f.big_x, f.big_y)))
+    scale, offset = [], []
+    for at, foot in ((u[lit], f.x[lit]), (v[lit], f.y[lit])):
+        a, b = at - at.mean(), foot - foot.mean()
+        scale.append(float((a * b).sum() / (a * a).sum()))
+        offset.append(float(foot.mean() - scale[-1] * at.mean()))
+    if pupil.round:  # the survey's points miss the circle's edge
+        r = 0.5
+        light = tuple(tuple(offset[k] + scale[k] * (0.5 + s * r) for k in (0, 1)) for s in (-1.0, 1.0))
+        light = tuple(tuple(f(light[0][k], light[1][k]) for k in (0, 1)) for f in (min, max))
+    grid = (SURVEY, SURVEY)
+    area = _jacobian(f.big_x.view(grid), f.big_y.view(grid), 1.0, 1.0).abs()
+    foot = _jacobian(f.x.view(grid), f.y.view(grid), 1.0, 1.0).abs()
+    weight = f.power.view(grid)
+    magnification = float((weight * area).sum() / (weight * foot).sum()) ** 0.5
+    return Survey(light, landing, tuple(offset), tuple(scale), magnification)
+
+
+def _jacobian(a: Tensor, b: Tensor, dx: float, dy: float) -> Tensor:
+    """Determinant of the derivatives of two functions (n, m) of even samples."""
+    (ax, ay), (bx, by) = (torch.gradient(c, spacing=(dx, dy), dim=(0, 1)) for c in (a, b))
+    return ax * by - ay * bx
+
+
+@dataclass
+class Wavefront:
+    """Light on an even grid of feet: what each node has, (n, m) float64.
+
+    low, step: of the nodes, which stand in the middle of cells, mm; path: v less its mean, mm; density: power per mm^2; edge_x,
+    edge_y: distance inside the pupil's edges, mm on this plane, edge_y None for a circle; big_x, big_y: where light lands, mm;
+    sensitivity: derivative of the path by the height of the last surface; at_x, at_y: points of that surface, mm; both None unless
+    asked for.
+    """
+
+    low: tuple[float, float]
+    step: tuple[float, float]
+    path: Tensor
+    density: Tensor
+    edge_x: Tensor
+    edge_y: Tensor | None
+    big_x: Tensor
+    big_y: Tensor
+    sensitivity: Tensor | None = None
+    at_x: Tensor | None = None
+    at_y: Tensor | None = None
+
+    def within(self, middle: tuple[float, float], width: tuple[float, float]) -> Wavefront:
+        """Only the light that lands within a rectangle on the screen, mm; it ends softly."""
+        density = self.density
+        for big, m, w in zip((self.big_x, self.big_y), middle, width, strict=True):
+            density = density * ((0.5 * w - (big - m).abs()) / (SOFT * w)).clamp(0.0, 1.0)
+        return replace(self, density=density)
+
+    def on(self, low: tuple[float, float], step: tuple[float, float], count: tuple[int, int],
+           rows: slice = slice(None)) -> tuple[Tensor, Tensor, Tensor]:
+        """At a finer grid's rows, (rows, m) float64 each: path, mm; root of the power of a whole cell; part of it that is lit."""
+        weights = [_between(self.path.shape[k], self.low[k], self.step[k], low[k], step[k], count[k], self.path) for k in (0, 1)]
+        weights[0] = tuple(w[rows] for w in weights[0]) if weights[0] else None
+        if weights[0] is None and weights[1] is None:
+            def at(c: Tensor) -> Tensor:
+                return c[rows]
+        else:
+            def at(c: Tensor) -> Tensor:
+                return _interpolated(c, *weights)
+
+        root = at(self.density.sqrt()) * (step[0] * step[1]) ** 0.5
+        lit = (at(self.edge_x) / step[0] + 0.5).clamp(0.0, 1.0)
+        if self.edge_y is not None:
+            lit = lit * (at(self.edge_y) / step[1] + 0.5).clamp(0.0, 1.0)
+        return at(self.path), root, lit
+
+
+def _between(nodes: int, low: float, step: float, fine_low: float, fine_step: float, count: int, like: Tensor):
+    """First node and weights (count, POINTS) of Lagrange's interpolation at finer cells; None where they are the nodes."""
+    if nodes == count:
+        return None
+    x = (fine_low + fine_step * (torch.arange(count, dtype=torch.float64, device=like.device) + 0.5) - low) / step - 0.5
+    first = (torch.floor(x).long() - (POINTS // 2 - 1)).clamp(0, nodes - POINTS)
+    t, k = x - first, range(POINTS)
+    weights = torch.stack([_product([(t - j) / (i - j) for j in k if j != i]) for i in k], 1)
+    return first, weights
+
+
+def _product(factors: list[Tensor]) -> Tensor:
+    found = factors[0]
+    for f in factors[1:]:
+        found = found * f
+    return found
+
+
+def _interpolated(c: Tensor, along_x, along_y) -> Tensor:
+    if along_x is not None:
+        first, w = along_x
+        c = sum(w[:, k, None] * c[first + k] for k in range(POINTS))
+    if along_y is not None:
+        first, w = along_y
+        c = sum(w[None, :, k] * c[:, first + k] for k in range(POINTS))
+    return c
+
+
+def wavefront(optics: Optics, seen: Survey, low: tuple[float, float], step: tuple[float, float], count: tuple[int, int],
+              sensitive: bool = False, exact: bool = False) -> Wavefront:
+    """The light on a grid of `count` cells `step` wide from `low` on; differentiable by the heights in `optics.parameters`.
+
+    exact: seek feet until rounding is all that is left.
+    sensitive: with what its derivative by the height of the last surface needs, which is then not asked of autograd.
+
+    Raises:
+        CausticError: light crosses itself before it gets there, so that no single wavefront stands for it.
+    """
+    device = _device(optics)
+    differentiable = not sensitive and torch.is_grad_enabled() and any(h.requires_grad for h in optics.parameters.values())
+    left = (LEFT_EXACT if exact else LEFT) * optics.wavelength / optics.index
+    x, y = (low[k] + step[k] * (torch.arange(count[k], dtype=torch.float64, device=device) + 0.5) for k in (0, 1))
+    shape = (len(x), len(y))
+    x, y = (c.reshape(-1) for c in torch.meshgrid(x, y, indexing="ij"))
+    with torch.no_grad():
+        u, v = ((c - seen.offset[k]) / seen.scale[k] for k, c in enumerate((x, y)))
+        for _ in range(TRIES):
+            f = optics.feet(u.clamp(0.0, 1.0), v.clamp(0.0, 1.0))
+            ex, ey = (x - f.x) / seen.scale[0], (y - f.y) / seen.scale[1]
+            if _left(f, x, y, shape, step, u, v) <= left:
+                break
+            u, v = u.clamp(0.0, 1.0) + ex, v.clamp(0.0, 1.0) + ey
+    held = u.clamp(0.0, 1.0), v.clamp(0.0, 1.0)
+    at = {}
+    if sensitive:
+        with torch.no_grad():
+            f, at = _sensitive(optics, *held)
+    elif differentiable:
+        f = optics.feet(*held)
+    ex, ey = x - f.x, y - f.y
+    path = f.path + optics.index * (f.qx * ex + f.qy * ey)
+    lit = f.power > 0
+    path = torch.where(lit, path - path[lit].detach().mean(), torch.zeros_like(path))
+    # Where on the pupil light with its foot on the grid comes from, in mm of this plane; its stretch is the density's.
+    px, py = ((h - 0.5) * c for h, c in zip(held, seen.scale, strict=True))
+    (pxx, pxy), (pyx, pyy) = (torch.gradient(p.view(shape), spacing=step, dim=(0, 1)) for p in (px, py))
+    px, py = px + pxx.reshape(-1) * ex + pxy.reshape(-1) * ey, py + pyx.reshape(-1) * ex + pyy.reshape(-1) * ey
+    pupil = optics.mode.scene.pupil
+    mm = [2.0 * pupil.half_size[k] / abs(seen.scale[k]) for k in (0, 1)]
+    squeeze = mm[0] * mm[1] * _jacobian(px.view(shape), py.view(shape), *step)
+    power = f.power.view(shape)
+    crossed = torch.where(squeeze.detach() <= 0, power.detach(), torch.zeros_like(power))
+    if float(crossed.sum()) > CROSSED * float(power.detach().sum()):
+        raise CausticError("light crosses itself within the lens' own depth, so that no wavefront behind it stands for it;"
+                           " a flatter surface or a screen farther away has one")
+    density = power * squeeze.clamp_min(0.0)
+    rx, ry = (abs(s) / 2.0 for s in seen.scale)
+    px, py = px.view(shape), py.view(shape)
+    edge_x, edge_y = (rx - torch.hypot(px, py * (rx / ry)), None) if pupil.round else (rx - px.abs(), ry - py.abs())
+    landed = (c.detach().view(shape) for c in (f.big_x, f.big_y))
+    return Wavefront(low, step, path.view(shape), density, edge_x, edge_y, *landed,
+                     **{name: value.view(shape) for name, value in at.items()})
+
+
+def _left(f: Feet, x: Tensor, y: Tensor, shape, step, u: Tensor, v: Tensor) -> float:
+    """Bound of the path left out where feet miss the grid by e: half e^2 times the wavefront's curvature there, mm."""
+    inside = (f.power > 0) & (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
+    if not bool(inside.any()):
+        return 0.0
+    e2 = (x - f.x).square() + (y - f.y).square()
+    bend = sum(g.abs() for c in (f.qx, f.qy) for g in torch.gradient(c.view(shape), spacing=step, dim=(0, 1)))
+    return float((0.5 * e2.view(shape) * bend)[inside.view(shape)].max())
+
+
+def _sensitive(optics: Optics, u: Tensor, v: Tensor) -> tuple[Feet, dict[str, Tensor]]:
+    """Rays by their feet, with where they meet the last surface and how its height changes their path."""
+    feet, found = [], []
+    for start in range(0, len(u), CHUNK):
+        m = optics.meetings(u[start : start + CHUNK], v[start : start + CHUNK])
+        feet.append(optics.footed(m))
+        into = m.incoming[2]
+        normal = m.element.pose.axes[2]
+        out = sum(c * a for c, a in zip(m.state.full(m.state.direction), normal, strict=True))
+        found.append((m.n_in * into - m.n_out * out, *(c.expand(out.shape) for c in m.local[:2])))
+    f = Feet(*(torch.cat([getattr(p, name) for p in feet]) for name in Feet.__dataclass_fields__))
+    return f, dict(zip(("sensitivity", "at_x", "at_y"), (torch.cat(c) for c in zip(*found, strict=True)), strict=True))
+
+
+def _device(optics: Optics) -> torch.device:
+    return next((h.device for h in optics.parameters.values()), torch.device("cpu"))
