@@ -122,6 +122,13 @@ def error(message: str) -> None:
     sys.stderr.write(f"caustic: {line if len(line) <= LONGEST_LINE else line[:LONGEST_LINE] + ' ...'}\n")
 
 
+def _wavelengths(values: list[float]) -> str:
+    """Wavelengths in a clause."""
+    if len(values) == 1:
+        return f"at {values[0]:.4g} nm"
+    return f"at {len(values)} wavelengths, {min(values):.4g} to {max(values):.4g} nm"
+
+
 def figures_rows(figures: dict) -> list[tuple[str, str]]:
     """The JSON figures as a person reads them."""
     def number(key: str, form: str) -> str:
@@ -132,6 +139,13 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
     noise = []
     if "error_estimate" in figures:
         noise = [("noise of the image", f"{figures['error_estimate']:.2g}, estimated; {figures['rays_traced']:,} rays in all")]
+    waves = []
+    if "no_wave_image" in figures:
+        waves = [("of light as a wave", f"no image: {figures['no_wave_image']}")]
+    elif "wave_relative_rms" in figures:
+        waves = [("of light as a wave", f"relative RMS error {number('wave_relative_rms', '.4f')}, on the picture"
+                                        f" {number('wave_on_target', '.2%')}, {_wavelengths(figures['wave_wavelengths'])}"),
+                 ("details light carries", number("resolvable", "d") + " across")]
     return [
         ("relative RMS error", number("relative_rms", ".4f")),
         ("loss (eq. 5.2.1)", number("loss", ".4e")),
@@ -140,6 +154,7 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
         ("light on the screen", number("on_screen", ".2%")),
         ("light on the picture", number("on_target", ".2%")),
         ("lost", lost or "nothing"),
+        *waves,
         ("rays", number("rays", ",d")),
         *noise,
         ("iterations", number("iterations", "d")),

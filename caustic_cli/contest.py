@@ -15,6 +15,7 @@ from caustic_cli.derive import NETWORK_CONTROL, Settings, build_options, build_s
 from caustic_cli.inverse.designer import Designer, Options, State
 from caustic_cli.inverse.first import first_surface
 from caustic_cli.inverse.objective import Objective
+from caustic_cli.inverse.parametrisation import Heights
 from caustic_cli.inverse.schedule import Stage, coarse_to_fine
 from caustic_cli.inverse.target import target_on_screen
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -36,10 +37,10 @@ class Turns(Designer):
 
     _kept: tuple[int, Objective] | None = None
 
-    def _objective(self, k: int) -> Objective:
+    def _objective(self, k: int, heights: Heights) -> Objective:
         if self._kept is None or self._kept[0] != k:
             self._kept = None  # never two at once: they are large
-            self._kept = k, super()._objective(k)
+            self._kept = k, super()._objective(k, heights)
         return self._kept[1]
 
 
@@ -139,12 +140,12 @@ def plans(scene: Scene, full: Settings, dtype: torch.dtype | None = None,
 
     L-BFGS on the finished control net, on nets of half and a quarter of its knot spans, coarse to fine, and from transport where
     the design would begin there; Adam on the heights themselves and on the networks of the thesis, on its control net.  Rays,
-    filter, apron and loss are those of the last stage.
+    filter, apron and loss are those of the last stage on rays.
 
     Raises:
         InputError: a setting is out of range.
     """
-    last, options = build_stages(full)[-1], build_options(full)
+    last, options = [s for s in build_stages(full) if not s.waves][-1], build_options(full)
     options = replace(options, dtype=dtype or options.dtype, seed=options.seed if seed is None else seed)
     last = replace(last, blur=0.0, iterations=ENDLESS, tolerance=0.0, source=None)
     lens = scene.lens

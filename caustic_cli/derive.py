@@ -12,11 +12,20 @@ import torch
 
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Options
-from caustic_cli.inverse.schedule import LEAST_SPANS, Stage, coarse_to_fine, refinement, refinement_spans
+from caustic_cli.inverse.schedule import (
+    LEAST_RAYS,
+    LEAST_SPANS,
+    Stage,
+    coarse_to_fine,
+    refinement,
+    refinement_spans,
+    wave_refinement,
+)
 from caustic_cli.optics.reconstruction import Filter
-from caustic_cli.scene import Offset, Screen, Source, checks, sources
+from caustic_cli.optics.resolution import BAND, Resolution, white
+from caustic_cli.scene import Offset, Scene, Screen, Source, checks, sources
 from caustic_cli.scene.light import RGB
-from caustic_cli.settings import DEFAULTS, build_screen, build_source, index_of, with_defaults
+from caustic_cli.settings import DEFAULTS, build_lens, build_light, build_screen, build_source, index_of, with_defaults
 
 DEFAULT_MAG = 3.0
 DEFAULT_MARGIN = 0.28  # table 6.1: the screen is 6.4 wide where the picture is 5
@@ -27,6 +36,8 @@ RAYS_PER_PIXEL = 9.0  # 750 x 750 rays on 250 x 250 pixels, tables D.1 and D.2
 SINGLE_STAGE_ITERATIONS = 1000  # thesis 6.2.1
 DRAFT_SECONDS, FINE_SECONDS = 8.0, 60.0  # time limits below and from which another quality is the better use of the time
 STEEPEST = 1.25  # least radius of a derived sphere, in half diagonals of the lens: slopes up to 1.3
+WAVE_TOLERANCE = 1e-3  # of a stage on the wave image
+WAVE_KEYS = ("control", "blur", "apron", "iterations", "tolerance")  # of a stage on rays that one on the wave image has too
 COLOR_GLASS = "N-BK7"  # of a coloured picture, unless glass or index is said: dispersion has to be known
 
 Settings = dict[str, dict[str, Any]]
@@ -157,10 +168,36 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
     else:
         stages = [Stage(tuple(lens["control"]), rays or base, sampler, apron=math.ceil(0.04 * max(nx, ny)),
                         iterations=SINGLE_STAGE_ITERATIONS, tolerance=2e-3 if plain else 0.0)]
+    stages += _wave_stages(s, source, quality, plain)
     design["stages"] = [_stage_table(stage) for stage in stages]
     if design["loss"].strip() == "rms":  # eq. 5.2.1 knows the screen alone
         for table in design["stages"]:
             table["apron"] = 0
+
+
+def _wave_stages(s: Settings, source: Source, quality: str, plain: bool) -> list[Stage]:
+    """What refines the wave image after the ray image, where that is asked for or called for."""
+    design, lens, screen = s["design"], s["lens"], s["screen"]
+    asked = checks.choice("[design] waves", design["waves"], ("auto", "on", "off"))
+    if asked == "on" and design["network"] != "none":
+        raise InputError("[design] waves on needs network none: the wave image refines the heights themselves")
+    if asked == "off" or (asked == "auto" and (not plain or any(screen.get("tilt", ())))):
+        return []
+    seen = Resolution.before(Scene(source, build_lens(s), build_screen(s), build_light(s)), tuple(s["target"]["size"]))
+    if asked == "auto" and not seen.matters:
+        return []
+    own = s["source"].get("wavelengths", [])
+    plan = wave_refinement(_wave_samples(s, seen), len(own), quality, hurry=asked == "auto")
+    apron = math.ceil(0.04 * max(screen["resolution"]))
+    return [Stage(tuple(lens["control"]), LEAST_RAYS, apron=apron, iterations=n, tolerance=WAVE_TOLERANCE,
+                  waves=tuple(map(float, own)) or white(count)) for count, n in plan]
+
+
+def _wave_samples(s: Settings, seen: Resolution) -> float:
+    """About how many samples the field of one wavelength needs: the picture and its blur on each side, times the lens."""
+    throw, shortest = abs(s["screen"]["z"]), min(s["source"].get("wavelengths", []) or BAND[:1]) * 1e-6
+    return math.prod(w * (t + 4.0 * seen.diffraction) / (shortest * throw)
+                     for w, t in zip(s["lens"]["size"], s["target"]["size"], strict=True))
 
 
 def _quality(time_limit: float) -> str:
@@ -174,6 +211,9 @@ def _sampler(source: Source) -> str:
 
 
 def _stage_table(stage: Stage) -> dict[str, Any]:
+    if stage.waves:
+        return {"control": list(stage.control), "waves": list(stage.waves), "blur": stage.blur, "apron": stage.apron,
+                "iterations": stage.iterations, "tolerance": stage.tolerance}
     return {"control": list(stage.control), "rays": stage.rays, "sampler": stage.sampler,
             "reconstruction": stage.filter.kind, "filter_size": list(stage.filter.size), "blur": stage.blur,
             "apron": stage.apron, "iterations": stage.iterations, "tolerance": stage.tolerance,
@@ -181,11 +221,15 @@ def _stage_table(stage: Stage) -> dict[str, Any]:
 
 
 def _complete_stage(table: dict[str, Any], s: Settings, sampler: str) -> dict[str, Any]:
+    base = _stage_base(s, sampler)
+    return {**({k: base[k] for k in WAVE_KEYS} if table.get("waves") else base), **table}
+
+
+def _stage_base(s: Settings, sampler: str) -> dict[str, Any]:
     nx, ny = s["screen"]["resolution"]
-    base = {"control": list(s["lens"]["control"]), "rays": int(RAYS_PER_PIXEL * nx * ny), "sampler": sampler,
+    return {"control": list(s["lens"]["control"]), "rays": int(RAYS_PER_PIXEL * nx * ny), "sampler": sampler,
             "reconstruction": "cosine", "filter_size": [3, 3], "blur": 0.0, "apron": 0,
             "iterations": SINGLE_STAGE_ITERATIONS, "tolerance": 0.0, "oversample": 1}
-    return {**base, **table}
 
 
 def filter_from(kind: str, size, screen: Screen, per_mm2: float | None = None, per_pixel2: float | None = None) -> Filter:
@@ -210,10 +254,11 @@ def build_stages(settings: Settings) -> list[Stage]:
     on = build_screen(settings)
     stages = []
     for t in settings["design"].get("stages", []):
+        t = _stage_base(settings, "grid") | t
         f = filter_from(t["reconstruction"], t["filter_size"], on, t.get("alpha_per_mm2"), t.get("alpha_per_pixel2"))
         source = build_source(settings, type=t["source"]) if "source" in t else None
         stages.append(Stage(tuple(t["control"]), t["rays"], t["sampler"], f, t["blur"], t["apron"], t["iterations"],
-                            t["tolerance"], source, t["oversample"]))
+                            t["tolerance"], source, t["oversample"], tuple(t.get("waves", ()))))
     if not stages:
         raise InputError("[[design.stages]] at least one stage is needed")
     if list(stages[-1].control) != list(settings["lens"]["control"]):
@@ -233,4 +278,4 @@ def build_options(settings: Settings) -> Options:
         if not d[key] > 0:
             raise InputError(f"[design] {key} must be greater than 0 s, got {d[key]:g}")
     return Options(d["loss"], d["optimizer"], d["lr"], d["network"], d["initial"], d["preconditioner"],
-                   d["filter_target"], d["seed"], dtype, d["max_slope"], d["min_radius"])
+                   d["filter_target"], d["seed"], dtype, d["max_slope"], d["min_radius"], d["waves"] == "on")

@@ -26,6 +26,7 @@ from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.first import first_surface
 from caustic_cli.inverse.schedule import transport_cells
 from caustic_cli.inverse.target import grey
+from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.picture import read_picture
 from caustic_cli.project import CHECKPOINT, RENDER, TOML, Project, is_project
@@ -118,17 +119,30 @@ def design(project: Project, first: torch.Tensor | None, device: str, say: Repor
         return figures or resume(project, None, None, device, say, began)
     with project.hold:
         designer, target = _designer(project, device)
-        _say_blur(designer.scene, say)
+        _say_resolution(project, designer, say)
         state = designer.begin(first)
         return _run(project, designer, target, state, say, began, 0, None, device)
 
 
-def _say_blur(scene: Scene, say: Reporter) -> None:
-    """What no lens can do about an extended source, before time is spent on it."""
+def _say_resolution(project: Project, designer: Designer, say: Reporter) -> None:
+    """What no lens can do about diffraction and an extended source, before time is spent on it."""
+    scene = designer.scene
+    seen = Resolution.before(scene, tuple(project.settings["target"]["size"]))
+    if seen.matters or seen.source > 0:
+        say.say(seen.sentence())
+    waves = project.settings["design"]["waves"]
+    if seen.matters and waves == "auto" and not any(s.waves for s in designer.stages):
+        say.say("rays alone are refined: the wave image would take longer than this quality allows, or is not asked for by default"
+                " here; --waves on refines it")
     blur, pixel = scene.source.blur(scene.lens.z_in, abs(scene.screen.z - scene.lens.z_in)), max(scene.screen.pixel)
     if blur > 0:
         finer = f"; the picture's detail below that, {blur / pixel:.3g} pixels, is out of reach" if blur > pixel else ""
         say.say(f"the source's own size blurs every point over {blur:.3g} mm on the screen{finer}")
+
+
+def _listed(wavelengths: tuple[float, ...]) -> str:
+    """Numbers in a clause."""
+    return ", ".join(f"{w:.4g}" for w in wavelengths)
 
 
 def resume(project: Project, iterations: int | None, time_limit: float | None, device: str, say: Reporter,
@@ -201,7 +215,7 @@ def _first_heights(project: Project, lifted: bool) -> torch.Tensor | None:
         return None
     if start == "transport":
         designer, target = _designer(project, "cpu")
-        cells = transport_cells(designer.stages[-1].rays, not designer.scene.source.collimated)
+        cells = transport_cells(max(s.rays for s in designer.stages), not designer.scene.source.collimated)
         found = first_surface(designer.scene, grey(target), designer.field(0), cells)
         lens = designer.scene.lens
         short = lens.z_in + lens.min_thickness - float(found.min())
@@ -269,8 +283,8 @@ def _run(project: Project, designer: Designer, target: np.ndarray, state: State,
             if now.stage != stage:
                 stage = now.stage
                 s = designer.stages[stage]
-                say.say(f"stage {stage + 1}/{len(designer.stages)}: {s.control[0]} x {s.control[1]} control points,"
-                        f" {s.rays:,} rays, blur {s.blur:g} px")
+                light = f"the wave image at {_listed(s.waves)} nm" if s.waves else f"{s.rays:,} rays, blur {s.blur:g} px"
+                say.say(f"stage {stage + 1}/{len(designer.stages)}: {s.control[0]} x {s.control[1]} control points, {light}")
             _, _, loss, on_screen, _ = now.history[-1]
             show(f"stage {stage + 1}/{len(designer.stages)}",
                  f"loss {loss * grey(target).size:.4f}  on screen {on_screen:.1%}", now.total, total)

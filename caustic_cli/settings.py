@@ -97,6 +97,7 @@ SCHEMA: dict[str, dict[str, Key]] = {
         "initial": Key("text", "parameters at first: zero, uniform (+-1e-4) or random"),
         "preconditioner": Key("text", "none or laplacian"),
         "filter_target": Key("flag", "filter the target as the render is filtered"),
+        "waves": Key("text", "auto, on or off: refine the wave image after the ray image"),
         "start": Key("text", "transport, offset, or the project or file whose lens was the first surface"),
         "iterations": Key("whole", "in all; 0: what the stages say"),
         "time_limit": Key("number", "s; inf for none"),
@@ -119,13 +120,14 @@ STAGE: dict[str, Key] = {
     "apron": Key("whole", "dark pixels around the screen that catch stray light"),
     "iterations": Key("whole"),
     "tolerance": Key("number", "ends the stage when 10 iterations gain less than this part; 0 never"),
+    "waves": Key("list", "nm, refine the wave image at these, of light that says none, instead of the ray image"),
 }
 DEFAULTS: dict[str, dict[str, Any]] = {
     "source": {"type": "plane", "power": 1.0, "intensity": "uniform", "aim": True},
     "lens": {"size": [10.0, 10.0], "z_in": 0.0, "min_thickness": 1.0, "fresnel": "exact", "degree": [3, 3]},
     "screen": {"z": 300.0},
     "target": {"encoding": "srgb", "flip": ""},
-    "design": {"loss": "rms-light", "optimizer": "lbfgs", "lr": 1e-3, "network": "none", "initial": "zero",
+    "design": {"loss": "rms-light", "optimizer": "lbfgs", "waves": "auto", "lr": 1e-3, "network": "none", "initial": "zero",
                "filter_target": True, "max_slope": 0.0, "min_radius": 0.0, "iterations": 0, "time_limit": math.inf,
                "checkpoint_every": 10.0, "seed": 0, "dtype": "float32"},
 }

@@ -13,12 +13,15 @@ import torch
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.losses import parse
 from caustic_cli.inverse.target import grey
+from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.waves import WaveImage
 from caustic_cli.picture import write_image
 from caustic_cli.project import RENDER, REPORT, Project
 from caustic_cli.studies.panels import write_report
 from caustic_cli.studies.retrace import FINAL_RAYS, retrace, white_level
+from caustic_cli.studies.waves import beside, unseen_figures, wave_figures
 
 #: Points along each side of the aperture at which the report draws the surface.
 REPORT_SAMPLES = 401
@@ -31,7 +34,8 @@ BRIGHTER = 1.01
 def judge(project: Project, designer: Designer, target: np.ndarray, state: State, device: str) -> tuple[State, dict]:
     """Retrace the finished lens; write render.png and report.png.
 
-    Where nothing but likeness was asked for, a lens that is worse than what the design began from is replaced by that.
+    Where nothing but likeness was asked for, a lens that is worse than what the design began from is replaced by that: by the wave
+    image where that was refined, whose figures are then there too.
 
     Returns:
         the state with the lens that was kept, and its figures, with start_relative_rms where a start was retraced.
@@ -41,20 +45,41 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
     def trace(heights: torch.Tensor):
         return retrace(scene, field, heights, target, rays=FINAL_RAYS, device=device, seed=seed)
 
+    waves = any(s.waves for s in designer.stages[: state.stage + 1])
+    light, seen = None, Resolution.before(scene, tuple(project.settings["target"]["size"]))
+
+    def as_waves(heights: torch.Tensor) -> tuple[WaveImage | None, dict]:
+        return wave_figures(scene, field, heights.to(device), target, seen, required=designer.options.waves)
+
     exposure, figures = trace(state.heights)
+    if waves:
+        light, more = as_waves(state.heights)
+        figures |= more
     likeness = {name for _, name in parse(designer.options.loss)} <= LIKENESS
     if state.start is not None and likeness:
         start = designer.within_limits(replace(state, heights=designer.begun(state)))
         first, began = trace(start)
+        of_start = None
+        if waves:
+            of_start, more = as_waves(start)
+            began |= more
         if _worse(figures, began):
             state = replace(designer.showing(state, start), reason=f"{state.reason}; its start was better and is kept")
-            exposure, figures = first, began
+            exposure, figures, light = first, began, of_start
         figures = figures | {"start_relative_rms": began["relative_rms"]}
+        if waves:
+            figures |= {"start_wave_relative_rms": began["wave_relative_rms"]}
+    if light is not None:
+        figures |= unseen_figures(scene, field, state.heights.to(device), target)
     image, encoding = exposure.image.cpu().numpy(), project.settings["target"]["encoding"]
     write_image(project.path / RENDER, image, white_level(image, target), encoding)
+    of_light = None
+    if light is not None:
+        of_light = light.image.cpu().numpy()
+        write_image(beside(project.path / RENDER), of_light, white_level(of_light, target), encoding)
     history = np.array(state.history, dtype=float).reshape(-1, 5)
     write_report(project.path / REPORT, grey(target), grey(image), _surface(field, state.heights), history, scene.lens,
-                 scene.screen, figures, encoding)
+                 scene.screen, figures, encoding, None if of_light is None else grey(of_light))
     return state, figures
 
 
@@ -62,8 +87,9 @@ def _worse(figures: dict, than: dict) -> bool:
     """Whether a picture is less like its target without being brighter; a black one is worse than any other."""
     if than["on_screen"] == 0:
         return False
-    return figures["on_screen"] == 0 or (figures["relative_rms"] > than["relative_rms"]
-                                         and figures["on_screen"] < BRIGHTER * than["on_screen"])
+    as_waves = None not in (f.get("wave_relative_rms") for f in (figures, than))
+    likeness, light = ("wave_relative_rms", "wave_on_screen") if as_waves else ("relative_rms", "on_screen")
+    return figures["on_screen"] == 0 or (figures[likeness] > than[likeness] and figures[light] < BRIGHTER * than[light])
 
 
 def _surface(field: HeightField, heights: torch.Tensor) -> np.ndarray:

@@ -226,8 +226,8 @@ def test_a_design_is_never_worse_than_its_start(capfd):
 
 
 def test_transport_begins_where_the_offset_ends(capfd):
-    sphere = design(capfd, "blob.png", *TINY, "--start", "offset", "-o", "sphere")
-    fine = ["--resolution", "24", "--control", "35", "--rays", "40000", "--quiet", "--threads", "1"]
+    sphere = design(capfd, "blob.png", *TINY, "--start", "offset", "--waves", "off", "-o", "sphere")
+    fine = ["--resolution", "24", "--control", "35", "--rays", "40000", "--waves", "off", "--quiet", "--threads", "1"]
     moved = design(capfd, "blob.png", *fine, "--iterations", 1, "-o", "moved")
     assert moved["relative_rms"] < 1.2 * sphere["relative_rms"]
     assert load("moved").state.history[0][2] < 0.7 * load("sphere").state.history[0][2]
@@ -246,7 +246,7 @@ def test_a_start_that_a_fixed_thickness_would_cut_is_lifted(capfd):
 @pytest.mark.parametrize("limit, control, rays", [(5, 32, 40_000), (20, 48, 40_000), (90, 48, 256 * 24 * 24)])
 def test_the_time_limit_chooses_the_quality(capfd, limit, control, rays, monkeypatch):
     monkeypatch.setattr(session, "_run", lambda *args: {"lost": {}, "image": "", "reason": ""})
-    design(capfd, "blob.png", "--resolution", "24", "--quiet", "--threads", "1", "--time-limit", limit, "-o", "p")
+    design(capfd, "blob.png", "--resolution", "24", "--waves", "off", "--quiet", "--threads", "1", "--time-limit", limit, "-o", "p")
     stages = session.Project.open("p").settings["design"]["stages"]
     assert stages[-1]["control"] == [control + 3, control + 3]
     assert stages[-1]["rays"] == rays and len(stages) == {5: 1, 20: 2, 90: 3}[limit]
@@ -277,7 +277,7 @@ def test_the_two_losses_lead_to_different_lenses(capfd):
 
 @pytest.mark.parametrize(("quality", "total"), [("draft", 115), ("standard", 200), ("fine", 360)])
 def test_quality(capfd, quality, total):
-    design(capfd, "blob.png", *TINY, "--quality", quality, "--start", "offset", "--iterations", 1)
+    design(capfd, "blob.png", *TINY, "--quality", quality, "--start", "offset", "--waves", "off", "--iterations", 1)
     text = (Path("blob.caustic") / "project.toml").read_text()
     assert sum(int(line.split("=")[1].split("#")[0]) for line in text.split("[[design.stages]]", 1)[1].splitlines()
                if line.startswith("iterations")) == total

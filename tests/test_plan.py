@@ -129,7 +129,7 @@ def test_a_plane_wave_without_effects_runs_the_bare_path(monkeypatch):
     plan = plan_of(scene, heights)
     assert plan.scene is scene and plan.requests == NO_REQUESTS
     assert is_lowered(plan.scene, HeightField.of(scene.lens), plan.requests)
-    assert plan.simulated == ("fresnel",)
+    assert plan.simulated == ("fresnel", "diffraction")
     (sample,) = rays_of(scene, "lines", 100).chunks()
     traced = traced_through(plan.scene, sample, plan.requests)
     assert type(traced.fused).__name__ == "PlaneImage" and traced.actions == () and not traced.recorded
@@ -164,7 +164,7 @@ def test_leaving_out_matters_where_the_effect_is():
     plan = plan_of(scene, heights)
     whole, checked = image_of(plan, heights), 0
     for name in plan.simulated:
-        if not (plan[name].fixed or name in ("total-reflection", "second-meeting")):
+        if not (plan[name].fixed or name in ("total-reflection", "second-meeting", "diffraction")):
             less = image_of(plan_of(scene, heights, set(plan.simulated) - {name}), heights)
             assert float((less.image - whole.image).abs().sum()) > 1e-5, name
             checked += 1
@@ -177,6 +177,6 @@ def test_names():
     with pytest.raises(InputError, match="did you mean ghosts"):
         parse_effects("ghost")
     names = [effect.name for effect in EFFECTS]
-    assert len(set(names)) == len(names) == 15
+    assert len(set(names)) == len(names) == 16
     assert {effect.name for effect in EFFECTS if effect.free} == {"missed-surface", "total-reflection", "screen-shift"}
     assert replace(NO_REQUESTS, stages=True) == STAGES != NO_REQUESTS

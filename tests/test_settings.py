@@ -188,14 +188,15 @@ def test_glass_replaces_the_index():
         complete({"lens": {"glass": "N-BK7", "index": 1.5}}, 1.0)
 
 
-OFFSET = {"design": {"start": "offset"}}
+OFFSET = {"design": {"start": "offset", "waves": "off"}}
+RAYS = {"design": {"waves": "off"}}
 
 
 @pytest.mark.parametrize(("quality", "first", "last"), [("draft", 15, 25), ("standard", 25, 50), ("fine", 40, 120)])
 def test_quality_shapes_the_stages(quality, first, last):
     stages = complete(OFFSET, 1.0, quality=quality)["design"]["stages"]
     assert stages[0]["iterations"] == first and stages[-1]["iterations"] == last
-    moved = [complete({}, 1.0, quality=q)["design"]["stages"] for q in ("draft", "standard", "fine")]
+    moved = [complete(RAYS, 1.0, quality=q)["design"]["stages"] for q in ("draft", "standard", "fine")]
     assert [len(s) for s in moved] == [1, 2, 3]
     assert [s[-1]["control"][0] for s in moved] == sorted(s[-1]["control"][0] for s in moved)
 

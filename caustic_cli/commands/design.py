@@ -74,6 +74,8 @@ def run(
     loss: Annotated[Text, typer.Option(help="rms (eq. 5.2.1), rms-light, where every ray counts, throughput, diffusion,"
                                        " uniformity, laplacian, curvature; or a weighted sum: 'rms-light + 0.01 laplacian'."
                                        "  [default: rms-light]")] = None,
+    waves: Annotated[Text, typer.Option(metavar="auto|on|off", help="Refine the wave image after the ray image: where diffraction"
+                                        " matters and time allows, always, or never.  [default: auto]")] = None,
     network: Annotated[Text, typer.Option(help="none, sparse or dense.  [default: none]")] = None,
     optimizer: Annotated[Text, typer.Option(help="lbfgs or adam.  [default: lbfgs; adam for a network]")] = None,
     lr: Annotated[float | None, typer.Option(help="Learning rate of adam.  [default: 0.001]")] = None,
@@ -117,6 +119,7 @@ def run(
         ("target", "flip", "--flip"): flip,
         ("target", "color", "--color"): color or None,
         ("design", "loss", "--loss"): loss,
+        ("design", "waves", "--waves"): waves,
         ("design", "network", "--network"): network,
         ("design", "optimizer", "--optimizer"): optimizer or ("adam" if network in ("sparse", "dense") else None),
         ("design", "lr", "--lr"): lr,

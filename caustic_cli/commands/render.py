@@ -90,10 +90,12 @@ def run(
     from caustic_cli.derive import filter_from  # noqa: PLC0415
     from caustic_cli.files import refuse_foreign  # noqa: PLC0415
     from caustic_cli.optics.plan import compile_plan, parse_effects  # noqa: PLC0415
+    from caustic_cli.optics.resolution import Resolution  # noqa: PLC0415
     from caustic_cli.picture import write_image, write_npy  # noqa: PLC0415
     from caustic_cli.project import RENDER, Project  # noqa: PLC0415
     from caustic_cli.reuse import Outputs  # noqa: PLC0415
     from caustic_cli.studies.retrace import retrace, white_level  # noqa: PLC0415
+    from caustic_cli.studies.waves import beside, wave_figures  # noqa: PLC0415
 
     wanted = parse_effects(effects)
     opened = archive = None
@@ -108,10 +110,11 @@ def run(
     image_path = output or (project / RENDER if opened else Path(project.stem + ".png"))
     panels = image_path.with_name("verify.png" if output is None else f"{image_path.stem}-verify.png") if verify else None
     sheet = image_path.with_name("report.json" if output is None else f"{image_path.stem}-report.json") if report else None
-    for path in (image_path, npy, panels, sheet):
+    of_waves = beside(image_path), beside(npy) if npy else None
+    for path in (image_path, npy, panels, sheet, *of_waves):
         if path is not None:
             refuse_foreign(path, force)
-    made = Outputs(opened, "render", asked, (image_path, npy, panels, sheet)) if opened and not verify else None
+    made = Outputs(opened, "render", asked, (image_path, npy, panels, sheet, *of_waves)) if opened and not verify else None
     if made and not force and (figures := made.found()):
         say.say(f"{image_path}: is what the same options made of the same project, so there is nothing to do; --force does it"
                 " again")
@@ -148,6 +151,19 @@ def run(
     write_image(image_path, image, white_level(image, target), encoding)
     if npy is not None:
         write_npy(npy, image)
+    if plan["diffraction"].on:
+        with say.patience("taking the wave image"):
+            seen = Resolution.before(plan.scene, tuple(opened.settings["target"]["size"])) if opened else \
+                Resolution.at(plan.scene, field, heights)
+            light, more = wave_figures(plan.scene, field, heights.to(device), target, seen, finer=1.0,
+                                       required=wanted is not None)
+        figures |= more
+        if light is not None:
+            of_light = light.image.cpu().numpy()
+            write_image(of_waves[0], of_light, white_level(of_light, target), encoding)
+            if npy is not None:
+                write_npy(of_waves[1], of_light)
+            figures |= {"wave_image": str(of_waves[0])}
     figures |= {"iterations": iterations, "seconds": time.monotonic() - began, "image": str(image_path)}
     say.table(f"{project}", console.figures_rows(figures))
     if explain:

@@ -19,12 +19,14 @@ from caustic_cli.inverse import ranks
 from caustic_cli.inverse.limits import within_limits
 from caustic_cli.inverse.losses import parse
 from caustic_cli.inverse.objective import Objective
-from caustic_cli.inverse.parametrisation import INITIAL, NETWORKS, PRECONDITIONERS, Heights, parametrise
+from caustic_cli.inverse.parametrisation import INITIAL, NETWORKS, PRECONDITIONERS, FreeHeights, Heights, parametrise
 from caustic_cli.inverse.schedule import Stage
 from caustic_cli.inverse.steps import Adam, Newtonlike
+from caustic_cli.inverse.waves import WaveObjective
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.waves import NoWaveImage
 from caustic_cli.scene import Scene, checks
 
 OPTIMIZERS = ("lbfgs", "adam")
@@ -40,7 +42,7 @@ class Options:
     min_radius: least radius of concave places, mm, 0 for any;
     optimizer, lr: lbfgs, or adam with its learning rate; network, initial, preconditioner:
     see `parametrisation`; filter_target: filter the target as the render is filtered; seed: of rays and networks;
-    dtype: precision of the rays.
+    dtype: precision of the rays; waves: stages on the wave image have to be, see `NoWaveImage`.
     """
 
     loss: str = "rms-light"
@@ -54,6 +56,7 @@ class Options:
     dtype: torch.dtype = torch.float32
     max_slope: float = 0.0
     min_radius: float = 0.0
+    waves: bool = False
 
     def __post_init__(self):
         parse(self.loss)
@@ -111,6 +114,8 @@ class Designer:
             raise InputError("[design] loss: throughput needs dark pixels around the screen that catch stray light; every stage"
                              " needs an apron")
         self.scene, self.target, self.stages, self.options, self.device = scene, target, stages, options, device
+        if options.network != "none" and any(s.waves for s in stages):
+            raise InputError("[[design.stages]] waves needs network none: the wave image refines the heights themselves")
         for stage in stages:
             self._bounds(stage)  # refuse an impossible lens before any work
 
@@ -161,7 +166,7 @@ class Designer:
         began, before = time.monotonic(), state.seconds
         limit = iterations or sum(s.iterations for s in self.stages)
         last = len(self.stages) - 1
-        costs = [s.iterations * (s.rays + 20.0 * s.control[0] * s.control[1]) for s in self.stages]
+        costs = [s.cost for s in self.stages]
         ahead = sum(costs[state.stage :])
         state.reason = ""
         for k in range(state.stage, last + 1):
@@ -204,8 +209,16 @@ class Designer:
                 return not final
             if method is None:
                 heights = self._module(state)
-                method = (Adam if self.options.optimizer == "adam" else Newtonlike)(
-                    self._objective(k), heights, self.options.lr)
+                try:
+                    objective = self._objective(k, heights)
+                except NoWaveImage as error:
+                    if self.options.waves:
+                        raise
+                    notice(f"stage {k + 1}: the wave image is not refined: {error}")
+                    state.reason = "no wave image"
+                    return True
+                adam = self.options.optimizer == "adam" and not stage.waves
+                method = (Adam if adam else Newtonlike)(objective, heights, self.options.lr)
                 if state.optimizer:
                     method.load(state.optimizer)
             told = method.taken_back > 0
@@ -224,10 +237,14 @@ class Designer:
             state.parameters, state.optimizer = heights.state_dict(), method.state()
             on_iteration(state)
 
-    def _objective(self, k: int) -> Objective:
+    def _objective(self, k: int, heights: Heights) -> Objective | WaveObjective:
         stage, o, scene = self.stages[k], self.options, self.scene
         if stage.source is not None:
             scene = replace(scene, source=stage.source)
+        if stage.waves:
+            return WaveObjective(scene, self.field(k), heights.begun(), self.target, o.loss, wavelengths=stage.waves,
+                                 blur=stage.blur, apron=stage.apron, max_slope=o.max_slope, min_radius=o.min_radius,
+                                 dtype=o.dtype, device=self.device)
         rays = rays_of(scene, stage.sampler, stage.rays, stream(o.seed, f"stage {k}"), self.device)
         return Objective(scene, self.field(k), rays, stage.filter, self.target, o.loss, blur=stage.blur,
                          filter_target=o.filter_target, apron=stage.apron, max_slope=o.max_slope, min_radius=o.min_radius,
@@ -235,7 +252,7 @@ class Designer:
 
     def _next(self, state: State, k: int) -> State:
         """The state at the beginning of stage k: the same surface on its net."""
-        keep = self.options.network != "none" or self.options.optimizer == "adam"
+        keep = self.options.network != "none" or (self.options.optimizer == "adam" and not self.stages[k].waves)
         if self.stages[k].control == self.stages[k - 1].control and keep:
             return replace(state, stage=k, iteration=0, optimizer={})
         if self.options.network != "none":
@@ -246,6 +263,8 @@ class Designer:
     def _parametrise(self, k: int, start: Tensor | None) -> Heights:
         o = self.options
         low, high = self._bounds(self.stages[k])
+        if self.stages[k].waves:
+            return FreeHeights(low, high, start, counted=True)
         return parametrise(low, high, o.network, start=start, degree=self.scene.lens.degree, initial=o.initial,
                            preconditioner=o.preconditioner, seed=o.seed)
 

@@ -44,6 +44,13 @@ class Evaluation:
         return self.gradients[EXIT]
 
 
+def penalty_of(scene: Scene, field: HeightField, loss: str, max_slope: float, min_radius: float,
+               device: str | torch.device) -> Penalty:
+    """What a loss and the limits say of the surface itself."""
+    terms = [(weight, name) for weight, name in parse(loss) if name in PENALTIES and weight > 0]
+    return Penalty(scene, field, terms, max_slope, device, min_radius)
+
+
 class Objective:
     """The loss as a function of the heights.
 
@@ -77,8 +84,7 @@ class Objective:
             fine = wide.repeat_interleave(oversample, -2).repeat_interleave(oversample, -1)
             smooth = self._pool(torch.stack([filter.smooth(c) for c in fine]) if scene.colored else filter.smooth(fine))
         self.loss = (ColorLoss if scene.colored else Loss)(loss, smooth, blur, apron, wide > 0)
-        terms = [(weight, name) for weight, name in parse(loss) if name in PENALTIES and weight > 0]
-        self.penalty = Penalty(scene, field, terms, max_slope, sampler.device, min_radius)
+        self.penalty = penalty_of(scene, field, loss, max_slope, min_radius, sampler.device)
         self.scene, self.field, self.sampler, self.dtype = scene, field, sampler, dtype
         self.chunk, self.kept = CHUNK, None
         if sampler.count <= KEPT_RAYS:

@@ -4,7 +4,8 @@
 
     none      raw = parameters themselves, or with the Laplacian preconditioner
               raw = start + C_u^T (s o y) C_v, y the parameters, C orthonormal cosine transforms (DCT-II) and
-              s_kl = 1 / (lambda_k + lambda_l), lambda_k = 4 sin^2(pi k / 2n), the inverse Laplacian of the control net
+              s_kl = 1 / (lambda_k + lambda_l), lambda_k = 4 sin^2(pi k / 2n), the inverse Laplacian of the control net;
+              or raw = start + y, counted from the start
     sparse    1 -> a tanh layer of control-net size -> a locally connected layer, kernel (2p + 1) x (2q + 1), own weights
     dense     1 -> three tanh layers of control-net size joined by two full matrices
 
@@ -69,14 +70,15 @@ class FreeHeights(Heights):
 
     Args:
         start: (n, m) heights to start from, or None for the middle of the range.
+        counted: parameters are counted from the start, which `begun` tells.
     """
 
-    def __init__(self, low: Tensor, high: Tensor, start: Tensor | None = None, laplacian: bool = False):
+    def __init__(self, low: Tensor, high: Tensor, start: Tensor | None = None, laplacian: bool = False, counted: bool = False):
         super().__init__(low, high)
-        self.laplacian = laplacian
+        self.laplacian, counted = laplacian, counted or laplacian
         raw = torch.zeros_like(low) if start is None else self.invert(start)
-        self.register_buffer("start", raw if laplacian else None)
-        self.y = torch.nn.Parameter(torch.zeros_like(raw) if laplacian else raw.clone())
+        self.register_buffer("start", raw if counted else None)
+        self.y = torch.nn.Parameter(torch.zeros_like(raw) if counted else raw.clone())
         if laplacian:
             n, m = low.shape
             self.cu, self.cv = cosine_transform(n).to(low), cosine_transform(m).to(low)
@@ -87,8 +89,12 @@ class FreeHeights(Heights):
 
     def raw(self) -> Tensor:
         if not self.laplacian:
-            return self.y
+            return self.y if self.start is None else self.start + self.y
         return self.start + self.cu.T @ (self.scale * self.y) @ self.cv
+
+    def begun(self) -> Tensor:
+        """The heights (n, m) that parameters are counted from."""
+        return self.low + 0.5 * (1.0 + torch.tanh(self.start.double())) * self.span
 
 
 class NetworkHeights(Heights):

@@ -14,6 +14,8 @@ from caustic_cli.optics.sampling import SAMPLERS
 from caustic_cli.scene import Source, checks
 
 QUALITIES = ("draft", "standard", "fine")
+#: Rays that take as long as the transform at one wavelength of a scene of usual size.
+RAYS_A_WAVE = 600_000
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,8 @@ class Stage:
         source: what shines during this stage, None for the scene's own (6.4: a point first, then the grid).
         tolerance: ends the stage when ten iterations lowered the loss by less than this part; 0 never.
         oversample: see `Objective`.
+        waves: nm, the wavelengths at which the wave image is refined instead of the ray image, of light that says none; empty for
+            rays.
     """
 
     control: tuple[int, int]
@@ -42,6 +46,7 @@ class Stage:
     tolerance: float = 2e-3
     source: Source | None = None
     oversample: int = 1
+    waves: tuple[float, ...] = ()
 
     def __post_init__(self):
         checks.whole("[[design.stages]] rays", self.rays, 1, 10**12)
@@ -51,6 +56,14 @@ class Stage:
         checks.whole("[[design.stages]] iterations", self.iterations, 0, 10**9)
         checks.number("[[design.stages]] tolerance", self.tolerance, 0.0, 1.0)
         checks.whole("[[design.stages]] oversample", self.oversample, 1, 8)
+        for wavelength in self.waves:
+            checks.number("[[design.stages]] waves", wavelength, 100.0, 20_000.0)
+
+    @property
+    def cost(self) -> float:
+        """Of all its iterations, in rays."""
+        each = RAYS_A_WAVE * len(self.waves) if self.waves else self.rays
+        return self.iterations * (each + 20.0 * self.control[0] * self.control[1])
 
 
 def coarse_to_fine(control: tuple[int, int], degree: tuple[int, int], rays: int, resolution: tuple[int, int],
@@ -127,3 +140,32 @@ def refinement(control: tuple[int, int], rays: int | None, resolution: tuple[int
         stages.append(Stage(control, max(1, round(part * rays)), "grid", filter, 0.0, apron,
                             iterations, oversample=finer))
     return stages
+
+
+#: What a quality means for the refinement on the wave image: wavelengths of white light, iterations of each stage, and how many
+#: seconds `waves = "auto"` may take for it on two cores.
+WAVES = {
+    "draft": (3, (10,), 8.0),
+    "standard": (5, (16, 24), 25.0),
+    "fine": (8, (40, 50, 50), 90.0),
+}
+#: Seconds on two cores for one sample of the field in one iteration: at each wavelength, and for the spline there.
+SECONDS_A_SAMPLE, SECONDS_A_POINT = 2.2e-8, 6e-8
+#: Fewer iterations than these are not worth an exact trace.
+LEAST_WAVES = 5
+
+
+def wave_refinement(samples: float, wavelengths: int, quality: str = "standard", hurry: bool = True) -> list[tuple[int, int]]:
+    """Stages on the wave image after those on rays: (wavelengths of white light, iterations) each.
+
+    Args:
+        samples: of the field at one wavelength.
+        wavelengths: of the source; 0 for white light.
+        hurry: keep within the quality's time, with fewer iterations or none at all.
+    """
+    checks.choice("--quality", quality, QUALITIES)
+    count, plan, seconds = WAVES[quality]
+    each = samples * (SECONDS_A_SAMPLE * (wavelengths or count) + SECONDS_A_POINT)
+    part = min(1.0, seconds / (each * sum(plan))) if hurry else 1.0
+    stages = [(count, int(part * n)) for n in plan]
+    return [s for s in stages if s[1] >= LEAST_WAVES]

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.optics.interface import reflectance, reflectances
+from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.sampling import LARGEST_NORMAL
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
@@ -33,7 +34,8 @@ class Bounds:
     microfacets' normals; index: the largest of all wavelengths; critical: n sin i, total reflection is impossible below 1; climb: L
     times the tangent of the direction in which rays leave, a second meeting is impossible below 1; reach: how far rays get to the
     aperture's edge, in parts of its half width, at the greatest height; ghost: part of the power that is reflected twice inside;
-    polarised: of unpolarised light, how much the exit's reflectance changes by what the entrance makes of s and p.
+    polarised: of unpolarised light, how much the exit's reflectance changes by what the entrance makes of s and p; resolution: what
+    diffraction, source and pixels let it show.
     """
 
     incidence: float
@@ -46,6 +48,7 @@ class Bounds:
     reach: float
     ghost: float
     polarised: float
+    resolution: Resolution
 
 
 def bounds_of(scene: Scene, field: HeightField, heights: Tensor) -> Bounds:
@@ -65,7 +68,8 @@ def bounds_of(scene: Scene, field: HeightField, heights: Tensor) -> Bounds:
     climb = slope * math.tan(out) if out < math.pi / 2.0 else (math.inf if slope > 0 else 0.0)
     reach = _reach(scene, inside, float(heights.min()), float(heights.max()))
     ghost, polarised = _ghost(scene, field, heights, inside, most), _polarised(incidence, critical, most)
-    return Bounds(incidence, inside, slope, lean, most, critical, climb, reach, ghost, polarised)
+    return Bounds(incidence, inside, slope, lean, most, critical, climb, reach, ghost, polarised,
+                  Resolution.at(scene, field, heights))
 
 
 def _incidence(scene: Scene) -> float:

@@ -27,6 +27,7 @@ from caustic_cli.optics.plan import Plan, compile_plan
 from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose, is_lowered
+from caustic_cli.optics.waves import wave_image
 from caustic_cli.scene import Scene, checks
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.report import COLOURS, MARKERS, Study
@@ -36,6 +37,10 @@ RAYS, REPEATS = 1 << 16, 5
 BY_NAME = {effect.name: effect for effect in EFFECTS}
 #: Whether an effect costs nothing that could be saved.
 FREE = {effect.name: effect.free for effect in EFFECTS}
+#: Whether it is seen in the wave image alone.
+WAVES = {effect.name: effect.waves for effect in EFFECTS}
+#: Least rays to a pixel of the ray image that a wave image is compared with.
+RAYS_A_PIXEL = 30
 
 COLUMNS = {
     "series": "effect",
@@ -51,6 +56,20 @@ COLUMNS = {
     "seconds_max": "most of them, s",
     "whole": "least time with it, s",
 }
+
+
+def measure_waves(plan: Plan, field: HeightField, heights: Tensor, *, rays: int = RAYS, repeats: int = 1, seed: int = 0) -> dict:
+    """The same of what is seen in the wave image alone: its time, and how the ray image without it differs from it."""
+    times, light = [], None
+    for _ in range(max(1, min(repeats, 2))):
+        began = time.process_time()
+        light = wave_image(plan.scene, field, heights.detach()).image.cpu()
+        times.append(time.process_time() - began)
+    sampler = rays_of(plan.scene, "stratified", max(rays, RAYS_A_PIXEL * light.numel()), stream(seed, "effects"), heights.device)
+    drawn = expose(plan.scene, field, heights, sampler, requests=plan.requests).image.cpu()
+    drawn, light = drawn.flatten(0, -2), light.flatten(0, -2)
+    return {"error": relative_rms(drawn, light), "power": float(drawn.sum() - light.sum()), "seconds": min(times),
+            "seconds_min": min(times), "seconds_max": max(times), "whole": min(times)}
 
 
 def measure(with_: Plan, without: Plan, field: HeightField, heights: Tensor, *, rays: int = RAYS, repeats: int = REPEATS,
@@ -96,7 +115,8 @@ def explain(plan: Plan, scene: Scene, field: HeightField, heights: Tensor, *, ra
         else:
             with_, without = (compile_plan(scene, field, heights, chosen)
                               for chosen in (set(plan.simulated) | {effect.name}, set(plan.simulated) - {effect.name}))
-            found = measure(with_, without, field, heights, rays=rays, repeats=repeats, seed=seed, dtype=dtype)
+            found = measure_waves(with_, field, heights, rays=rays, repeats=repeats, seed=seed) if WAVES[effect.name] else \
+                measure(with_, without, field, heights, rays=rays, repeats=repeats, seed=seed, dtype=dtype)
             scale = 0.0 if FREE[effect.name] else 1e3
             cost, *extremes = (scale * found[k] for k in ("seconds", "seconds_min", "seconds_max"))
             row |= {"cost_ms": cost, "cost_ms_range": extremes, "error": found["error"], "power": found["power"]}
@@ -169,7 +189,8 @@ def _row(effect: Verdict, plan: Plan, scene: Scene, field: HeightField, heights:
         return None
     with_ = compile_plan(scene, field, heights, set(plan.simulated) | {name})
     without = compile_plan(bare or scene, field, heights, None if bare else set(plan.simulated) - {name})
-    found = measure(with_, without, field, heights, rays=rays, repeats=repeats, seed=seed, dtype=dtype)
+    found = measure_waves(with_, field, heights, rays=rays, repeats=repeats, seed=seed) if WAVES[name] else \
+        measure(with_, without, field, heights, rays=rays, repeats=repeats, seed=seed, dtype=dtype)
     if FREE[name]:
         found |= dict.fromkeys(("seconds", "seconds_min", "seconds_max"), 0.0)
     return {"series": name, "on": effect.on, "why": effect.why, "bound": effect.bound, "limit": effect.limit,

@@ -12,7 +12,7 @@ from caustic_cli.scene import Lens, Screen
 
 
 def write_report(path: Path, target: np.ndarray, image: np.ndarray, heights: np.ndarray, history: np.ndarray,
-                 lens: Lens, screen: Screen, figures: dict, encoding: str) -> None:
+                 lens: Lens, screen: Screen, figures: dict, encoding: str, waves: np.ndarray | None = None) -> None:
     """Write the panels.
 
     Args:
@@ -20,26 +20,35 @@ def write_report(path: Path, target: np.ndarray, image: np.ndarray, heights: np.
         heights: (a, b) surface heights on an even grid over the aperture, mm; the sphere that fits best is taken out,
             because it hides the relief.
         history: (k, 5) rows iteration, stage, loss, on_screen, seconds.
+        waves: (n_x, n_y), the wave image, where there is one: light follows it, and errors are its errors.
     """
     import matplotlib  # noqa: PLC0415
 
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt  # noqa: PLC0415
 
-    figure, axes = plt.subplots(2, 3, figsize=(14.4, 8.8), constrained_layout=True)
+    across = 3 if waves is None else 4
+    figure, axes = plt.subplots(2, across, figsize=(4.8 * across, 8.8), constrained_layout=True)
     extent = [-screen.half_size[0], screen.half_size[0], -screen.half_size[1], screen.half_size[1]]
     scale = target.sum() / target.max()
-    relative = figures["relative_rms"]
-    titles = ("target", "caustic" if relative is None else f"caustic, relative RMS error {relative:.3f}")
-    for axis, picture, title in zip(axes[0, :2], (target, image), titles, strict=True):
-        shown = np.clip(picture / max(picture.sum(), 1e-300) * scale, 0.0, 1.0)
-        axis.imshow((to_srgb(shown) if encoding == "srgb" else shown).T, origin="lower", extent=extent, cmap="gray",
+    def titled(name: str, relative: float | None) -> str:
+        return name if relative is None else f"{name}, relative RMS error {relative:.3f}"
+
+    if waves is None:
+        shown = [(target, "target"), (image, titled("caustic", figures["relative_rms"]))]
+    else:
+        shown = [(target, "target"), (image, titled("by rays", figures["relative_rms"])),
+                 (waves, titled("what light will do (waves)", figures["wave_relative_rms"]))]
+        image = waves
+    for axis, (picture, title) in zip(axes[0], shown, strict=False):
+        drawn = np.clip(picture / max(picture.sum(), 1e-300) * scale, 0.0, 1.0)
+        axis.imshow((to_srgb(drawn) if encoding == "srgb" else drawn).T, origin="lower", extent=extent, cmap="gray",
                     vmin=0, vmax=1)
         axis.set(title=title, xlabel="x on the screen (mm)", ylabel="y (mm)")
     error = image / max(image.sum(), 1e-300) - target / target.sum()
-    drawn = axes[0, 2].imshow(error.T * target.size, origin="lower", extent=extent, cmap="coolwarm", vmin=-1.0, vmax=1.0)
-    figure.colorbar(drawn, ax=axes[0, 2], label="of the mean irradiance")
-    axes[0, 2].set(title="error: too dark (blue), too bright (red)", xlabel="x on the screen (mm)", ylabel="y (mm)")
+    drawn = axes[0, -1].imshow(error.T * target.size, origin="lower", extent=extent, cmap="coolwarm", vmin=-1.0, vmax=1.0)
+    figure.colorbar(drawn, ax=axes[0, -1], label="of the mean irradiance")
+    axes[0, -1].set(title="error: too dark (blue), too bright (red)", xlabel="x on the screen (mm)", ylabel="y (mm)")
     rx, ry = lens.half_size
     drawn = axes[1, 0].imshow(_without_sphere(heights, rx, ry).T * 1e3, origin="lower", extent=[-rx, rx, -ry, ry], cmap="viridis")
     figure.colorbar(drawn, ax=axes[1, 0], label="µm")
@@ -50,7 +59,9 @@ def write_report(path: Path, target: np.ndarray, image: np.ndarray, heights: np.
         axes[1, 2].plot(rows[:, 4], rows[:, 3], lw=1.5)
     axes[1, 1].set(title="loss of each stage against time", xlabel="s", ylabel="relative RMS")
     axes[1, 2].set(title="light on the screen against time", xlabel="s", ylabel="part of the source's power", ylim=(0.0, 1.0))
-    for last in axes[1, 1:]:
+    for last in axes[1, 3:]:
+        last.set_axis_off()
+    for last in axes[1, 1:3]:
         last.grid(alpha=0.3, which="both")
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", dpi=100, metadata={"Software": SOFTWARE})

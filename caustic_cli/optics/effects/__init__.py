@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from caustic_cli.optics.effects.absorption import Absorption
 from caustic_cli.optics.effects.base import NEGLIGIBLE, NO_REQUESTS, Action, Amount, Effect, Requests, Verdict
+from caustic_cli.optics.effects.diffraction import Diffraction
 from caustic_cli.optics.effects.dispersion import Dispersion
 from caustic_cli.optics.effects.entrance import Entrance
 from caustic_cli.optics.effects.fresnel import Fresnel
@@ -22,6 +23,7 @@ from caustic_cli.optics.effects.total_reflection import TotalReflection
 EFFECTS: tuple[Effect, ...] = (
     SourceSize(), Polarisation(), Dispersion(), Entrance(), Intersection(), MissedSurface(), Absorption(), Roughness(), Fresnel(),
     TotalReflection(), Mirror(), SecondMeeting(), Ghosts(), ScreenTilt(), ScreenShift(),
+    Diffraction(),
 )
 
 __all__ = ["EFFECTS", "NEGLIGIBLE", "NO_REQUESTS", "Action", "Amount", "Effect", "Requests", "Verdict"]

@@ -99,6 +99,8 @@ class Effect(ABC):
     name: str
     #: It costs nothing that could be saved: a mask of every path, or an addend in a sum.
     free = False
+    #: It is seen in the wave image alone.
+    waves = False
 
     @abstractmethod
     def judge(self, scene: Scene, bounds: Bounds) -> Verdict:

@@ -4,12 +4,11 @@
     sampling    how finely field and screen are sampled
     propagation Fresnel's integral as one Fourier transform, on pixels, with its adjoint
     image       wavelengths and points of the source added up
-    resolution  what diffraction lets a lens show, before anything is traced
 """
 
 from __future__ import annotations
 
 from caustic_cli.optics.waves.image import WaveImage, image_of, lines_of, lines_of_system, wave_image
-from caustic_cli.optics.waves.resolution import Resolution, diffraction_blur, white
+from caustic_cli.optics.waves.sampling import NoWaveImage
 
-__all__ = ["Resolution", "WaveImage", "diffraction_blur", "image_of", "lines_of", "lines_of_system", "wave_image", "white"]
+__all__ = ["NoWaveImage", "WaveImage", "image_of", "lines_of", "lines_of_system", "wave_image"]

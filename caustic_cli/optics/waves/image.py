@@ -12,19 +12,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from caustic_cli.errors import CausticError
 from caustic_cli.optics.emission.coherent import Mode, edges, middle, modes
 from caustic_cli.optics.meeting import Parameters
+from caustic_cli.optics.resolution import WHITE_LINES, white
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, Placed, System
 from caustic_cli.optics.waves.propagation import TURN, cells, power_in_pieces, power_on_pixels, ramp
 from caustic_cli.optics.waves.receiver import Plane, Receiver, receiver_of
-from caustic_cli.optics.waves.resolution import WHITE_LINES, white
-from caustic_cli.optics.waves.sampling import Sampling, memory_free
+from caustic_cli.optics.waves.sampling import NoWaveImage, Sampling, memory_free
 from caustic_cli.optics.waves.spread import Spread, spread_by
 from caustic_cli.optics.waves.tilted import power_on_tilted
 from caustic_cli.optics.waves.wavefront import Optics, Survey, Wavefront, distance_of, survey, wavefront
@@ -36,6 +36,8 @@ NM = 1e-6
 A_SPAN, LEAST_NODES = 3, 384
 #: The screen and so much of it on each side are watched, at most, where light lands beside it.
 BESIDE = 0.5
+#: Light is watched as far beyond where rays land as so many of the widths over which diffraction blurs.
+BLURS = 2.0
 #: Points that stand for an extended source where its image is not simply spread.
 EACH = 24
 
@@ -50,6 +52,16 @@ class Line:
     system: System
     label: float | None = None
     channel: int | None = None
+
+    @property
+    def length(self) -> float:
+        """The wavelength in vacuum, mm."""
+        return self.wavelength * NM
+
+    @property
+    def behind(self) -> float:
+        """The wavelength in the medium before the screen, mm."""
+        return self.length / self.system.media()[-1].index_at(self.label)
 
 
 @dataclass(frozen=True)
@@ -111,7 +123,7 @@ def wave_image(scene: Scene, field: HeightField, heights: Tensor, *, wavelengths
         dtype: of the field; paths are float64.
 
     Raises:
-        CausticError: no light reaches the screen, light crosses itself within the lens, or memory is short.
+        NoWaveImage: no light reaches the screen, light crosses itself within the lens, or memory is short.
     """
     lines = lines_of(scene, field, wavelengths)
     return image_of(lines, {EXIT: heights.double()}, screen or scene.screen, finer=finer, dtype=dtype)
@@ -143,39 +155,48 @@ class Imager:
     spread: Spread | None
     nodes: tuple[int, int]
     single: bool
+    upright: bool
     exact: bool = False
 
     @classmethod
     def of(cls, lines: list[Line], parameters: Parameters, receiver: Receiver, finer: float = 1.0,
-           exact: bool = False) -> Imager:
-        """Look where the light goes, and choose samples for it.  exact: see `wavefront`.
+           exact: bool = False, watched: tuple | None = None, dense: bool = False) -> Imager:
+        """Look where the light goes, and choose samples for it.
+
+        Args:
+            exact: see `wavefront`.
+            watched: lows and highs, mm, on an upright screen, of what has to be seen of it besides the light; None for all.
+            dense: trace a ray for every sample of the light.
 
         Raises:
-            CausticError: see `wave_image`.
+            NoWaveImage: see `wave_image`.
         """
         line = min(lines, key=lambda k: k.wavelength)
         system = line.system
         plane = receiver.plane(system.axis)
         distance = distance_of(system, parameters, plane)
-        optics = Optics(system, middle(system), parameters, line.wavelength * NM, line.label, plane, distance)
+        optics = Optics(system, middle(system), parameters, line.length, line.label, plane, distance)
         seen = survey(optics)
-        lengths = tuple(k.wavelength * NM / optics.index for k in lines)
+        lengths = tuple(k.behind for k in lines)
         blur = math.sqrt(max(lengths) * distance * seen.magnification)
         spread = spread_by(optics, edges(system), seen, max(blur, *receiver.pixel)) if system.source.extended else None
         outer = [mode for mode in edges(system)] if system.source.extended else []
         low, high = receiver.extent(plane)
-        light, landing = seen.light, [list(low), list(high)]
+        upright = receiver.across(system.axis)
+        around = [BLURS * math.sqrt(max(lengths) * distance * seen.magnification)] * 2
+        light, landing = seen.light, [list(c) for c in (watched if watched and upright else (low, high))]
         for other in [seen] + [survey(replace(optics, mode=m)) for m in outer]:
             light = tuple(tuple(w(a[k], b[k]) for k in (0, 1)) for w, a, b in
                           ((min, light[0], other.light[0]), (max, light[1], other.light[1])))
             for k in (0, 1):
                 room = BESIDE * (high[k] - low[k])
-                landing[0][k] = min(landing[0][k], max(other.landing[0][k], low[k] - room))
-                landing[1][k] = max(landing[1][k], min(other.landing[1][k], high[k] + room))
+                landing[0][k] = min(landing[0][k], max(other.landing[0][k] - around[k], low[k] - room))
+                landing[1][k] = max(landing[1][k], min(other.landing[1][k] + around[k], high[k] + room))
         sampling = Sampling.of(light, tuple(map(tuple, landing)), receiver.pixel, distance, lengths, finer)
         spans = [len(s.breaks) - 1 for e in system.elements if isinstance(e.surface, HeightField) for s in e.surface.spaces]
-        nodes = tuple(min(n, max(LEAST_NODES, A_SPAN * max(spans, default=0))) for n in sampling.count)
-        return cls(receiver, plane, seen, sampling, spread, nodes, spread is not None or not system.source.extended, exact)
+        nodes = sampling.count if dense else tuple(min(n, max(LEAST_NODES, A_SPAN * max(spans, default=0))) for n in sampling.count)
+        return cls(receiver, plane, seen, sampling, spread, nodes, spread is not None or not system.source.extended, upright,
+                   exact)
 
     def expose(self, lines: list[Line], parameters: Parameters, dtype: torch.dtype = torch.float32) -> WaveImage:
         """The wave image of such lines, at heights {name: (n, m) mm} close to those that samples were chosen for."""
@@ -204,7 +225,7 @@ class Imager:
 
     def optics(self, line: Line, mode: Mode, parameters: Parameters) -> Optics:
         """What makes a wavefront of one of them."""
-        return Optics(line.system, mode, parameters, line.wavelength * NM, line.label, self.plane, self.sampling.distance)
+        return Optics(line.system, mode, parameters, line.length, line.label, self.plane, self.sampling.distance)
 
     def front(self, line: Line, mode: Mode, parameters: Parameters, sensitive: bool = False) -> Wavefront:
         """The light of a mode behind the lens, on `nodes`."""
@@ -217,65 +238,70 @@ class Imager:
         """The part of it that lands where its transform at a wavelength in mm reaches."""
         return front.within(self.sampling.middle, tuple(length * self.sampling.distance / d for d in self.sampling.step))
 
-    def masks(self, line: Line, device: torch.device, dtype: torch.dtype, sub: int = 1,
-              beside: tuple[int, int] = (0, 0)) -> tuple[Tensor, Tensor]:
-        """Which samples fall on which pixels along each axis; `sub` pixels for one of the screen's, and so many of these beside."""
-        length = line.wavelength * NM / self.index(line)
-        first, spacing, found = self.sampling.first(length), self.sampling.spacing(length), []
+    @cached_property
+    def cut(self) -> tuple[int, tuple[int, int]]:
+        """Into how many a pixel is cut along each axis, and how many of these are seen beside the screen."""
+        return (1, (0, 0)) if self.spread is None else self.spread.grid(self.receiver.pixel)
+
+    def masks(self, line: Line, device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+        """Which samples of an upright screen fall on which of the cut pixels, along each axis."""
+        s, (sub, beside), low, found = self.sampling, self.cut, self.receiver.extent(self.plane)[0], []
+        first, spacing = s.first(line.behind), s.spacing(line.behind)
         for k in (0, 1):
             width = self.receiver.pixel[k] / sub
-            found.append(cells(self._low(k) - beside[k] * width, width, sub * self.receiver.resolution[k] + 2 * beside[k], first[k],
-                               spacing[k], self.sampling.padded[k], device).to(dtype))
+            found.append(cells(low[k] - beside[k] * width, width, sub * self.receiver.resolution[k] + 2 * beside[k], first[k],
+                               spacing[k], s.padded[k], device).to(dtype))
         return tuple(found)
 
-    def _low(self, k: int) -> float:
-        return self.receiver.extent(self.plane)[0][k]
+    def spread_out(self, image: Tensor) -> Tensor:
+        """An image of the source's middle on cut pixels -> that of the source on the screen's pixels."""
+        return image if self.spread is None else self.spread(image, self.receiver.pixel, *self.cut)
 
-    @staticmethod
-    def index(line: Line) -> float:
-        """Of the medium before the screen."""
-        return line.system.media()[-1].index_at(line.label)
+    def field(self, line: Line, front: Wavefront, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+        """Phase, rad, with the kernel's, and amplitude of each sample of a wavefront, (n, m), and the power of all: ()."""
+        s, front = self.sampling, self.watched(front, line.behind)
+        path, root, lit = front.on(s.low, s.step, s.count)
+        across, along = (ramp(s, line.behind, k, path.device) for k in (0, 1))
+        phase = torch.remainder(TURN / line.length * path + across[:, None] + along[None, :], TURN)
+        power, amplitude = (root.square() * lit).sum(), root * lit
+        amplitude = amplitude * (power / amplitude.square().sum()).sqrt()
+        return phase.to(dtype), amplitude.to(dtype), power
 
-    def image(self, line: Line, whole: Wavefront, dtype: torch.dtype) -> tuple[Tensor, float]:
+    def image(self, line: Line, front: Wavefront, dtype: torch.dtype) -> tuple[Tensor, float]:
         """Power on the pixels of the light of one mode at one wavelength, float64, and that of all of it."""
-        s, k0, length = self.sampling, TURN / (line.wavelength * NM), line.wavelength * NM / self.index(line)
-        front, device = self.watched(whole, length), whole.path.device
-        if not self.receiver.across(line.system.axis):
-            return power_on_tilted(self.receiver, self.plane, s, front, k0, length, dtype)
-        sub, beside = (1, (0, 0)) if self.spread is None else self.spread.grid(self.receiver.pixel)
-        rows, columns = self.masks(line, device, dtype, sub, beside)
-        across, along = ramp(s, length, 0, device), ramp(s, length, 1, device)
-        wide = 8 if dtype == torch.float32 else 16
+        s, wide = self.sampling, 8 if dtype == torch.float32 else 16
+        if not self.upright:
+            return power_on_tilted(self.receiver, self.plane, s, self.watched(front, line.behind), TURN / line.length, line.behind,
+                                   dtype)
+        rows, columns = self.masks(line, front.path.device, dtype)
         pieces = s.pieces(wide)
-        if pieces == 1:
-            self._check_memory(wide)
-            path, root, lit = front.on(s.low, s.step, s.count)
-            phase = torch.remainder(k0 * path + across[:, None] + along[None, :], TURN).to(dtype)
-            power = (root.square() * lit).sum()
-            amplitude = root * lit
-            amplitude = (amplitude * (power / amplitude.square().sum()).sqrt()).to(dtype)
-            found = power_on_pixels(phase, amplitude, s.padded, rows, columns).double()
+        if pieces > 1 and not front.path.requires_grad:
+            found, power = self._in_pieces(line, self.watched(front, line.behind), pieces, rows, columns, dtype)
         else:
-            sums = [0.0, 0.0]
+            self._check_memory(wide)
+            phase, amplitude, power = self.field(line, front, dtype)
+            found = power_on_pixels(phase, amplitude, s.padded, rows, columns).double()
+        return self.spread_out(found), float(power)
 
-            def field(part: slice) -> Tensor:
-                path, root, lit = front.on(s.low, s.step, s.count, part)
-                sums[0] += float((root.square() * lit).sum()) / pieces
-                sums[1] += float((root * lit).square().sum()) / pieces
-                phase = torch.remainder(k0 * path + across[part, None] + along[None, :], TURN).to(dtype)
-                return torch.polar((root * lit).to(dtype), phase)
+    @torch.no_grad()
+    def _in_pieces(self, line: Line, front: Wavefront, pieces: int, rows: Tensor, columns: Tensor,
+                   dtype: torch.dtype) -> tuple[Tensor, float]:
+        s, sums = self.sampling, [0.0, 0.0]
+        across, along = (ramp(s, line.behind, k, front.path.device) for k in (0, 1))
 
-            with torch.no_grad():
-                found, _ = power_in_pieces(field, s, pieces, rows, columns)
-            power = torch.tensor(sums[0], dtype=torch.float64)
-            found = found * (sums[0] / sums[1])
-        if self.spread is not None:
-            found = self.spread(found, self.receiver.pixel, sub, beside)
-        return found, float(power.detach())
+        def field(part: slice) -> Tensor:
+            path, root, lit = front.on(s.low, s.step, s.count, part)
+            sums[0] += float((root.square() * lit).sum()) / pieces
+            sums[1] += float((root * lit).square().sum()) / pieces
+            phase = torch.remainder(TURN / line.length * path + across[part, None] + along[None, :], TURN)
+            return torch.polar((root * lit).to(dtype), phase.to(dtype))
+
+        found, _ = power_in_pieces(field, s, pieces, rows, columns)
+        return found * (sums[0] / sums[1]), sums[0]
 
     def _check_memory(self, wide: int) -> None:
         n, m = self.sampling.count
         needed = 4 * wide * self.sampling.samples + 48 * n * m + 160 * self.nodes[0] * self.nodes[1]
         if needed > memory_free():
-            raise CausticError(f"a wave image of this scene takes about {needed / 2**30:.1f} GiB of memory, and"
+            raise NoWaveImage(f"a wave image of this scene takes about {needed / 2**30:.1f} GiB of memory, and"
                                f" {memory_free() / 2**30:.1f} GiB are free: fewer pixels, a smaller screen or lens need less")

@@ -30,6 +30,10 @@ MOST, PIECE = 1 << 17, 1 << 29
 COPIES = 4
 
 
+class NoWaveImage(CausticError):
+    """A scene whose light has no wave image, or none that can be made."""
+
+
 @dataclass(frozen=True)
 class Sampling:
     """Samples of the light on the plane behind the lens and of its transform, of each axis.
@@ -54,7 +58,7 @@ class Sampling:
             pixel: widths, mm; wavelengths: mm; finer: than is needed by so many times along each axis of both planes.
 
         Raises:
-            CausticError: more than MOST.
+            NoWaveImage: more than MOST.
         """
         short, long = min(wavelengths), max(wavelengths)
         low, step, count, padded, middle = [], [], [], [], []
@@ -64,7 +68,7 @@ class Sampling:
             n = max(LEAST, math.ceil(finer * width * seen / (short * distance)))
             most = max(FINER * n * finer, A_PIXEL * finer * long * distance * n / (width * pixel[k]))
             if most > MOST:
-                raise CausticError(f"a wave image of this scene needs {most:,.0f} samples along an axis, where {MOST:,} can be had,"
+                raise NoWaveImage(f"a wave image of this scene needs {most:,.0f} samples along an axis, where {MOST:,} can be had,"
                                    f" and {8 * most * most / 2**30:,.0f} GiB: a smaller lens or screen, or a longer throw, needs"
                                    " fewer")
             low.append(light[0][k])

@@ -18,10 +18,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from caustic_cli.errors import CausticError
 from caustic_cli.optics.waves.propagation import TURN, ramp
 from caustic_cli.optics.waves.receiver import Plane, Receiver, dot
-from caustic_cli.optics.waves.sampling import Sampling
+from caustic_cli.optics.waves.sampling import NoWaveImage, Sampling
 from caustic_cli.optics.waves.wavefront import Wavefront
 
 #: Part of a pixel by which light may move between planes; most planes; points along each axis of a pixel.
@@ -33,7 +32,7 @@ def power_on_tilted(r: Receiver, plane: Plane, s: Sampling, front: Wavefront, k0
     """Power on a tilted screen's pixels of one wavefront, float64, and that of all its light.
 
     Raises:
-        CausticError: too many planes.
+        NoWaveImage: too many planes.
     """
     e1, e2, e3 = plane.axes
     device = front.path.device
@@ -54,7 +53,7 @@ def power_on_tilted(r: Receiver, plane: Plane, s: Sampling, front: Wavefront, k0
     residual = max(m[2] for m in maps)
     planes = max(1, math.ceil(2.0 * depth * residual / (2.0 * STEP * min(r.pixel))))
     if planes > MOST_PLANES:
-        raise CausticError(f"a wave image of this tilted screen needs {planes} planes, at most {MOST_PLANES} are made: less tilt or"
+        raise NoWaveImage(f"a wave image of this tilted screen needs {planes} planes, at most {MOST_PLANES} are made: less tilt or"
                            " larger pixels need fewer")
     image = torch.zeros(u.numel(), v.numel(), dtype=torch.float64, device=device)
     height = 2.0 * depth / planes

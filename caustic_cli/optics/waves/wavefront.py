@@ -25,13 +25,13 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from caustic_cli.errors import CausticError
 from caustic_cli.optics.effects import Requests
 from caustic_cli.optics.emission.coherent import Mode
 from caustic_cli.optics.meeting import Meeting, Parameters
 from caustic_cli.optics.system import System
 from caustic_cli.optics.trace import Tracer
 from caustic_cli.optics.waves.receiver import Plane, dot
+from caustic_cli.optics.waves.sampling import NoWaveImage
 
 #: Points along each side of the pupil from which extents are found.
 SURVEY = 65
@@ -144,7 +144,7 @@ def survey(optics: Optics) -> Survey:
     """Look where the light of a mode goes.
 
     Raises:
-        CausticError: nowhere.
+        NoWaveImage: nowhere.
     """
     line = torch.linspace(0.0, 1.0, SURVEY, dtype=torch.float64, device=_device(optics))
     u, v = (c.reshape(-1) for c in torch.meshgrid(line, line, indexing="ij"))
@@ -154,7 +154,7 @@ def survey(optics: Optics) -> Survey:
     if pupil.round:
         lit &= (2.0 * u - 1.0) ** 2 + (2.0 * v - 1.0) ** 2 <= 1.0 + 1e-12
     if int(lit.sum()) < 16:
-        raise CausticError("no light reaches the screen, so it has no wave image")
+        raise NoWaveImage("no light reaches the screen, so it has no wave image")
     light, landing = (tuple(tuple(float(getattr(c[lit], w)()) for c in pair) for w in ("min", "max"))
                       for pair in ((f.x, f.y), (f.big_x, f.big_y)))
     scale, offset = [], []
@@ -264,7 +264,7 @@ def wavefront(optics: Optics, seen: Survey, low: tuple[float, float], step: tupl
     sensitive: with what its derivative by the height of the last surface needs, which is then not asked of autograd.
 
     Raises:
-        CausticError: light crosses itself before it gets there, so that no single wavefront stands for it.
+        NoWaveImage: light crosses itself before it gets there, so that no single wavefront stands for it.
     """
     device = _device(optics)
     differentiable = not sensitive and torch.is_grad_enabled() and any(h.requires_grad for h in optics.parameters.values())
@@ -293,7 +293,8 @@ def wavefront(optics: Optics, seen: Survey, low: tuple[float, float], step: tupl
     path = torch.where(lit, path - path[lit].detach().mean(), torch.zeros_like(path))
     # Where on the pupil light with its foot on the grid comes from, in mm of this plane; its stretch is the density's.
     px, py = ((h - 0.5) * c for h, c in zip(held, seen.scale, strict=True))
-    (pxx, pxy), (pyx, pyy) = (torch.gradient(p.view(shape), spacing=step, dim=(0, 1)) for p in (px, py))
+    (pxx, pxy), (pyx, pyy) = (torch.gradient((p + e).detach().view(shape), spacing=step, dim=(0, 1))
+                              for p, e in ((px, ex), (py, ey)))
     px, py = px + pxx.reshape(-1) * ex + pxy.reshape(-1) * ey, py + pyx.reshape(-1) * ex + pyy.reshape(-1) * ey
     pupil = optics.mode.scene.pupil
     mm = [2.0 * pupil.half_size[k] / abs(seen.scale[k]) for k in (0, 1)]
@@ -301,7 +302,7 @@ def wavefront(optics: Optics, seen: Survey, low: tuple[float, float], step: tupl
     power = f.power.view(shape)
     crossed = torch.where(squeeze.detach() <= 0, power.detach(), torch.zeros_like(power))
     if float(crossed.sum()) > CROSSED * float(power.detach().sum()):
-        raise CausticError("light crosses itself within the lens' own depth, so that no wavefront behind it stands for it;"
+        raise NoWaveImage("light crosses itself within the lens' own depth, so that no wavefront behind it stands for it;"
                            " a flatter surface or a screen farther away has one")
     density = power * squeeze.clamp_min(0.0)
     rx, ry = (abs(s) / 2.0 for s in seen.scale)

@@ -1,0 +1,163 @@
+"""The loss of a lens' wave image and its derivative by the control heights.
+
+Around the lens at which a stage begins, with heights h_0 and optical path v_0(x) to a foot x of light on the plane behind it,
+
+    v(x) = v_0(x) + c(x) (h - h_0)(s(x)),    c = n_in d_in - n_out d_out along the surface's normal axis
+
+is the path of a lens of heights h: by Fermat's principle exact to first order, s(x) the point of the surface where that light
+meets it.  A refinement moves a surface by tenths of a micrometre, where the second order is some thousandths of a wavelength; the
+next stage begins from an exact trace again.  Amplitudes stay those of the trace.  So an evaluation takes no rays: the spline at
+fixed points, one Fourier transform and its adjoint for each wavelength.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from caustic_cli.inverse import ranks
+from caustic_cli.inverse.losses import ColorLoss, Loss
+from caustic_cli.inverse.objective import Evaluation, penalty_of
+from caustic_cli.optics.surfaces import HeightField
+from caustic_cli.optics.system import EXIT
+from caustic_cli.optics.waves.image import Imager, Line, lines_of
+from caustic_cli.optics.waves.propagation import TURN, power_on_pixels
+from caustic_cli.optics.waves.receiver import receiver_of
+from caustic_cli.optics.waves.wavefront import Wavefront
+from caustic_cli.scene import Scene
+
+#: Bytes of graphs that are kept from an image to its derivative; beyond, every transform is made again.
+KEPT = 1 << 29
+
+
+@dataclass(frozen=True)
+class Part:
+    """Light of one wavelength and one point of the source: phase (n, m) rad at h_0 in [0, 2 pi), its derivative by the height
+    (n, m) rad/mm, amplitude (n, m), and which samples fall on which pixels."""
+
+    line: Line
+    front: Wavefront
+    phase: Tensor
+    slope: Tensor
+    amplitude: Tensor
+    rows: Tensor
+    columns: Tensor
+    power: float
+
+
+class WaveObjective:
+    """The loss as a function of the heights; see above.
+
+    Args:
+        scene: its screen is the one the picture is judged on.
+        field: spline spaces of the heights.
+        heights: h_0 (n, m) mm.
+        target, loss, blur, apron, max_slope, min_radius: as of an `Objective`.
+        wavelengths: nm, in equal parts; empty for the scene's own.
+        dtype: of fields; paths are float64.
+
+    Raises:
+        NoWaveImage: no light, no single wavefront, or memory is short.
+    """
+
+    def __init__(self, scene: Scene, field: HeightField, heights: Tensor, target: Tensor, loss: str, *,
+                 wavelengths: tuple[float, ...] = (), blur: float = 0.0, apron: int = 0, max_slope: float = 0.0,
+                 min_radius: float = 0.0, dtype: torch.dtype = torch.float32, device: str | torch.device = "cpu"):
+        self.scene, self.field, self.apron, self.dtype = scene, field, apron, dtype
+        self.middle = heights.detach().double().to(device)
+        screen = scene.screen.grown((apron, apron))
+        wide = torch.nn.functional.pad(target.double().to(device), (apron,) * 4)
+        self.loss = (ColorLoss if scene.colored else Loss)(loss, wide, blur, apron, wide > 0)
+        self.penalty = penalty_of(scene, field, loss, max_slope, min_radius, device)
+        own = scene.light.wavelengths
+        lines = lines_of(scene, field, None if own and (not wavelengths or scene.colored) else wavelengths or None)
+        rank, count = ranks.place()
+        parameters = {EXIT: self.middle}
+        with torch.no_grad():
+            receiver = receiver_of(lines[0].system, screen)
+            self.imager = Imager.of(lines, parameters, receiver, watched=_lit(scene, target), dense=True)
+            self.parts = list(self._parts(lines[rank::count], parameters))
+        if self.parts:
+            front = self.parts[0].front
+            self.points = front.at_x.reshape(-1).contiguous(), front.at_y.reshape(-1).contiguous()
+            self.shape = front.at_x.shape
+        self.colours = len({line.channel for line in lines if line.channel is not None})
+        n = self.imager.sampling
+        self.whole = len(self.parts) * (8 * n.samples + 16 * n.count[0] * n.count[1]) <= KEPT
+
+    def _parts(self, lines: list[Line], parameters):
+        imager, made = self.imager, {}
+        for line in lines:
+            for k, mode in enumerate(imager.modes(line.system)):
+                key = id(line.system), line.label, k
+                if key not in made:  # wavelengths of one index go the same ways
+                    made[key] = imager.front(line, mode, parameters, sensitive=True)
+                front = made[key]
+                phase, amplitude, power = imager.field(line, front, self.dtype)
+                slope = (TURN / line.length * front.sensitivity).to(self.dtype)
+                rows, columns = imager.masks(line, phase.device, self.dtype)
+                yield Part(line, front, phase, slope, amplitude, rows, columns, float(power))
+
+    def __call__(self, heights: Tensor) -> Evaluation:
+        """Value and gradient at heights (n, m) mm float64.
+
+        Raises:
+            NoLight: no light reaches the screen.
+        """
+        heights = heights.detach().to(self.middle).clone()
+        ranks.share(heights)
+        heights.requires_grad_()
+        penalty = self.penalty(heights) if self.penalty else torch.zeros((), dtype=torch.float64, device=heights.device)
+        moved = self.field.at_points(heights - self.middle, *self.points).view(self.shape) if self.parts else None
+        shape = (3, *self.loss.target.shape) if self.colours else self.loss.target.shape
+        image = torch.zeros(shape, dtype=torch.float64, device=heights.device)
+        leaving = image.new_zeros(image.shape[:-2])
+        by = None if moved is None else moved.detach().to(self.dtype).requires_grad_()
+        seen = []
+        with torch.set_grad_enabled(self.whole):
+            for part in self.parts:
+                found = self._image(part, by)
+                self._channel(image, part)[...] += part.line.part * found.detach().double()
+                self._channel(leaving, part)[...] += part.line.part * part.power
+                seen.append(found if self.whole else None)
+        ranks.add(image, leaving)
+        image.requires_grad_()
+        loss = self.loss(image, leaving, penalty)
+        by_image, direct = torch.autograd.grad(loss, (image, heights), allow_unused=True) if penalty.requires_grad else \
+            (*torch.autograd.grad(loss, (image,)), None)
+        by_moved = torch.zeros(self.shape, dtype=torch.float64, device=heights.device) if self.parts else None
+        for part, found in zip(self.parts, seen, strict=True):
+            found = self._image(part, by) if found is None else found
+            pull = part.line.part * self._channel(by_image, part)
+            by_moved += torch.autograd.grad(found, by, pull.to(found.dtype))[0].double()
+        gradient = torch.zeros_like(heights) if moved is None else torch.autograd.grad(moved, heights, by_moved)[0]
+        ranks.add(gradient)
+        if direct is not None:
+            gradient = gradient + direct
+        a = self.apron
+        inner = image.detach()[..., a : image.shape[-2] - a, a : image.shape[-1] - a]
+        return Evaluation(float(loss.detach()), {EXIT: gradient}, float(inner.sum()))
+
+    def _image(self, part: Part, moved: Tensor) -> Tensor:
+        imager = self.imager
+        if not imager.upright:
+            front = replace(part.front, path=part.front.path + part.front.sensitivity * moved)
+            return imager.image(part.line, front, self.dtype)[0]
+        found = power_on_pixels(part.phase + part.slope * moved, part.amplitude, imager.sampling.padded, part.rows, part.columns)
+        return imager.spread_out(found)
+
+    def _channel(self, values: Tensor, part: Part) -> Tensor:
+        return values if part.line.channel is None else values[part.line.channel]
+
+
+def _lit(scene: Scene, target: Tensor) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Lows and highs of the picture's bright part on an upright screen, mm."""
+    grey = target if target.ndim == 2 else target.sum(0)
+    found = []
+    for k in (0, 1):
+        at = (grey.sum(1 - k) > 0).nonzero()[:, 0]
+        low, width = scene.screen.low[k], scene.screen.pixel[k]
+        found.append((low + width * int(at[0]), low + width * (int(at[-1]) + 1)))
+    return tuple(f[0] for f in found), tuple(f[1] for f in found)

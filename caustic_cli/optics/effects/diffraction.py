@@ -1,0 +1,24 @@
+"""Diffraction: light is a wave, and its image is taken from fields instead of rays (`optics.waves`).
+
+It changes no ray: the wave image stands beside the ray image, which is that of no wavelength at all.
+"""
+
+from __future__ import annotations
+
+from caustic_cli.optics.effects.base import Effect, Verdict
+from caustic_cli.optics.resolution import WIDENED
+from caustic_cli.scene import Scene
+
+
+class Diffraction(Effect):
+    """Left out, there is no wave image."""
+
+    name = "diffraction"
+    waves = True
+
+    def judge(self, scene: Scene, bounds) -> Verdict:
+        """By what it adds to the blur of source and pixel."""
+        r = bounds.resolution
+        light = f"{r.wavelength:.4g} nm" if r.said else f"{r.wavelength:g} nm, as the scene says no wavelength,"
+        why = f"light of {light} blurs over {r.diffraction:.2g} mm, the source over {r.source:.2g} mm, a pixel is {r.pixel:.2g} mm"
+        return Verdict(self.name, r.matters, why, r.widened, WIDENED)

@@ -1,0 +1,67 @@
+"""The verdict on a lens as light sees it: its wave image, at wavelengths and on grids that no optimiser used."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from caustic_cli.optics.image import Image
+from caustic_cli.optics.resolution import Resolution
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.waves import NoWaveImage, WaveImage, wave_image
+from caustic_cli.scene import Scene
+from caustic_cli.studies.metrics import judge
+
+#: So many times finer than needed are a verdict's samples, on both planes.
+FINER = 1.25
+#: Wavelengths beside a single one, in parts of it, that say how a lens bears light of another colour.
+ASIDE = (0.99, 1.01)
+
+
+def wave_figures(scene: Scene, field: HeightField, heights: Tensor, target: np.ndarray | None, seen: Resolution, *,
+                 finer: float = FINER, dtype: torch.dtype = torch.float32,
+                 required: bool = True) -> tuple[WaveImage | None, dict]:
+    """The wave image of a lens at the scene's wavelengths, white light's where it says none, and its figures.
+
+    Returns:
+        the image, None where there is none and `required` is false; and wave_relative_rms, wave_on_target (None without a target),
+        wave_on_screen, wave_wavelengths (nm) and resolvable, the number of details across that light carries.
+    """
+    try:
+        found = wave_image(scene, field, heights.detach(), finer=finer, dtype=dtype)
+    except NoWaveImage as error:
+        if required:
+            raise
+        return None, dict.fromkeys(("wave_relative_rms", "wave_on_target", "wave_on_screen")) | {
+            "wave_wavelengths": [], "resolvable": seen.resolvable, "no_wave_image": str(error)}
+    of = _judged(found, target)
+    return found, {"wave_relative_rms": of["relative_rms"], "wave_on_target": of["on_target"], "wave_on_screen": of["on_screen"],
+                   "wave_wavelengths": list(found.wavelengths), "resolvable": seen.resolvable}
+
+
+def unseen_figures(scene: Scene, field: HeightField, heights: Tensor, target: np.ndarray, *, finer: float = FINER,
+                   dtype: torch.dtype = torch.float32) -> dict:
+    """The same at other wavelengths than those that a scene says: between them, or beside a single one; of white light nothing.
+
+    Returns:
+        wave_unseen_relative_rms and wave_unseen_wavelengths, nm.
+    """
+    own = sorted(scene.light.wavelengths)
+    if not own or scene.colored:
+        return {}
+    others = tuple(0.5 * (a + b) for a, b in pairwise(own)) or tuple(a * own[0] for a in ASIDE)
+    found = wave_image(scene, field, heights.detach(), wavelengths=others, finer=finer, dtype=dtype)
+    return {"wave_unseen_relative_rms": _judged(found, target)["relative_rms"], "wave_unseen_wavelengths": list(others)}
+
+
+def _judged(found: WaveImage, target: np.ndarray | None) -> dict:
+    return judge(Image(found.image, found.leaving, {}), target)
+
+
+def beside(path: Path) -> Path:
+    """Where the wave image belongs beside a ray image or its numbers: render.png -> wave.png, NAME.png -> NAME-wave.png."""
+    return path.with_name(f"wave{path.suffix}" if path.stem == "render" else f"{path.stem}-wave{path.suffix}")
