@@ -8,6 +8,7 @@ from torch import Tensor
 
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels import batches, blocks, hit, spline
+from caustic_cli.optics.kernels.threads import ALL
 
 
 class FusedSurface:
@@ -23,7 +24,9 @@ class FusedSurface:
 
     def coefficients(self, heights: Tensor) -> np.ndarray:
         """(n, m) mm -> the polynomial of every span product, (I, J, p + 1, q + 1) float64."""
-        return spline.coefficients(heights.detach().double().contiguous().numpy(), *self.linear)
+        out = np.empty(self._coefficients())
+        spline.coefficients(ALL, heights.detach().double().contiguous().numpy(), *self.linear, out)
+        return out
 
     def order(self, x: Tensor, y: Tensor) -> tuple[np.ndarray, int]:
         """Points (N,), mm, in order of their span products, and how many of these there are."""
@@ -37,14 +40,20 @@ class FusedSurface:
 
     def workspace(self) -> np.ndarray:
         """Derivatives by the coefficients, a set for each block, to be overwritten."""
-        shape = (blocks(), *(len(a.first) for a in self.axes), *(a.matrices.shape[1] for a in self.axes))
+        shape = (blocks(), *self._coefficients())
         if self.grads is None or self.grads.shape != shape:
             self.grads = np.zeros(shape)
         return self.grads
 
     def pull(self, grads: np.ndarray) -> Tensor:
         """Derivatives by the coefficients, block by block -> by the heights, (n, m) float64."""
-        return torch.from_numpy(spline.pull_coefficients(grads, *self.shape, *self.linear))
+        (_, matrices, _, _), out = self.linear, np.zeros(self.shape)
+        spline.pull_coefficients(ALL, grads, *self.linear, np.zeros((*matrices.shape[:2], self.shape[1])), out)
+        return torch.from_numpy(out)
+
+    def _coefficients(self) -> tuple[int, ...]:
+        """Shape of all polynomials' coefficients."""
+        return *(len(a.first) for a in self.axes), *(a.matrices.shape[1] for a in self.axes)
 
 
 def scattered_surface(surface: FusedSurface, heights: Tensor, u: np.ndarray, v: np.ndarray):
@@ -56,7 +65,7 @@ class _ScatteredSurface(torch.autograd.Function):
     @staticmethod
     def forward(heights: Tensor, surface: FusedSurface, u: np.ndarray, v: np.ndarray):
         out = [torch.empty(len(u), dtype=torch.float64) for _ in range(3)]
-        spline.evaluate(u, v, surface.coefficients(heights), *surface.geometry, *surface.scale, *(t.numpy() for t in out),
+        spline.evaluate(ALL, u, v, surface.coefficients(heights), *surface.geometry, *surface.scale, *(t.numpy() for t in out),
                         blocks())
         return tuple(out)
 
@@ -69,7 +78,7 @@ class _ScatteredSurface(torch.autograd.Function):
     def backward(ctx, *by):
         surface, u, v = ctx.rest
         grads = surface.workspace()
-        spline.pull_back(u, v, *(g.contiguous().numpy() for g in by), *surface.geometry, *surface.scale, grads)
+        spline.pull_back(ALL, u, v, *(g.contiguous().numpy() for g in by), *surface.geometry, *surface.scale, grads)
         return surface.pull(grads).to(ctx.heights_dtype), None, None, None
 
     @staticmethod
