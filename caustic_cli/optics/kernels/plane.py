@@ -58,13 +58,10 @@ from caustic_cli.optics.kernels.threads import ALL, on_threads
 FRESNEL, REFLECTED, OFF_SCREEN, LEAVING, MISSED, COLUMNS = range(6)  # of the ledger
 
 
-@njit(**FAST)
-def _bend(vectors, i, surface, rays, exit_, frame, slanted):
-    """The surface, powers and landing points of row i."""
-    v, (first, bu, du, net, net_x, net_y), (x, y, _, _, share) = vectors, surface, rays
-    if slanted is not None:
-        slant.aim(v, _slanted(i, surface, rays), x[i], y[i], exit_, frame)
-        return
+@njit(inline="always", **FAST)
+def _bend(v, i, surface, rays, exit_, frame):
+    """The surface, powers and landing points of row i, of rays along z."""
+    (first, bu, du, net, net_x, net_y), (x, y, _, _, share) = surface, rays
     combine(i, first, bu, du, net, net_x, net_y, v[SAG], v[GX], v[GY])
     load(share[i], v[SHARE])
     load(x[i], v[X])
@@ -83,10 +80,10 @@ def _slanted(i, surface, rays):
     return net[i], net_x[i], net_y[i], along_x[i], along_y[i], share[i]
 
 
-@njit(**FAST)
-def _share(vectors, splat, sx, sy, dx, dy):
+@njit(inline="always", **FAST)
+def _share(v, splat, sx, sy, dx, dy):
     """Shares of one row's rays among pixels, and their slopes unless dx and dy are empty."""
-    v, scratch = vectors, vectors[VECTORS:]
+    scratch = v[VECTORS:]
     if splat.size_x > 1:
         fraction(v[PX], v[PHI])
     shares(splat.kind, splat.size_x, splat.alpha_x, v[PHI], sx, dx, v[OVER_X], v[LEAN_X], scratch)
@@ -235,7 +232,7 @@ def scratch_rows(splat: Splat) -> int:
     return VECTORS + SCRATCH + 2 * (splat.size_x + splat.size_y)
 
 
-@njit(**FAST)
+@njit(inline="always", **FAST)
 def _cut(scratch, vx, vy):
     """A block's scratch as vectors, shares along x and y, their slopes."""
     a = VECTORS + SCRATCH
@@ -270,7 +267,11 @@ def forward(block, images, ledgers, scratch, first, bu, du, net, net_x, net_y, x
     v, sx, sy, dx, dy = _cut(scratch[block], vx, vy)
     column = np.zeros(vy + -vy % 4)
     for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-        _bend(v, i, (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share), exit_, frame, slanted)
+        surface, rays = (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share)
+        if slanted is None:
+            _bend(v, i, surface, rays, exit_, frame)
+        else:
+            slant.aim(v, _slanted(i, surface, rays), x[i], y[i], exit_, frame)
         _share(v, splat, sx, sy, dx[:0], dy[:0])
         _scatter(v, exit_, frame, splat, sx, sy, images[block], ledgers[block], column)
 
@@ -298,11 +299,15 @@ def backward(block, grad, grad_leaving, apart, nets, scratch, first, bu, du, net
     v, sx, sy, dx, dy = _cut(scratch[block], vx, vy)
     column, tilt = np.zeros(vy + -vy % 4), np.zeros(vy + -vy % 4)
     for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-        _bend(v, i, (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share), exit_, frame, slanted)
+        surface, rays = (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share)
+        if slanted is None:
+            _bend(v, i, surface, rays, exit_, frame)
+        else:
+            slant.aim(v, _slanted(i, surface, rays), x[i], y[i], exit_, frame)
         _share(v, splat, sx, sy, dx, dy)
         _gather(v, exit_, frame, splat, sx, sy, dx, dy, grad, grad_leaving, column, tilt)
         if slanted is not None:
-            slant.pull(v, _slanted(i, (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share)), exit_, nets[0, 0, i],
+            slant.pull(v, _slanted(i, surface, rays), exit_, nets[0, 0, i],
                        nets[1, 0, i], nets[2, 0, i])
             continue
         pull(v, exit_)
@@ -322,10 +327,14 @@ def tangent(block, t_net, t_net_x, t_net_y, images, leaving, scratch, first, bu,
     images[block], leaving[block] = 0.0, 0.0
     v, sx, sy, dx, dy = _cut(scratch[block], vx, vy)
     for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-        _bend(v, i, (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share), exit_, frame, slanted)
+        surface, rays = (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share)
+        if slanted is None:
+            _bend(v, i, surface, rays, exit_, frame)
+        else:
+            slant.aim(v, _slanted(i, surface, rays), x[i], y[i], exit_, frame)
         _share(v, splat, sx, sy, dx, dy)
         if slanted is not None:
-            slant.push(v, _slanted(i, (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share)),
+            slant.push(v, _slanted(i, surface, rays),
                        (t_net[i], t_net_x[i], t_net_y[i]), exit_, frame)
         else:
             combine(i, first, bu, du, t_net, t_net_x, t_net_y, v[T_SAG], v[T_GX], v[T_GY])
