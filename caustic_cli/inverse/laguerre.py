@@ -199,11 +199,13 @@ def density(f, x, y, a, b):
     return (f[i, j] * (1 - u) + f[i1, j] * u) * (1 - v) + (f[i, j1] * (1 - u) + f[i1, j1] * u) * v
 
 
-@njit(entry=True, nogil=True)
 def sampled(f, x1, x2, a, b):
     """Bilinear values of f on a raster, (n, m); (1, 1) where f is one constant."""
-    if f.size == 1:
-        return f.copy()
+    return f.copy() if f.size == 1 else _sampled(f, x1, x2, a, b)
+
+
+@njit(entry=True, nogil=True)
+def _sampled(f, x1, x2, a, b):
     out = np.empty((len(x1), len(x2)))
     for i in range(len(x1)):
         for j in range(len(x2)):
@@ -211,17 +213,12 @@ def sampled(f, x1, x2, a, b):
     return out
 
 
-@njit(entry=True, nogil=True)
 def _means(site, values, sites):
     """Mean of raster values in each cell, (N,)."""
-    total, count = np.zeros(sites), np.zeros(sites)
     if values.size == 1:
         return np.full(sites, values[0, 0])
-    for i in range(site.shape[0]):
-        for j in range(site.shape[1]):
-            total[site[i, j]] += values[i, j]
-            count[site[i, j]] += 1.0
-    return total / np.maximum(count, 1.0)
+    total, count = np.bincount(site.ravel(), values.ravel(), sites), np.bincount(site.ravel(), minlength=sites)
+    return total / np.maximum(count, 1)
 
 
 def cells(psi, y1, y2, site, head, link, end, degree, f, values, a, b):

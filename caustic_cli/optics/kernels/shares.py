@@ -51,7 +51,7 @@ def _cosine(x):
     return 1.0 - y * (1 / 2.0) * (1.0 - y * (1 / 12.0) * (1.0 - y * (1 / 30.0) * c))
 
 
-@njit(**FAST)
+@njit(inline="always", **FAST)
 def _scaled(by, phi, v, out):
     """out[j] = by f(by phi') for the cosine filter's two functions: out[0] cosines, out[1] sines of theta q, over v."""
     for j in range(len(phi)):
@@ -60,7 +60,7 @@ def _scaled(by, phi, v, out):
         out[1, j] = _sine(by * (0.5 - phi[j])) / v
 
 
-@njit(**FAST)
+@njit(inline="always", **FAST)
 def _raised_cosine(phi, v, out, slope, scratch):
     theta = 2.0 * math.pi / v
     _scaled(theta, phi, v, scratch)
@@ -77,7 +77,7 @@ def _mix(constant, a, b, x, y, out):
         out[j] = constant + a * x[j] + b * y[j]
 
 
-@njit(**FAST)
+@njit(inline="always", **FAST)
 def _short_series(phi, offset, square, alpha, out):
     """`_series` where its arguments are below TINY."""
     for j in range(len(phi)):
@@ -88,7 +88,7 @@ def _short_series(phi, offset, square, alpha, out):
         out[j] = room * p * (1.0 - y * (1.0 - y * (1 / 2.0) * (1.0 - y * (1 / 3.0))))
 
 
-@njit(**FAST)
+@njit(inline="always", **FAST)
 def _series(phi, offset, square, alpha, out):
     """A pixel's share of a very wide Gaussian, over alpha exp(-alpha (v/2)^2); the series' arguments are below SMALL."""
     for j in range(len(phi)):
@@ -101,7 +101,7 @@ def _series(phi, offset, square, alpha, out):
         out[j] = room * p * (1.0 - y * (1.0 - y * (1 / 2.0) * (1.0 - y * (1 / 3.0) * e)))
 
 
-@njit(**FAST)
+@njit(inline="always", **FAST)
 def _series_slope(phi, offset, alpha, out):
     for j in range(len(phi)):
         d = offset - phi[j]
@@ -110,7 +110,7 @@ def _series_slope(phi, offset, alpha, out):
         out[j] = 2.0 * d * (1.0 - y * (1.0 - y * (1 / 2.0) * (1.0 - y * (1 / 3.0) * e)))
 
 
-@njit(**FAST)
+@njit(inline="always", **FAST)
 def _recursion(phi, v, alpha, out, slope, scratch):
     """Shares over exp(-alpha q^2): exp(-alpha (d^2 - q^2)) follows from pixel to pixel."""
     r = (v - 1) // 2
@@ -151,7 +151,7 @@ def _lean(phi, k, alpha, value, out):
         out[j] = 2.0 * alpha * (0.5 - phi[j] + k) * value[j]
 
 
-@njit(**FAST)
+@njit(inline="always", **FAST)
 def _exponentials(phi, v, alpha, out, slope):
     """Shares over exp(-alpha q^2) of a narrow Gaussian, whose recursion would overflow."""
     for k in range(v):
@@ -178,7 +178,7 @@ def _sum(rows, out):
             out[j] += row[j]
 
 
-@njit(**FAST)
+@njit(inline="always", **FAST)
 def _level(value, over, lean, slope):
     for j in range(len(slope)):
         slope[j] -= value[j] * over[j] * lean[j]
