@@ -17,9 +17,9 @@ import numpy as np
 from caustic_cli.optics.kernels import cache, functions, plane
 
 #: What is compiled by itself, and about how long that takes, s.
-PARTS = {"adjoint": 9.5, "transport": 9.0, "splat": 7.5, "surface": 6.0}
+PARTS = {"adjoint": 5.0, "transport": 5.5, "splat": 4.0, "surface": 2.8}
 #: Parts that call the same functions, and how much sooner they are compiled one after the other in one process, s.
-ALIKE, SAVED = {"adjoint", "splat"}, 2.0
+ALIKE, SAVED = {"adjoint", "splat"}, 2.2
 
 
 def kept() -> bool:

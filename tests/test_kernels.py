@@ -8,6 +8,7 @@ torch's rays are compared with theirs, to 1e-5.
 from __future__ import annotations
 
 import numba
+import numpy as np
 import pytest
 import torch
 
@@ -15,9 +16,11 @@ from caustic_cli import firstrun
 from caustic_cli.optics.backends import backend_for, plain
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.frames import IDENTITY
-from caustic_cli.optics.kernels import banded, plane, spline
+from caustic_cli.optics.kernels import banded, pixels, plane, spline
 from caustic_cli.optics.kernels import shares as kernel_shares
 from caustic_cli.optics.kernels.functions import PlaneKernel
+from caustic_cli.optics.kernels.jit import njit
+from caustic_cli.optics.kernels.threads import ALL, on_threads
 from caustic_cli.optics.reconstruction import Filter, splat
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -219,7 +222,7 @@ def test_the_first_run_compiles_what_designs_and_renders_use(dtype):
     """A kernel that is called in another way than it was compiled ahead for would be compiled again, half a minute each time."""
     for part in firstrun.PARTS:
         firstrun.compile_part(part)
-    kernels = (plane.forward, plane.backward, plane.total, spline.evaluate, spline.pull_back, banded._contract, banded._spread)
+    kernels = (plane.forward, plane.backward, pixels.sums, spline.evaluate, spline.pull_back, banded._contract, banded._spread)
     ahead = [list(kernel.signatures) for kernel in kernels]
     for kind, rays in (("lines", 900), ("stratified", 1500), ("uniform", 900), ("uniform", 1)):
         image, *_ = next(exposures(scene("schlick"), heights().requires_grad_(), FILTERS[-1], kind, dtype, rays))
@@ -233,6 +236,27 @@ def test_parts_of_the_first_run_are_shared_out():
         assert sorted(part for share in shares for part in share) == sorted(firstrun.PARTS)
         assert len(shares) == processes
         assert all(shares)
+
+
+@njit(entry=True)
+def _numbered(k, pair, factor, refused):
+    if k == ALL:
+        on_threads(len(pair[0]), (pair, factor, refused))
+        return
+    if k == refused:
+        raise MemoryError
+    pair[0][k] = factor * k
+    pair[1][k] = 1.0
+
+
+def test_a_kernel_calls_itself_with_every_number_and_says_when_a_call_failed():
+    numbers, ones = np.zeros(1000), np.zeros(1000)
+    _numbered(ALL, (numbers, ones), 0.5, -2)
+    np.testing.assert_array_equal(numbers, 0.5 * np.arange(1000))
+    assert ones.all()
+    _numbered(ALL, (np.zeros(0), ones), 0.5, -2)
+    with pytest.raises(MemoryError):
+        _numbered(ALL, (numbers, ones), 0.5, 700)
 
 
 def test_threads_are_not_those_of_tbb():

@@ -151,7 +151,7 @@ def start_torch(device: str, threads: int | None, say: Reporter):
     if backend_for(device).compiled:
         from caustic_cli import firstrun  # noqa: PLC0415
 
-        with say.patience("compiling the kernels for this machine, once: about twenty seconds"):
+        with say.patience("compiling the kernels for this machine, once: about ten seconds"):
             if not firstrun.kept():
                 firstrun.compile_side_by_side()
             backend_for(device).compile_plane()

@@ -14,9 +14,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from caustic_cli.optics.kernels.jit import njit, prange
+from caustic_cli.optics.kernels.jit import njit
+from caustic_cli.optics.kernels.threads import ALL, on_threads
 
 MISSED = 16  # cuts added to a cell after those of its neighbours on the raster
+TASKS = 32  # parts of the sites, in each of which cells are cut by one thread
 
 
 @njit(nogil=True)
@@ -55,7 +57,6 @@ def _line(y, f, n, x, value, place, hull):
         place[r] = hull[k]
 
 
-@njit(parallel=True, nogil=True)
 def envelope(psi, rows, first, y2, x1, x2):
     """phi and the site that attains it on a raster.
 
@@ -67,44 +68,62 @@ def envelope(psi, rows, first, y2, x1, x2):
         phi (n, m), site (n, m) int32.
     """
     n, m, k = len(x1), len(x2), len(rows)
-    part, who = np.empty((m, k)), np.empty((m, k), np.int32)
-    for i in prange(k):
-        a, b = first[i], first[i + 1]
-        value, place, hull = np.empty(m), np.empty(m, np.int32), np.empty(b - a, np.int32)
-        _line(y2[a:b], psi[a:b], b - a, x2, value, place, hull)
-        for r in range(m):
-            part[r, i], who[r, i] = -value[r], a + place[r]
     phi, site = np.empty((n, m)), np.empty((n, m), np.int32)
-    strips = (m + 15) // 16
-    for s in prange(strips):
-        value, place, hull = np.empty((16, n)), np.empty((16, n), np.int32), np.empty(k, np.int32)
-        low, high = 16 * s, min(16 * s + 16, m)
-        for r in range(low, high):
-            _line(rows, part[r], k, x1, value[r - low], place[r - low], hull)
-        for i in range(n):
-            for r in range(low, high):
-                phi[i, r], site[i, r] = value[r - low, i], who[r, place[r - low, i]]
+    _envelope(ALL, False, psi, rows, first, y2, x1, x2, np.empty((m, k)), np.empty((m, k), np.int32), phi, site)
     return phi, site
 
 
-@njit(parallel=True, nogil=True)
+@njit(entry=True, nogil=True)
+def _envelope(i, across, psi, rows, first, y2, x1, x2, part, who, phi, site):
+    """Row i, or then the strip i across all rows, of `envelope`."""
+    n, m, k = len(x1), len(x2), len(rows)
+    if i == ALL:
+        on_threads(k, (False, psi, rows, first, y2, x1, x2, part, who, phi, site))
+        on_threads((m + 15) // 16, (True, psi, rows, first, y2, x1, x2, part, who, phi, site))
+        return
+    if across:
+        value, place, hull = np.empty((16, n)), np.empty((16, n), np.int32), np.empty(k, np.int32)
+        low, high = 16 * i, min(16 * i + 16, m)
+        for r in range(low, high):
+            _line(rows, part[r], k, x1, value[r - low], place[r - low], hull)
+        for j in range(n):
+            for r in range(low, high):
+                phi[j, r], site[j, r] = value[r - low, j], who[r, place[r - low, j]]
+        return
+    a, b = first[i], first[i + 1]
+    value, place, hull = np.empty((1, m)), np.empty((1, m), np.int32), np.empty(b - a, np.int32)
+    _line(y2[a:b], psi[a:b], b - a, x2, value[0], place[0], hull)
+    for r in range(m):
+        part[r, i], who[r, i] = -value[0, r], a + place[0, r]
+
+
 def prices(phi, rows, first, y2, x1, x2):
     """The Legendre transform back: psi_p = max over the raster of x . y_p - phi(x), (N,), and where: index i m + j, (N,)."""
-    n, m, k = len(x1), len(x2), len(rows)
-    part, which = np.empty((k, m)), np.empty((k, m), np.int32)
-    for r in prange(m):
-        value, place, hull = np.empty(k), np.empty(k, np.int32), np.empty(n, np.int32)
-        _line(x1, phi[:, r].copy(), n, rows, value, place, hull)
-        for i in range(k):
-            part[i, r], which[i, r] = -value[i], place[i]
+    m, k = len(x2), len(rows)
     psi, at = np.empty(len(y2)), np.empty(len(y2), np.int64)
-    for i in prange(k):
+    _prices(ALL, False, phi, rows, first, y2, x1, x2, np.empty((k, m)), np.empty((k, m), np.int32), psi, at)
+    return psi, at
+
+
+@njit(entry=True, nogil=True)
+def _prices(i, across, phi, rows, first, y2, x1, x2, part, which, psi, at):
+    """Column i of the raster, or then the row i of sites, of `prices`."""
+    n, m, k = len(x1), len(x2), len(rows)
+    if i == ALL:
+        on_threads(m, (False, phi, rows, first, y2, x1, x2, part, which, psi, at))
+        on_threads(k, (True, phi, rows, first, y2, x1, x2, part, which, psi, at))
+        return
+    if across:
         a, b = first[i], first[i + 1]
         value, place, hull = np.empty(b - a), np.empty(b - a, np.int32), np.empty(m, np.int32)
         _line(x2, part[i], m, y2[a:b], value, place, hull)
         for p in range(a, b):
             psi[p], at[p] = value[p - a], which[i, place[p - a]] * m + place[p - a]
-    return psi, at
+        return
+    value, place, hull = np.empty(k), np.empty(k, np.int32), np.empty(n, np.int32)
+    _line(x1, phi[:, i].copy(), n, rows, value, place, hull)
+    for j in range(k):
+        part[j, i], which[j, i] = -value[j], place[j]
 
 
 @njit(nogil=True)
@@ -180,11 +199,13 @@ def density(f, x, y, a, b):
     return (f[i, j] * (1 - u) + f[i1, j] * u) * (1 - v) + (f[i, j1] * (1 - u) + f[i1, j1] * u) * v
 
 
-@njit(entry=True, nogil=True)
 def sampled(f, x1, x2, a, b):
     """Bilinear values of f on a raster, (n, m); (1, 1) where f is one constant."""
-    if f.size == 1:
-        return f.copy()
+    return f.copy() if f.size == 1 else _sampled(f, x1, x2, a, b)
+
+
+@njit(entry=True, nogil=True)
+def _sampled(f, x1, x2, a, b):
     out = np.empty((len(x1), len(x2)))
     for i in range(len(x1)):
         for j in range(len(x2)):
@@ -192,22 +213,34 @@ def sampled(f, x1, x2, a, b):
     return out
 
 
-@njit(nogil=True)
 def _means(site, values, sites):
     """Mean of raster values in each cell, (N,)."""
-    total, count = np.zeros(sites), np.zeros(sites)
     if values.size == 1:
         return np.full(sites, values[0, 0])
-    for i in range(site.shape[0]):
-        for j in range(site.shape[1]):
-            total[site[i, j]] += values[i, j]
-            count[site[i, j]] += 1.0
-    return total / np.maximum(count, 1.0)
+    total, count = np.bincount(site.ravel(), values.ravel(), sites), np.bincount(site.ravel(), minlength=sites)
+    return total / np.maximum(count, 1)
 
 
-@njit(nogil=True)
-def _cells(low, high, psi, y1, y2, site, head, link, end, degree, f, level, a, b, mass, weight):
-    """`cells` for the sites low..high."""
+def cells(psi, y1, y2, site, head, link, end, degree, f, values, a, b):
+    """Mass of every cell and d(mass) across every border.
+
+    Returns:
+        mass (N,): source light in the cell, its area times the mean over its raster points of `values`, the source f sampled;
+        weight (half-borders,): f times the border's length over the sites' distance, the derivative of the mass by the
+        difference of the two prices (Kitagawa, Merigot & Thibert, J. Eur. Math. Soc. 21, 2019, theorem 1.3).
+    """
+    mass, weight, level = np.zeros(len(psi)), np.zeros(len(end)), _means(site, values, len(psi))
+    _cells(ALL, psi, y1, y2, site, head, link, end, degree, f, level, a, b, mass, weight)
+    return mass, weight
+
+
+@njit(entry=True, nogil=True)
+def _cells(task, psi, y1, y2, site, head, link, end, degree, f, level, a, b, mass, weight):
+    """`cells` for one of TASKS parts of the sites."""
+    if task == ALL:
+        on_threads(TASKS, (psi, y1, y2, site, head, link, end, degree, f, level, a, b, mass, weight))
+        return
+    low, high = task * len(psi) // TASKS, (task + 1) * len(psi) // TASKS
     room, flat = 0, f.size == 1
     rn, rm = site.shape
     for p in range(low, high):
@@ -250,20 +283,3 @@ def _cells(low, high, psi, y1, y2, site, head, link, end, degree, f, level, a, b
                 length = np.hypot(px[k1] - px[k], py[k1] - py[k])
                 g = f[0, 0] if flat else density(f, 0.5 * (px[k] + px[k1]), 0.5 * (py[k] + py[k1]), a, b)
                 weight[po[k]] = g * length / np.hypot(y1[q] - y1[p], y2[q] - y2[p])
-
-
-@njit(parallel=True, nogil=True)
-def cells(psi, y1, y2, site, head, link, end, degree, f, values, a, b):
-    """Mass of every cell and d(mass) across every border.
-
-    Returns:
-        mass (N,): source light in the cell, its area times the mean over its raster points of `values`, the source f sampled;
-        weight (half-borders,): f times the border's length over the sites' distance, the derivative of the mass by the
-        difference of the two prices (Kitagawa, Merigot & Thibert, J. Eur. Math. Soc. 21, 2019, theorem 1.3).
-    """
-    sites, tasks = len(psi), 32
-    mass, weight, level = np.zeros(sites), np.zeros(len(end)), _means(site, values, sites)
-    for task in prange(tasks):
-        _cells(task * sites // tasks, (task + 1) * sites // tasks, psi, y1, y2, site, head, link, end, degree, f, level, a, b,
-               mass, weight)
-    return mass, weight

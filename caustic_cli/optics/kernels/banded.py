@@ -11,7 +11,8 @@ from torch import Tensor
 
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels import blocks
-from caustic_cli.optics.kernels.jit import FAST, njit, prange
+from caustic_cli.optics.kernels.jit import FAST, njit
+from caustic_cli.optics.kernels.threads import ALL, on_threads
 
 
 class AlongV:
@@ -33,7 +34,7 @@ class _Contraction(torch.autograd.Function):
     @staticmethod
     def forward(net: Tensor, along: AlongV):
         out = [torch.empty(len(net), len(along.arrays[0]), dtype=torch.float64) for _ in range(2)]
-        _contract(net.detach().contiguous().numpy(), *along.arrays, *(t.numpy() for t in out))
+        _contract(ALL, net.detach().contiguous().numpy(), *along.arrays, *(t.numpy() for t in out))
         return tuple(out)
 
     @staticmethod
@@ -43,7 +44,7 @@ class _Contraction(torch.autograd.Function):
     @staticmethod
     def backward(ctx, by_value, by_slope):
         out = torch.zeros(len(by_value), ctx.along.size, dtype=torch.float64)
-        _spread(by_value.contiguous().numpy(), by_slope.contiguous().numpy(), *ctx.along.arrays, out.numpy())
+        _spread(ALL, by_value.contiguous().numpy(), by_slope.contiguous().numpy(), *ctx.along.arrays, out.numpy())
         return out, None
 
     @staticmethod
@@ -51,23 +52,27 @@ class _Contraction(torch.autograd.Function):
         return _Contraction.apply(tangent.detach(), ctx.along)  # within torch.func numbers are within reach only so
 
 
-@njit(parallel=True, **FAST)
-def _contract(net, first, values, slopes, out, out_slope):
-    for i in prange(len(net)):
-        row, to, to_slope = net[i], out[i], out_slope[i]
-        for j in range(len(first)):
-            value, slope, at = 0.0, 0.0, first[j]
-            for k in range(values.shape[1]):
-                value += values[j, k] * row[at + k]
-                slope += slopes[j, k] * row[at + k]
-            to[j], to_slope[j] = value, slope
+@njit(entry=True, **FAST)
+def _contract(i, net, first, values, slopes, out, out_slope):
+    if i == ALL:
+        on_threads(len(net), (net, first, values, slopes, out, out_slope))
+        return
+    row, to, to_slope = net[i], out[i], out_slope[i]
+    for j in range(len(first)):
+        value, slope, at = 0.0, 0.0, first[j]
+        for k in range(values.shape[1]):
+            value += values[j, k] * row[at + k]
+            slope += slopes[j, k] * row[at + k]
+        to[j], to_slope[j] = value, slope
 
 
-@njit(parallel=True, **FAST)
-def _spread(by_value, by_slope, first, values, slopes, out):
-    for i in prange(len(out)):
-        to, value, slope = out[i], by_value[i], by_slope[i]
-        for j in range(len(first)):
-            at = first[j]
-            for k in range(values.shape[1]):
-                to[at + k] += values[j, k] * value[j] + slopes[j, k] * slope[j]
+@njit(entry=True, **FAST)
+def _spread(i, by_value, by_slope, first, values, slopes, out):
+    if i == ALL:
+        on_threads(len(out), (by_value, by_slope, first, values, slopes, out))
+        return
+    to, value, slope = out[i], by_value[i], by_slope[i]
+    for j in range(len(first)):
+        at = first[j]
+        for k in range(values.shape[1]):
+            to[at + k] += values[j, k] * value[j] + slopes[j, k] * slope[j]

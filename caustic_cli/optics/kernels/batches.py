@@ -40,8 +40,9 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from caustic_cli.optics.kernels.hit import HIT, MISSED, _leaves, _root, _value
-from caustic_cli.optics.kernels.jit import FAST, njit, prange
+from caustic_cli.optics.kernels.jit import FAST, njit
 from caustic_cli.optics.kernels.spline import curvatures, jet, piece, push_powers
+from caustic_cli.optics.kernels.threads import ALL, on_threads
 from caustic_cli.optics.tolerances import FEW_ULP, LEAST_COSINE
 
 #: Rays of a batch: enough to fill the vectors several times over, few enough for sums over them to stay in registers.
@@ -273,98 +274,101 @@ def _guess(ou, ov, oz, du, dv, dz, middle, thick, c, bu, mu, wu, bv, mv, wv):
     return t, piece(ou + t * du, bu), piece(ov + t * dv, bv)
 
 
-@njit(parallel=True, **FAST)
-def meet(order, batched, ou, ov, oz, du, dv, dz, limits, slopes, round_, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y, status,
-         reach, gx, gy, met, where, blocks):
+@njit(entry=True, **FAST)
+def meet(block, order, batched, ou, ov, oz, du, dv, dz, limits, slopes, round_, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y,
+         status, reach, gx, gy, met, where, blocks):
     """First hits of rays (N,): status, distances (-1 for none), dz/dx and dz/dy there into status, reach, gx, gy.
 
     order (N,): of the rays; batched: whether to look for batches; limits: least and largest control height; slopes: bounds of
     |Z_u| and |Z_v|; round_: radius of a circular aperture, mm, or infinite.  met (N,): the rays in the order in which they were
     met, where (N,): the span products where they hit, counted row by row, -1 for none.
     """
+    if block == ALL:
+        on_threads(blocks, (order, batched, ou, ov, oz, du, dv, dz, limits, slopes, round_, c, bu, mu, wu, bv, mv, wv, scale_x,
+                            scale_y, status, reach, gx, gy, met, where, blocks))
+        return
     count, wide = len(ou), len(bv) - 1
     size, middle, thick = max(abs(limits[0]), abs(limits[1])), 0.5 * (limits[0] + limits[1]), 0.5 * (limits[1] - limits[0])
     fewest = max(1, FEWEST // (c.shape[2] * c.shape[3]))
-    for block in prange(blocks):
-        w, ends = np.empty(ROWS * LANES), np.empty(BOX + 2, np.int32)
-        start, at, key = np.empty(TILE), np.empty(TILE, np.int32), np.empty(TILE, np.int32)
-        some, together, alone = np.empty(TILE, np.int32), np.empty(TILE, np.int32), np.empty(TILE, np.int32)
-        first, stop = block * count // blocks, (block + 1) * count // blocks
-        to = first
-        while first < stop:
-            last, left, lone, low, high = min(first + TILE, stop), 0, 0, np.int32(2**31 - 1), np.int32(0)
-            for k in range(first, last):
-                r = UINT(order[k])
-                u, v, safe = ou[r], ov[r], slopes[0] * abs(du[r]) + slopes[1] * abs(dv[r]) < dz[r]
-                if not (batched and safe and u >= 0.0 and u <= 1.0 and v >= 0.0 and v <= 1.0):
-                    alone[lone] = r
-                    lone += 1
-                    continue
-                t, i, j = _guess(u, v, oz[r], du[r], dv[r], dz[r], middle, thick, c, bu, mu, wu, bv, mv, wv)
-                start[left], at[left], some[left], key[left] = t, r, left, i * wide + j
-                low, high = min(low, key[left]), max(high, key[left])
-                left += 1
-            for _ in range(TURNS):
-                if left < fewest or high - low >= BOX:
-                    break
-                _group(some, left, key, low, high, ends, together)
-                begin, some_end, left, low, high = 0, left, 0, np.int32(2**31 - 1), np.int32(0)
-                known, bounds = np.int32(-1), (0.0, 0.0, 0.0)
-                while begin < some_end:
-                    piece_ = key[together[begin]]
-                    end, most = begin + 1, min(begin + LANES, some_end)
-                    while end < most and key[together[end]] == piece_:
-                        end += 1
-                    if end - begin < fewest:
-                        for k in range(begin, end):
-                            alone[lone] = at[together[k]]
-                            lone += 1
-                        begin = end
-                        continue
-                    a, b = piece_ // wide, piece_ % wide
-                    if piece_ != known:
-                        known, bounds = piece_, _bounds(c, a, b)
-                    for k in range(LANES):
-                        s = together[min(begin + k, end - 1)]
-                        r = UINT(at[s])
-                        w[OU + k], w[OV + k], w[OZ + k], w[T + k] = ou[r], ov[r], oz[r], start[s]
-                        w[DU + k], w[DV + k], w[DZ + k] = du[r], dv[r], dz[r]
-                    _settle(w, size, c, a, b, bounds, (bu[a], bu[a + 1]), (bv[b], bv[b + 1]), mu[a], wu[a], mv[b], wv[b], scale_x,
-                            scale_y)
-                    for k in range(end - begin):
-                        s, t = together[begin + k], w[T + k]
-                        r = UINT(at[s])
-                        if w[DONE + k] > 0.0:
-                            met[to], where[to] = r, piece_
-                            status[r], reach[r], gx[r], gy[r] = HIT, t, w[G_U + k] * scale_x, w[G_V + k] * scale_y
-                            to += 1
-                            continue
-                        start[s] = t
-                        key[s] = piece(w[OU + k] + t * w[DU + k], bu) * wide + piece(w[OV + k] + t * w[DV + k], bv)
-                        low, high = min(low, key[s]), max(high, key[s])
-                        some[left] = s
-                        left += 1
-                    begin = end
-            for k in range(left):
-                alone[lone] = at[some[k]]
+    w, ends = np.empty(ROWS * LANES), np.empty(BOX + 2, np.int32)
+    start, at, key = np.empty(TILE), np.empty(TILE, np.int32), np.empty(TILE, np.int32)
+    some, together, alone = np.empty(TILE, np.int32), np.empty(TILE, np.int32), np.empty(TILE, np.int32)
+    first, stop = block * count // blocks, (block + 1) * count // blocks
+    to = first
+    while first < stop:
+        last, left, lone, low, high = min(first + TILE, stop), 0, 0, np.int32(2**31 - 1), np.int32(0)
+        for k in range(first, last):
+            r = UINT(order[k])
+            u, v, safe = ou[r], ov[r], slopes[0] * abs(du[r]) + slopes[1] * abs(dv[r]) < dz[r]
+            if not (batched and safe and u >= 0.0 and u <= 1.0 and v >= 0.0 and v <= 1.0):
+                alone[lone] = r
                 lone += 1
-            for k in range(lone):
-                r = alone[k]
-                slope = slopes[0] * abs(du[r]) + slopes[1] * abs(dv[r])
-                t, status[r] = _root((ou[r], ov[r], oz[r], du[r], dv[r], dz[r]), -1.0, limits, slope, c, bu, mu, wu, bv, mv, wv)
-                met[to], where[to], reach[r], gx[r], gy[r] = r, -1, -1.0, 0.0, 0.0
-                if status[r] == HIT:
-                    u, v = ou[r] + t * du[r], ov[r] + t * dv[r]
-                    _, zu, zv = _value(c, u, v, bu, mu, wu, bv, mv, wv)
-                    where[to], reach[r], gx[r], gy[r] = piece(u, bu) * wide + piece(v, bv), t, zu * scale_x, zv * scale_y
-                to += 1
-            if round_ < np.inf:  # beyond a circular aperture there is the lens' side
-                for k in range(first, last):
-                    r = met[k]
-                    x, y = (ou[r] - 0.5 + reach[r] * du[r]) / scale_x, (ov[r] - 0.5 + reach[r] * dv[r]) / scale_y
-                    if status[r] == HIT and x * x + y * y > round_ * round_:
-                        where[k], status[r], reach[r], gx[r], gy[r] = -1, MISSED, -1.0, 0.0, 0.0
-            first = last
+                continue
+            t, i, j = _guess(u, v, oz[r], du[r], dv[r], dz[r], middle, thick, c, bu, mu, wu, bv, mv, wv)
+            start[left], at[left], some[left], key[left] = t, r, left, i * wide + j
+            low, high = min(low, key[left]), max(high, key[left])
+            left += 1
+        for _ in range(TURNS):
+            if left < fewest or high - low >= BOX:
+                break
+            _group(some, left, key, low, high, ends, together)
+            begin, some_end, left, low, high = 0, left, 0, np.int32(2**31 - 1), np.int32(0)
+            known, bounds = np.int32(-1), (0.0, 0.0, 0.0)
+            while begin < some_end:
+                piece_ = key[together[begin]]
+                end, most = begin + 1, min(begin + LANES, some_end)
+                while end < most and key[together[end]] == piece_:
+                    end += 1
+                if end - begin < fewest:
+                    for k in range(begin, end):
+                        alone[lone] = at[together[k]]
+                        lone += 1
+                    begin = end
+                    continue
+                a, b = piece_ // wide, piece_ % wide
+                if piece_ != known:
+                    known, bounds = piece_, _bounds(c, a, b)
+                for k in range(LANES):
+                    s = together[min(begin + k, end - 1)]
+                    r = UINT(at[s])
+                    w[OU + k], w[OV + k], w[OZ + k], w[T + k] = ou[r], ov[r], oz[r], start[s]
+                    w[DU + k], w[DV + k], w[DZ + k] = du[r], dv[r], dz[r]
+                _settle(w, size, c, a, b, bounds, (bu[a], bu[a + 1]), (bv[b], bv[b + 1]), mu[a], wu[a], mv[b], wv[b], scale_x,
+                        scale_y)
+                for k in range(end - begin):
+                    s, t = together[begin + k], w[T + k]
+                    r = UINT(at[s])
+                    if w[DONE + k] > 0.0:
+                        met[to], where[to] = r, piece_
+                        status[r], reach[r], gx[r], gy[r] = HIT, t, w[G_U + k] * scale_x, w[G_V + k] * scale_y
+                        to += 1
+                        continue
+                    start[s] = t
+                    key[s] = piece(w[OU + k] + t * w[DU + k], bu) * wide + piece(w[OV + k] + t * w[DV + k], bv)
+                    low, high = min(low, key[s]), max(high, key[s])
+                    some[left] = s
+                    left += 1
+                begin = end
+        for k in range(left):
+            alone[lone] = at[some[k]]
+            lone += 1
+        for k in range(lone):
+            r = alone[k]
+            slope = slopes[0] * abs(du[r]) + slopes[1] * abs(dv[r])
+            t, status[r] = _root((ou[r], ov[r], oz[r], du[r], dv[r], dz[r]), -1.0, limits, slope, c, bu, mu, wu, bv, mv, wv)
+            met[to], where[to], reach[r], gx[r], gy[r] = r, -1, -1.0, 0.0, 0.0
+            if status[r] == HIT:
+                u, v = ou[r] + t * du[r], ov[r] + t * dv[r]
+                _, zu, zv = _value(c, u, v, bu, mu, wu, bv, mv, wv)
+                where[to], reach[r], gx[r], gy[r] = piece(u, bu) * wide + piece(v, bv), t, zu * scale_x, zv * scale_y
+            to += 1
+        if round_ < np.inf:  # beyond a circular aperture there is the lens' side
+            for k in range(first, last):
+                r = met[k]
+                x, y = (ou[r] - 0.5 + reach[r] * du[r]) / scale_x, (ov[r] - 0.5 + reach[r] * dv[r]) / scale_y
+                if status[r] == HIT and x * x + y * y > round_ * round_:
+                    where[k], status[r], reach[r], gx[r], gy[r] = -1, MISSED, -1.0, 0.0, 0.0
+        first = last
 
 
 @njit(**FAST)
@@ -440,9 +444,9 @@ def _gather(table, p, q, total):
             total[a + 1, b + 3] += s7
 
 
-@njit(parallel=True, **FAST)
-def pull_back(met, where, by_t, by_gx, by_gy, ou, ov, du, dv, dz, t, gx, gy, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y, grads,
-              by_ox, by_oy, by_oz):
+@njit(entry=True, **FAST)
+def pull_back(block, met, where, by_t, by_gx, by_gy, ou, ov, du, dv, dz, t, gx, gy, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y,
+              grads, by_ox, by_oy, by_oz):
     """Adjoint of `meet`: derivatives by the coefficients (blocks, I, J, p + 1, q + 1), overwritten, and by the rays' starts.
 
     by_*: derivatives by distance and slopes (N,); met, where, t, gx, gy: as `meet` found them, t its reach; grads may have no
@@ -450,98 +454,104 @@ def pull_back(met, where, by_t, by_gx, by_gy, ou, ov, du, dv, dz, t, gx, gy, c, 
     """
     count, blocks, p, q, wide = len(t), len(grads), c.shape[2], c.shape[3], len(bv) - 1
     nets, starts = grads.shape[1] > 0, len(by_ox) > 0
-    for block in prange(blocks):
-        w, grad, powers = np.zeros(ROWS * LANES), grads[block], np.empty((2, q))
-        grad[:] = 0.0
-        pp, qq = (p + 1) // 2 * 2, (q + 3) // 4 * 4
-        table, total = np.zeros(2 * (pp + qq) * LANES), np.zeros((pp, qq))
-        begin, stop = block * count // blocks, (block + 1) * count // blocks
-        summed = False
-        while begin < stop:
-            if where[begin] < 0:
-                if starts:
-                    by_ox[met[begin]], by_oy[met[begin]], by_oz[met[begin]] = 0.0, 0.0, 0.0
-                begin += 1
-                continue
-            end, most, a, b = begin + 1, min(begin + LANES, stop), where[begin] // wide, where[begin] % wide
-            while end < most and where[end] == where[begin]:
-                end += 1
-            wi, wj, mi, mj = wu[a], wv[b], mu[a], mv[b]
-            if not summed and (end - begin) * (p + q) < ALONE:
-                for k in range(begin, end):
-                    r = met[k]
-                    xi, eta = (ou[r] + t[r] * du[r] - mi) * wi, (ov[r] + t[r] * dv[r] - mj) * wj
-                    xx, xy, yy = curvatures(c, a, b, xi, eta)
-                    xx, xy, yy = xx * wi * wi, xy * wi * wj, yy * wj * wj
-                    by_u, by_v = by_gx[r] * scale_x, by_gy[r] * scale_y
-                    by_x, by_y = by_u * xx + by_v * xy, by_u * xy + by_v * yy
-                    cosine = max(dz[r] - gx[r] * du[r] / scale_x - gy[r] * dv[r] / scale_y, LEAST_COSINE)
-                    by_z = (by_t[r] + by_x * du[r] + by_y * dv[r]) / cosine
-                    if nets:
-                        push_powers(grad, a, b, xi, eta, by_z, by_u * wi, by_v * wj, powers)
-                    if starts:
-                        by_ox[r], by_oy[r], by_oz[r] = by_x * scale_x + by_z * gx[r], by_y * scale_y + by_z * gy[r], -by_z
-                begin = end
-                continue
-            for k in range(LANES):
-                r, here = UINT(met[min(begin + k, end - 1)]), 1.0 if k < end - begin else 0.0
-                w[OU + k], w[OV + k], w[T + k], w[GX + k], w[GY + k] = ou[r], ov[r], t[r], gx[r], gy[r]
-                w[DU + k], w[DV + k], w[DZ + k] = du[r], dv[r], dz[r]
-                w[BY_T + k], w[BY_U + k], w[BY_V + k] = here * by_t[r], here * by_gx[r], here * by_gy[r]
-            for k in range(LANES):
-                w[XI + k] = (w[OU + k] + w[T + k] * w[DU + k] - mi) * wi
-                w[ETA + k] = (w[OV + k] + w[T + k] * w[DV + k] - mj) * wj
-            _curvatures(w, c, a, b)
-            for k in range(LANES):
-                xx, xy, yy = 2.0 * w[H_XI + k] * wi * wi, w[MIXED + k] * wi * wj, 2.0 * w[H_ETA + k] * wj * wj
-                by_u, by_v = w[BY_U + k] * scale_x, w[BY_V + k] * scale_y
-                by_x, by_y = by_u * xx + by_v * xy, by_u * xy + by_v * yy
-                cosine = max(w[DZ + k] - w[GX + k] / scale_x * w[DU + k] - w[GY + k] / scale_y * w[DV + k], LEAST_COSINE)
-                by_z = (w[BY_T + k] + by_x * w[DU + k] + by_y * w[DV + k]) / cosine
-                w[BY_Z + k], w[BY_U + k], w[BY_V + k] = by_z, by_u * wi, by_v * wj
-                w[BY_X + k], w[BY_Y + k] = by_x * scale_x + by_z * w[GX + k], by_y * scale_y + by_z * w[GY + k]
+    if block == ALL:
+        on_threads(blocks, (met, where, by_t, by_gx, by_gy, ou, ov, du, dv, dz, t, gx, gy, c, bu, mu, wu, bv, mv, wv, scale_x,
+                            scale_y, grads, by_ox, by_oy, by_oz))
+        return
+    w, grad, powers = np.zeros(ROWS * LANES), grads[block], np.empty((2, q))
+    grad[:] = 0.0
+    pp, qq = (p + 1) // 2 * 2, (q + 3) // 4 * 4
+    table, total = np.zeros(2 * (pp + qq) * LANES), np.zeros((pp, qq))
+    begin, stop = block * count // blocks, (block + 1) * count // blocks
+    summed = False
+    while begin < stop:
+        if where[begin] < 0:
             if starts:
-                for k in range(end - begin):
-                    r = met[begin + k]
-                    by_ox[r], by_oy[r], by_oz[r] = w[BY_X + k], w[BY_Y + k], -w[BY_Z + k]
-            if nets:
-                _tables(w, p, q, table)
-                _gather(table, p, q, total)
-                summed = end < stop and where[end] == where[begin]
-                if not summed:
-                    for k in range(p):
-                        for m in range(q):
-                            grad[a, b, k, m] += total[k, m]
-                    total[:] = 0.0
+                by_ox[met[begin]], by_oy[met[begin]], by_oz[met[begin]] = 0.0, 0.0, 0.0
+            begin += 1
+            continue
+        end, most, a, b = begin + 1, min(begin + LANES, stop), where[begin] // wide, where[begin] % wide
+        while end < most and where[end] == where[begin]:
+            end += 1
+        wi, wj, mi, mj = wu[a], wv[b], mu[a], mv[b]
+        if not summed and (end - begin) * (p + q) < ALONE:
+            for k in range(begin, end):
+                r = met[k]
+                xi, eta = (ou[r] + t[r] * du[r] - mi) * wi, (ov[r] + t[r] * dv[r] - mj) * wj
+                xx, xy, yy = curvatures(c, a, b, xi, eta)
+                xx, xy, yy = xx * wi * wi, xy * wi * wj, yy * wj * wj
+                by_u, by_v = by_gx[r] * scale_x, by_gy[r] * scale_y
+                by_x, by_y = by_u * xx + by_v * xy, by_u * xy + by_v * yy
+                cosine = max(dz[r] - gx[r] * du[r] / scale_x - gy[r] * dv[r] / scale_y, LEAST_COSINE)
+                by_z = (by_t[r] + by_x * du[r] + by_y * dv[r]) / cosine
+                if nets:
+                    push_powers(grad, a, b, xi, eta, by_z, by_u * wi, by_v * wj, powers)
+                if starts:
+                    by_ox[r], by_oy[r], by_oz[r] = by_x * scale_x + by_z * gx[r], by_y * scale_y + by_z * gy[r], -by_z
             begin = end
+            continue
+        for k in range(LANES):
+            r, here = UINT(met[min(begin + k, end - 1)]), 1.0 if k < end - begin else 0.0
+            w[OU + k], w[OV + k], w[T + k], w[GX + k], w[GY + k] = ou[r], ov[r], t[r], gx[r], gy[r]
+            w[DU + k], w[DV + k], w[DZ + k] = du[r], dv[r], dz[r]
+            w[BY_T + k], w[BY_U + k], w[BY_V + k] = here * by_t[r], here * by_gx[r], here * by_gy[r]
+        for k in range(LANES):
+            w[XI + k] = (w[OU + k] + w[T + k] * w[DU + k] - mi) * wi
+            w[ETA + k] = (w[OV + k] + w[T + k] * w[DV + k] - mj) * wj
+        _curvatures(w, c, a, b)
+        for k in range(LANES):
+            xx, xy, yy = 2.0 * w[H_XI + k] * wi * wi, w[MIXED + k] * wi * wj, 2.0 * w[H_ETA + k] * wj * wj
+            by_u, by_v = w[BY_U + k] * scale_x, w[BY_V + k] * scale_y
+            by_x, by_y = by_u * xx + by_v * xy, by_u * xy + by_v * yy
+            cosine = max(w[DZ + k] - w[GX + k] / scale_x * w[DU + k] - w[GY + k] / scale_y * w[DV + k], LEAST_COSINE)
+            by_z = (w[BY_T + k] + by_x * w[DU + k] + by_y * w[DV + k]) / cosine
+            w[BY_Z + k], w[BY_U + k], w[BY_V + k] = by_z, by_u * wi, by_v * wj
+            w[BY_X + k], w[BY_Y + k] = by_x * scale_x + by_z * w[GX + k], by_y * scale_y + by_z * w[GY + k]
+        if starts:
+            for k in range(end - begin):
+                r = met[begin + k]
+                by_ox[r], by_oy[r], by_oz[r] = w[BY_X + k], w[BY_Y + k], -w[BY_Z + k]
+        if nets:
+            _tables(w, p, q, table)
+            _gather(table, p, q, total)
+            summed = end < stop and where[end] == where[begin]
+            if not summed:
+                for k in range(p):
+                    for m in range(q):
+                        grad[a, b, k, m] += total[k, m]
+                total[:] = 0.0
+        begin = end
 
 
-@njit(parallel=True, **FAST)
-def push(change, move_x, move_y, move_z, met, where, ou, ov, du, dv, dz, t, gx, gy, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y,
-         out_t, out_x, out_y, blocks):
+@njit(entry=True, **FAST)
+def push(block, change, move_x, move_y, move_z, met, where, ou, ov, du, dv, dz, t, gx, gy, c, bu, mu, wu, bv, mv, wv, scale_x,
+         scale_y, out_t, out_x, out_y, blocks):
     """Tangents of the distances and slopes that `meet` found, into out_t, out_x, out_y (N,).
 
     change: of the coefficients; move_x, move_y, move_z (N,): of the rays' points that hit, at fixed t, mm; either may be empty.
     """
+    if block == ALL:
+        on_threads(blocks, (change, move_x, move_y, move_z, met, where, ou, ov, du, dv, dz, t, gx, gy, c, bu, mu, wu, bv, mv, wv,
+                            scale_x, scale_y, out_t, out_x, out_y, blocks))
+        return
     count, wide = len(t), len(bv) - 1
     nets, moves = change.shape[0] > 0, len(move_x) > 0
-    for block in prange(blocks):
-        for k in range(block * count // blocks, (block + 1) * count // blocks):
-            r = met[k]
-            out_t[r], out_x[r], out_y[r] = 0.0, 0.0, 0.0
-            if where[k] < 0:
-                continue
-            i, j = where[k] // wide, where[k] % wide
-            xi, eta = (ou[r] + t[r] * du[r] - mu[i]) * wu[i], (ov[r] + t[r] * dv[r] - mv[j]) * wv[j]
-            uu, uv, vv = curvatures(c, i, j, xi, eta)
-            uu, uv, vv = uu * wu[i] * wu[i], uv * wu[i] * wv[j], vv * wv[j] * wv[j]
-            z, zu, zv, x, y = 0.0, 0.0, 0.0, 0.0, 0.0
-            if nets:
-                z, zu, zv = jet(change, i, j, xi, eta)
-            if moves:
-                x, y = move_x[r], move_y[r]
-                z += gx[r] * x + gy[r] * y - move_z[r]
-            along = z / max(dz[r] - gx[r] * du[r] / scale_x - gy[r] * dv[r] / scale_y, LEAST_COSINE)
-            u, v = x * scale_x + along * du[r], y * scale_y + along * dv[r]
-            out_t[r] = along
-            out_x[r], out_y[r] = (zu * wu[i] + uu * u + uv * v) * scale_x, (zv * wv[j] + uv * u + vv * v) * scale_y
+    for k in range(block * count // blocks, (block + 1) * count // blocks):
+        r = met[k]
+        out_t[r], out_x[r], out_y[r] = 0.0, 0.0, 0.0
+        if where[k] < 0:
+            continue
+        i, j = where[k] // wide, where[k] % wide
+        xi, eta = (ou[r] + t[r] * du[r] - mu[i]) * wu[i], (ov[r] + t[r] * dv[r] - mv[j]) * wv[j]
+        uu, uv, vv = curvatures(c, i, j, xi, eta)
+        uu, uv, vv = uu * wu[i] * wu[i], uv * wu[i] * wv[j], vv * wv[j] * wv[j]
+        z, zu, zv, x, y = 0.0, 0.0, 0.0, 0.0, 0.0
+        if nets:
+            z, zu, zv = jet(change, i, j, xi, eta)
+        if moves:
+            x, y = move_x[r], move_y[r]
+            z += gx[r] * x + gy[r] * y - move_z[r]
+        along = z / max(dz[r] - gx[r] * du[r] / scale_x - gy[r] * dv[r] / scale_y, LEAST_COSINE)
+        u, v = x * scale_x + along * du[r], y * scale_y + along * dv[r]
+        out_t[r] = along
+        out_x[r], out_y[r] = (zu * wu[i] + uu * u + uv * v) * scale_x, (zv * wv[j] + uv * u + vv * v) * scale_y

@@ -130,7 +130,7 @@ def _by_sag(reach, sag, gx, gy, by_px, by_py, height, out):
         out[j] = -reach[j] / (h if h > 0.0 else 1.0) * (by_px[j] * gx[j] + by_py[j] * gy[j])
 
 
-@njit(**FAST)
+@njit(inline="always", **FAST)
 def pull(vectors, exit_):
     """Derivatives by the surface, left in T_SAG, T_GX, T_GY, from those by power and pixel coordinates."""
     n, height, v = exit_.index, exit_.height, vectors

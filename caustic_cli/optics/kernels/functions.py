@@ -11,10 +11,11 @@ import torch
 from torch import Tensor
 
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.kernels import bend, blocks, plane, points, shares
+from caustic_cli.optics.kernels import bend, blocks, pixels, plane, points, shares
 from caustic_cli.optics.kernels.arguments import Exit, Frame, Splat
 from caustic_cli.optics.kernels.banded import AlongV
 from caustic_cli.optics.kernels.surface import FusedSurface, RayHits, scattered_surface
+from caustic_cli.optics.kernels.threads import ALL
 from caustic_cli.optics.reconstruction import Filter, padding
 from caustic_cli.scene import Screen
 
@@ -213,9 +214,11 @@ class _Image(torch.autograd.Function):
     @staticmethod
     def forward(net: Tensor, net_x: Tensor, net_y: Tensor, rows: tuple, apart: bool, arguments: tuple, workspace: _Workspace):
         images, scratch = _images(arguments, workspace)
-        ledger = plane.forward(images, scratch, *rows, *_arrays(net, net_x, net_y), *arguments)
+        ledgers = np.empty((len(images), plane.COLUMNS))
+        plane.forward(ALL, images, ledgers, scratch, *rows, *_arrays(net, net_x, net_y), *arguments)
+        ledger = ledgers.sum(0)
         leaving = torch.tensor(ledger[plane.LEAVING], dtype=torch.float64)
-        return torch.from_numpy(plane.total(images)), leaving, torch.from_numpy(ledger)
+        return torch.from_numpy(pixels.total(images)), leaving, torch.from_numpy(ledger)
 
     @staticmethod
     def setup_context(ctx, inputs, output):
@@ -227,7 +230,7 @@ class _Image(torch.autograd.Function):
     @staticmethod
     def backward(ctx, by_image, by_leaving, _):
         sums = _adjoint(by_image, float(by_leaving), ctx.saved_tensors, ctx.rows, ctx.apart, ctx.arguments, ctx.workspace)
-        nets = (torch.from_numpy(s[0] if ctx.apart else plane.total(s)) for s in sums)
+        nets = (torch.from_numpy(s[0] if ctx.apart else pixels.total(s)) for s in sums)
         return *nets, None, None, None, None
 
     @staticmethod
@@ -235,8 +238,9 @@ class _Image(torch.autograd.Function):
         nets = ctx.saved_tensors
         along = [torch.zeros_like(n) if t is None else t for t, n in zip(tangents[:3], nets, strict=True)]
         images, scratch = _images(ctx.arguments, ctx.workspace)
-        leaving = plane.tangent(*_arrays(*along), images, scratch, *ctx.rows, *_arrays(*nets), *ctx.arguments)
-        return torch.from_numpy(plane.total(images)), torch.tensor(leaving, dtype=torch.float64), None
+        leaving = np.empty(len(images))
+        plane.tangent(ALL, *_arrays(*along), images, leaving, scratch, *ctx.rows, *_arrays(*nets), *ctx.arguments)
+        return torch.from_numpy(pixels.total(images)), torch.tensor(leaving.sum(), dtype=torch.float64), None
 
 
 def _adjoint(by_image: Tensor, by_leaving: float, nets, rows: tuple, apart: bool, arguments: tuple,
@@ -244,7 +248,7 @@ def _adjoint(by_image: Tensor, by_leaving: float, nets, rows: tuple, apart: bool
     """Derivatives by the three nets (n, b), a sum for each block: (3, blocks, n, b), or (3, 1, n, b) with `apart`."""
     scratch, shape = _images(arguments, workspace)[1], nets[0].shape
     sums = np.empty((3, 1, *shape)) if apart else workspace("nets", 3, len(scratch), *shape)
-    plane.backward(by_image.contiguous().numpy(), by_leaving, apart, sums, scratch, *rows, *_arrays(*nets), *arguments)
+    plane.backward(ALL, by_image.contiguous().numpy(), by_leaving, apart, sums, scratch, *rows, *_arrays(*nets), *arguments)
     return sums
 
 

@@ -23,6 +23,7 @@ from caustic_cli.optics.kernels import blocks
 from caustic_cli.optics.kernels.banded import AlongV
 from caustic_cli.optics.kernels.jit import FAST, njit, prange
 from caustic_cli.optics.kernels.rows import combine, spread
+from caustic_cli.optics.kernels.threads import ALL, on_threads
 
 
 class GridSurface:
@@ -45,12 +46,14 @@ class GridSurface:
         return _Rows.apply(*self.along_v(heights), self.rows)
 
 
-@njit(parallel=True, **FAST)
-def _combine(net, net_y, first, bu, du, z, zx, zy, blocks):
+@njit(entry=True, **FAST)
+def _combine(block, net, net_y, first, bu, du, z, zx, zy, blocks):
     """z and slopes (a, b)."""
-    for block in prange(blocks):
-        for i in range(block * len(z) // blocks, (block + 1) * len(z) // blocks):
-            combine(i, first, bu, du, net, net, net_y, z[i], zx[i], zy[i])
+    if block == ALL:
+        on_threads(blocks, (net, net_y, first, bu, du, z, zx, zy, blocks))
+        return
+    for i in range(block * len(z) // blocks, (block + 1) * len(z) // blocks):
+        combine(i, first, bu, du, net, net, net_y, z[i], zx[i], zy[i])
 
 
 @njit(parallel=True, **FAST)
@@ -73,7 +76,7 @@ class _Rows(torch.autograd.Function):
         shape = len(rows[0]), net.shape[1]
         out = [torch.empty(shape[0] * shape[1], dtype=torch.float64) for _ in range(3)]
         nets = (t.detach().contiguous().numpy() for t in (net, net_y))
-        _combine(*nets, *rows, *(t.numpy().reshape(shape) for t in out), blocks())
+        _combine(ALL, *nets, *rows, *(t.numpy().reshape(shape) for t in out), blocks())
         return tuple(out)
 
     @staticmethod

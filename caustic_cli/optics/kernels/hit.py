@@ -13,8 +13,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from caustic_cli.optics.kernels.jit import FAST, njit, prange
+from caustic_cli.optics.kernels.jit import FAST, njit
 from caustic_cli.optics.kernels.spline import jet, piece
+from caustic_cli.optics.kernels.threads import ALL, on_threads
 from caustic_cli.optics.tolerances import FEW_ULP, FINEST, MOST_PROBES, MOST_STEPS
 
 HIT, MISSED, UNRESOLVED = 0, 1, 2
@@ -142,58 +143,63 @@ def _root(ray, start, limits, slope, c, bu, mu, wu, bv, mv, wv):
     return t, UNRESOLVED
 
 
-@njit(parallel=True, **FAST)
-def intersect(ou, ov, oz, du, dv, dz, start, limits, slopes, c, bu, mu, wu, bv, mv, wv, t, status, blocks):
+@njit(entry=True, **FAST)
+def intersect(block, ou, ov, oz, du, dv, dz, start, limits, slopes, c, bu, mu, wu, bv, mv, wv, t, status, blocks):
     """First hits of rays (N,) into t and status (N,).
 
     limits: least and largest control height; slopes: bounds of |Z_u| and |Z_v|; start (N,): near which the hits are, infinite
     for none; or empty, if that is not known.
     """
+    if block == ALL:
+        on_threads(blocks, (ou, ov, oz, du, dv, dz, start, limits, slopes, c, bu, mu, wu, bv, mv, wv, t, status, blocks))
+        return
     count = len(ou)
-    for block in prange(blocks):
-        for k in range(block * count // blocks, (block + 1) * count // blocks):
-            ray = (ou[k], ov[k], oz[k], du[k], dv[k], dz[k])
-            slope = slopes[0] * abs(du[k]) + slopes[1] * abs(dv[k])
-            begin = start[k] if len(start) else -1.0
-            if begin == np.inf:
-                t[k], status[k] = 0.0, MISSED
-                continue
-            t[k], status[k] = _root(ray, begin, limits, slope, c, bu, mu, wu, bv, mv, wv)
+    for k in range(block * count // blocks, (block + 1) * count // blocks):
+        ray = (ou[k], ov[k], oz[k], du[k], dv[k], dz[k])
+        slope = slopes[0] * abs(du[k]) + slopes[1] * abs(dv[k])
+        begin = start[k] if len(start) else -1.0
+        if begin == np.inf:
+            t[k], status[k] = 0.0, MISSED
+            continue
+        t[k], status[k] = _root(ray, begin, limits, slope, c, bu, mu, wu, bv, mv, wv)
 
 
-@njit(parallel=True, **FAST)
-def intersect_again(ou, ov, oz, du, dv, dz, side, limits, slopes, round_, step, halvings, most, c, bu, mu, wu, bv, mv, wv, t,
-                    blocks):
+@njit(entry=True, **FAST)
+def intersect_again(block, ou, ov, oz, du, dv, dz, side, limits, slopes, round_, step, halvings, most, c, bu, mu, wu, bv, mv, wv,
+                    t, blocks):
     """Next meetings of rays (N,) that start on the surface, into t (N,), 0 for none: the search of `reintersection.reference`.
 
     side: 1 above the surface, -1 under it; limits, slopes: as in `intersect`; round_: the surface ends at the circle inscribed
     in its aperture; step, halvings, most: least step (mm), bisections of the last one and most steps.
     """
+    if block == ALL:
+        on_threads(blocks, (ou, ov, oz, du, dv, dz, side, limits, slopes, round_, step, halvings, most, c, bu, mu, wu, bv, mv, wv,
+                            t, blocks))
+        return
     count, highest = len(ou), limits[1] if side > 0.0 else -limits[0]
-    for block in prange(blocks):
-        for k in range(block * count // blocks, (block + 1) * count // blocks):
-            t[k] = 0.0
-            rise = side * dz[k] - slopes[0] * abs(du[k]) - slopes[1] * abs(dv[k])
-            if rise > 0.0:  # no slope of the surface catches the ray
-                continue
-            before, after, f = 0.0, 1e-3 * step, 0.0
-            for probe in range(most):
-                u, v, z = ou[k] + after * du[k], ov[k] + after * dv[k], oz[k] + after * dz[k]
-                across = (u - 0.5) ** 2 + (v - 0.5) ** 2 if round_ else max(abs(u - 0.5), abs(v - 0.5)) ** 2
-                if not across <= 0.25 or (side * dz[k] > 0.0 and side * z > highest):
-                    break
-                f = side * (z - _value(c, u, v, bu, mu, wu, bv, mv, wv)[0])
-                if f <= 0.0:
-                    if probe > 0:
-                        t[k] = after
-                    break
-                before, after = after, after + max(f / -rise, step)
-            if t[k] > 0.0:
-                for _ in range(halvings):
-                    middle = 0.5 * (before + after)
-                    z = _value(c, ou[k] + middle * du[k], ov[k] + middle * dv[k], bu, mu, wu, bv, mv, wv)[0]
-                    if side * (oz[k] + middle * dz[k] - z) > 0.0:
-                        before = middle
-                    else:
-                        after = middle
-                t[k] = after
+    for k in range(block * count // blocks, (block + 1) * count // blocks):
+        t[k] = 0.0
+        rise = side * dz[k] - slopes[0] * abs(du[k]) - slopes[1] * abs(dv[k])
+        if rise > 0.0:  # no slope of the surface catches the ray
+            continue
+        before, after, f = 0.0, 1e-3 * step, 0.0
+        for probe in range(most):
+            u, v, z = ou[k] + after * du[k], ov[k] + after * dv[k], oz[k] + after * dz[k]
+            across = (u - 0.5) ** 2 + (v - 0.5) ** 2 if round_ else max(abs(u - 0.5), abs(v - 0.5)) ** 2
+            if not across <= 0.25 or (side * dz[k] > 0.0 and side * z > highest):
+                break
+            f = side * (z - _value(c, u, v, bu, mu, wu, bv, mv, wv)[0])
+            if f <= 0.0:
+                if probe > 0:
+                    t[k] = after
+                break
+            before, after = after, after + max(f / -rise, step)
+        if t[k] > 0.0:
+            for _ in range(halvings):
+                middle = 0.5 * (before + after)
+                z = _value(c, ou[k] + middle * du[k], ov[k] + middle * dv[k], bu, mu, wu, bv, mv, wv)[0]
+                if side * (oz[k] + middle * dz[k] - z) > 0.0:
+                    before = middle
+                else:
+                    after = middle
+            t[k] = after

@@ -14,6 +14,7 @@ from torch.autograd.function import once_differentiable
 from caustic_cli.optics.kernels import blocks, mirror, refraction
 from caustic_cli.optics.kernels.bend import FRESNEL
 from caustic_cli.optics.kernels.stage import components, given, keep, kept, new, tangent, wanted
+from caustic_cli.optics.kernels.threads import ALL
 
 
 def interact(direction, slopes, power: Tensor, *, eta: float, reflects: bool, fresnel: str, field=None):
@@ -50,7 +51,7 @@ class _Refraction(torch.autograd.Function):
     def forward(dx, dy, dz, gx, gy, power, ex, ey, ez, surface: refraction.Interface):
         *t, after = new(4, len(power))
         passes = np.empty(len(power), np.bool_)
-        refraction.refract(components((dx, dy, dz, gx, gy, power, ex, ey, ez)), surface, tuple(t), after, passes, blocks())
+        refraction.refract(ALL, components((dx, dy, dz, gx, gy, power, ex, ey, ez)), surface, tuple(t), after, passes, blocks())
         return tuple(torch.from_numpy(a) for a in (*t, after, passes))
 
     @staticmethod
@@ -65,14 +66,14 @@ class _Refraction(torch.autograd.Function):
         ray = components(kept(ctx))
         count = len(ray[5])
         out = wanted(ctx, 9, count)
-        refraction.refract_adjoint(ray, ctx.surface, components(by[:4]), out, count, blocks())
+        refraction.refract_adjoint(ALL, ray, ctx.surface, components(by[:4]), out, count, blocks())
         return *given(ctx, out), None
 
     @staticmethod
     def jvp(ctx, *along):
         def push(ray, along):
             out = new(4, len(ray[5]))
-            refraction.refract_tangent(ray, ctx.surface, along, out, len(ray[5]), blocks())
+            refraction.refract_tangent(ALL, ray, ctx.surface, along, out, len(ray[5]), blocks())
             return out
 
         return *tangent(ctx, along, push), None
@@ -84,7 +85,7 @@ class _Mirror(torch.autograd.Function):
     @staticmethod
     def forward(dx, dy, dz, gx, gy):
         t = new(3, len(gx))
-        mirror.reflect(components((dx, dy, dz, gx, gy)), t, blocks())
+        mirror.reflect(ALL, components((dx, dy, dz, gx, gy)), t, blocks())
         return tuple(torch.from_numpy(a) for a in t)
 
     @staticmethod
@@ -97,14 +98,14 @@ class _Mirror(torch.autograd.Function):
         ray = components(kept(ctx))
         count = len(ray[3])
         out = wanted(ctx, 5, count)
-        mirror.reflect_adjoint(ray, components(by), out, count, blocks())
+        mirror.reflect_adjoint(ALL, ray, components(by), out, count, blocks())
         return tuple(given(ctx, out))
 
     @staticmethod
     def jvp(ctx, *along):
         def push(ray, along):
             out = new(3, len(ray[3]))
-            mirror.reflect_tangent(ray, along, out, len(ray[3]), blocks())
+            mirror.reflect_tangent(ALL, ray, along, out, len(ray[3]), blocks())
             return out
 
         return tangent(ctx, along, push)

@@ -21,8 +21,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.kernels import blocks
-from caustic_cli.optics.kernels.jit import FAST, njit, prange
+from caustic_cli.optics.kernels.jit import FAST, njit
 from caustic_cli.optics.kernels.stage import BATCH, components, given, keep, kept, load, new, store, tangent, wanted
+from caustic_cli.optics.kernels.threads import ALL, on_threads
 from caustic_cli.optics.tolerances import PARALLEL
 
 OX, OY, OZ, DX, DY, DZ, K, OVER, ON_WAY, X, Y, BY_OX, BY_OY, BY_OZ, BY_DX, BY_DY, BY_DZ, ROWS = range(18)
@@ -98,12 +99,14 @@ def _land_some(begin, end, ray, plane, x, y, on_way):
             batch[j] = v[ON_WAY, j] > 0.0
 
 
-@njit(parallel=True, **FAST)
-def _land(ray, plane, x, y, on_way, blocks):
+@njit(entry=True, **FAST)
+def _land(block, ray, plane, x, y, on_way, blocks):
     """x, y and on_way (N,), from ray: o and d, six components."""
+    if block == ALL:
+        on_threads(blocks, (ray, plane, x, y, on_way, blocks))
+        return
     count = len(x)
-    for block in prange(blocks):
-        _land_some(block * count // blocks, (block + 1) * count // blocks, ray, plane, x, y, on_way)
+    _land_some(block * count // blocks, (block + 1) * count // blocks, ray, plane, x, y, on_way)
 
 
 @njit(**FAST)
@@ -128,11 +131,13 @@ def _pull_some(begin, end, ray, plane, given, out):
             store(v[BY_OX + i], start, count, out[i])
 
 
-@njit(parallel=True, **FAST)
-def _land_adjoint(ray, plane, given, out, count, blocks):
+@njit(entry=True, **FAST)
+def _land_adjoint(block, ray, plane, given, out, count, blocks):
     """Derivatives by the ray's components into `out`, from those by x and y."""
-    for block in prange(blocks):
-        _pull_some(block * count // blocks, (block + 1) * count // blocks, ray, plane, given, out)
+    if block == ALL:
+        on_threads(blocks, (ray, plane, given, out, count, blocks))
+        return
+    _pull_some(block * count // blocks, (block + 1) * count // blocks, ray, plane, given, out)
 
 
 @njit(**FAST)
@@ -154,11 +159,13 @@ def _push_some(begin, end, ray, plane, along, out):
         store(v[Y], start, count, out[1])
 
 
-@njit(parallel=True, **FAST)
-def _land_tangent(ray, plane, along, out, count, blocks):
+@njit(entry=True, **FAST)
+def _land_tangent(block, ray, plane, along, out, count, blocks):
     """Derivatives of x and y into `out` along `along`, six components."""
-    for block in prange(blocks):
-        _push_some(block * count // blocks, (block + 1) * count // blocks, ray, plane, along, out)
+    if block == ALL:
+        on_threads(blocks, (ray, plane, along, out, count, blocks))
+        return
+    _push_some(block * count // blocks, (block + 1) * count // blocks, ray, plane, along, out)
 
 
 class _Landing(torch.autograd.Function):
@@ -169,7 +176,7 @@ class _Landing(torch.autograd.Function):
         ray = (ox, oy, oz, dx, dy, dz)
         count = _count(ray)
         (x, y), on_way = new(2, count), np.empty(count, np.bool_)
-        _land(components(ray), plane, x, y, on_way, blocks())
+        _land(ALL, components(ray), plane, x, y, on_way, blocks())
         return tuple(torch.from_numpy(a) for a in (x, y, on_way))
 
     @staticmethod
@@ -183,14 +190,14 @@ class _Landing(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, by_x, by_y, _):
         out = wanted(ctx, 6, ctx.count)
-        _land_adjoint(components(kept(ctx)), ctx.plane, components((by_x, by_y)), out, ctx.count, blocks())
+        _land_adjoint(ALL, components(kept(ctx)), ctx.plane, components((by_x, by_y)), out, ctx.count, blocks())
         return *given(ctx, out), None
 
     @staticmethod
     def jvp(ctx, *along):
         def push(ray, along):
             out = new(2, ctx.count)
-            _land_tangent(ray, ctx.plane, along, out, ctx.count, blocks())
+            _land_tangent(ALL, ray, ctx.plane, along, out, ctx.count, blocks())
             return out
 
         return *tangent(ctx, along, push), None

@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from caustic_cli.optics.kernels.jit import FAST, njit, prange
+from caustic_cli.optics.kernels.jit import FAST, njit
 from caustic_cli.optics.kernels.stage import BATCH, load, store
+from caustic_cli.optics.kernels.threads import ALL, on_threads
 
 DX, DY, DZ, GX, GY, BY_TX, BY_TY, BY_TZ, BY_DX, BY_DY, BY_DZ, BY_GX, BY_GY, ROWS = range(14)
 
@@ -42,12 +43,14 @@ def _reflect_some(begin, end, ray, t):
             store(v[BY_TX + i], start, count, t[i])
 
 
-@njit(parallel=True, **FAST)
-def reflect(ray, t, blocks):
+@njit(entry=True, **FAST)
+def reflect(block, ray, t, blocks):
     """Directions t, three components, from ray: d and g, five components."""
+    if block == ALL:
+        on_threads(blocks, (ray, t, blocks))
+        return
     count = len(t[0])
-    for block in prange(blocks):
-        _reflect_some(block * count // blocks, (block + 1) * count // blocks, ray, t)
+    _reflect_some(block * count // blocks, (block + 1) * count // blocks, ray, t)
 
 
 @njit(**FAST)
@@ -73,11 +76,13 @@ def _pull_some(begin, end, ray, given, out):
             store(v[BY_DX + i], start, count, out[i])
 
 
-@njit(parallel=True, **FAST)
-def reflect_adjoint(ray, given, out, count, blocks):
+@njit(entry=True, **FAST)
+def reflect_adjoint(block, ray, given, out, count, blocks):
     """Derivatives by the ray's components into `out`, from those by t, three components."""
-    for block in prange(blocks):
-        _pull_some(block * count // blocks, (block + 1) * count // blocks, ray, given, out)
+    if block == ALL:
+        on_threads(blocks, (ray, given, out, count, blocks))
+        return
+    _pull_some(block * count // blocks, (block + 1) * count // blocks, ray, given, out)
 
 
 @njit(**FAST)
@@ -99,8 +104,10 @@ def _push_some(begin, end, ray, along, out):
             store(v[BY_TX + i], start, count, out[i])
 
 
-@njit(parallel=True, **FAST)
-def reflect_tangent(ray, along, out, count, blocks):
+@njit(entry=True, **FAST)
+def reflect_tangent(block, ray, along, out, count, blocks):
     """Derivatives of t into `out` along `along`, five components."""
-    for block in prange(blocks):
-        _push_some(block * count // blocks, (block + 1) * count // blocks, ray, along, out)
+    if block == ALL:
+        on_threads(blocks, (ray, along, out, count, blocks))
+        return
+    _push_some(block * count // blocks, (block + 1) * count // blocks, ray, along, out)

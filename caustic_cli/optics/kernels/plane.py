@@ -49,21 +49,19 @@ from caustic_cli.optics.kernels.bend import (
     push,
     reach,
 )
-from caustic_cli.optics.kernels.jit import FAST, njit, prange
+from caustic_cli.optics.kernels.jit import FAST, njit
+from caustic_cli.optics.kernels.pixels import FOUR, ONE, THREE, TWO, UINT, limits
 from caustic_cli.optics.kernels.rows import combine, spread
 from caustic_cli.optics.kernels.shares import shares
+from caustic_cli.optics.kernels.threads import ALL, on_threads
 
 FRESNEL, REFLECTED, OFF_SCREEN, LEAVING, MISSED, COLUMNS = range(6)  # of the ledger
-UINT, ONE, TWO = np.uintp, np.uintp(1), np.uintp(2)  # an unsigned index is never taken to count from the end
 
 
-@njit(**FAST)
-def _bend(vectors, i, surface, rays, exit_, frame, slanted):
-    """The surface, powers and landing points of row i."""
-    v, (first, bu, du, net, net_x, net_y), (x, y, _, _, share) = vectors, surface, rays
-    if slanted is not None:
-        slant.aim(v, _slanted(i, surface, rays), x[i], y[i], exit_, frame)
-        return
+@njit(inline="always", **FAST)
+def _bend(v, i, surface, rays, exit_, frame):
+    """The surface, powers and landing points of row i, of rays along z."""
+    (first, bu, du, net, net_x, net_y), (x, y, _, _, share) = surface, rays
     combine(i, first, bu, du, net, net_x, net_y, v[SAG], v[GX], v[GY])
     load(share[i], v[SHARE])
     load(x[i], v[X])
@@ -82,16 +80,16 @@ def _slanted(i, surface, rays):
     return net[i], net_x[i], net_y[i], along_x[i], along_y[i], share[i]
 
 
-@njit(**FAST)
-def _share(vectors, splat, sx, sy, dx, dy, sloping):
-    """Shares of one row's rays among pixels."""
-    v, scratch = vectors, vectors[VECTORS:]
+@njit(inline="always", **FAST)
+def _share(v, splat, sx, sy, dx, dy):
+    """Shares of one row's rays among pixels, and their slopes unless dx and dy are empty."""
+    scratch = v[VECTORS:]
     if splat.size_x > 1:
         fraction(v[PX], v[PHI])
-    shares(splat.kind, splat.size_x, splat.alpha_x, v[PHI], sx, dx, v[OVER_X], v[LEAN_X], scratch, sloping)
+    shares(splat.kind, splat.size_x, splat.alpha_x, v[PHI], sx, dx, v[OVER_X], v[LEAN_X], scratch)
     if splat.size_y > 1:
         fraction(v[PY], v[PHI])
-    shares(splat.kind, splat.size_y, splat.alpha_y, v[PHI], sy, dy, v[OVER_Y], v[LEAN_Y], scratch, sloping)
+    shares(splat.kind, splat.size_y, splat.alpha_y, v[PHI], sy, dy, v[OVER_Y], v[LEAN_Y], scratch)
 
 
 @njit(**FAST)
@@ -99,8 +97,7 @@ def _scatter(vectors, exit_, frame, splat, sx, sy, image, ledger, column):
     """Add one row's rays to the padded image and the ledger.  column: (longest v,) scratch."""
     # Everything the loop needs is a local: after a store to the image the compiler would have to read an array again.
     vx, vy, height = splat.size_x, splat.size_y, exit_.height
-    rx, ry = (vx - 1) // 2, (vy - 1) // 2
-    low_x, low_y, high_x, high_y = float(-rx), float(-ry), float(frame.pixels_x + rx), float(frame.pixels_y + ry)
+    rx, ry, low_x, low_y, high_x, high_y = limits(frame.pixels_x, frame.pixels_y, vx, vy)
     sag, share, power, px, py = vectors[SAG], vectors[SHARE], vectors[POWER], vectors[PX], vectors[PY]
     over_x, over_y = vectors[OVER_X], vectors[OVER_Y]
     lost_fresnel, lost_reflected, lost_off, lost_missed, leaving = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -136,13 +133,13 @@ def _scatter(vectors, exit_, frame, splat, sx, sy, image, ledger, column):
             part, k = sx[a, j], UINT(j0)
             for b in range(0, len(column), 4):
                 b = UINT(b)
-                c0, c1, c2, c3 = column[b], column[b + ONE], column[b + TWO], column[b + UINT(3)]
-                p0, p1, p2, p3 = image[i, k], image[i, k + ONE], image[i, k + TWO], image[i, k + UINT(3)]
+                c0, c1, c2, c3 = column[b], column[b + ONE], column[b + TWO], column[b + THREE]
+                p0, p1, p2, p3 = image[i, k], image[i, k + ONE], image[i, k + TWO], image[i, k + THREE]
                 image[i, k] = p0 + part * c0
                 image[i, k + ONE] = p1 + part * c1
                 image[i, k + TWO] = p2 + part * c2
-                image[i, k + UINT(3)] = p3 + part * c3
-                k += UINT(4)
+                image[i, k + THREE] = p3 + part * c3
+                k += FOUR
             i += ONE
     ledger[FRESNEL] += lost_fresnel
     ledger[REFLECTED] += lost_reflected
@@ -155,8 +152,7 @@ def _scatter(vectors, exit_, frame, splat, sx, sy, image, ledger, column):
 def _gather(vectors, exit_, frame, splat, sx, sy, dx, dy, grad, grad_leaving, column, tilt):
     """Derivatives by each ray's power and pixel coordinates, from those by the padded image."""
     vx, vy, height, scale_x, scale_y = splat.size_x, splat.size_y, exit_.height, 1.0 / frame.pixel_x, 1.0 / frame.pixel_y
-    rx, ry = (vx - 1) // 2, (vy - 1) // 2
-    low_x, low_y, high_x, high_y = float(-rx), float(-ry), float(frame.pixels_x + rx), float(frame.pixels_y + ry)
+    rx, ry, low_x, low_y, high_x, high_y = limits(frame.pixels_x, frame.pixels_y, vx, vy)
     sag, power, px, py = vectors[SAG], vectors[POWER], vectors[PX], vectors[PY]
     by_power, by_px, by_py = vectors[BY_POWER], vectors[BY_PX], vectors[BY_PY]
     over_x, over_y, lean_x, lean_y = vectors[OVER_X], vectors[OVER_Y], vectors[LEAN_X], vectors[LEAN_Y]
@@ -185,16 +181,16 @@ def _gather(vectors, exit_, frame, splat, sx, sy, dx, dy, grad, grad_leaving, co
                     a0, a1, a2, a3, t0, t1, t2, t3 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
                     for b in range(0, len(column), 4):
                         b = UINT(b)
-                        g0, g1, g2, g3 = grad[i, k], grad[i, k + ONE], grad[i, k + TWO], grad[i, k + UINT(3)]
+                        g0, g1, g2, g3 = grad[i, k], grad[i, k + ONE], grad[i, k + TWO], grad[i, k + THREE]
                         a0 += g0 * column[b]
                         a1 += g1 * column[b + ONE]
                         a2 += g2 * column[b + TWO]
-                        a3 += g3 * column[b + UINT(3)]
+                        a3 += g3 * column[b + THREE]
                         t0 += g0 * tilt[b]
                         t1 += g1 * tilt[b + ONE]
                         t2 += g2 * tilt[b + TWO]
-                        t3 += g3 * tilt[b + UINT(3)]
-                        k += UINT(4)
+                        t3 += g3 * tilt[b + THREE]
+                        k += FOUR
                     i += ONE
                     along, across = (a0 + a2) + (a1 + a3), (t0 + t2) + (t1 + t3)
                     value += sx[a, j] * along
@@ -210,8 +206,7 @@ def _gather(vectors, exit_, frame, splat, sx, sy, dx, dy, grad, grad_leaving, co
 def _scatter_tangent(vectors, exit_, frame, splat, sx, sy, dx, dy, image):
     """Add the tangent of one row's image; returns the leaving power's."""
     vx, vy = splat.size_x, splat.size_y
-    rx, ry = (vx - 1) // 2, (vy - 1) // 2
-    low_x, low_y, high_x, high_y = float(-rx), float(-ry), float(frame.pixels_x + rx), float(frame.pixels_y + ry)
+    rx, ry, low_x, low_y, high_x, high_y = limits(frame.pixels_x, frame.pixels_y, vx, vy)
     v, leaving, height = vectors, 0.0, exit_.height
     for j in range(v.shape[1]):
         weight, change = v[POWER, j], v[T_POWER, j]
@@ -232,25 +227,12 @@ def _scatter_tangent(vectors, exit_, frame, splat, sx, sy, dx, dy, image):
     return leaving
 
 
-@njit(parallel=True, **FAST)
-def total(images):
-    """Sum over blocks, in order."""
-    out = np.empty(images.shape[1:])
-    for i in prange(images.shape[1]):
-        for j in range(images.shape[2]):
-            out[i, j] = images[0, i, j]
-        for block in range(1, images.shape[0]):
-            for j in range(images.shape[2]):
-                out[i, j] += images[block, i, j]
-    return out
-
-
 def scratch_rows(splat: Splat) -> int:
     """Rows of ray vectors that a block works in."""
     return VECTORS + SCRATCH + 2 * (splat.size_x + splat.size_y)
 
 
-@njit(**FAST)
+@njit(inline="always", **FAST)
 def _cut(scratch, vx, vy):
     """A block's scratch as vectors, shares along x and y, their slopes."""
     a = VECTORS + SCRATCH
@@ -258,93 +240,103 @@ def _cut(scratch, vx, vy):
     return scratch[:a], scratch[a:b], scratch[b:c], scratch[c:d], scratch[d:]
 
 
-@njit(parallel=True, **FAST)
-def forward(images, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, share, exit_, frame, splat,
-            slanted):
-    """The ledger (COLUMNS,), power by what became of it; the blocks' images, whose `total` is the padded one, fill `images`.
+@njit(entry=True, **FAST)
+def forward(block, images, ledgers, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, share, exit_, frame,
+            splat, slanted):
+    """Blocks' ledgers (blocks, COLUMNS), power by what became of it, and their images, whose `pixels.total` is the padded one.
 
     The surface comes by rows.  Row i of the sag is sum_k bu[i, k] net[first[i] + k], of dz/dx the same with du and net_x,
     of dz/dy with bu and net_y.  first (a,) int64; bu, du (a, p + 1); nets (n, b); x, y mm and share, parts of the
     source's power, (a, b).
 
-    images (blocks, n_x + 4 r_x, n_y + 4 r_y) and scratch (blocks, `scratch_rows`, b) are overwritten; they set the number of
-    blocks.
+    images (blocks, n_x + 4 r_x, n_y + 4 r_y), ledgers and scratch (blocks, `scratch_rows`, b) are overwritten; they set the number
+    of blocks.
 
     exit_, frame, splat: an `Exit`, a `Frame` and a `Splat`.  Of slanted rays `along_x` and `along_y` (a, b) are their
     directions' components, and instead of the sag comes the distance along them to the surface; each has a net's number to
     itself, (a, b), whatever first, bu and du are.  slanted: True for them, None for rays along z, which are compiled apart.
     """
+    if block == ALL:
+        on_threads(len(images), (images, ledgers, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, share, exit_,
+                                 frame, splat, slanted))
+        return
     rows, blocks = len(x), len(images)
     vx, vy = splat.size_x, splat.size_y
-    ledgers = np.zeros((blocks, COLUMNS))
-    for block in prange(blocks):
-        images[block] = 0.0
-        v, sx, sy, _, _ = _cut(scratch[block], vx, vy)
-        column = np.zeros(vy + -vy % 4)
-        for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-            _bend(v, i, (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share), exit_, frame, slanted)
-            _share(v, splat, sx, sy, sx, sy, False)
-            _scatter(v, exit_, frame, splat, sx, sy, images[block], ledgers[block], column)
-    ledger = np.zeros(COLUMNS)
-    for block in range(blocks):
-        for name in range(COLUMNS):
-            ledger[name] += ledgers[block, name]
-    return ledger
+    images[block] = 0.0
+    ledgers[block] = 0.0
+    v, sx, sy, dx, dy = _cut(scratch[block], vx, vy)
+    column = np.zeros(vy + -vy % 4)
+    for i in range(block * rows // blocks, (block + 1) * rows // blocks):
+        surface, rays = (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share)
+        if slanted is None:
+            _bend(v, i, surface, rays, exit_, frame)
+        else:
+            slant.aim(v, _slanted(i, surface, rays), x[i], y[i], exit_, frame)
+        _share(v, splat, sx, sy, dx[:0], dy[:0])
+        _scatter(v, exit_, frame, splat, sx, sy, images[block], ledgers[block], column)
 
 
-@njit(parallel=True, **FAST)
-def backward(grad, grad_leaving, apart, nets, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, share, exit_,
-             frame, splat, slanted):
+@njit(entry=True, **FAST)
+def backward(block, grad, grad_leaving, apart, nets, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, share,
+             exit_, frame, splat, slanted):
     """Adjoint of `forward`: derivatives by the three nets, from those by the padded image and leaving power.
 
-    nets (3, 1 if apart else blocks, n, b) are overwritten: the `total` of each is the derivative by a net (n, b).
+    nets (3, 1 if apart else blocks, n, b) are overwritten: the `pixels.total` of each is the derivative by a net (n, b).
 
     apart: no two rows share a row of the nets, so that one sum serves all blocks.  Otherwise net_x is taken to be net
     itself, and the sum of both derivatives comes as the first.  scratch: overwritten, as in `forward`.
     """
+    if block == ALL:
+        if apart and slanted is None:
+            nets[:] = 0.0
+        on_threads(len(scratch), (grad, grad_leaving, apart, nets, scratch, first, bu, du, net, net_x, net_y, x, y, along_x,
+                                  along_y, share, exit_, frame, splat, slanted))
+        return
     rows, blocks = len(x), len(scratch)
     vx, vy = splat.size_x, splat.size_y
-    if apart and slanted is None:
-        nets[:] = 0.0
-    for block in prange(blocks):
-        if not apart:
-            nets[:, block] = 0.0
-        v, sx, sy, dx, dy = _cut(scratch[block], vx, vy)
-        column, tilt = np.zeros(vy + -vy % 4), np.zeros(vy + -vy % 4)
-        for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-            _bend(v, i, (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share), exit_, frame, slanted)
-            _share(v, splat, sx, sy, dx, dy, True)
-            _gather(v, exit_, frame, splat, sx, sy, dx, dy, grad, grad_leaving, column, tilt)
-            if slanted is not None:
-                slant.pull(v, _slanted(i, (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share)), exit_,
-                           nets[0, 0, i], nets[1, 0, i], nets[2, 0, i])
-                continue
-            pull(v, exit_)
-            spread(i, first, bu, du, v[T_SAG], v[T_GX], v[T_GY], nets[:, np.int64(0) if apart else np.int64(block)],
-                    apart)
+    if not apart:
+        nets[:, block] = 0.0
+    v, sx, sy, dx, dy = _cut(scratch[block], vx, vy)
+    column, tilt = np.zeros(vy + -vy % 4), np.zeros(vy + -vy % 4)
+    for i in range(block * rows // blocks, (block + 1) * rows // blocks):
+        surface, rays = (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share)
+        if slanted is None:
+            _bend(v, i, surface, rays, exit_, frame)
+        else:
+            slant.aim(v, _slanted(i, surface, rays), x[i], y[i], exit_, frame)
+        _share(v, splat, sx, sy, dx, dy)
+        _gather(v, exit_, frame, splat, sx, sy, dx, dy, grad, grad_leaving, column, tilt)
+        if slanted is not None:
+            slant.pull(v, _slanted(i, surface, rays), exit_, nets[0, 0, i],
+                       nets[1, 0, i], nets[2, 0, i])
+            continue
+        pull(v, exit_)
+        spread(i, first, bu, du, v[T_SAG], v[T_GX], v[T_GY], nets[:, 0 if apart else block], apart)
 
 
-@njit(parallel=True, **FAST)
-def tangent(t_net, t_net_x, t_net_y, images, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, share, exit_,
-            frame, splat, slanted):
-    """Derivative of `forward` along (t_net, t_net_x, t_net_y): the leaving power's; the `total` of `images` is the image's."""
+@njit(entry=True, **FAST)
+def tangent(block, t_net, t_net_x, t_net_y, images, leaving, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y,
+            share, exit_, frame, splat, slanted):
+    """Derivative of `forward` along (t_net, t_net_x, t_net_y): blocks' images, and leaving powers (blocks,)."""
+    if block == ALL:
+        on_threads(len(images), (t_net, t_net_x, t_net_y, images, leaving, scratch, first, bu, du, net, net_x, net_y, x, y, along_x,
+                                 along_y, share, exit_, frame, splat, slanted))
+        return
     rows, blocks = len(x), len(images)
     vx, vy = splat.size_x, splat.size_y
-    leaving = np.zeros(blocks)
-    for block in prange(blocks):
-        images[block] = 0.0
-        v, sx, sy, dx, dy = _cut(scratch[block], vx, vy)
-        for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-            _bend(v, i, (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share), exit_, frame, slanted)
-            _share(v, splat, sx, sy, dx, dy, True)
-            if slanted is not None:
-                slant.push(v, _slanted(i, (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share)),
-                           (t_net[i], t_net_x[i], t_net_y[i]), exit_, frame)
-            else:
-                combine(i, first, bu, du, t_net, t_net_x, t_net_y, v[T_SAG], v[T_GX], v[T_GY])
-                push(v, exit_, frame)
-            leaving[block] += _scatter_tangent(v, exit_, frame, splat, sx, sy, dx, dy, images[block])
-    change = 0.0
-    for block in range(blocks):
-        change += leaving[block]
-    return change
+    images[block], leaving[block] = 0.0, 0.0
+    v, sx, sy, dx, dy = _cut(scratch[block], vx, vy)
+    for i in range(block * rows // blocks, (block + 1) * rows // blocks):
+        surface, rays = (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share)
+        if slanted is None:
+            _bend(v, i, surface, rays, exit_, frame)
+        else:
+            slant.aim(v, _slanted(i, surface, rays), x[i], y[i], exit_, frame)
+        _share(v, splat, sx, sy, dx, dy)
+        if slanted is not None:
+            slant.push(v, _slanted(i, surface, rays),
+                       (t_net[i], t_net_x[i], t_net_y[i]), exit_, frame)
+        else:
+            combine(i, first, bu, du, t_net, t_net_x, t_net_y, v[T_SAG], v[T_GX], v[T_GY])
+            push(v, exit_, frame)
+        leaving[block] += _scatter_tangent(v, exit_, frame, splat, sx, sy, dx, dy, images[block])

@@ -16,8 +16,9 @@ import torch
 from torch import Tensor
 
 from caustic_cli.optics.kernels import batches, blocks
-from caustic_cli.optics.kernels.jit import FAST, njit, prange
+from caustic_cli.optics.kernels.jit import FAST, njit
 from caustic_cli.optics.kernels.surface import FusedSurface, _sag
+from caustic_cli.optics.kernels.threads import ALL, on_threads
 
 #: What the box's floor lies below the least height, in heights of the hull and in widths of the aperture.
 BELOW = 0.01, 1e-3
@@ -60,36 +61,38 @@ def _stretch(o, d, first, last):
     return (first, last) if o >= 0.0 and o <= 1.0 else (np.inf, -np.inf)
 
 
-@njit(parallel=True, **FAST)
-def enter(ou, ov, oz, du, dv, dz, floor, circle, scale_x, scale_y, way, blocks):
+@njit(entry=True, **FAST)
+def enter(block, ou, ov, oz, du, dv, dz, floor, circle, scale_x, scale_y, way, blocks):
     """Take rays (N,) to where they enter the box, ou, ov, oz overwritten; way (N,): how far that is.
 
     floor: of the box, mm; circle: radius of the aperture, mm, or infinite.  A ray that never enters is put beside the aperture.
     """
+    if block == ALL:
+        on_threads(blocks, (ou, ov, oz, du, dv, dz, floor, circle, scale_x, scale_y, way, blocks))
+        return
     count = len(ou)
-    for block in prange(blocks):
-        for k in range(block * count // blocks, (block + 1) * count // blocks):
-            first, last = _stretch(ou[k], du[k], 0.0, np.inf)
-            first, last = _stretch(ov[k], dv[k], first, last)
-            if circle < np.inf:
-                x, y, dx, dy = (ou[k] - 0.5) / scale_x, (ov[k] - 0.5) / scale_y, du[k] / scale_x, dv[k] / scale_y
-                a, b, beyond = dx * dx + dy * dy, x * dx + y * dy, x * x + y * y - circle * circle
-                root = b * b - a * beyond
-                if root >= 0.0 and a > 0.0:  # the roots by sums without cancellation
-                    far = -b - np.sqrt(root) if b > 0.0 else -b + np.sqrt(root)
-                    one, two = far / a, beyond / far if far != 0.0 else 0.0
-                    first, last = max(first, min(one, two)), min(last, max(one, two))
-                elif beyond > 0.0:
-                    last = -np.inf
-            way[k] = 0.0
-            if not (first <= last and dz[k] > 0.0):
-                ou[k] = -1.0
-                continue
-            t = max(first, min((floor - oz[k]) / dz[k], last))
-            if t > 0.0:
-                ou[k], ov[k] = min(max(ou[k] + t * du[k], 0.0), 1.0), min(max(ov[k] + t * dv[k], 0.0), 1.0)
-                oz[k] += t * dz[k]
-                way[k] = t
+    for k in range(block * count // blocks, (block + 1) * count // blocks):
+        first, last = _stretch(ou[k], du[k], 0.0, np.inf)
+        first, last = _stretch(ov[k], dv[k], first, last)
+        if circle < np.inf:
+            x, y, dx, dy = (ou[k] - 0.5) / scale_x, (ov[k] - 0.5) / scale_y, du[k] / scale_x, dv[k] / scale_y
+            a, b, beyond = dx * dx + dy * dy, x * dx + y * dy, x * x + y * y - circle * circle
+            root = b * b - a * beyond
+            if root >= 0.0 and a > 0.0:  # the roots by sums without cancellation
+                far = -b - np.sqrt(root) if b > 0.0 else -b + np.sqrt(root)
+                one, two = far / a, beyond / far if far != 0.0 else 0.0
+                first, last = max(first, min(one, two)), min(last, max(one, two))
+            elif beyond > 0.0:
+                last = -np.inf
+        way[k] = 0.0
+        if not (first <= last and dz[k] > 0.0):
+            ou[k] = -1.0
+            continue
+        t = max(first, min((floor - oz[k]) / dz[k], last))
+        if t > 0.0:
+            ou[k], ov[k] = min(max(ou[k] + t * du[k], 0.0), 1.0), min(max(ov[k] + t * dv[k], 0.0), 1.0)
+            oz[k] += t * dz[k]
+            way[k] = t
 
 
 def _rays(surface: FusedSurface, o, d) -> tuple[np.ndarray, ...]:
@@ -106,11 +109,11 @@ class _HitsOfRays(torch.autograd.Function):
         low, high = float(h.min()), float(h.max())
         rays, way, n = _rays(surface, (ox, oy, oz - middle), (dx, dy, dz)), np.empty(len(ox)), blocks()
         floor = low - max(BELOW[0] * (high - low), BELOW[1] / min(surface.scale))
-        enter(*rays, floor, np.inf if rectangle else radius, *surface.scale, way, n)
+        enter(ALL, *rays, floor, np.inf if rectangle else radius, *surface.scale, way, n)
         order, used = batches.order(*rays[:2], surface.geometry[0], surface.geometry[3])
         status, *out = batches.found(len(way))
         top = high + 1e-6 * (high - low)  # above what touches the hull's top, by whatever rounding
-        batches.meet(order, len(way) >= batches.CROWD * used, *rays, (low, top), surface.slope_bounds(h), radius,
+        batches.meet(ALL, order, len(way) >= batches.CROWD * used, *rays, (low, top), surface.slope_bounds(h), radius,
                      surface.coefficients(h), *surface.geometry, *surface.scale, status, *out, n)
         reach, gx, gy, met, where = (torch.from_numpy(a) for a in out)
         t = torch.from_numpy(way) + reach
@@ -134,7 +137,7 @@ class _HitsOfRays(torch.autograd.Function):
         c = surface.coefficients(_sag(heights)[0])
         grads = surface.workspace() if wanted[0] else np.empty((blocks(), 0, *c.shape[1:]))
         starts = [torch.empty(len(t) if any(wanted[1:7]) else 0, dtype=torch.float64) for _ in range(3)]
-        batches.pull_back(met.numpy(), where.numpy(), *(b.double().contiguous().numpy() for b in by[:3]), ou, ov, *directions,
+        batches.pull_back(ALL, met.numpy(), where.numpy(), *(b.double().contiguous().numpy() for b in by[:3]), ou, ov, *directions,
                           *(a.detach().numpy() for a in (t, gx, gy)), c, *surface.geometry, *surface.scale, grads,
                           *(a.numpy() for a in starts))
         out = [surface.pull(grads).to(heights.dtype) if wanted[0] else None]
@@ -154,6 +157,7 @@ class _HitsOfRays(torch.autograd.Function):
             starts, turns = ([none if m is None else m for m in tangents[k : k + 3]] for k in (1, 4))
             moves = [(o + t.detach() * d).detach().double().contiguous().numpy() for o, d in zip(starts, turns, strict=True)]
         out = [torch.empty_like(t) for _ in range(3)]
-        batches.push(change, *moves, met.numpy(), where.numpy(), ou, ov, *directions, *(a.detach().numpy() for a in (t, gx, gy)), c,
-                     *surface.geometry, *surface.scale, *(a.numpy() for a in out), blocks())
+        batches.push(ALL, change, *moves, met.numpy(), where.numpy(), ou, ov, *directions,
+                     *(a.detach().numpy() for a in (t, gx, gy)), c, *surface.geometry, *surface.scale, *(a.numpy() for a in out),
+                     blocks())
         return *out, None, None, None

@@ -26,8 +26,9 @@ from typing import NamedTuple
 import numpy as np
 
 from caustic_cli.optics.kernels.bend import EXACT, SCHLICK
-from caustic_cli.optics.kernels.jit import FAST, njit, prange
+from caustic_cli.optics.kernels.jit import FAST, njit
 from caustic_cli.optics.kernels.stage import BATCH, load, store
+from caustic_cli.optics.kernels.threads import ALL, on_threads
 from caustic_cli.optics.polarisation import NORMAL
 from caustic_cli.optics.tolerances import CRITICAL
 
@@ -138,12 +139,14 @@ def _refract_some(begin, end, ray, surface, t, after, passes):
             batch[j] = v[PASSES, j] > 0.0
 
 
-@njit(parallel=True, **FAST)
-def refract(ray, surface, t, after, passes, blocks):
+@njit(entry=True, **FAST)
+def refract(block, ray, surface, t, after, passes, blocks):
     """Directions t, powers `after` and whether light passes (N,), from ray: d, g, P and E, nine components."""
+    if block == ALL:
+        on_threads(blocks, (ray, surface, t, after, passes, blocks))
+        return
     count = len(after)
-    for block in prange(blocks):
-        _refract_some(block * count // blocks, (block + 1) * count // blocks, ray, surface, t, after, passes)
+    _refract_some(block * count // blocks, (block + 1) * count // blocks, ray, surface, t, after, passes)
 
 
 @njit(inline="always", **FAST)
@@ -213,11 +216,13 @@ def _pull_some(begin, end, ray, surface, given, out):
             store(v[BY_DX + i], start, count, out[i])
 
 
-@njit(parallel=True, **FAST)
-def refract_adjoint(ray, surface, given, out, count, blocks):
+@njit(entry=True, **FAST)
+def refract_adjoint(block, ray, surface, given, out, count, blocks):
     """Derivatives by the ray's components into `out`, from those by t and P', four components."""
-    for block in prange(blocks):
-        _pull_some(block * count // blocks, (block + 1) * count // blocks, ray, surface, given, out)
+    if block == ALL:
+        on_threads(blocks, (ray, surface, given, out, count, blocks))
+        return
+    _pull_some(block * count // blocks, (block + 1) * count // blocks, ray, surface, given, out)
 
 
 @njit(inline="always", **FAST)
@@ -265,8 +270,10 @@ def _push_some(begin, end, ray, surface, along, out):
             store(v[BY_TX + i], start, count, out[i])
 
 
-@njit(parallel=True, **FAST)
-def refract_tangent(ray, surface, along, out, count, blocks):
+@njit(entry=True, **FAST)
+def refract_tangent(block, ray, surface, along, out, count, blocks):
     """Derivatives of t and P' into `out` along `along`, nine components."""
-    for block in prange(blocks):
-        _push_some(block * count // blocks, (block + 1) * count // blocks, ray, surface, along, out)
+    if block == ALL:
+        on_threads(blocks, (ray, surface, along, out, count, blocks))
+        return
+    _push_some(block * count // blocks, (block + 1) * count // blocks, ray, surface, along, out)

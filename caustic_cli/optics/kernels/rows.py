@@ -26,7 +26,7 @@ def _weighted(weights, net, first, out):
         a += 1
 
 
-@njit(**FAST)
+@njit(inline="always", **FAST)
 def combine(i, first, bu, du, net, net_x, net_y, sag, gx, gy):
     """Row i of the surface from the nets already contracted along v: sag, dz/dx, dz/dy (b,)."""
     _weighted(bu[i], net, first[i], sag)

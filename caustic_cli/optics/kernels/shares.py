@@ -51,7 +51,7 @@ def _cosine(x):
     return 1.0 - y * (1 / 2.0) * (1.0 - y * (1 / 12.0) * (1.0 - y * (1 / 30.0) * c))
 
 
-@njit(**FAST)
+@njit(inline="always", **FAST)
 def _scaled(by, phi, v, out):
     """out[j] = by f(by phi') for the cosine filter's two functions: out[0] cosines, out[1] sines of theta q, over v."""
     for j in range(len(phi)):
@@ -60,14 +60,14 @@ def _scaled(by, phi, v, out):
         out[1, j] = _sine(by * (0.5 - phi[j])) / v
 
 
-@njit(**FAST)
-def _raised_cosine(phi, v, out, slope, scratch, sloping):
+@njit(inline="always", **FAST)
+def _raised_cosine(phi, v, out, slope, scratch):
     theta = 2.0 * math.pi / v
     _scaled(theta, phi, v, scratch)
     for k in range(v):  # cos(theta (k - r + q)) by addition
         c, s = math.cos(theta * (k - (v - 1) // 2)), math.sin(theta * (k - (v - 1) // 2))
         _mix(1.0 / v, c, -s, scratch[0], scratch[1], out[k])
-        if sloping:
+        if len(slope):
             _mix(0.0, theta * s, theta * c, scratch[0], scratch[1], slope[k])
 
 
@@ -77,7 +77,7 @@ def _mix(constant, a, b, x, y, out):
         out[j] = constant + a * x[j] + b * y[j]
 
 
-@njit(**FAST)
+@njit(inline="always", **FAST)
 def _short_series(phi, offset, square, alpha, out):
     """`_series` where its arguments are below TINY."""
     for j in range(len(phi)):
@@ -88,7 +88,7 @@ def _short_series(phi, offset, square, alpha, out):
         out[j] = room * p * (1.0 - y * (1.0 - y * (1 / 2.0) * (1.0 - y * (1 / 3.0))))
 
 
-@njit(**FAST)
+@njit(inline="always", **FAST)
 def _series(phi, offset, square, alpha, out):
     """A pixel's share of a very wide Gaussian, over alpha exp(-alpha (v/2)^2); the series' arguments are below SMALL."""
     for j in range(len(phi)):
@@ -101,7 +101,7 @@ def _series(phi, offset, square, alpha, out):
         out[j] = room * p * (1.0 - y * (1.0 - y * (1 / 2.0) * (1.0 - y * (1 / 3.0) * e)))
 
 
-@njit(**FAST)
+@njit(inline="always", **FAST)
 def _series_slope(phi, offset, alpha, out):
     for j in range(len(phi)):
         d = offset - phi[j]
@@ -110,8 +110,8 @@ def _series_slope(phi, offset, alpha, out):
         out[j] = 2.0 * d * (1.0 - y * (1.0 - y * (1 / 2.0) * (1.0 - y * (1 / 3.0) * e)))
 
 
-@njit(**FAST)
-def _recursion(phi, v, alpha, out, slope, scratch, sloping):
+@njit(inline="always", **FAST)
+def _recursion(phi, v, alpha, out, slope, scratch):
     """Shares over exp(-alpha q^2): exp(-alpha (d^2 - q^2)) follows from pixel to pixel."""
     r = (v - 1) // 2
     edge, up, down, rise, fall = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
@@ -132,10 +132,10 @@ def _recursion(phi, v, alpha, out, slope, scratch, sloping):
             for j in range(len(phi)):
                 fall[j] *= ratio * down[j]
             _above(fall, edge, out[r - k])
-            if sloping:
+            if len(slope):
                 _lean(phi, -k, alpha, fall, slope[r - k])
         _above(rise, edge, out[r + k])
-        if sloping:
+        if len(slope):
             _lean(phi, k, alpha, rise, slope[r + k])
 
 
@@ -151,8 +151,8 @@ def _lean(phi, k, alpha, value, out):
         out[j] = 2.0 * alpha * (0.5 - phi[j] + k) * value[j]
 
 
-@njit(**FAST)
-def _exponentials(phi, v, alpha, out, slope, sloping):
+@njit(inline="always", **FAST)
+def _exponentials(phi, v, alpha, out, slope):
     """Shares over exp(-alpha q^2) of a narrow Gaussian, whose recursion would overflow."""
     for k in range(v):
         for j in range(len(phi)):
@@ -160,7 +160,7 @@ def _exponentials(phi, v, alpha, out, slope, sloping):
             d = k - (v - 1) // 2 + q
             e = math.exp(-alpha * (d * d - q * q))
             out[k, j] = -e * math.expm1(-alpha * max(0.25 * v * v - d * d, 0.0))
-            if sloping:
+            if len(slope):
                 slope[k, j] = 2.0 * alpha * d * e
 
 
@@ -178,31 +178,31 @@ def _sum(rows, out):
             out[j] += row[j]
 
 
-@njit(**FAST)
+@njit(inline="always", **FAST)
 def _level(value, over, lean, slope):
     for j in range(len(slope)):
         slope[j] -= value[j] * over[j] * lean[j]
 
 
 @njit(**FAST)
-def shares(kind, v, alpha, phi, out, slope, over, lean, scratch, sloping):
+def shares(kind, v, alpha, phi, out, slope, over, lean, scratch):
     """Shares of rays at sub-pixel positions phi (b,), up to a factor: out (v, b), the share is out * over.
 
-    With `sloping` also what their derivatives by phi are made of: (slope - out * lean) * over.  Left to the reader, the factor
-    costs a ray one product instead of one a pixel.
+    And what their derivatives by phi are made of, unless `slope` is empty: (slope - out * lean) * over.  Left to the reader, the
+    factor costs a ray one product instead of one a pixel.
 
     scratch: (5, b).
     """
     over[:] = 1.0
-    if sloping:
+    if len(slope):
         lean[:] = 0.0
     if v == 1:
         out[0] = 1.0
-        if sloping:
+        if len(slope):
             slope[0] = 0.0
         return
     if kind == COSINE:
-        _raised_cosine(phi, v, out, slope, scratch, sloping)
+        _raised_cosine(phi, v, out, slope, scratch)
         return
     square = 0.25 * v * v
     if alpha * square < SMALL:
@@ -212,16 +212,16 @@ def shares(kind, v, alpha, phi, out, slope, over, lean, scratch, sloping):
                 _short_series(phi, offset, square, alpha, out[k])
             else:
                 _series(phi, offset, square, alpha, out[k])
-            if sloping:
+            if len(slope):
                 _series_slope(phi, offset, alpha, slope[k])
     elif alpha <= MODERATE:
-        _recursion(phi, v, alpha, out, slope, scratch, sloping)
+        _recursion(phi, v, alpha, out, slope, scratch)
     else:
-        _exponentials(phi, v, alpha, out, slope, sloping)
+        _exponentials(phi, v, alpha, out, slope)
     _sum(out, over)
     for j in range(len(over)):
         over[j] = 1.0 / over[j]
-    if sloping:
+    if len(slope):
         _sum(slope, lean)
         if alpha > MODERATE:  # slopes of a narrow Gaussian all but cancel: before they are summed over pixels, not after
             for k in range(v):

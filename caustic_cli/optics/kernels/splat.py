@@ -26,9 +26,12 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.kernels import blocks
-from caustic_cli.optics.kernels.jit import FAST, njit, prange
+from caustic_cli.optics.kernels.bend import fraction
+from caustic_cli.optics.kernels.jit import FAST, njit
+from caustic_cli.optics.kernels.pixels import FOUR, ONE, THREE, TWO, UINT, limits, total
 from caustic_cli.optics.kernels.shares import KINDS, shares
 from caustic_cli.optics.kernels.stage import component, components, given, keep, kept, load, store, tangent, wanted
+from caustic_cli.optics.kernels.threads import ALL, on_threads
 from caustic_cli.optics.reconstruction import Filter, padding
 from caustic_cli.scene import Screen
 
@@ -37,8 +40,6 @@ ROW = 512
 # Rows of a block's scratch; then what `shares` works in, then shares and slopes along x and y.
 PX, PY, W, PHI, OVER_X, OVER_Y, LEAN_X, LEAN_Y, BY_X, BY_Y, BY_W, VECTORS = range(12)
 SCRATCH = 5
-UINT = np.uintp  # an unsigned index is never taken to count from the end
-ONE, TWO, THREE, FOUR = (UINT(k) for k in (1, 2, 3, 4))
 
 
 class Frame(NamedTuple):
@@ -92,30 +93,17 @@ def _pixels(x, low, wide, count, out):
 
 
 @njit(**FAST)
-def _fraction(p, out):
-    for j in range(len(out)):
-        out[j] = p[j] - math.floor(p[j])
-
-
-@njit(**FAST)
-def _aim(x, y, weight, start, count, frame, v, sx, sy, dx, dy, sloping):
-    """Pixel coordinates, weights and shares of one row of rays."""
+def _aim(x, y, weight, start, count, frame, v, sx, sy, dx, dy):
+    """Pixel coordinates, weights and shares of one row of rays, with their slopes unless dx and dy are empty."""
     load(x, start, count, v[PX])
     load(y, start, count, v[PY])
     load(weight, start, count, v[W])
     _pixels(v[PX], frame.low_x, frame.wide_x, count, v[PX])
     _pixels(v[PY], frame.low_y, frame.wide_y, count, v[PY])
-    _fraction(v[PX], v[PHI])
-    shares(frame.kind, frame.size_x, frame.alpha_x, v[PHI], sx, dx, v[OVER_X], v[LEAN_X], v[VECTORS:], sloping)
-    _fraction(v[PY], v[PHI])
-    shares(frame.kind, frame.size_y, frame.alpha_y, v[PHI], sy, dy, v[OVER_Y], v[LEAN_Y], v[VECTORS:], sloping)
-
-
-@njit(inline="always", **FAST)
-def _limits(frame):
-    """r along x and y, and the least and the first too large coordinate of a ray that reaches into the frame."""
-    rx, ry = (frame.size_x - 1) // 2, (frame.size_y - 1) // 2
-    return rx, ry, float(-rx), float(-ry), float(frame.pixels_x + rx), float(frame.pixels_y + ry)
+    fraction(v[PX], v[PHI])
+    shares(frame.kind, frame.size_x, frame.alpha_x, v[PHI], sx, dx, v[OVER_X], v[LEAN_X], v[VECTORS:])
+    fraction(v[PY], v[PHI])
+    shares(frame.kind, frame.size_y, frame.alpha_y, v[PHI], sy, dy, v[OVER_Y], v[LEAN_Y], v[VECTORS:])
 
 
 @njit(**FAST)
@@ -123,7 +111,7 @@ def _scatter(v, count, frame, sx, sy, image, column):
     """Add one row's rays to the padded image; returns the weight of those outside."""
     # Everything the loop needs is a local: after a store to the image the compiler would have to read an array again.
     vx, vy = frame.size_x, frame.size_y
-    rx, ry, low_x, low_y, high_x, high_y = _limits(frame)
+    rx, ry, low_x, low_y, high_x, high_y = limits(frame.pixels_x, frame.pixels_y, vx, vy)
     px, py, weights, over_x, over_y = v[PX], v[PY], v[W], v[OVER_X], v[OVER_Y]
     outside = 0.0
     for j in range(count):
@@ -162,31 +150,19 @@ def _scatter(v, count, frame, sx, sy, image, column):
     return outside
 
 
-@njit(parallel=True, **FAST)
-def _total(images):
-    """Sum over blocks, in order."""
-    total = np.empty(images.shape[1:])
-    for i in prange(images.shape[1]):
-        total[i] = images[0, i]
-        for block in range(1, images.shape[0]):
-            for j in range(images.shape[2]):
-                total[i, j] += images[block, i, j]
-    return total
-
-
-@njit(parallel=True, **FAST)
-def _splat(x, y, weight, frame, images):
-    """Padded image and the weight outside; images, one for each block, are overwritten."""
+@njit(entry=True, **FAST)
+def _splat(block, x, y, weight, frame, images, outside):
+    """Blocks' images, whose `total` is the padded one, and weights outside (blocks,): both are overwritten."""
     rows, blocks = -(-len(x) // ROW), len(images)
-    outside = np.zeros(blocks)
-    for block in prange(blocks):
-        images[block] = 0.0
-        v, sx, sy, dx, dy, column, _ = _cut(frame)
-        for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-            count = min(ROW, len(x) - i * ROW)
-            _aim(x, y, weight, i * ROW, count, frame, v, sx, sy, dx, dy, False)
-            outside[block] += _scatter(v, count, frame, sx, sy, images[block], column)
-    return _total(images), outside
+    if block == ALL:
+        on_threads(blocks, (x, y, weight, frame, images, outside))
+        return
+    images[block], outside[block] = 0.0, 0.0
+    v, sx, sy, dx, dy, column, _ = _cut(frame)
+    for i in range(block * rows // blocks, (block + 1) * rows // blocks):
+        count = min(ROW, len(x) - i * ROW)
+        _aim(x, y, weight, i * ROW, count, frame, v, sx, sy, dx[:0], dy[:0])
+        outside[block] += _scatter(v, count, frame, sx, sy, images[block], column)
 
 
 @njit(**FAST)
@@ -196,7 +172,7 @@ def _gather(v, count, frame, sx, sy, dx, dy, grad, by_outside, column, tilt):
     sum G a_i a_j, sum G a'_i a_j and sum G a_i a'_j over the pixels first; then what normalises the shares; then W and p.
     """
     vx, vy, per_x, per_y = frame.size_x, frame.size_y, 1.0 / frame.wide_x, 1.0 / frame.wide_y
-    rx, ry, low_x, low_y, high_x, high_y = _limits(frame)
+    rx, ry, low_x, low_y, high_x, high_y = limits(frame.pixels_x, frame.pixels_y, vx, vy)
     px, py, weights, by_x, by_y, by_w = v[PX], v[PY], v[W], v[BY_X], v[BY_Y], v[BY_W]
     over_x, over_y, lean_x, lean_y = v[OVER_X], v[OVER_Y], v[LEAN_X], v[LEAN_Y]
     for j in range(count):
@@ -246,25 +222,27 @@ def _gather(v, count, frame, sx, sy, dx, dy, grad, by_outside, column, tilt):
         by_w[j] = over * value
 
 
-@njit(parallel=True, **FAST)
-def _splat_adjoint(x, y, weight, frame, grad, by_outside, out, blocks):
+@njit(entry=True, **FAST)
+def _splat_adjoint(block, x, y, weight, frame, grad, by_outside, out, blocks):
     """Derivatives by x, y and weight into `out`, from those by the padded image and the weight outside."""
+    if block == ALL:
+        on_threads(blocks, (x, y, weight, frame, grad, by_outside, out, blocks))
+        return
     rows = -(-len(x) // ROW)
-    for block in prange(blocks):
-        v, sx, sy, dx, dy, column, tilt = _cut(frame)
-        for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-            count = min(ROW, len(x) - i * ROW)
-            _aim(x, y, weight, i * ROW, count, frame, v, sx, sy, dx, dy, True)
-            _gather(v, count, frame, sx, sy, dx, dy, grad, by_outside, column, tilt)
-            for k in range(3):
-                store(v[BY_X + k], i * ROW, count, out[k])
+    v, sx, sy, dx, dy, column, tilt = _cut(frame)
+    for i in range(block * rows // blocks, (block + 1) * rows // blocks):
+        count = min(ROW, len(x) - i * ROW)
+        _aim(x, y, weight, i * ROW, count, frame, v, sx, sy, dx, dy)
+        _gather(v, count, frame, sx, sy, dx, dy, grad, by_outside, column, tilt)
+        for k in range(3):
+            store(v[BY_X + k], i * ROW, count, out[k])
 
 
 @njit(**FAST)
 def _scatter_tangent(v, count, frame, sx, sy, dx, dy, image):
     """Add the tangent of one row's image, with d_x, d_y and d_W in BY_X, BY_Y and BY_W; returns that of the weight outside."""
     vx, vy, outside = frame.size_x, frame.size_y, 0.0
-    rx, ry, low_x, low_y, high_x, high_y = _limits(frame)
+    rx, ry, low_x, low_y, high_x, high_y = limits(frame.pixels_x, frame.pixels_y, vx, vy)
     for j in range(count):
         x, y, change = v[PX, j], v[PY, j], v[BY_W, j]
         if not (x >= low_x and x < high_x and y >= low_y and y < high_y):
@@ -281,21 +259,21 @@ def _scatter_tangent(v, count, frame, sx, sy, dx, dy, image):
     return outside
 
 
-@njit(parallel=True, **FAST)
-def _splat_tangent(x, y, weight, frame, along, images):
-    """Derivatives of the padded image and of the weight outside along d_x, d_y and d_W."""
+@njit(entry=True, **FAST)
+def _splat_tangent(block, x, y, weight, frame, along, images, outside):
+    """Derivatives of `_splat`'s images and weights along d_x, d_y and d_W."""
     rows, blocks = -(-len(x) // ROW), len(images)
-    outside = np.zeros(blocks)
-    for block in prange(blocks):
-        images[block] = 0.0
-        v, sx, sy, dx, dy, _, _ = _cut(frame)
-        for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-            count = min(ROW, len(x) - i * ROW)
-            _aim(x, y, weight, i * ROW, count, frame, v, sx, sy, dx, dy, True)
-            for k in range(3):
-                load(along[k], i * ROW, count, v[BY_X + k])
-            outside[block] += _scatter_tangent(v, count, frame, sx, sy, dx, dy, images[block])
-    return _total(images), outside
+    if block == ALL:
+        on_threads(blocks, (x, y, weight, frame, along, images, outside))
+        return
+    images[block], outside[block] = 0.0, 0.0
+    v, sx, sy, dx, dy, _, _ = _cut(frame)
+    for i in range(block * rows // blocks, (block + 1) * rows // blocks):
+        count = min(ROW, len(x) - i * ROW)
+        _aim(x, y, weight, i * ROW, count, frame, v, sx, sy, dx, dy)
+        for k in range(3):
+            load(along[k], i * ROW, count, v[BY_X + k])
+        outside[block] += _scatter_tangent(v, count, frame, sx, sy, dx, dy, images[block])
 
 
 def _shape(frame: Frame) -> tuple[int, int]:
@@ -303,13 +281,19 @@ def _shape(frame: Frame) -> tuple[int, int]:
     return frame.pixels_x + 2 * (frame.size_x - 1), frame.pixels_y + 2 * (frame.size_y - 1) + -frame.size_y % 4
 
 
+def _room(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+    """For blocks' images and weights outside."""
+    return np.empty((blocks(), *_shape(frame))), np.empty(blocks())
+
+
 class _Splat(torch.autograd.Function):
     """x, y, weight and the frame -> padded image, the weight outside ()."""
 
     @staticmethod
     def forward(x, y, weight, frame: Frame):
-        image, outside = _splat(*components((x, y, weight)), frame, np.empty((blocks(), *_shape(frame))))
-        return torch.from_numpy(image), torch.tensor(outside.sum(), dtype=torch.float64)
+        images, outside = _room(frame)
+        _splat(ALL, *components((x, y, weight)), frame, images, outside)
+        return torch.from_numpy(total(images)), torch.tensor(outside.sum(), dtype=torch.float64)
 
     @staticmethod
     def setup_context(ctx, inputs, output):
@@ -322,13 +306,14 @@ class _Splat(torch.autograd.Function):
         rays, frame = components(kept(ctx)), ctx.frame
         out = wanted(ctx, 3, len(rays[0]))
         grad = np.zeros(_shape(frame)) if by_image is None else component(by_image)
-        _splat_adjoint(*rays, frame, grad, 0.0 if by_outside is None else float(by_outside), out, blocks())
+        _splat_adjoint(ALL, *rays, frame, grad, 0.0 if by_outside is None else float(by_outside), out, blocks())
         return *given(ctx, out), None
 
     @staticmethod
     def jvp(ctx, *along):
         def push(rays, along):
-            image, outside = _splat_tangent(*rays, ctx.frame, along, np.empty((blocks(), *_shape(ctx.frame))))
-            return image, np.array(outside.sum())
+            images, outside = _room(ctx.frame)
+            _splat_tangent(ALL, *rays, ctx.frame, along, images, outside)
+            return total(images), np.array(outside.sum())
 
         return tangent(ctx, along, push)

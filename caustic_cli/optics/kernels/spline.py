@@ -18,7 +18,8 @@ import numpy as np
 import torch
 
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.kernels.jit import FAST, njit, prange
+from caustic_cli.optics.kernels.jit import FAST, njit
+from caustic_cli.optics.kernels.threads import ALL, on_threads
 
 
 class Axis:
@@ -37,61 +38,63 @@ class Axis:
         self.geometry = (breaks.numpy(), middle.numpy(), (1.0 / width).numpy())
 
 
-@njit(parallel=True, **FAST)
-def coefficients(heights, first_u, mu, first_v, mv):
-    """(n, m) control heights -> (I, J, p + 1, q + 1)."""
+@njit(entry=True, **FAST)
+def coefficients(i, heights, first_u, mu, first_v, mv, out):
+    """(n, m) control heights -> out (I, J, p + 1, q + 1)."""
+    if i == ALL:
+        on_threads(len(mu), (heights, first_u, mu, first_v, mv, out))
+        return
     p, q = mu.shape[1], mv.shape[1]
-    out = np.empty((len(mu), len(mv), p, q))
-    for i in prange(len(mu)):
-        part = np.empty((p, q))
-        for j in range(len(mv)):
-            for a in range(p):
-                for b in range(q):
-                    total = 0.0
-                    for k in range(p):
-                        total += mu[i, a, k] * heights[first_u[i] + k, first_v[j] + b]
-                    part[a, b] = total
-            for a in range(p):
-                for b in range(q):
-                    total = 0.0
-                    for k in range(q):
-                        total += part[a, k] * mv[j, b, k]
-                    out[i, j, a, b] = total
-    return out
-
-
-@njit(parallel=True, **FAST)
-def pull_coefficients(grads, n, m, first_u, mu, first_v, mv):
-    """Adjoint of `coefficients`: derivatives (blocks, I, J, p + 1, q + 1), added in order of the blocks -> (n, m)."""
-    p, q = mu.shape[1], mv.shape[1]
-    rows = np.zeros((len(mu), p, m))
-    for i in prange(len(mu)):
-        total, part = np.empty((p, q)), np.empty((p, q))
-        for j in range(len(mv)):
-            for a in range(p):
-                for b in range(q):
-                    value = 0.0
-                    for block in range(len(grads)):
-                        value += grads[block, i, j, a, b]
-                    total[a, b] = value
-            for a in range(p):
-                for b in range(q):
-                    value = 0.0
-                    for k in range(q):
-                        value += total[a, k] * mv[j, k, b]
-                    part[a, b] = value
-            for a in range(p):
-                for b in range(q):
-                    value = 0.0
-                    for k in range(p):
-                        value += mu[i, k, a] * part[k, b]
-                    rows[i, a, first_v[j] + b] += value
-    out = np.zeros((n, m))
-    for i in range(len(mu)):
+    part = np.empty((p, q))
+    for j in range(len(mv)):
         for a in range(p):
-            for j in range(m):  # not a sum of rows, which would be a parallel loop of its own each time
-                out[first_u[i] + a, j] += rows[i, a, j]
-    return out
+            for b in range(q):
+                total = 0.0
+                for k in range(p):
+                    total += mu[i, a, k] * heights[first_u[i] + k, first_v[j] + b]
+                part[a, b] = total
+        for a in range(p):
+            for b in range(q):
+                total = 0.0
+                for k in range(q):
+                    total += part[a, k] * mv[j, b, k]
+                out[i, j, a, b] = total
+
+
+@njit(entry=True, **FAST)
+def pull_coefficients(i, grads, first_u, mu, first_v, mv, rows, out):
+    """Adjoint of `coefficients`: derivatives (blocks, I, J, p + 1, q + 1), added in order of the blocks -> out (n, m).
+
+    rows (I, p + 1, m): scratch, zero as `out` is.
+    """
+    if i == ALL:
+        on_threads(len(mu), (grads, first_u, mu, first_v, mv, rows, out))
+        for k in range(len(mu)):
+            for a in range(rows.shape[1]):
+                for j in range(rows.shape[2]):
+                    out[first_u[k] + a, j] += rows[k, a, j]
+        return
+    p, q = mu.shape[1], mv.shape[1]
+    total, part = np.empty((p, q)), np.empty((p, q))
+    for j in range(len(mv)):
+        for a in range(p):
+            for b in range(q):
+                value = 0.0
+                for block in range(len(grads)):
+                    value += grads[block, i, j, a, b]
+                total[a, b] = value
+        for a in range(p):
+            for b in range(q):
+                value = 0.0
+                for k in range(q):
+                    value += total[a, k] * mv[j, k, b]
+                part[a, b] = value
+        for a in range(p):
+            for b in range(q):
+                value = 0.0
+                for k in range(p):
+                    value += mu[i, k, a] * part[k, b]
+                rows[i, a, first_v[j] + b] += value
 
 
 @njit(inline="always", **FAST)
@@ -161,26 +164,30 @@ def push_powers(grad, i, j, xi, eta, by_z, by_xi, by_eta, powers):
         power *= xi
 
 
-@njit(parallel=True, **FAST)
-def evaluate(u, v, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y, z, zx, zy, blocks):
+@njit(entry=True, **FAST)
+def evaluate(block, u, v, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y, z, zx, zy, blocks):
     """Height and slopes at points (u, v) (N,) into z, zx, zy (N,): breaks, middles, one over widths of the pieces."""
+    if block == ALL:
+        on_threads(blocks, (u, v, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y, z, zx, zy, blocks))
+        return
     count = len(u)
-    for block in prange(blocks):
-        for k in range(block * count // blocks, (block + 1) * count // blocks):
-            i, j = piece(u[k], bu), piece(v[k], bv)
-            value, along, across = jet(c, i, j, (u[k] - mu[i]) * wu[i], (v[k] - mv[j]) * wv[j])
-            z[k], zx[k], zy[k] = value, along * wu[i] * scale_x, across * wv[j] * scale_y
+    for k in range(block * count // blocks, (block + 1) * count // blocks):
+        i, j = piece(u[k], bu), piece(v[k], bv)
+        value, along, across = jet(c, i, j, (u[k] - mu[i]) * wu[i], (v[k] - mv[j]) * wv[j])
+        z[k], zx[k], zy[k] = value, along * wu[i] * scale_x, across * wv[j] * scale_y
 
 
-@njit(parallel=True, **FAST)
-def pull_back(u, v, gz, gx, gy, bu, mu, wu, bv, mv, wv, scale_x, scale_y, grads):
+@njit(entry=True, **FAST)
+def pull_back(block, u, v, gz, gx, gy, bu, mu, wu, bv, mv, wv, scale_x, scale_y, grads):
     """Adjoint of `evaluate`: derivatives by the coefficients into grads (blocks, I, J, p + 1, q + 1), overwritten."""
     count, blocks = len(u), len(grads)
-    for block in prange(blocks):
-        grad = grads[block]
-        grad[:] = 0.0
-        powers = np.empty((2, grad.shape[3]))
-        for k in range(block * count // blocks, (block + 1) * count // blocks):
-            i, j = piece(u[k], bu), piece(v[k], bv)
-            push_powers(grad, i, j, (u[k] - mu[i]) * wu[i], (v[k] - mv[j]) * wv[j], gz[k], gx[k] * wu[i] * scale_x,
-                        gy[k] * wv[j] * scale_y, powers)
+    if block == ALL:
+        on_threads(blocks, (u, v, gz, gx, gy, bu, mu, wu, bv, mv, wv, scale_x, scale_y, grads))
+        return
+    grad = grads[block]
+    grad[:] = 0.0
+    powers = np.empty((2, grad.shape[3]))
+    for k in range(block * count // blocks, (block + 1) * count // blocks):
+        i, j = piece(u[k], bu), piece(v[k], bv)
+        push_powers(grad, i, j, (u[k] - mu[i]) * wu[i], (v[k] - mv[j]) * wv[j], gz[k], gx[k] * wu[i] * scale_x,
+                    gy[k] * wv[j] * scale_y, powers)

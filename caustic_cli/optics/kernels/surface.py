@@ -8,6 +8,7 @@ from torch import Tensor
 
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels import batches, blocks, hit, spline
+from caustic_cli.optics.kernels.threads import ALL
 
 
 class FusedSurface:
@@ -23,7 +24,9 @@ class FusedSurface:
 
     def coefficients(self, heights: Tensor) -> np.ndarray:
         """(n, m) mm -> the polynomial of every span product, (I, J, p + 1, q + 1) float64."""
-        return spline.coefficients(heights.detach().double().contiguous().numpy(), *self.linear)
+        out = np.empty(self._coefficients())
+        spline.coefficients(ALL, heights.detach().double().contiguous().numpy(), *self.linear, out)
+        return out
 
     def order(self, x: Tensor, y: Tensor) -> tuple[np.ndarray, int]:
         """Points (N,), mm, in order of their span products, and how many of these there are."""
@@ -37,14 +40,20 @@ class FusedSurface:
 
     def workspace(self) -> np.ndarray:
         """Derivatives by the coefficients, a set for each block, to be overwritten."""
-        shape = (blocks(), *(len(a.first) for a in self.axes), *(a.matrices.shape[1] for a in self.axes))
+        shape = (blocks(), *self._coefficients())
         if self.grads is None or self.grads.shape != shape:
             self.grads = np.zeros(shape)
         return self.grads
 
     def pull(self, grads: np.ndarray) -> Tensor:
         """Derivatives by the coefficients, block by block -> by the heights, (n, m) float64."""
-        return torch.from_numpy(spline.pull_coefficients(grads, *self.shape, *self.linear))
+        (_, matrices, _, _), out = self.linear, np.zeros(self.shape)
+        spline.pull_coefficients(ALL, grads, *self.linear, np.zeros((*matrices.shape[:2], self.shape[1])), out)
+        return torch.from_numpy(out)
+
+    def _coefficients(self) -> tuple[int, ...]:
+        """Shape of all polynomials' coefficients."""
+        return *(len(a.first) for a in self.axes), *(a.matrices.shape[1] for a in self.axes)
 
 
 def scattered_surface(surface: FusedSurface, heights: Tensor, u: np.ndarray, v: np.ndarray):
@@ -56,7 +65,7 @@ class _ScatteredSurface(torch.autograd.Function):
     @staticmethod
     def forward(heights: Tensor, surface: FusedSurface, u: np.ndarray, v: np.ndarray):
         out = [torch.empty(len(u), dtype=torch.float64) for _ in range(3)]
-        spline.evaluate(u, v, surface.coefficients(heights), *surface.geometry, *surface.scale, *(t.numpy() for t in out),
+        spline.evaluate(ALL, u, v, surface.coefficients(heights), *surface.geometry, *surface.scale, *(t.numpy() for t in out),
                         blocks())
         return tuple(out)
 
@@ -69,7 +78,7 @@ class _ScatteredSurface(torch.autograd.Function):
     def backward(ctx, *by):
         surface, u, v = ctx.rest
         grads = surface.workspace()
-        spline.pull_back(u, v, *(g.contiguous().numpy() for g in by), *surface.geometry, *surface.scale, grads)
+        spline.pull_back(ALL, u, v, *(g.contiguous().numpy() for g in by), *surface.geometry, *surface.scale, grads)
         return surface.pull(grads).to(ctx.heights_dtype), None, None, None
 
     @staticmethod
@@ -91,7 +100,7 @@ def next_meetings(surface: FusedSurface, heights: Tensor, o, d, below: bool, rou
     rays = (o[0] * surface.scale[0] + 0.5, o[1] * surface.scale[1] + 0.5, o[2] - middle,
             d[0] * surface.scale[0], d[1] * surface.scale[1], d[2])
     t = np.empty(len(o[0]))
-    hit.intersect_again(*(c.contiguous().numpy() for c in rays), -1.0 if below else 1.0, (float(h.min()), float(h.max())),
+    hit.intersect_again(ALL, *(c.contiguous().numpy() for c in rays), -1.0 if below else 1.0, (float(h.min()), float(h.max())),
                         surface.slope_bounds(h), round, step, halvings, most, surface.coefficients(h), *surface.geometry, t,
                         blocks())
     return torch.from_numpy(t)
@@ -133,7 +142,7 @@ class RayHits:
             self.t = np.maximum(reach, 0.0)
             return c
         c, limits, slopes = self._shape(heights)
-        hit.intersect(*self.rays, start, limits, slopes, c, *self.surface.geometry, self.t, self.status, blocks())
+        hit.intersect(ALL, *self.rays, start, limits, slopes, c, *self.surface.geometry, self.t, self.status, blocks())
         x, y = ((o - 0.5 + self.t * d) / s for o, d, s in zip(self.rays[:2], self.rays[3:5], self.surface.scale, strict=True))
         beyond = (x * x + y * y > self.radius**2) & (self.status == 0)  # there is the lens' side
         self.t[beyond], self.status[beyond] = 0.0, 1
@@ -143,8 +152,8 @@ class RayHits:
         """Coefficients of the surface, and what `batches.meet` finds."""
         c, *bounds = self._shape(heights)
         out = batches.found(len(self.t))
-        batches.meet(self.order, self.batched, *self.rays, *bounds, self.radius, c, *self.surface.geometry, *self.surface.scale,
-                     *out, blocks())
+        batches.meet(ALL, self.order, self.batched, *self.rays, *bounds, self.radius, c, *self.surface.geometry,
+                     *self.surface.scale, *out, blocks())
         return c, *out
 
     def _shape(self, heights: Tensor) -> tuple:
@@ -172,7 +181,7 @@ class _Hits(torch.autograd.Function):
         heights, *found, met, where, c = ctx.saved_tensors
         surface, (ou, ov, _, *directions) = ctx.rays.surface, ctx.rays.rays
         grads, none = surface.workspace(), np.empty(0)
-        batches.pull_back(met.numpy(), where.numpy(), *(g.contiguous().numpy() for g in by[:3]), ou, ov, *directions,
+        batches.pull_back(ALL, met.numpy(), where.numpy(), *(g.contiguous().numpy() for g in by[:3]), ou, ov, *directions,
                           *(t.detach().numpy() for t in found), c.numpy(), *surface.geometry, *surface.scale, grads, none, none,
                           none)
         return surface.pull(grads).to(heights.dtype), None
@@ -182,7 +191,7 @@ class _Hits(torch.autograd.Function):
         _, *found, met, where, c = ctx.saved_tensors
         surface, (ou, ov, _, *directions), none = ctx.rays.surface, ctx.rays.rays, np.empty(0)
         out = [torch.empty(len(met), dtype=torch.float64) for _ in range(3)]
-        batches.push(surface.coefficients(tangent), none, none, none, met.numpy(), where.numpy(), ou, ov, *directions,
+        batches.push(ALL, surface.coefficients(tangent), none, none, none, met.numpy(), where.numpy(), ou, ov, *directions,
                      *(t.detach().numpy() for t in found), c.numpy(), *surface.geometry, *surface.scale,
                      *(t.numpy() for t in out), blocks())
         return *out, None, None, None
