@@ -47,12 +47,12 @@ def run(capfd, *arguments, code=0):
 def test_explain_and_effects(capfd, tmp_path):
     run(capfd, "design", "blob.png", *TINY)
     plain = run(capfd, "render", "blob.caustic", "--rays", "4000", "--npy", "plain.npy", "--quiet")
-    assert "effects" not in plain
+    assert "effects" not in plain and plain["wave_relative_rms"] > 0 and plain["wave_wavelengths"]
     told = run(capfd, "render", "blob.caustic", "--rays", "4000", "--explain", "--quiet", "--npy", "told.npy")
     assert np.array_equal(np.load("plain.npy"), np.load("told.npy"))
     rows = {row["name"]: row for row in told["effects"]}
     assert tuple(rows) == NAMES
-    assert {k for k, row in rows.items() if row["on"]} == {"fresnel"}
+    assert {k for k, row in rows.items() if row["on"]} == {"fresnel", "diffraction"}
     for row in rows.values():
         assert set(row) == {"name", "on", "why", "bound", "limit", "cost_ms", "cost_ms_range", "error", "power"} and row["why"]
     assert rows["fresnel"]["power"] == pytest.approx(plain["lost"]["fresnel"], rel=0.02)
@@ -200,7 +200,7 @@ def test_the_study_of_effects(capfd, tmp_path):
     found = run(capfd, "convergence", "--study", "effects", "--rays", "1000", "--repeats", "1", "--quiet", "-o", "out")
     rows = {row["series"]: row for row in found["rows"]}
     assert set(NAMES) == set(rows)
-    assert [row["on"] for row in rows.values()].count(True) == 1
+    assert {name for name, row in rows.items() if row["on"]} == {"fresnel", "diffraction"}
     for name in ("absorption", "roughness", "dispersion", "screen-tilt", "screen-shift", "source-size", "mirror"):
         assert rows[name]["amount"] != "the scene's own" and rows[name]["error"] + abs(rows[name]["power"]) > 1e-7, name
     assert rows["entrance"]["error"] < 1e-12

@@ -27,7 +27,7 @@ from caustic_cli.optics.plan import Plan, compile_plan
 from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose, is_lowered
-from caustic_cli.optics.waves import wave_image
+from caustic_cli.optics.waves import NoWaveImage, wave_image
 from caustic_cli.scene import Scene, checks
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.report import COLOURS, MARKERS, Study
@@ -63,7 +63,10 @@ def measure_waves(plan: Plan, field: HeightField, heights: Tensor, *, rays: int 
     times, light = [], None
     for _ in range(max(1, min(repeats, 2))):
         began = time.process_time()
-        light = wave_image(plan.scene, field, heights.detach()).image.cpu()
+        try:
+            light = wave_image(plan.scene, field, heights.detach()).image.cpu()
+        except NoWaveImage:  # nothing to compare with
+            return {"error": None, "power": None} | dict.fromkeys(("seconds", "seconds_min", "seconds_max", "whole"), 0.0)
         times.append(time.process_time() - began)
     sampler = rays_of(plan.scene, "stratified", max(rays, RAYS_A_PIXEL * light.numel()), stream(seed, "effects"), heights.device)
     drawn = expose(plan.scene, field, heights, sampler, requests=plan.requests).image.cpu()
@@ -173,7 +176,7 @@ def run_effects(scene: Scene, field: HeightField, heights: Tensor, *, rays: int 
 
 def _matters(row: dict) -> float:
     """What leaving an effect out changes: the larger of error and power."""
-    return max(row["error"], abs(row["power"]))
+    return max(row["error"] or 0.0, abs(row["power"] or 0.0))
 
 
 def _row(effect: Verdict, plan: Plan, scene: Scene, field: HeightField, heights: Tensor, rays: int, repeats: int, seed: int,

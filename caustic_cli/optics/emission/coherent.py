@@ -81,12 +81,12 @@ def middle(scene: Lit) -> Mode:
 
 
 def edges(scene: Lit) -> list[Mode]:
-    """Its outermost points along x and y, of no power: what they do differently says whether they may be taken for shifted ones."""
+    """Its outermost points along x, -x, y and -y, each with all its power: what their light does differently."""
     source = scene.source
     if source.distant:
         s = math.sin(source.half_angle)
         ways = ((1, 0), (-1, 0), (0, 1), (0, -1)) if s else ()
-        return [Mode(scene, (a * s, b * s, math.sqrt(1.0 - s * s)), 0.0) for a, b in ways]
+        return [Mode(scene, (a * s, b * s, math.sqrt(1.0 - s * s)), 1.0) for a, b in ways]
     if not source.extended:
         return []
     at, (ex, ey) = source.points()[0], source.extent
@@ -95,7 +95,7 @@ def edges(scene: Lit) -> list[Mode]:
         for sign in (1.0, -1.0):
             point = at[np.argmax(sign * at[:, k])].copy()
             point[k] += sign * e
-            found.append(Mode(scene, tuple(map(float, point)), 0.0))
+            found.append(Mode(scene, tuple(map(float, point)), 1.0))
     return found
 
 
