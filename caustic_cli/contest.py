@@ -16,7 +16,7 @@ from caustic_cli.inverse.designer import Designer, Options, State
 from caustic_cli.inverse.first import first_surface
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.parametrisation import Heights
-from caustic_cli.inverse.schedule import Stage, coarse_to_fine
+from caustic_cli.inverse.schedule import LEAST_CELLS, Stage, coarse_to_fine
 from caustic_cli.inverse.target import target_on_screen
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.project import Project
@@ -126,6 +126,14 @@ def entries_of(project: Project | None, device: str, dtype: torch.dtype | None =
         target = project.target(scene)
     goal = torch.from_numpy(target)
     return scene, target, [Entry(*plan, scene, goal, device) for plan in plans(scene, full, dtype, seed)]
+
+
+def lens_of_disc() -> tuple[Scene, HeightField, Tensor]:
+    """The default scene with the transport's lens for a bright disc: its field and heights."""
+    full = complete({}, 1.0)
+    scene = settings.build_scene(full)
+    field = HeightField.of(scene.lens)
+    return scene, field, first_surface(scene, disc(scene, tuple(full["target"]["size"])), field, LEAST_CELLS)
 
 
 def disc(scene: Scene, size: tuple[float, float]) -> np.ndarray:

@@ -19,9 +19,9 @@ EXAMPLES = """Examples:
   caustic convergence flame.caustic --study design --seconds 20
 """
 
-STUDIES = ("intersection", "rays", "reconstruction", "precision", "effects", "design")
+STUDIES = ("intersection", "rays", "reconstruction", "precision", "effects", "design", "diffraction")
 #: What the progress of a study counts.
-UNITS = {"intersection": "evaluations", "effects": "effects", "design": "turns"}
+UNITS = {"intersection": "evaluations", "effects": "effects", "design": "turns", "diffraction": "cases"}
 
 
 def run(
@@ -31,7 +31,8 @@ def run(
     study: Annotated[str, typer.Option(help="intersection: of rays and surface, by the thesis' triangle mesh and by Newton's"
                                        " method; rays: samplers; reconstruction: filters; precision: float32 and float64;"
                                        " effects: each on and off; design:"
-                                       " optimisers, networks and control nets.")] = "intersection",
+                                       " optimisers, networks and control nets; diffraction: rays against waves over lens"
+                                       " size, wavelength and source size.")] = "intersection",
     rays: Annotated[str | None, typer.Option(metavar="N", help="Rays of the largest setting; the reference takes 16 times as"
                                              " many.  Of intersection: rays intersected; of design: rays of a retrace."
                                              "  [default: by study, about half a minute in all]")] = None,
@@ -56,7 +57,7 @@ def run(
         raise InputError(f"--study must be one of {', '.join(STUDIES)}, got {study!r}")
     count = options.rays("--rays", rays) if rays else None
     for option, given, for_study in (("--seconds", seconds is not None, study == "design"),
-                                     ("--repeats", repeats is not None, study != "design"),
+                                     ("--repeats", repeats is not None, study not in ("design", "diffraction")),
                                      ("--dtype", dtype is not None, study != "intersection")):
         if given and not for_study:
             raise InputError(f"{option} has no meaning for --study {study}: leave it out")
@@ -65,10 +66,11 @@ def run(
         raise InputError(f"{output}: is a file; a directory for CSV, JSON and PNG is needed")
     device = options.start_torch(device, threads, say)
 
-    from caustic_cli.studies import effects, intersection, report, training  # noqa: PLC0415
+    from caustic_cli.studies import diffraction, effects, intersection, report, training  # noqa: PLC0415
 
     if output.is_dir():
-        plots = {"intersection": intersection.PLOTS, "design": training.PLOTS, "effects": effects.PLOTS}.get(study)
+        plots = {"intersection": intersection.PLOTS, "design": training.PLOTS, "effects": effects.PLOTS,
+                 "diffraction": diffraction.PLOTS}.get(study)
         report.refuse_foreign_files(report.paths_of(study, output, plots), force)
     opened = _open(project)
     with say.progress(None) as show:
@@ -84,6 +86,12 @@ def run(
             scene, target, entries = contest.entries_of(opened[0] if opened else None, device, precision, seed)
             found = training.run_training(scene, target, entries, seconds=seconds, seed=seed or 0, rays=count, device=device,
                                           progress=tell)
+        elif study == "diffraction":
+            from caustic_cli.contest import lens_of_disc  # noqa: PLC0415
+
+            scene, field, heights = opened[1:] if opened else lens_of_disc()
+            found = diffraction.run_diffraction(scene, field, heights.to(device), rays=count, seed=seed or 0, dtype=precision,
+                                                progress=tell)
         else:
             from caustic_cli.session import sphere  # noqa: PLC0415
             from caustic_cli.studies.convergence import run_study  # noqa: PLC0415

@@ -260,7 +260,7 @@ class Imager:
     def field(self, line: Line, front: Wavefront, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
         """Phase, rad, with the kernel's, and amplitude of each sample of a wavefront, (n, m), and the power of all: ()."""
         s, front = self.sampling, self.watched(front, line.behind)
-        path, root, lit = front.on(s.low, s.step, s.count)
+        path, root, lit = front.on(s.low, s.step, s.count).rows()
         across, along = (ramp(s, line.behind, k, path.device) for k in (0, 1))
         phase = torch.remainder(TURN / line.length * path + across[:, None] + along[None, :], TURN)
         power, amplitude = (root.square() * lit).sum(), root * lit
@@ -286,11 +286,11 @@ class Imager:
     @torch.no_grad()
     def _in_pieces(self, line: Line, front: Wavefront, pieces: int, rows: Tensor, columns: Tensor,
                    dtype: torch.dtype) -> tuple[Tensor, float]:
-        s, sums = self.sampling, [0.0, 0.0]
+        s, sums, fine = self.sampling, [0.0, 0.0], front.on(self.sampling.low, self.sampling.step, self.sampling.count)
         across, along = (ramp(s, line.behind, k, front.path.device) for k in (0, 1))
 
         def field(part: slice) -> Tensor:
-            path, root, lit = front.on(s.low, s.step, s.count, part)
+            path, root, lit = fine.rows(part)
             sums[0] += float((root.square() * lit).sum()) / pieces
             sums[1] += float((root * lit).square().sum()) / pieces
             phase = torch.remainder(TURN / line.length * path + across[part, None] + along[None, :], TURN)

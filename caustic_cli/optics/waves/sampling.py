@@ -24,8 +24,8 @@ from caustic_cli.errors import CausticError
 BEYOND, FINER, LEAST = 1.06, 1.08, 128
 #: Samples of the transform to a pixel, at least.
 A_PIXEL = 3.0
-#: Most samples along an axis, and bytes of one piece of a transform.
-MOST, PIECE = 1 << 17, 1 << 29
+#: Most samples along an axis; bytes that one piece of a transform may take in any case, and in parts of the free memory.
+MOST, PIECE, OF_FREE = 1 << 17, 1 << 30, 0.3
 #: Bytes that the work on one sample takes at a time, in parts of a complex number's.
 COPIES = 4
 
@@ -88,7 +88,7 @@ class Sampling:
 
     def pieces(self, wide: int) -> int:
         """In how many pieces the transform has to be made, of numbers of `wide` bytes: a divisor of N along x."""
-        least = math.ceil(COPIES * wide * self.padded[0] * self.padded[1] / PIECE)
+        least = math.ceil(COPIES * wide * self.samples / max(PIECE, OF_FREE * memory_free()))
         return next((b for b in range(least, self.padded[0] + 1) if self.padded[0] % b == 0), self.padded[0])
 
     @property

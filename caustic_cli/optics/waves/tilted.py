@@ -43,7 +43,7 @@ def power_on_tilted(r: Receiver, plane: Plane, s: Sampling, front: Wavefront, k0
     facing = dot(r.axes[2], e3)
     nx, ny, nz = (math.copysign(1.0, facing) * dot(r.axes[2], e) for e in (e1, e2, e3))
 
-    path, root, lit = front.on(s.low, s.step, s.count)
+    path, root, lit = front.on(s.low, s.step, s.count).rows()
     amplitude = root * lit
     power = (root.square() * lit).sum()
     amplitude = amplitude * (power / amplitude.square().sum()).sqrt()

@@ -209,23 +209,37 @@ class Wavefront:
             density = density * ((0.5 * w - (big - m).abs()) / (SOFT * w)).clamp(0.0, 1.0)
         return replace(self, density=density)
 
-    def on(self, low: tuple[float, float], step: tuple[float, float], count: tuple[int, int],
-           rows: slice = slice(None)) -> tuple[Tensor, Tensor, Tensor]:
-        """At a finer grid's rows, (rows, m) float64 each: path, mm; root of the power of a whole cell; part of it that is lit."""
-        weights = [_between(self.path.shape[k], self.low[k], self.step[k], low[k], step[k], count[k], self.path) for k in (0, 1)]
-        weights[0] = tuple(w[rows] for w in weights[0]) if weights[0] else None
-        if weights[0] is None and weights[1] is None:
-            def at(c: Tensor) -> Tensor:
-                return c[rows]
-        else:
-            def at(c: Tensor) -> Tensor:
-                return _interpolated(c, *weights)
+    def on(self, low: tuple[float, float], step: tuple[float, float], count: tuple[int, int]) -> Refined:
+        """The same on a finer grid."""
+        x, y = (_between(self.path.shape[k], self.low[k], self.step[k], low[k], step[k], count[k], self.path) for k in (0, 1))
+        scale = (step[0] * step[1]) ** 0.5
+        root = self.density.sqrt() * scale
+        return Refined(*(None if c is None else _along_y(c, y) for c in (self.path, root, self.edge_x, self.edge_y)), step, x)
 
-        root = at(self.density.sqrt()) * (step[0] * step[1]) ** 0.5
-        lit = (at(self.edge_x) / step[0] + 0.5).clamp(0.0, 1.0)
+
+@dataclass
+class Refined:
+    """A wavefront on a finer grid: its columns are there, rows are made when asked for.  first, weights: of rows, or None."""
+
+    path: Tensor
+    root: Tensor
+    edge_x: Tensor
+    edge_y: Tensor | None
+    step: tuple[float, float]
+    along_x: tuple[Tensor, Tensor] | None
+
+    def rows(self, part: slice = slice(None)) -> tuple[Tensor, Tensor, Tensor]:
+        """Path, mm; root of the power of a whole cell; part of it within the pupil: (rows, m) float64 each."""
+        lit = (self._at(self.edge_x, part) / self.step[0] + 0.5).clamp(0.0, 1.0)
         if self.edge_y is not None:
-            lit = lit * (at(self.edge_y) / step[1] + 0.5).clamp(0.0, 1.0)
-        return at(self.path), root, lit
+            lit = lit * (self._at(self.edge_y, part) / self.step[1] + 0.5).clamp(0.0, 1.0)
+        return self._at(self.path, part), self._at(self.root, part), lit
+
+    def _at(self, c: Tensor, part: slice) -> Tensor:
+        if self.along_x is None:
+            return c[part]
+        first, w = (t[part] for t in self.along_x)
+        return sum(w[:, k, None] * c[first + k] for k in range(POINTS))
 
 
 def _between(nodes: int, low: float, step: float, fine_low: float, fine_step: float, count: int, like: Tensor):
@@ -246,14 +260,11 @@ def _product(factors: list[Tensor]) -> Tensor:
     return found
 
 
-def _interpolated(c: Tensor, along_x, along_y) -> Tensor:
-    if along_x is not None:
-        first, w = along_x
-        c = sum(w[:, k, None] * c[first + k] for k in range(POINTS))
-    if along_y is not None:
-        first, w = along_y
-        c = sum(w[None, :, k] * c[:, first + k] for k in range(POINTS))
-    return c
+def _along_y(c: Tensor, along_y: tuple[Tensor, Tensor] | None) -> Tensor:
+    if along_y is None:
+        return c
+    first, w = along_y
+    return sum(w[None, :, k] * c[:, first + k] for k in range(POINTS))
 
 
 def wavefront(optics: Optics, seen: Survey, low: tuple[float, float], step: tuple[float, float], count: tuple[int, int],

@@ -1,0 +1,153 @@
+"""Where rays are enough: how far the ray image is from the wave image over lens size, wavelength and size of the source.
+
+Notation
+    size        width of the lens; throw, screen and relief grow with it, so that all angles stay as they are
+    wave        the wave image at one wavelength, `error` the relative RMS between it and the ray image, each over its own mean
+    noise       of the ray image, from two halves of its rays; taken off the error in quadrature
+    blur        predicted: sqrt(lambda L M) and the source's own, mm
+
+A larger lens at the same angles has larger pixels, too: the Fresnel scale grows only with the root of the size, so rays come
+closer.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from caustic_cli import __version__
+from caustic_cli.optics.resolution import GREEN, Resolution
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.trace import expose
+from caustic_cli.optics.waves import NoWaveImage, wave_image
+from caustic_cli.scene import Disc, Lens, Light, Offset, PlaneWave, Scene
+from caustic_cli.studies.measurement import Reference
+from caustic_cli.studies.metrics import relative_rms
+from caustic_cli.studies.report import COLOURS, MARKERS, Study
+from caustic_cli.studies.retrace import sampler_for
+
+#: Lens widths, mm; wavelengths, nm; full angles of a distant source, degrees.
+SIZES = (5.0, 10.0, 20.0, 40.0, 60.0, 100.0)
+WAVELENGTHS = (405.0, 550.0, 780.0, 1064.0, 1550.0)
+ANGLES = (0.0, 0.02, 0.05, 0.2)
+#: Rays of each ray image, to a pixel, unless said.
+A_PIXEL = 64
+#: An error up to which rays are called enough.
+ENOUGH = 0.1
+
+COLUMNS = {
+    "series": "what is varied",
+    "value": "lens size (mm), wavelength (nm) or the source's full angle (degrees)",
+    "error": "relative RMS between ray image and wave image, each over its own mean, the rays' noise taken off",
+    "noise": "of the ray image, relative RMS",
+    "blur": "predicted blur by diffraction and the source, pixels",
+    "seconds": "time of the wave image, s",
+    "rays_seconds": "time of the ray image, s",
+    "samples": "of the largest transform, along an axis",
+}
+
+
+def scaled(scene: Scene, field: HeightField, heights: Tensor, factor: float) -> tuple[Scene, HeightField, Tensor]:
+    """Everything of a scene in plane light so many times as large, angles as they are."""
+    lens, screen = scene.lens, scene.screen
+    radius = tuple(factor * r for r in lens.offset.radius)
+    larger: Lens = replace(lens, size=tuple(factor * s for s in lens.size), z_in=factor * lens.z_in,
+                           min_thickness=factor * lens.min_thickness, offset=Offset(factor * lens.offset.thickness, radius),
+                           height_range=tuple(factor * h for h in lens.height_range), absorption=lens.absorption / factor,
+                           border=factor * lens.border)
+    wide = replace(screen, size=tuple(factor * s for s in screen.size), z=factor * screen.z,
+                   shift=tuple(factor * s for s in screen.shift))
+    return replace(scene, lens=larger, screen=wide), HeightField(field.spaces, larger.half_size), factor * heights
+
+
+def run_diffraction(scene: Scene, field: HeightField, heights: Tensor, *, rays: int | None = None, seed: int = 0,
+                    dtype: torch.dtype | None = None, progress: Callable[[int, int], None] | None = None) -> Study:
+    """Ray image against wave image of a lens in plane light, at several sizes, wavelengths and source sizes."""
+    plane = replace(scene, source=PlaneWave(scene.source.power), light=Light())
+    own = plane.lens.size[0]
+    cases = [("lens size", size, GREEN, 0.0, size / own) for size in SIZES]
+    cases += [("wavelength", wavelength, wavelength, 0.0, 1.0) for wavelength in WAVELENGTHS]
+    cases += [("source size", angle, GREEN, angle, 1.0) for angle in ANGLES]
+    count = rays or A_PIXEL * math.prod(plane.screen.resolution)
+    rows, drawn = [], {}
+    for k, (series, value, wavelength, angle, factor) in enumerate(cases):
+        one, net, lifted = scaled(plane, field, heights.detach().double(), factor)
+        if angle:
+            one = replace(one, source=Disc(power=plane.source.power, angle=angle))
+        key = factor, angle
+        if key not in drawn:
+            drawn = {key: _rays(one, net, lifted, count, seed)}
+        reference, ray_seconds = drawn[key]
+        began = time.perf_counter()
+        try:
+            light = wave_image(one, net, lifted, wavelengths=(wavelength,), dtype=dtype or torch.float32)
+        except NoWaveImage:
+            continue
+        seconds = time.perf_counter() - began
+        seen = Resolution.at(replace(one, light=Light(None, (wavelength,))), net, lifted)
+        rows.append({"series": series, "value": value, "error": reference.error_of(light.image.cpu()), "noise": reference.error,
+                     "blur": seen.blur / seen.pixel, "seconds": seconds, "rays_seconds": ray_seconds,
+                     "samples": max(light.samples)})
+        if progress is not None:
+            progress(k + 1, len(cases))
+    if not rows:
+        raise NoWaveImage("this lens has no wave image at any of the sizes, wavelengths and sources of the study")
+    about = {"version": __version__, "seed": seed, "repeats": 1, "rays": count, "device": str(heights.device),
+             "reference_error": max(r["noise"] for r in rows), "threads": torch.get_num_threads(),
+             "dtype": str(dtype or torch.float32).removeprefix("torch."), "lens": own}
+    return Study("diffraction", COLUMNS, rows, {}, _advice(rows), about, "value", PLOTS)
+
+
+def _rays(scene: Scene, field: HeightField, heights: Tensor, rays: int, seed: int) -> tuple[Reference, float]:
+    """The ray image by two halves, and its time."""
+    began = time.perf_counter()
+    samplers = [sampler_for(scene, rays // 2, seed + k, str(heights.device)) for k in (0, 1)]
+    halves = [expose(scene, field, heights, sampler).image.cpu() for sampler in samplers]
+    return Reference(sum(halves) / 2.0, rays, relative_rms(*halves) / 2.0), time.perf_counter() - began
+
+
+def _advice(rows: list[dict]) -> str:
+    """One sentence: from which size on rays are enough."""
+    sizes = [r for r in rows if r["series"] == "lens size"]
+    found = []
+    enough = [r["value"] for r in sizes if r["error"] <= ENOUGH]
+    if enough:
+        found.append(f"for lenses of {min(enough):g} mm and more at these angles")
+    angles = [r["value"] for r in rows if r["series"] == "source size" and r["error"] <= ENOUGH]
+    if angles:
+        found.append(f"for sources of {min(angles):g} degrees and more" if min(angles) > 0 else "for a point of light already")
+    if found:
+        return f"rays are within {ENOUGH:.0%} of light {' or '.join(found)}"
+    best = min(rows, key=lambda r: r["error"])
+    return (f"rays are nowhere within {ENOUGH:.0%} of light here; closest, {best['error']:.2g}, at a {best['series']} of"
+            f" {best['value']:g}")
+
+
+def draw_diffraction(study: Study, figure: Figure) -> None:
+    """Error against what is varied, with the predicted blur in pixels."""
+    figure.set_size_inches(10.8, 3.8)
+    titles = {"lens size": "lens size (mm), all angles alike", "wavelength": "wavelength (nm)",
+              "source size": "the source's full angle (degrees)"}
+    for k, (series, label) in enumerate(titles.items()):
+        axes = figure.add_subplot(1, 3, k + 1)
+        rows = [r for r in study.rows if r["series"] == series]
+        x = [r["value"] for r in rows]
+        axes.plot(x, [r["error"] for r in rows], MARKERS[0] + "-", color=COLOURS[0], label="ray image against wave image")
+        axes.plot(x, [r["noise"] for r in rows], ":", color=COLOURS[7], label="noise of the rays")
+        axes.axhline(ENOUGH, color=COLOURS[1], linewidth=0.8)
+        axes.set(yscale="log", xlabel=label, ylabel="relative RMS" if k == 0 else None)
+        if series == "lens size":
+            axes.set_xscale("log")
+        axes.grid(which="major", linewidth=0.4)
+        if k == 0:
+            axes.legend(fontsize="x-small")
+
+
+#: Endings of the pictures' names, and what draws them.
+PLOTS = {"": draw_diffraction}
