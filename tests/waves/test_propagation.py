@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -281,7 +282,7 @@ def test_second_order_taylor():
     with torch.no_grad():
         for h in (1e-2, 1e-3, 1e-4):
             left.append(abs(float(loss_of(given, phase + h * along[0], amplitude + h * along[1]) - value) - h * slope))
-    orders = [math.log10(a / b) for a, b in zip(left, left[1:], strict=False)]
+    orders = [math.log10(a / b) for a, b in pairwise(left)]
     assert all(1.9 < order < 2.1 for order in orders), (left, orders)
 
 

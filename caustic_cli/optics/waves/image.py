@@ -161,7 +161,9 @@ class Imager:
         seen = survey(optics)
         lengths = tuple(k.wavelength * NM / optics.index for k in lines)
         blur = math.sqrt(max(lengths) * distance * seen.magnification)
-        spread = spread_by(optics, edges(system), seen, max(blur, *receiver.pixel)) if system.source.extended else None
+        spread = None
+        if system.source.extended and receiver.across(system.axis):
+            spread = spread_by(optics, edges(system), max(blur, *receiver.pixel))
         outer = [mode for mode in edges(system)] if system.source.extended else []
         low, high = receiver.extent(plane)
         light, landing = seen.light, [list(low), list(high)]
@@ -169,7 +171,7 @@ class Imager:
             light = tuple(tuple(w(a[k], b[k]) for k in (0, 1)) for w, a, b in
                           ((min, light[0], other.light[0]), (max, light[1], other.light[1])))
             for k in (0, 1):
-                room = BESIDE * (high[k] - low[k])
+                room = max(BESIDE * (high[k] - low[k]), spread.reach()[k] + receiver.pixel[k] if spread else 0.0)
                 landing[0][k] = min(landing[0][k], max(other.landing[0][k], low[k] - room))
                 landing[1][k] = max(landing[1][k], min(other.landing[1][k], high[k] + room))
         sampling = Sampling.of(light, tuple(map(tuple, landing)), receiver.pixel, distance, lengths, finer)
@@ -241,37 +243,28 @@ class Imager:
         s, k0, length = self.sampling, TURN / (line.wavelength * NM), line.wavelength * NM / self.index(line)
         front, device = self.watched(whole, length), whole.path.device
         if not self.receiver.across(line.system.axis):
-            return power_on_tilted(self.receiver, self.plane, s, front, k0, length, dtype)
+            return power_on_tilted(self.receiver, self.plane, s, front, k0, length, dtype), whole.power()
         sub, beside = (1, (0, 0)) if self.spread is None else self.spread.grid(self.receiver.pixel)
         rows, columns = self.masks(line, device, dtype, sub, beside)
         across, along = ramp(s, length, 0, device), ramp(s, length, 1, device)
         wide = 8 if dtype == torch.float32 else 16
         pieces = s.pieces(wide)
-        if pieces == 1:
+        if pieces == 1 or (torch.is_grad_enabled() and front.path.requires_grad):
             self._check_memory(wide)
             path, root, lit = front.on(s.low, s.step, s.count)
             phase = torch.remainder(k0 * path + across[:, None] + along[None, :], TURN).to(dtype)
-            power = (root.square() * lit).sum()
-            amplitude = root * lit
-            amplitude = (amplitude * (power / amplitude.square().sum()).sqrt()).to(dtype)
-            found = power_on_pixels(phase, amplitude, s.padded, rows, columns).double()
+            found = power_on_pixels(phase, (root * lit).to(dtype), s.padded, rows, columns).double()
         else:
-            sums = [0.0, 0.0]
-
             def field(part: slice) -> Tensor:
                 path, root, lit = front.on(s.low, s.step, s.count, part)
-                sums[0] += float((root.square() * lit).sum()) / pieces
-                sums[1] += float((root * lit).square().sum()) / pieces
                 phase = torch.remainder(k0 * path + across[part, None] + along[None, :], TURN).to(dtype)
                 return torch.polar((root * lit).to(dtype), phase)
 
             with torch.no_grad():
                 found, _ = power_in_pieces(field, s, pieces, rows, columns)
-            power = torch.tensor(sums[0], dtype=torch.float64)
-            found = found * (sums[0] / sums[1])
         if self.spread is not None:
             found = self.spread(found, self.receiver.pixel, sub, beside)
-        return found, float(power.detach())
+        return found, whole.power()
 
     def _check_memory(self, wide: int) -> None:
         n, m = self.sampling.count

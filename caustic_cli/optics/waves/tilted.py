@@ -29,8 +29,8 @@ STEP, MOST_PLANES, A_PIXEL = 0.2, 400, 4
 
 
 def power_on_tilted(r: Receiver, plane: Plane, s: Sampling, front: Wavefront, k0: float, length: float,
-                    dtype: torch.dtype) -> tuple[Tensor, float]:
-    """Power on a tilted screen's pixels of one wavefront, float64, and that of all its light.
+                    dtype: torch.dtype) -> Tensor:
+    """Power on a tilted screen's pixels of one wavefront, float64.
 
     Raises:
         CausticError: too many planes.
@@ -46,8 +46,6 @@ def power_on_tilted(r: Receiver, plane: Plane, s: Sampling, front: Wavefront, k0
 
     path, root, lit = front.on(s.low, s.step, s.count)
     amplitude = root * lit
-    power = (root.square() * lit).sum()
-    amplitude = amplitude * (power / amplitude.square().sum()).sqrt()
     foot = [s.low[k] + s.step[k] * (torch.arange(s.count[k], dtype=torch.float64, device=device) + 0.5) for k in (0, 1)]
     maps = _mean_map(front, s.distance)  # slopes qx, qy of the light that lands at X, Y: a + b X
     depth = float(z.abs().max())
@@ -67,7 +65,7 @@ def power_on_tilted(r: Receiver, plane: Plane, s: Sampling, front: Wavefront, k0
                                  here, k0, length, dtype)
     cell = r.pixel[0] * r.pixel[1] / A_PIXEL**2
     n, m = r.resolution
-    return image.view(n, A_PIXEL, m, A_PIXEL).sum((1, 3)) * cell, float(power.detach())
+    return image.view(n, A_PIXEL, m, A_PIXEL).sum((1, 3)) * cell
 
 
 def _through(s, path, amplitude, foot, maps, point, normal, here, k0, length, dtype) -> Tensor:
