@@ -50,7 +50,7 @@ def disc(x: np.ndarray, y: np.ndarray, radius: float, fine: int = 16) -> np.ndar
 
 def slit(x: np.ndarray, half: float, wavelength: float, distance: float) -> np.ndarray:
     """Fresnel's pattern of a slit of half width `half`, in parts of the incident irradiance."""
-    scale = math.sqrt(2.0 / (wavelength * distance))
+    scale = np.sqrt(2.0 / (wavelength * distance))
     (s1, c1), (s2, c2) = fresnel(scale * (x + half)), fresnel(scale * (x - half))
     return 0.5 * ((c1 - c2) ** 2 + (s1 - s2) ** 2)
 

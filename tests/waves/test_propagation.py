@@ -35,7 +35,8 @@ def test_slit_near(half, distance):
 def test_rectangle_near():
     """Sharp along both axes, sampled as an image is: 2e-2."""
     half, distance, screen, count = (0.8, 0.5), 60.0, (1.0, 0.7), (60, 44)
-    exact = [mean_over(lambda x, h=h: slit(x, h, LAMBDA, distance), -s, s, n, 8) for h, s, n in zip(half, screen, count, strict=True)]
+    exact = [mean_over(lambda x, h=h: slit(x, h, LAMBDA, distance), -s, s, n, 8)
+             for h, s, n in zip(half, screen, count, strict=True)]
     found = Given(half, screen, count, distance, LAMBDA).power(FLAT, ONE)
     assert np.abs(found - exact[0][:, None] * exact[1][None, :]).max() < 2e-2
 

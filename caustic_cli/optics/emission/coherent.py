@@ -20,6 +20,9 @@ from caustic_cli.optics.sampling import Sample
 #: Turn between one point of a disc and the next, rad: such a spiral fills it evenly.
 GOLDEN = math.pi * (3.0 - math.sqrt(5.0))
 
+#: Points along each axis by which the mean of a profile over a circle is found.
+ROUND = 1000
+
 
 @dataclass(frozen=True)
 class Mode:
@@ -67,11 +70,13 @@ class Mode:
             return torch.full_like(u, self.part / area)
         table = torch.as_tensor(np.asarray(profile), dtype=torch.float64, device=u.device)
         a, b = ((c * n).long().clamp(0, n - 1) for c, n in zip((u, v), table.shape, strict=True))
-        inside = torch.ones_like(table)
-        if pupil.round:
-            x, y = (2.0 * (torch.arange(n).to(table) + 0.5) / n - 1.0 for n in table.shape)
-            inside = (x[:, None] ** 2 + y[None, :] ** 2 <= 1.0).double()
-        return self.part / area * table[a, b] / ((table * inside).sum() / inside.sum())
+        mean = table.mean()
+        if pupil.round:  # over the circle, which cuts through cells of the table
+            at = (torch.arange(ROUND).to(table) + 0.5) / ROUND
+            inside = ((2.0 * at[:, None] - 1.0) ** 2 + (2.0 * at[None, :] - 1.0) ** 2 <= 1.0).double()
+            i, j = ((at * n).long() for n in table.shape)
+            mean = (table[i[:, None], j[None, :]] * inside).sum() / inside.sum()
+        return self.part / area * table[a, b] / mean
 
 
 def middle(scene: Lit) -> Mode:
@@ -81,12 +86,12 @@ def middle(scene: Lit) -> Mode:
 
 
 def edges(scene: Lit) -> list[Mode]:
-    """Its outermost points along x and y, of no power: what they do differently says whether they may be taken for shifted ones."""
+    """Its outermost points along x and y, each with all its power: what they do differently says whether they are shifted ones."""
     source = scene.source
     if source.distant:
         s = math.sin(source.half_angle)
         ways = ((1, 0), (-1, 0), (0, 1), (0, -1)) if s else ()
-        return [Mode(scene, (a * s, b * s, math.sqrt(1.0 - s * s)), 0.0) for a, b in ways]
+        return [Mode(scene, (a * s, b * s, math.sqrt(1.0 - s * s)), 1.0) for a, b in ways]
     if not source.extended:
         return []
     at, (ex, ey) = source.points()[0], source.extent
@@ -95,7 +100,7 @@ def edges(scene: Lit) -> list[Mode]:
         for sign in (1.0, -1.0):
             point = at[np.argmax(sign * at[:, k])].copy()
             point[k] += sign * e
-            found.append(Mode(scene, tuple(map(float, point)), 0.0))
+            found.append(Mode(scene, tuple(map(float, point)), 1.0))
     return found
 
 

@@ -39,8 +39,8 @@ SURVEY = 65
 LEFT, TRIES = 1e-3, 16
 #: The same where it has to be exact: derivatives see the misses of feet to first order.
 LEFT_EXACT = 1e-9
-#: At the edges of what is dark they are sought so often, at least, and may miss the grid by this part of a cell; rays that never saw
-#: light go so far to the middle each time.
+#: At the edges of what is dark they are sought so often, at least, and may miss the grid by this part of a cell; rays that never
+#: saw light go so far to the middle each time.
 AT_EDGES, AT_EDGE, INWARDS = 10, 0.05, 0.02
 #: Rays traced at a time.
 CHUNK = 1 << 19
