@@ -95,10 +95,10 @@ class WaveObjective:
                 if key not in made:  # wavelengths of one index go the same ways
                     made[key] = imager.front(line, mode, parameters, sensitive=True)
                 front = made[key]
-                phase, amplitude, power = imager.field(line, front, self.dtype)
+                phase, amplitude = imager.field(line, front, self.dtype)
                 slope = (TURN / line.length * front.sensitivity).to(self.dtype)
                 rows, columns = imager.masks(line, phase.device, self.dtype)
-                yield Part(line, front, phase, slope, amplitude, rows, columns, float(power))
+                yield Part(line, front, phase, slope, amplitude, rows, columns, front.power())
 
     def __call__(self, heights: Tensor) -> Evaluation:
         """Value and gradient at heights (n, m) mm float64.

@@ -20,6 +20,9 @@ from caustic_cli.optics.sampling import Sample
 #: Turn between one point of a disc and the next, rad: such a spiral fills it evenly.
 GOLDEN = math.pi * (3.0 - math.sqrt(5.0))
 
+#: Points along each axis by which the mean of a profile over a circle is found.
+ROUND = 1000
+
 
 @dataclass(frozen=True)
 class Mode:
@@ -67,11 +70,13 @@ class Mode:
             return torch.full_like(u, self.part / area)
         table = torch.as_tensor(np.asarray(profile), dtype=torch.float64, device=u.device)
         a, b = ((c * n).long().clamp(0, n - 1) for c, n in zip((u, v), table.shape, strict=True))
-        inside = torch.ones_like(table)
-        if pupil.round:
-            x, y = (2.0 * (torch.arange(n).to(table) + 0.5) / n - 1.0 for n in table.shape)
-            inside = (x[:, None] ** 2 + y[None, :] ** 2 <= 1.0).double()
-        return self.part / area * table[a, b] / ((table * inside).sum() / inside.sum())
+        mean = table.mean()
+        if pupil.round:  # over the circle, which cuts through cells of the table
+            at = (torch.arange(ROUND).to(table) + 0.5) / ROUND
+            inside = ((2.0 * at[:, None] - 1.0) ** 2 + (2.0 * at[None, :] - 1.0) ** 2 <= 1.0).double()
+            i, j = ((at * n).long() for n in table.shape)
+            mean = (table[i[:, None], j[None, :]] * inside).sum() / inside.sum()
+        return self.part / area * table[a, b] / mean
 
 
 def middle(scene: Lit) -> Mode:

@@ -179,7 +179,9 @@ class Imager:
         seen = survey(optics)
         lengths = tuple(k.behind for k in lines)
         blur = math.sqrt(max(lengths) * distance * seen.magnification)
-        spread = spread_by(optics, edges(system), seen, max(blur, *receiver.pixel)) if system.source.extended else None
+        spread = None
+        if system.source.extended and receiver.across(system.axis):
+            spread = spread_by(optics, edges(system), max(blur, *receiver.pixel))
         outer = [mode for mode in edges(system)] if system.source.extended else []
         low, high = receiver.extent(plane)
         upright = receiver.across(system.axis)
@@ -189,7 +191,7 @@ class Imager:
             light = tuple(tuple(w(a[k], b[k]) for k in (0, 1)) for w, a, b in
                           ((min, light[0], other.light[0]), (max, light[1], other.light[1])))
             for k in (0, 1):
-                room = BESIDE * (high[k] - low[k])
+                room = max(BESIDE * (high[k] - low[k]), spread.reach()[k] + receiver.pixel[k] if spread else 0.0)
                 landing[0][k] = min(landing[0][k], max(other.landing[0][k] - around[k], low[k] - room))
                 landing[1][k] = max(landing[1][k], min(other.landing[1][k] + around[k], high[k] + room))
         sampling = Sampling.of(light, tuple(map(tuple, landing)), receiver.pixel, distance, lengths, finer)
@@ -257,47 +259,42 @@ class Imager:
         """An image of the source's middle on cut pixels -> that of the source on the screen's pixels."""
         return image if self.spread is None else self.spread(image, self.receiver.pixel, *self.cut)
 
-    def field(self, line: Line, front: Wavefront, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
-        """Phase, rad, with the kernel's, and amplitude of each sample of a wavefront, (n, m), and the power of all: ()."""
+    def field(self, line: Line, front: Wavefront, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+        """Phase, rad, with the kernel's, and amplitude of each sample of a wavefront, (n, m)."""
         s, front = self.sampling, self.watched(front, line.behind)
         path, root, lit = front.on(s.low, s.step, s.count).rows()
         across, along = (ramp(s, line.behind, k, path.device) for k in (0, 1))
         phase = torch.remainder(TURN / line.length * path + across[:, None] + along[None, :], TURN)
-        power, amplitude = (root.square() * lit).sum(), root * lit
-        amplitude = amplitude * (power / amplitude.square().sum()).sqrt()
-        return phase.to(dtype), amplitude.to(dtype), power
+        return phase.to(dtype), (root * lit).to(dtype)
 
     def image(self, line: Line, front: Wavefront, dtype: torch.dtype) -> tuple[Tensor, float]:
         """Power on the pixels of the light of one mode at one wavelength, float64, and that of all of it."""
         s, wide = self.sampling, 8 if dtype == torch.float32 else 16
         if not self.upright:
-            return power_on_tilted(self.receiver, self.plane, s, self.watched(front, line.behind), TURN / line.length, line.behind,
-                                   dtype)
+            found = power_on_tilted(self.receiver, self.plane, s, self.watched(front, line.behind), TURN / line.length, line.behind,
+                                    dtype)
+            return found, front.power()
         rows, columns = self.masks(line, front.path.device, dtype)
         pieces = s.pieces(wide)
-        if pieces > 1 and not front.path.requires_grad:
-            found, power = self._in_pieces(line, self.watched(front, line.behind), pieces, rows, columns, dtype)
+        if pieces > 1 and not (torch.is_grad_enabled() and front.path.requires_grad):
+            found = self._in_pieces(line, self.watched(front, line.behind), pieces, rows, columns, dtype)
         else:
             self._check_memory(wide)
-            phase, amplitude, power = self.field(line, front, dtype)
-            found = power_on_pixels(phase, amplitude, s.padded, rows, columns).double()
-        return self.spread_out(found), float(power)
+            found = power_on_pixels(*self.field(line, front, dtype), s.padded, rows, columns).double()
+        return self.spread_out(found), front.power()
 
     @torch.no_grad()
     def _in_pieces(self, line: Line, front: Wavefront, pieces: int, rows: Tensor, columns: Tensor,
-                   dtype: torch.dtype) -> tuple[Tensor, float]:
-        s, sums, fine = self.sampling, [0.0, 0.0], front.on(self.sampling.low, self.sampling.step, self.sampling.count)
+                   dtype: torch.dtype) -> Tensor:
+        s, fine = self.sampling, front.on(self.sampling.low, self.sampling.step, self.sampling.count)
         across, along = (ramp(s, line.behind, k, front.path.device) for k in (0, 1))
 
         def field(part: slice) -> Tensor:
             path, root, lit = fine.rows(part)
-            sums[0] += float((root.square() * lit).sum()) / pieces
-            sums[1] += float((root * lit).square().sum()) / pieces
             phase = torch.remainder(TURN / line.length * path + across[part, None] + along[None, :], TURN)
             return torch.polar((root * lit).to(dtype), phase.to(dtype))
 
-        found, _ = power_in_pieces(field, s, pieces, rows, columns)
-        return found * (sums[0] / sums[1]), sums[0]
+        return power_in_pieces(field, s, pieces, rows, columns)[0]
 
     def _check_memory(self, wide: int) -> None:
         n, m = self.sampling.count

@@ -22,8 +22,8 @@ from caustic_cli.errors import CausticError
 
 #: What is watched, in parts of screen and light; N over n; least samples across the light, so many diffraction widths are watched.
 BEYOND, FINER, LEAST = 1.06, 1.08, 128
-#: Samples of the transform to a pixel, at least.
-A_PIXEL = 3.0
+#: Samples of the transform to a pixel, at least: a pixel a few samples wide is off by the square of their distance over its width.
+A_PIXEL = 6.0
 #: Most samples along an axis; bytes that one piece of a transform may take in any case, and in parts of the free memory.
 MOST, PIECE, OF_FREE = 1 << 17, 1 << 30, 0.3
 #: Bytes that the work on one sample takes at a time, in parts of a complex number's.

@@ -15,7 +15,7 @@ from scipy.special import j1
 from torch import Tensor
 
 from caustic_cli.optics.emission.coherent import Mode
-from caustic_cli.optics.waves.wavefront import SURVEY, Optics, Survey
+from caustic_cli.optics.waves.wavefront import SURVEY, Optics
 
 #: What `error` may be, in parts of what the image shows anyway: of diffraction's blur or a pixel, the larger.
 ALLOWED = 0.25
@@ -60,39 +60,37 @@ class Spread:
 
 
 @torch.no_grad()
-def spread_by(optics: Optics, edges: list[Mode], seen: Survey, shown: float) -> Spread | None:
+def spread_by(optics: Optics, edges: list[Mode], shown: float) -> Spread | None:
     """How an extended source spreads the image of its middle; None where it does more than shift it.
 
     Args:
-        optics: of the middle, surveyed as `seen`; edges: the outermost points, +x, -x, +y, -y.
+        optics: of the middle; edges: the outermost points, +x, -x, +y, -y.
         shown: mm, what the image shows anyway.
     """
-    system = optics.system
-    source = system.source
+    source = optics.system.source
     n = (SURVEY + 1) // 2
     line = torch.linspace(0.0, 1.0, n, dtype=torch.float64)
     u, v = (c.reshape(-1) for c in torch.meshgrid(line, line, indexing="ij"))
-    at = optics.feet(u, v)
-    shifts, error = [], 0.0
+    at, moved = optics.feet(u, v), []
     for mode in edges:
         f = replace(optics, mode=mode).feet(u, v)
         lit = (f.power > 0) & (at.power > 0)
         if not bool(lit.any()):
             return None
-        moved = [(a - b)[lit] for a, b in ((f.big_x, at.big_x), (f.big_y, at.big_y))]
-        mean = [float(m.mean()) for m in moved]
-        error = max(error, float(torch.hypot(*(m - c for m, c in zip(moved, mean, strict=True))).max()))
-        shifts.append(mean)
-    half = tuple(0.5 * abs(shifts[2 * k][k] - shifts[2 * k + 1][k]) for k in (0, 1))
+        moved.append([(a - b)[lit] for a, b in ((f.big_x, at.big_x), (f.big_y, at.big_y))])
+    # Shifts in proportion to the place on the source, by the outermost along each axis, and what departs from that.
+    slope = []
+    for k in (0, 1):
+        (up, down), (high, low) = edges[2 * k : 2 * k + 2], moved[2 * k : 2 * k + 2]
+        apart = up.position[k] - down.position[k]
+        slope.append(float(high[k].mean() - low[k].mean()) / apart if apart else 0.0)
+    centre = optics.mode.position
+    error = max(float(torch.hypot(*(m[k] - slope[k] * (mode.position[k] - centre[k]) for k in (0, 1))).max())
+                for mode, m in zip(edges, moved, strict=True))
     if error > ALLOWED * shown or (not source.distant and float(np.ptp(source.points()[0][:, 2])) > 0):
         return None
     if source.distant:
-        return Spread(half, ((0.0, 0.0, 1.0),), error)
-    (positions, parts), (ex, ey) = source.points(), source.extent
-    cx, cy, _ = source.centre
-    per = [0.5 * (shifts[2 * k][k] - shifts[2 * k + 1][k]) for k in (0, 1)]
-    width = [float(max((positions[:, k].max() - positions[:, k].min()) / 2.0 + e, 1e-300)) for k, e in ((0, ex), (1, ey))]
-    slope = [p / w if w > 1e-299 else 0.0 for p, w in zip(per, width, strict=True)]
-    places = tuple((float(slope[0] * (p[0] - cx)), float(slope[1] * (p[1] - cy)), float(part))
-                   for p, part in zip(positions, parts, strict=True))
-    return Spread((abs(slope[0]) * ex, abs(slope[1]) * ey), places, error)
+        return Spread(tuple(abs(c) * math.sin(source.half_angle) for c in slope), ((0.0, 0.0, 1.0),), error)
+    places = tuple((float(slope[0] * (p[0] - centre[0])), float(slope[1] * (p[1] - centre[1])), float(part))
+                   for p, part in zip(*source.points(), strict=True))
+    return Spread(tuple(abs(c) * e for c, e in zip(slope, source.extent, strict=True)), places, error)

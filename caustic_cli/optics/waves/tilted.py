@@ -5,9 +5,10 @@ Notation, at a plane at distance L_k whose light comes from feet x (see `wavefro
     P           (X |U|^2 - Re(conj(U) U_x)) / L, power times its mean slope: the transverse flux
     d           P / |U|^2 of the light as a whole, by the mean map of feet to landing points
 
-A point of the screen at height z over the plane takes |U|^2 and P where its light passes the plane, at X - z d, and gets
-(|U|^2 n_z + P . n) per area, n the screen's normal.  Planes are so close that the light's departure from the mean map moves by less
-than STEP of what the image shows in between.
+A point of the screen at height z over the plane takes |U|^2 and P where its light passes the plane, at (X - z a) / (1 + z b) with
+d = a + b X, thinner by 1 + z b along each axis, and gets (|U|^2 n_z + P . n) per area, n the screen's normal.  Planes are so close
+that the light's departure from the mean map, and waves that cross to make fringes of two pixels, move by less than STEP of a pixel
+in between.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ STEP, MOST_PLANES, A_PIXEL = 0.2, 400, 4
 
 
 def power_on_tilted(r: Receiver, plane: Plane, s: Sampling, front: Wavefront, k0: float, length: float,
-                    dtype: torch.dtype) -> tuple[Tensor, float]:
-    """Power on a tilted screen's pixels of one wavefront, float64, and that of all its light.
+                    dtype: torch.dtype) -> Tensor:
+    """Power on a tilted screen's pixels of one wavefront, float64.
 
     Raises:
         NoWaveImage: too many planes.
@@ -45,12 +46,10 @@ def power_on_tilted(r: Receiver, plane: Plane, s: Sampling, front: Wavefront, k0
 
     path, root, lit = front.on(s.low, s.step, s.count).rows()
     amplitude = root * lit
-    power = (root.square() * lit).sum()
-    amplitude = amplitude * (power / amplitude.square().sum()).sqrt()
     foot = [s.low[k] + s.step[k] * (torch.arange(s.count[k], dtype=torch.float64, device=device) + 0.5) for k in (0, 1)]
     maps = _mean_map(front, s.distance)  # slopes qx, qy of the light that lands at X, Y: a + b X
     depth = float(z.abs().max())
-    residual = max(m[2] for m in maps)
+    residual = max(m[2] for m in maps) + 0.5 * length / min(r.pixel)
     planes = max(1, math.ceil(2.0 * depth * residual / (2.0 * STEP * min(r.pixel))))
     if planes > MOST_PLANES:
         raise NoWaveImage(f"a wave image of this tilted screen needs {planes} planes, at most {MOST_PLANES} are made: less tilt or"
@@ -63,13 +62,13 @@ def power_on_tilted(r: Receiver, plane: Plane, s: Sampling, front: Wavefront, k0
         if not bool(here.any()):
             continue
         image = image + _through(replace(s, distance=s.distance + at), path, amplitude, foot, maps, (x, y, z - at), (nx, ny, nz),
-                                 here, k0, length, dtype)
+                                 here, k0, length, dtype, r.pixel)
     cell = r.pixel[0] * r.pixel[1] / A_PIXEL**2
     n, m = r.resolution
-    return image.view(n, A_PIXEL, m, A_PIXEL).sum((1, 3)) * cell, float(power.detach())
+    return image.view(n, A_PIXEL, m, A_PIXEL).sum((1, 3)) * cell
 
 
-def _through(s, path, amplitude, foot, maps, point, normal, here, k0, length, dtype) -> Tensor:
+def _through(s, path, amplitude, foot, maps, point, normal, here, k0, length, dtype, pixel) -> Tensor:
     """Power per area of the screen's points near one plane, 0 elsewhere."""
     phase = torch.remainder(k0 * path + ramp(s, length, 0, path.device)[:, None] + ramp(s, length, 1, path.device)[None, :],
                             TURN).to(dtype)
@@ -84,12 +83,18 @@ def _through(s, path, amplitude, foot, maps, point, normal, here, k0, length, dt
     flux = [(grid * density - (fields[0].conj() * moved).real / (dx * dy)) / s.distance
             for grid, moved in ((grid_x[:, None], fields[1]), (grid_y[None, :], fields[2]))]
     total = density * normal[2] + flux[0] * normal[0] + flux[1] * normal[1]
-    qx, qy = ((a + b * c) for (a, b, _), c in zip(maps, (x, y), strict=True))
-    at_x, at_y = (x - z * qx - x0) / dx, (y - z * qy - y0) / dy
+    for axis, width in ((0, pixel[0] / dx), (1, pixel[1] / dy)):  # what lies between the points of a pixel counts too
+        half = int(0.5 * width / A_PIXEL)
+        if half > 0:
+            size, pad = ((2 * half + 1, 1), (half, 0)) if axis == 0 else ((1, 2 * half + 1), (0, half))
+            total = torch.nn.functional.avg_pool2d(total[None, None], size, 1, pad)[0, 0]
+    thinner = [1.0 + z * b for _, b, _ in maps]
+    at_x, at_y = (((c - z * a) / t - c0) / d
+                  for c, (a, _, _), t, c0, d in zip((x, y), maps, thinner, (x0, y0), (dx, dy), strict=True))
     n, m = s.padded
     spots = torch.stack([2.0 * at_y[here] / (m - 1) - 1.0, 2.0 * at_x[here] / (n - 1) - 1.0], -1).to(dtype)
     seen = torch.nn.functional.grid_sample(total[None, None], spots[None, None], mode="bicubic", align_corners=True)[0, 0, 0]
-    return torch.zeros_like(x).masked_scatter(here, seen.double())
+    return torch.zeros_like(x).masked_scatter(here, seen.double()) / (thinner[0] * thinner[1])
 
 
 @torch.no_grad()

@@ -36,9 +36,12 @@ from caustic_cli.optics.waves.sampling import NoWaveImage
 #: Points along each side of the pupil from which extents are found.
 SURVEY = 65
 #: Feet are sought until the path that this leaves out is below this part of a wavelength, at most so often.
-LEFT, TRIES = 1e-3, 12
+LEFT, TRIES = 1e-3, 16
 #: The same where it has to be exact: derivatives see the misses of feet to first order.
 LEFT_EXACT = 1e-9
+#: At the edges of what is dark they are sought so often, at least, and may miss the grid by this part of a cell; rays that never
+#: saw light go so far to the middle each time.
+AT_EDGES, AT_EDGE, INWARDS = 10, 0.05, 0.02
 #: Rays traced at a time.
 CHUNK = 1 << 19
 #: The part of the light that may lie where rays have crossed before the plane of the feet.
@@ -157,15 +160,22 @@ def survey(optics: Optics) -> Survey:
         raise NoWaveImage("no light reaches the screen, so it has no wave image")
     light, landing = (tuple(tuple(float(getattr(c[lit], w)()) for c in pair) for w in ("min", "max"))
                       for pair in ((f.x, f.y), (f.big_x, f.big_y)))
-    scale, offset = [], []
-    for at, foot in ((u[lit], f.x[lit]), (v[lit], f.y[lit])):
+    scale, offset, lows, highs = [], [], [], []
+    for k, (at, foot) in enumerate(((u[lit], f.x[lit]), (v[lit], f.y[lit]))):
         a, b = at - at.mean(), foot - foot.mean()
         scale.append(float((a * b).sum() / (a * a).sum()))
         offset.append(float(foot.mean() - scale[-1] * at.mean()))
-    if pupil.round:  # the survey's points miss the circle's edge
-        r = 0.5
-        light = tuple(tuple(offset[k] + scale[k] * (0.5 + s * r) for k in (0, 1)) for s in (-1.0, 1.0))
-        light = tuple(tuple(f(light[0][k], light[1][k]) for k in (0, 1)) for f in (min, max))
+        low, high = light[0][k], light[1][k]
+        for end, edge in ((at.min(), 0.0), (at.max(), 1.0)):
+            upper = (edge > 0.5) == (scale[-1] > 0)
+            if float(end) != edge:  # an edge within the pupil, somewhere between this point and the next
+                reach = (high if upper else low) + (1.0 if upper else -1.0) * abs(scale[-1]) / (SURVEY - 1)
+            else:  # the survey's points may miss a circle's edge
+                reach = offset[-1] + scale[-1] * edge if pupil.round else low
+            low, high = (low, max(high, reach)) if upper else (min(low, reach), high)
+        lows.append(low)
+        highs.append(high)
+    light = (tuple(lows), tuple(highs))
     grid = (SURVEY, SURVEY)
     area = _jacobian(f.big_x.view(grid), f.big_y.view(grid), 1.0, 1.0).abs()
     foot = _jacobian(f.x.view(grid), f.y.view(grid), 1.0, 1.0).abs()
@@ -176,7 +186,7 @@ def survey(optics: Optics) -> Survey:
 
 def _jacobian(a: Tensor, b: Tensor, dx: float, dy: float) -> Tensor:
     """Determinant of the derivatives of two functions (n, m) of even samples."""
-    (ax, ay), (bx, by) = (torch.gradient(c, spacing=(dx, dy), dim=(0, 1)) for c in (a, b))
+    (ax, ay), (bx, by) = (torch.gradient(c, spacing=(dx, dy), dim=(0, 1), edge_order=2) for c in (a, b))
     return ax * by - ay * bx
 
 
@@ -186,6 +196,7 @@ class Wavefront:
 
     low, step: of the nodes, which stand in the middle of cells, mm; path: v less its mean, mm; density: power per mm^2; edge_x,
     edge_y: distance inside the pupil's edges, mm on this plane, edge_y None for a circle; big_x, big_y: where light lands, mm;
+    shade: 0 where light is stopped behind the pupil, path and density going on from beside it, and 1 elsewhere; None for no such;
     sensitivity: derivative of the path by the height of the last surface; at_x, at_y: points of that surface, mm; both None unless
     asked for.
     """
@@ -198,6 +209,7 @@ class Wavefront:
     edge_y: Tensor | None
     big_x: Tensor
     big_y: Tensor
+    shade: Tensor | None = None
     sensitivity: Tensor | None = None
     at_x: Tensor | None = None
     at_y: Tensor | None = None
@@ -209,12 +221,20 @@ class Wavefront:
             density = density * ((0.5 * w - (big - m).abs()) / (SOFT * w)).clamp(0.0, 1.0)
         return replace(self, density=density)
 
+    def power(self) -> float:
+        """Of all its light."""
+        lit = _within_pupil(self.edge_x, self.edge_y, self.step).detach()
+        if self.shade is not None:
+            lit = lit * self.shade
+        return float((self.density.detach() * lit).sum()) * self.step[0] * self.step[1]
+
     def on(self, low: tuple[float, float], step: tuple[float, float], count: tuple[int, int]) -> Refined:
         """The same on a finer grid."""
         x, y = (_between(self.path.shape[k], self.low[k], self.step[k], low[k], step[k], count[k], self.path) for k in (0, 1))
-        scale = (step[0] * step[1]) ** 0.5
-        root = self.density.sqrt() * scale
-        return Refined(*(None if c is None else _along_y(c, y) for c in (self.path, root, self.edge_x, self.edge_y)), step, x)
+        bright = self.density > 0  # at 0 a root has no derivative
+        root = torch.where(bright, self.density, torch.ones_like(self.density)).sqrt() * bright * (step[0] * step[1]) ** 0.5
+        columns = self.path, root, self.edge_x, self.edge_y, self.shade
+        return Refined(*(None if c is None else _along_y(c, y) for c in columns), step, x)
 
 
 @dataclass
@@ -225,14 +245,15 @@ class Refined:
     root: Tensor
     edge_x: Tensor
     edge_y: Tensor | None
+    shade: Tensor | None
     step: tuple[float, float]
     along_x: tuple[Tensor, Tensor] | None
 
     def rows(self, part: slice = slice(None)) -> tuple[Tensor, Tensor, Tensor]:
-        """Path, mm; root of the power of a whole cell; part of it within the pupil: (rows, m) float64 each."""
-        lit = (self._at(self.edge_x, part) / self.step[0] + 0.5).clamp(0.0, 1.0)
-        if self.edge_y is not None:
-            lit = lit * (self._at(self.edge_y, part) / self.step[1] + 0.5).clamp(0.0, 1.0)
+        """Path, mm; root of the power of a whole cell; part of it that is lit: (rows, m) float64 each."""
+        lit = _within_pupil(self._at(self.edge_x, part), None if self.edge_y is None else self._at(self.edge_y, part), self.step)
+        if self.shade is not None:
+            lit = lit * self._at(self.shade, part).clamp(0.0, 1.0)
         return self._at(self.path, part), self._at(self.root, part), lit
 
     def _at(self, c: Tensor, part: slice) -> Tensor:
@@ -240,6 +261,13 @@ class Refined:
             return c[part]
         first, w = (t[part] for t in self.along_x)
         return sum(w[:, k, None] * c[first + k] for k in range(POINTS))
+
+
+def _within_pupil(edge_x: Tensor, edge_y: Tensor | None, step: tuple[float, float]) -> Tensor:
+    """Part of each cell that lies inside the pupil's edges."""
+    if edge_y is None:
+        return (edge_x / (0.5 * (step[0] + step[1])) + 0.5).clamp(0.0, 1.0)
+    return (edge_x / step[0] + 0.5).clamp(0.0, 1.0) * (edge_y / step[1] + 0.5).clamp(0.0, 1.0)
 
 
 def _between(nodes: int, low: float, step: float, fine_low: float, fine_step: float, count: int, like: Tensor):
@@ -284,14 +312,7 @@ def wavefront(optics: Optics, seen: Survey, low: tuple[float, float], step: tupl
     shape = (len(x), len(y))
     x, y = (c.reshape(-1) for c in torch.meshgrid(x, y, indexing="ij"))
     with torch.no_grad():
-        u, v = ((c - seen.offset[k]) / seen.scale[k] for k, c in enumerate((x, y)))
-        for _ in range(TRIES):
-            f = optics.feet(u.clamp(0.0, 1.0), v.clamp(0.0, 1.0))
-            ex, ey = (x - f.x) / seen.scale[0], (y - f.y) / seen.scale[1]
-            if _left(f, x, y, shape, step, u, v) <= left:
-                break
-            u, v = u.clamp(0.0, 1.0) + ex, v.clamp(0.0, 1.0) + ey
-    held = u.clamp(0.0, 1.0), v.clamp(0.0, 1.0)
+        f, held, behind = _sought(optics, seen, (x, y), shape, step, left)
     at = {}
     if sensitive:
         with torch.no_grad():
@@ -300,33 +321,81 @@ def wavefront(optics: Optics, seen: Survey, low: tuple[float, float], step: tupl
         f = optics.feet(*held)
     ex, ey = x - f.x, y - f.y
     path = f.path + optics.index * (f.qx * ex + f.qy * ey)
-    lit = f.power > 0
-    path = torch.where(lit, path - path[lit].detach().mean(), torch.zeros_like(path))
+    dark = (f.power <= 0) | (behind & ((ex.abs() > AT_EDGE * step[0]) | (ey.abs() > AT_EDGE * step[1]))).detach()
+    known = ~dark | (behind & (f.power > 0))  # beside the dark, rays from the edge of the light stand for its path
+    path = torch.where(known, path - path[~dark].detach().mean(), torch.zeros_like(path))
+    dark = dark.view(shape)
+    ex, ey = ex.view(shape), ey.view(shape)
     # Where on the pupil light with its foot on the grid comes from, in mm of this plane; its stretch is the density's.
-    px, py = ((h - 0.5) * c for h, c in zip(held, seen.scale, strict=True))
-    (pxx, pxy), (pyx, pyy) = (torch.gradient((p + e).detach().view(shape), spacing=step, dim=(0, 1))
-                              for p, e in ((px, ex), (py, ey)))
-    px, py = px + pxx.reshape(-1) * ex + pxy.reshape(-1) * ey, py + pyx.reshape(-1) * ex + pyy.reshape(-1) * ey
+    px, py = (((h - 0.5) * c).view(shape) for h, c in zip(held, seen.scale, strict=True))
+    gone = [_filled((p + e).detach() - c.view(shape), dark) + c.view(shape) for p, e, c in ((px, ex, x), (py, ey, y))]
+    (pxx, pxy), (pyx, pyy) = (torch.gradient(p, spacing=step, dim=(0, 1), edge_order=2) for p in gone)
+    px = torch.where(dark, gone[0], px + pxx * ex + pxy * ey)
+    py = torch.where(dark, gone[1], py + pyx * ex + pyy * ey)
     pupil = optics.mode.scene.pupil
     mm = [2.0 * pupil.half_size[k] / abs(seen.scale[k]) for k in (0, 1)]
-    squeeze = mm[0] * mm[1] * _jacobian(px.view(shape), py.view(shape), *step)
+    squeeze = mm[0] * mm[1] * _jacobian(px, py, *step)
     power = f.power.view(shape)
-    crossed = torch.where(squeeze.detach() <= 0, power.detach(), torch.zeros_like(power))
+    crossed = torch.where((squeeze.detach() <= 0) & ~dark, power.detach(), torch.zeros_like(power))
     if float(crossed.sum()) > CROSSED * float(power.detach().sum()):
         raise NoWaveImage("light crosses itself within the lens' own depth, so that no wavefront behind it stands for it;"
                            " a flatter surface or a screen farther away has one")
-    density = power * squeeze.clamp_min(0.0)
+    if bool((~dark).any()):
+        power = torch.where(dark, _filled(power.detach(), dark), power)
+    by_x, by_y = torch.gradient(power.detach(), spacing=step, dim=(0, 1), edge_order=2)
+    density = (power + torch.where(dark, torch.zeros_like(ex), by_x * ex + by_y * ey)).clamp_min(0.0) * squeeze.clamp_min(0.0)
     rx, ry = (abs(s) / 2.0 for s in seen.scale)
-    px, py = px.view(shape), py.view(shape)
     edge_x, edge_y = (rx - torch.hypot(px, py * (rx / ry)), None) if pupil.round else (rx - px.abs(), ry - py.abs())
     landed = (c.detach().view(shape) for c in (f.big_x, f.big_y))
-    return Wavefront(low, step, path.view(shape), density, edge_x, edge_y, *landed,
+    return Wavefront(low, step, path.view(shape), density, edge_x, edge_y, *landed, (~dark).double() if bool(dark.any()) else None,
                      **{name: value.view(shape) for name, value in at.items()})
 
 
-def _left(f: Feet, x: Tensor, y: Tensor, shape, step, u: Tensor, v: Tensor) -> float:
+def _sought(optics: Optics, seen: Survey, at: tuple[Tensor, Tensor], shape, step,
+            left: float) -> tuple[Feet, tuple[Tensor, Tensor], Tensor]:
+    """Rays with their feet at points (N,) each, where they pass the pupil, and which of them stand at the edge of what is dark.
+
+    Rays beyond the pupil's edges stay on them.  Where rays are stopped behind it their feet say nothing: they go back towards the
+    last ray that was not, and such as never were towards the middle.
+    """
+    x, y = at
+    u, v = ((c - seen.offset[k]) / seen.scale[k] for k, c in enumerate(at))
+    middle = [(0.5 * (seen.light[0][k] + seen.light[1][k]) - seen.offset[k]) / seen.scale[k] for k in (0, 1)]
+    found = behind = torch.zeros_like(x, dtype=torch.bool)
+    held = u.clamp(0.0, 1.0), v.clamp(0.0, 1.0)
+    for k in range(TRIES):
+        hu, hv = u.clamp(0.0, 1.0), v.clamp(0.0, 1.0)
+        f = optics.feet(hu, hv)
+        lit = f.power > 0
+        found, behind = found | lit, behind | ~lit
+        held = tuple(torch.where(lit | ~found, h, before) for h, before in zip((hu, hv), held, strict=True))
+        settled = _left(f, x, y, shape, step, u, v, behind) <= left
+        if settled and (k + 1 >= AT_EDGES or not bool(behind.any())):
+            break
+        ahead = (hu + (x - f.x) / seen.scale[0], hv + (y - f.y) / seen.scale[1])
+        u, v = (torch.where(lit, a, torch.where(found, 0.5 * (h + b), h + INWARDS * (m - h)))
+                for a, h, b, m in zip(ahead, (hu, hv), held, middle, strict=True))
+    if bool(behind.any()):
+        f = optics.feet(*held)
+    return f, held, behind
+
+
+def _filled(c: Tensor, dark: Tensor) -> Tensor:
+    """A function (n, m) with what it is beside the dark in a few cells of that, 0 beyond."""
+    if not bool(dark.any()):
+        return c
+    known, c = (~dark).to(c), torch.where(dark, torch.zeros_like(c), c)
+    for _ in range(POINTS // 2 + 1):
+        around, count = (torch.nn.functional.avg_pool2d(t[None, None], 3, 1, 1)[0, 0] for t in (c * known, known))
+        new = (known == 0) & (count > 0)
+        c = torch.where(new, around / count.clamp_min(1e-9), c)
+        known = torch.where(new, torch.ones_like(known), known)
+    return c
+
+
+def _left(f: Feet, x: Tensor, y: Tensor, shape, step, u: Tensor, v: Tensor, behind: Tensor) -> float:
     """Bound of the path left out where feet miss the grid by e: half e^2 times the wavefront's curvature there, mm."""
-    inside = (f.power > 0) & (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
+    inside = ~behind & (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
     if not bool(inside.any()):
         return 0.0
     e2 = (x - f.x).square() + (y - f.y).square()

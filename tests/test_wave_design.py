@@ -1,0 +1,259 @@
+"""Designs on the wave image: the loss and its derivative, the stages, what commands say of it."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from caustic_cli import cli, derive, verdict
+from caustic_cli.errors import InputError
+from caustic_cli.inverse.schedule import LEAST_WAVES, WAVES, wave_refinement
+from caustic_cli.inverse.waves import WaveObjective
+from caustic_cli.optics.resolution import Resolution, diffraction_blur, local_magnification, white
+from caustic_cli.optics.surfaces import HeightField
+from caustic_cli.optics.waves import NoWaveImage, wave_image
+from caustic_cli.scene import Disc, Lens, Light, Offset, PlaneWave, Points, Scene, Screen
+from caustic_cli.studies import diffraction
+from caustic_cli.studies.metrics import relative_rms
+
+SMALL = ["--lens-size", "2", "--throw", "60", "--mag", "2", "--resolution", "32", "--quiet", "--threads", "1"]
+
+
+def scene_of(source=None, **lens) -> Scene:
+    given = {"size": (2.0, 2.0), "control": (19, 19), "offset": Offset(1.5, (16.0, 16.0)), "height_range": (-0.3, 0.3),
+             "min_thickness": 0.5}
+    return Scene(source or PlaneWave(), Lens(**(given | lens)), Screen((5.0, 5.0), 60.0, (32, 32)), lens.pop("light", Light()))
+
+
+def heights_of(scene: Scene, relief: float = 2e-4) -> torch.Tensor:
+    x, y = HeightField.of(scene.lens).control_xy()
+    bumps = torch.cos(7.0 * x)[:, None] * torch.cos(5.0 * y + 0.4)[None, :]
+    return scene.lens.offset.thickness + torch.from_numpy(scene.lens.offset.sag(x[:, None].numpy(), y[None, :].numpy())) + relief * bumps
+
+
+def goal() -> torch.Tensor:
+    x = torch.linspace(-1.0, 1.0, 32, dtype=torch.float64)
+    return ((x[:, None] ** 2 + x[None, :] ** 2) < 0.5).double()
+
+
+@pytest.fixture
+def _here(tmp_path, monkeypatch):
+    """A fresh directory with a picture, and few rays for the verdict."""
+    monkeypatch.chdir(tmp_path)
+    y, x = np.mgrid[-1:1:32j, -1:1:32j]
+    Image.fromarray(((np.hypot(x, y) < 0.7) * 255).astype(np.uint8)).save("blob.png")
+    monkeypatch.setattr(verdict, "FINAL_RAYS", 40_000)
+
+
+def design(capfd, *arguments, code=0) -> dict | str:
+    """Figures of `caustic design`, or what it says."""
+    assert cli.run(["design", *map(str, arguments), "--json"]) == code
+    out, err = capfd.readouterr()
+    return json.loads(out) if code == 0 else err.strip()
+
+
+# loss and derivative
+
+
+@pytest.mark.parametrize("source", [None, Points(((0.1, 0.0, -80.0),)), Disc(angle=0.1)], ids=["plane", "point", "disc"])
+@pytest.mark.parametrize("options", [{}, {"max_slope": 0.01, "blur": 1.0, "apron": 2}], ids=["plain", "limits"])
+def test_gradient_of_the_loss(source, options):
+    """As central differences say, in float64; a unit of wavelengths at a time or all kept."""
+    scene = scene_of(source)
+    heights, field = heights_of(scene), HeightField.of(scene.lens)
+    made = WaveObjective(scene, field, heights, goal(), "rms-light", wavelengths=(500.0, 600.0), dtype=torch.float64, **options)
+    g = torch.Generator().manual_seed(1)
+    moved = heights + 2e-5 * torch.randn(heights.shape, generator=g, dtype=torch.float64)
+    along = torch.randn(heights.shape, generator=g, dtype=torch.float64)
+    found, step = made(moved), 1e-7
+    difference = (made(moved + step * along).loss - made(moved - step * along).loss) / (2 * step)
+    assert float((found.gradient * along).sum()) == pytest.approx(difference, rel=2e-5)
+    assert 0.5 < found.on_screen < 1.0
+    made.whole = not made.whole
+    again = made(moved)
+    assert again.loss == pytest.approx(found.loss, rel=1e-12)
+    assert torch.allclose(again.gradient, found.gradient, rtol=1e-9, atol=1e-12 * float(found.gradient.abs().max()))
+
+
+def test_the_path_around_a_lens_is_that_of_the_moved_lens():
+    """The loss' own image after a move of 0.1 micrometres against that of an exact trace of the moved lens."""
+    scene = scene_of()
+    heights, field = heights_of(scene), HeightField.of(scene.lens)
+    made = WaveObjective(scene, field, heights, goal(), "rms", wavelengths=(550.0,), dtype=torch.float64)
+    g = torch.Generator().manual_seed(2)
+    moved = heights + 1e-4 * torch.randn(heights.shape, generator=g, dtype=torch.float64)
+    exact = wave_image(scene, field, moved, wavelengths=(550.0,), finer=1.5, dtype=torch.float64).image
+    there = wave_image(scene, field, heights, wavelengths=(550.0,), dtype=torch.float64).image
+    target = goal()
+    loss = relative_rms(exact, target) / target.numel()
+    assert made(moved).loss == pytest.approx(loss, rel=5e-3)
+    assert relative_rms(exact, there) > 0.2  # the move matters
+
+
+def test_wavelengths_of_the_scene_are_those_of_the_loss():
+    scene = replace(scene_of(glass="N-BK7", index=1.5168), light=Light(None, (450.0, 650.0), (1.0, 3.0)))
+    heights, field = heights_of(scene), HeightField.of(scene.lens)
+    made = WaveObjective(scene, field, heights, goal(), "rms", wavelengths=(500.0,), dtype=torch.float64)
+    assert [(p.line.wavelength, p.line.part) for p in made.parts] == [(450.0, 0.25), (650.0, 0.75)]
+    assert made.parts[0].line.system is not made.parts[1].line.system
+    image = wave_image(scene, field, heights, finer=1.5, dtype=torch.float64).image
+    assert made(heights).loss == pytest.approx(relative_rms(image, goal()) / 1024, rel=5e-3)
+
+
+# what is decided
+
+
+def test_blur_and_details():
+    assert diffraction_blur(550.0, 300.0, 3.0) == pytest.approx(0.7036, abs=1e-4)
+    seen = Resolution(0.7036, 0.0, 0.12, 30.0, 10.0)
+    assert seen.resolvable == 43 and seen.matters
+    assert seen.lens_for_all() == pytest.approx(58.6, abs=0.1)
+    assert seen.sentence() == ("light carries about 43 x 43 details here (diffraction 0.7 mm, source 0 mm, pixel 0.12 mm);"
+                               " a lens of 59 mm would carry 250")
+    assert not Resolution(0.7, 2.8, 0.12, 30.0, 10.0).matters  # the sun washes it out
+    assert not Resolution(0.01, 0.0, 0.12, 30.0, 10.0).matters
+    assert Resolution(0.01, 0.0, 0.12, 30.0, 10.0).resolvable == 250
+    assert white(1) == (550.0,) and len(set(white(5)) & set(white(6))) == 0
+
+
+def test_local_magnification_is_that_of_the_map():
+    """A sphere for magnification 2; the same from a point 100 mm before."""
+    scene = scene_of()
+    heights = heights_of(scene, 0.0)
+    assert local_magnification(scene, HeightField.of(scene.lens), heights) == pytest.approx(1 + 58.5 * 0.5443 / 16.0, rel=0.01)
+
+
+@pytest.mark.parametrize(("extra", "stages"), [([], True), (["--waves", "off"], False), (["--resolution", "4"], False),
+                                               (["--resolution", "4", "--waves", "on"], True), (["--source-angle", "3"], False),
+                                               (["--network", "sparse"], False), (["--screen-tilt", "0,10"], False)])
+def test_auto_is_by_the_scene(extra, stages, _here, capfd, monkeypatch):
+    from caustic_cli import session  # noqa: PLC0415
+
+    monkeypatch.setattr(session, "_run", lambda *args: {"lost": {}, "image": "", "reason": ""})
+    small = SMALL if "--resolution" not in extra else [a for a in SMALL if a not in ("--resolution", "32")]
+    design(capfd, "blob.png", *small, *extra, "-o", "p")
+    tables = session.Project.open("p").settings["design"]["stages"]
+    assert any(t.get("waves") for t in tables) == stages
+    assert not stages or [len(t["waves"]) for t in tables if t.get("waves")] == [WAVES["standard"][0]] * len(WAVES["standard"][1])
+
+
+def test_time_bounds_the_stages():
+    assert wave_refinement(1e6, 0) == [(5, n) for n in WAVES["standard"][1]]
+    fewer = wave_refinement(1e7, 0)
+    assert 0 < sum(n for _, n in fewer) < sum(WAVES["standard"][1]) and all(n >= LEAST_WAVES for _, n in fewer)
+    assert wave_refinement(1e9, 0) == [] and len(wave_refinement(1e9, 0, hurry=False)) == 2
+    with pytest.raises(InputError, match="waves must be one of|auto"):
+        derive.complete({"design": {"waves": "perhaps"}}, 1.0)
+    with pytest.raises(InputError, match="network none"):
+        derive.complete({"design": {"waves": "on", "network": "sparse", "optimizer": "adam"}}, 1.0)
+
+
+# designs
+
+
+def test_a_design_for_light(_here, capfd):
+    """The wave image at wavelengths the design never used: far better than of a design for rays, with all of the light."""
+    rays = design(capfd, "blob.png", *SMALL, "--waves", "off", "-o", "rays")
+    assert "wave_relative_rms" not in rays and not Path("rays/wave.png").exists()
+    waves = design(capfd, "blob.png", *SMALL, "-o", "waves")
+    judged = json.loads(_render(capfd, "rays"))
+    assert waves["wave_relative_rms"] < 0.6 * judged["wave_relative_rms"]
+    assert waves["wave_relative_rms"] < 0.6 * waves["start_wave_relative_rms"]
+    assert waves["wave_on_target"] > 0.93 * waves["wave_on_screen"] and waves["resolvable"] <= 32
+    assert len(waves["wave_wavelengths"]) == 6 and Path("waves/wave.png").exists()
+    again = json.loads(_render(capfd, "waves"))
+    assert again["wave_relative_rms"] == pytest.approx(waves["wave_relative_rms"], rel=0.03)
+    assert again["wave_image"] == "waves/wave.png" and "relative_rms" in again
+    assert cli.run(["render", "waves", "--rays", "4000", "--quiet", "--npy", "ray.npy", "-o", "ray.png"]) == 0
+    light = np.load("ray-wave.npy")
+    assert light.sum() == pytest.approx(again["wave_on_screen"], abs=1e-6) and Path("ray-wave.png").exists()
+    none = json.loads(_render(capfd, "waves", "--effects", "fresnel"))
+    assert "wave_relative_rms" not in none
+
+
+def _render(capfd, project, *options) -> str:
+    assert cli.run(["render", project, "--rays", "4000", "--quiet", "--json", *options]) == 0
+    return capfd.readouterr().out
+
+
+def test_resumed_within_a_wave_stage(_here, capfd):
+    """Ten and ten iterations are twenty, bitwise, where the wave image is refined from the twelfth on."""
+    Path("two.toml").write_text("[lens]\ncontrol = [19, 19]\n[[design.stages]]\ncontrol = [19, 19]\nrays = 4096\niterations = 6\n"
+                                "[[design.stages]]\ncontrol = [19, 19]\nwaves = [500.0, 600.0]\niterations = 20\n")
+    options = [*SMALL, "--config", "two.toml"]
+    design(capfd, "blob.png", *options, "--iterations", 16, "-o", "whole")
+    design(capfd, "blob.png", *options, "--iterations", 11, "-o", "parts")
+    design(capfd, "--resume", "parts", "--iterations", 16, "--quiet", "--threads", 1)
+    states = [_state(p) for p in ("whole", "parts")]
+    assert torch.equal(states[0].heights, states[1].heights) and states[0].stage == 1
+    assert [row[2] for row in states[0].history] == [row[2] for row in states[1].history]
+    assert Path("whole/project.toml").read_bytes() == Path("parts/project.toml").read_bytes()
+
+
+def _state(path: str):
+    from caustic_cli.project import Project  # noqa: PLC0415
+
+    return Project.open(path).load().state
+
+
+def test_one_wavelength_is_judged_beside_it_too(_here, capfd):
+    figures = design(capfd, "blob.png", *SMALL, "--wavelengths", "550", "-o", "laser")
+    assert figures["wave_wavelengths"] == [550.0] and figures["wave_unseen_wavelengths"] == pytest.approx([544.5, 555.5])
+    assert figures["wave_relative_rms"] < figures["wave_unseen_relative_rms"]
+
+
+def test_limits_are_kept(_here, capfd):
+    figures = design(capfd, "blob.png", *SMALL, "--max-slope", "0.08", "-o", "p")
+    from caustic_cli.project import Project  # noqa: PLC0415
+
+    project = Project.open("p")
+    field, checkpoint = project.lens(project.scene())
+    u = torch.linspace(-0.999, 0.999, 301, dtype=torch.float64)
+    x, y = (c.reshape(-1) for c in torch.meshgrid(u, u, indexing="ij"))
+    _, gx, gy = field.evaluate(checkpoint.state.heights, x, y)
+    assert float(torch.hypot(gx, gy).max()) <= 0.08 * (1 + 1e-3) and figures["wave_relative_rms"] > 0
+
+
+def test_light_without_a_wave_image(_here, capfd, monkeypatch):
+    """Auto does without and says so; on is an error of one line."""
+    def refuse(*args, **kwargs):
+        raise NoWaveImage("light crosses itself")
+
+    monkeypatch.setattr("caustic_cli.optics.waves.image.wavefront", refuse)
+    figures = design(capfd, "blob.png", *SMALL, "-o", "auto")
+    assert figures["wave_relative_rms"] is None and figures["reason"] == "no wave image"
+    assert json.loads(_render(capfd, "auto"))["no_wave_image"] == "light crosses itself"
+    assert design(capfd, "blob.png", *SMALL, "--waves", "on", "-o", "on", code=1) == "caustic: light crosses itself"
+
+
+# the study
+
+
+def test_study_of_diffraction(monkeypatch):
+    """Rays come closer to light for larger lenses, shorter waves and larger sources."""
+    monkeypatch.setattr(diffraction, "SIZES", (2.0, 8.0))
+    monkeypatch.setattr(diffraction, "WAVELENGTHS", (400.0, 800.0))
+    monkeypatch.setattr(diffraction, "ANGLES", (0.0, 0.6))
+    scene = scene_of()
+    study = diffraction.run_diffraction(scene, HeightField.of(scene.lens), heights_of(scene, 1e-3), rays=400_000)
+    rows = {(r["series"], r["value"]): r for r in study.rows}
+    assert len(rows) == 6 and all(math.isfinite(r["error"]) and r["seconds"] > 0 for r in study.rows)
+    assert rows["lens size", 8.0]["error"] < rows["lens size", 2.0]["error"]
+    assert rows["wavelength", 400.0]["error"] < rows["wavelength", 800.0]["error"]
+    assert rows["source size", 0.6]["error"] < 0.5 * rows["source size", 0.0]["error"]
+    assert "rays are" in study.advice
+
+
+def test_a_scaled_lens_is_the_same_lens():
+    scene = scene_of()
+    larger, field, heights = diffraction.scaled(scene, HeightField.of(scene.lens), heights_of(scene), 10.0)
+    assert larger.lens.half_size == (10.0, 10.0) and larger.screen.z == 600.0 and larger.screen.pixel[0] == 10 * scene.screen.pixel[0]
+    before = local_magnification(scene, HeightField.of(scene.lens), heights_of(scene))
+    assert local_magnification(larger, field, heights) == pytest.approx(before, rel=1e-9)
