@@ -131,8 +131,8 @@ def by_points(scene, field, heights, each: int):
 
 @pytest.mark.parametrize("kind", ["sun", "disc", "grid"])
 def test_spread_is_many_points(kind):
-    """A convolution in place of a sum over points: 6 % relative RMS, of which 30 points leave about 4; its stated misplacement is below
-    a quarter of a pixel."""
+    """A convolution in place of a sum over points: 6 % relative RMS, of which 30 points leave about 4; its stated misplacement
+    is below a quarter of a pixel."""
     source = {"sun": Disc(angle=0.53), "disc": Disc((0.1, -0.1, -400.0), (3.0, 2.0)),
               "grid": Points.grid((0.0, 0.0, -400.0), (3.0, 2.0), (4, 3))}[kind]
     screen = Screen((2.0, 2.0), 42.0, (20, 20))
