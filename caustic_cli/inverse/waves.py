@@ -55,7 +55,7 @@ class WaveObjective:
         field: spline spaces of the heights.
         heights: h_0 (n, m) mm.
         target, loss, blur, apron, max_slope, min_radius: as of an `Objective`.
-        wavelengths: nm, in equal parts; empty for the scene's own.
+        wavelengths: nm, in equal parts, of a scene that says none; empty for white light's.
         dtype: of fields; paths are float64.
 
     Raises:
@@ -71,8 +71,7 @@ class WaveObjective:
         wide = torch.nn.functional.pad(target.double().to(device), (apron,) * 4)
         self.loss = (ColorLoss if scene.colored else Loss)(loss, wide, blur, apron, wide > 0)
         self.penalty = penalty_of(scene, field, loss, max_slope, min_radius, device)
-        own = scene.light.wavelengths
-        lines = lines_of(scene, field, None if own and (not wavelengths or scene.colored) else wavelengths or None)
+        lines = lines_of(scene, field, None if scene.light.wavelengths else wavelengths or None)
         rank, count = ranks.place()
         parameters = {EXIT: self.middle}
         with torch.no_grad():

@@ -116,17 +116,25 @@ def _advice(rows: list[dict]) -> str:
     """One sentence: from which size on rays are enough."""
     sizes = [r for r in rows if r["series"] == "lens size"]
     found = []
-    enough = [r["value"] for r in sizes if r["error"] <= ENOUGH]
-    if enough:
-        found.append(f"for lenses of {min(enough):g} mm and more at these angles")
-    angles = [r["value"] for r in rows if r["series"] == "source size" and r["error"] <= ENOUGH]
-    if angles:
-        found.append(f"for sources of {min(angles):g} degrees and more" if min(angles) > 0 else "for a point of light already")
+    if (size := _from(sizes)) is not None:
+        found.append(f"for lenses of {size:g} mm and more at these angles")
+    if (angle := _from([r for r in rows if r["series"] == "source size"])) is not None:
+        found.append(f"for sources of {angle:g} degrees and more" if angle > 0 else "for a point of light already")
     if found:
         return f"rays are within {ENOUGH:.0%} of light {' or '.join(found)}"
     best = min(rows, key=lambda r: r["error"])
     return (f"rays are nowhere within {ENOUGH:.0%} of light here; closest, {best['error']:.2g}, at a {best['series']} of"
             f" {best['value']:g}")
+
+
+def _from(rows: list[dict]) -> float | None:
+    """The least value from which on every error is small enough; None where the last is not."""
+    found = None
+    for row in sorted(rows, key=lambda r: -r["value"]):
+        if row["error"] > ENOUGH:
+            break
+        found = row["value"]
+    return found
 
 
 def draw_diffraction(study: Study, figure: Figure) -> None:

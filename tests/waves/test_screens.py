@@ -131,8 +131,8 @@ def by_points(scene, field, heights, each: int):
 
 @pytest.mark.parametrize("kind", ["sun", "disc", "grid"])
 def test_spread_is_many_points(kind):
-    """A convolution in place of a sum over points: 6 % relative RMS, of which 30 points leave about 4; its stated misplacement is
-    below a quarter of a pixel."""
+    """A convolution in place of a sum over points: 6 % relative RMS, of which 30 points leave about 4; its stated misplacement
+    is below a quarter of a pixel."""
     source = {"sun": Disc(angle=0.53), "disc": Disc((0.1, -0.1, -400.0), (3.0, 2.0)),
               "grid": Points.grid((0.0, 0.0, -400.0), (3.0, 2.0), (4, 3))}[kind]
     screen = Screen((2.0, 2.0), 42.0, (20, 20))
@@ -199,7 +199,9 @@ def test_leaving_is_what_rays_leave_with(source, aperture):
     field, heights = wavy(scene, 1e-3)
     found = wave_image(scene, field, heights)
     rays = expose(scene, field, heights, rays_of(scene, "stratified", 200_000))
-    assert found.leaving == pytest.approx(rays.leaving, abs=1e-4 if source in ("plane", "profile") else 5e-4, rel=1e-3)
+    # Cells of the light that a step of a profile cuts are one or the other.
+    assert found.leaving == pytest.approx(rays.leaving, abs=1e-4 if source in ("plane", "profile") else 5e-4,
+                                          rel=2e-3 if source == "profile" else 1e-3)
     assert float(found.image.sum()) + found.off_screen == pytest.approx(found.leaving, abs=1e-12)
     on = float(rays.image.sum())
     assert float(found.image.sum()) == pytest.approx(on, abs=(0.02 if source == "narrow" else 0.01) * max(on, found.leaving * 0.1))

@@ -30,18 +30,19 @@ from caustic_cli.optics.emission.coherent import Mode
 from caustic_cli.optics.meeting import Meeting, Parameters
 from caustic_cli.optics.system import System
 from caustic_cli.optics.trace import Tracer
+from caustic_cli.optics.waves.nodes import between, filled, interpolated
 from caustic_cli.optics.waves.receiver import Plane, dot
 from caustic_cli.optics.waves.sampling import NoWaveImage
+from caustic_cli.optics.waves.seeking import sought
 
 #: Points along each side of the pupil from which extents are found.
 SURVEY = 65
-#: Feet are sought until the path that this leaves out is below this part of a wavelength, at most so often.
-LEFT, TRIES = 1e-3, 16
+#: Feet are sought until the path that this leaves out is below this part of a wavelength.
+LEFT = 1e-3
 #: The same where it has to be exact: derivatives see the misses of feet to first order.
 LEFT_EXACT = 1e-9
-#: At the edges of what is dark they are sought so often, at least, and may miss the grid by this part of a cell; rays that never
-#: saw light go so far to the middle each time.
-AT_EDGES, AT_EDGE, INWARDS = 10, 0.05, 0.02
+#: At the edges of what is dark rays may miss the grid by this part of a cell.
+AT_EDGE = 0.05
 #: Rays traced at a time.
 CHUNK = 1 << 19
 #: The part of the light that may lie where rays have crossed before the plane of the feet.
@@ -49,8 +50,6 @@ CROSSED = 1e-3
 STAGES = Requests.to(stages=True)
 #: Part of what is watched on the screen over which light beyond it is left out.
 SOFT = 0.02
-#: Points of the interpolation between nodes along an axis.
-POINTS = 6
 
 
 @dataclass
@@ -230,11 +229,11 @@ class Wavefront:
 
     def on(self, low: tuple[float, float], step: tuple[float, float], count: tuple[int, int]) -> Refined:
         """The same on a finer grid."""
-        x, y = (_between(self.path.shape[k], self.low[k], self.step[k], low[k], step[k], count[k], self.path) for k in (0, 1))
+        x, y = (between(self.path.shape[k], self.low[k], self.step[k], low[k], step[k], count[k], self.path) for k in (0, 1))
         bright = self.density > 0  # at 0 a root has no derivative
         root = torch.where(bright, self.density, torch.ones_like(self.density)).sqrt() * bright * (step[0] * step[1]) ** 0.5
         columns = self.path, root, self.edge_x, self.edge_y, self.shade
-        return Refined(*(None if c is None else _along_y(c, y) for c in columns), step, x)
+        return Refined(*(None if c is None else interpolated(c, None, y) for c in columns), step, x)
 
 
 @dataclass
@@ -257,10 +256,7 @@ class Refined:
         return self._at(self.path, part), self._at(self.root, part), lit
 
     def _at(self, c: Tensor, part: slice) -> Tensor:
-        if self.along_x is None:
-            return c[part]
-        first, w = (t[part] for t in self.along_x)
-        return sum(w[:, k, None] * c[first + k] for k in range(POINTS))
+        return c[part] if self.along_x is None else interpolated(c, tuple(t[part] for t in self.along_x), None)
 
 
 def _within_pupil(edge_x: Tensor, edge_y: Tensor | None, step: tuple[float, float]) -> Tensor:
@@ -268,31 +264,6 @@ def _within_pupil(edge_x: Tensor, edge_y: Tensor | None, step: tuple[float, floa
     if edge_y is None:
         return (edge_x / (0.5 * (step[0] + step[1])) + 0.5).clamp(0.0, 1.0)
     return (edge_x / step[0] + 0.5).clamp(0.0, 1.0) * (edge_y / step[1] + 0.5).clamp(0.0, 1.0)
-
-
-def _between(nodes: int, low: float, step: float, fine_low: float, fine_step: float, count: int, like: Tensor):
-    """First node and weights (count, POINTS) of Lagrange's interpolation at finer cells; None where they are the nodes."""
-    if nodes == count:
-        return None
-    x = (fine_low + fine_step * (torch.arange(count, dtype=torch.float64, device=like.device) + 0.5) - low) / step - 0.5
-    first = (torch.floor(x).long() - (POINTS // 2 - 1)).clamp(0, nodes - POINTS)
-    t, k = x - first, range(POINTS)
-    weights = torch.stack([_product([(t - j) / (i - j) for j in k if j != i]) for i in k], 1)
-    return first, weights
-
-
-def _product(factors: list[Tensor]) -> Tensor:
-    found = factors[0]
-    for f in factors[1:]:
-        found = found * f
-    return found
-
-
-def _along_y(c: Tensor, along_y: tuple[Tensor, Tensor] | None) -> Tensor:
-    if along_y is None:
-        return c
-    first, w = along_y
-    return sum(w[None, :, k] * c[:, first + k] for k in range(POINTS))
 
 
 def wavefront(optics: Optics, seen: Survey, low: tuple[float, float], step: tuple[float, float], count: tuple[int, int],
@@ -312,7 +283,7 @@ def wavefront(optics: Optics, seen: Survey, low: tuple[float, float], step: tupl
     shape = (len(x), len(y))
     x, y = (c.reshape(-1) for c in torch.meshgrid(x, y, indexing="ij"))
     with torch.no_grad():
-        f, held, behind = _sought(optics, seen, (x, y), shape, step, left)
+        f, held, behind = sought(optics, seen, (x, y), shape, step, left)
     at = {}
     if sensitive:
         with torch.no_grad():
@@ -328,7 +299,7 @@ def wavefront(optics: Optics, seen: Survey, low: tuple[float, float], step: tupl
     ex, ey = ex.view(shape), ey.view(shape)
     # Where on the pupil light with its foot on the grid comes from, in mm of this plane; its stretch is the density's.
     px, py = (((h - 0.5) * c).view(shape) for h, c in zip(held, seen.scale, strict=True))
-    gone = [_filled((p + e).detach() - c.view(shape), dark) + c.view(shape) for p, e, c in ((px, ex, x), (py, ey, y))]
+    gone = [filled((p + e).detach() - c.view(shape), dark) + c.view(shape) for p, e, c in ((px, ex, x), (py, ey, y))]
     (pxx, pxy), (pyx, pyy) = (torch.gradient(p, spacing=step, dim=(0, 1), edge_order=2) for p in gone)
     px = torch.where(dark, gone[0], px + pxx * ex + pxy * ey)
     py = torch.where(dark, gone[1], py + pyx * ex + pyy * ey)
@@ -341,7 +312,7 @@ def wavefront(optics: Optics, seen: Survey, low: tuple[float, float], step: tupl
         raise NoWaveImage("light crosses itself within the lens' own depth, so that no wavefront behind it stands for it;"
                            " a flatter surface or a screen farther away has one")
     if bool((~dark).any()):
-        power = torch.where(dark, _filled(power.detach(), dark), power)
+        power = torch.where(dark, filled(power.detach(), dark), power)
     by_x, by_y = torch.gradient(power.detach(), spacing=step, dim=(0, 1), edge_order=2)
     density = (power + torch.where(dark, torch.zeros_like(ex), by_x * ex + by_y * ey)).clamp_min(0.0) * squeeze.clamp_min(0.0)
     rx, ry = (abs(s) / 2.0 for s in seen.scale)
@@ -349,58 +320,6 @@ def wavefront(optics: Optics, seen: Survey, low: tuple[float, float], step: tupl
     landed = (c.detach().view(shape) for c in (f.big_x, f.big_y))
     return Wavefront(low, step, path.view(shape), density, edge_x, edge_y, *landed, (~dark).double() if bool(dark.any()) else None,
                      **{name: value.view(shape) for name, value in at.items()})
-
-
-def _sought(optics: Optics, seen: Survey, at: tuple[Tensor, Tensor], shape, step,
-            left: float) -> tuple[Feet, tuple[Tensor, Tensor], Tensor]:
-    """Rays with their feet at points (N,) each, where they pass the pupil, and which of them stand at the edge of what is dark.
-
-    Rays beyond the pupil's edges stay on them.  Where rays are stopped behind it their feet say nothing: they go back towards the
-    last ray that was not, and such as never were towards the middle.
-    """
-    x, y = at
-    u, v = ((c - seen.offset[k]) / seen.scale[k] for k, c in enumerate(at))
-    middle = [(0.5 * (seen.light[0][k] + seen.light[1][k]) - seen.offset[k]) / seen.scale[k] for k in (0, 1)]
-    found = behind = torch.zeros_like(x, dtype=torch.bool)
-    held = u.clamp(0.0, 1.0), v.clamp(0.0, 1.0)
-    for k in range(TRIES):
-        hu, hv = u.clamp(0.0, 1.0), v.clamp(0.0, 1.0)
-        f = optics.feet(hu, hv)
-        lit = f.power > 0
-        found, behind = found | lit, behind | ~lit
-        held = tuple(torch.where(lit | ~found, h, before) for h, before in zip((hu, hv), held, strict=True))
-        settled = _left(f, x, y, shape, step, u, v, behind) <= left
-        if settled and (k + 1 >= AT_EDGES or not bool(behind.any())):
-            break
-        ahead = (hu + (x - f.x) / seen.scale[0], hv + (y - f.y) / seen.scale[1])
-        u, v = (torch.where(lit, a, torch.where(found, 0.5 * (h + b), h + INWARDS * (m - h)))
-                for a, h, b, m in zip(ahead, (hu, hv), held, middle, strict=True))
-    if bool(behind.any()):
-        f = optics.feet(*held)
-    return f, held, behind
-
-
-def _filled(c: Tensor, dark: Tensor) -> Tensor:
-    """A function (n, m) with what it is beside the dark in a few cells of that, 0 beyond."""
-    if not bool(dark.any()):
-        return c
-    known, c = (~dark).to(c), torch.where(dark, torch.zeros_like(c), c)
-    for _ in range(POINTS // 2 + 1):
-        around, count = (torch.nn.functional.avg_pool2d(t[None, None], 3, 1, 1)[0, 0] for t in (c * known, known))
-        new = (known == 0) & (count > 0)
-        c = torch.where(new, around / count.clamp_min(1e-9), c)
-        known = torch.where(new, torch.ones_like(known), known)
-    return c
-
-
-def _left(f: Feet, x: Tensor, y: Tensor, shape, step, u: Tensor, v: Tensor, behind: Tensor) -> float:
-    """Bound of the path left out where feet miss the grid by e: half e^2 times the wavefront's curvature there, mm."""
-    inside = ~behind & (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
-    if not bool(inside.any()):
-        return 0.0
-    e2 = (x - f.x).square() + (y - f.y).square()
-    bend = sum(g.abs() for c in (f.qx, f.qy) for g in torch.gradient(c.view(shape), spacing=step, dim=(0, 1)))
-    return float((0.5 * e2.view(shape) * bend)[inside.view(shape)].max())
 
 
 def _sensitive(optics: Optics, u: Tensor, v: Tensor) -> tuple[Feet, dict[str, Tensor]]:

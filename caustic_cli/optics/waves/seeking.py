@@ -1,0 +1,50 @@
+"""Rays that have their feet on a given grid, by Newton's method on the pupil; for `wavefront`."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+#: Feet are sought so often at most, and at the edges of what is dark at least; rays that never saw light go so far to the middle
+#: each time.
+TRIES, AT_EDGES, INWARDS = 16, 10, 0.02
+
+
+def sought(optics, seen, at: tuple[Tensor, Tensor], shape, step,
+            left: float) -> tuple:
+    """Rays (`Feet`) of an `Optics` surveyed as `seen`, with their feet at points (N,) each; where they pass the pupil; and which of
+    them stand at the edge of what is dark.
+
+    Rays beyond the pupil's edges stay on them.  Where rays are stopped behind it their feet say nothing: they go back towards the
+    last ray that was not, and such as never were towards the middle.
+    """
+    x, y = at
+    u, v = ((c - seen.offset[k]) / seen.scale[k] for k, c in enumerate(at))
+    middle = [(0.5 * (seen.light[0][k] + seen.light[1][k]) - seen.offset[k]) / seen.scale[k] for k in (0, 1)]
+    found = behind = torch.zeros_like(x, dtype=torch.bool)
+    held = u.clamp(0.0, 1.0), v.clamp(0.0, 1.0)
+    for k in range(TRIES):
+        hu, hv = u.clamp(0.0, 1.0), v.clamp(0.0, 1.0)
+        f = optics.feet(hu, hv)
+        lit = f.power > 0
+        found, behind = found | lit, behind | ~lit
+        held = tuple(torch.where(lit | ~found, h, before) for h, before in zip((hu, hv), held, strict=True))
+        settled = _left(f, x, y, shape, step, u, v, behind) <= left
+        if settled and (k + 1 >= AT_EDGES or not bool(behind.any())):
+            break
+        ahead = (hu + (x - f.x) / seen.scale[0], hv + (y - f.y) / seen.scale[1])
+        u, v = (torch.where(lit, a, torch.where(found, 0.5 * (h + b), h + INWARDS * (m - h)))
+                for a, h, b, m in zip(ahead, (hu, hv), held, middle, strict=True))
+    if bool(behind.any()):
+        f = optics.feet(*held)
+    return f, held, behind
+
+
+def _left(f, x: Tensor, y: Tensor, shape, step, u: Tensor, v: Tensor, behind: Tensor) -> float:
+    """Bound of the path left out where feet miss the grid by e: half e^2 times the wavefront's curvature there, mm."""
+    inside = ~behind & (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
+    if not bool(inside.any()):
+        return 0.0
+    e2 = (x - f.x).square() + (y - f.y).square()
+    bend = sum(g.abs() for c in (f.qx, f.qy) for g in torch.gradient(c.view(shape), spacing=step, dim=(0, 1)))
+    return float((0.5 * e2.view(shape) * bend)[inside.view(shape)].max())
