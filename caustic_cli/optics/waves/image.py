@@ -262,10 +262,12 @@ class Imager:
     def field(self, line: Line, front: Wavefront, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """Phase, rad, with the kernel's, and amplitude of each sample of a wavefront, (n, m)."""
         s, front = self.sampling, self.watched(front, line.behind)
-        path, root, lit = front.on(s.low, s.step, s.count).rows()
+        path, amplitude = front.on(s.low, s.step, s.count).whole
         across, along = (ramp(s, line.behind, k, path.device) for k in (0, 1))
-        phase = torch.remainder(TURN / line.length * path + across[:, None] + along[None, :], TURN)
-        return phase.to(dtype), (root * lit).to(dtype)
+        phase = path * (TURN / line.length)  # in place from here: new memory costs more than the sums
+        phase += across[:, None]
+        phase += along[None, :]
+        return phase.remainder_(TURN).to(dtype), amplitude.to(dtype)
 
     def image(self, line: Line, front: Wavefront, dtype: torch.dtype) -> tuple[Tensor, float]:
         """Power on the pixels of the light of one mode at one wavelength, float64, and that of all of it."""

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
+
 import torch
 from torch import Tensor
 
@@ -28,6 +31,7 @@ def _product(factors: list[Tensor]) -> Tensor:
 
 
 def interpolated(c: Tensor, along_x, along_y) -> Tensor:
+    """A function (n, m) at finer rows and columns, by what `between` gives for each, None for the nodes themselves."""
     if along_x is not None:
         first, w = along_x
         c = sum(w[:, k, None] * c[first + k] for k in range(POINTS))
@@ -48,3 +52,39 @@ def filled(c: Tensor, dark: Tensor) -> Tensor:
         c = torch.where(new, around / count.clamp_min(1e-9), c)
         known = torch.where(new, torch.ones_like(known), known)
     return c
+
+
+@dataclass
+class Refined:
+    """A wavefront on a finer grid: its columns are there, rows are made when asked for.  first, weights: of rows, or None."""
+
+    path: Tensor
+    root: Tensor
+    edge_x: Tensor
+    edge_y: Tensor | None
+    shade: Tensor | None
+    step: tuple[float, float]
+    along_x: tuple[Tensor, Tensor] | None
+
+    def rows(self, part: slice = slice(None)) -> tuple[Tensor, Tensor, Tensor]:
+        """Path, mm; root of the power of a whole cell; part of it that is lit: (rows, m) float64 each."""
+        lit = within_pupil(self._at(self.edge_x, part), None if self.edge_y is None else self._at(self.edge_y, part), self.step)
+        if self.shade is not None:
+            lit = lit * self._at(self.shade, part).clamp(0.0, 1.0)
+        return self._at(self.path, part), self._at(self.root, part), lit
+
+    @cached_property
+    def whole(self) -> tuple[Tensor, Tensor]:
+        """Path, mm, and amplitude of every cell, (n, m) float64."""
+        path, root, lit = self.rows()
+        return path, root * lit
+
+    def _at(self, c: Tensor, part: slice) -> Tensor:
+        return c[part] if self.along_x is None else interpolated(c, tuple(t[part] for t in self.along_x), None)
+
+
+def within_pupil(edge_x: Tensor, edge_y: Tensor | None, step: tuple[float, float]) -> Tensor:
+    """Part of each cell that lies inside the pupil's edges."""
+    if edge_y is None:
+        return (edge_x / (0.5 * (step[0] + step[1])) + 0.5).clamp(0.0, 1.0)
+    return (edge_x / step[0] + 0.5).clamp(0.0, 1.0) * (edge_y / step[1] + 0.5).clamp(0.0, 1.0)

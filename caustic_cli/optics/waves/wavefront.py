@@ -20,7 +20,7 @@ The derivative by the heights is that at fixed x, as it should be, with rays hel
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -30,7 +30,7 @@ from caustic_cli.optics.emission.coherent import Mode
 from caustic_cli.optics.meeting import Meeting, Parameters
 from caustic_cli.optics.system import System
 from caustic_cli.optics.trace import Tracer
-from caustic_cli.optics.waves.nodes import between, filled, interpolated
+from caustic_cli.optics.waves.nodes import Refined, between, filled, interpolated, within_pupil
 from caustic_cli.optics.waves.receiver import Plane, dot
 from caustic_cli.optics.waves.sampling import NoWaveImage
 from caustic_cli.optics.waves.seeking import sought
@@ -212,58 +212,36 @@ class Wavefront:
     sensitivity: Tensor | None = None
     at_x: Tensor | None = None
     at_y: Tensor | None = None
+    _fine: tuple | None = field(default=None, init=False, repr=False)
 
     def within(self, middle: tuple[float, float], width: tuple[float, float]) -> Wavefront:
-        """Only the light that lands within a rectangle on the screen, mm; it ends softly."""
-        density = self.density
+        """Only the light that lands within a rectangle on the screen, mm; it ends softly.  Itself where that is all."""
+        density, lit = self.density, self.density > 0
         for big, m, w in zip((self.big_x, self.big_y), middle, width, strict=True):
-            density = density * ((0.5 * w - (big - m).abs()) / (SOFT * w)).clamp(0.0, 1.0)
-        return replace(self, density=density)
+            inside = ((0.5 * w - (big - m).abs()) / (SOFT * w)).clamp(0.0, 1.0)
+            if bool(((inside < 1.0) & lit).any()):
+                density = density * inside
+        return self if density is self.density else replace(self, density=density)
 
     def power(self) -> float:
         """Of all its light."""
-        lit = _within_pupil(self.edge_x, self.edge_y, self.step).detach()
+        lit = within_pupil(self.edge_x, self.edge_y, self.step).detach()
         if self.shade is not None:
             lit = lit * self.shade
         return float((self.density.detach() * lit).sum()) * self.step[0] * self.step[1]
 
     def on(self, low: tuple[float, float], step: tuple[float, float], count: tuple[int, int]) -> Refined:
-        """The same on a finer grid."""
+        """The same on a finer grid; kept for the next who asks for that grid."""
+        key = low, step, count
+        if self._fine is not None and self._fine[0] == key:
+            return self._fine[1]
         x, y = (between(self.path.shape[k], self.low[k], self.step[k], low[k], step[k], count[k], self.path) for k in (0, 1))
         bright = self.density > 0  # at 0 a root has no derivative
         root = torch.where(bright, self.density, torch.ones_like(self.density)).sqrt() * bright * (step[0] * step[1]) ** 0.5
         columns = self.path, root, self.edge_x, self.edge_y, self.shade
-        return Refined(*(None if c is None else interpolated(c, None, y) for c in columns), step, x)
-
-
-@dataclass
-class Refined:
-    """A wavefront on a finer grid: its columns are there, rows are made when asked for.  first, weights: of rows, or None."""
-
-    path: Tensor
-    root: Tensor
-    edge_x: Tensor
-    edge_y: Tensor | None
-    shade: Tensor | None
-    step: tuple[float, float]
-    along_x: tuple[Tensor, Tensor] | None
-
-    def rows(self, part: slice = slice(None)) -> tuple[Tensor, Tensor, Tensor]:
-        """Path, mm; root of the power of a whole cell; part of it that is lit: (rows, m) float64 each."""
-        lit = _within_pupil(self._at(self.edge_x, part), None if self.edge_y is None else self._at(self.edge_y, part), self.step)
-        if self.shade is not None:
-            lit = lit * self._at(self.shade, part).clamp(0.0, 1.0)
-        return self._at(self.path, part), self._at(self.root, part), lit
-
-    def _at(self, c: Tensor, part: slice) -> Tensor:
-        return c[part] if self.along_x is None else interpolated(c, tuple(t[part] for t in self.along_x), None)
-
-
-def _within_pupil(edge_x: Tensor, edge_y: Tensor | None, step: tuple[float, float]) -> Tensor:
-    """Part of each cell that lies inside the pupil's edges."""
-    if edge_y is None:
-        return (edge_x / (0.5 * (step[0] + step[1])) + 0.5).clamp(0.0, 1.0)
-    return (edge_x / step[0] + 0.5).clamp(0.0, 1.0) * (edge_y / step[1] + 0.5).clamp(0.0, 1.0)
+        fine = Refined(*(None if c is None else interpolated(c, None, y) for c in columns), step, x)
+        self._fine = key, fine
+        return fine
 
 
 def wavefront(optics: Optics, seen: Survey, low: tuple[float, float], step: tuple[float, float], count: tuple[int, int],
