@@ -44,7 +44,8 @@ Settings = dict[str, dict[str, Any]]
 
 
 def complete(given: Settings, aspect: float, *, mag: float | None = None, margin: float | None = None,
-             width: int | None = None, quality: str | None = None, rays: int | None = None) -> Settings:
+             width: int | None = None, quality: str | None = None, rays: int | None = None,
+             lit: tuple[float, float] = (1.0, 1.0)) -> Settings:
     """Every setting a project needs.
 
     Args:
@@ -52,7 +53,8 @@ def complete(given: Settings, aspect: float, *, mag: float | None = None, margin
         aspect: height over width of the picture.
         mag: picture width over lens width; margin: black border, part of the picture's width in all.
         width: pixels across the screen when only that is known; the rows follow the screen's shape.
-        quality: of the default stages; rays: of the last default stage.
+        quality: of the default stages; rays: of the last default stage; lit: parts of the picture's width and height that light is
+            to cover.
 
     Raises:
         InputError: a value is out of range, or two contradict each other.
@@ -91,7 +93,7 @@ def complete(given: Settings, aspect: float, *, mag: float | None = None, margin
     build_screen(s)
     source = build_source(s)
     _complete_lens(lens, screen, target, source)
-    _complete_design(s, source, quality, rays)
+    _complete_design(s, source, quality, rays, lit)
     return s
 
 
@@ -137,7 +139,7 @@ def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[st
         lens["radius"] = list(radius)
 
 
-def _complete_design(s: Settings, source: Source, quality: str | None, rays: int | None) -> None:
+def _complete_design(s: Settings, source: Source, quality: str | None, rays: int | None, lit: tuple[float, float]) -> None:
     lens, screen, design, given = s["lens"], s["screen"], s["design"], quality
     degree = tuple(checks.whole("[lens] degree", p, 1, 15) for p in lens["degree"])
     plain = design["network"] == "none" and design["optimizer"] == "lbfgs"
@@ -168,14 +170,14 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
     else:
         stages = [Stage(tuple(lens["control"]), rays or base, sampler, apron=math.ceil(0.04 * max(nx, ny)),
                         iterations=SINGLE_STAGE_ITERATIONS, tolerance=2e-3 if plain else 0.0)]
-    stages += _wave_stages(s, source, quality, plain)
+    stages += _wave_stages(s, source, quality, plain, lit)
     design["stages"] = [_stage_table(stage) for stage in stages]
     if design["loss"].strip() == "rms":  # eq. 5.2.1 knows the screen alone
         for table in design["stages"]:
             table["apron"] = 0
 
 
-def _wave_stages(s: Settings, source: Source, quality: str, plain: bool) -> list[Stage]:
+def _wave_stages(s: Settings, source: Source, quality: str, plain: bool, lit: tuple[float, float]) -> list[Stage]:
     """What refines the wave image after the ray image, where that is asked for or called for."""
     design, lens, screen = s["design"], s["lens"], s["screen"]
     asked = checks.choice("[design] waves", design["waves"], ("auto", "on", "off"))
@@ -187,17 +189,17 @@ def _wave_stages(s: Settings, source: Source, quality: str, plain: bool) -> list
     if asked == "auto" and not seen.matters:
         return []
     own = s["source"].get("wavelengths", [])
-    plan = wave_refinement(_wave_samples(s, seen), len(own), quality, hurry=asked == "auto")
+    plan = wave_refinement(_wave_samples(s, seen, lit), len(own), quality, hurry=asked == "auto")
     apron = math.ceil(0.04 * max(screen["resolution"]))
     return [Stage(tuple(lens["control"]), LEAST_RAYS, apron=apron, iterations=n, tolerance=WAVE_TOLERANCE,
                   waves=tuple(map(float, own)) or white(count)) for count, n in plan]
 
 
-def _wave_samples(s: Settings, seen: Resolution) -> float:
-    """About how many samples the field of one wavelength needs: the picture and its blur on each side, times the lens."""
+def _wave_samples(s: Settings, seen: Resolution, lit: tuple[float, float]) -> float:
+    """About how many samples the field of one wavelength needs: the bright part and its blur on each side, times the lens."""
     throw, shortest = abs(s["screen"]["z"]), min(s["source"].get("wavelengths", []) or BAND[:1]) * 1e-6
-    return math.prod(w * (t + 4.0 * seen.diffraction) / (shortest * throw)
-                     for w, t in zip(s["lens"]["size"], s["target"]["size"], strict=True))
+    return math.prod(w * (part * t + 4.0 * seen.diffraction) / (shortest * throw)
+                     for w, t, part in zip(s["lens"]["size"], s["target"]["size"], lit, strict=True))
 
 
 def _quality(time_limit: float) -> str:

@@ -72,6 +72,17 @@ class Picture:
             table = to_linear(table)
         return np.ascontiguousarray(np.moveaxis(table[self.values][::-1], (0, 1), (-1, -2)))
 
+    @property
+    def lit(self) -> tuple[float, float]:
+        """Parts of its width and height that the least rectangle about all its light takes; all of a black picture."""
+        light = self.irradiance()
+        bright = (light if light.ndim == 2 else light.sum(0)) > 0
+        found = []
+        for k in (0, 1):
+            at = np.flatnonzero(bright.any(1 - k))
+            found.append(float(at[-1] - at[0] + 1) / bright.shape[k] if at.size else 1.0)
+        return found[0], found[1]
+
     def write(self, path: Path) -> None:
         """Write it losslessly; `path` ends in `suffix`."""
         if self.suffix == ".npy":

@@ -76,7 +76,8 @@ def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: d
     light = read_picture(config.parent / profile, linear=True) if profile else None
     path = out or Path(f"{target.stem or 'design'}.caustic")
     try:
-        full = complete(said, picture.aspect, width=pixels[0] if pixels and len(pixels) == 1 else None, **shaped)
+        full = complete(said, picture.aspect, width=pixels[0] if pixels and len(pixels) == 1 else None,
+                        lit=picture.lit, **shaped)
         settings.refuse_unused(full["source"], given, [stage.get("source") for stage in full["design"]["stages"]])
         full["target"] |= {"file": f"target{picture.suffix}", "encoding": picture.encoding}
         if light is not None:

@@ -3,9 +3,9 @@
     python tests/benchmarks/quality.py [--pictures flame,ball] [--qualities standard] [--source point] [-o DIR]
 
 All pictures at standard quality and flame, ball and portrait at all three take about ten minutes on two cores; prints a Markdown
-table.  Every design is a whole command, from its start to its exit, in a process of its own, with kernels compiled before; every
-figure is what `caustic render` says afterwards.  The portrait is matplotlib's sample picture (Grace Hopper, US Navy, public
-domain), its upper square; text, lines, gradient and the oblong picture are drawn here or cut from it.
+table.  Every design is a whole command, from its start to its exit, in a process of its own, with kernels compiled before; each
+figure is what `caustic render` says afterwards, by rays and of the wave image (`--waves off`: designs for rays).  The portrait is
+matplotlib's sample picture (Grace Hopper, US Navy, public domain), its upper square; text, lines, gradient and the oblong picture are drawn here or cut from it.
 """
 
 from __future__ import annotations
@@ -63,7 +63,10 @@ def row(picture: Path, quality: str, folder: Path, more: list[str]) -> list[str]
     seconds = time.monotonic() - began
     sharp = caustic("render", project, "--rays", "3.2e7")
     light = sharp["on_screen"] + sharp["lost"]["fresnel"]
-    return [name, quality, f"{said['relative_rms']:.3f}", f"{sharp['relative_rms']:.3f}", f"{light:.4f}",
+    waves = "-" if sharp.get("wave_relative_rms") is None else f"{sharp['wave_relative_rms']:.3f}"
+    whole = 1.0 - sharp["lost"]["fresnel"]
+    kept = "-" if sharp.get("wave_relative_rms") is None else f"{sharp['wave_on_target'] / whole:.3f}"
+    return [name, quality, waves, kept, f"{said['relative_rms']:.3f}", f"{sharp['relative_rms']:.3f}", f"{light:.4f}",
             f"{sharp['on_target'] / sharp['on_screen']:.3f}", f"{seconds:.0f}"]
 
 
@@ -78,8 +81,8 @@ def main() -> None:
         folder.mkdir(parents=True, exist_ok=True)
         known = pictures(folder)
         caustic("design", known["flame"], "--quality", "draft", "--time-limit", 1, *more, "-o", folder / "warm.caustic")
-        print("| picture | quality | relative RMS error | with 3.2e7 rays | light | of it on the picture | seconds |\n"
-              "| --- | --- | --- | --- | --- | --- | --- |")
+        print("| picture | quality | as a wave | of its light on the picture | by rays | with 3.2e7 rays | light | of it on the"
+              " picture | seconds |\n| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
         for name in options.pictures.split(","):
             for quality in options.qualities.split(","):
                 if name in MAIN or quality == "standard" or options.qualities != ",".join(QUALITIES):
