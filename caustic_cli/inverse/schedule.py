@@ -146,8 +146,8 @@ def refinement(control: tuple[int, int], rays: int | None, resolution: tuple[int
 #: seconds `waves = "auto"` may take for it on two cores.
 WAVES = {
     "draft": (3, (10,), 8.0),
-    "standard": (5, (16, 24), 25.0),
-    "fine": (8, (40, 50, 50), 90.0),
+    "standard": (5, (12, 20), 25.0),
+    "fine": (8, (30, 30), 90.0),
 }
 #: Seconds on two cores for one sample of the field in one iteration: at each wavelength, and for the spline there.
 SECONDS_A_SAMPLE, SECONDS_A_POINT = 2.2e-8, 6e-8

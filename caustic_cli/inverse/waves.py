@@ -29,7 +29,7 @@ from caustic_cli.optics.waves.wavefront import Wavefront
 from caustic_cli.scene import Scene
 
 #: Bytes of graphs that are kept from an image to its derivative; beyond, every transform is made again.
-KEPT = 1 << 29
+KEPT = 1 << 30
 
 
 @dataclass(frozen=True)

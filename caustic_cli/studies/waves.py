@@ -29,7 +29,8 @@ def wave_figures(scene: Scene, field: HeightField, heights: Tensor, target: np.n
 
     Returns:
         the image, None where there is none and `required` is false; and wave_relative_rms, wave_on_target (None without a target),
-        wave_on_screen, wave_wavelengths (nm) and resolvable, the number of details across that light carries.
+        wave_on_screen, wave_wavelengths (nm), resolvable, the number of details across that light carries, wave_source_points, the
+        points that the source was taken as, and wave_source_error, by how much an extended source's light is misplaced so, mm.
     """
     try:
         found = wave_image(scene, field, heights.detach(), finer=finer, dtype=dtype)
@@ -40,7 +41,8 @@ def wave_figures(scene: Scene, field: HeightField, heights: Tensor, target: np.n
             "wave_wavelengths": [], "resolvable": seen.resolvable, "no_wave_image": str(error)}
     of = _judged(found, target)
     return found, {"wave_relative_rms": of["relative_rms"], "wave_on_target": of["on_target"], "wave_on_screen": of["on_screen"],
-                   "wave_wavelengths": list(found.wavelengths), "resolvable": seen.resolvable}
+                   "wave_wavelengths": list(found.wavelengths), "resolvable": seen.resolvable,
+                   "wave_source_points": found.points, "wave_source_error": found.spread_error}
 
 
 def unseen_figures(scene: Scene, field: HeightField, heights: Tensor, target: np.ndarray, *, finer: float = FINER,

@@ -5,7 +5,8 @@
 All pictures at standard quality and flame, ball and portrait at all three take about ten minutes on two cores; prints a Markdown
 table.  Every design is a whole command, from its start to its exit, in a process of its own, with kernels compiled before; each
 figure is what `caustic render` says afterwards, by rays and of the wave image (`--waves off`: designs for rays).  The portrait is
-matplotlib's sample picture (Grace Hopper, US Navy, public domain), its upper square; text, lines, gradient and the oblong picture are drawn here or cut from it.
+matplotlib's sample picture (Grace Hopper, US Navy, public domain), its upper square; text, lines, gradient and the oblong picture
+are drawn here or cut from it.
 """
 
 from __future__ import annotations

@@ -157,6 +157,7 @@ class Imager:
     single: bool
     upright: bool
     exact: bool = False
+    tapered: bool = True
 
     @classmethod
     def of(cls, lines: list[Line], parameters: Parameters, receiver: Receiver, finer: float = 1.0,
@@ -165,7 +166,8 @@ class Imager:
 
         Args:
             exact: see `wavefront`.
-            watched: lows and highs, mm, on an upright screen, of what has to be seen of it besides the light; None for all.
+            watched: lows and highs, mm, on an upright screen, of what has to be seen of it besides nearly all of the light, whose
+                rest then comes in from the other side; None for all of the screen and the light, the rest being left out.
             dense: trace a ray for every sample of the light.
 
         Raises:
@@ -192,13 +194,14 @@ class Imager:
                           ((min, light[0], other.light[0]), (max, light[1], other.light[1])))
             for k in (0, 1):
                 room = max(BESIDE * (high[k] - low[k]), spread.reach()[k] + receiver.pixel[k] if spread else 0.0)
-                landing[0][k] = min(landing[0][k], max(other.landing[0][k] - around[k], low[k] - room))
-                landing[1][k] = max(landing[1][k], min(other.landing[1][k] + around[k], high[k] + room))
+                lands = other.mostly if watched else other.landing
+                landing[0][k] = min(landing[0][k], max(lands[0][k] - around[k], low[k] - room))
+                landing[1][k] = max(landing[1][k], min(lands[1][k] + around[k], high[k] + room))
         sampling = Sampling.of(light, tuple(map(tuple, landing)), receiver.pixel, distance, lengths, finer)
         spans = [len(s.breaks) - 1 for e in system.elements if isinstance(e.surface, HeightField) for s in e.surface.spaces]
         nodes = sampling.count if dense else tuple(min(n, max(LEAST_NODES, A_SPAN * max(spans, default=0))) for n in sampling.count)
         return cls(receiver, plane, seen, sampling, spread, nodes, spread is not None or not system.source.extended, upright,
-                   exact)
+                   exact, watched is None)
 
     def expose(self, lines: list[Line], parameters: Parameters, dtype: torch.dtype = torch.float32) -> WaveImage:
         """The wave image of such lines, at heights {name: (n, m) mm} close to those that samples were chosen for."""
@@ -212,8 +215,8 @@ class Imager:
                     part, power = self.image(line, front, dtype)
                     images[line.channel] = images.get(line.channel, 0.0) + line.part * part
                     leaving += line.part * power
-        dark = torch.zeros(self.receiver.resolution, dtype=torch.float64)
-        image = torch.stack([images.get(k, dark) for k in range(3)]) if colours else images[None]
+        some = next(iter(images.values()))
+        image = torch.stack([images.get(k, torch.zeros_like(some)) for k in range(3)]) if colours else some
         return WaveImage(image, leaving, leaving - float(image.detach().sum()),
                          tuple(dict.fromkeys(line.wavelength for line in lines)), len(self.modes(lines[0].system)),
                          self.spread.error if self.spread else 0.0, self.sampling.padded)
@@ -238,6 +241,8 @@ class Imager:
 
     def watched(self, front: Wavefront, length: float) -> Wavefront:
         """The part of it that lands where its transform at a wavelength in mm reaches."""
+        if not self.tapered:
+            return front
         return front.within(self.sampling.middle, tuple(length * self.sampling.distance / d for d in self.sampling.step))
 
     @cached_property

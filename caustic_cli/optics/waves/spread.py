@@ -69,7 +69,8 @@ def spread_by(optics: Optics, edges: list[Mode], shown: float) -> Spread | None:
     """
     source = optics.system.source
     n = (SURVEY + 1) // 2
-    line = torch.linspace(0.0, 1.0, n, dtype=torch.float64)
+    device = next((h.device for h in optics.parameters.values()), torch.device("cpu"))
+    line = torch.linspace(0.0, 1.0, n, dtype=torch.float64, device=device)
     u, v = (c.reshape(-1) for c in torch.meshgrid(line, line, indexing="ij"))
     at, moved = optics.feet(u, v), []
     for mode in edges:

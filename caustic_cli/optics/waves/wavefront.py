@@ -36,7 +36,7 @@ from caustic_cli.optics.waves.sampling import NoWaveImage
 from caustic_cli.optics.waves.seeking import sought
 
 #: Points along each side of the pupil from which extents are found.
-SURVEY = 65
+SURVEY, FEW = 65, 0.01
 #: Feet are sought until the path that this leaves out is below this part of a wavelength.
 LEFT = 1e-3
 #: The same where it has to be exact: derivatives see the misses of feet to first order.
@@ -132,13 +132,14 @@ def distance_of(system: System, parameters: Parameters, plane: Plane) -> float:
 class Survey:
     """Where light goes, from few rays: lows and highs of feet and of landing points, mm, and the mean stretch from the pupil's
     u and v, in [0, 1], to feet: x = offset + scale u along each axis; magnification, root of the mean area of landing points over
-    that of feet, or 0 where light has no extent."""
+    that of feet, or 0 where light has no extent; mostly, lows and highs of landing points beyond which the part FEW of rays is."""
 
     light: tuple
     landing: tuple
     offset: tuple[float, float]
     scale: tuple[float, float]
     magnification: float
+    mostly: tuple
 
 
 @torch.no_grad()
@@ -180,7 +181,8 @@ def survey(optics: Optics) -> Survey:
     foot = _jacobian(f.x.view(grid), f.y.view(grid), 1.0, 1.0).abs()
     weight = f.power.view(grid)
     magnification = float((weight * area).sum() / (weight * foot).sum()) ** 0.5
-    return Survey(light, landing, tuple(offset), tuple(scale), magnification)
+    mostly = tuple(tuple(float(torch.quantile(c[lit], q)) for c in (f.big_x, f.big_y)) for q in (FEW, 1.0 - FEW))
+    return Survey(light, landing, tuple(offset), tuple(scale), magnification, mostly)
 
 
 def _jacobian(a: Tensor, b: Tensor, dx: float, dy: float) -> Tensor:
