@@ -62,7 +62,7 @@ FILTER = Addition(3, edits=(
                  for j in range(len(phi)):
                      d = k - (v - 1) // 2 + 0.5 - phi[j]
                      out[k, j] = max(0.5 * v - abs(d), 0.0)
-                     if sloping:
+                     if len(slope):
                          slope[k, j] = math.copysign(1.0, d) if abs(d) < 0.5 * v else 0.0
          elif alpha * square < SMALL:
              for k in range(v):

@@ -113,7 +113,7 @@ def own_design(book: Book, name: str, picture: str, config: Path, quick: bool, *
     text = re.sub(r"^thickness = 0\.0$", "thickness = 3.0", text, flags=re.M)  # table D.1 begins in the middle of 0 to 6
     scene, project, began = book.folder / f"{name}.toml", book.folder / f"{name}.caustic", time.monotonic()
     scene.write_text(text)
-    quality = ("--quality", "draft") if quick else ()
+    quality = ("--waves", "off", *(("--quality", "draft") if quick else ()))  # judged by rays, as the thesis is
     figures = caustic("design", PICTURES / picture, "--config", scene, "--min-thickness", 0, *quality, *more, "-o", project,
                       "--force")
     finish(book, name, project, figures, time.monotonic() - began)

@@ -142,7 +142,7 @@ def test_adam_with_steps_far_too_long(network, compare):
     assert said, "this case no longer meets a bad step"
     naive = d.begin()
     heights = d._parametrise(0, naive.heights if network == "none" else None)
-    objective = d._objective(0)
+    objective = d._objective(0, heights)
     adam = torch.optim.Adam(heights.parameters(), lr=30.0)
     worst = 0.0
     for _ in range(8):
