@@ -35,7 +35,8 @@ KEPT = 1 << 30
 @dataclass(frozen=True)
 class Part:
     """Light of one wavelength and one point of the source: phase (n, m) rad at h_0 in [0, 2 pi), its derivative by the height
-    (n, m) rad/mm, amplitude (n, m), and which samples fall on which pixels."""
+    (n, m) rad/mm, amplitude (n, m), which samples fall on which pixels, and the power of all of it.  front: shared by parts whose
+    light goes the same ways."""
 
     line: Line
     front: Wavefront
@@ -78,10 +79,7 @@ class WaveObjective:
             receiver = receiver_of(lines[0].system, screen)
             self.imager = Imager.of(lines, parameters, receiver, watched=_lit(scene, target), dense=True)
             self.parts = list(self._parts(lines[rank::count], parameters))
-        if self.parts:
-            front = self.parts[0].front
-            self.points = front.at_x.reshape(-1).contiguous(), front.at_y.reshape(-1).contiguous()
-            self.shape = front.at_x.shape
+        self.fronts = list({id(part.front): part.front for part in self.parts}.values())
         self.colours = len({line.channel for line in lines if line.channel is not None})
         n = self.imager.sampling
         self.whole = len(self.parts) * (8 * n.samples + 16 * n.count[0] * n.count[1]) <= KEPT
@@ -109,15 +107,15 @@ class WaveObjective:
         ranks.share(heights)
         heights.requires_grad_()
         penalty = self.penalty(heights) if self.penalty else torch.zeros((), dtype=torch.float64, device=heights.device)
-        moved = self.field.at_points(heights - self.middle, *self.points).view(self.shape) if self.parts else None
+        moved = [self._moved(front, heights - self.middle) for front in self.fronts]
         shape = (3, *self.loss.target.shape) if self.colours else self.loss.target.shape
         image = torch.zeros(shape, dtype=torch.float64, device=heights.device)
         leaving = image.new_zeros(image.shape[:-2])
-        by = None if moved is None else moved.detach().to(self.dtype).requires_grad_()
+        by = {id(front): z.detach().to(self.dtype).requires_grad_() for front, z in zip(self.fronts, moved, strict=True)}
         seen = []
         with torch.set_grad_enabled(self.whole):
             for part in self.parts:
-                found = self._image(part, by)
+                found = self._image(part, by[id(part.front)])
                 self._channel(image, part)[...] += part.line.part * found.detach().double()
                 self._channel(leaving, part)[...] += part.line.part * part.power
                 seen.append(found if self.whole else None)
@@ -126,18 +124,23 @@ class WaveObjective:
         loss = self.loss(image, leaving, penalty)
         by_image, direct = torch.autograd.grad(loss, (image, heights), allow_unused=True) if penalty.requires_grad else \
             (*torch.autograd.grad(loss, (image,)), None)
-        by_moved = torch.zeros(self.shape, dtype=torch.float64, device=heights.device) if self.parts else None
+        by_moved = {key: torch.zeros_like(z, dtype=torch.float64) for key, z in by.items()}
         for part, found in zip(self.parts, seen, strict=True):
-            found = self._image(part, by) if found is None else found
+            z = by[id(part.front)]
+            found = self._image(part, z) if found is None else found
             pull = part.line.part * self._channel(by_image, part)
-            by_moved += torch.autograd.grad(found, by, pull.to(found.dtype))[0].double()
-        gradient = torch.zeros_like(heights) if moved is None else torch.autograd.grad(moved, heights, by_moved)[0]
+            by_moved[id(part.front)] += torch.autograd.grad(found, z, pull.to(found.dtype))[0]
+        gradient = torch.autograd.grad(moved, heights, list(by_moved.values()))[0] if moved else torch.zeros_like(heights)
         ranks.add(gradient)
         if direct is not None:
             gradient = gradient + direct
         a = self.apron
         inner = image.detach()[..., a : image.shape[-2] - a, a : image.shape[-1] - a]
         return Evaluation(float(loss.detach()), {EXIT: gradient}, float(inner.sum()))
+
+    def _moved(self, front: Wavefront, change: Tensor) -> Tensor:
+        """How far the surface moved where light of a wavefront meets it, (n, m) mm."""
+        return self.field.evaluate(change, front.at_x.reshape(-1), front.at_y.reshape(-1))[0].view(front.at_x.shape)
 
     def _image(self, part: Part, moved: Tensor) -> Tensor:
         imager = self.imager

@@ -105,7 +105,7 @@ class Tracer:
 
     def last(self, parameters: Parameters) -> Meeting:
         """The rays at the last element, behind which they have gone straight on."""
-        return next(reversed([self._behind, *self._walk(parameters)]))
+        return [self._behind, *self._walk(parameters)][-1]
 
     @torch.no_grad()
     def exit_of(self, parameters: Parameters) -> tuple[tuple, tuple, Tensor]:

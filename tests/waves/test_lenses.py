@@ -181,6 +181,24 @@ def test_dispersion_changes_the_focus():
     assert float(both.image.max()) == pytest.approx(0.5 * (peaks[450.0, 450.0] + peaks[650.0, 450.0]), rel=0.02)
 
 
+def test_sources_of_a_system_are_watched_where_their_light_goes():
+    """Two points so far apart that light of either misses the other's half of the screen: the sum of the two alone."""
+    field = HeightField((SplineSpace.uniform(6, 3),) * 2, (1.0, 1.0))
+    elements = (Element("front", Plane(), Aperture((0.5, 0.5)), behind=Medium(1.5)),
+                Element("back", field, Aperture((1.5, 1.5)), pose=Pose((0, 0, 0.5))))
+    screen = Screen((6.0, 2.0), 30.0, (60, 20))
+    heights = {"back": spline_of(field, lambda x, y: -(x * x + y * y) / 40.0)}
+    points = [Points(((x, 0.0, -30.0),), (power,)) for x, power in ((2.0, 1.0), (-2.0, 3.0))]
+    system = System(tuple(points), elements, (screen,), Light(wavelengths=(GREEN,)))
+    found = image_of(lines_of_system(system), heights, screen, dtype=DOUBLE)
+    alone = [image_of(lines_of_system(replace(system, sources=(p,))), heights, screen, dtype=DOUBLE) for p in points]
+    both = 0.25 * alone[0].image + 0.75 * alone[1].image
+    torch.testing.assert_close(found.image, both, rtol=1e-9, atol=1e-12)
+    assert found.leaving == pytest.approx(0.25 * alone[0].leaving + 0.75 * alone[1].leaving)
+    assert found.points == 2
+    assert float(found.image[30:].sum()) == pytest.approx(3.0 * float(found.image[:30].sum()), rel=0.01)  # each has its half
+
+
 # Derivatives by heights
 
 

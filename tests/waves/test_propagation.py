@@ -11,7 +11,7 @@ import torch
 from fields import Given, disc, mean_around, mean_over, middles, slit
 from scipy.special import airy, j0, j1, jv
 
-from caustic_cli.optics.waves.propagation import cells, power_in_pieces, power_on_pixels
+from caustic_cli.optics.waves.propagation import cells, power_by_blocks, power_on_pixels
 from caustic_cli.optics.waves.sampling import Sampling
 
 LAMBDA = 5.5e-4
@@ -206,16 +206,15 @@ def test_energy_of_the_transform(dtype, tolerance):
 
 
 @pytest.mark.parametrize("pieces", [1, 2, 4, 11])
-def test_pieces_are_the_whole(pieces):
+def test_blocks_and_pieces_are_the_whole(pieces):
     """To rounding, at block sizes that divide nothing."""
     given = Given((0.8, 0.5), (1.0, 0.7), (60, 44), 60.0, LAMBDA)
     phase, amplitude = random_field(given, 2, torch.float64)
     s = given.sampling
-    short = next(b for b in range(pieces, s.padded[0]) if s.padded[0] % b == 0)
     field = torch.polar(amplitude, phase)
     whole = power_on_pixels(phase, amplitude, s.padded, *given.masks)
     for block in (37, 256):
-        found, power = power_in_pieces(lambda part: field[part], s, short, *given.masks, block=block)
+        found, power = power_by_blocks(lambda part: field[part], s, pieces, *given.masks, block=block)
         torch.testing.assert_close(found, whole, rtol=1e-11, atol=1e-12 * float(whole.max()))
         assert power == pytest.approx(float(amplitude.square().sum()), rel=1e-12)
 

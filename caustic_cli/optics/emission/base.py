@@ -87,6 +87,14 @@ class Emission:
         return RayState((x, y, self.scene.pupil.z), direction, power, lost={"missed_lens": emitted - float(power.sum())})
 
 
+def intensity_of(source: Source, cone: float, secant: Tensor) -> Tensor | float:
+    """Power per solid angle, 1/sr, of a near source of power 1 that shines into a cone of this half-angle, rad; secant: 1 / cos of
+    its light's angle to the axis."""
+    if source.intensity == "lambertian":
+        return 1.0 / (math.pi * math.sin(cone) ** 2 * secant)
+    return 1.0 / (4.0 * math.pi * math.sin(cone / 2.0) ** 2)
+
+
 def _starts(scene: Lit) -> int:
     """Positions of the source; a distant one counts as one."""
     return max(1, len(scene.source.points()[0]))

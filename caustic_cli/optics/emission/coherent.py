@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.emission.base import Lit
+from caustic_cli.optics.emission.base import Lit, intensity_of
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import Sample
 
@@ -53,12 +53,8 @@ class Mode:
         r = torch.sqrt(dx * dx + dy * dy + h * h)
         cone = source.cone_over(pupil.half_size, pupil.z, pupil.round)
         cosine = h / r
-        if source.intensity == "lambertian":
-            intensity = cosine / (math.pi * math.sin(cone) ** 2)
-        else:
-            intensity = torch.full_like(r, 1.0 / (4.0 * math.pi * math.sin(cone / 2.0) ** 2))
         lit = cosine >= math.cos(cone) * (1.0 - 4.0 * torch.finfo(torch.float64).eps)
-        power = torch.where(lit, self.part * intensity * cosine / (r * r), torch.zeros_like(r))
+        power = torch.where(lit, self.part * intensity_of(source, cone, r / h) * cosine / (r * r), torch.zeros_like(r))
         return RayState((x, y, pupil.z), (dx / r, dy / r, cosine), power, path=index * r)
 
     def _even(self, u: Tensor, v: Tensor) -> Tensor:

@@ -22,7 +22,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.emission.base import Emission
+from caustic_cli.optics.emission.base import Emission, intensity_of
 from caustic_cli.optics.rays import RayState
 
 #: A source whose foot is this many of its distances inside the aperture's edge is near: 1 - cos = 0.32 of a hemisphere misses.
@@ -83,8 +83,7 @@ class Near(Emission):
         tan_b, by_sine = _even_sine((lows[1] - y0) / (h * stretch), (highs[1] - y0) / (h * stretch), tall / (h * stretch), v)
         ay = tan_b * stretch
         rho2 = ax * ax + ay * ay  # in units of h
-        intensity = 1.0 / (math.pi * math.sin(cone) ** 2 * torch.sqrt(1.0 + rho2)) if lambertian else 1.0 / (2.0 * math.pi * w_c)
-        aimed = part * by_angle * by_sine * intensity
+        aimed = part * by_angle * by_sine * intensity_of(source, cone, torch.sqrt(1.0 + rho2))
         limit = math.tan(cone) ** 2 * (1.0 + 2.0 * torch.finfo(torch.float64).eps) if cone < math.pi / 2 else math.inf
         aimed = torch.where(rho2 <= limit, aimed, torch.zeros_like(aimed))
 

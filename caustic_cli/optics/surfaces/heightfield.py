@@ -96,10 +96,6 @@ class HeightField(Surface):
         """As of any surface, by the kernels of the device's backend; linear in the heights."""
         return list(backend_for(x.device).spline_at(self, heights, x, y))
 
-    def at_points(self, heights: Tensor, x: Tensor, y: Tensor) -> Tensor:
-        """Z alone at points (N,) mm, differentiable by the heights: (N,) float64."""
-        return backend_for(x.device).spline_at(self, heights, x, y)[0]
-
     def meet(self, heights: Tensor, origin, direction, side: float) -> Hit:
         """As of any surface, by the kernels of the device's backend."""
         return backend_for(heights.device).meet_spline(self, heights, origin, direction, side)

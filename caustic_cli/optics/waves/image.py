@@ -22,7 +22,7 @@ from caustic_cli.optics.meeting import Parameters
 from caustic_cli.optics.resolution import WHITE_LINES, white
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, Placed, System
-from caustic_cli.optics.waves.propagation import TURN, cells, power_in_pieces, power_on_pixels, ramp
+from caustic_cli.optics.waves.propagation import cells, phase_of, power_by_blocks, power_on_pixels
 from caustic_cli.optics.waves.receiver import Plane, Receiver, receiver_of
 from caustic_cli.optics.waves.sampling import NoWaveImage, Sampling, memory_free
 from caustic_cli.optics.waves.spread import Spread, spread_by
@@ -131,9 +131,16 @@ def wave_image(scene: Scene, field: HeightField, heights: Tensor, *, wavelengths
 
 def image_of(lines: list[Line], parameters: Parameters, screen: Screen | Placed, *, finer: float = 1.0,
              dtype: torch.dtype = torch.float32) -> WaveImage:
-    """The wave image of lines of light on one screen; see `wave_image`."""
-    return Imager.of(lines, parameters, receiver_of(lines[0].system, screen), finer,
-                      any(h.requires_grad for h in parameters.values())).expose(lines, parameters, dtype)
+    """The wave image of lines of light on one screen, the sources of a system one by one; see `wave_image`."""
+    exact, by_source, found = any(h.requires_grad for h in parameters.values()), {}, []
+    for line in lines:
+        by_source.setdefault(id(line.system.source), []).append(line)
+    for light in by_source.values():
+        imager = Imager.of(light, parameters, receiver_of(light[0].system, screen), finer, exact)
+        found.append(imager.expose(light, parameters, dtype))
+    return found[0] if len(found) == 1 else WaveImage(
+        sum(w.image for w in found), sum(w.leaving for w in found), sum(w.off_screen for w in found), found[0].wavelengths,
+        sum(w.points for w in found), max(w.spread_error for w in found), max(w.samples for w in found))
 
 
 def _alike(lines: list[Line]) -> list[list[Line]]:
@@ -146,7 +153,7 @@ def _alike(lines: list[Line]) -> list[list[Line]]:
 
 @dataclass(frozen=True)
 class Imager:
-    """What the images of several lines and modes have in common: where their light is watched, and how finely."""
+    """What the images of a source's lines and modes have in common: where their light is watched, and how finely."""
 
     receiver: Receiver
     plane: Plane
@@ -173,35 +180,31 @@ class Imager:
         Raises:
             NoWaveImage: see `wave_image`.
         """
-        line = min(lines, key=lambda k: k.wavelength)
-        system = line.system
-        plane = receiver.plane(system.axis)
+        ways = [group[0] for group in _alike(lines)]
+        system = ways[0].system
+        plane, upright = receiver.plane(system.axis), receiver.across(system.axis)
         distance = distance_of(system, parameters, plane)
-        optics = Optics(system, middle(system), parameters, line.length, line.label, plane, distance)
-        seen = survey(optics)
+        alike = [Optics(k.system, middle(system), parameters, k.length, k.label, plane, distance) for k in ways]
+        outer = edges(system)
+        surveys = [survey(replace(one, mode=mode)) for one in alike for mode in (one.mode, *outer)]
         lengths = tuple(k.behind for k in lines)
-        blur = math.sqrt(max(lengths) * distance * seen.magnification)
-        spread = None
-        if system.source.extended and receiver.across(system.axis):
-            spread = spread_by(optics, edges(system), max(blur, *receiver.pixel))
-        outer = [mode for mode in edges(system)] if system.source.extended else []
+        blur = math.sqrt(max(lengths) * distance * surveys[0].magnification)
+        spread = spread_by(alike[0], outer, max(blur, *receiver.pixel)) if outer and upright else None
         low, high = receiver.extent(plane)
-        upright = receiver.across(system.axis)
-        around = [BLURS * math.sqrt(max(lengths) * distance * seen.magnification)] * 2
-        light, landing = seen.light, [list(c) for c in (watched if watched and upright else (low, high))]
-        for other in [seen] + [survey(replace(optics, mode=m)) for m in outer]:
-            light = tuple(tuple(w(a[k], b[k]) for k in (0, 1)) for w, a, b in
-                          ((min, light[0], other.light[0]), (max, light[1], other.light[1])))
+        lows, highs = (list(c) for c in (watched if watched and upright else (low, high)))
+        for seen in surveys:
+            lands = seen.mostly if watched else seen.landing
             for k in (0, 1):
                 room = max(BESIDE * (high[k] - low[k]), spread.reach()[k] + receiver.pixel[k] if spread else 0.0)
-                lands = other.mostly if watched else other.landing
-                landing[0][k] = min(landing[0][k], max(lands[0][k] - around[k], low[k] - room))
-                landing[1][k] = max(landing[1][k], min(lands[1][k] + around[k], high[k] + room))
-        sampling = Sampling.of(light, tuple(map(tuple, landing)), receiver.pixel, distance, lengths, finer)
+                lows[k] = min(lows[k], max(lands[0][k] - BLURS * blur, low[k] - room))
+                highs[k] = max(highs[k], min(lands[1][k] + BLURS * blur, high[k] + room))
+        light = (tuple(min(s.light[0][k] for s in surveys) for k in (0, 1)),
+                 tuple(max(s.light[1][k] for s in surveys) for k in (0, 1)))
+        sampling = Sampling.of(light, (tuple(lows), tuple(highs)), receiver.pixel, distance, lengths, finer)
         spans = [len(s.breaks) - 1 for e in system.elements if isinstance(e.surface, HeightField) for s in e.surface.spaces]
         nodes = sampling.count if dense else tuple(min(n, max(LEAST_NODES, A_SPAN * max(spans, default=0))) for n in sampling.count)
-        return cls(receiver, plane, seen, sampling, spread, nodes, spread is not None or not system.source.extended, upright,
-                   exact, watched is None)
+        single = spread is not None or not outer
+        return cls(receiver, plane, surveys[0], sampling, spread, nodes, single, upright, exact, watched is None)
 
     def expose(self, lines: list[Line], parameters: Parameters, dtype: torch.dtype = torch.float32) -> WaveImage:
         """The wave image of such lines, at heights {name: (n, m) mm} close to those that samples were chosen for."""
@@ -268,40 +271,32 @@ class Imager:
         """Phase, rad, with the kernel's, and amplitude of each sample of a wavefront, (n, m)."""
         s, front = self.sampling, self.watched(front, line.behind)
         path, amplitude = front.on(s.low, s.step, s.count).whole
-        across, along = (ramp(s, line.behind, k, path.device) for k in (0, 1))
-        phase = path * (TURN / line.length)  # in place from here: new memory costs more than the sums
-        phase += across[:, None]
-        phase += along[None, :]
-        return phase.remainder_(TURN).to(dtype), amplitude.to(dtype)
+        return phase_of(path, s, line.length, line.behind).to(dtype), amplitude.to(dtype)
 
     def image(self, line: Line, front: Wavefront, dtype: torch.dtype) -> tuple[Tensor, float]:
         """Power on the pixels of the light of one mode at one wavelength, float64, and that of all of it."""
         s, wide = self.sampling, 8 if dtype == torch.float32 else 16
         if not self.upright:
-            found = power_on_tilted(self.receiver, self.plane, s, self.watched(front, line.behind), TURN / line.length, line.behind,
-                                    dtype)
+            found = power_on_tilted(self.receiver, self.plane, s, self.watched(front, line.behind), line.length, line.behind, dtype)
             return found, front.power()
         rows, columns = self.masks(line, front.path.device, dtype)
-        pieces = s.pieces(wide)
-        if pieces > 1 and not (torch.is_grad_enabled() and front.path.requires_grad):
-            found = self._in_pieces(line, self.watched(front, line.behind), pieces, rows, columns, dtype)
-        else:
+        if torch.is_grad_enabled() and front.path.requires_grad:
             self._check_memory(wide)
             found = power_on_pixels(*self.field(line, front, dtype), s.padded, rows, columns).double()
+        else:
+            found = self._by_blocks(line, self.watched(front, line.behind), s.pieces(wide), rows, columns, dtype)
         return self.spread_out(found), front.power()
 
     @torch.no_grad()
-    def _in_pieces(self, line: Line, front: Wavefront, pieces: int, rows: Tensor, columns: Tensor,
+    def _by_blocks(self, line: Line, front: Wavefront, pieces: int, rows: Tensor, columns: Tensor,
                    dtype: torch.dtype) -> Tensor:
         s, fine = self.sampling, front.on(self.sampling.low, self.sampling.step, self.sampling.count)
-        across, along = (ramp(s, line.behind, k, front.path.device) for k in (0, 1))
 
         def field(part: slice) -> Tensor:
             path, root, lit = fine.rows(part)
-            phase = torch.remainder(TURN / line.length * path + across[part, None] + along[None, :], TURN)
-            return torch.polar((root * lit).to(dtype), phase.to(dtype))
+            return torch.polar((root * lit).to(dtype), phase_of(path, s, line.length, line.behind, part).to(dtype))
 
-        return power_in_pieces(field, s, pieces, rows, columns)[0]
+        return power_by_blocks(field, s, pieces, rows, columns)[0]
 
     def _check_memory(self, wide: int) -> None:
         n, m = self.sampling.count

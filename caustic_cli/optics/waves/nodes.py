@@ -10,6 +10,8 @@ from torch import Tensor
 
 #: Points of the interpolation between nodes along an axis.
 POINTS = 6
+#: Finer rows that are made at a time.
+BLOCK = 256
 
 
 def between(nodes: int, low: float, step: float, fine_low: float, fine_step: float, count: int, like: Tensor):
@@ -23,6 +25,18 @@ def between(nodes: int, low: float, step: float, fine_low: float, fine_step: flo
     return first, weights
 
 
+def _mixed(c: Tensor, first: Tensor, weights: Tensor) -> Tensor:
+    """Rows of c (n, m) in these mixtures (count, m), a block of them at a time by a matrix of the few rows that it needs."""
+    found = []
+    for start in range(0, len(first), BLOCK):
+        at, w = first[start : start + BLOCK], weights[start : start + BLOCK]
+        low, high = int(at.min()), int(at.max()) + POINTS
+        matrix = torch.zeros(len(at), high - low, dtype=w.dtype, device=w.device)
+        matrix.scatter_(1, (at - low)[:, None] + torch.arange(POINTS, device=at.device), w)
+        found.append(matrix @ c[low:high])
+    return torch.cat(found)
+
+
 def _product(factors: list[Tensor]) -> Tensor:
     found = factors[0]
     for f in factors[1:]:
@@ -33,11 +47,9 @@ def _product(factors: list[Tensor]) -> Tensor:
 def interpolated(c: Tensor, along_x, along_y) -> Tensor:
     """A function (n, m) at finer rows and columns, by what `between` gives for each, None for the nodes themselves."""
     if along_x is not None:
-        first, w = along_x
-        c = sum(w[:, k, None] * c[first + k] for k in range(POINTS))
+        c = _mixed(c, *along_x)
     if along_y is not None:
-        first, w = along_y
-        c = sum(w[None, :, k] * c[:, first + k] for k in range(POINTS))
+        c = _mixed(c.T, *along_y).T.contiguous()
     return c
 
 
@@ -56,7 +68,10 @@ def filled(c: Tensor, dark: Tensor) -> Tensor:
 
 @dataclass
 class Refined:
-    """A wavefront on a finer grid: its columns are there, rows are made when asked for.  first, weights: of rows, or None."""
+    """A wavefront on a finer grid: its columns are there, rows are made when asked for.
+
+    root: of the power of a whole cell; shade: see `Wavefront`; step: of the finer grid; along_x: of rows, see `between`.
+    """
 
     path: Tensor
     root: Tensor

@@ -6,8 +6,7 @@ Of U only |U|^2 is asked for, so the factor before the integral is left out; wha
 apart (`sampling`), and unitary: sum |U|^2 = sum |u|^2 to rounding.  Light's path is given so that this integral, which is exact for
 parabolic wavefronts, lands every ray where the trace says (`wavefront`).
 
-Large transforms are made in pieces (decimation in frequency): the outputs k = r + B m along x are the transform of length N / B of
-the inputs, turned by exp(-2 pi i r j / N) and added up modulo N / B.
+Without derivatives, a transform is made along y for blocks of rows and along x for blocks of columns, in bounded memory.
 """
 
 from __future__ import annotations
@@ -21,6 +20,8 @@ from torch import Tensor
 from caustic_cli.optics.waves.sampling import Sampling
 
 TURN = 2.0 * math.pi
+#: Rows or columns that are transformed at a time.
+BLOCK = 256
 
 
 def ramp(sampling: Sampling, wavelength: float, axis: int, device: torch.device) -> Tensor:
@@ -29,6 +30,18 @@ def ramp(sampling: Sampling, wavelength: float, axis: int, device: torch.device)
     x = sampling.low[axis] + (j + 0.5) * sampling.step[axis]
     k, x0 = TURN / wavelength, sampling.first(wavelength)[axis]
     return torch.remainder(k * (0.5 * x * x - x0 * x) / sampling.distance, TURN)
+
+
+def phase_of(path: Tensor, sampling: Sampling, length: float, behind: float, part: slice = slice(None)) -> Tensor:
+    """Phase, rad in [0, 2 pi), of samples with these paths, mm, the kernel's added: rows `part` of all, (rows, m) float64.
+
+    length, behind: wavelength in vacuum and in the medium before the screen, mm.
+    """
+    across, along = (ramp(sampling, behind, k, path.device) for k in (0, 1))
+    phase = path * (TURN / length)  # in place from here: new memory costs more than the sums
+    phase += across[part, None]
+    phase += along
+    return phase.remainder_(TURN)
 
 
 def cells(low: float, width: float, count: int, first: float, spacing: float, samples: int, device: torch.device) -> Tensor:
@@ -73,27 +86,29 @@ def power_on_pixels(phase: Tensor, amplitude: Tensor, shape: tuple[int, int], ro
     return _Illuminance.apply(phase, amplitude, shape, rows, columns)
 
 
-def power_in_pieces(field: Callable[[slice], Tensor], sampling: Sampling, pieces: int, rows: Tensor, columns: Tensor,
-                    block: int = 256) -> tuple[Tensor, float]:
-    """The same without derivatives for a field that is given block of rows by block of rows, complex (rows, m), in bounded memory.
+@torch.no_grad()
+def power_by_blocks(field: Callable[[slice], Tensor], sampling: Sampling, pieces: int, rows: Tensor, columns: Tensor,
+                    block: int = BLOCK) -> tuple[Tensor, float]:
+    """The same without derivatives for a field that is given block of rows by block of rows, complex (rows, m).
+
+    Of the transform, a piece of the screen's columns and a block of it at a time take memory: (n, M / pieces) + (N, block).
 
     Returns:
         power on the pixels (a, b) float64, and that of the whole transform.
     """
-    (n, m), (big, wide) = sampling.count, sampling.padded
-    short = big // pieces
+    (n, _), (big, wide) = sampling.count, sampling.padded
+    width = math.ceil(wide / pieces)
     image, whole = 0.0, 0.0
-    for r in range(pieces):
-        folded = None
+    for left in range(0, wide, width):
+        half = []
         for start in range(0, n, block):
             u = field(slice(start, min(n, start + block)))
-            j = torch.arange(start, start + len(u), device=u.device)
-            if folded is None:
-                folded = torch.zeros(short, m, dtype=u.dtype, device=u.device)
-            turn = torch.remainder(r * j, big).double() * (-TURN / big)
-            folded.index_add_(0, j % short, u * torch.polar(torch.ones_like(turn), turn).to(u.dtype)[:, None])
-        transformed = torch.fft.fft2(folded, s=(short, wide))
-        power = (transformed.real.square() + transformed.imag.square()) / (float(big) * wide)
-        whole += float(power.sum(dtype=torch.float64))
-        image = image + (rows[:, r::pieces] @ power @ columns.T).double()
+            half.append(torch.fft.fft(u, n=wide, norm="ortho")[:, left : left + width].contiguous())
+        half = torch.cat(half)
+        for start in range(0, half.shape[1], block):
+            u = torch.fft.fft(half[:, start : start + block], n=big, dim=0, norm="ortho")
+            power = u.real.square() + u.imag.square()
+            whole += float(power.sum(dtype=torch.float64))
+            at = slice(left + start, left + start + power.shape[1])
+            image = image + ((rows @ power) @ columns[:, at].T).double()
     return image, whole

@@ -26,8 +26,8 @@ BEYOND, FINER, LEAST = 1.06, 1.08, 128
 A_PIXEL = 6.0
 #: Most samples along an axis; bytes that one piece of a transform may take in any case, and in parts of the free memory.
 MOST, PIECE, OF_FREE = 1 << 17, 1 << 30, 0.3
-#: Bytes that the work on one sample takes at a time, in parts of a complex number's.
-COPIES = 4
+#: How often a piece is in memory at a time.
+COPIES = 2
 
 
 class NoWaveImage(CausticError):
@@ -87,9 +87,8 @@ class Sampling:
         return tuple(m - 0.5 * (n - 1) * d for m, n, d in zip(self.middle, self.padded, self.spacing(wavelength), strict=True))
 
     def pieces(self, wide: int) -> int:
-        """In how many pieces the transform has to be made, of numbers of `wide` bytes: a divisor of N along x."""
-        least = math.ceil(COPIES * wide * self.samples / max(PIECE, OF_FREE * memory_free()))
-        return next((b for b in range(least, self.padded[0] + 1) if self.padded[0] % b == 0), self.padded[0])
+        """In how many pieces the transform has to be made, of numbers of `wide` bytes, where they are put together from blocks."""
+        return min(self.padded[1], math.ceil(COPIES * wide * self.count[0] * self.padded[1] / max(PIECE, OF_FREE * memory_free())))
 
     @property
     def samples(self) -> int:

@@ -10,10 +10,9 @@ from torch import Tensor
 TRIES, AT_EDGES, INWARDS = 16, 10, 0.02
 
 
-def sought(optics, seen, at: tuple[Tensor, Tensor], shape, step,
-            left: float) -> tuple:
+def sought(optics, seen, at: tuple[Tensor, Tensor], shape: tuple[int, int], step: tuple[float, float], left: float) -> tuple:
     """Rays (`Feet`) of an `Optics` surveyed as `seen`, with their feet at points (N,) each; where they pass the pupil; and which of
-    them stand at the edge of what is dark.
+    them stand at the edge of what is dark; left: see `_left`.
 
     Rays beyond the pupil's edges stay on them.  Where rays are stopped behind it their feet say nothing: they go back towards the
     last ray that was not, and such as never were towards the middle.
@@ -40,7 +39,8 @@ def sought(optics, seen, at: tuple[Tensor, Tensor], shape, step,
     return f, held, behind
 
 
-def _left(f, x: Tensor, y: Tensor, shape, step, u: Tensor, v: Tensor, behind: Tensor) -> float:
+def _left(f, x: Tensor, y: Tensor, shape: tuple[int, int], step: tuple[float, float], u: Tensor, v: Tensor,
+          behind: Tensor) -> float:
     """Bound of the path left out where feet miss the grid by e: half e^2 times the wavefront's curvature there, mm."""
     inside = ~behind & (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
     if not bool(inside.any()):

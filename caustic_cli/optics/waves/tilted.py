@@ -19,7 +19,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.waves.propagation import TURN, ramp
+from caustic_cli.optics.waves.propagation import phase_of
 from caustic_cli.optics.waves.receiver import Plane, Receiver, dot
 from caustic_cli.optics.waves.sampling import NoWaveImage, Sampling
 from caustic_cli.optics.waves.wavefront import Wavefront
@@ -28,9 +28,11 @@ from caustic_cli.optics.waves.wavefront import Wavefront
 STEP, MOST_PLANES, A_PIXEL = 0.2, 400, 4
 
 
-def power_on_tilted(r: Receiver, plane: Plane, s: Sampling, front: Wavefront, k0: float, length: float,
+def power_on_tilted(r: Receiver, plane: Plane, s: Sampling, front: Wavefront, length: float, behind: float,
                     dtype: torch.dtype) -> Tensor:
     """Power on a tilted screen's pixels of one wavefront, float64.
+
+    length, behind: wavelength in vacuum and in the medium before the screen, mm.
 
     Raises:
         NoWaveImage: too many planes.
@@ -49,7 +51,7 @@ def power_on_tilted(r: Receiver, plane: Plane, s: Sampling, front: Wavefront, k0
     foot = [s.low[k] + s.step[k] * (torch.arange(s.count[k], dtype=torch.float64, device=device) + 0.5) for k in (0, 1)]
     maps = _mean_map(front, s.distance)  # slopes qx, qy of the light that lands at X, Y: a + b X
     depth = float(z.abs().max())
-    residual = max(m[2] for m in maps) + 0.5 * length / min(r.pixel)
+    residual = max(m[2] for m in maps) + 0.5 * behind / min(r.pixel)
     planes = max(1, math.ceil(2.0 * depth * residual / (2.0 * STEP * min(r.pixel))))
     if planes > MOST_PLANES:
         raise NoWaveImage(f"a wave image of this tilted screen needs {planes} planes, at most {MOST_PLANES} are made: less tilt or"
@@ -62,20 +64,18 @@ def power_on_tilted(r: Receiver, plane: Plane, s: Sampling, front: Wavefront, k0
         if not bool(here.any()):
             continue
         image = image + _through(replace(s, distance=s.distance + at), path, amplitude, foot, maps, (x, y, z - at), (nx, ny, nz),
-                                 here, k0, length, dtype, r.pixel)
+                                 here, length, behind, dtype, r.pixel)
     cell = r.pixel[0] * r.pixel[1] / A_PIXEL**2
     n, m = r.resolution
     return image.view(n, A_PIXEL, m, A_PIXEL).sum((1, 3)) * cell
 
 
-def _through(s, path, amplitude, foot, maps, point, normal, here, k0, length, dtype, pixel) -> Tensor:
+def _through(s, path, amplitude, foot, maps, point, normal, here, length, behind, dtype, pixel) -> Tensor:
     """Power per area of the screen's points near one plane, 0 elsewhere."""
-    phase = torch.remainder(k0 * path + ramp(s, length, 0, path.device)[:, None] + ramp(s, length, 1, path.device)[None, :],
-                            TURN).to(dtype)
-    u = torch.polar(amplitude.to(dtype), phase)
+    u = torch.polar(amplitude.to(dtype), phase_of(path, s, length, behind).to(dtype))
     moments = (u, u * foot[0].to(dtype)[:, None], u * foot[1].to(dtype)[None, :])
     fields = [torch.fft.fft2(w, s=s.padded, norm="ortho") for w in moments]
-    (dx, dy), (x0, y0) = s.spacing(length), s.first(length)
+    (dx, dy), (x0, y0) = s.spacing(behind), s.first(behind)
     x, y, z = point
     grid_x, grid_y = (c0 + d * torch.arange(n, dtype=dtype, device=path.device)
                       for c0, d, n in zip((x0, y0), (dx, dy), s.padded, strict=True))

@@ -54,8 +54,7 @@ SOFT = 0.02
 
 @dataclass
 class Feet:
-    """Rays by their feet, (N,) each: x, y, path v, directions qx, qy, landing X, Y, power (density on the pupil), and the Meeting
-    with the last surface in the dict `last` if asked for."""
+    """Rays by their feet, (N,) each: x, y, path v, directions qx, qy, landing X, Y, and power, a density on the pupil."""
 
     x: Tensor
     y: Tensor
@@ -132,7 +131,7 @@ def distance_of(system: System, parameters: Parameters, plane: Plane) -> float:
 class Survey:
     """Where light goes, from few rays: lows and highs of feet and of landing points, mm, and the mean stretch from the pupil's
     u and v, in [0, 1], to feet: x = offset + scale u along each axis; magnification, root of the mean area of landing points over
-    that of feet, or 0 where light has no extent; mostly, lows and highs of landing points beyond which the part FEW of rays is."""
+    that of feet; mostly, lows and highs of landing points beyond which the part FEW of rays is."""
 
     light: tuple
     landing: tuple
