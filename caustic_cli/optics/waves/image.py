@@ -20,14 +20,14 @@ from torch import Tensor
 from caustic_cli.optics.emission.coherent import Mode, edges, middle, modes
 from caustic_cli.optics.meeting import Parameters
 from caustic_cli.optics.resolution import WHITE_LINES, white
+from caustic_cli.optics.spread import Convolution, Spread, spread_of
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, Placed, System
 from caustic_cli.optics.waves.propagation import cells, phase_of, power_by_blocks, power_on_pixels
 from caustic_cli.optics.waves.receiver import Plane, Receiver, receiver_of
 from caustic_cli.optics.waves.sampling import NoWaveImage, Sampling, memory_free
-from caustic_cli.optics.waves.spread import Spread, spread_by
 from caustic_cli.optics.waves.tilted import power_on_tilted
-from caustic_cli.optics.waves.wavefront import Optics, Survey, Wavefront, distance_of, survey, wavefront
+from caustic_cli.optics.waves.wavefront import Optics, Survey, Wavefront, device_of, distance_of, survey, wavefront
 from caustic_cli.scene import Light, Scene, Screen
 from caustic_cli.scene.materials import refractive_index
 
@@ -38,6 +38,8 @@ A_SPAN, LEAST_NODES = 3, 384
 BESIDE = 0.5
 #: Light is watched as far beyond where rays land as so many of the widths over which diffraction blurs.
 BLURS = 2.0
+#: What the misplacement of light that is taken as spread may be, of diffraction's blur or a pixel, the larger.
+ALLOWED = 0.25
 #: Points that stand for an extended source where its image is not simply spread.
 EACH = 24
 
@@ -189,7 +191,9 @@ class Imager:
         surveys = [survey(replace(one, mode=mode)) for one in alike for mode in (one.mode, *outer)]
         lengths = tuple(k.behind for k in lines)
         blur = math.sqrt(max(lengths) * distance * surveys[0].magnification)
-        spread = spread_by(alike[0], outer, max(blur, *receiver.pixel)) if outer and upright else None
+        spread = spread_of(system, alike[0].landing, device_of(alike[0])) if outer and upright else None
+        if spread is not None and spread.error > ALLOWED * max(blur, *receiver.pixel):
+            spread = None
         low, high = receiver.extent(plane)
         lows, highs = (list(c) for c in (watched if watched and upright else (low, high)))
         for seen in surveys:
@@ -249,13 +253,14 @@ class Imager:
         return front.within(self.sampling.middle, tuple(length * self.sampling.distance / d for d in self.sampling.step))
 
     @cached_property
-    def cut(self) -> tuple[int, tuple[int, int]]:
-        """Into how many a pixel is cut along each axis, and how many of these are seen beside the screen."""
-        return (1, (0, 0)) if self.spread is None else self.spread.grid(self.receiver.pixel)
+    def spreading(self) -> Convolution | None:
+        """The spread on the screen's pixels."""
+        return None if self.spread is None else self.spread.on(self.receiver.pixel)
 
     def masks(self, line: Line, device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """Which samples of an upright screen fall on which of the cut pixels, along each axis."""
-        s, (sub, beside), low, found = self.sampling, self.cut, self.receiver.extent(self.plane)[0], []
+        s, low, found = self.sampling, self.receiver.extent(self.plane)[0], []
+        sub, beside = (1, (0, 0)) if self.spreading is None else (self.spreading.cut, self.spreading.beside)
         first, spacing = s.first(line.behind), s.spacing(line.behind)
         for k in (0, 1):
             width = self.receiver.pixel[k] / sub
@@ -265,7 +270,7 @@ class Imager:
 
     def spread_out(self, image: Tensor) -> Tensor:
         """An image of the source's middle on cut pixels -> that of the source on the screen's pixels."""
-        return image if self.spread is None else self.spread(image, self.receiver.pixel, *self.cut)
+        return image if self.spreading is None else self.spreading(image)
 
     def field(self, line: Line, front: Wavefront, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """Phase, rad, with the kernel's, and amplitude of each sample of a wavefront, (n, m)."""

@@ -102,6 +102,11 @@ class Optics:
             return parts[0]
         return Feet(*(torch.cat([getattr(p, name) for p in parts]) for name in Feet.__dataclass_fields__))
 
+    def landing(self, mode: Mode, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Where another mode's light lands, X, Y, mm, and its power."""
+        f = replace(self, mode=mode).feet(u, v)
+        return f.big_x, f.big_y, f.power
+
     def footed(self, m: Meeting) -> Feet:
         """Rays behind the last element by their feet."""
         state, (e1, e2, e3) = m.state.spread(), self.plane.axes
@@ -148,7 +153,7 @@ def survey(optics: Optics) -> Survey:
     Raises:
         NoWaveImage: nowhere.
     """
-    line = torch.linspace(0.0, 1.0, SURVEY, dtype=torch.float64, device=_device(optics))
+    line = torch.linspace(0.0, 1.0, SURVEY, dtype=torch.float64, device=device_of(optics))
     u, v = (c.reshape(-1) for c in torch.meshgrid(line, line, indexing="ij"))
     f = optics.feet(u, v)
     lit = f.power > 0
@@ -255,7 +260,7 @@ def wavefront(optics: Optics, seen: Survey, low: tuple[float, float], step: tupl
     Raises:
         NoWaveImage: light crosses itself before it gets there, so that no single wavefront stands for it.
     """
-    device = _device(optics)
+    device = device_of(optics)
     differentiable = not sensitive and torch.is_grad_enabled() and any(h.requires_grad for h in optics.parameters.values())
     left = (LEFT_EXACT if exact else LEFT) * optics.wavelength / optics.index
     x, y = (low[k] + step[k] * (torch.arange(count[k], dtype=torch.float64, device=device) + 0.5) for k in (0, 1))
@@ -315,5 +320,6 @@ def _sensitive(optics: Optics, u: Tensor, v: Tensor) -> tuple[Feet, dict[str, Te
     return f, dict(zip(("sensitivity", "at_x", "at_y"), (torch.cat(c) for c in zip(*found, strict=True)), strict=True))
 
 
-def _device(optics: Optics) -> torch.device:
+def device_of(optics: Optics) -> torch.device:
+    """Of its surfaces' heights."""
     return next((h.device for h in optics.parameters.values()), torch.device("cpu"))

@@ -1,0 +1,153 @@
+"""An extended source that shifts the image: the image of its middle, convolved with its own shape.
+
+Light of a source point beside the middle lands shifted by (S_x dx, S_y dy), nearly alike for all of the lens.  How nearly is
+measured on the outermost points: `error` is the most by which light lands elsewhere than so shifted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from scipy.fft import next_fast_len
+from torch import Tensor
+
+from caustic_cli.optics.emission.base import Lit
+from caustic_cli.optics.emission.coherent import Mode, edges, middle
+
+#: Points along each axis of the pupil whose light says how a source shifts the image.
+POINTS = 33
+#: Cells of an image in the half axes of an ellipse that are aimed at, and into how many a pixel is cut at most for that.
+CELLS, MOST_CUT = 2.0, 4
+#: Points of an ellipse: least along an axis, and to a cell of an image.
+LEAST, A_CELL = 64, 6
+
+#: Where the light of a point of the source lands that passes points (N,) of the pupil: X, Y, mm, and its power.
+Landing = Callable[[Mode, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
+
+
+@dataclass(frozen=True)
+class Spread:
+    """half: half axes of the ellipse over which a point of the image is spread, mm, 0 for points; shifts: of the source's positions
+    on the screen (dx, dy), mm, and their parts of the power; error: see above."""
+
+    half: tuple[float, float]
+    shifts: tuple[tuple[float, float, float], ...]
+    error: float
+
+    def reach(self) -> tuple[float, float]:
+        """How far it spreads, mm."""
+        return tuple(max(abs(s[k]) for s in self.shifts) + self.half[k] for k in (0, 1))
+
+    def on(self, pixel: tuple[float, float]) -> Convolution:
+        """The same on an image of such pixels, mm, that are cut where they are too wide for it."""
+        fine = min((h for h in self.half if h > 0), default=max(self.reach()) / 2.0)
+        cut = max(1, min(MOST_CUT, math.ceil(CELLS * max(pixel) / fine))) if fine > 0 else 1
+        return Convolution(torch.from_numpy(self.kernel(tuple(w / cut for w in pixel))), cut)
+
+    def kernel(self, cell: tuple[float, float]) -> np.ndarray:
+        """Part of the light of a cell that each cell about it gets: (2 a + 1, 2 b + 1), of sum 1, not negative.
+
+        Points of the ellipse are shared out linearly among cells, which widens it; its half axes are less by so much that its
+        second moments stay what they are.
+        """
+        a, b = (math.ceil(r / w) + 1 for r, w in zip(self.reach(), cell, strict=True))
+        half = tuple(math.sqrt(max(0.0, h * h - 2.0 / 3.0 * w * w)) for h, w in zip(self.half, cell, strict=True))
+        x, y = (h / w * c for h, w, c in zip(half, cell, _even_disc(half, cell), strict=True))
+        dx, dy, part = np.array(self.shifts).T
+        at_x, at_y = (d[:, None] / w + c + n for d, c, w, n in ((dx, x, cell[0], a), (dy, y, cell[1], b)))
+        i, j = np.floor(at_x).astype(int), np.floor(at_y).astype(int)
+        found = np.zeros((2 * a + 2) * (2 * b + 2))
+        for p in (0, 1):
+            for q in (0, 1):
+                weight = part[:, None] * np.abs(1 - p - (at_x - i)) * np.abs(1 - q - (at_y - j))
+                found += np.bincount(((i + p) * (2 * b + 2) + j + q).ravel(), weight.ravel(), len(found))
+        found = found.reshape(2 * a + 2, 2 * b + 2)[:-1, :-1]
+        return found / found.sum()
+
+
+def _even_disc(half: tuple[float, float], cell: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Even points of the unit disc, so close that an ellipse of these half axes has many in each cell; the middle of none."""
+    if max(half) == 0:
+        return np.zeros(1), np.zeros(1)
+    n = max(LEAST, math.ceil(A_CELL * max(2.0 * h / w for h, w in zip(half, cell, strict=True))))
+    line = (np.arange(n) + 0.5) * (2.0 / n) - 1.0
+    x, y = (c.ravel() for c in np.meshgrid(line, line, indexing="ij"))
+    inside = x * x + y * y <= 1.0
+    return x[inside], y[inside]
+
+
+@dataclass(frozen=True)
+class Convolution:
+    """A kernel (2 a + 1, 2 b + 1) of sum 1 for images whose pixels are cut into `cut` along each axis."""
+
+    kernel: Tensor
+    cut: int
+
+    @cached_property
+    def beside(self) -> tuple[int, int]:
+        """Cut pixels beside the screen, whole pixels of them, whose light reaches it."""
+        return tuple(self.cut * math.ceil((n // 2) / self.cut) for n in self.kernel.shape)
+
+    def __call__(self, image: Tensor) -> Tensor:
+        """An image on cut pixels, with those beside, (a, b) -> that on the screen's pixels alone; differentiable."""
+        (n, m), (a, b) = image.shape, self.beside
+        found = self.whole(image)[a : n - a, b : m - b]
+        n, m = (s // self.cut for s in found.shape)
+        return found.reshape(n, self.cut, m, self.cut).sum((1, 3))
+
+    def whole(self, image: Tensor, adjoint: bool = False) -> Tensor:
+        """An image convolved with the kernel, dark beyond its frame; adjoint: with the kernel turned round."""
+        reach = tuple(n // 2 for n in self.kernel.shape)
+        shape = tuple(next_fast_len(n + r, real=True) for n, r in zip(image.shape, reach, strict=True))
+        spectrum = self._spectrum(shape, image)
+        found = torch.fft.irfft2(torch.fft.rfft2(image, s=shape) * (spectrum.conj() if adjoint else spectrum), s=shape)
+        return found[: image.shape[0], : image.shape[1]]
+
+    def _spectrum(self, shape: tuple[int, int], like: Tensor) -> Tensor:
+        kept = self.__dict__.setdefault("_spectra", {})
+        key = shape, like.dtype, like.device
+        if key not in kept:
+            padded = like.new_zeros(shape)
+            n, m = self.kernel.shape
+            padded[:n, :m] = self.kernel
+            kept[key] = torch.fft.rfft2(torch.roll(padded, (-(n // 2), -(m // 2)), (0, 1)))
+        return kept[key]
+
+
+@torch.no_grad()
+def spread_of(lit: Lit, landing: Landing, device: str | torch.device = "cpu") -> Spread | None:
+    """How an extended source spreads the image of its middle; None where it is none, or its light misses, or lies in depth.
+
+    Raises:
+        as `landing`.
+    """
+    source, outer, centre = lit.source, edges(lit), middle(lit)
+    if not outer or (not source.distant and float(np.ptp(source.points()[0][:, 2])) > 0):
+        return None
+    line = torch.linspace(0.0, 1.0, POINTS, dtype=torch.float64, device=device)
+    u, v = (c.reshape(-1) for c in torch.meshgrid(line, line, indexing="ij"))
+    (x, y, power), moved = landing(centre, u, v), []
+    for mode in outer:
+        to_x, to_y, arriving = landing(mode, u, v)
+        lit_too = (power > 0) & (arriving > 0)
+        if not bool(lit_too.any()):
+            return None
+        moved.append([(to_x - x)[lit_too], (to_y - y)[lit_too]])
+    # Shifts in proportion to the place on the source, by the outermost along each axis, and what departs from that.
+    slope = []
+    for k in (0, 1):
+        (up, down), (high, low) = outer[2 * k : 2 * k + 2], moved[2 * k : 2 * k + 2]
+        apart = up.position[k] - down.position[k]
+        slope.append(float(high[k].mean() - low[k].mean()) / apart if apart else 0.0)
+    error = max(float(torch.hypot(*(m[k] - slope[k] * (mode.position[k] - centre.position[k]) for k in (0, 1))).max())
+                for mode, m in zip(outer, moved, strict=True))
+    if source.distant:
+        return Spread(tuple(abs(c) * math.sin(source.half_angle) for c in slope), ((0.0, 0.0, 1.0),), error)
+    places = tuple((float(slope[0] * (p[0] - centre.position[0])), float(slope[1] * (p[1] - centre.position[1])), float(part))
+                   for p, part in zip(*source.points(), strict=True))
+    return Spread(tuple(abs(c) * e for c, e in zip(slope, source.extent, strict=True)), places, error)
