@@ -1,6 +1,6 @@
 """A project directory: the scene and the design in text, the lens in a checkpoint, pictures beside them.
 
-    NAME.caustic/  project.toml  checkpoints.h5  target.png (or target.npy)  render.png  report.png
+    NAME.caustic/  project.toml  checkpoints.h5  target.png (or target.npy)  render.png  wave.png  report.png
 """
 
 from __future__ import annotations
@@ -21,12 +21,19 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.picture import Picture, read_picture
 from caustic_cli.scene import Scene, sources
 
-TOML, CHECKPOINT, RENDER, REPORT = "project.toml", "checkpoints.h5", "render.png", "report.png"
+TOML, CHECKPOINT, RENDER, WAVE, REPORT = "project.toml", "checkpoints.h5", "render.png", "wave.png", "report.png"
+#: What a design makes beside its inputs; WAVE only where diffraction is simulated.
+MADE = (CHECKPOINT, RENDER, WAVE, REPORT)
 
 
 def is_project(path: Path) -> bool:
     """Whether a directory holds a project.toml."""
     return (path / TOML).is_file()
+
+
+def beside(path: Path) -> Path:
+    """Where the wave image belongs beside a ray image or its numbers: render.png -> wave.png, NAME.png -> NAME-wave.png."""
+    return path.with_stem(Path(WAVE).stem if path.stem == Path(RENDER).stem else f"{path.stem}-wave")
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,6 +146,6 @@ class Project:
 
 
 def _picture(directory: Path, name: str, linear: bool, color: bool = False) -> Picture:
-    if name != Path(name).name or name in ("", ".", "..", TOML, CHECKPOINT, RENDER, REPORT):
+    if name != Path(name).name or name in ("", ".", "..", TOML, *MADE):
         raise InputError(f"a picture's file must be the name of one within the project directory, got {name!r}")
     return read_picture(directory / name, linear, color)

@@ -176,7 +176,9 @@ def test_a_design_for_light(_here, capfd):
     light = np.load("ray-wave.npy")
     assert light.sum() == pytest.approx(again["wave_on_screen"], abs=1e-6) and Path("ray-wave.png").exists()
     none = json.loads(_render(capfd, "waves", "--effects", "fresnel"))
-    assert "wave_relative_rms" not in none
+    assert "wave_relative_rms" not in none and not Path("waves/wave.png").exists() and Path("ray-wave.png").exists()
+    design(capfd, "blob.png", *SMALL, "-o", "waves")  # the same again is no work, but what is missing is made
+    assert Path("waves/wave.png").exists()
 
 
 def _render(capfd, project, *options) -> str:
