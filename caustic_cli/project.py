@@ -41,7 +41,7 @@ class Project:
     """An opened project: its directory, complete settings, target picture and source profile.
 
     asked: digest of what its user gave (`reuse`); found: the checkpoint, where the same had been asked for before; hold: what
-    lets go of the directory when the design that works there is done.
+    lets go of the directory when the design that works there is done; without_waves: see `derive`.
     """
 
     path: Path
@@ -51,6 +51,7 @@ class Project:
     asked: str = ""
     found: Checkpoint | None = None
     hold: ExitStack = field(default_factory=ExitStack, repr=False)
+    without_waves: str = ""
 
     @classmethod
     def open(cls, path: str | Path) -> Project:

@@ -145,6 +145,41 @@ def test_auto_is_by_the_scene(extra, stages, _here, capfd, monkeypatch):
     assert not stages or [len(t["waves"]) for t in tables if t.get("waves")] == [WAVES["standard"][0]] * len(WAVES["standard"][1])
 
 
+OWN = "[[design.stages]]\ncontrol = [19, 19]\nrays = 4096\niterations = 1\n"
+
+
+@pytest.mark.parametrize(("extra", "reason"), [
+    ([], ""), (["--waves", "off"], ""), (["--resolution", "4"], ""), (["--source-angle", "3"], ""),
+    (["--network", "sparse"], "a network is trained on rays alone; --network none refines it"),
+    (["--optimizer", "adam"], "adam was asked for, and the wave image takes lbfgs; --waves on adds"),
+    (["--screen-tilt", "0,10"], "on a tilted screen it takes many transforms for each wavelength; --waves on"),
+    (["--quality", "fine"], "5 iterations on it would take longer than this quality's time; --waves on"),
+    (["--config", "own.toml", "--control", "19"], "none of the given [[design.stages]] has waves; one with waves = [550.0]"),
+])
+def test_what_is_said_before_a_design(extra, reason, _here, capfd, monkeypatch):
+    """One line on what light carries; one more where the wave image is left out although it matters, of why."""
+    from caustic_cli import session  # noqa: PLC0415
+
+    monkeypatch.setattr(session, "_run", lambda *args: {"lost": {}, "image": "", "reason": ""})
+    if "fine" in extra:
+        monkeypatch.setattr("caustic_cli.inverse.schedule.SECONDS_A_SAMPLE", 1.0)
+    Path("own.toml").write_text(OWN)
+    small = [a for a in SMALL if a != "--quiet" and not ("--resolution" in extra and a in ("--resolution", "32"))]
+    assert cli.run(["design", "blob.png", *small, *extra, "-o", "p"]) == 0
+    said = capfd.readouterr().err.splitlines()
+    carried = [k for k, line in enumerate(said) if line.startswith("light carries about")]
+    assert len(carried) == 1 and not any("blurs every point" in line for line in said)
+    after = [line for line in said if line.startswith("the wave image is not refined: ")]
+    assert after == said[carried[0] + 1 : carried[0] + 2] and reason in after[0] if reason else not after
+
+
+@pytest.mark.parametrize(("waves", "own", "words"), [("on", {}, "none of them has waves"), ("maybe", {}, "auto, on, off"),
+                                                     ("off", {"waves": [550.0]}, "one of them has waves")])
+def test_waves_and_own_stages_that_contradict_each_other(waves, own, words):
+    with pytest.raises(InputError, match=words):
+        derive.complete({"design": {"waves": waves, "stages": [{"rays": 100} | own]}}, 1.0)
+
+
 def test_time_bounds_the_stages():
     assert wave_refinement(1e6, 0) == [(5, n) for n in WAVES["standard"][1]]
     fewer = wave_refinement(1e7, 0)
