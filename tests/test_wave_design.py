@@ -12,7 +12,7 @@ import pytest
 import torch
 from PIL import Image
 
-from caustic_cli import cli, derive, verdict
+from caustic_cli import cli, contest, derive, verdict
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.schedule import LEAST_WAVES, WAVES, wave_refinement
 from caustic_cli.inverse.waves import WaveObjective
@@ -180,6 +180,18 @@ def test_waves_and_own_stages_that_contradict_each_other(waves, own, words):
         derive.complete({"design": {"waves": waves, "stages": [{"rays": 100} | own]}}, 1.0)
 
 
+@pytest.mark.parametrize("text", ["", "0", "nan", "1e9", "-5", "550,", "550:1:2", "550:0", "blue"])
+def test_wavelengths_that_are_none(text, _here, capfd):
+    message = design(capfd, "blob.png", *SMALL, "--wavelengths", text, code=2)
+    assert message.startswith("caustic: --wavelengths must ") and "\n" not in message and not Path("blob.caustic").exists()
+
+
+def test_a_design_on_waves_alone_has_no_rays_to_compare_others_on():
+    full = derive.complete({"lens": {"control": [9, 9]}, "design": {"stages": [{"waves": [550.0]}]}}, 1.0)
+    with pytest.raises(InputError, match="one stage on rays is needed"):
+        contest.plans(None, full)
+
+
 def test_time_bounds_the_stages():
     assert wave_refinement(1e6, 0) == [(5, n) for n in WAVES["standard"][1]]
     fewer = wave_refinement(1e7, 0)
@@ -210,6 +222,10 @@ def test_a_design_for_light(_here, capfd):
     assert cli.run(["render", "waves", "--rays", "4000", "--quiet", "--npy", "ray.npy", "-o", "ray.png"]) == 0
     light = np.load("ray-wave.npy")
     assert light.sum() == pytest.approx(again["wave_on_screen"], abs=1e-6) and Path("ray-wave.png").exists()
+    assert cli.run(["export", "waves", "--format", "lighttools", "-o", "lens.npz", "--quiet"]) == 0
+    capfd.readouterr()
+    assert cli.run(["render", "lens.npz", "--rays", "4000", "--effects", "diffraction"]) == 0
+    assert "of light as a wave     on the screen 99" in capfd.readouterr().err and Path("lens-wave.png").exists()
     none = json.loads(_render(capfd, "waves", "--effects", "fresnel"))
     assert "wave_relative_rms" not in none and not Path("waves/wave.png").exists() and Path("ray-wave.png").exists()
     design(capfd, "blob.png", *SMALL, "-o", "waves")  # the same again is no work, but what is missing is made
