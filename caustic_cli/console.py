@@ -143,8 +143,10 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
     if "no_wave_image" in figures:
         waves = [("of light as a wave", f"no image: {figures['no_wave_image']}")]
     elif "wave_relative_rms" in figures:
-        waves = [("of light as a wave", f"relative RMS error {number('wave_relative_rms', '.4f')}, on the picture"
-                                        f" {number('wave_on_target', '.2%')}, {_wavelengths(figures['wave_wavelengths'])}"),
+        seen = f"relative RMS error {number('wave_relative_rms', '.4f')}, on the picture {number('wave_on_target', '.2%')}"
+        if figures["wave_relative_rms"] is None:  # an archive has no picture to be like
+            seen = f"on the screen {number('wave_on_screen', '.2%')}"
+        waves = [("of light as a wave", f"{seen}, {_wavelengths(figures['wave_wavelengths'])}"),
                  ("details light carries", number("resolvable", "d") + " across")]
     return [
         ("relative RMS error", number("relative_rms", ".4f")),

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from caustic_cli import settings
 from caustic_cli.derive import NETWORK_CONTROL, Settings, build_options, build_stages, complete
+from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Designer, Options, State
 from caustic_cli.inverse.first import first_surface
 from caustic_cli.inverse.objective import Objective
@@ -151,9 +152,12 @@ def plans(scene: Scene, full: Settings, dtype: torch.dtype | None = None,
     filter, apron and loss are those of the last stage on rays.
 
     Raises:
-        InputError: a setting is out of range.
+        InputError: a setting is out of range, or no stage is on rays.
     """
-    last, options = [s for s in build_stages(full) if not s.waves][-1], build_options(full)
+    on_rays, options = [s for s in build_stages(full) if not s.waves], build_options(full)
+    if not on_rays:
+        raise InputError("[[design.stages]] all have waves; designs are compared on rays, so one stage on rays is needed")
+    last = on_rays[-1]
     options = replace(options, dtype=dtype or options.dtype, seed=options.seed if seed is None else seed)
     last = replace(last, blur=0.0, iterations=ENDLESS, tolerance=0.0, source=None)
     lens = scene.lens

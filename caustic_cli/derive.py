@@ -15,6 +15,7 @@ from caustic_cli.inverse.designer import Options
 from caustic_cli.inverse.schedule import (
     LEAST_RAYS,
     LEAST_SPANS,
+    LEAST_WAVES,
     Stage,
     coarse_to_fine,
     refinement,
@@ -143,6 +144,7 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
     lens, screen, design, given = s["lens"], s["screen"], s["design"], quality
     degree = tuple(checks.whole("[lens] degree", p, 1, 15) for p in lens["degree"])
     plain = design["network"] == "none" and design["optimizer"] == "lbfgs"
+    asked = checks.choice("[design] waves", design["waves"], ("auto", "on", "off"))
     held = "control" not in lens or min(n - p for n, p in zip(lens["control"], degree, strict=True)) >= LEAST_SPANS
     design.setdefault("start", "transport" if plain and held and not source.apart else "offset")
     if design["start"] == "transport" and design["network"] != "none":
@@ -160,6 +162,9 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
             raise InputError("--quality and --rays shape the default stages, but the configuration brings [[design.stages]]"
                              " of its own: change them there")
         design["stages"] = [_complete_stage(stage, s, _sampler(source)) for stage in design["stages"]]
+        if asked != "auto" and any(stage.get("waves") for stage in design["stages"]) != (asked == "on"):
+            raise InputError(f"[design] waves {asked} and the given [[design.stages]] contradict each other: "
+                             + ("none of them has waves, such as waves = [550.0]" if asked == "on" else "one of them has waves"))
         return
     nx, ny = screen["resolution"]
     sampler, base = _sampler(source), min(4_000_000, max(40_000, int(RAYS_PER_PIXEL * nx * ny)))
@@ -170,20 +175,44 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
     else:
         stages = [Stage(tuple(lens["control"]), rays or base, sampler, apron=math.ceil(0.04 * max(nx, ny)),
                         iterations=SINGLE_STAGE_ITERATIONS, tolerance=2e-3 if plain else 0.0)]
-    stages += _wave_stages(s, source, quality, plain, lit)
+    stages += _wave_stages(s, source, quality, lit)
     design["stages"] = [_stage_table(stage) for stage in stages]
     if design["loss"].strip() == "rms":  # eq. 5.2.1 knows the screen alone
         for table in design["stages"]:
             table["apron"] = 0
 
 
-def _wave_stages(s: Settings, source: Source, quality: str, plain: bool, lit: tuple[float, float]) -> list[Stage]:
+def without_waves(s: Settings, given: bool) -> str:
+    """Why `waves = "auto"` leaves the wave image out of complete settings although diffraction matters, and what puts it in.
+
+    given: whether the stages are the user's own.
+    """
+    design = s["design"]
+    if any(stage.get("waves") for stage in design["stages"]):
+        return ""
+    if given:
+        return "none of the given [[design.stages]] has waves; one with waves = [550.0] refines it at that wavelength"
+    return _not_by_default(s) or f"{LEAST_WAVES} iterations on it would take longer than this quality's time; --waves on takes it"
+
+
+def _not_by_default(s: Settings) -> str:
+    """What `waves = "auto"` does not refine the wave image with, however long that takes, and what puts it in."""
+    design = s["design"]
+    if design["network"] != "none":
+        return "a network is trained on rays alone; --network none refines it"
+    if design["optimizer"] != "lbfgs":
+        return f"{design['optimizer']} was asked for, and the wave image takes lbfgs; --waves on adds stages that use it"
+    if any(s["screen"].get("tilt", ())):
+        return "on a tilted screen it takes many transforms for each wavelength; --waves on refines it all the same"
+    return ""
+
+
+def _wave_stages(s: Settings, source: Source, quality: str, lit: tuple[float, float]) -> list[Stage]:
     """What refines the wave image after the ray image, where that is asked for or called for."""
-    design, lens, screen = s["design"], s["lens"], s["screen"]
-    asked = checks.choice("[design] waves", design["waves"], ("auto", "on", "off"))
+    design, lens, screen, asked = s["design"], s["lens"], s["screen"], s["design"]["waves"]
     if asked == "on" and design["network"] != "none":
         raise InputError("[design] waves on needs network none: the wave image refines the heights themselves")
-    if asked == "off" or (asked == "auto" and (not plain or any(screen.get("tilt", ())))):
+    if asked == "off" or (asked == "auto" and _not_by_default(s)):
         return []
     seen = Resolution.before(Scene(source, build_lens(s), build_screen(s), build_light(s)), tuple(s["target"]["size"]))
     if asked == "auto" and not seen.matters:

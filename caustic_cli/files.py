@@ -86,6 +86,12 @@ def is_ours(path: str | Path) -> bool:
     return b'"created_by": "' + MARK in head + tail or CREATED_BY.encode() + b" " in head
 
 
+def discard(path: Path) -> None:
+    """Remove a file that is out of date, if this program made it."""
+    if path.is_file() and is_ours(path):
+        path.unlink()
+
+
 def refuse_foreign(path: str | Path, force: bool = False) -> None:
     """Stop before work begins when `path` cannot be written, or holds something this program did not make.
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from caustic_cli.errors import InputError
 from caustic_cli.files import LEFT_BEHIND, is_ours
-from caustic_cli.project import CHECKPOINT, RENDER, REPORT, Project, is_project
+from caustic_cli.project import MADE, Project, is_project
 
 try:
     import fcntl
@@ -64,7 +64,7 @@ def settle(project: Project, force: bool) -> None:
     try:
         if path.exists():
             project.hold.enter_context(held(path))
-            for name in (CHECKPOINT, RENDER, REPORT):
+            for name in MADE:
                 (path / name).unlink(missing_ok=True)
             project.write(path)
             return

@@ -1,6 +1,6 @@
 """A project directory: the scene and the design in text, the lens in a checkpoint, pictures beside them.
 
-    NAME.caustic/  project.toml  checkpoints.h5  target.png (or target.npy)  render.png  report.png
+    NAME.caustic/  project.toml  checkpoints.h5  target.png (or target.npy)  render.png  wave.png  report.png
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.picture import Picture, read_picture
 from caustic_cli.scene import Scene, sources
 
-TOML, CHECKPOINT, RENDER, REPORT = "project.toml", "checkpoints.h5", "render.png", "report.png"
+TOML, CHECKPOINT, RENDER, WAVE, REPORT = "project.toml", "checkpoints.h5", "render.png", "wave.png", "report.png"
+#: What a design makes beside its inputs; WAVE only where diffraction is simulated.
+MADE = (CHECKPOINT, RENDER, WAVE, REPORT)
 
 
 def is_project(path: Path) -> bool:
@@ -29,12 +31,17 @@ def is_project(path: Path) -> bool:
     return (path / TOML).is_file()
 
 
+def beside(path: Path) -> Path:
+    """Where the wave image belongs beside a ray image or its numbers: render.png -> wave.png, NAME.png -> NAME-wave.png."""
+    return path.with_stem(Path(WAVE).stem if path.stem == Path(RENDER).stem else f"{path.stem}-wave")
+
+
 @dataclass(frozen=True, eq=False)
 class Project:
     """An opened project: its directory, complete settings, target picture and source profile.
 
     asked: digest of what its user gave (`reuse`); found: the checkpoint, where the same had been asked for before; hold: what
-    lets go of the directory when the design that works there is done.
+    lets go of the directory when the design that works there is done; without_waves: see `derive`.
     """
 
     path: Path
@@ -44,6 +51,7 @@ class Project:
     asked: str = ""
     found: Checkpoint | None = None
     hold: ExitStack = field(default_factory=ExitStack, repr=False)
+    without_waves: str = ""
 
     @classmethod
     def open(cls, path: str | Path) -> Project:
@@ -139,6 +147,6 @@ class Project:
 
 
 def _picture(directory: Path, name: str, linear: bool, color: bool = False) -> Picture:
-    if name != Path(name).name or name in ("", ".", "..", TOML, CHECKPOINT, RENDER, REPORT):
+    if name != Path(name).name or name in ("", ".", "..", TOML, *MADE):
         raise InputError(f"a picture's file must be the name of one within the project directory, got {name!r}")
     return read_picture(directory / name, linear, color)

@@ -21,7 +21,7 @@ from caustic_cli.derive import Settings
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.files import write_bytes
 from caustic_cli.picture import Picture
-from caustic_cli.project import CHECKPOINT, RENDER, REPORT, Project, is_project
+from caustic_cli.project import CHECKPOINT, MADE, RENDER, WAVE, Project, is_project
 
 RECORD = ".outputs.json"
 #: Options that say where and how loudly, not what.
@@ -65,7 +65,8 @@ def same_design(path: Path, asked: str) -> tuple[Project, Checkpoint] | None:
 
 def finished(project: Project, checkpoint: Checkpoint) -> dict | None:
     """The figures of a finished design whose files are all there, which are touched; None if something is left to do."""
-    files = [project.path / name for name in (CHECKPOINT, RENDER, REPORT)]
+    waves = checkpoint.results.get("wave_relative_rms") is not None
+    files = [project.path / name for name in MADE if name != WAVE or waves]
     if not checkpoint.results or not all(p.exists() for p in files):
         return None
     _touch(files)

@@ -19,7 +19,7 @@ import torch
 from caustic_cli import __version__, place, reuse, settings
 from caustic_cli.checkpoint import Checkpoint
 from caustic_cli.console import Reporter
-from caustic_cli.derive import build_options, build_stages, complete
+from caustic_cli.derive import build_options, build_stages, complete, without_waves
 from caustic_cli.errors import CausticError, InputError, Interrupted
 from caustic_cli.inverse import ranks
 from caustic_cli.inverse.designer import Designer, State
@@ -82,7 +82,8 @@ def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: d
         full["target"] |= {"file": f"target{picture.suffix}", "encoding": picture.encoding}
         if light is not None:
             full["source"]["profile"] = f"profile{light.suffix}"
-        project = Project(path, full, picture, light, asked=reuse.digest(full, picture, light))
+        project = Project(path, full, picture, light, reuse.digest(full, picture, light),
+                          without_waves=without_waves(full, "stages" in said.get("design", {})))
         if not force and (same := reuse.same_design(path, project.asked)):
             return replace(same[0], found=same[1]), None
         place.check(path, force)  # before the transport, which may take a minute
@@ -127,18 +128,10 @@ def design(project: Project, first: torch.Tensor | None, device: str, say: Repor
 
 def _say_resolution(project: Project, designer: Designer, say: Reporter) -> None:
     """What no lens can do about diffraction and an extended source, before time is spent on it."""
-    scene = designer.scene
-    seen = Resolution.before(scene, tuple(project.settings["target"]["size"]))
-    if seen.matters or seen.source > 0:
-        say.say(seen.sentence())
-    waves = project.settings["design"]["waves"]
-    if seen.matters and waves == "auto" and not any(s.waves for s in designer.stages):
-        say.say("rays alone are refined: the wave image would take longer than this quality allows, or is not asked for by default"
-                " here; --waves on refines it")
-    blur, pixel = scene.source.blur(scene.lens.z_in, abs(scene.screen.z - scene.lens.z_in)), max(scene.screen.pixel)
-    if blur > 0:
-        finer = f"; the picture's detail below that, {blur / pixel:.3g} pixels, is out of reach" if blur > pixel else ""
-        say.say(f"the source's own size blurs every point over {blur:.3g} mm on the screen{finer}")
+    seen = Resolution.before(designer.scene, tuple(project.settings["target"]["size"]))
+    say.say(seen.sentence())
+    if seen.matters and project.settings["design"]["waves"] == "auto" and project.without_waves:
+        say.say(f"the wave image is not refined: {project.without_waves}")
 
 
 def _listed(wavelengths: tuple[float, ...]) -> str:

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from caustic_cli.files import discard
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.losses import parse
 from caustic_cli.inverse.target import grey
@@ -18,10 +19,10 @@ from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.waves import WaveImage
 from caustic_cli.picture import write_image
-from caustic_cli.project import RENDER, REPORT, Project
+from caustic_cli.project import RENDER, REPORT, WAVE, Project
 from caustic_cli.studies.panels import write_report
 from caustic_cli.studies.retrace import FINAL_RAYS, retrace, white_level
-from caustic_cli.studies.waves import FINER, beside, unseen_figures, wave_figures
+from caustic_cli.studies.waves import FINER, unseen_figures, wave_figures
 
 #: Points along each side of the aperture at which the report draws the surface.
 REPORT_SAMPLES = 401
@@ -73,10 +74,11 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
         figures |= unseen_figures(scene, field, state.heights.to(device), target)
     image, encoding = exposure.image.cpu().numpy(), project.settings["target"]["encoding"]
     write_image(project.path / RENDER, image, white_level(image, target), encoding)
+    discard(project.path / WAVE)  # of another lens
     of_light = None
     if light is not None:
         of_light = light.image.cpu().numpy()
-        write_image(beside(project.path / RENDER), of_light, white_level(of_light, target), encoding)
+        write_image(project.path / WAVE, of_light, white_level(of_light, target), encoding)
     history = np.array(state.history, dtype=float).reshape(-1, 5)
     write_report(project.path / REPORT, grey(target), grey(image), _surface(field, state.heights), history, scene.lens,
                  scene.screen, figures, encoding, None if of_light is None else grey(of_light))

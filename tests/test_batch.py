@@ -101,6 +101,29 @@ def test_an_unfinished_design_goes_on_when_it_is_asked_for_again(capfd, monkeypa
     assert "nothing to do" in run(DESIGN, capfd).err
 
 
+@pytest.mark.parametrize("command", [DESIGN, ["render", "blob.caustic", "--rays", "3000"]], ids=["design", "render"])
+def test_no_wave_image_of_another_lens_stands_beside_a_new_image(capfd, command):
+    run([*DESIGN, "--quiet"], capfd)
+    wave, mine, aside = (Path("blob.caustic") / name for name in ("wave.png", "mine-wave.png", "aside.png"))
+    for path in (wave, mine):
+        shutil.copy("blob.caustic/render.png", path)
+    run(["render", "blob.caustic", "--rays", "3000", "-o", aside, "--effects", "fresnel"], capfd)
+    assert wave.exists()  # render.png is as it was
+    Path("blob.caustic/render.png").unlink()
+    run(command, capfd)
+    assert not wave.exists() and mine.exists()
+
+
+def test_a_picture_that_is_not_ours_is_never_removed(capfd):
+    run([*DESIGN, "--quiet"], capfd)
+    wave = Path("blob.caustic/wave.png")
+    shutil.copy("blob.png", wave)
+    render = ["render", "blob.caustic", "--rays", "3000", "--effects", "fresnel"]
+    assert "was not made by caustic" in run(render, capfd, 2).err
+    run([*render, "--force"], capfd)
+    assert wave.read_bytes() == Path("blob.png").read_bytes()
+
+
 def test_a_start_from_another_lens_is_an_input(capfd):
     run([*DESIGN, "--quiet"], capfd)
     second = [*DESIGN[:8], "--start", "blob.caustic", "--iterations", "1", "-o", "second.caustic", "--threads", "1"]

@@ -55,6 +55,8 @@ def test_explain_and_effects(capfd, tmp_path):
     assert {k for k, row in rows.items() if row["on"]} == {"fresnel", "diffraction"}
     for row in rows.values():
         assert set(row) == {"name", "on", "why", "bound", "limit", "cost_ms", "cost_ms_range", "error", "power"} and row["why"]
+    least, most = rows["diffraction"]["cost_ms_range"]
+    assert 0 < least == rows["diffraction"]["cost_ms"] < most
     assert rows["fresnel"]["power"] == pytest.approx(plain["lost"]["fresnel"], rel=0.02)
     for name in ("entrance", "intersection", "polarisation", "second-meeting", "total-reflection"):
         assert rows[name]["error"] < 1e-12, name
@@ -205,6 +207,18 @@ def test_the_study_of_effects(capfd, tmp_path):
         assert rows[name]["amount"] != "the scene's own" and rows[name]["error"] + abs(rows[name]["power"]) > 1e-7, name
     assert rows["entrance"]["error"] < 1e-12
     assert {p.suffix for p in (tmp_path / "out").iterdir()} == {".csv", ".json", ".png"}
+
+
+def test_rounds_of_a_wave_image(monkeypatch):
+    """As many as are asked for, and their least and most."""
+    times = iter([0.0, 3.0, 10.0, 12.0, 20.0, 27.0])
+    monkeypatch.setattr(study.time, "process_time", lambda: next(times))
+    scene = Scene(PlaneWave(), Lens((1.0, 1.0), control=(6, 6), offset=Offset(1.0)), Screen((2.0, 2.0), 30.0, (8, 8)),
+                  Light(wavelengths=(550.0,)))
+    field = HeightField.of(scene.lens)
+    heights = torch.full(field.shape, 1.0, dtype=torch.float64)
+    found = study.measure_waves(study.compile_plan(scene, field, heights), field, heights, rays=1000, repeats=3)
+    assert [found[k] for k in ("seconds", "seconds_min", "seconds_max", "whole")] == [2.0, 2.0, 7.0, 2.0] and found["error"] > 0
 
 
 @pytest.mark.parametrize(("changes", "message"), [

@@ -3,6 +3,8 @@
 import json
 import re
 import shutil
+from dataclasses import replace
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -10,13 +12,13 @@ import pytest
 import torch
 from PIL import Image
 
-from caustic_cli import checkpoint, cli, session, verdict
+from caustic_cli import checkpoint, cli, place, reuse, session, verdict
 from caustic_cli.checkpoint import Checkpoint
 from caustic_cli.console import Reporter
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import State
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.project import Project
+from caustic_cli.project import MADE, Project, beside
 
 CONFIG = """
 [lens]
@@ -233,6 +235,7 @@ def test_editing_the_resolution_keeps_the_light(copy, capfd):
     (r"^size = \[10\.0, 10\.0\]", "size = [-1, 10]", ["[lens] size"]),
     (r"^file = .*$", "file = '../target.npy'", ["file"]),
     (r"^file = .*$", "file = 'none.png'", ["none.png"]),
+    (r"^file = .*$", "file = 'wave.png'", ["'wave.png'"]),
     (r"^type = .*$", "type = 'sun'", ["[source] type", "plane"]),
     (r"^flip = .*$", "flip = 'q'", ["[target] flip"]),
     (r"^encoding = .*$", "encoding = 'moon'", ["[target] encoding"]),
@@ -266,6 +269,32 @@ def test_an_output_never_replaces_what_the_project_is_made_of(copy, capfd, name)
     before = (copy / name).read_bytes()
     refusal(["render", copy, "--rays", "1000", "-o", copy / name], capfd)
     assert (copy / name).read_bytes() == before
+
+
+# the wave image beside the ray image
+
+
+@pytest.mark.parametrize(("ray", "wave"), [("p/render.png", "p/wave.png"), ("render.npy", "wave.npy"), ("a.b.png", "a.b-wave.png")])
+def test_where_a_wave_image_belongs(ray, wave):
+    assert beside(Path(ray)) == Path(wave)
+
+
+def test_a_new_design_leaves_nothing_of_the_one_before(copy):
+    for name in MADE:
+        (copy / name).write_bytes(b"of before")
+    (copy / "notes.txt").write_text("mine")
+    place.settle(Project.open(copy), True)
+    assert sorted(p.name for p in copy.iterdir()) == ["notes.txt", "project.toml", "target.npy"]
+
+
+@pytest.mark.parametrize("results", [{"loss": 1.0}, {"loss": 1.0, "wave_relative_rms": None}, {"wave_relative_rms": 0.1}])
+def test_finished_where_every_image_stands_that_was_made(copy, results):
+    project = Project.open(copy)
+    state = replace(project.load(), results=results)
+    (copy / "report.png").touch()
+    assert (reuse.finished(project, state) is None) == (results.get("wave_relative_rms") is not None)
+    (copy / "wave.png").touch()
+    assert reuse.finished(project, state)["project"] == str(copy)
 
 
 # the source's profile

@@ -12,7 +12,7 @@ import pytest
 import torch
 from PIL import Image
 
-from caustic_cli import cli, derive, verdict
+from caustic_cli import cli, contest, derive, verdict
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.schedule import LEAST_WAVES, WAVES, wave_refinement
 from caustic_cli.inverse.waves import WaveObjective
@@ -145,6 +145,53 @@ def test_auto_is_by_the_scene(extra, stages, _here, capfd, monkeypatch):
     assert not stages or [len(t["waves"]) for t in tables if t.get("waves")] == [WAVES["standard"][0]] * len(WAVES["standard"][1])
 
 
+OWN = "[[design.stages]]\ncontrol = [19, 19]\nrays = 4096\niterations = 1\n"
+
+
+@pytest.mark.parametrize(("extra", "reason"), [
+    ([], ""), (["--waves", "off"], ""), (["--resolution", "4"], ""), (["--source-angle", "3"], ""),
+    (["--network", "sparse"], "a network is trained on rays alone; --network none refines it"),
+    (["--optimizer", "adam"], "adam was asked for, and the wave image takes lbfgs; --waves on adds"),
+    (["--screen-tilt", "0,10"], "on a tilted screen it takes many transforms for each wavelength; --waves on"),
+    (["--quality", "fine"], "5 iterations on it would take longer than this quality's time; --waves on"),
+    (["--config", "own.toml", "--control", "19"], "none of the given [[design.stages]] has waves; one with waves = [550.0]"),
+])
+def test_what_is_said_before_a_design(extra, reason, _here, capfd, monkeypatch):
+    """One line on what light carries; one more where the wave image is left out although it matters, of why."""
+    from caustic_cli import session  # noqa: PLC0415
+
+    monkeypatch.setattr(session, "_run", lambda *args: {"lost": {}, "image": "", "reason": ""})
+    if "fine" in extra:
+        monkeypatch.setattr("caustic_cli.inverse.schedule.SECONDS_A_SAMPLE", 1.0)
+    Path("own.toml").write_text(OWN)
+    small = [a for a in SMALL if a != "--quiet" and not ("--resolution" in extra and a in ("--resolution", "32"))]
+    assert cli.run(["design", "blob.png", *small, *extra, "-o", "p"]) == 0
+    said = capfd.readouterr().err.splitlines()
+    carried = [k for k, line in enumerate(said) if line.startswith("light carries about")]
+    assert len(carried) == 1 and not any("blurs every point" in line for line in said)
+    after = [line for line in said if line.startswith("the wave image is not refined: ")]
+    assert after == said[carried[0] + 1 : carried[0] + 2] and reason in after[0] if reason else not after
+
+
+@pytest.mark.parametrize(("waves", "own", "words"), [("on", {}, "none of them has waves"), ("maybe", {}, "auto, on, off"),
+                                                     ("off", {"waves": [550.0]}, "one of them has waves")])
+def test_waves_and_own_stages_that_contradict_each_other(waves, own, words):
+    with pytest.raises(InputError, match=words):
+        derive.complete({"design": {"waves": waves, "stages": [{"rays": 100} | own]}}, 1.0)
+
+
+@pytest.mark.parametrize("text", ["", "0", "nan", "1e9", "-5", "550,", "550:1:2", "550:0", "blue"])
+def test_wavelengths_that_are_none(text, _here, capfd):
+    message = design(capfd, "blob.png", *SMALL, "--wavelengths", text, code=2)
+    assert message.startswith("caustic: --wavelengths must ") and "\n" not in message and not Path("blob.caustic").exists()
+
+
+def test_a_design_on_waves_alone_has_no_rays_to_compare_others_on():
+    full = derive.complete({"lens": {"control": [9, 9]}, "design": {"stages": [{"waves": [550.0]}]}}, 1.0)
+    with pytest.raises(InputError, match="one stage on rays is needed"):
+        contest.plans(None, full)
+
+
 def test_time_bounds_the_stages():
     assert wave_refinement(1e6, 0) == [(5, n) for n in WAVES["standard"][1]]
     fewer = wave_refinement(1e7, 0)
@@ -175,8 +222,14 @@ def test_a_design_for_light(_here, capfd):
     assert cli.run(["render", "waves", "--rays", "4000", "--quiet", "--npy", "ray.npy", "-o", "ray.png"]) == 0
     light = np.load("ray-wave.npy")
     assert light.sum() == pytest.approx(again["wave_on_screen"], abs=1e-6) and Path("ray-wave.png").exists()
+    assert cli.run(["export", "waves", "--format", "lighttools", "-o", "lens.npz", "--quiet"]) == 0
+    capfd.readouterr()
+    assert cli.run(["render", "lens.npz", "--rays", "4000", "--effects", "diffraction"]) == 0
+    assert "of light as a wave     on the screen 99" in capfd.readouterr().err and Path("lens-wave.png").exists()
     none = json.loads(_render(capfd, "waves", "--effects", "fresnel"))
-    assert "wave_relative_rms" not in none
+    assert "wave_relative_rms" not in none and not Path("waves/wave.png").exists() and Path("ray-wave.png").exists()
+    design(capfd, "blob.png", *SMALL, "-o", "waves")  # the same again is no work, but what is missing is made
+    assert Path("waves/wave.png").exists()
 
 
 def _render(capfd, project, *options) -> str:

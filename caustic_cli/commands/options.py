@@ -55,7 +55,8 @@ ScreenShift = Annotated[str | None, typer.Option(metavar="X,Y", help="Move the s
 def physics(polarisation: float | None, wavelengths: str | None, absorption: float | None, roughness: float | None,
             tilt: str | None, shift: str | None) -> dict[tuple[str, str, str], object]:
     """The options of effects as (section, key, option) -> value, without those that were not given."""
-    lines = [numbers("--wavelengths", part, (1, 2), ":") for part in wavelengths.split(",")] if wavelengths else None
+    form = "wavelengths in nm, each with a weight or without, like 450:2,550"
+    lines = None if wavelengths is None else [numbers("--wavelengths", p, (1, 2), ":", form) for p in wavelengths.split(",")]
     given = {
         ("source", "polarisation", "--polarisation"): polarisation,
         ("source", "wavelengths", "--wavelengths"): lines and [line[0] for line in lines],
@@ -83,8 +84,8 @@ def source(kind: str | None, position: list[str] | None, size_: str | None, grid
     return {key: value for key, value in given.items() if value is not None}
 
 
-def numbers(option: str, text: str, count: tuple[int, ...], separator: str = r"[xX×]") -> tuple[float, ...]:
-    """Numbers parted by x ("10x8") or by what `separator` matches.
+def numbers(option: str, text: str, count: tuple[int, ...], separator: str = r"[xX×]", form: str = "") -> tuple[float, ...]:
+    """Numbers parted by x ("10x8") or by what `separator` matches; `form` says what would be accepted.
 
     Raises:
         InputError: naming the option.
@@ -95,7 +96,7 @@ def numbers(option: str, text: str, count: tuple[int, ...], separator: str = r"[
     except ValueError:
         values = ()
     if len(values) not in count or not all(math.isfinite(v) for v in values):
-        form = "a number or two like 10x8" if separator.startswith("[x") else f"{max(count)} numbers parted by commas"
+        form = form or "a number or two like 10x8" if separator.startswith("[x") else f"{max(count)} numbers parted by commas"
         raise InputError(f"{option} must be {form}, got {text!r}")
     return values
 

@@ -88,14 +88,14 @@ def run(
     device = options.start_torch(device, threads, say)
 
     from caustic_cli.derive import filter_from  # noqa: PLC0415
-    from caustic_cli.files import refuse_foreign  # noqa: PLC0415
+    from caustic_cli.files import discard, refuse_foreign  # noqa: PLC0415
     from caustic_cli.optics.plan import compile_plan, parse_effects  # noqa: PLC0415
     from caustic_cli.optics.resolution import Resolution  # noqa: PLC0415
     from caustic_cli.picture import write_image, write_npy  # noqa: PLC0415
-    from caustic_cli.project import RENDER, Project  # noqa: PLC0415
+    from caustic_cli.project import RENDER, WAVE, Project, beside  # noqa: PLC0415
     from caustic_cli.reuse import Outputs  # noqa: PLC0415
     from caustic_cli.studies.retrace import retrace, white_level  # noqa: PLC0415
-    from caustic_cli.studies.waves import beside, wave_figures  # noqa: PLC0415
+    from caustic_cli.studies.waves import wave_figures  # noqa: PLC0415
 
     wanted = parse_effects(effects)
     opened = archive = None
@@ -149,6 +149,8 @@ def run(
         raise InputError(str(error).replace("[screen] z", "--screen-at") if screen_at is not None else str(error)) from error
     image = exposure.image.cpu().numpy()
     write_image(image_path, image, white_level(image, target), encoding)
+    if of_waves[0] == project / WAVE:
+        discard(of_waves[0])  # of what render.png was before
     if npy is not None:
         write_npy(npy, image)
     if plan["diffraction"].on:

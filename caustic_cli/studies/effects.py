@@ -32,8 +32,8 @@ from caustic_cli.scene import Scene, checks
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.report import COLOURS, MARKERS, Study
 
-#: Rays of every image, and rounds, unless said: a few seconds for each effect on two cores.
-RAYS, REPEATS = 1 << 16, 5
+#: Rays of every image, and rounds, unless said: a few seconds for each effect on two cores.  A wave image alone takes seconds.
+RAYS, REPEATS, WAVE_REPEATS = 1 << 16, 5, 2
 BY_NAME = {effect.name: effect for effect in EFFECTS}
 #: Whether an effect costs nothing that could be saved.
 FREE = {effect.name: effect.free for effect in EFFECTS}
@@ -58,21 +58,28 @@ COLUMNS = {
 }
 
 
-def measure_waves(plan: Plan, field: HeightField, heights: Tensor, *, rays: int = RAYS, repeats: int = 1, seed: int = 0) -> dict:
-    """The same of what is seen in the wave image alone: its time, and how the ray image without it differs from it."""
-    times, light = [], None
-    for _ in range(max(1, min(repeats, 2))):
-        began = time.process_time()
+def measure_waves(plan: Plan, field: HeightField, heights: Tensor, *, rays: int = RAYS, repeats: int = WAVE_REPEATS,
+                  seed: int = 0) -> dict:
+    """The same of what is seen in the wave image alone: the rounds' times of it, for without it nothing is done, and how the ray
+    image differs from it."""
+    times, light, clock = [], None, _clock(heights)
+    for _ in range(repeats):
+        began = clock()
         try:
             light = wave_image(plan.scene, field, heights.detach()).image.cpu()
         except NoWaveImage:  # nothing to compare with
             return {"error": None, "power": None} | dict.fromkeys(("seconds", "seconds_min", "seconds_max", "whole"), 0.0)
-        times.append(time.process_time() - began)
+        times.append(clock() - began)
     sampler = rays_of(plan.scene, "stratified", max(rays, RAYS_A_PIXEL * light.numel()), stream(seed, "effects"), heights.device)
     drawn = expose(plan.scene, field, heights, sampler, requests=plan.requests).image.cpu()
     drawn, light = drawn.flatten(0, -2), light.flatten(0, -2)
     return {"error": relative_rms(drawn, light), "power": float(drawn.sum() - light.sum()), "seconds": min(times),
             "seconds_min": min(times), "seconds_max": max(times), "whole": min(times)}
+
+
+def _clock(heights: Tensor) -> Callable[[], float]:
+    """Processor time of all threads; wall time where a GPU works."""
+    return time.perf_counter if heights.is_cuda else time.process_time
 
 
 def measure(with_: Plan, without: Plan, field: HeightField, heights: Tensor, *, rays: int = RAYS, repeats: int = REPEATS,
@@ -84,7 +91,7 @@ def measure(with_: Plan, without: Plan, field: HeightField, heights: Tensor, *, 
     if is_lowered(with_.scene, field, with_.requests) and not is_lowered(without.scene, field, without.requests):
         with_ = replace(with_, requests=with_.requests | Requests(stages=True))
 
-    clock = time.perf_counter if heights.is_cuda else time.process_time
+    clock = _clock(heights)
 
     def image(plan: Plan) -> tuple[Image, float]:
         began = clock()
@@ -102,7 +109,7 @@ def measure(with_: Plan, without: Plan, field: HeightField, heights: Tensor, *, 
 
 
 def explain(plan: Plan, scene: Scene, field: HeightField, heights: Tensor, *, rays: int = RAYS, seed: int = 0,
-            dtype: torch.dtype = torch.float64, repeats: int = REPEATS) -> list[dict]:
+            dtype: torch.dtype = torch.float64) -> list[dict]:
     """A row for each effect of a plan of `scene`: name, on, why, bound, limit, cost_ms, cost_ms_range, error, power.
 
     error and power are those of leaving it out.  cost_ms of an effect that is off is what it would cost; cost_ms_range are the
@@ -118,8 +125,8 @@ def explain(plan: Plan, scene: Scene, field: HeightField, heights: Tensor, *, ra
         else:
             with_, without = (compile_plan(scene, field, heights, chosen)
                               for chosen in (set(plan.simulated) | {effect.name}, set(plan.simulated) - {effect.name}))
-            found = measure_waves(with_, field, heights, rays=rays, repeats=repeats, seed=seed) if WAVES[effect.name] else \
-                measure(with_, without, field, heights, rays=rays, repeats=repeats, seed=seed, dtype=dtype)
+            found = measure_waves(with_, field, heights, rays=rays, seed=seed) if WAVES[effect.name] else \
+                measure(with_, without, field, heights, rays=rays, repeats=REPEATS, seed=seed, dtype=dtype)
             scale = 0.0 if FREE[effect.name] else 1e3
             cost, *extremes = (scale * found[k] for k in ("seconds", "seconds_min", "seconds_max"))
             row |= {"cost_ms": cost, "cost_ms_range": extremes, "error": found["error"], "power": found["power"]}
@@ -154,11 +161,11 @@ def run_effects(scene: Scene, field: HeightField, heights: Tensor, *, rays: int 
         InputError: numbers out of range.
     """
     rays = checks.whole("--rays", RAYS if rays is None else rays, 256, 1 << 32)
-    repeats = checks.whole("--repeats", REPEATS if repeats is None else repeats, 1, 1000)
+    rounds = [checks.whole("--repeats", usual if repeats is None else repeats, 1, 1000) for usual in (REPEATS, WAVE_REPEATS)]
     heights = heights.detach().double()
     plan, rows = compile_plan(scene, field, heights), []
     for k, effect in enumerate(plan.effects):
-        found = _row(effect, plan, scene, field, heights, rays, repeats, seed, dtype or torch.float64)
+        found = _row(effect, plan, scene, field, heights, rays, rounds[WAVES[effect.name]], seed, dtype or torch.float64)
         if found is not None:
             rows.append(found)
         if progress is not None:
@@ -168,8 +175,8 @@ def run_effects(scene: Scene, field: HeightField, heights: Tensor, *, rays: int 
         "this scene calls for no effect"
     unfounded = max((_matters(r) for r in rows if not r["on"] and r["amount"] == "the scene's own"), default=0.0)
     advice += f"; what auto leaves out of it changes image or power by at most {unfounded:.2g}"
-    about = {"version": __version__, "seed": seed, "repeats": repeats, "rays": rays, "device": str(heights.device),
-             "reference_error": 0.0, "threads": torch.get_num_threads(),
+    about = {"version": __version__, "seed": seed, "repeats": rounds[0], "wave_repeats": rounds[1], "rays": rays,
+             "device": str(heights.device), "reference_error": 0.0, "threads": torch.get_num_threads(),
              "dtype": str(dtype or torch.float64).removeprefix("torch.")}
     return Study("effects", COLUMNS, rows, {}, advice, about, "rays", PLOTS)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -62,8 +61,3 @@ def unseen_figures(scene: Scene, field: HeightField, heights: Tensor, target: np
 
 def _judged(found: WaveImage, target: np.ndarray | None) -> dict:
     return judge(Image(found.image, found.leaving, {}), target)
-
-
-def beside(path: Path) -> Path:
-    """Where the wave image belongs beside a ray image or its numbers: render.png -> wave.png, NAME.png -> NAME-wave.png."""
-    return path.with_name(f"wave{path.suffix}" if path.stem == "render" else f"{path.stem}-wave{path.suffix}")
