@@ -34,11 +34,14 @@ KEPT = 1 << 30
 
 @dataclass(frozen=True)
 class Part:
-    """Light of one wavelength and one point of the source: phase (n, m) rad at h_0 in [0, 2 pi), its derivative by the height
-    (n, m) rad/mm, amplitude (n, m), which samples fall on which pixels, and the power of all of it.  front: shared by parts whose
-    light goes the same ways."""
+    """Light of one wavelength and one point of the source, by its number: phase (n, m) rad at h_0 in [0, 2 pi), its derivative by
+    the height (n, m) rad/mm, amplitude (n, m), which samples fall on which pixels, and the power of all of it.
+
+    front: shared by parts whose light goes the same ways.
+    """
 
     line: Line
+    mode: int
     front: Wavefront
     phase: Tensor
     slope: Tensor
@@ -95,7 +98,7 @@ class WaveObjective:
                 phase, amplitude = imager.field(line, front, self.dtype)
                 slope = (TURN / line.length * front.sensitivity).to(self.dtype)
                 rows, columns = imager.masks(line, phase.device, self.dtype)
-                yield Part(line, front, phase, slope, amplitude, rows, columns, front.power())
+                yield Part(line, k, front, phase, slope, amplitude, rows, columns, front.power())
 
     def __call__(self, heights: Tensor) -> Evaluation:
         """Value and gradient at heights (n, m) mm float64.
@@ -146,9 +149,9 @@ class WaveObjective:
         imager = self.imager
         if not imager.upright:
             front = replace(part.front, path=part.front.path + part.front.sensitivity * moved)
-            return imager.image(part.line, front, self.dtype)[0]
+            return imager.image(part.line, front, part.mode, self.dtype)[0]
         found = power_on_pixels(part.phase + part.slope * moved, part.amplitude, imager.sampling.padded, part.rows, part.columns)
-        return imager.spread_out(found)
+        return imager.spread_out(found, part.mode)
 
     def _channel(self, values: Tensor, part: Part) -> Tensor:
         return values if part.line.channel is None else values[part.line.channel]

@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 import torch
 from scipy.fft import next_fast_len
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from caustic_cli.optics.emission.base import Lit
@@ -43,31 +44,50 @@ class Spread:
         """How far it spreads, mm."""
         return tuple(max(abs(s[k]) for s in self.shifts) + self.half[k] for k in (0, 1))
 
-    def on(self, pixel: tuple[float, float]) -> Convolution:
-        """The same on an image of such pixels, mm, that are cut where they are too wide for it."""
-        fine = min((h for h in self.half if h > 0), default=max(self.reach()) / 2.0)
-        cut = max(1, min(MOST_CUT, math.ceil(CELLS * max(pixel) / fine))) if fine > 0 else 1
+    def on(self, pixel: tuple[float, float], most: int = MOST_CUT) -> Convolution:
+        """The same on an image of such pixels, mm, that are cut into 1, 2 or 4 along each axis, at most, if they are too wide."""
+        cut = _cut(min((h for h in self.half if h > 0), default=max(self.reach()) / 2.0), pixel, most)
         return Convolution(torch.from_numpy(self.kernel(tuple(w / cut for w in pixel))), cut)
 
-    def kernel(self, cell: tuple[float, float]) -> np.ndarray:
+    def parts_on(self, pixel: tuple[float, float], places: list[tuple[float, float]]) -> list[Convolution]:
+        """The same of parts of every position: of all that is nearest to each of these points of the unit disc, about this point.
+
+        Their kernels' sums are their parts of the whole times the number of parts.
+        """
+        cut = _cut(min(h for h in self.half if h > 0) / math.sqrt(len(places)), pixel, MOST_CUT)
+        cell = tuple(w / cut for w in pixel)
+        return [Convolution(torch.from_numpy(self.kernel(cell, (places, k))), cut) for k in range(len(places))]
+
+    def kernel(self, cell: tuple[float, float], part: tuple[list[tuple[float, float]], int] | None = None) -> np.ndarray:
         """Part of the light of a cell that each cell about it gets: (2 a + 1, 2 b + 1), of sum 1, not negative.
 
         Points of the ellipse are shared out linearly among cells, which widens it; its half axes are less by so much that its
-        second moments stay what they are.
+        second moments stay what they are.  part: see `parts_on`, points and the number of one.
         """
         a, b = (math.ceil(r / w) + 1 for r, w in zip(self.reach(), cell, strict=True))
         half = tuple(math.sqrt(max(0.0, h * h - 2.0 / 3.0 * w * w)) for h, w in zip(self.half, cell, strict=True))
-        x, y = (h / w * c for h, w, c in zip(half, cell, _even_disc(half, cell), strict=True))
-        dx, dy, part = np.array(self.shifts).T
+        x, y = _even_disc(half, cell)
+        dx, dy, power = np.array(self.shifts if part is None else ((0.0, 0.0, 1.0),)).T
+        power = power / (power.sum() * len(x))
+        if part is not None:
+            places, k = np.array(part[0]), part[1]
+            mine = cKDTree(places).query(np.stack([x, y], 1))[1] == k
+            x, y, power = x[mine] - places[k, 0], y[mine] - places[k, 1], power * len(places)
+        x, y = (h / w * c for h, w, c in zip(half, cell, (x, y), strict=True))
         at_x, at_y = (d[:, None] / w + c + n for d, c, w, n in ((dx, x, cell[0], a), (dy, y, cell[1], b)))
         i, j = np.floor(at_x).astype(int), np.floor(at_y).astype(int)
         found = np.zeros((2 * a + 2) * (2 * b + 2))
         for p in (0, 1):
             for q in (0, 1):
-                weight = part[:, None] * np.abs(1 - p - (at_x - i)) * np.abs(1 - q - (at_y - j))
+                weight = power[:, None] * np.abs(1 - p - (at_x - i)) * np.abs(1 - q - (at_y - j))
                 found += np.bincount(((i + p) * (2 * b + 2) + j + q).ravel(), weight.ravel(), len(found))
-        found = found.reshape(2 * a + 2, 2 * b + 2)[:-1, :-1]
-        return found / found.sum()
+        return found.reshape(2 * a + 2, 2 * b + 2)[:-1, :-1]
+
+
+def _cut(fine: float, pixel: tuple[float, float], most: int) -> int:
+    """Into how many cells a pixel is cut along each axis for what is so fine, mm."""
+    wanted = CELLS * max(pixel) / fine if fine > 0 else 1.0
+    return min(most, 1 if wanted <= 1.0 else 2 if wanted <= 2.0 else MOST_CUT)
 
 
 def _even_disc(half: tuple[float, float], cell: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
@@ -83,7 +103,7 @@ def _even_disc(half: tuple[float, float], cell: tuple[float, float]) -> tuple[np
 
 @dataclass(frozen=True)
 class Convolution:
-    """A kernel (2 a + 1, 2 b + 1) of sum 1 for images whose pixels are cut into `cut` along each axis."""
+    """A kernel (2 a + 1, 2 b + 1) for images whose pixels are cut into `cut` along each axis."""
 
     kernel: Tensor
     cut: int

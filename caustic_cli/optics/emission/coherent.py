@@ -105,19 +105,19 @@ def modes(scene: Lit, each: int) -> list[Mode]:
     source = scene.source
     if source.distant:
         s = math.sin(source.half_angle)
-        spread = _even_disc(each) if s else [(0.0, 0.0)]
+        spread = even_disc(each) if s else [(0.0, 0.0)]
         found = []
         for a, b in spread:
             dx, dy = s * a, s * b
             found.append(Mode(scene, (dx, dy, math.sqrt(1.0 - dx * dx - dy * dy)), 1.0 / len(spread)))
         return found
     (ex, ey), (positions, parts) = source.extent, source.points()
-    spread = _even_disc(each) if max(ex, ey) > 0 else [(0.0, 0.0)]
+    spread = even_disc(each) if max(ex, ey) > 0 else [(0.0, 0.0)]
     return [Mode(scene, (float(x + ex * a), float(y + ey * b), float(z)), float(part) / len(spread))
             for (x, y, z), part in zip(positions, parts, strict=True) for a, b in spread]
 
 
-def _even_disc(count: int) -> list[tuple[float, float]]:
+def even_disc(count: int) -> list[tuple[float, float]]:
     """Points of the unit disc, each for the same area of it: Vogel's spiral."""
     radii = [math.sqrt((k + 0.5) / count) for k in range(count)]
     return [(r * math.cos(k * GOLDEN), r * math.sin(k * GOLDEN)) for k, r in enumerate(radii)]

@@ -2,7 +2,7 @@
 
 Every wavelength and every point of the source is coherent in itself; their powers are added.  A source with an extent that only
 shifts the image of its middle, to within a part of what the image shows anyway, is taken as that image spread by the source's own;
-otherwise as so many points.
+otherwise as so many points, each spread by its part of the source.
 
 What rays carry through the system counts: Fresnel's losses, absorption, dispersion, polarisation.  Light that does not go straight
 on (ghosts, second meetings, rough surfaces) is no part of it.
@@ -17,7 +17,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.emission.coherent import Mode, edges, middle, modes
+from caustic_cli.optics.emission.coherent import Mode, edges, even_disc, middle, modes
 from caustic_cli.optics.meeting import Parameters
 from caustic_cli.optics.resolution import WHITE_LINES, white
 from caustic_cli.optics.spread import Convolution, Spread, spread_of
@@ -40,8 +40,8 @@ BESIDE = 0.5
 BLURS = 2.0
 #: What the misplacement of light that is taken as spread may be, of diffraction's blur or a pixel, the larger.
 ALLOWED = 0.25
-#: Points that stand for an extended source where its image is not simply spread.
-EACH = 24
+#: Points that stand for an extended source where its image is not simply spread, at most, and least of each of its positions.
+EACH, LEAST_EACH = 24, 4
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,10 @@ def _alike(lines: list[Line]) -> list[list[Line]]:
 
 @dataclass(frozen=True)
 class Imager:
-    """What the images of a source's lines and modes have in common: where their light is watched, and how finely."""
+    """What the images of a source's lines and modes have in common: where their light is watched, and how finely.
+
+    spread: of the light of a mode; each: modes for every position of the source, 0 for one that stands for all of it.
+    """
 
     receiver: Receiver
     plane: Plane
@@ -163,7 +166,7 @@ class Imager:
     sampling: Sampling
     spread: Spread | None
     nodes: tuple[int, int]
-    single: bool
+    each: int
     upright: bool
     exact: bool = False
     tapered: bool = True
@@ -192,8 +195,11 @@ class Imager:
         lengths = tuple(k.behind for k in lines)
         blur = math.sqrt(max(lengths) * distance * surveys[0].magnification)
         spread = spread_of(system, alike[0].landing, device_of(alike[0])) if outer and upright else None
-        if spread is not None and spread.error > ALLOWED * max(blur, *receiver.pixel):
-            spread = None
+        each = 0 if not outer else max(LEAST_EACH, EACH // max(1, len(system.source.points()[0])))
+        if spread is not None:
+            parts = (spread.error / (ALLOWED * max(blur, *receiver.pixel))) ** 2
+            each = 0 if parts <= 1.0 else min(each, math.ceil(parts))
+            spread = None if each and not max(spread.half) > 0 else spread
         low, high = receiver.extent(plane)
         lows, highs = (list(c) for c in (watched if watched and upright else (low, high)))
         for seen in surveys:
@@ -207,8 +213,7 @@ class Imager:
         sampling = Sampling.of(light, (tuple(lows), tuple(highs)), receiver.pixel, distance, lengths, finer)
         spans = [len(s.breaks) - 1 for e in system.elements if isinstance(e.surface, HeightField) for s in e.surface.spaces]
         nodes = sampling.count if dense else tuple(min(n, max(LEAST_NODES, A_SPAN * max(spans, default=0))) for n in sampling.count)
-        single = spread is not None or not outer
-        return cls(receiver, plane, surveys[0], sampling, spread, nodes, single, upright, exact, watched is None)
+        return cls(receiver, plane, surveys[0], sampling, spread, nodes, each, upright, exact, watched is None)
 
     def expose(self, lines: list[Line], parameters: Parameters, dtype: torch.dtype = torch.float32) -> WaveImage:
         """The wave image of such lines, at heights {name: (n, m) mm} close to those that samples were chosen for."""
@@ -216,24 +221,21 @@ class Imager:
         images: dict[int | None, Tensor] = {}
         leaving = 0.0
         for group in _alike(lines):
-            for mode in self.modes(group[0].system):
+            for k, mode in enumerate(self.modes(group[0].system)):
                 front = self.front(group[0], mode, parameters)
                 for line in group:
-                    part, power = self.image(line, front, dtype)
+                    part, power = self.image(line, front, k, dtype)
                     images[line.channel] = images.get(line.channel, 0.0) + line.part * part
                     leaving += line.part * power
         some = next(iter(images.values()))
         image = torch.stack([images.get(k, torch.zeros_like(some)) for k in range(3)]) if colours else some
         return WaveImage(image, leaving, leaving - float(image.detach().sum()),
                          tuple(dict.fromkeys(line.wavelength for line in lines)), len(self.modes(lines[0].system)),
-                         self.spread.error if self.spread else 0.0, self.sampling.padded)
+                         self.spread.error / math.sqrt(max(1, self.each)) if self.spread else 0.0, self.sampling.padded)
 
     def modes(self, system: System) -> list[Mode]:
         """Points that the source is taken as."""
-        if self.single:
-            return [middle(system)]
-        positions = max(1, len(system.source.points()[0]))
-        return modes(system, max(4, EACH // positions))
+        return modes(system, self.each) if self.each else [middle(system)]
 
     def optics(self, line: Line, mode: Mode, parameters: Parameters) -> Optics:
         """What makes a wavefront of one of them."""
@@ -243,7 +245,7 @@ class Imager:
         """The light of a mode behind the lens, on `nodes`."""
         optics, s = self.optics(line, mode, parameters), self.sampling
         step = tuple(d * n / m for d, n, m in zip(s.step, s.count, self.nodes, strict=True))
-        seen = self.seen if self.single else survey(optics)
+        seen = survey(optics) if self.each else self.seen
         return wavefront(optics, seen, s.low, step, self.nodes, sensitive, self.exact)
 
     def watched(self, front: Wavefront, length: float) -> Wavefront:
@@ -253,14 +255,17 @@ class Imager:
         return front.within(self.sampling.middle, tuple(length * self.sampling.distance / d for d in self.sampling.step))
 
     @cached_property
-    def spreading(self) -> Convolution | None:
-        """The spread on the screen's pixels."""
-        return None if self.spread is None else self.spread.on(self.receiver.pixel)
+    def spreading(self) -> list[Convolution]:
+        """The spread on the screen's pixels: of the whole source, or of each mode of a position; none of points."""
+        if self.spread is None:
+            return []
+        pixel = self.receiver.pixel
+        return self.spread.parts_on(pixel, even_disc(self.each)) if self.each else [self.spread.on(pixel)]
 
     def masks(self, line: Line, device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """Which samples of an upright screen fall on which of the cut pixels, along each axis."""
         s, low, found = self.sampling, self.receiver.extent(self.plane)[0], []
-        sub, beside = (1, (0, 0)) if self.spreading is None else (self.spreading.cut, self.spreading.beside)
+        sub, beside = (self.spreading[0].cut, self.spreading[0].beside) if self.spreading else (1, (0, 0))
         first, spacing = s.first(line.behind), s.spacing(line.behind)
         for k in (0, 1):
             width = self.receiver.pixel[k] / sub
@@ -268,9 +273,9 @@ class Imager:
                                spacing[k], s.padded[k], device).to(dtype))
         return tuple(found)
 
-    def spread_out(self, image: Tensor) -> Tensor:
-        """An image of the source's middle on cut pixels -> that of the source on the screen's pixels."""
-        return image if self.spreading is None else self.spreading(image)
+    def spread_out(self, image: Tensor, mode: int) -> Tensor:
+        """An image of a mode's light on cut pixels -> that of its part of the source on the screen's pixels."""
+        return self.spreading[mode % len(self.spreading)](image) if self.spreading else image
 
     def field(self, line: Line, front: Wavefront, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """Phase, rad, with the kernel's, and amplitude of each sample of a wavefront, (n, m)."""
@@ -278,8 +283,8 @@ class Imager:
         path, amplitude = front.on(s.low, s.step, s.count).whole
         return phase_of(path, s, line.length, line.behind).to(dtype), amplitude.to(dtype)
 
-    def image(self, line: Line, front: Wavefront, dtype: torch.dtype) -> tuple[Tensor, float]:
-        """Power on the pixels of the light of one mode at one wavelength, float64, and that of all of it."""
+    def image(self, line: Line, front: Wavefront, mode: int, dtype: torch.dtype) -> tuple[Tensor, float]:
+        """Power on the pixels of the light of one mode, by its number, at one wavelength, float64, and that of all of it."""
         s, wide = self.sampling, 8 if dtype == torch.float32 else 16
         if not self.upright:
             found = power_on_tilted(self.receiver, self.plane, s, self.watched(front, line.behind), line.length, line.behind, dtype)
@@ -290,7 +295,7 @@ class Imager:
             found = power_on_pixels(*self.field(line, front, dtype), s.padded, rows, columns).double()
         else:
             found = self._by_blocks(line, self.watched(front, line.behind), s.pieces(wide), rows, columns, dtype)
-        return self.spread_out(found), front.power()
+        return self.spread_out(found, mode), front.power()
 
     @torch.no_grad()
     def _by_blocks(self, line: Line, front: Wavefront, pieces: int, rows: Tensor, columns: Tensor,
