@@ -12,6 +12,7 @@ import torch
 
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Options
+from caustic_cli.inverse.extended import shift_of
 from caustic_cli.inverse.schedule import (
     LEAST_RAYS,
     LEAST_SPANS,
@@ -146,13 +147,15 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
     plain = design["network"] == "none" and design["optimizer"] == "lbfgs"
     asked = checks.choice("[design] waves", design["waves"], ("auto", "on", "off"))
     held = "control" not in lens or min(n - p for n, p in zip(lens["control"], degree, strict=True)) >= LEAST_SPANS
+    spread = plain and held and not source.sharp and _shifts(s, source)
     design.setdefault("start", "transport" if plain and held and not source.apart else "offset")
     if design["start"] == "transport" and design["network"] != "none":
         raise InputError("[design] start transport gives a surface, which a network cannot begin from; use start offset, or"
                          " network none")
     quality = quality or _quality(design["time_limit"])
-    # Sharp light's transport is right at every scale at once, if the net can hold it; otherwise from coarse to fine.
-    moved = plain and held and design["start"] != "offset" and source.sharp
+    # Sharp light's transport is right at every scale at once, if the net can hold it, and so is that of a source that shifts the
+    # image, for the light behind its blur; otherwise from coarse to fine.
+    moved = plain and held and design["start"] != "offset" and (source.sharp or spread)
     if "control" not in lens:
         spans = refinement_spans(max(screen["resolution"]), quality) if moved else DEFAULT_SPANS
         lens["control"] = ([spans + p for p in degree] if design["network"] == "none" else [NETWORK_CONTROL] * 2)
@@ -169,7 +172,8 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
     nx, ny = screen["resolution"]
     sampler, base = _sampler(source), min(4_000_000, max(40_000, int(RAYS_PER_PIXEL * nx * ny)))
     if moved:
-        stages = refinement(tuple(lens["control"]), rays, (nx, ny), quality, scattered=sampler != "lines")
+        centre = source.pointlike() if spread else source
+        stages = refinement(tuple(lens["control"]), rays, (nx, ny), quality, scattered=not centre.collimated, spread=spread)
     elif plain and "knots_u" not in lens:
         stages = coarse_to_fine(tuple(lens["control"]), degree, rays or base, (nx, ny), quality, sampler=sampler)
     else:
@@ -192,6 +196,8 @@ def without_waves(s: Settings, given: bool) -> str:
         return ""
     if given:
         return "none of the given [[design.stages]] has waves; one with waves = [550.0] refines it at that wavelength"
+    if (seen := _resolution(s, build_source(s))).source >= seen.diffraction:
+        return "the source blurs more than diffraction does; --waves on refines it all the same"
     return _not_by_default(s) or f"{LEAST_WAVES} iterations on it would take longer than this quality's time; --waves on takes it"
 
 
@@ -214,14 +220,19 @@ def _wave_stages(s: Settings, source: Source, quality: str, lit: tuple[float, fl
         raise InputError("[design] waves on needs network none: the wave image refines the heights themselves")
     if asked == "off" or (asked == "auto" and _not_by_default(s)):
         return []
-    seen = Resolution.before(Scene(source, build_lens(s), build_screen(s), build_light(s)), tuple(s["target"]["size"]))
-    if asked == "auto" and not seen.matters:
+    seen = _resolution(s, source)
+    if asked == "auto" and not (seen.matters and seen.diffraction > seen.source):
         return []
     own = s["source"].get("wavelengths", [])
     plan = wave_refinement(_wave_samples(s, seen, lit), len(own), quality, hurry=asked == "auto")
     apron = math.ceil(0.04 * max(screen["resolution"]))
     return [Stage(tuple(lens["control"]), LEAST_RAYS, apron=apron, iterations=n, tolerance=WAVE_TOLERANCE,
                   waves=tuple(map(float, own)) or white(count)) for count, n in plan]
+
+
+def _resolution(s: Settings, source: Source) -> Resolution:
+    """What complete settings let light show."""
+    return Resolution.before(Scene(source, build_lens(s), build_screen(s), build_light(s)), tuple(s["target"]["size"]))
 
 
 def _wave_samples(s: Settings, seen: Resolution, lit: tuple[float, float]) -> float:
@@ -241,6 +252,12 @@ def _sampler(source: Source) -> str:
     return "lines" if source.collimated else "stratified"
 
 
+def _shifts(s: Settings, source: Source) -> bool:
+    """Whether all that a source's extent does is to shift the image."""
+    lens = build_lens({**s, "lens": {"control": [LEAST_SPANS] * 2, **s["lens"]}})
+    return shift_of(Scene(source, lens, build_screen(s), build_light(s))) is not None
+
+
 def _stage_table(stage: Stage) -> dict[str, Any]:
     if stage.waves:
         return {"control": list(stage.control), "waves": list(stage.waves), "blur": stage.blur, "apron": stage.apron,
@@ -248,7 +265,7 @@ def _stage_table(stage: Stage) -> dict[str, Any]:
     return {"control": list(stage.control), "rays": stage.rays, "sampler": stage.sampler,
             "reconstruction": stage.filter.kind, "filter_size": list(stage.filter.size), "blur": stage.blur,
             "apron": stage.apron, "iterations": stage.iterations, "tolerance": stage.tolerance,
-            "oversample": stage.oversample}
+            "oversample": stage.oversample, **({"spread": True} if stage.spread else {})}
 
 
 def _complete_stage(table: dict[str, Any], s: Settings, sampler: str) -> dict[str, Any]:
@@ -289,7 +306,7 @@ def build_stages(settings: Settings) -> list[Stage]:
         f = filter_from(t["reconstruction"], t["filter_size"], on, t.get("alpha_per_mm2"), t.get("alpha_per_pixel2"))
         source = build_source(settings, type=t["source"]) if "source" in t else None
         stages.append(Stage(tuple(t["control"]), t["rays"], t["sampler"], f, t["blur"], t["apron"], t["iterations"],
-                            t["tolerance"], source, t["oversample"], tuple(t.get("waves", ()))))
+                            t["tolerance"], source, t["oversample"], tuple(t.get("waves", ())), t.get("spread", False)))
     if not stages:
         raise InputError("[[design.stages]] at least one stage is needed")
     if list(stages[-1].control) != list(settings["lens"]["control"]):

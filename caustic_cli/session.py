@@ -22,7 +22,9 @@ from caustic_cli.console import Reporter
 from caustic_cli.derive import build_options, build_stages, complete, without_waves
 from caustic_cli.errors import CausticError, InputError, Interrupted
 from caustic_cli.inverse import ranks
+from caustic_cli.inverse.deconvolution import SMOOTH_STEPS, deconvolved
 from caustic_cli.inverse.designer import Designer, State
+from caustic_cli.inverse.extended import centre_of, limits, shift_of
 from caustic_cli.inverse.first import first_surface
 from caustic_cli.inverse.schedule import transport_cells
 from caustic_cli.inverse.target import grey
@@ -121,15 +123,18 @@ def design(project: Project, first: torch.Tensor | None, device: str, say: Repor
         return figures or resume(project, None, None, device, say, began)
     with project.hold:
         designer, target = _designer(project, device)
-        _say_resolution(project, designer, say)
+        _say_limits(project, designer, target, say)
         state = designer.begin(first)
         return _run(project, designer, target, state, say, began, 0, None, device)
 
 
-def _say_resolution(project: Project, designer: Designer, say: Reporter) -> None:
+def _say_limits(project: Project, designer: Designer, target: np.ndarray, say: Reporter) -> None:
     """What no lens can do about diffraction and an extended source, before time is spent on it."""
     seen = Resolution.before(designer.scene, tuple(project.settings["target"]["size"]))
     say.say(seen.sentence())
+    words = limits(designer.scene, grey(target)).sentence()
+    if words:
+        say.say(words)
     if seen.matters and project.settings["design"]["waves"] == "auto" and project.without_waves:
         say.say(f"the wave image is not refined: {project.without_waves}")
 
@@ -209,8 +214,13 @@ def _first_heights(project: Project, lifted: bool) -> torch.Tensor | None:
         return None
     if start == "transport":
         designer, target = _designer(project, "cpu")
-        cells = transport_cells(max(s.rays for s in designer.stages), not designer.scene.source.collimated)
-        found = first_surface(designer.scene, grey(target), designer.field(0), cells)
+        scene, goal = designer.scene, grey(target)
+        cells = transport_cells(max(s.rays for s in designer.stages), not scene.source.collimated)
+        spread = shift_of(scene) if designer.stages[0].spread else None
+        if spread is not None:
+            light = deconvolved(goal, spread.on(scene.screen.pixel), SMOOTH_STEPS)
+            scene, goal = replace(scene, source=centre_of(scene), screen=scene.screen.grown(light.beside)), light.light
+        found = first_surface(scene, goal, designer.field(0), cells)
         lens = designer.scene.lens
         short = lens.z_in + lens.min_thickness - float(found.min())
         return found + 1.01 * short if lifted and short > 0 else found

@@ -115,6 +115,7 @@ STAGE: dict[str, Key] = {
     "filter_size": Key("wholes", "pixels, odd"),
     "alpha_per_mm2": Key("number", "of the gaussian, 1/mm^2 (eq. 4.4.5)"),
     "alpha_per_pixel2": Key("number", "of the gaussian, 1/pixel^2, instead of alpha_per_mm2"),
+    "spread": Key("flag", "rays of the source's middle, whose image is spread by the source's extent"),
     "oversample": Key("whole", "filter on pixels so many times smaller, added up: sharper than the filter"),
     "blur": Key("number", "pixels, of render and target in the loss"),
     "apron": Key("whole", "dark pixels around the screen that catch stray light"),

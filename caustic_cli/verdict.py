@@ -12,6 +12,7 @@ import torch
 
 from caustic_cli.files import discard
 from caustic_cli.inverse.designer import Designer, State
+from caustic_cli.inverse.extended import limits
 from caustic_cli.inverse.losses import parse
 from caustic_cli.inverse.target import grey
 from caustic_cli.optics.resolution import Resolution
@@ -70,6 +71,11 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
         figures = figures | {"start_relative_rms": began["relative_rms"]}
         if waves:
             figures |= {"start_wave_relative_rms": began["wave_relative_rms"]}
+    bounds = limits(scene, grey(target), field, state.heights)
+    if bounds.light is not None:
+        figures |= {"least_relative_rms": bounds.light.error}
+    if bounds.etendue is not None:
+        figures |= {"etendue_limit": bounds.etendue}
     if light is not None:
         figures |= unseen_figures(scene, field, state.heights.to(device), target)
     image, encoding = exposure.image.cpu().numpy(), project.settings["target"]["encoding"]

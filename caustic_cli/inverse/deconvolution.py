@@ -19,12 +19,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import torch
+from scipy.fft import irfft2, next_fast_len, rfft2
 
 from caustic_cli.optics.spread import Convolution
 
 #: Iterations until the light is returned, which is still smooth then, and for the least error; how often that is looked at.
-SMOOTH_STEPS, MOST_STEPS, LOOK = 60, 400, 50
+SMOOTH_STEPS, MOST_STEPS, LOOK = 60, 300, 50
 #: Part of the least error to which its bound comes before the iterations end.
 TIGHT = 0.02
 #: Light farther out than where this part of it reaches the screen is none.
@@ -49,40 +49,49 @@ def deconvolved(target: np.ndarray, spread: Convolution, steps: int = MOST_STEPS
         target: (n, m), not negative, not all zero, any scale.
         spread: of the source on the target's pixels.
     """
-    cut, around = spread.cut, (spread.beside[1],) * 2 + (spread.beside[0],) * 2
-    b = torch.from_numpy(target / target.mean())
+    cut, b, kernel = spread.cut, target / target.mean(), spread.kernel.numpy()
+    pixels = tuple(n // cut for n in spread.beside)
+    shape = tuple(cut * (n + 2 * a) for n, a in zip(b.shape, pixels, strict=True))
+    frame = tuple(next_fast_len(n + k // 2, real=True) for n, k in zip(shape, kernel.shape, strict=True))
+    padded = np.zeros(frame)
+    padded[: kernel.shape[0], : kernel.shape[1]] = kernel
+    transfer = rfft2(np.roll(padded, tuple(-(n // 2) for n in kernel.shape), (0, 1)))
+    inner = tuple(slice(a, a + n) for a, n in zip(pixels, b.shape, strict=True))
 
-    def cells(v: torch.Tensor) -> torch.Tensor:
-        return torch.nn.functional.pad(v.repeat_interleave(cut, 0).repeat_interleave(cut, 1), around)
+    def cells(v: np.ndarray) -> np.ndarray:
+        wide = np.pad(v, tuple((a, a) for a in pixels))
+        return wide.repeat(cut, 0).repeat(cut, 1) if cut > 1 else wide
 
-    def seen(x: torch.Tensor) -> torch.Tensor:
-        return spread(x) / cut**2
+    def whole(x: np.ndarray) -> np.ndarray:
+        return x.reshape(shape[0] // cut, cut, shape[1] // cut, cut).mean((1, 3)) if cut > 1 else x
 
-    def back(v: torch.Tensor) -> torch.Tensor:
-        return spread.whole(cells(v), adjoint=True) / cut**2
+    def seen(x: np.ndarray) -> np.ndarray:
+        return whole(irfft2(rfft2(x, s=frame) * transfer, s=frame)[: shape[0], : shape[1]])[inner]
 
-    reach = back(torch.ones_like(b))
-    near = reach > REACHES / cut**2
+    def back(v: np.ndarray) -> np.ndarray:  # the adjoint, times cut^2: the step of the gradient on cells
+        return irfft2(rfft2(cells(v), s=frame) * transfer.conj(), s=frame)[: shape[0], : shape[1]]
+
+    reach = back(np.ones_like(b))
+    near = reach > REACHES
     x = cells(b)
     ahead, t, c, light, least, bound = x, 1.0, 0.0, None, math.inf, 0.0
     for k in range(1, steps + 1):
         y = seen(ahead)
-        moved = torch.where(near, (ahead + cut**2 * back(b + c - y)).clamp_min(0.0), 0.0)
+        moved = np.where(near, np.maximum(ahead + back(b + c - y), 0.0), 0.0)
         c += 0.5 * (1.0 - float(y.mean()))
         if float(((ahead - moved) * (moved - x)).sum()) > 0.0:
             t = 1.0
         after = 0.5 * (1.0 + math.sqrt(1.0 + 4.0 * t * t))
         ahead, x, t = moved + (t - 1.0) / after * (moved - x), moved, after
         if k == min(SMOOTH_STEPS, steps):
-            n, m = (s // cut for s in x.shape)
-            light = x.reshape(n, cut, m, cut).mean((1, 3)).numpy()
+            light = whole(x)
         if k % LOOK == 0 or k == steps:
             y = seen(x)
             y = y / y.mean()
             nu = b + c - y
-            dual = float((nu * b).sum() - 0.5 * nu.square().sum() - b.numel() * (back(nu)[near] / reach[near]).max())
-            least = min(least, float((y - b).square().mean().sqrt()))
-            bound = max(bound, math.sqrt(max(0.0, 2.0 * dual / b.numel())))
+            dual = float((nu * b).sum() - 0.5 * (nu * nu).sum() - b.size * (back(nu)[near] / reach[near]).max())
+            least = min(least, math.sqrt(float(((y - b) ** 2).mean())))
+            bound = max(bound, math.sqrt(max(0.0, 2.0 * dual / b.size)))
             if bound > (1.0 - TIGHT) * least:
                 break
-    return Deconvolved(light, tuple(a // cut for a in spread.beside), least, bound)
+    return Deconvolved(light, pixels, least, bound)

@@ -20,6 +20,7 @@ from caustic_cli.inverse.penalties import Penalty
 from caustic_cli.optics.emission import Rays
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.shortage import smaller
+from caustic_cli.optics.spread import Spread
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT
 from caustic_cli.optics.trace import Parameters, Tracer, tracers
@@ -68,14 +69,18 @@ class Objective:
         max_slope: limit of the lens' slope, 0 for none; min_radius: least radius of concave places, mm, 0 for any.
         oversample: the filter works on pixels so many times smaller along each axis, which are then added up: a render that
             is nearly a bincount, and yet smooth in the heights.
+        spread: of the source, whose image convolves that of the rays, which are those of its middle; None for rays of all of it.
+            Rays are caught around the screen and the apron as far as their light reaches these.
         dtype: precision of the rays.
     """
 
     def __init__(self, scene: Scene, field: HeightField, sampler: Rays, filter: Filter, target: Tensor, loss: str, *,
                  blur: float = 0.0, filter_target: bool = True, apron: int = 0, max_slope: float = 0.0, min_radius: float = 0.0,
-                 oversample: int = 1, dtype: torch.dtype = torch.float32):
+                 oversample: int = 1, spread: Spread | None = None, dtype: torch.dtype = torch.float32):
         self.device = sampler.device
-        screen = scene.screen.grown((apron, apron))
+        self.spread = None if spread is None else spread.on(scene.screen.pixel, oversample)
+        beside = (0, 0) if self.spread is None else (n // self.spread.cut for n in self.spread.beside)
+        screen = scene.screen.grown(tuple(apron + n for n in beside))
         self.screen = replace(screen, resolution=tuple(oversample * n for n in screen.resolution))
         self.filter, self.apron, self.oversample = filter, apron, oversample
         wide = torch.nn.functional.pad(target.double().to(sampler.device), (apron, apron, apron, apron))
@@ -99,10 +104,21 @@ class Objective:
         ray after each of them."""
         return self.kept is not None and (sum(t.fused is None for t in self.kept) <= 1)
 
-    def _pool(self, image: Tensor) -> Tensor:
-        """Pixels of the screen from those of the render."""
-        k, (*colors, n, m) = self.oversample, image.shape
+    def _pool(self, image: Tensor, cut: int = 1) -> Tensor:
+        """Pixels of the screen, cut into so many along each axis, from those of the render."""
+        k, (*colors, n, m) = self.oversample // cut, image.shape
         return image if k == 1 else image.view(*colors, n // k, k, m // k, k).sum((-3, -1))
+
+    @property
+    def cut(self) -> int:
+        """Cells of the accumulated image along each axis of a pixel."""
+        return 1 if self.spread is None else self.spread.cut
+
+    def _spread_out(self, image: Tensor) -> Tensor:
+        """The source's image on screen and apron, from that of the rays."""
+        if self.spread is None:
+            return image
+        return torch.stack([self.spread(c) for c in image]) if image.ndim == 3 else self.spread(image)
 
     def _tracers(self) -> Iterator[Tracer]:
         """This rank's chunks, ready to be traced."""
@@ -140,7 +156,8 @@ class Objective:
             heights.requires_grad_()
         leaves = list(parameters.values())
         penalty = self.penalty(parameters[EXIT]) if self.penalty else torch.zeros((), device=self.device)
-        shape = (3, *self.loss.target.shape) if self.scene.colored else self.loss.target.shape
+        shape = tuple(n // (self.oversample // self.cut) for n in self.screen.resolution)
+        shape = (3, *shape) if self.scene.colored else shape
         image = torch.zeros(shape, dtype=torch.float64, device=self.device)
         leaving, parts = image.new_zeros(image.shape[:-2]), []  # one for each colour
         with torch.set_grad_enabled(self.whole):
@@ -151,7 +168,8 @@ class Objective:
                     parts.append(part)
         ranks.add(image, leaving)
         image, leaving = image.requires_grad_(), leaving.requires_grad_()
-        loss = self.loss(image, leaving, penalty)
+        seen = self._spread_out(image)
+        loss = self.loss(seen, leaving, penalty)
         wanted = [image, leaving, *leaves] if penalty.requires_grad else [image, leaving]
         by_image, by_leaving, *direct = torch.autograd.grad(loss, wanted, allow_unused=True)
         gradients = [torch.zeros_like(heights) for heights in leaves]
@@ -169,10 +187,10 @@ class Objective:
             if more is not None:
                 gradient += more
         a = self.apron
-        inner = image.detach()[..., a : image.shape[-2] - a, a : image.shape[-1] - a]
+        inner = seen.detach()[..., a : seen.shape[-2] - a, a : seen.shape[-1] - a]
         return Evaluation(float(loss.detach()), dict(zip(parameters, gradients, strict=True)), float(inner.sum()))
 
     def _see(self, traced: Tracer, parameters: Parameters) -> tuple[Tensor, Tensor]:
         """What a chunk adds to the image, and to the power that leaves the lens."""
         part = traced.expose(parameters, self.screen, self.filter)
-        return self._pool(part.image), part.leaving
+        return self._pool(part.image, self.cut), part.leaving

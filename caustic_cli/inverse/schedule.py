@@ -34,6 +34,8 @@ class Stage:
         oversample: see `Objective`.
         waves: nm, the wavelengths at which the wave image is refined instead of the ray image, of light that says none; empty for
             rays.
+        spread: the rays are those of the source's middle, and their image is spread by the source's, where that is what the source
+            does.
     """
 
     control: tuple[int, int]
@@ -47,6 +49,7 @@ class Stage:
     source: Source | None = None
     oversample: int = 1
     waves: tuple[float, ...] = ()
+    spread: bool = False
 
     def __post_init__(self):
         checks.whole("[[design.stages]] rays", self.rays, 1, 10**12)
@@ -119,7 +122,7 @@ def transport_cells(rays: int, scattered: bool) -> int:
 
 
 def refinement(control: tuple[int, int], rays: int | None, resolution: tuple[int, int], quality: str = "standard",
-               filter: Filter | None = None, scattered: bool = False) -> list[Stage]:
+               filter: Filter | None = None, scattered: bool = False, spread: bool = False) -> list[Stage]:
     """The default stages after a transport start, whose surface has every scale right already: full detail at once.
 
     Rays stand in a regular grid: under a smooth filter, which the render's finer pixels leave narrow, such sums are far more exact
@@ -128,17 +131,18 @@ def refinement(control: tuple[int, int], rays: int | None, resolution: tuple[int
     Args:
         rays: of the last stage, None for what the quality says.
         scattered: the source's rays have to be intersected one by one: take a quarter of them.
+        spread: as of a stage; the light that the source spreads beside the screen is no error there.
     """
     checks.choice("--quality", quality, QUALITIES)
     _, _, each, most, finer, plan = REFINEMENT[quality]
     pixels = resolution[0] * resolution[1]
     rays = rays or max(LEAST_RAYS, min(most, each * pixels) // (4 if scattered else 1))
     finer = max(1, min(finer, math.isqrt(rays // pixels)))
-    filter, apron = filter or Filter("cosine", (3, 3)), math.ceil(0.04 * max(resolution))
+    filter, apron = filter or Filter("cosine", (3, 3)), 0 if spread else math.ceil(0.04 * max(resolution))
     stages = []
     for part, iterations in plan:
         stages.append(Stage(control, max(1, round(part * rays)), "grid", filter, 0.0, apron,
-                            iterations, oversample=finer))
+                            iterations, oversample=finer, spread=spread))
     return stages
 
 

@@ -19,6 +19,10 @@ from torch import Tensor
 
 from caustic_cli.optics.emission.base import Lit
 from caustic_cli.optics.emission.coherent import Mode, edges, middle
+from caustic_cli.optics.surfaces import HeightField
+from caustic_cli.optics.system import EXIT, System
+from caustic_cli.optics.trace import Tracer
+from caustic_cli.scene import Scene
 
 #: Points along each axis of the pupil whose light says how a source shifts the image.
 POINTS = 33
@@ -137,6 +141,20 @@ class Convolution:
             padded[:n, :m] = self.kernel
             kept[key] = torch.fft.rfft2(torch.roll(padded, (-(n // 2), -(m // 2)), (0, 1)))
         return kept[key]
+
+
+def spread_at(scene: Scene, field: HeightField, heights: Tensor) -> Spread | None:
+    """How an extended source spreads the image of its middle on the screen of a scene whose lens has these heights (n, m) mm; None
+    where it does not."""
+    system, parameters = System.of(scene, field), {EXIT: heights.detach().double()}
+
+    def landing(mode: Mode, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        rays = mode.through(u, v, system.before.index_at(None))
+        state = Tracer(system, rays).land(parameters, scene.screen)[0].spread()
+        x, y, _ = state.full(state.origin)
+        return x, y, state.power
+
+    return spread_of(system, landing, heights.device)
 
 
 @torch.no_grad()

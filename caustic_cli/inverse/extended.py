@@ -1,0 +1,111 @@
+"""What an extended source lets a lens do: the best light behind its blur, the least error, and the most light that etendue lets by.
+
+Etendue, the integral of cos cos / r^2 dA dA' over two areas that see each other, is kept from the source's light to the screen's:
+of light of etendue E_1 through the lens no more than E_2 / E_1 lands on a screen that sees the lens under E_2.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from caustic_cli.inverse.deconvolution import Deconvolved, deconvolved
+from caustic_cli.optics.spread import Spread, spread_at
+from caustic_cli.optics.surfaces import HeightField
+from caustic_cli.scene import Points, Scene, Source
+
+#: A source shifts the image where it misplaces light by no more than this part of what it spreads it over.
+SHIFTS = 0.35
+#: Points along each axis of an area.
+POINTS = 12
+#: Control points along each axis of the offset surface by which this is judged before there is a lens.
+NET = 24
+
+
+@dataclass(frozen=True)
+class Limits:
+    """light: the best behind the source's blur; etendue: the most of the light that the lens is lit with that the screen can get, a
+    part; None of either where it does not follow from the source's image or extent."""
+
+    light: Deconvolved | None
+    etendue: float | None
+
+    def sentence(self) -> str:
+        """What cannot be."""
+        found = []
+        if self.light is not None:
+            found.append(f"behind the source's blur no lens comes closer to the picture than {self.light.error:.3g} relative RMS"
+                         f" (proven: {self.light.bound:.3g})")
+        if self.etendue is not None:
+            found.append(f"etendue lets {self.etendue:.0%} of the light on the lens reach the screen")
+        return "; ".join(found)
+
+
+def limits(scene: Scene, target: np.ndarray, field: HeightField | None = None, heights: torch.Tensor | None = None) -> Limits:
+    """What the source of a scene lets any lens do, by the spread of this lens, or of the offset surface; target: (n, m)."""
+    if not scene.source.extended or scene.source.apart:
+        return Limits(None, None)
+    spread = shift_of(scene, field, heights)
+    light = None if spread is None else deconvolved(target, spread.on(scene.screen.pixel))
+    return Limits(light, etendue_limit(scene))
+
+
+def shift_of(scene: Scene, field: HeightField | None = None, heights: torch.Tensor | None = None) -> Spread | None:
+    """How an extended source spreads its middle's image; None where it has no extent, or does much else."""
+    if not scene.source.extended or scene.source.apart or any(scene.screen.tilt):
+        return None
+    if heights is None:
+        scene = replace(scene, lens=replace(scene.lens, control=(NET, NET), knots=None))
+        field = HeightField.of(scene.lens)
+        x, y = (c.numpy() for c in field.control_xy())
+        offset = scene.lens.offset
+        heights = torch.from_numpy(offset.thickness + offset.sag(x[:, None], y[None, :]))
+    found = spread_at(scene, field, heights)
+    return found if found is not None and found.error <= SHIFTS * max(found.reach()) else None
+
+
+def centre_of(scene: Scene) -> Source:
+    """The source without its extent, that shines into the same cone."""
+    source = scene.source.pointlike()
+    if isinstance(source, Points) and source.cone is None:
+        cone = scene.source.cone_over(scene.lens.half_size, scene.lens.z_in, scene.lens.round)
+        return replace(source, cone=math.degrees(cone))
+    return source
+
+
+def etendue_limit(scene: Scene) -> float | None:
+    """E_2 / E_1, at most 1; None for a source that has no area."""
+    lens, screen, source = scene.lens, scene.screen, scene.source
+    x, y, cell = _area(lens.half_size, lens.round)
+    area = cell * len(x)
+    if source.distant:
+        given = area * math.pi * math.sin(source.half_angle) ** 2
+    elif min(source.extent) > 0 and len(source.points()[0]) == 1:
+        a, b, part = _area(source.extent, True)
+        x0, y0, z0 = source.points()[0][0]
+        given = cell * part * _seen(x, y, a + x0, b + y0, lens.z_in - z0).sum()
+    else:
+        return None
+    a, b, part = _area(screen.half_size, False)
+    taken = cell * part * _seen(x, y, a + screen.shift[0], b + screen.shift[1], screen.z - lens.offset.thickness).sum()
+    return min(1.0, float(taken / given)) if given > 0 else None
+
+
+def _area(half: tuple[float, float], round: bool) -> tuple[np.ndarray, np.ndarray, float]:
+    """Even points of a rectangle or an ellipse, and the area of each."""
+    x, y = (h * ((np.arange(POINTS) + 0.5) * (2.0 / POINTS) - 1.0) for h in half)
+    x, y = (c.ravel() for c in np.meshgrid(x, y, indexing="ij"))
+    area = 4.0 * half[0] * half[1]
+    if round:
+        inside = (x / half[0]) ** 2 + (y / half[1]) ** 2 <= 1.0
+        x, y, area = x[inside], y[inside], area * math.pi / 4.0
+    return x, y, area / len(x)
+
+
+def _seen(x: np.ndarray, y: np.ndarray, a: np.ndarray, b: np.ndarray, distance: float) -> np.ndarray:
+    """cos cos / r^2 between points of two parallel planes."""
+    r2 = (x[:, None] - a) ** 2 + (y[:, None] - b) ** 2 + distance * distance
+    return distance * distance / (r2 * r2)
