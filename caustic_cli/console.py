@@ -136,9 +136,11 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
         return "-" if value is None else format(value, form)
 
     lost = ", ".join(f"{name.replace('_', ' ')} {value:.2%}" for name, value in figures["lost"].items() if value > 5e-7)
-    noise = []
-    if "error_estimate" in figures:
-        noise = [("noise of the image", f"{figures['error_estimate']:.2g}, estimated; {figures['rays_traced']:,} rays in all")]
+    own = figures.get("noise")
+    of_rays, noise = "" if own is None else f", noise {own:.2g}", []
+    if figures.get("error_estimate") is not None:
+        in_all = f"; {figures['rays_traced']:,} rays in all" if "rays_traced" in figures else ""
+        noise = [("noise of the image", f"{figures['error_estimate']:.2g}, estimated{in_all}")]
     waves = []
     if "no_wave_image" in figures:
         waves = [("of light as a wave", f"no image: {figures['no_wave_image']}")]
@@ -149,7 +151,7 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
         waves = [("of light as a wave", f"{seen}, {_wavelengths(figures['wave_wavelengths'])}"),
                  ("details light carries", number("resolvable", "d") + " across")]
     return [
-        ("relative RMS error", number("relative_rms", ".4f")),
+        ("relative RMS error", number("relative_rms", ".4f") + of_rays),
         ("loss (eq. 5.2.1)", number("loss", ".4e")),
         ("PSNR", number("psnr_db", ".2f") + " dB"),
         ("SSIM", number("ssim", ".4f")),
