@@ -129,6 +129,15 @@ def _wavelengths(values: list[float]) -> str:
     return f"at {len(values)} wavelengths, {min(values):.4g} to {max(values):.4g} nm"
 
 
+def _absolute(figures: dict, prefix: str) -> list[tuple[str, str]]:
+    """Peak and mean of the image on the screen, in its unit."""
+    if figures.get(f"{prefix}peak_irradiance") is None:
+        return []
+    unit = figures["irradiance_unit"]
+    return [("illuminance" if unit == "lux" else "irradiance",
+             f"peak {figures[prefix + 'peak_irradiance']:.4g} {unit}, mean {figures[prefix + 'mean_irradiance']:.4g} {unit}")]
+
+
 def figures_rows(figures: dict) -> list[tuple[str, str]]:
     """The JSON figures as a person reads them."""
     def number(key: str, form: str) -> str:
@@ -149,6 +158,7 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
         if figures["wave_relative_rms"] is None:  # an archive has no picture to be like
             seen = f"on the screen {number('wave_on_screen', '.2%')}"
         waves = [("of light as a wave", f"{seen}, {_wavelengths(figures['wave_wavelengths'])}"),
+                 *((f"{name} as a wave", value) for name, value in _absolute(figures, "wave_")),
                  ("details light carries", number("resolvable", "d") + " across")]
     return [
         ("relative RMS error", number("relative_rms", ".4f") + of_rays),
@@ -158,6 +168,7 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
         ("light on the screen", number("on_screen", ".2%")),
         ("light on the picture", number("on_target", ".2%")),
         ("lost", lost or "nothing"),
+        *_absolute(figures, ""),
         *waves,
         ("rays", number("rays", ",d")),
         *noise,

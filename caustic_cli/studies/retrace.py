@@ -18,6 +18,7 @@ from caustic_cli.optics.sampling import SOBOL_RAYS, stream
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Scene, Screen
+from caustic_cli.studies.irradiance import irradiance_figures, unit_figures
 from caustic_cli.studies.metrics import judge
 from caustic_cli.studies.noise import image_noise, lift, standard_error, variance_of
 
@@ -116,7 +117,7 @@ def retrace(scene: Scene, field: HeightField, heights: Tensor, target: np.ndarra
     Returns:
         the exposure, reconstructed by `filter` (bincount unless given), and the figures of the JSON table, always by bincount,
         with the rays that were traced; noise, of relative_rms, None without a target; error_estimate, the relative RMS noise of the
-        image, None of a black one; with `tolerance` also rays_traced.
+        image, None of a black one; those of `studies.irradiance`; with `tolerance` also rays_traced.
     """
     def trace(name: str, count: int) -> Image:
         sampler = _rays(scene, max(1, count), stream(seed, name), device)
@@ -143,6 +144,7 @@ def retrace(scene: Scene, field: HeightField, heights: Tensor, target: np.ndarra
             enough = quiet is None or target is None or figures["noise"] <= quiet * figures["relative_rms"]
             if enough or 2 * len(parts[0]) > MOST_TIMES:
                 break
+    figures |= irradiance_figures(scene, counted.image, screen) | unit_figures(scene)
     if filter is None or filter.reach == (0, 0):
         return counted, figures
     return expose(scene, field, heights, sampler_for(scene, counted.rays, seed, device), filter, dtype, screen,
