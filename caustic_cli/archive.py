@@ -9,7 +9,7 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.scene import Disc, Lens, PlaneWave, Points, Scene, Screen, Source
+from caustic_cli.scene import Disc, Lens, Light, PlaneWave, Points, Scene, Screen, Source
 from caustic_cli.surfaces import load_npz, surface_of
 
 
@@ -29,7 +29,7 @@ def open_archive(path: str | Path) -> tuple[Scene, HeightField, Tensor]:
                     aperture=_text(data, "aperture", "rectangle"))
         screen = Screen(tuple(2.0 * h for h in _reals(data, "screen_half_size", 2)), float(data["z_screen"]),
                         tuple(int(n) for n in _reals(data, "resolution", 2)))
-        return Scene(_source(data), lens, screen), field, heights
+        return Scene(_source(data), lens, screen, Light(unit=_text(data, "source_power_unit", "W"))), field, heights
     except KeyError as error:
         raise InputError(f"{path}: has no {error.args[0]}; an archive of caustic export --format lighttools is needed") from error
     except (TypeError, ValueError, IndexError) as error:

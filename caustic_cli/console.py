@@ -129,6 +129,15 @@ def _wavelengths(values: list[float]) -> str:
     return f"at {len(values)} wavelengths, {min(values):.4g} to {max(values):.4g} nm"
 
 
+def _absolute(figures: dict, prefix: str) -> list[tuple[str, str]]:
+    """Peak and mean of the image on the screen, in its unit."""
+    if figures.get(f"{prefix}peak_irradiance") is None:
+        return []
+    unit = figures["irradiance_unit"]
+    return [("illuminance" if unit == "lux" else "irradiance",
+             f"peak {figures[prefix + 'peak_irradiance']:.4g} {unit}, mean {figures[prefix + 'mean_irradiance']:.4g} {unit}")]
+
+
 def figures_rows(figures: dict) -> list[tuple[str, str]]:
     """The JSON figures as a person reads them."""
     def number(key: str, form: str) -> str:
@@ -136,9 +145,11 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
         return "-" if value is None else format(value, form)
 
     lost = ", ".join(f"{name.replace('_', ' ')} {value:.2%}" for name, value in figures["lost"].items() if value > 5e-7)
-    noise = []
-    if "error_estimate" in figures:
-        noise = [("noise of the image", f"{figures['error_estimate']:.2g}, estimated; {figures['rays_traced']:,} rays in all")]
+    own = figures.get("noise")
+    of_rays, noise = "" if own is None else f", noise {own:.2g}", []
+    if figures.get("error_estimate") is not None:
+        in_all = f"; {figures['rays_traced']:,} rays in all" if "rays_traced" in figures else ""
+        noise = [("noise of the image", f"{figures['error_estimate']:.2g}, estimated{in_all}")]
     waves = []
     if "no_wave_image" in figures:
         waves = [("of light as a wave", f"no image: {figures['no_wave_image']}")]
@@ -147,15 +158,17 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
         if figures["wave_relative_rms"] is None:  # an archive has no picture to be like
             seen = f"on the screen {number('wave_on_screen', '.2%')}"
         waves = [("of light as a wave", f"{seen}, {_wavelengths(figures['wave_wavelengths'])}"),
+                 *((f"{name} as a wave", value) for name, value in _absolute(figures, "wave_")),
                  ("details light carries", number("resolvable", "d") + " across")]
     return [
-        ("relative RMS error", number("relative_rms", ".4f")),
+        ("relative RMS error", number("relative_rms", ".4f") + of_rays),
         ("loss (eq. 5.2.1)", number("loss", ".4e")),
         ("PSNR", number("psnr_db", ".2f") + " dB"),
         ("SSIM", number("ssim", ".4f")),
         ("light on the screen", number("on_screen", ".2%")),
         ("light on the picture", number("on_target", ".2%")),
         ("lost", lost or "nothing"),
+        *_absolute(figures, ""),
         *waves,
         ("rays", number("rays", ",d")),
         *noise,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -37,7 +38,8 @@ class Key:
 SCHEMA: dict[str, dict[str, Key]] = {
     "source": {
         "type": Key("text", sources.in_words()),
-        "power": Key("number", "W, of all: through the aperture, or into the cone"),
+        "power": Key("number", "of all: through the aperture, or into the cone"),
+        "power_unit": Key("text", "W, or lm for images in lux; without it, W"),
         "profile": Key("text", "plane: file here with the relative irradiance over the aperture"),
         "position": Key("points", "mm; point: one or several [x, y, z]; grid, disc: the centre"),
         "powers": Key("list", "point: relative power of each position"),
@@ -294,13 +296,13 @@ def build_light(settings: dict[str, dict[str, Any]]) -> Light:
     """Wavelengths and polarisation of the [source] section, whatever its type."""
     s = settings["source"]
     return Light(s.get("polarisation"), tuple(s.get("wavelengths", ())), tuple(s.get("weights", ())),
-                 color=settings["target"].get("color", False))
+                 color=settings["target"].get("color", False), unit=s.get("power_unit", "W"))
 
 
 def as_options(message: str, given) -> str:
     """A message about settings, in the words of the options (section, key, option) that gave them."""
     for section, key, option in given:
-        message = message.replace(f"[{section}] {key}", option)
+        message = re.sub(rf"\[{section}\] {key}\b", lambda _, option=option: option, message)
     return message
 
 

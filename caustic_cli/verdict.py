@@ -29,6 +29,8 @@ from caustic_cli.studies.waves import FINER, unseen_figures, wave_figures
 REPORT_SAMPLES = 401
 #: Losses whose aim is the likeness itself; another may rightly pay for what it wants with likeness.
 LIKENESS = {"rms", "rms-light", "throughput"}
+#: Part of relative_rms that the noise of its rays may be.
+QUIET = 0.1
 #: From so many times the light on the screen, a lens may be less like its target than the start is.
 BRIGHTER = 1.01
 
@@ -44,8 +46,8 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
     """
     scene, field, seed = designer.scene, designer.field(state.stage), project.settings["design"]["seed"]
 
-    def trace(heights: torch.Tensor):
-        return retrace(scene, field, heights, target, rays=FINAL_RAYS, device=device, seed=seed)
+    def trace(heights: torch.Tensor, noise: bool = True):
+        return retrace(scene, field, heights, target, rays=FINAL_RAYS, device=device, seed=seed, noise=noise, quiet=QUIET)
 
     waves = any(s.waves for s in designer.stages[: state.stage + 1])
     light, seen = None, Resolution.before(scene, tuple(project.settings["target"]["size"]))
@@ -60,14 +62,15 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
     likeness = {name for _, name in parse(designer.options.loss)} <= LIKENESS
     if state.start is not None and likeness:
         start = designer.within_limits(replace(state, heights=designer.begun(state)))
-        first, began = trace(start)
+        _, began = trace(start, noise=False)
         of_start = None
         if waves:
             of_start, more = as_waves(start, 1.0)
             began |= more
         if _worse(figures, began):
             state = replace(designer.showing(state, start), reason=f"{state.reason}; its start was better and is kept")
-            exposure, figures, light = first, began, of_start
+            exposure, judged = trace(start)
+            figures, light = began | judged, of_start
         figures = figures | {"start_relative_rms": began["relative_rms"]}
         if waves:
             figures |= {"start_wave_relative_rms": began["wave_relative_rms"]}

@@ -222,6 +222,8 @@ def test_a_design_for_light(_here, capfd):
     assert cli.run(["render", "waves", "--rays", "4000", "--quiet", "--npy", "ray.npy", "-o", "ray.png"]) == 0
     light = np.load("ray-wave.npy")
     assert light.sum() == pytest.approx(again["wave_on_screen"], abs=1e-6) and Path("ray-wave.png").exists()
+    assert again["wave_mean_irradiance"] / again["mean_irradiance"] == pytest.approx(again["wave_on_screen"] / again["on_screen"])
+    assert again["wave_peak_irradiance"] == pytest.approx(again["wave_mean_irradiance"] * light.max() / light.mean())
     assert cli.run(["export", "waves", "--format", "lighttools", "-o", "lens.npz", "--quiet"]) == 0
     capfd.readouterr()
     assert cli.run(["render", "lens.npz", "--rays", "4000", "--effects", "diffraction"]) == 0

@@ -32,6 +32,7 @@ def run(
     source_grid: options.SourceGrid = None,
     source_angle: options.SourceAngle = None,
     cone: options.Cone = None,
+    power: options.Power = None,
     polarisation: options.Polarisation = None,
     wavelengths: options.Wavelengths = None,
     absorption: options.Absorption = None,
@@ -101,7 +102,7 @@ def run(
     speaks = os.environ.get("RANK", "0") == "0"  # under torchrun, the first of all
     began, say = time.monotonic(), console.Reporter(quiet or not speaks, progress)
     given = {
-        **options.source(source, source_position, source_size, source_grid, source_angle, cone),
+        **options.source(source, source_position, source_size, source_grid, source_angle, cone, power),
         **options.physics(polarisation, wavelengths, absorption, roughness, screen_tilt, screen_shift),
         ("lens", "mirror", "--mirror"): mirror or None,
         ("lens", "size", "--lens-size"): lens_size and options.both(options.size("--lens-size", lens_size)),

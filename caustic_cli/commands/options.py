@@ -37,6 +37,8 @@ SourceAngle = Annotated[float | None, typer.Option(metavar="DEG", help="Disc at 
                                                    " 0.533).")]
 Cone = Annotated[float | None, typer.Option(metavar="DEG", help="Half-angle of a source's cone about +z.  [default: as wide as"
                                             " the lens]")]
+Power = Annotated[str | None, typer.Option(metavar="NUMBER[W|lm]", help="All of the source's power: 2W, or 100lm for images in lux."
+                                           "  [default: 1W]")]
 
 
 Polarisation = Annotated[float | None, typer.Option(metavar="DEG", help="The source is linearly polarised, so far from +x."
@@ -70,9 +72,12 @@ def physics(polarisation: float | None, wavelengths: str | None, absorption: flo
 
 
 def source(kind: str | None, position: list[str] | None, size_: str | None, grid: str | None, angle: float | None,
-           cone: float | None) -> dict[tuple[str, str, str], object]:
+           cone: float | None, power_: str | None = None) -> dict[tuple[str, str, str], object]:
     """The source options as (section, key, option) -> value, without those that were not given."""
+    watts = (None, None) if power_ is None else power("--power", power_)
     given = {
+        ("source", "power", "--power"): watts[0],
+        ("source", "power_unit", "--power"): watts[1],
         ("source", "type", "--source"): kind or ("disc" if angle is not None else None),
         ("source", "position", "--source-position"):
             [list(numbers("--source-position", p, (3,), ",")) for p in position] if position else None,
@@ -107,6 +112,25 @@ def size(option: str, text: str) -> tuple[float, float] | tuple[float]:
     if min(values) <= 0:
         raise InputError(f"{option} must be greater than 0, got {text!r}")
     return values
+
+
+def power(option: str, text: str) -> tuple[float, str]:
+    """A power and its unit, W where none is said: "100lm", "2 W", "2".
+
+    Raises:
+        InputError: naming the option.
+    """
+    from caustic_cli.scene import checks  # noqa: PLC0415
+
+    found = re.fullmatch(r"([0-9.]+(?:[eE][+-]?[0-9]+)?) ?(W|lm)?", text.strip(), re.ASCII)
+    try:
+        value = float(found[1]) if found else math.nan
+    except ValueError:  # of two points
+        value = math.nan
+    if not 0 < value <= checks.POWER:
+        raise InputError(f"{option} must be a number greater than 0 and at most {checks.POWER:g}, of W or lm, like 2W or 100lm,"
+                         f" got {text!r}")
+    return value, found[2] or "W"
 
 
 def counts(option: str, text: str) -> tuple[int, ...]:

@@ -38,6 +38,7 @@ def run(
     source_grid: options.SourceGrid = None,
     source_angle: options.SourceAngle = None,
     cone: options.Cone = None,
+    power: options.Power = None,
     polarisation: options.Polarisation = None,
     wavelengths: options.Wavelengths = None,
     absorption: options.Absorption = None,
@@ -83,7 +84,7 @@ def run(
         raise InputError(f"--verify must be mitsuba, got {verify!r}")
     if verify and screen_at is not None:
         raise InputError("--verify compares on the project's own screen: give no --screen-at")
-    given = options.source(source, source_position, source_size, source_grid, source_angle, cone)
+    given = options.source(source, source_position, source_size, source_grid, source_angle, cone, power)
     given |= options.physics(polarisation, wavelengths, absorption, roughness, screen_tilt, screen_shift)
     device = options.start_torch(device, threads, say)
 

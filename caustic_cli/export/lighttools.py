@@ -1,6 +1,6 @@
 """The LightTools archive: one `.npz` with the sampled surface, the exact B-spline beside it, and the whole scene.
 
-Lengths are mm, powers W, angles degrees.  Reals are float64, counts (`shape`, `resolution`, `degrees`,
+Lengths are mm, powers W (or lm), angles degrees.  Reals are float64, counts (`shape`, `resolution`, `degrees`,
 `format_version`) int64, names strings; `numpy.load` reads it with allow_pickle=False.  Grids are indexed [i, j], i
 along +x and j along +y, and flattened row-major: x varies slowest.
 
@@ -80,7 +80,7 @@ def _source(scene: Scene) -> dict[str, np.ndarray]:
 
     `source_power` (k,), of each position; (1,), through the aperture, for a plane wave or a disc at infinity.  `source_profile`
     (a, b), the relative irradiance over the aperture [i, j], is there only when a wave is not uniform; `source_size` (2,) mm
-    or `source_angle` (full, degrees) only for a disc; `source_intensity` where there is a cone.
+    or `source_angle` (full, degrees) only for a disc; `source_intensity` where there is a cone; `source_power_unit` unless W.
 
     Raises:
         InputError: the archive knows no source of this type.
@@ -92,6 +92,7 @@ def _source(scene: Scene) -> dict[str, np.ndarray]:
         "source_type": np.array(source.kind),
         "source_positions": source.points()[0],
         "source_power": _reals(source.powers),
+        **({} if scene.light.unit == "W" else {"source_power_unit": np.array(scene.light.unit)}),
         **_KEYS[source.kind](scene),
     }
 

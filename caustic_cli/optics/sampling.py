@@ -80,7 +80,7 @@ def numbers(kind: str, shape: tuple[int, int], seed: int, dimensions: int, start
         if stop > SOBOL_RAYS:
             raise InputError(f"the sobol sampler has at most {SOBOL_RAYS} rays, got {stop}")
         engine = torch.quasirandom.SobolEngine(dimensions, scramble=True, seed=seed)
-        points = engine.fast_forward(start).draw(stop - start, dtype=torch.float64)
+        points = _forwarded(engine, start).draw(stop - start, dtype=torch.float64)
         return [x.contiguous().to(device) for x in points.T]
     k, (nu, nv) = torch.arange(start, stop, device=device), shape
     if kind in ("grid", "lines"):
@@ -93,6 +93,20 @@ def numbers(kind: str, shape: tuple[int, int], seed: int, dimensions: int, start
     else:
         first = backend_for(device).scatter(seed, start, stop, shape, kind == "stratified", device)
     return first + [random_numbers(seed, d, k) for d in range(2, dimensions)]
+
+
+def _forwarded(engine: torch.quasirandom.SobolEngine, count: int) -> torch.quasirandom.SobolEngine:
+    """A new engine whose next point is number `count`, as by its own fast_forward, which takes `count` steps to get there.
+
+    The point before, number k, is the sum modulo 2 of the direction numbers of the ones in Gray's code k ^ (k >> 1), and the shift.
+    """
+    if count:
+        gray = (count - 1) ^ ((count - 1) >> 1)
+        for bit in range(engine.MAXBIT):
+            if gray >> bit & 1:
+                engine.quasi ^= engine.sobolstate[:, bit]
+        engine.num_generated = count
+    return engine
 
 
 def spread(seed: int, start: int, stop: int, shape: tuple[int, int], stratified: bool,

@@ -30,7 +30,7 @@ class Band:
 
 @dataclass(frozen=True)
 class Scene:
-    """Source, lens and screen on one optical axis (z); lengths in mm, powers in W.
+    """Source, lens and screen on one optical axis (z); lengths in mm, powers in the unit of `light`.
 
     Raises:
         InputError: the screen does not stand behind the lens, or the source not before it.

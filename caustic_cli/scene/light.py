@@ -1,4 +1,4 @@
-"""What the light is, wherever it comes from: its wavelengths, its polarisation, and whether colours are told apart."""
+"""What the light is, wherever it comes from: wavelengths, polarisation, unit of power, and whether colours are told apart."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from caustic_cli.scene import checks
 
 #: Dominant wavelengths of the primaries of sRGB (IEC 61966-2-1), nm: what stands for red, green and blue.
 RGB = (611.4, 549.1, 464.3)
+#: Radiant power, or luminous flux.
+UNITS = ("W", "lm")
 #: Most wavelengths of one source: each is traced.
 MAX_WAVELENGTHS = 99
 
@@ -23,6 +25,7 @@ class Light:
         weights: part of the power at each wavelength, any scale; empty for equal parts.
         tracked: unpolarised light is traced as two polarisations, for the exit to know what the entrance did to each.
         color: the wavelengths are red, green and blue, and the image is kept apart for each.
+        unit: of the source's power, one of UNITS.
     """
 
     polarisation: float | None = None
@@ -30,8 +33,10 @@ class Light:
     weights: tuple[float, ...] = ()
     tracked: bool = False
     color: bool = False
+    unit: str = "W"
 
     def __post_init__(self):
+        checks.choice("[source] power_unit", self.unit, UNITS)
         if self.polarisation is not None:
             checks.number("[source] polarisation", self.polarisation, -360.0, 360.0)
         if len(self.wavelengths) > MAX_WAVELENGTHS:

@@ -12,6 +12,10 @@ Notation
     ssim            mean of (2 m_K m_T + c_1)(2 s_KT + c_2) / ((m_K^2 + m_T^2 + c_1)(s_K^2 + s_T^2 + c_2)), local
                     means m, variances s^2 and covariance s_KT under an 11 x 11 Gaussian window; c_i = (k_i L)^2
 
+The noise of an image's own rays adds to every squared error.  Where V is known, the variance of each pixel's noise on the scale
+of J, the figures are without it, as of endless rays: mean(V / (S J)^2) is taken off loss^2, and the window's mean of V off s_K^2,
+which stays at least s_KT^2 / s_T^2.  Both are without bias in the squares; the ratio that SSIM is keeps some.
+
 A black image is compared as it is, all zero: its relative_rms against an even target is 1.  What has no value (the
 logarithm of no error, anything relative to a black target) is None, because JSON has neither infinity nor NaN.
 
@@ -37,22 +41,25 @@ SSIM_SIGMA, SSIM_RADIUS, SSIM_K1, SSIM_K2 = 1.5, 5, 0.01, 0.03
 _FIGURES = ("loss", "relative_rms", "psnr_db", "ssim")
 
 
-def loss(image, target) -> float:
+def loss(image, target, variance=None) -> float:
     """Eq. 5.2.1 between image and target, (n_x, n_y) each on any scale: a part of the whole light, per pixel.
+
+    variance: (n_x, n_y) of the image's noise, or None to leave it in; an error below it is 0.
 
     Raises:
         InputError: the two differ in shape, or hold something that is not a finite number.
     """
     image, target = _pair(image, target)
-    return float(np.sqrt(np.mean((_normalised(image) - _normalised(target)) ** 2)))
+    square = np.mean((_normalised(image) - _normalised(target)) ** 2)
+    return float(np.sqrt(max(0.0, square - np.mean(_of_normalised(variance, image)))))
 
 
-def relative_rms(image, target) -> float:
+def relative_rms(image, target, variance=None) -> float:
     """`loss` times the number of pixels: the RMS error in units of the mean of the target."""
-    return loss(image, target) * np.size(_array(target))
+    return loss(image, target, variance) * np.size(_array(target))
 
 
-def psnr_db(image, target) -> float | None:
+def psnr_db(image, target, variance=None) -> float | None:
     """Peak signal to noise ratio in dB of the image scaled to the target's sum, peak = target maximum.
 
     None where the two are equal (it would be infinite) or the target is black (it has no peak).
@@ -61,11 +68,11 @@ def psnr_db(image, target) -> float | None:
     peak = target.max()
     if not peak > 0:
         return None
-    error = loss(image, target) * (target.sum() / peak)  # RMS of K - T over L
+    error = loss(image, target, variance) * (target.sum() / peak)  # RMS of K - T over L
     return -20.0 * math.log10(error) if error > 0 else None
 
 
-def ssim(image, target) -> float | None:
+def ssim(image, target, variance=None) -> float | None:
     """Mean structural similarity of the image scaled to the target's sum, at most 1; None for a black target.
 
     Population covariances; the mean is over the pixels whose window lies inside the picture.  A picture narrower than
@@ -82,6 +89,9 @@ def ssim(image, target) -> float | None:
 
     m_k, m_t = window(k), window(t)
     var_k, var_t, cov = window(k * k) - m_k * m_k, window(t * t) - m_t * m_t, window(k * t) - m_k * m_t
+    if variance is not None:
+        least = np.divide(cov * cov, var_t, out=np.zeros_like(cov), where=var_t > 0)
+        var_k = np.maximum(var_k - window(_of_normalised(variance, image) * (target.sum() / peak) ** 2), least)
     c1, c2 = SSIM_K1**2, SSIM_K2**2
     local = (2 * m_k * m_t + c1) * (2 * cov + c2) / ((m_k**2 + m_t**2 + c1) * (var_k + var_t + c2))
     if min(local.shape) > 2 * SSIM_RADIUS:
@@ -95,12 +105,13 @@ def on_target(image, target) -> float:
     return float(image[target > 0].sum())
 
 
-def judge(exposure: Image, target) -> dict:
+def judge(exposure: Image, target, variance=None) -> dict:
     """The figures that `render --json` and `design --json` share, ready for `json.dumps(..., allow_nan=False)`.
 
     Args:
         exposure: a traced image; eq. 5.2.1 asks for bincount reconstruction.
         target: (n_x, n_y), any scale, or None where there is none: what compares with it is None then.
+        variance: of the noise of the image's pixels, of its shape, for figures without it; None leaves it in.
 
     Returns:
         loss, relative_rms, psnr_db, ssim (None where undefined), on_screen, on_target, lost (name -> part of the
@@ -110,13 +121,14 @@ def judge(exposure: Image, target) -> dict:
     """
     image = exposure.image
     if image.ndim == 3 and target is not None:
-        parts = [judge(replace(exposure, image=i), t) for i, t in zip(image, target, strict=True) if t.sum() > 0]
+        noise = [None] * len(image) if variance is None else variance
+        parts = [judge(replace(exposure, image=i), t, v) for i, t, v in zip(image, target, noise, strict=True) if t.sum() > 0]
         means = {k: None if None in (v := [p[k] for p in parts]) else math.fsum(v) / len(v) for k in _FIGURES}
         sums = {k: math.fsum(p[k] for p in parts) for k in ("on_screen", "on_target")}
         return means | sums | {k: parts[0][k] for k in ("lost", "rays")}
     against = (loss, relative_rms, psnr_db, ssim)
     return {
-        **{figure.__name__: None if target is None else figure(image, target) for figure in against},
+        **{figure.__name__: None if target is None else figure(image, target, variance) for figure in against},
         "on_screen": float(_array(image).sum()),
         "on_target": None if target is None else on_target(image, target),
         "lost": {name: float(value) for name, value in exposure.lost.items()},
@@ -137,6 +149,12 @@ def _pair(image, target) -> tuple[np.ndarray, np.ndarray]:
     if not (np.isfinite(image).all() and np.isfinite(target).all()):
         raise InputError("image and target must hold finite numbers only, got NaN or infinity")
     return image, target
+
+
+def _of_normalised(variance, image: np.ndarray) -> np.ndarray:
+    """The variance of a normalised image's noise; zero where none is known or the image is black."""
+    total = image.sum()
+    return np.zeros_like(image) if variance is None or not total > 0 else _array(variance) / total**2
 
 
 def _normalised(a: np.ndarray) -> np.ndarray:

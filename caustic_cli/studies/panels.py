@@ -7,8 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from caustic_cli.files import atomic_path
-from caustic_cli.picture import SOFTWARE, to_srgb
+from caustic_cli.picture import SOFTWARE, to_linear, to_srgb
 from caustic_cli.scene import Lens, Screen
+
+#: A scale of irradiance that ends below this has no room for ticks between numbers; a black image has such a one.
+DARK = 1e-250
 
 
 def write_report(path: Path, target: np.ndarray, image: np.ndarray, heights: np.ndarray, history: np.ndarray,
@@ -16,7 +19,8 @@ def write_report(path: Path, target: np.ndarray, image: np.ndarray, heights: np.
     """Write the panels.
 
     Args:
-        target, image: (n_x, n_y) irradiance; drawn at the same exposure and in the picture's encoding.
+        target, image: (n_x, n_y) irradiance; drawn at the same exposure and in the picture's encoding, images beside a bar of
+            what they are on the screen.
         heights: (a, b) surface heights on an even grid over the aperture, mm; the sphere that fits best is taken out,
             because it hides the relief.
         history: (k, 5) rows iteration, stage, loss, on_screen, seconds.
@@ -26,13 +30,14 @@ def write_report(path: Path, target: np.ndarray, image: np.ndarray, heights: np.
 
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt  # noqa: PLC0415
+    from matplotlib.colors import FuncNorm, Normalize  # noqa: PLC0415
 
     across = 3 if waves is None else 4
     figure, axes = plt.subplots(2, across, figsize=(4.8 * across, 8.8), constrained_layout=True)
     extent = [-screen.half_size[0], screen.half_size[0], -screen.half_size[1], screen.half_size[1]]
     scale = target.sum() / target.max()
     def titled(name: str, relative: float | None) -> str:
-        return name if relative is None else f"{name}, relative RMS error {relative:.3f}"
+        return name if relative is None else f"{name}\nrelative RMS error {relative:.3f}"
 
     if waves is None:
         shown = [(target, "target"), (image, titled("caustic", figures["relative_rms"]))]
@@ -41,9 +46,15 @@ def write_report(path: Path, target: np.ndarray, image: np.ndarray, heights: np.
                  (waves, titled("what light will do (waves)", figures["wave_relative_rms"]))]
         image = waves
     for axis, (picture, title) in zip(axes[0], shown, strict=False):
-        drawn = np.clip(picture / max(picture.sum(), 1e-300) * scale, 0.0, 1.0)
-        axis.imshow((to_srgb(drawn) if encoding == "srgb" else drawn).T, origin="lower", extent=extent, cmap="gray",
-                    vmin=0, vmax=1)
+        part = picture / max(picture.sum(), 1e-300)
+        mean = figures["wave_mean_irradiance" if picture is waves else "mean_irradiance"]
+        white = mean * picture.size / scale
+        white = white if white > DARK else 1.0
+        norm = FuncNorm((lambda e, w=white: to_srgb(e / w), lambda v, w=white: w * to_linear(v)), 0.0, white, clip=True) \
+            if encoding == "srgb" else Normalize(0.0, white, clip=True)
+        drawn = axis.imshow((part * scale * white).T, origin="lower", extent=extent, cmap="gray", norm=norm)
+        if picture is not target:
+            figure.colorbar(drawn, ax=axis, label=_irradiance_words(figures, "wave_" if picture is waves else ""))
         axis.set(title=title, xlabel="x on the screen (mm)", ylabel="y (mm)")
     error = image / max(image.sum(), 1e-300) - target / target.sum()
     drawn = axes[0, -1].imshow(error.T * target.size, origin="lower", extent=extent, cmap="coolwarm", vmin=-1.0, vmax=1.0)
@@ -66,6 +77,13 @@ def write_report(path: Path, target: np.ndarray, image: np.ndarray, heights: np.
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", dpi=100, metadata={"Software": SOFTWARE})
     plt.close(figure)
+
+
+def _irradiance_words(figures: dict, prefix: str) -> str:
+    """What a bar of irradiance shows, its unit, and the peak and the mean of the image."""
+    unit = figures["irradiance_unit"].replace("^2", "²")
+    peak, mean = (figures[f"{prefix}{k}_irradiance"] for k in ("peak", "mean"))
+    return f"{'illuminance' if unit == 'lux' else 'irradiance'} ({unit}): peak {peak:.3g}, mean {mean:.3g}"
 
 
 def _without_sphere(heights: np.ndarray, rx: float, ry: float) -> np.ndarray:

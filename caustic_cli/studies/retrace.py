@@ -14,34 +14,49 @@ from caustic_cli.optics.effects import NO_REQUESTS, Requests
 from caustic_cli.optics.emission import Rays, rays_of
 from caustic_cli.optics.image import Image
 from caustic_cli.optics.reconstruction import Filter
-from caustic_cli.optics.sampling import stream
+from caustic_cli.optics.sampling import SOBOL_RAYS, stream
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Scene, Screen
+from caustic_cli.studies.irradiance import irradiance_figures, unit_figures
 from caustic_cli.studies.metrics import judge
+from caustic_cli.studies.noise import image_noise, lift, standard_error, variance_of
 
 #: Rays of the retrace that ends a design.
 FINAL_RAYS = 4_000_000
 #: Independent images whose scatter tells their mean's noise: over thousands of pixels four are plenty.
 BATCHES = 4
+#: So many times the rays asked for may be traced to bring the noise of a figure down.
+MOST_TIMES = 4
+#: Orders of the noise: of stratified rays on two dimensions; of Sobol's on the four of a disc, measured.
+ORDER, SOBOL_ORDER = 0.75, 0.58
+#: A plane wave's noise is told by two images of one PROBE-th of its rays each.
+PROBE = 8
 #: Most rays that --tolerance may ask for in one go.
 MOST_RAYS = 10**11
 
 
 def sampler_for(scene: Scene, rays: int, seed: int, device: str = "cpu") -> Rays:
-    """About `rays` stratified rays of the scene's source, unrelated to those of any design."""
-    return rays_of(scene, "stratified", rays, stream(seed, "render"), device)
+    """About `rays` rays of the scene's source, unrelated to those of any design."""
+    return _rays(scene, rays, stream(seed, "render"), device)
+
+
+def _rays(scene: Scene, rays: int, seed: int, device: str) -> Rays:
+    """Stratified rays of a plane wave, whose two dimensions strata fill evenly; of other light, up to four dimensions, Sobol's."""
+    even = scene.source.collimated or rays > SOBOL_RAYS // 2
+    return rays_of(scene, "stratified" if even else "sobol", rays, seed, device)
 
 
 @dataclass(frozen=True)
 class Converged:
     """An image traced until its noise was low enough.
 
-    exposure: the mean of BATCHES independent ones; error: estimated relative RMS of that mean's noise, from their variance;
-    traced: rays spent in all, those of the attempts before it included.
+    exposure: the mean of BATCHES independent ones, and halves, the means of one half of them and the other; error: estimated
+    relative RMS of that mean's noise, from their variance; traced: rays spent in all, those of the attempts before it included.
     """
 
     exposure: Image
+    halves: tuple[Image, Image]
     error: float
     traced: int
 
@@ -49,18 +64,18 @@ class Converged:
 def converge(scene: Scene, field: HeightField, heights: Tensor, tolerance: float, *, rays: int, seed: int = 0,
              screen: Screen | None = None, device: str = "cpu", dtype: torch.dtype = torch.float64,
              requests: Requests = NO_REQUESTS) -> Converged:
-    """Trace BATCHES independent sets of stratified rays, about `rays` in all, then more until the noise is at most `tolerance`.
+    """Trace BATCHES independent sets of rays, about `rays` in all, then more until the noise is at most `tolerance`.
 
-    The relative RMS noise of the mean of B images J_k is sqrt(mean over pixels of var(J_k) / B) / mean(J).  Stratified rays
-    converge with order 3/4, so n rays that leave an error e are followed by n (e / tolerance)^(4/3).
+    The relative RMS noise of the mean of B images J_k is sqrt(mean over pixels of var(J_k) / B) / mean(J).  Rays that converge with
+    order p are n (e / tolerance)^(1 / p) after n that leave an error e.
 
     Raises:
         CausticError: MOST_RAYS are not enough, or no light reaches the screen.
     """
-    each, traced = max(1, rays // BATCHES), 0
+    each, traced, order = max(1, rays // BATCHES), 0, ORDER if scene.source.collimated else SOBOL_ORDER
     while True:
-        parts = [expose(scene, field, heights, rays_of(scene, "stratified", each, stream(seed, f"batch {k}"), device), None, dtype,
-                        screen, requests=requests) for k in range(BATCHES)]
+        parts = [expose(scene, field, heights, _rays(scene, each, stream(seed, f"batch {k}"), device), None, dtype, screen,
+                        requests=requests) for k in range(BATCHES)]
         traced += sum(p.rays for p in parts)
         images = torch.stack([p.image for p in parts])
         mean = images.mean(0)
@@ -68,10 +83,9 @@ def converge(scene: Scene, field: HeightField, heights: Tensor, tolerance: float
             raise CausticError("no light reaches the screen, so there is no image to converge")
         error = math.sqrt(float(images.var(0).mean()) / BATCHES) / float(mean.mean())
         if error <= tolerance:
-            lost = {name: math.fsum(p.lost[name] for p in parts) / BATCHES for name in parts[0].lost}
-            leaving = math.fsum(p.leaving for p in parts) / BATCHES
-            return Converged(Image(mean, leaving, lost, sum(p.rays for p in parts)), error, traced)
-        more = max(1.3, 1.1 * (error / tolerance) ** (4.0 / 3.0))
+            halves = mean_of(parts[: BATCHES // 2]), mean_of(parts[BATCHES // 2 :])
+            return Converged(mean_of(parts), halves, error, traced)
+        more = max(1.3, 1.1 * (error / tolerance) ** (1.0 / order))
         foreseen = each * more if each > mean.numel() else 0.0  # too few rays a pixel foretell nothing
         each = int(each * min(32.0, more))
         if max(each, foreseen) * BATCHES > MOST_RAYS:
@@ -79,28 +93,88 @@ def converge(scene: Scene, field: HeightField, heights: Tensor, tolerance: float
                                f" error of {error:.2g}; fewer pixels or a larger tolerance need fewer")
 
 
+def mean_of(parts: list[Image]) -> Image:
+    """The image that several of as many rays each make together."""
+    lost = {name: math.fsum(p.lost[name] for p in parts) / len(parts) for name in parts[0].lost}
+    leaving = math.fsum(p.leaving for p in parts) / len(parts)
+    return Image(torch.stack([p.image for p in parts]).mean(0), leaving, lost, sum(p.rays for p in parts))
+
+
 def retrace(scene: Scene, field: HeightField, heights: Tensor, target: np.ndarray | None, *, rays: int, seed: int = 0,
             filter: Filter | None = None, screen: Screen | None = None, device: str = "cpu",
             dtype: torch.dtype = torch.float64, tolerance: float | None = None,
-            requests: Requests = NO_REQUESTS) -> tuple[Image, dict]:
-    """Trace a lens with stratified rays of its own; with `tolerance`, as many as that asks for (`converge`).  requests: of a plan.
+            requests: Requests = NO_REQUESTS, noise: bool = True, quiet: float | None = None) -> tuple[Image, dict]:
+    """Trace a lens with rays of its own; with `tolerance`, as many as that asks for (`converge`).  requests: of a plan.
+
+    A plane wave's stratified rays leave little noise, which its figures hold.  All other light, and with `tolerance` that too, is
+    traced in independent halves, from which the figures are without noise (`studies.noise`).
+
+    Args:
+        noise: say what the noise is; a plane wave needs a quarter more rays for that.
+        quiet: part of relative_rms that its noise may be: until then other light than a plane wave's gets more rays, up to
+            MOST_TIMES as many.
 
     Returns:
-        the exposure, reconstructed by `filter` (bincount unless given), and the figures of the JSON table, always by
-        bincount, with the rays that were traced; with `tolerance` also error_estimate and rays_traced.
+        the exposure, reconstructed by `filter` (bincount unless given), and the figures of the JSON table, always by bincount,
+        with the rays that were traced; noise, of relative_rms, None without a target; error_estimate, the relative RMS noise of the
+        image, None of a black one; those of `studies.irradiance`; with `tolerance` also rays_traced.
     """
-    if tolerance is None:
-        counted = expose(scene, field, heights, sampler_for(scene, rays, seed, device), None, dtype, screen, requests=requests)
-        figures = judge(counted, target)
-    else:
+    def trace(name: str, count: int) -> Image:
+        sampler = _rays(scene, max(1, count), stream(seed, name), device)
+        return expose(scene, field, heights, sampler, None, dtype, screen, requests=requests)
+
+    even = scene.source.collimated
+    if tolerance is not None:
         found = converge(scene, field, heights, tolerance, rays=rays, seed=seed, screen=screen, device=device, dtype=dtype,
                          requests=requests)
         counted = found.exposure
-        figures = judge(counted, target) | {"error_estimate": found.error, "rays_traced": found.traced}
+        figures = _judged_halves(counted, target, found.halves) | {"error_estimate": found.error, "rays_traced": found.traced}
+    elif even:
+        counted = trace("render", rays)
+        figures = _judged_even(counted, target, tuple(trace(f"noise {k}", rays // PROBE) for k in (0, 1)) if noise else None)
+    else:
+        parts: tuple[list[Image], list[Image]] = [], []
+        while True:
+            for k in range(len(parts[0]), max(1, 2 * len(parts[0]))):
+                for part, name in zip(parts, ("render", "render, other half"), strict=True):
+                    part.append(trace(f"{name} {k}" if k else name, rays // 2))
+            halves = mean_of(parts[0]), mean_of(parts[1])
+            counted = mean_of(list(halves))
+            figures = _judged_halves(counted, target, halves)
+            enough = quiet is None or target is None or figures["noise"] <= quiet * figures["relative_rms"]
+            if enough or 2 * len(parts[0]) > MOST_TIMES:
+                break
+    figures |= irradiance_figures(scene, counted.image, screen) | unit_figures(scene)
     if filter is None or filter.reach == (0, 0):
         return counted, figures
     return expose(scene, field, heights, sampler_for(scene, counted.rays, seed, device), filter, dtype, screen,
                   requests=requests), figures
+
+
+def _judged_halves(counted: Image, target: np.ndarray | None, halves: tuple[Image, Image]) -> dict:
+    """Figures of the mean of two halves, without its noise."""
+    pair = [h.image.cpu().numpy() for h in halves]
+    variance = variance_of(*pair)
+    figures = judge(counted, target, variance)
+    noise = None if target is None else standard_error(*pair, target, figures["relative_rms"])
+    return figures | {"noise": noise, "error_estimate": image_noise(variance, counted.image.cpu().numpy())}
+
+
+def _judged_even(counted: Image, target: np.ndarray | None, fewer: tuple[Image, Image] | None) -> dict:
+    """Figures of an image as it is.
+
+    fewer: two others, from whose noise its own follows, or None: stratified rays on two dimensions converge with order 3/4.
+    """
+    figures = judge(counted, target) | {"noise": None, "error_estimate": None}
+    if fewer is None:
+        return figures
+    pair = [f.image.cpu().numpy() for f in fewer]
+    image, falls = counted.image.cpu().numpy(), (sum(f.rays for f in fewer) / 2.0 / counted.rays) ** ORDER
+    error = image_noise(2.0 * variance_of(*pair) * falls**2, image)
+    if target is not None and error is not None:
+        own = standard_error(*pair, target, figures["relative_rms"]) * math.sqrt(2.0) * falls  # of one image, not of both's mean
+        figures["noise"] = math.hypot(lift(figures["relative_rms"], error), own)
+    return figures | {"error_estimate": error}
 
 
 def white_level(image: np.ndarray, target: np.ndarray | None) -> float:

@@ -103,7 +103,7 @@ def run_training(scene: Scene, target: np.ndarray, contenders: Sequence[Contende
     def judge() -> None:
         for table, c in zip(tables, contenders, strict=True):
             if not table or c.iterations > table[-1]["iterations"]:
-                _, figures = retrace(scene, c.field, c.heights, target, rays=rays, seed=seed, device=device)
+                _, figures = retrace(scene, c.field, c.heights, target, rays=rays, seed=seed, device=device, noise=False)
                 table.append(_row(c, figures["relative_rms"]))
 
     judge()

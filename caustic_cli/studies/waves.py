@@ -13,6 +13,7 @@ from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.waves import NoWaveImage, WaveImage, wave_image
 from caustic_cli.scene import Scene
+from caustic_cli.studies.irradiance import irradiance_figures
 from caustic_cli.studies.metrics import judge
 
 #: So many times finer than needed are a verdict's samples, on both planes.
@@ -29,19 +30,22 @@ def wave_figures(scene: Scene, field: HeightField, heights: Tensor, target: np.n
     Returns:
         the image, None where there is none and `required` is false; and wave_relative_rms, wave_on_target (None without a target),
         wave_on_screen, wave_wavelengths (nm), resolvable, the number of details across that light carries, wave_source_points, the
-        points that the source was taken as, and wave_source_error, by how much an extended source's light is misplaced so, mm.
+        points that the source was taken as, wave_source_error, by how much an extended source's light is misplaced so, mm, and
+        wave_peak_irradiance and wave_mean_irradiance, as of a ray image.
     """
     try:
         found = wave_image(scene, field, heights.detach(), finer=finer, dtype=dtype)
     except NoWaveImage as error:
         if required:
             raise
-        return None, dict.fromkeys(("wave_relative_rms", "wave_on_target", "wave_on_screen")) | {
+        return None, dict.fromkeys(("wave_relative_rms", "wave_on_target", "wave_on_screen",
+                                    "wave_peak_irradiance", "wave_mean_irradiance")) | {
             "wave_wavelengths": [], "resolvable": seen.resolvable, "no_wave_image": str(error)}
     of = _judged(found, target)
+    absolute = {f"wave_{name}": value for name, value in irradiance_figures(scene, found.image).items()}
     return found, {"wave_relative_rms": of["relative_rms"], "wave_on_target": of["on_target"], "wave_on_screen": of["on_screen"],
                    "wave_wavelengths": list(found.wavelengths), "resolvable": seen.resolvable,
-                   "wave_source_points": found.points, "wave_source_error": found.spread_error}
+                   "wave_source_points": found.points, "wave_source_error": found.spread_error} | absolute
 
 
 def unseen_figures(scene: Scene, field: HeightField, heights: Tensor, target: np.ndarray, *, finer: float = FINER,

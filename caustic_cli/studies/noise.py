@@ -1,0 +1,64 @@
+"""What the rays of an image leave in it and in its figures: noise, estimated from two halves of them that are independent.
+
+Notation
+    A, B        images of the two halves, (n_x, n_y), parts of the source's power; M = (A + B) / 2 is the image that is shown
+    T           target; a, b, m, t are A, B, M, T over their own means
+    V           (A - B)^2 / 4, an unbiased estimate of the variance of M's pixels
+    F           relative_rms without noise: F^2 = mean((m - t)^2) - mean(V) / mean(M)^2 = mean((a - t) (b - t)), without bias since
+                the noise of A is independent of that of B
+
+The standard error of F^2 follows from how far the halves differ.  E_A and E_B are their squared errors in a block of pixels, over
+the number of all pixels: var(F^2) = sum over blocks of (E_A - E_B)^2 / 4.  Indeed (E_A - E_B) / 2 is the block's part of
+mean((m - t) (a - b)), which varies as F^2 does: by noise where the image is wrong, and by the product of both halves' noise.
+Neighbours, which share a ray that lands near their border one way or the other, are mostly in one block.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+#: Pixels along the sides of a block.
+BLOCK = 8
+
+
+def variance_of(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """V of two images, (n_x, n_y) or (3, n_x, n_y) each."""
+    return (one - other) ** 2 / 4.0
+
+
+def image_noise(variance: np.ndarray, image: np.ndarray) -> float | None:
+    """Relative RMS of an image's noise, over the image's mean; None of a black one.  variance: an estimate, of any sign."""
+    mean = float(image.mean())
+    return math.sqrt(max(0.0, float(variance.mean()))) / mean if mean > 0 else None
+
+
+def lift(relative_rms: float, error: float) -> float:
+    """By how much the noise of an image, `error` of its mean, lifts its relative_rms where it is left in."""
+    return relative_rms - math.sqrt(max(0.0, relative_rms**2 - error**2))
+
+
+def standard_error(one: np.ndarray, other: np.ndarray, target: np.ndarray, relative_rms: float) -> float:
+    """Of F, `relative_rms`, of the mean of two images; in colour, (3, n_x, n_y), as if all colours' noise went one way.
+
+    With s that of F^2 it is sqrt(F^2 + s) - F: s / (2 F) where that is small, sqrt(s) where there is nothing but noise.
+    """
+    colours = [(one, other, target)] if target.ndim == 2 else [c for c in zip(one, other, target, strict=True) if c[2].sum() > 0]
+    square = math.fsum(_of_square(*c) for c in colours) / max(1, len(colours))
+    return math.sqrt(relative_rms**2 + square) - relative_rms
+
+
+def _of_square(one: np.ndarray, other: np.ndarray, target: np.ndarray) -> float:
+    """Standard error of F^2; 0 where an image is black."""
+    if min(one.sum(), other.sum(), target.sum()) <= 0:
+        return 0.0
+    errors = [_blocks((a / a.mean() - target / target.mean()) ** 2) / target.size for a in (one, other)]
+    return 0.5 * float(np.sqrt(np.sum((errors[0] - errors[1]) ** 2)))
+
+
+def _blocks(a: np.ndarray) -> np.ndarray:
+    """Sums of (n_x, n_y) over blocks; those at the far borders may be smaller."""
+    for axis in (0, 1):
+        a = np.add.reduceat(a, np.arange(0, a.shape[axis], BLOCK), axis)
+    return a

@@ -1,0 +1,136 @@
+"""Absolute light: power and its unit on the command line, in project.toml and in exports; W/mm^2 and lux of images."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from caustic_cli import cli, settings, verdict
+from caustic_cli.archive import open_archive
+from caustic_cli.commands.options import power
+from caustic_cli.derive import complete
+from caustic_cli.errors import InputError
+from caustic_cli.project import Project
+from caustic_cli.scene import Disc, Lens, Light, PlaneWave, Scene, Screen
+from caustic_cli.studies.irradiance import irradiance_figures, per_part, unit_figures
+from caustic_cli.studies.panels import write_report
+
+TINY = ["--resolution", "24", "--control", "12", "--rays", "4000", "--waves", "off", "--quiet", "--threads", "1", "--json"]
+RENDER = ["render", "blob.caustic", "--rays", "20000", "--quiet", "--threads", "1", "--json"]
+BAD = ["100 lumens?", "-1W", "nanW", "1e400lm", "", "0", "0lm", "infW", "W", "lm", "1.2.3", "1,5W", "2mW", "100LM", "1_000W", "+2W",
+       "1e31", "\u0662W"]
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    y, x = np.mgrid[0:24, 0:24]
+    Image.fromarray((40 + 200 * np.exp(-((x - 8) ** 2 + (y - 9) ** 2) / 30.0)).astype(np.uint8)).save("blob.png")
+    monkeypatch.setattr(verdict, "FINAL_RAYS", 40_000)
+
+
+def run(capfd, *arguments, code=0):
+    assert cli.run(list(map(str, arguments))) == code
+    out, err = capfd.readouterr()
+    return json.loads(out) if code == 0 else err.strip()
+
+
+@pytest.mark.parametrize(("text", "value"), [("2", (2.0, "W")), ("2W", (2.0, "W")), ("100lm", (100.0, "lm")),
+                                             (" 1.5e3 lm ", (1500.0, "lm")), (".5W", (0.5, "W")), ("1e-3W", (1e-3, "W")),
+                                             ("1e30", (1e30, "W"))])
+def test_a_power_with_and_without_a_unit(text, value):
+    assert power("--power", text) == value
+
+
+@pytest.mark.parametrize("text", BAD)
+def test_what_is_no_power_is_refused_in_one_line(text, capfd):
+    said = run(capfd, "design", "blob.png", f"--power={text}", code=2)
+    assert "--power must be a number greater than 0 and at most 1e+30, of W or lm" in said and "\n" not in said
+    with pytest.raises(InputError, match="--power"):
+        power("--power", text)
+
+
+def test_irradiance_is_power_over_area():
+    """100 lm on a quarter of 4 x 2 mm: 1 lux is 1 lm on a square metre."""
+    scene = Scene(PlaneWave(100.0), Lens(), Screen((4.0, 2.0), 100.0, (8, 4)), Light(unit="lm"))
+    image = np.zeros((8, 4))
+    image[:4, :2] = 1.0 / 8.0
+    assert irradiance_figures(scene, image) == pytest.approx({"peak_irradiance": 100.0 / 2e-6, "mean_irradiance": 100.0 / 8e-6})
+    assert unit_figures(scene) == {"power": 100.0, "power_unit": "lm", "irradiance_unit": "lux"}
+    in_watts = Scene(Disc(power=3.0), Lens(), scene.screen)
+    assert irradiance_figures(in_watts, image)["peak_irradiance"] == pytest.approx(3.0 / 2.0)
+    assert unit_figures(in_watts)["irradiance_unit"] == "W/mm^2"
+    assert per_part(in_watts, Screen((8.0, 4.0), 50.0, (8, 4))) == pytest.approx(3.0)
+    colours = np.stack([image, 0.0 * image, image])
+    assert irradiance_figures(in_watts, colours)["mean_irradiance"] == pytest.approx(3.0 * 2.0 / 8.0)
+
+
+def test_a_unit_of_power_is_watts_or_lumens():
+    with pytest.raises(InputError, match=r"\[source\] power_unit must be one of W, lm, got 'cd'"):
+        Light(unit="cd")
+    old = complete({"source": {"power": 3.0}}, 1.0)
+    assert "power_unit" not in old["source"] and settings.build_light(old).unit == "W"
+    said = settings.dump(complete({"source": {"power": 3.0, "power_unit": "lm"}}, 1.0))
+    assert settings.build_light(complete(settings.parse(said, "here"), 1.0)).unit == "lm"
+    with pytest.raises(InputError, match="power_unit must be text"):
+        settings.parse("[source]\npower_unit = 3", "here")
+
+
+@pytest.mark.parametrize("source", ["plane", "disc"])
+def test_design_and_render_say_lux_and_watts(source, capfd):
+    figures = run(capfd, "design", "blob.png", "--source", source, "--power", "100lm", "--iterations", "3", *TINY)
+    assert (figures["power"], figures["power_unit"], figures["irradiance_unit"]) == (100.0, "lm", "lux")
+    wide, tall = Project.open("blob.caustic").scene().screen.half_size
+    area = 4.0 * wide * tall
+    assert figures["mean_irradiance"] == pytest.approx(1e8 * figures["on_screen"] / area, rel=1e-12)
+    assert figures["peak_irradiance"] > figures["mean_irradiance"]
+    same = run(capfd, *RENDER, "--npy", "a.npy")
+    image = np.load("a.npy")
+    assert same["peak_irradiance"] == pytest.approx(1e8 * image.max() * image.size / area, rel=1e-12)
+    watts = run(capfd, *RENDER, "--power", "2", "--npy", "b.npy", "--force")
+    assert (watts["power"], watts["power_unit"], watts["irradiance_unit"]) == (2.0, "W", "W/mm^2")
+    assert np.array_equal(np.load("b.npy"), image) and watts["relative_rms"] == same["relative_rms"]
+    assert watts["peak_irradiance"] == pytest.approx(2e-8 * same["peak_irradiance"], rel=1e-12)
+    assert "power_unit = \"lm\"" in (Project.open("blob.caustic").path / "project.toml").read_text()
+    assert cli.run(["export", "blob.caustic", "--format", "lighttools", "-o", "a.npz", "--quiet"]) == 0
+    assert open_archive("a.npz")[0].light.unit == "lm"
+    of_archive = run(capfd, "render", "a.npz", *RENDER[2:])
+    assert of_archive["irradiance_unit"] == "lux"
+    assert of_archive["mean_irradiance"] == pytest.approx(same["mean_irradiance"], rel=1e-3)
+
+
+def test_the_table_and_the_report_say_it_too(capfd, monkeypatch):
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    bars, plain = [], Figure.colorbar
+
+    def colorbar(figure, drawn, **options):
+        norm = drawn.norm
+        bars.append((options["label"], norm.vmin, norm.vmax, float(drawn.get_array().max()), norm(norm.vmax)))
+        return plain(figure, drawn, **options)
+
+    monkeypatch.setattr(Figure, "colorbar", colorbar)
+    assert cli.run(["design", "blob.png", "--power", "2W", "--iterations", "3", *(a for a in TINY if a != "--quiet")]) == 0
+    out, err = capfd.readouterr()
+    figures = json.loads(out)
+    peak, mean = (figures[f"{k}_irradiance"] for k in ("peak", "mean"))
+    assert f"peak {peak:.4g} W/mm^2, mean {mean:.4g} W/mm^2" in err
+    label, low, high, most, full = bars[0]
+    assert label == f"irradiance (W/mm²): peak {peak:.3g}, mean {mean:.3g}"
+    assert low == 0 < high and most == pytest.approx(peak) and full == pytest.approx(1.0)
+    target = Project.open("blob.caustic").target(Project.open("blob.caustic").scene())
+    assert high == pytest.approx(mean * target.max() / target.mean())  # white, as in render.png
+
+
+@pytest.mark.parametrize("mean", [0.0, 5e-324, 1e-200, 1e-36, 1e36])
+@pytest.mark.parametrize("encoding", ["srgb", "linear"])
+def test_a_report_of_any_brightness(tmp_path, mean, encoding):
+    target = np.random.default_rng(0).random((12, 9))
+    figures = {"relative_rms": 0.1, "mean_irradiance": mean, "peak_irradiance": 2.0 * mean, "irradiance_unit": "lux"}
+    history = np.array([[1, 0, 0.1, 0.9, 0.1], [2, 0, 0.05, 0.9, 0.2]])
+    write_report(tmp_path / "r.png", target, target * mean, np.zeros((9, 9)), history, Lens(), Screen((12.0, 9.0), 300.0, (12, 9)),
+                 figures, encoding)
+    assert (tmp_path / "r.png").stat().st_size > 10_000
