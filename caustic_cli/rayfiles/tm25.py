@@ -1,0 +1,104 @@
+"""IES TM-25 ray files (ANSI/IES TM-25-13 and -20), `.tm25ray`: little-endian, floats of 32 bits, mm, nm.
+
+    offset  0   "TM25", int32 version (2013 or 2020), int32 how it was made
+           12   float32 luminous flux, lm; float32 radiant flux, W; uint64 number of rays
+           28   28 bytes date, int32 where rays start
+           60   int32 spectrum: 0 none, 1 one wavelength, 2 each ray its own, 3 one table, 4 each ray a table's number
+           64   float32 wavelength, least and greatest, nm
+           76   int32 number of tables, of additional columns, and bytes of additional text; zeros to 256
+          256   8 int32, each 0 or 1: position, direction, radiant flux, wavelength, luminous flux, Stokes, tristimulus,
+                table number
+          288   9 texts of 1000 UTF-32 characters
+        36288   tables: int32 N, N pairs (float32 nm, float32 weight); zeros to a multiple of 32 bytes
+                512 bytes for the name of each additional column; the additional text
+                rays, one after another, all float32: x y z, unit k, W, nm, lm, 3 Stokes and 3 ellipse, 2 tristimulus, table
+                number, each if its flag is set, and the additional columns
+
+Quantities that are not known are 0 or NaN.
+"""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+
+from caustic_cli.errors import InputError
+from caustic_cli.scene.sources.rayset import RaySet
+
+MAGIC = b"TM25"
+VERSIONS = (2013, 2020)
+#: Bytes before the tables, their unit of padding, and of a column's name.
+HEADER, BLOCK, NAME = 36_288, 32, 512
+MOST_TABLES = 10_000
+#: Columns by the flag that brings them along.
+COLUMNS = (3, 3, 1, 1, 1, 6, 2, 1)
+FLAGS = ("position", "direction", "radiant flux", "wavelength", "luminous flux", "Stokes", "tristimulus", "table number")
+
+
+def begins(data: bytes) -> bool:
+    """Whether a file is one of these."""
+    return data.startswith(MAGIC)
+
+
+def parse(data: bytes) -> RaySet:
+    """The rays in a file's bytes.
+
+    Raises:
+        InputError: it breaks the format.
+    """
+    if len(data) < HEADER:
+        raise InputError(f"is cut off: the header of TM-25 is {HEADER:,} bytes, the file {len(data):,}")
+    version, _, lumens, watts, rays = struct.unpack_from("<iiffQ", data, 4)
+    if version not in VERSIONS:
+        swapped = struct.unpack_from(">i", data, 4)[0] in VERSIONS
+        raise InputError("has its bytes in big-endian order; TM-25 is little-endian" if swapped else
+                         f"is TM-25 of version {version}; 2013 and 2020 are read")
+    spectrum, single = struct.unpack_from("<if", data, 60)
+    tables, more, text = struct.unpack_from("<iii", data, 76)
+    flags = struct.unpack_from("<8i", data, 256)
+    if not 0 <= spectrum <= 4:
+        raise InputError(f"has a spectral data identifier of {spectrum}; TM-25 knows 0 to 4")
+    if min(tables, more, text) < 0 or tables > MOST_TABLES:
+        raise InputError(f"counts {tables} spectral tables, {more} additional columns and {text} bytes of text; none may be"
+                         f" negative, and tables at most {MOST_TABLES:,}")
+    for name, flag in zip(FLAGS, flags, strict=True):
+        if flag not in (0, 1):
+            raise InputError(f"has a {name} flag of {flag}; 0 or 1 is needed")
+    if not (flags[0] and flags[1]):
+        raise InputError("says that its rays have no position or no direction; both are needed")
+    if not (flags[2] or flags[4]):
+        raise InputError("says that its rays have neither radiant nor luminous flux; one is needed")
+    if spectrum == 2 and not flags[3]:
+        raise InputError("says that each ray has a wavelength, but has no column for it")
+    start = _after_tables(data, tables) + NAME * more + text
+    each = sum(n for n, flag in zip(COLUMNS, flags, strict=True) if flag) + more
+    if rays == 0:
+        raise InputError("holds no rays; at least one is needed")
+    whole = start + 4 * each * rays
+    if whole != len(data):
+        raise InputError(f"is {len(data):,} bytes, but its header and {rays:,} rays of {each} columns are {whole:,}")
+    table = np.frombuffer(data, dtype="<f4", count=each * rays, offset=start).reshape(rays, each)
+    at = dict(zip(FLAGS, np.cumsum([0, *(n * f for n, f in zip(COLUMNS, flags, strict=True))]).tolist(), strict=False))
+    radiant = bool(flags[2])
+    flux = table[:, at["radiant flux" if radiant else "luminous flux"]]
+    wavelengths = table[:, at["wavelength"]] if flags[3] else None
+    if spectrum == 1:
+        if not single > 0:
+            raise InputError(f"says that it has one wavelength, but that is {single:g} nm")
+        wavelengths = np.full(rays, single)
+    total = watts if radiant else lumens
+    return RaySet(table[:, 0:3], table[:, 3:6], flux, total if np.isfinite(total) else 0.0, "W" if radiant else "lm", wavelengths)
+
+
+def _after_tables(data: bytes, tables: int) -> int:
+    """Offset of what follows the spectral tables and their padding."""
+    at = HEADER
+    for k in range(tables):
+        if at + 4 > len(data):
+            raise InputError(f"is cut off in spectral table {k + 1} of {tables}")
+        (pairs,) = struct.unpack_from("<i", data, at)
+        if pairs <= 0 or at + 4 + 8 * pairs > len(data):
+            raise InputError(f"counts {pairs} wavelengths in spectral table {k + 1} of {tables}, which its size does not hold")
+        at += 4 + 8 * pairs
+    return at + -(at - HEADER) % BLOCK

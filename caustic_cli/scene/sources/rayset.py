@@ -1,0 +1,141 @@
+"""A set of rays measured or simulated on a light source, and what it says of that source as a whole.
+
+Notation, ray i
+    p_i     a point of it, mm;  d_i  its unit direction;  w_i  its flux
+    c       point of closest approach to all rays: sum w_i |(1 - d_i d_i') (p_i - c)|^2 is least
+
+Everything is in the file's own coordinates, whose z axis is that of emission.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from caustic_cli.errors import InputError
+
+#: Largest coordinate of a ray, mm.
+FARTHEST = 1e9
+#: Parallel rays meet nowhere: their point of closest approach is sought no farther from where they start, mm.
+PARALLEL_AT = 1e6
+#: Wavelengths that are taken for such, nm.
+SHORTEST, LONGEST = 100.0, 20_000.0
+
+
+@dataclass(frozen=True, eq=False)
+class RaySet:
+    """Rays of a source.
+
+    Args:
+        positions: (N, 3) mm, a point of each ray, where it starts.
+        directions: (N, 3), any length but 0; kept as unit vectors.
+        flux: (N,) of each ray, not negative; relative, since a scene says the power of its source.
+        total: flux of the whole source, in `unit`.
+        unit: W, or lm.
+        wavelengths: (N,) nm, or None.
+
+    Raises:
+        InputError: no rays, a number that is not finite, a direction without length, a negative flux, or none at all.
+    """
+
+    positions: np.ndarray
+    directions: np.ndarray
+    flux: np.ndarray
+    total: float = 1.0
+    unit: str = "W"
+    wavelengths: np.ndarray | None = None
+
+    def __post_init__(self):
+        with np.errstate(invalid="ignore"):  # a signalling NaN is refused below
+            flux, positions, directions = (np.asarray(a, dtype=np.float64) for a in (self.flux, self.positions, self.directions))
+        n = len(flux)
+        if n == 0:
+            raise InputError("holds no rays; at least one is needed")
+        if positions.shape != (n, 3) or directions.shape != (n, 3):
+            raise InputError(f"positions and directions must be {n} x 3, got {positions.shape} and {directions.shape}")
+        _refuse(~(np.abs(positions) <= FARTHEST).all(1), "a position that is not finite, or beyond 1e9 mm")
+        with np.errstate(over="ignore", invalid="ignore"):
+            length, whole = np.sqrt((directions * directions).sum(1)), float(flux.sum())
+        _refuse(~(np.isfinite(length) & (length > 0)), "a direction that is not finite, or of no length")
+        _refuse(~(np.isfinite(flux) & (flux >= 0)), "a flux that is negative or not finite")
+        if not 0 < whole < np.inf:
+            raise InputError("holds no light: the flux of every ray is 0" if whole == 0 else "holds more flux than can be added up")
+        if self.unit not in ("W", "lm"):
+            raise InputError(f"the unit of flux must be W or lm, got {self.unit!r}")
+        for name, value in (("positions", positions), ("directions", directions / length[:, None]), ("flux", flux),
+                            ("total", float(self.total) if 0 < self.total < np.inf else whole)):
+            object.__setattr__(self, name, value)
+        if self.wavelengths is not None:
+            wavelengths = np.asarray(self.wavelengths, dtype=np.float64)
+            if wavelengths.shape != (n,):
+                raise InputError(f"wavelengths must be {n}, got {wavelengths.shape}")
+            _refuse(~((wavelengths >= SHORTEST) & (wavelengths <= LONGEST)),
+                    f"a wavelength outside {SHORTEST:g} to {LONGEST:g} nm")
+            object.__setattr__(self, "wavelengths", wavelengths)
+
+    @property
+    def count(self) -> int:
+        """Number of rays."""
+        return len(self.flux)
+
+    @cached_property
+    def forward(self) -> np.ndarray:
+        """Flux of every ray that runs towards +z, 0 of the others, (N,).
+
+        Raises:
+            InputError: none does.
+        """
+        found = np.where(self.directions[:, 2] > 0, self.flux, 0.0)
+        if not found.any():
+            raise InputError("has no ray that carries light towards +z, along which sources shine here")
+        return found
+
+    @cached_property
+    def nearest(self) -> float:
+        """Largest z at which a ray with light starts towards +z, mm."""
+        return float(self.positions[self.forward > 0, 2].max())
+
+    @cached_property
+    def focus(self) -> np.ndarray:
+        """Point of closest approach c to the rays that run towards +z, weighted by flux, (3,) mm.
+
+        Where rays are so nearly parallel that it lies more than PARALLEL_AT from their mean start, it is sought no farther.
+        """
+        lit = self.forward > 0
+        p, d, w = self.positions[lit], self.directions[lit], self.forward[lit] / self.forward.sum()
+        mean = w @ p
+        p = p - mean
+        across = p - d * (p * d).sum(1)[:, None]
+        normal = np.eye(3) - (d * w[:, None]).T @ d
+        values, axes = np.linalg.eigh(normal)
+        values = np.maximum(values, np.finfo(float).eps)
+        off = axes @ ((axes.T @ (w @ across)) / values)
+        axis = w @ d  # behind parallel rays, not before them
+        size = float(np.linalg.norm(off))
+        if values[0] < 1.0 / PARALLEL_AT**2 * max(1.0, float(w @ (p * p).sum(1))):
+            off, size = -axis / np.linalg.norm(axis) * PARALLEL_AT, PARALLEL_AT
+        return mean + off * min(1.0, PARALLEL_AT / size if size > 0 else 1.0)
+
+    @cached_property
+    def spread(self) -> tuple[float, float]:
+        """Half widths along x and y of the source where it is narrowest: twice the root mean square distance from `focus` at
+        which rays pass the plane of that, mm.  Of an evenly bright ellipse these are its half axes.
+
+        Light near the axis counts most, by (cos theta)^4: the depth of a source looks wide from aside.
+        """
+        lit = self.forward > 0
+        p, d, c = self.positions[lit], self.directions[lit], self.focus
+        w = self.forward[lit] * d[:, 2] ** 4
+        found = []
+        for k in (0, 1):
+            off = p[:, k] + (c[2] - p[:, 2]) * d[:, k] / d[:, 2] - c[k]
+            found.append(2.0 * float(np.sqrt(w @ (off * off) / w.sum())))
+        return found[0], found[1]
+
+
+def _refuse(wrong: np.ndarray, what: str) -> None:
+    """Name the first of the rays that are wrong."""
+    if wrong.any():
+        raise InputError(f"ray {int(np.argmax(wrong)) + 1} of {len(wrong):,} has {what}")
