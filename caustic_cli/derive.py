@@ -204,6 +204,8 @@ def without_waves(s: Settings, given: bool) -> str:
 def _not_by_default(s: Settings) -> str:
     """What `waves = "auto"` does not refine the wave image with, however long that takes, and what puts it in."""
     design = s["design"]
+    if s["source"]["type"] == "rays":
+        return "a ray file says nothing of its light's phase"
     if design["network"] != "none":
         return "a network is trained on rays alone; --network none refines it"
     if design["optimizer"] != "lbfgs":
@@ -218,6 +220,8 @@ def _wave_stages(s: Settings, source: Source, quality: str, lit: tuple[float, fl
     design, lens, screen, asked = s["design"], s["lens"], s["screen"], s["design"]["waves"]
     if asked == "on" and design["network"] != "none":
         raise InputError("[design] waves on needs network none: the wave image refines the heights themselves")
+    if asked == "on" and source.rays is not None:
+        raise InputError("[design] waves on: a ray file says nothing of its light's phase, so that it has no wave image to refine")
     if asked == "off" or (asked == "auto" and _not_by_default(s)):
         return []
     seen = _resolution(s, source)

@@ -107,7 +107,7 @@ def refuse_foreign(path: str | Path, force: bool = False) -> None:
     if not os.access(path.parent, os.W_OK):
         raise InputError(f"{path}: its directory {path.parent} is read-only; one you may write to is needed")
     if (path.parent / "project.toml").exists() and path.name.startswith(
-            ("project.toml", "checkpoints.h5", "target.", "profile.", ".outputs.json")):
+            ("project.toml", "checkpoints.h5", "target.", "profile.", "source.", "intensity.", ".outputs.json")):
         raise InputError(f"{path}: is part of the project and is never replaced by an output; choose another name")
     if path.exists() and not force and not is_ours(path):
         raise InputError(f"{path}: exists and was not made by caustic; --force replaces it, another name spares it")

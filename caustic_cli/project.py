@@ -1,6 +1,7 @@
-"""A project directory: the scene and the design in text, the lens in a checkpoint, pictures beside them.
+"""A project directory: the scene and the design in text, the lens in a checkpoint, pictures and the source's files beside them.
 
     NAME.caustic/  project.toml  checkpoints.h5  target.png (or target.npy)  render.png  wave.png  report.png
+                   source.tm25ray (or what else [source] file names)
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from caustic_cli import checkpoint, settings
+from caustic_cli import attachments, checkpoint, settings
 from caustic_cli.checkpoint import Checkpoint
 from caustic_cli.derive import Settings, build_options, build_stages, complete
 from caustic_cli.errors import InputError
@@ -69,7 +70,11 @@ class Project:
             goal = given.get("target", {})
             picture = _picture(path, goal.get("file", "target.png"), goal.get("encoding", "srgb") == "linear",
                                goal.get("color", False))
-            profile = given.get("source", {}).get("profile")
+            light = given.get("source", {})
+            profile = light.get("profile")
+            for key in attachments.STEMS.keys() & light.keys():
+                _within(light[key])
+            given["source"] = attachments.attached(light, path)
             full = complete(given, picture.aspect)
             build_stages(full), build_options(full)  # a project whose design is impossible is not opened for its lens either
             return cls(path, full, picture, _picture(path, profile, True) if profile else None)
@@ -85,8 +90,10 @@ class Project:
             except InputError as error:
                 raise InputError(f"{self.path / TOML}: {error}") from error
         changed = {section: dict(values) for section, values in self.settings.items()}
+        before = changed["source"]["type"]
         for (section, key, _), value in given.items():
             changed[section][key] = value
+        _change(changed["source"], before, {key for section, key, _ in given if section == "source"})
         settings.refuse_unused(changed["source"], given)
         if changed["source"]["type"] not in sources.used_by("profile"):
             changed["source"].pop("profile", None)
@@ -139,6 +146,8 @@ class Project:
         self.picture.write(path / self.settings["target"]["file"])
         if self.profile is not None:
             self.profile.write(path / self.settings["source"]["profile"])
+        for file in attachments.of(self.settings["source"]):
+            write_bytes(path / file, file.data)
         self.write_settings(path)
 
     def write_settings(self, path: Path | None = None) -> None:
@@ -146,7 +155,18 @@ class Project:
         write_bytes((path or self.path) / TOML, settings.dump(self.settings).encode())
 
 
-def _picture(directory: Path, name: str, linear: bool, color: bool = False) -> Picture:
+def _change(source: Settings, before: str, given: set[str]) -> None:
+    """Read the files that new keys of [source] name, and forget that of another type."""
+    if source["type"] != before and "file" not in given:
+        source.pop("file", None)
+    source |= attachments.attached(source)
+
+
+def _within(name: str) -> None:
     if name != Path(name).name or name in ("", ".", "..", TOML, *MADE):
-        raise InputError(f"a picture's file must be the name of one within the project directory, got {name!r}")
+        raise InputError(f"a file of a project must be the name of one within its directory, got {name!r}")
+
+
+def _picture(directory: Path, name: str, linear: bool, color: bool = False) -> Picture:
+    _within(name)
     return read_picture(directory / name, linear, color)

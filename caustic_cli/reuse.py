@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from caustic_cli import __version__, settings
+from caustic_cli import __version__, attachments, settings
 from caustic_cli.checkpoint import Checkpoint
 from caustic_cli.derive import Settings
 from caustic_cli.errors import CausticError, InputError
@@ -29,11 +29,13 @@ IRRELEVANT = ("project", "output", "force", "json", "quiet", "debug", "threads",
 
 
 def digest(full: Settings, *pictures: Picture | None) -> str:
-    """Hash of complete settings and the pictures they speak of; of another project to start from, its lens too."""
+    """Hash of complete settings and the pictures and files they speak of; of another project to start from, its lens too."""
     found = hashlib.sha256(f"{__version__}\n{settings.dump(full)}".encode())
     for picture in filter(None, pictures):
         found.update(f"{picture.values.shape}{picture.values.dtype}{picture.encoding}".encode())
         found.update(np.ascontiguousarray(picture.values).tobytes())
+    for file in attachments.of(full["source"]):
+        found.update(hashlib.sha256(file.data).digest())
     start = Path(full["design"]["start"])
     if is_project(start):
         found.update(_hash(start / CHECKPOINT).encode())
@@ -85,6 +87,7 @@ class Outputs:
         self.record, self.paths = project.path / RECORD, [p for p in paths if p is not None]
         given = {k: str(v) for k, v in sorted(options.items()) if k not in IRRELEVANT}
         inputs = [digest(project.settings, project.picture, project.profile), _hash(project.path / CHECKPOINT)]
+        inputs += [_hash(Path(options[name])) for name in ("source_file",) if options.get(name)]
         self.asked = hashlib.sha256(json.dumps([command, given, inputs]).encode()).hexdigest()
         self.key = " ".join(str(p.resolve()) for p in self.paths)
 

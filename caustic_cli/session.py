@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from caustic_cli import __version__, place, reuse, settings
+from caustic_cli import __version__, attachments, place, reuse, settings
 from caustic_cli.checkpoint import Checkpoint
 from caustic_cli.console import Reporter
 from caustic_cli.derive import build_options, build_stages, complete, without_waves
@@ -28,6 +28,7 @@ from caustic_cli.inverse.extended import centre_of, limits, shift_of
 from caustic_cli.inverse.first import first_surface
 from caustic_cli.inverse.schedule import transport_cells
 from caustic_cli.inverse.target import grey
+from caustic_cli.optics.emission.measured import coarse_words
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.picture import read_picture
@@ -54,8 +55,12 @@ def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: d
         InputError: something is wrong; nothing was written.
     """
     said = settings.read(config) if config else {}
+    if "source" in said:
+        said["source"] = attachments.attached(said["source"], config.parent)
     for (section, key, _), value in given.items():
         said.setdefault(section, {})[key] = value
+    if "source" in said:
+        said["source"] = attachments.attached(said["source"])
     if "index" in said.get("lens", {}) and "glass" in said["lens"]:
         names = [option for (_, key, option) in given if key in ("index", "glass")]
         if len(names) == 1:  # an option replaces what the configuration says
@@ -84,6 +89,7 @@ def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: d
         full["target"] |= {"file": f"target{picture.suffix}", "encoding": picture.encoding}
         if light is not None:
             full["source"]["profile"] = f"profile{light.suffix}"
+        attachments.named_in_project(full["source"])
         project = Project(path, full, picture, light, reuse.digest(full, picture, light),
                           without_waves=without_waves(full, "stages" in said.get("design", {})))
         if not force and (same := reuse.same_design(path, project.asked)):
@@ -130,6 +136,8 @@ def design(project: Project, first: torch.Tensor | None, device: str, say: Repor
 
 def _say_limits(project: Project, designer: Designer, target: np.ndarray, say: Reporter) -> None:
     """What no lens can do about diffraction and an extended source, before time is spent on it."""
+    if coarse := coarse_words(designer.scene):
+        say.say(coarse)
     seen = Resolution.before(designer.scene, tuple(project.settings["target"]["size"]))
     say.say(seen.sentence())
     words = limits(designer.scene, grey(target)).sentence()

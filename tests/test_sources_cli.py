@@ -101,7 +101,7 @@ def test_a_design_changes_its_source_and_resumes_inside_any_stage(capfd):
 
 
 @pytest.mark.parametrize("arguments, message", [
-    (["--source", "sun"], "--source must be one of plane, point, grid, disc, got 'sun'"),
+    (["--source", "sun"], "--source must be one of plane, point, grid, disc, rays, got 'sun'"),
     (["--source", "point", "--source-position", "1,2"], "--source-position must be 3 numbers parted by commas"),
     (["--source", "point", "--source-position", "0,0,5"], "--source-position must lie before the lens"),
     (["--source", "grid", "--source-position", "0,0,-5", "--source-position", "1,0,-5"], "is its centre, one"),
@@ -163,11 +163,11 @@ def test_a_stage_of_a_plane_wave_may_have_a_source_that_stands_somewhere(capfd):
     run(capfd, "render", "blob.caustic", "--rays", "4000", "--quiet")
     Path("schedule.toml").write_text(plane.replace('"point"', '"sun"'))
     assert run(capfd, "design", "blob.png", "--config", "schedule.toml", "-o", "x", code=2) == (
-        "caustic: [[design.stages]] source must be one of plane, point, grid, disc, got 'sun'")
+        "caustic: [[design.stages]] source must be one of plane, point, grid, disc, rays, got 'sun'")
 
 
 @pytest.mark.parametrize(("options", "message"), [
-    (["--source-position", "0,0,-50"], "--source-position belongs to --source point, grid or disc, got plane"),
+    (["--source-position", "0,0,-50"], "--source-position belongs to --source point, grid, disc or rays, got plane"),
     (["--source", "point", "--source-size", "2"], "--source-size belongs to --source grid or disc, got point"),
     (["--source", "disc", "--source-grid", "5"], "--source-grid belongs to --source grid, got disc"),
     (["--source", "grid", "--source-angle", "1"], "--source-angle belongs to --source disc, got grid"),

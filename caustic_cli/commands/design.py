@@ -27,6 +27,7 @@ def run(
     target: Annotated[Path, typer.Argument(metavar="TARGET", help="The picture: an image file or a 2-D .npy of irradiance;"
                                            " with --resume, the project.", show_default=False)],
     source: options.SourceType = None,
+    source_file: options.SourceFile = None,
     source_position: options.SourcePosition = None,
     source_size: options.SourceSize = None,
     source_grid: options.SourceGrid = None,
@@ -102,7 +103,7 @@ def run(
     speaks = os.environ.get("RANK", "0") == "0"  # under torchrun, the first of all
     began, say = time.monotonic(), console.Reporter(quiet or not speaks, progress)
     given = {
-        **options.source(source, source_position, source_size, source_grid, source_angle, cone, power),
+        **options.source(source, source_position, source_size, source_grid, source_angle, cone, power, source_file),
         **options.physics(polarisation, wavelengths, absorption, roughness, screen_tilt, screen_shift),
         ("lens", "mirror", "--mirror"): mirror or None,
         ("lens", "size", "--lens-size"): lens_size and options.both(options.size("--lens-size", lens_size)),

@@ -28,9 +28,13 @@ Project = Annotated[Path, typer.Argument(help="Project directory made by caustic
 
 
 SourceType = Annotated[str | None, typer.Option(help="plane: parallel light along +z as wide as the lens; point; grid of"
-                                                " points; disc, an extended source.  [default: plane]")]
-SourcePosition = Annotated[list[str] | None, typer.Option(metavar="X,Y,Z", help="Point (may be repeated), or centre of a grid or"
-                                                          " disc, mm.  [default: on the axis, five lens widths before it]")]
+                                                " points; disc, an extended source; rays of a --source-file."
+                                                "  [default: plane]")]
+SourceFile = Annotated[str | None, typer.Option(metavar="FILE", help="Ray file: IES TM-25 (.tm25ray), Zemax binary (.dat, .sdf) or"
+                                                " LightTools text (.ray, .txt); the project keeps a copy.")]
+SourcePosition = Annotated[list[str] | None, typer.Option(metavar="X,Y,Z", help="Point (may be repeated), centre of a grid or"
+                                                          " disc, or origin of a ray file, mm.  [default: on the axis, five lens"
+                                                          " widths before it]")]
 SourceSize = Annotated[str | None, typer.Option(metavar="W[xH]", help="Grid or disc, mm.  [default: a fifth of the lens]")]
 SourceGrid = Annotated[str | None, typer.Option(metavar="N[xM]", help="Points of a grid.  [default: 25x25]")]
 SourceAngle = Annotated[float | None, typer.Option(metavar="DEG", help="Disc at infinity: full angle it is seen under (the sun:"
@@ -72,7 +76,7 @@ def physics(polarisation: float | None, wavelengths: str | None, absorption: flo
 
 
 def source(kind: str | None, position: list[str] | None, size_: str | None, grid: str | None, angle: float | None,
-           cone: float | None, power_: str | None = None) -> dict[tuple[str, str, str], object]:
+           cone: float | None, power_: str | None = None, file: str | None = None) -> dict[tuple[str, str, str], object]:
     """The source options as (section, key, option) -> value, without those that were not given."""
     watts = (None, None) if power_ is None else power("--power", power_)
     given = {
@@ -85,6 +89,7 @@ def source(kind: str | None, position: list[str] | None, size_: str | None, grid
         ("source", "grid", "--source-grid"): both(counts("--source-grid", grid)) if grid else None,
         ("source", "angle", "--source-angle"): angle,
         ("source", "cone", "--cone"): cone,
+        ("source", "file", "--source-file"): file,
     }
     return {key: value for key, value in given.items() if value is not None}
 

@@ -33,6 +33,7 @@ def run(
     filter_size: Annotated[str, typer.Option(metavar="V[xW]", help="Filter size, odd, pixels.")] = "3",
     alpha: Annotated[float | None, typer.Option(help="Of the gaussian, 1/mm^2.  [default: 1 per pixel^2]")] = None,
     source: options.SourceType = None,
+    source_file: options.SourceFile = None,
     source_position: options.SourcePosition = None,
     source_size: options.SourceSize = None,
     source_grid: options.SourceGrid = None,
@@ -84,12 +85,13 @@ def run(
         raise InputError(f"--verify must be mitsuba, got {verify!r}")
     if verify and screen_at is not None:
         raise InputError("--verify compares on the project's own screen: give no --screen-at")
-    given = options.source(source, source_position, source_size, source_grid, source_angle, cone, power)
+    given = options.source(source, source_position, source_size, source_grid, source_angle, cone, power, source_file)
     given |= options.physics(polarisation, wavelengths, absorption, roughness, screen_tilt, screen_shift)
     device = options.start_torch(device, threads, say)
 
     from caustic_cli.derive import filter_from  # noqa: PLC0415
     from caustic_cli.files import discard, refuse_foreign  # noqa: PLC0415
+    from caustic_cli.optics.emission.measured import coarse_words  # noqa: PLC0415
     from caustic_cli.optics.plan import compile_plan, parse_effects  # noqa: PLC0415
     from caustic_cli.optics.resolution import Resolution  # noqa: PLC0415
     from caustic_cli.picture import write_image, write_npy  # noqa: PLC0415
@@ -143,6 +145,8 @@ def run(
     try:
         scene = replace(scene, screen=screen)
         plan = compile_plan(scene, field, heights, wanted)
+        if coarse := coarse_words(scene):
+            say.say(coarse)
         options.compile_for(None if explain else plan.scene, device, say, plan.requests)
         exposure, figures = retrace(plan.scene, field, heights, target, rays=count, filter=filter, device=device, seed=seed,
                                     dtype=precision, tolerance=tolerance, requests=plan.requests)

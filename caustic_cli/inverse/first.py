@@ -19,9 +19,11 @@ import torch
 from scipy.interpolate import RectBivariateSpline
 from torch import Tensor
 
+from caustic_cli.errors import InputError
 from caustic_cli.inverse import start
 from caustic_cli.inverse.target import overlap
 from caustic_cli.inverse.transport import corners
+from caustic_cli.optics.emission.measured import irradiance
 from caustic_cli.optics.interface import reflectance
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
@@ -88,6 +90,9 @@ def _light(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray, shape) -> 
         return profile, None
     x0, y0, z0 = source.centre
     h, t, n = lens.z_in - z0, z - lens.z_in, lens.inside
+    if h <= 0:
+        raise InputError(f"[source] file: its rays meet at z = {z0:.4g} mm, not before the lens, where a first surface by transport"
+                         " needs a source; --start offset needs none")
     dx, dy = x[:, None] - x0, y[None, :] - y0
     rho = np.hypot(dx, dy)
     q = np.maximum(rho / (h + t / n), (rho - t / math.sqrt((n - 1.0) * (n + 1.0))) / h)
@@ -110,5 +115,7 @@ def _light(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray, shape) -> 
         power *= cosine
     cone = min(source.cone_over(lens.half_size, lens.z_in, lens.round), 1.57079)
     power = np.where(q <= math.tan(cone) * (1 + 1e-9), power, 0.0)
-    light = 0.25 * (power[1:, 1:] + power[:-1, 1:] + power[1:, :-1] + power[:-1, :-1])
+    light = irradiance(scene, x, y, float(z.mean()))
+    if light is None:
+        light = 0.25 * (power[1:, 1:] + power[:-1, 1:] + power[1:, :-1] + power[:-1, :-1])
     return light, (sx * cosine / n, sy * cosine / n, inside)

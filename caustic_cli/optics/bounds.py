@@ -55,7 +55,7 @@ def bounds_of(scene: Scene, field: HeightField, heights: Tensor) -> Bounds:
     """Bounds that hold for every ray of a scene at these heights (n, m) mm."""
     lens, indices = scene.lens, [band.scene.lens.inside for band in scene.bands]
     least, most = min(indices), max(indices)
-    incidence = _incidence(scene)
+    incidence = scene.source.incidence(scene.lens.half_size, scene.lens.z_in, scene.lens.round)
     inside = math.asin(min(1.0, math.sin(incidence) / least))
     slope = field.slope_bound(heights)
     lean = math.atan(slope + lens.roughness * LARGEST_NORMAL)
@@ -70,17 +70,6 @@ def bounds_of(scene: Scene, field: HeightField, heights: Tensor) -> Bounds:
     ghost, polarised = _ghost(scene, field, heights, inside, most), _polarised(incidence, critical, most)
     return Bounds(incidence, inside, slope, lean, most, critical, climb, reach, ghost, polarised,
                   Resolution.at(scene, field, heights))
-
-
-def _incidence(scene: Scene) -> float:
-    """The most that rays to the aperture lean from z before the entrance, rad."""
-    source, lens = scene.source, scene.lens
-    if source.distant:
-        return source.half_angle
-    positions, extent = source.points()[0], source.extent
-    far = np.hypot(*(np.abs(positions[:, k]) + extent[k] + lens.half_size[k] for k in (0, 1)))
-    steepest = float(np.arctan2(far, lens.z_in - positions[:, 2]).max())
-    return min(source.cone_over(lens.half_size, lens.z_in, lens.round), steepest)
 
 
 def _polarised(incidence: float, critical: float, n: float) -> float:

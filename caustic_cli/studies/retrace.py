@@ -70,10 +70,13 @@ def converge(scene: Scene, field: HeightField, heights: Tensor, tolerance: float
     order p are n (e / tolerance)^(1 / p) after n that leave an error e.
 
     Raises:
-        CausticError: MOST_RAYS are not enough, or no light reaches the screen.
+        CausticError: MOST_RAYS or those of a file are not enough, or no light reaches the screen.
     """
     each, traced, order = max(1, rays // BATCHES), 0, ORDER if scene.source.collimated else SOBOL_ORDER
+    held = scene.source.rays
     while True:
+        if held is not None and each * BATCHES > held.count:  # parts of a file as large as itself are no independent images
+            raise CausticError(f"--tolerance {tolerance:g} asks for more rays than the file holds, {held.count:,}")
         parts = [expose(scene, field, heights, _rays(scene, each, stream(seed, f"batch {k}"), device), None, dtype, screen,
                         requests=requests) for k in range(BATCHES)]
         traced += sum(p.rays for p in parts)

@@ -187,6 +187,8 @@ class Imager:
         """
         ways = [group[0] for group in _alike(lines)]
         system = ways[0].system
+        if system.source.rays is not None:
+            raise NoWaveImage("a ray file says nothing of its light's phase, so that it has no wave image")
         plane, upright = receiver.plane(system.axis), receiver.across(system.axis)
         distance = distance_of(system, parameters, plane)
         alike = [Optics(k.system, middle(system), parameters, k.length, k.label, plane, distance) for k in ways]

@@ -14,6 +14,8 @@ import math
 
 import numpy as np
 
+from caustic_cli.scene.sources.rayset import RaySet
+
 #: A cone that just covers the aperture is wider by this part, so that rounding leaves no corner dark.
 SLACK = 1e-9
 
@@ -24,7 +26,8 @@ class Source:
     kind: its type, as [source] type names it; power: emitted into the cone, or through the aperture by a distant source;
     profile: relative irradiance over the aperture, (a, b), or None if even; cone: half-angle of the cone as the user said it,
     degrees, or None for the narrowest that covers the lens; intensity: uniform in solid angle, or lambertian; aimed: rays are
-    sampled on the lens instead of all over the cone; collimated: see above.
+    sampled on the lens instead of all over the cone; collimated: see above; rays: those of a file, None of a source that has as
+    many as are asked for.
     """
 
     kind: str
@@ -34,6 +37,7 @@ class Source:
     intensity: str = "uniform"
     aimed: bool = True
     collimated: bool = False
+    rays: RaySet | None = None
 
     @property
     def distant(self) -> bool:
@@ -137,6 +141,15 @@ class Source:
         across = [np.abs(positions[:, k]) + extent[k] + (0.0 if round else half_size[k]) for k in (0, 1)]
         farthest = np.hypot(*across) + (half_size[0] if round else 0.0)
         return min((1.0 + SLACK) * float(np.arctan2(farthest, z_in - positions[:, 2]).max()), math.pi / 2.0)
+
+    def incidence(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> float:
+        """A bound of how far its rays to the aperture lean from z, rad."""
+        if self.distant:
+            return self.half_angle
+        positions, extent = self.points()[0], self.extent
+        far = np.hypot(*(np.abs(positions[:, k]) + extent[k] + half_size[k] for k in (0, 1)))
+        steepest = float(np.arctan2(far, z_in - positions[:, 2]).max())
+        return min(self.cone_over(half_size, z_in, round), steepest)
 
     def _width(self) -> float:
         """Full width of a near source along the axis where it is wider."""

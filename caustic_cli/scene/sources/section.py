@@ -21,6 +21,33 @@ COMMON = ("type", "power")
 DISTANCE, WIDTH, GRID = 5.0, 0.2, (25, 25)
 
 
+class Attached(str):
+    """The name of a file that [source] speaks of, together with what it holds; to whoever asks for text it is the name.
+
+    data: the file's bytes; content: what was read from them.
+    """
+
+    data: bytes = b""
+    content: Any = None
+
+    @classmethod
+    def of(cls, name: str, data: bytes, content: Any) -> Attached:
+        """A file of that name."""
+        found = cls(name)
+        found.data, found.content = data, content
+        return found
+
+    def named(self, name: str) -> Attached:
+        """The same file under another name."""
+        return self.of(name, self.data, self.content)
+
+
+def content(table: Table, key: str, kind: type) -> Any | None:
+    """What the file holds that a key names, if it is of that kind; None if not, or if there is no such file."""
+    held = getattr(table.get(key), "content", None)
+    return held if isinstance(held, kind) else None
+
+
 def nothing(_lens: Table) -> dict[str, Any]:
     """Defaults of a type that needs none."""
     return {}

@@ -1,0 +1,156 @@
+"""Rays of a file, carried to the pupil: all of them, or an even part of those that meet it.
+
+Fewer than those are drawn by systematic resampling in Morton's order of where they pass the pupil: of every stretch of that order
+with the same power one ray is taken, so that the part is as even over the pupil as the whole, and every ray carries the same.
+
+An image of N independent rays that carry the same has on P pixels a noise of sqrt(P / N), root mean square in units of its mean
+pixel: the variance of a pixel is its power times that of a ray.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from scipy.ndimage import gaussian_filter
+from torch import Tensor
+
+from caustic_cli.errors import InputError
+from caustic_cli.optics.emission.base import Lit
+from caustic_cli.optics.interface import reflectance
+from caustic_cli.optics.rays import RayState
+from caustic_cli.optics.sampling import SAMPLERS, random_numbers
+from caustic_cli.scene import Scene, Source
+
+#: Bits of each coordinate in Morton's order: finer than a million rays stand apart.
+BITS = 12
+#: Noise of an image from which its pictures are worth looking at.
+WORTHY = 0.1
+#: Rays over whose light the irradiance of a lens is smoothed, and the widest smoothing, in parts of the lens.
+SMOOTHED, WIDEST = 1000.0, 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredRays:
+    """The rays of a file, or about as many of them as are asked for.
+
+    Args:
+        scene: what is lit, by rays of a file.
+        kind: sampler, one of `sampling.SAMPLERS`; all of them mean the same here.
+        rays: at most so many.
+        seed: of the part that is taken; device: where they live.
+
+    Raises:
+        InputError: none of them meets the pupil.
+    """
+
+    scene: Lit
+    kind: str
+    rays: int
+    seed: int = 0
+    device: str | torch.device = "cpu"
+
+    def __post_init__(self):
+        if self.kind not in SAMPLERS:
+            raise InputError(f"sampler must be one of {', '.join(SAMPLERS)}, got {self.kind!r}")
+        _ = self._drawn
+
+    @cached_property
+    def _drawn(self) -> tuple[Tensor, ...]:
+        """Points of the pupil x, y, mm, directions, and parts of the source's power: (N,) each."""
+        source, pupil = self.scene.source, self.scene.pupil
+        x, y, met, part = _meeting(source, pupil.half_size, pupil.z, pupil.round)
+        if self.rays < len(met):
+            (rx, ry), chosen = pupil.half_size, random_numbers(self.seed, 0, torch.zeros(1, dtype=torch.int64))
+            order = np.argsort(_morton(0.5 + 0.5 * x / rx, 0.5 + 0.5 * y / ry), kind="stable")
+            sums, whole = np.cumsum(part[order]), float(part.sum())
+            at = (np.arange(self.rays) + float(chosen)) * (sums[-1] / self.rays)
+            taken = order[np.searchsorted(sums, at, side="right").clip(max=len(order) - 1)]
+            x, y, met, part = x[taken], y[taken], met[taken], np.full(self.rays, whole / self.rays)
+        d = source.rays.directions[met]
+        return tuple(torch.from_numpy(np.ascontiguousarray(c)).to(self.device) for c in (x, y, *d.T, part))
+
+    @property
+    def count(self) -> int:
+        """Number of rays: of those that meet the pupil."""
+        return len(self._drawn[0])
+
+    def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[RayState]:
+        """As of an `Emission`."""
+        missed = 1.0 - float(self._drawn[-1].sum())
+        for start in range(first * size, self.count, step * size):
+            x, y, dx, dy, dz, power = (c[start : start + size] for c in self._drawn)
+            lost = missed * len(power) / self.count
+            yield RayState((x, y, self.scene.pupil.z), (dx, dy, dz), power, lost={"missed_lens": lost})
+
+
+def _meeting(source: Source, half_size: tuple[float, float], z: float, round: bool) -> tuple[np.ndarray, ...]:
+    """Where rays meet an aperture, x and y mm, their numbers in the file, and their parts of the power."""
+    x, y, met = source.meeting(half_size, z, round)
+    (met,) = np.nonzero(met)
+    if not len(met):
+        raise InputError(f"[source] file: none of its {source.rays.count:,} rays meets the lens, which stands along +z from them;"
+                         " --source-position moves them")
+    return x[met], y[met], met, source.rays.flux[met] / source.rays.flux.sum()
+
+
+def _morton(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Morton's code of points of the unit square: the bits of both coordinates by turns."""
+    code = np.zeros(len(u), dtype=np.int64)
+    i, j = ((c * (1 << BITS)).astype(np.int64).clip(0, (1 << BITS) - 1) for c in (u, v))
+    for bit in range(BITS):
+        code |= (i >> bit & 1) << (2 * bit + 1) | (j >> bit & 1) << (2 * bit)
+    return code
+
+
+def coarseness(scene: Scene) -> tuple[float, int] | None:
+    """Noise of the image of all rays of a scene's file, in units of its mean pixel, and how many rays a file like it would have to
+    hold for that to be WORTHY; None of a source that has as many as are asked for."""
+    source, lens = scene.source, scene.lens
+    if source.rays is None:
+        return None
+    *_, part = _meeting(source, lens.half_size, lens.z_in, lens.round)
+    equal = float(part.sum()) ** 2 / float((part * part).sum())  # so many rays of the same power
+    noise = math.sqrt(math.prod(scene.screen.resolution) / equal)
+    return noise, math.ceil(source.rays.count * (noise / WORTHY) ** 2)
+
+
+def coarse_words(scene: Scene) -> str | None:
+    """That a scene's ray file is too coarse for its picture, and how many rays it would take; None where it is not."""
+    found = coarseness(scene)
+    if found is None or found[0] <= WORTHY:
+        return None
+    (noise, wanted), (nx, ny), rays = found, scene.screen.resolution, scene.source.rays.count
+    return (f"the ray file is coarse for {nx} x {ny} pixels: its {rays:,} rays leave {noise:.0%} of noise, and it would take"
+            f" {_rounded(wanted)} to leave {WORTHY:.0%}")
+
+
+def _rounded(count: int) -> str:
+    """Two digits of a number of rays, rounded up."""
+    scale = 10 ** max(0, len(str(count)) - 2)
+    return f"{-(-count // scale) * scale:,}"
+
+
+def irradiance(scene: Scene, x: np.ndarray, y: np.ndarray, height: float) -> np.ndarray | None:
+    """Power of a ray file in the cells between corners x (n + 1,), y (m + 1,) of the plane at `height`, mm, behind the entrance:
+    (n, m), smoothed over as many cells as hold SMOOTHED rays; None of a source that has no such rays."""
+    source, lens = scene.source, scene.lens
+    if source.rays is None:
+        return None
+    at_x, at_y, met, part = _meeting(source, lens.half_size, lens.z_in, lens.round)
+    d, n = source.rays.directions[met], lens.inside
+    inside = np.sqrt(1.0 - (d[:, 0] ** 2 + d[:, 1] ** 2) / (n * n))
+    if lens.fresnel != "none" and not lens.mirror:
+        part = part * (1.0 - reflectance("exact", d[:, 2], inside, 1.0 / n))
+    way = (height - lens.z_in) / (n * inside)
+    cells, _, _ = np.histogram2d(at_x + way * d[:, 0], at_y + way * d[:, 1], (x, y), weights=part)
+    lit = max(1, np.count_nonzero(cells))
+    sigma = math.sqrt(SMOOTHED * lit / (4.0 * math.pi * len(met)))
+    return gaussian_filter(cells, [min(sigma, WIDEST * k) for k in cells.shape], mode="reflect")
+
+
+EMISSIONS = {"rays": MeasuredRays}

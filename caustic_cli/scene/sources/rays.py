@@ -1,0 +1,107 @@
+"""Rays from a file: a light source as it was measured or simulated."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from caustic_cli.errors import InputError
+from caustic_cli.scene.sources import ranges
+from caustic_cli.scene.sources.base import Source
+from caustic_cli.scene.sources.points import Points
+from caustic_cli.scene.sources.rayset import RaySet
+from caustic_cli.scene.sources.section import DISTANCE, SourceType, Table, content, positions
+
+
+@dataclass(frozen=True, eq=False)
+class Measured(Source):
+    """A set of rays that stands before the lens.  Light that does not run towards the lens is counted as missing it.
+
+    As a whole it stands at the rays' point of closest approach and is as wide as they are there (`RaySet`).
+
+    Args:
+        rays: in coordinates of their own, whose z axis is the scene's.
+        position: of the origin of those, mm.
+        power: of all rays, W.
+    """
+
+    rays: RaySet = field()
+    position: tuple[float, float, float] = (0.0, 0.0, -50.0)
+    power: float = 1.0
+
+    kind = "rays"
+
+    def __post_init__(self):
+        ranges.position(self.position)
+        ranges.power(self.power)
+        _ = self.rays.forward  # refused here if there is none
+
+    def points(self) -> tuple[np.ndarray, np.ndarray]:
+        """The point of closest approach."""
+        return (self.rays.focus + self.position)[None, :], np.ones(1)
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """Half widths there."""
+        return self.rays.spread
+
+    @property
+    def nearest(self) -> float:
+        """Where a ray starts that is nearest to the lens."""
+        return self.rays.nearest + self.position[2]
+
+    @property
+    def sharp(self) -> bool:
+        """Never: the shape of its design does not hang on how small it is."""
+        return False
+
+    @property
+    def label(self) -> str:
+        """As of a source."""
+        return f"{self.rays.count:,} rays of a file"
+
+    def pointlike(self) -> Source:
+        """A point where the rays approach each other most."""
+        return Points((self.centre,), (self.power,))
+
+    def blur(self, z_in: float, throw: float) -> float:
+        """As of a source, from the point of closest approach."""
+        return throw * self._width() / max(abs(z_in - self.centre[2]), np.finfo(float).tiny)
+
+    def apparent_angle(self, z_in: float) -> float:
+        """As of a source, from the point of closest approach."""
+        return 2.0 * math.degrees(math.atan2(self._width() / 2.0, abs(z_in - self.centre[2])))
+
+    def incidence(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> float:
+        """As of a source: of the very rays."""
+        d = self.rays.directions[self.meeting(half_size, z_in, round)[2]]
+        return float(np.arctan2(np.hypot(d[:, 0], d[:, 1]), d[:, 2]).max(initial=0.0))
+
+    def meeting(self, half_size: tuple[float, float], z: float, round: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Where rays pass the plane at z, x and y (N,) mm, and which of them carry light through an aperture there (N,)."""
+        p, d = self.rays.positions, self.rays.directions
+        with np.errstate(divide="ignore", over="ignore", invalid="ignore"):  # rays along the plane, which carry nothing
+            way = (z - self.position[2] - p[:, 2]) / d[:, 2]
+            x, y = (p[:, k] + self.position[k] + way * d[:, k] for k in (0, 1))
+            inside = x * x + y * y <= half_size[0] ** 2 if round else (np.abs(x) <= half_size[0]) & (np.abs(y) <= half_size[1])
+        return x, y, inside & (self.rays.forward > 0)
+
+
+def _build(table: Table, _profile) -> Measured:
+    rays, places = content(table, "file", RaySet), positions(table)
+    if rays is None:
+        raise InputError("[source] file of type rays must be a ray file: IES TM-25 (.tm25ray), Zemax binary (.dat, .sdf) or"
+                         " LightTools text (.ray, .txt)")
+    if len(places) != 1:
+        raise InputError(f"[source] position of a ray file is that of its origin, one [x, y, z], got {len(places)}")
+    return Measured(rays, places[0], table["power"])
+
+
+def _standing(lens: Table) -> dict[str, Any]:
+    return {"position": [[0.0, 0.0, lens["z_in"] - DISTANCE * max(lens["size"])]]}
+
+
+TYPES = (SourceType("rays", "rays (of a file)", ("position", "file"), _build, _standing),)
