@@ -10,6 +10,7 @@ from torch import Tensor
 from caustic_cli.errors import InputError
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Disc, Lens, Light, PlaneWave, Points, Scene, Screen, Source
+from caustic_cli.scene.sources.distribution import Distribution
 from caustic_cli.surfaces import load_npz, surface_of
 
 
@@ -57,8 +58,9 @@ def _points(data: dict[str, np.ndarray]) -> Points:
 def _disc(data: dict[str, np.ndarray]) -> Disc:
     power = float(data["source_power"][0])
     if "source_angle" in data:
-        return Disc(power=power, angle=float(data["source_angle"]))
-    return Disc(_positions(data)[0], tuple(_reals(data, "source_size", 2)), power, **_shining(data))
+        return Disc(power=power, angle=float(data["source_angle"]), brightness=data.get("source_brightness"))
+    return Disc(_positions(data)[0], tuple(_reals(data, "source_size", 2)), power, brightness=data.get("source_brightness"),
+                **_shining(data))
 
 
 #: What makes a source of its keys in the archive, by its kind: see `export/lighttools.py`.
@@ -70,7 +72,11 @@ def _positions(data: dict[str, np.ndarray]) -> tuple[tuple[float, ...], ...]:
 
 
 def _shining(data: dict[str, np.ndarray]) -> dict[str, object]:
-    return {"cone": float(data["cone_half_angle"]), "intensity": data["source_intensity"].item()}
+    intensity = data["source_intensity"].item()
+    if intensity == "table":
+        angles, values = np.asarray(data["source_intensity_table"], dtype=float).T.tolist()
+        intensity = Distribution(tuple(angles), tuple(values))
+    return {"cone": float(data["cone_half_angle"]), "intensity": intensity}
 
 
 def _reals(data: dict[str, np.ndarray], key: str, count: int) -> list[float]:

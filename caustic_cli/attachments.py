@@ -6,12 +6,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from caustic_cli.errors import InputError
+from caustic_cli.intensities import MOST_BYTES, TABLE, parse_distribution
+from caustic_cli.picture import read_picture
 from caustic_cli.rayfiles import ACCEPTED, MAX_BYTES, SUFFIXES, parse_rays, read_bytes
 from caustic_cli.scene.sources.section import Attached
 
 #: Keys of [source] that may name a file, and what it is called in a project.
-STEMS = {"file": "source"}
+STEMS = {"file": "source", "intensity": "intensity"}
 
 
 def attached(source: Mapping[str, Any], folder: Path | None = None) -> dict[str, Any]:
@@ -45,13 +46,18 @@ def of(source: Mapping[str, Any]) -> list[Attached]:
     return [value for key in STEMS if isinstance(value := source.get(key), Attached)]
 
 
-def _is_file(_key: str, name: str) -> bool:
-    return bool(name)
+def _is_file(key: str, name: str) -> bool:
+    """Whether what a key says is a file: an intensity may be one of a few words, and no file of tables goes without a suffix."""
+    return bool(name) and (key != "intensity" or bool(Path(name).suffix))
 
 
-def _read(_key: str, name: str) -> Attached:
+def _read(key: str, name: str) -> Attached:
     path = Path(name)
-    if path.suffix.lower() not in SUFFIXES:
-        raise InputError(f"{path}: ends in {path.suffix or 'nothing'}; {ACCEPTED}")
-    data = read_bytes(path, MAX_BYTES, ACCEPTED)
-    return Attached.of(name, data, parse_rays(data, name))
+    if key == "intensity":
+        data = read_bytes(path, MOST_BYTES, TABLE)
+        return Attached.of(name, data, parse_distribution(data, name))
+    if path.suffix.lower() in SUFFIXES:
+        data = read_bytes(path, MAX_BYTES, ACCEPTED)
+        return Attached.of(name, data, parse_rays(data, name))
+    light = read_picture(path, linear=True).irradiance()
+    return Attached.of(name, read_bytes(path, MAX_BYTES, ACCEPTED), light)

@@ -87,7 +87,7 @@ class Outputs:
         self.record, self.paths = project.path / RECORD, [p for p in paths if p is not None]
         given = {k: str(v) for k, v in sorted(options.items()) if k not in IRRELEVANT}
         inputs = [digest(project.settings, project.picture, project.profile), _hash(project.path / CHECKPOINT)]
-        inputs += [_hash(Path(options[name])) for name in ("source_file",) if options.get(name)]
+        inputs += [_hash(Path(options[name])) for name in ("source_file", "intensity") if options.get(name)]
         self.asked = hashlib.sha256(json.dumps([command, given, inputs]).encode()).hexdigest()
         self.key = " ".join(str(p.resolve()) for p in self.paths)
 

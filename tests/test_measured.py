@@ -266,7 +266,7 @@ def test_another_file_is_another_design(here, capfd):
      "one [x, y, z]"),
     (["--source", "rays", "--source-file", "led.dat", "--cone", "3"], "--cone belongs to --source"),
     (["--source", "rays", "--source-file", "led.dat", "--waves", "on"], "--waves on: a ray file says nothing"),
-    (["--source", "point", "--source-file", "led.dat"], "--source-file belongs to --source rays"),
+    (["--source", "point", "--source-file", "led.dat"], "--source-file belongs to --source disc or rays"),
 ])
 def test_bad_files_are_one_line(here, capfd, arguments, message):
     Path("led.dat").write_bytes(zemax(*cone_of(357, 12.0)))

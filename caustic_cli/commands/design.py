@@ -28,6 +28,7 @@ def run(
                                            " with --resume, the project.", show_default=False)],
     source: options.SourceType = None,
     source_file: options.SourceFile = None,
+    intensity: options.Intensity = None,
     source_position: options.SourcePosition = None,
     source_size: options.SourceSize = None,
     source_grid: options.SourceGrid = None,
@@ -103,7 +104,7 @@ def run(
     speaks = os.environ.get("RANK", "0") == "0"  # under torchrun, the first of all
     began, say = time.monotonic(), console.Reporter(quiet or not speaks, progress)
     given = {
-        **options.source(source, source_position, source_size, source_grid, source_angle, cone, power, source_file),
+        **options.source(source, source_position, source_size, source_grid, source_angle, cone, power, source_file, intensity),
         **options.physics(polarisation, wavelengths, absorption, roughness, screen_tilt, screen_shift),
         ("lens", "mirror", "--mirror"): mirror or None,
         ("lens", "size", "--lens-size"): lens_size and options.both(options.size("--lens-size", lens_size)),

@@ -31,7 +31,11 @@ SourceType = Annotated[str | None, typer.Option(help="plane: parallel light alon
                                                 " points; disc, an extended source; rays of a --source-file."
                                                 "  [default: plane]")]
 SourceFile = Annotated[str | None, typer.Option(metavar="FILE", help="Ray file: IES TM-25 (.tm25ray), Zemax binary (.dat, .sdf) or"
-                                                " LightTools text (.ray, .txt); the project keeps a copy.")]
+                                                " LightTools text (.ray, .txt); of a disc, a picture of its brightness,"
+                                                " whose values are taken as they are.  The project keeps a copy.")]
+Intensity = Annotated[str | None, typer.Option(metavar="uniform|lambertian|FILE", help="Of a point, grid or disc: the same"
+                                               " into every solid angle, by the cosine, or a .csv of angles from +z, degrees, and"
+                                               " relative intensities.  [default: uniform]")]
 SourcePosition = Annotated[list[str] | None, typer.Option(metavar="X,Y,Z", help="Point (may be repeated), centre of a grid or"
                                                           " disc, or origin of a ray file, mm.  [default: on the axis, five lens"
                                                           " widths before it]")]
@@ -76,7 +80,8 @@ def physics(polarisation: float | None, wavelengths: str | None, absorption: flo
 
 
 def source(kind: str | None, position: list[str] | None, size_: str | None, grid: str | None, angle: float | None,
-           cone: float | None, power_: str | None = None, file: str | None = None) -> dict[tuple[str, str, str], object]:
+           cone: float | None, power_: str | None = None, file: str | None = None,
+           intensity: str | None = None) -> dict[tuple[str, str, str], object]:
     """The source options as (section, key, option) -> value, without those that were not given."""
     watts = (None, None) if power_ is None else power("--power", power_)
     given = {
@@ -90,6 +95,7 @@ def source(kind: str | None, position: list[str] | None, size_: str | None, grid
         ("source", "angle", "--source-angle"): angle,
         ("source", "cone", "--cone"): cone,
         ("source", "file", "--source-file"): file,
+        ("source", "intensity", "--intensity"): intensity,
     }
     return {key: value for key, value in given.items() if value is not None}
 

@@ -34,6 +34,7 @@ def run(
     alpha: Annotated[float | None, typer.Option(help="Of the gaussian, 1/mm^2.  [default: 1 per pixel^2]")] = None,
     source: options.SourceType = None,
     source_file: options.SourceFile = None,
+    intensity: options.Intensity = None,
     source_position: options.SourcePosition = None,
     source_size: options.SourceSize = None,
     source_grid: options.SourceGrid = None,
@@ -85,7 +86,7 @@ def run(
         raise InputError(f"--verify must be mitsuba, got {verify!r}")
     if verify and screen_at is not None:
         raise InputError("--verify compares on the project's own screen: give no --screen-at")
-    given = options.source(source, source_position, source_size, source_grid, source_angle, cone, power, source_file)
+    given = options.source(source, source_position, source_size, source_grid, source_angle, cone, power, source_file, intensity)
     given |= options.physics(polarisation, wavelengths, absorption, roughness, screen_tilt, screen_shift)
     device = options.start_torch(device, threads, say)
 

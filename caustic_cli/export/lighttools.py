@@ -21,7 +21,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.export.surface import sample_grid
 from caustic_cli.files import MARK, atomic_path
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.scene import Scene
+from caustic_cli.scene import Scene, Source
 
 FORMAT_VERSION = 1
 
@@ -80,7 +80,9 @@ def _source(scene: Scene) -> dict[str, np.ndarray]:
 
     `source_power` (k,), of each position; (1,), through the aperture, for a plane wave or a disc at infinity.  `source_profile`
     (a, b), the relative irradiance over the aperture [i, j], is there only when a wave is not uniform; `source_size` (2,) mm
-    or `source_angle` (full, degrees) only for a disc; `source_intensity` where there is a cone; `source_power_unit` unless W.
+    or `source_angle` (full, degrees) only for a disc; `source_intensity` where there is a cone, with
+    `source_intensity_table` (k, 2), degrees and relative intensity, if that is a table; `source_brightness` (a, b), the relative
+    radiance over a disc's rectangle [i, j], only where a picture says it; `source_power_unit` unless W.
 
     Raises:
         InputError: the archive knows no source of this type.
@@ -105,18 +107,33 @@ def _of_plane(scene: Scene) -> dict[str, np.ndarray]:
 def _of_points(scene: Scene) -> dict[str, np.ndarray]:
     source, lens = scene.source, scene.lens
     return {"cone_half_angle": _reals(np.degrees(source.cone_over(lens.half_size, lens.z_in, lens.round))),
-            "source_intensity": np.array(source.intensity)}
+            **_intensity(source)}
+
+
+def _intensity(source: Source) -> dict[str, np.ndarray]:
+    """A word, and the angles and intensities of a table."""
+    given = source.intensity
+    if isinstance(given, str):
+        return {"source_intensity": np.array(given)}
+    return {"source_intensity": np.array("table"), "source_intensity_table": _reals((given.angles, given.values)).T}
 
 
 def _of_disc(scene: Scene) -> dict[str, np.ndarray]:
     source = scene.source
+    light = {} if source.brightness is None else {"source_brightness": _reals(source.brightness)}
     if source.distant:
-        return {"cone_half_angle": _reals(source.angle / 2.0), "source_angle": _reals(source.angle)}
-    return _of_points(scene) | {"source_size": _reals(source.size)}
+        return {"cone_half_angle": _reals(source.angle / 2.0), "source_angle": _reals(source.angle)} | light
+    return _of_points(scene) | {"source_size": _reals(source.size)} | light
+
+
+def _of_rays(scene: Scene) -> dict[str, np.ndarray]:
+    """Of a ray file, which stays a file of its own, where its rays approach each other most."""
+    source, lens = scene.source, scene.lens
+    return {"cone_half_angle": _reals(np.degrees(source.cone_over(lens.half_size, lens.z_in, lens.round)))}
 
 
 #: What else the archive says of a source, by its kind.
-_KEYS = {"plane": _of_plane, "point": _of_points, "grid": _of_points, "disc": _of_disc}
+_KEYS = {"plane": _of_plane, "point": _of_points, "grid": _of_points, "disc": _of_disc, "rays": _of_rays}
 
 
 def _reals(value) -> np.ndarray:

@@ -160,6 +160,8 @@ def _area(scene: Scene) -> list[str]:
     if source.distant or source.intensity != "lambertian" or source.cone is not None:
         raise InputError("--format mitsuba: of discs only a Lambertian one without a cone of its own can be written, not one at"
                          " infinity; render --verify mitsuba traces them all")
+    if source.brightness is not None:
+        raise InputError("--format mitsuba: its disc is evenly bright, so one with a picture of its brightness cannot be written")
     (wx, wy), (x, y, z), cone = source.size, source.position, source.cone_over(lens.half_size, lens.z_in, lens.round)
     radiance = source.power / (math.pi * math.pi * wx * wy / 4.0 * math.sin(cone) ** 2)  # its cone just covers the lens
     return ['<shape type="disk" id="light">',
@@ -172,7 +174,7 @@ def _spots(scene: Scene) -> list[str]:
     """A spot a point.  Mitsuba's fall off towards their rim, so they are even a little beyond the cone."""
     source, lens = scene.source, scene.lens
     if source.intensity != "uniform":
-        raise InputError("--format mitsuba: its spots shine evenly, so Lambertian points cannot be written")
+        raise InputError("--format mitsuba: its spots shine evenly, so points of another intensity cannot be written")
     cone = source.cone_over(lens.half_size, lens.z_in, lens.round)
     lines, degrees = [], math.degrees(cone)
     for (x, y, z), power in zip(source.positions, source.powers, strict=True):

@@ -27,6 +27,7 @@ from caustic_cli.optics.emission.measured import irradiance
 from caustic_cli.optics.interface import reflectance
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
+from caustic_cli.scene.sources.distribution import relative
 
 #: Source cells along the lens' longer side: a picture of 250 x 250 pixels is resolved, and they are cheap.
 CELLS = 256
@@ -111,8 +112,7 @@ def _light(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray, shape) -> 
     power = np.abs(gx[0] * gy[1] - gx[1] * gy[0]) * cosine**3
     if lens.fresnel != "none":
         power *= 1.0 - reflectance("exact", cosine, inside, 1.0 / n)
-    if source.intensity == "lambertian":
-        power *= cosine
+    power *= relative(source.intensity, q)
     cone = min(source.cone_over(lens.half_size, lens.z_in, lens.round), 1.57079)
     power = np.where(q <= math.tan(cone) * (1 + 1e-9), power, 0.0)
     light = irradiance(scene, x, y, float(z.mean()))

@@ -165,6 +165,8 @@ def spread_of(lit: Lit, landing: Landing, device: str | torch.device = "cpu") ->
         as `landing`.
     """
     source, outer, centre = lit.source, edges(lit), middle(lit)
+    if source.brightness is not None or source.rays is not None:  # light that is not even over its ellipse
+        return None
     if not outer or (not source.distant and float(np.ptp(source.points()[0][:, 2])) > 0):
         return None
     line = torch.linspace(0.0, 1.0, POINTS, dtype=torch.float64, device=device)

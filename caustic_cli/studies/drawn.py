@@ -10,6 +10,8 @@ from caustic_cli.scene import Scene, Source
 
 #: Rays at a time.
 BATCH = 1 << 20
+#: Angles by which a table of intensities is summed.
+TABLE = 20_001
 
 
 def emitted(scene: Scene, rays: int, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
@@ -27,7 +29,10 @@ def emitted(scene: Scene, rays: int, rng: np.random.Generator) -> Iterator[tuple
         one = np.ones(n)
         if source.distant:
             sine = np.sqrt(a) * np.sin(source.half_angle)
-            d = np.array([sine * np.cos(2 * np.pi * b), sine * np.sin(2 * np.pi * b), np.sqrt(1 - sine**2)])
+            dx, dy = sine * np.cos(2 * np.pi * b), sine * np.sin(2 * np.pi * b)
+            if source.brightness is not None:
+                dx, dy = source.frame[0] * _on_picture(source.brightness, n, rng)
+            d = np.array([dx, dy, np.sqrt(1 - dx**2 - dy**2)])
             x, y = ((2 * u - 1) * rx, (2 * v - 1) * ry) if not round_ else (rx * np.sqrt(u) * np.cos(2 * np.pi * v),
                                                                             rx * np.sqrt(u) * np.sin(2 * np.pi * v))
             if source.profile is not None:
@@ -37,6 +42,9 @@ def emitted(scene: Scene, rays: int, rng: np.random.Generator) -> Iterator[tuple
         cone = source.cone_over((rx, ry), z_in, round_)
         if source.intensity == "lambertian":
             sine = np.sqrt(a) * np.sin(cone)
+        elif source.intensity != "uniform":
+            angles = np.linspace(0, cone, TABLE)
+            sine = np.sin(np.interp(a, *_summed(source.intensity.relative(angles) * np.sin(angles), angles)))
         else:  # even in the cosine, reckoned from 1
             drop = a * 2 * np.sin(cone / 2) ** 2
             sine = np.sqrt(drop * (2 - drop))
@@ -52,10 +60,26 @@ def _on_points(source: Source, u: np.ndarray, _v: np.ndarray, rng: np.random.Gen
     return positions[rng.choice(len(parts), len(u), p=parts)].T
 
 
-def _on_disc(source: Source, u: np.ndarray, v: np.ndarray, _rng: np.random.Generator) -> np.ndarray:
-    """(3, N): even over the ellipse."""
+def _on_disc(source: Source, u: np.ndarray, v: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """(3, N): even over the ellipse, or by a picture."""
+    if source.brightness is not None:
+        x, y = np.array(source.frame)[:, None] * _on_picture(source.brightness, len(u), rng)
+        return source.points()[0].T + np.array([x, y, 0 * u])
     wide, high = np.sqrt(u) * np.array(source.extent)[:, None]
     return source.points()[0].T + np.array([wide * np.cos(2 * np.pi * v), high * np.sin(2 * np.pi * v), 0 * u])
+
+
+def _on_picture(light: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """(2, N): points of [-1, 1]^2, as many in each pixel as its light asks for."""
+    cell = rng.choice(light.size, count, p=light.ravel() / light.sum())
+    places = zip(np.unravel_index(cell, light.shape), light.shape, strict=True)
+    return np.array([2 * (k + rng.random(count)) / n - 1 for k, n in places])
+
+
+def _summed(density: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Parts of a density up to each place, by trapezia, and the places."""
+    sums = np.append(0.0, np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(at)))
+    return sums / sums[-1], at
 
 
 #: Where rays of a near source of each kind start, and the kinds of which rays can be drawn.

@@ -18,6 +18,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import SAMPLERS, numbers
 from caustic_cli.scene import Pupil, Source
+from caustic_cli.scene.sources.distribution import Distribution
 
 
 class Lit(Protocol):
@@ -90,9 +91,21 @@ class Emission:
 def intensity_of(source: Source, cone: float, secant: Tensor) -> Tensor | float:
     """Power per solid angle, 1/sr, of a near source of power 1 that shines into a cone of this half-angle, rad; secant: 1 / cos of
     its light's angle to the axis."""
-    if source.intensity == "lambertian":
+    given = source.intensity
+    if isinstance(given, Distribution):
+        return _by_table(given, torch.atan(torch.sqrt((secant * secant - 1.0).clamp_min(0.0)))) / given.flux(cone)
+    if given == "lambertian":
         return 1.0 / (math.pi * math.sin(cone) ** 2 * secant)
     return 1.0 / (4.0 * math.pi * math.sin(cone / 2.0) ** 2)
+
+
+def _by_table(given: Distribution, angle: Tensor) -> Tensor:
+    """Relative intensity at angles, rad."""
+    angles = torch.deg2rad(torch.tensor(given.angles, dtype=torch.float64, device=angle.device))
+    values = torch.tensor(given.values, dtype=torch.float64, device=angle.device)
+    k = (torch.searchsorted(angles, angle.contiguous(), right=True) - 1).clamp(0, len(angles) - 2)
+    found = values[k] + (values[k + 1] - values[k]) * (angle - angles[k]) / (angles[k + 1] - angles[k])
+    return torch.where(angle <= angles[-1], found, torch.zeros_like(found))
 
 
 def _starts(scene: Lit) -> int:

@@ -14,12 +14,15 @@ import torch
 from torch import Tensor
 
 from caustic_cli.optics.emission.base import Lit, intensity_of
+from caustic_cli.optics.emission.brightness import bright_points
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import Sample
+from caustic_cli.scene import Source
 
 #: Turn between one point of a disc and the next, rad: such a spiral fills it evenly.
 GOLDEN = math.pi * (3.0 - math.sqrt(5.0))
-
+#: Parts of this number, counted up, fill a line evenly: the golden ratio.
+RATIO = (1.0 + math.sqrt(5.0)) / 2.0
 #: Points along each axis by which the mean of a profile over a circle is found.
 ROUND = 1000
 
@@ -104,17 +107,26 @@ def modes(scene: Lit, each: int) -> list[Mode]:
     """The source as points: `each` in place of every position that has an extent, evenly over its ellipse."""
     source = scene.source
     if source.distant:
-        s = math.sin(source.half_angle)
-        spread = even_disc(each) if s else [(0.0, 0.0)]
+        spread = _spots(source, each)
         found = []
-        for a, b in spread:
-            dx, dy = s * a, s * b
+        for dx, dy in spread:
             found.append(Mode(scene, (dx, dy, math.sqrt(1.0 - dx * dx - dy * dy)), 1.0 / len(spread)))
         return found
-    (ex, ey), (positions, parts) = source.extent, source.points()
-    spread = even_disc(each) if max(ex, ey) > 0 else [(0.0, 0.0)]
-    return [Mode(scene, (float(x + ex * a), float(y + ey * b), float(z)), float(part) / len(spread))
-            for (x, y, z), part in zip(positions, parts, strict=True) for a, b in spread]
+    (positions, parts), spread = source.points(), _spots(source, each)
+    return [Mode(scene, (float(x + dx), float(y + dy), float(z)), float(part) / len(spread))
+            for (x, y, z), part in zip(positions, parts, strict=True) for dx, dy in spread]
+
+
+def _spots(source: Source, each: int) -> list[tuple[float, float]]:
+    """Points about a position of a source that stand for the same part of its light each, mm, or sines of a distant one."""
+    fx, fy = source.frame
+    if not max(fx, fy) > 0:
+        return [(0.0, 0.0)]
+    if source.brightness is None:
+        return [(fx * a, fy * b) for a, b in even_disc(each)]
+    k = torch.arange(each, dtype=torch.float64) + 0.5
+    x, y = bright_points(source.brightness, k / each, torch.frac(k / RATIO))
+    return [(fx * a, fy * b) for a, b in zip(x.tolist(), y.tolist(), strict=True)]
 
 
 def even_disc(count: int) -> list[tuple[float, float]]:

@@ -1,4 +1,4 @@
-"""Rays of an evenly bright disc at infinity, such as the sun: even over the aperture, and over the projected solid angle."""
+"""Rays of a disc at infinity, such as the sun: even over the aperture, and over the projected solid angle or by its brightness."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.optics.emission.base import Emission
+from caustic_cli.optics.emission.brightness import bright_points
 from caustic_cli.optics.rays import RayState
 
 
@@ -18,9 +19,12 @@ class Distant(Emission):
     dimensions: ClassVar[int] = 4
 
     def _drawn(self, start: int, u: Tensor, v: Tensor, a: Tensor, b: Tensor) -> RayState:
-        (rx, ry), half = self.scene.pupil.half_size, self.scene.source.half_angle
-        sine = a.sqrt() * math.sin(half)  # even over the projected solid angle: an evenly bright disc
-        dx, dy = sine * torch.cos(2 * math.pi * b), sine * torch.sin(2 * math.pi * b)
+        (rx, ry), source = self.scene.pupil.half_size, self.scene.source
+        if source.brightness is None:
+            sine = a.sqrt() * math.sin(source.half_angle)  # even over the projected solid angle: an evenly bright disc
+            dx, dy = sine * torch.cos(2 * math.pi * b), sine * torch.sin(2 * math.pi * b)
+        else:
+            dx, dy = (w * c for w, c in zip(source.frame, bright_points(source.brightness, a, b), strict=True))
         share, x, y = torch.full_like(u, 1.0 / self.count), (2.0 * u - 1.0) * rx, (2.0 * v - 1.0) * ry
         if self.scene.pupil.round:  # even over the disc
             x, y = rx * u.sqrt() * torch.cos(2 * math.pi * v), rx * u.sqrt() * torch.sin(2 * math.pi * v)

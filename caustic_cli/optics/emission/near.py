@@ -6,9 +6,10 @@ Notation, a source point at distance h before the entrance plane
     rho     distance on the entrance plane from the point below the source; r^2 = rho^2 + h^2
 
 A ray sampled evenly over the cone carries an even share.  Aimed at the aperture, it carries I(theta) dOmega with
-I = 1 / (4 pi sin^2(theta_c / 2)), or for a Lambertian source I = cos theta / (pi sin^2 theta_c).  Its direction is
-(sin a cos b, sin b, cos a cos b) with a and sin b even between the aperture's edges, so that dOmega = da d(sin b): from afar an
-even sample of the aperture, and from nearby, where nearly all light meets the lens at the source's foot, one of the directions.
+I = 1 / (4 pi sin^2(theta_c / 2)), or for a Lambertian source I = cos theta / (pi sin^2 theta_c), or that of a table.  Its
+direction is (sin a cos b, sin b, cos a cos b) with a and sin b even between the aperture's edges, so that dOmega = da d(sin b):
+from afar an even sample of the aperture, and from nearby, where nearly all light meets the lens at the source's foot, one of the
+directions.
 A cone that lies within the aperture is sampled itself, and so is that of a source NEAR the aperture, which hardly any ray misses:
 few rays are wasted either way.
 """
@@ -23,7 +24,9 @@ import torch
 from torch import Tensor
 
 from caustic_cli.optics.emission.base import Emission, intensity_of
+from caustic_cli.optics.emission.brightness import bright_points
 from caustic_cli.optics.rays import RayState
+from caustic_cli.scene.sources.distribution import Distribution
 
 #: A source whose foot is this many of its distances inside the aperture's edge is near: 1 - cos = 0.32 of a hemisphere misses.
 NEAR = 3.0
@@ -67,10 +70,7 @@ class Near(Emission):
             within &= torch.maximum(-lows[0], highs[0]) ** 2 + torch.maximum(-lows[1], highs[1]) ** 2 <= rx * rx
         from_cone = within | (room >= max(ex, ey) + NEAR * h) if source.aimed else torch.ones_like(within)
 
-        lambertian = source.intensity == "lambertian"
-        w_c = 2.0 * math.sin(cone / 2.0) ** 2
-        sine2 = u * math.sin(cone) ** 2
-        w = sine2 / (1.0 + torch.sqrt(1.0 - sine2)) if lambertian else u * w_c
+        w = _drops(source.intensity, cone, u)
         sine, cosine = torch.sqrt(w * (2.0 - w)), 1.0 - w
         tangent = sine / cosine.clamp_min(1e-300)
         cx, cy = tangent * torch.cos(2 * math.pi * v), tangent * torch.sin(2 * math.pi * v)  # tangents along x and y
@@ -98,13 +98,27 @@ class Near(Emission):
 
 
 class NearDisc(Near):
-    """Rays of ellipses, whose half axes are the source's extent."""
+    """Rays of ellipses, whose half axes are the source's extent, or of pictures of its brightness."""
 
     dimensions: ClassVar[int] = 4
 
     def _aside(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-        (ex, ey), turn = self.scene.source.extent, 2 * math.pi * b
+        source = self.scene.source
+        if source.brightness is not None:
+            return tuple(w * c for w, c in zip(source.frame, bright_points(source.brightness, a, b), strict=True))
+        (ex, ey), turn = source.extent, 2 * math.pi * b
         return ex * a.sqrt() * torch.cos(turn), ey * a.sqrt() * torch.sin(turn)
+
+
+def _drops(intensity: str | Distribution, cone: float, part: Tensor) -> Tensor:
+    """w = 1 - cos theta of the angles within which such parts of the light into a cone lie."""
+    if isinstance(intensity, Distribution):
+        theta = torch.from_numpy(intensity.angle_of(part.cpu().numpy(), cone)).to(part.device)
+        return 2.0 * torch.sin(0.5 * theta) ** 2
+    if intensity == "lambertian":
+        sine2 = part * math.sin(cone) ** 2
+        return sine2 / (1.0 + torch.sqrt(1.0 - sine2))
+    return part * (2.0 * math.sin(cone / 2.0) ** 2)
 
 
 def _even_angle(low: Tensor, high: Tensor, width: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:

@@ -14,6 +14,7 @@ import math
 
 import numpy as np
 
+from caustic_cli.scene.sources.distribution import Distribution
 from caustic_cli.scene.sources.rayset import RaySet
 
 #: A cone that just covers the aperture is wider by this part, so that rounding leaves no corner dark.
@@ -25,19 +26,20 @@ class Source:
 
     kind: its type, as [source] type names it; power: emitted into the cone, or through the aperture by a distant source;
     profile: relative irradiance over the aperture, (a, b), or None if even; cone: half-angle of the cone as the user said it,
-    degrees, or None for the narrowest that covers the lens; intensity: uniform in solid angle, or lambertian; aimed: rays are
-    sampled on the lens instead of all over the cone; collimated: see above; rays: those of a file, None of a source that has as
-    many as are asked for.
+    degrees, or None for the narrowest that covers the lens; intensity: uniform in solid angle, lambertian, or a table; aimed: rays
+    are sampled on the lens instead of all over the cone; collimated: see above; rays: those of a file, None of a source that has as
+    many as are asked for; brightness: relative radiance over `frame`, (a, b) [i, j], or None if even over an ellipse.
     """
 
     kind: str
     power: float
     profile: np.ndarray | None = None
     cone: float | None = None
-    intensity: str = "uniform"
+    intensity: str | Distribution = "uniform"
     aimed: bool = True
     collimated: bool = False
     rays: RaySet | None = None
+    brightness: np.ndarray | None = None
 
     @property
     def distant(self) -> bool:
@@ -64,6 +66,11 @@ class Source:
     def extent(self) -> tuple[float, float]:
         """Half widths about each position along x and y; 0 for points and for what is distant."""
         return 0.0, 0.0
+
+    @property
+    def frame(self) -> tuple[float, float]:
+        """Half widths of the rectangle that `brightness` is laid over: mm, or sines of the angle to z of a distant source."""
+        return (math.sin(self.half_angle),) * 2 if self.distant else self.extent
 
     @property
     def nearest(self) -> float:

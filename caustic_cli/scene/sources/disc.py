@@ -1,18 +1,20 @@
-"""A disc: an extended source before the lens, or at infinity such as the sun (thesis 4.2)."""
+"""A disc: an extended source before the lens, or at infinity such as the sun (thesis 4.2); evenly bright, or by a picture."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
+from caustic_cli.errors import InputError
 from caustic_cli.scene import checks
 from caustic_cli.scene.sources import ranges
 from caustic_cli.scene.sources.base import Source
 from caustic_cli.scene.sources.plane import PlaneWave
 from caustic_cli.scene.sources.points import Points
-from caustic_cli.scene.sources.section import SourceType, Table, middle, shining, standing
+from caustic_cli.scene.sources.section import SourceType, Table, content, middle, shining, standing
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,8 @@ class Disc(Source):
         cone, intensity, aimed: as for `Points`.
         angle: full angle under which the lens sees a round, evenly bright disc at infinity, degrees; position, size, cone,
             intensity and aimed then mean nothing.
+        brightness: relative radiance over the rectangle about the ellipse, (a, b) [i, j] with i along +x, instead of an even
+            ellipse; of a disc at infinity over the sines of the angles to z.
     """
 
     position: tuple[float, float, float] = (0.0, 0.0, -50.0)
@@ -35,6 +39,7 @@ class Disc(Source):
     intensity: str = "lambertian"
     aimed: bool = True
     angle: float | None = None
+    brightness: np.ndarray | None = field(default=None, compare=False)
 
     kind = "disc"
 
@@ -46,6 +51,13 @@ class Disc(Source):
         ranges.intensity(self.intensity)
         if self.angle is not None:
             checks.number("[source] angle", self.angle, 0.0, 170.0)
+        if self.brightness is not None:
+            light = np.asarray(self.brightness, dtype=float)
+            if light.ndim != 2 or not np.isfinite(light).all() or (light < 0).any() or not 0 < light.sum() < np.inf:
+                raise InputError("[source] file of a disc must be a 2-D picture, finite, not negative, and not black all over")
+            object.__setattr__(self, "brightness", light)
+            if self.distant and self.frame[0] * self._reach[2] >= 1.0:
+                raise InputError(f"[source] angle of {self.angle:g} degrees is too wide for a picture whose corners lie beyond it")
 
     @property
     def distant(self) -> bool:
@@ -54,8 +66,35 @@ class Disc(Source):
 
     @property
     def half_angle(self) -> float:
+        """As of a source; with a picture, that of the outermost corner of its light."""
+        if not self.distant:
+            return 0.0
+        half = math.radians(self.angle) / 2.0
+        return half if self.brightness is None else math.asin(math.sin(half) * self._reach[2])
+
+    @property
+    def frame(self) -> tuple[float, float]:
         """As of a source."""
-        return math.radians(self.angle) / 2.0 if self.distant else 0.0
+        return (math.sin(math.radians(self.angle) / 2.0),) * 2 if self.distant else (self.size[0] / 2.0, self.size[1] / 2.0)
+
+    @cached_property
+    def _reach(self) -> tuple[float, float, float]:
+        """How far light of the picture is from its middle along x, along y and in all, in half widths."""
+        lit = self.brightness > 0
+        far = [np.maximum(np.abs(edge[:-1]), np.abs(edge[1:])) for edge in (np.linspace(-1.0, 1.0, n + 1) for n in lit.shape)]
+        corner = np.hypot(far[0][:, None], far[1][None, :])
+        return float(far[0][lit.any(1)].max()), float(far[1][lit.any(0)].max()), float(corner[lit].max())
+
+    @property
+    def centre(self) -> tuple[float, float, float]:
+        """As of a source; with a picture, the mean of its light."""
+        if self.distant or self.brightness is None:
+            return super().centre
+        cells = [(np.arange(n) + 0.5) * (2.0 / n) - 1.0 for n in self.brightness.shape]
+        total = self.brightness.sum()
+        (x, y, z), (fx, fy) = self.position, self.frame
+        return (x + fx * float(cells[0] @ self.brightness.sum(1) / total),
+                y + fy * float(cells[1] @ self.brightness.sum(0) / total), float(z))
 
     def points(self) -> tuple[np.ndarray, np.ndarray]:
         """Its middle."""
@@ -63,8 +102,11 @@ class Disc(Source):
 
     @property
     def extent(self) -> tuple[float, float]:
-        """Half axes of the ellipse."""
-        return (0.0, 0.0) if self.distant else (self.size[0] / 2.0, self.size[1] / 2.0)
+        """Half axes of the ellipse, or half widths of the rectangle that holds all light of the picture."""
+        if self.distant:
+            return 0.0, 0.0
+        wide, high = (1.0, 1.0) if self.brightness is None else self._reach[:2]
+        return wide * self.size[0] / 2.0, high * self.size[1] / 2.0
 
     @property
     def sharp(self) -> bool:
@@ -84,11 +126,16 @@ class Disc(Source):
         """A plane wave, or a point in the middle."""
         if self.distant:
             return PlaneWave(self.power)
-        return Points((self.position,), (self.power,), self.cone, self.intensity, self.aimed)
+        place = self.position if self.brightness is None else self.centre
+        return Points((place,), (self.power,), self.cone, self.intensity, self.aimed)
 
 
 def _build(table: Table, _profile) -> Disc:
-    return Disc(middle(table, "disc"), tuple(table["size"]), table["power"], angle=table.get("angle"), **shining(table))
+    light = content(table, "file", np.ndarray)
+    if light is None and table.get("file"):
+        raise InputError("[source] file of a disc must be a picture of its brightness, an image or a 2-D .npy")
+    return Disc(middle(table, "disc"), tuple(table["size"]), table["power"], angle=table.get("angle"), brightness=light,
+                **shining(table))
 
 
 def _idle(table: Table) -> dict[str, str]:
@@ -96,4 +143,4 @@ def _idle(table: Table) -> dict[str, str]:
     return dict.fromkeys(("position", "size", "cone"), why) if "angle" in table else {}
 
 
-TYPES = (SourceType("disc", "disc", ("position", "size", "cone", "angle", "intensity", "aim"), _build, standing, _idle),)
+TYPES = (SourceType("disc", "disc", ("position", "size", "cone", "angle", "intensity", "aim", "file"), _build, standing, _idle),)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from caustic_cli.errors import InputError
 from caustic_cli.scene import checks
+from caustic_cli.scene.sources.distribution import Distribution
 
 #: uniform: the same power into every solid angle; lambertian: proportional to the cosine from +z.
 INTENSITIES = ("uniform", "lambertian")
@@ -35,6 +36,7 @@ def cone(value: float | None) -> None:
         checks.number("[source] cone", value, 1e-9, 90.0)
 
 
-def intensity(value: str) -> None:
-    """One of INTENSITIES."""
-    checks.choice("[source] intensity", value, INTENSITIES)
+def intensity(value: str | Distribution) -> None:
+    """One of INTENSITIES, or a table."""
+    if not isinstance(value, Distribution) and value not in INTENSITIES:
+        raise InputError(f"[source] intensity must be one of {', '.join(INTENSITIES)}, or a .csv file, got {value!r}")

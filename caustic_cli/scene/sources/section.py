@@ -13,6 +13,7 @@ import numpy as np
 
 from caustic_cli.errors import InputError
 from caustic_cli.scene.sources.base import Source
+from caustic_cli.scene.sources.distribution import Distribution
 
 Table = Mapping[str, Any]
 #: Keys of every source: the name of its type, and its power, W.
@@ -85,7 +86,8 @@ def standing(lens: Table) -> dict[str, Any]:
 
 def shining(table: Table) -> dict[str, Any]:
     """How a source that stands somewhere shines, as arguments of its class."""
-    return {"cone": table.get("cone"), "intensity": table["intensity"], "aimed": table["aim"]}
+    intensity = content(table, "intensity", Distribution) or str(table["intensity"])
+    return {"cone": table.get("cone"), "intensity": intensity, "aimed": table["aim"]}
 
 
 def positions(table: Table) -> tuple[tuple[float, float, float], ...]:

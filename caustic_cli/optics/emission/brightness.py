@@ -1,0 +1,35 @@
+"""Points of a source whose brightness a picture shows, as many where it is twice as bright as light asks for.
+
+A number a in [0, 1] picks the row of the picture by the power of the rows before it, and the place within that; b likewise the
+pixel of the row.  Both maps ascend, so that even numbers, or those of a sequence of low discrepancy, stay as even as they are.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+def bright_points(picture: np.ndarray, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    """Points x, y (N,) of [-1, 1]^2 for numbers a, b (N,) in [0, 1]; picture: brightness (n, m), [i, j] with i along +x."""
+    light = torch.as_tensor(np.asarray(picture, dtype=np.float64), device=a.device)
+    rows = light.sum(1)
+    i, x = _place(rows / rows.sum(), a, torch.zeros_like(a, dtype=torch.int64), len(rows))
+    _, y = _place((light / torch.where(rows > 0, rows, 1.0)[:, None]).reshape(-1), b, i * light.shape[1], light.shape[1])
+    return 2.0 * x - 1.0, 2.0 * y - 1.0
+
+
+def _place(parts: Tensor, number: Tensor, first: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """The cell that each number falls into, among the `count` from `first` on, whose parts sum to 1, and where between 0 and 1."""
+    sums = torch.cat([parts.new_zeros(1), torch.cumsum(parts, 0)])
+    before = sums[first]
+    wanted = (before + number * (sums[first + count] - before)).contiguous()
+    k = torch.searchsorted(sums, wanted, right=True) - 1
+    k = torch.minimum(torch.maximum(k, first), first + count - 1)
+    dark = parts[k] <= 0  # rounding at the end of a row: the last cell with light before it
+    if bool(dark.any()):
+        lit = torch.where(parts > 0, torch.arange(len(parts), device=parts.device), -1).cummax(0).values
+        k = torch.where(dark, lit[k], k)
+    within = ((wanted - sums[k]) / parts[k]).clamp(0.0, 1.0)
+    return k - first, (k - first + within) / count
