@@ -31,19 +31,22 @@ def attached(source: Mapping[str, Any], folder: Path | None = None) -> dict[str,
             found[key] = _read(key, name if folder is None else str(folder / name))
             if folder is not None:
                 found[key] = found[key].named(name)
+    if "also" in source:
+        found["also"] = [attached(table, folder) for table in source["also"]]
     return found
 
 
 def named_in_project(source: dict[str, Any]) -> None:
-    """Rename the files of a section as a project calls them."""
-    for key, stem in STEMS.items():
-        if isinstance(source.get(key), Attached):
-            source[key] = source[key].named(stem + Path(source[key]).suffix.lower())
+    """Rename the files of a section as a project calls them, those of further sources by their number."""
+    for k, table in enumerate((source, *source.get("also", ()))):
+        for key, stem in STEMS.items():
+            if isinstance(table.get(key), Attached):
+                table[key] = table[key].named(f"{stem}{f'-{k + 1}' if k else ''}{Path(table[key]).suffix.lower()}")
 
 
 def of(source: Mapping[str, Any]) -> list[Attached]:
     """All files of a section."""
-    return [value for key in STEMS if isinstance(value := source.get(key), Attached)]
+    return [value for table in (source, *source.get("also", ())) for key in STEMS if isinstance(value := table.get(key), Attached)]
 
 
 def _is_file(key: str, name: str) -> bool:

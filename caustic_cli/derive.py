@@ -66,6 +66,8 @@ def complete(given: Settings, aspect: float, *, mag: float | None = None, margin
         s["screen"]["z"] = -s["screen"]["z"]
     lens, screen, target = s["lens"], s["screen"], s["target"]
     if target.get("color", False):
+        if s["source"].get("also"):
+            raise InputError("[[source]] of a coloured picture must be one, whose three wavelengths are its colours")
         s["source"].setdefault("wavelengths", list(RGB))
         if "index" not in lens:
             lens.setdefault("glass", COLOR_GLASS)
@@ -81,6 +83,10 @@ def complete(given: Settings, aspect: float, *, mag: float | None = None, margin
     checks.choice("[target] flip", target["flip"], ("", "x", "y", "xy"))
     checks.choice("[target] encoding", target["encoding"], ("srgb", "linear"))
     _complete_source(s["source"], lens, [stage.get("source", "") for stage in s["design"].get("stages", [])])
+    if "also" in s["source"]:
+        s["source"]["also"] = [{**DEFAULTS["source"], **table} for table in s["source"]["also"]]
+        for table in s["source"]["also"]:
+            _complete_source(table, lens, [], "[[source]] type")
     if "size" not in target or mag is not None:
         if mag is None and "size" in screen:
             fit = min(screen["size"][0], screen["size"][1] / aspect) / (1.0 + margin)
@@ -99,12 +105,12 @@ def complete(given: Settings, aspect: float, *, mag: float | None = None, margin
     return s
 
 
-def _complete_source(source: dict[str, Any], lens: dict[str, Any], stages: list[str]) -> None:
+def _complete_source(source: dict[str, Any], lens: dict[str, Any], stages: list[str], where: str = "[source] type") -> None:
     """What the types of source in use need and nobody said, without what none of them has: a plane wave has no intensity.
 
     `stages`: the types that stages name, "" for the source's own; they need their keys too.
     """
-    types = [sources.type_of(source["type"])]
+    types = [sources.type_of(source["type"], where)]
     types += [sources.type_of(type, "[[design.stages]] source") for type in stages if type]
     for type in types:
         for key, value in type.defaults(lens).items():
@@ -206,6 +212,8 @@ def _not_by_default(s: Settings) -> str:
     design = s["design"]
     if s["source"]["type"] == "rays":
         return "a ray file says nothing of its light's phase"
+    if s["source"].get("also"):
+        return "light of several sources is refined by rays alone"
     if design["network"] != "none":
         return "a network is trained on rays alone; --network none refines it"
     if design["optimizer"] != "lbfgs":
@@ -222,6 +230,8 @@ def _wave_stages(s: Settings, source: Source, quality: str, lit: tuple[float, fl
         raise InputError("[design] waves on needs network none: the wave image refines the heights themselves")
     if asked == "on" and source.rays is not None:
         raise InputError("[design] waves on: a ray file says nothing of its light's phase, so that it has no wave image to refine")
+    if asked == "on" and len(source.members) > 1:
+        raise InputError("[design] waves on needs one source: light of several is refined by rays alone")
     if asked == "off" or (asked == "auto" and _not_by_default(s)):
         return []
     seen = _resolution(s, source)

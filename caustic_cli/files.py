@@ -16,6 +16,8 @@ from caustic_cli.errors import CausticError, InputError
 SOFTWARE = "caustic"
 MARK = SOFTWARE.encode()
 CREATED_BY = f"created by {SOFTWARE}"  # in a comment at the beginning of a text file
+#: How files begin that a project is made of.
+PARTS = ("project.toml", "checkpoints.h5", "target.", "profile.", "source.", "source-", "intensity.", "intensity-", ".outputs.json")
 NPY_HEADER = 256  # bytes; NumPy itself pads to 64 or 128
 #: A temporary file nobody has written to for so many seconds was left by a killed process.
 LEFT_BEHIND = 600.0
@@ -106,8 +108,7 @@ def refuse_foreign(path: str | Path, force: bool = False) -> None:
         raise InputError(f"{path}: its directory {path.parent} does not exist; make it first")
     if not os.access(path.parent, os.W_OK):
         raise InputError(f"{path}: its directory {path.parent} is read-only; one you may write to is needed")
-    if (path.parent / "project.toml").exists() and path.name.startswith(
-            ("project.toml", "checkpoints.h5", "target.", "profile.", "source.", "intensity.", ".outputs.json")):
+    if (path.parent / "project.toml").exists() and path.name.startswith(PARTS):
         raise InputError(f"{path}: is part of the project and is never replaced by an output; choose another name")
     if path.exists() and not force and not is_ours(path):
         raise InputError(f"{path}: exists and was not made by caustic; --force replaces it, another name spares it")

@@ -47,9 +47,10 @@ def check(path: Path, force: bool) -> None:
 
 def _of_a_birth(path: Path) -> bool:
     """Whether a file is what a project begins with: one may have been killed before its project.toml was written."""
-    return path.is_file() and (path.name.startswith((".target.", ".profile.", ".source.", ".intensity.", ".project.toml."))
+    return path.is_file() and (path.name.startswith((".target.", ".profile.", ".source", ".intensity", ".project.toml."))
                                or (path.stem in ("target", "profile") and is_ours(path))
-                               or (path.stem in ("source", "intensity") and any(map(is_ours, path.parent.glob("target.*")))))
+                               or (path.stem.split("-")[0] in ("source", "intensity")
+                                   and any(map(is_ours, path.parent.glob("target.*")))))
 
 
 def settle(project: Project, force: bool) -> None:

@@ -72,8 +72,9 @@ class Project:
                                goal.get("color", False))
             light = given.get("source", {})
             profile = light.get("profile")
-            for key in attachments.STEMS.keys() & light.keys():
-                _within(light[key])
+            for table in (light, *light.get("also", ())):
+                for key in attachments.STEMS.keys() & table.keys():
+                    _within(table[key])
             given["source"] = attachments.attached(light, path)
             full = complete(given, picture.aspect)
             build_stages(full), build_options(full)  # a project whose design is impossible is not opened for its lens either
@@ -157,6 +158,8 @@ class Project:
 
 def _change(source: Settings, before: str, given: set[str]) -> None:
     """Read the files that new keys of [source] name, and forget that of another type."""
+    if given - {"polarisation"}:  # another light is another light for all of it
+        source.pop("also", None)
     if source["type"] != before and "file" not in given:
         source.pop("file", None)
     source |= attachments.attached(source)

@@ -126,6 +126,11 @@ STAGE: dict[str, Key] = {
     "tolerance": Key("number", "ends the stage when 10 iterations gain less than this part; 0 never"),
     "waves": Key("list", "nm, refine the wave image at these, of light that says none, instead of the ray image"),
 }
+#: Keys that hold tables: their heading in the file, and what each may say.  Sources beside the first are those of [source] also;
+#: FIRST is the first's alone.
+FIRST = ("polarisation", "profile", "power_unit")
+TABLES = {("design", "stages"): ("design.stages", STAGE),
+          ("source", "also"): ("source", {k: v for k, v in SCHEMA["source"].items() if k not in FIRST})}
 DEFAULTS: dict[str, dict[str, Any]] = {
     "source": {"type": "plane", "power": 1.0, "intensity": "uniform", "aim": True},
     "lens": {"size": [10.0, 10.0], "z_in": 0.0, "min_thickness": 1.0, "fresnel": "exact", "degree": [3, 3]},
@@ -158,12 +163,14 @@ def parse(text: str, where: str) -> dict[str, dict[str, Any]]:
     for section, table in raw.items():
         if section not in SCHEMA:
             raise InputError(f"{where}: [{section}] is not a section{_near(section, SCHEMA)}")
+        if section == "source" and isinstance(table, list) and table and isinstance(table[0], dict):
+            table = {**table[0], "also": table[1:]}
         if not isinstance(table, dict):
             raise InputError(f"{where}: {section} must be a section, written [{section}]")
         out[section] = {}
         for key, value in table.items():
-            if (section, key) == ("design", "stages"):
-                out[section][key] = _stages(value, where)
+            if (section, key) in TABLES:
+                out[section][key] = _tables(value, where, *TABLES[section, key])
                 continue
             out[section][key] = _typed(f"{where}: [{section}] {key}", key, value, SCHEMA[section])
     return out
@@ -176,10 +183,10 @@ def _fits(value) -> bool:
     return not isinstance(value, int) or -(2**63) <= value < 2**63
 
 
-def _stages(tables, where: str) -> list[dict[str, Any]]:
-    if not isinstance(tables, list) or not tables or not all(isinstance(t, dict) for t in tables):
-        raise InputError(f"{where}: [[design.stages]] must be a list of tables")
-    return [{k: _typed(f"{where}: [[design.stages]] {k}", k, v, STAGE) for k, v in t.items()} for t in tables]
+def _tables(tables, where: str, name: str, keys: dict[str, Key]) -> list[dict[str, Any]]:
+    if not isinstance(tables, list) or not (tables or name == "source") or not all(isinstance(t, dict) for t in tables):
+        raise InputError(f"{where}: [[{name}]] must be a list of tables")
+    return [{k: _typed(f"{where}: [[{name}]] {k}", k, v, keys) for k, v in t.items()} for t in tables]
 
 
 def _typed(where: str, key: str, value, keys: dict[str, Key]):
@@ -228,7 +235,10 @@ def dump(settings: dict[str, dict[str, Any]]) -> str:
     lines = ["# A caustic project: edit by hand as you like, then `caustic render` or `caustic design --resume`.",
              f"format_version = {FORMAT_VERSION}", f'created_by = "caustic {__version__}"']
     for section, keys in SCHEMA.items():
-        lines += ["", f"[{section}]", *_assignments(settings.get(section, {}), keys)]
+        first = settings.get(section, {})
+        also = first.get("also", []) if section == "source" else []
+        for table in (first, *also):
+            lines += ["", f"[[{section}]]" if also else f"[{section}]", *_assignments(table, keys)]
     for stage in settings.get("design", {}).get("stages", []):
         lines += ["", "[[design.stages]]", *_assignments(stage, STAGE)]
     return "\n".join(lines) + "\n"
@@ -277,8 +287,9 @@ def build_source(settings: dict[str, dict[str, Any]], profile: np.ndarray | None
     made, lit = sources.type_of(type or s["type"]), sources.used_by("profile")
     checks.number("[source] power", s["power"], 0.0, checks.POWER, open_low=True)  # before it is shared among points
     if "profile" in s and not {made.name, s["type"]} & set(lit):
-        raise InputError(f"[source] profile belongs to type {_either(lit)}, got type {s['type']}")
-    return made.from_settings(s, profile)
+        raise InputError(f"[source] profile belongs to type {sources.either(lit)}, got type {s['type']}")
+    one = made.from_settings(s, profile)
+    return one if type is not None else sources.together(one, s)
 
 
 def build_scene(settings: dict[str, dict[str, Any]], profile: np.ndarray | None = None) -> Scene:
@@ -294,10 +305,8 @@ def build_screen(settings: dict[str, dict[str, Any]]) -> Screen:
 
 
 def build_light(settings: dict[str, dict[str, Any]]) -> Light:
-    """Wavelengths and polarisation of the [source] section, whatever its type."""
-    s = settings["source"]
-    return Light(s.get("polarisation"), tuple(s.get("wavelengths", ())), tuple(s.get("weights", ())),
-                 color=settings["target"].get("color", False), unit=s.get("power_unit", "W"))
+    """Wavelengths and polarisation of the [source] section, whatever its type; of several sources, of all."""
+    return sources.light_of_all(settings["source"], settings["target"].get("color", False))
 
 
 def as_options(message: str, given) -> str:
@@ -319,17 +328,12 @@ def refuse_unused(source: dict[str, Any], given, stages: Sequence[str | None] = 
     options = {key: option for section, key, option in given if section == "source" and sources.used_by(key)}
     for key, option in options.items():
         if not types & set(sources.used_by(key)):
-            raise InputError(f"{option} belongs to --source {_either(sources.used_by(key))}, got {source['type']}")
+            raise InputError(f"{option} belongs to --source {sources.either(sources.used_by(key))}, got {source['type']}")
     if len(types) == 1 and types <= set(sources.names()):
         idle = sources.type_of(*types).idle(source)
         for key, option in options.items():
             if key in idle:
                 raise InputError(f"{option} {idle[key]}")
-
-
-def _either(names: Sequence[str]) -> str:
-    *others, last = names
-    return f"{', '.join(others)} or {last}" if others else last
 
 
 def read(path: Path) -> dict[str, dict[str, Any]]:

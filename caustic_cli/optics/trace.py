@@ -29,7 +29,7 @@ from torch import Tensor
 from caustic_cli.errors import InputError
 from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.effects import EFFECTS, NO_REQUESTS, Action, Requests
-from caustic_cli.optics.emission import Rays, rays_of
+from caustic_cli.optics.emission import Rays, of_member, rays_of
 from caustic_cli.optics.frames import IDENTITY, Pose, advanced, into, out_of, turned, turned_back
 from caustic_cli.optics.image import Image
 from caustic_cli.optics.meeting import Meeting, Parameters
@@ -364,7 +364,7 @@ def tracers(scene: Scene, field: HeightField, sampler: Rays, dtype: torch.dtype,
     bands = scene.bands
     for band in bands:
         system, traced = System.of(band.scene, field), None
-        for rays in sampler.chunks(chunk, *part):
+        for rays in of_member(sampler, band.member).chunks(chunk, *part):
             traced = Tracer(system, rays, dtype, requests, traced, weight=band.weight, channel=band.channel, **options)
             yield traced
 

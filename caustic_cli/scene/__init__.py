@@ -20,12 +20,13 @@ from caustic_cli.scene.materials import refractive_index
 class Band:
     """Light that is traced in one go: a part of the source's power, with one index and one state of polarisation.
 
-    channel: of a coloured image, or None where the image has no colours.
+    channel: of a coloured image, or None where the image has no colours; member: which of several sources shines, None of one.
     """
 
     scene: Scene
     weight: float = 1.0
     channel: int | None = None
+    member: int | None = None
 
 
 @dataclass(frozen=True)
@@ -69,8 +70,20 @@ class Scene:
         return self.light.color
 
     @property
+    def apiece(self) -> tuple[Scene, ...]:
+        """The scene in the light of each of its sources alone."""
+        if len(self.source.members) == 1:
+            return (self,)
+        spectra = self.source.spectra if self.light.wavelengths else [((), ())] * len(self.source.members)
+        return tuple(replace(self, source=one, light=replace(self.light, wavelengths=wavelengths, weights=weights))
+                     for one, (wavelengths, weights) in zip(self.source.members, spectra, strict=True))
+
+    @property
     def bands(self) -> tuple[Band, ...]:
-        """What has to be traced apart, by wavelength and polarisation: the scene itself where one trace says it all."""
+        """What has to be traced apart, by source, wavelength and polarisation: the scene itself where one trace says it all."""
+        if len(self.source.members) > 1:
+            return tuple(replace(band, weight=share * band.weight, member=k)
+                         for k, (one, share) in enumerate(zip(self.apiece, self.source.shares, strict=True)) for band in one.bands)
         states = (0.0, 90.0) if self.light.tracked and self.light.polarisation is None else (self.light.polarisation,)
         if not (self.dispersive or self.colored):
             if len(states) == 1:

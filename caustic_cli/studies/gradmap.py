@@ -27,7 +27,7 @@ from torch.autograd import forward_ad
 
 from caustic_cli.errors import InputError
 from caustic_cli.files import SOFTWARE, atomic_path
-from caustic_cli.optics.emission import Rays
+from caustic_cli.optics.emission import Rays, of_member
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -67,7 +67,7 @@ def gradient_image(scene: Scene, field: HeightField, heights: Tensor, control: t
     total = torch.zeros(scene.screen.resolution, dtype=torch.float64, device=sampler.device)
     for band in scene.bands:
         system, traced = System.of(band.scene, field), None
-        for rays in sampler.chunks(chunk):
+        for rays in of_member(sampler, band.member).chunks(chunk):
             if isinstance(rays, Sample):
                 rays = _under(field, control, rays)
                 if not all(rays.shape):

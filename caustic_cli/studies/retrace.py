@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -47,6 +47,16 @@ def _rays(scene: Scene, rays: int, seed: int, device: str) -> Rays:
     return rays_of(scene, "stratified" if even else "sobol", rays, seed, device)
 
 
+def _held(scene: Scene) -> int:
+    """Rays that the smallest of the scene's ray files holds; more than can be asked for where there is none."""
+    return min((one.rays.count for one in scene.source.members if one.rays is not None), default=BATCHES * MOST_RAYS)
+
+
+def _part(scene: Scene, k: int, of: int) -> Scene:
+    """The scene in the k-th of so many lights that are alike and independent: rays of a file are shared out among them."""
+    return replace(scene, source=scene.source.part(k, of))
+
+
 @dataclass(frozen=True)
 class Converged:
     """An image traced until its noise was low enough.
@@ -73,12 +83,12 @@ def converge(scene: Scene, field: HeightField, heights: Tensor, tolerance: float
         CausticError: MOST_RAYS or those of a file are not enough, or no light reaches the screen.
     """
     each, traced, order = max(1, rays // BATCHES), 0, ORDER if scene.source.collimated else SOBOL_ORDER
-    held = scene.source.rays
+    held, lights = _held(scene), [_part(scene, k, BATCHES) for k in range(BATCHES)]
     while True:
-        if held is not None and each * BATCHES > held.count:  # parts of a file as large as itself are no independent images
-            raise CausticError(f"--tolerance {tolerance:g} asks for more rays than the file holds, {held.count:,}")
-        parts = [expose(scene, field, heights, _rays(scene, each, stream(seed, f"batch {k}"), device), None, dtype, screen,
-                        requests=requests) for k in range(BATCHES)]
+        if each * BATCHES > held:
+            raise CausticError(f"--tolerance {tolerance:g} asks for more rays than the file holds, {held:,}")
+        parts = [expose(light, field, heights, _rays(light, each, stream(seed, f"batch {k}"), device), None, dtype, screen,
+                        requests=requests) for k, light in enumerate(lights)]
         traced += sum(p.rays for p in parts)
         images = torch.stack([p.image for p in parts])
         mean = images.mean(0)
@@ -122,9 +132,9 @@ def retrace(scene: Scene, field: HeightField, heights: Tensor, target: np.ndarra
         with the rays that were traced; noise, of relative_rms, None without a target; error_estimate, the relative RMS noise of the
         image, None of a black one; those of `studies.irradiance`; with `tolerance` also rays_traced.
     """
-    def trace(name: str, count: int) -> Image:
-        sampler = _rays(scene, max(1, count), stream(seed, name), device)
-        return expose(scene, field, heights, sampler, None, dtype, screen, requests=requests)
+    def trace(name: str, count: int, light: Scene = scene) -> Image:
+        sampler = _rays(light, max(1, count), stream(seed, name), device)
+        return expose(light, field, heights, sampler, None, dtype, screen, requests=requests)
 
     even = scene.source.collimated
     if tolerance is not None:
@@ -137,15 +147,16 @@ def retrace(scene: Scene, field: HeightField, heights: Tensor, target: np.ndarra
         figures = _judged_even(counted, target, tuple(trace(f"noise {k}", rays // PROBE) for k in (0, 1)) if noise else None)
     else:
         parts: tuple[list[Image], list[Image]] = [], []
+        lights = [_part(scene, k, 2) for k in (0, 1)]
         while True:
             for k in range(len(parts[0]), max(1, 2 * len(parts[0]))):
-                for part, name in zip(parts, ("render", "render, other half"), strict=True):
-                    part.append(trace(f"{name} {k}" if k else name, rays // 2))
+                for part, name, light in zip(parts, ("render", "render, other half"), lights, strict=True):
+                    part.append(trace(f"{name} {k}" if k else name, rays // 2, light))
             halves = mean_of(parts[0]), mean_of(parts[1])
             counted = mean_of(list(halves))
             figures = _judged_halves(counted, target, halves)
             enough = quiet is None or target is None or figures["noise"] <= quiet * figures["relative_rms"]
-            if enough or 2 * len(parts[0]) > MOST_TIMES:
+            if enough or 2 * len(parts[0]) > MOST_TIMES or rays * len(parts[0]) >= _held(scene):
                 break
     figures |= irradiance_figures(scene, counted.image, screen) | unit_figures(scene)
     if filter is None or filter.reach == (0, 0):

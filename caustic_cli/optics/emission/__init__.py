@@ -14,11 +14,13 @@ import torch
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.emission.base import Emission, Lit
+from caustic_cli.optics.emission.measured import MeasuredRays
+from caustic_cli.optics.emission.several import SeveralRays
 from caustic_cli.optics.sampling import Sampler
 
-__all__ = ["Emission", "Lit", "Rays", "rays_of", "register"]
+__all__ = ["Emission", "Lit", "Rays", "of_member", "rays_of", "register"]
 
-Rays = Sampler | Emission
+Rays = Sampler | Emission | MeasuredRays | SeveralRays
 #: what is lit, sampler, number of rays, seed, device -> rays.
 Maker = Callable[[Lit, str, int, int, str | torch.device], Rays]
 
@@ -40,6 +42,11 @@ def rays_of(scene: Lit, kind: str, rays: int, seed: int = 0, device: str | torch
     if name not in _MAKERS:
         raise InputError(f"[source] type {scene.source.kind} has no rays: no emission is registered as {name!r}")
     return _MAKERS[name](scene, kind, rays, seed, device)
+
+
+def of_member(rays: Rays, member: int | None) -> Rays:
+    """The rays of one of several sources, by its number; all of them where that is None."""
+    return rays if member is None else rays.members[member]
 
 
 for _module in pkgutil.iter_modules(__path__):

@@ -121,10 +121,10 @@ def coarseness(scene: Scene) -> tuple[float, int] | None:
 
 def coarse_words(scene: Scene) -> str | None:
     """That a scene's ray file is too coarse for its picture, and how many rays it would take; None where it is not."""
-    found = coarseness(scene)
-    if found is None or found[0] <= WORTHY:
+    worst = max((one for one in scene.apiece if one.source.rays is not None), key=lambda one: coarseness(one)[0], default=None)
+    if worst is None or coarseness(worst)[0] <= WORTHY:
         return None
-    (noise, wanted), (nx, ny), rays = found, scene.screen.resolution, scene.source.rays.count
+    (noise, wanted), (nx, ny), rays = coarseness(worst), scene.screen.resolution, worst.source.rays.count
     return (f"the ray file is coarse for {nx} x {ny} pixels: its {rays:,} rays leave {noise:.0%} of noise, and it would take"
             f" {_rounded(wanted)} to leave {WORTHY:.0%}")
 

@@ -86,6 +86,9 @@ class WaveImage:
 
 def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | None = None) -> list[Line]:
     """The light of a scene by wavelength and polarisation: its own, or these with equal parts; white where it has none."""
+    if len(scene.source.members) > 1:
+        return [replace(line, part=share * line.part) for one, share in zip(scene.apiece, scene.source.shares, strict=True)
+                for line in lines_of(one, field, wavelengths)]
     found, own, systems = [], scene.light.wavelengths, {}
     if wavelengths is not None or not own:
         given = wavelengths or white(WHITE_LINES)

@@ -7,6 +7,7 @@ found by itself.  Unless its rays are drawn as another's are (`Source.emission`)
 from __future__ import annotations
 
 import pkgutil
+from collections.abc import Sequence
 from importlib import import_module
 
 from caustic_cli.scene import checks
@@ -14,10 +15,11 @@ from caustic_cli.scene.sources.base import Source
 from caustic_cli.scene.sources.disc import Disc
 from caustic_cli.scene.sources.plane import PlaneWave
 from caustic_cli.scene.sources.points import Points
-from caustic_cli.scene.sources.section import COMMON, SourceType
+from caustic_cli.scene.sources.section import COMMON, SourceType, Table
+from caustic_cli.scene.sources.several import Several, light_of_all, lights_of
 
-__all__ = ["COMMON", "Disc", "PlaneWave", "Points", "Source", "SourceType", "in_words", "names", "own_keys",
-           "register", "type_of", "used_by"]
+__all__ = ["COMMON", "Disc", "PlaneWave", "Points", "Source", "SourceType", "either", "in_words",
+           "light_of_all", "names", "own_keys", "register", "together", "type_of", "used_by"]
 
 #: Files in the order in which messages and comments name their types; others follow by name.
 _FIRST = ("plane", "points", "disc")
@@ -57,6 +59,20 @@ def own_keys() -> dict[str, tuple[str, str]]:
 def used_by(key: str) -> tuple[str, ...]:
     """Names of the types that use a key of [source]."""
     return tuple(name for name, type in _TYPES.items() if key in type.keys)
+
+
+def either(names: Sequence[str]) -> str:
+    """Names in a clause."""
+    *others, last = names
+    return f"{', '.join(others)} or {last}" if others else last
+
+
+def together(first: Source, section: Table) -> Source:
+    """The first source of a [source] section, with the others where it names some."""
+    if not section.get("also"):
+        return first
+    others = (type_of(table["type"], "[[source]] type").from_settings(table, None) for table in section["also"])
+    return Several((first, *others), tuple((light.wavelengths, light.weights) for light in lights_of(section)))
 
 
 for _module in sorted((m.name for m in pkgutil.iter_modules(__path__)),

@@ -42,6 +42,15 @@ class Source:
     brightness: np.ndarray | None = None
 
     @property
+    def members(self) -> tuple[Source, ...]:
+        """The sources that it is made of: itself, unless it is several."""
+        return (self,)
+
+    def part(self, k: int, of: int) -> Source:
+        """The k-th of so many sources that shine alike and share no ray: itself, unless its rays are counted."""
+        return self
+
+    @property
     def distant(self) -> bool:
         """Light from infinity."""
         return self.collimated

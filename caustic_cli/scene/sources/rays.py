@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -42,6 +42,10 @@ class Measured(Source):
     def points(self) -> tuple[np.ndarray, np.ndarray]:
         """The point of closest approach."""
         return (self.rays.focus + self.position)[None, :], np.ones(1)
+
+    def part(self, k: int, of: int) -> Source:
+        """As of a source: every ray is in one of them, by chance."""
+        return replace(self, rays=self.rays.part(k, of))
 
     @property
     def extent(self) -> tuple[float, float]:

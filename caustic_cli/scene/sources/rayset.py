@@ -20,6 +20,8 @@ from caustic_cli.errors import InputError
 FARTHEST = 1e9
 #: Parallel rays meet nowhere: their point of closest approach is sought no farther from where they start, mm.
 PARALLEL_AT = 1e6
+#: Fewer rays than these are not worth sharing out: a part of them may hold none that meets the lens.
+LEAST_SHARED = 50
 #: Wavelengths that are taken for such, nm.
 SHORTEST, LONGEST = 100.0, 20_000.0
 
@@ -79,6 +81,14 @@ class RaySet:
     def count(self) -> int:
         """Number of rays."""
         return len(self.flux)
+
+    def part(self, k: int, of: int) -> RaySet:
+        """The k-th of so many sets among which the rays are shared out at random, the same way always; all of them if too few."""
+        if self.count < LEAST_SHARED * of:
+            return self
+        mine = np.sort(np.random.default_rng(0).permutation(self.count)[k::of])
+        wavelengths = None if self.wavelengths is None else self.wavelengths[mine]
+        return RaySet(self.positions[mine], self.directions[mine], self.flux[mine], self.total, self.unit, wavelengths)
 
     @cached_property
     def forward(self) -> np.ndarray:

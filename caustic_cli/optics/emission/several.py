@@ -1,0 +1,56 @@
+"""Rays of several sources: those of each, as many as its part of the power asks for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import torch
+
+from caustic_cli.optics.emission.base import Lit
+from caustic_cli.optics.rays import RayState
+from caustic_cli.optics.sampling import Sample
+
+
+@dataclass(frozen=True, eq=False)
+class SeveralRays:
+    """members: the rays of each source; shares: its part of all power."""
+
+    members: tuple
+    shares: tuple[float, ...]
+    device: str | torch.device = "cpu"
+
+    @property
+    def count(self) -> int:
+        """Number of all rays."""
+        return sum(one.count for one in self.members)
+
+    def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[Sample | RayState]:
+        """As of an `Emission`, one source after the other; powers and losses of all sum to 1."""
+        for one, share in zip(self.members, self.shares, strict=True):
+            for rays in one.chunks(size, first, step):
+                if isinstance(rays, Sample):
+                    yield replace(rays, share=share * rays.share)
+                else:
+                    yield replace(rays, power=share * rays.power, lost={k: share * v for k, v in rays.lost.items()})
+
+
+@dataclass(frozen=True)
+class _Alone:
+    """What is lit, by one of its sources."""
+
+    source: object
+    pupil: object
+
+
+def several(scene: Lit, kind: str, rays: int, seed: int = 0, device: str | torch.device = "cpu") -> SeveralRays:
+    """About `rays` rays in all."""
+    from caustic_cli.optics.emission import rays_of  # noqa: PLC0415  every way of drawing is registered there by now
+
+    source = scene.source
+    members = tuple(rays_of(_Alone(one, scene.pupil), kind, max(1, round(rays * share)), seed + k, device)
+                    for k, (one, share) in enumerate(zip(source.members, source.shares, strict=True)))
+    return SeveralRays(members, source.shares, device)
+
+
+EMISSIONS = {"several": several}

@@ -1,0 +1,155 @@
+"""Several sources that shine at once, each with its own power and wavelengths."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from caustic_cli.errors import InputError
+from caustic_cli.scene.light import Light
+from caustic_cli.scene.sources.base import Source
+from caustic_cli.scene.sources.section import Table
+
+#: Most sources of one scene.
+MOST = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Several(Source):
+    """Sources in one light; each is traced by itself, see `Scene.bands`.
+
+    Args:
+        members: two or more, none of which is several itself.
+        spectra: wavelengths, nm, and relative powers of each; empty where it says none.
+
+    Raises:
+        InputError: too few or too many, or only some of them say their wavelengths.
+    """
+
+    members: tuple[Source, ...] = ()
+    spectra: tuple[tuple[tuple[float, ...], tuple[float, ...]], ...] = ()
+
+    kind = "several"
+
+    def __post_init__(self):
+        if not 2 <= len(self.members) <= MOST:
+            raise InputError(f"[[source]] must be 1 to {MOST} sources, got {len(self.members)}")
+        if len({bool(wavelengths) for wavelengths, _ in self.spectra}) > 1:
+            raise InputError("[[source]] wavelengths must be said of every source, or of none")
+
+    @property
+    def power(self) -> float:
+        """Of all, W."""
+        return math.fsum(one.power for one in self.members)
+
+    @property
+    def shares(self) -> tuple[float, ...]:
+        """Part of all power of each."""
+        return tuple(one.power / self.power for one in self.members)
+
+    @property
+    def collimated(self) -> bool:
+        """Whether all of them are, and even."""
+        return all(one.collimated and one.profile is None for one in self.members)
+
+    @property
+    def distant(self) -> bool:
+        """Whether all of them are."""
+        return all(one.distant for one in self.members)
+
+    @property
+    def half_angle(self) -> float:
+        """The largest."""
+        return max(one.half_angle for one in self.members)
+
+    def part(self, k: int, of: int) -> Source:
+        """As of a source, of each."""
+        return replace(self, members=tuple(one.part(k, of) for one in self.members))
+
+    @property
+    def _near(self) -> list[Source]:
+        return [one for one in self.members if not one.distant]
+
+    def points(self) -> tuple[np.ndarray, np.ndarray]:
+        """Those of all that stand somewhere, by their power."""
+        if self.distant:
+            return super().points()
+        places, parts = zip(*(one.points() for one in self._near), strict=True)
+        parts = np.concatenate([one.power * p for one, p in zip(self._near, parts, strict=True)])
+        return np.concatenate(places), parts / parts.sum()
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """The largest along each axis."""
+        return tuple(max((one.extent[k] for one in self._near), default=0.0) for k in (0, 1))
+
+    @property
+    def nearest(self) -> float:
+        """Of all."""
+        return max(one.nearest for one in self.members)
+
+    @property
+    def extended(self) -> bool:
+        """Whether light comes to some place of the lens from more than one direction."""
+        return self.apart or any(one.extended for one in self.members)
+
+    @property
+    def apart(self) -> bool:
+        """Whether they stand in different places, or some of them are such."""
+        return len({one.centre for one in self.members}) > 1 or any(one.apart for one in self.members)
+
+    @property
+    def sharp(self) -> bool:
+        """Whether all are, in one place."""
+        return not self.apart and all(one.sharp for one in self.members)
+
+    @property
+    def label(self) -> str:
+        """As of a source."""
+        return f"{len(self.members)} sources"
+
+    def extent_words(self, z_in: float) -> str:
+        """As of a source."""
+        return f"{len(self.members)} sources shine at once"
+
+    def pointlike(self) -> Source:
+        """Each without its extent."""
+        return Several(tuple(one.pointlike() for one in self.members), self.spectra)
+
+    def apparent_angle(self, z_in: float) -> float:
+        """The largest."""
+        return max(one.apparent_angle(z_in) for one in self.members)
+
+    def blur(self, z_in: float, throw: float) -> float:
+        """The largest; sources in places of their own make a picture each."""
+        return max(one.blur(z_in, throw) for one in self.members)
+
+    def cone_over(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> float:
+        """The widest; a hemisphere where some are distant and others not."""
+        if self._near and len(self._near) < len(self.members):
+            return math.pi / 2.0
+        return max(one.cone_over(half_size, z_in, round) for one in self.members)
+
+    def incidence(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> float:
+        """The greatest."""
+        return max(one.incidence(half_size, z_in, round) for one in self.members)
+
+
+def lights_of(section: Table, color: bool = False) -> list[Light]:
+    """The light of each source of a [source] section: its own wavelengths, the first's polarisation and unit of power."""
+    state, unit = section.get("polarisation"), section.get("power_unit", "W")
+    return [Light(state, tuple(t.get("wavelengths", ())), tuple(t.get("weights", ())), color=color, unit=unit)
+            for t in (section, *section.get("also", ()))]
+
+
+def light_of_all(section: Table, color: bool = False) -> Light:
+    """The light of all of them: at the wavelengths of all, with their parts of all power."""
+    lights = lights_of(section, color)
+    if len(lights) == 1:
+        return lights[0]
+    powers = [table["power"] for table in (section, *section["also"])]
+    wavelengths = tuple(w for light in lights for w in light.wavelengths)
+    weights = tuple(power * part for power, light in zip(powers, lights, strict=True) for part in light.parts)
+    return replace(lights[0], wavelengths=wavelengths, weights=weights)

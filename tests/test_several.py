@@ -1,0 +1,162 @@
+"""Several sources at once: their light adds up, by power and wavelength, from the settings to the image."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from rayfiles import cone_of, zemax
+from test_emission import LENS, heights
+
+from caustic_cli import cli, session, settings, verdict
+from caustic_cli.derive import complete
+from caustic_cli.errors import InputError
+from caustic_cli.optics.bounds import bounds_of
+from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.emission.measured import coarse_words
+from caustic_cli.optics.plan import compile_plan
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.trace import expose
+from caustic_cli.optics.waves.image import lines_of
+from caustic_cli.scene import Disc, Lens, Light, PlaneWave, Points, Scene, Screen
+from caustic_cli.scene.sources.rays import Measured
+from caustic_cli.scene.sources.rayset import RaySet
+from caustic_cli.scene.sources.several import Several
+
+SCREEN = Screen((40.0, 32.0), 100.0, (40, 32))
+MEMBERS = (PlaneWave(1.0), Points(((0.5, 0.0, -20.0),), (2.0,)), Disc((0.0, 1.0, -30.0), (2.0, 1.0), 0.5),
+           Measured(RaySet(*cone_of(100_000, 12.0)), (0.0, 0.0, -25.0), 3.0), Disc(angle=1.0, power=0.25))
+NONE = ((), ())
+GLASS = Lens(size=(10.0, 8.0), control=(8, 7), glass="N-BK7", index=1.5168)
+
+
+def test_what_they_say_together():
+    some = Several(MEMBERS[1:3], (NONE,) * 2)
+    assert (some.kind, some.power, some.distant, some.collimated) == ("several", 2.5, False, False) and some.several and some.apart
+    assert some.shares == pytest.approx((0.8, 0.2)) and some.nearest == -20.0 and some.extent == (1.0, 0.5)
+    assert some.centre == pytest.approx((0.4, 0.2, -22.0)) and sum(some.powers) == pytest.approx(2.5)
+    assert some.blur(0.0, 100.0) == MEMBERS[2].blur(0.0, 100.0) and some.pointlike().extent == (0.0, 0.0)
+    assert some.cone_over((5, 4), 0.0) == max(m.cone_over((5, 4), 0.0) for m in some.members)
+    far = Several((MEMBERS[0], MEMBERS[4]), (NONE,) * 2)
+    assert far.distant and not far.collimated and far.nearest == -math.inf and len(far.points()[0]) == 0
+    assert far.half_angle == pytest.approx(math.radians(0.5)) and far.incidence((5, 4), 0.0) == far.half_angle
+    mixed = Several(MEMBERS, (NONE,) * 5)
+    assert not mixed.distant and mixed.cone_over((5, 4), 0.0) == math.pi / 2 and mixed.extent_words(0.0)
+    assert mixed.incidence((5, 4), 0.0) == max(m.incidence((5, 4), 0.0) for m in MEMBERS)
+    same = Several((Points(((0.0, 0.0, -20.0),)),) * 3, (NONE,) * 3)
+    assert not same.apart and same.sharp and not same.extended
+
+
+def test_their_light_adds_up():
+    """The image of all is the sum of each one's own by its part of the power, up to the rays that are drawn."""
+    here = Scene(Several(MEMBERS, (NONE,) * 5), LENS, SCREEN)
+    field, z = HeightField.of(LENS), heights(LENS)
+    sampler = rays_of(here, "stratified", 1_000_000, 3)
+    together = expose(here, field, z, sampler)
+    assert abs(float(together.image.sum()) + math.fsum(together.lost.values()) - 1.0) < 1e-12
+    alone = [expose(one, field, z, rays, chunk=1 << 17) for one, rays in zip(here.apiece, sampler.members, strict=True)]
+    image = sum(share * found.image for share, found in zip(here.source.shares, alone, strict=True))
+    torch.testing.assert_close(together.image, image, rtol=0, atol=1e-15)
+    assert sampler.count == sum(one.count for one in sampler.members)
+    for chunk in (1 << 20, 999):
+        whole = [(float(c.share.sum()) if hasattr(c, "share") and c.share.ndim else float(c.share) * math.prod(c.shape))
+                 if hasattr(c, "share") else float(c.power.sum()) + c.lost["missed_lens"] for c in sampler.chunks(chunk)]
+        assert math.fsum(whole) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_each_has_its_own_wavelengths():
+    """Red from one source and blue from the other: each refracted by its own index, and by that alone."""
+    members = (Points(((0.0, 0.0, -20.0),), (3.0,)), Points(((1.0, 0.0, -20.0),), (1.0,)))
+    whole = Several(members, (((656.3,), ()), ((486.1, 435.8), (1.0, 3.0))))
+    light = Light(None, (656.3, 486.1, 435.8), (0.75, 0.0625, 0.1875))
+    here = Scene(whole, GLASS, SCREEN, light)
+    assert [(b.member, pytest.approx(b.weight)) for b in here.bands] == [(0, 0.75), (1, 0.0625), (1, 0.1875)]
+    field, z = HeightField.of(GLASS), heights(LENS)
+    found = expose(here, field, z, sampler := rays_of(here, "stratified", 200_000))
+    red = expose(Scene(members[0], GLASS, SCREEN, Light(None, (656.3,))), field, z, sampler.members[0])
+    blue = expose(Scene(members[1], GLASS, SCREEN, Light(None, (486.1, 435.8), (1.0, 3.0))), field, z, sampler.members[1])
+    torch.testing.assert_close(found.image, 0.75 * red.image + 0.25 * blue.image, rtol=0, atol=1e-15)
+    plan = compile_plan(here, field, z)
+    assert plan["dispersion"].on and not compile_plan(here, field, z, ["entrance"]).scene.light.wavelengths
+    assert len(compile_plan(here, field, z, ["entrance", "intersection"]).scene.bands) == 2
+    assert sum(line.part for line in lines_of(here, field)) == pytest.approx(1.0) and len(lines_of(here, field)) == 3
+    assert bounds_of(here, field, z).index == max(b.scene.lens.index for b in here.bands)
+
+
+def test_the_coarsest_ray_file_speaks():
+    few = Measured(RaySet(*cone_of(500, 12.0)), (0.0, 0.0, -25.0))
+    words = coarse_words(Scene(Several((MEMBERS[3], few), (NONE,) * 2), LENS, SCREEN))
+    assert "its 500 rays" in words
+
+
+@pytest.mark.parametrize(("what", "message"), [
+    (lambda: Several((MEMBERS[0],), (NONE,)), "must be 1 to 64 sources"),
+    (lambda: Several(MEMBERS[:2], (((500.0,), ()), NONE)), "said of every source, or of none"),
+    (lambda: settings.parse("source = 3", "a"), "source must be a section"),
+    (lambda: settings.parse("[[source]]\nsise = 3", "a"), r"\[source\] sise is not a key"),
+    (lambda: settings.parse("[[source]]\n[[source]]\nsise = 3", "a"), r"\[\[source\]\] sise is not a key"),
+    (lambda: settings.parse("[[source]]\n[[source]]\npolarisation = 3", "a"), r"\[\[source\]\] polarisation is not a key"),
+    (lambda: settings.parse("[source]\nalso = 3", "a"), r"\[\[source\]\] must be a list of tables"),
+    (lambda: complete(settings.parse("[[source]]\n[[source]]\ntype = 'sun'", "a"), 1.0), r"\[\[source\]\] type must be one of"),
+    (lambda: settings.build_light(complete({"source": {"also": [{"type": "point"}]}, "target": {"color": True}}, 1.0)),
+     "of a coloured picture must be one"),
+])
+def test_impossible_ones_are_refused(what, message):
+    with pytest.raises(InputError, match=message):
+        what()
+
+
+def test_settings_go_round():
+    text = ("[[source]]\ntype = 'point'\npower = 3.0\nwavelengths = [620.0]\n"
+            "[[source]]\ntype = 'disc'\nwavelengths = [450.0, 500.0]\n")
+    full = complete(settings.parse(text, "a"), 1.0)
+    assert settings.dump(full).count("[[source]]") == 2
+    again = settings.parse(settings.dump(full), "b")
+    assert again["source"] == {k: v for k, v in full["source"].items()}
+    source, light = settings.build_source(full), settings.build_light(full)
+    assert [m.kind for m in source.members] == ["point", "disc"] and source.shares == (0.75, 0.25)
+    assert light.wavelengths == (620.0, 450.0, 500.0) and light.parts == pytest.approx((0.75, 0.125, 0.125))
+    assert full["design"]["start"] == "transport"  # both stand in the same place
+    one = complete(settings.parse("[[source]]\ntype = 'point'\n", "a"), 1.0)
+    assert len(settings.build_source(one).members) == 1 and "[source]" in settings.dump(one)
+
+
+def test_a_design_in_several_lights(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    y, x = np.mgrid[0:24, 0:24]
+    Image.fromarray((40 + 200 * np.exp(-((x - 8) ** 2 + (y - 9) ** 2) / 30.0)).astype(np.uint8)).save("blob.png")
+    monkeypatch.setattr(verdict, "FINAL_RAYS", 40_000)
+    monkeypatch.setattr(verdict, "write_report", lambda *args: None)
+    Path("led.dat").write_bytes(zemax(*cone_of(20_000, 12.0)))
+    Path("led.csv").write_text("0,1\n30,0.5\n")
+    Path("two.toml").write_text("[[source]]\ntype = 'point'\npower = 2.0\nwavelengths = [620.0]\n[[source]]\ntype = 'rays'\n"
+                                "file = 'led.dat'\nwavelengths = [450.0]\n[[source]]\ntype = 'disc'\nintensity = 'led.csv'\n"
+                                "wavelengths = [500.0]\n[lens]\nglass = 'N-BK7'\n")
+
+    def run(*arguments, code=0):
+        assert cli.run([*arguments, "--json", "--quiet", "--threads", "1"]) == code
+        out, err = capfd.readouterr()
+        return json.loads(out) if code == 0 else err.strip()
+
+    base = ["design", "blob.png", "--config", "two.toml", "--resolution", "24", "--control", "12", "--rays", "6000"]
+    figures = run(*base, "--iterations", "6")
+    assert figures["on_screen"] + sum(figures["lost"].values()) == pytest.approx(1.0, abs=1e-12)
+    for name in ("led.dat", "led.csv"):
+        Path(name).unlink()
+    assert {"source-2.dat", "intensity-3.csv"} <= {p.name for p in Path("blob.caustic").iterdir()}
+    history = session.Project.open("blob.caustic").load().state.history
+    assert history[-1][2] < history[0][2]
+    again = run("render", "blob.caustic", "--rays", "40000", "--force", "-o", "a.png", "--effects",
+                "entrance,intersection,fresnel,dispersion,source-size")
+    assert again["relative_rms"] == pytest.approx(figures["relative_rms"], rel=0.05)
+    other = run("render", "blob.caustic", "--rays", "40000", "-o", "b.png", "--source", "plane", "--effects", "fresnel,dispersion")
+    assert other["lost"]["missed_lens"] == 0.0  # another light is another light for all of it
+    assert cli.run(["gradmap", "blob.caustic", "--control", "5,5", "--rays", "20000", "--check", "--quiet", "--json"]) == 0
+    assert json.loads(capfd.readouterr().out)["maps"][0]["check"]["relative_error"] < 1e-4
+    Path("two.toml").write_text("[[source]]\n[[source]]\ntype = 'point'\n")
+    assert "--waves on needs one source" in run(*base, "-o", "c.caustic", "--waves", "on", code=2)
