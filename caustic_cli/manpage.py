@@ -41,6 +41,9 @@ Control heights, optimiser state, loss history, provenance (HDF5); replaced as a
 .IR NAME.caustic/target.png " or " target.npy
 The target as used.
 .TP
+.IR NAME.caustic/source.* ", " intensity.csv
+Copies of the files that [source] names: rays, a picture of its brightness, a table of angles; source-2.*, ... of further sources.
+.TP
 .I NAME.caustic/render.png
 The caustic, as last rendered.
 .TP
