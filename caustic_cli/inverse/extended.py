@@ -77,8 +77,10 @@ def centre_of(scene: Scene) -> Source:
 
 
 def etendue_limit(scene: Scene) -> float | None:
-    """E_2 / E_1, at most 1; None for a source that has no area."""
+    """E_2 / E_1, at most 1; None for a source that has no area, or is not evenly bright over it."""
     lens, screen, source = scene.lens, scene.screen, scene.source
+    if not source.even:
+        return None
     x, y, cell = _area(lens.half_size, lens.round)
     area = cell * len(x)
     if source.distant:

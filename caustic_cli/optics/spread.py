@@ -159,13 +159,13 @@ def spread_at(scene: Scene, field: HeightField, heights: Tensor) -> Spread | Non
 
 @torch.no_grad()
 def spread_of(lit: Lit, landing: Landing, device: str | torch.device = "cpu") -> Spread | None:
-    """How an extended source spreads the image of its middle; None where it is none, or its light misses, or lies in depth.
+    """How an extended source spreads the image of its middle; None where it is none or not even, or its light misses or lies in depth.
 
     Raises:
         as `landing`.
     """
     source, outer, centre = lit.source, edges(lit), middle(lit)
-    if source.brightness is not None or source.rays is not None:  # light that is not even over its ellipse
+    if not source.even:
         return None
     if not outer or (not source.distant and float(np.ptp(source.points()[0][:, 2])) > 0):
         return None

@@ -46,6 +46,11 @@ class Source:
         """The sources that it is made of: itself, unless it is several."""
         return (self,)
 
+    @property
+    def even(self) -> bool:
+        """Whether it is one source, evenly bright over the ellipse of its extent about each of its positions."""
+        return len(self.members) == 1 and self.brightness is None and self.rays is None
+
     def part(self, k: int, of: int) -> Source:
         """The k-th of so many sources that shine alike and share no ray: itself, unless its rays are counted."""
         return self
