@@ -159,7 +159,8 @@ def spread_at(scene: Scene, field: HeightField, heights: Tensor) -> Spread | Non
 
 @torch.no_grad()
 def spread_of(lit: Lit, landing: Landing, device: str | torch.device = "cpu") -> Spread | None:
-    """How an extended source spreads the image of its middle; None where it is none or not even, or its light misses or lies in depth.
+    """How an extended source spreads the image of its middle; None where it is none or not even, or its light misses
+    or lies in depth.
 
     Raises:
         as `landing`.
