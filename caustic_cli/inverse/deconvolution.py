@@ -34,12 +34,14 @@ REACHES = 1e-3
 @dataclass(frozen=True, eq=False)
 class Deconvolved:
     """light: (n + 2 a, m + 2 b), relative irradiance of pixels on the screen and around it; beside: (a, b); error: relative RMS
-    between the picture and the best light found, spread, each over its own mean on the screen; bound: no light comes closer."""
+    between the picture and the best light found, spread, each over its own mean on the screen; bound: no light comes closer; kept:
+    the part of that light which is spread onto the screen."""
 
     light: np.ndarray
     beside: tuple[int, int]
     error: float
     bound: float
+    kept: float
 
 
 def deconvolved(target: np.ndarray, spread: Convolution, steps: int = MOST_STEPS) -> Deconvolved:
@@ -74,7 +76,7 @@ def deconvolved(target: np.ndarray, spread: Convolution, steps: int = MOST_STEPS
     reach = back(np.ones_like(b))
     near = reach > REACHES
     x = cells(b)
-    ahead, t, c, light, least, bound = x, 1.0, 0.0, None, math.inf, 0.0
+    ahead, t, c, light, kept, least, bound = x, 1.0, 0.0, None, 1.0, math.inf, 0.0
     for k in range(1, steps + 1):
         y = seen(ahead)
         moved = np.where(near, np.maximum(ahead + back(b + c - y), 0.0), 0.0)
@@ -84,7 +86,7 @@ def deconvolved(target: np.ndarray, spread: Convolution, steps: int = MOST_STEPS
         after = 0.5 * (1.0 + math.sqrt(1.0 + 4.0 * t * t))
         ahead, x, t = moved + (t - 1.0) / after * (moved - x), moved, after
         if k == min(SMOOTH_STEPS, steps):
-            light = whole(x)
+            light, kept = whole(x), float(seen(x).sum() * cut**2 / x.sum())
         if k % LOOK == 0 or k == steps:
             y = seen(x)
             y = y / y.mean()
@@ -94,4 +96,4 @@ def deconvolved(target: np.ndarray, spread: Convolution, steps: int = MOST_STEPS
             bound = max(bound, math.sqrt(max(0.0, 2.0 * dual / b.size)))
             if bound > (1.0 - TIGHT) * least:
                 break
-    return Deconvolved(light, pixels, least, bound)
+    return Deconvolved(light, pixels, least, bound, kept)

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse import ranks
-from caustic_cli.inverse.extended import centre_of
+from caustic_cli.inverse.deconvolution import SMOOTH_STEPS, deconvolved
+from caustic_cli.inverse.extended import regular_rays, shift_of
 from caustic_cli.inverse.limits import within_limits
 from caustic_cli.inverse.losses import parse
 from caustic_cli.inverse.objective import Objective
@@ -26,7 +27,6 @@ from caustic_cli.inverse.steps import Adam, Newtonlike
 from caustic_cli.inverse.waves import WaveObjective
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.sampling import stream
-from caustic_cli.optics.spread import spread_at
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.waves import NoWaveImage
 from caustic_cli.scene import Scene, checks
@@ -247,13 +247,15 @@ class Designer:
             return WaveObjective(scene, self.field(k), heights.begun(), self.target, o.loss, wavelengths=stage.waves,
                                  blur=stage.blur, apron=stage.apron, max_slope=o.max_slope, min_radius=o.min_radius,
                                  dtype=o.dtype, device=self.device)
-        spread = spread_at(scene, self.field(k), heights.begun()) if stage.spread else None
-        if spread is not None:
-            scene = replace(scene, source=centre_of(scene))
-        rays = rays_of(scene, stage.sampler, stage.rays, stream(o.seed, f"stage {k}"), self.device)
+        if stage.spread and (spread := shift_of(scene, self.field(k), heights.begun())) is not None:
+            goal = self.target if self.target.ndim == 2 else self.target.sum(0)
+            kept = deconvolved(goal.numpy(), spread.on(scene.screen.pixel), SMOOTH_STEPS).kept
+            scene, rays, spread = regular_rays(scene, spread, stage, stream(o.seed, f"stage {k}"), self.device)
+        else:
+            rays, spread, kept = rays_of(scene, stage.sampler, stage.rays, stream(o.seed, f"stage {k}"), self.device), (), 1.0
         return Objective(scene, self.field(k), rays, stage.filter, self.target, o.loss, blur=stage.blur,
                          filter_target=o.filter_target, apron=stage.apron, max_slope=o.max_slope, min_radius=o.min_radius,
-                         oversample=stage.oversample, spread=spread, dtype=o.dtype)
+                         oversample=stage.oversample, spread=spread, kept=kept, dtype=o.dtype)
 
     def _next(self, state: State, k: int) -> State:
         """The state at the beginning of stage k: the same surface on its net."""

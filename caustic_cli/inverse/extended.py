@@ -13,12 +13,18 @@ import numpy as np
 import torch
 
 from caustic_cli.inverse.deconvolution import Deconvolved, deconvolved
-from caustic_cli.optics.spread import Spread, spread_at
+from caustic_cli.inverse.schedule import Stage
+from caustic_cli.optics.emission import Rays, rays_of
+from caustic_cli.optics.emission.coherent import even_disc, modes
+from caustic_cli.optics.emission.regular import RegularGrid
+from caustic_cli.optics.spread import Convolution, Spread, spread_at
 from caustic_cli.optics.surfaces import HeightField
-from caustic_cli.scene import Points, Scene, Source
+from caustic_cli.scene import Scene, Source
 
 #: A source shifts the image where it misplaces light by no more than this part of what it spreads it over.
 SHIFTS = 0.35
+#: How much of it may be misplaced in a refinement, and how many points of a source are taken for that, at most.
+EXACT, MOST_MODES = 0.04, 24
 #: Points along each axis of an area.
 POINTS = 12
 #: Control points along each axis of the offset surface by which this is judged before there is a lens.
@@ -64,16 +70,29 @@ def shift_of(scene: Scene, field: HeightField | None = None, heights: torch.Tens
         offset = scene.lens.offset
         heights = torch.from_numpy(offset.thickness + offset.sag(x[:, None], y[None, :]))
     found = spread_at(scene, field, heights)
-    return found if found is not None and found.error <= SHIFTS * max(found.reach()) else None
+    return found if found is not None and found.rms <= SHIFTS * max(found.reach()) else None
 
 
 def centre_of(scene: Scene) -> Source:
     """The source without its extent, that shines into the same cone."""
     source = scene.source.pointlike()
-    if isinstance(source, Points) and source.cone is None:
+    if not source.distant and source.cone is None:
         cone = scene.source.cone_over(scene.lens.half_size, scene.lens.z_in, scene.lens.round)
         return replace(source, cone=math.degrees(cone))
     return source
+
+
+def regular_rays(scene: Scene, spread: Spread, stage: Stage, seed: int,
+                 device: str | torch.device) -> tuple[Scene, Rays | list[Rays], list[Convolution]]:
+    """The rays of a stage that are spread: of the source's middle, or of a few of its points where its light does more than shift;
+    with the scene that they are for, and what the image of each point's is convolved with."""
+    pixel, each = scene.screen.pixel, math.ceil((spread.rms / (EXACT * max(spread.reach()))) ** 2)
+    if each <= 1 or not min(spread.half) > 0:
+        scene = replace(scene, source=centre_of(scene))
+        return scene, rays_of(scene, stage.sampler, stage.rays, seed, device), [spread.on(pixel, stage.oversample)]
+    each = min(each, MOST_MODES)
+    parts = spread.parts_on(pixel, even_disc(each), stage.oversample)
+    return scene, RegularGrid.of_modes(modes(scene, each), stage.rays, device), parts
 
 
 def etendue_limit(scene: Scene) -> float | None:

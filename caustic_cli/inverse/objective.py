@@ -8,7 +8,7 @@ Everything that does not depend on the heights (basis matrices, filtered target,
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -20,7 +20,7 @@ from caustic_cli.inverse.penalties import Penalty
 from caustic_cli.optics.emission import Rays
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.shortage import smaller
-from caustic_cli.optics.spread import Spread
+from caustic_cli.optics.spread import Convolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT
 from caustic_cli.optics.trace import Parameters, Tracer, tracers
@@ -58,7 +58,7 @@ class Objective:
     Args:
         scene: its screen is the one the picture is judged on.
         field: spline spaces of the heights.
-        sampler: the rays, the same at every evaluation.
+        sampler: the rays, the same at every evaluation; or those of each of several points of the source.
         filter: reconstruction filter.
         target: (n_x, n_y) irradiance on the scene's screen, or (3, n_x, n_y) of a coloured scene.
         loss: weighted terms, see `losses.parse`.
@@ -69,30 +69,33 @@ class Objective:
         max_slope: limit of the lens' slope, 0 for none; min_radius: least radius of concave places, mm, 0 for any.
         oversample: the filter works on pixels so many times smaller along each axis, which are then added up: a render that
             is nearly a bincount, and yet smooth in the heights.
-        spread: of the source, whose image convolves that of the rays, which are those of its middle; None for rays of all of it.
-            Rays are caught around the screen and the apron as far as their light reaches these.
+        spread: what the image of the rays of each point is convolved with, the part of the source that it stands for; empty for
+            rays of all of it.  Rays are caught around the screen and the apron as far as their light reaches these.
+        kept: part of the light that the loss expects on screen and apron: what a source spreads beside them is none of its concern.
         dtype: precision of the rays.
     """
 
-    def __init__(self, scene: Scene, field: HeightField, sampler: Rays, filter: Filter, target: Tensor, loss: str, *,
-                 blur: float = 0.0, filter_target: bool = True, apron: int = 0, max_slope: float = 0.0, min_radius: float = 0.0,
-                 oversample: int = 1, spread: Spread | None = None, dtype: torch.dtype = torch.float32):
-        self.device = sampler.device
-        self.spread = None if spread is None else spread.on(scene.screen.pixel, oversample)
-        beside = (0, 0) if self.spread is None else (n // self.spread.cut for n in self.spread.beside)
+    def __init__(self, scene: Scene, field: HeightField, sampler: Rays | Sequence[Rays], filter: Filter, target: Tensor,
+                 loss: str, *, blur: float = 0.0, filter_target: bool = True, apron: int = 0, max_slope: float = 0.0,
+                 min_radius: float = 0.0, oversample: int = 1, spread: Sequence[Convolution] = (), kept: float = 1.0,
+                 dtype: torch.dtype = torch.float32):
+        self.samplers = list(sampler) if isinstance(sampler, Sequence) else [sampler]
+        self.device = self.samplers[0].device
+        self.spread, self.cut = list(spread), spread[0].cut if spread else 1
+        beside = (n // self.cut for n in spread[0].beside) if spread else (0, 0)
         screen = scene.screen.grown(tuple(apron + n for n in beside))
         self.screen = replace(screen, resolution=tuple(oversample * n for n in screen.resolution))
         self.filter, self.apron, self.oversample = filter, apron, oversample
-        wide = torch.nn.functional.pad(target.double().to(sampler.device), (apron, apron, apron, apron))
+        wide = torch.nn.functional.pad(target.double().to(self.device), (apron, apron, apron, apron))
         smooth = wide
         if filter_target:
             fine = wide.repeat_interleave(oversample, -2).repeat_interleave(oversample, -1)
             smooth = self._pool(torch.stack([filter.smooth(c) for c in fine]) if scene.colored else filter.smooth(fine))
         self.loss = (ColorLoss if scene.colored else Loss)(loss, smooth, blur, apron, wide > 0)
-        self.penalty = penalty_of(scene, field, loss, max_slope, min_radius, sampler.device)
-        self.scene, self.field, self.sampler, self.dtype = scene, field, sampler, dtype
-        self.chunk, self.kept = CHUNK, None
-        if sampler.count <= KEPT_RAYS:
+        self.penalty = penalty_of(scene, field, loss, max_slope, min_radius, self.device)
+        self.scene, self.field, self.dtype = scene, field, dtype
+        self.expected, self.chunk, self.kept = kept, CHUNK, None
+        if sum(s.count for s in self.samplers) <= KEPT_RAYS:
             try:
                 self.kept = list(self._tracers())
             except (MemoryError, RuntimeError) as error:
@@ -102,29 +105,27 @@ class Objective:
     def whole(self) -> bool:
         """Whether chunks keep their graphs: a fused kernel's holds the net or the surface at its rays, a trace by stages every
         ray after each of them."""
-        return self.kept is not None and (sum(t.fused is None for t in self.kept) <= 1)
+        return self.kept is not None and (sum(t.fused is None for _, t in self.kept) <= 1)
 
     def _pool(self, image: Tensor, cut: int = 1) -> Tensor:
         """Pixels of the screen, cut into so many along each axis, from those of the render."""
         k, (*colors, n, m) = self.oversample // cut, image.shape
         return image if k == 1 else image.view(*colors, n // k, k, m // k, k).sum((-3, -1))
 
-    @property
-    def cut(self) -> int:
-        """Cells of the accumulated image along each axis of a pixel."""
-        return 1 if self.spread is None else self.spread.cut
+    def _spread_out(self, images: Tensor) -> Tensor:
+        """The source's image on screen and apron, from those of the rays of each of its points."""
+        if not self.spread:
+            return images[0]
+        return sum(torch.stack([spread(c) for c in image]) if image.ndim == 3 else spread(image)
+                   for spread, image in zip(self.spread, images, strict=True))
 
-    def _spread_out(self, image: Tensor) -> Tensor:
-        """The source's image on screen and apron, from that of the rays."""
-        if self.spread is None:
-            return image
-        return torch.stack([self.spread(c) for c in image]) if image.ndim == 3 else self.spread(image)
-
-    def _tracers(self) -> Iterator[Tracer]:
-        """This rank's chunks, ready to be traced."""
+    def _tracers(self) -> Iterator[tuple[int, Tracer]]:
+        """This rank's chunks, ready to be traced, each with the number of its point."""
         rank, count = ranks.place()
-        size = min(self.chunk, math.ceil(self.sampler.count / count)) if count > 1 else self.chunk
-        return tracers(self.scene, self.field, self.sampler, self.dtype, size, part=(rank, count))
+        for k, sampler in enumerate(self.samplers):
+            size = min(self.chunk, math.ceil(sampler.count / count)) if count > 1 else self.chunk
+            for traced in tracers(self.scene, self.field, sampler, self.dtype, size, part=(rank, count)):
+                yield k, traced
 
     def __call__(self, heights: Tensor) -> Evaluation:
         """`evaluate` at the heights (n, m) mm float64 of a lens' exit."""
@@ -158,24 +159,25 @@ class Objective:
         penalty = self.penalty(parameters[EXIT]) if self.penalty else torch.zeros((), device=self.device)
         shape = tuple(n // (self.oversample // self.cut) for n in self.screen.resolution)
         shape = (3, *shape) if self.scene.colored else shape
-        image = torch.zeros(shape, dtype=torch.float64, device=self.device)
-        leaving, parts = image.new_zeros(image.shape[:-2]), []  # one for each colour
+        image = torch.zeros((len(self.samplers), *shape), dtype=torch.float64, device=self.device)
+        leaving, parts = image.new_zeros(shape[:-2]), []  # one for each colour
         with torch.set_grad_enabled(self.whole):
-            for traced in self.kept or self._tracers():
+            for k, traced in self.kept or self._tracers():
                 part = self._see(traced, parameters)
-                image, leaving = image + part[0].detach().double(), leaving + part[1].detach().double()
+                image[k] += part[0].detach()
+                leaving = leaving + part[1].detach().double()
                 if self.whole:
-                    parts.append(part)
+                    parts.append((k, part))
         ranks.add(image, leaving)
         image, leaving = image.requires_grad_(), leaving.requires_grad_()
         seen = self._spread_out(image)
-        loss = self.loss(seen, leaving, penalty)
+        loss = self.loss(seen, self.expected * leaving, penalty)
         wanted = [image, leaving, *leaves] if penalty.requires_grad else [image, leaving]
         by_image, by_leaving, *direct = torch.autograd.grad(loss, wanted, allow_unused=True)
         gradients = [torch.zeros_like(heights) for heights in leaves]
-        for part in parts or (self._see(traced, parameters) for traced in self.kept or self._tracers()):
+        for k, part in parts or ((k, self._see(traced, parameters)) for k, traced in self.kept or self._tracers()):
             # Whole pixels, and what leaves a lens without reflections, do not depend on the heights at all.
-            pulls = [(value, by.to(value.dtype)) for value, by in zip(part, (by_image, by_leaving), strict=True)
+            pulls = [(value, by.to(value.dtype)) for value, by in zip(part, (by_image[k], by_leaving), strict=True)
                      if value.requires_grad and by is not None]
             if pulls:
                 values, by = zip(*pulls, strict=True)

@@ -1,7 +1,7 @@
 """An extended source that shifts the image: the image of its middle, convolved with its own shape.
 
 Light of a source point beside the middle lands shifted by (S_x dx, S_y dy), nearly alike for all of the lens.  How nearly is
-measured on the outermost points: `error` is the most by which light lands elsewhere than so shifted.
+measured on the outermost points: `error` is the most by which light lands elsewhere than so shifted, `rms` its root mean square.
 """
 
 from __future__ import annotations
@@ -38,11 +38,12 @@ Landing = Callable[[Mode, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 @dataclass(frozen=True)
 class Spread:
     """half: half axes of the ellipse over which a point of the image is spread, mm, 0 for points; shifts: of the source's positions
-    on the screen (dx, dy), mm, and their parts of the power; error: see above."""
+    on the screen (dx, dy), mm, and their parts of the power; error, rms: see above."""
 
     half: tuple[float, float]
     shifts: tuple[tuple[float, float, float], ...]
     error: float
+    rms: float = 0.0
 
     def reach(self) -> tuple[float, float]:
         """How far it spreads, mm."""
@@ -53,12 +54,13 @@ class Spread:
         cut = _cut(min((h for h in self.half if h > 0), default=max(self.reach()) / 2.0), pixel, most)
         return Convolution(torch.from_numpy(self.kernel(tuple(w / cut for w in pixel))), cut)
 
-    def parts_on(self, pixel: tuple[float, float], places: list[tuple[float, float]]) -> list[Convolution]:
+    def parts_on(self, pixel: tuple[float, float], places: list[tuple[float, float]],
+                 most: int = MOST_CUT) -> list[Convolution]:
         """The same of parts of every position: of all that is nearest to each of these points of the unit disc, about this point.
 
         Their kernels' sums are their parts of the whole times the number of parts.
         """
-        cut = _cut(min(h for h in self.half if h > 0) / math.sqrt(len(places)), pixel, MOST_CUT)
+        cut = _cut(min(h for h in self.half if h > 0) / math.sqrt(len(places)), pixel, most)
         cell = tuple(w / cut for w in pixel)
         return [Convolution(torch.from_numpy(self.kernel(cell, (places, k))), cut) for k in range(len(places))]
 
@@ -185,10 +187,11 @@ def spread_of(lit: Lit, landing: Landing, device: str | torch.device = "cpu") ->
         (up, down), (high, low) = outer[2 * k : 2 * k + 2], moved[2 * k : 2 * k + 2]
         apart = up.position[k] - down.position[k]
         slope.append(float(high[k].mean() - low[k].mean()) / apart if apart else 0.0)
-    error = max(float(torch.hypot(*(m[k] - slope[k] * (mode.position[k] - centre.position[k]) for k in (0, 1))).max())
-                for mode, m in zip(outer, moved, strict=True))
+    off = torch.cat([torch.hypot(*(m[k] - slope[k] * (mode.position[k] - centre.position[k]) for k in (0, 1)))
+                     for mode, m in zip(outer, moved, strict=True)])
+    error, rms = float(off.max()), float(off.square().mean().sqrt())
     if source.distant:
-        return Spread(tuple(abs(c) * math.sin(source.half_angle) for c in slope), ((0.0, 0.0, 1.0),), error)
+        return Spread(tuple(abs(c) * math.sin(source.half_angle) for c in slope), ((0.0, 0.0, 1.0),), error, rms)
     places = tuple((float(slope[0] * (p[0] - centre.position[0])), float(slope[1] * (p[1] - centre.position[1])), float(part))
                    for p, part in zip(*source.points(), strict=True))
-    return Spread(tuple(abs(c) * e for c, e in zip(slope, source.extent, strict=True)), places, error)
+    return Spread(tuple(abs(c) * e for c, e in zip(slope, source.extent, strict=True)), places, error, rms)

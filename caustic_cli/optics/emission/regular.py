@@ -1,0 +1,52 @@
+"""Rays of one point of a source on a regular grid of the pupil, whose light stands for its part of the source's."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import torch
+
+from caustic_cli.optics.emission.base import Emission
+from caustic_cli.optics.emission.coherent import Mode
+from caustic_cli.optics.rays import RayState
+
+#: Shifts of one grid against the next, in cells: the additive recurrence of Roberts' R2 sequence.
+SHIFTS = (0.7548776662466927, 0.5698402909980532)
+
+
+@dataclass(frozen=True, eq=False)
+class RegularGrid(Emission):
+    """Rays through points of the pupil in even cells, one grid shifted against the next by a part of a cell.
+
+    mode: the point; number: of the grid, which says how it is shifted.
+    """
+
+    mode: Mode | None = None
+    number: int = 0
+
+    @classmethod
+    def of_modes(cls, modes: list[Mode], rays: int, device: str | torch.device = "cpu") -> list[RegularGrid]:
+        """About `rays` rays in all."""
+        scene = modes[0].scene
+        base = cls.of_size(scene, "grid", max(1, rays // len(modes)), 0, device)
+        return [replace(base, mode=mode, number=k) for k, mode in enumerate(modes)]
+
+    @property
+    def count(self) -> int:
+        """Number of rays."""
+        return self.shape[0] * self.shape[1]
+
+    def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[RayState]:
+        """As of an emission; powers sum to the mode's part of the light on the pupil, to the grid's accuracy."""
+        (nu, nv), pupil = self.shape, self.scene.pupil
+        shift = [(0.5 + self.number * s) % 1.0 for s in SHIFTS]
+        cell = 4.0 * pupil.half_size[0] * pupil.half_size[1] / self.count
+        for start in range(first * size, self.count, step * size):
+            k = torch.arange(start, min(start + size, self.count), device=self.device)
+            u, v = ((i.double() + s) / n for i, s, n in zip((k // nv, k % nv), shift, (nu, nv), strict=True))
+            state = self.mode.through(u, v)
+            power = torch.as_tensor(state.power) * cell
+            if pupil.round:
+                power = torch.where((2.0 * u - 1.0) ** 2 + (2.0 * v - 1.0) ** 2 <= 1.0, power, torch.zeros_like(power))
+            yield replace(state, power=power)
