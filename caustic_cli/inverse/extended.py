@@ -70,7 +70,7 @@ def shift_of(scene: Scene, field: HeightField | None = None, heights: torch.Tens
         offset = scene.lens.offset
         heights = torch.from_numpy(offset.thickness + offset.sag(x[:, None], y[None, :]))
     found = spread_at(scene, field, heights)
-    return found if found is not None and found.rms <= SHIFTS * max(found.reach()) else None
+    return found if found is not None and found.usual <= SHIFTS * max(found.reach()) else None
 
 
 def centre_of(scene: Scene) -> Source:
@@ -86,7 +86,7 @@ def regular_rays(scene: Scene, spread: Spread, stage: Stage, seed: int,
                  device: str | torch.device) -> tuple[Scene, Rays | list[Rays], list[Convolution]]:
     """The rays of a stage that are spread: of the source's middle, or of a few of its points where its light does more than shift;
     with the scene that they are for, and what the image of each point's is convolved with."""
-    pixel, each = scene.screen.pixel, math.ceil((spread.rms / (EXACT * max(spread.reach()))) ** 2)
+    pixel, each = scene.screen.pixel, math.ceil((spread.usual / (EXACT * max(spread.reach()))) ** 2)
     if each <= 1 or not min(spread.half) > 0:
         scene = replace(scene, source=centre_of(scene))
         return scene, rays_of(scene, stage.sampler, stage.rays, seed, device), [spread.on(pixel, stage.oversample)]

@@ -119,6 +119,11 @@ class Objective:
         return sum(torch.stack([spread(c) for c in image]) if image.ndim == 3 else spread(image)
                    for spread, image in zip(self.spread, images, strict=True))
 
+    def _due(self, seen: Tensor, leaving: Tensor) -> Tensor:
+        """Power that the loss holds against an image: all that leaves the lens; behind a source's blur what it sees, unless that
+        is less than what can be expected there."""
+        return torch.maximum(seen.sum((-2, -1)), self.expected * leaving) if self.spread else leaving
+
     def _tracers(self) -> Iterator[tuple[int, Tracer]]:
         """This rank's chunks, ready to be traced, each with the number of its point."""
         rank, count = ranks.place()
@@ -171,7 +176,7 @@ class Objective:
         ranks.add(image, leaving)
         image, leaving = image.requires_grad_(), leaving.requires_grad_()
         seen = self._spread_out(image)
-        loss = self.loss(seen, self.expected * leaving, penalty)
+        loss = self.loss(seen, self._due(seen, leaving), penalty)
         wanted = [image, leaving, *leaves] if penalty.requires_grad else [image, leaving]
         by_image, by_leaving, *direct = torch.autograd.grad(loss, wanted, allow_unused=True)
         gradients = [torch.zeros_like(heights) for heights in leaves]

@@ -100,6 +100,8 @@ REFINEMENT = {
     "standard": (2.0, 768, 64, 4_000_000, 4, ((0.5, 8), (1.0, 24))),
     "fine": (2.0, 768, 256, 16_000_000, 4, ((0.125, 15), (0.25, 65), (1.0, 25))),
 }
+#: So many times the iterations where what is refined is seen through a source's blur only.
+LONGER = 2
 #: Source cells of the transport start along the lens: one to so many rays of the last stage, within bounds.
 RAYS_PER_CELL, LEAST_CELLS, MOST_CELLS = 4, 256, 1024
 LEAST_SPANS = 32
@@ -142,7 +144,7 @@ def refinement(control: tuple[int, int], rays: int | None, resolution: tuple[int
     stages = []
     for part, iterations in plan:
         stages.append(Stage(control, max(1, round(part * rays)), "grid", filter, 0.0, apron,
-                            iterations, oversample=finer, spread=spread))
+                            LONGER * iterations if spread else iterations, oversample=finer, spread=spread))
     return stages
 
 

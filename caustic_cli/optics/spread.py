@@ -1,7 +1,8 @@
 """An extended source that shifts the image: the image of its middle, convolved with its own shape.
 
 Light of a source point beside the middle lands shifted by (S_x dx, S_y dy), nearly alike for all of the lens.  How nearly is
-measured on the outermost points: `error` is the most by which light lands elsewhere than so shifted, `rms` its root mean square.
+measured on the outermost points: `error` is the most by which light lands elsewhere than so shifted, `usual` what most of it
+keeps below.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Scene
 
+#: The part of light that is most of it.
+MOST = 0.8
 #: Points along each axis of the pupil whose light says how a source shifts the image.
 POINTS = 33
 #: Cells of an image in the half axes of an ellipse that are aimed at, and into how many a pixel is cut at most for that.
@@ -38,12 +41,12 @@ Landing = Callable[[Mode, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 @dataclass(frozen=True)
 class Spread:
     """half: half axes of the ellipse over which a point of the image is spread, mm, 0 for points; shifts: of the source's positions
-    on the screen (dx, dy), mm, and their parts of the power; error, rms: see above."""
+    on the screen (dx, dy), mm, and their parts of the power; error, usual: see above."""
 
     half: tuple[float, float]
     shifts: tuple[tuple[float, float, float], ...]
     error: float
-    rms: float = 0.0
+    usual: float = 0.0
 
     def reach(self) -> tuple[float, float]:
         """How far it spreads, mm."""
@@ -189,9 +192,9 @@ def spread_of(lit: Lit, landing: Landing, device: str | torch.device = "cpu") ->
         slope.append(float(high[k].mean() - low[k].mean()) / apart if apart else 0.0)
     off = torch.cat([torch.hypot(*(m[k] - slope[k] * (mode.position[k] - centre.position[k]) for k in (0, 1)))
                      for mode, m in zip(outer, moved, strict=True)])
-    error, rms = float(off.max()), float(off.square().mean().sqrt())
+    error, usual = float(off.max()), float(torch.quantile(off, MOST))
     if source.distant:
-        return Spread(tuple(abs(c) * math.sin(source.half_angle) for c in slope), ((0.0, 0.0, 1.0),), error, rms)
+        return Spread(tuple(abs(c) * math.sin(source.half_angle) for c in slope), ((0.0, 0.0, 1.0),), error, usual)
     places = tuple((float(slope[0] * (p[0] - centre.position[0])), float(slope[1] * (p[1] - centre.position[1])), float(part))
                    for p, part in zip(*source.points(), strict=True))
-    return Spread(tuple(abs(c) * e for c, e in zip(slope, source.extent, strict=True)), places, error, rms)
+    return Spread(tuple(abs(c) * e for c, e in zip(slope, source.extent, strict=True)), places, error, usual)

@@ -35,7 +35,7 @@ from caustic_cli.studies.retrace import sampler_for
 #: Lens widths, mm; wavelengths, nm; full angles of a distant source, degrees.
 SIZES = (5.0, 10.0, 20.0, 40.0, 60.0, 100.0)
 WAVELENGTHS = (405.0, 550.0, 780.0, 1064.0, 1550.0)
-ANGLES = (0.0, 0.02, 0.05, 0.2)
+ANGLES = (0.0, 0.02, 0.05, 0.1)
 #: Rays of each ray image, to a pixel, unless said.
 A_PIXEL = 64
 #: An error up to which rays are called enough.
