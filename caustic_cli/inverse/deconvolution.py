@@ -25,6 +25,8 @@ from caustic_cli.optics.spread import Convolution
 
 #: Iterations until the light is returned, which is still smooth then, and for the least error; how often that is looked at.
 SMOOTH_STEPS, MOST_STEPS, LOOK = 60, 300, 50
+#: Cells of a pixel, along each axis, that light may be told apart by; finer ones take long.
+FINEST = 2
 #: Part of the least error to which its bound comes before the iterations end.
 TIGHT = 0.02
 #: Light farther out than where this part of it reaches the screen is none.

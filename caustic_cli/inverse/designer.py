@@ -16,7 +16,7 @@ from torch import Tensor
 
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse import ranks
-from caustic_cli.inverse.deconvolution import SMOOTH_STEPS, deconvolved
+from caustic_cli.inverse.deconvolution import FINEST, SMOOTH_STEPS, deconvolved
 from caustic_cli.inverse.extended import regular_rays, shift_of
 from caustic_cli.inverse.limits import within_limits
 from caustic_cli.inverse.losses import parse
@@ -249,7 +249,7 @@ class Designer:
                                  dtype=o.dtype, device=self.device)
         if stage.spread and (spread := shift_of(scene, self.field(k), heights.begun())) is not None:
             goal = self.target if self.target.ndim == 2 else self.target.sum(0)
-            kept = deconvolved(goal.numpy(), spread.on(scene.screen.pixel), SMOOTH_STEPS).kept
+            kept = deconvolved(goal.numpy(), spread.on(scene.screen.pixel, FINEST), SMOOTH_STEPS).kept
             scene, rays, spread = regular_rays(scene, spread, stage, stream(o.seed, f"stage {k}"), self.device)
         else:
             rays, spread, kept = rays_of(scene, stage.sampler, stage.rays, stream(o.seed, f"stage {k}"), self.device), (), 1.0

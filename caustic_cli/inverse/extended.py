@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from caustic_cli.inverse.deconvolution import Deconvolved, deconvolved
+from caustic_cli.inverse.deconvolution import FINEST, Deconvolved, deconvolved
 from caustic_cli.inverse.schedule import Stage
 from caustic_cli.optics.emission import Rays, rays_of
 from caustic_cli.optics.emission.coherent import even_disc, modes
@@ -55,7 +55,7 @@ def limits(scene: Scene, target: np.ndarray, field: HeightField | None = None, h
     if not scene.source.extended or scene.source.apart:
         return Limits(None, None)
     spread = shift_of(scene, field, heights)
-    light = None if spread is None else deconvolved(target, spread.on(scene.screen.pixel))
+    light = None if spread is None else deconvolved(target, spread.on(scene.screen.pixel, FINEST))
     return Limits(light, etendue_limit(scene))
 
 
