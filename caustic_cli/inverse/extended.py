@@ -60,7 +60,8 @@ def limits(scene: Scene, target: np.ndarray, field: HeightField | None = None, h
 
 
 def shift_of(scene: Scene, field: HeightField | None = None, heights: torch.Tensor | None = None) -> Spread | None:
-    """How an extended source spreads its middle's image; None where it has no extent, or does much else."""
+    """How an extended source spreads its middle's image; None where it has no extent, does much else, or lights far more than the
+    screen."""
     if not scene.source.extended or scene.source.apart or any(scene.screen.tilt):
         return None
     if heights is None:
@@ -70,7 +71,9 @@ def shift_of(scene: Scene, field: HeightField | None = None, heights: torch.Tens
         offset = scene.lens.offset
         heights = torch.from_numpy(offset.thickness + offset.sag(x[:, None], y[None, :]))
     found = spread_at(scene, field, heights)
-    return found if found is not None and found.usual <= SHIFTS * max(found.reach()) else None
+    if found is None or found.usual > SHIFTS * max(found.reach()) or max(found.reach()) > max(scene.screen.size):
+        return None
+    return found
 
 
 def centre_of(scene: Scene) -> Source:

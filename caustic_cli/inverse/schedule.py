@@ -101,7 +101,7 @@ REFINEMENT = {
     "fine": (2.0, 768, 256, 16_000_000, 4, ((0.125, 15), (0.25, 65), (1.0, 25))),
 }
 #: So many times the iterations where what is refined is seen through a source's blur only.
-LONGER = 2
+LONGER = 3
 #: Source cells of the transport start along the lens: one to so many rays of the last stage, within bounds.
 RAYS_PER_CELL, LEAST_CELLS, MOST_CELLS = 4, 256, 1024
 LEAST_SPANS = 32
