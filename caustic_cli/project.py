@@ -167,7 +167,7 @@ def _change(source: Settings, before: str, given: set[str]) -> None:
 
 def _within(name: str) -> None:
     if name != Path(name).name or name in ("", ".", "..", TOML, *MADE):
-        raise InputError(f"a file of a project must be the name of one within its directory, got {name!r}")
+        raise InputError(f"a file of a project must be the name of one within the project, got {name!r}")
 
 
 def _picture(directory: Path, name: str, linear: bool, color: bool = False) -> Picture:

@@ -15,7 +15,7 @@ import torch
 from caustic_cli.inverse.deconvolution import FINEST, Deconvolved, deconvolved
 from caustic_cli.inverse.schedule import Stage
 from caustic_cli.optics.emission import Rays, rays_of
-from caustic_cli.optics.emission.coherent import even_disc, modes
+from caustic_cli.optics.emission.coherent import modes, spots
 from caustic_cli.optics.emission.regular import RegularGrid
 from caustic_cli.optics.spread import Convolution, Spread, spread_at
 from caustic_cli.optics.surfaces import HeightField
@@ -94,7 +94,7 @@ def regular_rays(scene: Scene, spread: Spread, stage: Stage, seed: int,
         scene = replace(scene, source=centre_of(scene))
         return scene, rays_of(scene, stage.sampler, stage.rays, seed, device), [spread.on(pixel, stage.oversample)]
     each = min(each, MOST_MODES)
-    parts = spread.parts_on(pixel, even_disc(each), stage.oversample)
+    parts = spread.parts_on(pixel, spots(scene.source, each), stage.oversample)
     return scene, RegularGrid.of_modes(modes(scene, each), stage.rays, device), parts
 
 

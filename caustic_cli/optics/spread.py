@@ -41,12 +41,15 @@ Landing = Callable[[Mode, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 @dataclass(frozen=True)
 class Spread:
     """half: half axes of the ellipse over which a point of the image is spread, mm, 0 for points; shifts: of the source's positions
-    on the screen (dx, dy), mm, and their parts of the power; error, usual: see above."""
+    on the screen (dx, dy), mm, and their parts of the power; error, usual: see above; brightness: of the source over its frame,
+    (n, m) [i, j], None if even over the ellipse; frame: half widths of that on the screen, mm, negative where it is mirrored."""
 
     half: tuple[float, float]
     shifts: tuple[tuple[float, float, float], ...]
     error: float
     usual: float = 0.0
+    brightness: np.ndarray | None = None
+    frame: tuple[float, float] = (0.0, 0.0)
 
     def reach(self) -> tuple[float, float]:
         """How far it spreads, mm."""
@@ -59,7 +62,7 @@ class Spread:
 
     def parts_on(self, pixel: tuple[float, float], places: list[tuple[float, float]],
                  most: int = MOST_CUT) -> list[Convolution]:
-        """The same of parts of every position: of all that is nearest to each of these points of the unit disc, about this point.
+        """The same of parts of every position: of all that is nearest to each of these points of its frame, [-1, 1]^2, about it.
 
         Their kernels' sums are their parts of the whole times the number of parts.
         """
@@ -74,23 +77,38 @@ class Spread:
         second moments stay what they are.  part: see `parts_on`, points and the number of one.
         """
         a, b = (math.ceil(r / w) + 1 for r, w in zip(self.reach(), cell, strict=True))
-        half = tuple(math.sqrt(max(0.0, h * h - 2.0 / 3.0 * w * w)) for h, w in zip(self.half, cell, strict=True))
-        x, y = _even_disc(half, cell)
+        if self.brightness is None:
+            half = tuple(math.sqrt(max(0.0, h * h - 2.0 / 3.0 * w * w)) for h, w in zip(self.half, cell, strict=True))
+            x, y = _even_disc(half, cell)
+            light = np.full(len(x), 1.0 / len(x))
+        else:
+            half = self.frame
+            x, y, light = _bright(self.brightness, half, cell)
         dx, dy, power = np.array(self.shifts if part is None else ((0.0, 0.0, 1.0),)).T
-        power = power / (power.sum() * len(x))
+        power = power / power.sum()
         if part is not None:
             places, k = np.array(part[0]), part[1]
             mine = cKDTree(places).query(np.stack([x, y], 1))[1] == k
-            x, y, power = x[mine] - places[k, 0], y[mine] - places[k, 1], power * len(places)
+            x, y, light = x[mine] - places[k, 0], y[mine] - places[k, 1], light[mine] * len(places)
         x, y = (h / w * c for h, w, c in zip(half, cell, (x, y), strict=True))
         at_x, at_y = (d[:, None] / w + c + n for d, c, w, n in ((dx, x, cell[0], a), (dy, y, cell[1], b)))
         i, j = np.floor(at_x).astype(int), np.floor(at_y).astype(int)
         found = np.zeros((2 * a + 2) * (2 * b + 2))
         for p in (0, 1):
             for q in (0, 1):
-                weight = power[:, None] * np.abs(1 - p - (at_x - i)) * np.abs(1 - q - (at_y - j))
+                weight = power[:, None] * light * np.abs(1 - p - (at_x - i)) * np.abs(1 - q - (at_y - j))
                 found += np.bincount(((i + p) * (2 * b + 2) + j + q).ravel(), weight.ravel(), len(found))
         return found.reshape(2 * a + 2, 2 * b + 2)[:-1, :-1]
+
+
+def _bright(picture: np.ndarray, half: tuple[float, float], cell: tuple[float, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points of [-1, 1]^2, even within every pixel of a picture of brightness and many to a cell, and their parts of its light."""
+    fine = [math.ceil(A_CELL * 2.0 * abs(h) / (w * n)) for h, w, n in zip(half, cell, picture.shape, strict=True)]
+    light = picture.repeat(max(1, fine[0]), 0).repeat(max(1, fine[1]), 1)
+    x, y = ((np.arange(n) + 0.5) * (2.0 / n) - 1.0 for n in light.shape)
+    lit = light > 0
+    i, j = np.nonzero(lit)
+    return x[i], y[j], light[lit] / light.sum()
 
 
 def _cut(fine: float, pixel: tuple[float, float], most: int) -> int:
@@ -164,14 +182,13 @@ def spread_at(scene: Scene, field: HeightField, heights: Tensor) -> Spread | Non
 
 @torch.no_grad()
 def spread_of(lit: Lit, landing: Landing, device: str | torch.device = "cpu") -> Spread | None:
-    """How an extended source spreads the image of its middle; None where it is none or not even, or its light misses
-    or lies in depth.
+    """How an extended source spreads the image of its middle; None where it is none, or its light misses or lies in depth.
 
     Raises:
         as `landing`.
     """
     source, outer, centre = lit.source, edges(lit), middle(lit)
-    if not source.even:
+    if source.rays is not None or len(source.members) > 1:
         return None
     if not outer or (not source.distant and float(np.ptp(source.points()[0][:, 2])) > 0):
         return None
@@ -193,8 +210,11 @@ def spread_of(lit: Lit, landing: Landing, device: str | torch.device = "cpu") ->
     off = torch.cat([torch.hypot(*(m[k] - slope[k] * (mode.position[k] - centre.position[k]) for k in (0, 1)))
                      for mode, m in zip(outer, moved, strict=True)])
     error, usual = float(off.max()), float(torch.quantile(off, MOST))
+    frame = tuple(c * f for c, f in zip(slope, source.frame, strict=True))
     if source.distant:
-        return Spread(tuple(abs(c) * math.sin(source.half_angle) for c in slope), ((0.0, 0.0, 1.0),), error, usual)
+        half = tuple(abs(c) * math.sin(source.half_angle) for c in slope)
+        return Spread(half, ((0.0, 0.0, 1.0),), error, usual, source.brightness, frame)
     places = tuple((float(slope[0] * (p[0] - centre.position[0])), float(slope[1] * (p[1] - centre.position[1])), float(part))
                    for p, part in zip(*source.points(), strict=True))
-    return Spread(tuple(abs(c) * e for c, e in zip(slope, source.extent, strict=True)), places, error, usual)
+    return Spread(tuple(abs(c) * e for c, e in zip(slope, source.extent, strict=True)), places, error, usual, source.brightness,
+                  frame)

@@ -120,13 +120,18 @@ def modes(scene: Lit, each: int) -> list[Mode]:
 def _spots(source: Source, each: int) -> list[tuple[float, float]]:
     """Points about a position of a source that stand for the same part of its light each, mm, or sines of a distant one."""
     fx, fy = source.frame
-    if not max(fx, fy) > 0:
+    return [(fx * a, fy * b) for a, b in spots(source, each)]
+
+
+def spots(source: Source, each: int) -> list[tuple[float, float]]:
+    """The same in the source's frame, [-1, 1]^2."""
+    if not max(source.frame) > 0:
         return [(0.0, 0.0)]
     if source.brightness is None:
-        return [(fx * a, fy * b) for a, b in even_disc(each)]
+        return even_disc(each)
     k = torch.arange(each, dtype=torch.float64) + 0.5
     x, y = bright_points(source.brightness, k / each, torch.frac(k / RATIO))
-    return [(fx * a, fy * b) for a, b in zip(x.tolist(), y.tolist(), strict=True)]
+    return list(zip(x.tolist(), y.tolist(), strict=True))
 
 
 def even_disc(count: int) -> list[tuple[float, float]]:

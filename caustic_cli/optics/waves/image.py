@@ -17,7 +17,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.emission.coherent import Mode, edges, even_disc, middle, modes
+from caustic_cli.optics.emission.coherent import Mode, edges, middle, modes, spots
 from caustic_cli.optics.meeting import Parameters
 from caustic_cli.optics.resolution import WHITE_LINES, white
 from caustic_cli.optics.spread import Convolution, Spread, spread_of
@@ -28,7 +28,7 @@ from caustic_cli.optics.waves.receiver import Plane, Receiver, receiver_of
 from caustic_cli.optics.waves.sampling import NoWaveImage, Sampling, memory_free
 from caustic_cli.optics.waves.tilted import power_on_tilted
 from caustic_cli.optics.waves.wavefront import Optics, Survey, Wavefront, device_of, distance_of, survey, wavefront
-from caustic_cli.scene import Light, Scene, Screen
+from caustic_cli.scene import Light, Scene, Screen, Source
 from caustic_cli.scene.materials import refractive_index
 
 NM = 1e-6
@@ -163,6 +163,7 @@ class Imager:
     spread: of the light of a mode; each: modes for every position of the source, 0 for one that stands for all of it.
     """
 
+    source: Source
     receiver: Receiver
     plane: Plane
     seen: Survey
@@ -218,7 +219,7 @@ class Imager:
         sampling = Sampling.of(light, (tuple(lows), tuple(highs)), receiver.pixel, distance, lengths, finer)
         spans = [len(s.breaks) - 1 for e in system.elements if isinstance(e.surface, HeightField) for s in e.surface.spaces]
         nodes = sampling.count if dense else tuple(min(n, max(LEAST_NODES, A_SPAN * max(spans, default=0))) for n in sampling.count)
-        return cls(receiver, plane, surveys[0], sampling, spread, nodes, each, upright, exact, watched is None)
+        return cls(system.source, receiver, plane, surveys[0], sampling, spread, nodes, each, upright, exact, watched is None)
 
     def expose(self, lines: list[Line], parameters: Parameters, dtype: torch.dtype = torch.float32) -> WaveImage:
         """The wave image of such lines, at heights {name: (n, m) mm} close to those that samples were chosen for."""
@@ -265,7 +266,7 @@ class Imager:
         if self.spread is None:
             return []
         pixel = self.receiver.pixel
-        return self.spread.parts_on(pixel, even_disc(self.each)) if self.each else [self.spread.on(pixel)]
+        return self.spread.parts_on(pixel, spots(self.source, self.each)) if self.each else [self.spread.on(pixel)]
 
     def masks(self, line: Line, device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """Which samples of an upright screen fall on which of the cut pixels, along each axis."""
