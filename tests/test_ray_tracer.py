@@ -139,7 +139,7 @@ def test_chunks_add_up():
     target = torch.rand(SCREEN.resolution, dtype=torch.float64)
     objective = Objective(scene, field, rays, Filter("cosine", (3, 3)), target, "rms", dtype=torch.float64)
     whole = objective(heights)
-    objective.kept = [Tracer(System.of(scene, field), b) for b in rays.chunks(700)]
+    objective.kept = [(0, Tracer(System.of(scene, field), b)) for b in rays.chunks(700)]
     assert len(objective.kept) > 5
     again = objective(heights)
     assert again.loss == pytest.approx(whole.loss, rel=1e-12)

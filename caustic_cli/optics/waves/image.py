@@ -38,7 +38,7 @@ A_SPAN, LEAST_NODES = 3, 384
 BESIDE = 0.5
 #: Light is watched as far beyond where rays land as so many of the widths over which diffraction blurs.
 BLURS = 2.0
-#: What the misplacement of light that is taken as spread may be, of what diffraction, or a pixel, and the source blur anyway.
+#: What the misplacement of light that is taken as spread may be, of diffraction's blur or a pixel, the larger.
 ALLOWED = 0.25
 #: Points that stand for an extended source where its image is not simply spread, at most, and least of each of its positions.
 EACH, LEAST_EACH = 24, 4
@@ -203,7 +203,7 @@ class Imager:
         spread = spread_of(system, alike[0].landing, device_of(alike[0])) if outer and upright else None
         each = 0 if not outer else max(LEAST_EACH, EACH // max(1, len(system.source.points()[0])))
         if spread is not None:
-            parts = (spread.error / (ALLOWED * math.hypot(max(blur, *receiver.pixel), max(spread.reach())))) ** 2
+            parts = (spread.error / (ALLOWED * max(blur, *receiver.pixel))) ** 2
             each = 0 if parts <= 1.0 else min(each, math.ceil(parts))
             spread = None if each and not max(spread.half) > 0 else spread
         low, high = receiver.extent(plane)
