@@ -160,11 +160,17 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
         waves = [("of light as a wave", f"{seen}, {_wavelengths(figures['wave_wavelengths'])}"),
                  *((f"{name} as a wave", value) for name, value in _absolute(figures, "wave_")),
                  ("details light carries", number("resolvable", "d") + " across")]
+    least = [("least possible", number("least_relative_rms", ".4f") + ", behind the source's blur")] \
+        if "least_relative_rms" in figures else []
+    if "etendue_limit" in figures:
+        least.append(("etendue limit", number("etendue_limit", ".2%") + " of the light on the lens"))
     return [
         ("relative RMS error", number("relative_rms", ".4f") + of_rays),
+        *least,
         ("loss (eq. 5.2.1)", number("loss", ".4e")),
         ("PSNR", number("psnr_db", ".2f") + " dB"),
         ("SSIM", number("ssim", ".4f")),
+        *least,
         ("light on the screen", number("on_screen", ".2%")),
         ("light on the picture", number("on_target", ".2%")),
         ("lost", lost or "nothing"),

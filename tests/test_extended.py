@@ -13,6 +13,7 @@ import torch
 from PIL import Image
 
 from caustic_cli import cli, settings, verdict
+from caustic_cli.console import figures_rows
 from caustic_cli.inverse import extended
 from caustic_cli.inverse.deconvolution import deconvolved
 from caustic_cli.inverse.extended import centre_of, etendue_limit, limits, regular_rays, shift_of
@@ -239,6 +240,8 @@ def test_a_design_comes_close_to_the_least_error(source, _here, capfd):
     assert found["least_relative_rms"] <= found["relative_rms"] + 3 * found["noise"]
     assert found["relative_rms"] < 1.25 * found["least_relative_rms"] + 0.02
     assert 0.0 < found["etendue_limit"] <= 1.0
+    rows = dict(figures_rows(found))
+    assert f"{found['least_relative_rms']:.4f}" in rows["least possible"] and "%" in rows["etendue limit"]
 
 
 def test_resumed_within_a_spread_stage(_here, capfd):

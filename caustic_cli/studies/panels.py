@@ -40,7 +40,10 @@ def write_report(path: Path, target: np.ndarray, image: np.ndarray, heights: np.
         return name if relative is None else f"{name}\nrelative RMS error {relative:.3f}"
 
     if waves is None:
-        shown = [(target, "target"), (image, titled("caustic", figures["relative_rms"]))]
+        title = titled("caustic", figures["relative_rms"])
+        if "least_relative_rms" in figures:
+            title += f", {figures['least_relative_rms']:.3f} possible"
+        shown = [(target, "target"), (image, title)]
     else:
         shown = [(target, "target"), (image, titled("by rays", figures["relative_rms"])),
                  (waves, titled("what light will do (waves)", figures["wave_relative_rms"]))]
