@@ -202,8 +202,8 @@ def without_waves(s: Settings, given: bool) -> str:
         return ""
     if given:
         return "none of the given [[design.stages]] has waves; one with waves = [550.0] refines it at that wavelength"
-    if build_source(s).extended:
-        return "that of an extended source takes many times as long; --waves on refines it all the same"
+    if (seen := _resolution(s, build_source(s))).source > seen.pixel:
+        return "that of a source whose blur is wider than a pixel takes many times as long; --waves on refines it all the same"
     return _not_by_default(s) or f"{LEAST_WAVES} iterations on it would take longer than this quality's time; --waves on takes it"
 
 
@@ -235,7 +235,7 @@ def _wave_stages(s: Settings, source: Source, quality: str, lit: tuple[float, fl
     if asked == "off" or (asked == "auto" and _not_by_default(s)):
         return []
     seen = _resolution(s, source)
-    if asked == "auto" and (source.extended or not seen.matters):
+    if asked == "auto" and (seen.source > seen.pixel or not seen.matters):
         return []
     own = s["source"].get("wavelengths", [])
     plan = wave_refinement(_wave_samples(s, seen, lit), len(own), quality, hurry=asked == "auto")

@@ -24,7 +24,9 @@ from scipy.fft import irfft2, next_fast_len, rfft2
 from caustic_cli.optics.spread import Convolution
 
 #: Iterations until the light is returned, which is still smooth then, and for the least error; how often that is looked at.
-SMOOTH_STEPS, MOST_STEPS, LOOK = 60, 300, 50
+SMOOTH_STEPS, MOST_STEPS, LOOK = 60, 3000, 50
+#: Iterations times cells that are worth their time, about a second, and least iterations.
+WORK, LEAST_STEPS = 3e7, 300
 #: Cells of a pixel, along each axis, that light may be told apart by; finer ones take long.
 FINEST = 2
 #: Part of the least error to which its bound comes before the iterations end.
@@ -46,12 +48,13 @@ class Deconvolved:
     kept: float
 
 
-def deconvolved(target: np.ndarray, spread: Convolution, steps: int = MOST_STEPS) -> Deconvolved:
+def deconvolved(target: np.ndarray, spread: Convolution, steps: int | None = None) -> Deconvolved:
     """The best light behind a source's spread.
 
     Args:
         target: (n, m), not negative, not all zero, any scale.
         spread: of the source on the target's pixels.
+        steps: iterations; None for as many as a second is enough for.
     """
     cut, b, kernel = spread.cut, target / target.mean(), spread.kernel.numpy()
     pixels = tuple(n // cut for n in spread.beside)
@@ -75,6 +78,7 @@ def deconvolved(target: np.ndarray, spread: Convolution, steps: int = MOST_STEPS
     def back(v: np.ndarray) -> np.ndarray:  # the adjoint, times cut^2: the step of the gradient on cells
         return irfft2(rfft2(cells(v), s=frame) * transfer.conj(), s=frame)[: shape[0], : shape[1]]
 
+    steps = steps or int(min(MOST_STEPS, max(LEAST_STEPS, WORK / (shape[0] * shape[1]))))
     reach = back(np.ones_like(b))
     near = reach > REACHES
     x = cells(b)
