@@ -27,6 +27,8 @@ SHIFTS = 0.35
 EXACT, MOST_MODES = 0.04, 24
 #: Points along each axis of an area.
 POINTS = 12
+#: Pixels over which light is spread at least where anything is said of the least error.
+LEAST_REACH = 0.5
 #: Control points along each axis of the offset surface by which this is judged before there is a lens.
 NET = 24
 
@@ -55,7 +57,8 @@ def limits(scene: Scene, target: np.ndarray, field: HeightField | None = None, h
     if not scene.source.extended or scene.source.apart:
         return Limits(None, None)
     spread = shift_of(scene, field, heights)
-    light = None if spread is None else deconvolved(target, spread.on(scene.screen.pixel, FINEST))
+    seen = spread is not None and max(spread.reach()) > LEAST_REACH * max(scene.screen.pixel)
+    light = deconvolved(target, spread.on(scene.screen.pixel, FINEST)) if seen else None
     return Limits(light, etendue_limit(scene))
 
 
