@@ -22,9 +22,9 @@ from caustic_cli.console import Reporter
 from caustic_cli.derive import build_options, build_stages, complete, without_waves
 from caustic_cli.errors import CausticError, InputError, Interrupted
 from caustic_cli.inverse import ranks
-from caustic_cli.inverse.deconvolution import FINEST, SMOOTH_STEPS, deconvolved
+from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
 from caustic_cli.inverse.designer import Designer, State
-from caustic_cli.inverse.extended import centre_of, limits, shift_of
+from caustic_cli.inverse.extended import best_light, centre_of, limits, shift_of
 from caustic_cli.inverse.first import first_surface
 from caustic_cli.inverse.schedule import transport_cells
 from caustic_cli.inverse.target import grey
@@ -226,7 +226,7 @@ def _first_heights(project: Project, lifted: bool) -> torch.Tensor | None:
         cells = transport_cells(max(s.rays for s in designer.stages), not scene.source.collimated)
         spread = shift_of(scene) if designer.stages[0].spread else None
         if spread is not None:
-            light = deconvolved(goal, spread.on(scene.screen.pixel, FINEST), SMOOTH_STEPS)
+            light = best_light(scene, goal, spread, SMOOTH_STEPS)
             scene, goal = replace(scene, source=centre_of(scene), screen=scene.screen.grown(light.beside)), light.light
         found = first_surface(scene, goal, designer.field(0), cells)
         lens = designer.scene.lens

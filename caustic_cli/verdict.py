@@ -23,7 +23,7 @@ from caustic_cli.picture import write_image
 from caustic_cli.project import RENDER, REPORT, WAVE, Project
 from caustic_cli.studies.panels import write_report
 from caustic_cli.studies.retrace import FINAL_RAYS, retrace, white_level
-from caustic_cli.studies.waves import FINER, unseen_figures, wave_figures
+from caustic_cli.studies.waves import unseen_figures, wave_figures
 
 #: Points along each side of the aperture at which the report draws the surface.
 REPORT_SAMPLES = 401
@@ -52,8 +52,8 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
     waves = any(s.waves for s in designer.stages[: state.stage + 1])
     light, seen = None, Resolution.before(scene, tuple(project.settings["target"]["size"]))
 
-    def as_waves(heights: torch.Tensor, finer: float = FINER) -> tuple[WaveImage | None, dict]:
-        return wave_figures(scene, field, heights.to(device), target, seen, finer=finer, required=designer.options.waves)
+    def as_waves(heights: torch.Tensor) -> tuple[WaveImage | None, dict]:
+        return wave_figures(scene, field, heights.to(device), target, seen, required=designer.options.waves)
 
     exposure, figures = trace(state.heights)
     if waves:
@@ -65,7 +65,7 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
         _, began = trace(start, noise=False)
         of_start = None
         if waves:
-            of_start, more = as_waves(start, 1.0)
+            of_start, more = as_waves(start)
             began |= more
         if _worse(figures, began):
             state = replace(designer.showing(state, start), reason=f"{state.reason}; its start was better and is kept")

@@ -103,6 +103,7 @@ def test_a_design_changes_its_source_and_resumes_inside_any_stage(capfd):
 @pytest.mark.parametrize("arguments, message", [
     (["--source", "sun"], "--source must be one of plane, point, grid, disc, rays, got 'sun'"),
     (["--source", "point", "--source-position", "1,2"], "--source-position must be 3 numbers parted by commas"),
+    (["--wavelengths", "abc"], "--wavelengths must be wavelengths in nm, each with a weight or without, like 450:2,550, got 'abc'"),
     (["--source", "point", "--source-position", "0,0,5"], "--source-position must lie before the lens"),
     (["--source", "grid", "--source-position", "0,0,-5", "--source-position", "1,0,-5"], "is its centre, one"),
     (["--source", "point", "--cone", "95"], "--cone must be"),

@@ -112,8 +112,8 @@ def numbers(option: str, text: str, count: tuple[int, ...], separator: str = r"[
     except ValueError:
         values = ()
     if len(values) not in count or not all(math.isfinite(v) for v in values):
-        form = form or "a number or two like 10x8" if separator.startswith("[x") else f"{max(count)} numbers parted by commas"
-        raise InputError(f"{option} must be {form}, got {text!r}")
+        usual = "a number or two like 10x8" if separator.startswith("[x") else f"{max(count)} numbers parted by commas"
+        raise InputError(f"{option} must be {form or usual}, got {text!r}")
     return values
 
 

@@ -19,7 +19,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.fft import irfft2, next_fast_len, rfft2
+import torch
+from torch import Tensor
 
 from caustic_cli.optics.spread import Convolution
 
@@ -31,8 +32,8 @@ WORK, LEAST_STEPS = 3e7, 300
 FINEST = 2
 #: Part of the least error to which its bound comes before the iterations end.
 TIGHT = 0.02
-#: Light farther out than where this part of it reaches the screen is none.
-REACHES = 1e-3
+#: Light of which no more than this part, rounding, reaches the screen does not count.
+REACHES = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,50 +57,43 @@ def deconvolved(target: np.ndarray, spread: Convolution, steps: int | None = Non
         spread: of the source on the target's pixels.
         steps: iterations; None for as many as a second is enough for.
     """
-    cut, b, kernel = spread.cut, target / target.mean(), spread.kernel.numpy()
+    cut, b = spread.cut, torch.from_numpy(target / target.mean())
     pixels = tuple(n // cut for n in spread.beside)
-    shape = tuple(cut * (n + 2 * a) for n, a in zip(b.shape, pixels, strict=True))
-    frame = tuple(next_fast_len(n + k // 2, real=True) for n, k in zip(shape, kernel.shape, strict=True))
-    padded = np.zeros(frame)
-    padded[: kernel.shape[0], : kernel.shape[1]] = kernel
-    transfer = rfft2(np.roll(padded, tuple(-(n // 2) for n in kernel.shape), (0, 1)))
-    inner = tuple(slice(a, a + n) for a, n in zip(pixels, b.shape, strict=True))
+    around = (spread.beside[1],) * 2 + (spread.beside[0],) * 2
 
-    def cells(v: np.ndarray) -> np.ndarray:
-        wide = np.pad(v, tuple((a, a) for a in pixels))
-        return wide.repeat(cut, 0).repeat(cut, 1) if cut > 1 else wide
+    def cells(v: Tensor) -> Tensor:
+        return torch.nn.functional.pad(v.repeat_interleave(cut, 0).repeat_interleave(cut, 1), around)
 
-    def whole(x: np.ndarray) -> np.ndarray:
-        return x.reshape(shape[0] // cut, cut, shape[1] // cut, cut).mean((1, 3)) if cut > 1 else x
+    def seen(x: Tensor) -> Tensor:
+        return spread(x) / cut**2
 
-    def seen(x: np.ndarray) -> np.ndarray:
-        return whole(irfft2(rfft2(x, s=frame) * transfer, s=frame)[: shape[0], : shape[1]])[inner]
+    def back(v: Tensor) -> Tensor:  # the adjoint, times cut^2: the step of the gradient on cells
+        return spread.whole(cells(v), adjoint=True)
 
-    def back(v: np.ndarray) -> np.ndarray:  # the adjoint, times cut^2: the step of the gradient on cells
-        return irfft2(rfft2(cells(v), s=frame) * transfer.conj(), s=frame)[: shape[0], : shape[1]]
-
-    steps = steps or int(min(MOST_STEPS, max(LEAST_STEPS, WORK / (shape[0] * shape[1]))))
-    reach = back(np.ones_like(b))
+    steps = steps or int(min(MOST_STEPS, max(LEAST_STEPS, WORK / cells(b).numel())))
+    reach = back(torch.ones_like(b))
     near = reach > REACHES
     x = cells(b)
     ahead, t, c, light, kept, least, bound = x, 1.0, 0.0, None, 1.0, math.inf, 0.0
     for k in range(1, steps + 1):
         y = seen(ahead)
-        moved = np.where(near, np.maximum(ahead + back(b + c - y), 0.0), 0.0)
+        moved = torch.where(near, (ahead + back(b + c - y)).clamp_min(0.0), 0.0)
         c += 0.5 * (1.0 - float(y.mean()))
         if float(((ahead - moved) * (moved - x)).sum()) > 0.0:
             t = 1.0
         after = 0.5 * (1.0 + math.sqrt(1.0 + 4.0 * t * t))
         ahead, x, t = moved + (t - 1.0) / after * (moved - x), moved, after
         if k == min(SMOOTH_STEPS, steps):
-            light, kept = whole(x), float(seen(x).sum() * cut**2 / x.sum())
+            n, m = (s // cut for s in x.shape)
+            light = x.reshape(n, cut, m, cut).mean((1, 3)).numpy()
+            kept = float(seen(x).sum() * cut**2 / x.sum())
         if k % LOOK == 0 or k == steps:
             y = seen(x)
             y = y / y.mean()
             nu = b + c - y
-            dual = float((nu * b).sum() - 0.5 * (nu * nu).sum() - b.size * (back(nu)[near] / reach[near]).max())
-            least = min(least, math.sqrt(float(((y - b) ** 2).mean())))
-            bound = max(bound, math.sqrt(max(0.0, 2.0 * dual / b.size)))
+            dual = float((nu * b).sum() - 0.5 * nu.square().sum() - b.numel() * (back(nu)[near] / reach[near]).max())
+            least = min(least, float((y - b).square().mean().sqrt()))
+            bound = max(bound, math.sqrt(max(0.0, 2.0 * dual / b.numel())))
             if bound > (1.0 - TIGHT) * least:
                 break
     return Deconvolved(light, pixels, least, bound, kept)

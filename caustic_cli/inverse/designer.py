@@ -16,14 +16,15 @@ from torch import Tensor
 
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse import ranks
-from caustic_cli.inverse.deconvolution import FINEST, SMOOTH_STEPS, deconvolved
-from caustic_cli.inverse.extended import regular_rays, shift_of
+from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
+from caustic_cli.inverse.extended import best_light, regular_rays, shift_of
 from caustic_cli.inverse.limits import within_limits
 from caustic_cli.inverse.losses import parse
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.parametrisation import INITIAL, NETWORKS, PRECONDITIONERS, FreeHeights, Heights, parametrise
 from caustic_cli.inverse.schedule import Stage
 from caustic_cli.inverse.steps import Adam, Newtonlike
+from caustic_cli.inverse.target import grey
 from caustic_cli.inverse.waves import WaveObjective
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.sampling import stream
@@ -248,14 +249,14 @@ class Designer:
                                  blur=stage.blur, apron=stage.apron, max_slope=o.max_slope, min_radius=o.min_radius,
                                  dtype=o.dtype, device=self.device)
         if stage.spread and (spread := shift_of(scene, self.field(k), heights.begun())) is not None:
-            goal = self.target if self.target.ndim == 2 else self.target.sum(0)
-            kept = deconvolved(goal.numpy(), spread.on(scene.screen.pixel, FINEST), SMOOTH_STEPS).kept
+            expected = best_light(scene, grey(self.target.cpu().numpy()), spread, SMOOTH_STEPS).kept
             scene, rays, spread = regular_rays(scene, spread, stage, stream(o.seed, f"stage {k}"), self.device)
         else:
-            rays, spread, kept = rays_of(scene, stage.sampler, stage.rays, stream(o.seed, f"stage {k}"), self.device), (), 1.0
+            rays, spread = rays_of(scene, stage.sampler, stage.rays, stream(o.seed, f"stage {k}"), self.device), ()
+            expected = 1.0
         return Objective(scene, self.field(k), rays, stage.filter, self.target, o.loss, blur=stage.blur,
                          filter_target=o.filter_target, apron=stage.apron, max_slope=o.max_slope, min_radius=o.min_radius,
-                         oversample=stage.oversample, spread=spread, kept=kept, dtype=o.dtype)
+                         oversample=stage.oversample, spread=spread, expected=expected, dtype=o.dtype)
 
     def _next(self, state: State, k: int) -> State:
         """The state at the beginning of stage k: the same surface on its net."""

@@ -45,8 +45,8 @@ class Limits:
         """What cannot be."""
         found = []
         if self.light is not None:
-            found.append(f"behind the source's blur no lens comes closer to the picture than {self.light.error:.3g} relative RMS"
-                         f" (proven: {self.light.bound:.3g})")
+            found.append(f"behind the source's blur the best light there can be is {self.light.error:.3g} relative RMS from the"
+                         f" picture (proven: at least {self.light.bound:.3g})")
         if self.etendue is not None:
             found.append(f"etendue lets {self.etendue:.0%} of the light on the lens reach the screen")
         return "; ".join(found)
@@ -58,8 +58,13 @@ def limits(scene: Scene, target: np.ndarray, field: HeightField | None = None, h
         return Limits(None, None)
     spread = shift_of(scene, field, heights)
     seen = spread is not None and max(spread.reach()) > LEAST_REACH * max(scene.screen.pixel)
-    light = deconvolved(target, spread.on(scene.screen.pixel, FINEST)) if seen else None
+    light = best_light(scene, target, spread) if seen else None
     return Limits(light, etendue_limit(scene))
+
+
+def best_light(scene: Scene, target: np.ndarray, spread: Spread, steps: int | None = None) -> Deconvolved:
+    """The best light on a scene's screen behind a source's spread; see `deconvolved`."""
+    return deconvolved(target, spread.on(scene.screen.pixel, FINEST), steps)
 
 
 def shift_of(scene: Scene, field: HeightField | None = None, heights: torch.Tensor | None = None) -> Spread | None:

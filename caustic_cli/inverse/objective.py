@@ -71,13 +71,14 @@ class Objective:
             is nearly a bincount, and yet smooth in the heights.
         spread: what the image of the rays of each point is convolved with, the part of the source that it stands for; empty for
             rays of all of it.  Rays are caught around the screen and the apron as far as their light reaches these.
-        kept: part of the light that the loss expects on screen and apron: what a source spreads beside them is none of its concern.
+        expected: part of the light that the loss asks for on screen and apron; what a source spreads beside them is none of its
+            concern.
         dtype: precision of the rays.
     """
 
     def __init__(self, scene: Scene, field: HeightField, sampler: Rays | Sequence[Rays], filter: Filter, target: Tensor,
                  loss: str, *, blur: float = 0.0, filter_target: bool = True, apron: int = 0, max_slope: float = 0.0,
-                 min_radius: float = 0.0, oversample: int = 1, spread: Sequence[Convolution] = (), kept: float = 1.0,
+                 min_radius: float = 0.0, oversample: int = 1, spread: Sequence[Convolution] = (), expected: float = 1.0,
                  dtype: torch.dtype = torch.float32):
         self.samplers = list(sampler) if isinstance(sampler, Sequence) else [sampler]
         self.device = self.samplers[0].device
@@ -94,7 +95,7 @@ class Objective:
         self.loss = (ColorLoss if scene.colored else Loss)(loss, smooth, blur, apron, wide > 0)
         self.penalty = penalty_of(scene, field, loss, max_slope, min_radius, self.device)
         self.scene, self.field, self.dtype = scene, field, dtype
-        self.expected, self.chunk, self.kept = kept, CHUNK, None
+        self.expected, self.chunk, self.kept = expected, CHUNK, None
         if sum(s.count for s in self.samplers) <= KEPT_RAYS:
             try:
                 self.kept = list(self._tracers())

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -128,12 +128,13 @@ def _even_disc(half: tuple[float, float], cell: tuple[float, float]) -> tuple[np
     return x[inside], y[inside]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Convolution:
     """A kernel (2 a + 1, 2 b + 1) for images whose pixels are cut into `cut` along each axis."""
 
     kernel: Tensor
     cut: int
+    _spectra: dict = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
     def beside(self) -> tuple[int, int]:
@@ -156,14 +157,13 @@ class Convolution:
         return found[: image.shape[0], : image.shape[1]]
 
     def _spectrum(self, shape: tuple[int, int], like: Tensor) -> Tensor:
-        kept = self.__dict__.setdefault("_spectra", {})
         key = shape, like.dtype, like.device
-        if key not in kept:
+        if key not in self._spectra:
             padded = like.new_zeros(shape)
             n, m = self.kernel.shape
             padded[:n, :m] = self.kernel
-            kept[key] = torch.fft.rfft2(torch.roll(padded, (-(n // 2), -(m // 2)), (0, 1)))
-        return kept[key]
+            self._spectra[key] = torch.fft.rfft2(torch.roll(padded, (-(n // 2), -(m // 2)), (0, 1)))
+        return self._spectra[key]
 
 
 def spread_at(scene: Scene, field: HeightField, heights: Tensor) -> Spread | None:
