@@ -65,7 +65,7 @@ class Entry:
         if self.series != TRANSPORT:
             return self.designer.begin()
         began = time.monotonic()
-        first = first_surface(self.designer.scene, target.numpy(), self.designer.field(0))
+        first = first_surface(self.designer.scene, target.numpy(), self.designer.field(0)).heights
         return replace(self.designer.begin(first), seconds=time.monotonic() - began)
 
     @property
@@ -134,13 +134,18 @@ def lens_of_disc() -> tuple[Scene, HeightField, Tensor]:
     full = complete({}, 1.0)
     scene = settings.build_scene(full)
     field = HeightField.of(scene.lens)
-    return scene, field, first_surface(scene, disc(scene, tuple(full["target"]["size"])), field, LEAST_CELLS)
+    return scene, field, first_surface(scene, disc(scene, tuple(full["target"]["size"])), field, LEAST_CELLS).heights
 
 
 def disc(scene: Scene, size: tuple[float, float]) -> np.ndarray:
     """A bright disc in a dark square of `size` mm on the scene's screen: (n_x, n_y)."""
+    return target_on_screen(picture_of_disc(), size, scene.screen)
+
+
+def picture_of_disc() -> np.ndarray:
+    """The same, (CELLS, CELLS)."""
     x = (np.arange(CELLS) + 0.5) * 2.0 / CELLS - 1.0
-    return target_on_screen((np.hypot(x[:, None], x) <= DISC).astype(float), size, scene.screen)
+    return (np.hypot(x[:, None], x) <= DISC).astype(float)
 
 
 def plans(scene: Scene, full: Settings, dtype: torch.dtype | None = None,

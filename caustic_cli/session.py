@@ -26,6 +26,7 @@ from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.extended import best_light, centre_of, limits, shift_of
 from caustic_cli.inverse.first import first_surface
+from caustic_cli.inverse.reach import refuse_unreachable
 from caustic_cli.inverse.schedule import transport_cells
 from caustic_cli.inverse.target import grey
 from caustic_cli.optics.emission.measured import coarse_words
@@ -95,18 +96,30 @@ def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: d
         if not force and (same := reuse.same_design(path, project.asked)):
             return replace(same[0], found=same[1]), None
         place.check(path, force)  # before the transport, which may take a minute
-        _designer(project, "cpu")  # builds and so checks scene, target, stages, options
-        fixed = "thickness" in said.get("lens", {})
-        first = _first_heights(project, lifted=fixed)
-        if first is not None and _make_room(full, said, first):
-            _designer(project, "cpu")
-            first = _first_heights(project, lifted=fixed)
-        if first is not None:
-            first = _designer(project, "cpu")[0].within_limits(State(first))
+        designer, goal = _designer(project, "cpu")  # builds and so checks scene, target, stages, options
+        refuse_unreachable(designer.scene, grey(goal))
+        first = first_heights(project, said)
     except InputError as error:  # about a project.toml that is not written yet
         raise InputError(settings.as_options(str(error).removeprefix(f"{path / TOML}: "), given)) from error
     place.settle(project, force)
     return project, first
+
+
+def first_heights(project: Project, said: dict) -> torch.Tensor | None:
+    """The heights that a design begins from, None for the offset surface; thickness and height range of the project's settings
+    become what they need, but for what was `said`.
+
+    Raises:
+        InputError: as of `begin`.
+    """
+    fixed, lens = "thickness" in said.get("lens", {}), project.settings["lens"]
+    first, middle = _solved(project, fixed)
+    if middle is not None:
+        lens["thickness"] = middle
+    if first is not None and _make_room(project.settings, said, first) and middle is None:
+        _designer(project, "cpu")
+        first, _ = _solved(project, fixed)
+    return None if first is None else _designer(project, "cpu")[0].within_limits(State(first))
 
 
 def find(target: Path, out: Path | None) -> Project:
@@ -160,7 +173,7 @@ def resume(project: Project, iterations: int | None, time_limit: float | None, d
         designer, target = _designer(project, device)
         begun = (project.path / CHECKPOINT).exists()  # if not, it was killed before its first checkpoint
         before = project.load() if begun else None
-        state = before.state if begun else designer.begin(_first_heights(project, lifted=True))
+        state = before.state if begun else designer.begin(_solved(project, fixed=True)[0])
         if state.stage >= len(designer.stages):
             raise InputError(f"{project.path / TOML}: has {len(designer.stages)} stages, but the checkpoint stands in stage"
                              f" {state.stage + 1}")
@@ -209,17 +222,18 @@ def _designer(project: Project, device: str) -> tuple[Designer, np.ndarray]:
     return Designer(scene, torch.from_numpy(target), stages, chosen, device), target
 
 
-def _first_heights(project: Project, lifted: bool) -> torch.Tensor | None:
-    """Heights of the transport start or of --start on the first stage's net, or None for the offset surface.
+def _solved(project: Project, fixed: bool) -> tuple[torch.Tensor | None, float | None]:
+    """Heights of the transport start or of --start on the first stage's net, or None for the offset surface; and the thickness that
+    goes with them, None if it is the project's.
 
-    lifted: raise a transport start that would reach below the least thickness, which the user fixed: light follows slopes.
+    fixed: of the thickness by the user; so raise a transport start that would reach below the least one: light follows slopes.
 
     Raises:
         InputError: no such project or surface, its lens is of another size, or transport cannot reach the picture.
     """
     start = project.settings["design"]["start"]
     if start == "offset":
-        return None
+        return None, None
     if start == "transport":
         designer, target = _designer(project, "cpu")
         scene, goal = designer.scene, grey(target)
@@ -228,13 +242,13 @@ def _first_heights(project: Project, lifted: bool) -> torch.Tensor | None:
         if spread is not None:
             light = best_light(scene, goal, spread, SMOOTH_STEPS)
             scene, goal = replace(scene, source=centre_of(scene), screen=scene.screen.grown(light.beside)), light.light
-        found = first_surface(scene, goal, designer.field(0), cells)
+        found = first_surface(scene, goal, designer.field(0), cells, fixed)
         lens = designer.scene.lens
-        short = lens.z_in + lens.min_thickness - float(found.min())
-        return found + 1.01 * short if lifted and short > 0 else found
+        short = lens.z_in + lens.min_thickness - float(found.heights.min())
+        return found.heights + 1.01 * short if fixed and short > 0 else found.heights, found.middle
     net = _designer(project, "cpu")[0].field(0)
     if Path(start).suffix.lower() in SUFFIXES and not Path(start).is_dir():
-        return onto(*read_surface(start, net.half_size), net)
+        return onto(*read_surface(start, net.half_size), net), None
     if not is_project(Path(start)):
         raise InputError("[design] start must be transport, offset, a project directory or a lens surface"
                          f" ({', '.join(SUFFIXES)}), got {start!r}")
@@ -243,7 +257,7 @@ def _first_heights(project: Project, lifted: bool) -> torch.Tensor | None:
     if other.settings["lens"]["size"] != project.settings["lens"]["size"]:
         raise InputError(f"[design] start: the lens of {start} is {other.settings['lens']['size']} mm, not"
                          f" {project.settings['lens']['size']} mm")
-    return onto(field, checkpoint.state.heights, net)
+    return onto(field, checkpoint.state.heights, net), None
 
 
 def _make_room(full: dict, said: dict, first: torch.Tensor) -> bool:

@@ -91,7 +91,8 @@ SCHEMA: dict[str, dict[str, Key]] = {
         "color": Key("flag", "red, green and blue apart, at the source's three wavelengths"),
     },
     "design": {
-        "loss": Key("text", "weighted sum of rms (eq. 5.2.1), rms-light, throughput, diffusion, uniformity, laplacian, curvature"),
+        "loss": Key("text", "weighted sum of rms (eq. 5.2.1), rms-light, throughput, light, diffusion, uniformity, laplacian,"
+                            " curvature"),
         "max_slope": Key("number", "limit of the surface's slope; 0 for none"),
         "min_radius": Key("number", "mm, least radius of concave places (the tool's); 0 for any"),
         "optimizer": Key("text", "lbfgs or adam"),

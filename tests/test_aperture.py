@@ -136,7 +136,7 @@ def test_transport_to_a_picture_from_a_circle():
     scene, field, _ = rounded(make(control=(40, 40), size=(8.0, 8.0)))
     target = np.zeros(scene.screen.resolution)
     target[12:52, 10:40] = 1.0
-    first = first_surface(scene, target, field, 64)
+    first = first_surface(scene, target, field, 64).heights
     image = expose(scene, field, first, rays_of(scene, "stratified", 400_000)).image.numpy()
     assert image[12:52, 10:40].sum() / image.sum() > 0.97
     inner = image[15:49, 13:37]

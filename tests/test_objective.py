@@ -201,7 +201,7 @@ def test_three_wavelengths_keep_their_graphs(kind, fresnel, kernels):
 
         target = made.loss.target
 
-        def forward(self, image, leaving, penalty):
+        def forward(self, image, leaving, penalty, entering):
             return (image * towards).sum() + 3.0 * leaving + penalty
 
     def gradient(of: Scene) -> torch.Tensor:

@@ -11,6 +11,7 @@ import typer
 from caustic_cli import console
 from caustic_cli.commands import options
 from caustic_cli.errors import InputError
+from caustic_cli.scene import checks
 
 EXAMPLES = """Examples:
 
@@ -19,26 +20,29 @@ EXAMPLES = """Examples:
   caustic convergence flame.caustic --study design --seconds 20
 """
 
-STUDIES = ("intersection", "rays", "reconstruction", "precision", "effects", "design", "diffraction")
+STUDIES = ("intersection", "rays", "reconstruction", "precision", "effects", "design", "diffraction", "light")
 #: What the progress of a study counts.
-UNITS = {"intersection": "evaluations", "effects": "effects", "design": "turns", "diffraction": "cases"}
+UNITS = {"intersection": "evaluations", "effects": "effects", "design": "turns", "diffraction": "cases", "light": "lenses"}
 
 
 def run(
     project: Annotated[Path | None, typer.Argument(metavar="[PROJECT]", help="Project made by caustic design; without one, the"
                                                    " sphere a design begins from (intersection: the scene of the thesis' table"
-                                                   " D.3; design: a bright disc).", show_default=False)] = None,
+                                                   " D.3; design: a bright disc; light: the same, from an LED 3 mm before"
+                                                   " the lens).", show_default=False)] = None,
     study: Annotated[str, typer.Option(help="intersection: of rays and surface, by the thesis' triangle mesh and by Newton's"
                                        " method; rays: samplers; reconstruction: filters; precision: float32 and float64;"
                                        " effects: each on and off; design:"
                                        " optimisers, networks and control nets; diffraction: rays against waves over lens"
-                                       " size, wavelength and source size.")] = "intersection",
+                                       " size, wavelength and source size; light: the picture against the light that is kept, over"
+                                       " thickness and the loss' weight of light.")] = "intersection",
     rays: Annotated[str | None, typer.Option(metavar="N", help="Rays of the largest setting; the reference takes 16 times as"
                                              " many.  Of intersection: rays intersected; of design: rays of a retrace."
                                              "  [default: by study, about half a minute in all]")] = None,
     repeats: Annotated[int | None, typer.Option(help="Rounds, each with fresh rays (intersection: the same); the times' median and"
                                                 " range are reported.  [default: 3; intersection: 9]")] = None,
-    seconds: Annotated[float | None, typer.Option(help="Of design: for each contender.  [default: 4]")] = None,
+    seconds: Annotated[float | None, typer.Option(help="Of design: for each contender.  [default: 4]  Of light: for each"
+                                                  " lens.  [default: 10]")] = None,
     output: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Where CSV, JSON and PNG go.")]
     = Path("convergence"),
     force: options.Force = False,
@@ -56,9 +60,9 @@ def run(
     if study not in STUDIES:
         raise InputError(f"--study must be one of {', '.join(STUDIES)}, got {study!r}")
     count = options.rays("--rays", rays) if rays else None
-    for option, given, for_study in (("--seconds", seconds is not None, study == "design"),
-                                     ("--repeats", repeats is not None, study not in ("design", "diffraction")),
-                                     ("--dtype", dtype is not None, study != "intersection")):
+    for option, given, for_study in (("--seconds", seconds is not None, study in ("design", "light")),
+                                     ("--repeats", repeats is not None, study not in ("design", "diffraction", "light")),
+                                     ("--dtype", dtype is not None, study not in ("intersection", "light"))):
         if given and not for_study:
             raise InputError(f"{option} has no meaning for --study {study}: leave it out")
     precision = options.dtype_of(dtype) if dtype else None
@@ -66,11 +70,11 @@ def run(
         raise InputError(f"{output}: is a file; a directory for CSV, JSON and PNG is needed")
     device = options.start_torch(device, threads, say)
 
-    from caustic_cli.studies import diffraction, effects, intersection, report, training  # noqa: PLC0415
+    from caustic_cli.studies import diffraction, effects, intersection, light, report, training  # noqa: PLC0415
 
     if output.is_dir():
         plots = {"intersection": intersection.PLOTS, "design": training.PLOTS, "effects": effects.PLOTS,
-                 "diffraction": diffraction.PLOTS}.get(study)
+                 "diffraction": diffraction.PLOTS, "light": light.PLOTS}.get(study)
         report.refuse_foreign_files(report.paths_of(study, output, plots), force)
     opened = _open(project)
     with say.progress(None) as show:
@@ -86,6 +90,12 @@ def run(
             scene, target, entries = contest.entries_of(opened[0] if opened else None, device, precision, seed)
             found = training.run_training(scene, target, entries, seconds=seconds, seed=seed or 0, rays=count, device=device,
                                           progress=tell)
+        elif study == "light":
+            from caustic_cli import tradeoff  # noqa: PLC0415
+
+            each = checks.number("--seconds", light.SECONDS if seconds is None else seconds, 0.0, 1e6, open_low=True)
+            count_of, lenses = tradeoff.lenses(opened[0] if opened else None, each, device)
+            found = light.run_light(lenses, count_of, rays=count, seed=seed or 0, device=device, progress=tell)
         elif study == "diffraction":
             from caustic_cli.contest import lens_of_disc  # noqa: PLC0415
 

@@ -74,8 +74,9 @@ def run(
                                         " points or a small net]")] = None,
     quality: Annotated[Text, typer.Option(help="draft, standard or fine.  [default: standard]")] = None,
     rays: Annotated[Text, typer.Option(metavar="N", help="Rays of the last stage.  [default: by quality]")] = None,
-    loss: Annotated[Text, typer.Option(help="rms (eq. 5.2.1), rms-light, where every ray counts, throughput, diffusion,"
-                                       " uniformity, laplacian, curvature; or a weighted sum: 'rms-light + 0.01 laplacian'."
+    loss: Annotated[Text, typer.Option(help="rms (eq. 5.2.1), rms-light, where every ray counts, throughput, light (what does"
+                                       " not reach the screen), diffusion, uniformity, laplacian, curvature; or a weighted sum:"
+                                       " 'rms-light + 0.01 laplacian'."
                                        "  [default: rms-light]")] = None,
     waves: Annotated[Text, typer.Option(metavar="auto|on|off", help="Refine the wave image after the ray image: where diffraction"
                                         " matters and time allows, always, or never.  [default: auto]")] = None,

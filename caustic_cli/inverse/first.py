@@ -1,18 +1,14 @@
-"""The first surface of a design by transport: what lights the exit surface, and the heights that send it onto the picture.
+"""The first surface of a design by transport: the heights that send what lights the exit surface onto the picture.
 
-Notation
-    p = (x, y, z)   a point of the exit surface; o = (x_0, y_0, z_0) the source, h its distance before the entrance
-    s               tangents of the ray's direction from the source, (d_x, d_y) / d_z; q = |s|
-    f               power on the exit surface, seen along z, per area
-
-A ray of tangent q crosses the entrance at h q from the axis through the source and the glass under it by t q', with
-q' = q / sqrt(n^2 (1 + q^2) - q^2) by Snell; t is the height of p above the entrance.  So the point p is reached by the q with
-h q + t q' = |(x - x_0, y - y_0)|, and f = I(q) (1 - R(q)) (1 + q^2)^(-3/2) |d(s_x, s_y) / d(x, y)|.
+Light of a source close by can be lost: it leaves by the sides of a thick lens, and what reaches a thin one asks for more depth than
+that has.  So where much is lost, surfaces of several heights are solved for, each cut off at the least thickness, and only from
+the light that they do send to the picture: what falls on the cut, or cannot be refracted so far, counts for nothing.  The one is
+taken that keeps most.
 """
 
 from __future__ import annotations
 
-import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -21,49 +17,197 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.inverse import start
-from caustic_cli.inverse.target import overlap
+from caustic_cli.inverse.incidence import incident
 from caustic_cli.inverse.transport import corners
-from caustic_cli.optics.emission.measured import irradiance
-from caustic_cli.optics.interface import reflectance
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
-from caustic_cli.scene.sources.distribution import relative
 
 #: Source cells along the lens' longer side: a picture of 250 x 250 pixels is resolved, and they are cheap.
 CELLS = 256
-#: Newton steps for q; its function is concave, so from the greater of two lower bounds each step stays below the root.
-STEPS = 40
 #: How much higher a net may be than the surface it was interpolated from.
 OVERSHOOT = 2.0
 #: Surfaces solved for in turn where the light depends on the surface it meets.
-PASSES = 2
+PASSES = 3
+#: Light where a near source has none to give, in parts of the mean: it costs as much of the picture, and saves many steps.
+DARKEST = 0.02
+#: Cells on which the height of a near source's lens is chosen; one that sends this part of the light on it to the screen will do.
+FEW_CELLS, WELL = 64, 0.7
+#: Heights of the surface's middle that are tried where one sends less, in parts of the lens' thickness.
+TRIED = (0.3, 0.45, 0.65, 1.5, 2.2, 3.3)
+#: Cells along which light has nowhere to go that are left out at most before the picture counts as out of reach.
+RETRIES = 4
+UNREACHED = ("no light of the source that meets the lens can be refracted to the picture by a surface over this aperture; a picture"
+             " nearer the light's way, or a source farther away, is needed")
 
 
-def first_surface(scene: Scene, target: np.ndarray, field: HeightField, cells: int = CELLS) -> Tensor:
-    """Control heights (n, m) mm float64 of a lens that throws the picture, from the light of the source's centre.
+@dataclass(frozen=True, eq=False)
+class First:
+    """A first surface: its control heights (n, m) mm float64; of a near source also the part of the light on the lens that it sends
+    to the screen, and the height of its middle, mm."""
+
+    heights: Tensor
+    kept: float | None = None
+    middle: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """Corners x (n + 1,), y (m + 1,) of source cells over the lens of a scene, and its target."""
+
+    scene: Scene
+    target: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+
+    @classmethod
+    def of(cls, scene: Scene, target: np.ndarray, cells: int) -> _Grid:
+        half = scene.lens.half_size
+        shape = tuple(max(3, round(cells * r / max(half))) for r in half)  # four corners carry a cubic
+        return cls(scene, target, corners(shape[0], half[0]), corners(shape[1], half[1]))
+
+    @property
+    def offset(self) -> np.ndarray:
+        """Heights of the offset surface."""
+        offset = self.scene.lens.offset
+        return offset.thickness + offset.sag(self.x[:, None], self.y[None, :])
+
+    @property
+    def floor(self) -> float:
+        """The least height that the lens may have."""
+        return self.scene.lens.z_in + self.scene.lens.min_thickness
+
+    def scaled(self, values: np.ndarray, onto: _Grid) -> np.ndarray:
+        """What these corners have, at those of another grid."""
+        return RectBivariateSpline(self.x, self.y, values)(onto.x, onto.y)
+
+    def solved(self, light: np.ndarray, directions, mean: float, again: start.Start | None = None, **options) -> start.Start:
+        """The surface of this mean height that sends the light to the picture."""
+        scene = self.scene
+        if not scene.source.distant and not light.all():
+            options["darkest"] = DARKEST
+        return start.surface(light, self.target, scene.lens.half_size, scene.screen.half_size, scene.lens.bend, scene.screen.z,
+                             mean, directions, centre=scene.screen.shift,
+                             start=None if again is None else again.transport.potential, **options)
+
+    def above(self, z: np.ndarray) -> np.ndarray:
+        """Part of each cell's corners where the surface is not cut off."""
+        return _mean((z > self.floor).astype(float))
+
+    def kept(self, z: np.ndarray) -> float:
+        """Part of the light on the lens that a surface, cut off at the least thickness, sends to the screen."""
+        scene, lens, screen = self.scene, self.scene.lens, self.scene.screen
+        z = np.maximum(z, self.floor)
+        on_lens = incident(scene, self.x, self.y, np.full_like(z, lens.z_in))[0].sum()
+        light, directions = incident(scene, self.x, self.y, z)
+        surface = RectBivariateSpline(self.x, self.y, z)
+        at = np.broadcast_arrays(self.x[:, None], self.y[None, :])
+        u, v, part = start.thrown(*at, z, surface(self.x, self.y, dx=1), surface(self.x, self.y, dy=1), directions, lens.bend,
+                                  screen.z, "none" if lens.fresnel == "none" else "exact")
+        on = (np.abs(u - screen.shift[0]) <= screen.half_size[0]) & (np.abs(v - screen.shift[1]) <= screen.half_size[1])
+        return float((light * self.above(z) * _mean(np.where(on, part, 0.0))).sum() / on_lens) if on_lens > 0 else 0.0
+
+    def cut(self, z: np.ndarray, middle: float, passes: int, again: start.Start | None = None) -> _Cut:
+        """The surface of this height in its middle that sends what light it can to the picture, cut off at the least thickness.
+
+        Args:
+            z: heights to begin from.
+            again: a surface much like it, on these cells.
+
+        Raises:
+            InputError: no light can be refracted to the picture.
+        """
+        reached = 1.0
+        for _ in range(passes):
+            z = np.maximum(z + middle - _middle(z), self.floor)
+            light, directions = incident(self.scene, self.x, self.y, z)
+            for left in range(RETRIES, -1, -1):
+                lit = light * self.above(z) * reached
+                if not lit.max() > 0:
+                    raise InputError(UNREACHED)
+                try:
+                    again = self.solved(lit, directions, float(z.mean()), again, corrections=1)
+                    break
+                except start.OutOfReach as error:
+                    if not left:
+                        raise
+                    reached = reached * _mean(~error.where)
+            z = again.heights
+        z = z + middle - _middle(z)
+        return _Cut(np.maximum(z, self.floor), middle, max(0.0, self.floor - float(z.min())), again)
+
+
+@dataclass(frozen=True, eq=False)
+class _Cut:
+    """Heights of a cut surface, that of its middle, how far it would reach below the cut, mm, and what it was solved by."""
+
+    z: np.ndarray
+    middle: float
+    short: float
+    found: start.Start
+
+
+def first_surface(scene: Scene, target: np.ndarray, field: HeightField, cells: int = CELLS, fixed: bool = False) -> First:
+    """A lens that throws the picture, from the light of the source's centre.
 
     Args:
         scene: source, lens and screen.
         target: (n_x, n_y) irradiance on its screen.
         field: spline spaces of the heights.
         cells: source cells along the lens' longer side.
+        fixed: the thickness is the user's own, and none other is tried.
 
     Raises:
         InputError: the picture is out of reach of refraction.
     """
-    lens, half = scene.lens, scene.lens.half_size
-    shape = tuple(max(3, round(cells * r / max(half))) for r in half)  # four corners carry a cubic
-    x, y = corners(shape[0], half[0]), corners(shape[1], half[1])
-    z = lens.offset.thickness + lens.offset.sag(x[:, None], y[None, :])
-    mean, found = float(z.mean()), None
-    for _ in range(1 if scene.source.distant else PASSES):
-        light, directions = _light(scene, x, y, z, shape)
-        if lens.round:
-            light = light * _part_within(x, y, half[0])
-        found = start.surface(light, target, half, scene.screen.half_size, lens.bend, scene.screen.z, mean, directions,
-                              centre=scene.screen.shift, start=None if found is None else found.transport.potential)
-        z = found.heights
-    spline = RectBivariateSpline(x, y, z)
+    grid, lens = _Grid.of(scene, target, cells), scene.lens
+    z = grid.offset
+    if scene.source.distant or lens.mirror:
+        found = None
+        for _ in range(1 if scene.source.distant else PASSES):
+            found = grid.solved(*incident(scene, grid.x, grid.y, z), float(grid.offset.mean()), found)
+            z = found.heights
+        return First(_net(grid, z, field))
+    few = _Grid.of(scene, target, min(cells, FEW_CELLS))
+    best = _best(few, lens.offset.thickness, fixed)
+    scale = few.scaled(best.found.transport.potential, grid)
+    again = replace(best.found, transport=replace(best.found.transport, potential=scale))
+    found = grid.cut(few.scaled(best.z, grid), best.middle, 1, again)
+    net = _net(grid, found.z, field)
+    if best.short:  # a spline through a kink undershoots
+        net = net.clamp_min(grid.floor)
+    return First(net, grid.kept(found.z), best.middle)
+
+
+def _best(grid: _Grid, middle: float, fixed: bool) -> _Cut:
+    """The cut surface that keeps most light: of this height in its middle, or of others where it is not fixed."""
+    tried: list[tuple[float, _Cut]] = []
+
+    def attempt(middle: float) -> _Cut | None:
+        try:
+            found = grid.cut(grid.offset, middle, PASSES)
+        except InputError as error:
+            problems.append(error)
+            return None
+        tried.append((grid.kept(found.z), found))
+        return found
+
+    problems: list[InputError] = []
+    found = attempt(middle)
+    if not fixed:
+        if found is not None and found.short:
+            attempt(middle + found.short)
+        if max((kept for kept, _ in tried), default=0.0) < WELL:
+            low = grid.scene.lens.z_in
+            for part in TRIED:
+                attempt(low + part * (middle - low))
+    if not any(kept > 0 for kept, _ in tried):
+        raise problems[0] if problems else InputError(UNREACHED)
+    return max(tried, key=lambda t: t[0])[1]
+
+
+def _net(grid: _Grid, z: np.ndarray, field: HeightField) -> Tensor:
+    """Control heights of the surface with these heights."""
+    spline = RectBivariateSpline(grid.x, grid.y, z)
     at = [torch.linalg.inv(s.matrix(s.greville)) for s in field.spaces]
     values = torch.from_numpy(spline(*(c.numpy() for c in field.control_xy())))
     net = at[0] @ values @ at[1].T
@@ -71,51 +215,12 @@ def first_surface(scene: Scene, target: np.ndarray, field: HeightField, cells: i
     return net if float(net.max() - net.min()) <= OVERSHOOT * float(values.max() - values.min()) else values
 
 
-def _part_within(x: np.ndarray, y: np.ndarray, radius: float, parts: int = 8) -> np.ndarray:
-    """Part of each cell between corners x, y that lies within a circle, from parts x parts points of it."""
-    fine = [np.linspace(c[0], c[-1], 2 * parts * (len(c) - 1) + 1)[1::2] for c in (x, y)]
-    inside = (fine[0][:, None] ** 2 + fine[1][None, :] ** 2 <= radius**2).astype(float)
-    return inside.reshape(len(x) - 1, parts, len(y) - 1, parts).mean((1, 3))
+def _mean(v: np.ndarray) -> np.ndarray:
+    """Of the four corners of each cell."""
+    return 0.25 * (v[1:, 1:] + v[:-1, 1:] + v[1:, :-1] + v[:-1, :-1])
 
 
-def _light(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray, shape) -> tuple[np.ndarray, tuple | None]:
-    """Power in the cells between corners x, y, and the unit directions inside the glass there (None for along z)."""
-    source, lens = scene.source, scene.lens
-    if source.distant:
-        profile = source.profile
-        if profile is None:
-            return np.ones(shape), None
-        for axis in (0, 1):  # the profile's cells, averaged over these
-            covers = overlap(np.linspace(0.0, 1.0, profile.shape[axis] + 1), np.linspace(0.0, 1.0, shape[axis] + 1))
-            profile = covers @ profile if axis == 0 else (covers @ profile.T).T
-        return profile, None
-    x0, y0, z0 = source.centre
-    h, t, n = lens.z_in - z0, z - lens.z_in, lens.inside
-    if h <= 0:
-        raise InputError(f"[source] file: its rays meet at z = {z0:.4g} mm, not before the lens, where a first surface by transport"
-                         " needs a source; --start offset needs none")
-    dx, dy = x[:, None] - x0, y[None, :] - y0
-    rho = np.hypot(dx, dy)
-    q = np.maximum(rho / (h + t / n), (rho - t / math.sqrt((n - 1.0) * (n + 1.0))) / h)
-    for _ in range(STEPS):
-        root = np.sqrt(n * n + (n - 1.0) * (n + 1.0) * q * q)
-        step = (rho - h * q - t * q / root) / (h + t * n * n / root**3)
-        q = q + step
-        if (np.abs(step) <= 1e-14 * q).all():
-            break
-    root = np.sqrt(n * n + (n - 1.0) * (n + 1.0) * q * q)
-    ratio = 1.0 / (h + t / root)  # q / rho
-    sx, sy = dx * ratio, dy * ratio
-    gx, gy = np.gradient(sx, x, y), np.gradient(sy, x, y)
-    cosine = 1.0 / np.sqrt(1.0 + q * q)
-    inside = root * cosine / n
-    power = np.abs(gx[0] * gy[1] - gx[1] * gy[0]) * cosine**3
-    if lens.fresnel != "none":
-        power *= 1.0 - reflectance("exact", cosine, inside, 1.0 / n)
-    power *= relative(source.intensity, q)
-    cone = min(source.cone_over(lens.half_size, lens.z_in, lens.round), 1.57079)
-    power = np.where(q <= math.tan(cone) * (1 + 1e-9), power, 0.0)
-    light = irradiance(scene, x, y, float(z.mean()))
-    if light is None:
-        light = 0.25 * (power[1:, 1:] + power[:-1, 1:] + power[1:, :-1] + power[:-1, :-1])
-    return light, (sx * cosine / n, sy * cosine / n, inside)
+def _middle(z: np.ndarray) -> float:
+    """Height in the middle of the lens."""
+    n, m = z.shape
+    return float(z[(n - 1) // 2 : n // 2 + 1, (m - 1) // 2 : m // 2 + 1].mean())

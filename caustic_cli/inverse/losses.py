@@ -6,6 +6,8 @@ Every term is a dimensionless root mean square t; r is the relative residual N (
     rms-light   r with P = P_out, the power that leaves the lens: every ray counts.
     throughput  t^2 is the part of the light beside the screen, each ray weighted by its distance from it (1 at the apron's rim):
                 it pulls back where rms-light, which sees how much light is out there but not how far, has no slope
+    light       t^2 is the part of the light on the lens that does not reach the screen, whatever becomes of it; what lands beside
+                the screen counts by its distance, as of throughput, so that there is a slope
     diffusion   the Laplacian of r, with P = P_out: errors that alternate from pixel to pixel count
     uniformity  standard deviation of J over its mean where the target is not dark: no picture is asked for (5.2)
     laplacian, curvature    of the lens, see `penalties`
@@ -22,7 +24,7 @@ from torch import Tensor
 
 from caustic_cli.errors import CausticError, InputError
 
-LOSSES = ("rms", "rms-light", "throughput", "diffusion", "uniformity")
+LOSSES = ("rms", "rms-light", "throughput", "light", "diffusion", "uniformity")
 PENALTIES = ("laplacian", "curvature")
 
 
@@ -85,10 +87,10 @@ class Loss:
         self.distance = torch.maximum(*torch.broadcast_tensors(beyond[0][:, None], beyond[1][None, :])).clamp_min(0.0)
         self.apron = apron
 
-    def __call__(self, image: Tensor, leaving: Tensor, penalty: Tensor | float = 0.0) -> Tensor:
+    def __call__(self, image: Tensor, leaving: Tensor, penalty: Tensor | float = 0.0, entering: Tensor | None = None) -> Tensor:
         """Loss of an image (n_x, n_y) made by rays that carried `leaving` out of the lens: scalar, in units of eq. 5.2.1.
 
-        penalty: sum of weighted squares of what does not concern the image.
+        penalty: sum of weighted squares of what does not concern the image; entering: light on the lens, None for `leaving`.
 
         Raises:
             NoLight: no light to compare.
@@ -97,15 +99,18 @@ class Loss:
         if not float(total.detach()) > 0:
             raise NoLight("no light reaches the screen, so there is nothing to improve: every ray is reflected inside"
                           " the lens or misses the screen; check index, throw, mag and screen size")
-        square = sum(weight * self._square(name, image, leaving, total) for weight, name in self.terms) + penalty
+        entering = leaving if entering is None else entering
+        square = sum(weight * self._square(name, image, leaving, entering, total) for weight, name in self.terms) + penalty
         pixels = self.target.numel()
         if not float(square.detach()) > 0:
             return square / pixels  # a perfect picture: the root's slope is infinite there, the square's is 0
         return square.sqrt() / pixels
 
-    def _square(self, name: str, image: Tensor, leaving: Tensor, total: Tensor) -> Tensor:
+    def _square(self, name: str, image: Tensor, leaving: Tensor, entering: Tensor, total: Tensor) -> Tensor:
         if name == "throughput":
             return (image * self.distance).sum() / (self.apron * leaving)
+        if name == "light":
+            return 1.0 - (image * (1.0 - self.distance / max(self.apron, 1))).sum() / entering
         if name == "uniformity":
             inside = image[self.region]
             if not float(inside.detach().sum()) > 0:  # evenly dark is not what was asked for
@@ -133,8 +138,9 @@ class ColorLoss:
         self.channels = [(k, Loss(text, target[k], blur, apron, region[k])) for k in lit]
         self.target = self.channels[0][1].target
 
-    def __call__(self, image: Tensor, leaving: Tensor, penalty: Tensor | float = 0.0) -> Tensor:
-        """Loss of an image (3, n_x, n_y) by rays that carried `leaving` (3,): scalar, in units of eq. 5.2.1."""
-        losses = torch.stack([loss(image[k], leaving[k], penalty) for k, loss in self.channels])
+    def __call__(self, image: Tensor, leaving: Tensor, penalty: Tensor | float = 0.0, entering: Tensor | None = None) -> Tensor:
+        """Loss of an image (3, n_x, n_y) by rays that carried `leaving` (3,) of `entering` (3,): scalar, in units of eq. 5.2.1."""
+        on_lens = leaving if entering is None else entering
+        losses = torch.stack([loss(image[k], leaving[k], penalty, on_lens[k]) for k, loss in self.channels])
         square = (losses * losses).mean()
         return square.sqrt() if float(square.detach()) > 0 else square

@@ -166,18 +166,18 @@ class Objective:
         shape = tuple(n // (self.oversample // self.cut) for n in self.screen.resolution)
         shape = (3, *shape) if self.scene.colored else shape
         image = torch.zeros((len(self.samplers), *shape), dtype=torch.float64, device=self.device)
-        leaving, parts = image.new_zeros(shape[:-2]), []  # one for each colour
+        leaving, entering, parts = image.new_zeros(shape[:-2]), image.new_zeros(shape[:-2]), []  # one for each colour
         with torch.set_grad_enabled(self.whole):
             for k, traced in self.kept or self._tracers():
                 part = self._see(traced, parameters)
                 image[k] += part[0].detach()
-                leaving = leaving + part[1].detach().double()
+                leaving, entering = leaving + part[1].detach().double(), entering + traced.entering.double()
                 if self.whole:
                     parts.append((k, part))
-        ranks.add(image, leaving)
+        ranks.add(image, leaving, entering)
         image, leaving = image.requires_grad_(), leaving.requires_grad_()
         seen = self._spread_out(image)
-        loss = self.loss(seen, self._due(seen, leaving), penalty)
+        loss = self.loss(seen, self._due(seen, leaving), penalty, entering)
         wanted = [image, leaving, *leaves] if penalty.requires_grad else [image, leaving]
         by_image, by_leaving, *direct = torch.autograd.grad(loss, wanted, allow_unused=True)
         gradients = [torch.zeros_like(heights) for heights in leaves]

@@ -39,6 +39,14 @@ ENOUGH = 0.05  # pixels of e, root mean square, that are left alone
 REPEATS = 4  # of the heights; each takes another factor of about angle^2 / throw off the error
 
 
+class OutOfReach(InputError):
+    """Light that no refraction turns to where the map sends it; where: the corners that it comes from, (n + 1, m + 1) bool."""
+
+    def __init__(self, where: np.ndarray):
+        super().__init__("the picture cannot be reached by refraction: a smaller picture or a longer throw is needed")
+        self.where = where
+
+
 @dataclass(frozen=True, eq=False)
 class Start:
     """A surface and where it sends the light.
@@ -66,7 +74,7 @@ def surface(source, target, source_half, target_half, index, z_screen, thickness
     """Exit surface of a lens that throws `target` on the screen.
 
     Args:
-        source: irradiance of the exit surface, seen along z, (n, m), any unit.
+        source: irradiance of the exit surface, seen along z, (n, m), any unit; where it is 0, the surface just goes on.
         target: the picture, (k, l), any unit; half sizes in mm as for `transport.solve`.
         index: of the glass, with 1 outside; -1 for a mirror.
         z_screen, thickness: the screen's plane and the surface's mean height, mm.
@@ -77,7 +85,8 @@ def surface(source, target, source_half, target_half, index, z_screen, thickness
 
     Raises:
         InputError: as `transport.solve`; an index not above 1, a screen not above the lens, directions that are no unit
-            vectors towards it, or a picture out of reach of refraction.
+            vectors towards it.
+        OutOfReach: light that cannot be refracted to the picture.
     """
     began = time.perf_counter()
     shape = np.shape(source)
@@ -97,9 +106,9 @@ def surface(source, target, source_half, target_half, index, z_screen, thickness
     pixel = [2.0 * h / s for h, s in zip(target_half, np.shape(target), strict=True)]
     aim, shift = (map_.x + centre[0], map_.y + centre[1]), np.zeros((2, *light.shape))
     for again in range(corrections + 1):
-        z = heights(map_, aim, x, y, d, index, z_screen, thickness)
+        z = heights(map_, aim, x, y, d, index, z_screen, thickness, light > 0)
         landing = land(z, x, y, d, index, z_screen)
-        off = np.stack([w - t for w, t in zip(landing, aim, strict=True)])
+        off = np.nan_to_num(np.stack([w - t for w, t in zip(landing, aim, strict=True)]))
         miss = float(np.sqrt((light * (off**2).sum(0)).sum()))
         off = np.stack([gaussian_filter(w, EVEN) for w in off])
         if again == corrections or not np.sqrt((light * (off**2).sum(0)).sum()) > ENOUGH * min(pixel):
@@ -142,14 +151,18 @@ def _directions(directions, shape) -> tuple:
     return d
 
 
-def heights(map_: Transport, aim, x, y, d, index: float, z_screen: float, mean: float) -> np.ndarray:
+def heights(map_: Transport, aim, x, y, d, index: float, z_screen: float, mean: float, lit: np.ndarray) -> np.ndarray:
     """Heights at the corners x (n + 1, 1), y (1, m + 1), mm, whose rays land at `aim` as nearly as a surface can.
 
     Args:
         map_: a map close to `aim` (two arrays, mm): its potential is taken as it is, and only the rest integrated.
         d, index, z_screen, mean: ray directions in the glass, its index, the screen's plane and the heights' mean, mm.
+        lit: (n + 1, m + 1) bool, corners whose light counts; others that are out of reach take the map's own slope.
 
     A mirror's normal is parallel to d - t, as if the index were 1, and t runs back.
+
+    Raises:
+        OutOfReach: no refraction sends light of a lit corner where it is aimed.
     """
     forward, n = math.copysign(1.0, index), abs(index)
     step = float(x[1, 0] - x[0, 0]), float(y[0, 1] - y[0, 0])
@@ -161,9 +174,11 @@ def heights(map_: Transport, aim, x, y, d, index: float, z_screen: float, mean: 
         tx, ty, tz = aim[0] - x, aim[1] - y, z_screen - z
         length = np.sqrt(tx * tx + ty * ty + tz * tz)
         lean = n * d[2] - tz / length  # N_z, up to a factor
-        if not ((index * (d[0] * tx + d[1] * ty + d[2] * tz) > forward * length) & (forward * tz > 0)).all():  # t . N > 0
-            raise InputError("the picture cannot be reached by refraction: a smaller picture or a longer throw is needed")
-        rest = [(t / length - n * v) / lean - s for t, v, s in zip((tx, ty), d, slope, strict=False)]
+        within = (index * (d[0] * tx + d[1] * ty + d[2] * tz) > forward * length) & (forward * tz > 0)  # t . N > 0
+        if not within[lit].all():
+            raise OutOfReach(lit & ~within)
+        rest = [np.where(within, (t / length - n * v) / np.where(within, lean, 1.0) - s, 0.0)
+                for t, v, s in zip((tx, ty), d, slope, strict=False)]
         z = main + integrate(*rest, step)
         z += mean - z.mean()
     return z
@@ -186,11 +201,12 @@ def integrate(sx: np.ndarray, sy: np.ndarray, step: tuple[float, float]) -> np.n
 def land(z: np.ndarray, x, y, d, index: float, z_screen: float) -> tuple[np.ndarray, np.ndarray]:
     """Landing points (n, m), mm, of the rays d through the bicubic spline of z; NaN where totally reflected."""
     spline = RectBivariateSpline(x[:, 0], y[0], z, kx=min(3, len(z) - 1), ky=min(3, z.shape[1] - 1))
-    return thrown(x, y, z, spline(x[:, 0], y[0], dx=1), spline(x[:, 0], y[0], dy=1), d, index, z_screen)
+    return thrown(x, y, z, spline(x[:, 0], y[0], dx=1), spline(x[:, 0], y[0], dy=1), d, index, z_screen)[:2]
 
 
-def thrown(x, y, z, zx, zy, d, index: float, z_screen: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where rays d inside the glass land that leave it at (x, y, z) with slopes zx, zy; NaN where totally reflected."""
+def thrown(x, y, z, zx, zy, d, index: float, z_screen: float, fresnel: str = "none") -> tuple[np.ndarray, ...]:
+    """Where rays d inside the glass land that leave it at (x, y, z) with slopes zx, zy, NaN where totally reflected, and the part
+    of each that passes."""
     shape, backend = z.shape, Torch()  # too few rays to wait for a compiler
 
     def flat(value):
@@ -198,6 +214,6 @@ def thrown(x, y, z, zx, zy, d, index: float, z_screen: float) -> tuple[np.ndarra
 
     origin, slopes, mirror = [flat(c) for c in (x, y, z)], (flat(zx), flat(zy)), index == -1.0
     out = backend.interact(tuple(map(flat, d)), slopes, torch.ones(z.size, dtype=torch.float64), eta=1.0 if mirror else index,
-                           reflects=mirror, fresnel="none")
+                           reflects=mirror, fresnel=fresnel)
     landing = backend.land(tuple(origin), out.direction, (0.0, 0.0, z_screen), IDENTITY, -1.0 if mirror else 1.0)[:2]
-    return tuple(torch.where(out.passes, c, torch.nan).view(shape).numpy() for c in landing)
+    return *(torch.where(out.passes, c, torch.nan).view(shape).numpy() for c in landing), out.power.view(shape).numpy()

@@ -41,7 +41,7 @@ MAX_LATTICE = 1024  # the picture is halved until it has at most so many pixels 
 BOND = 4.0  # border of a missing cell
 COARSE_TOLERANCE, LINEAR_TOLERANCE = 1e-2, 3e-2
 EVENER = (1.0, 0.7, 0.4, 0.2, 0.1, 0.03, 0.0)  # parts of uniform light, if a level fails on the source itself
-DARKEST = 1e-3  # the source is lifted to this part of its mean: a cell without light has no derivative
+DARKEST = 1e-3  # the source is lifted to at least this part of its mean: a cell without light has no derivative
 MAX_CELLS = 4096
 
 
@@ -91,7 +91,8 @@ def corners(n: int, half: float) -> np.ndarray:
     return np.linspace(-half, half, n + 1)
 
 
-def solve(source, target, source_half, target_half, *, start=None, smooth=1.5, tolerance=5e-3, most=10) -> Transport:
+def solve(source, target, source_half, target_half, *, start=None, smooth=1.5, tolerance=5e-3, most=10,
+          darkest=DARKEST) -> Transport:
     """The map that carries `source` onto `target` at least quadratic cost.
 
     Args:
@@ -102,6 +103,7 @@ def solve(source, target, source_half, target_half, *, start=None, smooth=1.5, t
         smooth: width of the average over phi, source cells: a triangle of twice this width; at least 0.5.
         tolerance: light in the wrong cell at which Newton's method stops, a part of the whole.
         most: Newton steps a level.
+        darkest: part of its mean to which the source is lifted where it is darker; the more, the fewer steps.
 
     Raises:
         InputError: a density that is not 2-D, not finite, negative or black, or a size that is not positive.
@@ -113,7 +115,7 @@ def solve(source, target, source_half, target_half, *, start=None, smooth=1.5, t
     if not 0.5 <= smooth <= 16:
         raise InputError(f"smooth must be 0.5 to 16 source cells, got {smooth!r}")
     n, m = f.shape
-    f = np.maximum(f / f.mean(), DARKEST)
+    f = np.maximum(f / f.mean(), darkest)
     f = f[:1, :1] if np.ptp(f) == 0 else f
     f = f / (f.mean() * 4.0 * a * b)
     most_sites = int(n * m * f.mean() ** 2 / (f * f).mean())  # so that where most light is, a cell is not below a source cell

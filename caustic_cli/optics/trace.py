@@ -69,6 +69,9 @@ class Tracer:
         for effect in EFFECTS:
             state = effect.prepare(system, state, requests)
         made = (effect.action(system, requests) for effect in EFFECTS)
+        #: Power that comes through the pupil, () or, with colours, (3,).
+        shape = state.power.shape if state.sample is None else state.sample.shape
+        self.entering = self._of_color(weight * state.power.expand(shape).sum(dtype=torch.float64))
         self.actions: tuple[Action, ...] = tuple(a for a in made if a is not None)
         self.recorded = any(a.detours for a in self.actions)
         self.before: list[Meeting] = []
@@ -143,10 +146,13 @@ class Tracer:
         w = self.weight
         if w != 1.0:
             image, leaving, lost = w * image, w * leaving, {name: w * value for name, value in lost.items()}
-        if self.channel is not None:
-            image, leaving = (torch.stack([t if k == self.channel else torch.zeros_like(t) for k in range(3)])
-                              for t in (image, leaving))
-        return Image(image, leaving, lost, self.start.count)
+        return Image(self._of_color(image), self._of_color(leaving), lost, self.start.count)
+
+    def _of_color(self, value: Tensor) -> Tensor:
+        """The same in this light's channel of three, where the scene has colours."""
+        if self.channel is None:
+            return value
+        return torch.stack([value if k == self.channel else torch.zeros_like(value) for k in range(3)])
 
     # One element.
 

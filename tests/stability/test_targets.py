@@ -71,7 +71,7 @@ def test_transport_start(name, source):
         picture = picture / picture.max()  # as the pictures' reader and `target_on_screen` hand them on
     lens = Lens(size=(10.0, 10.0), control=(19, 19), index=1.5)
     s = Scene(source, lens, Screen((20.0, 20.0), 200.0, (N, N)))
-    heights = first_surface(s, picture, HeightField.of(lens), 48)
+    heights = first_surface(s, picture, HeightField.of(lens), 48).heights
     assert bool(torch.isfinite(heights).all())
     rays = rays_of(s, "stratified", 4000, 1)
     image = expose(s, HeightField.of(lens), heights, rays).image.numpy()
@@ -143,6 +143,6 @@ def test_transport_start_on_repeated_knots(degree):
     lens = Lens(size=(10.0, 10.0), control=(n, n), degree=(degree, degree), knots=(t, t), index=1.5)
     field = HeightField.of(lens)
     s = Scene(PlaneWave(), lens, Screen((20.0, 20.0), 200.0, (N, N)))
-    heights = first_surface(s, pictures()["16 bits"], field, 48)
+    heights = first_surface(s, pictures()["16 bits"], field, 48).heights
     assert bool(torch.isfinite(heights).all())
     assert float(heights.max() - heights.min()) < 2.0  # of a surface that is 0.2 mm high

@@ -1,0 +1,121 @@
+"""What light a picture costs: lenses of one scene whose losses weigh the light that is kept against the picture, and their front.
+
+A lens close to its source keeps the more light the thinner it is, up to a point, and shows the source the larger.  So lenses of
+several thicknesses are designed, each with the loss `rms + w light` for several weights w, and all are judged by rays that no
+design has seen.  A lens is on the Pareto front if none other is both brighter and closer to the picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from caustic_cli import __version__
+from caustic_cli.errors import CausticError
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.scene import Scene, checks
+from caustic_cli.studies.fit import pareto
+from caustic_cli.studies.report import Study, styles
+from caustic_cli.studies.retrace import FINAL_RAYS, retrace
+
+#: Seconds of iterations for each lens, unless said.
+SECONDS = 10.0
+#: Rays of a retrace per pixel.
+RAYS_PER_PIXEL = 64
+
+COLUMNS = {
+    "series": "thickness as --thickness says it, mm",
+    "thickness": "the same, mm",
+    "weight": "of light beside the picture",
+    "loss": "what the lens was designed with: --loss",
+    "error": "relative RMS between the retraced image and the target, each over its own mean, the rays' noise taken off",
+    "noise": "standard error of that",
+    "on_screen": "part of the source's power on the screen",
+    "front": "whether no other lens is both brighter and closer to the picture",
+    "seconds": "of the design's iterations",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """A designed lens: its thickness, mm, the weight of the light, the loss, the scene, the spline spaces and heights (n, m) mm,
+    the target (n_x, n_y), and the seconds its iterations took."""
+
+    thickness: float
+    weight: float
+    loss: str
+    scene: Scene
+    field: HeightField
+    heights: Tensor
+    target: np.ndarray
+    seconds: float
+
+
+def run_light(lenses: Iterable[Lens], count: int, *, rays: int | None = None, seed: int = 0, device: str = "cpu",
+              progress: Callable[[int, int], None] | None = None) -> Study:
+    """Judge lenses one by one.
+
+    Args:
+        count: how many there may be.
+        rays: of every retrace, None for RAYS_PER_PIXEL a pixel.
+        progress: told (lenses done, in all) after each.
+
+    Raises:
+        CausticError: there is none.
+    """
+    rows: list[dict] = []
+    for k, lens in enumerate(lenses):
+        traced = checks.whole("--rays", min(FINAL_RAYS, RAYS_PER_PIXEL * lens.target.size) if rays is None else rays, 256, 1 << 32)
+        _, figures = retrace(lens.scene, lens.field, lens.heights, lens.target, rays=traced, seed=seed, device=device)
+        rows.append({"series": f"{lens.thickness:g} mm", "thickness": lens.thickness, "weight": lens.weight, "loss": lens.loss,
+                     "error": figures["relative_rms"], "noise": figures["noise"], "on_screen": figures["on_screen"],
+                     "seconds": lens.seconds})
+        if progress is not None:
+            progress(k + 1, count)
+    if not rows:
+        raise CausticError("no lens of this scene sends any light to the picture")
+    for row, front in zip(rows, pareto([1.0 - r["on_screen"] for r in rows], [r["error"] for r in rows]), strict=True):
+        row["front"] = bool(front)
+    about = {"version": __version__, "seed": seed, "device": device, "threads": torch.get_num_threads(), "retrace_rays": traced,
+             "resolution": list(lens.scene.screen.resolution), "reference_error": max(r["noise"] or 0.0 for r in rows)}
+    return Study("light", COLUMNS, rows, {}, _advice(rows), about, "on_screen", PLOTS)
+
+
+def _advice(rows: list[dict]) -> str:
+    """The ends of the front in one sentence."""
+    front = sorted((r for r in rows if r["front"]), key=lambda r: r["error"])
+    sharp, bright = front[0], front[-1]
+    if sharp is bright:
+        return f"one lens is both the sharpest and the brightest: {_words(sharp)}"
+    return f"{len(front)} lenses are on the front, from {_words(sharp)} to {_words(bright)}"
+
+
+def _words(row: dict) -> str:
+    made = f"--thickness {row['thickness']:g} --loss \"{row['loss']}\""
+    return f"error {row['error']:.3g} with {row['on_screen']:.1%} of the light ({made})"
+
+
+def draw_light(study: Study, figure: Figure) -> None:
+    """Error against light, a curve for each thickness, the Pareto front ringed and joined."""
+    axes = figure.add_subplot()
+    for series, style in styles(row["series"] for row in study.rows).items():
+        mine = [row for row in study.rows if row["series"] == series]
+        axes.errorbar([100.0 * r["on_screen"] for r in mine], [r["error"] for r in mine], yerr=[r["noise"] or 0.0 for r in mine],
+                      label=f"--thickness {series}", **style)
+    front = sorted((100.0 * r["on_screen"], r["error"]) for r in study.rows if r["front"])
+    axes.plot(*zip(*front, strict=True), linestyle=":", color="black", marker="o", markersize=11, markerfacecolor="none",
+              label="Pareto front")
+    axes.set(xlabel="light on the screen (% of the source's)", ylabel="relative RMS error of the picture",
+             title="light: picture against light")
+    axes.set_ylim(bottom=0.0)
+    axes.grid(which="major", linewidth=0.4)
+    axes.legend(fontsize="small")
+
+
+#: Endings of the pictures' names, and what draws them.
+PLOTS = {"": draw_light}

@@ -1,0 +1,78 @@
+"""The designs that `convergence --study light` makes: one scene, of several thicknesses and weights of the light that is kept."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from caustic_cli import settings
+from caustic_cli.contest import picture_of_disc
+from caustic_cli.derive import build_options, build_stages, complete
+from caustic_cli.errors import CausticError
+from caustic_cli.inverse.designer import Designer
+from caustic_cli.picture import Picture
+from caustic_cli.project import Project
+from caustic_cli.session import first_heights
+from caustic_cli.studies.light import Lens
+
+#: Weights of the loss "light" beside "rms"; of light from infinity, whose lens may be of any thickness, and of light close by.
+DISTANT_WEIGHTS, NEAR_WEIGHTS = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0), (0.0, 1.0, 10.0)
+#: Thicknesses that are tried with light close by, in parts of the scene's own.
+PARTS = (0.7, 1.0, 1.4, 2.0)
+#: Without a project: the width of an LED, mm, so close that much of its light is lost, its cone in degrees, and
+#: pixels across the screen.
+LED, BEFORE, CONE, PIXELS = 2.0, 3.0, 90.0, 100
+
+
+def led() -> dict:
+    """Settings of the scene of a study without a project."""
+    full = complete({"source": {"type": "disc", "position": [[0.0, 0.0, -BEFORE]], "size": [LED, LED], "cone": CONE},
+                     "screen": {"z": 25.0, "resolution": [PIXELS, PIXELS]}}, 1.0)
+    full["target"] |= {"file": "target.npy", "encoding": "linear"}
+    return full
+
+
+def lenses(project: Project | None, seconds: float, device: str) -> tuple[int, Iterator[Lens]]:
+    """How many lenses there are, and each when it is designed, for at most so many seconds of iterations; one whose light cannot
+    reach the picture is left out."""
+    full = led() if project is None else project.settings
+    near = not settings.build_source(full).distant and not full["lens"].get("mirror", False)
+    weights, parts = (NEAR_WEIGHTS, PARTS) if near else (DISTANT_WEIGHTS, (1.0,))
+    return len(weights) * len(parts), _designed(project, full, weights, parts, seconds, device)
+
+
+def _designed(project: Project | None, full: dict, weights, parts, seconds: float, device: str) -> Iterator[Lens]:
+    for part in parts:
+        own = copy.deepcopy(full)
+        lens = own["lens"]
+        thickness = lens["z_in"] + part * (lens["thickness"] - lens["z_in"])
+        lens["thickness"] = thickness
+        own["design"]["waves"] = "off"
+        own["design"]["stages"] = [s for s in own["design"]["stages"] if not s.get("waves")]
+        try:
+            first, own, goal = _first(project, own)
+        except CausticError:
+            continue
+        scene = settings.build_scene(own)
+        for weight in weights:
+            loss = f"rms + {weight:g} light" if weight else "rms"
+            options = replace(build_options(own), loss=loss, waves=False)
+            try:
+                designer = Designer(scene, torch.from_numpy(goal), build_stages(own), options, device)
+                state = designer.run(designer.begin(first), time_limit=seconds)
+            except CausticError:
+                continue
+            yield Lens(thickness, weight, loss, scene, designer.field(state.stage), designer.within_limits(state), goal,
+                       state.seconds)
+
+
+def _first(project: Project | None, own: dict) -> tuple[torch.Tensor | None, dict, np.ndarray]:
+    """First heights for settings, the settings as they need them, and the target (n_x, n_y)."""
+    project = Project(Path(), own, Picture(picture_of_disc(), "linear")) if project is None else replace(project, settings=own)
+    first = first_heights(project, {"lens": {"thickness": own["lens"]["thickness"]}})
+    return first, own, project.target(project.scene())
