@@ -45,8 +45,8 @@ class Limits:
         """What cannot be."""
         found = []
         if self.light is not None:
-            found.append(f"behind the source's blur the best light there can be is {self.light.error:.3g} relative RMS from the"
-                         f" picture (proven: at least {self.light.bound:.3g})")
+            found.append(f"behind the source's blur the best light there can be is {self.light.bound:.3g} (proven) to"
+                         f" {self.light.error:.3g} (found) relative RMS from the picture")
         if self.etendue is not None:
             found.append(f"etendue lets {self.etendue:.0%} of the light on the lens reach the screen")
         return "; ".join(found)

@@ -8,7 +8,7 @@ taken that keeps most.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -106,17 +106,16 @@ class _Grid:
         on = (np.abs(u - screen.shift[0]) <= screen.half_size[0]) & (np.abs(v - screen.shift[1]) <= screen.half_size[1])
         return float((light * self.above(z) * _mean(np.where(on, part, 0.0))).sum() / on_lens) if on_lens > 0 else 0.0
 
-    def cut(self, z: np.ndarray, middle: float, passes: int, again: start.Start | None = None) -> _Cut:
+    def cut(self, z: np.ndarray, middle: float, passes: int) -> _Cut:
         """The surface of this height in its middle that sends what light it can to the picture, cut off at the least thickness.
 
         Args:
             z: heights to begin from.
-            again: a surface much like it, on these cells.
 
         Raises:
             InputError: no light can be refracted to the picture.
         """
-        reached = 1.0
+        reached, again = 1.0, None
         for _ in range(passes):
             z = np.maximum(z + middle - _middle(z), self.floor)
             light, directions = incident(self.scene, self.x, self.y, z)
@@ -125,7 +124,7 @@ class _Grid:
                 if not lit.max() > 0:
                     raise InputError(UNREACHED)
                 try:
-                    again = self.solved(lit, directions, float(z.mean()), again, corrections=1)
+                    again = self.solved(lit, directions, float(z.mean()), again)
                     break
                 except start.OutOfReach as error:
                     if not left:
@@ -133,17 +132,16 @@ class _Grid:
                     reached = reached * _mean(~error.where)
             z = again.heights
         z = z + middle - _middle(z)
-        return _Cut(np.maximum(z, self.floor), middle, max(0.0, self.floor - float(z.min())), again)
+        return _Cut(np.maximum(z, self.floor), middle, max(0.0, self.floor - float(z.min())))
 
 
 @dataclass(frozen=True, eq=False)
 class _Cut:
-    """Heights of a cut surface, that of its middle, how far it would reach below the cut, mm, and what it was solved by."""
+    """Heights of a cut surface, that of its middle, and how far it would reach below the cut, mm."""
 
     z: np.ndarray
     middle: float
     short: float
-    found: start.Start
 
 
 def first_surface(scene: Scene, target: np.ndarray, field: HeightField, cells: int = CELLS, fixed: bool = False) -> First:
@@ -169,9 +167,7 @@ def first_surface(scene: Scene, target: np.ndarray, field: HeightField, cells: i
         return First(_net(grid, z, field))
     few = _Grid.of(scene, target, min(cells, FEW_CELLS))
     best = _best(few, lens.offset.thickness, fixed)
-    scale = few.scaled(best.found.transport.potential, grid)
-    again = replace(best.found, transport=replace(best.found.transport, potential=scale))
-    found = grid.cut(few.scaled(best.z, grid), best.middle, 1, again)
+    found = grid.cut(few.scaled(best.z, grid), best.middle, PASSES - 1)
     net = _net(grid, found.z, field)
     if best.short:  # a spline through a kink undershoots
         net = net.clamp_min(grid.floor)
