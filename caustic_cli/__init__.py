@@ -1,3 +1,22 @@
-"""caustic: free-form lenses that throw a picture as a caustic."""
+"""caustic: free-form lenses that throw a picture as a caustic.
+
+`from caustic_cli import design, render, load, trace` is the library (`workflow.library`), loaded on first use.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from caustic_cli.workflow.library import Lens, Render, design, load, render, trace
 
 __version__ = "0.1.0"
+__all__ = ["Lens", "Render", "__version__", "design", "load", "render", "trace"]
+
+
+def __getattr__(name: str) -> Any:
+    if name in __all__:
+        from caustic_cli.workflow import library  # noqa: PLC0415
+
+        return getattr(library, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

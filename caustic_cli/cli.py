@@ -12,8 +12,8 @@ from typing import Annotated
 
 import typer
 
-from caustic_cli import __version__, console
-from caustic_cli.commands import convergence, design, export, gradmap, render
+from caustic_cli import __version__
+from caustic_cli.commands import console, convergence, design, export, gradmap, render
 from caustic_cli.errors import CausticError, InputError, Interrupted, is_shortage
 
 DESCRIPTION = """Design free-form lenses that throw a picture as a caustic.

@@ -12,14 +12,14 @@ from PIL import Image
 from test_export import make, signed_volume
 from test_verify import NAMES, SOURCES, scene_with
 
-from caustic_cli import cli, verdict
-from caustic_cli.archive import open_archive
+from caustic_cli import cli
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.export.lighttools import write_lighttools
 from caustic_cli.export.lighttools_script import write_script
 from caustic_cli.export.mesh import FLANGE, closed_mesh, patch, rim_of
 from caustic_cli.export.mitsuba import companions, write_mitsuba
 from caustic_cli.inverse.first import first_surface
+from caustic_cli.io.archive import open_archive
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.rays import Status
 from caustic_cli.optics.sampling import Sample
@@ -27,6 +27,7 @@ from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer, expose
 from caustic_cli.scene import Lens, PlaneWave, Points, Scene
 from caustic_cli.studies import verify
+from caustic_cli.workflow import evaluation
 
 
 def rounded(made, border: float = 0.0):
@@ -224,8 +225,8 @@ def test_an_archive_holds_the_whole_scene(tmp_path, source, aperture):
 @pytest.mark.parametrize("options", ["--lens-size 8 --aperture circle --border 1", "--lens-size 12x8 --border 0.5 --mag 2"])
 def test_from_picture_to_files(tmp_path, monkeypatch, capfd, options):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(verdict, "FINAL_RAYS", 20_000)
-    monkeypatch.setattr(verdict, "write_report", lambda *args: None)
+    monkeypatch.setattr(evaluation, "FINAL_RAYS", 20_000)
+    monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
     y, x = np.mgrid[0:24, 0:40]
     Image.fromarray((40 + 200 * np.exp(-((x - 14) ** 2 + (y - 9) ** 2) / 60.0)).astype(np.uint8)).save("wide.png")
     text = f"design wide.png --resolution 40 --quality draft --control 35 --rays 30000 --iterations 4 --json --quiet {options}"

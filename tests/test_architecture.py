@@ -8,17 +8,23 @@ import pytest
 PACKAGE = Path(__file__).resolve().parent.parent / "caustic_cli"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
-#: What a part may import from the package: commands -> studies, inverse, export -> optics -> scene -> errors.
-#: Studies and exports write files and pictures; nothing else here does.
+#: What a room may import from the package: commands -> workflow -> project -> config -> inverse -> optics -> scene -> errors, with
+#: studies and exports beside the inverse problem.  They write files and pictures, through io; nothing else below the project does.
 ALLOWED = {
     "scene": {"scene", "errors"},
     "optics": {"optics", "scene", "errors"},
     "inverse": {"inverse", "optics", "scene", "errors"},
-    "export": {"export", "optics", "scene", "errors", "files"},
-    "studies": {"studies", "optics", "scene", "errors", "files", "picture"},
+    "io": {"io", "optics", "scene", "errors"},
+    "export": {"export", "optics", "scene", "errors", "io"},
+    "studies": {"studies", "optics", "scene", "errors", "io"},
+    "config": {"config", "inverse", "optics", "scene", "errors"},
+    "project": {"project", "config", "inverse", "io", "optics", "scene", "errors"},
+    "workflow": {"workflow", "project", "config", "inverse", "studies", "export", "io", "optics", "scene", "errors"},
 }
-#: Only the command line and its manual page's generator may import the command line.
-TOP = {"cli", "__main__", "commands", "manpage"}
+#: Only the command line may import the command line.
+TOP = {"cli", "__main__", "commands"}
+#: What the package's top level holds, besides the rooms.
+FRONT = {"__init__.py", "__main__.py", "cli.py", "errors.py"}
 #: Files, formats and terminals: none of it below the command line's own modules.
 OUTSIDE = {"typer", "rich", "click", "PIL", "h5py", "tomli_w", "tomllib", "json", "csv", "argparse", "matplotlib"}
 
@@ -47,7 +53,7 @@ IMPORTS = {module_name(p): imports_in(ast.parse(p.read_text("utf-8")), module_na
 
 
 def part_of(module: str) -> str:
-    """`optics` for caustic_cli.optics.trace, `files` for caustic_cli.files, "" for the package itself."""
+    """`optics` for caustic_cli.optics.trace, `files` for caustic_cli.io.files, "" for the package itself."""
     return [*module.split("."), ""][1]
 
 
@@ -83,10 +89,24 @@ def test_imports_run_one_way(part):
     assert not wrong
 
 
+def test_the_top_level_holds_rooms():
+    assert {p.name for p in PACKAGE.glob("*.py")} == FRONT
+    assert {p.name for p in PACKAGE.iterdir() if p.is_dir() and p.name != "__pycache__"} == {*ALLOWED, "commands"}
+
+
+def test_compiled_loops_are_kernels():
+    """The files that compile functions, read from their decorators."""
+    compiled = {str(p.relative_to(PACKAGE).parent) for p in FILES if any(
+        "njit" in ast.unparse(d) for node in ast.walk(ast.parse(p.read_text("utf-8"))) if isinstance(node, ast.FunctionDef)
+        for d in node.decorator_list)}
+    assert compiled == {"optics/kernels"}
+
+
 def test_nobody_imports_the_command_line_but_itself():
     assert not [m for m, i in IMPORTS.items() if part_of(m) not in TOP and own(i) & {"cli", "commands"}]
     assert "commands" in own(IMPORTS["caustic_cli.cli"])
-    assert "cli" not in set().union(*(own(i) for m, i in IMPORTS.items() if part_of(m) == "commands"))
+    shown = "caustic_cli.commands.manpage"  # of which the whole parser is the subject
+    assert "cli" not in set().union(*(own(i) for m, i in IMPORTS.items() if part_of(m) == "commands" and m != shown))
 
 
 @pytest.mark.parametrize("part", ["scene", "optics", "inverse"])

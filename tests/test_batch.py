@@ -11,8 +11,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from caustic_cli import checkpoint, cli, session, verdict
+from caustic_cli import cli
 from caustic_cli.inverse.designer import Designer
+from caustic_cli.project import checkpoint
+from caustic_cli.workflow import design as workflow
+from caustic_cli.workflow import evaluation
 
 DESIGN = ["design", "blob.png", "--resolution", "16", "--control", "9", "--rays", "2000", "--start", "offset", "--iterations", "3",
           "--threads", "1"]
@@ -24,8 +27,8 @@ ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(cli.__file__).parents[1])}
 def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     paint("blob.png", 5)
-    monkeypatch.setattr(verdict, "FINAL_RAYS", 5000)
-    monkeypatch.setattr(verdict, "write_report", lambda path, *rest: path.write_bytes(b"a report"))
+    monkeypatch.setattr(evaluation, "FINAL_RAYS", 5000)
+    monkeypatch.setattr(evaluation, "write_report", lambda path, *rest: path.write_bytes(b"a report"))
 
 
 def paint(name, centre):
@@ -60,7 +63,7 @@ def test_the_same_design_again_is_no_work(capfd, monkeypatch):
     before = [p.read_bytes() for p in files]
     age(*files)
     monkeypatch.setattr(Designer, "run", forbidden)
-    monkeypatch.setattr(verdict, "retrace", forbidden)
+    monkeypatch.setattr(evaluation, "retrace", forbidden)
     again, err = run([*DESIGN, "--json"], capfd)
     assert again == first and "nothing to do" in err and "--force" in err
     assert [p.read_bytes() for p in files] == before
@@ -91,7 +94,7 @@ def test_another_design_is_refused_as_before(capfd, change):
 
 def test_an_unfinished_design_goes_on_when_it_is_asked_for_again(capfd, monkeypatch):
     with monkeypatch.context() as patch:  # killed after its last iteration, before the verdict
-        patch.setattr(session, "judge", interrupt)
+        patch.setattr(workflow, "judge", interrupt)
         assert run([*DESIGN, "--quiet"], capfd, 130).err == "caustic: interrupted\n"
     assert not checkpoint.load(Path("blob.caustic/checkpoints.h5")).results
     out, err = run([*DESIGN, "--json"], capfd)

@@ -16,8 +16,10 @@ import pytest
 import typer
 from PIL import Image
 
-from caustic_cli import __version__, cli, console, verdict
-from caustic_cli.commands.export import FORMATS
+from caustic_cli import __version__, cli
+from caustic_cli.commands import console
+from caustic_cli.export import FORMATS
+from caustic_cli.workflow import evaluation
 
 COMMANDS = ("design", "render", "gradmap", "export", "convergence")
 SHARED_KEYS = {"loss", "relative_rms", "psnr_db", "ssim", "on_screen", "on_target", "lost", "rays", "iterations", "seconds",
@@ -49,7 +51,7 @@ def designed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cli")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        patch.setattr(verdict, "FINAL_RAYS", 10_000)
+        patch.setattr(evaluation, "FINAL_RAYS", 10_000)
         y, x = np.mgrid[0:24, 0:24]
         Image.fromarray((40 + 200 * np.exp(-((x - 8) ** 2 + (y - 9) ** 2) / 30.0)).astype(np.uint8)).save("blob.png")
         text = "design blob.png --resolution 24 --control 12 --rays 4000 --iterations 2 --quiet"
@@ -62,8 +64,8 @@ def here(designed, tmp_path, monkeypatch):
     folder = tmp_path / "here"
     shutil.copytree(designed, folder)
     monkeypatch.chdir(folder)
-    monkeypatch.setattr(verdict, "FINAL_RAYS", 10_000)
-    monkeypatch.setattr(verdict, "write_report", lambda *args: None)
+    monkeypatch.setattr(evaluation, "FINAL_RAYS", 10_000)
+    monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
     return folder
 
 

@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from caustic_cli.errors import CausticError, InputError
-from caustic_cli.files import is_ours
+from caustic_cli.io.files import is_ours
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import SAMPLERS
 from caustic_cli.optics.surfaces.heightfield import HeightField

@@ -14,7 +14,10 @@ import pytest
 import torch
 from PIL import Image
 
-from caustic_cli import checkpoint, cli, session, verdict
+from caustic_cli import cli
+from caustic_cli.project import checkpoint
+from caustic_cli.workflow import design as workflow
+from caustic_cli.workflow import evaluation
 
 TINY = ["--resolution", "24", "--control", "12", "--rays", "4000", "--quiet", "--threads", "1"]
 
@@ -26,8 +29,8 @@ def _here(tmp_path, monkeypatch):
     y, x = np.mgrid[0:24, 0:24]
     light = 40 + 200 * np.exp(-((x - 8) ** 2 + (y - 9) ** 2) / 30.0)
     Image.fromarray(light.astype(np.uint8)).save("blob.png")
-    monkeypatch.setattr(verdict, "FINAL_RAYS", 40_000)
-    monkeypatch.setattr(verdict, "write_report", lambda *args: None)
+    monkeypatch.setattr(evaluation, "FINAL_RAYS", 40_000)
+    monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
 
 
 def design(capfd, *arguments, code=0) -> dict:
@@ -185,8 +188,9 @@ def test_threads_are_what_was_asked_for():
     """In a process of its own: the first design of a process must not differ from the next, whatever loads meanwhile."""
     program = f"""
 import torch
-from caustic_cli import cli, verdict
-verdict.FINAL_RAYS, verdict.write_report = 1000, lambda *args: None
+from caustic_cli import cli
+from caustic_cli.workflow import evaluation
+evaluation.FINAL_RAYS, evaluation.write_report = 1000, lambda *args: None
 for name in "ab":
     assert cli.run(["design", "blob.png", *{TINY!r}, "--iterations", "3", "-o", name]) == 0
     assert torch.get_num_threads() == 1, torch.get_num_threads()
@@ -245,9 +249,9 @@ def test_a_start_that_a_fixed_thickness_would_cut_is_lifted(capfd):
 
 @pytest.mark.parametrize("limit, control, rays", [(5, 32, 40_000), (20, 48, 40_000), (90, 48, 256 * 24 * 24)])
 def test_the_time_limit_chooses_the_quality(capfd, limit, control, rays, monkeypatch):
-    monkeypatch.setattr(session, "_run", lambda *args: {"lost": {}, "image": "", "reason": ""})
+    monkeypatch.setattr(workflow, "_run", lambda *args: {"lost": {}, "image": "", "reason": ""})
     design(capfd, "blob.png", "--resolution", "24", "--waves", "off", "--quiet", "--threads", "1", "--time-limit", limit, "-o", "p")
-    stages = session.Project.open("p").settings["design"]["stages"]
+    stages = workflow.Project.open("p").settings["design"]["stages"]
     assert stages[-1]["control"] == [control + 3, control + 3]
     assert stages[-1]["rays"] == rays and len(stages) == {5: 1, 20: 2, 90: 3}[limit]
 
@@ -318,7 +322,7 @@ def test_a_time_limit_reaches_the_last_stage(capfd):
     """However short: a lens on a coarse net alone would not be the lens of project.toml."""
     design(capfd, "blob.png", *TINY, "--time-limit", 0.01)
     state = load("blob.caustic").state
-    stages = session.Project.open("blob.caustic").settings["design"]["stages"]
+    stages = workflow.Project.open("blob.caustic").settings["design"]["stages"]
     assert state.stage == len(stages) - 1 and tuple(state.heights.shape) == (12, 12)
 
 
@@ -391,5 +395,5 @@ def test_a_signal_saves_and_the_design_goes_on(capfd, number, status):
 
 def test_a_place_that_is_taken_is_refused_before_the_transport_is_solved(capfd, monkeypatch):
     design(capfd, "blob.png", *TINY, "--iterations", "1")
-    monkeypatch.setattr(session, "first_surface", lambda *args: pytest.fail("solved for nothing"))
+    monkeypatch.setattr(workflow, "first_surface", lambda *args: pytest.fail("solved for nothing"))
     assert "holds a design already" in design(capfd, "blob.png", *TINY, code=2)

@@ -14,13 +14,13 @@ from rayfiles import zemax
 from scipy.integrate import quad
 from test_emission import LENS, heights, rectangle, scene, whole
 
-from caustic_cli import cli, session, verdict
-from caustic_cli.archive import open_archive
+from caustic_cli import cli
 from caustic_cli.errors import InputError
 from caustic_cli.export.lighttools import write_lighttools
 from caustic_cli.export.mitsuba import write_mitsuba
-from caustic_cli.intensities import parse_distribution
 from caustic_cli.inverse.first import first_surface
+from caustic_cli.io.archive import open_archive
+from caustic_cli.io.intensities import parse_distribution
 from caustic_cli.optics.bounds import bounds_of
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.emission.brightness import bright_points
@@ -30,6 +30,8 @@ from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Disc, Lens, Points, Scene, Screen
 from caustic_cli.scene.sources.distribution import Distribution
 from caustic_cli.studies.drawn import emitted
+from caustic_cli.workflow import design as workflow
+from caustic_cli.workflow import evaluation
 
 AT = (0.5, -0.5, -12.0)
 COSINE = Distribution(tuple(np.linspace(0, 90, 2001)), tuple(np.cos(np.radians(np.linspace(0, 90, 2001)))))
@@ -248,8 +250,8 @@ def here(tmp_path, monkeypatch):
     Image.fromarray(np.array([[0, 255], [255, 255]], np.uint8)).save("die.png")
     Path("led.csv").write_text("angle,intensity\n0,1\n10,2\n60,0\n")
     Path("rays.dat").write_bytes(zemax(np.zeros((9, 3)), np.tile([0.0, 0.0, 1.0], (9, 1)), np.ones(9)))
-    monkeypatch.setattr(verdict, "FINAL_RAYS", 40_000)
-    monkeypatch.setattr(verdict, "write_report", lambda *args: None)
+    monkeypatch.setattr(evaluation, "FINAL_RAYS", 40_000)
+    monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
 
 
 def run(capfd, *arguments, code=0):
@@ -275,7 +277,7 @@ def test_designs_keep_their_files(here, capfd, source, kept):
     again = run(capfd, "render", "blob.caustic", "--rays", "40000", "--force",
                 "--effects", "entrance,intersection,fresnel,source-size")
     assert again["relative_rms"] == pytest.approx(figures["relative_rms"], rel=0.05)
-    assert session.Project.open("blob.caustic").settings["source"]["intensity"] == (
+    assert workflow.Project.open("blob.caustic").settings["source"]["intensity"] == (
         "intensity.csv" if "intensity.csv" in kept else "lambertian" if "lambertian" in source else "uniform")
 
 

@@ -7,19 +7,22 @@ import pytest
 import torch
 from PIL import Image
 
-from caustic_cli import cli, session, settings, verdict
-from caustic_cli.derive import complete
+from caustic_cli import cli
+from caustic_cli.config import settings
+from caustic_cli.config.completion import complete
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.losses import Loss
 from caustic_cli.inverse.objective import Objective
+from caustic_cli.io.picture import read_picture
 from caustic_cli.optics.effects import EFFECTS
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.picture import read_picture
 from caustic_cli.scene import Lens, Light, Offset, PlaneWave, Scene, Screen
 from caustic_cli.scene.light import RGB
 from caustic_cli.studies import effects as study
+from caustic_cli.workflow import design as workflow
+from caustic_cli.workflow import evaluation
 
 NAMES = tuple(effect.name for effect in EFFECTS)
 TINY = ["--resolution", "24", "--control", "12", "--rays", "4000", "--quiet", "--threads", "1", "--iterations", "6"]
@@ -32,8 +35,8 @@ def _here(tmp_path, monkeypatch):
     blob = (40 + 200 * np.exp(-((x - 8) ** 2 + (y - 9) ** 2) / 30.0)).astype(np.uint8)
     Image.fromarray(blob).save("blob.png")
     Image.fromarray(np.stack([blob, blob // 2, blob[::-1]], -1)).save("rgb.png")
-    monkeypatch.setattr(verdict, "FINAL_RAYS", 20_000)
-    monkeypatch.setattr(verdict, "write_report", lambda *args: None)
+    monkeypatch.setattr(evaluation, "FINAL_RAYS", 20_000)
+    monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
     monkeypatch.setattr(study, "RAYS", 1000)
     monkeypatch.setattr(study, "REPEATS", 1)
 
@@ -117,7 +120,7 @@ def test_a_design_for_a_shifted_screen_hits_it(capfd):
 def test_a_mirror_is_designed_and_not_exported_as_a_lens(capfd):
     figures = run(capfd, "design", "blob.png", "--mirror", *TINY)
     assert figures["on_screen"] > 0.98 and figures["lost"]["fresnel"] == 0
-    toml = settings.read(session.Path("blob.caustic/project.toml"))
+    toml = settings.read(workflow.Path("blob.caustic/project.toml"))
     assert toml["lens"]["mirror"] and toml["screen"]["z"] == -300.0
     lens = run(capfd, "design", "blob.png", *TINY, "-o", "lens.caustic")
     assert figures["relative_rms"] < 1.2 * lens["relative_rms"]
@@ -136,7 +139,7 @@ def test_dispersion_of_a_glass_and_its_range(capfd):
 
 def test_a_coloured_target(capfd):
     figures = run(capfd, "design", "rgb.png", "--color", *TINY)
-    project = session.Project.open("rgb.caustic")
+    project = workflow.Project.open("rgb.caustic")
     assert project.settings["source"]["wavelengths"] == list(RGB) and project.settings["lens"]["glass"] == "N-BK7"
     light = project.picture.irradiance().sum((1, 2))
     assert project.settings["source"]["weights"] == pytest.approx(list(light / light.sum()))

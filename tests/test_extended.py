@@ -12,8 +12,9 @@ import pytest
 import torch
 from PIL import Image
 
-from caustic_cli import cli, settings, verdict
-from caustic_cli.console import figures_rows
+from caustic_cli import cli
+from caustic_cli.commands.console import figures_rows
+from caustic_cli.config import settings
 from caustic_cli.inverse import extended
 from caustic_cli.inverse.deconvolution import deconvolved
 from caustic_cli.inverse.extended import centre_of, etendue_limit, limits, regular_rays, shift_of
@@ -28,6 +29,7 @@ from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies.metrics import relative_rms
+from caustic_cli.workflow import evaluation
 
 SMALL = ["--lens-size", "2", "--throw", "60", "--mag", "2", "--resolution", "32", "--quiet", "--threads", "1"]
 
@@ -221,7 +223,7 @@ def test_the_middle_shines_into_the_cone_of_the_whole():
 def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Image.fromarray((disc_on(32, 0.7) * 255).astype(np.uint8)).save("blob.png")
-    monkeypatch.setattr(verdict, "FINAL_RAYS", 200_000)
+    monkeypatch.setattr(evaluation, "FINAL_RAYS", 200_000)
 
 
 def design(capfd, *arguments) -> dict:

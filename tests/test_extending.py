@@ -91,13 +91,13 @@ EXPORT = Addition(2, new={"export/sag.py": '''
 
     from __future__ import annotations
 
-    from caustic_cli.files import write_bytes
+    from caustic_cli.io.files import write_bytes
 
 
     def write_sag(path, scene, field, heights, samples=None):
         """Control heights, mm."""
         write_bytes(path, "\\n".join(" ".join(f"{z:.9g}" for z in row) for row in heights.tolist()).encode())
-'''}, edits=(("commands/export.py", '    "zemax": (', '    "sag": (".txt", "sag", "control heights as text"),\n    "zemax": ('),),
+'''}, edits=(("export/__init__.py", '    "zemax": (', '    "sag": (".txt", "sag", "control heights as text"),\n    "zemax": ('),),
     used="""
     import os, subprocess, sys
     from pathlib import Path
@@ -247,8 +247,8 @@ from caustic_cli.optics.emission.near import Near
 EMISSIONS = {"spokes": Near.of_size}
 '''}, used='''
 import torch
-from caustic_cli import settings
-from caustic_cli.derive import complete
+from caustic_cli.config import settings
+from caustic_cli.config.completion import complete
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose

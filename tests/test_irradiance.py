@@ -8,15 +8,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from caustic_cli import cli, settings, verdict
-from caustic_cli.archive import open_archive
+from caustic_cli import cli
 from caustic_cli.commands.options import power
-from caustic_cli.derive import complete
+from caustic_cli.config import settings
+from caustic_cli.config.completion import complete
 from caustic_cli.errors import InputError
-from caustic_cli.project import Project
+from caustic_cli.io.archive import open_archive
+from caustic_cli.project.project import Project
 from caustic_cli.scene import Disc, Lens, Light, PlaneWave, Scene, Screen
 from caustic_cli.studies.irradiance import irradiance_figures, per_part, unit_figures
 from caustic_cli.studies.panels import write_report
+from caustic_cli.workflow import evaluation
 
 TINY = ["--resolution", "24", "--control", "12", "--rays", "4000", "--waves", "off", "--quiet", "--threads", "1", "--json"]
 RENDER = ["render", "blob.caustic", "--rays", "20000", "--quiet", "--threads", "1", "--json"]
@@ -29,7 +31,7 @@ def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     y, x = np.mgrid[0:24, 0:24]
     Image.fromarray((40 + 200 * np.exp(-((x - 8) ** 2 + (y - 9) ** 2) / 30.0)).astype(np.uint8)).save("blob.png")
-    monkeypatch.setattr(verdict, "FINAL_RAYS", 40_000)
+    monkeypatch.setattr(evaluation, "FINAL_RAYS", 40_000)
 
 
 def run(capfd, *arguments, code=0):

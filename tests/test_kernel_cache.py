@@ -118,8 +118,8 @@ def test_a_temporary_directory_of_others_is_not_trusted(tmp_path):
 
 def test_every_file_with_a_kernel_counts():
     names = {p.relative_to(cache.PACKAGE).as_posix() for p in cache.sources()}
-    assert {"optics/kernels/plane.py", "optics/kernels/bend.py", "optics/tolerances.py", "inverse/laguerre.py",
-            "inverse/multigrid.py"} <= names
+    assert {"optics/kernels/plane.py", "optics/kernels/bend.py", "optics/tolerances.py", "optics/kernels/laguerre.py",
+            "optics/kernels/multigrid.py"} <= names
 
 
 def test_old_directories_of_ours_alone_are_removed(tmp_path):

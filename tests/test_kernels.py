@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 
-from caustic_cli import firstrun
 from caustic_cli.optics.backends import backend_for, plain
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.frames import IDENTITY
@@ -27,6 +26,7 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Lens, PlaneWave, Scene, Screen
+from caustic_cli.workflow import compilation
 
 FILTERS = [Filter(), *(Filter("cosine", (v, w)) for v, w in ((3, 3), (1, 5), (11, 3), (15, 15))),
            *(Filter("gaussian", (v, w), (a, b)) for v, w, a, b in (
@@ -220,8 +220,8 @@ def test_series_and_recursion_meet():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_first_run_compiles_what_designs_and_renders_use(dtype):
     """A kernel that is called in another way than it was compiled ahead for would be compiled again, half a minute each time."""
-    for part in firstrun.PARTS:
-        firstrun.compile_part(part)
+    for part in compilation.PARTS:
+        compilation.compile_part(part)
     kernels = (plane.forward, plane.backward, pixels.sums, spline.evaluate, spline.pull_back, banded._contract, banded._spread)
     ahead = [list(kernel.signatures) for kernel in kernels]
     for kind, rays in (("lines", 900), ("stratified", 1500), ("uniform", 900), ("uniform", 1)):
@@ -232,8 +232,8 @@ def test_the_first_run_compiles_what_designs_and_renders_use(dtype):
 
 def test_parts_of_the_first_run_are_shared_out():
     for processes in range(1, 5):
-        shares = firstrun.shares(processes)
-        assert sorted(part for share in shares for part in share) == sorted(firstrun.PARTS)
+        shares = compilation.shares(processes)
+        assert sorted(part for share in shares for part in share) == sorted(compilation.PARTS)
         assert len(shares) == processes
         assert all(shares)
 

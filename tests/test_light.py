@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from caustic_cli import cli, session
+from caustic_cli import cli
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.first import First, first_surface
 from caustic_cli.inverse.incidence import incident
@@ -24,6 +24,7 @@ from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies.metrics import relative_rms
+from caustic_cli.workflow import design as workflow
 
 
 def blob(n: int = 48) -> np.ndarray:
@@ -139,7 +140,7 @@ def test_the_largest_turn_is_that_of_refraction():
 def test_nothing_is_solved_for_a_picture_out_of_reach(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     Image.fromarray((255 * blob()).astype(np.uint8)).save("blob.png")
-    monkeypatch.setattr(session, "first_surface", lambda *args: pytest.fail("solved for nothing"))
+    monkeypatch.setattr(workflow, "first_surface", lambda *args: pytest.fail("solved for nothing"))
     assert cli.run(["design", "blob.png", "--screen-shift", "2000,0", "--resolution", "32"]) == 2
     assert "no light can leave the lens" in capfd.readouterr().err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["blob.png"]

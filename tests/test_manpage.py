@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 import typer
 
-from caustic_cli import manpage
 from caustic_cli.cli import app
+from caustic_cli.commands import manpage
 
 PAGE = Path(__file__).parents[1] / "man" / "caustic.1"
 COMMANDS = typer.main.get_command(app).commands
@@ -20,7 +20,7 @@ def plain() -> str:
 
 def test_the_committed_pages_are_fresh():
     committed = {p.name: p.read_text(encoding="utf-8") for p in PAGE.parent.glob("*.1")}
-    assert committed == manpage.pages(), "python -m caustic_cli.manpage man"
+    assert committed == manpage.pages(), "python -m caustic_cli.commands.manpage man"
     installed = (PAGE.parents[1] / "pyproject.toml").read_text(encoding="utf-8")
     assert all(f'"man/{name}" = "share/man/man1/{name}"' in installed for name in committed)
 

@@ -13,16 +13,17 @@ from PIL import Image
 from scipy.optimize import brentq
 from test_export import make
 
-from caustic_cli import cli, verdict
+from caustic_cli import cli
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse.limits import within_limits
 from caustic_cli.inverse.penalties import Penalty
 from caustic_cli.optics import curvature
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.project import Project
+from caustic_cli.project.project import Project
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies import manufacture as manufacture_module
 from caustic_cli.studies.manufacture import manufacture
+from caustic_cli.workflow import evaluation
 
 ORDERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 
@@ -139,8 +140,8 @@ def test_the_penalty_of_a_radius(radius, rough):
 def test_a_designed_lens_obeys_its_limits(tmp_path, monkeypatch, capfd):
     """At 1e6 points, where the same design without limits does not."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(verdict, "FINAL_RAYS", 10_000)
-    monkeypatch.setattr(verdict, "write_report", lambda *args: None)
+    monkeypatch.setattr(evaluation, "FINAL_RAYS", 10_000)
+    monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
     y, x = np.mgrid[0:24, 0:24]
     Image.fromarray(np.where((x - 9) ** 2 + (y - 13) ** 2 < 34, 255, 60).astype(np.uint8)).save("dot.png")
     base = "design dot.png --resolution 24 --quality draft --control 35 --rays 20000 --iterations 3 --quiet "

@@ -13,8 +13,9 @@ from PIL import Image
 from rayfiles import cone_of, lighttools, tm25, zemax
 from test_emission import LENS, heights, scene
 
-from caustic_cli import cli, session, settings, verdict
-from caustic_cli.derive import complete
+from caustic_cli import cli
+from caustic_cli.config import settings
+from caustic_cli.config.completion import complete
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse.first import first_surface
 from caustic_cli.optics.bounds import bounds_of
@@ -28,6 +29,8 @@ from caustic_cli.scene import Disc, Lens, Points, Scene, Screen
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.rayset import RaySet
 from caustic_cli.studies.retrace import converge
+from caustic_cli.workflow import design as workflow
+from caustic_cli.workflow import evaluation
 
 AT = (0.5, -0.5, -30.0)
 #: The same light as rays and as the source that they are drawn from.
@@ -206,8 +209,8 @@ def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     y, x = np.mgrid[0:24, 0:24]
     Image.fromarray((40 + 200 * np.exp(-((x - 8) ** 2 + (y - 9) ** 2) / 30.0)).astype(np.uint8)).save("blob.png")
-    monkeypatch.setattr(verdict, "FINAL_RAYS", 40_000)
-    monkeypatch.setattr(verdict, "write_report", lambda *args: None)
+    monkeypatch.setattr(evaluation, "FINAL_RAYS", 40_000)
+    monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
 
 
 def run(capfd, *arguments, code=0):
@@ -224,7 +227,7 @@ def test_a_design_from_a_file_stands_alone(here, capfd, form, name):
     figures, err = run(capfd, *base)
     assert figures["on_screen"] + sum(figures["lost"].values()) == pytest.approx(1.0, abs=1e-12)
     assert figures["rays"] < 30_000 and "the ray file is coarse for 24 x 24 pixels: its 30,000 rays" in err
-    project = session.Project.open("blob.caustic")
+    project = workflow.Project.open("blob.caustic")
     kept = f"source{Path(name).suffix.lower()}"
     assert project.settings["source"]["file"] == kept and project.settings["source"]["position"] == [[0, 0, -40]]
     assert Path("blob.caustic", kept).read_bytes() == Path(name).read_bytes()

@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image as Picture
 
-from caustic_cli import cli, verdict
+from caustic_cli import cli
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.sampling import numbers, stream
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -18,6 +18,7 @@ from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies import metrics, noise
 from caustic_cli.studies.retrace import MOST_TIMES, retrace
+from caustic_cli.workflow import evaluation
 
 PIXELS = (40, 36)
 SOURCES = {"disc": Disc((0.0, 0.0, -100.0), (6.0, 6.0)), "point": Points(((0.0, 0.0, -100.0),)), "sun": Disc(angle=2.0)}
@@ -148,8 +149,8 @@ def test_sobol_points_do_not_depend_on_where_a_draw_begins():
 
 def test_design_and_render_of_a_disc_say_their_noise(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(verdict, "FINAL_RAYS", 40_000)
-    monkeypatch.setattr(verdict, "write_report", lambda *args: None)
+    monkeypatch.setattr(evaluation, "FINAL_RAYS", 40_000)
+    monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
     y, x = np.mgrid[0:24, 0:24]
     Picture.fromarray((40 + 200 * np.exp(-((x - 8) ** 2 + (y - 9) ** 2) / 30.0)).astype(np.uint8)).save("blob.png")
     common = ["--threads", "1", "--json"]

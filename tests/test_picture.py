@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from PIL import Image
 
-from caustic_cli import files
 from caustic_cli.errors import InputError
-from caustic_cli.picture import Picture, read_picture, write_image, write_npy
+from caustic_cli.io import files
+from caustic_cli.io.picture import Picture, read_picture, write_image, write_npy
 
 CODE_8 = 0.5 / 255 + 1e-12  # half a step of an 8-bit code
 CODE_16 = 2.0 / 65535  # rounding of a 16-bit sRGB code, at the curve's steepest

@@ -12,13 +12,16 @@ import pytest
 import torch
 from PIL import Image
 
-from caustic_cli import checkpoint, cli, place, reuse, session, verdict
-from caustic_cli.checkpoint import Checkpoint
-from caustic_cli.console import Reporter
+from caustic_cli import cli
+from caustic_cli.commands.console import Reporter
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import State
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.project import MADE, Project, beside
+from caustic_cli.project import checkpoint, directory, uptodate
+from caustic_cli.project.checkpoint import Checkpoint
+from caustic_cli.project.project import MADE, Project, beside
+from caustic_cli.workflow import design as workflow
+from caustic_cli.workflow import evaluation
 
 CONFIG = """
 [lens]
@@ -41,10 +44,10 @@ def designed(tmp_path_factory):
     np.save(folder / "blob.npy", np.exp(-((x[:, None] - 6) ** 2 + (x - 12) ** 2) / 20.0) + 0.1)
     (folder / "c.toml").write_text(CONFIG)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(verdict, "FINAL_RAYS", 10_000)
-        patch.setattr(verdict, "write_report", lambda *args: None)
-        project, first = session.begin(folder / "blob.npy", folder / "blob.caustic", {}, None, None, {}, folder / "c.toml", False)
-        session.design(project, first, "cpu", Reporter(quiet=True), 0.0)
+        patch.setattr(evaluation, "FINAL_RAYS", 10_000)
+        patch.setattr(evaluation, "write_report", lambda *args: None)
+        project, first = workflow.begin(folder / "blob.npy", folder / "blob.caustic", {}, None, None, {}, folder / "c.toml", False)
+        workflow.design(project, first, "cpu", Reporter(quiet=True), 0.0)
     return project.path
 
 
@@ -283,7 +286,7 @@ def test_a_new_design_leaves_nothing_of_the_one_before(copy):
     for name in MADE:
         (copy / name).write_bytes(b"of before")
     (copy / "notes.txt").write_text("mine")
-    place.settle(Project.open(copy), True)
+    directory.settle(Project.open(copy), True)
     assert sorted(p.name for p in copy.iterdir()) == ["notes.txt", "project.toml", "target.npy"]
 
 
@@ -292,9 +295,9 @@ def test_finished_where_every_image_stands_that_was_made(copy, results):
     project = Project.open(copy)
     state = replace(project.load(), results=results)
     (copy / "report.png").touch()
-    assert (reuse.finished(project, state) is None) == (results.get("wave_relative_rms") is not None)
+    assert (uptodate.finished(project, state) is None) == (results.get("wave_relative_rms") is not None)
     (copy / "wave.png").touch()
-    assert reuse.finished(project, state)["project"] == str(copy)
+    assert uptodate.finished(project, state)["project"] == str(copy)
 
 
 # the source's profile
@@ -303,8 +306,8 @@ def test_finished_where_every_image_stands_that_was_made(copy, results):
 def test_a_profile_weights_the_light(designed, tmp_path, monkeypatch, capfd):
     """Only the aperture's +x half shines, so light arrives on that side only, and all of it is accounted for."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(verdict, "FINAL_RAYS", 10_000)
-    monkeypatch.setattr(verdict, "write_report", lambda *args: None)
+    monkeypatch.setattr(evaluation, "FINAL_RAYS", 10_000)
+    monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
     profile = np.zeros((4, 3))
     profile[2:] = 1.0
     np.save("half.npy", profile)

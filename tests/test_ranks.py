@@ -10,16 +10,20 @@ import pytest
 import torch
 from PIL import Image
 
-from caustic_cli import checkpoint, cli, verdict
+from caustic_cli import cli
 from caustic_cli.inverse import ranks
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.sampling import Sample
+from caustic_cli.project import checkpoint
 from caustic_cli.scene import Lens, Offset, PlaneWave, Points, Scene, Screen
+from caustic_cli.workflow import evaluation
 
 DRIVER = """
 import sys
-from caustic_cli import cli, session, verdict
-verdict.FINAL_RAYS, verdict.write_report = 5000, lambda *args: None
+from caustic_cli import cli
+from caustic_cli.workflow import design as workflow
+from caustic_cli.workflow import evaluation
+evaluation.FINAL_RAYS, evaluation.write_report = 5000, lambda *args: None
 sys.exit(cli.run(["design", "blob.png", "--config", "c.toml", "--quiet", "--threads", "1", "-o", "two"]))
 """
 #: Both ways of emitting rays; 12 iterations of L-BFGS, whose line searches ask for more evaluations than that.
@@ -46,8 +50,8 @@ tolerance = 0.0
 def test_two_ranks_design_what_one_process_does(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("CAUSTIC_KERNELS", "torch")
-    monkeypatch.setattr(verdict, "FINAL_RAYS", 5000)
-    monkeypatch.setattr(verdict, "write_report", lambda *args: None)
+    monkeypatch.setattr(evaluation, "FINAL_RAYS", 5000)
+    monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
     y, x = np.mgrid[0:16, 0:16]
     Image.fromarray((40 + 200 * np.exp(-((x - 5) ** 2 + (y - 6) ** 2) / 15.0)).astype(np.uint8)).save("blob.png")
     Path("c.toml").write_text(CONFIG)

@@ -32,12 +32,12 @@ from caustic_cli.export.step import write_step
 from caustic_cli.export.stl import write_stl
 from caustic_cli.export.surface import STEPS_PER_SPAN, sample_grid, second_derivative_bounds
 from caustic_cli.export.zemax import write_zemax
-from caustic_cli.files import is_ours
+from caustic_cli.io.files import is_ours
+from caustic_cli.io.surfaces import onto, read_surface
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Disc, PlaneWave, Points, Scene
-from caustic_cli.surfaces import onto, read_surface
 
 LIMIT = 1e-3  # mm on a screen 300 mm away
 CASE = {"control": (22, 16), "size": (10.0, 8.0), "relief": 0.03}

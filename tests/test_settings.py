@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from caustic_cli import settings
-from caustic_cli.derive import build_options, build_stages, complete
+from caustic_cli.config import settings
+from caustic_cli.config.completion import build_options, build_stages, complete
+from caustic_cli.config.settings import SCHEMA, STAGE, build_lens, build_scene, dump, parse
 from caustic_cli.errors import InputError
-from caustic_cli.settings import SCHEMA, STAGE, build_lens, build_scene, dump, parse
 
 INDEX = 1.5443  # table D.2
 

@@ -13,8 +13,9 @@ from PIL import Image
 from rayfiles import cone_of, zemax
 from test_emission import LENS, heights
 
-from caustic_cli import cli, session, settings, verdict
-from caustic_cli.derive import complete
+from caustic_cli import cli
+from caustic_cli.config import settings
+from caustic_cli.config.completion import complete
 from caustic_cli.errors import InputError
 from caustic_cli.optics.bounds import bounds_of
 from caustic_cli.optics.emission import rays_of
@@ -27,6 +28,8 @@ from caustic_cli.scene import Disc, Lens, Light, PlaneWave, Points, Scene, Scree
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.rayset import RaySet
 from caustic_cli.scene.sources.several import Several
+from caustic_cli.workflow import design as workflow
+from caustic_cli.workflow import evaluation
 
 SCREEN = Screen((40.0, 32.0), 100.0, (40, 32))
 MEMBERS = (PlaneWave(1.0), Points(((0.5, 0.0, -20.0),), (2.0,)), Disc((0.0, 1.0, -30.0), (2.0, 1.0), 0.5),
@@ -130,8 +133,8 @@ def test_a_design_in_several_lights(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     y, x = np.mgrid[0:24, 0:24]
     Image.fromarray((40 + 200 * np.exp(-((x - 8) ** 2 + (y - 9) ** 2) / 30.0)).astype(np.uint8)).save("blob.png")
-    monkeypatch.setattr(verdict, "FINAL_RAYS", 40_000)
-    monkeypatch.setattr(verdict, "write_report", lambda *args: None)
+    monkeypatch.setattr(evaluation, "FINAL_RAYS", 40_000)
+    monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
     Path("led.dat").write_bytes(zemax(*cone_of(20_000, 12.0)))
     Path("led.csv").write_text("0,1\n30,0.5\n")
     Path("two.toml").write_text("[[source]]\ntype = 'point'\npower = 2.0\nwavelengths = [620.0]\n[[source]]\ntype = 'rays'\n"
@@ -149,7 +152,7 @@ def test_a_design_in_several_lights(tmp_path, monkeypatch, capfd):
     for name in ("led.dat", "led.csv"):
         Path(name).unlink()
     assert {"source-2.dat", "intensity-3.csv"} <= {p.name for p in Path("blob.caustic").iterdir()}
-    history = session.Project.open("blob.caustic").load().state.history
+    history = workflow.Project.open("blob.caustic").load().state.history
     assert history[-1][2] < history[0][2]
     again = run("render", "blob.caustic", "--rays", "40000", "--force", "-o", "a.png", "--effects",
                 "entrance,intersection,fresnel,dispersion,source-size")

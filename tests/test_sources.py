@@ -11,8 +11,8 @@ import torch
 from test_export import make
 
 import caustic_cli
-from caustic_cli import settings
-from caustic_cli.derive import complete
+from caustic_cli.config import settings
+from caustic_cli.config.completion import complete
 from caustic_cli.errors import InputError
 from caustic_cli.export.lighttools import write_lighttools
 from caustic_cli.export.mitsuba import write_mitsuba

@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from caustic_cli import cli, session, settings, verdict
-from caustic_cli.derive import complete
+from caustic_cli import cli
+from caustic_cli.config import settings
+from caustic_cli.config.completion import complete
 from caustic_cli.errors import InputError
 from caustic_cli.scene import Disc, Offset, Points
+from caustic_cli.workflow import design as workflow
+from caustic_cli.workflow import evaluation
 
 TINY = ["--resolution", "24", "--control", "12", "--rays", "4000", "--quiet", "--threads", "1"]
 SCHEDULE = """
@@ -37,8 +40,8 @@ def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     y, x = np.mgrid[0:24, 0:24]
     Image.fromarray((40 + 200 * np.exp(-((x - 8) ** 2 + (y - 9) ** 2) / 30.0)).astype(np.uint8)).save("blob.png")
-    monkeypatch.setattr(verdict, "FINAL_RAYS", 40_000)
-    monkeypatch.setattr(verdict, "write_report", lambda *args: None)
+    monkeypatch.setattr(evaluation, "FINAL_RAYS", 40_000)
+    monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
 
 
 def run(capfd, *arguments, code=0):
@@ -56,7 +59,7 @@ def run(capfd, *arguments, code=0):
 ])
 def test_every_source_designs_renders_and_exports(capfd, source):
     figures = run(capfd, "design", "blob.png", *source, *TINY, "--iterations", "8")
-    history = session.Project.open("blob.caustic").load().state.history
+    history = workflow.Project.open("blob.caustic").load().state.history
     assert history[-1][2] < history[0][2]
     assert figures["on_screen"] + sum(figures["lost"].values()) == pytest.approx(1.0, abs=1e-9)
     again = run(capfd, "render", "blob.caustic", "--rays", "40000", "--quiet", "--threads", "1", "--force")
@@ -90,12 +93,12 @@ def test_a_design_changes_its_source_and_resumes_inside_any_stage(capfd):
     Path("schedule.toml").write_text(SCHEDULE)
     base = ["design", "blob.png", "--config", "schedule.toml", "--resolution", "24", "--quiet", "--threads", "1"]
     run(capfd, *base, "-o", "whole.caustic")
-    whole = session.Project.open("whole.caustic").load().state
+    whole = workflow.Project.open("whole.caustic").load().state
     assert [row[1] for row in whole.history] == [0] * 3 + [1] * 4
     for stop in (2, 5):
         run(capfd, *base, "-o", f"{stop}.caustic", "--iterations", stop)
         run(capfd, "design", "--resume", f"{stop}.caustic", "--iterations", 7, "--quiet", "--threads", "1")
-        state = session.Project.open(f"{stop}.caustic").load().state
+        state = workflow.Project.open(f"{stop}.caustic").load().state
         assert [row[:4] for row in state.history] == [row[:4] for row in whole.history]
         assert bool((state.heights == whole.heights).all())
 
@@ -185,9 +188,9 @@ def test_an_option_may_be_meant_for_the_source_of_a_stage(capfd):
     Path("schedule.toml").write_text(SCHEDULE.replace('type = "grid"', 'type = "plane"').replace("position = [0, 0, -40]", ""))
     run(capfd, "design", "blob.png", "--config", "schedule.toml", "--resolution", "24", "--source-position", "0,0,-40",
         "--start", "offset", "--quiet")
-    project = session.Project.open("blob.caustic")
+    project = workflow.Project.open("blob.caustic")
     assert project.settings["source"]["type"] == "plane"
-    assert session.build_stages(project.settings)[0].source == Points(((0.0, 0.0, -40.0),))
+    assert workflow.build_stages(project.settings)[0].source == Points(((0.0, 0.0, -40.0),))
 
 
 def test_a_refusal_names_no_file_that_was_never_written(capfd):

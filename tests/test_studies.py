@@ -9,18 +9,18 @@ import pytest
 import torch
 from PIL import Image
 
-from caustic_cli import contest
-from caustic_cli.derive import complete
+from caustic_cli.config.completion import complete
+from caustic_cli.config.settings import build_scene
 from caustic_cli.errors import CausticError, InputError
-from caustic_cli.files import is_ours
+from caustic_cli.io.files import is_ours
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.intersection import find
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Lens, Offset, PlaneWave, Points, Scene, Screen
-from caustic_cli.settings import build_scene
 from caustic_cli.studies import intersection, training
 from caustic_cli.studies.report import as_json, paths_of, refuse_foreign_files, write
 from caustic_cli.studies.retrace import retrace
+from caustic_cli.workflow import comparison
 
 
 def lens(source=None, control=(9, 8)):
@@ -44,13 +44,13 @@ def small():
     stages = [{"control": [19, 19], "rays": 5000, "apron": 1}]
     full = complete({"screen": {"resolution": [24, 24]}, "lens": {"control": [19, 19]}, "design": {"stages": stages}}, 1.0)
     scene = build_scene(full)
-    target = contest.disc(scene, tuple(full["target"]["size"]))
+    target = comparison.disc(scene, tuple(full["target"]["size"]))
     return scene, target, full
 
 
 def contender(small, k):
     scene, target, full = small
-    return contest.Entry(*contest.plans(scene, full)[k], scene, torch.from_numpy(target))
+    return comparison.Entry(*comparison.plans(scene, full)[k], scene, torch.from_numpy(target))
 
 
 def test_both_errors_of_the_mesh_are_of_order_two(meeting):
@@ -221,7 +221,7 @@ def test_contenders_get_equal_time_and_an_independent_verdict():
 
 def test_the_contenders_of_a_project(small):
     scene, target, full = small
-    plans = contest.plans(scene, full)
+    plans = comparison.plans(scene, full)
     assert [series for series, *_ in plans] == ["lbfgs, 19x19", "lbfgs, 11x11", "lbfgs, 7x7", "lbfgs, coarse to fine",
                                            "adam, 19x19", "adam, sparse network, 19x19", "adam, dense network, 19x19"]
     assert [(o.optimizer, o.network) for *_, o in plans[3:]] == [("lbfgs", "none"), ("adam", "none"), ("adam", "sparse"),
@@ -237,13 +237,13 @@ def test_the_contenders_of_a_project(small):
 def test_transport_contends_where_a_design_would_begin_there():
     full = complete({"screen": {"resolution": [24, 24]}, "lens": {"control": [35, 35]}}, 1.0, rays=5000)
     scene = build_scene(full)
-    target = torch.from_numpy(contest.disc(scene, tuple(full["target"]["size"])))
-    entries = {plan[0]: contest.Entry(*plan, scene, target) for plan in contest.plans(scene, full)
-               if plan[0] in ("lbfgs, 35x35", contest.TRANSPORT)}
+    target = torch.from_numpy(comparison.disc(scene, tuple(full["target"]["size"])))
+    entries = {plan[0]: comparison.Entry(*plan, scene, target) for plan in comparison.plans(scene, full)
+               if plan[0] in ("lbfgs, 35x35", comparison.TRANSPORT)}
     assert len(entries) == 2
     for entry in entries.values():
         entry.advance(0.0)
-    ahead, behind = entries[contest.TRANSPORT], entries["lbfgs, 35x35"]
+    ahead, behind = entries[comparison.TRANSPORT], entries["lbfgs, 35x35"]
     assert ahead.loss < 0.5 * behind.loss
     assert ahead.seconds - sum(ahead.steps) > 0 == pytest.approx(behind.seconds - sum(behind.steps))  # its start is not free
 
@@ -252,7 +252,7 @@ def test_a_lens_with_knots_of_its_own_keeps_its_net(small):
     scene, _, full = small
     knots = SplineSpace.uniform(19, 3).knots.tolist()
     own = replace(scene, lens=replace(scene.lens, knots=(knots, knots)))
-    plans = contest.plans(own, full)
+    plans = comparison.plans(own, full)
     assert [series for series, *_ in plans][:2] == ["lbfgs, 19x19", "adam, 19x19"] and len(plans) == 4
     assert {s.control for _, stages, _ in plans for s in stages} == {(19, 19)}
 

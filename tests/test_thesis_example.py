@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from caustic_cli import settings
+from caustic_cli.config import settings
 
 THESIS = Path(__file__).resolve().parent.parent / "examples" / "thesis"
 

@@ -6,8 +6,9 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.sparse import coo_matrix
 
 from caustic_cli.errors import InputError
-from caustic_cli.inverse import laguerre, start, transport
-from caustic_cli.inverse.multigrid import Multigrid
+from caustic_cli.inverse import start, transport
+from caustic_cli.optics.kernels import laguerre
+from caustic_cli.optics.kernels.multigrid import Multigrid
 
 A, B, C, D = 5.0, 4.0, 15.0, 9.0
 

@@ -12,7 +12,8 @@ import pytest
 import torch
 from PIL import Image
 
-from caustic_cli import cli, contest, derive, verdict
+from caustic_cli import cli
+from caustic_cli.config import completion
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.schedule import LEAST_WAVES, WAVES, wave_refinement
 from caustic_cli.inverse.waves import WaveObjective
@@ -22,6 +23,7 @@ from caustic_cli.optics.waves import NoWaveImage, wave_image
 from caustic_cli.scene import Disc, Lens, Light, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies import diffraction
 from caustic_cli.studies.metrics import relative_rms
+from caustic_cli.workflow import comparison, evaluation
 
 SMALL = ["--lens-size", "2", "--throw", "60", "--mag", "2", "--resolution", "32", "--quiet", "--threads", "1"]
 
@@ -50,7 +52,7 @@ def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     y, x = np.mgrid[-1:1:32j, -1:1:32j]
     Image.fromarray(((np.hypot(x, y) < 0.7) * 255).astype(np.uint8)).save("blob.png")
-    monkeypatch.setattr(verdict, "FINAL_RAYS", 40_000)
+    monkeypatch.setattr(evaluation, "FINAL_RAYS", 40_000)
 
 
 def design(capfd, *arguments, code=0) -> dict | str:
@@ -135,12 +137,12 @@ def test_local_magnification_is_that_of_the_map():
                                                (["--resolution", "4", "--waves", "on"], True), (["--source-angle", "3"], False),
                                                (["--network", "sparse"], False), (["--screen-tilt", "0,10"], False)])
 def test_auto_is_by_the_scene(extra, stages, _here, capfd, monkeypatch):
-    from caustic_cli import session  # noqa: PLC0415
+    from caustic_cli.workflow import design as workflow  # noqa: PLC0415
 
-    monkeypatch.setattr(session, "_run", lambda *args: {"lost": {}, "image": "", "reason": ""})
+    monkeypatch.setattr(workflow, "_run", lambda *args: {"lost": {}, "image": "", "reason": ""})
     small = SMALL if "--resolution" not in extra else [a for a in SMALL if a not in ("--resolution", "32")]
     design(capfd, "blob.png", *small, *extra, "-o", "p")
-    tables = session.Project.open("p").settings["design"]["stages"]
+    tables = workflow.Project.open("p").settings["design"]["stages"]
     assert any(t.get("waves") for t in tables) == stages
     assert not stages or [len(t["waves"]) for t in tables if t.get("waves")] == [WAVES["standard"][0]] * len(WAVES["standard"][1])
 
@@ -158,9 +160,9 @@ OWN = "[[design.stages]]\ncontrol = [19, 19]\nrays = 4096\niterations = 1\n"
 ])
 def test_what_is_said_before_a_design(extra, reason, _here, capfd, monkeypatch):
     """One line on what light carries; one more where the wave image is left out although it matters, of why."""
-    from caustic_cli import session  # noqa: PLC0415
+    from caustic_cli.workflow import design as workflow  # noqa: PLC0415
 
-    monkeypatch.setattr(session, "_run", lambda *args: {"lost": {}, "image": "", "reason": ""})
+    monkeypatch.setattr(workflow, "_run", lambda *args: {"lost": {}, "image": "", "reason": ""})
     if "fine" in extra:
         monkeypatch.setattr("caustic_cli.inverse.schedule.SECONDS_A_SAMPLE", 1.0)
     Path("own.toml").write_text(OWN)
@@ -177,7 +179,7 @@ def test_what_is_said_before_a_design(extra, reason, _here, capfd, monkeypatch):
                                                      ("off", {"waves": [550.0]}, "one of them has waves")])
 def test_waves_and_own_stages_that_contradict_each_other(waves, own, words):
     with pytest.raises(InputError, match=words):
-        derive.complete({"design": {"waves": waves, "stages": [{"rays": 100} | own]}}, 1.0)
+        completion.complete({"design": {"waves": waves, "stages": [{"rays": 100} | own]}}, 1.0)
 
 
 @pytest.mark.parametrize("text", ["", "0", "nan", "1e9", "-5", "550,", "550:1:2", "550:0", "blue"])
@@ -187,9 +189,9 @@ def test_wavelengths_that_are_none(text, _here, capfd):
 
 
 def test_a_design_on_waves_alone_has_no_rays_to_compare_others_on():
-    full = derive.complete({"lens": {"control": [9, 9]}, "design": {"stages": [{"waves": [550.0]}]}}, 1.0)
+    full = completion.complete({"lens": {"control": [9, 9]}, "design": {"stages": [{"waves": [550.0]}]}}, 1.0)
     with pytest.raises(InputError, match="one stage on rays is needed"):
-        contest.plans(None, full)
+        comparison.plans(None, full)
 
 
 def test_time_bounds_the_stages():
@@ -198,9 +200,9 @@ def test_time_bounds_the_stages():
     assert 0 < sum(n for _, n in fewer) < sum(WAVES["standard"][1]) and all(n >= LEAST_WAVES for _, n in fewer)
     assert wave_refinement(1e9, 0) == [] and len(wave_refinement(1e9, 0, hurry=False)) == 2
     with pytest.raises(InputError, match="waves"):
-        derive.complete({"design": {"waves": "perhaps"}}, 1.0)
+        completion.complete({"design": {"waves": "perhaps"}}, 1.0)
     with pytest.raises(InputError, match="network none"):
-        derive.complete({"design": {"waves": "on", "network": "sparse", "optimizer": "adam"}}, 1.0)
+        completion.complete({"design": {"waves": "on", "network": "sparse", "optimizer": "adam"}}, 1.0)
 
 
 # designs
@@ -254,7 +256,7 @@ def test_resumed_within_a_wave_stage(_here, capfd):
 
 
 def _state(path: str):
-    from caustic_cli.project import Project  # noqa: PLC0415
+    from caustic_cli.project.project import Project  # noqa: PLC0415
 
     return Project.open(path).load().state
 
@@ -267,7 +269,7 @@ def test_one_wavelength_is_judged_beside_it_too(_here, capfd):
 
 def test_limits_are_kept(_here, capfd):
     figures = design(capfd, "blob.png", *SMALL, "--max-slope", "0.08", "-o", "p")
-    from caustic_cli.project import Project  # noqa: PLC0415
+    from caustic_cli.project.project import Project  # noqa: PLC0415
 
     project = Project.open("p")
     field, checkpoint = project.lens(project.scene())

@@ -8,8 +8,7 @@ from typing import Annotated
 
 import typer
 
-from caustic_cli import console
-from caustic_cli.commands import options
+from caustic_cli.commands import console, options
 from caustic_cli.errors import InputError
 from caustic_cli.scene import checks
 
@@ -85,30 +84,31 @@ def run(
             case = (intersection.of_lens(*opened[1:], count, seed or 0) if opened else intersection.table_d3(count, seed or 0))
             found = intersection.run_intersection(case, seed=seed or 0, repeats=repeats, progress=tell)
         elif study == "design":
-            from caustic_cli import contest  # noqa: PLC0415
+            from caustic_cli.workflow import comparison  # noqa: PLC0415
 
-            scene, target, entries = contest.entries_of(opened[0] if opened else None, device, precision, seed)
+            scene, target, entries = comparison.entries_of(opened[0] if opened else None, device, precision, seed)
             found = training.run_training(scene, target, entries, seconds=seconds, seed=seed or 0, rays=count, device=device,
                                           progress=tell)
         elif study == "light":
-            from caustic_cli import tradeoff  # noqa: PLC0415
+            from caustic_cli.workflow import tradeoff  # noqa: PLC0415
 
             each = checks.number("--seconds", light.SECONDS if seconds is None else seconds, 0.0, 1e6, open_low=True)
             count_of, lenses = tradeoff.lenses(opened[0] if opened else None, each, device)
             found = light.run_light(lenses, count_of, rays=count, seed=seed or 0, device=device, progress=tell)
         elif study == "diffraction":
-            from caustic_cli.contest import lens_of_disc  # noqa: PLC0415
+            from caustic_cli.workflow.comparison import lens_of_disc  # noqa: PLC0415
 
             scene, field, heights = opened[1:] if opened else lens_of_disc()
             found = diffraction.run_diffraction(scene, field, heights.to(device), rays=count, seed=seed or 0, dtype=precision,
                                                 progress=tell)
         else:
-            from caustic_cli.session import sphere  # noqa: PLC0415
             from caustic_cli.studies.convergence import run_study  # noqa: PLC0415
+            from caustic_cli.workflow.compilation import compile_for  # noqa: PLC0415
+            from caustic_cli.workflow.design import sphere  # noqa: PLC0415
 
             scene, field, heights = opened[1:] if opened else sphere()
             if study == "effects":
-                options.compile_for(None, device, say)
+                compile_for(None, device, say)
                 found = effects.run_effects(scene, field, heights.to(device), rays=count, repeats=repeats, seed=seed or 0,
                                             dtype=precision, progress=tell)
             else:
@@ -132,7 +132,7 @@ def _open(path: Path | None) -> tuple | None:
     """The project, its scene, its lens' field and heights; None for no path."""
     if path is None:
         return None
-    from caustic_cli.project import Project  # noqa: PLC0415
+    from caustic_cli.project.project import Project  # noqa: PLC0415
 
     opened = Project.open(path)
     scene = opened.scene()

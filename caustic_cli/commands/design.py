@@ -9,8 +9,7 @@ from typing import Annotated
 
 import typer
 
-from caustic_cli import console
-from caustic_cli.commands import options
+from caustic_cli.commands import console, options
 from caustic_cli.errors import InputError
 
 EXAMPLES = """Examples:
@@ -142,17 +141,18 @@ def run(
     if time_limit is not None and not time_limit > 0:
         raise InputError(f"--time-limit must be greater than 0 s, got {time_limit:g}")
     if not resume and speaks:
-        from caustic_cli.picture import read_picture  # noqa: PLC0415
+        from caustic_cli.io.picture import read_picture  # noqa: PLC0415
 
         read_picture(target, linear, color)  # before torch is loaded and kernels are compiled for nothing
     device = options.start_torch(device, threads, say)
 
-    from caustic_cli import session  # noqa: PLC0415
     from caustic_cli.inverse import ranks  # noqa: PLC0415
+    from caustic_cli.workflow import design as workflow  # noqa: PLC0415
+    from caustic_cli.workflow.compilation import compile_for  # noqa: PLC0415
 
     with ranks.together(device) as rank:
         if rank > 0:
-            session.follow(device)
+            workflow.follow(device)
             return
         if resume:
             names = [key[2] for key in given if key[2] not in ("--iterations", "--time-limit")]
@@ -161,15 +161,15 @@ def run(
             if names:
                 raise InputError(f"--resume goes on with a project as it is, so {', '.join(names)} cannot be given;"
                                  " --iterations and --time-limit can, and project.toml can be edited")
-            project = session.find(target, out)
-            options.compile_for(project.scene(), device, say, gradient=True)
-            figures = session.resume(project, iterations, time_limit, device, say, began)
+            project = workflow.find(target, out)
+            compile_for(project.scene(), device, say, gradient=True)
+            figures = workflow.resume(project, iterations, time_limit, device, say, began)
         else:
             with say.patience("solving the transport of the light to the picture; the first time, its kernels are compiled, which"
                               " takes about half a minute"):
-                project, first = session.begin(target, out, given, screen, pixels, shaped, config, force)
-            options.compile_for(project.scene(), device, say, gradient=True)
-            figures = session.design(project, first, device, say, began)
+                project, first = workflow.begin(target, out, given, screen, pixels, shaped, config, force)
+            compile_for(project.scene(), device, say, gradient=True)
+            figures = workflow.design(project, first, device, say, began)
     say.table(str(project.path), [*console.figures_rows(figures), ("ended by", figures["reason"])])
     if json:
         console.emit_json(figures)

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import time
-from importlib import import_module
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from caustic_cli import console
-from caustic_cli.commands import options
+from caustic_cli.commands import console, options
 from caustic_cli.errors import InputError
+from caustic_cli.export import FORMATS, MESHES
 
 EXAMPLES = """Examples:
 
@@ -19,21 +18,6 @@ EXAMPLES = """Examples:
 
   caustic export flame.caustic --format stl --tolerance 0.0001 -o flame.stl
 """
-
-#: Format -> suffix of its default file, where its `write_<format>` is, what the file is.
-FORMATS = {
-    "lighttools": (".npz", "lighttools", "point cloud with normals and the exact spline"),
-    "zemax": (".dat", "zemax", "Grid Sag with exact derivatives"),
-    "step": (".step", "step", "the exact spline as a solid"),
-    "stl": (".stl", "stl", "closed mesh"),
-    "ply": (".ply", "ply", "closed mesh"),
-    "obj": (".obj", "obj", "closed mesh"),
-    "csv": (".csv", "points", "points of the exit surface"),
-    "xyz": (".xyz", "points", "points of the exit surface"),
-    "mitsuba": (".xml", "mitsuba", "the whole scene for Mitsuba 3, ready to run, with two meshes beside it"),
-}
-MESHES = ("stl", "ply", "obj", "mitsuba")
-
 
 def run(
     project: options.Project,
@@ -53,7 +37,7 @@ def run(
     debug: options.Debug = False,
 ) -> None:
     """Write the lens of PROJECT in the format of another program."""
-    asked, began, say = locals(), time.monotonic(), console.Reporter(quiet)
+    began, say = time.monotonic(), console.Reporter(quiet)
     if format not in FORMATS:
         raise InputError(f"--format must be one of {', '.join(FORMATS)}, got {format!r}")
     given: dict = {}
@@ -68,40 +52,12 @@ def run(
     if script and format != "lighttools":
         raise InputError(f"--script belongs to --format lighttools, got {format}")
 
-    from caustic_cli.files import refuse_foreign  # noqa: PLC0415
-    from caustic_cli.project import Project  # noqa: PLC0415
-    from caustic_cli.reuse import Outputs  # noqa: PLC0415
+    from caustic_cli.workflow.export import export  # noqa: PLC0415
 
-    opened = Project.open(project)
-    suffix, module, _ = FORMATS[format]
-    path = output or Path(project.resolve().stem + suffix)
-    home = import_module(f"caustic_cli.export.{module}")
-    beside = import_module("caustic_cli.export.lighttools_script") if script else None
-    scene = opened.scene()
-    written = [path]
-    if format == "mitsuba":
-        written += home.companions(path, scene.lens.round)
-    elif script:
-        written += beside.companions(path)
-    for file in written:
-        refuse_foreign(file, force)
-    if scene.lens.mirror:
-        raise InputError(f"{project}: is a mirror, and the formats hold lenses: nothing is exported")
-    made = Outputs(opened, "export", asked, written)
-    if not force and (found := made.found()):
-        say.say(f"{path}: is what the same options made of the same project, so there is nothing to do; --force does it again")
-        if json:
-            console.emit_json(found)
-        return
-    field, checkpoint = opened.lens(scene)
-    getattr(home, f"write_{format}")(path, scene, field, checkpoint.state.heights, **given)
-    if beside is not None:
-        beside.write_script(path, scene, field, checkpoint.state.heights, **given)
-    sizes = [file.stat().st_size for file in written]
-    for file, size in zip(written, sizes, strict=True):
-        say.say(f"{file}: {size:,} bytes")
-    more = {"beside": [str(file) for file in written[1:]]} if len(written) > 1 else {}
-    figures = {"file": str(path), "format": format, "bytes": sizes[0], **more, "seconds": time.monotonic() - began}
-    made.keep(figures)
+    figures, reused = export(project, format, output, script, given, force, say)
+    if not reused:
+        for file in (figures["file"], *figures.get("beside", ())):
+            say.say(f"{file}: {Path(file).stat().st_size:,} bytes")
+        figures["seconds"] = time.monotonic() - began
     if json:
         console.emit_json(figures)

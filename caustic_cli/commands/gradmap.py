@@ -8,8 +8,7 @@ from typing import Annotated
 
 import typer
 
-from caustic_cli import console
-from caustic_cli.commands import options
+from caustic_cli.commands import console, options
 from caustic_cli.errors import InputError
 
 EXAMPLES = """Examples:
@@ -49,16 +48,17 @@ def run(
     points = [options.indices("--control", text) for text in control or []]
     device = options.start_torch(device, threads, say)
 
-    from caustic_cli.derive import filter_from  # noqa: PLC0415
-    from caustic_cli.files import refuse_foreign  # noqa: PLC0415
-    from caustic_cli.picture import write_npy  # noqa: PLC0415
-    from caustic_cli.project import Project  # noqa: PLC0415
+    from caustic_cli.config.completion import filter_from  # noqa: PLC0415
+    from caustic_cli.io.files import refuse_foreign  # noqa: PLC0415
+    from caustic_cli.io.picture import write_npy  # noqa: PLC0415
+    from caustic_cli.project.project import Project  # noqa: PLC0415
     from caustic_cli.studies import gradmap  # noqa: PLC0415
     from caustic_cli.studies.retrace import sampler_for  # noqa: PLC0415
+    from caustic_cli.workflow.compilation import compile_for  # noqa: PLC0415
 
     opened = Project.open(project)
     scene = opened.scene()
-    options.compile_for(scene, device, say)
+    compile_for(scene, device, say)
     field, checkpoint = opened.lens(scene)
     points = points or [(field.shape[0] // 2, field.shape[1] // 2)]
     for i, j in points:

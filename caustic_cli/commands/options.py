@@ -9,8 +9,8 @@ from typing import Annotated
 
 import typer
 
-from caustic_cli.console import Reporter
-from caustic_cli.errors import InputError, is_shortage
+from caustic_cli.commands.console import Reporter
+from caustic_cli.errors import InputError
 
 Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", envvar="CAUSTIC_QUIET", help="Say nothing on stderr but errors.")]
@@ -182,46 +182,11 @@ def start_torch(device: str, threads: int | None, say: Reporter):
     if device == "cuda" and not torch.cuda.is_available():
         raise InputError("--device cuda: no CUDA device is at hand here; use auto or cpu")
     device = "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
-    from caustic_cli.optics.backends import backend_for  # noqa: PLC0415
+    from caustic_cli.workflow.compilation import compile_usual  # noqa: PLC0415
 
-    if backend_for(device).compiled:
-        from caustic_cli import firstrun  # noqa: PLC0415
-
-        with say.patience("compiling the kernels for this machine, once: about ten seconds"):
-            if not firstrun.kept():
-                firstrun.compile_side_by_side()
-            backend_for(device).compile_plane()
+    with say.patience("compiling the kernels for this machine, once: about ten seconds"):
+        compile_usual(device)
     return device
-
-
-def compile_for(scene, device: str, say: Reporter, requests=None, gradient: bool = False) -> None:
-    """Have the CPU's kernels compiled that the light of a scene needs beyond those of `start_torch`.
-
-    Args:
-        scene: None for whatever any scene may need.
-        requests: of a plan, or None.
-        gradient: derivatives are needed too.
-    """
-    from caustic_cli.optics.backends import backend_for  # noqa: PLC0415
-
-    if not backend_for(device).compiled:
-        return
-    from caustic_cli.optics.effects import NO_REQUESTS, Requests  # noqa: PLC0415
-    from caustic_cli.optics.trace import warm_up  # noqa: PLC0415
-    from caustic_cli.scene import Lens, PlaneWave, Points, Scene, Screen  # noqa: PLC0415
-
-    wanted = [(scene, requests or NO_REQUESTS)]
-    if scene is None:
-        lens, screen = Lens(), Screen((30.0, 30.0))
-        wanted = [(Scene(Points(((0.0, 0.0, -50.0),)), lens, screen), NO_REQUESTS),
-                  (Scene(PlaneWave(), lens, screen), Requests(stages=True))]
-    with say.patience("compiling the kernels that this scene needs, once: about half a minute"):
-        try:
-            for one, asked in wanted:
-                warm_up(one, asked, gradient)
-        except (MemoryError, RuntimeError) as problem:
-            if not is_shortage(problem):  # the work itself knows what to do about that, and compiles what it needs
-                raise
 
 
 def dtype_of(name: str):

@@ -19,7 +19,7 @@ from torch import Tensor
 from caustic_cli import __version__
 from caustic_cli.errors import InputError
 from caustic_cli.export.surface import sample_grid
-from caustic_cli.files import MARK, atomic_path
+from caustic_cli.io.files import MARK, atomic_path
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene, Source
 

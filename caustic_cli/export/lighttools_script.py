@@ -18,7 +18,7 @@ from torch import Tensor
 from caustic_cli.errors import InputError
 from caustic_cli.export.surface import SurfaceGrid, sample_grid
 from caustic_cli.export.text import CREATED, real
-from caustic_cli.files import atomic_path, write_bytes
+from caustic_cli.io.files import atomic_path, write_bytes
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 

@@ -24,7 +24,7 @@ from caustic_cli.export.mesh import patch, refuse_open, rim_of, triangles
 from caustic_cli.export.ply import write_mesh
 from caustic_cli.export.surface import STEPS_PER_SPAN
 from caustic_cli.export.text import CREATED, real
-from caustic_cli.files import write_bytes
+from caustic_cli.io.files import write_bytes
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Lens, Scene
 from caustic_cli.scene.plain import beyond_plain

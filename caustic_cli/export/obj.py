@@ -8,7 +8,7 @@ from torch import Tensor
 
 from caustic_cli.export.mesh import closed_mesh
 from caustic_cli.export.text import CREATED, rows
-from caustic_cli.files import atomic_path
+from caustic_cli.io.files import atomic_path
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 

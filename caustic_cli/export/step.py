@@ -23,7 +23,7 @@ from caustic_cli import __version__
 from caustic_cli.export.mesh import FLANGE, refuse_open
 from caustic_cli.export.surface import sample_grid
 from caustic_cli.export.text import CREATED
-from caustic_cli.files import atomic_path
+from caustic_cli.io.files import atomic_path
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Lens, Scene

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from caustic_cli import __version__
-from caustic_cli.files import CREATED_BY
+from caustic_cli.io.files import CREATED_BY
 
 #: The comment that every text file carries in its first lines, each in its format's own way.
 CREATED = f"{CREATED_BY} {__version__}"

@@ -20,7 +20,7 @@ from torch import Tensor
 from caustic_cli.errors import InputError
 from caustic_cli.export.surface import STEPS_PER_SPAN, sample_grid
 from caustic_cli.export.text import CREATED, real, rows
-from caustic_cli.files import atomic_path
+from caustic_cli.io.files import atomic_path
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene

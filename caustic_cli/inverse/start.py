@@ -29,10 +29,10 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import gaussian_filter
 
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.laguerre import prices
 from caustic_cli.inverse.transport import Transport, corners, solve
 from caustic_cli.optics.backends.reference import Torch
 from caustic_cli.optics.frames import IDENTITY
+from caustic_cli.optics.kernels.laguerre import prices
 
 EVEN = 2.0  # cells over which e is smoothed: at a kink of phi the rays miss by the spline's own width, which is no error of T
 ENOUGH = 0.05  # pixels of e, root mean square, that are left alone

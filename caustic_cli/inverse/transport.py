@@ -29,9 +29,8 @@ from scipy import ndimage
 from scipy.interpolate import RectBivariateSpline
 
 from caustic_cli.errors import InputError
-from caustic_cli.inverse import laguerre
-from caustic_cli.inverse.multigrid import Multigrid, matrix
-from caustic_cli.optics.kernels import blocks
+from caustic_cli.optics.kernels import blocks, laguerre
+from caustic_cli.optics.kernels.multigrid import Multigrid, matrix
 
 FINE = 4  # raster points a source cell, along each axis
 LEAST = 128  # raster points along an axis

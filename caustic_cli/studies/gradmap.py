@@ -26,7 +26,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from caustic_cli.errors import InputError
-from caustic_cli.files import SOFTWARE, atomic_path
+from caustic_cli.io.files import SOFTWARE, atomic_path
 from caustic_cli.optics.emission import Rays, of_member
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sample

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.files import SOFTWARE, write_bytes
+from caustic_cli.io.files import SOFTWARE, write_bytes
 from caustic_cli.optics import curvature
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.emission import rays_of

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from caustic_cli.files import atomic_path
-from caustic_cli.picture import SOFTWARE, to_linear, to_srgb
+from caustic_cli.io.files import atomic_path
+from caustic_cli.io.picture import SOFTWARE, to_linear, to_srgb
 from caustic_cli.scene import Lens, Screen
 
 #: A scale of irradiance that ends below this has no room for ticks between numbers; a black image has such a one.

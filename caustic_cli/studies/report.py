@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from caustic_cli.errors import InputError
-from caustic_cli.files import SOFTWARE, atomic_path, refuse_foreign, write_bytes
+from caustic_cli.io.files import SOFTWARE, atomic_path, refuse_foreign, write_bytes
 from caustic_cli.studies.fit import Order, pareto
 
 #: Colours of Okabe and Ito, told apart by every kind of colour vision, and a marker of its own for each curve.

@@ -27,7 +27,7 @@ import numpy as np
 from torch import Tensor
 
 from caustic_cli.errors import CausticError, InputError
-from caustic_cli.files import SOFTWARE, atomic_path
+from caustic_cli.io.files import SOFTWARE, atomic_path
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.surfaces.heightfield import HeightField

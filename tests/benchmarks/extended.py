@@ -23,8 +23,8 @@ import torch
 
 from caustic_cli.inverse.deconvolution import Deconvolved, deconvolved
 from caustic_cli.inverse.target import target_on_screen
+from caustic_cli.io.picture import read_picture
 from caustic_cli.optics.spread import Convolution
-from caustic_cli.picture import read_picture
 from caustic_cli.scene import Screen
 
 PICTURES = Path(__file__).resolve().parents[2] / "examples"

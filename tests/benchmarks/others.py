@@ -42,7 +42,7 @@ from numba import njit
 from scipy.ndimage import zoom
 
 from caustic_cli.inverse.target import target_on_screen
-from caustic_cli.picture import read_picture
+from caustic_cli.io.picture import read_picture
 from caustic_cli.scene import Screen
 from caustic_cli.studies.metrics import relative_rms
 

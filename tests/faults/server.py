@@ -15,13 +15,14 @@ import time
 import torch
 import torch._dynamo
 
-from caustic_cli import cli, verdict
+from caustic_cli import cli
 from caustic_cli.commands import export, render  # noqa: F401
 from caustic_cli.export import lighttools, stl  # noqa: F401
 from caustic_cli.inverse.designer import Designer
+from caustic_cli.workflow import evaluation
 
 torch.set_num_threads(1)
-verdict.FINAL_RAYS, verdict.write_report = 5000, lambda *args: None  # its drawing takes most of the time
+evaluation.FINAL_RAYS, evaluation.write_report = 5000, lambda *args: None  # its drawing takes most of the time
 with open(sys.argv[1], "r+b") as f:
     board = mmap.mmap(f.fileno(), 0)
 run = Designer.run

@@ -11,15 +11,19 @@ import pytest
 import torch
 from PIL import Image
 
-from caustic_cli import checkpoint, cli, files, place, session, verdict
+from caustic_cli import cli
 from caustic_cli.errors import CausticError
 from caustic_cli.inverse.objective import Objective
+from caustic_cli.io import files
 from caustic_cli.optics import shortage, trace
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.project import Project
+from caustic_cli.project import checkpoint, directory
+from caustic_cli.project.project import Project
 from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
+from caustic_cli.workflow import design as workflow
+from caustic_cli.workflow import evaluation
 
 DESIGN = ["design", "blob.png", "--resolution", "16", "--control", "9", "--rays", "2000", "--start", "offset", "--iterations", "3",
           "--quiet", "--threads", "1"]
@@ -30,8 +34,8 @@ def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     y, x = np.mgrid[0:16, 0:16]
     Image.fromarray((40 + 200 * np.exp(-((x - 5) ** 2 + (y - 6) ** 2) / 15.0)).astype(np.uint8)).save("blob.png")
-    monkeypatch.setattr(verdict, "FINAL_RAYS", 5000)
-    monkeypatch.setattr(verdict, "write_report", lambda *args: None)
+    monkeypatch.setattr(evaluation, "FINAL_RAYS", 5000)
+    monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
 
 
 def run(arguments, capfd, code):
@@ -50,8 +54,10 @@ def content(folder) -> dict:
 
 FULL = """
 import json, resource, sys
-from caustic_cli import cli, session, verdict
-verdict.FINAL_RAYS, verdict.write_report = 5000, lambda *args: None
+from caustic_cli import cli
+from caustic_cli.workflow import design as workflow
+from caustic_cli.workflow import evaluation
+evaluation.FINAL_RAYS, evaluation.write_report = 5000, lambda *args: None
 resource.setrlimit(resource.RLIMIT_FSIZE, (9000, 9000))  # writing beyond fails as on a full disk
 for arguments in json.load(sys.stdin):
     print(cli.run(arguments), flush=True)
@@ -149,18 +155,18 @@ def test_a_flipped_bit_in_project_toml_is_refused_or_harmless(capfd):
 def test_one_design_at_a_time_holds_a_project(capfd, monkeypatch):
     run(DESIGN, capfd, 0)
     before, inner = content("blob.caustic"), []
-    with place.held(Path("blob.caustic")):
+    with directory.held(Path("blob.caustic")):
         for arguments in (["design", "--resume", "blob.caustic", "--iterations", "5", "--quiet"], [*DESIGN, "--force"]):
             assert "another caustic design is at work there" in run(arguments, capfd, 2)
         assert content("blob.caustic") == before
         run(["export", "blob.caustic", "--quiet"], capfd, 0)  # to look is allowed
-    judged = session.judge
+    judged = workflow.judge
 
     def judge(*arguments):
         inner.append(cli.run(["design", "--resume", str(arguments[0].path), "--quiet"]))
         return judged(*arguments)
 
-    monkeypatch.setattr(session, "judge", judge)
+    monkeypatch.setattr(workflow, "judge", judge)
     for arguments in ([*DESIGN, "-o", "fresh"], [*DESIGN, "--force"], ["design", "--resume", "fresh", "--quiet"]):
         assert cli.run(arguments) == 0
     assert inner == [2, 2, 2]
@@ -240,5 +246,5 @@ def test_memory_short_anywhere_is_one_sentence(error, monkeypatch, capfd):
     def begin(*args):
         raise error
 
-    monkeypatch.setattr(session, "begin", begin)
+    monkeypatch.setattr(workflow, "begin", begin)
     assert "out of memory" in run(DESIGN, capfd, 1)

@@ -18,10 +18,12 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from caustic_cli import checkpoint, cli, verdict
-from caustic_cli import settings as toml
+from caustic_cli import cli
+from caustic_cli.config import settings as toml
 from caustic_cli.errors import InputError
-from caustic_cli.picture import read_picture
+from caustic_cli.io.picture import read_picture
+from caustic_cli.project import checkpoint
+from caustic_cli.workflow import evaluation
 
 EXAMPLES = int(os.environ.get("CAUSTIC_EXAMPLES", "40"))
 many = settings(max_examples=EXAMPLES)
@@ -33,8 +35,8 @@ def designed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("hostile")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        patch.setattr(verdict, "FINAL_RAYS", 2000)
-        patch.setattr(verdict, "write_report", lambda *args: None)
+        patch.setattr(evaluation, "FINAL_RAYS", 2000)
+        patch.setattr(evaluation, "write_report", lambda *args: None)
         y, x = np.mgrid[0:16, 0:16]
         Image.fromarray((40 + 200 * np.exp(-((x - 5) ** 2 + (y - 6) ** 2) / 15.0)).astype(np.uint8)).save("blob.png")
         assert cli.run(["design", "blob.png", "--resolution", "16", "--control", "9", "--rays", "2000", "--start", "offset",
@@ -274,8 +276,8 @@ def test_no_picture_beyond_the_project_is_opened(copy, capfd, file):
 
 def test_resuming_rewrites_no_picture(copy, capfd, monkeypatch):
     """project.toml may name a picture of the user's own; it is read."""
-    monkeypatch.setattr(verdict, "FINAL_RAYS", 2000)
-    monkeypatch.setattr(verdict, "write_report", lambda *args: None)
+    monkeypatch.setattr(evaluation, "FINAL_RAYS", 2000)
+    monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
     (copy / "mine.jpg").write_bytes(image("JPEG"))
     path = copy / "project.toml"
     path.write_text(path.read_text().replace('"target.png"', '"mine.jpg"'))

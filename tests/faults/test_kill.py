@@ -16,8 +16,9 @@ import pytest
 import torch
 from PIL import Image
 
-from caustic_cli import checkpoint, cli
-from caustic_cli.project import Project
+from caustic_cli import cli
+from caustic_cli.project import checkpoint
+from caustic_cli.project.project import Project
 
 KILLS = int(os.environ.get("CAUSTIC_KILLS", "12"))
 EVERY = 0.05  # s between checkpoints

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from caustic_cli import cli, verdict
-from caustic_cli.checkpoint import load
+from caustic_cli import cli
 from caustic_cli.errors import CausticError
 from caustic_cli.inverse import designer
 from caustic_cli.inverse.designer import Designer, Options
@@ -22,8 +21,10 @@ from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT
 from caustic_cli.optics.trace import expose
+from caustic_cli.project.checkpoint import load
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies.metrics import judge
+from caustic_cli.workflow import evaluation
 
 SCREEN = Screen((20.0, 20.0), 60.0, (12, 12))
 TARGET = torch.ones(12, 12, dtype=torch.float64)
@@ -173,8 +174,8 @@ def test_where_nothing_begins_it_stops_with_a_sentence():
 @pytest.fixture
 def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(verdict, "FINAL_RAYS", 10_000)
-    monkeypatch.setattr(verdict, "write_report", lambda *args: None)
+    monkeypatch.setattr(evaluation, "FINAL_RAYS", 10_000)
+    monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
     np.save("spot.npy", np.eye(12))
     return tmp_path
 

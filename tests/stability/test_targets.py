@@ -9,8 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from caustic_cli import cli, verdict
-from caustic_cli.checkpoint import load
+from caustic_cli import cli
 from caustic_cli.inverse.first import first_surface
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.parametrisation import FreeHeights
@@ -19,7 +18,9 @@ from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
+from caustic_cli.project.checkpoint import load
 from caustic_cli.scene import Lens, PlaneWave, Points, Scene, Screen
+from caustic_cli.workflow import evaluation
 
 N = 16
 
@@ -83,8 +84,8 @@ def test_transport_start(name, source):
 def test_designs_of_extreme_pictures_write_finite_files(tmp_path, monkeypatch, capfd):
     """The whole command: zeros and one bright pixel as 8-bit and 16-bit images and as .npy."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(verdict, "FINAL_RAYS", 10_000)
-    monkeypatch.setattr(verdict, "write_report", lambda *args: None)
+    monkeypatch.setattr(evaluation, "FINAL_RAYS", 10_000)
+    monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
     spot = np.zeros((N, N))
     spot[4, 11] = 1.0
     Image.fromarray((255 * spot).astype(np.uint8)).save("spot8.png")

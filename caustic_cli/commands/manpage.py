@@ -1,4 +1,6 @@
-"""The manual pages, from the commands themselves: `python -m caustic_cli.manpage man` writes caustic.1 and one for each command.
+"""The manual pages, from the commands themselves.
+
+`python -m caustic_cli.commands.manpage man` writes caustic.1 and one for each command.
 
 Options and their help come from the parser, so they cannot differ from `--help`; the sections around them are below.
 """
@@ -11,7 +13,7 @@ from pathlib import Path
 
 from caustic_cli import __version__
 from caustic_cli.cli import parser
-from caustic_cli.files import write_bytes
+from caustic_cli.io.files import write_bytes
 
 HEAD = r""".TH CAUSTIC 1 "" "caustic {version}" "User Commands"
 .SH NAME
@@ -156,6 +158,6 @@ def _plain(text: str) -> str:
 
 if __name__ == "__main__":
     if len(sys.argv) != 2:
-        raise SystemExit("usage: python -m caustic_cli.manpage DIRECTORY")
+        raise SystemExit("usage: python -m caustic_cli.commands.manpage DIRECTORY")
     for file, page in pages().items():
         write_bytes(Path(sys.argv[1]) / file, page.encode())

@@ -16,10 +16,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from caustic_cli import __version__, attachments, place, reuse, settings
-from caustic_cli.checkpoint import Checkpoint
-from caustic_cli.console import Reporter
-from caustic_cli.derive import build_options, build_stages, complete, without_waves
+from caustic_cli import __version__
+from caustic_cli.config import settings
+from caustic_cli.config.completion import build_options, build_stages, complete, without_waves
 from caustic_cli.errors import CausticError, InputError, Interrupted
 from caustic_cli.inverse import ranks
 from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
@@ -29,14 +28,17 @@ from caustic_cli.inverse.first import first_surface
 from caustic_cli.inverse.reach import refuse_unreachable
 from caustic_cli.inverse.schedule import transport_cells
 from caustic_cli.inverse.target import grey
+from caustic_cli.io.picture import read_picture
+from caustic_cli.io.surfaces import SUFFIXES, onto, read_surface
 from caustic_cli.optics.emission.measured import coarse_words
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.picture import read_picture
-from caustic_cli.project import CHECKPOINT, RENDER, TOML, Project, is_project
+from caustic_cli.project import attachments, directory, uptodate
+from caustic_cli.project.checkpoint import Checkpoint
+from caustic_cli.project.project import CHECKPOINT, RENDER, TOML, Project, is_project
 from caustic_cli.scene import Scene
-from caustic_cli.surfaces import SUFFIXES, onto, read_surface
-from caustic_cli.verdict import judge
+from caustic_cli.workflow.evaluation import judge
+from caustic_cli.workflow.reporter import Reporter
 
 #: Part of a time limit that is left to the iterations, however long the start took.
 LEAST_PART = 0.25
@@ -91,17 +93,17 @@ def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: d
         if light is not None:
             full["source"]["profile"] = f"profile{light.suffix}"
         attachments.named_in_project(full["source"])
-        project = Project(path, full, picture, light, reuse.digest(full, picture, light),
+        project = Project(path, full, picture, light, uptodate.digest(full, picture, light),
                           without_waves=without_waves(full, "stages" in said.get("design", {})))
-        if not force and (same := reuse.same_design(path, project.asked)):
+        if not force and (same := uptodate.same_design(path, project.asked)):
             return replace(same[0], found=same[1]), None
-        place.check(path, force)  # before the transport, which may take a minute
+        directory.check(path, force)  # before the transport, which may take a minute
         designer, goal = _designer(project, "cpu")  # builds and so checks scene, target, stages, options
         refuse_unreachable(designer.scene, grey(goal))
         first = first_heights(project, said)
     except InputError as error:  # about a project.toml that is not written yet
         raise InputError(settings.as_options(str(error).removeprefix(f"{path / TOML}: "), given)) from error
-    place.settle(project, force)
+    directory.settle(project, force)
     return project, first
 
 
@@ -136,7 +138,7 @@ def design(project: Project, first: torch.Tensor | None, device: str, say: Repor
     One that `begin` found needs no work, or goes on.
     """
     if project.found is not None:
-        figures = reuse.finished(project, project.found)
+        figures = uptodate.finished(project, project.found)
         say.say(f"{project.path}: was designed from the same picture with the same options, so "
                 + ("there is nothing to do; --force designs it anew" if figures else "it goes on from its checkpoint"))
         return figures or resume(project, None, None, device, say, began)
@@ -169,7 +171,7 @@ def resume(project: Project, iterations: int | None, time_limit: float | None, d
            began: float) -> dict:
     """Go on from the last checkpoint; with nothing left to do, judge the lens again."""
     with project.hold:
-        project.hold.enter_context(place.held(project.path))
+        project.hold.enter_context(directory.held(project.path))
         designer, target = _designer(project, device)
         begun = (project.path / CHECKPOINT).exists()  # if not, it was killed before its first checkpoint
         before = project.load() if begun else None
@@ -185,7 +187,7 @@ def resume(project: Project, iterations: int | None, time_limit: float | None, d
             project.settings["design"]["iterations"] = iterations
             project.write_settings()
         if begun:
-            project = replace(project, asked=reuse.asked_of(project, before))
+            project = replace(project, asked=uptodate.asked_of(project, before))
         return _run(project, designer, target, state, say, began, iterations, time_limit, device)
 
 
@@ -288,7 +290,7 @@ def _run(project: Project, designer: Designer, target: np.ndarray, state: State,
         "target_sha256": hashlib.sha256(np.ascontiguousarray(project.picture.values).tobytes()).hexdigest(),
     }
 
-    inputs = reuse.inputs(project)
+    inputs = uptodate.inputs(project)
     goes_on = f"caustic design --resume {project.path} goes on from it"
     safe = f"the one before is whole, {goes_on}" if (project.path / CHECKPOINT).exists() else "nothing of it is on disk"
 

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caustic_cli import settings
-from caustic_cli.derive import NETWORK_CONTROL, Settings, build_options, build_stages, complete
+from caustic_cli.config import settings
+from caustic_cli.config.completion import NETWORK_CONTROL, Settings, build_options, build_stages, complete
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Designer, Options, State
 from caustic_cli.inverse.first import first_surface
@@ -20,7 +20,7 @@ from caustic_cli.inverse.parametrisation import Heights
 from caustic_cli.inverse.schedule import LEAST_CELLS, Stage, coarse_to_fine
 from caustic_cli.inverse.target import target_on_screen
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.project import Project
+from caustic_cli.project.project import Project
 from caustic_cli.scene import Scene
 
 #: A contest without a project: pixels across the screen, and control points, 64 spans and the degree.

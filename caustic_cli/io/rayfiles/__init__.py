@@ -9,7 +9,7 @@ import stat
 from pathlib import Path
 
 from caustic_cli.errors import InputError
-from caustic_cli.rayfiles import lighttools, tm25, zemax
+from caustic_cli.io.rayfiles import lighttools, tm25, zemax
 from caustic_cli.scene.sources.rayset import RaySet
 
 __all__ = ["ACCEPTED", "MAX_BYTES", "SUFFIXES", "parse_rays", "read_bytes"]

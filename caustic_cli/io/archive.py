@@ -8,10 +8,10 @@ import numpy as np
 from torch import Tensor
 
 from caustic_cli.errors import InputError
+from caustic_cli.io.surfaces import load_npz, surface_of
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Disc, Lens, Light, PlaneWave, Points, Scene, Screen, Source
 from caustic_cli.scene.sources.distribution import Distribution
-from caustic_cli.surfaces import load_npz, surface_of
 
 
 def open_archive(path: str | Path) -> tuple[Scene, HeightField, Tensor]:

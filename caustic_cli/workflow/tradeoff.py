@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from caustic_cli import settings
-from caustic_cli.contest import picture_of_disc
-from caustic_cli.derive import build_options, build_stages, complete
+from caustic_cli.config import settings
+from caustic_cli.config.completion import build_options, build_stages, complete
 from caustic_cli.errors import CausticError
 from caustic_cli.inverse.designer import Designer
-from caustic_cli.picture import Picture
-from caustic_cli.project import Project
-from caustic_cli.session import first_heights
+from caustic_cli.io.picture import Picture
+from caustic_cli.project.project import Project
 from caustic_cli.studies.light import Lens
+from caustic_cli.workflow.comparison import picture_of_disc
+from caustic_cli.workflow.design import first_heights
 
 #: Weights of the loss "light" beside "rms"; of light from infinity, whose lens may be of any thickness, and of light close by.
 DISTANT_WEIGHTS, NEAR_WEIGHTS = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0), (0.0, 1.0, 10.0)

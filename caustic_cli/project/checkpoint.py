@@ -29,8 +29,8 @@ import torch
 
 from caustic_cli import __version__
 from caustic_cli.errors import InputError
-from caustic_cli.files import write_bytes
 from caustic_cli.inverse.designer import State
+from caustic_cli.io.files import write_bytes
 from caustic_cli.optics.bspline import SplineSpace
 
 FORMAT_VERSION = 1

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from caustic_cli.config.settings import DEFAULTS, build_lens, build_light, build_screen, build_source, index_of, with_defaults
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Options
 from caustic_cli.inverse.extended import shift_of
@@ -27,7 +28,6 @@ from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.resolution import BAND, Resolution, white
 from caustic_cli.scene import Offset, Scene, Screen, Source, checks, sources
 from caustic_cli.scene.light import RGB
-from caustic_cli.settings import DEFAULTS, build_lens, build_light, build_screen, build_source, index_of, with_defaults
 
 DEFAULT_MAG = 3.0
 DEFAULT_MARGIN = 0.28  # table 6.1: the screen is 6.4 wide where the picture is 5

@@ -15,13 +15,15 @@ from pathlib import Path
 
 import numpy as np
 
-from caustic_cli import __version__, attachments, settings
-from caustic_cli.checkpoint import Checkpoint
-from caustic_cli.derive import Settings
+from caustic_cli import __version__
+from caustic_cli.config import settings
+from caustic_cli.config.completion import Settings
 from caustic_cli.errors import CausticError, InputError
-from caustic_cli.files import write_bytes
-from caustic_cli.picture import Picture
-from caustic_cli.project import CHECKPOINT, MADE, RENDER, WAVE, Project, is_project
+from caustic_cli.io.files import write_bytes
+from caustic_cli.io.picture import Picture
+from caustic_cli.project import attachments
+from caustic_cli.project.checkpoint import Checkpoint
+from caustic_cli.project.project import CHECKPOINT, MADE, RENDER, WAVE, Project, is_project
 
 RECORD = ".outputs.json"
 #: Options that say where and how loudly, not what.

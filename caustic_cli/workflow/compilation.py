@@ -14,7 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
+from caustic_cli.errors import is_shortage
+from caustic_cli.optics.backends import backend_for
+from caustic_cli.optics.effects import NO_REQUESTS, Requests
 from caustic_cli.optics.kernels import cache, functions, plane
+from caustic_cli.optics.trace import warm_up
+from caustic_cli.scene import Lens, PlaneWave, Points, Scene, Screen
+from caustic_cli.workflow.reporter import Reporter
 
 #: What is compiled by itself, and about how long that takes, s.
 PARTS = {"adjoint": 5.0, "transport": 5.5, "splat": 4.0, "surface": 2.8}
@@ -59,7 +65,7 @@ def compile_side_by_side() -> None:
     """Compile what is not kept, on as many cores as this process may use."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     mine, *others = shares(min(len(PARTS), cores))
-    path = os.pathsep.join([str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
+    path = os.pathsep.join([str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
     env = os.environ | {"PYTHONPATH": path, "NUMBA_CACHE_DIR": str(cache.DIRECTORY.parent)}  # so that theirs is this one too
     running = [subprocess.Popen([sys.executable, "-m", __name__, *parts], env=env,
                                 stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) for parts in others]
@@ -71,6 +77,40 @@ def compile_side_by_side() -> None:
     finally:
         for process in running:
             process.terminate()
+
+
+def compile_usual(device: str) -> None:
+    """Compile the kernels that every design and render takes, where the device's are compiled."""
+    if not backend_for(device).compiled:
+        return
+    if not kept():
+        compile_side_by_side()
+    backend_for(device).compile_plane()
+
+
+def compile_for(scene: Scene | None, device: str, say: Reporter, requests: Requests | None = None,
+                gradient: bool = False) -> None:
+    """Have the CPU's kernels compiled that the light of a scene needs beyond the usual ones.
+
+    Args:
+        scene: None for whatever any scene may need.
+        requests: of a plan, or None.
+        gradient: derivatives are needed too.
+    """
+    if not backend_for(device).compiled:
+        return
+    wanted = [(scene, requests or NO_REQUESTS)]
+    if scene is None:
+        lens, screen = Lens(), Screen((30.0, 30.0))
+        wanted = [(Scene(Points(((0.0, 0.0, -50.0),)), lens, screen), NO_REQUESTS),
+                  (Scene(PlaneWave(), lens, screen), Requests(stages=True))]
+    with say.patience("compiling the kernels that this scene needs, once: about half a minute"):
+        try:
+            for one, asked in wanted:
+                warm_up(one, asked, gradient)
+        except (MemoryError, RuntimeError) as problem:
+            if not is_shortage(problem):  # the work itself knows what to do about that, and compiles what it needs
+                raise
 
 
 if __name__ == "__main__":

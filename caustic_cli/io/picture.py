@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image, ImageOps, PngImagePlugin
 
 from caustic_cli.errors import InputError
-from caustic_cli.files import NPY_HEADER, SOFTWARE, atomic_path
+from caustic_cli.io.files import NPY_HEADER, SOFTWARE, atomic_path
 
 ENCODINGS = ("srgb", "linear")
 #: Largest picture read, in pixels: a float64 copy of it is half a gigabyte.

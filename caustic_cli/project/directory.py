@@ -15,8 +15,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from caustic_cli.errors import InputError
-from caustic_cli.files import LEFT_BEHIND, is_ours
-from caustic_cli.project import MADE, Project, is_project
+from caustic_cli.io.files import LEFT_BEHIND, is_ours
+from caustic_cli.project.project import MADE, Project, is_project
 
 try:
     import fcntl

@@ -1,26 +1,26 @@
-"""The verdict on a finished design: its lens retraced with rays of its own, beside the one it began from; render and report.
+"""Evaluation of a finished design: its lens retraced with rays of its own, beside the one it began from; render and report.
 
 What the optimiser saw is no judge of what it did: it learns its own rays and its own filter.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
-from caustic_cli.files import discard
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.extended import limits
 from caustic_cli.inverse.losses import parse
 from caustic_cli.inverse.target import grey
+from caustic_cli.io.files import discard
+from caustic_cli.io.picture import write_image
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.waves import WaveImage
-from caustic_cli.picture import write_image
-from caustic_cli.project import RENDER, REPORT, WAVE, Project
+from caustic_cli.project.project import RENDER, REPORT, WAVE, Project
 from caustic_cli.studies.panels import write_report
 from caustic_cli.studies.retrace import FINAL_RAYS, retrace, white_level
 from caustic_cli.studies.waves import unseen_figures, wave_figures
@@ -35,28 +35,62 @@ QUIET = 0.1
 BRIGHTER = 1.01
 
 
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """What a finished design is worth.
+
+    state: with the lens that was kept; figures: of the JSON table, with start_relative_rms where a start was retraced; image,
+    waves: irradiance on the screen, power per pixel, by rays and as a wave (None where that was not refined), (n_x, n_y) or
+    (3, n_x, n_y), float64.
+    """
+
+    state: State
+    figures: dict
+    image: np.ndarray
+    waves: np.ndarray | None
+
+
 def judge(project: Project, designer: Designer, target: np.ndarray, state: State, device: str) -> tuple[State, dict]:
-    """Retrace the finished lens; write render.png and report.png.
+    """Evaluate the finished lens; write render.png, wave.png and report.png into the project.
+
+    Returns:
+        the state with the lens that was kept, and its figures.
+    """
+    found = evaluate(designer, target, state, device, project.settings["design"]["seed"], tuple(project.settings["target"]["size"]))
+    encoding = project.settings["target"]["encoding"]
+    write_image(project.path / RENDER, found.image, white_level(found.image, target), encoding)
+    discard(project.path / WAVE)  # of another lens
+    if found.waves is not None:
+        write_image(project.path / WAVE, found.waves, white_level(found.waves, target), encoding)
+    history = np.array(state.history, dtype=float).reshape(-1, 5)
+    surface = _surface(designer.field(found.state.stage), found.state.heights)
+    write_report(project.path / REPORT, grey(target), grey(found.image), surface, history, designer.scene.lens,
+                 designer.scene.screen, found.figures, encoding, None if found.waves is None else grey(found.waves))
+    return found.state, found.figures
+
+
+def evaluate(designer: Designer, target: np.ndarray, state: State, device: str, seed: int, size: tuple[float, float]) -> Evaluation:
+    """Retrace the finished lens with rays that it was not designed with, and where diffraction was refined, as a wave.
 
     Where nothing but likeness was asked for, a lens that is worse than what the design began from is replaced by that: by the wave
     image where that was refined, whose figures are then there too.
 
-    Returns:
-        the state with the lens that was kept, and its figures, with start_relative_rms where a start was retraced.
+    Args:
+        seed: of the rays; size: width and height of the picture, mm.
     """
-    scene, field, seed = designer.scene, designer.field(state.stage), project.settings["design"]["seed"]
+    scene, field = designer.scene, designer.field(state.stage)
 
     def trace(heights: torch.Tensor, noise: bool = True):
         return retrace(scene, field, heights, target, rays=FINAL_RAYS, device=device, seed=seed, noise=noise, quiet=QUIET)
 
-    waves = any(s.waves for s in designer.stages[: state.stage + 1])
-    light, seen = None, Resolution.before(scene, tuple(project.settings["target"]["size"]))
+    refined = any(s.waves for s in designer.stages[: state.stage + 1])
+    light, seen = None, Resolution.before(scene, size)
 
     def as_waves(heights: torch.Tensor) -> tuple[WaveImage | None, dict]:
         return wave_figures(scene, field, heights.to(device), target, seen, required=designer.options.waves)
 
     exposure, figures = trace(state.heights)
-    if waves:
+    if refined:
         light, more = as_waves(state.heights)
         figures |= more
     likeness = {name for _, name in parse(designer.options.loss)} <= LIKENESS
@@ -64,7 +98,7 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
         start = designer.within_limits(replace(state, heights=designer.begun(state)))
         _, began = trace(start, noise=False)
         of_start = None
-        if waves:
+        if refined:
             of_start, more = as_waves(start)
             began |= more
         if _worse(figures, began):
@@ -72,7 +106,7 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
             exposure, judged = trace(start)
             figures, light = began | judged, of_start
         figures = figures | {"start_relative_rms": began["relative_rms"]}
-        if waves:
+        if refined:
             figures |= {"start_wave_relative_rms": began["wave_relative_rms"]}
     bounds = limits(scene, grey(target), field, state.heights)
     if bounds.light is not None:
@@ -81,17 +115,7 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
         figures |= {"etendue_limit": bounds.etendue}
     if light is not None:
         figures |= unseen_figures(scene, field, state.heights.to(device), target)
-    image, encoding = exposure.image.cpu().numpy(), project.settings["target"]["encoding"]
-    write_image(project.path / RENDER, image, white_level(image, target), encoding)
-    discard(project.path / WAVE)  # of another lens
-    of_light = None
-    if light is not None:
-        of_light = light.image.cpu().numpy()
-        write_image(project.path / WAVE, of_light, white_level(of_light, target), encoding)
-    history = np.array(state.history, dtype=float).reshape(-1, 5)
-    write_report(project.path / REPORT, grey(target), grey(image), _surface(field, state.heights), history, scene.lens,
-                 scene.screen, figures, encoding, None if of_light is None else grey(of_light))
-    return state, figures
+    return Evaluation(state, figures, exposure.image.cpu().numpy(), None if light is None else light.image.cpu().numpy())
 
 
 def _worse(figures: dict, than: dict) -> bool:

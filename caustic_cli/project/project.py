@@ -12,14 +12,15 @@ from pathlib import Path
 
 import numpy as np
 
-from caustic_cli import attachments, checkpoint, settings
-from caustic_cli.checkpoint import Checkpoint
-from caustic_cli.derive import Settings, build_options, build_stages, complete
+from caustic_cli.config import settings
+from caustic_cli.config.completion import Settings, build_options, build_stages, complete
 from caustic_cli.errors import InputError
-from caustic_cli.files import write_bytes
 from caustic_cli.inverse.target import target_on_screen
+from caustic_cli.io.files import write_bytes
+from caustic_cli.io.picture import Picture, read_picture
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.picture import Picture, read_picture
+from caustic_cli.project import attachments, checkpoint
+from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.scene import Scene, sources
 
 TOML, CHECKPOINT, RENDER, WAVE, REPORT = "project.toml", "checkpoints.h5", "render.png", "wave.png", "report.png"

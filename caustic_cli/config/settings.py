@@ -10,7 +10,7 @@ import difflib
 import math
 import re
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -175,6 +175,22 @@ def parse(text: str, where: str) -> dict[str, dict[str, Any]]:
                 continue
             out[section][key] = _typed(f"{where}: [{section}] {key}", key, value, SCHEMA[section])
     return out
+
+
+def checked(given: Mapping[str, Any], where: str) -> dict[str, dict[str, Any]]:
+    """Settings given as Python values, NumPy's too, with the refusals of a file."""
+    def plain(value):
+        if isinstance(value, Mapping):
+            return {str(k): plain(v) for k, v in value.items()}
+        if isinstance(value, np.ndarray | np.generic):
+            return plain(value.tolist())
+        return [plain(v) for v in value] if isinstance(value, list | tuple) else value
+
+    try:
+        text = tomli_w.dumps(plain(given))
+    except TypeError as error:
+        raise InputError(f"{where}: holds what is neither text, a number, true or false nor a list of such ({error})") from error
+    return parse(text, where)
 
 
 def _fits(value) -> bool:

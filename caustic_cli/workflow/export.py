@@ -1,0 +1,74 @@
+"""A lens into the file of another program."""
+
+from __future__ import annotations
+
+import time
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+
+from torch import Tensor
+
+from caustic_cli.errors import InputError
+from caustic_cli.export import FORMATS
+from caustic_cli.io.files import refuse_foreign
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.project.project import Project
+from caustic_cli.project.uptodate import Outputs
+from caustic_cli.scene import Scene
+from caustic_cli.workflow.reporter import Reporter
+
+
+def export(project: Path, format: str, output: Path | None, script: bool, given: dict, force: bool,
+           say: Reporter) -> tuple[dict, bool]:
+    """Write the lens of a project.
+
+    Args:
+        format: a name of FORMATS.
+        output: file to write, None for the project's name here.
+        script: of lighttools: also the script that rebuilds the scene.
+        given: samples (n, m) or tolerance, mm, of the sampled formats.
+        force: replace files that are not ours, and do again what is up to date.
+
+    Returns:
+        file, format, bytes, seconds and what was written beside it; whether an earlier run of the same had made all of it.
+
+    Raises:
+        InputError: no lens there, one that the format cannot hold, or a file in the way; nothing was written.
+    """
+    began, opened = time.monotonic(), Project.open(project)
+    path = output or Path(project.resolve().stem + FORMATS[format][0])
+    scene = opened.scene()
+    written = files(path, scene, format, script)
+    for file in written:
+        refuse_foreign(file, force)
+    if scene.lens.mirror:
+        raise InputError(f"{project}: is a mirror, and the formats hold lenses: nothing is exported")
+    made = Outputs(opened, "export", {"format": format, "script": script, **given}, written)
+    if not force and (found := made.found()):
+        say.say(f"{path}: is what the same options made of the same project, so there is nothing to do; --force does it again")
+        return found, True
+    field, checkpoint = opened.lens(scene)
+    write(path, scene, field, checkpoint.state.heights, format, script, **given)
+    more = {"beside": [str(file) for file in written[1:]]} if len(written) > 1 else {}
+    figures = {"file": str(path), "format": format, "bytes": path.stat().st_size, **more, "seconds": time.monotonic() - began}
+    made.keep(figures)
+    return figures, False
+
+
+def write(path: Path, scene: Scene, field: HeightField, heights: Tensor, format: str, script: bool = False, **given) -> None:
+    """Write a lens' files, see `files`; given: samples or tolerance."""
+    getattr(_home(format), f"write_{format}")(path, scene, field, heights, **given)
+    if script:
+        import_module("caustic_cli.export.lighttools_script").write_script(path, scene, field, heights, **given)
+
+
+def files(path: Path, scene: Scene, format: str, script: bool = False) -> list[Path]:
+    """All that an export writes, the lens first."""
+    if format == "mitsuba":
+        return [path, *_home(format).companions(path, scene.lens.round)]
+    return [path, *import_module("caustic_cli.export.lighttools_script").companions(path)] if script else [path]
+
+
+def _home(format: str) -> ModuleType:
+    return import_module(f"caustic_cli.export.{FORMATS[format][1]}")

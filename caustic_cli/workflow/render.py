@@ -1,0 +1,202 @@
+"""A render from beginning to end: open the lens, compile the scene into a plan, retrace it, write images and figures."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from caustic_cli.config.completion import filter_from
+from caustic_cli.errors import InputError
+from caustic_cli.export.mitsuba import quick_samples, write_mitsuba
+from caustic_cli.io.archive import open_archive
+from caustic_cli.io.files import discard, refuse_foreign
+from caustic_cli.io.picture import write_image, write_npy
+from caustic_cli.optics.emission.measured import coarse_words
+from caustic_cli.optics.plan import Plan, compile_plan, parse_effects
+from caustic_cli.optics.resolution import Resolution
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.project.project import RENDER, WAVE, Project, beside
+from caustic_cli.project.uptodate import Outputs
+from caustic_cli.scene import Scene
+from caustic_cli.studies import effects as effects_study
+from caustic_cli.studies import manufacture
+from caustic_cli.studies.retrace import retrace, white_level
+from caustic_cli.studies.verify import require_mitsuba, verify, write_panels
+from caustic_cli.studies.waves import wave_figures
+from caustic_cli.workflow.compilation import compile_for
+from caustic_cli.workflow.reporter import Reporter
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked of a render.
+
+    Args:
+        lens: project directory, or an .npz archive as exported.
+        rays: traced; with `tolerance`, where the number begins.
+        tolerance: relative RMS noise of the image that rays are added for, None for none.
+        reconstruction, filter_size, alpha: of the image; alpha in 1/mm^2, None for 1 per pixel^2.
+        given: (section, key, option) -> value, settings that replace the project's own.
+        screen_at: the screen's z instead of the scene's, mm.
+        effects: auto, none or names, see `optics.plan.parse_effects`; explain: measure what each costs.
+        image, npy: files to write; None for render.png in the project, and for none.
+        verify: compare with Mitsuba; report: say what making the lens asks for, tool_radius in mm.
+        force: replace files that are not ours, and do again what is up to date.
+        seed, dtype: of rays; None for the project's own and for float64.
+    """
+
+    lens: Path
+    rays: int = 1_000_000
+    tolerance: float | None = None
+    reconstruction: str = "bincount"
+    filter_size: tuple[int, int] = (3, 3)
+    alpha: float | None = None
+    given: Mapping[tuple[str, str, str], object] = field(default_factory=dict)
+    screen_at: float | None = None
+    effects: str = "auto"
+    explain: bool = False
+    image: Path | None = None
+    npy: Path | None = None
+    verify: bool = False
+    report: bool = False
+    tool_radius: float | None = None
+    force: bool = False
+    seed: int | None = None
+    dtype: torch.dtype = torch.float64
+
+    @property
+    def asks(self) -> dict[str, object]:
+        """What decides the outcome, by name; where it goes does not."""
+        names = ("rays", "tolerance", "reconstruction", "filter_size", "alpha", "screen_at", "effects", "explain", "report",
+                 "tool_radius", "seed", "dtype")
+        return {name: getattr(self, name) for name in names} | {option: value for (_, _, option), value in self.given.items()}
+
+
+@dataclass(frozen=True)
+class Opened:
+    """A lens to render, with the project it is of (None of an archive), its target (n_x, n_y) and where that has got to."""
+
+    project: Project | None
+    scene: Scene
+    field: HeightField
+    heights: Tensor
+    target: np.ndarray | None = None
+    iterations: int | None = None
+    encoding: str = "srgb"
+    seed: int = 0
+
+    def resolution(self, scene: Scene) -> Resolution:
+        """What diffraction lets the scene show."""
+        if self.project is None:
+            return Resolution.at(scene, self.field, self.heights)
+        return Resolution.before(scene, tuple(self.project.settings["target"]["size"]))
+
+
+def render(asked: Request, device: str, say: Reporter) -> dict:
+    """Trace a lens and write its irradiance image.
+
+    Returns:
+        the figures of the JSON table; `effects`, `report` and `verify` where asked for; `reused` where an earlier run of the same
+        has made them, and nothing was done.
+
+    Raises:
+        InputError: no lens there, a value out of range, or a file in the way; nothing was written.
+    """
+    began = time.monotonic()
+    wanted = parse_effects(asked.effects)
+    project = None if _archived(asked.lens) else Project.open(asked.lens)
+    if project is None and asked.given:
+        raise InputError(f"{next(iter(asked.given))[2]}: an archive's source is fixed; render its project under another light")
+    image_path = asked.image or (asked.lens / RENDER if project else Path(asked.lens.stem + ".png"))
+
+    def companion(name: str) -> Path:
+        return image_path.with_name(name if asked.image is None else f"{image_path.stem}-{name}")
+
+    panels = companion("verify.png") if asked.verify else None
+    sheet = companion("report.json") if asked.report else None
+    wave_path, wave_npy = beside(image_path), beside(asked.npy) if asked.npy else None
+    paths = (image_path, asked.npy, panels, sheet, wave_path, wave_npy)
+    for path in paths:
+        if path is not None:
+            refuse_foreign(path, asked.force)
+    made = Outputs(project, "render", asked.asks, paths) if project and not asked.verify else None
+    if made and not asked.force and (figures := made.found()):
+        say.say(f"{image_path}: is what the same options made of the same project, so there is nothing to do; --force does it"
+                " again")
+        return figures | {"reused": True}
+    lens = _opened(asked, project)
+    scene = lens.scene if asked.screen_at is None else replace(lens.scene, screen=replace(lens.scene.screen, z=asked.screen_at))
+    if asked.verify:
+        require_mitsuba(scene)
+    filter = filter_from(asked.reconstruction, asked.filter_size, scene.screen, asked.alpha)
+    seed = lens.seed if asked.seed is None else asked.seed
+    plan = compile_plan(scene, lens.field, lens.heights, wanted)
+    if coarse := coarse_words(scene):
+        say.say(coarse)
+    compile_for(None if asked.explain else plan.scene, device, say, plan.requests)
+    exposure, figures = retrace(plan.scene, lens.field, lens.heights, lens.target, rays=asked.rays, filter=filter, device=device,
+                                seed=seed, dtype=asked.dtype, tolerance=asked.tolerance, requests=plan.requests)
+    image = exposure.image.cpu().numpy()
+    write_image(image_path, image, white_level(image, lens.target), lens.encoding)
+    if wave_path == asked.lens / WAVE:
+        discard(wave_path)  # of what render.png was before
+    if asked.npy is not None:
+        write_npy(asked.npy, image)
+    if plan["diffraction"].on:
+        with say.patience("taking the wave image"):
+            figures |= _wave_image(plan, lens, device, wanted is not None, wave_path, wave_npy)
+    figures |= {"iterations": lens.iterations, "seconds": time.monotonic() - began, "image": str(image_path)}
+    if asked.explain:
+        figures["effects"] = effects_study.explain(plan, scene, lens.field, lens.heights.to(device),
+                                                   rays=min(asked.rays, effects_study.RAYS), seed=seed, dtype=asked.dtype)
+    if sheet is not None:
+        figures["report"] = manufacture.manufacture(scene, lens.field, lens.heights, asked.tool_radius, seed)
+        manufacture.write_json(sheet, figures["report"])
+    if panels is not None:
+        figures["verify"] = _verified(scene, lens, asked.rays, seed, panels)
+    if made:
+        made.keep(figures)
+    return figures
+
+
+def _archived(path: Path) -> bool:
+    return path.suffix.lower() == ".npz" and path.is_file()
+
+
+def _opened(asked: Request, project: Project | None) -> Opened:
+    if project is None:
+        return Opened(None, *open_archive(asked.lens))
+    scene = project.scene(dict(asked.given))
+    target, (surface, checkpoint) = project.target(scene), project.lens(scene)
+    return Opened(project, scene, surface, checkpoint.state.heights, target, checkpoint.state.total,
+                  project.settings["target"]["encoding"], project.settings["design"]["seed"])
+
+
+def _wave_image(plan: Plan, lens: Opened, device: str, required: bool, path: Path, npy: Path | None) -> dict:
+    """Write the wave image; its figures."""
+    light, figures = wave_figures(plan.scene, lens.field, lens.heights.to(device), lens.target, lens.resolution(plan.scene),
+                                  finer=1.0, required=required)
+    if light is None:
+        return figures
+    image = light.image.cpu().numpy()
+    write_image(path, image, white_level(image, lens.target), lens.encoding)
+    if npy is not None:
+        write_npy(npy, image)
+    return figures | {"wave_image": str(path)}
+
+
+def _verified(scene: Scene, lens: Opened, rays: int, seed: int, panels: Path) -> dict:
+    """The figures of the comparison with Mitsuba; its picture is written to `panels`."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "lens.xml"
+        write_mitsuba(path, scene, lens.field, lens.heights, quick_samples(lens.field), dark=True)
+        found = verify(path, scene, lens.field, lens.heights, rays, seed)
+    write_panels(panels, found, scene)
+    return found.figures | {"image": str(panels)}
