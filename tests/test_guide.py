@@ -1,0 +1,98 @@
+"""The guide's commands and Python run as they stand, in a directory with the examples' pictures, on few rays and pixels."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from caustic_cli import cli
+from caustic_cli.workflow import evaluation
+
+ROOT = Path(__file__).resolve().parent.parent
+GUIDE = ROOT / "examples" / "guide"
+CHAPTERS = sorted(GUIDE.glob("[1-9]-*.md"))
+#: So that every design is a small one; what a line says itself goes before.
+SMALL = {f"CAUSTIC_{name}": value for name, value in {
+    "DESIGN_RESOLUTION": "24", "DESIGN_ITERATIONS": "2", "DESIGN_WAVES": "off", "DESIGN_QUIET": "1", "DESIGN_THREADS": "1",
+    "DESIGN_FORCE": "1", "RENDER_QUIET": "1", "RENDER_RAYS": "20000", "RENDER_FORCE": "1", "CONVERGENCE_QUIET": "1",
+    "CONVERGENCE_FORCE": "1"}.items()}
+#: What a line needs that the chapters before do not make, and other programs' lines.
+NEEDS_MORE = ("--verify", "--source-file led.tm25ray")
+
+
+def blocks(path: Path, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", path.read_text("utf-8"), re.M | re.S)
+
+
+def commands(path: Path) -> list[list[str]]:
+    """The arguments of each line that calls caustic."""
+    lines = [line.strip() for block in blocks(path, "sh") for line in block.splitlines()]
+    return [shlex.split(line, comments=True)[1:] for line in lines
+            if line.startswith("caustic ") and not any(word in line for word in NEEDS_MORE)]
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    """A directory with the pictures, the thesis' configurations and three projects, that all chapters work in."""
+    directory = tmp_path_factory.mktemp("guide")
+    before = Path.cwd()
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in SMALL.items():
+            patch.setenv(name, value)
+        patch.setattr(evaluation, "FINAL_RAYS", 20_000)
+        os.chdir(directory)
+        for name in ("flame.png", "ball.png"):
+            shutil.copy(ROOT / "examples" / name, directory)
+        shutil.copytree(ROOT / "examples" / "thesis", directory / "thesis")
+        x = np.linspace(0.0, 255.0, 64)
+        Image.fromarray((0.5 * (x[:, None] + x[None, :])).astype(np.uint8)).save("portrait.jpg")
+        for project, *more in (("portrait.caustic", "portrait.jpg"), ("flame.caustic", "flame.png"),
+                               ("point.caustic", "flame.png", "--source", "point"),
+                               ("led.caustic", "flame.png", "--source", "disc", "--source-size", "1", "--control", "40")):
+            assert cli.run(["design", *more, "-o", project]) == 0
+        yield directory
+        os.chdir(before)
+
+
+@pytest.mark.parametrize("chapter", CHAPTERS, ids=lambda p: p.stem)
+def test_the_commands_of_a_chapter_run(chapter, home, monkeypatch, capfd):
+    monkeypatch.chdir(home)
+    for arguments in commands(chapter):
+        few = ["1e5" if k and arguments[k - 1] == "--rays" and float(a) > 1e5 else a for k, a in enumerate(arguments)]
+        where = few.index("2>") if "2>" in few else len(few)
+        status = cli.run(few[:where])
+        assert status == 0, f"caustic {shlex.join(arguments)}\n{capfd.readouterr().err}"
+
+
+@pytest.mark.parametrize("chapter", [c for c in CHAPTERS if blocks(c, "python")], ids=lambda p: p.stem)
+def test_the_python_of_a_chapter_runs(chapter, home, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(home / "flame.png", tmp_path)
+    for block in blocks(chapter, "python"):
+        exec(compile(block, str(chapter), "exec"), {})
+
+
+def test_links_of_the_documents_lead_somewhere():
+    documents = [*(ROOT / name / "README.md" for name in ("", "caustic_cli", "tests/benchmarks")), *GUIDE.glob("*.md")]
+    checked = 0
+    for path in documents:
+        for link in re.findall(r"\]\(([^)#]+)\)", path.read_text("utf-8")):
+            if "://" not in link:
+                assert (path.parent / link).exists(), f"{path}: {link}"
+                checked += 1
+    assert checked > 20 and len(CHAPTERS) == 8
+
+
+def test_the_readme_is_short_and_its_python_is_the_library():
+    text = (ROOT / "README.md").read_text("utf-8")
+    assert len(text.splitlines()) <= 130
+    (block,) = re.findall(r"^```python\n(.*?)^```", text, re.M | re.S)
+    names = re.search(r"from caustic_cli import (.*)", block)[1].split(", ")
+    assert set(names) <= set(__import__("caustic_cli").__all__)
