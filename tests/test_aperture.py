@@ -18,7 +18,7 @@ from caustic_cli.export.lighttools import write_lighttools
 from caustic_cli.export.lighttools_script import write_script
 from caustic_cli.export.mesh import FLANGE, closed_mesh, patch, rim_of
 from caustic_cli.export.mitsuba import companions, write_mitsuba
-from caustic_cli.inverse.first import first_surface
+from caustic_cli.inverse.initial_surface import first_surface
 from caustic_cli.io.archive import open_archive
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.rays import Status

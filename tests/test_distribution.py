@@ -18,7 +18,7 @@ from caustic_cli import cli
 from caustic_cli.errors import InputError
 from caustic_cli.export.lighttools import write_lighttools
 from caustic_cli.export.mitsuba import write_mitsuba
-from caustic_cli.inverse.first import first_surface
+from caustic_cli.inverse.initial_surface import first_surface
 from caustic_cli.io.archive import open_archive
 from caustic_cli.io.intensities import parse_distribution
 from caustic_cli.optics.bounds import bounds_of

@@ -22,7 +22,7 @@ from caustic_cli.scene.materials import refractive_index
 
 N, R0 = 1.5, 0.04
 POINT = Points(((0.5, -0.3, -40.0),))
-DETOURS, STAGES = Requests.to("ghosts", "second-meeting"), Requests(stages=True)
+DETOURS, STAGES = Requests.to("ghosts", "secondary-intersection"), Requests(stages=True)
 
 
 def scene_of(source=None, *, degree=(2, 2), control=(9, 8), screen=None, light=None, **lens) -> Scene:
@@ -244,7 +244,7 @@ def test_a_tilted_screen_that_cuts_into_the_lens_is_refused():
         check_room(scene, torch.full((9, 8), 3.0), scene.screen)
 
 
-# Detours
+# Stray light
 
 
 @pytest.mark.parametrize("absorption", [0.0, 0.05])
@@ -359,7 +359,7 @@ def test_the_way_of_a_ray_that_meets_the_surface_twice(fresnel):
     """From the ramp into the cliff and out on its far side: Snell's law in vector form, by hand, in two dimensions."""
     scene, heights = cliff()
     scene = replace(scene, lens=replace(scene.lens, fresnel=fresnel))
-    (straight, late), sample = land(scene, heights, Requests.to("second-meeting"), shape=(2000, 1))
+    (straight, late), sample = land(scene, heights, Requests.to("secondary-intersection"), shape=(2000, 1))
     x0 = (10 * sample.u - 5).numpy()
     s = math.sqrt(1 - (N * N - 1) * 0.64)
     tangent = (N - s) / (N * 0.64 + s) * 0.8
@@ -387,7 +387,7 @@ def test_the_way_of_a_ray_that_meets_the_surface_twice(fresnel):
 
 def test_second_meetings_are_taken_off_the_straight_light():
     scene, heights = cliff()
-    straight, true = (shine(scene, heights, r, rays=20_000) for r in (STAGES, STAGES | Requests.to("second-meeting")))
+    straight, true = (shine(scene, heights, r, rays=20_000) for r in (STAGES, STAGES | Requests.to("secondary-intersection")))
     assert float((straight.image - true.image).abs().sum()) > 0.02
     for e in (straight, true):
         assert float(e.image.sum()) + sum(e.lost.values()) == pytest.approx(1.0, abs=1e-12)

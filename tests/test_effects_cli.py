@@ -61,7 +61,7 @@ def test_explain_and_effects(capfd, tmp_path):
     least, most = rows["diffraction"]["cost_ms_range"]
     assert 0 < least == rows["diffraction"]["cost_ms"] < most
     assert rows["fresnel"]["power"] == pytest.approx(plain["lost"]["fresnel"], rel=0.02)
-    for name in ("entrance", "intersection", "polarisation", "second-meeting", "total-reflection"):
+    for name in ("entrance", "intersection", "polarisation", "secondary-intersection", "total-reflection"):
         assert rows[name]["error"] < 1e-12, name
     assert 0 < rows["ghosts"]["bound"] < 0.01 and rows["ghosts"]["power"] < 0
 

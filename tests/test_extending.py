@@ -53,9 +53,9 @@ FILTER = Addition(3, edits=(
      "            f = (0.5 * v - d.abs()).clamp_min(0.0)\n"
      "            return f / f.sum(-1, keepdim=True)\n"
      "        return self._gaussian(d, v, self.alpha[axis])"),
-    ("optics/kernels/shares.py", "BINCOUNT, GAUSSIAN, COSINE = 0, 1, 2", "BINCOUNT, GAUSSIAN, COSINE, TENT = 0, 1, 2, 3"),
-    ("optics/kernels/shares.py", 'KINDS = {"bincount": BINCOUNT,', 'KINDS = {"tent": TENT, "bincount": BINCOUNT,'),
-    ("optics/kernels/shares.py", "    if alpha * square < SMALL:\n        for k in range(v):\n            offset",
+    ("optics/kernels/filter_weights.py", "BINCOUNT, GAUSSIAN, COSINE = 0, 1, 2", "BINCOUNT, GAUSSIAN, COSINE, TENT = 0, 1, 2, 3"),
+    ("optics/kernels/filter_weights.py", 'KINDS = {"bincount": BINCOUNT,', 'KINDS = {"tent": TENT, "bincount": BINCOUNT,'),
+    ("optics/kernels/filter_weights.py", "    if alpha * square < SMALL:\n        for k in range(v):\n            offset",
      textwrap.dedent("""\
          if kind == TENT:
              for k in range(v):
@@ -114,7 +114,7 @@ EFFECT = Addition(2, new={"optics/effects/dust.py": '''
 
     from __future__ import annotations
 
-    from caustic_cli.optics.effects.base import NO_REQUESTS, Action, Effect, Requests, Verdict
+    from caustic_cli.optics.effects.base import NO_REQUESTS, Action, Effect, Requests, Decision
 
     COVERED = 0.05
 
@@ -126,7 +126,7 @@ EFFECT = Addition(2, new={"optics/effects/dust.py": '''
 
         def judge(self, scene, bounds):
             """Nobody knows."""
-            return Verdict(self.name, False, "surfaces are taken to be clean")
+            return Decision(self.name, False, "surfaces are taken to be clean")
 
         def request(self, scene, on, bounds):
             """To simulate it."""
@@ -140,10 +140,10 @@ EFFECT = Addition(2, new={"optics/effects/dust.py": '''
     class Covered(Action):
         """Takes its part."""
 
-        def arrive(self, meeting):
+        def arrive(self, interaction):
             """Before the surface."""
-            meeting.state.lose("absorbed", (COVERED * meeting.state.power).detach())
-            meeting.state.power = (1.0 - COVERED) * meeting.state.power
+            interaction.state.lose("absorbed", (COVERED * interaction.state.power).detach())
+            interaction.state.power = (1.0 - COVERED) * interaction.state.power
 '''}, edits=(("optics/effects/__init__.py", "from caustic_cli.optics.effects.entrance import Entrance\n",
               "from caustic_cli.optics.effects.dust import Dust\nfrom caustic_cli.optics.effects.entrance import Entrance\n"),
              ("optics/effects/__init__.py", "SourceSize(), Polarisation(),", "SourceSize(), Dust(), Polarisation(),")),

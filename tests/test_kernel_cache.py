@@ -16,7 +16,7 @@ from caustic_cli.optics.kernels import cache
 #: A kernel that is compiled in a second; what it gives follows from a constant of `tolerances`, by way of a function of `bend`.
 PROBE = '''"""A small kernel."""
 
-from caustic_cli.optics.kernels.bend import _s
+from caustic_cli.optics.kernels.axial_refraction import _s
 from caustic_cli.optics.kernels.jit import njit
 
 
@@ -118,7 +118,7 @@ def test_a_temporary_directory_of_others_is_not_trusted(tmp_path):
 
 def test_every_file_with_a_kernel_counts():
     names = {p.relative_to(cache.PACKAGE).as_posix() for p in cache.sources()}
-    assert {"optics/kernels/plane.py", "optics/kernels/bend.py", "optics/tolerances.py", "optics/kernels/laguerre.py",
+    assert {"optics/kernels/plane.py", "optics/kernels/axial_refraction.py", "optics/tolerances.py", "optics/kernels/laguerre.py",
             "optics/kernels/multigrid.py"} <= names
 
 

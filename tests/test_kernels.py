@@ -16,7 +16,7 @@ from caustic_cli.optics.backends import backend_for, plain
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.frames import IDENTITY
 from caustic_cli.optics.kernels import banded, pixels, plane, spline
-from caustic_cli.optics.kernels import shares as kernel_shares
+from caustic_cli.optics.kernels import filter_weights as kernel_shares
 from caustic_cli.optics.kernels.functions import PlaneKernel
 from caustic_cli.optics.kernels.jit import njit
 from caustic_cli.optics.kernels.threads import ALL, on_threads

@@ -13,8 +13,8 @@ from PIL import Image
 
 from caustic_cli import cli
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.first import First, first_surface
 from caustic_cli.inverse.incidence import incident
+from caustic_cli.inverse.initial_surface import First, first_surface
 from caustic_cli.inverse.losses import Loss
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.reach import refuse_unreachable

@@ -17,7 +17,7 @@ from caustic_cli import cli
 from caustic_cli.config import settings
 from caustic_cli.config.completion import complete
 from caustic_cli.errors import CausticError, InputError
-from caustic_cli.inverse.first import first_surface
+from caustic_cli.inverse.initial_surface import first_surface
 from caustic_cli.optics.bounds import bounds_of
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.emission.measured import coarse_words, coarseness, irradiance

@@ -51,7 +51,7 @@ def test_what_is_skipped_changes_nothing(source):
             assert float((there.image - here.image).abs().sum()) <= allowed, effect.name
             assert there.lost == pytest.approx(here.lost, abs=allowed), effect.name
             skipped.append(effect.name)
-    assert {"total-reflection", "second-meeting", "ghosts"} <= set(skipped)
+    assert {"total-reflection", "secondary-intersection", "ghosts"} <= set(skipped)
     assert source is not None or {"entrance", "intersection", "missed-surface", "polarisation"} <= set(skipped)
     assert len(skipped) >= 8
 
@@ -77,10 +77,10 @@ def test_no_ray_breaks_a_proof(source, bumps):
         (rays,) = rays_of(scene, "stratified", 1000, seed).chunks()
         traced = traced_through(scene, rays)
         assert traced.first == len(traced.system.elements) - 1
-        meeting = traced.cross(traced.first, traced.start, heights)
-        alive = meeting.state.power > 0
-        o, d = ([c[alive] for c in meeting.state.full(v)] for v in (meeting.local, meeting.state.direction))
-        if not plan["second-meeting"].on:
+        interaction = traced.cross(traced.first, traced.start, heights)
+        alive = interaction.state.power > 0
+        o, d = ([c[alive] for c in interaction.state.full(v)] for v in (interaction.local, interaction.state.direction))
+        if not plan["secondary-intersection"].on:
             _, found = again(field, heights, o, d, below=False)
             assert not bool(found.any())
             leaning = torch.hypot(d[0], d[1]) / d[2]
@@ -95,7 +95,7 @@ def test_the_critical_angle_decides_total_reflection():
     for slope, on in ((critical * (1 - 1e-9), False), (critical * (1 + 1e-9), True)):
         scene = scene_of()
         plan = plan_of(scene, heights_through(scene, sloped(slope)))
-        assert plan["total-reflection"].on == on == plan["second-meeting"].on
+        assert plan["total-reflection"].on == on == plan["secondary-intersection"].on
         assert plan["total-reflection"].bound == pytest.approx(1.0, abs=1e-8)
     slanted = scene_of(POINT)
     assert plan_of(slanted, heights_through(slanted, sloped(critical * 0.95)))["total-reflection"].on
@@ -106,7 +106,7 @@ def test_the_critical_angle_decides_total_reflection():
 def test_what_a_scene_has_is_simulated():
     scene, heights = cliff()
     plan = plan_of(scene, heights)
-    assert {"second-meeting", "ghosts", "total-reflection"} <= set(plan.simulated)
+    assert {"secondary-intersection", "ghosts", "total-reflection"} <= set(plan.simulated)
     assert plan.requests == DETOURS
     scene = scene_of(POINT, light=Light(10.0, (500.0, 600.0)), glass="PMMA", screen=Screen((16.0, 14.0), 60.0, (8, 8), (0.0, 5.0),
                      (1.0, 0.0)), absorption=0.01, roughness=0.001)
@@ -118,7 +118,7 @@ def test_what_a_scene_has_is_simulated():
     assert plan_of(scene_of(Disc(angle=1.0)), bumpy(scene, 0.1))["source-size"].on
     mirror = scene_of(mirror=True, screen=Screen((16.0, 14.0), -60.0, (8, 8)))
     assert {"mirror"} <= set(plan_of(mirror, bumpy(mirror, 0.1), ()).simulated)
-    assert plan_of(mirror, heights_through(mirror, lambda x, y: 3.0 + 0.2 * x * x + 0 * y))["second-meeting"].on
+    assert plan_of(mirror, heights_through(mirror, lambda x, y: 3.0 + 0.2 * x * x + 0 * y))["secondary-intersection"].on
 
 
 def test_a_plane_wave_without_effects_runs_the_bare_path(monkeypatch):
@@ -164,7 +164,7 @@ def test_leaving_out_matters_where_the_effect_is():
     plan = plan_of(scene, heights)
     whole, checked = image_of(plan, heights), 0
     for name in plan.simulated:
-        if not (plan[name].fixed or name in ("total-reflection", "second-meeting", "diffraction")):
+        if not (plan[name].fixed or name in ("total-reflection", "secondary-intersection", "diffraction")):
             less = image_of(plan_of(scene, heights, set(plan.simulated) - {name}), heights)
             assert float((less.image - whole.image).abs().sum()) > 1e-5, name
             checked += 1

@@ -15,8 +15,8 @@ from caustic_cli.optics.interface import reflect, reflectance, reflectances, ref
 from caustic_cli.optics.kernels import mirror, refraction
 from caustic_cli.optics.kernels.grid import GridSurface
 from caustic_cli.optics.kernels.interact import interact
-from caustic_cli.optics.kernels.land import land
 from caustic_cli.optics.kernels.splat import splat_rays
+from caustic_cli.optics.kernels.transfer import land
 from caustic_cli.optics.polarisation import field_of, part_s
 from caustic_cli.optics.reconstruction import Filter, splat
 from caustic_cli.optics.sampling import Sample

@@ -32,7 +32,7 @@ def lens(source=None, control=(9, 8)):
 
 
 @pytest.fixture(scope="module")
-def meeting():
+def interaction():
     told = []
     study = intersection.run_intersection(intersection.table_d3(5000), repeats=1, most=16, progress=lambda *s: told.append(s))
     return study, told
@@ -53,14 +53,14 @@ def contender(small, k):
     return comparison.Entry(*comparison.plans(scene, full)[k], scene, torch.from_numpy(target))
 
 
-def test_both_errors_of_the_mesh_are_of_order_two(meeting):
+def test_both_errors_of_the_mesh_are_of_order_two(interaction):
     """Eq. 4.3.21 and fig. 6.2.14."""
-    orders = meeting[0].orders
+    orders = interaction[0].orders
     assert set(orders) == {f"mesh, {m} {k}-error" for m in ("mean", "maximum") for k in "zt"}
     for found in orders.values():
         assert found.exponent == pytest.approx(2.0, abs=0.15)
         assert (found.points, found.low, found.high) == (5, 1.0, 16.0)
-    assert meeting[0].against == "n_u"
+    assert interaction[0].against == "n_u"
 
 
 def test_the_scene_is_that_of_table_d3():
@@ -81,8 +81,8 @@ def test_the_scene_is_that_of_table_d3():
     assert float((torch.sqrt(81 - x[:, None] ** 2 - y**2) - 9 - case.heights).abs().max()) == 0.0
 
 
-def test_newton_is_exact_and_every_method_finds_every_ray(meeting):
-    rows = meeting[0].rows
+def test_newton_is_exact_and_every_method_finds_every_ray(interaction):
+    rows = interaction[0].rows
     assert {r["series"] for r in rows} == {"mesh", "mesh, flat boxes", "newton", "mesh+newton"}
     assert len(rows) == 5 + 5 + 1 + 4
     assert all(r["rays"] == r["hits"] == 5000 and r["strayed"] == 0 for r in rows)
@@ -96,8 +96,8 @@ def test_newton_is_exact_and_every_method_finds_every_ray(meeting):
         assert all(a[k] == b[k] for k in ("n_u", "hits", "error", "t_max", "z_mean", "z_max"))
 
 
-def test_the_reference_lies_on_the_surface(meeting):
-    about = meeting[0].about
+def test_the_reference_lies_on_the_surface(interaction):
+    about = interaction[0].about
     assert about["reference_error"] <= 1e-14  # what the issue asks for; extended precision gives 1e-18
     if about["reference_bits"] == 64:
         assert about["reference_error"] < 1e-17
@@ -120,8 +120,8 @@ def test_heights_in_extended_precision_are_those_of_the_field(degrees):
     np.testing.assert_allclose(exact.astype(float), field.at(heights, x, y, ((0, 0),))[0].numpy(), rtol=0, atol=1e-14)
 
 
-def test_the_advice_and_the_ratio_follow_from_the_rows(meeting):
-    study, _ = meeting
+def test_the_advice_and_the_ratio_follow_from_the_rows(interaction):
+    study, _ = interaction
     assert study.about["newton_times_as_fast"] is None  # n_u = 16 does not reach 1e-6 mm
     rows = [{"error": 10.0**-k, "seconds": 2.0**k} for k in range(1, 5)]
     assert intersection.seconds_at(rows, 1e-3) == pytest.approx(8.0)
@@ -139,8 +139,8 @@ def test_the_advice_and_the_ratio_follow_from_the_rows(meeting):
     assert intersection._advice([mesh], None).startswith("no method reaches")
 
 
-def test_progress_ends_where_it_said(meeting):
-    done, total = zip(*meeting[1], strict=True)
+def test_progress_ends_where_it_said(interaction):
+    done, total = zip(*interaction[1], strict=True)
     assert set(total) == {30} and done == tuple(range(1, 31))
 
 
@@ -171,8 +171,8 @@ def test_a_large_net_bounds_the_mesh():
     assert ("newton", None) in settings
 
 
-def test_errors_of_zero_are_in_the_table_but_not_in_the_picture(meeting, tmp_path):
-    study = meeting[0]
+def test_errors_of_zero_are_in_the_table_but_not_in_the_picture(interaction, tmp_path):
+    study = interaction[0]
     rows = [{**r, "error": 0.0, "z_mean": 0.0} if "newton" in r["series"] else r for r in study.rows]
     paths = write(replace(study, rows=rows), tmp_path)
     assert "newton,,5000,5000,0,0.0," in paths[0].read_text()
@@ -289,8 +289,8 @@ def test_the_study_of_designs_lowers_the_error(small, tmp_path):
     check(write(study, tmp_path), study, ("design",))
 
 
-def test_files_of_the_intersection_study(meeting, tmp_path):
-    check(write(meeting[0], tmp_path), meeting[0], ("intersection", "intersection-pareto"))
+def test_files_of_the_intersection_study(interaction, tmp_path):
+    check(write(interaction[0], tmp_path), interaction[0], ("intersection", "intersection-pareto"))
 
 
 def check(paths, study, pictures):

@@ -220,9 +220,10 @@ SYSTEMS["folded"] = folded
 @pytest.mark.parametrize("name", SYSTEMS)
 @pytest.mark.parametrize("source", [PlaneWave(), Points(((0.2, -0.1, -60.0),))], ids=["plane", "point"])
 def test_energy_closes(name, source):
-    """Image + losses = 1 to 1e-12, with ghosts, second meetings and polarisation too."""
+    """Image + losses = 1 to 1e-12, with ghosts, secondary intersections and polarisation too."""
     system, heights = SYSTEMS[name]()
-    for light, requests in ((Light(), Requests()), (Light(30.0), Requests()), (Light(), Requests.to("ghosts", "second-meeting"))):
+    for light, requests in ((Light(), Requests()), (Light(30.0), Requests()),
+                            (Light(), Requests.to("ghosts", "secondary-intersection"))):
         lit = System((source,), system.elements, system.screens, light)
         (image,) = render(lit, heights, 2000, Filter("cosine", (3, 3)), requests=requests)
         assert bool(torch.isfinite(image.image).all())
@@ -248,14 +249,14 @@ def test_several_sources_and_wavelengths_add_up():
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
-@pytest.mark.parametrize("detours", [False, True])
-def test_gradients_of_every_surface(name, detours):
+@pytest.mark.parametrize("stray", [False, True])
+def test_gradients_of_every_surface(name, stray):
     """Taylor's remainder falls with the square of the step; reverse mode is the transpose of forward mode."""
-    if detours and name not in ("biconvex", "tilted"):
+    if stray and name not in ("biconvex", "tilted"):
         pytest.skip("a folded or cemented path's ghosts are tested for their energy")
     system, heights = SYSTEMS[name]()
     (sample,) = Sampler("stratified", (25, 20), 3).chunks()
-    traced = Tracer(system, sample, requests=Requests.to("ghosts") if detours else Requests())
+    traced = Tracer(system, sample, requests=Requests.to("ghosts") if stray else Requests())
     screen, filter = system.screens[0], Filter("cosine", (9, 9))
     g = torch.Generator().manual_seed(1)
     by = torch.randn((20, 20), generator=g, dtype=torch.float64)

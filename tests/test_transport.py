@@ -6,7 +6,7 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.sparse import coo_matrix
 
 from caustic_cli.errors import InputError
-from caustic_cli.inverse import start, transport
+from caustic_cli.inverse import surface_from_map, transport
 from caustic_cli.optics.kernels import laguerre
 from caustic_cli.optics.kernels.multigrid import Multigrid
 
@@ -209,7 +209,7 @@ def test_bad_input_is_one_sentence(call):
 
 def surface(target, n=64, half=(C, C), index=1.5, z_screen=300.0, thickness=5.0, directions=None, source=None, **options):
     source = np.ones((n, n)) if source is None else source
-    return start.surface(source, target, (A, A), half, index, z_screen, thickness, directions, **options)
+    return surface_from_map.surface(source, target, (A, A), half, index, z_screen, thickness, directions, **options)
 
 
 def traced(found, n, index, z_screen, samples=800):
@@ -217,7 +217,7 @@ def traced(found, n, index, z_screen, samples=800):
     at = transport.corners(n, A)
     spline, x = RectBivariateSpline(at, at, found.heights), transport.centres(samples, A)
     slopes = spline(x, x, dx=1), spline(x, x, dy=1)
-    return start.thrown(x[:, None], x[None, :], spline(x, x), *slopes, (0.0, 0.0, 1.0), index, z_screen)[:2]
+    return surface_from_map.thrown(x[:, None], x[None, :], spline(x, x), *slopes, (0.0, 0.0, 1.0), index, z_screen)[:2]
 
 
 @pytest.mark.parametrize("z_screen", [300.0, 30.0])
@@ -244,7 +244,7 @@ def test_parallel_light_to_a_uniform_screen():
 def test_refraction_keeps_snells_law():
     """Against the angles: n sin(a) = sin(b)."""
     slope, index = 0.2, 1.5
-    x, y, _ = start.thrown(np.zeros(1), np.zeros(1), np.zeros(1), np.full(1, slope), np.zeros(1), (0.0, 0.0, 1.0), index, 10.0)
+    x, y, _ = surface_from_map.thrown(*np.zeros((3, 1)), np.full(1, slope), np.zeros(1), (0.0, 0.0, 1.0), index, 10.0)
     inside = np.arctan(slope)
     assert x[0] == pytest.approx(10.0 * np.tan(np.arcsin(index * np.sin(inside)) - inside), rel=1e-12)
     assert y[0] == 0.0
@@ -266,7 +266,7 @@ def test_diverging_rays_are_taken_as_they_are():
 def test_integration_is_exact_for_parabolas():
     x, y = np.arange(20.0)[:, None] * 0.3, np.arange(15.0)[None, :] * 0.2
     z = 0.7 * x * x - 0.2 * y * y + 0.4 * x * y + x
-    got = start.integrate(1.4 * x + 0.4 * y + 1.0, -0.4 * y + 0.4 * x, (0.3, 0.2))
+    got = surface_from_map.integrate(1.4 * x + 0.4 * y + 1.0, -0.4 * y + 0.4 * x, (0.3, 0.2))
     np.testing.assert_allclose(got, z - z.mean(), atol=1e-12)
 
 

@@ -18,8 +18,8 @@ from caustic_cli.inverse import ranks
 from caustic_cli.inverse.losses import PENALTIES, ColorLoss, Loss, parse
 from caustic_cli.inverse.penalties import Penalty
 from caustic_cli.optics.emission import Rays
+from caustic_cli.optics.memory import smaller
 from caustic_cli.optics.reconstruction import Filter
-from caustic_cli.optics.shortage import smaller
 from caustic_cli.optics.spread import Convolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT

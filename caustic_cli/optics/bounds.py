@@ -32,10 +32,10 @@ class Bounds:
 
     incidence: the most that rays lean from z before the entrance; inside: behind it; slope: of the surface; lean: that of the
     microfacets' normals; index: the largest of all wavelengths; critical: n sin i, total reflection is impossible below 1; climb: L
-    times the tangent of the direction in which rays leave, a second meeting is impossible below 1; reach: how far rays get to the
-    aperture's edge, in parts of its half width, at the greatest height; ghost: part of the power that is reflected twice inside;
-    polarised: of unpolarised light, how much the exit's reflectance changes by what the entrance makes of s and p; resolution: what
-    diffraction, source and pixels let it show.
+    times the tangent of the direction in which rays leave, a secondary intersection is impossible below 1; reach: how far rays get
+    to the aperture's edge, in parts of its half width, at the greatest height; ghost: part of the power that is reflected twice
+    inside; polarised: of unpolarised light, how much the exit's reflectance changes by what the entrance makes of s and p;
+    resolution: what diffraction, source and pixels let it show.
     """
 
     incidence: float

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.bounds import bounds_of
-from caustic_cli.optics.effects import EFFECTS, NO_REQUESTS, Requests, Verdict
+from caustic_cli.optics.effects import EFFECTS, NO_REQUESTS, Decision, Requests
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.scene import Scene
 
@@ -24,11 +24,11 @@ from caustic_cli.scene import Scene
 class Plan:
     """effects, a verdict on each of EFFECTS; scene, what to trace; requests, how."""
 
-    effects: tuple[Verdict, ...]
+    effects: tuple[Decision, ...]
     scene: Scene
     requests: Requests
 
-    def __getitem__(self, name: str) -> Verdict:
+    def __getitem__(self, name: str) -> Decision:
         return next(e for e in self.effects if e.name == name)
 
     @property

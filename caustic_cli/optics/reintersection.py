@@ -24,7 +24,7 @@ HALVINGS = 50
 
 @torch.no_grad()
 def again(field: HeightField, heights: Tensor, o, d, below: bool, round: bool = False) -> tuple[Tensor, Tensor]:
-    """Next meeting with the surface of rays that start on it, by steps and bisection.
+    """Next intersection with the surface of rays that start on it, by steps and bisection.
 
     The slopes bound how fast a ray can come nearer, so its distance from the surface is a step that cannot miss it.
 

@@ -7,7 +7,7 @@
     arrive    what effects do on the way there and at the surface: absorption, roughness
     interact  Snell and Fresnel, or a mirror
     depart    what effects do behind it
-    detours   light that goes another way than straight on, after the walk: ghosts, second meetings
+    stray   light that goes another way than straight on, after the walk: ghosts, secondary intersections
 
 Elements before the first surface that a design may shape do not depend on any heights: they are walked once, when a `Tracer` is
 made.  What follows is *lowered* where it is one B-spline, upright, between the rays and an upright screen, with no effect but
@@ -32,11 +32,11 @@ from caustic_cli.optics.effects import EFFECTS, NO_REQUESTS, Action, Requests
 from caustic_cli.optics.emission import Rays, of_member, rays_of
 from caustic_cli.optics.frames import IDENTITY, Pose, advanced, into, out_of, turned, turned_back
 from caustic_cli.optics.image import Image
-from caustic_cli.optics.meeting import Meeting, Parameters
+from caustic_cli.optics.interaction import Interaction, Parameters
+from caustic_cli.optics.memory import with_less
 from caustic_cli.optics.rays import LOSSES, RayState, Status
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sample
-from caustic_cli.optics.shortage import with_less
 from caustic_cli.optics.surfaces import HeightField, Hit
 from caustic_cli.optics.system import EXIT, Element, Placed, System
 from caustic_cli.scene import Light, PlaneWave, Points, Scene, Screen
@@ -73,40 +73,40 @@ class Tracer:
         shape = state.power.shape if state.sample is None else state.sample.shape
         self.entering = self._of_color(weight * state.power.expand(shape).sum(dtype=torch.float64))
         self.actions: tuple[Action, ...] = tuple(a for a in made if a is not None)
-        self.recorded = any(a.detours for a in self.actions)
-        self.before: list[Meeting] = []
+        self.recorded = any(a.stray for a in self.actions)
+        self.before: list[Interaction] = []
         self.first, self._behind = 0, None
         with torch.no_grad():
             while self.first < len(system.elements) and system.elements[self.first].surface.shape is None:
-                meeting = self.cross(self.first, state, None)
+                interaction = self.cross(self.first, state, None)
                 if self.recorded:
-                    self.before.append(meeting)
-                state, self.first, self._behind = meeting.state, self.first + 1, meeting
+                    self.before.append(interaction)
+                state, self.first, self._behind = interaction.state, self.first + 1, interaction
         self.start = state
         self.fused = None if requests.stages else self._lowered(like)
 
     def __call__(self, parameters: Parameters) -> list[RayState]:
-        """Heights {name: (n, m) mm float64} -> rays behind the last element: those that went straight on, then those of detours."""
-        state, meetings = self.start, list(self.before)
-        for meeting in self._walk(parameters):
-            state = meeting.state
+        """Heights {name: (n, m) mm float64} -> rays behind the last element: those that went straight on, then those of stray."""
+        state, interactions = self.start, list(self.before)
+        for interaction in self._walk(parameters):
+            state = interaction.state
             if self.recorded:
-                meetings.append(meeting)
+                interactions.append(interaction)
         states = [state]
         for action in self.actions:
-            if action.detours:
-                states += action.detour(self, parameters, meetings)
+            if action.stray:
+                states += action.stray_light(self, parameters, interactions)
         return states
 
-    def _walk(self, parameters: Parameters) -> Iterator[Meeting]:
+    def _walk(self, parameters: Parameters) -> Iterator[Interaction]:
         """Straight on, from the first free surface to the last element."""
         state = self.start
         for k in range(self.first, len(self.system.elements)):
-            meeting = self.cross(k, state, parameters.get(self.system.elements[k].name))
-            yield meeting
-            state = meeting.state
+            interaction = self.cross(k, state, parameters.get(self.system.elements[k].name))
+            yield interaction
+            state = interaction.state
 
-    def last(self, parameters: Parameters) -> Meeting:
+    def last(self, parameters: Parameters) -> Interaction:
         """The rays at the last element, behind which they have gone straight on."""
         return [self._behind, *self._walk(parameters)][-1]
 
@@ -157,19 +157,19 @@ class Tracer:
     # One element.
 
     def cross(self, k: int, state: RayState, heights: Tensor | None, *, forward: bool = True, reflects: bool | None = None,
-              straight: bool = True) -> Meeting:
+              straight: bool = True) -> Interaction:
         """Rays to element k and behind it.
 
         Args:
             heights: of its surface, None where it has none.
             forward: in the system's own direction, or back.
             reflects: None for what the element does.
-            straight: whether this is the walk itself, or a detour.
+            straight: whether this is the walk itself, or a stray_light.
         """
         element = self.system.elements[k]
         n = [medium.index_at(state.wavelength) for medium in self.media[k : k + 2]]
         side = self.sides[k] if forward else -self.sides[k]
-        m = Meeting(self, k, element, forward, side, *(n if forward else n[::-1]),
+        m = Interaction(self, k, element, forward, side, *(n if forward else n[::-1]),
                     element.reflects if reflects is None else reflects, straight, state)
         self._meet(m, heights)
         for action in self.actions:
@@ -180,8 +180,8 @@ class Tracer:
             action.depart(m)
         return m
 
-    def _meet(self, m: Meeting, heights: Tensor | None) -> None:
-        """Carry the rays of a meeting to the surface."""
+    def _meet(self, m: Interaction, heights: Tensor | None) -> None:
+        """Carry the rays of a interaction to the surface."""
         element = m.element
         prepared = self.meets if m.state is getattr(self, "start", None) else None  # for the rays that it was prepared for
         state = replace(m.state, lost=dict(m.state.lost))
@@ -215,7 +215,7 @@ class Tracer:
         state.path = state.path + m.n_in * hit.t
         m.state = state
 
-    def _interact(self, m: Meeting) -> Tensor:
+    def _interact(self, m: Interaction) -> Tensor:
         """Change the directions, and give the power that goes on."""
         state, element = m.state, m.element
         polarised = None
@@ -241,7 +241,7 @@ class Tracer:
         state.sample = None
         return found.power
 
-    def _at_pupil(self, m: Meeting) -> bool:
+    def _at_pupil(self, m: Interaction) -> bool:
         """Whether the rays stand on this flat first element as they come from their source, which has left out all that miss it."""
         e, pupil, z = m.element, self.system.pupil, m.state.origin[2]
         if m.index or not m.forward or not isinstance(z, float) or z + m.state.datum != pupil.z:
@@ -357,7 +357,7 @@ def warm_up(scene: Scene, requests: Requests = NO_REQUESTS, gradient: bool = Fal
 
 
 def trace(system: System, rays: Sample | RayState, parameters: Parameters, **options) -> list[RayState]:
-    """Rays behind the last element of a system: those that went straight on, then those of detours.  options: of a `Tracer`."""
+    """Rays behind the last element of a system: those that went straight on, then those of stray.  options: of a `Tracer`."""
     return Tracer(system, rays, **options)(parameters)
 
 

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from caustic_cli import __version__
-from caustic_cli.optics.effects import EFFECTS, Requests, Verdict
+from caustic_cli.optics.effects import EFFECTS, Decision, Requests
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.image import Image
 from caustic_cli.optics.plan import Plan, compile_plan
@@ -186,7 +186,7 @@ def _matters(row: dict) -> float:
     return max(row["error"] or 0.0, abs(row["power"] or 0.0))
 
 
-def _row(effect: Verdict, plan: Plan, scene: Scene, field: HeightField, heights: Tensor, rays: int, repeats: int, seed: int,
+def _row(effect: Decision, plan: Plan, scene: Scene, field: HeightField, heights: Tensor, rays: int, repeats: int, seed: int,
          dtype: torch.dtype) -> dict | None:
     name, amount, bare = effect.name, "the scene's own", None
     if not effect.present:

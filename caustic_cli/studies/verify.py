@@ -68,7 +68,7 @@ def require_mitsuba(scene: Scene) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class Verdict:
+class Decision:
     """render, mitsuba, z: (n_x, n_y), z on taken-together pixels and NaN where too few rays are expected; figures for JSON."""
 
     render: np.ndarray
@@ -82,7 +82,7 @@ class Verdict:
         return self.figures["agree"]
 
 
-def verify(path: Path, scene: Scene, field: HeightField, heights: Tensor, rays: int, seed: int = 0) -> Verdict:
+def verify(path: Path, scene: Scene, field: HeightField, heights: Tensor, rays: int, seed: int = 0) -> Decision:
     """Trace the lens here and the exported scene at `path` in Mitsuba, with about `rays` rays each, and compare.
 
     Raises:
@@ -190,7 +190,7 @@ def _binned(x: np.ndarray, y: np.ndarray, value: np.ndarray, scene: Scene) -> np
 
 
 def compare(renders: np.ndarray, image: np.ndarray, squares: np.ndarray, rays: int, shift: float = 0.0,
-            about: dict | None = None) -> Verdict:
+            about: dict | None = None) -> Decision:
     """Z-scores of Mitsuba's image against several renders, and whether they are noise.
 
     Args:
@@ -227,7 +227,7 @@ def compare(renders: np.ndarray, image: np.ndarray, squares: np.ndarray, rays: i
     figures["agree"] = bool(
         chi2 <= 1 + CHI2 + 3 * (2 / len(some)) ** 0.5 and beyond <= 2 * NORMAL + 3 * (NORMAL / len(some)) ** 0.5
         and largest < LARGEST and abs(light) < LIGHT and own >= other - TIE)
-    return Verdict(render, image, np.repeat(np.repeat(z, side, 0), side, 1), figures)
+    return Decision(render, image, np.repeat(np.repeat(z, side, 0), side, 1), figures)
 
 
 def _z_scores(renders: np.ndarray, image: np.ndarray, squares: np.ndarray, rays: int, per_ray: float, shift: float):
@@ -278,7 +278,7 @@ def _noise(image: np.ndarray, squares: np.ndarray, renders: np.ndarray) -> float
     return float(np.sqrt(squares.mean() + renders.var(0, ddof=1).mean() / len(renders)) / image.mean())
 
 
-def write_panels(path: str | Path, verdict: Verdict, scene: Scene) -> None:
+def write_panels(path: str | Path, verdict: Decision, scene: Scene) -> None:
     """A PNG: the render, Mitsuba's image, and their difference in standard deviations."""
     from matplotlib.figure import Figure  # noqa: PLC0415
 

@@ -14,7 +14,7 @@ from caustic_cli.config import settings
 from caustic_cli.config.completion import NETWORK_CONTROL, Settings, build_options, build_stages, complete
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Designer, Options, State
-from caustic_cli.inverse.first import first_surface
+from caustic_cli.inverse.initial_surface import first_surface
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.parametrisation import Heights
 from caustic_cli.inverse.schedule import LEAST_CELLS, Stage, coarse_to_fine

@@ -24,7 +24,7 @@ from caustic_cli.inverse import ranks
 from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.extended import best_light, centre_of, limits, shift_of
-from caustic_cli.inverse.first import first_surface
+from caustic_cli.inverse.initial_surface import first_surface
 from caustic_cli.inverse.reach import refuse_unreachable
 from caustic_cli.inverse.schedule import transport_cells
 from caustic_cli.inverse.target import grey

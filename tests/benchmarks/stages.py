@@ -17,8 +17,8 @@ import torch
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels.grid import GridSurface
 from caustic_cli.optics.kernels.interact import interact
-from caustic_cli.optics.kernels.land import land
 from caustic_cli.optics.kernels.splat import splat_rays
+from caustic_cli.optics.kernels.transfer import land
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.scene import Screen
 

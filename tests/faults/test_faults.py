@@ -15,7 +15,7 @@ from caustic_cli import cli
 from caustic_cli.errors import CausticError
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.io import files
-from caustic_cli.optics import shortage, trace
+from caustic_cli.optics import memory, trace
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -237,7 +237,7 @@ def test_other_errors_are_not_taken_for_short_memory():
         raise RuntimeError("mat1 and mat2 shapes cannot be multiplied")
 
     with pytest.raises(RuntimeError, match="shapes"):
-        shortage.with_less(work, 1 << 20)
+        memory.with_less(work, 1 << 20)
     assert tried == [1 << 20]
 
 

@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from caustic_cli import cli
-from caustic_cli.inverse.first import first_surface
+from caustic_cli.inverse.initial_surface import first_surface
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.parametrisation import FreeHeights
 from caustic_cli.optics.emission import rays_of

@@ -15,10 +15,10 @@ from caustic_cli.optics.interface import Departure
 from caustic_cli.optics.kernels import functions
 from caustic_cli.optics.kernels.grid import GridSurface
 from caustic_cli.optics.kernels.interact import interact
-from caustic_cli.optics.kernels.land import land
 from caustic_cli.optics.kernels.rayhits import hits_of_rays
 from caustic_cli.optics.kernels.splat import splat_rays
 from caustic_cli.optics.kernels.surface import FusedSurface, RayHits, next_meetings, scattered_surface
+from caustic_cli.optics.kernels.transfer import land
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.reintersection import HALVINGS, MOST_STEPS

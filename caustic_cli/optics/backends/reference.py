@@ -68,7 +68,7 @@ class Torch:
         return lambda heights: intersection.reference(field, heights, origin, direction)
 
     def next_meetings(self, field, heights: Tensor, origin, direction, below: bool, round: bool, step: float) -> Tensor:
-        """Distances (N,) mm to the next meeting of rays that start on a B-spline, 0 for none: see `reintersection.again`."""
+        """Distances (N,) mm to the next intersection of rays that start on a B-spline, 0 for none: see `reintersection.again`."""
         return reintersection.reference(field, heights, origin, direction, below, round, step)
 
     def interact(self, direction, slopes, power: Tensor, *, eta: float, reflects: bool, fresnel: str, polarised=None,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from caustic_cli.optics.effects.absorption import Absorption
-from caustic_cli.optics.effects.base import NEGLIGIBLE, NO_REQUESTS, Action, Amount, Effect, Requests, Verdict
+from caustic_cli.optics.effects.base import NEGLIGIBLE, NO_REQUESTS, Action, Amount, Decision, Effect, Requests
 from caustic_cli.optics.effects.diffraction import Diffraction
 from caustic_cli.optics.effects.dispersion import Dispersion
 from caustic_cli.optics.effects.entrance import Entrance
@@ -16,14 +16,14 @@ from caustic_cli.optics.effects.polarisation import Polarisation
 from caustic_cli.optics.effects.roughness import Roughness
 from caustic_cli.optics.effects.screen_shift import ScreenShift
 from caustic_cli.optics.effects.screen_tilt import ScreenTilt
-from caustic_cli.optics.effects.second_meeting import SecondMeeting
+from caustic_cli.optics.effects.secondary_intersection import SecondaryIntersection
 from caustic_cli.optics.effects.source_size import SourceSize
 from caustic_cli.optics.effects.total_reflection import TotalReflection
 
 EFFECTS: tuple[Effect, ...] = (
     SourceSize(), Polarisation(), Dispersion(), Entrance(), Intersection(), MissedSurface(), Absorption(), Roughness(), Fresnel(),
-    TotalReflection(), Mirror(), SecondMeeting(), Ghosts(), ScreenTilt(), ScreenShift(),
+    TotalReflection(), Mirror(), SecondaryIntersection(), Ghosts(), ScreenTilt(), ScreenShift(),
     Diffraction(),
 )
 
-__all__ = ["EFFECTS", "NEGLIGIBLE", "NO_REQUESTS", "Action", "Amount", "Effect", "Requests", "Verdict"]
+__all__ = ["EFFECTS", "NEGLIGIBLE", "NO_REQUESTS", "Action", "Amount", "Decision", "Effect", "Requests"]

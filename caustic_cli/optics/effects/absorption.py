@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import Action, Amount, Effect, Requests, Verdict
+from caustic_cli.optics.effects.base import Action, Amount, Decision, Effect, Requests
 from caustic_cli.scene import Scene
 
 #: Coefficient that is measured where there is none, 1/mm.
@@ -19,11 +19,11 @@ class Absorption(Effect):
 
     name = "absorption"
 
-    def judge(self, scene: Scene, bounds) -> Verdict:
+    def judge(self, scene: Scene, bounds) -> Decision:
         """By the coefficient."""
         a = 0.0 if scene.lens.mirror else scene.lens.absorption
         why = f"the glass absorbs {a:g} per mm" if a > 0 else "the glass is clear"
-        return Verdict(self.name, a > 0, why, a, 0.0, present=a > 0)
+        return Decision(self.name, a > 0, why, a, 0.0, present=a > 0)
 
     def without(self, scene: Scene) -> Scene:
         """Clear glass."""

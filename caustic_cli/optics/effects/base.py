@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from torch import Tensor
 
 from caustic_cli.optics.bounds import Bounds
-from caustic_cli.optics.meeting import Meeting, Parameters, Walker
+from caustic_cli.optics.interaction import Interaction, Parameters, Walker
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.surfaces import Hit
 from caustic_cli.optics.system import System
@@ -24,7 +24,7 @@ NEGLIGIBLE = 0.01
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Decision:
     """What was decided of an effect in a scene.
 
     name: of the effect; on: whether it is simulated; why: one clause; bound, limit: the number that decides and what it is compared
@@ -73,23 +73,23 @@ class Amount:
 
 
 class Action:
-    """What an effect does to rays in one trace; a `Meeting`'s fields are read and changed in place."""
+    """What an effect does to rays in one trace; a `Interaction`'s fields are read and changed in place."""
 
-    #: Whether `detour` adds light that goes another way.
-    detours = False
+    #: Whether `stray_light` adds light that goes another way.
+    stray = False
 
-    def meet(self, meeting: Meeting, origin, direction, heights: Tensor | None) -> Hit | None:
+    def meet(self, interaction: Interaction, origin, direction, heights: Tensor | None) -> Hit | None:
         """Another way to meet the surface, from rays in its frame; None for the usual one."""
         return None
 
-    def arrive(self, meeting: Meeting) -> None:
+    def arrive(self, interaction: Interaction) -> None:
         """At the surface, before Snell's law."""
 
-    def depart(self, meeting: Meeting) -> None:
+    def depart(self, interaction: Interaction) -> None:
         """Behind the surface."""
 
-    def detour(self, tracer: Walker, parameters: Parameters, meetings: list[Meeting]) -> list[RayState]:
-        """Light behind the last element that has not gone straight on; takes it off what is in `meetings`' states and accounts."""
+    def stray_light(self, tracer: Walker, parameters: Parameters, interactions: list[Interaction]) -> list[RayState]:
+        """Light behind the last element that has not gone straight on; takes it off the `interactions`' states and accounts."""
         return []
 
 
@@ -103,7 +103,7 @@ class Effect(ABC):
     waves = False
 
     @abstractmethod
-    def judge(self, scene: Scene, bounds: Bounds) -> Verdict:
+    def judge(self, scene: Scene, bounds: Bounds) -> Decision:
         """Whether a scene calls for it, and why."""
 
     def without(self, scene: Scene) -> Scene:

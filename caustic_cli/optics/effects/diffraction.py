@@ -5,7 +5,7 @@ It changes no ray: the wave image stands beside the ray image, which is that of 
 
 from __future__ import annotations
 
-from caustic_cli.optics.effects.base import Effect, Verdict
+from caustic_cli.optics.effects.base import Decision, Effect
 from caustic_cli.optics.resolution import WIDENED
 from caustic_cli.scene import Scene
 
@@ -16,11 +16,11 @@ class Diffraction(Effect):
     name = "diffraction"
     waves = True
 
-    def judge(self, scene: Scene, bounds) -> Verdict:
+    def judge(self, scene: Scene, bounds) -> Decision:
         """By what it adds to the blur of source and pixel."""
         r = bounds.resolution
         if scene.source.rays is not None:
-            return Verdict(self.name, False, "a ray file says nothing of its light's phase", r.widened, WIDENED)
+            return Decision(self.name, False, "a ray file says nothing of its light's phase", r.widened, WIDENED)
         light = f"{r.wavelength:.4g} nm" if r.said else f"{r.wavelength:g} nm, as the scene says no wavelength,"
         why = f"light of {light} blurs over {r.diffraction:.2g} mm, the source over {r.source:.2g} mm, a pixel is {r.pixel:.2g} mm"
-        return Verdict(self.name, r.matters, why, r.widened, WIDENED)
+        return Decision(self.name, r.matters, why, r.widened, WIDENED)

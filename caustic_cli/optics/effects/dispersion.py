@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import Amount, Effect, Verdict
+from caustic_cli.optics.effects.base import Amount, Decision, Effect
 from caustic_cli.scene import Light, Scene
 from caustic_cli.scene.materials import D_LINE, refractive_index
 
@@ -19,16 +19,16 @@ class Dispersion(Effect):
 
     name = "dispersion"
 
-    def judge(self, scene: Scene, bounds) -> Verdict:
+    def judge(self, scene: Scene, bounds) -> Decision:
         """On where several wavelengths meet a glass."""
         if scene.dispersive:
             indices = [band.scene.lens.index for band in scene.bands]
             why = (f"{len(scene.light.wavelengths)} wavelengths in {scene.lens.glass}, whose index goes from {min(indices):.5f} to"
                    f" {max(indices):.5f}")
-            return Verdict(self.name, True, why, max(indices) - min(indices), 0.0)
+            return Decision(self.name, True, why, max(indices) - min(indices), 0.0)
         why = "one wavelength" if not scene.light.wavelengths else "a mirror treats all wavelengths alike" if scene.lens.mirror \
             else "the lens has one index for all wavelengths"
-        return Verdict(self.name, False, why, 0.0, 0.0, present=False)
+        return Decision(self.name, False, why, 0.0, 0.0, present=False)
 
     def without(self, scene: Scene) -> Scene:
         """One index."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from caustic_cli.optics.effects.base import Action, GeneralWay, Requests, Verdict
+from caustic_cli.optics.effects.base import Action, Decision, GeneralWay, Requests
 from caustic_cli.optics.frames import turned_back
 from caustic_cli.scene import Scene
 
@@ -14,13 +14,13 @@ class Entrance(GeneralWay):
 
     name = "entrance"
 
-    def judge(self, scene: Scene, b) -> Verdict:
+    def judge(self, scene: Scene, b) -> Decision:
         """On where rays come slanted."""
         angle, collimated = math.degrees(b.incidence), scene.source.collimated
         if collimated or scene.lens.mirror or angle == 0:
             why = "there is no glass before a mirror" if scene.lens.mirror else "normal incidence on a flat entrance bends nothing"
-            return Verdict(self.name, not collimated and not scene.lens.mirror, why, angle, 0.0)
-        return Verdict(self.name, True, f"rays meet the entrance at up to {angle:.3g} degrees", angle, 0.0)
+            return Decision(self.name, not collimated and not scene.lens.mirror, why, angle, 0.0)
+        return Decision(self.name, True, f"rays meet the entrance at up to {angle:.3g} degrees", angle, 0.0)
 
     def action(self, system, requests: Requests) -> Action | None:
         """Keeps directions at a flat first element."""

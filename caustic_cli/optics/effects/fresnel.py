@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from caustic_cli.optics.effects.base import Effect, Verdict
+from caustic_cli.optics.effects.base import Decision, Effect
 from caustic_cli.scene import Scene
 
 
@@ -13,14 +13,14 @@ class Fresnel(Effect):
 
     name = "fresnel"
 
-    def judge(self, scene: Scene, b) -> Verdict:
+    def judge(self, scene: Scene, b) -> Decision:
         """On unless the scene says otherwise."""
         if scene.lens.mirror:
-            return Verdict(self.name, False, "a mirror is taken to reflect all light", present=False)
+            return Decision(self.name, False, "a mirror is taken to reflect all light", present=False)
         if scene.lens.fresnel == "none":
-            return Verdict(self.name, False, "fresnel = none: perfectly coated", 0.0, 0.0)
+            return Decision(self.name, False, "fresnel = none: perfectly coated", 0.0, 0.0)
         normal = ((b.index - 1.0) / (b.index + 1.0)) ** 2
-        return Verdict(self.name, True, f"each surface reflects {normal:.2%} of normal light; {scene.lens.fresnel}", normal, 0.0)
+        return Decision(self.name, True, f"each surface reflects {normal:.2%} of normal light; {scene.lens.fresnel}", normal, 0.0)
 
     def without(self, scene: Scene) -> Scene:
         """Perfectly coated."""

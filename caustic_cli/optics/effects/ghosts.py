@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import torch
 
-from caustic_cli.optics.effects.base import NEGLIGIBLE, NO_REQUESTS, Action, Effect, Requests, Verdict
+from caustic_cli.optics.effects.base import NEGLIGIBLE, NO_REQUESTS, Action, Decision, Effect, Requests
 from caustic_cli.optics.rays import RayState
 from caustic_cli.scene import Scene
 
@@ -22,13 +22,13 @@ class Ghosts(Effect):
 
     name = "ghosts"
 
-    def judge(self, scene: Scene, b) -> Verdict:
+    def judge(self, scene: Scene, b) -> Decision:
         """By a bound of the power that is reflected twice."""
         if scene.lens.mirror:
-            return Verdict(self.name, False, "there is no glass", present=False)
+            return Decision(self.name, False, "there is no glass", present=False)
         if b.ghost <= NEGLIGIBLE:
-            return Verdict(self.name, False, f"at most {b.ghost:.2%} of the power is reflected twice", b.ghost, NEGLIGIBLE)
-        return Verdict(self.name, True, f"up to {b.ghost:.2%} of the power may be reflected twice", b.ghost, NEGLIGIBLE)
+            return Decision(self.name, False, f"at most {b.ghost:.2%} of the power is reflected twice", b.ghost, NEGLIGIBLE)
+        return Decision(self.name, True, f"up to {b.ghost:.2%} of the power may be reflected twice", b.ghost, NEGLIGIBLE)
 
     def request(self, scene: Scene, on: bool, bounds) -> Requests:
         """To trace them."""
@@ -42,13 +42,13 @@ class Ghosts(Effect):
 class Reflections(Action):
     """One bundle of rays for each pair of elements."""
 
-    detours = True
+    stray = True
 
-    def detour(self, tracer, parameters, meetings) -> list[RayState]:
+    def stray_light(self, tracer, parameters, interactions) -> list[RayState]:
         """The ghosts behind the last element."""
         found, elements = [], tracer.system.elements
         heights = [parameters.get(e.name) for e in elements]
-        for j, m in enumerate(meetings):
+        for j, m in enumerate(interactions):
             if m.reflects or not bool((m.arriving > m.departing).any()):
                 continue
             totally = ~m.passes

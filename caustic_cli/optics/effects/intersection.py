@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import Action, GeneralWay, Requests, Verdict
+from caustic_cli.optics.effects.base import Action, Decision, GeneralWay, Requests
 from caustic_cli.optics.surfaces import HeightField, Hit
 from caustic_cli.scene import Scene
 
@@ -17,12 +17,12 @@ class Intersection(GeneralWay):
 
     name = "intersection"
 
-    def judge(self, scene: Scene, b) -> Verdict:
+    def judge(self, scene: Scene, b) -> Decision:
         """On where rays run slanted inside the lens."""
         if scene.source.collimated:
-            return Verdict(self.name, False, "rays of a plane wave are sampled on the surface itself", 0.0, 0.0)
+            return Decision(self.name, False, "rays of a plane wave are sampled on the surface itself", 0.0, 0.0)
         angle = math.degrees(b.inside)
-        return Verdict(self.name, True, f"rays cross the lens at up to {angle:.3g} degrees", angle, 0.0)
+        return Decision(self.name, True, f"rays cross the lens at up to {angle:.3g} degrees", angle, 0.0)
 
     def action(self, system, requests: Requests) -> Action | None:
         """Meets the mean plane instead."""

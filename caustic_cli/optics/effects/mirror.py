@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import Amount, Effect, Verdict
+from caustic_cli.optics.effects.base import Amount, Decision, Effect
 from caustic_cli.scene import Scene
 
 
@@ -15,11 +15,11 @@ class Mirror(Effect):
 
     name = "mirror"
 
-    def judge(self, scene: Scene, bounds) -> Verdict:
+    def judge(self, scene: Scene, bounds) -> Decision:
         """As the scene says."""
         if scene.lens.mirror:
-            return Verdict(self.name, True, "the surface is a mirror", fixed=True)
-        return Verdict(self.name, False, "the surface is glass", fixed=True, present=False)
+            return Decision(self.name, True, "the surface is a mirror", fixed=True)
+        return Decision(self.name, False, "the surface is glass", fixed=True, present=False)
 
     def sample(self, scene: Scene, heights: Tensor) -> Amount:
         """The same surface as a mirror, with the screen as far before it."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from caustic_cli.optics.effects.base import Effect, Verdict
+from caustic_cli.optics.effects.base import Decision, Effect
 from caustic_cli.scene import Scene
 
 
@@ -14,13 +14,13 @@ class MissedSurface(Effect):
     name = "missed-surface"
     free = True
 
-    def judge(self, scene: Scene, b) -> Verdict:
+    def judge(self, scene: Scene, b) -> Decision:
         """By how far rays get at the surface's greatest height."""
         if scene.source.collimated:
-            return Verdict(self.name, False, "every ray of a plane wave is on the surface", b.reach, 1.0)
+            return Decision(self.name, False, "every ray of a plane wave is on the surface", b.reach, 1.0)
         if b.reach <= 1.0:
-            return Verdict(self.name, False, f"no ray gets beyond {b.reach:.4g} of the aperture's half width", b.reach, 1.0)
+            return Decision(self.name, False, f"no ray gets beyond {b.reach:.4g} of the aperture's half width", b.reach, 1.0)
         if math.isinf(b.reach):
-            return Verdict(self.name, True, "the surface may dip below the entrance", None, 1.0, fixed=True)
+            return Decision(self.name, True, "the surface may dip below the entrance", None, 1.0, fixed=True)
         why = f"rays may get to {b.reach:.4g} of the aperture's half width: its side takes them"
-        return Verdict(self.name, True, why, b.reach, 1.0, fixed=True)
+        return Decision(self.name, True, why, b.reach, 1.0, fixed=True)

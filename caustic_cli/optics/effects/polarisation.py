@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import NEGLIGIBLE, Action, Amount, Effect, Requests, Verdict
+from caustic_cli.optics.effects.base import NEGLIGIBLE, Action, Amount, Decision, Effect, Requests
 from caustic_cli.optics.frames import turned, turned_back
 from caustic_cli.optics.interface import refract
 from caustic_cli.optics.polarisation import beyond, field_of
@@ -20,18 +20,18 @@ class Polarisation(Effect):
 
     name = "polarisation"
 
-    def judge(self, scene: Scene, b) -> Verdict:
+    def judge(self, scene: Scene, b) -> Decision:
         """On for polarised light, and where what the entrance polarises changes what the exit reflects."""
         light, lens = scene.light, scene.lens
         if lens.mirror or lens.fresnel != "exact":
             why = "a mirror reflects all light alike" if lens.mirror else f"fresnel = {lens.fresnel} knows no polarisation"
-            return Verdict(self.name, False, why, present=False)
+            return Decision(self.name, False, why, present=False)
         if light.polarisation is not None:
-            return Verdict(self.name, True, f"the source is polarised at {light.polarisation:g} degrees")
+            return Decision(self.name, True, f"the source is polarised at {light.polarisation:g} degrees")
         if b.incidence == 0:
-            return Verdict(self.name, False, "unpolarised light, which normal incidence leaves so", 0.0, NEGLIGIBLE)
+            return Decision(self.name, False, "unpolarised light, which normal incidence leaves so", 0.0, NEGLIGIBLE)
         some = b.polarised > NEGLIGIBLE
-        return Verdict(self.name, some, "unpolarised light; what the entrance polarises changes what the exit reflects by"
+        return Decision(self.name, some, "unpolarised light; what the entrance polarises changes what the exit reflects by"
                        f" {'up to' if some else 'at most'} {b.polarised:.1e}", b.polarised, NEGLIGIBLE)
 
     def without(self, scene: Scene) -> Scene:

@@ -11,7 +11,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import Action, Amount, Effect, Requests, Verdict
+from caustic_cli.optics.effects.base import Action, Amount, Decision, Effect, Requests
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import normal_numbers
 from caustic_cli.scene import Scene
@@ -29,11 +29,11 @@ class Roughness(Effect):
 
     name = "roughness"
 
-    def judge(self, scene: Scene, bounds) -> Verdict:
+    def judge(self, scene: Scene, bounds) -> Decision:
         """By the facets' standard deviation."""
         r = scene.lens.roughness
         why = f"microfacets of slopes {r:g}" if r > 0 else "the surface is smooth"
-        return Verdict(self.name, r > 0, why, r, 0.0, present=r > 0)
+        return Decision(self.name, r > 0, why, r, 0.0, present=r > 0)
 
     def without(self, scene: Scene) -> Scene:
         """A smooth surface."""

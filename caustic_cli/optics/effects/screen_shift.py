@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import Amount, Effect, Verdict
+from caustic_cli.optics.effects.base import Amount, Decision, Effect
 from caustic_cli.scene import Scene
 
 #: Distance that is measured where there is none, mm.
@@ -19,10 +19,10 @@ class ScreenShift(Effect):
     name = "screen-shift"
     free = True
 
-    def judge(self, scene: Scene, bounds) -> Verdict:
+    def judge(self, scene: Scene, bounds) -> Decision:
         """By the distances."""
         (a, b), some = scene.screen.shift, any(scene.screen.shift)
-        return Verdict(self.name, some, f"the screen is shifted by {a:g} and {b:g} mm" if some else "the screen is on the axis",
+        return Decision(self.name, some, f"the screen is shifted by {a:g} and {b:g} mm" if some else "the screen is on the axis",
                        max(abs(a), abs(b)), 0.0, present=some)
 
     def without(self, scene: Scene) -> Scene:

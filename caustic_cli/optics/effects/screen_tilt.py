@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import Amount, Effect, Verdict
+from caustic_cli.optics.effects.base import Amount, Decision, Effect
 from caustic_cli.scene import Scene
 
 #: Angle that is measured where there is none, degrees.
@@ -18,10 +18,10 @@ class ScreenTilt(Effect):
 
     name = "screen-tilt"
 
-    def judge(self, scene: Scene, bounds) -> Verdict:
+    def judge(self, scene: Scene, bounds) -> Decision:
         """By the angles."""
         (a, b), some = scene.screen.tilt, any(scene.screen.tilt)
-        return Verdict(self.name, some, f"the screen is tilted by {a:g} and {b:g} degrees" if some else "the screen is upright",
+        return Decision(self.name, some, f"the screen is tilted by {a:g} and {b:g} degrees" if some else "the screen is upright",
                        max(abs(a), abs(b)), 0.0, present=some)
 
     def without(self, scene: Scene) -> Scene:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import Amount, Effect, Verdict
+from caustic_cli.optics.effects.base import Amount, Decision, Effect
 from caustic_cli.scene import Disc, Scene
 
 #: Amounts that are measured where there is none: the sun's angle, degrees; a disc's size, mm.
@@ -18,11 +18,11 @@ class SourceSize(Effect):
 
     name = "source-size"
 
-    def judge(self, scene: Scene, bounds) -> Verdict:
+    def judge(self, scene: Scene, bounds) -> Decision:
         """By the angle under which the lens sees a disc, or the number of points."""
         s, z_in = scene.source, scene.lens.z_in
         bound, limit = (float(len(s.points()[0])), 1.0) if s.several else (s.apparent_angle(z_in), 0.0)
-        return Verdict(self.name, s.extended, s.extent_words(z_in), bound, limit, present=s.extended)
+        return Decision(self.name, s.extended, s.extent_words(z_in), bound, limit, present=s.extended)
 
     def without(self, scene: Scene) -> Scene:
         """From the middle of the source."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from caustic_cli.optics.effects.base import NO_REQUESTS, Action, Effect, Requests, Verdict
+from caustic_cli.optics.effects.base import NO_REQUESTS, Action, Decision, Effect, Requests
 from caustic_cli.optics.frames import turned, turned_back
 from caustic_cli.optics.tolerances import PARALLEL
 from caustic_cli.scene import Scene
@@ -16,13 +16,13 @@ class TotalReflection(Effect):
     name = "total-reflection"
     free = True
 
-    def judge(self, scene: Scene, b) -> Verdict:
+    def judge(self, scene: Scene, b) -> Decision:
         """By n sin i at the steepest place of the surface."""
         if scene.lens.mirror:
-            return Verdict(self.name, False, "a mirror has no critical angle", present=False)
+            return Decision(self.name, False, "a mirror has no critical angle", present=False)
         if b.critical < 1.0:
-            return Verdict(self.name, False, f"n sin i <= {b.critical:.4g} at slopes up to {b.slope:.3g}", b.critical, 1.0)
-        return Verdict(self.name, True, f"n sin i may reach {b.critical:.4g} at slopes up to {b.slope:.3g}", b.critical, 1.0)
+            return Decision(self.name, False, f"n sin i <= {b.critical:.4g} at slopes up to {b.slope:.3g}", b.critical, 1.0)
+        return Decision(self.name, True, f"n sin i may reach {b.critical:.4g} at slopes up to {b.slope:.3g}", b.critical, 1.0)
 
     def request(self, scene: Scene, on: bool, bounds) -> Requests:
         """To do without, where it may happen."""

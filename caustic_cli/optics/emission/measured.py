@@ -90,7 +90,7 @@ class MeasuredRays:
 
 def _meeting(source: Source, half_size: tuple[float, float], z: float, round: bool) -> tuple[np.ndarray, ...]:
     """Where rays meet an aperture, x and y mm, their numbers in the file, and their parts of the power."""
-    x, y, met = source.meeting(half_size, z, round)
+    x, y, met = source.crossing(half_size, z, round)
     (met,) = np.nonzero(met)
     if not len(met):
         raise InputError(f"[source] file: none of its {source.rays.count:,} rays meets the lens, which stands along +z from them;"

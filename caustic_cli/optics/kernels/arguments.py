@@ -12,8 +12,8 @@ from typing import NamedTuple
 class Exit(NamedTuple):
     """The exit surface, and the screen beyond it.
 
-    index: before it over that behind it; fresnel: kind of Fresnel losses, as in `bend`; start: height at which slanted rays begin,
-    height: of the screen, mm, both above the zero of the sag.
+    index: before it over that behind it; fresnel: kind of Fresnel losses, as in `axial_refraction`; start: height at which
+    oblique rays begin, height: of the screen, mm, both above the zero of the sag.
     """
 
     index: float
@@ -34,7 +34,7 @@ class Frame(NamedTuple):
 
 
 class Splat(NamedTuple):
-    """The reconstruction filter: its kind, as in `shares`, sizes in pixels (odd), and alpha, per pixel squared."""
+    """The reconstruction filter: its kind, as in `filter_weights`, sizes in pixels (odd), and alpha, per pixel squared."""
 
     kind: int
     size_x: int

@@ -11,15 +11,15 @@ Horner's scheme then runs over the rays in its inner loop, without branches, as 
 Newton's iteration runs in all lanes of a batch at once.  From t it goes to t' = t - f / c, and with
 
     H_uu, H_uv, H_vv   bounds of |Z_uu|, |Z_uv|, |Z_vv| in the span product, from the coefficients
-    B = H_uu d_u^2 + 2 H_uv |d_u d_v| + H_vv d_v^2 >= |f''|    (f as in `hit`)
+    B = H_uu d_u^2 + 2 H_uv |d_u d_v| + H_vv d_v^2 >= |f''|    (f as in `intersect`)
 
 Taylor's formula leaves |t' - t*| <= B (t - t*)^2 / 2c there.  So the step that is known to end within a rounding of the root t*
 is the last one, and f is not evaluated once more to see it; the slopes at t are those at t' where the same bounds say so.  The
 first steps take the terms of second order alone.
 
-What is not plain, ray by ray, goes to `hit._root`, which decides: rays that start outside or above, that may meet the surface more
-than once (L >= d_z), that leave by the side, that do not converge.  What is found is a function of the rays, the heights and the
-number of blocks, not of what was found before; which rays share a batch changes a hit by a rounding at most.
+What is not plain, ray by ray, goes to `intersect._root`, which decides: rays that start outside or above, that may meet the surface
+more than once (L >= d_z), that leave by the side, that do not converge.  What is found is a function of the rays, the heights and
+the number of blocks, not of what was found before; which rays share a batch changes a hit by a rounding at most.
 
 At the hit, f(t; P, o, d) = 0 gives, with the point's move m = do + t dd at fixed t and the surface's change dZ there,
 
@@ -39,7 +39,7 @@ from numba import carray, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from caustic_cli.optics.kernels.hit import HIT, MISSED, _leaves, _root, _value
+from caustic_cli.optics.kernels.intersect import HIT, MISSED, _leaves, _root, _value
 from caustic_cli.optics.kernels.jit import FAST, njit
 from caustic_cli.optics.kernels.spline import curvatures, jet, piece, push_powers
 from caustic_cli.optics.kernels.threads import ALL, on_threads

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.kernels import bend, blocks, pixels, plane, points, shares
+from caustic_cli.optics.kernels import axial_refraction, blocks, filter_weights, pixels, plane, points
 from caustic_cli.optics.kernels.arguments import Exit, Frame, Splat
 from caustic_cli.optics.kernels.banded import AlongV
 from caustic_cli.optics.kernels.surface import FusedSurface, RayHits, scattered_surface
@@ -145,9 +145,9 @@ def _arguments(rays, interface: tuple[float, str], height: float, start: float, 
     """Whether rays are slanted, and what `plane` takes after the nets."""
     eta, fresnel = interface
     slanted = rays[2] is not _NONE
-    exit_ = Exit(float(eta), bend.FRESNEL[fresnel], float(start), float(height))
+    exit_ = Exit(float(eta), axial_refraction.FRESNEL[fresnel], float(start), float(height))
     frame = Frame(*map(int, screen.resolution), *map(float, screen.low), *map(float, screen.pixel))
-    splat = Splat(shares.KINDS[filter.kind], *(int(2 * r + 1) for r in filter.reach), *map(float, filter.alpha))
+    splat = Splat(filter_weights.KINDS[filter.kind], *(int(2 * r + 1) for r in filter.reach), *map(float, filter.alpha))
     return slanted, (*rays, exit_, frame, splat, True if slanted else None)
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.kernels import blocks, mirror, refraction
-from caustic_cli.optics.kernels.bend import FRESNEL
+from caustic_cli.optics.kernels.axial_refraction import FRESNEL
 from caustic_cli.optics.kernels.stage import components, given, keep, kept, new, tangent, wanted
 from caustic_cli.optics.kernels.threads import ALL
 

@@ -5,7 +5,7 @@ between rows; both are the reference it is tested against.  All of it in float64
 
 Each of a fixed number of blocks of rows has an image of its own and they are added in order, so the result does not depend
 on timing, only on the number of blocks (the number of threads).  Only the scatter and the gather of pixels go ray by ray,
-four pixels at a time; the rest (`rows`, `bend`, `shares`) goes a row at a time in vector instructions.
+four pixels at a time; the rest (`rows`, `axial_refraction`, `filter_weights`) goes a row at a time in vector instructions.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import math
 
 import numpy as np
 
-from caustic_cli.optics.kernels import slant
+from caustic_cli.optics.kernels import oblique_refraction
 from caustic_cli.optics.kernels.arguments import Splat
-from caustic_cli.optics.kernels.bend import (
+from caustic_cli.optics.kernels.axial_refraction import (
     BY_POWER,
     BY_PX,
     BY_PY,
@@ -49,10 +49,10 @@ from caustic_cli.optics.kernels.bend import (
     push,
     reach,
 )
+from caustic_cli.optics.kernels.filter_weights import shares
 from caustic_cli.optics.kernels.jit import FAST, njit
 from caustic_cli.optics.kernels.pixels import FOUR, ONE, THREE, TWO, UINT, limits
 from caustic_cli.optics.kernels.rows import combine, spread
-from caustic_cli.optics.kernels.shares import shares
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 
 FRESNEL, REFLECTED, OFF_SCREEN, LEAVING, MISSED, COLUMNS = range(6)  # of the ledger
@@ -75,7 +75,7 @@ def _bend(v, i, surface, rays, exit_, frame):
 
 @njit(inline="always", **FAST)
 def _slanted(i, surface, rays):
-    """Row i as `slant` takes it: slanted rays have a surface of their own each, and no row of it is a sum."""
+    """Row i as `oblique_refraction` takes it: slanted rays have a surface of their own each, and no row of it is a sum."""
     (_, _, _, net, net_x, net_y), (_, _, along_x, along_y, share) = surface, rays
     return net[i], net_x[i], net_y[i], along_x[i], along_y[i], share[i]
 
@@ -104,7 +104,7 @@ def _scatter(vectors, exit_, frame, splat, sx, sy, image, ledger, column):
     for j in range(len(power)):
         emitted, weight = share[j], power[j]
         if weight < 0.0:
-            if weight == slant.MISSED_POWER:
+            if weight == oblique_refraction.MISSED_POWER:
                 lost_missed += emitted
             else:
                 lost_reflected += emitted
@@ -271,7 +271,7 @@ def forward(block, images, ledgers, scratch, first, bu, du, net, net_x, net_y, x
         if slanted is None:
             _bend(v, i, surface, rays, exit_, frame)
         else:
-            slant.aim(v, _slanted(i, surface, rays), x[i], y[i], exit_, frame)
+            oblique_refraction.aim(v, _slanted(i, surface, rays), x[i], y[i], exit_, frame)
         _share(v, splat, sx, sy, dx[:0], dy[:0])
         _scatter(v, exit_, frame, splat, sx, sy, images[block], ledgers[block], column)
 
@@ -303,11 +303,11 @@ def backward(block, grad, grad_leaving, apart, nets, scratch, first, bu, du, net
         if slanted is None:
             _bend(v, i, surface, rays, exit_, frame)
         else:
-            slant.aim(v, _slanted(i, surface, rays), x[i], y[i], exit_, frame)
+            oblique_refraction.aim(v, _slanted(i, surface, rays), x[i], y[i], exit_, frame)
         _share(v, splat, sx, sy, dx, dy)
         _gather(v, exit_, frame, splat, sx, sy, dx, dy, grad, grad_leaving, column, tilt)
         if slanted is not None:
-            slant.pull(v, _slanted(i, surface, rays), exit_, nets[0, 0, i],
+            oblique_refraction.pull(v, _slanted(i, surface, rays), exit_, nets[0, 0, i],
                        nets[1, 0, i], nets[2, 0, i])
             continue
         pull(v, exit_)
@@ -331,10 +331,10 @@ def tangent(block, t_net, t_net_x, t_net_y, images, leaving, scratch, first, bu,
         if slanted is None:
             _bend(v, i, surface, rays, exit_, frame)
         else:
-            slant.aim(v, _slanted(i, surface, rays), x[i], y[i], exit_, frame)
+            oblique_refraction.aim(v, _slanted(i, surface, rays), x[i], y[i], exit_, frame)
         _share(v, splat, sx, sy, dx, dy)
         if slanted is not None:
-            slant.push(v, _slanted(i, surface, rays),
+            oblique_refraction.push(v, _slanted(i, surface, rays),
                        (t_net[i], t_net_x[i], t_net_y[i]), exit_, frame)
         else:
             combine(i, first, bu, du, t_net, t_net_x, t_net_y, v[T_SAG], v[T_GX], v[T_GY])

@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from caustic_cli.optics.kernels.bend import EXACT, SCHLICK
+from caustic_cli.optics.kernels.axial_refraction import EXACT, SCHLICK
 from caustic_cli.optics.kernels.jit import FAST, njit
 from caustic_cli.optics.kernels.stage import BATCH, load, store
 from caustic_cli.optics.kernels.threads import ALL, on_threads

@@ -7,7 +7,7 @@ scatter and the gather of pixels go ray by ray; the rest goes a row of rays at a
 Notation, in pixels (w = 1)
     p           landing coordinate, 0 at the frame's low edge, one for x and one for y;  phi = p - floor(p)
     v           filter size;  r = (v - 1) / 2
-    a_k, o      what `shares` gives: the share of pixel floor(p) - r + k is a_k o, so that they sum to 1
+    a_k, o      what `filter_weights` gives: the share of pixel floor(p) - r + k is a_k o, so that they sum to 1
     a'_k, l     and its derivative by p is (a'_k - a_k l) o
     W           weight of a ray;  G the derivatives by the padded image's pixels
     image       sum over rays of W o_x o_y a_i a_j on the frame padded by 2 r, less its padding
@@ -26,10 +26,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.kernels import blocks
-from caustic_cli.optics.kernels.bend import fraction
+from caustic_cli.optics.kernels.axial_refraction import fraction
+from caustic_cli.optics.kernels.filter_weights import KINDS, shares
 from caustic_cli.optics.kernels.jit import FAST, njit
 from caustic_cli.optics.kernels.pixels import FOUR, ONE, THREE, TWO, UINT, limits, total
-from caustic_cli.optics.kernels.shares import KINDS, shares
 from caustic_cli.optics.kernels.stage import component, components, given, keep, kept, load, store, tangent, wanted
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 from caustic_cli.optics.reconstruction import Filter, padding
@@ -37,7 +37,7 @@ from caustic_cli.scene import Screen
 
 #: Rays in a row.
 ROW = 512
-# Rows of a block's scratch; then what `shares` works in, then shares and slopes along x and y.
+# Rows of a block's scratch; then what `filter_weights` works in, then shares and slopes along x and y.
 PX, PY, W, PHI, OVER_X, OVER_Y, LEAN_X, LEAN_Y, BY_X, BY_Y, BY_W, VECTORS = range(12)
 SCRATCH = 5
 

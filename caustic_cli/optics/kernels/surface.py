@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.kernels import batches, blocks, hit, spline
+from caustic_cli.optics.kernels import batches, blocks, intersect, spline
 from caustic_cli.optics.kernels.threads import ALL
 
 
@@ -100,9 +100,10 @@ def next_meetings(surface: FusedSurface, heights: Tensor, o, d, below: bool, rou
     rays = (o[0] * surface.scale[0] + 0.5, o[1] * surface.scale[1] + 0.5, o[2] - middle,
             d[0] * surface.scale[0], d[1] * surface.scale[1], d[2])
     t = np.empty(len(o[0]))
-    hit.intersect_again(ALL, *(c.contiguous().numpy() for c in rays), -1.0 if below else 1.0, (float(h.min()), float(h.max())),
-                        surface.slope_bounds(h), round, step, halvings, most, surface.coefficients(h), *surface.geometry, t,
-                        blocks())
+    heights = float(h.min()), float(h.max())
+    intersect.intersect_again(ALL, *(c.contiguous().numpy() for c in rays), -1.0 if below else 1.0, heights,
+                              surface.slope_bounds(h), round, step, halvings, most, surface.coefficients(h), *surface.geometry, t,
+                              blocks())
     return torch.from_numpy(t)
 
 
@@ -142,7 +143,7 @@ class RayHits:
             self.t = np.maximum(reach, 0.0)
             return c
         c, limits, slopes = self._shape(heights)
-        hit.intersect(ALL, *self.rays, start, limits, slopes, c, *self.surface.geometry, self.t, self.status, blocks())
+        intersect.intersect(ALL, *self.rays, start, limits, slopes, c, *self.surface.geometry, self.t, self.status, blocks())
         x, y = ((o - 0.5 + self.t * d) / s for o, d, s in zip(self.rays[:2], self.rays[3:5], self.surface.scale, strict=True))
         beyond = (x * x + y * y > self.radius**2) & (self.status == 0)  # there is the lens' side
         self.t[beyond], self.status[beyond] = 0.0, 1

@@ -71,6 +71,6 @@ class Surface(ABC):
         return heights, 0.0
 
     def meet(self, heights: Tensor | None, origin, direction, side: float) -> Hit:
-        """First meetings of rays (N,), mm, unit directions with side d_z > 0; differentiable by heights, origins and directions."""
+        """First intersections of rays (N,), mm, unit directions with side d_z > 0; differentiable by all three."""
         (device,) = {c.device for c in (*origin, *direction) if isinstance(c, Tensor)} or {torch.device("cpu")}
         return backend_for(device).meet(self, heights, origin, direction, side)

@@ -5,7 +5,7 @@ shifts the image of its middle, to within a part of what the image shows anyway,
 otherwise as so many points, each spread by its part of the source.
 
 What rays carry through the system counts: Fresnel's losses, absorption, dispersion, polarisation.  Light that does not go straight
-on (ghosts, second meetings, rough surfaces) is no part of it.
+on (ghosts, secondary intersections, rough surfaces) is no part of it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.optics.emission.coherent import Mode, edges, middle, modes, spots
-from caustic_cli.optics.meeting import Parameters
+from caustic_cli.optics.interaction import Parameters
 from caustic_cli.optics.resolution import WHITE_LINES, white
 from caustic_cli.optics.spread import Convolution, Spread, spread_of
 from caustic_cli.optics.surfaces import HeightField

@@ -27,7 +27,7 @@ from torch import Tensor
 
 from caustic_cli.optics.effects import Requests
 from caustic_cli.optics.emission.coherent import Mode
-from caustic_cli.optics.meeting import Meeting, Parameters
+from caustic_cli.optics.interaction import Interaction, Parameters
 from caustic_cli.optics.system import System
 from caustic_cli.optics.trace import Tracer
 from caustic_cli.optics.waves.nodes import Refined, between, filled, interpolated, within_pupil
@@ -87,7 +87,7 @@ class Optics:
         """Of the medium behind the last element."""
         return self.system.media()[-1].index_at(self.label)
 
-    def meetings(self, u: Tensor, v: Tensor) -> Meeting:
+    def interactions(self, u: Tensor, v: Tensor) -> Interaction:
         """Rays through points (N,) of the pupil, up to behind the last element."""
         rays = self.mode.through(u, v, self.system.before.index_at(self.label))
         return Tracer(self.system, rays, requests=STAGES, wavelength=self.label).last(self.parameters)
@@ -97,7 +97,7 @@ class Optics:
         parts = []
         step = len(u) if torch.is_grad_enabled() else CHUNK
         for start in range(0, len(u), step):
-            parts.append(self.footed(self.meetings(u[start : start + step], v[start : start + step])))
+            parts.append(self.footed(self.interactions(u[start : start + step], v[start : start + step])))
         if len(parts) == 1:
             return parts[0]
         return Feet(*(torch.cat([getattr(p, name) for p in parts]) for name in Feet.__dataclass_fields__))
@@ -107,7 +107,7 @@ class Optics:
         f = replace(self, mode=mode).feet(u, v)
         return f.big_x, f.big_y, f.power
 
-    def footed(self, m: Meeting) -> Feet:
+    def footed(self, m: Interaction) -> Feet:
         """Rays behind the last element by their feet."""
         state, (e1, e2, e3) = m.state.spread(), self.plane.axes
         o, d = state.full((state.origin[0], state.origin[1], state.origin[2] + state.datum)), state.full(state.direction)
@@ -310,7 +310,7 @@ def _sensitive(optics: Optics, u: Tensor, v: Tensor) -> tuple[Feet, dict[str, Te
     """Rays by their feet, with where they meet the last surface and how its height changes their path."""
     feet, found = [], []
     for start in range(0, len(u), CHUNK):
-        m = optics.meetings(u[start : start + CHUNK], v[start : start + CHUNK])
+        m = optics.interactions(u[start : start + CHUNK], v[start : start + CHUNK])
         feet.append(optics.footed(m))
         into = m.incoming[2]
         normal = m.element.pose.axes[2]

@@ -81,10 +81,10 @@ class Measured(Source):
 
     def incidence(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> float:
         """As of a source: of the very rays."""
-        d = self.rays.directions[self.meeting(half_size, z_in, round)[2]]
+        d = self.rays.directions[self.crossing(half_size, z_in, round)[2]]
         return float(np.arctan2(np.hypot(d[:, 0], d[:, 1]), d[:, 2]).max(initial=0.0))
 
-    def meeting(self, half_size: tuple[float, float], z: float, round: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def crossing(self, half_size: tuple[float, float], z: float, round: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Where rays pass the plane at z, x and y (N,) mm, and which of them carry light through an aperture there (N,)."""
         p, d = self.rays.positions, self.rays.directions
         with np.errstate(divide="ignore", over="ignore", invalid="ignore"):  # rays along the plane, which carry nothing

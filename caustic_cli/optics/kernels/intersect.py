@@ -167,7 +167,7 @@ def intersect(block, ou, ov, oz, du, dv, dz, start, limits, slopes, c, bu, mu, w
 @njit(entry=True, **FAST)
 def intersect_again(block, ou, ov, oz, du, dv, dz, side, limits, slopes, round_, step, halvings, most, c, bu, mu, wu, bv, mv, wv,
                     t, blocks):
-    """Next meetings of rays (N,) that start on the surface, into t (N,), 0 for none: the search of `reintersection.reference`.
+    """Next intersections of rays (N,) that start on the surface, into t (N,), 0 for none: the search of `reintersection.reference`.
 
     side: 1 above the surface, -1 under it; limits, slopes: as in `intersect`; round_: the surface ends at the circle inscribed
     in its aperture; step, halvings, most: least step (mm), bisections of the last one and most steps.

@@ -29,12 +29,12 @@ class Walker(Protocol):
     backend: Any
 
     def cross(self, k: int, state: RayState, heights: Tensor | None, *, forward: bool = True, reflects: bool | None = None,
-              straight: bool = True) -> Meeting:
+              straight: bool = True) -> Interaction:
         """Rays to element k and behind it."""
 
 
 @dataclass
-class Meeting:
+class Interaction:
     """Rays at one element: what effects see and change.
 
     tracer, index, element: whose and which; forward: whether light runs in the system's own direction; side: from which the
@@ -43,7 +43,7 @@ class Meeting:
     the element's frame; incoming: directions before it, in that frame; slopes: of the surface there; length: of the way to it, mm;
     lift: how far above the met point the rays go on, mm, where an effect says so; arriving, departing: power before and
     after the interaction; passes: of the interaction; straight: whether this is the walk
-    itself, not a detour.
+    itself, not a stray_light.
     """
 
     tracer: Walker

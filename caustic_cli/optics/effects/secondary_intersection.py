@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import torch
 
-from caustic_cli.optics.effects.base import NO_REQUESTS, Action, Effect, Requests, Verdict
+from caustic_cli.optics.effects.base import NO_REQUESTS, Action, Decision, Effect, Requests
 from caustic_cli.optics.frames import out_of, turned, turned_back
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.reintersection import again, touch
@@ -19,17 +19,17 @@ from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.scene import Scene
 
 
-class SecondMeeting(Effect):
+class SecondaryIntersection(Effect):
     """Left out, rays go straight on."""
 
-    name = "second-meeting"
+    name = "secondary-intersection"
 
-    def judge(self, scene: Scene, b) -> Verdict:
+    def judge(self, scene: Scene, b) -> Decision:
         """By whether a slope can catch a ray."""
         if b.climb < 1.0:
             why = f"slopes up to {b.slope:.3g} are {b.climb:.3g} of what rays leaving climb at"
-            return Verdict(self.name, False, why, b.climb, 1.0)
-        return Verdict(self.name, True, f"slopes up to {b.slope:.3g} may catch a ray that has left",
+            return Decision(self.name, False, why, b.climb, 1.0)
+        return Decision(self.name, True, f"slopes up to {b.slope:.3g} may catch a ray that has left",
                        b.climb if math.isfinite(b.climb) else None, 1.0)
 
     def request(self, scene: Scene, on: bool, bounds) -> Requests:
@@ -44,11 +44,11 @@ class SecondMeeting(Effect):
 class Again(Action):
     """Takes rays that meet the last surface again off the straight light."""
 
-    detours = True
+    stray = True
 
-    def detour(self, tracer, parameters, meetings) -> list[RayState]:
+    def stray_light(self, tracer, parameters, interactions) -> list[RayState]:
         """What becomes of them, behind the surface."""
-        m = meetings[-1]
+        m = interactions[-1]
         element, state, side = m.element, m.state, m.side
         surface, pose, heights = element.surface, element.pose, parameters[element.name]
         round_, interact = element.aperture.round, tracer.backend.interact

@@ -1,6 +1,6 @@
 """The stage from a surface on to a plane: the landing points of straight rays, with kernels, adjoint and tangent.
 
-Rays are float64 components, see `stage`; the reference is the last step of `stepwise.StepTracer`.
+Rays are float64 components, see `stage`; the reference is `backends.reference`.
 
 Notation, a ray from o in direction d, a plane through p with unit vectors a (along), b (up) and n (normal)
     v       d . n; the ray arrives where forward v > PARALLEL, forward being 1, or -1 for light that comes back from a mirror

@@ -16,8 +16,9 @@ from scipy.interpolate import RectBivariateSpline
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.inverse import start
 from caustic_cli.inverse.incidence import incident
+from caustic_cli.inverse.surface_from_map import OutOfReach, Start, thrown
+from caustic_cli.inverse.surface_from_map import surface as refracting_surface
 from caustic_cli.inverse.transport import corners
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
@@ -80,14 +81,14 @@ class _Grid:
         """What these corners have, at those of another grid."""
         return RectBivariateSpline(self.x, self.y, values)(onto.x, onto.y)
 
-    def solved(self, light: np.ndarray, directions, mean: float, again: start.Start | None = None, **options) -> start.Start:
+    def solved(self, light: np.ndarray, directions, mean: float, again: Start | None = None, **options) -> Start:
         """The surface of this mean height that sends the light to the picture."""
         scene = self.scene
         if not scene.source.distant and not light.all():
             options["darkest"] = DARKEST
-        return start.surface(light, self.target, scene.lens.half_size, scene.screen.half_size, scene.lens.bend, scene.screen.z,
-                             mean, directions, centre=scene.screen.shift,
-                             start=None if again is None else again.transport.potential, **options)
+        return refracting_surface(light, self.target, scene.lens.half_size, scene.screen.half_size, scene.lens.bend,
+                                  scene.screen.z, mean, directions, centre=scene.screen.shift,
+                                  start=None if again is None else again.transport.potential, **options)
 
     def above(self, z: np.ndarray) -> np.ndarray:
         """Part of each cell's corners where the surface is not cut off."""
@@ -101,8 +102,8 @@ class _Grid:
         light, directions = incident(scene, self.x, self.y, z)
         surface = RectBivariateSpline(self.x, self.y, z)
         at = np.broadcast_arrays(self.x[:, None], self.y[None, :])
-        u, v, part = start.thrown(*at, z, surface(self.x, self.y, dx=1), surface(self.x, self.y, dy=1), directions, lens.bend,
-                                  screen.z, "none" if lens.fresnel == "none" else "exact")
+        u, v, part = thrown(*at, z, surface(self.x, self.y, dx=1), surface(self.x, self.y, dy=1), directions,
+                            lens.bend, screen.z, "none" if lens.fresnel == "none" else "exact")
         on = (np.abs(u - screen.shift[0]) <= screen.half_size[0]) & (np.abs(v - screen.shift[1]) <= screen.half_size[1])
         return float((light * self.above(z) * _mean(np.where(on, part, 0.0))).sum() / on_lens) if on_lens > 0 else 0.0
 
@@ -126,7 +127,7 @@ class _Grid:
                 try:
                     again = self.solved(lit, directions, float(z.mean()), again)
                     break
-                except start.OutOfReach as error:
+                except OutOfReach as error:
                     if not left:
                         raise
                     reached = reached * _mean(~error.where)

@@ -1,7 +1,7 @@
 """A row of rays of any direction, refracted at their hits and carried to the screen, with derivatives, for the CPU kernels.
 
-The same physics as `bend`, which knows that a plane wave's rays all run along z.  Rays are copied into rows of a small scratch, a
-batch at a time, for the reason that `stage` gives; what a ray has lost its way to is masked, not branched around.
+The same physics as `axial_refraction`, which knows that a plane wave's rays all run along z.  Rays are copied into rows of a
+small scratch, a batch at a time, for the reason that `stage` gives; what a ray has lost its way to is masked, not branched around.
 
 Notation, a ray with unit direction d inside the lens, slopes g at the hit, N = (-g_x, -g_y, 1), index n
     c, s    d . N and t . N with t the refracted unit direction; s = sqrt(|N|^2 (1 - n^2) + n^2 c^2), 1 if light is reflected
@@ -10,7 +10,7 @@ Notation, a ray with unit direction d inside the lens, slopes g at the hit, N = 
     q       (h - sag) / t_z, length of the path to the screen
 
 In, beside the directions: the distances along the rays to their hits (mm; -1 for none), dz/dx and dz/dy there, x and y where the
-rays begin, and their powers.  Out, in rows of `bend`'s vectors: SAG, POWER, PX, PY, SHARE.
+rays begin, and their powers.  Out, in rows of `axial_refraction`'s vectors: SAG, POWER, PX, PY, SHARE.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import math
 
 import numpy as np
 
-from caustic_cli.optics.kernels.bend import (
+from caustic_cli.optics.kernels.axial_refraction import (
     BY_POWER,
     BY_PX,
     BY_PY,
