@@ -6,6 +6,8 @@ import os
 import re
 import shlex
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -77,6 +79,14 @@ def test_the_python_of_a_chapter_runs(chapter, home, monkeypatch, tmp_path):
     shutil.copy(home / "flame.png", tmp_path)
     for block in blocks(chapter, "python"):
         exec(compile(block, str(chapter), "exec"), {})
+
+
+@pytest.mark.parametrize("script", sorted((ROOT / "tests" / "benchmarks").glob("*.py")), ids=lambda p: p.stem)
+def test_a_benchmark_says_what_it_takes(script, tmp_path):
+    pytest.importorskip("mitsuba" if script.stem == "intersection" else "caustic_cli")
+    said = subprocess.run([sys.executable, script, "--help"], capture_output=True, text=True, cwd=tmp_path, check=True,
+                          env=os.environ | {"PYTHONPATH": str(ROOT)})
+    assert said.stdout.startswith("usage:") and not list(tmp_path.iterdir())
 
 
 def test_links_of_the_documents_lead_somewhere():

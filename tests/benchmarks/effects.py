@@ -12,6 +12,7 @@ their quartiles.
 
 from __future__ import annotations
 
+import argparse
 import os
 import platform
 import statistics
@@ -141,7 +142,8 @@ def worker() -> None:
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    if "--worker" in sys.argv:
-        worker()
-    else:
-        main(Path(sys.argv[1]) if len(sys.argv) > 1 else None)
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("other", type=Path, nargs="?", help="another checkout to compare with")
+    parser.add_argument("--worker", action="store_true", help="one iteration for every line on stdin")
+    options = parser.parse_args()
+    worker() if options.worker else main(options.other)

@@ -12,6 +12,7 @@ point's lens throws the picture itself, convolved with the disc.
 
 from __future__ import annotations
 
+import argparse
 import json
 import subprocess
 import sys
@@ -63,7 +64,9 @@ def designed(name: str, distance: float) -> dict:
 
 
 if __name__ == "__main__":
-    designs = "--designs" in sys.argv[1:]
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--designs", action="store_true", help="also design each lens, five minutes")
+    designs = parser.parse_args().designs
     print("| picture | distance, mm | blur, mm | a point's lens | the least possible |" + (" designed | time |" if designs else ""))
     print("| --- | --- | --- | --- | --- |" + (" --- | --- |" if designs else ""))
     for name in ("ball", "flame"):

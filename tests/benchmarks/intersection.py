@@ -11,9 +11,9 @@ ratios.  Errors are of t, against Newton's, which is checked against the surface
 
 from __future__ import annotations
 
+import argparse
 import math
 import statistics
-import sys
 import time
 
 import drjit as dr
@@ -29,7 +29,9 @@ RAYS, ROUNDS, HALF = 2_000_000, 9, 5.0
 
 
 def main() -> None:
-    cells = [int(a) for a in sys.argv[1:]] or [512, 1024, 1536]
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("cells", type=int, nargs="*", default=[512, 1024, 1536], help="of Mitsuba's meshes, along an axis")
+    cells = parser.parse_args().cells
     mi.set_variant("llvm_ad_mono", "llvm_ad_rgb")
     space = SplineSpace.uniform(15, 3)
     field = HeightField((space, space), (HALF, HALF))

@@ -10,6 +10,7 @@ float32.
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import platform
@@ -208,7 +209,9 @@ def plot(results: dict, path: Path) -> None:
 
 def main() -> None:
     """Measure everything and write it down."""
-    directory = Path(sys.argv[1] if len(sys.argv) > 1 else "speed")
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("directory", type=Path, nargs="?", default=Path("speed"), help="where tables and plots go")
+    directory = parser.parse_args().directory
     directory.mkdir(parents=True, exist_ok=True)
     results = {
         "against_torch": against_torch(),

@@ -8,8 +8,8 @@ told otherwise.  Every figure is a median over rounds.
 
 from __future__ import annotations
 
+import argparse
 import statistics
-import sys
 import time
 
 import torch
@@ -89,4 +89,6 @@ def main(threads: int = 1) -> None:
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("threads", type=int, nargs="?", default=1)
+    main(parser.parse_args().threads)
