@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 from typing import Annotated
 
@@ -37,7 +36,7 @@ def run(
     debug: options.Debug = False,
 ) -> None:
     """Write the lens of PROJECT in the format of another program."""
-    began, say = time.monotonic(), console.Reporter(quiet)
+    say = console.Reporter(quiet)
     if format not in FORMATS:
         raise InputError(f"--format must be one of {', '.join(FORMATS)}, got {format!r}")
     given: dict = {}
@@ -58,6 +57,5 @@ def run(
     if not reused:
         for file in (figures["file"], *figures.get("beside", ())):
             say.say(f"{file}: {Path(file).stat().st_size:,} bytes")
-        figures["seconds"] = time.monotonic() - began
     if json:
         console.emit_json(figures)

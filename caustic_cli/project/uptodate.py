@@ -26,8 +26,6 @@ from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.project import CHECKPOINT, MADE, RENDER, WAVE, Project, is_project
 
 RECORD = ".outputs.json"
-#: Options that say where and how loudly, not what.
-IRRELEVANT = ("project", "output", "force", "json", "quiet", "debug", "threads", "progress", "npy")
 
 
 def digest(full: Settings, *pictures: Picture | None) -> str:
@@ -81,15 +79,15 @@ class Outputs:
     """What a command writes from a project.
 
     Args:
-        project: where from; command: the command's name; options: all it was called with, by name.
+        project: where from; command: the command's name; options: what decides the outcome, by name.
         paths: the files it writes.
     """
 
     def __init__(self, project: Project, command: str, options: dict, paths: Iterable[Path | None]):
         self.record, self.paths = project.path / RECORD, [p for p in paths if p is not None]
-        given = {k: str(v) for k, v in sorted(options.items()) if k not in IRRELEVANT}
+        given = {k: str(v) for k, v in sorted(options.items())}
         inputs = [digest(project.settings, project.picture, project.profile), _hash(project.path / CHECKPOINT)]
-        inputs += [_hash(Path(options[name])) for name in ("source_file", "intensity") if options.get(name)]
+        inputs += [_hash(Path(options[name])) for name in ("source.file", "source.intensity") if options.get(name)]
         self.asked = hashlib.sha256(json.dumps([command, given, inputs]).encode()).hexdigest()
         self.key = " ".join(str(p.resolve()) for p in self.paths)
 

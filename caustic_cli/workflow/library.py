@@ -240,7 +240,7 @@ def _count(rays: float) -> int:
 def _picture(given: str | Path | np.ndarray | Tensor, linear: bool) -> Picture:
     if isinstance(given, str | Path):
         return read_picture(given, linear)
-    values = np.array(given.detach().cpu() if isinstance(given, Tensor) else given, dtype=np.float64)
+    values = np.array(given.detach().cpu().numpy() if isinstance(given, Tensor) else given, dtype=np.float64)
     if values.ndim != 2 or min(values.shape) < 2 or not np.isfinite(values).all() or values.min() < 0 or not values.max() > 0:
         raise InputError("picture must be a file, or a 2-D array of at least 2 x 2 finite values, none of them negative, not all 0")
     return Picture(values, "linear")

@@ -76,7 +76,8 @@ class Request:
         """What decides the outcome, by name; where it goes does not."""
         names = ("rays", "tolerance", "reconstruction", "filter_size", "alpha", "screen_at", "effects", "explain", "report",
                  "tool_radius", "seed", "dtype")
-        return {name: getattr(self, name) for name in names} | {option: value for (_, _, option), value in self.given.items()}
+        return {name: getattr(self, name) for name in names} | {
+            f"{section}.{key}": value for (section, key, _), value in self.given.items()}
 
 
 @dataclass(frozen=True)
@@ -111,7 +112,8 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     """
     began = time.monotonic()
     wanted = parse_effects(asked.effects)
-    project = None if _archived(asked.lens) else Project.open(asked.lens)
+    archive = open_archive(asked.lens) if asked.lens.suffix.lower() == ".npz" and asked.lens.is_file() else None
+    project = None if archive else Project.open(asked.lens)
     if project is None and asked.given:
         raise InputError(f"{next(iter(asked.given))[2]}: an archive's source is fixed; render its project under another light")
     image_path = asked.image or (asked.lens / RENDER if project else Path(asked.lens.stem + ".png"))
@@ -126,12 +128,12 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     for path in paths:
         if path is not None:
             refuse_foreign(path, asked.force)
-    made = Outputs(project, "render", asked.asks, paths) if project and not asked.verify else None
+    made = Outputs(project, "render", asked.asks | {"device": device}, paths) if project and not asked.verify else None
     if made and not asked.force and (figures := made.found()):
         say.say(f"{image_path}: is what the same options made of the same project, so there is nothing to do; --force does it"
                 " again")
         return figures | {"reused": True}
-    lens = _opened(asked, project)
+    lens = Opened(None, *archive) if project is None else _opened(project, asked)
     scene = lens.scene if asked.screen_at is None else replace(lens.scene, screen=replace(lens.scene.screen, z=asked.screen_at))
     if asked.verify:
         require_mitsuba(scene)
@@ -166,13 +168,7 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     return figures
 
 
-def _archived(path: Path) -> bool:
-    return path.suffix.lower() == ".npz" and path.is_file()
-
-
-def _opened(asked: Request, project: Project | None) -> Opened:
-    if project is None:
-        return Opened(None, *open_archive(asked.lens))
+def _opened(project: Project, asked: Request) -> Opened:
     scene = project.scene(dict(asked.given))
     target, (surface, checkpoint) = project.target(scene), project.lens(scene)
     return Opened(project, scene, surface, checkpoint.state.heights, target, checkpoint.state.total,
