@@ -77,7 +77,7 @@ def run(arguments: list[str]) -> int:
         console.error("interrupted")
         return 130
     except Interrupted as stop:
-        console.error(str(stop))
+        console.error(f"{stop}")
         return stop.status
     except Exception as problem:
         if debug:
@@ -88,7 +88,7 @@ def run(arguments: list[str]) -> int:
 def _report(problem: Exception) -> int:
     """Say in one line what went wrong; the exit status."""
     if isinstance(problem, CausticError):
-        console.error(str(problem))
+        console.error(f"{problem}")
         return 2 if isinstance(problem, InputError) else 1
     if hasattr(problem, "format_message"):  # a usage error of the command-line parser, whichever version wraps it
         message = problem.format_message()

@@ -1,14 +1,34 @@
 """What can go wrong, as full sentences: what, where, and what would be accepted.
 
-Only the command line turns these into exit codes; every other module raises them.
+Only the command line turns these into exit codes; every other module raises them.  A parameter that a sentence speaks of is marked,
+⟨screen_size⟩: `plain` says it by its name, as str() of an error does, and the command line by its option.
 """
+
+import re
+
+#: A marked parameter.
+MARK = re.compile("⟨([a-z_]+)⟩")
 
 #: How torch says that memory is short: on a CPU (its allocator, a failed mmap) and on a CUDA device.
 SHORTAGE = ("out of memory", "not enough memory", "can't allocate memory", "Cannot allocate memory")
 
 
+def plain(text: str) -> str:
+    """A text without its marks."""
+    return MARK.sub(r"\1", text)
+
+
 class CausticError(Exception):
-    """Something this program could not do; the message is one line for the user (exit status 1)."""
+    """Something this program could not do; the message is one line for the user (exit status 1).
+
+    Within an f-string it keeps its marks, for another error's message.
+    """
+
+    def __str__(self) -> str:
+        return plain(super().__str__())
+
+    def __format__(self, spec: str) -> str:
+        return format(super().__str__(), spec)
 
 
 class InputError(CausticError, ValueError):

@@ -203,7 +203,7 @@ def test_round_tolerance_wants_no_kinks():
 
 
 def test_scripts_are_for_rectangles(tmp_path):
-    with pytest.raises(InputError, match="--script"):
+    with pytest.raises(InputError, match="script"):
         write_script(tmp_path / "lens.npz", *rounded(make()))
 
 

@@ -1,9 +1,14 @@
 """Imports run one way, and every file says what it is: read from the source, nothing is imported."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
+
+from caustic_cli import cli
+from caustic_cli.commands import console
+from caustic_cli.errors import MARK, InputError
 
 PACKAGE = Path(__file__).resolve().parent.parent / "caustic_cli"
 FILES = sorted(PACKAGE.rglob("*.py"))
@@ -94,6 +99,13 @@ def test_the_top_level_holds_rooms():
     assert {p.name for p in PACKAGE.iterdir() if p.is_dir() and p.name != "__pycache__"} == {*ALLOWED, "commands"}
 
 
+@pytest.mark.parametrize("path", [p for p in FILES if not {"commands", "cli.py"} & set(p.relative_to(PACKAGE).parts)],
+                         ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_no_option_is_named_below_the_commands(path):
+    """Parameters that a message speaks of are marked, and the command line says them as options (`errors.MARK`)."""
+    assert not re.findall(r"(?<![\w-])--[a-z][\w-]*", path.read_text("utf-8"))
+
+
 def test_compiled_loops_are_kernels():
     """The files that compile functions, read from their decorators."""
     compiled = {str(p.relative_to(PACKAGE).parent) for p in FILES if any(
@@ -150,3 +162,14 @@ def test_no_two_modules_import_each_other():
 def test_files_say_what_they_are(path):
     text = path.read_text("utf-8")
     assert ast.get_docstring(ast.parse(text))
+
+
+def test_marked_parameters_are_options(capfd):
+    """Every mark in the sources names an option of some command; a library's reader sees the name alone."""
+    options = {o for c in cli.parser().commands.values() for p in c.params for o in p.opts if o.startswith("--")}
+    marked = {name for p in FILES if p.name != "errors.py" for name in MARK.findall(p.read_text("utf-8"))}
+    assert len(marked) > 20 and {"--" + name.replace("_", "-") for name in marked} <= options
+    error = InputError("⟨screen_size⟩ must be one or two lengths")
+    assert str(error) == "screen_size must be one or two lengths" and f"{InputError(f'x: {error}')}" == f"x: {error}"
+    console.error(f"{error}")
+    assert capfd.readouterr().err == "caustic: --screen-size must be one or two lengths\n"

@@ -154,7 +154,7 @@ def test_a_tolerance_beyond_the_file_is_refused():
     here = scene(measured(KNOWN["point"][0]))
     field, z = HeightField.of(LENS), heights(LENS)
     assert converge(here, field, z, 0.2, rays=4000).error <= 0.2
-    with pytest.raises(CausticError, match=r"--tolerance 0.001 asks for more rays than the file holds, 400,000"):
+    with pytest.raises(CausticError, match=r"tolerance 0.001 asks for more rays than the file holds, 400,000"):
         converge(here, field, z, 1e-3, rays=4000)
 
 

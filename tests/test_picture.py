@@ -348,7 +348,7 @@ def test_writing_into_no_directory_is_an_input_error(tmp_path):
 def test_foreign_files_are_refused_unless_forced(tmp_path):
     theirs = save(tmp_path / "theirs.png", ramp())
     before = theirs.read_bytes()
-    with pytest.raises(InputError, match="--force"):
+    with pytest.raises(InputError, match="force"):
         files.refuse_foreign(theirs)
     files.refuse_foreign(theirs, force=True)
     assert theirs.read_bytes() == before  # refusing writes nothing, nor does allowing

@@ -215,13 +215,13 @@ def test_adam_has_one_stage(design):
 
 
 @pytest.mark.parametrize(("given_", "shaped", "word"), [
-    ({}, {"mag": 0.0}, "--mag"), ({}, {"mag": math.nan}, "--mag"), ({}, {"mag": -3.0}, "--mag"),
-    ({}, {"margin": -0.1}, "--margin"), ({}, {"quality": "superb"}, "--quality"),
+    ({}, {"mag": 0.0}, "mag"), ({}, {"mag": math.nan}, "mag"), ({}, {"mag": -3.0}, "mag"),
+    ({}, {"margin": -0.1}, "margin"), ({}, {"quality": "superb"}, "quality"),
     ({"screen": {"z": 3.0}}, {}, "[screen] z"), ({"screen": {"z": math.inf}}, {}, "[screen] z"),
     ({"lens": {"degree": [99, 99]}}, {}, "[lens] degree"), ({"lens": {"index": 1.0}}, {}, "[lens] index"),
     ({"lens": {"glass": "wood"}}, {}, "wood"), ({"lens": {"size": [0.0, 1.0]}}, {}, "[lens] size"),
     ({"screen": {"size": [0.0, 1.0]}}, {}, "[screen] size"),
-    ({"design": {"stages": [{"blur": 1.0}]}}, {"rays": 1000}, "--rays"),
+    ({"design": {"stages": [{"blur": 1.0}]}}, {"rays": 1000}, "rays"),
 ])
 def test_out_of_range(given_, shaped, word):
     with pytest.raises(InputError) as caught:

@@ -198,7 +198,7 @@ def test_a_source_from_outside(ring, kernels, tmp_path):
     assert isinstance(source, Ring) and source.power == 2.0 and source.nearest == -20.0
     assert source.centre == pytest.approx((0.0, 0.0, -20.0)) and source.powers == pytest.approx((1 / 6,) * 12)
     settings.refuse_unused(full["source"], [("source", "size", "--source-size")])
-    with pytest.raises(InputError, match="--cone belongs to --source point, grid or disc, got ring"):
+    with pytest.raises(InputError, match="--cone belongs to source point, grid or disc, got ring"):
         settings.refuse_unused(full["source"], [("source", "cone", "--cone")])
 
     lens = Lens(size=(10.0, 8.0), control=(8, 7), index=1.5, offset=Offset(5.0, (-40.0, -40.0)))
@@ -227,7 +227,7 @@ def test_a_source_from_outside(ring, kernels, tmp_path):
 def test_a_kind_that_others_do_not_know_is_refused_in_a_sentence(ring, monkeypatch):
     scene = Scene(Ring((0.0, 0.0, -20.0), 3.0), make()[0].lens, Screen((10.0, 10.0)))
     monkeypatch.setattr(verify, "find_spec", lambda name: True)
-    with pytest.raises(InputError, match="--verify mitsuba knows no source of type ring"):
+    with pytest.raises(InputError, match="verify mitsuba knows no source of type ring"):
         verify.require_mitsuba(scene)
     monkeypatch.delitem(emission._MAKERS, "ring")
     with pytest.raises(InputError, match="type ring has no rays"):

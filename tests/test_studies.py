@@ -230,7 +230,7 @@ def test_the_contenders_of_a_project(small):
     entry = contender(small, 1)
     assert tuple(entry.heights.shape) == (11, 11)
     assert (entry.iterations, entry.seconds, entry.steps, entry.loss) == (0, 0.0, [], None)  # what was tried out is forgotten
-    with pytest.raises(InputError, match="--seconds"):
+    with pytest.raises(InputError, match="seconds"):
         training.run_training(scene, target, [entry], seconds=0.0)
 
 

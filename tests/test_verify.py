@@ -76,7 +76,7 @@ def test_few_rays_take_pixels_together_and_too_few_say_so():
     assert verdict.agree and verdict.figures["pixel_side"] == 2
     assert np.isnan(verdict.z).any() or verdict.figures["pixels"] == 15 * 12
     few, squares = counts(picture(), 5, 20)
-    with pytest.raises(CausticError, match="--rays"):
+    with pytest.raises(CausticError, match="rays"):
         verify.compare(renders, few, squares, 20)
 
 

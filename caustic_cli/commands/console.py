@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from caustic_cli.errors import InputError
+from caustic_cli.errors import MARK, InputError
 
 #: Characters of an error line; more is what somebody put into a file.
 LONGEST_LINE = 4000
@@ -42,6 +42,7 @@ class Reporter:
 
     def say(self, text: str) -> None:
         """A line for the user."""
+        text = named(text)
         if self.lines:
             self._line(event="message", text=text)
         else:
@@ -104,6 +105,11 @@ class Reporter:
                 task, description=description, text=text, completed=done, total=whole)
 
 
+def named(text: str) -> str:
+    """A text whose marked parameters are called by their options."""
+    return MARK.sub(lambda found: "--" + found[1].replace("_", "-"), text)
+
+
 def emit_json(value: dict) -> None:
     """Exactly one JSON object on stdout."""
     sys.stdout.write(json.dumps(value, allow_nan=False) + "\n")
@@ -118,7 +124,7 @@ def emit(line: str) -> None:
 
 def error(message: str) -> None:
     """One line on stderr, said even when quiet; nothing in it, a hostile file's name for instance, commands the terminal."""
-    line = "".join(c if c.isprintable() else "?" for c in " ".join(message.split()))
+    line = "".join(c if c.isprintable() else "?" for c in " ".join(named(message).split()))
     sys.stderr.write(f"caustic: {line if len(line) <= LONGEST_LINE else line[:LONGEST_LINE] + ' ...'}\n")
 
 

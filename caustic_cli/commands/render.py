@@ -95,7 +95,7 @@ def run(
     try:
         figures = render(asked, device, say)
     except InputError as error:
-        raise InputError(str(error).replace("[screen] z", "--screen-at") if screen_at is not None else str(error)) from error
+        raise InputError(f"{error}".replace("[screen] z", "--screen-at") if screen_at is not None else f"{error}") from error
     if not figures.pop("reused", False):
         _show(str(project), figures, say)
     if json:

@@ -51,7 +51,7 @@ def complete(given: Settings, aspect: float, *, mag: float | None = None, margin
     """Every setting a project needs.
 
     Args:
-        given: what the user fixed, by options or --config.
+        given: what the user fixed, by options or config.
         aspect: height over width of the picture.
         mag: picture width over lens width; margin: black border, part of the picture's width in all.
         width: pixels across the screen when only that is known; the rows follow the screen's shape.
@@ -72,8 +72,8 @@ def complete(given: Settings, aspect: float, *, mag: float | None = None, margin
         if "index" not in lens:
             lens.setdefault("glass", COLOR_GLASS)
     if mag is not None:
-        mag = checks.number("--mag", mag, 1e-3, 1e3)
-    margin = checks.number("--margin", DEFAULT_MARGIN if margin is None else margin, 0.0, 100.0)
+        mag = checks.number("⟨mag⟩", mag, 1e-3, 1e3)
+    margin = checks.number("⟨margin⟩", DEFAULT_MARGIN if margin is None else margin, 0.0, 100.0)
     checks.pair("[lens] size", lens["size"], lambda w, x: checks.number(w, x, 1e-6, 1e6))
     checks.number("[screen] z", screen["z"], -1e12, 1e12)
     if "size" in screen:
@@ -168,7 +168,7 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
     design.setdefault("preconditioner", "laplacian" if plain else "none")
     if "stages" in design:
         if given or rays:
-            raise InputError("--quality and --rays shape the default stages, but the configuration brings [[design.stages]]"
+            raise InputError("⟨quality⟩ and ⟨rays⟩ shape the default stages, but the configuration brings [[design.stages]]"
                              " of its own: change them there")
         design["stages"] = [_complete_stage(stage, s, _sampler(source)) for stage in design["stages"]]
         if asked != "auto" and any(stage.get("waves") for stage in design["stages"]) != (asked == "on"):
@@ -203,8 +203,8 @@ def without_waves(s: Settings, given: bool) -> str:
     if given:
         return "none of the given [[design.stages]] has waves; one with waves = [550.0] refines it at that wavelength"
     if (seen := _resolution(s, build_source(s))).source > seen.pixel:
-        return "that of a source whose blur is wider than a pixel takes many times as long; --waves on refines it all the same"
-    return _not_by_default(s) or f"{LEAST_WAVES} iterations on it would take longer than this quality's time; --waves on takes it"
+        return "that of a source whose blur is wider than a pixel takes many times as long; ⟨waves⟩ on refines it all the same"
+    return _not_by_default(s) or f"{LEAST_WAVES} iterations on it would take longer than this quality's time; ⟨waves⟩ on takes it"
 
 
 def _not_by_default(s: Settings) -> str:
@@ -215,11 +215,11 @@ def _not_by_default(s: Settings) -> str:
     if s["source"].get("also"):
         return "light of several sources is refined by rays alone"
     if design["network"] != "none":
-        return "a network is trained on rays alone; --network none refines it"
+        return "a network is trained on rays alone; ⟨network⟩ none refines it"
     if design["optimizer"] != "lbfgs":
-        return f"{design['optimizer']} was asked for, and the wave image takes lbfgs; --waves on adds stages that use it"
+        return f"{design['optimizer']} was asked for, and the wave image takes lbfgs; ⟨waves⟩ on adds stages that use it"
     if any(s["screen"].get("tilt", ())):
-        return "on a tilted screen it takes many transforms for each wavelength; --waves on refines it all the same"
+        return "on a tilted screen it takes many transforms for each wavelength; ⟨waves⟩ on refines it all the same"
     return ""
 
 

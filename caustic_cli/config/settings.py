@@ -249,7 +249,7 @@ def with_defaults(settings: dict[str, dict[str, Any]]) -> dict[str, dict[str, An
 
 def dump(settings: dict[str, dict[str, Any]]) -> str:
     """TOML text in the schema's order, each key with its unit or meaning beside it."""
-    lines = ["# A caustic project: edit by hand as you like, then `caustic render` or `caustic design --resume`.",
+    lines = ["# A caustic project: edit by hand as you like, then render it or resume its design.",
              f"format_version = {FORMAT_VERSION}", f'created_by = "caustic {__version__}"']
     for section, keys in SCHEMA.items():
         first = settings.get(section, {})
@@ -345,7 +345,7 @@ def refuse_unused(source: dict[str, Any], given, stages: Sequence[str | None] = 
     options = {key: option for section, key, option in given if section == "source" and sources.used_by(key)}
     for key, option in options.items():
         if not types & set(sources.used_by(key)):
-            raise InputError(f"{option} belongs to --source {sources.either(sources.used_by(key))}, got {source['type']}")
+            raise InputError(f"{option} belongs to ⟨source⟩ {sources.either(sources.used_by(key))}, got {source['type']}")
     if len(types) == 1 and types <= set(sources.names()):
         idle = sources.type_of(*types).idle(source)
         for key, option in options.items():

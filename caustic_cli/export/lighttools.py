@@ -89,7 +89,7 @@ def _source(scene: Scene) -> dict[str, np.ndarray]:
     """
     source = scene.source
     if source.kind not in _KEYS:
-        raise InputError(f"--format lighttools knows no source of type {source.kind}")
+        raise InputError(f"⟨format⟩ lighttools knows no source of type {source.kind}")
     return {
         "source_type": np.array(source.kind),
         "source_positions": source.points()[0],

@@ -156,14 +156,14 @@ def write_script(path: str | Path, scene: Scene, field: HeightField, heights: Te
     """
     path, source = Path(path), scene.source
     if source.profile is not None:
-        raise InputError("--script: its source is uniform, so one with a profile cannot be written")
+        raise InputError("⟨script⟩: its source is uniform, so one with a profile cannot be written")
     if source.brightness is not None or source.rays is not None or not isinstance(source.intensity, str):
-        raise InputError("--script: its source is evenly bright and uniform or Lambertian, so a picture, a table or a ray file"
+        raise InputError("⟨script⟩: its source is evenly bright and uniform or Lambertian, so a picture, a table or a ray file"
                          " cannot be written")
     if source.extent[0] != source.extent[1]:
-        raise InputError("--script: its disc is round, so an elliptical one cannot be written")
+        raise InputError("⟨script⟩: its disc is round, so an elliptical one cannot be written")
     if scene.lens.round:
-        raise InputError("--script: its freeform solid is a rectangle, so a circular aperture cannot be written")
+        raise InputError("⟨script⟩: its freeform solid is a rectangle, so a circular aperture cannot be written")
     script, block = companions(path)
     words = {"@CREATED@": CREATED, "@NPZ@": path.name, "@NAME@": script.name, "@STEM@": path.stem, "@FLAT@": str(FLAT)}
     text = SCRIPT

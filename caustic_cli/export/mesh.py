@@ -63,13 +63,13 @@ def closed_mesh(scene: Scene, field: HeightField, heights: Tensor, samples: tupl
 
 def patch(lens: Lens, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None,
           tolerance: float | None = None) -> Patch:
-    """The exit surface within the aperture, by --samples or --tolerance as of `closed_mesh`.
+    """The exit surface within the aperture, by samples or tolerance as of `closed_mesh`.
 
     Raises:
         InputError: both were given, they ask for too few or too many points, or a tolerance for a round lens with kinks.
     """
     if samples is not None and tolerance is not None:
-        raise InputError("--samples and --tolerance both say how fine the mesh is: give one of them")
+        raise InputError("⟨samples⟩ and ⟨tolerance⟩ both say how fine the mesh is: give one of them")
     if lens.round:
         return _round_patch(field, heights, _across(field, heights, samples, tolerance))
     grid = sample_grid(field, heights, samples) if tolerance is None else grid_within(field, heights, tolerance)
@@ -80,14 +80,14 @@ def _across(field: HeightField, heights: Tensor, samples: tuple[int, int] | None
     """Points along a diameter of a round lens."""
     if tolerance is None:
         counts = samples or [STEPS_PER_SPAN * (len(s.breaks) - 1) + 1 for s in field.spaces]
-        n, asked = max(checks.pair("--samples", counts, lambda w, k: checks.whole(w, k, 2, MAX_SAMPLES))), "--samples"
+        n, asked = max(checks.pair("⟨samples⟩", counts, lambda w, k: checks.whole(w, k, 2, MAX_SAMPLES))), "⟨samples⟩"
     else:
-        checks.number("--tolerance", tolerance, 0.0, open_low=True)
+        checks.number("⟨tolerance⟩", tolerance, 0.0, open_low=True)
         if any(int(torch.unique(s.knots[1:-1], return_counts=True)[1].max()) > s.degree for s in field.spaces) or \
                 min(s.degree for s in field.spaces) < 2:
-            raise InputError("--tolerance of a round mesh needs a surface without kinks; give --samples")
+            raise InputError("⟨tolerance⟩ of a round mesh needs a surface without kinks; give ⟨samples⟩")
         xx, xy, yy = second_derivative_bounds(field, heights)
-        bend, asked = (max(xx, yy) + xy) * STRETCH**2 / 6.0, f"--tolerance {tolerance:g}"
+        bend, asked = (max(xx, yy) + xy) * STRETCH**2 / 6.0, f"⟨tolerance⟩ {tolerance:g}"
         n = math.ceil(2.0 * max(field.half_size) * math.sqrt(bend / tolerance)) + 1 if bend > 0 else 2
         n = max(n, 9)
     if n > min(MAX_SAMPLES, math.isqrt(MAX_POINTS)):

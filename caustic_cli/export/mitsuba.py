@@ -135,9 +135,9 @@ def _light(scene: Scene) -> list[str]:
         InputError: Mitsuba has none like this.
     """
     if beyond_plain(scene):
-        raise InputError(f"--format mitsuba is written for clear lenses and straight screens, not {', '.join(beyond_plain(scene))}")
+        raise InputError(f"⟨format⟩ mitsuba is written for clear lenses and straight screens, not {', '.join(beyond_plain(scene))}")
     if scene.source.kind not in _EMITTERS:
-        raise InputError(f"--format mitsuba knows no source of type {scene.source.kind}")
+        raise InputError(f"⟨format⟩ mitsuba knows no source of type {scene.source.kind}")
     return _EMITTERS[scene.source.kind](scene)
 
 
@@ -145,7 +145,7 @@ def _collimated(scene: Scene) -> list[str]:
     """A plane wave: an area as wide as the lens."""
     source, lens = scene.source, scene.lens
     if source.profile is not None:
-        raise InputError("--format mitsuba: its collimated emitter is uniform, so a source with a profile cannot be written")
+        raise InputError("⟨format⟩ mitsuba: its collimated emitter is uniform, so a source with a profile cannot be written")
     (rx, ry), area = lens.half_size, lens.size[0] * lens.size[1] * (math.pi / 4.0 if lens.round else 1.0)
     radiance = real(source.power / area)
     return [f'<shape type="{"disk" if lens.round else "rectangle"}" id="light">',
@@ -158,10 +158,10 @@ def _area(scene: Scene) -> list[str]:
     """A disc that shines on everything."""
     source, lens = scene.source, scene.lens
     if source.distant or source.intensity != "lambertian" or source.cone is not None:
-        raise InputError("--format mitsuba: of discs only a Lambertian one without a cone of its own can be written, not one at"
-                         " infinity; render --verify mitsuba traces them all")
+        raise InputError("⟨format⟩ mitsuba: of discs only a Lambertian one without a cone of its own can be written, not one at"
+                         " infinity; render ⟨verify⟩ mitsuba traces them all")
     if source.brightness is not None:
-        raise InputError("--format mitsuba: its disc is evenly bright, so one with a picture of its brightness cannot be written")
+        raise InputError("⟨format⟩ mitsuba: its disc is evenly bright, so one with a picture of its brightness cannot be written")
     (wx, wy), (x, y, z), cone = source.size, source.position, source.cone_over(lens.half_size, lens.z_in, lens.round)
     radiance = source.power / (math.pi * math.pi * wx * wy / 4.0 * math.sin(cone) ** 2)  # its cone just covers the lens
     return ['<shape type="disk" id="light">',
@@ -174,7 +174,7 @@ def _spots(scene: Scene) -> list[str]:
     """A spot a point.  Mitsuba's fall off towards their rim, so they are even a little beyond the cone."""
     source, lens = scene.source, scene.lens
     if source.intensity != "uniform":
-        raise InputError("--format mitsuba: its spots shine evenly, so points of another intensity cannot be written")
+        raise InputError("⟨format⟩ mitsuba: its spots shine evenly, so points of another intensity cannot be written")
     cone = source.cone_over(lens.half_size, lens.z_in, lens.round)
     lines, degrees = [], math.degrees(cone)
     for (x, y, z), power in zip(source.positions, source.powers, strict=True):

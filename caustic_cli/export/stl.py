@@ -57,7 +57,7 @@ def _records(corners: np.ndarray) -> np.ndarray:
     length = np.linalg.norm(normal, axis=1, keepdims=True)  # twice the area
     if not (length > 0).all():
         raise InputError("an STL file holds float32 numbers, in which neighbouring points of this lens coincide;"
-                         " give fewer --samples, or take another format")
+                         " give fewer ⟨samples⟩, or take another format")
     records = np.zeros(len(corners), TRIANGLE)
     records["normal"], records["corners"] = normal / length, corners
     return records

@@ -76,7 +76,7 @@ def sample_grid(field: HeightField, heights: Tensor, samples: tuple[int, int] | 
     """
     if samples is None:
         return on_lines(field, heights, [_knot_lines(s, STEPS_PER_SPAN) for s in field.spaces])
-    counts = checks.pair("--samples", samples, lambda where, n: checks.whole(where, n, 2, MAX_SAMPLES))
+    counts = checks.pair("⟨samples⟩", samples, lambda where, n: checks.whole(where, n, 2, MAX_SAMPLES))
     return on_lines(field, heights, [torch.linspace(0.0, 1.0, n, dtype=torch.float64) for n in counts])
 
 
@@ -89,12 +89,12 @@ def grid_within(field: HeightField, heights: Tensor, tolerance: float) -> Surfac
     h = step_within(field, heights, tolerance)
     lines = [_knot_lines(s, (s.breaks.diff() * 2.0 * r / h).ceil().clamp(1, MAX_SAMPLES).long())
              for s, r in zip(field.spaces, field.half_size, strict=True)]
-    return on_lines(field, heights, lines, f"--tolerance {tolerance:g}")
+    return on_lines(field, heights, lines, f"⟨tolerance⟩ {tolerance:g}")
 
 
 def step_within(field: HeightField, heights: Tensor, tolerance: float) -> float:
     """Largest step h, mm, of a triangulated grid with the knots among its lines that is off by at most `tolerance` mm."""
-    checks.number("--tolerance", tolerance, 0.0, open_low=True)
+    checks.number("⟨tolerance⟩", tolerance, 0.0, open_low=True)
     xx, xy, yy = second_derivative_bounds(field, heights)
     bend = xx + 2.0 * xy + yy
     return math.sqrt(8.0 * tolerance / bend) if bend > 0 else math.inf
@@ -122,7 +122,7 @@ def _difference(net: Tensor, knots: Tensor, p: int) -> Tensor:
     return torch.where(step > 0, p * net.diff(dim=0) / step.clamp_min(1e-300), 0.0)
 
 
-def on_lines(field: HeightField, heights: Tensor, lines: Sequence[Tensor], asked: str = "--samples") -> SurfaceGrid:
+def on_lines(field: HeightField, heights: Tensor, lines: Sequence[Tensor], asked: str = "⟨samples⟩") -> SurfaceGrid:
     """The surface on grid lines u (nx,), v (ny,) on [0, 1]; `asked`: what a refusal names.
 
     Raises:

@@ -43,7 +43,7 @@ def write_zemax(path: str | Path, scene: Scene, field: HeightField, heights: Ten
     grid = sample_grid(field, heights, samples or tuple(_count(s) for s in field.spaces))
     nx, ny = grid.z.shape
     if min(nx, ny) < LEAST:
-        raise InputError(f"--samples of a zemax grid must be at least {LEAST} along each axis, got {nx} x {ny}")
+        raise InputError(f"⟨samples⟩ of a zemax grid must be at least {LEAST} along each axis, got {nx} x {ny}")
     vertex = float(field.at(heights, *torch.zeros(2, 1, dtype=torch.float64), [(0, 0)])[0])
     columns = grid.z - vertex, grid.zx, grid.zy, grid.zxy
     table = np.stack([c[:, ::-1].T.ravel() for c in columns], -1)

@@ -234,7 +234,7 @@ class Designer:
                 return True
             state.heights = heights().detach()
             if not bool(torch.isfinite(state.heights).all()):
-                raise CausticError("the heights stopped being finite; a smaller --lr may help")
+                raise CausticError("the heights stopped being finite; a smaller ⟨lr⟩ may help")
             state.iteration, state.total, state.seconds = state.iteration + 1, state.total + 1, time.monotonic() - origin
             state.history.append((state.total, k, method.loss, method.on_screen, state.seconds))
             state.parameters, state.optimizer = heights.state_dict(), method.state()

@@ -81,7 +81,7 @@ def _descend(limits: _Limits, heights: Tensor) -> Tensor:
 
 def _none(excess: float) -> CausticError:
     return CausticError(f"no surface near the designed one obeys the limits: it still exceeds them by {excess:.1%};"
-                        " a larger --max-slope, a smaller --min-radius or --min-thickness may do")
+                        " a larger ⟨max_slope⟩, a smaller ⟨min_radius⟩ or ⟨min_thickness⟩ may do")
 
 
 class _Limits:

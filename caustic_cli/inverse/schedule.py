@@ -76,7 +76,7 @@ def coarse_to_fine(control: tuple[int, int], degree: tuple[int, int], rays: int,
     Blurs are 1/16 of the screen at first and halve down to none.  Control nets have a quarter, half and all of the
     final knot spans, so knot insertion carries the surface on unchanged when those divide.
     """
-    checks.choice("--quality", quality, QUALITIES)
+    checks.choice("⟨quality⟩", quality, QUALITIES)
     filter = filter or Filter("cosine", (3, 3))
     early, late = {"draft": (15, 25), "standard": (25, 50), "fine": (40, 120)}[quality]
     pixels = max(resolution)
@@ -110,7 +110,7 @@ LEAST_RAYS = 40_000
 
 def refinement_spans(pixels: int, quality: str) -> int:
     """Knot spans along each axis of the lens for a screen of so many pixels: finer than the picture."""
-    checks.choice("--quality", quality, QUALITIES)
+    checks.choice("⟨quality⟩", quality, QUALITIES)
     density, most, *_ = REFINEMENT[quality]
     return min(most, max(LEAST_SPANS, round(density * pixels)))
 
@@ -135,7 +135,7 @@ def refinement(control: tuple[int, int], rays: int | None, resolution: tuple[int
         scattered: the source's rays have to be intersected one by one: take a quarter of them.
         spread: as of a stage; the light that the source spreads beside the screen is no error there.
     """
-    checks.choice("--quality", quality, QUALITIES)
+    checks.choice("⟨quality⟩", quality, QUALITIES)
     _, _, each, most, finer, plan = REFINEMENT[quality]
     pixels = resolution[0] * resolution[1]
     rays = rays or max(LEAST_RAYS, min(most, each * pixels) // (4 if scattered else 1))
@@ -169,7 +169,7 @@ def wave_refinement(samples: float, wavelengths: int, quality: str = "standard",
         wavelengths: of the source; 0 for white light.
         hurry: keep within the quality's time, with fewer iterations or none at all.
     """
-    checks.choice("--quality", quality, QUALITIES)
+    checks.choice("⟨quality⟩", quality, QUALITIES)
     count, plan, seconds = WAVES[quality]
     each = samples * (SECONDS_A_SAMPLE * (wavelengths or count) + SECONDS_A_POINT)
     part = min(1.0, seconds / (each * sum(plan))) if hurry else 1.0

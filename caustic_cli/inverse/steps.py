@@ -55,7 +55,7 @@ class Adam:
                 self.taken_back += halvings == 0
                 for p, old in zip(self.heights.parameters(), before, strict=True):
                     p.data = 0.5 * (p.data + old)
-        raise CausticError("no step along the gradient leads to a finite loss with light on the screen; a smaller --lr may help")
+        raise CausticError("no step along the gradient leads to a finite loss with light on the screen; a smaller ⟨lr⟩ may help")
 
     def _look(self) -> tuple[Tensor, Evaluation]:
         """Heights, with their graph, and their evaluation.

@@ -108,7 +108,7 @@ def solve(source, target, source_half, target_half, *, start=None, smooth=1.5, t
         InputError: a density that is not 2-D, not finite, negative or black, or a size that is not positive.
     """
     began = time.perf_counter()
-    blocks()  # --threads decides over numba's too
+    blocks()  # torch's threads decide over numba's too
     f, g = _density("source", source), _density("target", target)
     (a, b), (c, d) = _halves("source", source_half), _halves("target", target_half)
     if not 0.5 <= smooth <= 16:

@@ -15,7 +15,7 @@ from caustic_cli.scene.sources.distribution import Distribution
 
 
 def open_archive(path: str | Path) -> tuple[Scene, HeightField, Tensor]:
-    """Scene, spline spaces and control heights (n, m) mm of an archive made by `caustic export --format lighttools`.
+    """Scene, spline spaces and control heights (n, m) mm of an archive made by `caustic export format lighttools`.
 
     Raises:
         InputError: it cannot be read, something is missing, or something is out of range.
@@ -32,7 +32,7 @@ def open_archive(path: str | Path) -> tuple[Scene, HeightField, Tensor]:
                         tuple(int(n) for n in _reals(data, "resolution", 2)))
         return Scene(_source(data), lens, screen, Light(unit=_text(data, "source_power_unit", "W"))), field, heights
     except KeyError as error:
-        raise InputError(f"{path}: has no {error.args[0]}; an archive of caustic export --format lighttools is needed") from error
+        raise InputError(f"{path}: has no {error.args[0]}; an archive of caustic export ⟨format⟩ lighttools is needed") from error
     except (TypeError, ValueError, IndexError) as error:
         raise InputError(f"{path}: holds something of the wrong shape or type ({error})") from error
     except InputError as error:

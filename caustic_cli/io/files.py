@@ -111,7 +111,7 @@ def refuse_foreign(path: str | Path, force: bool = False) -> None:
     if (path.parent / "project.toml").exists() and path.name.startswith(PARTS):
         raise InputError(f"{path}: is part of the project and is never replaced by an output; choose another name")
     if path.exists() and not force and not is_ours(path):
-        raise InputError(f"{path}: exists and was not made by caustic; --force replaces it, another name spares it")
+        raise InputError(f"{path}: exists and was not made by caustic; ⟨force⟩ replaces it, another name spares it")
 
 
 def _sync_directory(directory: Path) -> None:

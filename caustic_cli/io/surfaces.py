@@ -51,7 +51,7 @@ def read_surface(path: str | Path, half_size: tuple[float, float]) -> tuple[Heig
     if any(abs(a - b) > SAME * b for a, b in zip(found[0].half_size, half_size, strict=True)):
         wide, high = (2.0 * r for r in found[0].half_size)
         raise InputError(f"{path}: the lens is {wide:g} x {high:g} mm, not {2 * half_size[0]:g} x {2 * half_size[1]:g} mm;"
-                         " --lens-size must be its own")
+                         " ⟨lens_size⟩ must be its own")
     return found
 
 
@@ -75,7 +75,7 @@ def load_npz(path: Path) -> dict[str, np.ndarray]:
 
 
 def read_npz(path: Path) -> tuple[HeightField, Tensor]:
-    """The exact B-spline of an archive made by `caustic export --format lighttools`."""
+    """The exact B-spline of an archive made by `caustic export format lighttools`."""
     return surface_of(load_npz(path), path)
 
 
@@ -87,7 +87,7 @@ def surface_of(data: dict[str, np.ndarray], path: Path) -> tuple[HeightField, Te
     """
     missing = [key for key in ("control_points", "degrees", "knots_u", "knots_v", "lens_half_size") if key not in data]
     if missing:
-        raise InputError(f"{path}: has no {', '.join(missing)}; an archive of caustic export --format lighttools is needed")
+        raise InputError(f"{path}: has no {', '.join(missing)}; an archive of caustic export ⟨format⟩ lighttools is needed")
     degrees, half = data["degrees"], data["lens_half_size"]
     if degrees.shape != (2,) or half.shape != (2,) or degrees.dtype.kind not in "iu" or not np.isfinite(half).all():
         raise InputError(f"{path}: degrees must be two whole numbers and lens_half_size two lengths in mm")

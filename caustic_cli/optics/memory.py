@@ -27,7 +27,7 @@ def smaller(chunk: int, problem: BaseException) -> int:
     if not is_shortage(problem):
         raise problem
     if chunk <= LEAST:
-        raise CausticError(f"out of memory, even with {chunk:,} rays at a time; a smaller --control or --resolution needs"
+        raise CausticError(f"out of memory, even with {chunk:,} rays at a time; a smaller ⟨control⟩ or ⟨resolution⟩ needs"
                            " less") from problem
     if torch.cuda.is_available():
         torch.cuda.empty_cache()

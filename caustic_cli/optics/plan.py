@@ -38,7 +38,7 @@ class Plan:
 
 
 def parse_effects(text: str) -> frozenset[str] | None:
-    """What --effects says: None for auto, else the names.
+    """What effects says: None for auto, else the names.
 
     Raises:
         InputError: an unknown name.
@@ -51,7 +51,7 @@ def parse_effects(text: str) -> frozenset[str] | None:
         if name not in known:
             near = difflib.get_close_matches(name, known, 1, 0.4)
             hint = f"; did you mean {near[0]}?" if near else ""
-            raise InputError(f"--effects must be auto, none, or some of {', '.join(known)}, got {name!r}{hint}")
+            raise InputError(f"⟨effects⟩ must be auto, none, or some of {', '.join(known)}, got {name!r}{hint}")
     return frozenset(names)
 
 

@@ -41,8 +41,8 @@ def check(path: Path, force: bool) -> None:
     if not is_project(path) and not all(_of_a_birth(p) for p in path.iterdir()):
         raise InputError(f"{path}: exists and is not a caustic project; -o DIR chooses another place")
     if is_project(path) and not force:
-        raise InputError(f"{path}: holds a design already, of another picture or other options; --resume goes on with it,"
-                         " --force begins anew, -o DIR chooses another place")
+        raise InputError(f"{path}: holds a design already, of another picture or other options; ⟨resume⟩ goes on with it,"
+                         " ⟨force⟩ begins anew, -o DIR chooses another place")
 
 
 def _of_a_birth(path: Path) -> bool:

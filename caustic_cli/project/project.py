@@ -102,7 +102,7 @@ class Project:
         try:
             return settings.build_scene(complete(changed, self.picture.aspect), profile)
         except InputError as error:
-            raise InputError(settings.as_options(str(error), given)) from error
+            raise InputError(settings.as_options(f"{error}", given)) from error
 
     def target(self, scene: Scene) -> np.ndarray:
         """The picture on the scene's screen, (n_x, n_y), or (3, n_x, n_y) of a coloured one."""

@@ -72,7 +72,7 @@ class Offset:
             if square.max(initial=0.0) >= rho * rho:
                 raise InputError(
                     f"[lens] radius must exceed the lens' own reach of {math.sqrt(square.max()):.4g} mm, got {abs(rho):.4g} mm"
-                    " (a smaller --mag or a longer --throw gives a larger radius)"
+                    " (a smaller ⟨mag⟩ or a longer ⟨throw⟩ gives a larger radius)"
                 )
             # rho - sign sqrt(rho^2 - s) without its cancellation
             total = total + square / (rho + math.copysign(1.0, rho) * np.sqrt(rho * rho - square))

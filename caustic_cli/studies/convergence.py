@@ -70,9 +70,9 @@ def run_study(name: str, scene: Scene, field: HeightField, heights: Tensor, *, s
         InputError: unknown study, or numbers out of range.
         CausticError: no light reaches the screen.
     """
-    checks.choice("--study", name, tuple(STUDIES))
-    max_rays = checks.whole("--rays", MAX_RAYS[name] if max_rays is None else max_rays, 256, 1 << 32)
-    checks.whole("--repeats", repeats, 1, 1000)
+    checks.choice("⟨study⟩", name, tuple(STUDIES))
+    max_rays = checks.whole("⟨rays⟩", MAX_RAYS[name] if max_rays is None else max_rays, 256, 1 << 32)
+    checks.whole("⟨repeats⟩", repeats, 1, 1000)
     bench = Bench(scene, field, heights.detach().double(), seed, repeats, max_rays, progress)
     return STUDIES[name](bench, dtype or torch.float64)
 

@@ -160,8 +160,8 @@ def run_effects(scene: Scene, field: HeightField, heights: Tensor, *, rays: int 
     Raises:
         InputError: numbers out of range.
     """
-    rays = checks.whole("--rays", RAYS if rays is None else rays, 256, 1 << 32)
-    rounds = [checks.whole("--repeats", usual if repeats is None else repeats, 1, 1000) for usual in (REPEATS, WAVE_REPEATS)]
+    rays = checks.whole("⟨rays⟩", RAYS if rays is None else rays, 256, 1 << 32)
+    rounds = [checks.whole("⟨repeats⟩", usual if repeats is None else repeats, 1, 1000) for usual in (REPEATS, WAVE_REPEATS)]
     heights = heights.detach().double()
     plan, rows = compile_plan(scene, field, heights), []
     for k, effect in enumerate(plan.effects):

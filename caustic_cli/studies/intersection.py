@@ -195,7 +195,7 @@ def run_intersection(case: Case, *, seed: int = 0, repeats: int | None = None, m
         most: largest n_u, a power of 2; None for 128, less for a lens with many knot spans.
         progress: told (evaluations done, in all) after each.
     """
-    repeats = checks.whole("--repeats", REPEATS if repeats is None else repeats, 1, 1000)
+    repeats = checks.whole("⟨repeats⟩", REPEATS if repeats is None else repeats, 1, 1000)
     settings = settings_of(case.field, most)
     total, done = len(settings) * (1 + repeats), 0
     truth, hit, residual = reference(case)

@@ -29,10 +29,10 @@ SECONDS = 10.0
 RAYS_PER_PIXEL = 64
 
 COLUMNS = {
-    "series": "thickness as --thickness says it, mm",
+    "series": "thickness of the design, mm",
     "thickness": "the same, mm",
     "weight": "of light beside the picture",
-    "loss": "what the lens was designed with: --loss",
+    "loss": "what the lens was designed with",
     "error": "relative RMS between the retraced image and the target, each over its own mean, the rays' noise taken off",
     "noise": "standard error of that",
     "on_screen": "part of the source's power on the screen",
@@ -70,7 +70,7 @@ def run_light(lenses: Iterable[Lens], count: int, *, rays: int | None = None, se
     """
     rows: list[dict] = []
     for k, lens in enumerate(lenses):
-        traced = checks.whole("--rays", min(FINAL_RAYS, RAYS_PER_PIXEL * lens.target.size) if rays is None else rays, 256, 1 << 32)
+        traced = checks.whole("⟨rays⟩", min(FINAL_RAYS, RAYS_PER_PIXEL * lens.target.size) if rays is None else rays, 256, 1 << 32)
         _, figures = retrace(lens.scene, lens.field, lens.heights, lens.target, rays=traced, seed=seed, device=device)
         rows.append({"series": f"{lens.thickness:g} mm", "thickness": lens.thickness, "weight": lens.weight, "loss": lens.loss,
                      "error": figures["relative_rms"], "noise": figures["noise"], "on_screen": figures["on_screen"],
@@ -96,7 +96,7 @@ def _advice(rows: list[dict]) -> str:
 
 
 def _words(row: dict) -> str:
-    made = f"--thickness {row['thickness']:g} --loss \"{row['loss']}\""
+    made = f"thickness {row['thickness']:g} mm, loss \"{row['loss']}\""
     return f"error {row['error']:.3g} with {row['on_screen']:.1%} of the light ({made})"
 
 
@@ -106,7 +106,7 @@ def draw_light(study: Study, figure: Figure) -> None:
     for series, style in styles(row["series"] for row in study.rows).items():
         mine = [row for row in study.rows if row["series"] == series]
         axes.errorbar([100.0 * r["on_screen"] for r in mine], [r["error"] for r in mine], yerr=[r["noise"] or 0.0 for r in mine],
-                      label=f"--thickness {series}", **style)
+                      label=f"thickness {series}", **style)
     front = sorted((100.0 * r["on_screen"], r["error"]) for r in study.rows if r["front"])
     axes.plot(*zip(*front, strict=True), linestyle=":", color="black", marker="o", markersize=11, markerfacecolor="none",
               label="Pareto front")

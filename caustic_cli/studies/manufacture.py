@@ -1,4 +1,4 @@
-"""What it takes to make a lens, and how well the optics must be kept: the figures of `render --report`.
+"""What it takes to make a lens, and how well the optics must be kept: the figures of `render report`.
 
 Lengths are mm, angles degrees.  The surface is looked at on a grid of some points a knot span, and bounded by its control net,
 which holds it: between the two lies the truth.
@@ -47,7 +47,7 @@ def manufacture(scene: Scene, field: HeightField, heights: Tensor, tool_radius: 
         InputError: the tool's radius is not above 0.
     """
     if tool_radius is not None and not 0 < tool_radius < math.inf:
-        raise InputError(f"--tool-radius must be greater than 0 mm, got {tool_radius:g}")
+        raise InputError(f"⟨tool_radius⟩ must be greater than 0 mm, got {tool_radius:g}")
     lens, pixel = scene.lens, max(scene.screen.pixel)
     z, *derivatives = sampled(field, heights, [_points(s) for s in field.spaces])
     if lens.round:  # what lies beyond the circle takes the middle's place

@@ -106,7 +106,7 @@ def on_target(image, target) -> float:
 
 
 def judge(exposure: Image, target, variance=None) -> dict:
-    """The figures that `render --json` and `design --json` share, ready for `json.dumps(..., allow_nan=False)`.
+    """The figures that `render json` and `design json` share, ready for `json.dumps(..., allow_nan=False)`.
 
     Args:
         exposure: a traced image; eq. 5.2.1 asks for bincount reconstruction.

@@ -32,7 +32,7 @@ MOST_TIMES = 4
 ORDER, SOBOL_ORDER = 0.75, 0.58
 #: A plane wave's noise is told by two images of one PROBE-th of its rays each.
 PROBE = 8
-#: Most rays that --tolerance may ask for in one go.
+#: Most rays that tolerance may ask for in one go.
 MOST_RAYS = 10**11
 
 
@@ -86,7 +86,7 @@ def converge(scene: Scene, field: HeightField, heights: Tensor, tolerance: float
     held, lights = _held(scene), [_part(scene, k, BATCHES) for k in range(BATCHES)]
     while True:
         if each * BATCHES > held:
-            raise CausticError(f"--tolerance {tolerance:g} asks for more rays than the file holds, {held:,}")
+            raise CausticError(f"⟨tolerance⟩ {tolerance:g} asks for more rays than the file holds, {held:,}")
         parts = [expose(light, field, heights, _rays(light, each, stream(seed, f"batch {k}"), device), None, dtype, screen,
                         requests=requests) for k, light in enumerate(lights)]
         traced += sum(p.rays for p in parts)
@@ -102,7 +102,7 @@ def converge(scene: Scene, field: HeightField, heights: Tensor, tolerance: float
         foreseen = each * more if each > mean.numel() else 0.0  # too few rays a pixel foretell nothing
         each = int(each * min(32.0, more))
         if max(each, foreseen) * BATCHES > MOST_RAYS:
-            raise CausticError(f"--tolerance {tolerance:g} asks for more than {MOST_RAYS:.0e} rays: {traced:,} left an estimated"
+            raise CausticError(f"⟨tolerance⟩ {tolerance:g} asks for more than {MOST_RAYS:.0e} rays: {traced:,} left an estimated"
                                f" error of {error:.2g}; fewer pixels or a larger tolerance need fewer")
 
 

@@ -96,8 +96,8 @@ def run_training(scene: Scene, target: np.ndarray, contenders: Sequence[Contende
         InputError: numbers out of range.
         CausticError: no light reaches the screen.
     """
-    seconds = checks.number("--seconds", SECONDS if seconds is None else seconds, 0.0, 1e6, open_low=True)
-    rays = checks.whole("--rays", min(FINAL_RAYS, RAYS_PER_PIXEL * target.size) if rays is None else rays, 256, 1 << 32)
+    seconds = checks.number("⟨seconds⟩", SECONDS if seconds is None else seconds, 0.0, 1e6, open_low=True)
+    rays = checks.whole("⟨rays⟩", min(FINAL_RAYS, RAYS_PER_PIXEL * target.size) if rays is None else rays, 256, 1 << 32)
     tables: list[list[dict]] = [[] for _ in contenders]
 
     def judge() -> None:

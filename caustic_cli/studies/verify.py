@@ -1,6 +1,6 @@
 """The same lens in Mitsuba 3, a light tracer that shares no line with this one: do the two images agree?
 
-Mitsuba loads the exported scene (`export --format mitsuba`) and sends independent rays through entrance and exit with its own
+Mitsuba loads the exported scene (`export format mitsuba`) and sends independent rays through entrance and exit with its own
 intersections and its own `dielectric`, transmission chosen at both, weighted by its Fresnel factor; what reaches the screen is
 binned.  What leaves by the sides or passes the lens is lost, as in a render.
 
@@ -58,13 +58,13 @@ def require_mitsuba(scene: Scene) -> None:
         InputError: Mitsuba is not installed, or the scene has what is not written for it, or other reflections than exact ones.
     """
     if find_spec("mitsuba") is None:
-        raise InputError("--verify mitsuba needs Mitsuba 3, which is not installed: pip install 'caustic-cli[verify]'")
+        raise InputError("⟨verify⟩ mitsuba needs Mitsuba 3, which is not installed: pip install 'caustic-cli[verify]'")
     if beyond_plain(scene):
-        raise InputError(f"--verify mitsuba traces clear lenses and straight screens, not {', '.join(beyond_plain(scene))}")
+        raise InputError(f"⟨verify⟩ mitsuba traces clear lenses and straight screens, not {', '.join(beyond_plain(scene))}")
     if scene.source.kind not in KINDS:
-        raise InputError(f"--verify mitsuba knows no source of type {scene.source.kind}")
+        raise InputError(f"⟨verify⟩ mitsuba knows no source of type {scene.source.kind}")
     if scene.lens.fresnel != "exact":
-        raise InputError(f"--verify mitsuba knows exact Fresnel reflection only; [lens] fresnel is {scene.lens.fresnel}")
+        raise InputError(f"⟨verify⟩ mitsuba knows exact Fresnel reflection only; [lens] fresnel is {scene.lens.fresnel}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +116,7 @@ def _choose_variant() -> str:
 
             mi.set_variant(variant)
             return variant
-    raise CausticError(f"--verify mitsuba: none of its variants {', '.join(VARIANTS)} works on this machine")
+    raise CausticError(f"⟨verify⟩ mitsuba: none of its variants {', '.join(VARIANTS)} works on this machine")
 
 
 # the light
@@ -209,7 +209,7 @@ def compare(renders: np.ndarray, image: np.ndarray, squares: np.ndarray, rays: i
     z, spread = _z_scores(*(_taken(a, side) for a in (renders, image, squares)), rays, per_ray, shift / side)
     some = z[np.isfinite(z)]
     if not len(some):
-        raise CausticError(f"{rays:,} rays are too few to judge a single pixel by; --rays must be larger")
+        raise CausticError(f"{rays:,} rays are too few to judge a single pixel by; ⟨rays⟩ must be larger")
     sums = renders.sum((1, 2))
     noise = squares.sum() - image.sum() ** 2 / rays + sums.var(ddof=1) / len(sums) + (LEAK * render.sum()) ** 2
     light = float((image.sum() - render.sum()) / noise**0.5)

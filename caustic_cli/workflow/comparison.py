@@ -1,4 +1,4 @@
-"""The designs that `convergence --study design` lets run against each other."""
+"""The designs that `convergence study design` lets run against each other."""
 
 from __future__ import annotations
 

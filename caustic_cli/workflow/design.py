@@ -52,7 +52,7 @@ def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: d
 
     Args:
         given: (section, key, option) -> value, what the options say.
-        screen: --screen-size, one or two lengths; pixels: --resolution, one or two counts; shaped: mag, margin, quality, rays.
+        screen: screen size, one or two lengths; pixels: resolution, one or two counts; shaped: mag, margin, quality, rays.
 
     Raises:
         InputError: something is wrong; nothing was written.
@@ -65,9 +65,9 @@ def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: d
     if "source" in said:
         said["source"] = attachments.attached(said["source"])
     if "index" in said.get("lens", {}) and "glass" in said["lens"]:
-        names = [option for (_, key, option) in given if key in ("index", "glass")]
+        names = [key for (_, key, _) in given if key in ("index", "glass")]
         if len(names) == 1:  # an option replaces what the configuration says
-            del said["lens"]["glass" if names[0] == "--index" else "index"]
+            del said["lens"]["glass" if names[0] == "index" else "index"]
     goal = said.get("target", {})
     picture = read_picture(target, goal.get("encoding") == "linear", goal.get("color", False))
     if goal.get("color", False):
@@ -76,12 +76,12 @@ def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: d
     if screen:
         height = screen[1] if len(screen) == 2 else screen[0] * picture.aspect
         said.setdefault("screen", {})["size"] = [screen[0], height]
-        given = {**given, ("screen", "size", "--screen-size"): screen}
+        given = {**given, ("screen", "size", "⟨screen_size⟩"): screen}
     if pixels and len(pixels) == 2:
         said.setdefault("screen", {})["resolution"] = list(pixels)
     elif pixels:
         said.get("screen", {}).pop("resolution", None)
-    given = {**given, ("screen", "resolution", "--resolution"): pixels}
+    given = {**given, ("screen", "resolution", "⟨resolution⟩"): pixels}
     profile = said.get("source", {}).get("profile")
     light = read_picture(config.parent / profile, linear=True) if profile else None
     path = out or Path(f"{target.stem or 'design'}.caustic")
@@ -102,7 +102,7 @@ def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: d
         refuse_unreachable(designer.scene, grey(goal))
         first = first_heights(project, said)
     except InputError as error:  # about a project.toml that is not written yet
-        raise InputError(settings.as_options(str(error).removeprefix(f"{path / TOML}: "), given)) from error
+        raise InputError(settings.as_options(f"{error}".removeprefix(f"{path / TOML}: "), given)) from error
     directory.settle(project, force)
     return project, first
 
@@ -125,10 +125,10 @@ def first_heights(project: Project, said: dict) -> torch.Tensor | None:
 
 
 def find(target: Path, out: Path | None) -> Project:
-    """The project that --resume means: TARGET itself, or the one that designing TARGET would make."""
+    """The project that resume means: TARGET itself, or the one that designing TARGET would make."""
     path = target if target.is_dir() else (out or Path(f"{target.stem}.caustic"))
     if not target.exists() and not path.exists():
-        raise InputError(f"{target}: no such project; --resume needs a directory made by caustic design")
+        raise InputError(f"{target}: no such project; ⟨resume⟩ needs a directory made by caustic design")
     return Project.open(path)
 
 
@@ -140,7 +140,7 @@ def design(project: Project, first: torch.Tensor | None, device: str, say: Repor
     if project.found is not None:
         figures = uptodate.finished(project, project.found)
         say.say(f"{project.path}: was designed from the same picture with the same options, so "
-                + ("there is nothing to do; --force designs it anew" if figures else "it goes on from its checkpoint"))
+                + ("there is nothing to do; ⟨force⟩ designs it anew" if figures else "it goes on from its checkpoint"))
         return figures or resume(project, None, None, device, say, began)
     with project.hold:
         designer, target = _designer(project, device)
@@ -225,7 +225,7 @@ def _designer(project: Project, device: str) -> tuple[Designer, np.ndarray]:
 
 
 def _solved(project: Project, fixed: bool) -> tuple[torch.Tensor | None, float | None]:
-    """Heights of the transport start or of --start on the first stage's net, or None for the offset surface; and the thickness that
+    """Heights of the transport start or of start on the first stage's net, or None for the offset surface; and the thickness that
     goes with them, None if it is the project's.
 
     fixed: of the thickness by the user; so raise a transport start that would reach below the least one: light follows slopes.
@@ -291,7 +291,7 @@ def _run(project: Project, designer: Designer, target: np.ndarray, state: State,
     }
 
     inputs = uptodate.inputs(project)
-    goes_on = f"caustic design --resume {project.path} goes on from it"
+    goes_on = f"caustic design ⟨resume⟩ {project.path} goes on from it"
     safe = f"the one before is whole, {goes_on}" if (project.path / CHECKPOINT).exists() else "nothing of it is on disk"
 
     def keep(now: State, results: dict | None = None) -> None:
@@ -329,7 +329,7 @@ def _run(project: Project, designer: Designer, target: np.ndarray, state: State,
             state.heights = designer.within_limits(state)
         if asked:
             raise Interrupted(f"interrupted after {state.total} iterations; {project.path / CHECKPOINT} is saved,"
-                              f" caustic design --resume {project.path} goes on", 128 + asked[0])
+                              f" caustic design ⟨resume⟩ {project.path} goes on", 128 + asked[0])
         lens, figures = judge(project, designer, target, state, device)
         figures |= {"iterations": state.total, "seconds": time.monotonic() - began, "image": str(project.path / RENDER),
                     "project": str(project.path), "reason": lens.reason}

@@ -46,7 +46,7 @@ def export(project: Path, format: str, output: Path | None, script: bool, given:
         raise InputError(f"{project}: is a mirror, and the formats hold lenses: nothing is exported")
     made = Outputs(opened, "export", {"format": format, "script": script, **given}, written)
     if not force and (found := made.found()):
-        say.say(f"{path}: is what the same options made of the same project, so there is nothing to do; --force does it again")
+        say.say(f"{path}: is what the same options made of the same project, so there is nothing to do; ⟨force⟩ does it again")
         return found, True
     field, checkpoint = opened.lens(scene)
     write(path, scene, field, checkpoint.state.heights, format, script, **given)

@@ -52,7 +52,7 @@ Progress = Callable[[str, str, int | None, int | None], None]
 
 
 class Render(NamedTuple):
-    """image: power per pixel as a part of the source's, (n_x, n_y) or (3, n_x, n_y), float64; figures: as of `render --json`."""
+    """image: power per pixel as a part of the source's, (n_x, n_y) or (3, n_x, n_y), float64; figures: as of `render json`."""
 
     image: np.ndarray
     figures: dict[str, Any]

@@ -130,7 +130,7 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
             refuse_foreign(path, asked.force)
     made = Outputs(project, "render", asked.asks | {"device": device}, paths) if project and not asked.verify else None
     if made and not asked.force and (figures := made.found()):
-        say.say(f"{image_path}: is what the same options made of the same project, so there is nothing to do; --force does it"
+        say.say(f"{image_path}: is what the same options made of the same project, so there is nothing to do; ⟨force⟩ does it"
                 " again")
         return figures | {"reused": True}
     lens = Opened(None, *archive) if project is None else _opened(project, asked)

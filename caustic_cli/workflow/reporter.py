@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import Protocol
 
+from caustic_cli.errors import plain
+
 #: Called with what is being done, a text about it, how much of it is done and of how much in all (None where unknown).
 Tell = Callable[..., None]
 
@@ -38,7 +40,7 @@ class Listener:
     def say(self, text: str) -> None:
         """Pass a line on."""
         if self.on_message is not None:
-            self.on_message(text)
+            self.on_message(plain(text))
 
     @contextmanager
     def progress(self, total: int | None) -> Iterator[Tell]:

@@ -1,4 +1,4 @@
-"""The designs that `convergence --study light` makes: one scene, of several thicknesses and weights of the light that is kept."""
+"""The designs that `convergence study light` makes: one scene, of several thicknesses and weights of the light that is kept."""
 
 from __future__ import annotations
 

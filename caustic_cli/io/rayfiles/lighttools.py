@@ -60,7 +60,7 @@ def parse(data: bytes) -> RaySet:
     if said.get("far_field_data", "no").lower() not in ("no", "0", "false"):
         raise InputError("has far-field data, whose rays start nowhere; lt_far_field_data must be NO")
     if any(float(v) != 0 for v in _numbers(said.get("data_origin", "0 0 0"), "lt_data_origin")):
-        raise InputError("has an lt_data_origin that is not 0 0 0; --source-position moves a source")
+        raise InputError("has an lt_data_origin that is not 0 0 0; ⟨source_position⟩ moves a source")
     colored = said.get("color_info", "none").lower()
     if colored not in ("none", "wavelength"):
         raise InputError(f"has lt_color_info {colored!r}; none or wavelength is needed")

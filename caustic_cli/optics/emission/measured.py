@@ -94,7 +94,7 @@ def _meeting(source: Source, half_size: tuple[float, float], z: float, round: bo
     (met,) = np.nonzero(met)
     if not len(met):
         raise InputError(f"[source] file: none of its {source.rays.count:,} rays meets the lens, which stands along +z from them;"
-                         " --source-position moves them")
+                         " ⟨source_position⟩ moves them")
     return x[met], y[met], met, source.rays.flux[met] / source.rays.flux.sum()
 
 

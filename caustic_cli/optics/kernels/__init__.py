@@ -12,7 +12,7 @@ THREADING = ["omp", "workqueue", "tbb"]
 
 
 def blocks() -> int:
-    """Blocks to cut the rays into, each with sums of its own: torch's threads, which numba's follow, so --threads decides."""
+    """Blocks to cut the rays into, each with sums of its own: torch's threads, which numba's follow."""
     import numba  # noqa: PLC0415
 
     if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:

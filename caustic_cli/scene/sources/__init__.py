@@ -27,7 +27,7 @@ _TYPES: dict[str, SourceType] = {}
 
 
 def register(type: SourceType) -> None:
-    """Make a type of source known to [source] type and --source."""
+    """Make a type of source known to [source] type and source."""
     _TYPES[type.name] = type
 
 

@@ -139,7 +139,7 @@ def _build(table: Table, _profile) -> Disc:
 
 
 def _idle(table: Table) -> dict[str, str]:
-    why = "has no meaning for a disc at infinity, which is an angle wide (--source-angle)"
+    why = "has no meaning for a disc at infinity, which is an angle wide (⟨source_angle⟩)"
     return dict.fromkeys(("position", "size", "cone"), why) if "angle" in table else {}
 
 
