@@ -338,7 +338,7 @@ def test_a_ray_that_meets_the_surface_twice():
 
 @pytest.mark.parametrize("below", [False, True])
 @pytest.mark.parametrize("round_", [False, True])
-def test_second_meetings_by_kernel_and_by_reference(below, round_, monkeypatch):
+def test_secondary_intersections_by_kernel_and_by_reference(below, round_, monkeypatch):
     """The same distances to 1e-12 mm on a wild surface, and some of either kind of ray: 3000 of them, 500 and more each."""
     scene = replace(scene_of(), lens=replace(scene_of().lens, size=(10.0, 10.0)))
     heights, field, random = bumpy(scene, 2.0), HeightField.of(scene.lens), np.random.default_rng(5)
@@ -385,7 +385,7 @@ def test_the_way_of_a_ray_that_meets_the_surface_twice(fresnel):
     np.testing.assert_allclose(late_power[found], power, rtol=1e-10)
 
 
-def test_second_meetings_are_taken_off_the_straight_light():
+def test_secondary_intersections_are_taken_off_the_straight_light():
     scene, heights = cliff()
     straight, true = (shine(scene, heights, r, rays=20_000) for r in (STAGES, STAGES | Requests.to("secondary-intersection")))
     assert float((straight.image - true.image).abs().sum()) > 0.02
