@@ -25,8 +25,8 @@ SMALL = {f"CAUSTIC_{name}": value for name, value in {
     "DESIGN_RESOLUTION": "24", "DESIGN_ITERATIONS": "2", "DESIGN_WAVES": "off", "DESIGN_QUIET": "1", "DESIGN_THREADS": "1",
     "DESIGN_FORCE": "1", "RENDER_QUIET": "1", "RENDER_RAYS": "20000", "RENDER_FORCE": "1", "CONVERGENCE_QUIET": "1",
     "CONVERGENCE_FORCE": "1"}.items()}
-#: What a line needs that the chapters before do not make, and other programs' lines.
-NEEDS_MORE = ("--verify", "--source-file led.tm25ray")
+#: Lines that need what no chapter makes, and studies of minutes, which tests of their own run smaller.
+NEEDS_MORE = ("--verify", "--source-file led.tm25ray", "--study diffraction", "led.caustic --study light")
 
 
 def blocks(path: Path, language: str) -> list[str]:
