@@ -517,5 +517,5 @@ def test_readers_refuse(tmp_path, lens):
         with pytest.raises(InputError, match=name):
             read_surface(tmp_path / name, half)
     for name in ("lens.step", "lens.npz"):
-        with pytest.raises(InputError, match="lens-size"):
+        with pytest.raises(InputError, match="lens_size"):
             read_surface(tmp_path / name, (5.0, 5.0))
