@@ -26,7 +26,7 @@ SMALL = {f"CAUSTIC_{name}": value for name, value in {
     "DESIGN_FORCE": "1", "RENDER_QUIET": "1", "RENDER_RAYS": "20000", "RENDER_FORCE": "1", "CONVERGENCE_QUIET": "1",
     "CONVERGENCE_FORCE": "1"}.items()}
 #: Lines that need what no chapter makes, and studies of minutes, which tests of their own run smaller.
-NEEDS_MORE = ("--verify", "--source-file led.tm25ray", "--study diffraction", "led.caustic --study light")
+NEEDS_MORE = ("--verify", "--source-file led.tm25ray", "--study diffraction", "led.caustic --study light", "--explain")
 
 
 def blocks(path: Path, language: str) -> list[str]:
