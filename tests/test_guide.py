@@ -78,7 +78,10 @@ def test_the_python_of_a_chapter_runs(chapter, home, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     shutil.copy(home / "flame.png", tmp_path)
     for block in blocks(chapter, "python"):
-        exec(compile(block, str(chapter), "exec"), {})
+        made: dict = {}
+        exec(compile(block, str(chapter), "exec"), made)
+        assert {"figures", "image", "near"} & made.keys()
+        assert "lens.export" not in block or Path("lens.step").stat().st_size > 1000
 
 
 @pytest.mark.parametrize("script", sorted((ROOT / "tests" / "benchmarks").glob("*.py")), ids=lambda p: p.stem)

@@ -47,7 +47,10 @@ The target as used.
 Copies of the files that [source] names: rays, a picture of its brightness, a table of angles; source-2.*, ... of further sources.
 .TP
 .I NAME.caustic/render.png
-The caustic, as last rendered.
+The caustic by rays, as last rendered.
+.TP
+.I NAME.caustic/wave.png
+The caustic as light makes it, where diffraction is simulated.
 .TP
 .I NAME.caustic/report.png
 Target, caustic, lens height, loss against time.

@@ -43,11 +43,10 @@ UNREACHED = ("no light of the source that meets the lens can be refracted to the
 
 @dataclass(frozen=True, eq=False)
 class First:
-    """A first surface: its control heights (n, m) mm float64; of a near source also the part of the light on the lens that it sends
-    to the screen, and the height of its middle, mm."""
+    """A first surface: its control heights (n, m) mm float64, and the height of its middle, mm, where that was chosen, for a near
+    source."""
 
     heights: Tensor
-    kept: float | None = None
     middle: float | None = None
 
 
@@ -169,10 +168,7 @@ def first_surface(scene: Scene, target: np.ndarray, field: HeightField, cells: i
     few = _Grid.of(scene, target, min(cells, FEW_CELLS))
     best = _best(few, lens.offset.thickness, fixed)
     found = grid.cut(few.scaled(best.z, grid), best.middle, PASSES - 1)
-    net = _net(grid, found.z, field)
-    if best.short:  # a spline through a kink undershoots
-        net = net.clamp_min(grid.floor)
-    return First(net, grid.kept(found.z), best.middle)
+    return First(_net(grid, found.z, field).clamp_min(grid.floor), best.middle)  # a spline through a kink undershoots
 
 
 def _best(grid: _Grid, middle: float, fixed: bool) -> _Cut:

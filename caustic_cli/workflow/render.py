@@ -161,6 +161,7 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     if sheet is not None:
         figures["report"] = manufacture.manufacture(scene, lens.field, lens.heights, asked.tool_radius, seed)
         manufacture.write_json(sheet, figures["report"])
+        say.say(f"{sheet}: what making the lens asks for")
     if panels is not None:
         figures["verify"] = _verified(scene, lens, asked.rays, seed, panels)
     if made:
