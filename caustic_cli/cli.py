@@ -14,7 +14,7 @@ import typer
 
 from caustic_cli import __version__
 from caustic_cli.commands import console, convergence, design, export, gradmap, render
-from caustic_cli.errors import CausticError, InputError, Interrupted, is_shortage
+from caustic_cli.errors import CausticError, InputError, Interrupted, is_out_of_memory
 
 DESCRIPTION = """Design free-form lenses that throw a picture as a caustic.
 
@@ -56,6 +56,7 @@ def parser():
 
 def run(arguments: list[str]) -> int:
     """Run one command line and return its exit status."""
+    console.speak({})
     debug = "--debug" in arguments or bool(os.environ.get("CAUSTIC_DEBUG"))
     try:
         status = parser().main(arguments, prog_name="caustic", standalone_mode=False, auto_envvar_prefix="CAUSTIC")
@@ -98,7 +99,7 @@ def _report(problem: Exception) -> int:
         if message:
             console.error(f"{message} (see caustic --help)")
         return 2
-    if is_shortage(problem):
+    if is_out_of_memory(problem):
         console.error("out of memory; fewer --rays, a smaller --control or --resolution needs less")
     elif isinstance(problem, OSError) and problem.strerror:
         console.error(f"{problem.filename or 'a file'}: {problem.strerror}")

@@ -1,21 +1,30 @@
 """What can go wrong, as full sentences: what, where, and what would be accepted.
 
-Only the command line turns these into exit codes; every other module raises them.  A parameter that a sentence speaks of is marked,
-⟨screen_size⟩: `plain` says it by its name, as str() of an error does, and the command line by its option.
+Only the command line turns these into exit codes; every other module raises them.  A setting that a sentence speaks of is named by
+its path in `config.table`, between marks: ⟨lens.size⟩, or ⟨mag⟩ of a parameter.  `plain`, and so str() of an error, says it as
+project.toml and the library do, [lens] size and mag; the command line says the option by which it was given.
 """
 
 import re
 
-#: A marked parameter.
-MARK = re.compile("⟨([a-z_]+)⟩")
+#: A marked path.
+MARK = re.compile(r"⟨([a-z_.]+)⟩")
+#: Sections that are lists of tables in project.toml, and what they are called there.
+LISTS = {"design.stages": "[[design.stages]]", "source.also": "[[source]]"}
 
 #: How torch says that memory is short: on a CPU (its allocator, a failed mmap) and on a CUDA device.
-SHORTAGE = ("out of memory", "not enough memory", "can't allocate memory", "Cannot allocate memory")
+OUT_OF_MEMORY = ("out of memory", "not enough memory", "can't allocate memory", "Cannot allocate memory")
+
+
+def plain_name(path: str) -> str:
+    """A path as project.toml says it: [lens] size; mag of a parameter without a section."""
+    section, _, key = path.rpartition(".")
+    return f"{LISTS.get(section, f'[{section}]')} {key}" if section else key
 
 
 def plain(text: str) -> str:
     """A text without its marks."""
-    return MARK.sub(r"\1", text)
+    return MARK.sub(lambda found: plain_name(found[1]), text)
 
 
 class CausticError(Exception):
@@ -47,6 +56,6 @@ class Interrupted(CausticError):
         self.status = status
 
 
-def is_shortage(error: BaseException) -> bool:
+def is_out_of_memory(error: BaseException) -> bool:
     """Whether an error says that memory ran out: NumPy's MemoryError, or one of torch's."""
-    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and any(s in str(error) for s in SHORTAGE))
+    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and any(s in str(error) for s in OUT_OF_MEMORY))

@@ -64,19 +64,19 @@ def test_a_cone_that_covers_a_circle():
 @pytest.mark.parametrize("source", SOURCES, ids=NAMES)
 def test_no_light_beyond_the_circle_and_the_account_closes(source, kernels):
     scene, field, heights = round_with(source)
-    shares = 0.0
+    fluxes = 0.0
     for rays in rays_of(scene, "stratified", 20_000).chunks(7000):
         if isinstance(rays, Sample):
             x, y = ((2 * c - 1) * r for c, r in zip((rays.u, rays.v), field.half_size, strict=True))
-            power = rays.share.expand(x.shape)
+            power = rays.flux.expand(x.shape)
         else:
             (x, y, _), power = rays.origin, rays.power
             (hits,) = Tracer(System.of(scene, field), rays, track=True).land({EXIT: heights}, scene.screen)
             beyond = hits.statuses() == Status.MISSED_SURFACE
             assert not float(hits.power[beyond].abs().sum()) > 0
-        shares += float(power.sum())
+        fluxes += float(power.sum())
         assert not float(power[x * x + y * y > 16.0].sum()) > 0
-    assert 0.2 < shares <= 1 + 1e-12
+    assert 0.2 < fluxes <= 1 + 1e-12
     out = expose(scene, field, heights, rays_of(scene, "stratified", 20_000))
     assert float(out.image.sum()) + sum(out.lost.values()) == pytest.approx(1, abs=1e-12)
     square = replace(scene, lens=replace(scene.lens, aperture="rectangle"))
@@ -91,10 +91,10 @@ def test_a_round_plane_wave_is_the_square_one_where_both_shine(sampler):
     part = 0.0
     disc, _, _ = rounded((scene, field, heights))
     for one, two in zip(rays_of(disc, sampler, 40_000).chunks(), rays_of(scene, sampler, 40_000).chunks(), strict=True):
-        shares, all_ = one.share.expand(one.shape), two.share.expand(two.shape)
-        lit = shares > 0
+        fluxes, all_ = one.flux.expand(one.shape), two.flux.expand(two.shape)
+        lit = fluxes > 0
         part += float(lit.double().mean())
-        torch.testing.assert_close(shares[lit].mean() / all_[lit].mean(), torch.tensor(4 / np.pi, dtype=torch.float64), atol=2e-2,
+        torch.testing.assert_close(fluxes[lit].mean() / all_[lit].mean(), torch.tensor(4 / np.pi, dtype=torch.float64), atol=2e-2,
                                    rtol=0)
     assert part == pytest.approx(np.pi / 4, abs=1e-2)
 
@@ -252,10 +252,10 @@ def test_mitsuba_agrees_on_round_lenses(tmp_path, source):
     write_mitsuba(tmp_path / "lens.xml", scene, field, heights, (257, 257), dark=True)
     assert all(p.is_file() for p in companions(tmp_path / "lens.xml"))
     try:
-        verdict = verify.verify(tmp_path / "lens.xml", scene, field, heights, 400_000)
+        decision = verify.verify(tmp_path / "lens.xml", scene, field, heights, 400_000)
     except CausticError as error:
         pytest.skip(str(error))
-    assert verdict.agree, verdict.figures
+    assert decision.agree, decision.figures
     square = replace(scene, lens=replace(scene.lens, aperture="rectangle"))
     if not isinstance(source, PlaneWave):
         assert not verify.verify(tmp_path / "lens.xml", square, field, heights, 400_000).agree

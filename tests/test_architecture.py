@@ -1,6 +1,7 @@
 """Imports run one way, and every file says what it is: read from the source, nothing is imported."""
 
 import ast
+import math
 import re
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import pytest
 
 from caustic_cli import cli
 from caustic_cli.commands import console
+from caustic_cli.config.table import TABLE
 from caustic_cli.errors import MARK, InputError
 
 PACKAGE = Path(__file__).resolve().parent.parent / "caustic_cli"
@@ -15,17 +17,20 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 
 #: What a room may import from the package: commands -> workflow -> project -> config -> inverse -> optics -> scene -> errors, with
 #: studies and exports beside the inverse problem.  They write files and pictures, through io; nothing else below the project does.
+#: The table of settings is data that stands below every room.
 ALLOWED = {
-    "scene": {"scene", "errors"},
-    "optics": {"optics", "scene", "errors"},
-    "inverse": {"inverse", "optics", "scene", "errors"},
-    "io": {"io", "optics", "scene", "errors"},
-    "export": {"export", "optics", "scene", "errors", "io"},
-    "studies": {"studies", "optics", "scene", "errors", "io"},
-    "config": {"config", "inverse", "optics", "scene", "errors"},
-    "project": {"project", "config", "inverse", "io", "optics", "scene", "errors"},
-    "workflow": {"workflow", "project", "config", "inverse", "studies", "export", "io", "optics", "scene", "errors"},
+    "scene": {"scene", "table", "errors"},
+    "optics": {"optics", "table", "scene", "errors"},
+    "inverse": {"inverse", "table", "optics", "scene", "errors"},
+    "io": {"io", "table", "optics", "scene", "errors"},
+    "export": {"export", "table", "optics", "scene", "errors", "io"},
+    "studies": {"studies", "table", "optics", "scene", "errors", "io"},
+    "table": {"table", "errors"},
+    "config": {"config", "table", "inverse", "optics", "scene", "errors"},
+    "project": {"project", "table", "config", "inverse", "io", "optics", "scene", "errors"},
+    "workflow": {"workflow", "table", "project", "config", "inverse", "studies", "export", "io", "optics", "scene", "errors"},
 }
+TABLE_MODULES = {"caustic_cli.config.table", "caustic_cli.config.checks"}
 #: Only the command line may import the command line.
 TOP = {"cli", "__main__", "commands"}
 #: What the package's top level holds, besides the rooms.
@@ -58,13 +63,15 @@ IMPORTS = {module_name(p): imports_in(ast.parse(p.read_text("utf-8")), module_na
 
 
 def part_of(module: str) -> str:
-    """`optics` for caustic_cli.optics.trace, `files` for caustic_cli.io.files, "" for the package itself."""
-    return [*module.split("."), ""][1]
+    """`optics` for caustic_cli.optics.trace, "table" for the table of settings and its checks, "" for the package itself."""
+    return "table" if module in TABLE_MODULES or module.rpartition(".")[0] in TABLE_MODULES else [*module.split("."), ""][1]
 
 
 def own(imported: set[str]) -> set[str]:
     """Parts of the package among the imported names that are modules, the package's own version and name aside."""
-    modules = (m for m in imported if m.startswith("caustic_cli.") and (m in IMPORTS or m.rpartition(".")[0] in IMPORTS))
+    modules = {m for m in imported if m.startswith("caustic_cli.") and (m in IMPORTS or m.rpartition(".")[0] in IMPORTS)}
+    if imported & TABLE_MODULES:
+        modules = {m for m in modules if m != "caustic_cli.config"}  # whose front holds nothing
     return {part_of(m) for m in modules} - {"__version__"}
 
 
@@ -89,17 +96,17 @@ def test_there_is_something_to_check():
 @pytest.mark.parametrize("part", ALLOWED)
 def test_imports_run_one_way(part):
     modules = [m for m in IMPORTS if part_of(m) == part]
-    assert len(modules) >= 3
+    assert len(modules) >= 2
     wrong = {m: sorted(own(IMPORTS[m]) - ALLOWED[part]) for m in modules if own(IMPORTS[m]) - ALLOWED[part]}
     assert not wrong
 
 
 def test_the_top_level_holds_rooms():
     assert {p.name for p in PACKAGE.glob("*.py")} == FRONT
-    assert {p.name for p in PACKAGE.iterdir() if p.is_dir() and p.name != "__pycache__"} == {*ALLOWED, "commands"}
+    assert {p.name for p in PACKAGE.iterdir() if p.is_dir() and p.name != "__pycache__"} == {*ALLOWED, "commands"} - {"table"}
 
 
-@pytest.mark.parametrize("path", [p for p in FILES if not {"commands", "cli.py"} & set(p.relative_to(PACKAGE).parts)],
+@pytest.mark.parametrize("path", [p for p in FILES if not {"commands", "cli.py", "table.py"} & set(p.relative_to(PACKAGE).parts)],
                          ids=lambda p: str(p.relative_to(PACKAGE)))
 def test_no_option_is_named_below_the_commands(path):
     """Parameters that a message speaks of are marked, and the command line says them as options (`errors.MARK`)."""
@@ -164,12 +171,47 @@ def test_files_say_what_they_are(path):
     assert ast.get_docstring(ast.parse(text))
 
 
-def test_marked_parameters_are_options(capfd):
-    """Every mark in the sources names an option of some command; a library's reader sees the name alone."""
+def test_marks_name_settings(capfd):
+    """Every mark in the sources is a path of the table, or an option of some command that no setting is."""
     options = {o for c in cli.parser().commands.values() for p in c.params for o in p.opts if o.startswith("--")}
     marked = {name for p in FILES if p.name != "errors.py" for name in MARK.findall(p.read_text("utf-8"))}
-    assert len(marked) > 20 and {"--" + name.replace("_", "-") for name in marked} <= options
-    error = InputError("⟨screen_size⟩ must be one or two lengths")
-    assert str(error) == "screen_size must be one or two lengths" and f"{InputError(f'x: {error}')}" == f"x: {error}"
-    console.error(f"{error}")
-    assert capfd.readouterr().err == "caustic: --screen-size must be one or two lengths\n"
+    paths = {name.replace("source.also.", "source.") for name in marked if "." in name and not name.endswith(("_", "."))}
+    assert len(paths) > 30 and paths <= set(TABLE)
+    assert {"--" + name.replace("_", "-") for name in marked if "." not in name} <= options
+
+
+def test_a_message_names_the_option_that_said_it(capfd):
+    """The library names settings as project.toml does; the command line the option, where one was used."""
+    error = InputError("⟨lens.size⟩ must be a pair; a larger ⟨mag⟩ will do")
+    assert str(error) == "[lens] size must be a pair; a larger mag will do"
+    assert f"{InputError(f'x: {error}')}" == f"x: {error}"
+    for spoken, words in (({}, "[lens] size"), ({"lens.size": "--lens-size"}, "--lens-size")):
+        console.speak(spoken)
+        console.error(f"{error}")
+        assert capfd.readouterr().err == f"caustic: {words} must be a pair; a larger --mag will do\n"
+
+
+@pytest.mark.parametrize("row", TABLE.values(), ids=lambda row: row.path)
+def test_every_setting_says_what_it_is(row):
+    """Each has a meaning, a default or how it follows, and accepts its own default."""
+    assert row.help and not row.help[0].isspace() and not row.help.endswith(".")
+    if row.default is not None and not (isinstance(row.default, float) and math.isinf(row.default)):
+        row.check(row.default)
+    if row.option and not row.option.common:
+        for name in row.option.commands:
+            options = {o: p for p in cli.parser().commands[name].params for o in p.opts}
+            assert row.option.name in options
+
+
+def test_no_message_spells_a_setting():
+    """Below the commands, settings are named by their marks alone."""
+    spelled = re.compile(r"\[\[?(?:source|lens|screen|target|design|design\.stages)\]\]? (\w+)")
+    wrong = []
+    for path in FILES:
+        if {"commands", "cli.py"} & set(path.relative_to(PACKAGE).parts):
+            continue
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.Raise):
+                wrong += [(path.name, m[0]) for m in spelled.finditer(ast.unparse(node)) if m[1] in
+                          {row.key for row in TABLE.values()}]
+    assert not wrong

@@ -7,9 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image
+from helpers import write_blob
 
 from caustic_cli import cli
 from caustic_cli.inverse.designer import Designer
@@ -32,8 +31,7 @@ def _here(tmp_path, monkeypatch):
 
 
 def paint(name, centre):
-    y, x = np.mgrid[0:16, 0:16]
-    Image.fromarray((40 + 200 * np.exp(-((x - centre) ** 2 + (y - 6) ** 2) / 15.0)).astype(np.uint8)).save(name)
+    write_blob(name, 16, (centre, 6), 15.0)
 
 
 def run(arguments, capfd, code=0):
@@ -93,7 +91,7 @@ def test_another_design_is_refused_as_before(capfd, change):
 
 
 def test_an_unfinished_design_goes_on_when_it_is_asked_for_again(capfd, monkeypatch):
-    with monkeypatch.context() as patch:  # killed after its last iteration, before the verdict
+    with monkeypatch.context() as patch:  # killed after its last iteration, before the decision
         patch.setattr(workflow, "judge", interrupt)
         assert run([*DESIGN, "--quiet"], capfd, 130).err == "caustic: interrupted\n"
     assert not checkpoint.load(Path("blob.caustic/checkpoints.h5")).results

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
+from helpers import write_blob
 from PIL import Image
 
 from caustic_cli import __version__, cli
@@ -52,8 +53,7 @@ def designed(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.setattr(evaluation, "FINAL_RAYS", 10_000)
-        y, x = np.mgrid[0:24, 0:24]
-        Image.fromarray((40 + 200 * np.exp(-((x - 8) ** 2 + (y - 9) ** 2) / 30.0)).astype(np.uint8)).save("blob.png")
+        write_blob()
         text = "design blob.png --resolution 24 --control 12 --rays 4000 --iterations 2 --quiet"
         assert cli.run(shlex.split(text)) == 0
     return folder

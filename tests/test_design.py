@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers import begun
 from PIL import Image
 
 from caustic_cli import cli
@@ -24,7 +25,7 @@ TINY = ["--resolution", "24", "--control", "12", "--rays", "4000", "--quiet", "-
 
 @pytest.fixture(autouse=True)
 def _here(tmp_path, monkeypatch):
-    """A fresh directory with a picture, few rays for the verdict, and no report (its drawing takes most of the time)."""
+    """A fresh directory with a picture, few rays for the decision, and no report (its drawing takes most of the time)."""
     monkeypatch.chdir(tmp_path)
     y, x = np.mgrid[0:24, 0:24]
     light = 40 + 200 * np.exp(-((x - 8) ** 2 + (y - 9) ** 2) / 30.0)
@@ -249,7 +250,7 @@ def test_a_start_that_a_fixed_thickness_would_cut_is_lifted(capfd):
 
 @pytest.mark.parametrize("limit, control, rays", [(5, 32, 40_000), (20, 48, 40_000), (90, 48, 256 * 24 * 24)])
 def test_the_time_limit_chooses_the_quality(capfd, limit, control, rays, monkeypatch):
-    monkeypatch.setattr(workflow, "_run", lambda *args: {"lost": {}, "image": "", "reason": ""})
+    monkeypatch.setattr(workflow, "_run", begun)
     design(capfd, "blob.png", "--resolution", "24", "--waves", "off", "--quiet", "--threads", "1", "--time-limit", limit, "-o", "p")
     stages = workflow.Project.open("p").settings["design"]["stages"]
     assert stages[-1]["control"] == [control + 3, control + 3]

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers import write_blob
 from PIL import Image
 from rayfiles import zemax
 from scipy.integrate import quad
@@ -245,8 +246,7 @@ def test_impossible_ones_are_refused(what, message):
 @pytest.fixture
 def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    y, x = np.mgrid[0:24, 0:24]
-    Image.fromarray((40 + 200 * np.exp(-((x - 8) ** 2 + (y - 9) ** 2) / 30.0)).astype(np.uint8)).save("blob.png")
+    write_blob()
     Image.fromarray(np.array([[0, 255], [255, 255]], np.uint8)).save("die.png")
     Path("led.csv").write_text("angle,intensity\n0,1\n10,2\n60,0\n")
     Path("rays.dat").write_bytes(zemax(np.zeros((9, 3)), np.tile([0.0, 0.0, 1.0], (9, 1)), np.ones(9)))

@@ -94,7 +94,7 @@ def test_brewster():
 
 @pytest.mark.parametrize("source", [None, POINT])
 def test_two_crossed_polarisations_are_unpolarised_light(source):
-    """Exactly so for a plane wave; a slanted entrance polarises, which the average of R_s and R_p at each surface does not know."""
+    """Exactly so for a plane wave; a oblique entrance polarises, which the average of R_s and R_p at each surface does not know."""
     heights = bumpy(scene_of(), 0.2)
     images = [shine(scene_of(source, light=Light(a)), heights, rays=20_000).image for a in (20.0, 110.0)]
     plain = shine(scene_of(source), heights, rays=20_000).image

@@ -148,7 +148,7 @@ def heights(lens, mag=2.0, throw=100.0):
 
 
 def test_a_source_a_kilometre_away_is_a_plane_wave():
-    """Thesis notes 16, and hard case 3: z = -1e6 mm."""
+    """Erratum E16, and hard case 3: z = -1e6 mm."""
     lens = Lens(size=(10.0, 8.0), control=(8, 7), index=1.5)
     field, z, images = HeightField.of(lens), heights(lens), []
     for source in (PlaneWave(), Points(((0.0, 0.0, -1e6),))):

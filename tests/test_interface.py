@@ -89,7 +89,7 @@ def test_sphere_by_trigonometry(index, rho):
 
 @pytest.mark.parametrize("index", INDICES)
 def test_total_internal_reflection_begins_at_the_critical_slope(index):
-    """|g|^2 = 1 / (n^2 - 1), thesis notes 1: 1e-12 to either side decides (the radicand's rounding is 1e-15)."""
+    """|g|^2 = 1 / (n^2 - 1), erratum E1: 1e-12 to either side decides (the radicand's rounding is 1e-15)."""
     critical = 1.0 / math.sqrt(index * index - 1.0)
     azimuth = torch.linspace(0, 2 * math.pi, 73, dtype=torch.float64)
     checked = 0

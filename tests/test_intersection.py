@@ -16,7 +16,7 @@ from caustic_cli.optics.backends.reference import Torch
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.frames import IDENTITY
 from caustic_cli.optics.intersection import Method, Status
-from caustic_cli.optics.kernels.surface import FusedSurface, RayHits
+from caustic_cli.optics.kernels.surface import FusedSurface, RayIntersections
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.surfaces import Plane
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -48,7 +48,7 @@ def fan(count, widest, seed=0, half=(5.0, 4.0), z=0.0):
 
 
 def find_fused(f, heights, rays, start=None):
-    hits = RayHits(FusedSurface(f.spaces, f.half_size), rays.origin, rays.direction, None)
+    hits = RayIntersections(FusedSurface(f.spaces, f.half_size), rays.origin, rays.direction, None)
     hits.find(heights, start)
     return torch.from_numpy(hits.t.copy()), torch.from_numpy(hits.status.astype(np.int64))
 
@@ -207,7 +207,7 @@ def test_always_finite_and_on_the_surface(seed, size, p, widest):
 
 
 def meet_fused(f, heights, rays):
-    return RayHits(FusedSurface(f.spaces, f.half_size), rays.origin, rays.direction, None)(heights)
+    return RayIntersections(FusedSurface(f.spaces, f.half_size), rays.origin, rays.direction, None)(heights)
 
 
 def meet_plainly(f, heights, rays):

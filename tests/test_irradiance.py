@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from PIL import Image
+from helpers import write_blob
 
 from caustic_cli import cli
 from caustic_cli.commands.options import power
@@ -29,8 +29,7 @@ BAD = ["100 lumens?", "-1W", "nanW", "1e400lm", "", "0", "0lm", "infW", "W", "lm
 @pytest.fixture(autouse=True)
 def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    y, x = np.mgrid[0:24, 0:24]
-    Image.fromarray((40 + 200 * np.exp(-((x - 8) ** 2 + (y - 9) ** 2) / 30.0)).astype(np.uint8)).save("blob.png")
+    write_blob()
     monkeypatch.setattr(evaluation, "FINAL_RAYS", 40_000)
 
 

@@ -41,7 +41,7 @@ def test_scales_cancel(name):
 
 
 def test_only_rms_light_minds_light_that_is_lost():
-    """Thesis notes 13: with 30 % of all light off the screen, the plain loss sees a perfect picture."""
+    """Erratum E13: with 30 % of all light off the screen, the plain loss sees a perfect picture."""
     perfect = TARGET / TARGET.sum()
     one = torch.ones((), dtype=torch.float64)
     assert float(Loss("rms", TARGET)(0.7 * perfect, one)) < 1e-17

@@ -8,6 +8,7 @@ import typer
 
 from caustic_cli.cli import app
 from caustic_cli.commands import manpage
+from caustic_cli.config.table import TABLE
 
 PAGE = Path(__file__).parents[1] / "man" / "caustic.1"
 COMMANDS = typer.main.get_command(app).commands
@@ -19,10 +20,17 @@ def plain() -> str:
 
 
 def test_the_committed_pages_are_fresh():
-    committed = {p.name: p.read_text(encoding="utf-8") for p in PAGE.parent.glob("*.1")}
+    committed = {p.name: p.read_text(encoding="utf-8") for p in PAGE.parent.glob("*.[15]")}
     assert committed == manpage.pages(), "python -m caustic_cli.commands.manpage man"
     installed = (PAGE.parents[1] / "pyproject.toml").read_text(encoding="utf-8")
-    assert all(f'"man/{name}" = "share/man/man1/{name}"' in installed for name in committed)
+    assert all(f'"man/{name}" = "share/man/man{name[-1]}/{name}"' in installed for name in committed)
+
+
+def test_the_reference_says_every_setting():
+    page = manpage.reference().replace("\\-", "-")
+    assert page.count(".TP\n") == len(TABLE) > 70
+    for row in TABLE.values():
+        assert f"\\fB{row.key}\\fR\n" in page and (not row.why or row.why in page)
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from helpers import write_blob
 from rayfiles import cone_of, lighttools, tm25, zemax
 from test_emission import LENS, heights, scene
 
@@ -207,8 +207,7 @@ def test_impossible_ones_are_refused(what, message):
 @pytest.fixture
 def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    y, x = np.mgrid[0:24, 0:24]
-    Image.fromarray((40 + 200 * np.exp(-((x - 8) ** 2 + (y - 9) ** 2) / 30.0)).astype(np.uint8)).save("blob.png")
+    write_blob()
     monkeypatch.setattr(evaluation, "FINAL_RAYS", 40_000)
     monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
 

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from PIL import Image as Picture
+from helpers import write_blob
 
 from caustic_cli import cli
 from caustic_cli.optics.emission import rays_of
@@ -151,8 +151,7 @@ def test_design_and_render_of_a_disc_say_their_noise(tmp_path, monkeypatch, capf
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(evaluation, "FINAL_RAYS", 40_000)
     monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
-    y, x = np.mgrid[0:24, 0:24]
-    Picture.fromarray((40 + 200 * np.exp(-((x - 8) ** 2 + (y - 9) ** 2) / 30.0)).astype(np.uint8)).save("blob.png")
+    write_blob()
     common = ["--threads", "1", "--json"]
     assert cli.run(["design", "blob.png", "--source", "disc", "--resolution", "24", "--control", "12", "--rays", "4000",
                     "--waves", "off", "--iterations", "20", *common]) == 0

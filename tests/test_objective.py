@@ -109,7 +109,7 @@ def tilted(reach: float) -> torch.Tensor:
 def test_the_apron_pulls_back_light_that_has_left_the_screen():
     """A prism throws the light of the lens' right half past the screen's edge and beyond its ghost pixels.
 
-    Without an apron the lens' right edge has no gradient, and the plain loss goes on throwing light away (thesis notes 13);
+    Without an apron the lens' right edge has no gradient, and the plain loss goes on throwing light away (erratum E13);
     with one the same sixty steps bring light back.
     """
     scene = replace(SCENE, lens=replace(LENS, fresnel="none"))

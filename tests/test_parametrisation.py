@@ -101,7 +101,7 @@ def test_laplacian_coordinates_are_the_laplacian_of_the_net():
 
 
 def test_number_of_weights():
-    """Thesis 5.1.1 and notes 10: one layer of input weights and biases; the dense network joins three by two full matrices."""
+    """Thesis 5.1.1 and erratum E10: one layer of input weights and biases; the dense network joins three by two full matrices."""
     low, high = bounds()
     size = N * M
     assert count(parametrise(low, high)) == count(parametrise(low, high, preconditioner="laplacian")) == size

@@ -84,7 +84,7 @@ def test_no_ray_breaks_a_proof(source, bumps):
             _, found = again(field, heights, o, d, below=False)
             assert not bool(found.any())
             leaning = torch.hypot(d[0], d[1]) / d[2]
-            assert bounds.slope * float(leaning.max()) <= bounds.climb * (1 + 1e-12)
+            assert bounds.slope * float(leaning.max()) <= bounds.slope_ratio * (1 + 1e-12)
             proven += 1
     assert proven >= (8 if bumps < 0.1 else 4 if source is None else 0)
 
@@ -97,8 +97,8 @@ def test_the_critical_angle_decides_total_reflection():
         plan = plan_of(scene, heights_through(scene, sloped(slope)))
         assert plan["total-reflection"].on == on == plan["secondary-intersection"].on
         assert plan["total-reflection"].bound == pytest.approx(1.0, abs=1e-8)
-    slanted = scene_of(POINT)
-    assert plan_of(slanted, heights_through(slanted, sloped(critical * 0.95)))["total-reflection"].on
+    oblique = scene_of(POINT)
+    assert plan_of(oblique, heights_through(oblique, sloped(critical * 0.95)))["total-reflection"].on
     rough = scene_of(roughness=0.05)
     assert plan_of(rough, heights_through(rough, sloped(critical * 0.9)))["total-reflection"].on
 

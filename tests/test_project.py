@@ -46,7 +46,8 @@ def designed(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(evaluation, "FINAL_RAYS", 10_000)
         patch.setattr(evaluation, "write_report", lambda *args: None)
-        project, first = workflow.begin(folder / "blob.npy", folder / "blob.caustic", {}, None, None, {}, folder / "c.toml", False)
+        project, first = workflow.begin(folder / "blob.npy", {}, config=folder / "c.toml", out=folder / "blob.caustic",
+                                        say=Reporter(quiet=True))
         workflow.design(project, first, "cpu", Reporter(quiet=True), 0.0)
     return project.path
 

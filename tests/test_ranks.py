@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from helpers import write_blob
 
 from caustic_cli import cli
 from caustic_cli.inverse import ranks
@@ -23,6 +23,7 @@ import sys
 from caustic_cli import cli
 from caustic_cli.workflow import design as workflow
 from caustic_cli.workflow import evaluation
+from helpers import write_blob
 evaluation.FINAL_RAYS, evaluation.write_report = 5000, lambda *args: None
 sys.exit(cli.run(["design", "blob.png", "--config", "c.toml", "--quiet", "--threads", "1", "-o", "two"]))
 """
@@ -52,8 +53,7 @@ def test_two_ranks_design_what_one_process_does(tmp_path, monkeypatch):
     monkeypatch.setenv("CAUSTIC_KERNELS", "torch")
     monkeypatch.setattr(evaluation, "FINAL_RAYS", 5000)
     monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
-    y, x = np.mgrid[0:16, 0:16]
-    Image.fromarray((40 + 200 * np.exp(-((x - 5) ** 2 + (y - 6) ** 2) / 15.0)).astype(np.uint8)).save("blob.png")
+    write_blob("blob.png", 16, (5, 6), 15.0)
     Path("c.toml").write_text(CONFIG)
     Path("two.py").write_text(DRIVER)
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "two.py"]
@@ -87,7 +87,7 @@ def test_the_ranks_chunks_are_all_rays_once(source, kind, count):
     def shares(chunks):
         out = []
         for c in chunks:
-            out.append(torch.broadcast_to(c.share, c.shape).reshape(-1) if isinstance(c, Sample) else c.power)
+            out.append(torch.broadcast_to(c.flux, c.shape).reshape(-1) if isinstance(c, Sample) else c.power)
         return torch.cat(out) if out else torch.zeros(0, dtype=torch.float64)
 
     whole = shares(rays.chunks(130))
@@ -99,7 +99,7 @@ def test_the_ranks_chunks_are_all_rays_once(source, kind, count):
 
 def test_alone_nothing_is_sent():
     tensor = torch.ones(3)
-    ranks.add(tensor), ranks.share(tensor), ranks.tell("nothing")
-    assert ranks.place() == (0, 1) and ranks.agree(True) and not ranks.agree(False) and torch.equal(tensor, torch.ones(3))
-    with ranks.together("cpu") as rank:
+    ranks.all_reduce(tensor), ranks.broadcast(tensor), ranks.send("nothing")
+    assert ranks.rank_and_size() == (0, 1) and ranks.decide(True) and not ranks.decide(False) and torch.equal(tensor, torch.ones(3))
+    with ranks.process_group("cpu") as rank:
         assert rank == 0

@@ -109,7 +109,7 @@ def thesis_image(x, y, weight, f: Filter, alpha: tuple[float, float]) -> np.ndar
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 3), (3, 11), (5, 1)])
 def test_gaussian_is_the_thesis_formula(size):
-    """alpha = 0.4 per mm^2 is alpha w^2 per pixel^2, different along x and y (thesis notes 15)."""
+    """alpha = 0.4 per mm^2 is alpha w^2 per pixel^2, different along x and y (erratum E15)."""
     (wx, wy), alpha = SCREEN.pixel, (0.4, 0.4)
     f = Filter("gaussian", size, (alpha[0] * wx**2, alpha[1] * wy**2))
     x, y, w = rays(300, 1.6)
@@ -123,10 +123,10 @@ def test_small_alpha_is_a_parabola_without_noise(alpha):
     phi = torch.linspace(0, 1, 101)
     d = torch.arange(-2, 3) + 0.5 - phi.double()[:, None]
     parabola = (6.25 - d * d) / (6.25 - d * d).sum(-1, keepdim=True)
-    ours = Filter("gaussian", (5, 5), (alpha, alpha)).shares(phi, 0)
+    ours = Filter("gaussian", (5, 5), (alpha, alpha)).weights(phi, 0)
     assert ours.dtype == torch.float32
     torch.testing.assert_close(ours.double(), parabola, rtol=0, atol=5e-7)
-    ours = Filter("gaussian", (5, 5), (alpha, alpha)).shares(phi.double(), 1)
+    ours = Filter("gaussian", (5, 5), (alpha, alpha)).weights(phi.double(), 1)
     torch.testing.assert_close(ours, parabola, rtol=0, atol=1e-14 + 2 * alpha)  # the parabola is the limit
     if alpha == 1e-9:
         naive = torch.exp(-alpha * d.float() ** 2) - math.exp(-alpha * 6.25)
@@ -139,11 +139,11 @@ def test_huge_alpha_is_bincount(alpha, dtype):
     """exp(-alpha d^2) underflows in every pixel but the one nearest; on an edge the two nearest share alike."""
     f = Filter("gaussian", (5, 5), (alpha, alpha))
     phi = torch.linspace(0.1, 0.9, 33, dtype=dtype)
-    shares = f.shares(phi, 0)
+    shares = f.weights(phi, 0)
     expected = torch.zeros_like(shares)
     expected[:, 2] = 1.0
     torch.testing.assert_close(shares, expected, rtol=0, atol=1e-12)
-    edge = f.shares(torch.zeros(1, dtype=dtype), 0)[0]
+    edge = f.weights(torch.zeros(1, dtype=dtype), 0)[0]
     torch.testing.assert_close(edge, torch.tensor([0, 0.5, 0.5, 0, 0], dtype=dtype), rtol=0, atol=1e-12)
 
 
@@ -154,12 +154,12 @@ def test_shares_are_continuous_across_pixels(f):
         if f.size[axis] == 1:
             continue
         phi = torch.tensor([0.0, math.nextafter(1.0, 0.0), 0.37], dtype=torch.float64)
-        at = f.shares(phi, axis)
+        at = f.weights(phi, axis)
         torch.testing.assert_close(at.sum(-1), torch.ones(3, dtype=torch.float64), rtol=0, atol=1e-14)
         assert float(at.min()) >= 0
         torch.testing.assert_close(at[0, :-1], at[1, 1:], rtol=0, atol=1e-12)
         assert abs(float(at[0, -1])) < 1e-15
-        torch.testing.assert_close(f.shares(1.0 - phi, axis).flip(-1), at, rtol=0, atol=1e-12)  # symmetric
+        torch.testing.assert_close(f.weights(1.0 - phi, axis).flip(-1), at, rtol=0, atol=1e-12)  # symmetric
 
 
 ONE_PIXEL = [Filter(), Filter("bincount", (3, 5)), Filter("gaussian", (1, 1), (2.0, 2.0)), Filter("cosine", (1, 1))]
@@ -197,7 +197,7 @@ KERNELS = [Filter("cosine", (3, 11)), Filter("gaussian", (3, 5), (0.0, 0.5)), Fi
 def test_kernel_is_the_mean_share_over_a_pixel(f):
     """By adaptive quadrature.  The midpoint rule with 512 points is off by |f''| / 24 / 512^2: 2e-6 up to |f''| = 12."""
     for axis in (0, 1):
-        exact, _ = quad_vec(lambda phi, k=axis: f.shares(torch.tensor(phi, dtype=torch.float64), k).numpy(), 0, 1, epsabs=1e-10)
+        exact, _ = quad_vec(lambda phi, k=axis: f.weights(torch.tensor(phi, dtype=torch.float64), k).numpy(), 0, 1, epsabs=1e-10)
         kernel = f.kernel(axis)
         np.testing.assert_allclose(kernel.numpy(), exact, rtol=0, atol=2e-6)
         assert float(kernel.sum()) == pytest.approx(1.0, abs=1e-14)

@@ -13,13 +13,13 @@ RAYS = 1 << 14
 
 
 def points(sampler: Sampler, size: int = 1 << 20) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Every ray's u, v and share as flat tensors, in order."""
-    u, v, share = [], [], []
+    """Every ray's u, v and flux as flat tensors, in order."""
+    u, v, flux = [], [], []
     for s in sampler.chunks(size):
         a, b = (s.u[:, None], s.v[None, :]) if s.tensor else (s.u, s.v)
-        for out, value in ((u, a), (v, b), (share, s.share)):
+        for out, value in ((u, a), (v, b), (flux, s.flux)):
             out.append(torch.broadcast_to(value, s.shape).reshape(-1))
-    return torch.cat(u), torch.cat(v), torch.cat(share)
+    return torch.cat(u), torch.cat(v), torch.cat(flux)
 
 
 @pytest.mark.usefixtures("kernels")
@@ -28,13 +28,13 @@ def points(sampler: Sampler, size: int = 1 << 20) -> tuple[torch.Tensor, torch.T
 def test_rays_start_strictly_inside_the_aperture(kind, shape):
     for seed in (0, 1, 2**32 - 1, 2**50):
         sampler = Sampler(kind, shape, seed)
-        u, v, share = points(sampler)
-        assert len(u) == len(v) == len(share) == sampler.count == shape[0] * shape[1]
+        u, v, flux = points(sampler)
+        assert len(u) == len(v) == len(flux) == sampler.count == shape[0] * shape[1]
         for at in (u, v):
             assert at.dtype == torch.float64
             assert float(at.min()) > 0
             assert float(at.max()) < 1
-        assert float(share.sum()) == pytest.approx(1.0, abs=1e-12)
+        assert float(flux.sum()) == pytest.approx(1.0, abs=1e-12)
 
 
 def test_random_numbers_are_odd_multiples_of_two_to_the_minus_33():
@@ -142,7 +142,7 @@ def test_random_numbers_are_uniform_in_one_and_two_dimensions():
     """Chi-square over values, (u, v) pairs, neighbours, strides, and the same ray under consecutive seeds.
 
     None may be smaller than 0.01 / how many, and all together must look uniform themselves (Kolmogorov-Smirnov; the tests
-    share numbers, so not to better than 1e-3).
+    flux numbers, so not to better than 1e-3).
     """
     p, k = [], torch.arange(RAYS)
     for seed in SEEDS:
@@ -214,21 +214,21 @@ def test_profile_lights_its_own_corner(kind):
     """[i, j], i along +x: only profile[-1, 0] is bright, so light starts at large u and small v alone."""
     profile = torch.zeros(4, 3, dtype=torch.float64)
     profile[3, 0] = 2.5
-    u, v, share = points(Sampler(kind, (40, 42), 1, profile))
+    u, v, flux = points(Sampler(kind, (40, 42), 1, profile))
     lit = (u > 0.75) & (v < 1 / 3)
     assert 0 < int(lit.sum()) < len(u) / 4
-    assert bool((share[lit] > 0).all())
-    assert not share[~lit].any()
-    assert float(share.sum()) == pytest.approx(1.0, abs=1e-12)
+    assert bool((flux[lit] > 0).all())
+    assert not flux[~lit].any()
+    assert float(flux.sum()) == pytest.approx(1.0, abs=1e-12)
 
 
 @pytest.mark.parametrize("kind", SAMPLERS)
 def test_profile_weights_rays_by_its_value(kind):
     profile = torch.rand(4, 3, dtype=torch.float64) + 0.1
-    u, v, share = points(Sampler(kind, (40, 42), 1, profile), 100)
+    u, v, flux = points(Sampler(kind, (40, 42), 1, profile), 100)
     value = profile[(u * 4).long(), (v * 3).long()]
-    torch.testing.assert_close(share, value / value.sum(), rtol=1e-13, atol=0)
-    assert float(share.sum()) == pytest.approx(1.0, abs=1e-12)
+    torch.testing.assert_close(flux, value / value.sum(), rtol=1e-13, atol=0)
+    assert float(flux.sum()) == pytest.approx(1.0, abs=1e-12)
 
 
 def test_a_profile_that_every_ray_misses_is_refused():

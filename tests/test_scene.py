@@ -6,8 +6,9 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
+from caustic_cli.config import checks
 from caustic_cli.errors import CausticError, InputError
-from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen, checks
+from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
 from caustic_cli.scene.materials import D_LINE, GLASSES, refractive_index
 
 INF, NAN = math.inf, math.nan
@@ -116,7 +117,7 @@ def test_a_sphere_that_ends_inside_the_aperture_is_refused(radius):
 
 
 def test_radius_for_a_magnification():
-    """Table 6.1 (cm): n = 1.5, screen 4 from the lens: magnifications 1.25 and 1.5 give 8 and 4 (thesis notes 12)."""
+    """Table 6.1 (cm): n = 1.5, screen 4 from the lens: magnifications 1.25 and 1.5 give 8 and 4 (erratum E12)."""
     reach = {"index": 1.5, "throw": 300.0, "thickness": 10.0}
     assert Offset.for_magnification((1.0, 1.0), **reach).radius == (INF, INF)
     assert Offset.for_magnification((3.0, 5.0), **reach).radius == pytest.approx((0.5 * 290 / 2, 0.5 * 290 / 4))
@@ -176,7 +177,7 @@ def test_refractive_indices(glass):
 
 
 def test_he_ne_is_not_the_d_line():
-    """Thesis notes 14: N-BK7 has 1.51509 at 632.8 nm (Schott)."""
+    """Erratum E14: N-BK7 has 1.51509 at 632.8 nm (Schott)."""
     assert refractive_index("N-BK7", 632.8) == pytest.approx(1.51509, abs=1e-5)
 
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from caustic_cli.config import settings
-from caustic_cli.config.completion import build_options, build_stages, complete
+from caustic_cli.config.completion import Derivation, build_options, build_stages, complete
 from caustic_cli.config.settings import SCHEMA, STAGE, build_lens, build_scene, dump, parse
 from caustic_cli.errors import InputError
 
@@ -130,23 +130,23 @@ def test_the_default_scene_is_table_d2():
 
 
 def test_mag_3():
-    s = complete({}, 1.0, mag=3.0)
+    s = complete({}, 1.0, Derivation(mag=3.0))
     assert s["target"]["size"] == pytest.approx([30.0, 30.0]) and s["screen"]["size"] == pytest.approx([38.4, 38.4])
     assert s["lens"]["radius"] == pytest.approx([(INDEX - 1) * (300 - 5) / 2] * 2, rel=1e-14)
     assert build_lens(s).offset.radius == tuple(s["lens"]["radius"])
 
 
 def test_mag_1_is_flat():
-    assert complete({}, 1.0, mag=1.0)["lens"]["radius"] == [math.inf, math.inf]
+    assert complete({}, 1.0, Derivation(mag=1.0))["lens"]["radius"] == [math.inf, math.inf]
 
 
 def test_mag_counts_lens_widths():
-    s = complete({"lens": {"size": [20.0, 20.0]}}, 1.0, mag=2.0, margin=0.5)
+    s = complete({"lens": {"size": [20.0, 20.0]}}, 1.0, Derivation(mag=2.0, margin=0.5))
     assert s["target"]["size"] == pytest.approx([40.0, 40.0]) and s["screen"]["size"] == pytest.approx([60.0, 60.0])
 
 
 def test_a_non_square_picture_keeps_its_shape():
-    s = complete({}, 0.5, mag=3.0)
+    s = complete({}, 0.5, Derivation(mag=3.0))
     assert s["target"]["size"] == pytest.approx([30.0, 15.0])
     assert s["screen"]["size"] == pytest.approx([38.4, 19.2])
     assert s["screen"]["resolution"] == [250, 125]
@@ -157,7 +157,7 @@ def test_a_non_square_picture_keeps_its_shape():
 @pytest.mark.parametrize(("width", "aspect", "expected"), [(24, 1.0, [24, 24]), (100, 2.0, [100, 200]), (100, 0.753, [100, 75]),
                                                            (2, 0.01, [2, 2])])
 def test_resolution_counts_across(width, aspect, expected):
-    assert complete({}, aspect, width=width)["screen"]["resolution"] == expected
+    assert complete({}, aspect, Derivation(resolution=(width,)))["screen"]["resolution"] == expected
 
 
 def test_screen_size_alone_sets_the_picture():
@@ -194,15 +194,15 @@ RAYS = {"design": {"waves": "off"}}
 
 @pytest.mark.parametrize(("quality", "first", "last"), [("draft", 15, 25), ("standard", 25, 50), ("fine", 40, 120)])
 def test_quality_shapes_the_stages(quality, first, last):
-    stages = complete(OFFSET, 1.0, quality=quality)["design"]["stages"]
+    stages = complete(OFFSET, 1.0, Derivation(quality=quality))["design"]["stages"]
     assert stages[0]["iterations"] == first and stages[-1]["iterations"] == last
-    moved = [complete(RAYS, 1.0, quality=q)["design"]["stages"] for q in ("draft", "standard", "fine")]
+    moved = [complete(RAYS, 1.0, Derivation(quality=q))["design"]["stages"] for q in ("draft", "standard", "fine")]
     assert [len(s) for s in moved] == [1, 2, 3]
     assert [s[-1]["control"][0] for s in moved] == sorted(s[-1]["control"][0] for s in moved)
 
 
 def test_stages_end_sharp_on_the_lens_own_net():
-    s = complete({"lens": {"control": [19, 35]}, **OFFSET}, 1.0, rays=5000)
+    s = complete({"lens": {"control": [19, 35]}, **OFFSET}, 1.0, Derivation(rays=5000))
     stages = build_stages(s)
     assert stages[-1].control == (19, 35) and stages[-1].rays == 5000 and stages[-1].blur == 0.0
     blurs = [stage.blur for stage in stages]
@@ -225,7 +225,7 @@ def test_adam_has_one_stage(design):
 ])
 def test_out_of_range(given_, shaped, word):
     with pytest.raises(InputError) as caught:
-        complete(given_, 1.0, **shaped)
+        complete(given_, 1.0, Derivation(**shaped))
     assert word in str(caught.value)
 
 

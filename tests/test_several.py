@@ -6,10 +6,9 @@ import json
 import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image
+from helpers import write_blob
 from rayfiles import cone_of, zemax
 from test_emission import LENS, heights
 
@@ -41,7 +40,7 @@ GLASS = Lens(size=(10.0, 8.0), control=(8, 7), glass="N-BK7", index=1.5168)
 def test_what_they_say_together():
     some = Several(MEMBERS[1:3], (NONE,) * 2)
     assert (some.kind, some.power, some.distant, some.collimated) == ("several", 2.5, False, False) and some.several and some.apart
-    assert some.shares == pytest.approx((0.8, 0.2)) and some.nearest == -20.0 and some.extent == (1.0, 0.5)
+    assert some.fractions == pytest.approx((0.8, 0.2)) and some.nearest == -20.0 and some.extent == (1.0, 0.5)
     assert some.centre == pytest.approx((0.4, 0.2, -22.0)) and sum(some.powers) == pytest.approx(2.5)
     assert some.blur(0.0, 100.0) == MEMBERS[2].blur(0.0, 100.0) and some.pointlike().extent == (0.0, 0.0)
     assert some.cone_over((5, 4), 0.0) == max(m.cone_over((5, 4), 0.0) for m in some.members)
@@ -62,13 +61,13 @@ def test_their_light_adds_up():
     sampler = rays_of(here, "stratified", 1_000_000, 3)
     together = expose(here, field, z, sampler)
     assert abs(float(together.image.sum()) + math.fsum(together.lost.values()) - 1.0) < 1e-12
-    alone = [expose(one, field, z, rays, chunk=1 << 17) for one, rays in zip(here.apiece, sampler.members, strict=True)]
-    image = sum(share * found.image for share, found in zip(here.source.shares, alone, strict=True))
+    alone = [expose(one, field, z, rays, chunk=1 << 17) for one, rays in zip(here.by_source, sampler.members, strict=True)]
+    image = sum(fraction * found.image for fraction, found in zip(here.source.fractions, alone, strict=True))
     torch.testing.assert_close(together.image, image, rtol=0, atol=1e-15)
     assert sampler.count == sum(one.count for one in sampler.members)
     for chunk in (1 << 20, 999):
-        whole = [(float(c.share.sum()) if hasattr(c, "share") and c.share.ndim else float(c.share) * math.prod(c.shape))
-                 if hasattr(c, "share") else float(c.power.sum()) + c.lost["missed_lens"] for c in sampler.chunks(chunk)]
+        whole = [(float(c.flux.sum()) if hasattr(c, "flux") and c.flux.ndim else float(c.flux) * math.prod(c.shape))
+                 if hasattr(c, "flux") else float(c.power.sum()) + c.lost["missed_lens"] for c in sampler.chunks(chunk)]
         assert math.fsum(whole) == pytest.approx(1.0, abs=1e-12)
 
 
@@ -122,7 +121,7 @@ def test_settings_go_round():
     again = settings.parse(settings.dump(full), "b")
     assert again["source"] == {k: v for k, v in full["source"].items()}
     source, light = settings.build_source(full), settings.build_light(full)
-    assert [m.kind for m in source.members] == ["point", "disc"] and source.shares == (0.75, 0.25)
+    assert [m.kind for m in source.members] == ["point", "disc"] and source.fractions == (0.75, 0.25)
     assert light.wavelengths == (620.0, 450.0, 500.0) and light.parts == pytest.approx((0.75, 0.125, 0.125))
     assert full["design"]["start"] == "transport"  # both stand in the same place
     one = complete(settings.parse("[[source]]\ntype = 'point'\n", "a"), 1.0)
@@ -131,8 +130,7 @@ def test_settings_go_round():
 
 def test_a_design_in_several_lights(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
-    y, x = np.mgrid[0:24, 0:24]
-    Image.fromarray((40 + 200 * np.exp(-((x - 8) ** 2 + (y - 9) ** 2) / 30.0)).astype(np.uint8)).save("blob.png")
+    write_blob()
     monkeypatch.setattr(evaluation, "FINAL_RAYS", 40_000)
     monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
     Path("led.dat").write_bytes(zemax(*cone_of(20_000, 12.0)))

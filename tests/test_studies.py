@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from caustic_cli.config.completion import complete
+from caustic_cli.config.completion import Derivation, complete
 from caustic_cli.config.settings import build_scene
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.io.files import is_ours
@@ -235,7 +235,7 @@ def test_the_contenders_of_a_project(small):
 
 
 def test_transport_contends_where_a_design_would_begin_there():
-    full = complete({"screen": {"resolution": [24, 24]}, "lens": {"control": [35, 35]}}, 1.0, rays=5000)
+    full = complete({"screen": {"resolution": [24, 24]}, "lens": {"control": [35, 35]}}, 1.0, Derivation(rays=5000))
     scene = build_scene(full)
     target = torch.from_numpy(comparison.disc(scene, tuple(full["target"]["size"])))
     entries = {plan[0]: comparison.Entry(*plan, scene, target) for plan in comparison.plans(scene, full)

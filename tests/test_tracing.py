@@ -9,6 +9,7 @@ import torch
 import torch.autograd.forward_ad as fwd
 from scipy.interpolate import BSpline
 
+from caustic_cli.config.table import TABLE
 from caustic_cli.errors import InputError
 from caustic_cli.optics.rays import LOSSES, RayState, Status
 from caustic_cli.optics.reconstruction import Filter
@@ -17,7 +18,8 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer, expose
 from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
-from caustic_cli.scene.lens import FRESNEL
+
+FRESNEL = TABLE["lens.fresnel"].choices
 
 pytestmark = pytest.mark.usefixtures("kernels")
 
@@ -53,7 +55,7 @@ def place(state: RayState, sample) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def closed_form(scene: Scene, heights: torch.Tensor, u: np.ndarray, v: np.ndarray):
-    """M(x0) = x0 + (n - S) / (n |g|^2 + S) (z_screen - f) g (thesis notes 1) over pairs u, v, and S^2; with SciPy's splines."""
+    """M(x0) = x0 + (n - S) / (n |g|^2 + S) (z_screen - f) g (erratum E1) over pairs u, v, and S^2; with SciPy's splines."""
     (rx, ry), (p, q), n = scene.lens.half_size, scene.lens.degree, scene.lens.index
     knots = [s.knots.numpy() for s in HeightField.of(scene.lens).spaces]
     along = [BSpline(t, np.eye(len(t) - k - 1), k) for t, k in zip(knots, (p, q), strict=True)]

@@ -1,4 +1,4 @@
-"""The verdict of --verify: noise alone agrees, every honest fault does not; and Mitsuba itself, where it is installed."""
+"""The decision of --verify: noise alone agrees, every honest fault does not; and Mitsuba itself, where it is installed."""
 
 import importlib.util
 import json
@@ -50,11 +50,11 @@ def judged(of_mitsuba, of_render):
 
 
 def test_noise_agrees():
-    verdict = judged(picture(), picture())
-    assert verdict.agree
-    assert 0.8 < verdict.figures["z_mean_square"] < 1.1 and verdict.figures["pixels"] > 500
-    assert verdict.figures["relative_rms_beyond_noise"] < 0.5 * verdict.figures["noise_rms"]
-    assert verdict.z.shape == picture().shape
+    decision = judged(picture(), picture())
+    assert decision.agree
+    assert 0.8 < decision.figures["z_mean_square"] < 1.1 and decision.figures["pixels"] > 500
+    assert decision.figures["relative_rms_beyond_noise"] < 0.5 * decision.figures["noise_rms"]
+    assert decision.z.shape == picture().shape
 
 
 @pytest.mark.parametrize("fault", [lambda a: a[::-1], lambda a: a[:, ::-1], lambda a: np.roll(a, 1, 0), lambda a: a**1.1,
@@ -72,9 +72,9 @@ def test_light_that_is_missing_is_noticed():
 def test_few_rays_take_pixels_together_and_too_few_say_so():
     few, squares = counts(picture(), 5, 9000)
     renders = np.array([counts(picture(), k, RAYS)[0] for k in range(4)])
-    verdict = verify.compare(renders, few, squares, 9000)
-    assert verdict.agree and verdict.figures["pixel_side"] == 2
-    assert np.isnan(verdict.z).any() or verdict.figures["pixels"] == 15 * 12
+    decision = verify.compare(renders, few, squares, 9000)
+    assert decision.agree and decision.figures["pixel_side"] == 2
+    assert np.isnan(decision.z).any() or decision.figures["pixels"] == 15 * 12
     few, squares = counts(picture(), 5, 20)
     with pytest.raises(CausticError, match="rays"):
         verify.compare(renders, few, squares, 20)
@@ -127,12 +127,12 @@ def mitsuba():
 def test_mitsuba_agrees(mitsuba, tmp_path, source, capsys):
     scene, field, heights = scene_with(source)
     write_mitsuba(tmp_path / "lens.xml", scene, field, heights, (129, 129), dark=True)
-    verdict = verify.verify(tmp_path / "lens.xml", scene, field, heights, RAYS)
+    decision = verify.verify(tmp_path / "lens.xml", scene, field, heights, RAYS)
     with capsys.disabled():
-        print(f"\n  {source.kind if hasattr(source, 'kind') else 'plane'}: mean Z^2 {verdict.figures['z_mean_square']:.3f},"
-              f" light {verdict.figures['on_screen']:.5f} and {verdict.figures['on_screen_render']:.5f}", end="")
-    assert verdict.agree, verdict.figures
-    verify.write_panels(tmp_path / "verify.png", verdict, scene)
+        print(f"\n  {source.kind if hasattr(source, 'kind') else 'plane'}: mean Z^2 {decision.figures['z_mean_square']:.3f},"
+              f" light {decision.figures['on_screen']:.5f} and {decision.figures['on_screen_render']:.5f}", end="")
+    assert decision.agree, decision.figures
+    verify.write_panels(tmp_path / "verify.png", decision, scene)
     assert (tmp_path / "verify.png").read_bytes()[1:4] == b"PNG"
 
 

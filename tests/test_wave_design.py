@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers import begun
 from PIL import Image
 
 from caustic_cli import cli
 from caustic_cli.config import completion
+from caustic_cli.config.plans import LEAST_WAVES, WAVES, wave_refinement
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.schedule import LEAST_WAVES, WAVES, wave_refinement
 from caustic_cli.inverse.waves import WaveObjective
 from caustic_cli.optics.resolution import Resolution, diffraction_blur, local_magnification, white
 from caustic_cli.optics.surfaces import HeightField
@@ -48,7 +49,7 @@ def goal() -> torch.Tensor:
 
 @pytest.fixture
 def _here(tmp_path, monkeypatch):
-    """A fresh directory with a picture, and few rays for the verdict."""
+    """A fresh directory with a picture, and few rays for the decision."""
     monkeypatch.chdir(tmp_path)
     y, x = np.mgrid[-1:1:32j, -1:1:32j]
     Image.fromarray(((np.hypot(x, y) < 0.7) * 255).astype(np.uint8)).save("blob.png")
@@ -139,7 +140,7 @@ def test_local_magnification_is_that_of_the_map():
 def test_auto_is_by_the_scene(extra, stages, _here, capfd, monkeypatch):
     from caustic_cli.workflow import design as workflow  # noqa: PLC0415
 
-    monkeypatch.setattr(workflow, "_run", lambda *args: {"lost": {}, "image": "", "reason": ""})
+    monkeypatch.setattr(workflow, "_run", begun)
     small = SMALL if "--resolution" not in extra else [a for a in SMALL if a not in ("--resolution", "32")]
     design(capfd, "blob.png", *small, *extra, "-o", "p")
     tables = workflow.Project.open("p").settings["design"]["stages"]
@@ -162,9 +163,9 @@ def test_what_is_said_before_a_design(extra, reason, _here, capfd, monkeypatch):
     """One line on what light carries; one more where the wave image is left out although it matters, of why."""
     from caustic_cli.workflow import design as workflow  # noqa: PLC0415
 
-    monkeypatch.setattr(workflow, "_run", lambda *args: {"lost": {}, "image": "", "reason": ""})
+    monkeypatch.setattr(workflow, "_run", begun)
     if "fine" in extra:
-        monkeypatch.setattr("caustic_cli.inverse.schedule.SECONDS_A_SAMPLE", 1.0)
+        monkeypatch.setattr("caustic_cli.config.plans.SECONDS_A_SAMPLE", 1.0)
     Path("own.toml").write_text(OWN)
     small = [a for a in SMALL if a != "--quiet" and not ("--resolution" in extra and a in ("--resolution", "32"))]
     assert cli.run(["design", "blob.png", *small, *extra, "-o", "p"]) == 0

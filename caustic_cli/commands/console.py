@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from caustic_cli.errors import MARK, InputError
+from caustic_cli.errors import MARK, InputError, plain_name
 
 #: Characters of an error line; more is what somebody put into a file.
 LONGEST_LINE = 4000
@@ -70,7 +70,7 @@ class Reporter:
         self.console.print(table)
 
     @contextmanager
-    def patience(self, text: str, seconds: float = 4.0):
+    def notify_if_slow(self, text: str, seconds: float = 4.0):
         """Say `text` if the block is still at work after so many seconds."""
         timer = threading.Timer(seconds, self.say, (text,))
         timer.daemon = True
@@ -105,9 +105,27 @@ class Reporter:
                 task, description=description, text=text, completed=done, total=whole)
 
 
+#: The options by which this run was told of settings, by their path.
+_spoken: dict[str, str] = {}
+
+
+def spoken() -> dict[str, str]:
+    """Those options, by path."""
+    return dict(_spoken)
+
+
+def speak(options: dict[str, str]) -> None:
+    """From now on, call settings (path) by the options that said them; others by their key in project.toml."""
+    _spoken.clear()
+    _spoken.update(options)
+
+
 def named(text: str) -> str:
-    """A text whose marked parameters are called by their options."""
-    return MARK.sub(lambda found: "--" + found[1].replace("_", "-"), text)
+    """A text whose marked settings are called by the options that said them, and parameters by their options."""
+    def name(path: str) -> str:
+        return _spoken.get(path) or (plain_name(path) if "." in path else "--" + path.replace("_", "-"))
+
+    return MARK.sub(lambda found: name(found[1]), text)
 
 
 def emit_json(value: dict) -> None:

@@ -89,7 +89,7 @@ def run(
             found = training.run_training(scene, target, entries, seconds=seconds, seed=seed or 0, rays=count, device=device,
                                           progress=tell)
         elif study == "light":
-            from caustic_cli.scene import checks  # noqa: PLC0415
+            from caustic_cli.config import checks  # noqa: PLC0415
             from caustic_cli.workflow import tradeoff  # noqa: PLC0415
 
             each = checks.number("--seconds", light.SECONDS if seconds is None else seconds, 0.0, 1e6, open_low=True)

@@ -1,18 +1,21 @@
-"""The manual pages, from the commands themselves.
+"""The manual pages: of the commands, from the parser itself, and of project.toml, from the table of settings.
 
-`python -m caustic_cli.commands.manpage man` writes caustic.1 and one for each command.
-
-Options and their help come from the parser, so they cannot differ from `--help`; the sections around them are below.
+`python -m caustic_cli.commands.manpage man` writes caustic.1, one for each command, and caustic-project.5, the reference of all
+settings.  The sections around them are below.
 """
 
 from __future__ import annotations
 
+import math
 import re
 import sys
 from pathlib import Path
 
 from caustic_cli import __version__
 from caustic_cli.cli import parser
+from caustic_cli.commands.options import default_words
+from caustic_cli.config.table import TABLE, Setting
+from caustic_cli.errors import plain_name
 from caustic_cli.io.files import write_bytes
 
 HEAD = r""".TH CAUSTIC 1 "" "caustic {version}" "User Commands"
@@ -35,7 +38,9 @@ TAIL = r""".SH FILES
 A project is a directory:
 .TP
 .I NAME.caustic/project.toml
-Everything that defines the scene and the design, with units.  Editing it and rendering again is a normal way to work.
+Everything that defines the scene and the design, with units:
+.BR caustic-project (5).
+Editing it and rendering again is a normal way to work.
 .TP
 .I NAME.caustic/checkpoints.h5
 Control heights, optimiser state, loss history, provenance (HDF5); replaced as a whole, never half-written.
@@ -122,9 +127,60 @@ def build() -> str:
     return "".join(parts) + TAIL
 
 
+REFERENCE = r""".TH CAUSTIC-PROJECT 5 "" "caustic {version}" "File Formats"
+.SH NAME
+caustic\-project \- the settings of a caustic project, project.toml
+.SH DESCRIPTION
+A project's directory holds
+.IR project.toml ,
+which says everything that defines the scene and the design.
+.B caustic design
+writes it, with each key's unit or meaning beside it; it may be edited by hand, and given to a new design with
+.BR \-\-config .
+The same names, as
+.IR section.key ,
+are the library's.  What a default's reason is stands after it.
+.PP
+Several tables
+.B [[source]]
+are several sources; several tables
+.B [[design.stages]]
+are the stages of a design, one after another.
+"""
+#: How a kind of setting is written.
+KINDS = {"number": "number", "whole": "whole number", "text": "text", "flag": "true or false", "numbers": "[x, y]",
+         "wholes": "[x, y], whole numbers", "list": "list of numbers", "points": "[x, y, z], or a list of such"}
+
+
+def reference() -> str:
+    """Every setting of the table, by section, as roff."""
+    parts = [REFERENCE.format(version=__version__)]
+    headings = {row.section: plain_name(f"{row.section}.").strip() for row in TABLE.values() if row.section}
+    for section, heading in headings.items():
+        parts.append(f".SH {_plain(heading)}\n" + "".join(_setting(row) for row in TABLE.values() if row.section == section))
+    parts.append(".SH FROM THE COMMAND LINE ALONE\nSettings are derived from these, and no project holds them.\n")
+    parts.append("".join(_setting(row) for row in TABLE.values() if not row.section))
+    return "".join(parts) + ".SH SEE ALSO\n.BR caustic (1)\n"
+
+
+def _setting(row: Setting) -> str:
+    low, high = (("" if math.isinf(v) else f"{v:g}") for v in (row.low, row.high))
+    bounds = f"{'greater than' if row.above else 'at least'} {low}" * bool(low) + " and " * bool(low and high) + \
+        f"at most {high}" * bool(high)
+    if row.choices:
+        bounds = "one of " + ", ".join(choice or '""' for choice in row.choices)
+    start = default_words(row)
+    facts = [f"{KINDS[row.kind]}{f', {row.unit}' if row.unit else ''}{f', {bounds}' if bounds else ''}.",
+             f"Default: {start}{f' ({row.why})' if row.why else ''}." if start != "none" or row.why else "",
+             f"Option: {row.option.name}." if row.option else ""]
+    return (f".TP\n\\fB{_plain(row.key)}\\fR\n{_plain(row.help[0].upper() + row.help[1:])}.\n.br\n"
+            f"{_plain(' '.join(filter(None, facts)))}\n")
+
+
 def pages() -> dict[str, str]:
-    """All pages by file name: the whole program, and each command alone."""
-    return {"caustic.1": build()} | {f"caustic-{name}.1": _page(name, command) for name, command in parser().commands.items()}
+    """All pages by file name: the whole program, each command alone, and the settings."""
+    commands = {f"caustic-{name}.1": _page(name, command) for name, command in parser().commands.items()}
+    return {"caustic.1": build(), **commands, "caustic-project.5": reference()}
 
 
 def _page(name: str, command) -> str:

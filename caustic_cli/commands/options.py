@@ -1,15 +1,19 @@
-"""Options that several commands share, defined once, and the parsing of sizes and counts."""
+"""Options: those that are settings, made from the table; those that several commands share; and the reading of their texts."""
 
 from __future__ import annotations
 
+import inspect
 import math
 import re
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
+from caustic_cli.commands import console
 from caustic_cli.commands.console import Reporter
+from caustic_cli.config import checks, table
+from caustic_cli.config.table import Setting
 from caustic_cli.errors import InputError
 
 Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout.")]
@@ -27,86 +31,151 @@ Progress = Annotated[str, typer.Option(envvar="CAUSTIC_PROGRESS", metavar="auto|
 Project = Annotated[Path, typer.Argument(help="Project directory made by caustic design.", show_default=False)]
 
 
-SourceType = Annotated[str | None, typer.Option(help="plane: parallel light along +z as wide as the lens; point; grid of"
-                                                " points; disc, an extended source; rays of a --source-file."
-                                                "  [default: plane]")]
-SourceFile = Annotated[str | None, typer.Option(metavar="FILE", help="Ray file: IES TM-25 (.tm25ray), Zemax binary (.dat, .sdf) or"
-                                                " LightTools text (.ray, .txt); of a disc, a picture of its brightness,"
-                                                " whose values are taken as they are.  The project keeps a copy.")]
-Intensity = Annotated[str | None, typer.Option(metavar="uniform|lambertian|FILE", help="Of a point, grid or disc: the same"
-                                               " into every solid angle, by the cosine, or a .csv of angles from +z, degrees, and"
-                                               " relative intensities.  [default: uniform]")]
-SourcePosition = Annotated[list[str] | None, typer.Option(metavar="X,Y,Z", help="Point (may be repeated), centre of a grid or"
-                                                          " disc, or origin of a ray file, mm.  [default: on the axis, five lens"
-                                                          " widths before it]")]
-SourceSize = Annotated[str | None, typer.Option(metavar="W[xH]", help="Grid or disc, mm.  [default: a fifth of the lens]")]
-SourceGrid = Annotated[str | None, typer.Option(metavar="N[xM]", help="Points of a grid.  [default: 25x25]")]
-SourceAngle = Annotated[float | None, typer.Option(metavar="DEG", help="Disc at infinity: full angle it is seen under (the sun:"
-                                                   " 0.533).")]
-Cone = Annotated[float | None, typer.Option(metavar="DEG", help="Half-angle of a source's cone about +z.  [default: as wide as"
-                                            " the lens]")]
-Power = Annotated[str | None, typer.Option(metavar="NUMBER[W|lm]", help="All of the source's power: 2W, or 100lm for images in lux."
-                                           "  [default: 1W]")]
+
+def from_table(command: str):
+    """Give a command the options that the table of settings has for it, in place of its parameter `given`.
+
+    The command gets `given`: path -> value of the settings that options said, in the table's kinds; from then on, messages about
+    them name the options (`console.speak`).
+    """
+    rows = {row.option.name.lstrip("-").replace("-", "_"): row for row in table.options_of(command)}
+
+    def decorate(body):
+        own = inspect.signature(body, eval_str=True).parameters
+
+        def run(**values):
+            said = {name: value for name in rows if not ((value := values.pop(name)) is None or value is False or value == [])}
+            spoken = {path: rows[name].option.name for name in said for path in (rows[name].path, *rows[name].speaks_for)}
+            common = {name: row for name, row in COMMON.items() if values.get(name) is not None}
+            console.speak(spoken | {row.path: row.option.name for row in common.values()})
+            given: dict[str, Any] = {row.path: values[name] for name, row in common.items()}
+            for name, value in said.items():
+                given |= _read(rows[name], value)
+            return body(given=given, **values)
+
+        parameters = []
+        for name, parameter in own.items():
+            parameters += map(_parameter, rows, rows.values()) if name == "given" else \
+                [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)]
+        run.__signature__ = inspect.Signature(parameters)
+        run.__annotations__ = {p.name: p.annotation for p in parameters}
+        run.__doc__, run.__name__ = body.__doc__, body.__name__
+        return run
+
+    return decorate
 
 
-Polarisation = Annotated[float | None, typer.Option(metavar="DEG", help="The source is linearly polarised, so far from +x."
-                                                     "  [default: unpolarised]")]
-Wavelengths = Annotated[str | None, typer.Option(metavar="NM[:W],...", help="The source's spectrum: wavelengths and relative"
-                                                 " powers; a --glass refracts each by its own index.  [default: one wavelength]")]
-Absorption = Annotated[float | None, typer.Option(metavar="PER_MM", help="Absorption coefficient of the glass, 1/mm."
-                                                   "  [default: 0]")]
-Roughness = Annotated[float | None, typer.Option(metavar="SLOPE", help="Standard deviation of the slopes of the surface's"
-                                                 " microfacets, mm per mm.  [default: 0]")]
-ScreenTilt = Annotated[str | None, typer.Option(metavar="A,B", help="Turn the screen about its own x, then y, degrees."
-                                                "  [default: 0,0]")]
-ScreenShift = Annotated[str | None, typer.Option(metavar="X,Y", help="Move the screen's middle off the axis, mm.  [default: 0,0]")]
+def _parameter(name: str, row: Setting) -> inspect.Parameter:
+    """The option of a setting as the command line's parser wants it."""
+    option, flag = row.option, row.kind == "flag" or row.option.constant is not None
+    words = HELP.get(row.path) or f"{_capital(row)}{f' ({row.unit})' if row.unit else ''}."
+    if not flag:
+        words += f"  [default: {default_words(row)}]"
+    kind = bool if flag else list[str] | None if row.kind == "points" else _scalar(row) | None
+    annotation = Annotated[kind, typer.Option(option.name, metavar=option.metavar, help=words)]
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False if flag else None, annotation=annotation)
 
 
-def physics(polarisation: float | None, wavelengths: str | None, absorption: float | None, roughness: float | None,
-            tilt: str | None, shift: str | None) -> dict[tuple[str, str, str], object]:
-    """The options of effects as (section, key, option) -> value, without those that were not given."""
+def _capital(row: Setting) -> str:
+    """The help as a sentence begins, unless it begins with a value or a symbol."""
+    first = row.help.split(maxsplit=1)[0]
+    return row.help if first.endswith(":") or first in row.choices or len(first) == 1 else f"{row.help[0].upper()}{row.help[1:]}"
+
+
+def _scalar(row: Setting) -> type:
+    """What the parser itself reads; what may have a unit or several numbers is text to it."""
+    if row.path in READERS or row.unit == "mm":
+        return str
+    return {"number": float, "whole": int}.get(row.kind, str)
+
+
+def default_words(row: Setting) -> str:
+    """The default in words."""
+    value = row.default
+    if value is None or row.derived:
+        return row.derived or "none"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list):
+        return ("," if row.option and "," in (row.option.metavar or "") else "x").join(f"{v:g}" for v in value)
+    if isinstance(value, float):
+        return "none" if math.isinf(value) else f"{value:g}"
+    return str(value) or "none"
+
+
+def _read(row: Setting, value: Any) -> dict[str, Any]:
+    """Settings by path that an option's text stands for."""
+    option = row.option
+    if row.path in READERS:
+        return READERS[row.path](option.name, value)
+    if row.kind == "flag":
+        return {row.path: True}
+    if option.constant is not None:
+        return {row.path: option.constant}
+    if row.kind == "points":
+        return {row.path: [list(numbers(option.name, p, (3,), ",", unit=row.unit)) for p in value]}
+    if row.kind == "numbers":
+        if "," in option.metavar:
+            return {row.path: list(numbers(option.name, value, (2,), ",", unit=row.unit))}
+        return {row.path: both(size(option.name, value))}
+    if row.kind == "wholes":
+        return {row.path: both(counts(option.name, value))}
+    if row.kind == "number" and row.unit == "mm":
+        return {row.path: numbers(option.name, value, (1,), unit="mm", form="a number of mm, or with a unit, like 30cm or 4in")[0]}
+    return {row.path: value}
+
+
+def _spectrum(option: str, text: str) -> dict[str, Any]:
+    """Wavelengths and their weights: "450:2,550"."""
     form = "wavelengths in nm, each with a weight or without, like 450:2,550"
-    lines = None if wavelengths is None else [numbers("--wavelengths", p, (1, 2), ":", form) for p in wavelengths.split(",")]
-    given = {
-        ("source", "polarisation", "--polarisation"): polarisation,
-        ("source", "wavelengths", "--wavelengths"): lines and [line[0] for line in lines],
-        ("source", "weights", "--wavelengths"): lines and [line[1] if len(line) == 2 else 1.0 for line in lines],
-        ("lens", "absorption", "--absorption"): absorption,
-        ("lens", "roughness", "--roughness"): roughness,
-        ("screen", "tilt", "--screen-tilt"): list(numbers("--screen-tilt", tilt, (2,), ",")) if tilt else None,
-        ("screen", "shift", "--screen-shift"): list(numbers("--screen-shift", shift, (2,), ",")) if shift else None,
-    }
-    return {key: value for key, value in given.items() if value is not None}
+    lines = [numbers(option, part, (1, 2), ":", form) for part in text.split(",")]
+    return {"source.wavelengths": [line[0] for line in lines],
+            "source.weights": [line[1] if len(line) == 2 else 1.0 for line in lines]}
 
 
-def source(kind: str | None, position: list[str] | None, size_: str | None, grid: str | None, angle: float | None,
-           cone: float | None, power_: str | None = None, file: str | None = None,
-           intensity: str | None = None) -> dict[tuple[str, str, str], object]:
-    """The source options as (section, key, option) -> value, without those that were not given."""
-    watts = (None, None) if power_ is None else power("--power", power_)
-    given = {
-        ("source", "power", "--power"): watts[0],
-        ("source", "power_unit", "--power"): watts[1],
-        ("source", "type", "--source"): kind or ("disc" if angle is not None else None),
-        ("source", "position", "--source-position"):
-            [list(numbers("--source-position", p, (3,), ",")) for p in position] if position else None,
-        ("source", "size", "--source-size"): both(size("--source-size", size_)) if size_ else None,
-        ("source", "grid", "--source-grid"): both(counts("--source-grid", grid)) if grid else None,
-        ("source", "angle", "--source-angle"): angle,
-        ("source", "cone", "--cone"): cone,
-        ("source", "file", "--source-file"): file,
-        ("source", "intensity", "--intensity"): intensity,
-    }
-    return {key: value for key, value in given.items() if value is not None}
+def _power(option: str, text: str) -> dict[str, Any]:
+    watts, unit = power(option, text)
+    return {"source.power": watts, "source.power_unit": unit}
 
 
-def numbers(option: str, text: str, count: tuple[int, ...], separator: str = r"[xX×]", form: str = "") -> tuple[float, ...]:
+#: Options whose text is read in a way of their own.
+READERS = {
+    "source.power": _power,
+    "source.wavelengths": _spectrum,
+    "rays": lambda option, text: {"rays": rays(option, text)},
+    "screen_size": lambda option, text: {"screen_size": size(option, text)},
+    "resolution": lambda option, text: {"resolution": counts(option, text)},
+}
+#: Help of options that say less than their setting can hold.
+HELP = {
+    "target.encoding": "Pixel values are irradiance as they are, not sRGB-encoded.",
+    "design.iterations": "Iterations in all; with --resume, counted from the very first.",
+    "source.position": "Point (may be repeated), centre of a grid or disc, or origin of a ray file (mm).",
+    "target.flip": "Mirror the picture along x, y or xy, for a viewer on the lens' side.",
+    "lens.mirror": "The surface reflects; the screen stands on the source's side, --throw before it.",
+    "source.wavelengths": "The source's spectrum: wavelengths (nm) and relative powers; a --glass refracts each by its own index.",
+}
+#: Options that are settings and that every command has.
+COMMON = {row.option.name.lstrip("-"): row for row in table.TABLE.values() if row.option and row.option.common}
+#: Millimetres in units that may follow a length.
+UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
+
+
+def numbers(option: str, text: str, count: tuple[int, ...], separator: str = r"[xX×]", form: str = "",
+            unit: str = "") -> tuple[float, ...]:
     """Numbers parted by x ("10x8") or by what `separator` matches; `form` says what would be accepted.
+
+    unit: mm for lengths, which may say another unit, the last one for all that say none: "10x8cm".
 
     Raises:
         InputError: naming the option.
     """
-    parts = re.split(separator, text.strip())
+    parts, scales = re.split(separator, text.strip()), [1.0]
+    if unit == "mm":
+        found = [re.fullmatch(r"(.*?[0-9.]) ?(mm|cm|m|in)?", part.strip()) for part in parts]
+        parts = [part if match is None else match[1] for part, match in zip(parts, found, strict=True)]
+        units = [match[2] if match else None for match in found]
+        scales = [UNITS[unit or units[-1] or "mm"] for unit in units]
     try:
         values = tuple(float(p) for p in parts)
     except ValueError:
@@ -114,12 +183,12 @@ def numbers(option: str, text: str, count: tuple[int, ...], separator: str = r"[
     if len(values) not in count or not all(math.isfinite(v) for v in values):
         usual = "a number or two like 10x8" if separator.startswith("[x") else f"{max(count)} numbers parted by commas"
         raise InputError(f"{option} must be {form or usual}, got {text!r}")
-    return values
+    return values if unit != "mm" else tuple(v * scale for v, scale in zip(values, scales, strict=True))
 
 
 def size(option: str, text: str) -> tuple[float, float] | tuple[float]:
-    """W or WxH in mm, greater than 0."""
-    values = numbers(option, text, (1, 2))
+    """W or WxH in mm, or with units, greater than 0."""
+    values = numbers(option, text, (1, 2), unit="mm")
     if min(values) <= 0:
         raise InputError(f"{option} must be greater than 0, got {text!r}")
     return values
@@ -131,8 +200,6 @@ def power(option: str, text: str) -> tuple[float, str]:
     Raises:
         InputError: naming the option.
     """
-    from caustic_cli.scene import checks  # noqa: PLC0415
-
     found = re.fullmatch(r"([0-9.]+(?:[eE][+-]?[0-9]+)?) ?(W|lm)?", text.strip(), re.ASCII)
     try:
         value = float(found[1]) if found else math.nan
@@ -184,7 +251,7 @@ def start_torch(device: str, threads: int | None, say: Reporter):
     device = "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
     from caustic_cli.workflow.compilation import compile_usual  # noqa: PLC0415
 
-    with say.patience("compiling the kernels for this machine, once: about ten seconds"):
+    with say.notify_if_slow("compiling the kernels for this machine, once: about ten seconds"):
         compile_usual(device)
     return device
 

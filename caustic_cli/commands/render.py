@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -18,9 +18,11 @@ EXAMPLES = """Examples:
 """
 
 
+@options.from_table("render")
 def run(
     project: Annotated[Path, typer.Argument(help="Project directory made by caustic design, or an .npz made by caustic export.",
                                             show_default=False)],
+    given: dict[str, Any],
     rays: Annotated[str, typer.Option(metavar="N", help="Number of rays, independent of those of the design.")] = "1000000",
     tolerance: Annotated[float | None, typer.Option(metavar="ERROR", help="Add rays until the image's noise, estimated,"
                                                     " is below this relative RMS; --rays is where it begins.")] = None,
@@ -28,21 +30,6 @@ def run(
     = "bincount",
     filter_size: Annotated[str, typer.Option(metavar="V[xW]", help="Filter size, odd, pixels.")] = "3",
     alpha: Annotated[float | None, typer.Option(help="Of the gaussian, 1/mm^2.  [default: 1 per pixel^2]")] = None,
-    source: options.SourceType = None,
-    source_file: options.SourceFile = None,
-    intensity: options.Intensity = None,
-    source_position: options.SourcePosition = None,
-    source_size: options.SourceSize = None,
-    source_grid: options.SourceGrid = None,
-    source_angle: options.SourceAngle = None,
-    cone: options.Cone = None,
-    power: options.Power = None,
-    polarisation: options.Polarisation = None,
-    wavelengths: options.Wavelengths = None,
-    absorption: options.Absorption = None,
-    roughness: options.Roughness = None,
-    screen_tilt: options.ScreenTilt = None,
-    screen_shift: options.ScreenShift = None,
     screen_at: Annotated[float | None, typer.Option(metavar="Z", help="Put the screen here instead, mm.")] = None,
     effects: Annotated[str, typer.Option(metavar="auto|none|NAME[,NAME...]", help="Effects to simulate: what the scene calls"
                                          " for, none that can be left out, or just these (--explain lists them).")] = "auto",
@@ -84,8 +71,11 @@ def run(
         raise InputError("--verify compares on the project's own screen: give no --screen-at")
     if alpha is not None and reconstruction != "gaussian":
         raise InputError(f"--alpha belongs to --reconstruction gaussian, got {reconstruction}")
-    given = options.source(source, source_position, source_size, source_grid, source_angle, cone, power, source_file, intensity)
-    given |= options.physics(polarisation, wavelengths, absorption, roughness, screen_tilt, screen_shift)
+    given = {path: value for path, value in given.items() if not path.startswith("design.")}  # of the rays of this render
+    if "source.angle" in given:
+        given.setdefault("source.type", "disc")
+    if screen_at is not None:
+        console.speak(console.spoken() | {"screen.z": "--screen-at"})
     device = options.start_torch(device, threads, say)
 
     from caustic_cli.workflow.render import Request, render  # noqa: PLC0415
@@ -95,7 +85,7 @@ def run(
     try:
         figures = render(asked, device, say)
     except InputError as error:
-        raise InputError(f"{error}".replace("[screen] z", "--screen-at") if screen_at is not None else f"{error}") from error
+        raise InputError(f"{error}".replace("⟨screen.z⟩", "--screen-at") if screen_at is not None else f"{error}") from error
     if not figures.pop("reused", False):
         _show(str(project), figures, say)
     if json:
@@ -118,7 +108,7 @@ def _show(title: str, figures: dict, say: console.Reporter) -> None:
     if "verify" in figures:
         f = figures["verify"]
         say.table(f"Mitsuba {f['mitsuba']}, {f['variant']}", [
-            ("verdict", "agree" if f["agree"] else "DISAGREE"),
+            ("decision", "agree" if f["agree"] else "DISAGREE"),
             ("mean Z^2, beyond 3, largest", f"{f['z_mean_square']:.3f}, {f['z_beyond_3']:.2%}, {f['z_largest']:.2f}"
                                             "  (of noise: 1, 0.27%, 4)"),
             ("judged", f"{f['pixels']:,} of {f['pixel_side']} x {f['pixel_side']} pixels, {f['noise']:.1%} noise each"),

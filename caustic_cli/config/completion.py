@@ -6,112 +6,146 @@ Screen, picture and offset surface follow from the magnification; the stages fro
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 
-from caustic_cli.config.settings import DEFAULTS, build_lens, build_light, build_screen, build_source, index_of, with_defaults
-from caustic_cli.errors import InputError
-from caustic_cli.inverse.designer import Options
-from caustic_cli.inverse.extended import shift_of
-from caustic_cli.inverse.schedule import (
-    LEAST_RAYS,
+from caustic_cli.config.plans import (
     LEAST_SPANS,
     LEAST_WAVES,
-    Stage,
+    Table,
     coarse_to_fine,
+    on_rays,
+    on_waves,
     refinement,
     refinement_spans,
     wave_refinement,
 )
+from caustic_cli.config.settings import (
+    DEFAULTS,
+    Settings,
+    build_lens,
+    build_light,
+    build_screen,
+    build_source,
+    index_of,
+    value_of,
+    with_defaults,
+)
+from caustic_cli.config.table import check, default
+from caustic_cli.errors import InputError
+from caustic_cli.inverse.designer import Options
+from caustic_cli.inverse.extended import shift_of
+from caustic_cli.inverse.schedule import Stage
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.resolution import BAND, Resolution, white
-from caustic_cli.scene import Offset, Scene, Screen, Source, checks, sources
+from caustic_cli.scene import Offset, Scene, Screen, Source, sources
 from caustic_cli.scene.light import RGB
 
-DEFAULT_MAG = 3.0
-DEFAULT_MARGIN = 0.28  # table 6.1: the screen is 6.4 wide where the picture is 5
 DEFAULT_RESOLUTION = 250
 DEFAULT_SPANS = 128  # knot spans of the finished net; 128 halve evenly through the stages
 NETWORK_CONTROL = 50  # table D.2
 RAYS_PER_PIXEL = 9.0  # 750 x 750 rays on 250 x 250 pixels, tables D.1 and D.2
-SINGLE_STAGE_ITERATIONS = 1000  # thesis 6.2.1
 DRAFT_SECONDS, FINE_SECONDS = 8.0, 60.0  # time limits below and from which another quality is the better use of the time
 STEEPEST = 1.25  # least radius of a derived sphere, in half diagonals of the lens: slopes up to 1.3
-WAVE_TOLERANCE = 1e-3  # of a stage on the wave image
 WAVE_KEYS = ("control", "blur", "apron", "iterations", "tolerance")  # of a stage on rays that one on the wave image has too
 COLOR_GLASS = "N-BK7"  # of a coloured picture, unless glass or index is said: dispersion has to be known
 
-Settings = dict[str, dict[str, Any]]
+
+@dataclass(frozen=True)
+class Derivation:
+    """What settings are derived from that no project holds, by its path in the table: `mag` and the like; None where not given.
+
+    mag: picture width over lens width; margin: black border, part of the picture's width in all; throw: distance of the screen;
+    screen_size: of the screen, mm, (width,) or (width, height); resolution: pixels, (across,) or (across, up); quality: of the
+    default stages; rays: of the last default stage.
+    """
+
+    mag: float | None = None
+    margin: float | None = None
+    throw: float | None = None
+    screen_size: tuple[float, ...] | None = None
+    resolution: tuple[int, ...] | None = None
+    quality: str | None = None
+    rays: int | None = None
+
+    def __post_init__(self):
+        for key in ("mag", "margin", "throw", "quality", "rays"):
+            if getattr(self, key) is not None:
+                check(key, getattr(self, key))
 
 
-def complete(given: Settings, aspect: float, *, mag: float | None = None, margin: float | None = None,
-             width: int | None = None, quality: str | None = None, rays: int | None = None,
-             lit: tuple[float, float] = (1.0, 1.0)) -> Settings:
+def complete(given: Settings, aspect: float, by: Derivation | None = None, lit: tuple[float, float] = (1.0, 1.0)) -> Settings:
     """Every setting a project needs.
 
     Args:
         given: what the user fixed, by options or config.
         aspect: height over width of the picture.
-        mag: picture width over lens width; margin: black border, part of the picture's width in all.
-        width: pixels across the screen when only that is known; the rows follow the screen's shape.
-        quality: of the default stages; rays: of the last default stage; lit: parts of the picture's width and height that light is
-            to cover.
+        by: what else was said.
+        lit: parts of the picture's width and height that light is to cover.
 
     Raises:
         InputError: a value is out of range, or two contradict each other.
     """
-    s = with_defaults(given)
-    if s["lens"].get("mirror", False) and "z" not in given.get("screen", {}):
-        s["screen"]["z"] = -s["screen"]["z"]
+    s, by = with_defaults(given), by or Derivation()
     lens, screen, target = s["lens"], s["screen"], s["target"]
-    if target.get("color", False):
+    mirror = value_of(lens, "lens.mirror")
+    if by.throw is not None:
+        screen["z"] = -by.throw if mirror else by.throw
+    elif mirror and "z" not in given.get("screen", {}):
+        screen["z"] = -screen["z"]
+    if by.screen_size is not None:
+        screen["size"] = [by.screen_size[0], by.screen_size[-1] if len(by.screen_size) == 2 else by.screen_size[0] * aspect]
+    if by.resolution is not None:
+        screen.pop("resolution", None)
+        if len(by.resolution) == 2:
+            screen["resolution"] = list(by.resolution)
+    if value_of(target, "target.color"):
         if s["source"].get("also"):
             raise InputError("[[source]] of a coloured picture must be one, whose three wavelengths are its colours")
         s["source"].setdefault("wavelengths", list(RGB))
         if "index" not in lens:
             lens.setdefault("glass", COLOR_GLASS)
-    if mag is not None:
-        mag = checks.number("⟨mag⟩", mag, 1e-3, 1e3)
-    margin = checks.number("⟨margin⟩", DEFAULT_MARGIN if margin is None else margin, 0.0, 100.0)
-    checks.pair("[lens] size", lens["size"], lambda w, x: checks.number(w, x, 1e-6, 1e6))
-    checks.number("[screen] z", screen["z"], -1e12, 1e12)
+    mag, margin = by.mag, default("margin") if by.margin is None else by.margin
+    check("lens.size", lens["size"])
+    check("screen.z", screen["z"])
     if "size" in screen:
-        checks.pair("[screen] size", screen["size"], lambda w, x: checks.number(w, x, 1e-6, 1e9))
+        check("screen.size", screen["size"])
     if "size" in target:
-        checks.pair("[target] size", target["size"], lambda w, x: checks.number(w, x, 1e-6, 1e9))
-    checks.choice("[target] flip", target["flip"], ("", "x", "y", "xy"))
-    checks.choice("[target] encoding", target["encoding"], ("srgb", "linear"))
+        check("target.size", target["size"])
+    check("target.flip", target["flip"])
+    check("target.encoding", target["encoding"])
     _complete_source(s["source"], lens, [stage.get("source", "") for stage in s["design"].get("stages", [])])
     if "also" in s["source"]:
         s["source"]["also"] = [{**DEFAULTS["source"], **table} for table in s["source"]["also"]]
         for table in s["source"]["also"]:
-            _complete_source(table, lens, [], "[[source]] type")
+            _complete_source(table, lens, [], "⟨source.also.type⟩")
     if "size" not in target or mag is not None:
         if mag is None and "size" in screen:
             fit = min(screen["size"][0], screen["size"][1] / aspect) / (1.0 + margin)
         else:
-            fit = (mag or DEFAULT_MAG) * lens["size"][0]
+            fit = (mag or default("mag")) * lens["size"][0]
         target["size"] = [fit, fit * aspect]
     if "size" not in screen:
         screen["size"] = [(1.0 + margin) * x for x in target["size"]]
     if "resolution" not in screen:
-        nx = width or DEFAULT_RESOLUTION
+        nx = by.resolution[0] if by.resolution else DEFAULT_RESOLUTION
         screen["resolution"] = [nx, max(2, round(nx * screen["size"][1] / screen["size"][0]))]
     build_screen(s)
     source = build_source(s)
     _complete_lens(lens, screen, target, source)
-    _complete_design(s, source, quality, rays, lit)
+    _complete_design(s, source, by.quality, by.rays, lit)
     return s
 
 
-def _complete_source(source: dict[str, Any], lens: dict[str, Any], stages: list[str], where: str = "[source] type") -> None:
+def _complete_source(source: dict[str, Any], lens: dict[str, Any], stages: list[str], where: str = "⟨source.type⟩") -> None:
     """What the types of source in use need and nobody said, without what none of them has: a plane wave has no intensity.
 
     `stages`: the types that stages name, "" for the source's own; they need their keys too.
     """
     types = [sources.type_of(source["type"], where)]
-    types += [sources.type_of(type, "[[design.stages]] source") for type in stages if type]
+    types += [sources.type_of(type, "⟨design.stages.source⟩") for type in stages if type]
     for type in types:
         for key, value in type.defaults(lens).items():
             source.setdefault(key, value)
@@ -121,19 +155,19 @@ def _complete_source(source: dict[str, Any], lens: dict[str, Any], stages: list[
 
 def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[str, Any], source: Source) -> None:
     index, scale = index_of(lens), max(lens["size"]) / 10.0
-    checks.number("[lens] index", index, 1.0, 5.0, open_low=True)
+    check("lens.index", index)
     if "glass" not in lens:
         lens["index"] = index
     else:
-        lens.setdefault("wavelength", 587.5618)
+        lens.setdefault("wavelength", default("lens.wavelength"))
     lens.setdefault("thickness", 5.0 * scale)
     lens.setdefault("height_range", [-scale, scale])
-    mirror = lens.get("mirror", False)
+    mirror = value_of(lens, "lens.mirror")
     if mirror and screen["z"] >= lens["thickness"] + lens["height_range"][0]:
-        raise InputError(f"[screen] z must lie before the mirror, which begins at"
+        raise InputError(f"⟨screen.z⟩ must lie before the mirror, which begins at"
                          f" {lens['thickness'] + lens['height_range'][0]:.4g} mm, got {screen['z']:g} mm")
     if not mirror and screen["z"] <= lens["thickness"] + lens["height_range"][1]:
-        raise InputError(f"[screen] z must lie behind the lens, which is up to"
+        raise InputError(f"⟨screen.z⟩ must lie behind the lens, which is up to"
                          f" {lens['thickness'] + lens['height_range'][1]:.4g} mm thick, got {screen['z']:g} mm")
     if "radius" not in lens:
         mag = tuple(t / w for t, w in zip(target["size"], lens["size"], strict=True))
@@ -149,14 +183,14 @@ def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[st
 
 def _complete_design(s: Settings, source: Source, quality: str | None, rays: int | None, lit: tuple[float, float]) -> None:
     lens, screen, design, given = s["lens"], s["screen"], s["design"], quality
-    degree = tuple(checks.whole("[lens] degree", p, 1, 15) for p in lens["degree"])
+    degree = check("lens.degree", lens["degree"])
     plain = design["network"] == "none" and design["optimizer"] == "lbfgs"
-    asked = checks.choice("[design] waves", design["waves"], ("auto", "on", "off"))
+    asked = check("design.waves", design["waves"])
     held = "control" not in lens or min(n - p for n, p in zip(lens["control"], degree, strict=True)) >= LEAST_SPANS
     spread = plain and held and not source.sharp and _shifts(s, source)
     design.setdefault("start", "transport" if plain and held and not source.apart else "offset")
     if design["start"] == "transport" and design["network"] != "none":
-        raise InputError("[design] start transport gives a surface, which a network cannot begin from; use start offset, or"
+        raise InputError("⟨design.start⟩ transport gives a surface, which a network cannot begin from; use start offset, or"
                          " network none")
     quality = quality or _quality(design["time_limit"])
     # Sharp light's transport is right at every scale at once, if the net can hold it, and so is that of a source that shifts the
@@ -172,7 +206,7 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
                              " of its own: change them there")
         design["stages"] = [_complete_stage(stage, s, _sampler(source)) for stage in design["stages"]]
         if asked != "auto" and any(stage.get("waves") for stage in design["stages"]) != (asked == "on"):
-            raise InputError(f"[design] waves {asked} and the given [[design.stages]] contradict each other: "
+            raise InputError(f"⟨design.waves⟩ {asked} and the given [[design.stages]] contradict each other: "
                              + ("none of them has waves, such as waves = [550.0]" if asked == "on" else "one of them has waves"))
         return
     nx, ny = screen["resolution"]
@@ -183,13 +217,12 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
     elif plain and "knots_u" not in lens:
         stages = coarse_to_fine(tuple(lens["control"]), degree, rays or base, (nx, ny), quality, sampler=sampler)
     else:
-        stages = [Stage(tuple(lens["control"]), rays or base, sampler, apron=math.ceil(0.04 * max(nx, ny)),
-                        iterations=SINGLE_STAGE_ITERATIONS, tolerance=2e-3 if plain else 0.0)]
+        stages = [on_rays(lens["control"], rays or base, sampler, apron=math.ceil(0.04 * max(nx, ny)),
+                          iterations=default("design.stages.iterations"), tolerance=2e-3 if plain else 0.0)]
     stages += _wave_stages(s, source, quality, lit)
-    design["stages"] = [_stage_table(stage) for stage in stages]
     if design["loss"].strip() == "rms":  # eq. 5.2.1 knows the screen alone
-        for table in design["stages"]:
-            table["apron"] = 0
+        stages = [stage | {"apron": 0} for stage in stages]
+    design["stages"] = stages
 
 
 def without_waves(s: Settings, given: bool) -> str:
@@ -223,15 +256,15 @@ def _not_by_default(s: Settings) -> str:
     return ""
 
 
-def _wave_stages(s: Settings, source: Source, quality: str, lit: tuple[float, float]) -> list[Stage]:
+def _wave_stages(s: Settings, source: Source, quality: str, lit: tuple[float, float]) -> list[Table]:
     """What refines the wave image after the ray image, where that is asked for or called for."""
     design, lens, screen, asked = s["design"], s["lens"], s["screen"], s["design"]["waves"]
     if asked == "on" and design["network"] != "none":
-        raise InputError("[design] waves on needs network none: the wave image refines the heights themselves")
+        raise InputError("⟨design.waves⟩ on needs network none: the wave image refines the heights themselves")
     if asked == "on" and source.rays is not None:
-        raise InputError("[design] waves on: a ray file says nothing of its light's phase, so that it has no wave image to refine")
+        raise InputError("⟨design.waves⟩ on: a ray file says nothing of its light's phase, so that it has no wave image to refine")
     if asked == "on" and len(source.members) > 1:
-        raise InputError("[design] waves on needs one source: light of several is refined by rays alone")
+        raise InputError("⟨design.waves⟩ on needs one source: light of several is refined by rays alone")
     if asked == "off" or (asked == "auto" and _not_by_default(s)):
         return []
     seen = _resolution(s, source)
@@ -240,8 +273,7 @@ def _wave_stages(s: Settings, source: Source, quality: str, lit: tuple[float, fl
     own = s["source"].get("wavelengths", [])
     plan = wave_refinement(_wave_samples(s, seen, lit), len(own), quality, hurry=asked == "auto")
     apron = math.ceil(0.04 * max(screen["resolution"]))
-    return [Stage(tuple(lens["control"]), LEAST_RAYS, apron=apron, iterations=n, tolerance=WAVE_TOLERANCE,
-                  waves=tuple(map(float, own)) or white(count)) for count, n in plan]
+    return [on_waves(lens["control"], list(map(float, own)) or white(count), apron, n) for count, n in plan]
 
 
 def _resolution(s: Settings, source: Source) -> Resolution:
@@ -272,26 +304,16 @@ def _shifts(s: Settings, source: Source) -> bool:
     return shift_of(Scene(source, lens, build_screen(s), build_light(s))) is not None
 
 
-def _stage_table(stage: Stage) -> dict[str, Any]:
-    if stage.waves:
-        return {"control": list(stage.control), "waves": list(stage.waves), "blur": stage.blur, "apron": stage.apron,
-                "iterations": stage.iterations, "tolerance": stage.tolerance}
-    return {"control": list(stage.control), "rays": stage.rays, "sampler": stage.sampler,
-            "reconstruction": stage.filter.kind, "filter_size": list(stage.filter.size), "blur": stage.blur,
-            "apron": stage.apron, "iterations": stage.iterations, "tolerance": stage.tolerance,
-            "oversample": stage.oversample, **({"spread": True} if stage.spread else {})}
-
-
 def _complete_stage(table: dict[str, Any], s: Settings, sampler: str) -> dict[str, Any]:
     base = _stage_base(s, sampler)
     return {**({k: base[k] for k in WAVE_KEYS} if table.get("waves") else base), **table}
 
 
-def _stage_base(s: Settings, sampler: str) -> dict[str, Any]:
+def _stage_base(s: Settings, sampler: str) -> Table:
+    """What a stage of the user's own says where it says nothing."""
     nx, ny = s["screen"]["resolution"]
-    return {"control": list(s["lens"]["control"]), "rays": int(RAYS_PER_PIXEL * nx * ny), "sampler": sampler,
-            "reconstruction": "cosine", "filter_size": [3, 3], "blur": 0.0, "apron": 0,
-            "iterations": SINGLE_STAGE_ITERATIONS, "tolerance": 0.0, "oversample": 1}
+    return on_rays(s["lens"]["control"], int(RAYS_PER_PIXEL * nx * ny), sampler, iterations=default("design.stages.iterations"),
+                   tolerance=default("design.stages.tolerance"))
 
 
 def filter_from(kind: str, size, screen: Screen, per_mm2: float | None = None, per_pixel2: float | None = None) -> Filter:
@@ -313,14 +335,7 @@ def build_stages(settings: Settings) -> list[Stage]:
     Raises:
         InputError: there are none, a value is out of range, or the last stage is not on the lens' own control net.
     """
-    on = build_screen(settings)
-    stages = []
-    for t in settings["design"].get("stages", []):
-        t = _stage_base(settings, "grid") | t
-        f = filter_from(t["reconstruction"], t["filter_size"], on, t.get("alpha_per_mm2"), t.get("alpha_per_pixel2"))
-        source = build_source(settings, type=t["source"]) if "source" in t else None
-        stages.append(Stage(tuple(t["control"]), t["rays"], t["sampler"], f, t["blur"], t["apron"], t["iterations"],
-                            t["tolerance"], source, t["oversample"], tuple(t.get("waves", ())), t.get("spread", False)))
+    stages = [stage_of(table, settings) for table in settings["design"].get("stages", [])]
     if not stages:
         raise InputError("[[design.stages]] at least one stage is needed")
     if list(stages[-1].control) != list(settings["lens"]["control"]):
@@ -329,15 +344,23 @@ def build_stages(settings: Settings) -> list[Stage]:
     return stages
 
 
+def stage_of(table: Table, settings: Settings) -> Stage:
+    """The stage that a table of complete settings describes."""
+    t = _stage_base(settings, "grid") | table
+    filter = filter_from(t["reconstruction"], t["filter_size"], build_screen(settings), t.get("alpha_per_mm2"),
+                         t.get("alpha_per_pixel2"))
+    source = build_source(settings, type=t["source"]) if "source" in t else None
+    return Stage(tuple(t["control"]), t["rays"], t["sampler"], filter, t["blur"], t["apron"], t["iterations"], t["tolerance"],
+                 source, t["oversample"], tuple(t.get("waves", ())), value_of(t, "design.stages.spread"))
+
+
 def build_options(settings: Settings) -> Options:
     """The design options of complete settings."""
     d = settings["design"]
-    dtype = {"float32": torch.float32, "float64": torch.float64}[checks.choice("[design] dtype", d["dtype"],
-                                                                              ("float32", "float64"))]
-    checks.whole("[design] seed", d["seed"], 0, 2**31 - 1)
-    checks.whole("[design] iterations", d["iterations"], 0, 10**9)
-    for key in ("time_limit", "checkpoint_every"):
+    for key in ("dtype", "seed", "iterations"):
+        check(f"design.{key}", d[key])
+    for key in ("time_limit", "checkpoint_every"):  # which may be without end
         if not d[key] > 0:
-            raise InputError(f"[design] {key} must be greater than 0 s, got {d[key]:g}")
+            raise InputError(f"⟨design.{key}⟩ must be greater than 0 s, got {d[key]:g}")
     return Options(d["loss"], d["optimizer"], d["lr"], d["network"], d["initial"], d["preconditioner"],
-                   d["filter_target"], d["seed"], dtype, d["max_slope"], d["min_radius"], d["waves"] == "on")
+                   d["filter_target"], d["seed"], getattr(torch, d["dtype"]), d["max_slope"], d["min_radius"], d["waves"] == "on")

@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from caustic_cli.config import checks
 from caustic_cli.errors import InputError
 from caustic_cli.export.surface import (
     MAX_POINTS,
@@ -31,7 +32,7 @@ from caustic_cli.export.surface import (
     second_derivative_bounds,
 )
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.scene import Lens, Scene, checks
+from caustic_cli.scene import Lens, Scene
 
 STRETCH = 1.28
 #: Height of the flange, as a part of the least height on the rim.
@@ -87,8 +88,8 @@ def _across(field: HeightField, heights: Tensor, samples: tuple[int, int] | None
                 min(s.degree for s in field.spaces) < 2:
             raise InputError("⟨tolerance⟩ of a round mesh needs a surface without kinks; give ⟨samples⟩")
         xx, xy, yy = second_derivative_bounds(field, heights)
-        bend, asked = (max(xx, yy) + xy) * STRETCH**2 / 6.0, f"⟨tolerance⟩ {tolerance:g}"
-        n = math.ceil(2.0 * max(field.half_size) * math.sqrt(bend / tolerance)) + 1 if bend > 0 else 2
+        curvature, asked = (max(xx, yy) + xy) * STRETCH**2 / 6.0, f"⟨tolerance⟩ {tolerance:g}"
+        n = math.ceil(2.0 * max(field.half_size) * math.sqrt(curvature / tolerance)) + 1 if curvature > 0 else 2
         n = max(n, 9)
     if n > min(MAX_SAMPLES, math.isqrt(MAX_POINTS)):
         raise InputError(f"{asked} must ask for at most {math.isqrt(MAX_POINTS)} points across a round lens, got {n}")

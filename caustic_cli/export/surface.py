@@ -25,10 +25,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from caustic_cli.config import checks
 from caustic_cli.errors import InputError
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.scene import checks
 
 #: Equal steps per knot span of the default grid.  With 2 a not-a-knot bicubic is exact already; with 4 a natural one,
 #: whose end conditions are wrong, is good to some micrometres on the screen too.
@@ -96,8 +96,8 @@ def step_within(field: HeightField, heights: Tensor, tolerance: float) -> float:
     """Largest step h, mm, of a triangulated grid with the knots among its lines that is off by at most `tolerance` mm."""
     checks.number("⟨tolerance⟩", tolerance, 0.0, open_low=True)
     xx, xy, yy = second_derivative_bounds(field, heights)
-    bend = xx + 2.0 * xy + yy
-    return math.sqrt(8.0 * tolerance / bend) if bend > 0 else math.inf
+    curvature = xx + 2.0 * xy + yy
+    return math.sqrt(8.0 * tolerance / curvature) if curvature > 0 else math.inf
 
 
 def second_derivative_bounds(field: HeightField, heights: Tensor) -> tuple[float, float, float]:

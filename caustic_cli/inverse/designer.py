@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
+from caustic_cli.config.table import check_all
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse import ranks
 from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
@@ -21,7 +22,7 @@ from caustic_cli.inverse.extended import best_light, regular_rays, shift_of
 from caustic_cli.inverse.limits import within_limits
 from caustic_cli.inverse.losses import parse
 from caustic_cli.inverse.objective import Objective
-from caustic_cli.inverse.parametrisation import INITIAL, NETWORKS, PRECONDITIONERS, FreeHeights, Heights, parametrise
+from caustic_cli.inverse.parametrisation import FreeHeights, Heights, parametrise
 from caustic_cli.inverse.schedule import Stage
 from caustic_cli.inverse.steps import Adam, Newtonlike
 from caustic_cli.inverse.target import grey
@@ -30,7 +31,7 @@ from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.waves import NoWaveImage
-from caustic_cli.scene import Scene, checks
+from caustic_cli.scene import Scene
 
 OPTIMIZERS = ("lbfgs", "adam")
 #: A stage's flatness is judged over so many iterations.
@@ -63,15 +64,9 @@ class Options:
 
     def __post_init__(self):
         parse(self.loss)
-        checks.number("[design] max_slope", self.max_slope, 0.0)
-        checks.number("[design] min_radius", self.min_radius, 0.0)
-        checks.choice("[design] network", self.network, NETWORKS)
-        checks.choice("[design] initial", self.initial, INITIAL)
-        checks.choice("[design] preconditioner", self.preconditioner, PRECONDITIONERS)
-        checks.choice("[design] optimizer", self.optimizer, OPTIMIZERS)
-        checks.number("[design] lr", self.lr, 0.0, open_low=True)
+        check_all("design", self, "max_slope", "min_radius", "network", "initial", "preconditioner", "optimizer", "lr", "seed")
         if self.optimizer == "lbfgs" and self.network != "none":
-            raise InputError("[design] optimizer lbfgs works on the heights themselves (network none);"
+            raise InputError("⟨design.optimizer⟩ lbfgs works on the heights themselves (network none);"
                              " a network needs optimizer adam")
 
 
@@ -114,11 +109,11 @@ class Designer:
             raise InputError("[lens] knots: a lens with knots of its own is designed on its own net; every stage's control"
                              f" must be {list(scene.lens.control)}")
         if any(name == "throughput" for _, name in parse(options.loss)) and not all(s.apron for s in stages):
-            raise InputError("[design] loss: throughput needs dark pixels around the screen that catch stray light; every stage"
+            raise InputError("⟨design.loss⟩: throughput needs dark pixels around the screen that catch stray light; every stage"
                              " needs an apron")
         self.scene, self.target, self.stages, self.options, self.device = scene, target, stages, options, device
         if options.network != "none" and any(s.waves for s in stages):
-            raise InputError("[[design.stages]] waves needs network none: the wave image refines the heights themselves")
+            raise InputError("⟨design.stages.waves⟩ needs network none: the wave image refines the heights themselves")
         for stage in stages:
             self._bounds(stage)  # refuse an impossible lens before any work
 
@@ -203,7 +198,7 @@ class Designer:
             if self._flat(state, stage.tolerance):
                 state.reason = "no progress"
                 return True
-            asked, late = (ranks.agree(said, self.device) for said in (stop(), time.monotonic() >= deadline))
+            asked, late = (ranks.decide(said, self.device) for said in (stop(), time.monotonic() >= deadline))
             if state.total >= limit or asked:
                 state.reason = "interrupted" if asked else "iterations"
                 return False
@@ -264,7 +259,7 @@ class Designer:
         if self.stages[k].control == self.stages[k - 1].control and keep:
             return replace(state, stage=k, iteration=0, optimizer={})
         if self.options.network != "none":
-            raise InputError("[[design.stages]] control cannot change between stages of a network")
+            raise InputError("⟨design.stages.control⟩ cannot change between stages of a network")
         tu, tv = (a.change_of_basis(b) for a, b in zip(self.field(k - 1).spaces, self.field(k).spaces, strict=True))
         return replace(state, stage=k, iteration=0, parameters={}, optimizer={}, heights=tu @ state.heights @ tv.T)
 
@@ -282,10 +277,10 @@ class Designer:
         low, high = lens.height_bounds(x.numpy(), y.numpy())
         screen = self.scene.screen
         if lens.mirror and low.min() <= screen.z + screen.depth:
-            raise InputError(f"[screen] z must lie before the mirror, whose surface may reach {low.min():.4g} mm,"
+            raise InputError(f"⟨screen.z⟩ must lie before the mirror, whose surface may reach {low.min():.4g} mm,"
                              f" got {screen.z:g} mm")
         if not lens.mirror and high.max() >= screen.z - screen.depth:
-            raise InputError(f"[screen] z must lie behind the lens, whose surface may reach {high.max():.4g} mm,"
+            raise InputError(f"⟨screen.z⟩ must lie behind the lens, whose surface may reach {high.max():.4g} mm,"
                              f" got {screen.z:g} mm")
         return torch.from_numpy(low), torch.from_numpy(high)
 

@@ -85,7 +85,7 @@ class _Grid:
         scene = self.scene
         if not scene.source.distant and not light.all():
             options["darkest"] = DARKEST
-        return refracting_surface(light, self.target, scene.lens.half_size, scene.screen.half_size, scene.lens.bend,
+        return refracting_surface(light, self.target, scene.lens.half_size, scene.screen.half_size, scene.lens.effective_index,
                                   scene.screen.z, mean, directions, centre=scene.screen.shift,
                                   start=None if again is None else again.transport.potential, **options)
 
@@ -102,7 +102,7 @@ class _Grid:
         surface = RectBivariateSpline(self.x, self.y, z)
         at = np.broadcast_arrays(self.x[:, None], self.y[None, :])
         u, v, part = thrown(*at, z, surface(self.x, self.y, dx=1), surface(self.x, self.y, dy=1), directions,
-                            lens.bend, screen.z, "none" if lens.fresnel == "none" else "exact")
+                            lens.effective_index, screen.z, "none" if lens.fresnel == "none" else "exact")
         on = (np.abs(u - screen.shift[0]) <= screen.half_size[0]) & (np.abs(v - screen.shift[1]) <= screen.half_size[1])
         return float((light * self.above(z) * _mean(np.where(on, part, 0.0))).sum() / on_lens) if on_lens > 0 else 0.0
 

@@ -2,7 +2,7 @@
 
 Every term is a dimensionless root mean square t; r is the relative residual N (J / P - T / sum T) on N pixels.
 
-    rms         r with P = sum J, eq. 5.2.1.  Light thrown off the screen costs nothing (notes 13).
+    rms         r with P = sum J, eq. 5.2.1.  Light thrown off the screen costs nothing (erratum E13).
     rms-light   r with P = P_out, the power that leaves the lens: every ray counts.
     throughput  t^2 is the part of the light beside the screen, each ray weighted by its distance from it (1 at the apron's rim):
                 it pulls back where rms-light, which sees how much light is out there but not how far, has no slope
@@ -56,11 +56,11 @@ def parse(text: str) -> list[tuple[float, str]]:
         except ValueError:
             value = math.nan
         if not (0.0 <= value < math.inf) or name not in LOSSES + PENALTIES:
-            raise InputError(f"[design] loss must be names with weights such as 'rms-light + 0.1 laplacian', of"
+            raise InputError(f"⟨design.loss⟩ must be names with weights such as 'rms-light + 0.1 laplacian', of"
                              f" {', '.join(LOSSES + PENALTIES)}; got {part.strip()!r}")
         terms.append((value, name))
     if not any(weight > 0 and name in LOSSES for weight, name in terms):
-        raise InputError(f"[design] loss must have one of {', '.join(LOSSES)} with a weight above 0, got {text!r}")
+        raise InputError(f"⟨design.loss⟩ must have one of {', '.join(LOSSES)} with a weight above 0, got {text!r}")
     return terms
 
 

@@ -127,7 +127,7 @@ class Objective:
 
     def _tracers(self) -> Iterator[tuple[int, Tracer]]:
         """This rank's chunks, ready to be traced, each with the number of its point."""
-        rank, count = ranks.place()
+        rank, count = ranks.rank_and_size()
         for k, sampler in enumerate(self.samplers):
             size = min(self.chunk, math.ceil(sampler.count / count)) if count > 1 else self.chunk
             for traced in tracers(self.scene, self.field, sampler, self.dtype, size, part=(rank, count)):
@@ -151,7 +151,7 @@ class Objective:
             try:
                 return self._evaluate(parameters)
             except (MemoryError, RuntimeError) as error:
-                if ranks.place()[1] > 1:  # the others wait for this chunk's image
+                if ranks.rank_and_size()[1] > 1:  # the others wait for this chunk's image
                     raise
                 problem = error.with_traceback(None)  # which would hold all that was allocated
             self.chunk, self.kept = smaller(self.chunk, problem), None
@@ -159,7 +159,7 @@ class Objective:
     def _evaluate(self, given: Parameters) -> Evaluation:
         parameters = {name: heights.detach().to(self.device).clone() for name, heights in given.items()}
         for heights in parameters.values():
-            ranks.share(heights)
+            ranks.broadcast(heights)
             heights.requires_grad_()
         leaves = list(parameters.values())
         penalty = self.penalty(parameters[EXIT]) if self.penalty else torch.zeros((), device=self.device)
@@ -174,7 +174,7 @@ class Objective:
                 leaving, entering = leaving + part[1].detach().double(), entering + traced.entering.double()
                 if self.whole:
                     parts.append((k, part))
-        ranks.add(image, leaving, entering)
+        ranks.all_reduce(image, leaving, entering)
         image, leaving = image.requires_grad_(), leaving.requires_grad_()
         seen = self._spread_out(image)
         loss = self.loss(seen, self._due(seen, leaving), penalty, entering)
@@ -190,7 +190,7 @@ class Objective:
                 for gradient, more in zip(gradients, torch.autograd.grad(values, leaves, by, allow_unused=True), strict=True):
                     if more is not None:
                         gradient += more
-        ranks.add(*gradients)
+        ranks.all_reduce(*gradients)
         for gradient, more in zip(gradients, direct or [None] * len(gradients), strict=True):
             if more is not None:
                 gradient += more

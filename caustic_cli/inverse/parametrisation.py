@@ -20,8 +20,8 @@ import math
 import torch
 from torch import Tensor
 
+from caustic_cli.config import checks
 from caustic_cli.errors import InputError
-from caustic_cli.scene import checks
 
 NETWORKS = ("none", "sparse", "dense")
 INITIAL = ("zero", "uniform", "random")
@@ -29,7 +29,7 @@ PRECONDITIONERS = ("none", "laplacian")
 #: tanh is inverted no closer than this to its limits: raw stays below 8.4 and a gradient remains.
 SATURATION = 1e-7
 UNIFORM_SPREAD = 1e-4  # thesis 6.2.1
-#: Most weights of the dense network: 2 n^4 of them for an n x n net (thesis notes 10); 5e8 are 6 GB with Adam's moments.
+#: Most weights of the dense network: 2 n^4 of them for an n x n net (erratum E10); 5e8 are 6 GB with Adam's moments.
 MAX_DENSE = 500_000_000
 
 
@@ -110,7 +110,7 @@ class NetworkHeights(Heights):
             layers += [(kernel, (kernel, size))]
         else:
             if 2 * size * size > MAX_DENSE:
-                raise InputError(f"[design] network dense needs {2 * size * size:.3g} weights for a {n} x {m} control net;"
+                raise InputError(f"⟨design.network⟩ dense needs {2 * size * size:.3g} weights for a {n} x {m} control net;"
                                  f" at most {MAX_DENSE:.3g} are supported (16000 control points): use sparse or none")
             layers += [(size, (size, size)), (size, (size, size))]
         generator = torch.Generator().manual_seed(seed)
@@ -141,9 +141,9 @@ def parametrise(low: Tensor, high: Tensor, network: str = "none", *, start: Tens
     Raises:
         InputError: an unknown name, a start or a preconditioner given to a network, or a network too large.
     """
-    checks.choice("[design] network", network, NETWORKS)
-    checks.choice("[design] initial", initial, INITIAL)
-    checks.choice("[design] preconditioner", preconditioner, PRECONDITIONERS)
+    checks.choice("⟨design.network⟩", network, NETWORKS)
+    checks.choice("⟨design.initial⟩", initial, INITIAL)
+    checks.choice("⟨design.preconditioner⟩", preconditioner, PRECONDITIONERS)
     if network == "none":
         if start is None and initial != "zero":
             spread = UNIFORM_SPREAD if initial == "uniform" else 1.0
@@ -155,6 +155,6 @@ def parametrise(low: Tensor, high: Tensor, network: str = "none", *, start: Tens
             start = module().detach()
         return FreeHeights(low, high, start, preconditioner == "laplacian")
     if start is not None or preconditioner != "none":
-        raise InputError(f"[design] network {network} begins from its own initial state with preconditioner none;"
+        raise InputError(f"⟨design.network⟩ {network} begins from its own initial state with preconditioner none;"
                          " a start surface or the laplacian preconditioner need network none")
     return NetworkHeights(low, high, network, degree, initial, seed)

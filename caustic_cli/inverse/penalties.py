@@ -39,16 +39,16 @@ class Penalty:
                  device: str | torch.device = "cpu", min_radius: float = 0.0):
         self.terms, self.limit, self.radius = terms, max_slope, min_radius
         if min_radius > 0 and min(s.degree for s in field.spaces) < 2:
-            raise InputError("[design] min_radius needs splines of degree 2 or more, which have a curvature")
+            raise InputError("⟨design.min_radius⟩ needs splines of degree 2 or more, which have a curvature")
         if terms and min(s.degree for s in field.spaces) < 2:
-            raise InputError("[design] loss: laplacian and curvature need splines of degree 2 or more")
+            raise InputError("⟨design.loss⟩: laplacian and curvature need splines of degree 2 or more")
         (su, sv), (rx, ry) = field.spaces, field.half_size
         self.u = [(su.matrix(su.greville, k) / (2.0 * rx) ** k).to(device) for k in range(3)]
         self.v = [(sv.matrix(sv.greville, k) / (2.0 * ry) ** k).T.to(device) for k in range(3)]
         x, y = (c.numpy() for c in field.control_xy())
         offset = scene.lens.offset
         self.base = torch.from_numpy(offset.thickness + offset.sag(x[:, None], y[None, :])).to(device)
-        self.gain = (scene.lens.bend - 1.0) * (scene.screen.z - offset.thickness)
+        self.gain = (scene.lens.effective_index - 1.0) * (scene.screen.z - offset.thickness)
 
     def __bool__(self) -> bool:
         return bool(self.terms) or self.limit > 0 or self.radius > 0

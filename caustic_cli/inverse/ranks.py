@@ -1,6 +1,6 @@
 """One design by several processes (`torchrun`): each rank traces its part of the rays, and images and gradients are summed.
 
-Rank 0 reads, decides, writes and speaks.  The others hear from it what is to be designed and walk through the same loop with
+Rank 0 reads, decides, writes and speaks.  The others receive from it what is to be designed and walk through the same loop with
 the same numbers; only what they trace differs.  Whatever depends on a clock or a signal is rank 0's to say.  In a single
 process every function here does nothing.
 """
@@ -19,7 +19,7 @@ from caustic_cli.errors import CausticError, Interrupted
 
 
 @contextmanager
-def together(device: str) -> Iterator[int]:
+def process_group(device: str) -> Iterator[int]:
     """Meet the other ranks if torchrun started this process, over gloo on CPUs and nccl on GPUs; gives the rank.
 
     Rank 0 lets the others go when its block ends; when it fails, they learn it from their next sum.
@@ -43,49 +43,49 @@ def together(device: str) -> Iterator[int]:
 
 def _say_goodbye(rank: int) -> None:
     if rank == 0:
-        tell(None)
+        send(None)
     dist.destroy_process_group()
 
 
-def place() -> tuple[int, int]:
+def rank_and_size() -> tuple[int, int]:
     """This process' rank, and how many there are."""
     if dist.is_available() and dist.is_initialized():
         return dist.get_rank(), dist.get_world_size()
     return 0, 1
 
 
-def tell(task) -> None:
-    """Rank 0: what the others are to do (`hear`), None for nothing more."""
-    if place()[1] > 1:
+def send(task) -> None:
+    """Rank 0: what the others are to do (`receive`), None for nothing more."""
+    if rank_and_size()[1] > 1:
         _call(dist.broadcast_object_list, [task], 0)
 
 
-def hear():
+def receive():
     """The other ranks: what rank 0 tells."""
     task = [None]
     _call(dist.broadcast_object_list, task, 0)
     return task[0]
 
 
-def add(*tensors: Tensor) -> None:
+def all_reduce(*tensors: Tensor) -> None:
     """Replace each tensor by its sum over all ranks; every rank gets the same bits."""
-    if place()[1] > 1:
+    if rank_and_size()[1] > 1:
         for tensor in tensors:
             _call(dist.all_reduce, tensor)
 
 
-def share(tensor: Tensor) -> None:
+def broadcast(tensor: Tensor) -> None:
     """Replace a tensor by that of rank 0."""
-    if place()[1] > 1:
+    if rank_and_size()[1] > 1:
         _call(dist.broadcast, tensor, 0)
 
 
-def agree(answer: bool, device: str | torch.device = "cpu") -> bool:
+def decide(answer: bool, device: str | torch.device = "cpu") -> bool:
     """Rank 0's answer."""
-    if place()[1] == 1:
+    if rank_and_size()[1] == 1:
         return answer
     said = torch.tensor(int(answer), device=device)
-    share(said)
+    broadcast(said)
     return bool(said)
 
 

@@ -6,14 +6,14 @@ blur halves from stage to stage, so that light always knows which way to go.  Ea
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 
+from caustic_cli.config import checks
+from caustic_cli.config.table import check_all, default
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import SAMPLERS
-from caustic_cli.scene import Source, checks
+from caustic_cli.scene import Source
 
-QUALITIES = ("draft", "standard", "fine")
 #: Rays that take as long as the transform at one wavelength of a scene of usual size.
 RAYS_A_WAVE = 600_000
 
@@ -42,136 +42,21 @@ class Stage:
     rays: int
     sampler: str = "lines"
     filter: Filter = field(default_factory=lambda: Filter("cosine", (3, 3)))
-    blur: float = 0.0
-    apron: int = 0
+    blur: float = default("design.stages.blur")
+    apron: int = default("design.stages.apron")
     iterations: int = 30
     tolerance: float = 2e-3
     source: Source | None = None
-    oversample: int = 1
+    oversample: int = default("design.stages.oversample")
     waves: tuple[float, ...] = ()
-    spread: bool = False
+    spread: bool = default("design.stages.spread")
 
     def __post_init__(self):
-        checks.whole("[[design.stages]] rays", self.rays, 1, 10**12)
-        checks.choice("[[design.stages]] sampler", self.sampler, SAMPLERS)
-        checks.number("[[design.stages]] blur", self.blur, 0.0, 1000.0)
-        checks.whole("[[design.stages]] apron", self.apron, 0, 4096)
-        checks.whole("[[design.stages]] iterations", self.iterations, 0, 10**9)
-        checks.number("[[design.stages]] tolerance", self.tolerance, 0.0, 1.0)
-        checks.whole("[[design.stages]] oversample", self.oversample, 1, 8)
-        for wavelength in self.waves:
-            checks.number("[[design.stages]] waves", wavelength, 100.0, 20_000.0)
+        check_all("design.stages", self, "control", "rays", "blur", "apron", "iterations", "tolerance", "oversample", "waves")
+        checks.choice("⟨design.stages.sampler⟩", self.sampler, SAMPLERS)
 
     @property
     def cost(self) -> float:
         """Of all its iterations, in rays."""
         each = RAYS_A_WAVE * len(self.waves) if self.waves else self.rays
         return self.iterations * (each + 20.0 * self.control[0] * self.control[1])
-
-
-def coarse_to_fine(control: tuple[int, int], degree: tuple[int, int], rays: int, resolution: tuple[int, int],
-                   quality: str = "standard", filter: Filter | None = None, sampler: str = "lines") -> list[Stage]:
-    """The default stages for a picture of `resolution` pixels, ending on `control` points with `rays` rays.
-
-    Blurs are 1/16 of the screen at first and halve down to none.  Control nets have a quarter, half and all of the
-    final knot spans, so knot insertion carries the surface on unchanged when those divide.
-    """
-    checks.choice("⟨quality⟩", quality, QUALITIES)
-    filter = filter or Filter("cosine", (3, 3))
-    early, late = {"draft": (15, 25), "standard": (25, 50), "fine": (40, 120)}[quality]
-    pixels = max(resolution)
-    blurs = [2.0**k * pixels / 250.0 for k in (4, 3, 2, 1, 0, -1)] + [0.0]
-    shrink = [4, 4, 2, 2, 1, 1, 1]
-    fewer = [0.16, 0.16, 0.3, 0.3, 0.64, 1.0, 1.0]
-    stages = []
-    for k, (blur, part, few) in enumerate(zip(blurs, shrink, fewer, strict=True)):
-        net = tuple(min(n, max(p + 1, -(-(n - p) // part) + p)) for n, p in zip(control, degree, strict=True))
-        apron = math.ceil(pixels * (0.12 if blur > 1 else 0.04))
-        stages.append(Stage(net, max(1, int(rays * few)), sampler, filter, round(blur, 6), apron,
-                            late if k == len(blurs) - 1 else early))
-    return stages
-
-
-#: What a quality means after a transport start: knot spans per pixel and their most; rays a pixel in the last stage and their most;
-#: pixels of the render to one of the screen, along each axis, where so many rays fall there; and of each stage its part of the rays
-#: and its iterations.
-REFINEMENT = {
-    "draft": (1.0, 256, 16, 1_000_000, 2, ((1.0, 14),)),
-    "standard": (2.0, 768, 64, 4_000_000, 4, ((0.5, 8), (1.0, 24))),
-    "fine": (2.0, 768, 256, 16_000_000, 4, ((0.125, 15), (0.25, 65), (1.0, 25))),
-}
-#: So many times the iterations where what is refined is seen through a source's blur only.
-LONGER = 3
-#: Source cells of the transport start along the lens: one to so many rays of the last stage, within bounds.
-RAYS_PER_CELL, LEAST_CELLS, MOST_CELLS = 4, 256, 1024
-LEAST_SPANS = 32
-LEAST_RAYS = 40_000
-
-
-def refinement_spans(pixels: int, quality: str) -> int:
-    """Knot spans along each axis of the lens for a screen of so many pixels: finer than the picture."""
-    checks.choice("⟨quality⟩", quality, QUALITIES)
-    density, most, *_ = REFINEMENT[quality]
-    return min(most, max(LEAST_SPANS, round(density * pixels)))
-
-
-def transport_cells(rays: int, scattered: bool) -> int:
-    """Source cells along the lens of a transport start that so many rays refine.
-
-    What a cell leaves bright or dark shows as stripes where the picture is dark, and takes many iterations to smooth.
-    """
-    return min(MOST_CELLS, max(LEAST_CELLS, round(math.sqrt(rays * (4 if scattered else 1)) / RAYS_PER_CELL)))
-
-
-def refinement(control: tuple[int, int], rays: int | None, resolution: tuple[int, int], quality: str = "standard",
-               filter: Filter | None = None, scattered: bool = False, spread: bool = False) -> list[Stage]:
-    """The default stages after a transport start, whose surface has every scale right already: full detail at once.
-
-    Rays stand in a regular grid: under a smooth filter, which the render's finer pixels leave narrow, such sums are far more exact
-    than those over random rays, whose noise a lens learns.
-
-    Args:
-        rays: of the last stage, None for what the quality says.
-        scattered: the source's rays have to be intersected one by one: take a quarter of them.
-        spread: as of a stage; the light that the source spreads beside the screen is no error there.
-    """
-    checks.choice("⟨quality⟩", quality, QUALITIES)
-    _, _, each, most, finer, plan = REFINEMENT[quality]
-    pixels = resolution[0] * resolution[1]
-    rays = rays or max(LEAST_RAYS, min(most, each * pixels) // (4 if scattered else 1))
-    finer = max(1, min(finer, math.isqrt(rays // pixels)))
-    filter, apron = filter or Filter("cosine", (3, 3)), 0 if spread else math.ceil(0.04 * max(resolution))
-    stages = []
-    for part, iterations in plan:
-        stages.append(Stage(control, max(1, round(part * rays)), "grid", filter, 0.0, apron,
-                            LONGER * iterations if spread else iterations, oversample=finer, spread=spread))
-    return stages
-
-
-#: What a quality means for the refinement on the wave image: wavelengths of white light, iterations of each stage, and how many
-#: seconds `waves = "auto"` may take for it on two cores.
-WAVES = {
-    "draft": (3, (10,), 8.0),
-    "standard": (5, (12, 20), 25.0),
-    "fine": (8, (30, 30), 90.0),
-}
-#: Seconds on two cores for one sample of the field in one iteration: at each wavelength, and for the spline there.
-SECONDS_A_SAMPLE, SECONDS_A_POINT = 2.2e-8, 6e-8
-#: Fewer iterations than these are not worth an exact trace.
-LEAST_WAVES = 5
-
-
-def wave_refinement(samples: float, wavelengths: int, quality: str = "standard", hurry: bool = True) -> list[tuple[int, int]]:
-    """Stages on the wave image after those on rays: (wavelengths of white light, iterations) each.
-
-    Args:
-        samples: of the field at one wavelength.
-        wavelengths: of the source; 0 for white light.
-        hurry: keep within the quality's time, with fewer iterations or none at all.
-    """
-    checks.choice("⟨quality⟩", quality, QUALITIES)
-    count, plan, seconds = WAVES[quality]
-    each = samples * (SECONDS_A_SAMPLE * (wavelengths or count) + SECONDS_A_POINT)
-    part = min(1.0, seconds / (each * sum(plan))) if hurry else 1.0
-    stages = [(count, int(part * n)) for n in plan]
-    return [s for s in stages if s[1] >= LEAST_WAVES]

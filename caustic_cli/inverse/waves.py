@@ -76,7 +76,7 @@ class WaveObjective:
         self.loss = (ColorLoss if scene.colored else Loss)(loss, wide, blur, apron, wide > 0)
         self.penalty = penalty_of(scene, field, loss, max_slope, min_radius, device)
         lines = lines_of(scene, field, None if scene.light.wavelengths else wavelengths or None)
-        rank, count = ranks.place()
+        rank, count = ranks.rank_and_size()
         parameters = {EXIT: self.middle}
         with torch.no_grad():
             receiver = receiver_of(lines[0].system, screen)
@@ -107,7 +107,7 @@ class WaveObjective:
             NoLight: no light reaches the screen.
         """
         heights = heights.detach().to(self.middle).clone()
-        ranks.share(heights)
+        ranks.broadcast(heights)
         heights.requires_grad_()
         penalty = self.penalty(heights) if self.penalty else torch.zeros((), dtype=torch.float64, device=heights.device)
         moved = [self._moved(front, heights - self.middle) for front in self.fronts]
@@ -122,7 +122,7 @@ class WaveObjective:
                 self._channel(image, part)[...] += part.line.part * found.detach().double()
                 self._channel(leaving, part)[...] += part.line.part * part.power
                 seen.append(found if self.whole else None)
-        ranks.add(image, leaving)
+        ranks.all_reduce(image, leaving)
         image.requires_grad_()
         loss = self.loss(image, leaving, penalty)
         by_image, direct = torch.autograd.grad(loss, (image, heights), allow_unused=True) if penalty.requires_grad else \
@@ -134,7 +134,7 @@ class WaveObjective:
             pull = part.line.part * self._channel(by_image, part)
             by_moved[id(part.front)] += torch.autograd.grad(found, z, pull.to(found.dtype))[0]
         gradient = torch.autograd.grad(moved, heights, list(by_moved.values()))[0] if moved else torch.zeros_like(heights)
-        ranks.add(gradient)
+        ranks.all_reduce(gradient)
         if direct is not None:
             gradient = gradient + direct
         a = self.apron

@@ -14,11 +14,13 @@ import torch
 from scipy.interpolate import RectBivariateSpline
 from torch import Tensor
 
+from caustic_cli.config.table import TABLE
 from caustic_cli.errors import InputError
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.scene.lens import MAX_CONTROL
 
+#: Most control points along one axis of a surface.
+MAX_CONTROL = int(TABLE["lens.control"].high)
 #: Kinds of file, by suffix.
 SUFFIXES = (".npz", ".step", ".stp", ".npy")
 #: Relative difference up to which two lengths, or poles and Greville abscissae, are the same.

@@ -31,8 +31,8 @@ class Bounds:
     """See above.  angles in rad; slope without unit; heights mm.
 
     incidence: the most that rays lean from z before the entrance; inside: behind it; slope: of the surface; lean: that of the
-    microfacets' normals; index: the largest of all wavelengths; critical: n sin i, total reflection is impossible below 1; climb: L
-    times the tangent of the direction in which rays leave, a secondary intersection is impossible below 1; reach: how far rays get
+    microfacets' normals; index: the largest of all wavelengths; critical: n sin i, total reflection is impossible below 1;
+    slope_ratio: of the slope bound to the exit ray's slope, a secondary intersection is impossible below 1; reach: how far rays get
     to the aperture's edge, in parts of its half width, at the greatest height; ghost: part of the power that is reflected twice
     inside; polarised: of unpolarised light, how much the exit's reflectance changes by what the entrance makes of s and p;
     resolution: what diffraction, source and pixels let it show.
@@ -44,7 +44,7 @@ class Bounds:
     lean: float
     index: float
     critical: float
-    climb: float
+    slope_ratio: float
     reach: float
     ghost: float
     polarised: float
@@ -65,10 +65,10 @@ def bounds_of(scene: Scene, field: HeightField, heights: Tensor) -> Bounds:
     else:
         critical = most * math.sin(min(i, math.pi / 2.0))
         out = inside + math.asin(critical) - i if critical < 1.0 else math.pi / 2.0
-    climb = slope * math.tan(out) if out < math.pi / 2.0 else (math.inf if slope > 0 else 0.0)
+    slope_ratio = slope * math.tan(out) if out < math.pi / 2.0 else (math.inf if slope > 0 else 0.0)
     reach = _reach(scene, inside, float(heights.min()), float(heights.max()))
     ghost, polarised = _ghost(scene, field, heights, inside, most), _polarised(incidence, critical, most)
-    return Bounds(incidence, inside, slope, lean, most, critical, climb, reach, ghost, polarised,
+    return Bounds(incidence, inside, slope, lean, most, critical, slope_ratio, reach, ghost, polarised,
                   Resolution.at(scene, field, heights))
 
 

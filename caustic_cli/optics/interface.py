@@ -7,7 +7,7 @@ ratio eta = n_in / n_out and c = d . N, the refracted unit direction is
 
 Snell's law (eq. 2.1.10) without normalising anything; a negative radicand is total internal reflection.  gamma is
 (s - eta c) / |N|^2 without its cancellation: an index close to 1 bends light by n - 1, of which a difference leaves nothing.
-For a plane wave along +z inside a lens it is the closed form of 3.2 (thesis notes 1) with s = S.
+For a plane wave along +z inside a lens it is the closed form of 3.2 (erratum E1) with s = S.
 
 Light that meets the surface from above (side -1) does what light from below does at the surface's mirror image in z = 0.
 """

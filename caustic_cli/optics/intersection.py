@@ -24,10 +24,10 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from caustic_cli.config import checks
 from caustic_cli.optics.backends import backend_for
-from caustic_cli.optics.surfaces.base import SECOND, Hit, Surface
+from caustic_cli.optics.surfaces.base import SECOND, Surface, SurfaceIntersection
 from caustic_cli.optics.tolerances import FEW_ULP, FINEST, LEAST_COSINE, MOST_PROBES, MOST_STEPS
-from caustic_cli.scene import checks
 
 METHODS = ("newton", "mesh", "mesh+newton")
 
@@ -58,12 +58,12 @@ class Method:
         checks.choice("intersection method", self.name, METHODS)
 
 
-def meet_any(surface: Surface, heights: Tensor | None, origin, direction, side: float) -> Hit:
+def meet_any(surface: Surface, heights: Tensor | None, origin, direction, side: float) -> SurfaceIntersection:
     """`Surface.meet` for any surface, in plain torch."""
     t, status = reference(surface, heights, origin, direction, side)
     found = status == Status.HIT
     t, gx, gy = attach(surface, heights, origin, direction, t, found)
-    return Hit(t, gx, gy, found)
+    return SurfaceIntersection(t, gx, gy, found)
 
 
 def attach(surface: Surface, heights: Tensor | None, origin, direction, t: Tensor, found: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -10,7 +10,7 @@ from typing import TypeVar
 
 import torch
 
-from caustic_cli.errors import CausticError, is_shortage
+from caustic_cli.errors import CausticError, is_out_of_memory
 
 #: Fewer rays at a time than these save nothing that matters.
 LEAST = 1 << 14
@@ -24,7 +24,7 @@ def smaller(chunk: int, problem: BaseException) -> int:
         CausticError: it is too small already.
         BaseException: `problem` itself, if it is not about memory.
     """
-    if not is_shortage(problem):
+    if not is_out_of_memory(problem):
         raise problem
     if chunk <= LEAST:
         raise CausticError(f"out of memory, even with {chunk:,} rays at a time; a smaller ⟨control⟩ or ⟨resolution⟩ needs"

@@ -22,7 +22,7 @@ from caustic_cli.scene import Scene
 
 @dataclass(frozen=True)
 class Plan:
-    """effects, a verdict on each of EFFECTS; scene, what to trace; requests, how."""
+    """effects, a decision on each of EFFECTS; scene, what to trace; requests, how."""
 
     effects: tuple[Decision, ...]
     scene: Scene
@@ -63,14 +63,14 @@ def compile_plan(scene: Scene, field: HeightField, heights: Tensor, wanted: Iter
             no image stays on.
     """
     bounds = bounds_of(scene, field, heights)
-    verdicts = [effect.judge(scene, bounds) for effect in EFFECTS]
+    decisions = [effect.judge(scene, bounds) for effect in EFFECTS]
     if wanted is not None:
         chosen = frozenset(wanted)
-        verdicts = [v if (v.name in chosen) == v.on or v.fixed else
+        decisions = [v if (v.name in chosen) == v.on or v.fixed else
                     replace(v, on=not v.on, why=f"{'asked for' if not v.on else 'left out as asked'}; by itself"
-                            f" {'off' if not v.on else 'on'}: {v.why}") for v in verdicts]
+                            f" {'off' if not v.on else 'on'}: {v.why}") for v in decisions]
     traced, requests = scene, NO_REQUESTS
-    for effect, verdict in zip(EFFECTS, verdicts, strict=True):
-        traced = effect.within(traced) if verdict.on else effect.without(traced)
-        requests |= effect.request(scene, verdict.on, bounds)
-    return Plan(tuple(verdicts), traced, requests)
+    for effect, decision in zip(EFFECTS, decisions, strict=True):
+        traced = effect.within(traced) if decision.on else effect.without(traced)
+        requests |= effect.request(scene, decision.on, bounds)
+    return Plan(tuple(decisions), traced, requests)

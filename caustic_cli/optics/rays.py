@@ -7,7 +7,7 @@ Notation, a ray of N
     path    optical path length, the sum of n t over the media behind it, mm
     E       unit vector of the field of linearly polarised light, normal to d; None where that is not asked for
 
-Components of o, d and E are (N,) tensors, or plain floats where all rays share them: the products with 0 and 1 of a plane wave
+Components of o, d and E are (N,) tensors, or plain floats where all rays flux them: the products with 0 and 1 of a plane wave
 are then never computed.  Sources emit such rays, every element hands them on, screens collect them.
 """
 
@@ -114,7 +114,7 @@ class RayState:
         x, y = (2.0 * sample.u - 1.0) * rx, (2.0 * sample.v - 1.0) * ry
         if sample.tensor:
             x, y = x[:, None], y[None, :]
-        return cls((x, y, z), (0.0, 0.0, 1.0), sample.share, sample=sample)
+        return cls((x, y, z), (0.0, 0.0, 1.0), sample.flux, sample=sample)
 
     def spread(self) -> RayState:
         """The same with x, y and power (N,): of a sample they are rows, columns and a number until rays go their own ways."""

@@ -6,9 +6,9 @@ Notation, in pixels (w = 1)
     v        filter size, odd;  r = (v - 1) / 2
     d_k      distance k + 1/2 - phi from the centre of pixel i0 + k, k = -r..r
 
-Every ray's shares are normalised over its v x v pixels, so its weight is conserved.  Rays in the r ghost pixels around
-the frame still reach into it; their shares reach 2 r pixels out, so the image is accumulated on a frame padded by 2 r
-and cropped (thesis notes 7 and 8).  What falls on the padding is counted as lost, never renormalised.
+Every ray's weights are normalised over its v x v pixels, so its weight is conserved.  Rays in the r ghost pixels around
+the frame still reach into it; their weights reach 2 r pixels out, so the image is accumulated on a frame padded by 2 r
+and cropped (errata E7 and E8).  What falls on the padding is counted as lost, never renormalised.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Filter:
     Args:
         kind: bincount, gaussian (truncated, C0: eq. 4.4.5) or cosine (raised cosine, C1).
         size: (v_x, v_y) pixels, odd; 1 is bincount along that axis.
-        alpha: (alpha_x, alpha_y) of the Gaussian per pixel squared; alpha per mm^2 times w^2 (thesis notes 15).
+        alpha: (alpha_x, alpha_y) of the Gaussian per pixel squared; alpha per mm^2 times w^2 (erratum E15).
     """
 
     kind: str = "bincount"
@@ -54,7 +54,7 @@ class Filter:
         """Pixels a share can travel from the ray's own, (r_x, r_y)."""
         return (0, 0) if self.kind == "bincount" else ((self.size[0] - 1) // 2, (self.size[1] - 1) // 2)
 
-    def shares(self, phi: Tensor, axis: int) -> Tensor:
+    def weights(self, phi: Tensor, axis: int) -> Tensor:
         """Shares of a ray at sub-pixel position phi (...) among its v pixels along an axis: (..., v), sum 1."""
         r = self.reach[axis]
         v = 2 * r + 1
@@ -77,13 +77,13 @@ class Filter:
         return f / f.sum(-1, keepdim=True)
 
     def kernel(self, axis: int) -> Tensor:
-        """Mean shares of rays spread evenly over a pixel: (v,), float64, sum 1.
+        """Mean weights of rays spread evenly over a pixel: (v,), float64, sum 1.
 
         Convolving a target with it gives the image a perfect lens would render: both sides of a loss, filtered alike.
         """
         fine = 512
         phi = (torch.arange(fine, dtype=torch.float64) + 0.5) / fine
-        return self.shares(phi, axis).mean(0)
+        return self.weights(phi, axis).mean(0)
 
     def smooth(self, image: Tensor) -> Tensor:
         """`image` (n_x, n_y) as this filter would render it; light that leaves the frame is lost."""
@@ -105,7 +105,7 @@ def splat(x: Tensor, y: Tensor, weight: Tensor, screen: Screen, filter: Filter) 
         weight.sum().
     """
     x, y, weight = x.reshape(-1), y.reshape(-1), weight.reshape(-1)
-    first, shares, inside = [], [], None
+    first, weights, inside = [], [], None
     for axis, at in ((0, x), (1, y)):
         n, r = screen.resolution[axis], filter.reach[axis]
         at = (at - screen.low[axis]) / screen.pixel[axis]
@@ -113,15 +113,15 @@ def splat(x: Tensor, y: Tensor, weight: Tensor, screen: Screen, filter: Filter) 
         at = torch.where(near, at, torch.zeros_like(at))
         i0 = at.detach().floor()
         first.append(i0.long() + r)  # index of the first share on the padded frame, whose origin is -2 r
-        shares.append(filter.shares(at - i0, axis))
+        weights.append(filter.weights(at - i0, axis))
         inside = near if inside is None else inside & near
     kept = torch.where(inside, weight, torch.zeros_like(weight))
     (nx, ny), (rx, ry) = screen.resolution, filter.reach
     shape = (nx + 4 * rx, ny + 4 * ry)
     padded = torch.zeros(shape[0] * shape[1], dtype=torch.float64, device=x.device)  # float32 stops counting at 2^24 rays
-    for k in range(shares[0].shape[1]):
-        at = ((first[0] + k) * shape[1] + first[1])[:, None] + torch.arange(shares[1].shape[1], device=x.device)
-        part = (kept * shares[0][:, k])[:, None] * shares[1]
+    for k in range(weights[0].shape[1]):
+        at = ((first[0] + k) * shape[1] + first[1])[:, None] + torch.arange(weights[1].shape[1], device=x.device)
+        part = (kept * weights[0][:, k])[:, None] * weights[1]
         padded = padded.scatter_add(0, at.reshape(-1), part.reshape(-1).double())
     padded = padded.view(shape)
     image = padded[2 * rx : 2 * rx + nx, 2 * ry : 2 * ry + ny]

@@ -6,7 +6,7 @@ chunks, on the device or on the number of threads, and any ray can be traced aga
     grid        centres of nu x nv equal cells
     lines       a grid whose columns and rows are each shifted at random within their cell: fresh rays that keep the
                 tensor-product structure which makes a spline surface cheap to evaluate
-    stratified  one ray anywhere in each cell (the perturbed grid of 4.2.1, kept inside [0, 1]: thesis notes 9)
+    stratified  one ray anywhere in each cell (the perturbed grid of 4.2.1, kept inside [0, 1]: erratum E9)
     uniform     independent rays
     sobol       a scrambled Sobol sequence (torch's), which fills the square more evenly than chance
 """
@@ -124,13 +124,13 @@ def spread(seed: int, start: int, stop: int, shape: tuple[int, int], stratified:
 class Sample:
     """Some rays of a sampler: the points (u_k, v_k), or with `tensor` all pairs (u_a, v_b), a fastest last.
 
-    `share` is each ray's part of the source's power, a scalar or one value a ray (shape of the ray grid).
+    `flux` is each ray's part of the source's power, a scalar or one value a ray (shape of the ray grid).
     """
 
     u: Tensor
     v: Tensor
     tensor: bool
-    share: Tensor
+    flux: Tensor
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -174,7 +174,7 @@ class Sampler:
         return self.shape[0] * self.shape[1]
 
     def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[Sample]:
-        """The rays in order, at most about `size` at a time; shares over all chunks sum to 1.
+        """The rays in order, at most about `size` at a time; fluxes over all chunks sum to 1.
 
         With `step`, only every step-th chunk from number `first` on: the part of one of several processes.
         """
@@ -182,11 +182,11 @@ class Sampler:
         if not even:
             total = sum(float(self._irradiance(s).sum()) for s in self._points(size))
             if not total > 0:
-                raise InputError("[source] profile: every ray fell where it is black; use more rays")
+                raise InputError("⟨source.profile⟩: every ray fell where it is black; use more rays")
             norm = 1.0 / total
         for s in self._points(size, first, step):
-            share = torch.tensor(norm, dtype=torch.float64) if even else norm * self._irradiance(s)
-            yield Sample(s.u, s.v, s.tensor, share.to(self.device))
+            flux = torch.tensor(norm, dtype=torch.float64) if even else norm * self._irradiance(s)
+            yield Sample(s.u, s.v, s.tensor, flux.to(self.device))
 
     def _points(self, size: int, first: int = 0, step: int = 1) -> Iterator[Sample]:
         nu, nv = self.shape

@@ -14,12 +14,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
+from caustic_cli.config import checks
+from caustic_cli.config.table import TABLE
 from caustic_cli.errors import InputError
 from caustic_cli.optics.frames import Pose
 from caustic_cli.optics.surfaces import HeightField, Plane, Surface
 from caustic_cli.optics.tolerances import PARALLEL
-from caustic_cli.scene import Aperture, Light, Pupil, Scene, Screen, Source, checks
-from caustic_cli.scene.lens import FRESNEL
+from caustic_cli.scene import Aperture, Light, Pupil, Scene, Screen, Source
 from caustic_cli.scene.materials import refractive_index
 
 INTERACTIONS = ("refract", "reflect")
@@ -76,7 +77,7 @@ class Element:
 
     def __post_init__(self):
         checks.choice("interaction", self.interaction, INTERACTIONS)
-        checks.choice("fresnel", self.fresnel, FRESNEL)
+        checks.choice("fresnel", self.fresnel, TABLE["lens.fresnel"].choices)
         checks.number("roughness", self.roughness, 0.0, 1.0)
 
     @property

@@ -37,7 +37,7 @@ from caustic_cli.optics.memory import with_less
 from caustic_cli.optics.rays import LOSSES, RayState, Status
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sample
-from caustic_cli.optics.surfaces import HeightField, Hit
+from caustic_cli.optics.surfaces import HeightField, SurfaceIntersection
 from caustic_cli.optics.system import EXIT, Element, Placed, System
 from caustic_cli.scene import Light, PlaneWave, Points, Scene, Screen
 
@@ -199,7 +199,7 @@ class Tracer:
         if hit is None:
             hit = prepared(heights) if prepared else element.surface.meet(heights, o, d, m.side)
         if state.power.dtype != self.dtype:  # the first surface is met in float64 whatever follows
-            state, hit = state.to(self.dtype), Hit(*(_cast(c, self.dtype) for c in hit[:3]), hit.found)
+            state, hit = state.to(self.dtype), SurfaceIntersection(*(_cast(c, self.dtype) for c in hit[:3]), hit.found)
             o, d = (tuple(_cast(c, self.dtype) for c in v) for v in (o, d))
         m.local, m.incoming, m.slopes, m.length = advanced(o, d, hit.t), d, (hit.gx, hit.gy), hit.t
         if prepared is None or state.sample is None:  # a sample stands on the surface
@@ -262,7 +262,8 @@ class Tracer:
 
     @cached_property
     def meets(self):
-        """How the rays of `start` meet the first free surface: a function of its heights to `Hit`s; None for the general way."""
+        """The intersections of the rays of `start` with the first free surface as a function of its heights; None for the general
+        way."""
         if self.first == len(self.system.elements) or self.requests.off & {"intersection"}:
             return None
         element, start = self.system.elements[self.first], self.start
@@ -277,10 +278,11 @@ class Tracer:
         if on_axis and centred and surface.half_size == pupil.half_size:
             evaluate = self.backend.spline_on(surface, start.sample, self.dtype)
 
-            def sampled(heights: Tensor) -> Hit:
+            def sampled(heights: Tensor) -> SurfaceIntersection:
                 sag, gx, gy = evaluate(surface.centred(heights)[0])
                 below = start.origin[2] - pz - float(heights.detach().double().mean()) - start.datum
-                return Hit(sag - below, gx, gy, torch.ones((), dtype=torch.bool, device=sag.device).expand(sag.shape))
+                found = torch.ones((), dtype=torch.bool, device=sag.device).expand(sag.shape)
+                return SurfaceIntersection(sag - below, gx, gy, found)
 
             return sampled
         spread = start.spread()
@@ -465,8 +467,8 @@ def check_room(scene: Scene, heights: Tensor, screen: Screen) -> None:
     lean = f" and its tilt takes it {screen.depth:.4g} mm nearer" if screen.depth else ""
     if scene.lens.mirror:
         if float(heights.min()) <= screen.z + screen.depth:
-            raise InputError(f"[screen] z must lie before the mirror, whose surface reaches {float(heights.min()):.6g} mm,"
+            raise InputError(f"⟨screen.z⟩ must lie before the mirror, whose surface reaches {float(heights.min()):.6g} mm,"
                              f" got {screen.z:g} mm{lean}")
     elif float(heights.max()) >= screen.z - screen.depth:
-        raise InputError(f"[screen] z must lie behind the lens, whose surface reaches {float(heights.max()):.6g} mm,"
+        raise InputError(f"⟨screen.z⟩ must lie behind the lens, whose surface reaches {float(heights.max()):.6g} mm,"
                          f" got {screen.z:g} mm{lean}")

@@ -38,14 +38,14 @@ def check(path: Path, force: bool) -> None:
         return
     if not path.is_dir():
         raise InputError(f"{path}: exists and is not a directory; -o DIR chooses another place")
-    if not is_project(path) and not all(_of_a_birth(p) for p in path.iterdir()):
+    if not is_project(path) and not all(_of_a_new_project(p) for p in path.iterdir()):
         raise InputError(f"{path}: exists and is not a caustic project; -o DIR chooses another place")
     if is_project(path) and not force:
         raise InputError(f"{path}: holds a design already, of another picture or other options; ⟨resume⟩ goes on with it,"
                          " ⟨force⟩ begins anew, -o DIR chooses another place")
 
 
-def _of_a_birth(path: Path) -> bool:
+def _of_a_new_project(path: Path) -> bool:
     """Whether a file is what a project begins with: one may have been killed before its project.toml was written."""
     return path.is_file() and (path.name.startswith((".target.", ".profile.", ".source", ".intensity", ".project.toml."))
                                or (path.stem in ("target", "profile") and is_ours(path))
@@ -65,7 +65,7 @@ def settle(project: Project, force: bool) -> None:
     check(path, force)
     try:
         if path.exists():
-            project.hold.enter_context(held(path))
+            project.hold.enter_context(locked(path))
             for name in MADE:
                 (path / name).unlink(missing_ok=True)
             project.write(path)
@@ -73,24 +73,24 @@ def settle(project: Project, force: bool) -> None:
         for left in path.parent.glob(".*.caustic-new"):
             if time.time() - left.stat().st_mtime > LEFT_BEHIND:
                 shutil.rmtree(left, ignore_errors=True)
-        cradle = Path(tempfile.mkdtemp(suffix=".caustic-new", prefix=".", dir=path.parent))
+        staging = Path(tempfile.mkdtemp(suffix=".caustic-new", prefix=".", dir=path.parent))
         try:
             umask = os.umask(0)
             os.umask(umask)
-            cradle.chmod(0o777 & ~umask)
-            project.hold.enter_context(held(cradle))
-            project.write(cradle)
-            os.rename(cradle, path)
+            staging.chmod(0o777 & ~umask)
+            project.hold.enter_context(locked(staging))
+            project.write(staging)
+            os.rename(staging, path)
         except BaseException:
             project.hold.close()
-            shutil.rmtree(cradle, ignore_errors=True)
+            shutil.rmtree(staging, ignore_errors=True)
             raise
     except OSError as error:
         raise InputError(f"{path}: cannot be written to ({error.strerror}); -o DIR chooses another place") from error
 
 
 @contextlib.contextmanager
-def held(directory: Path) -> Iterator[None]:
+def locked(directory: Path) -> Iterator[None]:
     """Hold a directory alone, until the block or the process ends.
 
     Raises:

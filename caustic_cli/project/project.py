@@ -6,15 +6,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from caustic_cli.config import settings
-from caustic_cli.config.completion import Settings, build_options, build_stages, complete
-from caustic_cli.errors import InputError
+from caustic_cli.config.completion import build_options, build_stages, complete
+from caustic_cli.config.settings import Settings
+from caustic_cli.errors import InputError, plain
 from caustic_cli.inverse.target import target_on_screen
 from caustic_cli.io.files import write_bytes
 from caustic_cli.io.picture import Picture, read_picture
@@ -42,11 +45,12 @@ def beside(path: Path) -> Path:
 class Project:
     """An opened project: its directory, complete settings, target picture and source profile.
 
-    asked: digest of what its user gave (`reuse`); found: the checkpoint, where the same had been asked for before; hold: what
-    lets go of the directory when the design that works there is done; without_waves: see `derive`.
+    path: None of one that is in memory alone; on_disk: whether its settings were read from there; asked: digest of what its user
+    gave (`uptodate`); found: the checkpoint, where the same had been asked for before; hold: what lets go of the directory when the
+    design that works there is done; without_waves: see `config.completion.without_waves`.
     """
 
-    path: Path
+    path: Path | None
     settings: Settings
     picture: Picture
     profile: Picture | None = None
@@ -54,6 +58,7 @@ class Project:
     found: Checkpoint | None = None
     hold: ExitStack = field(default_factory=ExitStack, repr=False)
     without_waves: str = ""
+    on_disk: bool = False
 
     @classmethod
     def open(cls, path: str | Path) -> Project:
@@ -79,30 +84,32 @@ class Project:
             given["source"] = attachments.attached(light, path)
             full = complete(given, picture.aspect)
             build_stages(full), build_options(full)  # a project whose design is impossible is not opened for its lens either
-            return cls(path, full, picture, _picture(path, profile, True) if profile else None)
+            return cls(path, full, picture, _picture(path, profile, True) if profile else None, on_disk=True)
         except InputError as error:
-            raise InputError(f"{path / TOML}: {error}") from error
+            raise InputError(f"{path / TOML}: {error!s}") from error
 
-    def scene(self, given: dict[tuple[str, str, str], object] | None = None) -> Scene:
-        """The scene it describes; `given`, (section, key, option) -> value, replaces some of its settings."""
+    def error(self, words: str) -> InputError:
+        """An error about its settings, which names the file if they are in one."""
+        return InputError(f"{self.path / TOML}: {plain(words)}" if self.on_disk else words)
+
+    def scene(self, given: Mapping[str, Any] | None = None) -> Scene:
+        """The scene it describes; `given`, path -> value, replaces some of its settings."""
         profile = None if self.profile is None else self.profile.irradiance()
         if not given:
             try:
                 return settings.build_scene(self.settings, profile)
             except InputError as error:
-                raise InputError(f"{self.path / TOML}: {error}") from error
+                raise self.error(f"{error}") from error
         changed = {section: dict(values) for section, values in self.settings.items()}
         before = changed["source"]["type"]
-        for (section, key, _), value in given.items():
+        for path, value in given.items():
+            section, _, key = path.rpartition(".")
             changed[section][key] = value
-        _change(changed["source"], before, {key for section, key, _ in given if section == "source"})
+        _change(changed["source"], before, {path.rpartition(".")[2] for path in given if path.startswith("source.")})
         settings.refuse_unused(changed["source"], given)
         if changed["source"]["type"] not in sources.used_by("profile"):
             changed["source"].pop("profile", None)
-        try:
-            return settings.build_scene(complete(changed, self.picture.aspect), profile)
-        except InputError as error:
-            raise InputError(settings.as_options(f"{error}", given)) from error
+        return settings.build_scene(complete(changed, self.picture.aspect), profile)
 
     def target(self, scene: Scene) -> np.ndarray:
         """The picture on the scene's screen, (n_x, n_y), or (3, n_x, n_y) of a coloured one."""
@@ -131,11 +138,11 @@ class Project:
         field = HeightField(state.spaces, scene.lens.half_size)
         degree = tuple(s.degree for s in state.spaces)
         if degree != scene.lens.degree:
-            raise InputError(f"{self.path / TOML}: [lens] degree {list(scene.lens.degree)} is not that of the designed lens,"
+            raise self.error(f"⟨lens.degree⟩ {list(scene.lens.degree)} is not that of the designed lens,"
                              f" {list(degree)}; design again to change it")
         done = state.state.stage == len(self.settings["design"]["stages"]) - 1
         if done and field.shape != scene.lens.control:
-            raise InputError(f"{self.path / TOML}: [lens] control {list(scene.lens.control)} is not that of the designed lens,"
+            raise self.error(f"⟨lens.control⟩ {list(scene.lens.control)} is not that of the designed lens,"
                              f" {list(field.shape)}; design again to change it")
         return field, state
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from caustic_cli import __version__
 from caustic_cli.config import settings
-from caustic_cli.config.completion import Settings
+from caustic_cli.config.settings import Settings
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.io.files import write_bytes
 from caustic_cli.io.picture import Picture

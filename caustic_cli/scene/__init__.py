@@ -45,10 +45,10 @@ class Scene:
     def __post_init__(self):
         if not self.lens.mirror and self.screen.z <= self.lens.z_in:
             raise InputError(
-                f"[screen] z must lie behind the lens (beyond z_in = {self.lens.z_in:g} mm), got {self.screen.z:g} mm"
+                f"⟨screen.z⟩ must lie behind the lens (beyond z_in = {self.lens.z_in:g} mm), got {self.screen.z:g} mm"
             )
         if self.source.nearest >= self.lens.z_in:
-            raise InputError(f"[source] position must lie before the lens (z below z_in = {self.lens.z_in:g} mm),"
+            raise InputError(f"⟨source.position⟩ must lie before the lens (z below z_in = {self.lens.z_in:g} mm),"
                              f" got z = {self.source.nearest:g} mm")
         if self.dispersive:
             for wavelength in self.light.wavelengths:
@@ -70,7 +70,7 @@ class Scene:
         return self.light.color
 
     @property
-    def apiece(self) -> tuple[Scene, ...]:
+    def by_source(self) -> tuple[Scene, ...]:
         """The scene in the light of each of its sources alone."""
         if len(self.source.members) == 1:
             return (self,)
@@ -82,8 +82,9 @@ class Scene:
     def bands(self) -> tuple[Band, ...]:
         """What has to be traced apart, by source, wavelength and polarisation: the scene itself where one trace says it all."""
         if len(self.source.members) > 1:
-            return tuple(replace(band, weight=share * band.weight, member=k)
-                         for k, (one, share) in enumerate(zip(self.apiece, self.source.shares, strict=True)) for band in one.bands)
+            each = zip(self.by_source, self.source.fractions, strict=True)
+            return tuple(replace(band, weight=fraction * band.weight, member=k)
+                         for k, (one, fraction) in enumerate(each) for band in one.bands)
         states = (0.0, 90.0) if self.light.tracked and self.light.polarisation is None else (self.light.polarisation,)
         if not (self.dispersive or self.colored):
             if len(states) == 1:

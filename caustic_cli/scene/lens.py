@@ -14,14 +14,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from caustic_cli.config import checks
+from caustic_cli.config.table import TABLE, check, check_all, default
 from caustic_cli.errors import InputError
-from caustic_cli.scene import checks
-
-#: Most control points along one axis: beyond it the dense basis matrices alone fill a workstation's memory.
-MAX_CONTROL = 4096
-FRESNEL = ("none", "schlick", "exact")
-#: circle: the largest that fits into the size; the spline goes on beyond it, but light and glass do not.
-APERTURES = ("rectangle", "circle")
 
 
 @dataclass(frozen=True)
@@ -38,17 +33,17 @@ class Offset:
     radius: tuple[float, float] = (math.inf, math.inf)
 
     def __post_init__(self):
-        checks.number("[lens] thickness", self.thickness, -checks.LENGTH, checks.LENGTH)
+        check("lens.thickness", self.thickness)
         for r in self.radius:
             if isinstance(r, bool) or not isinstance(r, int | float) or math.isnan(r) or r == 0:
-                raise InputError(f"[lens] radius must be a non-zero number or inf, got {r!r}")
+                raise InputError(f"⟨lens.radius⟩ must be a non-zero number or inf, got {r!r}")
 
     @classmethod
     def for_magnification(cls, mag: tuple[float, float], index: float, throw: float, thickness: float,
                           vergence: float = 0.0) -> Offset:
         """The sphere that spreads light over `mag` times the aperture: rho = (n - 1) T / (mag - 1 - T V), T = z_screen - z_lens.
 
-        For parallel light (V = 0) that is table 6.1's, thesis notes 12.  `throw` is z_screen, `thickness` is z_lens (mm);
+        For parallel light (V = 0) that is table 6.1's, erratum E12.  `throw` is z_screen, `thickness` is z_lens (mm);
         `vergence` V is one over the distance, behind the lens, from which the light seems to come (1/mm): paraxially a ray
         at height x lands at x (1 + T V + (n - 1) T / rho).
         """
@@ -71,7 +66,7 @@ class Offset:
                 continue
             if square.max(initial=0.0) >= rho * rho:
                 raise InputError(
-                    f"[lens] radius must exceed the lens' own reach of {math.sqrt(square.max()):.4g} mm, got {abs(rho):.4g} mm"
+                    f"⟨lens.radius⟩ must exceed the lens' own reach of {math.sqrt(square.max()):.4g} mm, got {abs(rho):.4g} mm"
                     " (a smaller ⟨mag⟩ or a longer ⟨throw⟩ gives a larger radius)"
                 )
             # rho - sign sqrt(rho^2 - s) without its cancellation
@@ -97,51 +92,42 @@ class Lens:
         absorption: absorption coefficient a of the glass, 1/mm: exp(-a t) passes t mm (Beer-Lambert).
         roughness: standard deviation, along either axis, of the slopes of the exit's microfacets about the surface's own.
         glass: a name of `materials`, whose index changes with the wavelength; None for `index` at every wavelength.
-        aperture: one of APERTURES.
+        aperture: rectangle, or circle, the largest that fits into the size; the spline goes on beyond it, light and glass do not.
         border: width of a dark rim around the aperture, which the exported solid has for its mount, mm.
         mirror: the surface reflects, the light comes through air, and `index`, `fresnel` and `absorption` mean nothing.
     """
 
-    size: tuple[float, float] = (10.0, 10.0)
-    z_in: float = 0.0
-    index: float = 1.5443
+    size: tuple[float, float] = default("lens.size")
+    z_in: float = default("lens.z_in")
+    index: float = default("lens.index")
     control: tuple[int, int] = (50, 50)
-    degree: tuple[int, int] = (3, 3)
+    degree: tuple[int, int] = default("lens.degree")
     knots: tuple[Sequence[float], Sequence[float]] | None = None
     min_thickness: float = 0.0
     offset: Offset = field(default_factory=Offset)
     height_range: tuple[float, float] = (-1.0, 1.0)
-    fresnel: str = "exact"
-    absorption: float = 0.0
-    roughness: float = 0.0
+    fresnel: str = default("lens.fresnel")
+    absorption: float = default("lens.absorption")
+    roughness: float = default("lens.roughness")
     glass: str | None = None
-    mirror: bool = False
-    aperture: str = "rectangle"
-    border: float = 0.0
+    mirror: bool = default("lens.mirror")
+    aperture: str = default("lens.aperture")
+    border: float = default("lens.border")
 
     def __post_init__(self):
-        checks.pair("[lens] size", self.size, lambda w, x: checks.number(w, x, 1e-6, 1e6))
-        checks.number("[lens] z_in", self.z_in, -checks.LENGTH, checks.LENGTH)
-        checks.number("[lens] index", self.index, 1.0, 5.0, open_low=True)
-        checks.pair("[lens] degree", self.degree, lambda w, x: checks.whole(w, x, 1, 15))
+        check_all("lens", self, "size", "z_in", "index", "degree", "min_thickness", "height_range", "fresnel", "absorption",
+                  "roughness", "aperture", "border")
         least = iter(self.degree)
-        checks.pair("[lens] control", self.control, lambda w, n: checks.whole(w, n, next(least) + 1, MAX_CONTROL))
+        checks.pair("⟨lens.control⟩", self.control, lambda w, n: checks.whole(w, n, next(least) + 1, TABLE["lens.control"].high))
         if self.knots is not None:
             for axis, t, n, p in zip("uv", self.knots, self.control, self.degree, strict=True):
                 if len(t) != n + p + 1:
-                    raise InputError(f"[lens] knots_{axis} must have control + degree + 1 = {n + p + 1} entries, got {len(t)}")
-        checks.number("[lens] min_thickness", self.min_thickness, 0.0, checks.LENGTH)
-        low, high = checks.pair("[lens] height_range", self.height_range,
-                                lambda w, x: checks.number(w, x, -checks.LENGTH, checks.LENGTH))
+                    raise InputError(f"⟨lens.knots_{axis}⟩ must have control + degree + 1 = {n + p + 1} entries, got {len(t)}")
+        low, high = self.height_range
         if not low < high:
-            raise InputError(f"[lens] height_range must ascend, got [{low:g}, {high:g}]")
-        checks.choice("[lens] fresnel", self.fresnel, FRESNEL)
-        checks.number("[lens] absorption", self.absorption, 0.0, 1e6)
-        checks.number("[lens] roughness", self.roughness, 0.0, 1.0)
-        checks.choice("[lens] aperture", self.aperture, APERTURES)
-        checks.number("[lens] border", self.border, 0.0, 1e6)
+            raise InputError(f"⟨lens.height_range⟩ must ascend, got [{low:g}, {high:g}]")
         if self.round and self.size[0] != self.size[1]:
-            raise InputError("[lens] size of a circular aperture must be its diameter, twice the same,"
+            raise InputError("⟨lens.size⟩ of a circular aperture must be its diameter, twice the same,"
                              f" got {self.size[0]:g} x {self.size[1]:g}")
 
     @property
@@ -160,7 +146,7 @@ class Lens:
         return 1.0 if self.mirror else self.index
 
     @property
-    def bend(self) -> float:
+    def effective_index(self) -> float:
         """n in "a slope turns light by n - 1 times itself": the index, or -1 for a mirror (Snell's law with index -1)."""
         return -1.0 if self.mirror else self.index
 
@@ -177,7 +163,7 @@ class Lens:
         high = f + self.height_range[1]
         if not (low < high).all():
             raise InputError(
-                f"[lens] min_thickness of {self.min_thickness:g} mm leaves the heights no room: offset plus height_range"
+                f"⟨lens.min_thickness⟩ of {self.min_thickness:g} mm leaves the heights no room: offset plus height_range"
                 f" reaches only {high.min() - self.z_in:.4g} mm above z_in; raise thickness or height_range"
             )
         return low, high

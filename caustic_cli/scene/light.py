@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from caustic_cli.config.table import check
 from caustic_cli.errors import InputError
-from caustic_cli.scene import checks
 
 #: Dominant wavelengths of the primaries of sRGB (IEC 61966-2-1), nm: what stands for red, green and blue.
 RGB = (611.4, 549.1, 464.3)
-#: Radiant power, or luminous flux.
-UNITS = ("W", "lm")
 #: Most wavelengths of one source: each is traced.
 MAX_WAVELENGTHS = 99
 
@@ -25,7 +23,7 @@ class Light:
         weights: part of the power at each wavelength, any scale; empty for equal parts.
         tracked: unpolarised light is traced as two polarisations, for the exit to know what the entrance did to each.
         color: the wavelengths are red, green and blue, and the image is kept apart for each.
-        unit: of the source's power, one of UNITS.
+        unit: of the source's power, W, radiant power, or lm, luminous flux.
     """
 
     polarisation: float | None = None
@@ -36,22 +34,20 @@ class Light:
     unit: str = "W"
 
     def __post_init__(self):
-        checks.choice("[source] power_unit", self.unit, UNITS)
+        check("source.power_unit", self.unit)
         if self.polarisation is not None:
-            checks.number("[source] polarisation", self.polarisation, -360.0, 360.0)
+            check("source.polarisation", self.polarisation)
         if len(self.wavelengths) > MAX_WAVELENGTHS:
-            raise InputError(f"[source] wavelengths must be at most {MAX_WAVELENGTHS}, got {len(self.wavelengths)}")
-        for wavelength in self.wavelengths:
-            checks.number("[source] wavelengths", wavelength, 100.0, 20_000.0)
+            raise InputError(f"⟨source.wavelengths⟩ must be at most {MAX_WAVELENGTHS}, got {len(self.wavelengths)}")
+        check("source.wavelengths", self.wavelengths)
         if self.weights and len(self.weights) != len(self.wavelengths):
-            raise InputError(f"[source] weights must be one for each of the {len(self.wavelengths)} wavelengths,"
+            raise InputError(f"⟨source.weights⟩ must be one for each of the {len(self.wavelengths)} wavelengths,"
                              f" got {len(self.weights)}")
-        for weight in self.weights:
-            checks.number("[source] weights", weight, 0.0)
+        check("source.weights", self.weights)
         if self.weights and not sum(self.weights) > 0:
-            raise InputError("[source] weights must not all be 0")
+            raise InputError("⟨source.weights⟩ must not all be 0")
         if self.color and len(self.wavelengths) != len(RGB):
-            raise InputError(f"[source] wavelengths of a coloured picture are three, red, green and blue,"
+            raise InputError(f"⟨source.wavelengths⟩ of a coloured picture are three, red, green and blue,"
                              f" got {len(self.wavelengths)}")
 
     @property

@@ -5,10 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from caustic_cli.scene import checks
-
-#: Most pixels along one axis of the screen.
-MAX_RESOLUTION = 16384
+from caustic_cli.config.table import check_all, default
 
 
 @dataclass(frozen=True)
@@ -24,17 +21,13 @@ class Screen:
     """
 
     size: tuple[float, float]
-    z: float = 300.0
+    z: float = default("screen.z")
     resolution: tuple[int, int] = (250, 250)
-    tilt: tuple[float, float] = (0.0, 0.0)
-    shift: tuple[float, float] = (0.0, 0.0)
+    tilt: tuple[float, float] = default("screen.tilt")
+    shift: tuple[float, float] = default("screen.shift")
 
     def __post_init__(self):
-        checks.pair("[screen] size", self.size, lambda w, x: checks.number(w, x, 1e-6, 1e9))
-        checks.number("[screen] z", self.z, -1e12, 1e12)
-        checks.pair("[screen] resolution", self.resolution, lambda w, x: checks.whole(w, x, 2, MAX_RESOLUTION))
-        checks.pair("[screen] tilt", self.tilt, lambda w, x: checks.number(w, x, -85.0, 85.0))
-        checks.pair("[screen] shift", self.shift, lambda w, x: checks.number(w, x, -1e9, 1e9))
+        check_all("screen", self, "size", "z", "resolution", "tilt", "shift")
 
     @property
     def half_size(self) -> tuple[float, float]:

@@ -18,11 +18,12 @@ import torch
 from torch import Tensor
 
 from caustic_cli import __version__
+from caustic_cli.config import checks
 from caustic_cli.optics.backends import plain
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import SAMPLERS
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.scene import Scene, checks
+from caustic_cli.scene import Scene
 from caustic_cli.studies.fit import Order, order
 from caustic_cli.studies.measurement import REFERENCE_SEED, Bench, Reference, Setting, haste
 from caustic_cli.studies.metrics import relative_rms
@@ -157,10 +158,10 @@ def study_precision(bench: Bench, _dtype) -> Study:
     } | _TIMES
     largest = rows[-2 * len(SAMPLERS) :]
     worst = max(largest[1::2], key=lambda row: row["difference"] / max(row["error"], truth.error))
-    verdict = "float32 is enough" if worst["difference"] <= NEGLIGIBLE * worst["error"] else "use float64"
+    decision = "float32 is enough" if worst["difference"] <= NEGLIGIBLE * worst["error"] else "use float64"
     advice = (f"float32 changes the image of {worst['rays']} {worst['sampler']} rays by {worst['difference']:.2g},"
               f" where the rays leave an error of {worst['error']:.2g}, and is {worst['speedup']:.2g} times as fast"
-              f" in plain torch: {verdict}{haste(rows)}")
+              f" in plain torch: {decision}{haste(rows)}")
     return Study("precision", columns, rows, _orders(bench, rows), advice, _about(bench, None, truth))
 
 

@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from caustic_cli import __version__
+from caustic_cli.config import checks
 from caustic_cli.optics.effects import EFFECTS, Decision, Requests
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.image import Image
@@ -28,7 +29,7 @@ from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose, is_lowered
 from caustic_cli.optics.waves import NoWaveImage, wave_image
-from caustic_cli.scene import Scene, checks
+from caustic_cli.scene import Scene
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.report import COLOURS, MARKERS, Study
 

@@ -1,4 +1,4 @@
-"""The derivative of the whole image with respect to one control height: one forward-mode pass (thesis 6.1, notes 11).
+"""The derivative of the whole image with respect to one control height: one forward-mode pass (thesis 6.1, erratum E11).
 
 Notation
     J           image, (n_x, n_y), parts of the source's power per pixel
@@ -87,7 +87,7 @@ def difference_step(scene: Scene, field: HeightField, control: tuple[int, int],
     """
     slope = field.slope_bound(_direction(field, control))  # 1/mm of slope per mm of height
     throw = scene.screen.z - scene.lens.z_in
-    return pixels * min(scene.screen.pixel) / (abs((scene.lens.bend - 1.0) * throw) * slope)
+    return pixels * min(scene.screen.pixel) / (abs((scene.lens.effective_index - 1.0) * throw) * slope)
 
 
 def _step(scene: Scene, field: HeightField, heights: Tensor, control: tuple[int, int]) -> float:
@@ -186,10 +186,10 @@ def _under(field: HeightField, control: tuple[int, int], sample: Sample) -> Samp
     for space, k, at in zip(field.spaces, control, (sample.u, sample.v), strict=True):
         low, high = float(space.knots[k]), float(space.knots[k + space.degree + 1])
         inside.append((at >= low) & (at <= high))
-    share = sample.share
+    flux = sample.flux
     if sample.tensor:
-        if share.ndim:
-            share = share[inside[0]][:, inside[1]]
-        return Sample(sample.u[inside[0]], sample.v[inside[1]], True, share)
+        if flux.ndim:
+            flux = flux[inside[0]][:, inside[1]]
+        return Sample(sample.u[inside[0]], sample.v[inside[1]], True, flux)
     both = inside[0] & inside[1]
-    return Sample(sample.u[both], sample.v[both], False, share[both] if share.ndim else share)
+    return Sample(sample.u[both], sample.v[both], False, flux[both] if flux.ndim else flux)

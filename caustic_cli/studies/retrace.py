@@ -1,4 +1,4 @@
-"""The verdict on a lens: an independent retrace by bincount, with rays no optimiser has seen."""
+"""The decision on a lens: an independent retrace by bincount, with rays no optimiser has seen."""
 
 from __future__ import annotations
 

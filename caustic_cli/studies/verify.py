@@ -64,7 +64,7 @@ def require_mitsuba(scene: Scene) -> None:
     if scene.source.kind not in KINDS:
         raise InputError(f"⟨verify⟩ mitsuba knows no source of type {scene.source.kind}")
     if scene.lens.fresnel != "exact":
-        raise InputError(f"⟨verify⟩ mitsuba knows exact Fresnel reflection only; [lens] fresnel is {scene.lens.fresnel}")
+        raise InputError(f"⟨verify⟩ mitsuba knows exact Fresnel reflection only; ⟨lens.fresnel⟩ is {scene.lens.fresnel}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +186,7 @@ def _binned(x: np.ndarray, y: np.ndarray, value: np.ndarray, scene: Scene) -> np
     return np.bincount(at, value[inside], nx * ny).reshape(nx, ny)
 
 
-# the verdict
+# the decision
 
 
 def compare(renders: np.ndarray, image: np.ndarray, squares: np.ndarray, rays: int, shift: float = 0.0,
@@ -278,21 +278,21 @@ def _noise(image: np.ndarray, squares: np.ndarray, renders: np.ndarray) -> float
     return float(np.sqrt(squares.mean() + renders.var(0, ddof=1).mean() / len(renders)) / image.mean())
 
 
-def write_panels(path: str | Path, verdict: Decision, scene: Scene) -> None:
+def write_panels(path: str | Path, decision: Decision, scene: Scene) -> None:
     """A PNG: the render, Mitsuba's image, and their difference in standard deviations."""
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     figure = Figure(figsize=(14.4, 5.0), dpi=100, layout="constrained")
     axes, (sx, sy) = figure.subplots(1, 3), scene.screen.half_size
-    white = np.quantile(verdict.render, 0.999) or 1.0
+    white = np.quantile(decision.render, 0.999) or 1.0
     shown = {"extent": [-sx, sx, -sy, sy], "origin": "lower"}
-    for axis, image, title in zip(axes, (verdict.render, verdict.mitsuba), ("caustic", "Mitsuba 3"), strict=False):
+    for axis, image, title in zip(axes, (decision.render, decision.mitsuba), ("caustic", "Mitsuba 3"), strict=False):
         axis.imshow(np.sqrt(np.clip(image / white, 0.0, 1.0)).T, cmap="gray", vmin=0, vmax=1, **shown)
         axis.set(title=title, xlabel="x on the screen (mm)", ylabel="y (mm)")
-    z = verdict.z[: verdict.render.shape[0], : verdict.render.shape[1]]
+    z = decision.z[: decision.render.shape[0], : decision.render.shape[1]]
     drawn = axes[2].imshow(z.T, cmap="coolwarm", vmin=-4, vmax=4, **shown)
     figure.colorbar(drawn, ax=axes[2], label="standard deviations")
-    f = verdict.figures
+    f = decision.figures
     axes[2].set(title=f"Mitsuba - caustic: mean Z² {f['z_mean_square']:.3f}, {'agree' if f['agree'] else 'DISAGREE'}",
                 xlabel="x on the screen (mm)", ylabel="y (mm)")
     with atomic_path(path) as temporary:

@@ -1,4 +1,4 @@
-"""The verdict on a lens as light sees it: its wave image, at wavelengths and on grids that no optimiser used."""
+"""The decision on a lens as light sees it: its wave image, at wavelengths and on grids that no optimiser used."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from caustic_cli.scene import Scene
 from caustic_cli.studies.irradiance import irradiance_figures
 from caustic_cli.studies.metrics import judge
 
-#: So many times finer than needed are a verdict's samples, on both planes.
+#: So many times finer than needed are a decision's samples, on both planes.
 FINER = 1.25
 #: Wavelengths beside a single one, in parts of it, that say how a lens bears light of another colour.
 ASIDE = (0.99, 1.01)

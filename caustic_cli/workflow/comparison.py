@@ -11,13 +11,15 @@ import torch
 from torch import Tensor
 
 from caustic_cli.config import settings
-from caustic_cli.config.completion import NETWORK_CONTROL, Settings, build_options, build_stages, complete
+from caustic_cli.config.completion import NETWORK_CONTROL, build_options, build_stages, complete, stage_of
+from caustic_cli.config.plans import LEAST_CELLS, coarse_to_fine
+from caustic_cli.config.settings import Settings
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Designer, Options, State
 from caustic_cli.inverse.initial_surface import first_surface
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.parametrisation import Heights
-from caustic_cli.inverse.schedule import LEAST_CELLS, Stage, coarse_to_fine
+from caustic_cli.inverse.schedule import Stage
 from caustic_cli.inverse.target import target_on_screen
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.project.project import Project
@@ -171,9 +173,9 @@ def plans(scene: Scene, full: Settings, dtype: torch.dtype | None = None,
     newton = replace(options, optimizer="lbfgs", network="none", initial="zero", preconditioner="laplacian")
     found = [(f"lbfgs, {_net(net)}", [replace(last, control=net)], newton) for net in nets]
     if len(nets) > 1:
-        stages = coarse_to_fine(lens.control, lens.degree, last.rays, scene.screen.resolution, filter=last.filter,
-                                sampler=last.sampler)
-        stages = [replace(s, apron=0 if options.loss == "rms" else s.apron) for s in stages]
+        stages = [stage_of(table, full) for table in coarse_to_fine(lens.control, lens.degree, last.rays, scene.screen.resolution,
+                                                                    sampler=last.sampler)]
+        stages = [replace(s, filter=last.filter, apron=0 if options.loss == "rms" else s.apron) for s in stages]
         stages[-1] = replace(stages[-1], iterations=ENDLESS, tolerance=0.0)
         found.append(("lbfgs, coarse to fine", stages, newton))
     net = lens.control if lens.knots is not None else tuple(min(n, max(NETWORK_CONTROL, p + 1)) for n, p in

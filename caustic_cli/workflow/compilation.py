@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from caustic_cli.errors import is_shortage
+from caustic_cli.errors import is_out_of_memory
 from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.effects import NO_REQUESTS, Requests
 from caustic_cli.optics.kernels import cache, functions, plane
@@ -104,12 +104,12 @@ def compile_for(scene: Scene | None, device: str, say: Reporter, requests: Reque
         lens, screen = Lens(), Screen((30.0, 30.0))
         wanted = [(Scene(Points(((0.0, 0.0, -50.0),)), lens, screen), NO_REQUESTS),
                   (Scene(PlaneWave(), lens, screen), Requests(stages=True))]
-    with say.patience("compiling the kernels that this scene needs, once: about half a minute"):
+    with say.notify_if_slow("compiling the kernels that this scene needs, once: about half a minute"):
         try:
             for one, asked in wanted:
                 warm_up(one, asked, gradient)
         except (MemoryError, RuntimeError) as problem:
-            if not is_shortage(problem):  # the work itself knows what to do about that, and compiles what it needs
+            if not is_out_of_memory(problem):  # the work itself knows what to do about that, and compiles what it needs
                 raise
 
 

@@ -5,20 +5,25 @@ Nothing is written before everything the user gave has been checked.
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import signal
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from caustic_cli import __version__
 from caustic_cli.config import settings
-from caustic_cli.config.completion import build_options, build_stages, complete, without_waves
+from caustic_cli.config.completion import Derivation, build_options, build_stages, complete, without_waves
+from caustic_cli.config.plans import transport_cells
+from caustic_cli.config.settings import Settings
 from caustic_cli.errors import CausticError, InputError, Interrupted
 from caustic_cli.inverse import ranks
 from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
@@ -26,16 +31,15 @@ from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.extended import best_light, centre_of, limits, shift_of
 from caustic_cli.inverse.initial_surface import first_surface
 from caustic_cli.inverse.reach import refuse_unreachable
-from caustic_cli.inverse.schedule import transport_cells
 from caustic_cli.inverse.target import grey
-from caustic_cli.io.picture import read_picture
+from caustic_cli.io.picture import Picture, read_picture
 from caustic_cli.io.surfaces import SUFFIXES, onto, read_surface
 from caustic_cli.optics.emission.measured import coarse_words
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.project import attachments, directory, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
-from caustic_cli.project.project import CHECKPOINT, RENDER, TOML, Project, is_project
+from caustic_cli.project.project import CHECKPOINT, RENDER, Project, is_project
 from caustic_cli.scene import Scene
 from caustic_cli.workflow.evaluation import judge
 from caustic_cli.workflow.reporter import Reporter
@@ -44,15 +48,18 @@ from caustic_cli.workflow.reporter import Reporter
 LEAST_PART = 0.25
 
 
-def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: dict, config: Path | None,
-          force: bool) -> tuple[Project, torch.Tensor | None]:
-    """Check everything, then make the project directory; also returns the first heights, None for the offset surface.
+def begin(target: Path | Picture, given: Mapping[str, Any], *, config: Path | None = None, out: Path | None = None,
+          force: bool = False, say: Reporter) -> tuple[Project, torch.Tensor | None]:
+    """Check everything, then make the project directory, if there is to be one; also returns the first heights, None for the
+    offset surface.
 
     Where the same has been designed already, or begun, that project is opened instead (`Project.found`).
 
     Args:
-        given: (section, key, option) -> value, what the options say.
-        screen: screen size, one or two lengths; pixels: resolution, one or two counts; shaped: mag, margin, quality, rays.
+        given: path in `config.table` -> value, parameters such as "mag" among them.
+        config: a TOML file of further settings, which those `given` replace.
+        out: the directory; None for a design in memory.
+        force: replace a project there.
 
     Raises:
         InputError: something is wrong; nothing was written.
@@ -60,80 +67,79 @@ def begin(target: Path, out: Path | None, given: dict, screen, pixels, shaped: d
     said = settings.read(config) if config else {}
     if "source" in said:
         said["source"] = attachments.attached(said["source"], config.parent)
-    for (section, key, _), value in given.items():
-        said.setdefault(section, {})[key] = value
+    for path, value in given.items():
+        section, _, key = path.rpartition(".")
+        if section:
+            said.setdefault(section, {})[key] = value
+    by = Derivation(**{path: value for path, value in given.items() if "." not in path})
     if "source" in said:
         said["source"] = attachments.attached(said["source"])
     if "index" in said.get("lens", {}) and "glass" in said["lens"]:
-        names = [key for (_, key, _) in given if key in ("index", "glass")]
-        if len(names) == 1:  # an option replaces what the configuration says
+        names = [key for key in ("index", "glass") if f"lens.{key}" in given]
+        if len(names) == 1:  # what is given replaces what the configuration says
             del said["lens"]["glass" if names[0] == "index" else "index"]
     goal = said.get("target", {})
-    picture = read_picture(target, goal.get("encoding") == "linear", goal.get("color", False))
+    picture = target if isinstance(target, Picture) else \
+        read_picture(target, goal.get("encoding") == "linear", goal.get("color", False))
     if goal.get("color", False):
         light = [float(c) for c in picture.irradiance().sum((1, 2))]
         said.setdefault("source", {}).setdefault("weights", [c / sum(light) for c in light])
-    if screen:
-        height = screen[1] if len(screen) == 2 else screen[0] * picture.aspect
-        said.setdefault("screen", {})["size"] = [screen[0], height]
-        given = {**given, ("screen", "size", "⟨screen_size⟩"): screen}
-    if pixels and len(pixels) == 2:
-        said.setdefault("screen", {})["resolution"] = list(pixels)
-    elif pixels:
-        said.get("screen", {}).pop("resolution", None)
-    given = {**given, ("screen", "resolution", "⟨resolution⟩"): pixels}
     profile = said.get("source", {}).get("profile")
-    light = read_picture(config.parent / profile, linear=True) if profile else None
-    path = out or Path(f"{target.stem or 'design'}.caustic")
-    try:
-        full = complete(said, picture.aspect, width=pixels[0] if pixels and len(pixels) == 1 else None,
-                        lit=picture.lit, **shaped)
-        settings.refuse_unused(full["source"], given, [stage.get("source") for stage in full["design"]["stages"]])
-        full["target"] |= {"file": f"target{picture.suffix}", "encoding": picture.encoding}
-        if light is not None:
-            full["source"]["profile"] = f"profile{light.suffix}"
-        attachments.named_in_project(full["source"])
-        project = Project(path, full, picture, light, uptodate.digest(full, picture, light),
-                          without_waves=without_waves(full, "stages" in said.get("design", {})))
-        if not force and (same := uptodate.same_design(path, project.asked)):
+    light = read_picture((config.parent if config else Path()) / profile, linear=True) if profile else None
+    full = complete(said, picture.aspect, by, picture.lit)
+    settings.refuse_unused(full["source"], given, [stage.get("source") for stage in full["design"]["stages"]])
+    full["target"] |= {"file": f"target{picture.suffix}", "encoding": picture.encoding}
+    if light is not None:
+        full["source"]["profile"] = f"profile{light.suffix}"
+    attachments.named_in_project(full["source"])
+    project = Project(out, full, picture, light, uptodate.digest(full, picture, light),
+                      without_waves=without_waves(full, "stages" in said.get("design", {})))
+    if out is not None:
+        if not force and (same := uptodate.same_design(out, project.asked)):
             return replace(same[0], found=same[1]), None
-        directory.check(path, force)  # before the transport, which may take a minute
-        designer, goal = _designer(project, "cpu")  # builds and so checks scene, target, stages, options
-        refuse_unreachable(designer.scene, grey(goal))
-        first = first_heights(project, said)
-    except InputError as error:  # about a project.toml that is not written yet
-        raise InputError(settings.as_options(f"{error}".removeprefix(f"{path / TOML}: "), given)) from error
-    directory.settle(project, force)
+        directory.check(out, force)  # before the transport, which may take a minute
+    designer, goal = _designer(project, "cpu")  # builds and so checks scene, target, stages, options
+    refuse_unreachable(designer.scene, grey(goal))
+    with say.notify_if_slow("solving the transport of the light to the picture; the first time, its kernels are compiled,"
+                            " which takes about half a minute"):
+        project, first = first_heights(project, said)
+    if out is not None:
+        directory.settle(project, force)
     return project, first
 
 
-def first_heights(project: Project, said: dict) -> torch.Tensor | None:
-    """The heights that a design begins from, None for the offset surface; thickness and height range of the project's settings
-    become what they need, but for what was `said`.
+def first_heights(project: Project, said: Settings) -> tuple[Project, torch.Tensor | None]:
+    """The heights that a design begins from, None for the offset surface; and the project whose thickness and height range are
+    what they need, but for what was `said`.
 
     Raises:
         InputError: as of `begin`.
     """
-    fixed, lens = "thickness" in said.get("lens", {}), project.settings["lens"]
+    fixed, project = "thickness" in said.get("lens", {}), replace(project, settings=copy.deepcopy(project.settings))
+    lens = project.settings["lens"]
     first, middle = _solved(project, fixed)
     if middle is not None:
         lens["thickness"] = middle
     if first is not None and _make_room(project.settings, said, first) and middle is None:
         _designer(project, "cpu")
         first, _ = _solved(project, fixed)
-    return None if first is None else _designer(project, "cpu")[0].within_limits(State(first))
+    return project, None if first is None else _designer(project, "cpu")[0].within_limits(State(first))
 
 
-def find(target: Path, out: Path | None) -> Project:
-    """The project that resume means: TARGET itself, or the one that designing TARGET would make."""
-    path = target if target.is_dir() else (out or Path(f"{target.stem}.caustic"))
-    if not target.exists() and not path.exists():
-        raise InputError(f"{target}: no such project; ⟨resume⟩ needs a directory made by caustic design")
-    return Project.open(path)
+@dataclass(frozen=True)
+class Result:
+    """A design that is done: its project, its lens, and the figures of the JSON table."""
+
+    project: Project
+    scene: Scene
+    field: HeightField
+    target: np.ndarray
+    state: State
+    figures: dict[str, Any]
 
 
-def design(project: Project, first: torch.Tensor | None, device: str, say: Reporter, began: float) -> dict:
-    """Run a new design from its first heights to its end; returns the figures of the JSON table.
+def design(project: Project, first: torch.Tensor | None, device: str, say: Reporter, began: float) -> Result:
+    """Run a new design from its first heights to its end.
 
     One that `begin` found needs no work, or goes on.
     """
@@ -141,12 +147,14 @@ def design(project: Project, first: torch.Tensor | None, device: str, say: Repor
         figures = uptodate.finished(project, project.found)
         say.say(f"{project.path}: was designed from the same picture with the same options, so "
                 + ("there is nothing to do; ⟨force⟩ designs it anew" if figures else "it goes on from its checkpoint"))
-        return figures or resume(project, None, None, device, say, began)
+        if not figures:
+            return resume(project, None, None, device, say, began)
+        scene = project.scene()
+        return Result(project, scene, project.lens(scene)[0], project.target(scene), project.found.state, figures)
     with project.hold:
         designer, target = _designer(project, device)
         _say_limits(project, designer, target, say)
-        state = designer.begin(first)
-        return _run(project, designer, target, state, say, began, 0, None, device)
+        return _run(project, designer, target, designer.begin(first), say, began, None, device)
 
 
 def _say_limits(project: Project, designer: Designer, target: np.ndarray, say: Reporter) -> None:
@@ -167,36 +175,36 @@ def _listed(wavelengths: tuple[float, ...]) -> str:
     return ", ".join(f"{w:.4g}" for w in wavelengths)
 
 
-def resume(project: Project, iterations: int | None, time_limit: float | None, device: str, say: Reporter,
-           began: float) -> dict:
+def resume(project: Project, iterations: int | None, time_limit: float | None, device: str, say: Reporter, began: float) -> Result:
     """Go on from the last checkpoint; with nothing left to do, judge the lens again."""
     with project.hold:
-        project.hold.enter_context(directory.held(project.path))
+        project.hold.enter_context(directory.locked(project.path))
         designer, target = _designer(project, device)
         begun = (project.path / CHECKPOINT).exists()  # if not, it was killed before its first checkpoint
         before = project.load() if begun else None
         state = before.state if begun else designer.begin(_solved(project, fixed=True)[0])
         if state.stage >= len(designer.stages):
-            raise InputError(f"{project.path / TOML}: has {len(designer.stages)} stages, but the checkpoint stands in stage"
+            raise project.error(f"has {len(designer.stages)} stages, but the checkpoint stands in stage"
                              f" {state.stage + 1}")
         if tuple(state.heights.shape) != designer.stages[state.stage].control:
-            raise InputError(f"{project.path / TOML}: stage {state.stage + 1} has control"
+            raise project.error(f"stage {state.stage + 1} has control"
                              f" {list(designer.stages[state.stage].control)}, but the checkpoint {list(state.heights.shape)}")
         state = designer.restored(state)
         if iterations is not None:
-            project.settings["design"]["iterations"] = iterations
+            changed = project.settings["design"] | {"iterations": iterations}
+            project = replace(project, settings=project.settings | {"design": changed})
             project.write_settings()
         if begun:
             project = replace(project, asked=uptodate.asked_of(project, before))
-        return _run(project, designer, target, state, say, began, iterations, time_limit, device)
+        return _run(project, designer, target, state, say, began, time_limit, device)
 
 
 def follow(device: str) -> None:
     """What every rank but the first does: design along with it, reading, deciding and writing nothing."""
     with _signals():  # the first rank's to answer
-        while task := ranks.hear():
+        while task := ranks.receive():
             *parts, state, limit = task
-            project = Project(Path(), *parts)
+            project = Project(None, *parts)
             _designer(project, device)[0].run(state, iterations=project.settings["design"]["iterations"], time_limit=limit)
 
 
@@ -252,17 +260,17 @@ def _solved(project: Project, fixed: bool) -> tuple[torch.Tensor | None, float |
     if Path(start).suffix.lower() in SUFFIXES and not Path(start).is_dir():
         return onto(*read_surface(start, net.half_size), net), None
     if not is_project(Path(start)):
-        raise InputError("[design] start must be transport, offset, a project directory or a lens surface"
+        raise InputError("⟨design.start⟩ must be transport, offset, a project directory or a lens surface"
                          f" ({', '.join(SUFFIXES)}), got {start!r}")
     other = Project.open(start)
     field, checkpoint = other.lens(other.scene())
     if other.settings["lens"]["size"] != project.settings["lens"]["size"]:
-        raise InputError(f"[design] start: the lens of {start} is {other.settings['lens']['size']} mm, not"
+        raise InputError(f"⟨design.start⟩: the lens of {start} is {other.settings['lens']['size']} mm, not"
                          f" {project.settings['lens']['size']} mm")
     return onto(field, checkpoint.state.heights, net), None
 
 
-def _make_room(full: dict, said: dict, first: torch.Tensor) -> bool:
+def _make_room(full: Settings, said: Settings, first: torch.Tensor) -> bool:
     """Widen height_range and thickness, unless the user fixed them, to what the first surface needs; True if they changed."""
     lens = settings.build_lens(full)
     offset = HeightField.of(replace(lens, control=tuple(first.shape)))
@@ -280,30 +288,13 @@ def _make_room(full: dict, said: dict, first: torch.Tensor) -> bool:
 
 
 def _run(project: Project, designer: Designer, target: np.ndarray, state: State, say: Reporter, began: float,
-         iterations: int | None, time_limit: float | None, device: str) -> dict:
+         time_limit: float | None, device: str) -> Result:
     chosen = project.settings["design"]
     limit = chosen["time_limit"] if time_limit is None else time_limit
     limit = max(LEAST_PART * limit, limit - (time.monotonic() - began))  # what the start took counts too
-    provenance = {
-        "caustic": __version__, "torch": torch.__version__, "numpy": np.__version__, "device": device,
-        "threads": torch.get_num_threads(), "seed": chosen["seed"],
-        "target_sha256": hashlib.sha256(np.ascontiguousarray(project.picture.values).tobytes()).hexdigest(),
-    }
-
-    inputs = uptodate.inputs(project)
-    goes_on = f"caustic design ⟨resume⟩ {project.path} goes on from it"
-    safe = f"the one before is whole, {goes_on}" if (project.path / CHECKPOINT).exists() else "nothing of it is on disk"
-
-    def keep(now: State, results: dict | None = None) -> None:
-        nonlocal safe
-        try:
-            project.save(Checkpoint(now, designer.field(now.stage).spaces, provenance, results or {}, inputs))
-        except CausticError as error:
-            raise CausticError(f"{error} after iteration {now.total}; {safe}") from error
-        safe = f"the one of iteration {now.total} is whole, {goes_on}"
-
+    records = _Records(project, designer, device)
     total = chosen["iterations"] or sum(s.iterations for s in designer.stages)
-    with _signals() as asked, say.progress(total) as show:
+    with _signals(project.path is not None) as asked, say.progress(total) as show:
         stage, saved = -1, time.monotonic()
 
         def on_iteration(now: State) -> None:
@@ -318,31 +309,69 @@ def _run(project: Project, designer: Designer, target: np.ndarray, state: State,
                  f"loss {loss * grey(target).size:.4f}  on screen {on_screen:.1%}", now.total, total)
             if time.monotonic() - saved >= chosen["checkpoint_every"]:
                 saved = time.monotonic()  # before the writing, which takes its time too
-                keep(now)
+                records.keep(now)
 
-        keep(state)
-        ranks.tell((project.settings, project.picture, project.profile, _on_cpu(state), limit))
+        records.keep(state)
+        ranks.send((project.settings, project.picture, project.profile, _on_cpu(state), limit))
         state = designer.run(state, iterations=chosen["iterations"], time_limit=limit, stop=lambda: bool(asked),
                              on_iteration=on_iteration, notice=say.say)
-        keep(state)
+        records.keep(state)
         if not asked:
             state.heights = designer.within_limits(state)
         if asked:
             raise Interrupted(f"interrupted after {state.total} iterations; {project.path / CHECKPOINT} is saved,"
                               f" caustic design ⟨resume⟩ {project.path} goes on", 128 + asked[0])
-        lens, figures = judge(project, designer, target, state, device)
-        figures |= {"iterations": state.total, "seconds": time.monotonic() - began, "image": str(project.path / RENDER),
-                    "project": str(project.path), "reason": lens.reason}
-        keep(lens, figures)
+        found = judge(project, designer, target, state, device)
+        figures = found.figures | {"iterations": state.total, "seconds": time.monotonic() - began, "reason": found.state.reason}
+        if project.path is not None:
+            figures |= {"image": str(project.path / RENDER), "project": str(project.path)}
+        records.keep(found.state, figures)
         if asked:
             raise Interrupted(f"interrupted when the design was done; {project.path} is whole", 128 + asked[0])
-    return figures
+    return Result(project, designer.scene, designer.field(found.state.stage), target, found.state, figures)
+
+
+class _Records:
+    """Checkpoints of a design, if it has a directory."""
+
+    def __init__(self, project: Project, designer: Designer, device: str):
+        self.project, self.designer, self.inputs = project, designer, uptodate.inputs(project)
+        self.provenance = provenance(project, device)
+        self._goes_on = f"caustic design ⟨resume⟩ {project.path} goes on from it"
+        before = project.path is not None and (project.path / CHECKPOINT).exists()
+        self._safe = f"the one before is whole, {self._goes_on}" if before else "nothing of it is on disk"
+
+    def keep(self, now: State, figures: dict[str, Any] | None = None) -> None:
+        """Write a checkpoint, with the figures of a finished design.
+
+        Raises:
+            CausticError: it could not be written, and what is safe.
+        """
+        if self.project.path is None:
+            return
+        try:
+            self.project.save(Checkpoint(now, self.designer.field(now.stage).spaces, self.provenance, figures or {}, self.inputs))
+        except CausticError as error:
+            raise CausticError(f"{error} after iteration {now.total}; {self._safe}") from error
+        self._safe = f"the one of iteration {now.total} is whole, {self._goes_on}"
+
+
+def provenance(project: Project, device: str) -> dict[str, Any]:
+    """What made a lens: versions, device, threads, seed and the picture's hash."""
+    return {
+        "caustic": __version__, "torch": torch.__version__, "numpy": np.__version__, "device": device,
+        "threads": torch.get_num_threads(), "seed": project.settings["design"]["seed"],
+        "target_sha256": hashlib.sha256(np.ascontiguousarray(project.picture.values).tobytes()).hexdigest(),
+    }
 
 
 @contextmanager
-def _signals() -> Iterator[list[int]]:
-    """Collect SIGINT and SIGTERM instead of dying of them; a second SIGINT interrupts at once."""
+def _signals(collect: bool = True) -> Iterator[list[int]]:
+    """Collect SIGINT and SIGTERM instead of dying of them, where wanted and in the main thread; a second SIGINT interrupts."""
     asked: list[int] = []
+    if not collect or threading.current_thread() is not threading.main_thread():
+        yield asked
+        return
 
     def handler(number: int, _frame) -> None:
         if asked and number == signal.SIGINT:

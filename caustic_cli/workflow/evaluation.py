@@ -50,13 +50,11 @@ class Evaluation:
     waves: np.ndarray | None
 
 
-def judge(project: Project, designer: Designer, target: np.ndarray, state: State, device: str) -> tuple[State, dict]:
-    """Evaluate the finished lens; write render.png, wave.png and report.png into the project.
-
-    Returns:
-        the state with the lens that was kept, and its figures.
-    """
+def judge(project: Project, designer: Designer, target: np.ndarray, state: State, device: str) -> Evaluation:
+    """Evaluate the finished lens; write render.png, wave.png and report.png into the project, if it has a directory."""
     found = evaluate(designer, target, state, device, project.settings["design"]["seed"], tuple(project.settings["target"]["size"]))
+    if project.path is None:
+        return found
     encoding = project.settings["target"]["encoding"]
     write_image(project.path / RENDER, found.image, white_level(found.image, target), encoding)
     discard(project.path / WAVE)  # of another lens
@@ -66,7 +64,7 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
     surface = _surface(designer.field(found.state.stage), found.state.heights)
     write_report(project.path / REPORT, grey(target), grey(found.image), surface, history, designer.scene.lens,
                  designer.scene.screen, found.figures, encoding, None if found.waves is None else grey(found.waves))
-    return found.state, found.figures
+    return found
 
 
 def evaluate(designer: Designer, target: np.ndarray, state: State, device: str, seed: int, size: tuple[float, float]) -> Evaluation:

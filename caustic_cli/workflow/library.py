@@ -13,7 +13,7 @@ Lengths are millimetres, angles degrees, wavelengths nanometres, powers watts; a
 
 from __future__ import annotations
 
-import math
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,29 +23,26 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caustic_cli import __version__
 from caustic_cli.config import settings as schema
-from caustic_cli.config.completion import build_options, build_stages, complete
 from caustic_cli.errors import InputError
 from caustic_cli.export import BY_SUFFIX
-from caustic_cli.inverse.designer import Designer, State
+from caustic_cli.inverse.designer import State
 from caustic_cli.io.archive import open_archive
-from caustic_cli.io.picture import Picture, read_picture
+from caustic_cli.io.picture import Picture
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT
 from caustic_cli.optics.trace import tracers
-from caustic_cli.project import attachments, directory, uptodate
+from caustic_cli.project import directory, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Scene
 from caustic_cli.studies.retrace import retrace
+from caustic_cli.workflow import design as workflow
 from caustic_cli.workflow.compilation import compile_for, compile_usual
-from caustic_cli.workflow.design import first_heights
-from caustic_cli.workflow.evaluation import evaluate
 from caustic_cli.workflow.export import write
-from caustic_cli.workflow.reporter import Listener
+from caustic_cli.workflow.reporter import Listener, Reporter
 
 #: Told of a design's progress: stage, what it is at, iterations done, and in all.
 Progress = Callable[[str, str, int | None, int | None], None]
@@ -127,27 +124,30 @@ class Lens:
         directory.check(project.path, force)
         directory.settle(project, force)
         with project.hold:
-            made = {"caustic": __version__, "torch": torch.__version__, "numpy": np.__version__, "by": "library"}
-            project.save(Checkpoint(self.state, self.field.spaces, made, self.figures, uptodate.inputs(project)))
+            project.save(Checkpoint(self.state, self.field.spaces, workflow.provenance(project, "cpu"), self.figures,
+                                    uptodate.inputs(project)))
         return project.path
 
 
-def design(picture: str | Path | np.ndarray | Tensor, *, source: str | Mapping[str, Any] = "plane", mag: float | None = None,
-           margin: float | None = None, quality: str | None = None, rays: float | None = None,
+def design(picture: str | Path | np.ndarray | Tensor, *, source: str | Mapping[str, Any] | None = None, mag: float | None = None,
+           margin: float | None = None, throw: float | None = None, quality: str | None = None, rays: float | None = None,
            settings: Mapping[str, Mapping[str, Any]] | None = None, linear: bool | None = None, waves: str | None = None,
-           time_limit: float = math.inf, on_progress: Progress | None = None, on_message: Callable[[str], None] | None = None,
-           device: str = "cpu") -> Lens:
+           time_limit: float | None = None, out: str | Path | None = None, force: bool = False, on_progress: Progress | None = None,
+           on_message: Callable[[str], None] | None = None, device: str = "cpu") -> Lens:
     """The lens that throws a picture, as `caustic design` finds it.
 
     Args:
         picture: a file, or irradiance (n_x, n_y), not negative, [i, j] with j upwards.
         source: a type such as "point", or a section as of project.toml: {"type": "disc", "position": [0, 0, -500], "size": [5, 5]}.
         mag: width of the picture over that of the lens; margin: dark border around it, part of its width in all.
+        throw: distance of the screen from the lens' origin, mm.
         quality: draft, standard or fine; rays: of the last stage.
-        settings: further sections and keys of project.toml: {"lens": {"size": [20, 20]}, "screen": {"z": 500}}.
+        settings: further sections and keys of project.toml: {"lens": {"size": [20, 20]}, "design": {"max_slope": 0.5}}.
         linear: whether values of the file are irradiance rather than sRGB codes.
         waves: auto, on or off: refine the wave image after the ray image.
-        time_limit: seconds for the iterations.
+        time_limit: seconds for the optimisation.
+        out: a project directory to keep checkpoints and pictures in; without it, no file is touched.
+        force: replace a project there.
         on_progress, on_message: told while it works.
         device: cpu or cuda.
 
@@ -155,39 +155,59 @@ def design(picture: str | Path | np.ndarray | Tensor, *, source: str | Mapping[s
         InputError: a value out of range, or a picture that no lens of this scene can throw.
         CausticError: the design could not be finished.
     """
-    say = Listener(on_progress, on_message)
-    read = _picture(picture, bool(linear))
-    given = {section: dict(values) for section, values in (settings or {}).items()}
-    if isinstance(source, str):
-        given.setdefault("source", {})["type"] = source
-    else:
-        given["source"] = given.get("source", {}) | dict(source)
-    if waves is not None:
-        given.setdefault("design", {})["waves"] = waves
-    given = schema.checked(given, "settings")
-    given["source"] = attachments.attached(given["source"])
-    said = {section: dict(values) for section, values in given.items()}
-    full = complete(given, read.aspect, mag=mag, margin=margin, quality=quality, rays=None if rays is None else _count(rays),
-                    lit=read.lit)
-    full["target"] |= {"file": f"target{read.suffix}", "encoding": read.encoding}
-    attachments.named_in_project(full["source"])
+    sections: dict[str, dict[str, Any]] = {section: dict(values) for section, values in (settings or {}).items()}
+    if source is not None:
+        sections["source"] = sections.get("source", {}) | ({"type": source} if isinstance(source, str) else dict(source))
+    design = {key: value for key, value in (("waves", waves), ("time_limit", time_limit)) if value is not None}
+    if design:
+        sections["design"] = sections.get("design", {}) | design
+    if linear:
+        sections["target"] = sections.get("target", {}) | {"encoding": "linear"}
+    by = {"mag": mag, "margin": margin, "throw": throw, "quality": quality, "rays": None if rays is None else _count(rays)}
+    given = {f"{section}.{key}": value for section, values in schema.checked(sections, "settings").items()
+             for key, value in values.items()}
+    given |= {path: value for path, value in by.items() if value is not None}
+    return design_of(picture if isinstance(picture, str | Path) else _picture(picture), given,
+                     out=None if out is None else Path(out), force=force, say=Listener(on_progress, on_message), device=device)
+
+
+def design_of(target: str | Path | Picture, given: Mapping[str, Any], *, config: Path | None = None, out: Path | None = None,
+              force: bool = False, say: Reporter, device: str = "cpu") -> Lens:
+    """The lens for a picture and settings by their paths in `config.table`: {"mag": 3, "lens.size": [20, 20]}.
+
+    Args:
+        config: a TOML file of further settings, which those `given` replace.
+        out, force, device: as of `design`; say: who is told while it works.
+
+    Raises:
+        InputError, CausticError: as of `design`.
+    """
+    began = time.monotonic()
     compile_usual(device)
-    project = Project(Path(), full, read)
-    first = first_heights(project, said)
-    project = replace(project, asked=uptodate.digest(full, read, None))
-    scene = project.scene()
-    compile_for(scene, device, say, gradient=True)
-    target = project.target(scene)
-    designer = Designer(scene, torch.from_numpy(target), build_stages(full), build_options(full), device)
-    whole = full["design"]["iterations"] or sum(s.iterations for s in designer.stages)
-    with say.progress(whole) as show:
-        state = designer.run(designer.begin(first), iterations=full["design"]["iterations"], time_limit=time_limit, notice=say.say,
-                             on_iteration=lambda now: show(f"stage {now.stage + 1}/{len(designer.stages)}",
-                                                           f"loss {now.history[-1][2] * target.size:.4f}", now.total, whole))
-    state.heights = designer.within_limits(state)
-    found = evaluate(designer, target, state, device, full["design"]["seed"], tuple(full["target"]["size"]))
-    figures = found.figures | {"iterations": state.total, "seconds": state.seconds, "reason": found.state.reason}
-    return Lens(scene, designer.field(found.state.stage), found.state.heights, target, figures, project, found.state)
+    project, first = workflow.begin(Path(target) if isinstance(target, str) else target, given, config=config, out=out, force=force,
+                                    say=say)
+    compile_for(project.scene(), device, say, gradient=True)
+    return _lens(workflow.design(project, first, device, say, began))
+
+
+def resume(path: str | Path, *, iterations: int | None = None, time_limit: float | None = None, say: Reporter | None = None,
+           device: str = "cpu") -> Lens:
+    """Go on with the design of a project directory from its last checkpoint.
+
+    Args:
+        iterations: in all, counted from the very first, instead of the project's; time_limit: s.
+
+    Raises:
+        InputError: there is no project, or it was edited into another design.
+    """
+    began, say = time.monotonic(), say or Listener()
+    project = Project.open(path)
+    compile_for(project.scene(), device, say, gradient=True)
+    return _lens(workflow.resume(project, iterations, time_limit, device, say, began))
+
+
+def _lens(done: workflow.Result) -> Lens:
+    return Lens(done.scene, done.field, done.state.heights, done.target, done.figures, done.project, done.state)
 
 
 def load(path: str | Path) -> Lens:
@@ -237,9 +257,7 @@ def _count(rays: float) -> int:
     return int(rays)
 
 
-def _picture(given: str | Path | np.ndarray | Tensor, linear: bool) -> Picture:
-    if isinstance(given, str | Path):
-        return read_picture(given, linear)
+def _picture(given: np.ndarray | Tensor) -> Picture:
     values = np.array(given.detach().cpu().numpy() if isinstance(given, Tensor) else given, dtype=np.float64)
     if values.ndim != 2 or min(values.shape) < 2 or not np.isfinite(values).all() or values.min() < 0 or not values.max() > 0:
         raise InputError("picture must be a file, or a 2-D array of at least 2 x 2 finite values, none of them negative, not all 0")

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import torch
@@ -43,7 +44,7 @@ class Request:
         rays: traced; with `tolerance`, where the number begins.
         tolerance: relative RMS noise of the image that rays are added for, None for none.
         reconstruction, filter_size, alpha: of the image; alpha in 1/mm^2, None for 1 per pixel^2.
-        given: (section, key, option) -> value, settings that replace the project's own.
+        given: path in `config.table` -> value, settings that replace the project's own.
         screen_at: the screen's z instead of the scene's, mm.
         effects: auto, none or names, see `optics.plan.parse_effects`; explain: measure what each costs.
         image, npy: files to write; None for render.png in the project, and for none.
@@ -58,7 +59,7 @@ class Request:
     reconstruction: str = "bincount"
     filter_size: tuple[int, int] = (3, 3)
     alpha: float | None = None
-    given: Mapping[tuple[str, str, str], object] = field(default_factory=dict)
+    given: Mapping[str, Any] = field(default_factory=dict)
     screen_at: float | None = None
     effects: str = "auto"
     explain: bool = False
@@ -76,8 +77,7 @@ class Request:
         """What decides the outcome, by name; where it goes does not."""
         names = ("rays", "tolerance", "reconstruction", "filter_size", "alpha", "screen_at", "effects", "explain", "report",
                  "tool_radius", "seed", "dtype")
-        return {name: getattr(self, name) for name in names} | {
-            f"{section}.{key}": value for (section, key, _), value in self.given.items()}
+        return {name: getattr(self, name) for name in names} | dict(self.given)
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     archive = open_archive(asked.lens) if asked.lens.suffix.lower() == ".npz" and asked.lens.is_file() else None
     project = None if archive else Project.open(asked.lens)
     if project is None and asked.given:
-        raise InputError(f"{next(iter(asked.given))[2]}: an archive's source is fixed; render its project under another light")
+        raise InputError(f"⟨{next(iter(asked.given))}⟩: an archive's source is fixed; render its project under another light")
     image_path = asked.image or (asked.lens / RENDER if project else Path(asked.lens.stem + ".png"))
 
     def companion(name: str) -> Path:
@@ -152,7 +152,7 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     if asked.npy is not None:
         write_npy(asked.npy, image)
     if plan["diffraction"].on:
-        with say.patience("taking the wave image"):
+        with say.notify_if_slow("taking the wave image"):
             figures |= _wave_image(plan, lens, device, wanted is not None, wave_path, wave_npy)
     figures |= {"iterations": lens.iterations, "seconds": time.monotonic() - began, "image": str(image_path)}
     if asked.explain:

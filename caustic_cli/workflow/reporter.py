@@ -21,7 +21,7 @@ class Reporter(Protocol):
     def progress(self, total: int | None) -> AbstractContextManager[Tell]:
         """What is told of the work in the block, of `total` steps in all."""
 
-    def patience(self, text: str, seconds: float = 4.0) -> AbstractContextManager[None]:
+    def notify_if_slow(self, text: str, seconds: float = 4.0) -> AbstractContextManager[None]:
         """Say `text` if the block is still at work after so many seconds."""
 
 
@@ -52,6 +52,6 @@ class Listener:
         yield tell
 
     @contextmanager
-    def patience(self, text: str, seconds: float = 4.0) -> Iterator[None]:
+    def notify_if_slow(self, text: str, seconds: float = 4.0) -> Iterator[None]:
         """Wait in silence."""
         yield

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -73,6 +72,6 @@ def _designed(project: Project | None, full: dict, weights, parts, seconds: floa
 
 def _first(project: Project | None, own: dict) -> tuple[torch.Tensor | None, dict, np.ndarray]:
     """First heights for settings, the settings as they need them, and the target (n_x, n_y)."""
-    project = Project(Path(), own, Picture(picture_of_disc(), "linear")) if project is None else replace(project, settings=own)
-    first = first_heights(project, {"lens": {"thickness": own["lens"]["thickness"]}})
-    return first, own, project.target(project.scene())
+    project = Project(None, own, Picture(picture_of_disc(), "linear")) if project is None else replace(project, settings=own)
+    project, first = first_heights(project, {"lens": {"thickness": own["lens"]["thickness"]}})
+    return first, project.settings, project.target(project.scene())

@@ -22,7 +22,7 @@ import numpy as np
 import torch
 
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.kernels.surface import FusedSurface, RayHits
+from caustic_cli.optics.kernels.surface import FusedSurface, RayIntersections
 from caustic_cli.optics.surfaces.heightfield import HeightField
 
 RAYS, ROUNDS, HALF = 2_000_000, 9, 5.0
@@ -43,7 +43,7 @@ def main() -> None:
     sine = np.sqrt(1.0 - cosine**2)
     d = np.array([sine * np.cos(angle), sine * np.sin(angle), cosine]).astype(np.float32).astype(float)  # Mitsuba's floats
     zero, *directions = (torch.from_numpy(a) for a in (np.zeros(RAYS), *d))
-    newton = RayHits(FusedSurface(field.spaces, field.half_size), (zero, zero, -6.0), directions, None)
+    newton = RayIntersections(FusedSurface(field.spaces, field.half_size), (zero, zero, -6.0), directions, None)
     ray = mi.Ray3f(mi.Point3f(0.0, 0.0, -6.0), mi.Vector3f(*(mi.Float(a) for a in d)))
     dr.eval(ray)
     scenes = {n: mi.load_dict({"type": "scene", "surface": mesh(field, heights, n)}) for n in cells}

@@ -19,7 +19,7 @@ mitsuba follows the method of Mitsuba 3's tutorial "Caustics optimization": a te
 caustic `ptracer` renders differentiably; Adam lessens the mean square of image over its mean less picture over its mean, while the
 texture is refined four times; after 0.7 and 0.9 of the iterations the step is halved and the rays are doubled.  Step (in parts of
 the picture) and rays are the tutorial's.  Unlike there, the surface begins as the sphere that spreads light over the whole picture,
-where a slab would light a ninth of it, and is rendered with the verdict's pixels.  The heights are kept in --out.
+where a slab would light a ninth of it, and is rendered with the decision's pixels.  The heights are kept in --out.
 
 The optimal-transport tool is github.com/dylanmsu/fast_caustic_design (transport on grids by Nader and Guennebaud; Ceres and CHOLMOD
 from the distribution), built as its README says, with the line of apps/caustic_design.cpp that scales the target points put in
@@ -196,7 +196,7 @@ def target(picture: Path, pixels: int = PIXELS) -> np.ndarray:
 
 
 def report(sheet: Sheet, picture: Path, seconds: float | None = None) -> None:
-    """Print the verdict as a Markdown table."""
+    """Print the decision as a Markdown table."""
     goal = target(picture)
     turned = {f"{name}{90 * k} degrees": np.rot90(g, k) for name, g in (("", goal), ("mirrored, ", goal[::-1])) for k in range(4)}
     print("| normals | relative RMS, 4e6 rays | 3.2e7 rays | light | picture turned | seconds |", "| --- " * 6 + "|", sep="\n")
@@ -234,7 +234,7 @@ def build(mi, sheet: Sheet, pixels: int):
 
 def optimise(picture: Path, resolution: int, iterations: int, samples: int, step: float, pixels: int = PIXELS) -> np.ndarray:
     """Heights in mm of the vertices, [i, j], after the tutorial's optimisation."""
-    import drjit as dr  # noqa: PLC0415 - the verdict needs neither
+    import drjit as dr  # noqa: PLC0415 - the decision needs neither
     import mitsuba as mi  # noqa: PLC0415
 
     mi.set_variant("cuda_ad_mono", "llvm_ad_mono")

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from helpers import write_blob
 
 from caustic_cli import cli
 from caustic_cli.errors import CausticError
@@ -32,8 +32,7 @@ DESIGN = ["design", "blob.png", "--resolution", "16", "--control", "9", "--rays"
 @pytest.fixture(autouse=True)
 def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    y, x = np.mgrid[0:16, 0:16]
-    Image.fromarray((40 + 200 * np.exp(-((x - 5) ** 2 + (y - 6) ** 2) / 15.0)).astype(np.uint8)).save("blob.png")
+    write_blob("blob.png", 16, (5, 6), 15.0)
     monkeypatch.setattr(evaluation, "FINAL_RAYS", 5000)
     monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
 
@@ -57,6 +56,7 @@ import json, resource, sys
 from caustic_cli import cli
 from caustic_cli.workflow import design as workflow
 from caustic_cli.workflow import evaluation
+from helpers import write_blob
 evaluation.FINAL_RAYS, evaluation.write_report = 5000, lambda *args: None
 resource.setrlimit(resource.RLIMIT_FSIZE, (9000, 9000))  # writing beyond fails as on a full disk
 for arguments in json.load(sys.stdin):
@@ -155,7 +155,7 @@ def test_a_flipped_bit_in_project_toml_is_refused_or_harmless(capfd):
 def test_one_design_at_a_time_holds_a_project(capfd, monkeypatch):
     run(DESIGN, capfd, 0)
     before, inner = content("blob.caustic"), []
-    with directory.held(Path("blob.caustic")):
+    with directory.locked(Path("blob.caustic")):
         for arguments in (["design", "--resume", "blob.caustic", "--iterations", "5", "--quiet"], [*DESIGN, "--force"]):
             assert "another caustic design is at work there" in run(arguments, capfd, 2)
         assert content("blob.caustic") == before
@@ -243,7 +243,7 @@ def test_other_errors_are_not_taken_for_short_memory():
 
 @pytest.mark.parametrize("error", [MemoryError(), RuntimeError("CUDA out of memory. Tried to allocate 2 GiB")])
 def test_memory_short_anywhere_is_one_sentence(error, monkeypatch, capfd):
-    def begin(*args):
+    def begin(*args, **options):
         raise error
 
     monkeypatch.setattr(workflow, "begin", begin)

@@ -14,6 +14,7 @@ import h5py
 import numpy as np
 import pytest
 import tomli_w
+from helpers import write_blob
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from PIL import Image
@@ -37,8 +38,7 @@ def designed(tmp_path_factory):
         patch.chdir(folder)
         patch.setattr(evaluation, "FINAL_RAYS", 2000)
         patch.setattr(evaluation, "write_report", lambda *args: None)
-        y, x = np.mgrid[0:16, 0:16]
-        Image.fromarray((40 + 200 * np.exp(-((x - 5) ** 2 + (y - 6) ** 2) / 15.0)).astype(np.uint8)).save("blob.png")
+        write_blob("blob.png", 16, (5, 6), 15.0)
         assert cli.run(["design", "blob.png", "--resolution", "16", "--control", "9", "--rays", "2000", "--start", "offset",
                         "--iterations", "2", "--quiet", "--threads", "1"]) == 0
     return folder / "blob.caustic"

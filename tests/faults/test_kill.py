@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from helpers import write_blob
 
 from caustic_cli import cli
 from caustic_cli.project import checkpoint
@@ -64,8 +64,7 @@ class Server:
 @pytest.fixture
 def server(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    y, x = np.mgrid[0:16, 0:16]
-    Image.fromarray((40 + 200 * np.exp(-((x - 5) ** 2 + (y - 6) ** 2) / 15.0)).astype(np.uint8)).save("blob.png")
+    write_blob("blob.png", 16, (5, 6), 15.0)
     Path("c.toml").write_text(CONFIG)
     running = Server(tmp_path)
     with running.process:

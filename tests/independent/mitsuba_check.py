@@ -252,7 +252,7 @@ def bin_points(x: np.ndarray, y: np.ndarray, weight: np.ndarray, of: np.ndarray,
     return np.bincount(at, of[inside], nx * ny).reshape(nx, ny)
 
 
-# the verdict
+# the decision
 
 
 def relative(a: np.ndarray) -> np.ndarray:

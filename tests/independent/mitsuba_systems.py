@@ -195,7 +195,7 @@ def interact(hit: mi.SurfaceInteraction3f, reflects: bool) -> tuple[mi.Vector3f,
     return hit.to_world(sample.wo), float(weight[0])
 
 
-# the program, and the verdict
+# the program, and the decision
 
 
 def program(system: System, heights: dict, rays: RayState) -> tuple[np.ndarray, np.ndarray]:

@@ -30,7 +30,7 @@ def radicand(g: float, d) -> float:
     return 0.0 if found is None else float(found[2])
 
 
-@pytest.mark.parametrize("d", [None, (0.28, 0.0, 0.96)], ids=["plane", "slanted"])
+@pytest.mark.parametrize("d", [None, (0.28, 0.0, 0.96)], ids=["plane", "oblique"])
 def test_before_the_critical_angle(kernels, dtype, d, compare):
     d = d and tuple(float(torch.tensor(c).to(dtype)) for c in d)
     if d:
@@ -67,7 +67,7 @@ def naive(dtype: torch.dtype) -> float:
     return float(torch.autograd.grad(torch.where(square > 0, torch.sqrt(square), torch.zeros_like(square)), sine)[0])
 
 
-@pytest.mark.parametrize("d", [None, (0.28, 0.0, 0.96)], ids=["plane", "slanted"])
+@pytest.mark.parametrize("d", [None, (0.28, 0.0, 0.96)], ids=["plane", "oblique"])
 def test_beyond_the_critical_angle(kernels, dtype, d):
     g = slopes(1, dtype, d)
     g = g[[radicand(v, d) == 0.0 for v in g]]

@@ -17,7 +17,7 @@ from caustic_cli.scene import Disc, Lens, PlaneWave, Points, Scene, Screen
 
 
 @pytest.mark.parametrize("index", [1.0 + 1e-12, 1.0 + 1e-9, 1.0 + 1e-6, 1.001])
-@pytest.mark.parametrize("d", [None, (0.28, 0.0, 0.96)], ids=["plane", "slanted"])
+@pytest.mark.parametrize("d", [None, (0.28, 0.0, 0.96)], ids=["plane", "oblique"])
 def test_index_close_to_one(index, d, kernels, dtype, compare):
     """The deflection is (n - 1) times the slope: its derivative by the slope, of which (s - n c) / |N|^2 leaves nothing."""
     g = np.array([0.05, 0.4, -0.3])

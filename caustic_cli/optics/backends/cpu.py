@@ -15,15 +15,15 @@ from caustic_cli.optics.interface import Departure
 from caustic_cli.optics.kernels import functions
 from caustic_cli.optics.kernels.grid import GridSurface
 from caustic_cli.optics.kernels.interact import interact
-from caustic_cli.optics.kernels.rayhits import hits_of_rays
+from caustic_cli.optics.kernels.ray_intersections import hits_of_rays
 from caustic_cli.optics.kernels.splat import splat_rays
-from caustic_cli.optics.kernels.surface import FusedSurface, RayHits, next_meetings, scattered_surface
+from caustic_cli.optics.kernels.surface import FusedSurface, RayIntersections, next_meetings, scattered_surface
 from caustic_cli.optics.kernels.transfer import land
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.reintersection import HALVINGS, MOST_STEPS
 from caustic_cli.optics.sampling import Sample, key, salt
-from caustic_cli.optics.surfaces.base import Hit
+from caustic_cli.optics.surfaces.base import SurfaceIntersection
 from caustic_cli.scene import Screen
 
 
@@ -60,22 +60,23 @@ class Numba(Torch):
         at = ((0.5 * (c / r + 1.0)).contiguous().numpy() for c, r in zip((x, y), field.half_size, strict=True))
         return scattered_surface(FusedSurface(field.spaces, field.half_size), heights.double(), *at)
 
-    def meet_spline(self, field, heights: Tensor, origin, direction, side: float) -> Hit:
+    def meet_spline(self, field, heights: Tensor, origin, direction, side: float) -> SurfaceIntersection:
         """As the reference."""
         rays = [torch.as_tensor(c, dtype=torch.float64) for c in (*origin, *direction)]
         rays = [c.contiguous() for c in torch.broadcast_tensors(*rays)]
         if not rays[0].numel():
             return super().meet_spline(field, heights, origin, direction, side)
-        return Hit(*hits_of_rays(FusedSurface(field.spaces, field.half_size), heights, tuple(rays[:3]), tuple(rays[3:]), side=side))
+        surface = FusedSurface(field.spaces, field.half_size)
+        return SurfaceIntersection(*hits_of_rays(surface, heights, tuple(rays[:3]), tuple(rays[3:]), side=side))
 
     def meet_fixed(self, field, origin, direction):
         """As the reference; what does not depend on the heights is prepared."""
-        hits = RayHits(FusedSurface(field.spaces, field.half_size), origin, direction, None)
+        hits = RayIntersections(FusedSurface(field.spaces, field.half_size), origin, direction, None)
 
-        def meet(heights: Tensor) -> Hit:
+        def meet(heights: Tensor) -> SurfaceIntersection:
             t, gx, gy = hits(heights)
             found = t.detach() >= 0
-            return Hit(torch.where(found, t, torch.zeros_like(t)), gx, gy, found)
+            return SurfaceIntersection(torch.where(found, t, torch.zeros_like(t)), gx, gy, found)
 
         return meet
 
@@ -85,13 +86,13 @@ class Numba(Torch):
         start, found = by_mesh(field, heights, origin, direction, method, radius)
         if found is not None:
             return found
-        hits = RayHits(FusedSurface(field.spaces, field.half_size), origin, direction, radius)
+        hits = RayIntersections(FusedSurface(field.spaces, field.half_size), origin, direction, radius)
         hits.find(heights, None if start is None else np.ascontiguousarray(start.numpy()))
         return torch.from_numpy(hits.t), torch.from_numpy(hits.status).long()
 
     def finder(self, field, origin, direction):
         """As the reference."""
-        hits = RayHits(FusedSurface(field.spaces, field.half_size), origin, direction, None)
+        hits = RayIntersections(FusedSurface(field.spaces, field.half_size), origin, direction, None)
 
         def find(heights: Tensor) -> tuple[Tensor, Tensor]:
             hits.find(heights)

@@ -11,7 +11,7 @@ from caustic_cli.optics.interface import Departure, interact
 from caustic_cli.optics.mesh import TriangleMesh
 from caustic_cli.optics.reconstruction import Filter, splat
 from caustic_cli.optics.sampling import Sample, spread
-from caustic_cli.optics.surfaces.base import Hit
+from caustic_cli.optics.surfaces.base import SurfaceIntersection
 from caustic_cli.optics.tolerances import PARALLEL
 from caustic_cli.scene import Screen
 
@@ -41,16 +41,16 @@ class Torch:
         """Height and slopes at fixed points (N,) mm, float64, linear in the heights."""
         return tuple(field.at(heights, x, y))
 
-    def meet(self, surface, heights: Tensor | None, origin, direction, side: float) -> Hit:
+    def meet(self, surface, heights: Tensor | None, origin, direction, side: float) -> SurfaceIntersection:
         """`Surface.meet` of any surface."""
         return intersection.meet_any(surface, heights, origin, direction, side)
 
-    def meet_spline(self, field, heights: Tensor, origin, direction, side: float) -> Hit:
+    def meet_spline(self, field, heights: Tensor, origin, direction, side: float) -> SurfaceIntersection:
         """`Surface.meet` of a B-spline."""
         return intersection.meet_any(field, heights, origin, direction, side)
 
     def meet_fixed(self, field, origin, direction):
-        """A function of heights (n, m) mm: `Hit`s from below of rays that do not depend on them."""
+        """A function of heights (n, m) mm: `SurfaceIntersection`s from below of rays that do not depend on them."""
         return lambda heights: intersection.meet_any(field, heights, origin, direction, 1.0)
 
     def find(self, field, heights: Tensor, origin, direction, method: intersection.Method,

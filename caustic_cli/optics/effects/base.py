@@ -15,7 +15,7 @@ from torch import Tensor
 from caustic_cli.optics.bounds import Bounds
 from caustic_cli.optics.interaction import Interaction, Parameters, Walker
 from caustic_cli.optics.rays import RayState
-from caustic_cli.optics.surfaces import Hit
+from caustic_cli.optics.surfaces import SurfaceIntersection
 from caustic_cli.optics.system import System
 from caustic_cli.scene import Scene
 
@@ -78,7 +78,7 @@ class Action:
     #: Whether `stray_light` adds light that goes another way.
     stray = False
 
-    def meet(self, interaction: Interaction, origin, direction, heights: Tensor | None) -> Hit | None:
+    def meet(self, interaction: Interaction, origin, direction, heights: Tensor | None) -> SurfaceIntersection | None:
         """Another way to meet the surface, from rays in its frame; None for the usual one."""
         return None
 

@@ -15,7 +15,7 @@ class Entrance(GeneralWay):
     name = "entrance"
 
     def judge(self, scene: Scene, b) -> Decision:
-        """On where rays come slanted."""
+        """On where rays come oblique."""
         angle, collimated = math.degrees(b.incidence), scene.source.collimated
         if collimated or scene.lens.mirror or angle == 0:
             why = "there is no glass before a mirror" if scene.lens.mirror else "normal incidence on a flat entrance bends nothing"

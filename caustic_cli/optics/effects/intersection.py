@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.optics.effects.base import Action, Decision, GeneralWay, Requests
-from caustic_cli.optics.surfaces import HeightField, Hit
+from caustic_cli.optics.surfaces import HeightField, SurfaceIntersection
 from caustic_cli.scene import Scene
 
 
@@ -18,7 +18,7 @@ class Intersection(GeneralWay):
     name = "intersection"
 
     def judge(self, scene: Scene, b) -> Decision:
-        """On where rays run slanted inside the lens."""
+        """On where rays run oblique inside the lens."""
         if scene.source.collimated:
             return Decision(self.name, False, "rays of a plane wave are sampled on the surface itself", 0.0, 0.0)
         angle = math.degrees(b.inside)
@@ -32,7 +32,7 @@ class Intersection(GeneralWay):
 class MeanPlane(Action):
     """A B-spline met where rays cross its mean height, with the height and the slopes that it has there."""
 
-    def meet(self, m, origin, direction, heights: Tensor | None) -> Hit | None:
+    def meet(self, m, origin, direction, heights: Tensor | None) -> SurfaceIntersection | None:
         """The height there is what the ray goes on from; no time passes between it and the mean plane."""
         surface = m.element.surface
         if not isinstance(surface, HeightField) or m.state.sample is not None:  # a plane wave's rays stand on the surface itself
@@ -45,7 +45,7 @@ class MeanPlane(Action):
         z, gx, gy = surface.evaluate(sag, x.detach().clamp(-rx, rx), y.detach().clamp(-ry, ry))
         m.lift = torch.where(found, z, torch.zeros_like(z))
         t = torch.where(found, t, torch.zeros_like(t))
-        return Hit(t, gx, gy, found)
+        return SurfaceIntersection(t, gx, gy, found)
 
     def arrive(self, m) -> None:
         """Onto the surface above or below."""

@@ -26,11 +26,11 @@ class SecondaryIntersection(Effect):
 
     def judge(self, scene: Scene, b) -> Decision:
         """By whether a slope can catch a ray."""
-        if b.climb < 1.0:
-            why = f"slopes up to {b.slope:.3g} are {b.climb:.3g} of what rays leaving climb at"
-            return Decision(self.name, False, why, b.climb, 1.0)
+        if b.slope_ratio < 1.0:
+            why = f"slopes up to {b.slope:.3g} are {b.slope_ratio:.3g} of what rays leaving slope_ratio at"
+            return Decision(self.name, False, why, b.slope_ratio, 1.0)
         return Decision(self.name, True, f"slopes up to {b.slope:.3g} may catch a ray that has left",
-                       b.climb if math.isfinite(b.climb) else None, 1.0)
+                       b.slope_ratio if math.isfinite(b.slope_ratio) else None, 1.0)
 
     def request(self, scene: Scene, on: bool, bounds) -> Requests:
         """To look for them."""

@@ -40,7 +40,7 @@ def rays_of(scene: Lit, kind: str, rays: int, seed: int = 0, device: str | torch
     """
     name = scene.source.emission
     if name not in _MAKERS:
-        raise InputError(f"[source] type {scene.source.kind} has no rays: no emission is registered as {name!r}")
+        raise InputError(f"⟨source.type⟩ {scene.source.kind} has no rays: no emission is registered as {name!r}")
     return _MAKERS[name](scene, kind, rays, seed, device)
 
 

@@ -25,10 +25,10 @@ class Distant(Emission):
             dx, dy = sine * torch.cos(2 * math.pi * b), sine * torch.sin(2 * math.pi * b)
         else:
             dx, dy = (w * c for w, c in zip(source.frame, bright_points(source.brightness, a, b), strict=True))
-        share, x, y = torch.full_like(u, 1.0 / self.count), (2.0 * u - 1.0) * rx, (2.0 * v - 1.0) * ry
+        flux, x, y = torch.full_like(u, 1.0 / self.count), (2.0 * u - 1.0) * rx, (2.0 * v - 1.0) * ry
         if self.scene.pupil.round:  # even over the disc
             x, y = rx * u.sqrt() * torch.cos(2 * math.pi * v), rx * u.sqrt() * torch.sin(2 * math.pi * v)
-        return self._at_pupil(x, y, (dx, dy, torch.sqrt(1.0 - dx * dx - dy * dy)), share, len(u) / self.count)
+        return self._at_pupil(x, y, (dx, dy, torch.sqrt(1.0 - dx * dx - dy * dy)), flux, len(u) / self.count)
 
 
 EMISSIONS = {"far disc": Distant.of_size}

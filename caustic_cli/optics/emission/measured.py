@@ -93,7 +93,7 @@ def _meeting(source: Source, half_size: tuple[float, float], z: float, round: bo
     x, y, met = source.crossing(half_size, z, round)
     (met,) = np.nonzero(met)
     if not len(met):
-        raise InputError(f"[source] file: none of its {source.rays.count:,} rays meets the lens, which stands along +z from them;"
+        raise InputError(f"⟨source.file⟩: none of its {source.rays.count:,} rays meets the lens, which stands along +z from them;"
                          " ⟨source_position⟩ moves them")
     return x[met], y[met], met, source.rays.flux[met] / source.rays.flux.sum()
 
@@ -121,7 +121,7 @@ def coarseness(scene: Scene) -> tuple[float, int] | None:
 
 def coarse_words(scene: Scene) -> str | None:
     """That a scene's ray file is too coarse for its picture, and how many rays it would take; None where it is not."""
-    worst = max((one for one in scene.apiece if one.source.rays is not None), key=lambda one: coarseness(one)[0], default=None)
+    worst = max((one for one in scene.by_source if one.source.rays is not None), key=lambda one: coarseness(one)[0], default=None)
     if worst is None or coarseness(worst)[0] <= WORTHY:
         return None
     (noise, wanted), (nx, ny), rays = coarseness(worst), scene.screen.resolution, worst.source.rays.count

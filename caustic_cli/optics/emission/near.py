@@ -5,7 +5,7 @@ Notation, a source point at distance h before the entrance plane
     w       1 - cos theta = 2 sin^2(theta / 2), which stays exact where 1 - cos loses all digits
     rho     distance on the entrance plane from the point below the source; r^2 = rho^2 + h^2
 
-A ray sampled evenly over the cone carries an even share.  Aimed at the aperture, it carries I(theta) dOmega with
+A ray sampled evenly over the cone carries an even flux.  Aimed at the aperture, it carries I(theta) dOmega with
 I = 1 / (4 pi sin^2(theta_c / 2)), or for a Lambertian source I = cos theta / (pi sin^2 theta_c), or that of a table.  Its
 direction is (sin a cos b, sin b, cos a cos b) with a and sin b even between the aperture's edges, so that dOmega = da d(sin b):
 from afar an even sample of the aperture, and from nearby, where nearly all light meets the lens at the source's foot, one of the
@@ -90,11 +90,11 @@ class Near(Emission):
         sx, sy = torch.where(from_cone, cx, ax), torch.where(from_cone, cy, ay)
         x, y = x0 + h * sx, y0 + h * sy
         on_lens = pupil.aperture.holds(x, y)
-        share = torch.where(on_lens, torch.where(from_cone, part, aimed), torch.zeros_like(part))
+        flux = torch.where(on_lens, torch.where(from_cone, part, aimed), torch.zeros_like(part))
         x, y = x.clamp(-rx, rx), y.clamp(-ry, ry)
         sx, sy = (x - x0) / h, (y - y0) / h  # rays that miss the lens stay finite; they carry nothing
         dz = 1.0 / torch.sqrt(1.0 + sx * sx + sy * sy)
-        return self._at_pupil(x, y, (sx * dz, sy * dz, dz), share, float(part.sum()))
+        return self._at_pupil(x, y, (sx * dz, sy * dz, dz), flux, float(part.sum()))
 
 
 class NearDisc(Near):

@@ -14,10 +14,10 @@ from caustic_cli.optics.sampling import Sample
 
 @dataclass(frozen=True, eq=False)
 class SeveralRays:
-    """members: the rays of each source; shares: its part of all power."""
+    """members: the rays of each source; fractions: each one's part of all power."""
 
     members: tuple
-    shares: tuple[float, ...]
+    fractions: tuple[float, ...]
     device: str | torch.device = "cpu"
 
     @property
@@ -27,12 +27,12 @@ class SeveralRays:
 
     def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[Sample | RayState]:
         """As of an `Emission`, one source after the other; powers and losses of all sum to 1."""
-        for one, share in zip(self.members, self.shares, strict=True):
+        for one, fraction in zip(self.members, self.fractions, strict=True):
             for rays in one.chunks(size, first, step):
                 if isinstance(rays, Sample):
-                    yield replace(rays, share=share * rays.share)
+                    yield replace(rays, flux=fraction * rays.flux)
                 else:
-                    yield replace(rays, power=share * rays.power, lost={k: share * v for k, v in rays.lost.items()})
+                    yield replace(rays, power=fraction * rays.power, lost={k: fraction * v for k, v in rays.lost.items()})
 
 
 @dataclass(frozen=True)
@@ -48,9 +48,9 @@ def several(scene: Lit, kind: str, rays: int, seed: int = 0, device: str | torch
     from caustic_cli.optics.emission import rays_of  # noqa: PLC0415  every way of drawing is registered there by now
 
     source = scene.source
-    members = tuple(rays_of(_Alone(one, scene.pupil), kind, max(1, round(rays * share)), seed + k, device)
-                    for k, (one, share) in enumerate(zip(source.members, source.shares, strict=True)))
-    return SeveralRays(members, source.shares, device)
+    members = tuple(rays_of(_Alone(one, scene.pupil), kind, max(1, round(rays * fraction)), seed + k, device)
+                    for k, (one, fraction) in enumerate(zip(source.members, source.fractions, strict=True)))
+    return SeveralRays(members, source.fractions, device)
 
 
 EMISSIONS = {"several": several}

@@ -19,9 +19,9 @@ NONE, SCHLICK, EXACT = 0, 1, 2
 #: Kinds of Fresnel losses by name.
 FRESNEL = {"none": NONE, "schlick": SCHLICK, "exact": EXACT}
 # Rows of a block's scratch of vectors: the surface, powers, landing points, derivatives, what turns the results of `filter_weights`
-# into shares, the rays' points and powers; five more for its own use.
+# into fluxes, the rays' points and powers; five more for its own use.
 SAG, GX, GY, POWER, PX, PY, PHI, BY_POWER, BY_PX, BY_PY, BY_A, T_SAG, T_GX, T_GY, T_POWER, REACH = range(16)
-OVER_X, OVER_Y, LEAN_X, LEAN_Y, X, Y, SHARE, VECTORS = range(16, 24)
+OVER_X, OVER_Y, LEAN_X, LEAN_Y, X, Y, FLUX, VECTORS = range(16, 24)
 SCRATCH = 5
 
 
@@ -74,13 +74,13 @@ def load(row, out):
 
 
 @njit(**FAST)
-def powers(fresnel, gx, gy, share, n, out):
+def powers(fresnel, gx, gy, flux, n, out):
     """Power of each ray behind the lens; -1 where it is totally reflected."""
     for j in range(len(out)):
         a = gx[j] * gx[j] + gy[j] * gy[j]
         _, passes = _s(a, n)
         reflected, _ = _reflected(fresnel, a, n)
-        out[j] = share[j] * (1.0 - reflected) if passes else -1.0
+        out[j] = flux[j] * (1.0 - reflected) if passes else -1.0
 
 
 @njit(**FAST)
@@ -106,14 +106,14 @@ def fraction(p, out):
 
 
 @njit(**FAST)
-def _by_a(fresnel, sag, gx, gy, share, by_power, by_px, by_py, n, height, out):
+def _by_a(fresnel, sag, gx, gy, flux, by_power, by_px, by_py, n, height, out):
     """Derivative by a = |g|^2, by way of the landing point and of the reflectance; 0 where totally reflected."""
     for j in range(len(out)):
         a = gx[j] * gx[j] + gy[j] * gy[j]
         _, passes = _s(a, n)
         _, dm = _m(a, n)
         _, dr = _reflected(fresnel, a, n)
-        value = (height - sag[j]) * dm * (by_px[j] * gx[j] + by_py[j] * gy[j]) - by_power[j] * share[j] * dr
+        value = (height - sag[j]) * dm * (by_px[j] * gx[j] + by_py[j] * gy[j]) - by_power[j] * flux[j] * dr
         out[j] = value if passes else 0.0
 
 
@@ -134,7 +134,7 @@ def _by_sag(reach, sag, gx, gy, by_px, by_py, height, out):
 def pull(vectors, exit_):
     """Derivatives by the surface, left in T_SAG, T_GX, T_GY, from those by power and pixel coordinates."""
     n, height, v = exit_.index, exit_.height, vectors
-    _by_a(exit_.fresnel, v[SAG], v[GX], v[GY], v[SHARE], v[BY_POWER], v[BY_PX], v[BY_PY], n, height, v[BY_A])
+    _by_a(exit_.fresnel, v[SAG], v[GX], v[GY], v[FLUX], v[BY_POWER], v[BY_PX], v[BY_PY], n, height, v[BY_A])
     _by_slope(v[REACH], v[GX], v[BY_PX], v[BY_A], v[T_GX])
     _by_slope(v[REACH], v[GY], v[BY_PY], v[BY_A], v[T_GY])
     _by_sag(v[REACH], v[SAG], v[GX], v[GY], v[BY_PX], v[BY_PY], height, v[T_SAG])
@@ -151,6 +151,6 @@ def push(vectors, exit_, frame):
         _, dr = _reflected(exit_.fresnel, a, n)
         h = height - v[SAG, j]
         change = -v[T_SAG, j] * m + h * dm * da
-        v[T_POWER, j] = -v[SHARE, j] * dr * da
+        v[T_POWER, j] = -v[FLUX, j] * dr * da
         v[BY_PX, j] = (change * gx + h * m * tx) / frame.pixel_x
         v[BY_PY, j] = (change * gy + h * m * ty) / frame.pixel_y

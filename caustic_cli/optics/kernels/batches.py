@@ -227,9 +227,9 @@ def _settle(w, size, c, i, j, bounds, ends_u, ends_v, mi, wi, mj, wj, scale_x, s
             step = (w[OZ + k] + t * dz - w[Z + k]) / slope
             u, v = abs(du), abs(dv)
             narrow, size_ = FEW_ULP * max(size, t), abs(step)
-            bend = xx * u * u + 2.0 * xy * u * v + yy * v * v
+            curvature = xx * u * u + 2.0 * xy * u * v + yy * v * v
             turn = max((xx * u + xy * v) * scale_x, (xy * u + yy * v) * scale_y)
-            near = (size_ <= narrow) | ((step * step * bend <= 0.5 * narrow * slope) & (size_ * turn <= FEW_ULP))
+            near = (size_ <= narrow) | ((step * step * curvature <= 0.5 * narrow * slope) & (size_ * turn <= FEW_ULP))
             done = busy and near and slope > 0.0
             w[T + k] = t - step if busy else t
             w[G_U + k] = zu if busy else w[G_U + k]

@@ -15,7 +15,7 @@ from caustic_cli.optics.kernels.jit import FAST, njit
 BINCOUNT, GAUSSIAN, COSINE = 0, 1, 2
 #: Filters of `reconstruction` by name.
 KINDS = {"bincount": BINCOUNT, "gaussian": GAUSSIAN, "cosine": COSINE}
-#: Below this alpha (v/2)^2 the Gaussian's shares come from Taylor series, without cancellation.
+#: Below this alpha (v/2)^2 the Gaussian's weights come from Taylor series, without cancellation.
 SMALL = 0.05
 TINY = 1e-3  # and below this from shorter ones
 #: Up to this alpha exp(-2 alpha q) stays within the reach of `_exp` and the recursion over pixels; above, plain exponentials.
@@ -185,8 +185,8 @@ def _level(value, over, lean, slope):
 
 
 @njit(**FAST)
-def shares(kind, v, alpha, phi, out, slope, over, lean, scratch):
-    """Shares of rays at sub-pixel positions phi (b,), up to a factor: out (v, b), the share is out * over.
+def pixel_weights(kind, v, alpha, phi, out, slope, over, lean, scratch):
+    """Weights of rays at sub-pixel positions phi (b,), up to a factor: out (v, b), the share is out * over.
 
     And what their derivatives by phi are made of, unless `slope` is empty: (slope - out * lean) * over.  Left to the reader, the
     factor costs a ray one product instead of one a pixel.

@@ -14,7 +14,7 @@ from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels import axial_refraction, blocks, filter_weights, pixels, plane, points
 from caustic_cli.optics.kernels.arguments import Exit, Frame, Splat
 from caustic_cli.optics.kernels.banded import AlongV
-from caustic_cli.optics.kernels.surface import FusedSurface, RayHits, scattered_surface
+from caustic_cli.optics.kernels.surface import FusedSurface, RayIntersections, scattered_surface
 from caustic_cli.optics.kernels.threads import ALL
 from caustic_cli.optics.reconstruction import Filter, padding
 from caustic_cli.scene import Screen
@@ -111,7 +111,7 @@ class RayKernel:
         x, y, *direction = (t.double()[order] for t in (*origin[:2], *direction))
         power = power.double()[order]
         power[count:] = 0.0
-        self.hits, self.z = RayHits(self.surface, (x, y, origin[2]), direction, radius), origin[2]
+        self.hits, self.z = RayIntersections(self.surface, (x, y, origin[2]), direction, radius), origin[2]
         self.rays = tuple(_strided(t.view(self.shape).numpy()) for t in (x, y, *direction[:2], power))
         ones = np.ones((self.shape[0], 1))
         self.rows = (np.arange(self.shape[0]), ones, ones)
@@ -125,30 +125,30 @@ class RayKernel:
 
 def _splat(nets, rows, apart: bool, rays, interface: tuple[float, str], height: float, start: float, screen: Screen,
            filter: Filter, workspace: _Workspace) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-    """Call the kernel.  interface: n_in / n_out and the kind of Fresnel losses; start: height at which slanted rays begin, mm.
+    """Call the kernel.  interface: n_in / n_out and the kind of Fresnel losses; start: height at which oblique rays begin, mm.
 
     Returns:
         image (n_x, n_y) and the power leaving the lens (), float64, differentiable; what was lost, by name.
     """
-    slanted, arguments = _arguments(rays, interface, height, start, screen, filter)
+    oblique, arguments = _arguments(rays, interface, height, start, screen, filter)
     padded, leaving, ledger = _Image.apply(*nets, rows, apart, arguments, workspace)
     (nx, ny), (rx, ry) = screen.resolution, filter.reach
     padded = padded[:, : ny + 4 * ry]  # beyond lies what rounds the scatter's steps up to four pixels
     image = padded[2 * rx : 2 * rx + nx, 2 * ry : 2 * ry + ny]
-    lost = {"missed_surface": ledger[plane.MISSED]} if slanted else {}
+    lost = {"missed_surface": ledger[plane.MISSED]} if oblique else {}
     return image, leaving, lost | {"fresnel": ledger[plane.FRESNEL], "total_internal_reflection": ledger[plane.REFLECTED],
                                    "off_screen": ledger[plane.OFF_SCREEN] + padding(padded.detach(), filter.reach)}
 
 
 def _arguments(rays, interface: tuple[float, str], height: float, start: float, screen: Screen,
                filter: Filter) -> tuple[bool, tuple]:
-    """Whether rays are slanted, and what `plane` takes after the nets."""
+    """Whether rays are oblique, and what `plane` takes after the nets."""
     eta, fresnel = interface
-    slanted = rays[2] is not _NONE
+    oblique = rays[2] is not _NONE
     exit_ = Exit(float(eta), axial_refraction.FRESNEL[fresnel], float(start), float(height))
     frame = Frame(*map(int, screen.resolution), *map(float, screen.low), *map(float, screen.pixel))
     splat = Splat(filter_weights.KINDS[filter.kind], *(int(2 * r + 1) for r in filter.reach), *map(float, filter.alpha))
-    return slanted, (*rays, exit_, frame, splat, True if slanted else None)
+    return oblique, (*rays, exit_, frame, splat, True if oblique else None)
 
 
 def _layout(count: int) -> tuple[int, int]:
@@ -158,7 +158,7 @@ def _layout(count: int) -> tuple[int, int]:
 
 
 def _strided(array: np.ndarray) -> np.ndarray:
-    """The same values read-only and not contiguous: tensor and scattered rays then share one compiled kernel."""
+    """The same values read-only and not contiguous: tensor and scattered rays then flux one compiled kernel."""
     if array.flags.c_contiguous:
         wide = np.empty((array.shape[0], array.shape[1] + 1), array.dtype)
         wide[:, :-1] = array
@@ -202,8 +202,8 @@ def _example() -> tuple:
     """What `_Image` takes, for a few rays."""
     space, at = SplineSpace.uniform(4, 3), torch.linspace(0.0, 1.0, 2, dtype=torch.float64)
     kernel = PlaneKernel((space, space), (1.0, 1.0), at, at, True, torch.tensor(0.25, dtype=torch.float64))
-    (x, y, share), net = kernel.rays, torch.zeros(4, 2, dtype=torch.float64)
-    _, arguments = _arguments((x, y, _NONE, _NONE, share), (1.5, "exact"), 10.0, 0.0, Screen((10.0, 10.0), 10.0, (4, 4)),
+    (x, y, flux), net = kernel.rays, torch.zeros(4, 2, dtype=torch.float64)
+    _, arguments = _arguments((x, y, _NONE, _NONE, flux), (1.5, "exact"), 10.0, 0.0, Screen((10.0, 10.0), 10.0, (4, 4)),
                               Filter("cosine", (3, 3)))
     return net, net, net, kernel.rows, False, arguments, kernel.workspace
 

@@ -10,7 +10,7 @@ Notation, a ray with unit direction d inside the lens, slopes g at the hit, N = 
     q       (h - sag) / t_z, length of the path to the screen
 
 In, beside the directions: the distances along the rays to their hits (mm; -1 for none), dz/dx and dz/dy there, x and y where the
-rays begin, and their powers.  Out, in rows of `axial_refraction`'s vectors: SAG, POWER, PX, PY, SHARE.
+rays begin, and their powers.  Out, in rows of `axial_refraction`'s vectors: SAG, POWER, PX, PY, FLUX.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from caustic_cli.optics.kernels.axial_refraction import (
     BY_PX,
     BY_PY,
     EXACT,
+    FLUX,
     POWER,
     PX,
     PY,
     SAG,
     SCHLICK,
-    SHARE,
     T_POWER,
     load,
 )
@@ -61,13 +61,13 @@ def _put(row, start, count, out):
 @njit(inline="always", **FAST)
 def _load(w, start, count, ray):
     """Distances, slopes, directions and powers of a batch."""
-    reach, gx, gy, dx, dy, share = ray
+    reach, gx, gy, dx, dy, flux = ray
     _copy(reach, start, count, w[REACH])
     _copy(gx, start, count, w[GX])
     _copy(gy, start, count, w[GY])
     load(dx[start : start + count], w[DX][:count])
     load(dy[start : start + count], w[DY][:count])
-    load(share[start : start + count], w[PART][:count])
+    load(flux[start : start + count], w[PART][:count])
 
 
 @njit(inline="always", **FAST)
@@ -120,7 +120,7 @@ def _aim(w, count, exit_, frame):
 
 @njit(**FAST)
 def aim(v, ray, x, y, exit_, frame):
-    """Heights of the hits above the reference, powers and landing points in pixels, and the rays' powers below, in SHARE.
+    """Heights of the hits above the reference, powers and landing points in pixels, and the rays' powers below, in FLUX.
 
     ray: distances, dz/dx, dz/dy, d_x, d_y and powers.
     """
@@ -135,7 +135,7 @@ def aim(v, ray, x, y, exit_, frame):
         _put(w[OUT_POWER], start, count, v[POWER])
         _put(w[OUT_PX], start, count, v[PX])
         _put(w[OUT_PY], start, count, v[PY])
-        _put(w[PART], start, count, v[SHARE])
+        _put(w[PART], start, count, v[FLUX])
 
 
 @njit(inline="always", **FAST)
@@ -201,6 +201,6 @@ def push(v, ray, along, exit_, frame):
         down = n * dz + gamma
         path = (height - start - t * dz) / down
         d_path = -(dt * dz + path * d_gamma) / down
-        v[T_POWER, j] = -v[SHARE, j] * (r_c * dc + r_s * ds + r_norm2 * d_norm2)
+        v[T_POWER, j] = -v[FLUX, j] * (r_c * dc + r_s * ds + r_norm2 * d_norm2)
         v[BY_PX, j] = (dt * dx + d_path * (n * dx - gamma * gx) - path * (d_gamma * gx + gamma * tx)) / frame.pixel_x
         v[BY_PY, j] = (dt * dy + d_path * (n * dy - gamma * gy) - path * (d_gamma * gy + gamma * ty)) / frame.pixel_y

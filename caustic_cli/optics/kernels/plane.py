@@ -20,6 +20,7 @@ from caustic_cli.optics.kernels.axial_refraction import (
     BY_POWER,
     BY_PX,
     BY_PY,
+    FLUX,
     GX,
     GY,
     LEAN_X,
@@ -33,7 +34,6 @@ from caustic_cli.optics.kernels.axial_refraction import (
     REACH,
     SAG,
     SCRATCH,
-    SHARE,
     T_GX,
     T_GY,
     T_POWER,
@@ -49,7 +49,7 @@ from caustic_cli.optics.kernels.axial_refraction import (
     push,
     reach,
 )
-from caustic_cli.optics.kernels.filter_weights import shares
+from caustic_cli.optics.kernels.filter_weights import pixel_weights
 from caustic_cli.optics.kernels.jit import FAST, njit
 from caustic_cli.optics.kernels.pixels import FOUR, ONE, THREE, TWO, UINT, limits
 from caustic_cli.optics.kernels.rows import combine, spread
@@ -61,23 +61,23 @@ FRESNEL, REFLECTED, OFF_SCREEN, LEAVING, MISSED, COLUMNS = range(6)  # of the le
 @njit(inline="always", **FAST)
 def _bend(v, i, surface, rays, exit_, frame):
     """The surface, powers and landing points of row i, of rays along z."""
-    (first, bu, du, net, net_x, net_y), (x, y, _, _, share) = surface, rays
+    (first, bu, du, net, net_x, net_y), (x, y, _, _, flux) = surface, rays
     combine(i, first, bu, du, net, net_x, net_y, v[SAG], v[GX], v[GY])
-    load(share[i], v[SHARE])
+    load(flux[i], v[FLUX])
     load(x[i], v[X])
     load(y[i], v[Y])
     n, height, fresnel = exit_.index, exit_.height, exit_.fresnel
-    powers(fresnel, v[GX], v[GY], v[SHARE], n, v[POWER])
+    powers(fresnel, v[GX], v[GY], v[FLUX], n, v[POWER])
     reach(v[SAG], v[GX], v[GY], n, height, v[REACH])
     landing(v[REACH], v[GX], v[X], frame.low_x, frame.pixel_x, v[PX])
     landing(v[REACH], v[GY], v[Y], frame.low_y, frame.pixel_y, v[PY])
 
 
 @njit(inline="always", **FAST)
-def _slanted(i, surface, rays):
-    """Row i as `oblique_refraction` takes it: slanted rays have a surface of their own each, and no row of it is a sum."""
-    (_, _, _, net, net_x, net_y), (_, _, along_x, along_y, share) = surface, rays
-    return net[i], net_x[i], net_y[i], along_x[i], along_y[i], share[i]
+def _oblique(i, surface, rays):
+    """Row i as `oblique_refraction` takes it: oblique rays have a surface of their own each, and no row of it is a sum."""
+    (_, _, _, net, net_x, net_y), (_, _, along_x, along_y, flux) = surface, rays
+    return net[i], net_x[i], net_y[i], along_x[i], along_y[i], flux[i]
 
 
 @njit(inline="always", **FAST)
@@ -86,10 +86,10 @@ def _share(v, splat, sx, sy, dx, dy):
     scratch = v[VECTORS:]
     if splat.size_x > 1:
         fraction(v[PX], v[PHI])
-    shares(splat.kind, splat.size_x, splat.alpha_x, v[PHI], sx, dx, v[OVER_X], v[LEAN_X], scratch)
+    pixel_weights(splat.kind, splat.size_x, splat.alpha_x, v[PHI], sx, dx, v[OVER_X], v[LEAN_X], scratch)
     if splat.size_y > 1:
         fraction(v[PY], v[PHI])
-    shares(splat.kind, splat.size_y, splat.alpha_y, v[PHI], sy, dy, v[OVER_Y], v[LEAN_Y], scratch)
+    pixel_weights(splat.kind, splat.size_y, splat.alpha_y, v[PHI], sy, dy, v[OVER_Y], v[LEAN_Y], scratch)
 
 
 @njit(**FAST)
@@ -98,11 +98,11 @@ def _scatter(vectors, exit_, frame, splat, sx, sy, image, ledger, column):
     # Everything the loop needs is a local: after a store to the image the compiler would have to read an array again.
     vx, vy, height = splat.size_x, splat.size_y, exit_.height
     rx, ry, low_x, low_y, high_x, high_y = limits(frame.pixels_x, frame.pixels_y, vx, vy)
-    sag, share, power, px, py = vectors[SAG], vectors[SHARE], vectors[POWER], vectors[PX], vectors[PY]
+    sag, flux, power, px, py = vectors[SAG], vectors[FLUX], vectors[POWER], vectors[PX], vectors[PY]
     over_x, over_y = vectors[OVER_X], vectors[OVER_Y]
     lost_fresnel, lost_reflected, lost_off, lost_missed, leaving = 0.0, 0.0, 0.0, 0.0, 0.0
     for j in range(len(power)):
-        emitted, weight = share[j], power[j]
+        emitted, weight = flux[j], power[j]
         if weight < 0.0:
             if weight == oblique_refraction.MISSED_POWER:
                 lost_missed += emitted
@@ -234,31 +234,31 @@ def scratch_rows(splat: Splat) -> int:
 
 @njit(inline="always", **FAST)
 def _cut(scratch, vx, vy):
-    """A block's scratch as vectors, shares along x and y, their slopes."""
+    """A block's scratch as vectors, weights along x and y, their slopes."""
     a = VECTORS + SCRATCH
     b, c, d = a + vx, a + vx + vy, a + 2 * vx + vy
     return scratch[:a], scratch[a:b], scratch[b:c], scratch[c:d], scratch[d:]
 
 
 @njit(entry=True, **FAST)
-def forward(block, images, ledgers, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, share, exit_, frame,
-            splat, slanted):
+def forward(block, images, ledgers, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, flux, exit_, frame,
+            splat, oblique):
     """Blocks' ledgers (blocks, COLUMNS), power by what became of it, and their images, whose `pixels.total` is the padded one.
 
     The surface comes by rows.  Row i of the sag is sum_k bu[i, k] net[first[i] + k], of dz/dx the same with du and net_x,
-    of dz/dy with bu and net_y.  first (a,) int64; bu, du (a, p + 1); nets (n, b); x, y mm and share, parts of the
+    of dz/dy with bu and net_y.  first (a,) int64; bu, du (a, p + 1); nets (n, b); x, y mm and flux, parts of the
     source's power, (a, b).
 
     images (blocks, n_x + 4 r_x, n_y + 4 r_y), ledgers and scratch (blocks, `scratch_rows`, b) are overwritten; they set the number
     of blocks.
 
-    exit_, frame, splat: an `Exit`, a `Frame` and a `Splat`.  Of slanted rays `along_x` and `along_y` (a, b) are their
+    exit_, frame, splat: an `Exit`, a `Frame` and a `Splat`.  Of oblique rays `along_x` and `along_y` (a, b) are their
     directions' components, and instead of the sag comes the distance along them to the surface; each has a net's number to
-    itself, (a, b), whatever first, bu and du are.  slanted: True for them, None for rays along z, which are compiled apart.
+    itself, (a, b), whatever first, bu and du are.  oblique: True for them, None for rays along z, which are compiled apart.
     """
     if block == ALL:
-        on_threads(len(images), (images, ledgers, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, share, exit_,
-                                 frame, splat, slanted))
+        on_threads(len(images), (images, ledgers, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, flux, exit_,
+                                 frame, splat, oblique))
         return
     rows, blocks = len(x), len(images)
     vx, vy = splat.size_x, splat.size_y
@@ -267,30 +267,30 @@ def forward(block, images, ledgers, scratch, first, bu, du, net, net_x, net_y, x
     v, sx, sy, dx, dy = _cut(scratch[block], vx, vy)
     column = np.zeros(vy + -vy % 4)
     for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-        surface, rays = (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share)
-        if slanted is None:
+        surface, rays = (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, flux)
+        if oblique is None:
             _bend(v, i, surface, rays, exit_, frame)
         else:
-            oblique_refraction.aim(v, _slanted(i, surface, rays), x[i], y[i], exit_, frame)
+            oblique_refraction.aim(v, _oblique(i, surface, rays), x[i], y[i], exit_, frame)
         _share(v, splat, sx, sy, dx[:0], dy[:0])
         _scatter(v, exit_, frame, splat, sx, sy, images[block], ledgers[block], column)
 
 
 @njit(entry=True, **FAST)
-def backward(block, grad, grad_leaving, apart, nets, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, share,
-             exit_, frame, splat, slanted):
+def backward(block, grad, grad_leaving, apart, nets, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, flux,
+             exit_, frame, splat, oblique):
     """Adjoint of `forward`: derivatives by the three nets, from those by the padded image and leaving power.
 
     nets (3, 1 if apart else blocks, n, b) are overwritten: the `pixels.total` of each is the derivative by a net (n, b).
 
-    apart: no two rows share a row of the nets, so that one sum serves all blocks.  Otherwise net_x is taken to be net
+    apart: no two rows flux a row of the nets, so that one sum serves all blocks.  Otherwise net_x is taken to be net
     itself, and the sum of both derivatives comes as the first.  scratch: overwritten, as in `forward`.
     """
     if block == ALL:
-        if apart and slanted is None:
+        if apart and oblique is None:
             nets[:] = 0.0
         on_threads(len(scratch), (grad, grad_leaving, apart, nets, scratch, first, bu, du, net, net_x, net_y, x, y, along_x,
-                                  along_y, share, exit_, frame, splat, slanted))
+                                  along_y, flux, exit_, frame, splat, oblique))
         return
     rows, blocks = len(x), len(scratch)
     vx, vy = splat.size_x, splat.size_y
@@ -299,15 +299,15 @@ def backward(block, grad, grad_leaving, apart, nets, scratch, first, bu, du, net
     v, sx, sy, dx, dy = _cut(scratch[block], vx, vy)
     column, tilt = np.zeros(vy + -vy % 4), np.zeros(vy + -vy % 4)
     for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-        surface, rays = (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share)
-        if slanted is None:
+        surface, rays = (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, flux)
+        if oblique is None:
             _bend(v, i, surface, rays, exit_, frame)
         else:
-            oblique_refraction.aim(v, _slanted(i, surface, rays), x[i], y[i], exit_, frame)
+            oblique_refraction.aim(v, _oblique(i, surface, rays), x[i], y[i], exit_, frame)
         _share(v, splat, sx, sy, dx, dy)
         _gather(v, exit_, frame, splat, sx, sy, dx, dy, grad, grad_leaving, column, tilt)
-        if slanted is not None:
-            oblique_refraction.pull(v, _slanted(i, surface, rays), exit_, nets[0, 0, i],
+        if oblique is not None:
+            oblique_refraction.pull(v, _oblique(i, surface, rays), exit_, nets[0, 0, i],
                        nets[1, 0, i], nets[2, 0, i])
             continue
         pull(v, exit_)
@@ -316,25 +316,25 @@ def backward(block, grad, grad_leaving, apart, nets, scratch, first, bu, du, net
 
 @njit(entry=True, **FAST)
 def tangent(block, t_net, t_net_x, t_net_y, images, leaving, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y,
-            share, exit_, frame, splat, slanted):
+            flux, exit_, frame, splat, oblique):
     """Derivative of `forward` along (t_net, t_net_x, t_net_y): blocks' images, and leaving powers (blocks,)."""
     if block == ALL:
         on_threads(len(images), (t_net, t_net_x, t_net_y, images, leaving, scratch, first, bu, du, net, net_x, net_y, x, y, along_x,
-                                 along_y, share, exit_, frame, splat, slanted))
+                                 along_y, flux, exit_, frame, splat, oblique))
         return
     rows, blocks = len(x), len(images)
     vx, vy = splat.size_x, splat.size_y
     images[block], leaving[block] = 0.0, 0.0
     v, sx, sy, dx, dy = _cut(scratch[block], vx, vy)
     for i in range(block * rows // blocks, (block + 1) * rows // blocks):
-        surface, rays = (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, share)
-        if slanted is None:
+        surface, rays = (first, bu, du, net, net_x, net_y), (x, y, along_x, along_y, flux)
+        if oblique is None:
             _bend(v, i, surface, rays, exit_, frame)
         else:
-            oblique_refraction.aim(v, _slanted(i, surface, rays), x[i], y[i], exit_, frame)
+            oblique_refraction.aim(v, _oblique(i, surface, rays), x[i], y[i], exit_, frame)
         _share(v, splat, sx, sy, dx, dy)
-        if slanted is not None:
-            oblique_refraction.push(v, _slanted(i, surface, rays),
+        if oblique is not None:
+            oblique_refraction.push(v, _oblique(i, surface, rays),
                        (t_net[i], t_net_x[i], t_net_y[i]), exit_, frame)
         else:
             combine(i, first, bu, du, t_net, t_net_x, t_net_y, v[T_SAG], v[T_GX], v[T_GY])

@@ -7,7 +7,7 @@ scatter and the gather of pixels go ray by ray; the rest goes a row of rays at a
 Notation, in pixels (w = 1)
     p           landing coordinate, 0 at the frame's low edge, one for x and one for y;  phi = p - floor(p)
     v           filter size;  r = (v - 1) / 2
-    a_k, o      what `filter_weights` gives: the share of pixel floor(p) - r + k is a_k o, so that they sum to 1
+    a_k, o      what `filter_weights` gives: the weight of pixel floor(p) - r + k is a_k o, so that they sum to 1
     a'_k, l     and its derivative by p is (a'_k - a_k l) o
     W           weight of a ray;  G the derivatives by the padded image's pixels
     image       sum over rays of W o_x o_y a_i a_j on the frame padded by 2 r, less its padding
@@ -27,7 +27,7 @@ from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.kernels import blocks
 from caustic_cli.optics.kernels.axial_refraction import fraction
-from caustic_cli.optics.kernels.filter_weights import KINDS, shares
+from caustic_cli.optics.kernels.filter_weights import KINDS, pixel_weights
 from caustic_cli.optics.kernels.jit import FAST, njit
 from caustic_cli.optics.kernels.pixels import FOUR, ONE, THREE, TWO, UINT, limits, total
 from caustic_cli.optics.kernels.stage import component, components, given, keep, kept, load, store, tangent, wanted
@@ -37,7 +37,7 @@ from caustic_cli.scene import Screen
 
 #: Rays in a row.
 ROW = 512
-# Rows of a block's scratch; then what `filter_weights` works in, then shares and slopes along x and y.
+# Rows of a block's scratch; then what `filter_weights` works in, then weights and slopes along x and y.
 PX, PY, W, PHI, OVER_X, OVER_Y, LEAN_X, LEAN_Y, BY_X, BY_Y, BY_W, VECTORS = range(12)
 SCRATCH = 5
 
@@ -79,7 +79,7 @@ def splat_rays(x: Tensor, y: Tensor, weight: Tensor, screen: Screen, filter: Fil
 
 @njit(**FAST)
 def _cut(frame):
-    """A block's scratch: vectors, shares along x and y, their slopes; a column of shares and one of slopes, in steps of four."""
+    """A block's scratch: vectors, filter weights along x and y, their slopes; a column of each, in steps of four."""
     v = np.zeros((VECTORS + SCRATCH, ROW))
     vx, vy = frame.size_x, frame.size_y
     long = vy + -vy % 4
@@ -94,16 +94,16 @@ def _pixels(x, low, wide, count, out):
 
 @njit(**FAST)
 def _aim(x, y, weight, start, count, frame, v, sx, sy, dx, dy):
-    """Pixel coordinates, weights and shares of one row of rays, with their slopes unless dx and dy are empty."""
+    """Pixel coordinates, powers and filter weights of one row of rays, with their slopes unless dx and dy are empty."""
     load(x, start, count, v[PX])
     load(y, start, count, v[PY])
     load(weight, start, count, v[W])
     _pixels(v[PX], frame.low_x, frame.wide_x, count, v[PX])
     _pixels(v[PY], frame.low_y, frame.wide_y, count, v[PY])
     fraction(v[PX], v[PHI])
-    shares(frame.kind, frame.size_x, frame.alpha_x, v[PHI], sx, dx, v[OVER_X], v[LEAN_X], v[VECTORS:])
+    pixel_weights(frame.kind, frame.size_x, frame.alpha_x, v[PHI], sx, dx, v[OVER_X], v[LEAN_X], v[VECTORS:])
     fraction(v[PY], v[PHI])
-    shares(frame.kind, frame.size_y, frame.alpha_y, v[PHI], sy, dy, v[OVER_Y], v[LEAN_Y], v[VECTORS:])
+    pixel_weights(frame.kind, frame.size_y, frame.alpha_y, v[PHI], sy, dy, v[OVER_Y], v[LEAN_Y], v[VECTORS:])
 
 
 @njit(**FAST)
@@ -169,7 +169,7 @@ def _splat(block, x, y, weight, frame, images, outside):
 def _gather(v, count, frame, sx, sy, dx, dy, grad, by_outside, column, tilt):
     """Derivatives by each ray's landing point (per mm) and weight, from those by the padded image and the weight outside.
 
-    sum G a_i a_j, sum G a'_i a_j and sum G a_i a'_j over the pixels first; then what normalises the shares; then W and p.
+    sum G a_i a_j, sum G a'_i a_j and sum G a_i a'_j over the pixels first; then what normalises the weights; then W and p.
     """
     vx, vy, per_x, per_y = frame.size_x, frame.size_y, 1.0 / frame.wide_x, 1.0 / frame.wide_y
     rx, ry, low_x, low_y, high_x, high_y = limits(frame.pixels_x, frame.pixels_y, vx, vy)

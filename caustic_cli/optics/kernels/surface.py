@@ -107,7 +107,7 @@ def next_meetings(surface: FusedSurface, heights: Tensor, o, d, below: bool, rou
     return torch.from_numpy(t)
 
 
-class RayHits:
+class RayIntersections:
     """Where rays known beforehand meet a height field from below: the fused form of `intersection.reference`.
 
     Args:
@@ -166,7 +166,7 @@ class RayHits:
 
 class _Hits(torch.autograd.Function):
     @staticmethod
-    def forward(heights: Tensor, rays: RayHits):
+    def forward(heights: Tensor, rays: RayIntersections):
         c, _, *out = rays.search(heights)
         return *(torch.from_numpy(a) for a in out), torch.from_numpy(c)
 

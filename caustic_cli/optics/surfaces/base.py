@@ -27,7 +27,7 @@ from caustic_cli.optics.backends import backend_for
 FIRST, SECOND = ((0, 0), (1, 0), (0, 1)), ((2, 0), (1, 1), (0, 2))
 
 
-class Hit(NamedTuple):
+class SurfaceIntersection(NamedTuple):
     """Where rays meet a surface: distance t along them (mm, 0 where they do not), slopes there, and whether they do; (N,) each.
 
     Slopes are plain floats where they are the same for every ray.
@@ -70,7 +70,7 @@ class Surface(ABC):
         """Heights of the same surface moved to where its numbers are small, and by how far it was higher, mm."""
         return heights, 0.0
 
-    def meet(self, heights: Tensor | None, origin, direction, side: float) -> Hit:
+    def meet(self, heights: Tensor | None, origin, direction, side: float) -> SurfaceIntersection:
         """First intersections of rays (N,), mm, unit directions with side d_z > 0; differentiable by all three."""
         (device,) = {c.device for c in (*origin, *direction) if isinstance(c, Tensor)} or {torch.device("cpu")}
         return backend_for(device).meet(self, heights, origin, direction, side)

@@ -20,7 +20,7 @@ from torch import Tensor
 from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.sampling import Sample
-from caustic_cli.optics.surfaces.base import FIRST, Hit, Surface
+from caustic_cli.optics.surfaces.base import FIRST, Surface, SurfaceIntersection
 from caustic_cli.scene import Lens
 
 
@@ -96,7 +96,7 @@ class HeightField(Surface):
         """As of any surface, by the kernels of the device's backend; linear in the heights."""
         return list(backend_for(x.device).spline_at(self, heights, x, y))
 
-    def meet(self, heights: Tensor, origin, direction, side: float) -> Hit:
+    def meet(self, heights: Tensor, origin, direction, side: float) -> SurfaceIntersection:
         """As of any surface, by the kernels of the device's backend."""
         return backend_for(heights.device).meet_spline(self, heights, origin, direction, side)
 

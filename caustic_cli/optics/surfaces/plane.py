@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.surfaces.base import FIRST, Hit, Surface
+from caustic_cli.optics.surfaces.base import FIRST, Surface, SurfaceIntersection
 from caustic_cli.optics.tolerances import PARALLEL
 
 
@@ -29,11 +29,11 @@ class Plane(Surface):
         """(0, 0)."""
         return 0.0, 0.0
 
-    def meet(self, heights: None, origin, direction, side: float) -> Hit:
+    def meet(self, heights: None, origin, direction, side: float) -> SurfaceIntersection:
         """t = -o_z / d_z; the slopes are the number 0."""
         like = next(c for c in (*origin, *direction) if isinstance(c, Tensor))
         oz, dz = (torch.as_tensor(c, dtype=like.dtype, device=like.device) for c in (origin[2], direction[2]))
         ahead = side * dz > PARALLEL
         t = torch.where(ahead, -oz / torch.where(ahead, dz, torch.ones_like(dz)), torch.zeros_like(like))
         found = ahead & (t >= 0)
-        return Hit(torch.where(found, t, torch.zeros_like(t)), 0.0, 0.0, found)
+        return SurfaceIntersection(torch.where(found, t, torch.zeros_like(t)), 0.0, 0.0, found)

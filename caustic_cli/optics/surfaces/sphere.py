@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.optics.surfaces.base import FIRST, Hit, Surface
+from caustic_cli.optics.surfaces.base import FIRST, Surface, SurfaceIntersection
 
 #: Part of the radius up to which the surface goes: at the equator its slope is infinite.
 EQUATOR = 1.0 - 1e-9
@@ -64,7 +64,7 @@ class Sphere(Surface):
         sine = min(self.reach * abs(self.curvature), EQUATOR) if math.isfinite(self.radius) else 0.0
         return (sine / math.sqrt(1.0 - sine * sine),) * 2
 
-    def meet(self, heights: None, origin, direction, side: float) -> Hit:
+    def meet(self, heights: None, origin, direction, side: float) -> SurfaceIntersection:
         """The closed form, from either side."""
         (ox, oy, oz), (dx, dy, dz), k = origin, direction, self.curvature
         big_f = k * (ox * ox + oy * oy + oz * oz) - 2.0 * oz
@@ -78,5 +78,5 @@ class Sphere(Surface):
         found = met & (t >= 0) & (cosine > math.sqrt(1.0 - EQUATOR**2)) & (side * (dz * cosine - k * (x * dx + y * dy)) > 0)
         none, one = torch.zeros_like(t), torch.ones_like(t)
         cosine = torch.where(found, cosine, one)
-        return Hit(torch.where(found, t, none), torch.where(found, k * x / cosine, none),
+        return SurfaceIntersection(torch.where(found, t, none), torch.where(found, k * x / cosine, none),
                    torch.where(found, k * y / cosine, none), found)

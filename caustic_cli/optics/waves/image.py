@@ -87,7 +87,8 @@ class WaveImage:
 def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | None = None) -> list[Line]:
     """The light of a scene by wavelength and polarisation: its own, or these with equal parts; white where it has none."""
     if len(scene.source.members) > 1:
-        return [replace(line, part=share * line.part) for one, share in zip(scene.apiece, scene.source.shares, strict=True)
+        return [replace(line, part=fraction * line.part)
+                for one, fraction in zip(scene.by_source, scene.source.fractions, strict=True)
                 for line in lines_of(one, field, wavelengths)]
     found, own, systems = [], scene.light.wavelengths, {}
     if wavelengths is not None or not own:
@@ -113,8 +114,8 @@ def lines_of_system(system: System) -> list[Line]:
     """The same of any system, whose sources are taken one by one."""
     given = system.light.wavelengths or white(WHITE_LINES)
     parts = system.light.parts if system.light.wavelengths else (1.0 / len(given),) * len(given)
-    return [Line(wavelength, share * part, system.with_source(source), wavelength)
-            for source, share in zip(system.sources, system.parts, strict=True)
+    return [Line(wavelength, fraction * part, system.with_source(source), wavelength)
+            for source, fraction in zip(system.sources, system.parts, strict=True)
             for wavelength, part in zip(given, parts, strict=True)]
 
 

@@ -100,5 +100,5 @@ def receiver_of(system: System, screen: Screen | Placed) -> Receiver:
     """
     found = Receiver.of(screen)
     if abs(dot(found.axes[2], system.axis)) < LEAST_COSINE:
-        raise InputError("[screen] tilt leaves the screen along the light, where no wave image can be taken")
+        raise InputError("⟨screen.tilt⟩ leaves the screen along the light, where no wave image can be taken")
     return found

@@ -46,5 +46,5 @@ def _left(f, x: Tensor, y: Tensor, shape: tuple[int, int], step: tuple[float, fl
     if not bool(inside.any()):
         return 0.0
     e2 = (x - f.x).square() + (y - f.y).square()
-    bend = sum(g.abs() for c in (f.qx, f.qy) for g in torch.gradient(c.view(shape), spacing=step, dim=(0, 1)))
-    return float((0.5 * e2.view(shape) * bend)[inside.view(shape)].max())
+    curvature = sum(g.abs() for c in (f.qx, f.qy) for g in torch.gradient(c.view(shape), spacing=step, dim=(0, 1)))
+    return float((0.5 * e2.view(shape) * curvature)[inside.view(shape)].max())

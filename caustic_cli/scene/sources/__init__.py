@@ -10,7 +10,7 @@ import pkgutil
 from collections.abc import Sequence
 from importlib import import_module
 
-from caustic_cli.scene import checks
+from caustic_cli.config import checks
 from caustic_cli.scene.sources.base import Source
 from caustic_cli.scene.sources.disc import Disc
 from caustic_cli.scene.sources.plane import PlaneWave
@@ -36,7 +36,7 @@ def names() -> tuple[str, ...]:
     return tuple(_TYPES)
 
 
-def type_of(name: str, where: str = "[source] type") -> SourceType:
+def type_of(name: str, where: str = "⟨source.type⟩") -> SourceType:
     """The type of that name.
 
     Raises:
@@ -71,7 +71,7 @@ def together(first: Source, section: Table) -> Source:
     """The first source of a [source] section, with the others where it names some."""
     if not section.get("also"):
         return first
-    others = (type_of(table["type"], "[[source]] type").from_settings(table, None) for table in section["also"])
+    others = (type_of(table["type"], "⟨source.also.type⟩").from_settings(table, None) for table in section["also"])
     return Several((first, *others), tuple((light.wavelengths, light.weights) for light in lights_of(section)))
 
 

@@ -8,13 +8,12 @@ from functools import cached_property
 
 import numpy as np
 
+from caustic_cli.config.table import check, check_all
 from caustic_cli.errors import InputError
-from caustic_cli.scene import checks
-from caustic_cli.scene.sources import ranges
 from caustic_cli.scene.sources.base import Source
 from caustic_cli.scene.sources.plane import PlaneWave
 from caustic_cli.scene.sources.points import Points
-from caustic_cli.scene.sources.section import SourceType, Table, content, middle, shining, standing
+from caustic_cli.scene.sources.section import SourceType, Table, check_shining, content, middle, shining, standing
 
 
 @dataclass(frozen=True)
@@ -44,20 +43,17 @@ class Disc(Source):
     kind = "disc"
 
     def __post_init__(self):
-        ranges.position(self.position)
-        ranges.size(self.size)
-        ranges.power(self.power)
-        ranges.cone(self.cone)
-        ranges.intensity(self.intensity)
+        check_all("source", self, "position", "size", "power")
+        check_shining(self)
         if self.angle is not None:
-            checks.number("[source] angle", self.angle, 0.0, 170.0)
+            check("source.angle", self.angle)
         if self.brightness is not None:
             light = np.asarray(self.brightness, dtype=float)
             if light.ndim != 2 or not np.isfinite(light).all() or (light < 0).any() or not 0 < light.sum() < np.inf:
-                raise InputError("[source] file of a disc must be a 2-D picture, finite, not negative, and not black all over")
+                raise InputError("⟨source.file⟩ of a disc must be a 2-D picture, finite, not negative, and not black all over")
             object.__setattr__(self, "brightness", light)
             if self.distant and self.frame[0] * self._reach[2] >= 1.0:
-                raise InputError(f"[source] angle of {self.angle:g} degrees is too wide for a picture whose corners lie beyond it")
+                raise InputError(f"⟨source.angle⟩ of {self.angle:g} degrees is too wide for a picture whose corners lie beyond it")
 
     @property
     def distant(self) -> bool:
@@ -133,7 +129,7 @@ class Disc(Source):
 def _build(table: Table, _profile) -> Disc:
     light = content(table, "file", np.ndarray)
     if light is None and table.get("file"):
-        raise InputError("[source] file of a disc must be a picture of its brightness, an image or a 2-D .npy")
+        raise InputError("⟨source.file⟩ of a disc must be a picture of its brightness, an image or a 2-D .npy")
     return Disc(middle(table, "disc"), tuple(table["size"]), table["power"], angle=table.get("angle"), brightness=light,
                 **shining(table))
 

@@ -98,7 +98,7 @@ def _table(given: Distribution, cone: float) -> tuple[np.ndarray, np.ndarray, np
     grown = _grown(angles[:-1], np.diff(angles), values[:-1], np.diff(values) / np.diff(angles))
     sums = np.append(0.0, np.cumsum(2.0 * math.pi * grown))
     if not sums[-1] > 0:
-        raise InputError(f"[source] intensity: there is no light within the cone of {math.degrees(cone):.4g} degrees")
+        raise InputError(f"⟨source.intensity⟩: there is no light within the cone of {math.degrees(cone):.4g} degrees")
     return angles, values, sums
 
 

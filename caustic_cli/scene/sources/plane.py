@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from caustic_cli.config.table import check
 from caustic_cli.errors import InputError
-from caustic_cli.scene.sources import ranges
 from caustic_cli.scene.sources.base import Source
 from caustic_cli.scene.sources.section import SourceType, Table
 
@@ -29,11 +29,11 @@ class PlaneWave(Source):
     collimated = True
 
     def __post_init__(self):
-        ranges.power(self.power)
+        check("source.power", self.power)
         if self.profile is not None:
             e = np.asarray(self.profile, dtype=float)
             if e.ndim != 2 or not np.isfinite(e).all() or (e < 0).any() or not e.sum() > 0:
-                raise InputError("[source] profile must be a 2-D picture, finite, not negative, and not black all over")
+                raise InputError("⟨source.profile⟩ must be a 2-D picture, finite, not negative, and not black all over")
             object.__setattr__(self, "profile", e)
 
     def extent_words(self, z_in: float) -> str:

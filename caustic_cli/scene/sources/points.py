@@ -8,11 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from caustic_cli.config.table import check
 from caustic_cli.errors import InputError
-from caustic_cli.scene import checks
-from caustic_cli.scene.sources import ranges
 from caustic_cli.scene.sources.base import Source
-from caustic_cli.scene.sources.section import SourceType, Table, middle, positions, shining, standing
+from caustic_cli.scene.sources.section import SourceType, Table, check_shining, middle, positions, shining, standing
 
 #: Most point sources at once.
 MAX_POINTS = 1_000_000
@@ -40,28 +39,26 @@ class Points(Source):
 
     def __post_init__(self):
         if not 1 <= len(self.positions) <= MAX_POINTS:
-            raise InputError(f"[source] position must name 1 to {MAX_POINTS:,} points, got {len(self.positions)}")
+            raise InputError(f"⟨source.position⟩ must name 1 to {MAX_POINTS:,} points, got {len(self.positions)}")
         for position in self.positions:
-            ranges.position(position)
+            check("source.position", position)
         if self.powers is None:
             object.__setattr__(self, "powers", (1.0 / len(self.positions),) * len(self.positions))
         if len(self.powers) != len(self.positions):
-            raise InputError(f"[source] powers must be one for each of the {len(self.positions)} positions,"
+            raise InputError(f"⟨source.powers⟩ must be one for each of the {len(self.positions)} positions,"
                              f" got {len(self.powers)}")
-        for power in self.powers:
-            checks.number("[source] powers", power, 0.0, checks.POWER)
+        check("source.powers", self.powers)
         if not sum(self.powers) > 0:
-            raise InputError("[source] powers must not all be 0")
-        ranges.cone(self.cone)
-        ranges.intensity(self.intensity)
+            raise InputError("⟨source.powers⟩ must not all be 0")
+        check_shining(self)
 
     @classmethod
     def grid(cls, centre: Sequence[float], size: tuple[float, float], shape: tuple[int, int], power: float = 1.0,
              **options) -> Points:
         """shape = (N, M) equispaced points on a rectangle of full width and height `size` mm, borders included (fig. 6.4.1)."""
-        centre = ranges.position(centre)
-        ranges.size(size)
-        checks.pair("[source] grid", shape, lambda w, n: checks.whole(w, n, 1, 1000))
+        centre = check("source.position", centre)
+        check("source.size", size)
+        check("source.grid", shape)
         xs, ys = (np.linspace(-w / 2.0, w / 2.0, n) if n > 1 else np.zeros(1) for w, n in zip(size, shape, strict=True))
         places = tuple((centre[0] + float(x), centre[1] + float(y), centre[2]) for x in xs for y in ys)
         return cls(places, (power / len(places),) * len(places), kind="grid", **options)

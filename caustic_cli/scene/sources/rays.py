@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from caustic_cli.config.table import check_all
 from caustic_cli.errors import InputError
-from caustic_cli.scene.sources import ranges
 from caustic_cli.scene.sources.base import Source
 from caustic_cli.scene.sources.points import Points
 from caustic_cli.scene.sources.rayset import RaySet
@@ -35,8 +35,7 @@ class Measured(Source):
     kind = "rays"
 
     def __post_init__(self):
-        ranges.position(self.position)
-        ranges.power(self.power)
+        check_all("source", self, "position", "power")
         _ = self.rays.forward  # refused here if there is none
 
     def points(self) -> tuple[np.ndarray, np.ndarray]:
@@ -97,10 +96,10 @@ class Measured(Source):
 def _build(table: Table, _profile) -> Measured:
     rays, places = content(table, "file", RaySet), positions(table)
     if rays is None:
-        raise InputError("[source] file of type rays must be a ray file: IES TM-25 (.tm25ray), Zemax binary (.dat, .sdf) or"
+        raise InputError("⟨source.file⟩ of type rays must be a ray file: IES TM-25 (.tm25ray), Zemax binary (.dat, .sdf) or"
                          " LightTools text (.ray, .txt)")
     if len(places) != 1:
-        raise InputError(f"[source] position of a ray file is that of its origin, one [x, y, z], got {len(places)}")
+        raise InputError(f"⟨source.position⟩ of a ray file is that of its origin, one [x, y, z], got {len(places)}")
     return Measured(rays, places[0], table["power"])
 
 

@@ -11,11 +11,14 @@ from typing import Any
 
 import numpy as np
 
+from caustic_cli.config.table import check
 from caustic_cli.errors import InputError
 from caustic_cli.scene.sources.base import Source
 from caustic_cli.scene.sources.distribution import Distribution
 
 Table = Mapping[str, Any]
+#: The same power into every solid angle; in proportion to the cosine from +z.
+INTENSITIES = ("uniform", "lambertian")
 #: Keys of every source: the name of its type, and its power, W.
 COMMON = ("type", "power")
 #: Of a source that stands somewhere, if not said: how far before the lens, how wide, in lens widths; the grid of fig. 6.4.1.
@@ -66,7 +69,7 @@ class SourceType:
     name: [source] type; note: the name with what has to be said about it in a line; keys: of the section that it uses besides
     COMMON; from_settings: makes it of the complete section and of the profile's irradiance, if one is named; defaults: of its keys,
     from the [lens] section; idle: of a section, keys of the type that mean nothing beside the others, and why; own: keys of the
-    section that no other type has, each with its kind and comment as of `settings.Key`.
+    section that no other type has, each with its kind and help as of `table.Setting`.
     """
 
     name: str
@@ -90,6 +93,14 @@ def shining(table: Table) -> dict[str, Any]:
     return {"cone": table.get("cone"), "intensity": intensity, "aimed": table["aim"]}
 
 
+def check_shining(source: Source) -> None:
+    """Refuse a cone or an intensity that there is none of."""
+    if source.cone is not None:
+        check("source.cone", source.cone)
+    if not isinstance(source.intensity, Distribution) and source.intensity not in INTENSITIES:
+        raise InputError(f"⟨source.intensity⟩ must be one of {', '.join(INTENSITIES)}, or a .csv file, got {source.intensity!r}")
+
+
 def positions(table: Table) -> tuple[tuple[float, float, float], ...]:
     """All positions of the section."""
     return tuple(tuple(p) for p in table["position"])
@@ -103,5 +114,5 @@ def middle(table: Table, name: str) -> tuple[float, float, float]:
     """
     found = positions(table)
     if len(found) != 1 and "angle" not in table:
-        raise InputError(f"[source] position of a {name} is its centre, one [x, y, z], got {len(found)}")
+        raise InputError(f"⟨source.position⟩ of a {name} is its centre, one [x, y, z], got {len(found)}")
     return found[0]

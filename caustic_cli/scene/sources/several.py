@@ -37,7 +37,7 @@ class Several(Source):
         if not 2 <= len(self.members) <= MOST:
             raise InputError(f"[[source]] must be 1 to {MOST} sources, got {len(self.members)}")
         if len({bool(wavelengths) for wavelengths, _ in self.spectra}) > 1:
-            raise InputError("[[source]] wavelengths must be said of every source, or of none")
+            raise InputError("⟨source.also.wavelengths⟩ must be said of every source, or of none")
 
     @property
     def power(self) -> float:
@@ -45,7 +45,7 @@ class Several(Source):
         return math.fsum(one.power for one in self.members)
 
     @property
-    def shares(self) -> tuple[float, ...]:
+    def fractions(self) -> tuple[float, ...]:
         """Part of all power of each."""
         return tuple(one.power / self.power for one in self.members)
 

@@ -15,8 +15,8 @@ from caustic_cli.optics import intersection
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.intersection import Status
 from caustic_cli.optics.kernels import batches
-from caustic_cli.optics.kernels.rayhits import hits_of_rays
-from caustic_cli.optics.kernels.surface import FusedSurface, RayHits
+from caustic_cli.optics.kernels.ray_intersections import hits_of_rays
+from caustic_cli.optics.kernels.surface import FusedSurface, RayIntersections
 from caustic_cli.optics.surfaces.heightfield import HeightField
 
 HALF = (5.0, 4.0)
@@ -38,7 +38,7 @@ def fan(count, widest, seed=0, spread=1.0, z=0.0):
 
 
 def hits_of(fused, origin, direction, radius=None):
-    return RayHits(fused, (*origin[:2], float(origin[2][0])), direction, radius)
+    return RayIntersections(fused, (*origin[:2], float(origin[2][0])), direction, radius)
 
 
 # batches

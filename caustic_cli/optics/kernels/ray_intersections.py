@@ -1,8 +1,8 @@
 """Where rays of any origin meet a height field, differentiable by the rays as well as by the heights.
 
-Of `surface.RayHits`, rays begin inside the aperture and below the surface, wherever a source puts them once and for all.  Behind
-another surface their origin o and direction d depend on that surface, and o may lie beyond this one's aperture: a long way off, a
-ray comes in at an angle.  So each is first taken to where it enters the
+Of `surface.RayIntersections`, rays begin inside the aperture and below the surface, wherever a source puts them once and for all.
+Behind another surface their origin o and direction d depend on that surface, and o may lie beyond this one's aperture: a long way
+off, a ray comes in at an angle.  So each is first taken to where it enters the
 
     box    aperture x [a little below the least control height, infinity)
 

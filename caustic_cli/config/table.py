@@ -1,0 +1,308 @@
+"""The table of settings: every parameter of a project, once.
+
+A row says what a setting is called, its type, unit, range and default, what it means, why its default is what it is, and by which
+option a command line gives it.  project.toml (`config.settings`), the scene's dataclasses, the commands' options, the manual pages
+and the reference are made from it.  It is plain data, imports nothing but errors and checks, and stands below every other room.
+
+A path is a section and a key, `lens.size`, which is `[lens] size` in project.toml.  A path without a section is a parameter that
+settings are derived from and that no project holds: `mag` makes `target.size`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from caustic_cli.config import checks
+from caustic_cli.errors import InputError
+
+#: Bounds of lengths on the lens, of distances and of sizes on the screen, mm.
+LENS, DISTANCE, SCREEN = (1e-6, 1e6), (-1e12, 1e12), (1e-6, 1e9)
+WAVELENGTHS = (100.0, 20_000.0)
+
+
+@dataclass(frozen=True)
+class Option:
+    """How a command line says a setting: by which option, what stands for its value, and in which commands.
+
+    constant: what a flag stands for; common: an option that every command has, which is not made from this table.
+    """
+
+    name: str
+    metavar: str | None = None
+    commands: tuple[str, ...] = ("design",)
+    constant: Any = None
+    common: bool = False
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A row of the table.
+
+    path: see the module; kind: number, whole, text, flag, numbers (a pair), wholes (a pair), list (of numbers), points ([x, y, z]
+    or a list of such); help: what it is, for comments, options and the reference; unit; low, high, above: range of each number,
+    `above` if low itself is excluded; choices: of a text; default: None where there is none or it is derived; derived: how it then
+    follows; why: the reason for the default; written: whether a new project's file says a default; option: of the command line;
+    speaks_for: other paths that the same option sets.
+    """
+
+    path: str
+    kind: str
+    help: str
+    unit: str = ""
+    low: float = -math.inf
+    high: float = math.inf
+    above: bool = False
+    choices: tuple[str, ...] = ()
+    default: Any = None
+    derived: str = ""
+    why: str = ""
+    written: bool = True
+    option: Option | None = None
+    speaks_for: tuple[str, ...] = ()
+
+    @property
+    def section(self) -> str:
+        """The part of the path before its last dot, "" of a parameter that no project holds."""
+        return self.path.rpartition(".")[0]
+
+    @property
+    def key(self) -> str:
+        """The path's last part."""
+        return self.path.rpartition(".")[2]
+
+    @property
+    def note(self) -> str:
+        """What is written beside it in project.toml: unit, and meaning."""
+        return ", ".join(filter(None, (self.unit, self.help)))
+
+    def check(self, value: Any) -> Any:
+        """`value`, if it is of the kind and within the range; pairs as tuples.
+
+        Raises:
+            InputError: naming the setting and what would be accepted.
+        """
+        where = f"⟨{self.path}⟩"
+        if self.choices:
+            return checks.choice(where, value, self.choices)
+        if self.kind == "number":
+            return self._number(where, value)
+        if self.kind == "whole":
+            return checks.whole(where, value, self.low, self.high)
+        if self.kind == "numbers":
+            return checks.pair(where, value, self._number)
+        if self.kind == "wholes":
+            return checks.pair(where, value, lambda w, n: checks.whole(w, n, self.low, self.high))
+        if self.kind == "list":
+            return tuple(self._number(where, v) for v in value)
+        if self.kind == "points":
+            if isinstance(value, str) or not isinstance(value, Sequence) or len(value) != 3:
+                raise InputError(f"{where} must be three numbers x, y, z in mm, got {value!r}")
+            return tuple(self._number(where, v) for v in value)
+        return value
+
+    def _number(self, where: str, value: Any) -> float:
+        return checks.number(where, value, self.low, self.high, open_low=self.above)
+
+
+BOTH = ("design", "render")
+# fmt: off
+_ROWS = (
+    # The light source
+    Setting("source.type", "text", "plane: parallel light along +z as wide as the lens; point; grid of points; disc, an extended"
+            " source; rays of a source file", default="plane", why="the thesis' first source, section 4.2.1",
+            option=Option("--source", commands=BOTH)),
+    Setting("source.power", "number", "all of the source's, through the aperture or into the cone; lm gives images in lux", "W",
+            0.0, checks.POWER, above=True, default=1.0, why="images are parts of the source's power",
+            option=Option("--power", "NUMBER[W|lm]", BOTH), speaks_for=("source.power_unit",)),
+    Setting("source.power_unit", "text", "W, or lm for images in lux", choices=("W", "lm"), default="W", written=False),
+    Setting("source.profile", "text", "plane: file here with the relative irradiance over the aperture"),
+    Setting("source.file", "text", "ray file (IES TM-25 .tm25ray, Zemax .dat or .sdf, LightTools .ray or .txt), of which the"
+            " project keeps a copy; of a disc, a picture of its brightness, whose values are taken as they are",
+            option=Option("--source-file", "FILE", BOTH)),
+    Setting("source.position", "points", "point: one or several [x, y, z]; grid, disc: the centre; rays: the file's origin", "mm",
+            *DISTANCE, derived="on the axis, five lens widths before it", option=Option("--source-position", "X,Y,Z", BOTH)),
+    Setting("source.powers", "list", "point: relative power of each position", low=0.0, high=checks.POWER, derived="equal"),
+    Setting("source.size", "numbers", "full width and height of a grid or disc", "mm", 0.0, 1e9, derived="a fifth of the lens",
+            option=Option("--source-size", "W[xH]", BOTH)),
+    Setting("source.grid", "wholes", "points of a grid along x and y", low=1, high=1000, derived="25 x 25",
+            why="figure 6.4.1 of the thesis", option=Option("--source-grid", "N[xM]", BOTH)),
+    Setting("source.cone", "number", "half-angle of the cone about +z", "degrees", 1e-9, 90.0, derived="as wide as the lens",
+            option=Option("--cone", "DEG", BOTH)),
+    Setting("source.angle", "number", "disc at infinity (the sun: 0.533): full angle it is seen under", "degrees", 0.0, 170.0,
+            derived="a disc at its position", option=Option("--source-angle", "DEG", BOTH)),
+    Setting("source.intensity", "text", "of a point, grid or disc: uniform in solid angle, lambertian, or a .csv of degrees from +z"
+            " and relative intensity", default="uniform", why="an isotropic source, the simplest",
+            option=Option("--intensity", "uniform|lambertian|FILE", BOTH)),
+    Setting("source.aim", "flag", "sample rays on the lens, not all over the cone", default=True,
+            why="no ray is spent beside the lens"),
+    Setting("source.polarisation", "number", "direction of linear polarisation from +x", "degrees", -360.0, 360.0,
+            derived="unpolarised", option=Option("--polarisation", "DEG", BOTH)),
+    Setting("source.wavelengths", "list", "the source's spectrum, each with its relative power; a glass refracts each by its own"
+            " index", "nm", *WAVELENGTHS, derived="one wavelength", option=Option("--wavelengths", "NM[:W],...", BOTH),
+            speaks_for=("source.weights",)),
+    Setting("source.weights", "list", "relative power at each wavelength", low=0.0, high=checks.POWER, derived="equal"),
+    # The lens
+    Setting("lens.size", "numbers", "full width and height of the lens' aperture", "mm", *LENS, default=[10.0, 10.0],
+            why="table D.2 of the thesis, in millimetres", option=Option("--lens-size", "W[xH]")),
+    Setting("lens.z_in", "number", "flat entrance surface", "mm", -checks.LENGTH, checks.LENGTH, default=0.0,
+            why="the lens' origin"),
+    Setting("lens.thickness", "number", "of the offset surface at the centre, from the lens' origin", "mm", -checks.LENGTH,
+            checks.LENGTH, derived="half the lens' width, or what the first surface needs", why="table D.2 of the thesis",
+            option=Option("--thickness", "MM")),
+    Setting("lens.radius", "numbers", "radius of the offset along x and y; inf is flat, positive spreads light", "mm",
+            derived="the sphere that spreads light over the picture", why="table 6.1 of the thesis"),
+    Setting("lens.height_range", "numbers", "least and largest departure from the offset", "mm", -checks.LENGTH, checks.LENGTH,
+            derived="a tenth of the lens' width, or what the first surface needs"),
+    Setting("lens.min_thickness", "number", "least distance of the surface from z_in", "mm", 0.0, checks.LENGTH, default=1.0,
+            why="a wall that can be made and held", option=Option("--min-thickness", "MM")),
+    Setting("lens.index", "number", "refractive index", low=1.0, high=5.0, above=True, default=1.5443, written=False,
+            why="table D.2 of the thesis", option=Option("--index")),
+    Setting("lens.glass", "text", "material instead of an index: N-BK7, SILICA, PMMA, PC, ...; N-BK7 of a coloured picture",
+            option=Option("--glass")),
+    Setting("lens.wavelength", "number", "at which the glass is taken", "nm", *WAVELENGTHS, default=587.5618, written=False,
+            why="the d line, for which catalogues give indices"),
+    Setting("lens.fresnel", "text", "reflection losses: none, schlick or exact", choices=("none", "schlick", "exact"),
+            default="exact", why="it costs 2 % of a trace"),
+    Setting("lens.absorption", "number", "a in exp(-a t) through t mm of glass (Beer-Lambert)", "1/mm", 0.0, 1e6, default=0.0,
+            written=False, option=Option("--absorption", "PER_MM", BOTH)),
+    Setting("lens.roughness", "number", "standard deviation of the slopes of the exit's microfacets along an axis, mm per mm",
+            low=0.0, high=1.0, default=0.0, written=False, option=Option("--roughness", "SLOPE", BOTH)),
+    Setting("lens.mirror", "flag", "the surface reflects; the screen stands on the source's side", default=False, written=False,
+            option=Option("--mirror")),
+    Setting("lens.aperture", "text", "shape of the lens: rectangle, or circle, the largest within size",
+            choices=("rectangle", "circle"), default="rectangle", written=False,
+            option=Option("--aperture", "rectangle|circle")),
+    Setting("lens.border", "number", "width of a rim around the aperture, which exported solids have for their mount", "mm", 0.0,
+            1e6, default=0.0, written=False, option=Option("--border", "MM")),
+    Setting("lens.control", "wholes", "control points of the finished lens", low=2, high=4096,
+            derived="by picture and quality: two knot spans a pixel", why="README, section on accuracy",
+            option=Option("--control", "N[xM]")),
+    Setting("lens.degree", "wholes", "spline degrees, 1 to 15", low=1, high=15, default=[3, 3],
+            why="the least whose curvature is continuous", option=Option("--degree", "P[xQ]")),
+    Setting("lens.knots_u", "list", "knot vector on [0, 1] along x", derived="open, equispaced"),
+    Setting("lens.knots_v", "list", "knot vector on [0, 1] along y", derived="open, equispaced"),
+    # The screen
+    Setting("throw", "number", "from the lens' origin to the screen, which a mirror has before it", "mm", -1e12, 1e12,
+            derived="300", option=Option("--throw", "MM"), speaks_for=("screen.z",)),
+    Setting("screen.z", "number", "distance from the lens' origin", "mm", *DISTANCE, default=300.0,
+            why="table D.2 of the thesis, in millimetres"),
+    Setting("screen_size", "numbers", "full width and height of the screen; one length follows the picture's shape", "mm",
+            derived="picture plus margin", option=Option("--screen-size", "W[xH]"), speaks_for=("screen.size",)),
+    Setting("screen.size", "numbers", "full width and height", "mm", *SCREEN, derived="picture plus margin"),
+    Setting("resolution", "wholes", "pixels over the whole screen; one number counts across, rows follow the shape", derived="250",
+            why="table D.2 of the thesis", option=Option("--resolution", "N[xM]"), speaks_for=("screen.resolution",)),
+    Setting("screen.resolution", "wholes", "pixels along x and y", low=2, high=16384, derived="250 across"),
+    Setting("screen.tilt", "numbers", "turns of the screen about its own centre, about x, then about y", "degrees", -85.0,
+            85.0, default=[0.0, 0.0], written=False, option=Option("--screen-tilt", "A,B", BOTH)),
+    Setting("screen.shift", "numbers", "shift of the screen's centre from the axis", "mm", -1e9, 1e9, default=[0.0, 0.0],
+            written=False, option=Option("--screen-shift", "X,Y", BOTH)),
+    # The target
+    Setting("mag", "number", "width of the picture over width of the lens", low=1e-3, high=1e3, default=3.0,
+            why="table 6.1 of the thesis", option=Option("--mag")),
+    Setting("margin", "number", "dark border, part of the picture's width in all", low=0.0, high=100.0, default=0.28,
+            why="table 6.1 of the thesis: a screen 6.4 wide for a picture of 5, so that stray light is seen",
+            option=Option("--margin")),
+    Setting("target.file", "text", "the picture, in this directory"),
+    Setting("target.size", "numbers", "width and height of the picture on the screen", "mm", *SCREEN,
+            derived="mag times the lens' width"),
+    Setting("target.encoding", "text", "of the picture's values: srgb, or linear (irradiance as it is)", choices=("srgb", "linear"),
+            default="srgb", why="what image files hold", option=Option("--linear", constant="linear")),
+    Setting("target.flip", "text", "mirror the picture along x, y or xy, for a viewer on the lens' side; empty for none",
+            choices=("", "x", "y", "xy"), default="", option=Option("--flip", "x|y|xy")),
+    Setting("target.color", "flag", "red, green and blue apart (611, 549, 464 nm), with the glass' index for each", default=False,
+            written=False, option=Option("--color")),
+    # How the lens is found
+    Setting("quality", "text", "of the default stages: draft, standard or fine", choices=("draft", "standard", "fine"),
+            derived="standard, or by the time limit", option=Option("--quality")),
+    Setting("rays", "whole", "of the last default stage", low=1, high=10**12, derived="by quality", option=Option("--rays", "N")),
+    Setting("design.loss", "text", "weighted sum of rms (eq. 5.2.1), rms-light (where every ray counts), throughput, light (what"
+            " does not reach the screen), diffusion, uniformity, laplacian, curvature: 'rms-light + 0.01 laplacian'",
+            default="rms-light", why="eq. 5.2.1 alone gains by throwing light off the screen", option=Option("--loss")),
+    Setting("design.max_slope", "number", "limit of the surface's slope, mm per mm; 0 for none", low=0.0, default=0.0,
+            option=Option("--max-slope")),
+    Setting("design.min_radius", "number", "least radius of curvature of concave places, such as a tool's; 0 for any", "mm", 0.0,
+            default=0.0, option=Option("--min-radius", "MM")),
+    Setting("design.optimizer", "text", "lbfgs or adam", choices=("lbfgs", "adam"), default="lbfgs",
+            why="fewest evaluations to an error: caustic convergence, study design; adam for a network",
+            option=Option("--optimizer")),
+    Setting("design.lr", "number", "learning rate of adam", low=0.0, above=True, default=1e-3, why="that of the thesis, table D.2",
+            option=Option("--lr")),
+    Setting("design.network", "text", "parametrisation of the heights: none, sparse or dense", choices=("none", "sparse", "dense"),
+            default="none", why="heights themselves converge fastest", option=Option("--network")),
+    Setting("design.initial", "text", "parameters at first: zero, uniform (+-1e-4) or random",
+            choices=("zero", "uniform", "random"), default="zero"),
+    Setting("design.preconditioner", "text", "none or laplacian", choices=("none", "laplacian"),
+            derived="laplacian of heights by lbfgs"),
+    Setting("design.filter_target", "flag", "filter the target as the render is filtered", default=True,
+            why="else the filter's own blur counts as error"),
+    Setting("design.waves", "text", "refine the wave image after the ray image: auto (where diffraction matters and time allows),"
+            " on or off", choices=("auto", "on", "off"), default="auto", why="an effect is simulated where a scene calls for it",
+            option=Option("--waves", "auto|on|off")),
+    Setting("design.start", "text", "first surface: transport (optimal transport of the light to the picture), offset (the sphere"
+            " that follows from the magnification), or the lens of another project or of a file: .npz or .step as exported, .npy of"
+            " heights in mm", derived="transport; offset for a network, adam, several points or a small net",
+            option=Option("--start", "transport|offset|PROJECT|FILE")),
+    Setting("design.iterations", "whole", "in all, counted from the very first; 0: what the stages say", low=0, high=10**9,
+            default=0, derived="what the stages say", option=Option("--iterations")),
+    Setting("design.time_limit", "number", "of the optimisation; inf for none", "s", 0.0, above=True, default=math.inf,
+            option=Option("--time-limit", "SECONDS")),
+    Setting("design.checkpoint_every", "number", "between checkpoints", "s", 0.0, above=True, default=10.0,
+            why="what a kill may cost"),
+    Setting("design.seed", "whole", "of every random number: the same seed gives the same bytes", low=0, high=2**31 - 1, default=0,
+            option=Option("--seed", common=True)),
+    Setting("design.dtype", "text", "precision of the rays: float32 or float64", choices=("float32", "float64"), default="float32",
+            why="noise of the rays exceeds its rounding", option=Option("--dtype", common=True)),
+    # A stage of the design
+    Setting("design.stages.source", "text", "type of source in this stage, with the other keys of [source]"),
+    Setting("design.stages.control", "wholes", "control points", low=2, high=4096, derived="the lens'"),
+    Setting("design.stages.rays", "whole", "traced in an iteration", low=1, high=10**12, derived="9 a pixel",
+            why="750 x 750 on 250 x 250 pixels, tables D.1 and D.2 of the thesis"),
+    Setting("design.stages.sampler", "text", "grid, lines, stratified, uniform or sobol", derived="by the source"),
+    Setting("design.stages.reconstruction", "text", "bincount, gaussian or cosine", derived="cosine"),
+    Setting("design.stages.filter_size", "wholes", "pixels, odd", derived="3 x 3"),
+    Setting("design.stages.alpha_per_mm2", "number", "of the gaussian (eq. 4.4.5)", "1/mm^2"),
+    Setting("design.stages.alpha_per_pixel2", "number", "of the gaussian, instead of alpha_per_mm2", "1/pixel^2"),
+    Setting("design.stages.spread", "flag", "rays of the source's centre, whose image is convolved with the source's extent",
+            default=False, written=False),
+    Setting("design.stages.oversample", "whole", "filter on pixels so many times smaller, added up: sharper than the filter",
+            low=1, high=8, default=1),
+    Setting("design.stages.blur", "number", "of render and target in the loss", "pixels", 0.0, 1000.0, default=0.0),
+    Setting("design.stages.apron", "whole", "dark pixels around the screen that catch stray light", low=0, high=4096, default=0),
+    Setting("design.stages.iterations", "whole", "at most", low=0, high=10**9, default=1000, why="section 6.2.1 of the thesis"),
+    Setting("design.stages.tolerance", "number", "ends the stage when 10 iterations gain less than this part; 0 never", low=0.0,
+            high=1.0, default=0.0),
+    Setting("design.stages.waves", "list", "refine the wave image at these, of light that says none, instead of the ray image",
+            "nm", *WAVELENGTHS),
+)
+# fmt: on
+TABLE: dict[str, Setting] = {row.path: row for row in _ROWS}
+
+
+def check(path: str, value: Any) -> Any:
+    """`value`, if the setting accepts it, see `Setting.check`."""
+    return TABLE[path].check(value)
+
+
+def check_all(section: str, of: object, *keys: str) -> None:
+    """Check attributes of an object that are settings of one section, by name."""
+    for key in keys:
+        check(f"{section}.{key}", getattr(of, key))
+
+
+def default(path: str) -> Any:
+    """The default of a setting; pairs as tuples."""
+    value = TABLE[path].default
+    return tuple(value) if isinstance(value, list) else value
+
+
+def in_section(section: str) -> dict[str, Setting]:
+    """The settings of a section, by key."""
+    return {row.key: row for row in _ROWS if row.section == section}
+
+
+def options_of(command: str) -> Iterator[Setting]:
+    """The settings that a command has options for, in the table's order."""
+    return (row for row in _ROWS if row.option and not row.option.common and command in row.option.commands)
