@@ -141,3 +141,24 @@ def test_old_directories_of_ours_alone_are_removed(tmp_path):
     assert own.exists()
     assert all(path.exists() for path in others)
     cache.tidy(tmp_path / "absent" / "directory")
+
+
+def test_a_kernel_kept_around_a_kept_loop_finds_its_threads(tmp_path):
+    """Three processes: one compiles the loop with another kernel, one compiles the kernel around it, one only calls that."""
+    other = """
+import numpy as np
+from caustic_cli.optics.kernels import blocks, pixels
+blocks()
+assert pixels.total(np.ones((2, 3, 4))).sum() == 24.0
+"""
+    kernel = """
+import torch
+from caustic_cli.optics.bspline import SplineSpace
+from caustic_cli.optics.kernels.surface import FusedSurface
+fused = FusedSurface((SplineSpace.uniform(6, 3),) * 2, (5.0, 5.0))
+assert fused.coefficients(torch.zeros(6, 6, dtype=torch.float64)).shape == (3, 3, 4, 4)
+"""
+    for text in (other, kernel, kernel):
+        ran = subprocess.run([sys.executable, "-c", text], env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}, check=False,
+                             capture_output=True, text=True)
+        assert ran.returncode == 0, ran.stderr[-2000:]

@@ -12,7 +12,12 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from caustic_cli.optics.kernels import blocks
 from caustic_cli.optics.kernels.jit import njit, prange
+
+# Threads have to run before the first kernel.  numba starts them for a function that has a parallel loop, but not for one that was
+# compiled, and kept, around a loop that itself came from the cache.
+blocks()
 
 #: First argument of a kernel that is to do the whole.
 ALL = -1
