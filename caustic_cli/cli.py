@@ -22,8 +22,13 @@ Lengths are millimetres, angles degrees, wavelengths nanometres, powers watts. R
 stderr. Exit status: 0 done; 1 could not finish; 2 bad usage or bad input; 130 or 143 interrupted, state saved.
 """
 
-app = typer.Typer(help=DESCRIPTION, rich_markup_mode=None, no_args_is_help=True, pretty_exceptions_enable=False,
-                  context_settings={"help_option_names": ["-h", "--help"]})
+app = typer.Typer(
+    help=DESCRIPTION,
+    rich_markup_mode=None,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
 
 
 def _version(value: bool) -> None:
@@ -33,8 +38,11 @@ def _version(value: bool) -> None:
 
 
 @app.callback()
-def _root(version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True,
-                                                help="Print the version and exit.")] = False) -> None:
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
     pass
 
 

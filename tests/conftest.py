@@ -12,18 +12,51 @@ with warnings.catch_warnings():  # torch loads this module on the first forward-
     import torch._decomp.decompositions_for_jvp
 
 torch.set_num_threads(1)  # the tests' tensors are small, and results must not depend on the machine's cores
-settings.register_profile("caustic", derandomize=True, deadline=None, max_examples=40, database=None,
-                          suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile(
+    "caustic", derandomize=True, deadline=None, max_examples=40, database=None, suppress_health_check=[HealthCheck.too_slow]
+)
 settings.load_profile("caustic")
 
 
 #: Tests that take long: whole commands, kills, hard cases, documents.  `pytest -m "not slow"` is the inner loop.
-SLOW = ("benchmarks", "faults", "independent", "stability", "waves", "test_aperture.py", "test_batch.py", "test_cli.py",
-        "test_convergence.py", "test_design.py", "test_distribution.py", "test_effects_cli.py", "test_extended.py",
-        "test_extending.py", "test_guide.py", "test_intersection.py", "test_irradiance.py", "test_kernel_cache.py", "test_light.py",
-        "test_manufacture.py", "test_measured.py", "test_others.py", "test_project.py", "test_ranks.py", "test_ray_tracer.py",
-        "test_sources_cli.py", "test_wave_design.py", "test_effects.py", "test_export.py", "test_library.py", "test_noise.py",
-        "test_roundtrip.py", "test_several.py", "test_stages.py", "test_system.py", "test_verify.py")
+SLOW = (
+    "benchmarks",
+    "faults",
+    "independent",
+    "stability",
+    "waves",
+    "test_aperture.py",
+    "test_batch.py",
+    "test_cli.py",
+    "test_convergence.py",
+    "test_design.py",
+    "test_distribution.py",
+    "test_effects_cli.py",
+    "test_extended.py",
+    "test_extending.py",
+    "test_guide.py",
+    "test_intersection.py",
+    "test_irradiance.py",
+    "test_kernel_cache.py",
+    "test_light.py",
+    "test_manufacture.py",
+    "test_measured.py",
+    "test_others.py",
+    "test_project.py",
+    "test_ranks.py",
+    "test_ray_tracer.py",
+    "test_sources_cli.py",
+    "test_wave_design.py",
+    "test_effects.py",
+    "test_export.py",
+    "test_library.py",
+    "test_noise.py",
+    "test_roundtrip.py",
+    "test_several.py",
+    "test_stages.py",
+    "test_system.py",
+    "test_verify.py",
+)
 
 
 def pytest_collection_modifyitems(items):

@@ -16,5 +16,6 @@ def write_blob(name: str = "blob.png", size: int = 24, centre: tuple[float, floa
 def begun(project, *_) -> SimpleNamespace:
     """In place of `workflow.design._run`: what was begun, without an iteration."""
     figures = {"lost": {}, "image": "", "reason": "", "project": str(project.path)}
-    return SimpleNamespace(project=project, scene=None, field=None, target=None, state=SimpleNamespace(heights=None),
-                           figures=figures)
+    return SimpleNamespace(
+        project=project, scene=None, field=None, target=None, state=SimpleNamespace(heights=None), figures=figures
+    )

@@ -7,8 +7,26 @@ import struct
 import numpy as np
 
 
-def tm25(positions, directions, flux, *, unit="W", wavelengths=None, total=None, tables=(), columns=0, text=b"", version=2013,
-         spectrum=None, stokes=False, magic=b"TM25", count=None, flags=None, single=float("nan"), order="<") -> bytes:
+def tm25(
+    positions,
+    directions,
+    flux,
+    *,
+    unit="W",
+    wavelengths=None,
+    total=None,
+    tables=(),
+    columns=0,
+    text=b"",
+    version=2013,
+    spectrum=None,
+    stokes=False,
+    magic=b"TM25",
+    count=None,
+    flags=None,
+    single=float("nan"),
+    order="<",
+) -> bytes:
     """A file of IES TM-25; every part of its header may be said otherwise than the rays are."""
     n = len(flux)
     spectrum = (2 if wavelengths is not None else 3 if len(tables) == 1 else 0) if spectrum is None else spectrum
@@ -36,8 +54,21 @@ def tm25(positions, directions, flux, *, unit="W", wavelengths=None, total=None,
     return head + text + np.hstack(rays).astype("<f4").tobytes()
 
 
-def zemax(positions, directions, flux, *, wavelengths=None, length=4, form=None, luminous=0, identifier=1010, count=None,
-          total=None, wavelength=0.0, order="<") -> bytes:
+def zemax(
+    positions,
+    directions,
+    flux,
+    *,
+    wavelengths=None,
+    length=4,
+    form=None,
+    luminous=0,
+    identifier=1010,
+    count=None,
+    total=None,
+    wavelength=0.0,
+    order="<",
+) -> bytes:
     """A Zemax binary source file."""
     n = len(flux)
     head = struct.pack(f"{order}iI100s", identifier, n if count is None else count, b"LED")
@@ -52,11 +83,19 @@ def zemax(positions, directions, flux, *, wavelengths=None, length=4, form=None,
 
 def lighttools(positions, directions, flux, *, wavelengths=None, end="\n", closing=True, **said) -> bytes:
     """A LightTools ray file as text; `said` replaces lines of its header."""
-    lines = {"lt_rdf_version": "2.0", "dataname": "LED", "lt_datatype": "radiant_power", "lt_radiant_flux": f"{np.sum(flux):.9g}",
-             "lt_far_field_data": "NO", "lt_color_info": "none" if wavelengths is None else "wavelength",
-             "lt_length_units": "millimeters", "lt_data_origin": "0 0 0"} | {f"lt_{k}": v for k, v in said.items()}
-    rays = np.hstack([positions, directions, np.reshape(flux, (-1, 1))]
-                     + ([] if wavelengths is None else [np.reshape(wavelengths, (-1, 1))]))
+    lines = {
+        "lt_rdf_version": "2.0",
+        "dataname": "LED",
+        "lt_datatype": "radiant_power",
+        "lt_radiant_flux": f"{np.sum(flux):.9g}",
+        "lt_far_field_data": "NO",
+        "lt_color_info": "none" if wavelengths is None else "wavelength",
+        "lt_length_units": "millimeters",
+        "lt_data_origin": "0 0 0",
+    } | {f"lt_{k}": v for k, v in said.items()}
+    rays = np.hstack(
+        [positions, directions, np.reshape(flux, (-1, 1))] + ([] if wavelengths is None else [np.reshape(wavelengths, (-1, 1))])
+    )
     rows = ["  ".join(f"{v:.9g}" for v in ray) for ray in rays]
     text = ["# LightTools", "# Ray Data Export File", *(f"{k}: {v}" for k, v in lines.items()), "lt_startofdata", *rows]
     return end.join([*text, *(["lt_endofdata"] if closing else []), ""]).encode()

@@ -94,8 +94,9 @@ def test_a_round_plane_wave_is_the_square_one_where_both_shine(sampler):
         fluxes, all_ = one.flux.expand(one.shape), two.flux.expand(two.shape)
         lit = fluxes > 0
         part += float(lit.double().mean())
-        torch.testing.assert_close(fluxes[lit].mean() / all_[lit].mean(), torch.tensor(4 / np.pi, dtype=torch.float64), atol=2e-2,
-                                   rtol=0)
+        torch.testing.assert_close(
+            fluxes[lit].mean() / all_[lit].mean(), torch.tensor(4 / np.pi, dtype=torch.float64), atol=2e-2, rtol=0
+        )
     assert part == pytest.approx(np.pi / 4, abs=1e-2)
 
 

@@ -76,8 +76,9 @@ def own(imported: set[str]) -> set[str]:
 
 
 def test_the_reader_of_imports_sees_all_forms():
-    source = ("import a.b\ndef f():\n    from caustic_cli.optics import trace\n"
-              "    from . import x\n    from ..scene.lens import Lens\n")
+    source = (
+        "import a.b\ndef f():\n    from caustic_cli.optics import trace\n    from . import x\n    from ..scene.lens import Lens\n"
+    )
     found = imports_in(ast.parse(source), "caustic_cli.inverse.losses", False)
     assert {"a.b", "caustic_cli.optics.trace", "caustic_cli.inverse.x", "caustic_cli.scene.lens"} <= found
     assert "caustic_cli.inverse.x" in imports_in(ast.parse("from . import x"), "caustic_cli.inverse", True)
@@ -106,8 +107,11 @@ def test_the_top_level_holds_rooms():
     assert {p.name for p in PACKAGE.iterdir() if p.is_dir() and p.name != "__pycache__"} == {*ALLOWED, "commands"} - {"table"}
 
 
-@pytest.mark.parametrize("path", [p for p in FILES if not {"commands", "cli.py", "table.py"} & set(p.relative_to(PACKAGE).parts)],
-                         ids=lambda p: str(p.relative_to(PACKAGE)))
+@pytest.mark.parametrize(
+    "path",
+    [p for p in FILES if not {"commands", "cli.py", "table.py"} & set(p.relative_to(PACKAGE).parts)],
+    ids=lambda p: str(p.relative_to(PACKAGE)),
+)
 def test_no_option_is_named_below_the_commands(path):
     """Parameters that a message speaks of are marked, and the command line says them as options (`errors.MARK`)."""
     assert not re.findall(r"(?<![\w-])--[a-z][\w-]*", path.read_text("utf-8"))
@@ -115,9 +119,16 @@ def test_no_option_is_named_below_the_commands(path):
 
 def test_compiled_loops_are_kernels():
     """The files that compile functions, read from their decorators."""
-    compiled = {str(p.relative_to(PACKAGE).parent) for p in FILES if any(
-        "njit" in ast.unparse(d) for node in ast.walk(ast.parse(p.read_text("utf-8"))) if isinstance(node, ast.FunctionDef)
-        for d in node.decorator_list)}
+    compiled = {
+        str(p.relative_to(PACKAGE).parent)
+        for p in FILES
+        if any(
+            "njit" in ast.unparse(d)
+            for node in ast.walk(ast.parse(p.read_text("utf-8")))
+            if isinstance(node, ast.FunctionDef)
+            for d in node.decorator_list
+        )
+    }
     assert compiled == {"optics/kernels"}
 
 
@@ -212,6 +223,7 @@ def test_no_message_spells_a_setting():
             continue
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(node, ast.Raise):
-                wrong += [(path.name, m[0]) for m in spelled.finditer(ast.unparse(node)) if m[1] in
-                          {row.key for row in TABLE.values()}]
+                wrong += [
+                    (path.name, m[0]) for m in spelled.finditer(ast.unparse(node)) if m[1] in {row.key for row in TABLE.values()}
+                ]
     assert not wrong

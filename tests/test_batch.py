@@ -16,8 +16,22 @@ from caustic_cli.project import checkpoint
 from caustic_cli.workflow import design as workflow
 from caustic_cli.workflow import evaluation
 
-DESIGN = ["design", "blob.png", "--resolution", "16", "--control", "9", "--rays", "2000", "--start", "offset", "--iterations", "3",
-          "--threads", "1"]
+DESIGN = [
+    "design",
+    "blob.png",
+    "--resolution",
+    "16",
+    "--control",
+    "9",
+    "--rays",
+    "2000",
+    "--start",
+    "offset",
+    "--iterations",
+    "3",
+    "--threads",
+    "1",
+]
 EXAMPLES = Path(__file__).parents[1] / "examples"
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(cli.__file__).parents[1])}
 
@@ -206,12 +220,18 @@ def test_defaults_from_the_environment(capfd, monkeypatch):
 def test_completion_is_installed_and_completes(tmp_path):
     home = tmp_path / "home"
     home.mkdir()
-    done = subprocess.run([sys.executable, "-m", "caustic_cli", "--install-completion", "bash"], check=True, text=True,
-                          capture_output=True, env={**ENVIRONMENT, "HOME": str(home)})
+    done = subprocess.run(
+        [sys.executable, "-m", "caustic_cli", "--install-completion", "bash"],
+        check=True,
+        text=True,
+        capture_output=True,
+        env={**ENVIRONMENT, "HOME": str(home)},
+    )
     assert "installed" in done.stdout and (home / ".bash_completions" / "caustic.sh").exists()
     asked = {"_CAUSTIC_COMPLETE": "complete_bash", "COMP_WORDS": "caustic render --screen", "COMP_CWORD": "2"}
-    done = subprocess.run([sys.executable, "-m", "caustic_cli"], check=True, text=True, capture_output=True,
-                          env=ENVIRONMENT | asked)
+    done = subprocess.run(
+        [sys.executable, "-m", "caustic_cli"], check=True, text=True, capture_output=True, env=ENVIRONMENT | asked
+    )
     assert "--screen-at" in done.stdout.split() and all(o.startswith("--screen") for o in done.stdout.split())
 
 
@@ -219,8 +239,10 @@ def test_completion_is_installed_and_completes(tmp_path):
 def test_make_gives_each_of_several_jobs_one_thread():
     for name in ("Makefile", "flame.png", "flame.toml", "ball.png", "ball.toml", "tophat.png", "tophat.toml"):
         shutil.copy(EXAMPLES / name, name)
-    Path("caustic").write_text("#!/bin/sh\necho \"$@\" >> log\nmkdir -p \"${2%.png}.caustic\"\n"
-                               "[ $1 = design ] && touch ${2%.png}.caustic/checkpoints.h5 || touch $2/render.png\n")
+    Path("caustic").write_text(
+        '#!/bin/sh\necho "$@" >> log\nmkdir -p "${2%.png}.caustic"\n'
+        "[ $1 = design ] && touch ${2%.png}.caustic/checkpoints.h5 || touch $2/render.png\n"
+    )
     Path("caustic").chmod(0o755)
     for jobs, expected in ((["-j2"], True), ([], False)):
         subprocess.run(["make", *jobs, "CAUSTIC=./caustic"], check=True, capture_output=True)

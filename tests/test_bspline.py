@@ -262,8 +262,9 @@ def cylinder(radius: float = 2.0, height: float = 3.0) -> Surface:
     around = SplineSpace(2, knots_with(2, [0.25, 0.5, 0.75], [2, 2, 2]))
     points = [[(radius * x, radius * y, along) for along in (0.0, height)] for x, y, _ in circle]
     weights = [[c[2], c[2]] for c in circle]
-    return Surface((around, SplineSpace.uniform(2, 1)), torch.tensor(points, dtype=torch.float64),
-                   torch.tensor(weights, dtype=torch.float64))
+    return Surface(
+        (around, SplineSpace.uniform(2, 1)), torch.tensor(points, dtype=torch.float64), torch.tensor(weights, dtype=torch.float64)
+    )
 
 
 def test_nurbs_cylinder_is_exact():

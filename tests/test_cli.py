@@ -23,8 +23,19 @@ from caustic_cli.export import FORMATS
 from caustic_cli.workflow import evaluation
 
 COMMANDS = ("design", "render", "gradmap", "export", "convergence")
-SHARED_KEYS = {"loss", "relative_rms", "psnr_db", "ssim", "on_screen", "on_target", "lost", "rays", "iterations", "seconds",
-               "image"}
+SHARED_KEYS = {
+    "loss",
+    "relative_rms",
+    "psnr_db",
+    "ssim",
+    "on_screen",
+    "on_target",
+    "lost",
+    "rays",
+    "iterations",
+    "seconds",
+    "image",
+}
 LOST = {"missed_lens", "missed_surface", "total_internal_reflection", "fresnel", "absorbed", "off_screen"}
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(cli.__file__).parents[1])}
 
@@ -33,8 +44,12 @@ def png_header(width: int, height: int) -> bytes:
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
-    return (b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0))
-            + chunk(b"IDAT", zlib.compress(b"\0")) + chunk(b"IEND", b""))
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0))
+        + chunk(b"IDAT", zlib.compress(b"\0"))
+        + chunk(b"IEND", b"")
+    )
 
 
 def run(text: str, capfd) -> tuple[int, str, str]:
@@ -239,8 +254,15 @@ def test_design_json(here, capfd):
     assert figures["iterations"] == 2 and figures["seconds"] > 0 and Path(figures["image"]).is_file()
 
 
-@pytest.mark.parametrize("options", ["", "--reconstruction cosine --filter-size 5", "--screen-at 200",
-                                     "--reconstruction gaussian --alpha 2 -o near.png --npy near.npy"])
+@pytest.mark.parametrize(
+    "options",
+    [
+        "",
+        "--reconstruction cosine --filter-size 5",
+        "--screen-at 200",
+        "--reconstruction gaussian --alpha 2 -o near.png --npy near.npy",
+    ],
+)
 def test_render_json(here, capfd, options):
     code, out, err = run(f"render blob.caustic --rays 5000 --json --quiet {options}", capfd)
     assert (code, err) == (0, "") and out.count("\n") == 1
@@ -250,30 +272,50 @@ def test_render_json(here, capfd, options):
     assert 4500 < figures["rays"] < 5500 and Path(figures["image"]).is_file()
 
 
-@pytest.mark.parametrize("text", ["gradmap blob.caustic --rays 2000", "export blob.caustic", "export blob.caustic --format stl",
-                                  "export blob.caustic --format mitsuba", "export blob.caustic --script",
-                                  "convergence blob.caustic --rays 2000 --repeats 1 -o c",
-                                  "convergence blob.caustic --study rays --rays 4000 --repeats 2 -o c",
-                                  "convergence blob.caustic --study design --rays 2000 --seconds 0.05 -o c"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "gradmap blob.caustic --rays 2000",
+        "export blob.caustic",
+        "export blob.caustic --format stl",
+        "export blob.caustic --format mitsuba",
+        "export blob.caustic --script",
+        "convergence blob.caustic --rays 2000 --repeats 1 -o c",
+        "convergence blob.caustic --study rays --rays 4000 --repeats 2 -o c",
+        "convergence blob.caustic --study design --rays 2000 --seconds 0.05 -o c",
+    ],
+)
 def test_the_others_print_one_object_too(here, capfd, text):
     code, out, err = run(text + " --json --quiet", capfd)
     assert (code, err) == (0, "") and out.count("\n") == 1 and isinstance(json.loads(out), dict)
 
 
-@pytest.mark.parametrize("text", ["design blob.png --force --resolution 24 --control 12 --rays 4000 --iterations 1",
-                                  "render blob.caustic --rays 2000", "gradmap blob.caustic --rays 2000",
-                                  "export blob.caustic --force"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "design blob.png --force --resolution 24 --control 12 --rays 4000 --iterations 1",
+        "render blob.caustic --rays 2000",
+        "gradmap blob.caustic --rays 2000",
+        "export blob.caustic --force",
+    ],
+)
 def test_quiet_is_silent_and_stdout_is_for_results(here, capfd, text):
     assert run(text + " --quiet", capfd) == (0, "", "")
     code, out, err = run(text, capfd)
     assert (code, out) == (0, "") and err != ""
 
 
-@pytest.mark.parametrize("text", ["render blob.caustic --rays 1000 -o a.png --npy a.npy",
-                                  "gradmap blob.caustic --rays 1000 -o b.png", "export blob.caustic",
-                                  *(f"export blob.caustic --format {name}" for name in FORMATS if name != "csv"),
-                                  "export blob.caustic --script",
-                                  "convergence blob.caustic --study rays --rays 2000 --repeats 2"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "render blob.caustic --rays 1000 -o a.png --npy a.npy",
+        "gradmap blob.caustic --rays 1000 -o b.png",
+        "export blob.caustic",
+        *(f"export blob.caustic --format {name}" for name in FORMATS if name != "csv"),
+        "export blob.caustic --script",
+        "convergence blob.caustic --study rays --rays 2000 --repeats 2",
+    ],
+)
 def test_what_it_made_it_replaces_unasked(here, capfd, text):
     for _ in range(2):
         code, _, err = run(text + " --quiet", capfd)
@@ -300,23 +342,45 @@ def test_a_picture_from_anywhere_makes_its_project_here(here, capfd):
     (here / "blob.png").rename(here / "pictures" / "dot.png")
     code, _, err = run("design pictures/dot.png --resolution 20 --control 9 --rays 2000 --iterations 1 --quiet", capfd)
     assert code == 0, err
-    assert sorted(p.name for p in (here / "dot.caustic").iterdir()) == ["checkpoints.h5", "project.toml", "render.png",
-                                                                        "target.png"]
+    assert sorted(p.name for p in (here / "dot.caustic").iterdir()) == [
+        "checkpoints.h5",
+        "project.toml",
+        "render.png",
+        "target.png",
+    ]
 
 
 def test_the_finished_project_has_all_five_files(designed):
     assert sorted(p.name for p in (designed / "blob.caustic").iterdir()) == [
-        "checkpoints.h5", "project.toml", "render.png", "report.png", "target.png"]
+        "checkpoints.h5",
+        "project.toml",
+        "render.png",
+        "report.png",
+        "target.png",
+    ]
 
 
-@pytest.mark.parametrize(("options", "line"), [
-    ("--lens-size 20x10", "size = [20.0, 10.0]"), ("--throw 200", "z = 200.0"), ("--index 1.49", "index = 1.49"),
-    ("--glass PMMA", 'glass = "PMMA"'), ("--degree 2x4", "degree = [2, 4]"), ("--flip x", 'flip = "x"'),
-    ("--linear", 'encoding = "linear"'), ("--min-thickness 2", "min_thickness = 2.0"), ("--loss rms", 'loss = "rms"'),
-    ("--margin 1", "size = [60.0, 60.0]"), ("--mag 2", "size = [20.0, 20.0]"), ("--screen-size 50x40", "size = [50.0, 40.0]"),
-    ("--resolution 24x12", "resolution = [24, 12]"), ("--config c.toml --seed 7", "seed = 7"),
-    ("--config c.toml", "z = 250.0"), ("--config c.toml --throw 260", "z = 260.0"),
-])
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        ("--lens-size 20x10", "size = [20.0, 10.0]"),
+        ("--throw 200", "z = 200.0"),
+        ("--index 1.49", "index = 1.49"),
+        ("--glass PMMA", 'glass = "PMMA"'),
+        ("--degree 2x4", "degree = [2, 4]"),
+        ("--flip x", 'flip = "x"'),
+        ("--linear", 'encoding = "linear"'),
+        ("--min-thickness 2", "min_thickness = 2.0"),
+        ("--loss rms", 'loss = "rms"'),
+        ("--margin 1", "size = [60.0, 60.0]"),
+        ("--mag 2", "size = [20.0, 20.0]"),
+        ("--screen-size 50x40", "size = [50.0, 40.0]"),
+        ("--resolution 24x12", "resolution = [24, 12]"),
+        ("--config c.toml --seed 7", "seed = 7"),
+        ("--config c.toml", "z = 250.0"),
+        ("--config c.toml --throw 260", "z = 260.0"),
+    ],
+)
 def test_options_reach_project_toml(here, capfd, options, line):
     (here / "c.toml").write_text("[screen]\nz = 250\n[design]\nseed = 5\n")
     resolution = "" if "--resolution" in options else "--resolution 20"
@@ -336,8 +400,11 @@ def test_a_design_begins_from_an_exported_lens(here, capfd, file):
     with np.load("lens.npz") as data:
         surface = data["z"]
         np.save("lens.npy", surface)
-    code, _, err = run(f"design blob.png -o again --start {file} --resolution 24 --control 12 --rays 4000 --iterations 1"
-                       " --lr 1e-9 --optimizer adam --quiet", capfd)
+    code, _, err = run(
+        f"design blob.png -o again --start {file} --resolution 24 --control 12 --rays 4000 --iterations 1"
+        " --lr 1e-9 --optimizer adam --quiet",
+        capfd,
+    )
     assert code == 0, err
     assert run("export again -o again.npz --samples 37 --quiet", capfd)[0] == 0
     with np.load("again.npz") as data:
@@ -365,9 +432,11 @@ def test_version(capfd):
 
 
 def test_help_loads_no_torch():
-    program = ("import sys; from caustic_cli.cli import run\n"
-               f"for c in ([], *[[n] for n in {COMMANDS!r}]): assert run([*c, '--help']) == 0\n"
-               "assert not {'torch', 'numba', 'matplotlib', 'h5py', 'scipy'} & set(sys.modules), 'help is slow'")
+    program = (
+        "import sys; from caustic_cli.cli import run\n"
+        f"for c in ([], *[[n] for n in {COMMANDS!r}]): assert run([*c, '--help']) == 0\n"
+        "assert not {'torch', 'numba', 'matplotlib', 'h5py', 'scipy'} & set(sys.modules), 'help is slow'"
+    )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=ENVIRONMENT, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stderr == "" and done.stdout.count("Usage: caustic") == 1 + len(COMMANDS)
@@ -408,15 +477,21 @@ def test_a_closed_pipe_is_not_an_error(arguments):
     reading, writing = os.pipe()
     os.close(reading)
     try:
-        done = subprocess.run([sys.executable, "-m", "caustic_cli", *arguments], stdout=writing, stderr=subprocess.PIPE,
-                              text=True, env=ENVIRONMENT, check=False)
+        done = subprocess.run(
+            [sys.executable, "-m", "caustic_cli", *arguments],
+            stdout=writing,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=ENVIRONMENT,
+            check=False,
+        )
     finally:
         os.close(writing)
     assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_results_into_a_closed_pipe(here):
-    program = (f"{shlex.quote(sys.executable)} -m caustic_cli render blob.caustic --rays 1000 --json --quiet; echo $? >&2")
+    program = f"{shlex.quote(sys.executable)} -m caustic_cli render blob.caustic --rays 1000 --json --quiet; echo $? >&2"
     done = subprocess.run(["bash", "-c", f"({program}) | true"], capture_output=True, text=True, env=ENVIRONMENT, check=False)
     assert done.stderr == "0\n"
 

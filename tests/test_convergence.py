@@ -235,11 +235,14 @@ def test_a_lens_that_lets_no_light_out_is_an_error():
         run_study("rays", *smooth(tilt=2.0), max_rays=256, repeats=1)
 
 
-@pytest.mark.parametrize(("name", "options", "complaint"), [
-    ("speed", {}, "must be one of rays, reconstruction, precision"),
-    ("rays", {"max_rays": 10}, "rays must be a whole number 256 to"),
-    ("rays", {"repeats": 0}, "repeats must be a whole number 1 to"),
-])
+@pytest.mark.parametrize(
+    ("name", "options", "complaint"),
+    [
+        ("speed", {}, "must be one of rays, reconstruction, precision"),
+        ("rays", {"max_rays": 10}, "rays must be a whole number 256 to"),
+        ("rays", {"repeats": 0}, "repeats must be a whole number 1 to"),
+    ],
+)
 def test_bad_input_is_refused(name, options, complaint):
     with pytest.raises(InputError, match=complaint):
         run_study(name, *smooth(), **options)

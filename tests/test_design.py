@@ -50,10 +50,16 @@ def content(project) -> dict:
     held = load(project)
     s = held.state
     tensors = {f"{group}.{k}": v for group in ("parameters", "optimizer") for k, v in getattr(s, group).items()}
-    return {"heights": s.heights, **tensors, "counts": (s.stage, s.iteration, s.total), "reason": s.reason,
-            "history": [row[:4] for row in s.history], "provenance": held.provenance,
-            "knots": torch.cat([space.knots for space in held.spaces]),
-            "results": {k: v for k, v in held.results.items() if k not in ("seconds", "image", "project")}}
+    return {
+        "heights": s.heights,
+        **tensors,
+        "counts": (s.stage, s.iteration, s.total),
+        "reason": s.reason,
+        "history": [row[:4] for row in s.history],
+        "provenance": held.provenance,
+        "knots": torch.cat([space.knots for space in held.spaces]),
+        "results": {k: v for k, v in held.results.items() if k not in ("seconds", "image", "project")},
+    }
 
 
 def assert_same(a: dict, b: dict) -> None:
@@ -83,14 +89,17 @@ control = [12, 12]
 [design]
 optimizer = "{optimizer}"
 {more}
-""" + "".join(f"""
+""" + "".join(
+    f"""
 [[design.stages]]
 control = [{net}, {net}]
 rays = {rays}
 blur = {blur}
 apron = 2
 iterations = 7
-""" for net, rays, blur in ((7, 1500, 1.5), (7, 2000, 0.5), (12, 3000, 0.0)))
+"""
+    for net, rays, blur in ((7, 1500, 1.5), (7, 2000, 0.5), (12, 3000, 0.0))
+)
 
 
 def staged(name="c.toml", optimizer="lbfgs", more="") -> str:
@@ -236,7 +245,7 @@ def test_transport_begins_where_the_offset_ends(capfd):
     moved = design(capfd, "blob.png", *fine, "--iterations", 1, "-o", "moved")
     assert moved["relative_rms"] < 1.2 * sphere["relative_rms"]
     assert load("moved").state.history[0][2] < 0.7 * load("sphere").state.history[0][2]
-    assert "start = \"transport\"" in Path("moved/project.toml").read_text()
+    assert 'start = "transport"' in Path("moved/project.toml").read_text()
 
 
 def test_a_start_that_a_fixed_thickness_would_cut_is_lifted(capfd):
@@ -284,8 +293,14 @@ def test_the_two_losses_lead_to_different_lenses(capfd):
 def test_quality(capfd, quality, total):
     design(capfd, "blob.png", *TINY, "--quality", quality, "--start", "offset", "--waves", "off", "--iterations", 1)
     text = (Path("blob.caustic") / "project.toml").read_text()
-    assert sum(int(line.split("=")[1].split("#")[0]) for line in text.split("[[design.stages]]", 1)[1].splitlines()
-               if line.startswith("iterations")) == total
+    assert (
+        sum(
+            int(line.split("=")[1].split("#")[0])
+            for line in text.split("[[design.stages]]", 1)[1].splitlines()
+            if line.startswith("iterations")
+        )
+        == total
+    )
 
 
 def test_a_start_from_another_project_takes_its_lens_over(capfd):
@@ -296,8 +311,11 @@ def test_a_start_from_another_project_takes_its_lens_over(capfd):
 
 
 def one_stage(more="") -> str:
-    Path("one.toml").write_text("[screen]\nresolution = [24, 24]\n[lens]\ncontrol = [12, 12]\n" + more +
-                                "[[design.stages]]\ncontrol = [12, 12]\nrays = 4000\n")
+    Path("one.toml").write_text(
+        "[screen]\nresolution = [24, 24]\n[lens]\ncontrol = [12, 12]\n"
+        + more
+        + "[[design.stages]]\ncontrol = [12, 12]\nrays = 4000\n"
+    )
     return "one.toml"
 
 
@@ -335,24 +353,39 @@ def test_no_light_on_the_screen_is_said_and_ends_in_1(capfd):
     profile = np.zeros((20, 20))
     profile[0, 0] = 1.0
     np.save("corner.npy", profile)
-    Path("one.toml").write_text("[source]\nprofile = 'corner.npy'\n[lens]\ncontrol = [12, 12]\nradius = [80.3, 80.3]\n"
-                                "[screen]\nsize = [2.0, 2.0]\nresolution = [24, 24]\n"
-                                "[[design.stages]]\ncontrol = [12, 12]\nrays = 4000\n")
+    Path("one.toml").write_text(
+        "[source]\nprofile = 'corner.npy'\n[lens]\ncontrol = [12, 12]\nradius = [80.3, 80.3]\n"
+        "[screen]\nsize = [2.0, 2.0]\nresolution = [24, 24]\n"
+        "[[design.stages]]\ncontrol = [12, 12]\nrays = 4000\n"
+    )
     err = design(capfd, "blob.png", "--config", "one.toml", "--start", "offset", "--quiet", code=1)
     assert err.startswith("caustic: ") and err.count("\n") == 1 and "no light reaches the screen" in err
     assert not (Path("blob.caustic") / "render.png").exists()
 
 
-@pytest.mark.parametrize(("section", "line"), [
-    ("design", "loss = 'moon'"), ("design", "network = 'moon'"), ("design", "initial = 'moon'"),
-    ("design", "preconditioner = 'moon'"), ("design", "optimizer = 'moon'"), ("design", "dtype = 'moon'"),
-    ("[design.stages]", "sampler = 'moon'"), ("[design.stages]", "reconstruction = 'moon'"), ("lens", "fresnel = 'moon'"),
-    ("target", "flip = 'moon'"), ("screen", "size = [0, 1]"), ("lens", "knots_u = [0, 1]"), ("design", "time_limit = nan"),
-])
+@pytest.mark.parametrize(
+    ("section", "line"),
+    [
+        ("design", "loss = 'moon'"),
+        ("design", "network = 'moon'"),
+        ("design", "initial = 'moon'"),
+        ("design", "preconditioner = 'moon'"),
+        ("design", "optimizer = 'moon'"),
+        ("design", "dtype = 'moon'"),
+        ("[design.stages]", "sampler = 'moon'"),
+        ("[design.stages]", "reconstruction = 'moon'"),
+        ("lens", "fresnel = 'moon'"),
+        ("target", "flip = 'moon'"),
+        ("screen", "size = [0, 1]"),
+        ("lens", "knots_u = [0, 1]"),
+        ("design", "time_limit = nan"),
+    ],
+)
 def test_a_word_that_means_nothing_is_refused_before_anything_is_made(capfd, section, line):
     Path("c.toml").write_text(f"[{section}]\n{line}\n")
-    err = design(capfd, "blob.png", *(TINY[:4] + TINY[6:] if "stages" in section else TINY), "--iterations", 1,
-                 "--config", "c.toml", code=2)
+    err = design(
+        capfd, "blob.png", *(TINY[:4] + TINY[6:] if "stages" in section else TINY), "--iterations", 1, "--config", "c.toml", code=2
+    )
     assert err.count("\n") == 1 and line.split()[0] in err, err
     assert not Path("blob.caustic").exists()
 

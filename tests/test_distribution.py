@@ -50,8 +50,14 @@ def test_flux_and_angles(given, cone):
             given.flux(cone)
         return
     ends = [a for a in np.radians(given.angles[:5]) if a < cone]
-    exact = sum(quad(lambda t: 2 * math.pi * given.relative(t) * math.sin(t), a, b, epsrel=1e-13)[0]
-                for a, b in zip(ends, [*ends[1:], cone], strict=True)) if given is not COSINE else math.pi * math.sin(cone) ** 2
+    exact = (
+        sum(
+            quad(lambda t: 2 * math.pi * given.relative(t) * math.sin(t), a, b, epsrel=1e-13)[0]
+            for a, b in zip(ends, [*ends[1:], cone], strict=True)
+        )
+        if given is not COSINE
+        else math.pi * math.sin(cone) ** 2
+    )
     assert given.flux(cone) == pytest.approx(exact, rel=1e-10 if given is not COSINE else 1e-6)
     part = np.concatenate([[0.0, 1.0], np.random.default_rng(0).random(1000)])
     angle = given.angle_of(part, cone)
@@ -69,12 +75,19 @@ def test_a_table_of_a_known_distribution_is_it(table, word, aimed):
         torch.testing.assert_close(one.origin[0], two.origin[0], rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("source", [
-    Points((AT,), cone=70.0, intensity=LED), Points((AT,), intensity=LED), Points((AT,), cone=70.0, intensity=LED, aimed=False),
-    Points((AT, (0.0, 0.0, -30.0)), (1.0, 2.0), intensity=HOLLOW), Disc(AT, (3.0, 2.0), intensity=LED),
-    Disc(AT, (3.0, 2.0), brightness=PICTURE), Disc(AT, (3.0, 2.0), cone=15.0, brightness=PICTURE, intensity=LED),
-    Disc(angle=3.0, brightness=PICTURE),
-])
+@pytest.mark.parametrize(
+    "source",
+    [
+        Points((AT,), cone=70.0, intensity=LED),
+        Points((AT,), intensity=LED),
+        Points((AT,), cone=70.0, intensity=LED, aimed=False),
+        Points((AT, (0.0, 0.0, -30.0)), (1.0, 2.0), intensity=HOLLOW),
+        Disc(AT, (3.0, 2.0), intensity=LED),
+        Disc(AT, (3.0, 2.0), brightness=PICTURE),
+        Disc(AT, (3.0, 2.0), cone=15.0, brightness=PICTURE, intensity=LED),
+        Disc(angle=3.0, brightness=PICTURE),
+    ],
+)
 @pytest.mark.parametrize("kind", ["stratified", "sobol", "uniform"])
 def test_the_account_closes(source, kind):
     here = scene(source)
@@ -105,40 +118,50 @@ def test_a_mode_s_light_is_that_of_the_rays():
 def test_the_first_surface_knows_the_table():
     lens = Lens(size=(10.0, 8.0), control=(20, 20), index=1.5)
     screen = Screen((30.0, 30.0), 100.0, (16, 16))
-    found = {name: first_surface(Scene(Points((AT,), intensity=i), lens, screen), np.ones((16, 16)), HeightField.of(lens), 32)
-             for name, i in (("cosine", COSINE), ("lambertian", "lambertian"), ("led", LED))}
+    found = {
+        name: first_surface(Scene(Points((AT,), intensity=i), lens, screen), np.ones((16, 16)), HeightField.of(lens), 32)
+        for name, i in (("cosine", COSINE), ("lambertian", "lambertian"), ("led", LED))
+    }
     found = {name: first.heights for name, first in found.items()}
     span = float(found["cosine"].max() - found["cosine"].min())
     assert float((found["cosine"] - found["lambertian"]).abs().max()) < 1e-5 * span
     assert float((found["led"] - found["lambertian"]).abs().max()) > 1e-2 * span
 
 
-@pytest.mark.parametrize(("data", "message"), [
-    (b"0 1\n10 2\n5 1\n", "must have angles that ascend from 0"),
-    (b"1 1\n10 2\n", "ascend from 0"),
-    (b"0 1\n190 2\n", "at most 180"),
-    (b"0 1\n", "must name 2 to 100,000 angles"),
-    (b"0 1\n10 -2\n", "at least 0"),
-    (b"0 0\n10 0\n", "must have light within 90 degrees"),
-    (b"0 0\n95 0\n120 1\n180 0\n", "must have light within 90 degrees"),
-    (b"0 1\n10 nan\n", "line 2 is '10 nan'"),
-    (b"0 1\n10 1e999\n", "line 2"),
-    (b"0 1 2\n10 1\n", "line 1 is '0 1 2'"),
-    (b"angle,intensity\nangle,intensity\n0,1\n", "line 2"),
-    (b"0,1\nten,1\n", "line 2 is 'ten,1'"),
-    (b"", "has no angles"),
-    (b"\xff\xfe\x00", "is not text"),
-    (b"0 1\n" * 100_001, "more than 100,000 angles"),
-])
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"0 1\n10 2\n5 1\n", "must have angles that ascend from 0"),
+        (b"1 1\n10 2\n", "ascend from 0"),
+        (b"0 1\n190 2\n", "at most 180"),
+        (b"0 1\n", "must name 2 to 100,000 angles"),
+        (b"0 1\n10 -2\n", "at least 0"),
+        (b"0 0\n10 0\n", "must have light within 90 degrees"),
+        (b"0 0\n95 0\n120 1\n180 0\n", "must have light within 90 degrees"),
+        (b"0 1\n10 nan\n", "line 2 is '10 nan'"),
+        (b"0 1\n10 1e999\n", "line 2"),
+        (b"0 1 2\n10 1\n", "line 1 is '0 1 2'"),
+        (b"angle,intensity\nangle,intensity\n0,1\n", "line 2"),
+        (b"0,1\nten,1\n", "line 2 is 'ten,1'"),
+        (b"", "has no angles"),
+        (b"\xff\xfe\x00", "is not text"),
+        (b"0 1\n" * 100_001, "more than 100,000 angles"),
+    ],
+)
 def test_tables_that_are_none(data, message):
     with pytest.raises(InputError) as error:
         parse_distribution(data, "led.csv")
     assert message in str(error.value) and str(error.value).startswith("led.csv: ") and "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("data", [
-    b"0,1\n10,2\n60,0\n", b"\xef\xbb\xbfangle (deg);intensity\r\n0;1\r\n10;2\r\n\r\n60;0\r\n", b"# LED\n0\t1 # axis\n10\t2\n60\t0",
-])
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"0,1\n10,2\n60,0\n",
+        b"\xef\xbb\xbfangle (deg);intensity\r\n0;1\r\n10;2\r\n\r\n60;0\r\n",
+        b"# LED\n0\t1 # axis\n10\t2\n60\t0",
+    ],
+)
 def test_ways_of_writing_a_table(data):
     assert parse_distribution(data, "led.csv") == Distribution((0.0, 10.0, 60.0), (1.0, 2.0, 0.0))
 
@@ -166,20 +189,27 @@ def test_what_a_disc_with_a_picture_says_of_itself():
     assert sun.half_angle == pytest.approx(math.asin(math.sqrt(2) * math.sin(math.radians(1.0))))
     assert Disc(angle=2.0, brightness=np.pad(np.ones((2, 2)), 7)).half_angle < math.radians(0.2)
     bundle = whole(disc, rays=100_000)
-    dz = torch.sqrt(1 - (bundle.direction[0]**2 + bundle.direction[1]**2) * 1.5**2)
+    dz = torch.sqrt(1 - (bundle.direction[0] ** 2 + bundle.direction[1] ** 2) * 1.5**2)
     x, y = (bundle.origin[k] - 12.0 * bundle.direction[k] * 1.5 / dz for k in (0, 1))
     assert float(x.min()) >= -0.5 - 1e-9 and float(x.max()) <= 0.5 + 1e-9 and float(y.min()) >= -0.5 - 1e-9
     here = scene(sun)
     (state,) = rays_of(here, "uniform", 200_000).chunks()
     sine = math.sin(math.radians(1.0))
-    assert float(state.direction[0].abs().max()) == pytest.approx(sine, rel=1e-4) and \
-        float(state.direction[0].square().mean()) == pytest.approx(sine**2 / 3, rel=1e-2)
+    assert float(state.direction[0].abs().max()) == pytest.approx(sine, rel=1e-4) and float(
+        state.direction[0].square().mean()
+    ) == pytest.approx(sine**2 / 3, rel=1e-2)
     lean = float(torch.hypot(*state.direction[:2]).max())
     assert lean <= math.sin(bounds_of(here, HeightField.of(LENS), heights(LENS)).incidence) * (1 + 1e-12)
 
 
-@pytest.mark.parametrize("source", [Disc(AT, (3.0, 2.0), brightness=PICTURE), Disc(angle=4.0, brightness=PICTURE),
-                                    Disc(AT, (3.0, 2.0), brightness=PICTURE, intensity=LED, cone=50.0)])
+@pytest.mark.parametrize(
+    "source",
+    [
+        Disc(AT, (3.0, 2.0), brightness=PICTURE),
+        Disc(angle=4.0, brightness=PICTURE),
+        Disc(AT, (3.0, 2.0), brightness=PICTURE, intensity=LED, cone=50.0),
+    ],
+)
 def test_rays_against_independent_ones(source):
     """The image against that of rays drawn in NumPy all over the cone, pixel by pixel in units of noise."""
     here = scene(source)
@@ -194,11 +224,17 @@ def test_rays_against_independent_ones(source):
     x, y, *d = np.concatenate(places, 1)
     inside = (np.abs(x) <= 5) & (np.abs(y) <= 4)
     (state,) = rays_of(here, "stratified", 1_000_000).chunks(10**9)
-    ours = [np.histogram2d(a, b, 16, r, weights=w)[0] for a, b, r, w in (
-        (state.origin[0], state.origin[1], [[-5, 5], [-4, 4]], state.power),
-        (state.direction[0], state.direction[1], [[-lean, lean]] * 2, state.power))]
-    theirs = [np.histogram2d(a[inside], b[inside], 16, r)[0] / rays for a, b, r in (
-        (x, y, [[-5, 5], [-4, 4]]), (d[0], d[1], [[-lean, lean]] * 2))]
+    ours = [
+        np.histogram2d(a, b, 16, r, weights=w)[0]
+        for a, b, r, w in (
+            (state.origin[0], state.origin[1], [[-5, 5], [-4, 4]], state.power),
+            (state.direction[0], state.direction[1], [[-lean, lean]] * 2, state.power),
+        )
+    ]
+    theirs = [
+        np.histogram2d(a[inside], b[inside], 16, r)[0] / rays
+        for a, b, r in ((x, y, [[-5, 5], [-4, 4]]), (d[0], d[1], [[-lean, lean]] * 2))
+    ]
     for one, two in zip(ours, theirs, strict=True):
         lit = two > 200 / rays
         score = (one - two)[lit] * np.sqrt(rays / two[lit])
@@ -231,13 +267,16 @@ def test_what_goes_out_comes_back(tmp_path):
             write_mitsuba(tmp_path / "lens.xml", scene(source, lens), field, z)
 
 
-@pytest.mark.parametrize(("what", "message"), [
-    (lambda: Disc(brightness=np.zeros((2, 2))), "not black all over"),
-    (lambda: Disc(brightness=np.array([[1.0, math.nan]])), "finite"),
-    (lambda: Disc(brightness=-np.ones((2, 2))), "not negative"),
-    (lambda: Disc(angle=120.0, brightness=np.ones((2, 2))), "too wide for a picture"),
-    (lambda: Points((AT,), intensity="blue"), "must be one of uniform, lambertian, or a .csv file, got 'blue'"),
-])
+@pytest.mark.parametrize(
+    ("what", "message"),
+    [
+        (lambda: Disc(brightness=np.zeros((2, 2))), "not black all over"),
+        (lambda: Disc(brightness=np.array([[1.0, math.nan]])), "finite"),
+        (lambda: Disc(brightness=-np.ones((2, 2))), "not negative"),
+        (lambda: Disc(angle=120.0, brightness=np.ones((2, 2))), "too wide for a picture"),
+        (lambda: Points((AT,), intensity="blue"), "must be one of uniform, lambertian, or a .csv file, got 'blue'"),
+    ],
+)
 def test_impossible_ones_are_refused(what, message):
     with pytest.raises(InputError, match=message):
         what()
@@ -260,36 +299,63 @@ def run(capfd, *arguments, code=0):
     return json.loads(out) if code == 0 else err.strip()
 
 
-@pytest.mark.parametrize(("source", "kept"), [
-    (["--source", "point", "--intensity", "led.csv"], {"intensity.csv": "led.csv"}),
-    (["--source", "disc", "--source-file", "die.png", "--source-size", "1", "--intensity", "led.csv"],
-     {"intensity.csv": "led.csv", "source.png": "die.png"}),
-    (["--source-angle", "1", "--source-file", "die.png"], {"source.png": "die.png"}),
-    (["--source", "disc", "--intensity", "lambertian"], {}),
-])
+@pytest.mark.parametrize(
+    ("source", "kept"),
+    [
+        (["--source", "point", "--intensity", "led.csv"], {"intensity.csv": "led.csv"}),
+        (
+            ["--source", "disc", "--source-file", "die.png", "--source-size", "1", "--intensity", "led.csv"],
+            {"intensity.csv": "led.csv", "source.png": "die.png"},
+        ),
+        (["--source-angle", "1", "--source-file", "die.png"], {"source.png": "die.png"}),
+        (["--source", "disc", "--intensity", "lambertian"], {}),
+    ],
+)
 def test_designs_keep_their_files(here, capfd, source, kept):
-    figures = run(capfd, "design", "blob.png", *source, "--resolution", "24", "--control", "12", "--rays", "4000",
-                  "--iterations", "5", "--waves", "off")
+    figures = run(
+        capfd,
+        "design",
+        "blob.png",
+        *source,
+        "--resolution",
+        "24",
+        "--control",
+        "12",
+        "--rays",
+        "4000",
+        "--iterations",
+        "5",
+        "--waves",
+        "off",
+    )
     assert figures["on_screen"] + sum(figures["lost"].values()) == pytest.approx(1.0, abs=1e-12)
     for name, given in kept.items():
         assert Path("blob.caustic", name).read_bytes() == Path(given).read_bytes()
         Path(given).unlink()
-    again = run(capfd, "render", "blob.caustic", "--rays", "40000", "--force",
-                "--effects", "entrance,intersection,fresnel,source-size")
+    again = run(
+        capfd, "render", "blob.caustic", "--rays", "40000", "--force", "--effects", "entrance,intersection,fresnel,source-size"
+    )
     assert again["relative_rms"] == pytest.approx(figures["relative_rms"], rel=0.05)
     assert workflow.Project.open("blob.caustic").settings["source"]["intensity"] == (
-        "intensity.csv" if "intensity.csv" in kept else "lambertian" if "lambertian" in source else "uniform")
+        "intensity.csv" if "intensity.csv" in kept else "lambertian" if "lambertian" in source else "uniform"
+    )
 
 
-@pytest.mark.parametrize(("arguments", "message"), [
-    (["--source", "point", "--intensity", "blue"], "--intensity must be one of uniform, lambertian, or a .csv file, got 'blue'"),
-    (["--source", "point", "--intensity", "none.csv"], "none.csv: no such file; a .csv of two columns is needed"),
-    (["--source", "point", "--intensity", "die.png"], "die.png: is not text"),
-    (["--intensity", "led.csv"], "--intensity belongs to --source point, grid or disc, got plane"),
-    (["--source", "disc", "--source-file", "rays.dat"], "--source-file of a disc must be a picture"),
-    (["--source", "disc", "--source-file", "none.png"], "none.png: no such file"),
-    (["--source", "rays", "--source-file", "die.png"], "--source-file of type rays must be a ray file"),
-])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ["--source", "point", "--intensity", "blue"],
+            "--intensity must be one of uniform, lambertian, or a .csv file, got 'blue'",
+        ),
+        (["--source", "point", "--intensity", "none.csv"], "none.csv: no such file; a .csv of two columns is needed"),
+        (["--source", "point", "--intensity", "die.png"], "die.png: is not text"),
+        (["--intensity", "led.csv"], "--intensity belongs to --source point, grid or disc, got plane"),
+        (["--source", "disc", "--source-file", "rays.dat"], "--source-file of a disc must be a picture"),
+        (["--source", "disc", "--source-file", "none.png"], "none.png: no such file"),
+        (["--source", "rays", "--source-file", "die.png"], "--source-file of type rays must be a ray file"),
+    ],
+)
 def test_bad_ones_are_one_line(here, capfd, arguments, message):
     err = run(capfd, "design", "blob.png", *arguments, code=2)
     assert message in err and "\n" not in err

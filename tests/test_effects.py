@@ -28,8 +28,12 @@ DETOURS, STAGES = Requests.to("ghosts", "secondary-intersection"), Requests(stag
 def scene_of(source=None, *, degree=(2, 2), control=(9, 8), screen=None, light=None, **lens) -> Scene:
     """A 10 x 8 mm lens about 3 mm thick, 60 mm before a screen of 16 x 14 mm."""
     options = {"index": N, **lens}
-    return Scene(source or PlaneWave(), Lens((10.0, 8.0), 0.0, control=control, degree=degree, offset=Offset(3.0), **options),
-                 screen or Screen((16.0, 14.0), 60.0, (32, 28)), light or Light())
+    return Scene(
+        source or PlaneWave(),
+        Lens((10.0, 8.0), 0.0, control=control, degree=degree, offset=Offset(3.0), **options),
+        screen or Screen((16.0, 14.0), 60.0, (32, 28)),
+        light or Light(),
+    )
 
 
 def heights_through(scene: Scene, f) -> torch.Tensor:
@@ -286,8 +290,9 @@ def test_ghost_of_a_slanted_plate(fresnel):
     assert checked > 50
 
 
-@pytest.mark.parametrize(("fresnel", "a", "whole"), [("exact", 0.05, 30), ("schlick", 0.05, 30), ("exact", 0.15, 25),
-                                                     ("schlick", 0.15, 25)])
+@pytest.mark.parametrize(
+    ("fresnel", "a", "whole"), [("exact", 0.05, 30), ("schlick", 0.05, 30), ("exact", 0.15, 25), ("schlick", 0.15, 25)]
+)
 def test_ghost_of_a_wedge(fresnel, a, whole):
     """A wedge of angle a: the ghost meets the entrance at 2 a and the exit at 3 a, so it leaves at asin(n sin 3 a) - a."""
     scene = scene_of(fresnel=fresnel)
@@ -405,10 +410,16 @@ SOURCES = [None, POINT, Disc((0.0, 0.0, -30.0), (2.0, 1.0))]
 def test_the_account_closes_and_all_is_finite(source, bumps):
     """Image + losses = 1 to 1e-12 with every effect at once, with and without total reflection."""
     light = Light(30.0, (450.0, 600.0), (1.0, 2.0))
-    scene = scene_of(source, light=light, glass="N-BK7", screen=Screen((16.0, 14.0), 60.0, (32, 28), (10.0, -20.0), (1.0, 0.5)),
-                     **EVERYTHING)
-    for requests in (NO_REQUESTS, DETOURS, Requests.to(without=("total-reflection",)),
-                     Requests.to(without=("entrance", "intersection")), Requests.to("entrance", "intersection")):
+    scene = scene_of(
+        source, light=light, glass="N-BK7", screen=Screen((16.0, 14.0), 60.0, (32, 28), (10.0, -20.0), (1.0, 0.5)), **EVERYTHING
+    )
+    for requests in (
+        NO_REQUESTS,
+        DETOURS,
+        Requests.to(without=("total-reflection",)),
+        Requests.to(without=("entrance", "intersection")),
+        Requests.to("entrance", "intersection"),
+    ):
         if "entrance" in requests.on and source is not None:
             continue
         found = shine(scene, bumpy(scene, bumps), requests, rays=2000)
@@ -445,8 +456,13 @@ def test_stages_without_effects_are_the_fused_kernels(source, bumps):
 def test_gradients_against_differences(case, kernels):
     """Central differences over a random direction; the smooth filter's third derivative leaves some 1e-7."""
     light = Light(30.0, (450.0, 600.0), (1.0, 2.0))
-    scene = scene_of(POINT if case == "point" else None, light=light, glass="N-BK7",
-                     screen=Screen((24.0, 24.0), 60.0, (12, 12), (10.0, -20.0), (1.0, 0.5)), **EVERYTHING)
+    scene = scene_of(
+        POINT if case == "point" else None,
+        light=light,
+        glass="N-BK7",
+        screen=Screen((24.0, 24.0), 60.0, (12, 12), (10.0, -20.0), (1.0, 0.5)),
+        **EVERYTHING,
+    )
     heights, step = bumpy(scene, 0.15), 1e-6
     if case == "mirror":
         scene = scene_of(screen=Screen((24.0, 24.0), -40.0, (12, 12), (0.0, 10.0)), mirror=True)

@@ -190,8 +190,9 @@ def test_the_loss_of_colours_is_their_root_mean_square():
     made = Objective(scene, field, rays_of(scene, "lines", 900), Filter("cosine", (3, 3)), target, "rms-light", **options)
     apart = []
     for k, band in enumerate(scene.bands[:2]):
-        one = Objective(band.scene, field, rays_of(band.scene, "lines", 900), Filter("cosine", (3, 3)), target[k], "rms-light",
-                        **options)
+        one = Objective(
+            band.scene, field, rays_of(band.scene, "lines", 900), Filter("cosine", (3, 3)), target[k], "rms-light", **options
+        )
         assert isinstance(one.loss, Loss)
         apart.append(one(heights).loss)
     found = made(heights)
@@ -216,22 +217,29 @@ def test_rounds_of_a_wave_image(monkeypatch):
     """As many as are asked for, and their least and most."""
     times = iter([0.0, 3.0, 10.0, 12.0, 20.0, 27.0])
     monkeypatch.setattr(study.time, "process_time", lambda: next(times))
-    scene = Scene(PlaneWave(), Lens((1.0, 1.0), control=(6, 6), offset=Offset(1.0)), Screen((2.0, 2.0), 30.0, (8, 8)),
-                  Light(wavelengths=(550.0,)))
+    scene = Scene(
+        PlaneWave(),
+        Lens((1.0, 1.0), control=(6, 6), offset=Offset(1.0)),
+        Screen((2.0, 2.0), 30.0, (8, 8)),
+        Light(wavelengths=(550.0,)),
+    )
     field = HeightField.of(scene.lens)
     heights = torch.full(field.shape, 1.0, dtype=torch.float64)
     found = study.measure_waves(study.compile_plan(scene, field, heights), field, heights, rays=1000, repeats=3)
     assert [found[k] for k in ("seconds", "seconds_min", "seconds_max", "whole")] == [2.0, 2.0, 7.0, 2.0] and found["error"] > 0
 
 
-@pytest.mark.parametrize(("changes", "message"), [
-    ({"lens_absorption": -1.0}, "[lens] absorption must be 0 to 1e+06, got -1"),
-    ({"lens_roughness": 2.0}, "[lens] roughness must be 0 to 1, got 2"),
-    ({"source_weights": [1.0]}, "[source] weights must be one for each of the 0 wavelengths, got 1"),
-    ({"source_polarisation": 1e9}, "[source] polarisation must be -360 to 360"),
-    ({"screen_tilt": [90.0, 0.0]}, "[screen] tilt must be -85 to 85, got 90"),
-    ({"target_color": True, "source_wavelengths": [500.0]}, "[source] wavelengths of a coloured picture are three"),
-])
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"lens_absorption": -1.0}, "[lens] absorption must be 0 to 1e+06, got -1"),
+        ({"lens_roughness": 2.0}, "[lens] roughness must be 0 to 1, got 2"),
+        ({"source_weights": [1.0]}, "[source] weights must be one for each of the 0 wavelengths, got 1"),
+        ({"source_polarisation": 1e9}, "[source] polarisation must be -360 to 360"),
+        ({"screen_tilt": [90.0, 0.0]}, "[screen] tilt must be -85 to 85, got 90"),
+        ({"target_color": True, "source_wavelengths": [500.0]}, "[source] wavelengths of a coloured picture are three"),
+    ],
+)
 def test_bad_values_are_named(changes, message):
     full = complete({}, 1.0)
     for name, value in changes.items():

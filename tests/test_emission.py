@@ -56,7 +56,7 @@ def test_a_cone_within_the_lens_is_sampled_itself():
 
 def test_lambertian_light_is_even_in_sine_squared():
     bundle = whole(Points(((0.0, 0.0, -6.0),), cone=30.0, intensity="lambertian"))
-    sine2 = (bundle.direction[0]**2 + bundle.direction[1]**2) * 1.5**2
+    sine2 = (bundle.direction[0] ** 2 + bundle.direction[1] ** 2) * 1.5**2
     assert float(sine2.mean()) == pytest.approx(0.5 * math.sin(math.radians(30.0)) ** 2, rel=1e-3)
     part = float(whole(Points(((0.0, 0.0, -6.0),), cone=60.0, intensity="lambertian")).power.sum())
     cone = float(whole(Points(((0.0, 0.0, -6.0),), cone=60.0, intensity="lambertian", aimed=False)).power.sum())
@@ -102,7 +102,7 @@ def test_a_grid_is_equispaced_with_its_borders():
 
 def test_a_disc_shines_from_all_of_itself():
     bundle = whole(Disc((0.5, 0.0, -8.0), (2.0, 1.0), cone=70.0), rays=200_000)
-    dz = torch.sqrt(1 - (bundle.direction[0]**2 + bundle.direction[1]**2) * 1.5**2)
+    dz = torch.sqrt(1 - (bundle.direction[0] ** 2 + bundle.direction[1] ** 2) * 1.5**2)
     x = bundle.origin[0] - 8.0 * bundle.direction[0] * 1.5 / dz
     y = bundle.origin[1] - 8.0 * bundle.direction[1] * 1.5 / dz
     inside = ((x - 0.5) / 1.0) ** 2 + (y / 0.5) ** 2
@@ -176,21 +176,24 @@ def test_aimed_and_unaimed_rays_make_the_same_image():
     assert float(score.pow(2).mean()) < 3.0  # each has 6 degrees of freedom: mean 1.5
 
 
-@pytest.mark.parametrize("source, message", [
-    (lambda: Points(()), "position must name 1 to"),
-    (lambda: Points(((0.0, 0.0),)), "three numbers"),
-    (lambda: Points(((0.0, 0.0, math.nan),)), "position"),
-    (lambda: Points(((0.0, 0.0, -5.0),), (0.0,)), "not all be 0"),
-    (lambda: Points(((0.0, 0.0, -5.0),), (1.0, 2.0)), "one for each"),
-    (lambda: Points(((0.0, 0.0, -5.0),), cone=0.0), "cone"),
-    (lambda: Points(((0.0, 0.0, -5.0),), cone=91.0), "cone"),
-    (lambda: Points(((0.0, 0.0, -5.0),), intensity="blue"), "intensity"),
-    (lambda: Points.grid((0.0, 0.0, -5.0), (1.0, 1.0), (0, 3)), "grid"),
-    (lambda: Disc(size=(-1.0, 1.0)), "size"),
-    (lambda: Disc(angle=200.0), "angle"),
-    (lambda: scene(Points(((0.0, 0.0, 0.0),))), "before the lens"),
-    (lambda: Emission(scene(Disc()), "halton", (2, 2)), "sampler"),
-])
+@pytest.mark.parametrize(
+    "source, message",
+    [
+        (lambda: Points(()), "position must name 1 to"),
+        (lambda: Points(((0.0, 0.0),)), "three numbers"),
+        (lambda: Points(((0.0, 0.0, math.nan),)), "position"),
+        (lambda: Points(((0.0, 0.0, -5.0),), (0.0,)), "not all be 0"),
+        (lambda: Points(((0.0, 0.0, -5.0),), (1.0, 2.0)), "one for each"),
+        (lambda: Points(((0.0, 0.0, -5.0),), cone=0.0), "cone"),
+        (lambda: Points(((0.0, 0.0, -5.0),), cone=91.0), "cone"),
+        (lambda: Points(((0.0, 0.0, -5.0),), intensity="blue"), "intensity"),
+        (lambda: Points.grid((0.0, 0.0, -5.0), (1.0, 1.0), (0, 3)), "grid"),
+        (lambda: Disc(size=(-1.0, 1.0)), "size"),
+        (lambda: Disc(angle=200.0), "angle"),
+        (lambda: scene(Points(((0.0, 0.0, 0.0),))), "before the lens"),
+        (lambda: Emission(scene(Disc()), "halton", (2, 2)), "sampler"),
+    ],
+)
 def test_impossible_sources_are_refused(source, message):
     with pytest.raises(InputError, match=message):
         source()
@@ -202,10 +205,16 @@ def test_the_covering_cone_reaches_every_corner():
     assert bool((whole(source).power > 0).all())
 
 
-@pytest.mark.parametrize("source, expected", [
-    (PlaneWave(), 0.0), (Points(((0.0, 0.0, -5.0),)), 0.0), (Disc(angle=0.533), 300.0 * math.radians(0.533)),
-    (Disc((0.0, 0.0, -50.0), (5.0, 2.0)), 30.0), (Points.grid((0.0, 0.0, -50.0), (2.0, 1.0), (5, 5)), 12.0),
-])
+@pytest.mark.parametrize(
+    "source, expected",
+    [
+        (PlaneWave(), 0.0),
+        (Points(((0.0, 0.0, -5.0),)), 0.0),
+        (Disc(angle=0.533), 300.0 * math.radians(0.533)),
+        (Disc((0.0, 0.0, -50.0), (5.0, 2.0)), 30.0),
+        (Points.grid((0.0, 0.0, -50.0), (2.0, 1.0), (5, 5)), 12.0),
+    ],
+)
 def test_the_blur_of_an_extended_source(source, expected):
     assert source.blur(0.0, 300.0) == pytest.approx(expected)
 

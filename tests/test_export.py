@@ -27,8 +27,7 @@ UNEVEN = (0.0, 0.0, 0.0, 0.0, 0.11, 0.2, 0.2, 0.55, 0.83, 1.0, 1.0, 1.0, 1.0)  #
 
 def make(*, control=(20, 20), degree=(3, 3), size=(10.0, 10.0), knots=None, relief=0.02, seed=1, **source):
     """A scene and random control heights on a concave sphere."""
-    lens = Lens(size=size, control=control, degree=degree, knots=knots, index=1.5443, z_in=-0.5,
-                offset=Offset(5.0, (80.0, 80.0)))
+    lens = Lens(size=size, control=control, degree=degree, knots=knots, index=1.5443, z_in=-0.5, offset=Offset(5.0, (80.0, 80.0)))
     scene = Scene(PlaneWave(**source), lens, Screen((38.4, 30.0), 300.0, (64, 50)))
     field = HeightField.of(lens)
     x, y = field.control_xy()
@@ -177,8 +176,7 @@ def test_bicubic_through_the_cloud_gives_the_designed_slopes_back(tmp_path):
         write_lighttools(tmp_path / "lens.npz", scene, field, heights, samples)
         data = load(tmp_path / "lens.npz")
         spline = RectBivariateSpline(data["x"], data["y"], data["z"], kx=3, ky=3, s=0)
-        worst[samples] = max(np.abs(spline(x, y, dx=a, dy=b) - scipy_surface(data, x, y, a, b)).max()
-                             for a, b in ((1, 0), (0, 1)))
+        worst[samples] = max(np.abs(spline(x, y, dx=a, dy=b) - scipy_surface(data, x, y, a, b)).max() for a, b in ((1, 0), (0, 1)))
     assert worst[None] < 1e-9
     assert worst[110, 80] > 1e-4
 
@@ -258,8 +256,9 @@ def signed_volume(corners):
 
 def exact_volume(data):
     """Integral of z - z_in over the aperture: a spline's is (mean of knot widths) . heights, exactly."""
-    wu, wv = ((t[p + 1 :] - t[: -p - 1]) / (p + 1)
-              for t, p in zip((data["knots_u"], data["knots_v"]), data["degrees"], strict=True))
+    wu, wv = (
+        (t[p + 1 :] - t[: -p - 1]) / (p + 1) for t, p in zip((data["knots_u"], data["knots_v"]), data["degrees"], strict=True)
+    )
     area = 4 * data["lens_half_size"].prod()
     return area * (wu @ (data["control_points"][..., 2] - data["z_in"]) @ wv)
 
@@ -300,8 +299,7 @@ def test_stl_encloses_the_lens(tmp_path):
     assert abs(error[0]) < 1e-3
     assert error[0] / error[1] == pytest.approx(4, rel=0.1)
     write_stl(tmp_path / "lens.stl", scene, field, heights, (61, 121))
-    assert signed_volume(read_stl(tmp_path / "lens.stl")["corners"].astype(float)) / volume - 1 == pytest.approx(
-        error[1], abs=1e-6)
+    assert signed_volume(read_stl(tmp_path / "lens.stl")["corners"].astype(float)) / volume - 1 == pytest.approx(error[1], abs=1e-6)
 
 
 def test_stl_spans_the_lens(tmp_path):

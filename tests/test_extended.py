@@ -135,8 +135,12 @@ def heights_of(scene: Scene, relief: float = 2e-3) -> torch.Tensor:
 
 
 CHIP = np.outer([3.0, 1.0, 0.0], [1.0, 2.0, 0.0, 1.0])  # neither even nor symmetrical
-SOURCES = {"sun": Disc(angle=1.5), "disc": Disc((0.0, 0.0, -80.0), (3.0, 2.0)),
-           "chip": Disc((0.0, 0.0, -80.0), (3.0, 2.0), brightness=CHIP), "far chip": Disc(angle=1.5, brightness=CHIP)}
+SOURCES = {
+    "sun": Disc(angle=1.5),
+    "disc": Disc((0.0, 0.0, -80.0), (3.0, 2.0)),
+    "chip": Disc((0.0, 0.0, -80.0), (3.0, 2.0), brightness=CHIP),
+    "far chip": Disc(angle=1.5, brightness=CHIP),
+}
 
 
 @pytest.mark.parametrize("round_", [False, True])
@@ -164,8 +168,18 @@ def test_objective_sees_the_image_of_the_source(kind, exact, monkeypatch):
     traced, rays, kernels = regular_rays(scene, shifts, stage, 0, "cpu")
     assert (len(kernels) > 1) == (exact < 1.0)
     target = torch.from_numpy(disc_on(32))
-    made = Objective(traced, field, rays, Filter("cosine", (3, 3)), target, "rms", spread=kernels, filter_target=False,
-                     oversample=4, dtype=torch.float64)
+    made = Objective(
+        traced,
+        field,
+        rays,
+        Filter("cosine", (3, 3)),
+        target,
+        "rms",
+        spread=kernels,
+        filter_target=False,
+        oversample=4,
+        dtype=torch.float64,
+    )
     image = expose(scene, field, heights, rays_of(scene, "sobol", 2_000_000)).image
     assert made(heights).loss * 32**2 == pytest.approx(relative_rms(image, target), rel=0.04)
     assert made(heights).on_screen == pytest.approx(float(image.sum()), rel=0.01)
@@ -231,9 +245,11 @@ def design(capfd, *arguments) -> dict:
     return json.loads(capfd.readouterr().out)
 
 
-@pytest.mark.parametrize("source", [["--source-angle", "0.8"],
-                                    ["--source", "disc", "--source-position", "0,0,-100", "--source-size", "1"]],
-                         ids=["sun", "disc"])
+@pytest.mark.parametrize(
+    "source",
+    [["--source-angle", "0.8"], ["--source", "disc", "--source-position", "0,0,-100", "--source-size", "1"]],
+    ids=["sun", "disc"],
+)
 def test_a_design_comes_close_to_the_least_error(source, _here, capfd):
     """Within a quarter of the bound at a small size, from stages that are spread; figures and report say the bound."""
     found = design(capfd, "blob.png", *SMALL, *source)

@@ -46,17 +46,28 @@ class Addition:
             (package / name).write_text(text.replace(there, instead))
 
 
-FILTER = Addition(3, edits=(
-    ("optics/reconstruction.py", 'FILTERS = ("bincount",', 'FILTERS = ("tent", "bincount",'),
-    ("optics/reconstruction.py", "        return self._gaussian(d, v, self.alpha[axis])",
-     '        if self.kind == "tent":\n'
-     "            f = (0.5 * v - d.abs()).clamp_min(0.0)\n"
-     "            return f / f.sum(-1, keepdim=True)\n"
-     "        return self._gaussian(d, v, self.alpha[axis])"),
-    ("optics/kernels/filter_weights.py", "BINCOUNT, GAUSSIAN, COSINE = 0, 1, 2", "BINCOUNT, GAUSSIAN, COSINE, TENT = 0, 1, 2, 3"),
-    ("optics/kernels/filter_weights.py", 'KINDS = {"bincount": BINCOUNT,', 'KINDS = {"tent": TENT, "bincount": BINCOUNT,'),
-    ("optics/kernels/filter_weights.py", "    if alpha * square < SMALL:\n        for k in range(v):\n            offset",
-     textwrap.dedent("""\
+FILTER = Addition(
+    3,
+    edits=(
+        ("optics/reconstruction.py", 'FILTERS = ("bincount",', 'FILTERS = ("tent", "bincount",'),
+        (
+            "optics/reconstruction.py",
+            "        return self._gaussian(d, v, self.alpha[axis])",
+            '        if self.kind == "tent":\n'
+            "            f = (0.5 * v - d.abs()).clamp_min(0.0)\n"
+            "            return f / f.sum(-1, keepdim=True)\n"
+            "        return self._gaussian(d, v, self.alpha[axis])",
+        ),
+        (
+            "optics/kernels/filter_weights.py",
+            "BINCOUNT, GAUSSIAN, COSINE = 0, 1, 2",
+            "BINCOUNT, GAUSSIAN, COSINE, TENT = 0, 1, 2, 3",
+        ),
+        ("optics/kernels/filter_weights.py", 'KINDS = {"bincount": BINCOUNT,', 'KINDS = {"tent": TENT, "bincount": BINCOUNT,'),
+        (
+            "optics/kernels/filter_weights.py",
+            "    if alpha * square < SMALL:\n        for k in range(v):\n            offset",
+            textwrap.dedent("""\
          if kind == TENT:
              for k in range(v):
                  for j in range(len(phi)):
@@ -66,8 +77,12 @@ FILTER = Addition(3, edits=(
                          slope[k, j] = math.copysign(1.0, d) if abs(d) < 0.5 * v else 0.0
          elif alpha * square < SMALL:
              for k in range(v):
-                 offset""").replace("\n", "\n    ").join(["    ", ""])),
-), used="""
+                 offset""")
+            .replace("\n", "\n    ")
+            .join(["    ", ""]),
+        ),
+    ),
+    used="""
     import torch
     from caustic_cli.optics.backends import backend_for, plain
     from caustic_cli.optics.reconstruction import Filter
@@ -84,9 +99,13 @@ FILTER = Addition(3, edits=(
         assert abs(float(image.sum() + off) - 1) < 1e-12
         found.append((image.detach(), *torch.autograd.grad((image * by).sum(), (x, y))))
     assert all(float((a - b).abs().max()) < 1e-12 and float(a.abs().max()) > 1e-4 for a, b in zip(*found))
-""")
+""",
+)
 
-EXPORT = Addition(2, new={"export/sag.py": '''
+EXPORT = Addition(
+    2,
+    new={
+        "export/sag.py": '''
     """The sag of the exit as text, a row a line."""
 
     from __future__ import annotations
@@ -97,7 +116,9 @@ EXPORT = Addition(2, new={"export/sag.py": '''
     def write_sag(path, scene, field, heights, samples=None):
         """Control heights, mm."""
         write_bytes(path, "\\n".join(" ".join(f"{z:.9g}" for z in row) for row in heights.tolist()).encode())
-'''}, edits=(("export/__init__.py", '    "zemax": (', '    "sag": (".txt", "sag", "control heights as text"),\n    "zemax": ('),),
+'''
+    },
+    edits=(("export/__init__.py", '    "zemax": (', '    "sag": (".txt", "sag", "control heights as text"),\n    "zemax": ('),),
     used="""
     import os, subprocess, sys
     from pathlib import Path
@@ -107,9 +128,13 @@ EXPORT = Addition(2, new={"export/sag.py": '''
     run("design", "picture.npy", "--resolution", "8", "--control", "6", "--start", "offset", "--rays", "100", "--iterations", "1")
     run("export", "picture.caustic", "--format", "sag")
     assert np.loadtxt("picture.txt").ndim == 2
-""")
+""",
+)
 
-EFFECT = Addition(2, new={"optics/effects/dust.py": '''
+EFFECT = Addition(
+    2,
+    new={
+        "optics/effects/dust.py": '''
     """Dust on every refracting surface, which stops a part of the light."""
 
     from __future__ import annotations
@@ -144,9 +169,16 @@ EFFECT = Addition(2, new={"optics/effects/dust.py": '''
             """Before the surface."""
             interaction.state.lose("absorbed", (COVERED * interaction.state.power).detach())
             interaction.state.power = (1.0 - COVERED) * interaction.state.power
-'''}, edits=(("optics/effects/__init__.py", "from caustic_cli.optics.effects.entrance import Entrance\n",
-              "from caustic_cli.optics.effects.dust import Dust\nfrom caustic_cli.optics.effects.entrance import Entrance\n"),
-             ("optics/effects/__init__.py", "SourceSize(), Polarisation(),", "SourceSize(), Dust(), Polarisation(),")),
+'''
+    },
+    edits=(
+        (
+            "optics/effects/__init__.py",
+            "from caustic_cli.optics.effects.entrance import Entrance\n",
+            "from caustic_cli.optics.effects.dust import Dust\nfrom caustic_cli.optics.effects.entrance import Entrance\n",
+        ),
+        ("optics/effects/__init__.py", "SourceSize(), Polarisation(),", "SourceSize(), Dust(), Polarisation(),"),
+    ),
     used="""
     import torch
     from caustic_cli.optics.emission import rays_of
@@ -161,9 +193,13 @@ EFFECT = Addition(2, new={"optics/effects/dust.py": '''
         image = expose(plan.scene, field, heights, rays_of(scene, "grid", 100), requests=plan.requests)
         assert abs(float(image.image.sum()) - left) < 1e-12 and abs(image.lost["absorbed"] - (1 - left)) < 1e-12
         assert plan["dust"].on == (wanted is not None)
-""")
+""",
+)
 
-SURFACE = Addition(3, new={"optics/surfaces/paraboloid.py": '''
+SURFACE = Addition(
+    3,
+    new={
+        "optics/surfaces/paraboloid.py": '''
     """A paraboloid of revolution, z = (x^2 + y^2) / (2 R)."""
 
     from __future__ import annotations
@@ -202,10 +238,16 @@ SURFACE = Addition(3, new={"optics/surfaces/paraboloid.py": '''
         def slope_bounds(self, heights: None) -> tuple[float, float]:
             """At the edges."""
             return (self.half / abs(self.radius),) * 2
-'''}, edits=(("optics/surfaces/__init__.py", "from caustic_cli.optics.surfaces.plane import Plane\n",
-              "from caustic_cli.optics.surfaces.paraboloid import Paraboloid\n"
-              "from caustic_cli.optics.surfaces.plane import Plane\n"),
-             ("optics/surfaces/__init__.py", '"Nurbs", "Plane"', '"Nurbs", "Paraboloid", "Plane"')),
+'''
+    },
+    edits=(
+        (
+            "optics/surfaces/__init__.py",
+            "from caustic_cli.optics.surfaces.plane import Plane\n",
+            "from caustic_cli.optics.surfaces.paraboloid import Paraboloid\nfrom caustic_cli.optics.surfaces.plane import Plane\n",
+        ),
+        ("optics/surfaces/__init__.py", '"Nurbs", "Plane"', '"Nurbs", "Paraboloid", "Plane"'),
+    ),
     used="""
     import torch
     from caustic_cli.optics.frames import Pose
@@ -219,9 +261,13 @@ SURFACE = Addition(3, new={"optics/surfaces/paraboloid.py": '''
     (sample,) = Sampler("grid", (20, 20)).chunks()
     (rays,) = Tracer(system, sample).land({}, system.screens[0])
     assert float(torch.hypot(*rays.origin[:2]).max()) < 1e-10 and abs(float(rays.power.sum()) - 1) < 1e-12
-""")
+""",
+)
 
-SOURCE = Addition(3, new={"scene/sources/spokes.py": '''\
+SOURCE = Addition(
+    3,
+    new={
+        "scene/sources/spokes.py": '''\
 """Points on a circle, as many as [source] spokes says."""
 from dataclasses import dataclass
 import numpy as np
@@ -240,12 +286,15 @@ class Spokes(Source):
 
 TYPES = (SourceType("spokes", "spokes", ("spokes",), lambda table, profile: Spokes(table["spokes"], table["power"]),
                     lambda lens: {"spokes": 5}, own={"spokes": ("whole", "how many")}),)
-''', "optics/emission/spokes.py": '''\
+''',
+        "optics/emission/spokes.py": '''\
 """The rays of spokes."""
 from caustic_cli.optics.emission.near import Near
 
 EMISSIONS = {"spokes": Near.of_size}
-'''}, used='''
+''',
+    },
+    used="""
 import torch
 from caustic_cli.config import settings
 from caustic_cli.config.completion import complete
@@ -260,10 +309,16 @@ rays = rays_of(scene, "stratified", 6300)
 exposure = expose(scene, HeightField.of(scene.lens), torch.full((8, 8), 5.0, dtype=torch.float64), rays)
 assert abs(float(exposure.image.sum()) + sum(exposure.lost.values()) - 1.0) < 1e-12
 assert (scene.source.kind, len(scene.source.powers), rays.count, again["source"]["spokes"]) == ("spokes", 7, 6300, 7)
-''')
+""",
+)
 
-ADDITIONS = {"a reconstruction filter": FILTER, "an export format": EXPORT, "an effect": EFFECT, "a surface": SURFACE,
-             "a source": SOURCE}
+ADDITIONS = {
+    "a reconstruction filter": FILTER,
+    "an export format": EXPORT,
+    "an effect": EFFECT,
+    "a surface": SURFACE,
+    "a source": SOURCE,
+}
 
 
 @pytest.mark.parametrize("what", ADDITIONS)
@@ -275,8 +330,14 @@ def test_an_addition_touches_few_files(what, tmp_path):
     addition.make(tmp_path / "caustic_cli")
     # Plain torch but for the filter, which has a kernel: the others need none compiled.
     kernels = {} if addition is FILTER else {"CAUSTIC_KERNELS": "torch"}
-    done = subprocess.run([sys.executable, "-c", textwrap.dedent(addition.used)], cwd=tmp_path, capture_output=True, text=True,
-                          check=False, env={**os.environ, **kernels, "PYTHONPATH": str(tmp_path)})
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(addition.used)],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, **kernels, "PYTHONPATH": str(tmp_path)},
+    )
     assert done.returncode == 0, done.stderr
 
 

@@ -21,10 +21,22 @@ ROOT = Path(__file__).resolve().parent.parent
 GUIDE = ROOT / "examples" / "guide"
 CHAPTERS = sorted(GUIDE.glob("[1-9]-*.md"))
 #: So that every design is a small one; what a line says itself goes before.
-SMALL = {f"CAUSTIC_{name}": value for name, value in {
-    "DESIGN_RESOLUTION": "24", "DESIGN_ITERATIONS": "2", "DESIGN_WAVES": "off", "DESIGN_QUIET": "1", "DESIGN_THREADS": "1",
-    "DESIGN_FORCE": "1", "RENDER_QUIET": "1", "RENDER_RAYS": "20000", "RENDER_FORCE": "1", "CONVERGENCE_QUIET": "1",
-    "CONVERGENCE_FORCE": "1"}.items()}
+SMALL = {
+    f"CAUSTIC_{name}": value
+    for name, value in {
+        "DESIGN_RESOLUTION": "24",
+        "DESIGN_ITERATIONS": "2",
+        "DESIGN_WAVES": "off",
+        "DESIGN_QUIET": "1",
+        "DESIGN_THREADS": "1",
+        "DESIGN_FORCE": "1",
+        "RENDER_QUIET": "1",
+        "RENDER_RAYS": "20000",
+        "RENDER_FORCE": "1",
+        "CONVERGENCE_QUIET": "1",
+        "CONVERGENCE_FORCE": "1",
+    }.items()
+}
 #: Lines that need what no chapter makes, and studies of minutes, which tests of their own run smaller.
 NEEDS_MORE = ("--verify", "--source-file led.tm25ray", "--study diffraction", "led.caustic --study light", "--explain")
 
@@ -36,8 +48,11 @@ def blocks(path: Path, language: str) -> list[str]:
 def commands(path: Path) -> list[list[str]]:
     """The arguments of each line that calls caustic."""
     lines = [line.strip() for block in blocks(path, "sh") for line in block.splitlines()]
-    return [shlex.split(line, comments=True)[1:] for line in lines
-            if line.startswith("caustic ") and not any(word in line for word in NEEDS_MORE)]
+    return [
+        shlex.split(line, comments=True)[1:]
+        for line in lines
+        if line.startswith("caustic ") and not any(word in line for word in NEEDS_MORE)
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -55,9 +70,12 @@ def home(tmp_path_factory):
         shutil.copytree(ROOT / "examples" / "thesis", directory / "thesis")
         x = np.linspace(0.0, 255.0, 64)
         Image.fromarray((0.5 * (x[:, None] + x[None, :])).astype(np.uint8)).save("portrait.jpg")
-        for project, *more in (("portrait.caustic", "portrait.jpg"), ("flame.caustic", "flame.png"),
-                               ("point.caustic", "flame.png", "--source", "point"),
-                               ("led.caustic", "flame.png", "--source", "disc", "--source-size", "1", "--control", "40")):
+        for project, *more in (
+            ("portrait.caustic", "portrait.jpg"),
+            ("flame.caustic", "flame.png"),
+            ("point.caustic", "flame.png", "--source", "point"),
+            ("led.caustic", "flame.png", "--source", "disc", "--source-size", "1", "--control", "40"),
+        ):
             assert cli.run(["design", *more, "-o", project]) == 0
         yield directory
         os.chdir(before)
@@ -87,8 +105,14 @@ def test_the_python_of_a_chapter_runs(chapter, home, monkeypatch, tmp_path):
 @pytest.mark.parametrize("script", sorted((ROOT / "tests" / "benchmarks").glob("*.py")), ids=lambda p: p.stem)
 def test_a_benchmark_says_what_it_takes(script, tmp_path):
     pytest.importorskip("mitsuba" if script.stem == "intersection" else "caustic_cli")
-    said = subprocess.run([sys.executable, script, "--help"], capture_output=True, text=True, cwd=tmp_path, check=True,
-                          env=os.environ | {"PYTHONPATH": str(ROOT)})
+    said = subprocess.run(
+        [sys.executable, script, "--help"],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        check=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )
     assert said.stdout.startswith("usage:") and not list(tmp_path.iterdir())
 
 

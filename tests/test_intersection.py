@@ -43,8 +43,9 @@ def fan(count, widest, seed=0, half=(5.0, 4.0), z=0.0):
     g = torch.Generator().manual_seed(seed)
     u = torch.rand(5, count, generator=g, dtype=torch.float64)
     tangent, phi = torch.tan(widest * u[2]), 2 * math.pi * u[3]
-    return bundle((2 * u[0] - 1) * half[0], (2 * u[1] - 1) * half[1], z, tangent * torch.cos(phi), tangent * torch.sin(phi),
-                  torch.ones(count))
+    return bundle(
+        (2 * u[0] - 1) * half[0], (2 * u[1] - 1) * half[1], z, tangent * torch.cos(phi), tangent * torch.sin(phi), torch.ones(count)
+    )
 
 
 def find_fused(f, heights, rays, start=None):
@@ -193,8 +194,12 @@ def test_what_cannot_hit_is_missed(find):
 
 
 @settings(max_examples=60, deadline=None)
-@given(seed=st.integers(0, 10_000), size=st.sampled_from([0.0, 1e-9, 0.01, 0.3, 3.0]), p=st.integers(1, 6),
-       widest=st.sampled_from([0.0, 0.3, 1.2, 1.57]))
+@given(
+    seed=st.integers(0, 10_000),
+    size=st.sampled_from([0.0, 1e-9, 0.01, 0.3, 3.0]),
+    p=st.integers(1, 6),
+    widest=st.sampled_from([0.0, 0.3, 1.2, 1.57]),
+)
 def test_always_finite_and_on_the_surface(seed, size, p, widest):
     f = field(9, 8, (p, 2))
     heights, rays = bumpy(f, size, seed) + 4 * size, fan(64, widest, seed)
@@ -239,8 +244,9 @@ def test_derivatives_by_the_implicit_function_theorem(meet):
     by = [torch.randn(len(rays.origin[0]), generator=g, dtype=torch.float64) for _ in range(3)]
     leaf = heights.clone().requires_grad_()
     (pulled,) = torch.autograd.grad(meet(f, leaf, rays), leaf, by)
-    assert float((pulled * along).sum()) == pytest.approx(float(sum((b * t).sum() for b, t in zip(by, tangents, strict=True))),
-                                                          rel=1e-11)
+    assert float((pulled * along).sum()) == pytest.approx(
+        float(sum((b * t).sum() for b, t in zip(by, tangents, strict=True))), rel=1e-11
+    )
 
 
 def test_derivatives_equal_those_of_unrolled_newton():
@@ -267,14 +273,20 @@ def test_numbers_that_all_rays_share_keep_their_digits():
     z, direction = numbers[0], (*numbers[1:], math.sqrt(1.0 - sum(c * c for c in numbers[1:])))
     spread = tuple(torch.full_like(x, c) for c in direction)
     for by_numbers, by_tensors in (
-            (intersection.meet_any(f, heights, (x, y, z), direction, 1.0),
-             intersection.meet_any(f, heights, (x, y, torch.full_like(x, z)), spread, 1.0)),
-            (Plane().meet(None, (x, y, z), direction, 1.0), Plane().meet(None, (x, y, torch.full_like(x, z)), spread, 1.0)),
-            (Torch().land((x, y, z), direction, (0.0, 0.0, 40.0), IDENTITY, 1.0),
-             Torch().land((x, y, torch.full_like(x, z)), spread, (0.0, 0.0, 40.0), IDENTITY, 1.0))):
+        (
+            intersection.meet_any(f, heights, (x, y, z), direction, 1.0),
+            intersection.meet_any(f, heights, (x, y, torch.full_like(x, z)), spread, 1.0),
+        ),
+        (Plane().meet(None, (x, y, z), direction, 1.0), Plane().meet(None, (x, y, torch.full_like(x, z)), spread, 1.0)),
+        (
+            Torch().land((x, y, z), direction, (0.0, 0.0, 40.0), IDENTITY, 1.0),
+            Torch().land((x, y, torch.full_like(x, z)), spread, (0.0, 0.0, 40.0), IDENTITY, 1.0),
+        ),
+    ):
         for a, b in zip(by_numbers[:2], by_tensors[:2], strict=True):
-            torch.testing.assert_close(torch.as_tensor(a, dtype=torch.float64).expand(9), torch.as_tensor(b).double().expand(9),
-                                       rtol=4e-15, atol=4e-15)
+            torch.testing.assert_close(
+                torch.as_tensor(a, dtype=torch.float64).expand(9), torch.as_tensor(b).double().expand(9), rtol=4e-15, atol=4e-15
+            )
 
 
 # the three methods

@@ -22,8 +22,26 @@ from caustic_cli.workflow import evaluation
 
 TINY = ["--resolution", "24", "--control", "12", "--rays", "4000", "--waves", "off", "--quiet", "--threads", "1", "--json"]
 RENDER = ["render", "blob.caustic", "--rays", "20000", "--quiet", "--threads", "1", "--json"]
-BAD = ["100 lumens?", "-1W", "nanW", "1e400lm", "", "0", "0lm", "infW", "W", "lm", "1.2.3", "1,5W", "2mW", "100LM", "1_000W", "+2W",
-       "1e31", "\u0662W"]
+BAD = [
+    "100 lumens?",
+    "-1W",
+    "nanW",
+    "1e400lm",
+    "",
+    "0",
+    "0lm",
+    "infW",
+    "W",
+    "lm",
+    "1.2.3",
+    "1,5W",
+    "2mW",
+    "100LM",
+    "1_000W",
+    "+2W",
+    "1e31",
+    "\u0662W",
+]
 
 
 @pytest.fixture(autouse=True)
@@ -39,9 +57,18 @@ def run(capfd, *arguments, code=0):
     return json.loads(out) if code == 0 else err.strip()
 
 
-@pytest.mark.parametrize(("text", "value"), [("2", (2.0, "W")), ("2W", (2.0, "W")), ("100lm", (100.0, "lm")),
-                                             (" 1.5e3 lm ", (1500.0, "lm")), (".5W", (0.5, "W")), ("1e-3W", (1e-3, "W")),
-                                             ("1e30", (1e30, "W"))])
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("2", (2.0, "W")),
+        ("2W", (2.0, "W")),
+        ("100lm", (100.0, "lm")),
+        (" 1.5e3 lm ", (1500.0, "lm")),
+        (".5W", (0.5, "W")),
+        ("1e-3W", (1e-3, "W")),
+        ("1e30", (1e30, "W")),
+    ],
+)
 def test_a_power_with_and_without_a_unit(text, value):
     assert power("--power", text) == value
 
@@ -95,7 +122,7 @@ def test_design_and_render_say_lux_and_watts(source, capfd):
     assert (watts["power"], watts["power_unit"], watts["irradiance_unit"]) == (2.0, "W", "W/mm^2")
     assert np.array_equal(np.load("b.npy"), image) and watts["relative_rms"] == same["relative_rms"]
     assert watts["peak_irradiance"] == pytest.approx(2e-8 * same["peak_irradiance"], rel=1e-12)
-    assert "power_unit = \"lm\"" in (Project.open("blob.caustic").path / "project.toml").read_text()
+    assert 'power_unit = "lm"' in (Project.open("blob.caustic").path / "project.toml").read_text()
     assert cli.run(["export", "blob.caustic", "--format", "lighttools", "-o", "a.npz", "--quiet"]) == 0
     assert open_archive("a.npz")[0].light.unit == "lm"
     of_archive = run(capfd, "render", "a.npz", *RENDER[2:])
@@ -132,6 +159,15 @@ def test_a_report_of_any_brightness(tmp_path, mean, encoding):
     target = np.random.default_rng(0).random((12, 9))
     figures = {"relative_rms": 0.1, "mean_irradiance": mean, "peak_irradiance": 2.0 * mean, "irradiance_unit": "lux"}
     history = np.array([[1, 0, 0.1, 0.9, 0.1], [2, 0, 0.05, 0.9, 0.2]])
-    write_report(tmp_path / "r.png", target, target * mean, np.zeros((9, 9)), history, Lens(), Screen((12.0, 9.0), 300.0, (12, 9)),
-                 figures, encoding)
+    write_report(
+        tmp_path / "r.png",
+        target,
+        target * mean,
+        np.zeros((9, 9)),
+        history,
+        Lens(),
+        Screen((12.0, 9.0), 300.0, (12, 9)),
+        figures,
+        encoding,
+    )
     assert (tmp_path / "r.png").stat().st_size > 10_000

@@ -34,8 +34,9 @@ def run(code: str, package: Path, **variables: str | None) -> list[str]:
     """What a fresh interpreter with a copy of the package prints, with changes to the environment (None: unset)."""
     env = os.environ | {"PYTHONDONTWRITEBYTECODE": "1", **variables}
     env = {name: value for name, value in env.items() if value is not None}
-    done = subprocess.run([sys.executable, "-c", code], cwd=package.parent, env=env, capture_output=True, text=True,
-                          check=False)  # python -c looks for modules in the working directory first
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=package.parent, env=env, capture_output=True, text=True, check=False
+    )  # python -c looks for modules in the working directory first
     assert done.returncode == 0, done.stderr
     return done.stdout.split()
 
@@ -75,8 +76,14 @@ def test_kernels_run_where_nothing_can_be_written(package, tmp_path, temporary):
     code = RUN if temporary else "import tempfile; tempfile.tempdir = '/proc/nonexistent'" + RUN
     nowhere = str(tmp_path / "file" / "cache")  # below a file there is no directory, for whoever asks
     try:
-        found = run(code, package, HOME="/proc/nonexistent", XDG_CACHE_HOME=None if temporary else nowhere,
-                    NUMBA_CACHE_DIR=None, TMPDIR=str(tmp_path / "temporary"))
+        found = run(
+            code,
+            package,
+            HOME="/proc/nonexistent",
+            XDG_CACHE_HOME=None if temporary else nowhere,
+            NUMBA_CACHE_DIR=None,
+            TMPDIR=str(tmp_path / "temporary"),
+        )
     finally:
         for path in (package, *package.rglob("*")):
             path.chmod(0o755)
@@ -118,8 +125,13 @@ def test_a_temporary_directory_of_others_is_not_trusted(tmp_path):
 
 def test_every_file_with_a_kernel_counts():
     names = {p.relative_to(cache.PACKAGE).as_posix() for p in cache.sources()}
-    assert {"optics/kernels/plane.py", "optics/kernels/axial_refraction.py", "optics/tolerances.py", "optics/kernels/laguerre.py",
-            "optics/kernels/multigrid.py"} <= names
+    assert {
+        "optics/kernels/plane.py",
+        "optics/kernels/axial_refraction.py",
+        "optics/tolerances.py",
+        "optics/kernels/laguerre.py",
+        "optics/kernels/multigrid.py",
+    } <= names
 
 
 def test_old_directories_of_ours_alone_are_removed(tmp_path):
@@ -134,8 +146,12 @@ def test_old_directories_of_ours_alone_are_removed(tmp_path):
 
     digits = "0123456789abcdef0123"[: cache.DIGITS]
     own, old = made(cache.PREFIX + digits, 99.0), made(cache.PREFIX + digits[::-1], 31.0)
-    others = [made(cache.PREFIX + "f" * cache.DIGITS, 29.0), made(cache.PREFIX + "e" * cache.DIGITS, 0.0, used=False),
-              made("kernels_" + digits, 99.0), made(cache.PREFIX + "notes", 99.0)]
+    others = [
+        made(cache.PREFIX + "f" * cache.DIGITS, 29.0),
+        made(cache.PREFIX + "e" * cache.DIGITS, 0.0, used=False),
+        made("kernels_" + digits, 99.0),
+        made(cache.PREFIX + "notes", 99.0),
+    ]
     cache.tidy(own)
     assert not old.exists()
     assert own.exists()
@@ -159,6 +175,11 @@ fused = FusedSurface((SplineSpace.uniform(6, 3),) * 2, (5.0, 5.0))
 assert fused.coefficients(torch.zeros(6, 6, dtype=torch.float64)).shape == (3, 3, 4, 4)
 """
     for text in (other, kernel, kernel):
-        ran = subprocess.run([sys.executable, "-c", text], env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}, check=False,
-                             capture_output=True, text=True)
+        ran = subprocess.run(
+            [sys.executable, "-c", text],
+            env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)},
+            check=False,
+            capture_output=True,
+            text=True,
+        )
         assert ran.returncode == 0, ran.stderr[-2000:]

@@ -28,10 +28,23 @@ from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Lens, PlaneWave, Scene, Screen
 from caustic_cli.workflow import compilation
 
-FILTERS = [Filter(), *(Filter("cosine", (v, w)) for v, w in ((3, 3), (1, 5), (11, 3), (15, 15))),
-           *(Filter("gaussian", (v, w), (a, b)) for v, w, a, b in (
-               (3, 3, 0.0, 0.0), (3, 3, 2.6e-6, 1e-4), (3, 5, 0.01, 0.02), (11, 11, 0.03, 0.001), (5, 11, 0.3, 1.9),
-               (3, 3, 2.1, 30.0), (3, 7, 100.0, 700.0), (1, 3, 1.0, 1.0)))]
+FILTERS = [
+    Filter(),
+    *(Filter("cosine", (v, w)) for v, w in ((3, 3), (1, 5), (11, 3), (15, 15))),
+    *(
+        Filter("gaussian", (v, w), (a, b))
+        for v, w, a, b in (
+            (3, 3, 0.0, 0.0),
+            (3, 3, 2.6e-6, 1e-4),
+            (3, 5, 0.01, 0.02),
+            (11, 11, 0.03, 0.001),
+            (5, 11, 0.3, 1.9),
+            (3, 3, 2.1, 30.0),
+            (3, 7, 100.0, 700.0),
+            (1, 3, 1.0, 1.0),
+        )
+    ),
+]
 SCREEN = Screen((6.0, 4.0), 40.0, (31, 20))
 ACCOUNT = ("fresnel", "total_internal_reflection", "off_screen")
 
@@ -212,8 +225,10 @@ def test_the_number_of_blocks_changes_rounding_only():
 def test_series_and_recursion_meet():
     """On either side of the borders between formulas the shares are the same function."""
     for border in (4 * kernel_shares.TINY / 9, 4 * kernel_shares.SMALL / 9, kernel_shares.MODERATE):
-        a, b = (next(exposures(scene(), heights(), Filter("gaussian", (3, 3), (alpha, alpha)), "lines"))[0]
-                for alpha in (border * (1 - 1e-12), border * (1 + 1e-12)))
+        a, b = (
+            next(exposures(scene(), heights(), Filter("gaussian", (3, 3), (alpha, alpha)), "lines"))[0]
+            for alpha in (border * (1 - 1e-12), border * (1 + 1e-12))
+        )
         torch.testing.assert_close(a, b, rtol=0, atol=1e-12)
 
 

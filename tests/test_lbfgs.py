@@ -106,8 +106,9 @@ def test_accepted_steps_meet_the_strong_wolfe_conditions(function):
 
 def test_a_step_that_does_not_decrease_enough_is_refused():
     """1 - x + a x^2 + b x^3 with f(0.2) = 1 + 1e-5 and f'(0.2) = 0.5: the first trial is flat enough, but higher."""
-    a, b = torch.linalg.solve(torch.tensor([[0.04, 0.008], [0.4, 0.12]], dtype=torch.float64),
-                              torch.tensor([0.2 + 1e-5, 1.5], dtype=torch.float64)).tolist()
+    a, b = torch.linalg.solve(
+        torch.tensor([[0.04, 0.008], [0.4, 0.12]], dtype=torch.float64), torch.tensor([0.2 + 1e-5, 1.5], dtype=torch.float64)
+    ).tolist()
     f = Counted(lambda x: (1 - x + a * x**2 + b * x**3).sum())
     method = LBFGS(f, torch.zeros(1, dtype=torch.float64))
     assert method.step()

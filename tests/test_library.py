@@ -45,8 +45,25 @@ def test_nothing_is_written_unless_asked(lens, tmp_path):
 
 def test_the_library_designs_what_the_command_line_designs(lens, capfd):
     np.save("blob.npy", picture())
-    arguments = ["blob.npy", "--mag", "2", "--lens-size", "2", "--throw", "60", "--resolution", "32", "--quality", "draft",
-                 "--waves", "off", "--quiet", "--json", "--threads", "1"]
+    arguments = [
+        "blob.npy",
+        "--mag",
+        "2",
+        "--lens-size",
+        "2",
+        "--throw",
+        "60",
+        "--resolution",
+        "32",
+        "--quality",
+        "draft",
+        "--waves",
+        "off",
+        "--quiet",
+        "--json",
+        "--threads",
+        "1",
+    ]
     assert cli.run(["design", *arguments]) == 0
     said = json.loads(capfd.readouterr().out)
     there = load("blob.caustic")
@@ -117,24 +134,34 @@ def test_a_trace_is_differentiable(source):
 
 def test_progress_and_sections(lens):
     told, lines = [], []
-    made = design(torch.from_numpy(picture()), source={"type": "disc", "position": [0, 0, -40.0], "size": [1.0, 1.0]}, mag=2,
-                  settings=SMALL | {"design": {"iterations": 3}}, quality="draft", waves="off",
-                  on_progress=lambda *step: told.append(step), on_message=lines.append)
+    made = design(
+        torch.from_numpy(picture()),
+        source={"type": "disc", "position": [0, 0, -40.0], "size": [1.0, 1.0]},
+        mag=2,
+        settings=SMALL | {"design": {"iterations": 3}},
+        quality="draft",
+        waves="off",
+        on_progress=lambda *step: told.append(step),
+        on_message=lines.append,
+    )
     assert [step[2] for step in told] == [1, 2, 3] and all(step[3] == 3 for step in told)
     assert made.scene.source.kind == "disc" and made.figures["iterations"] == 3
 
 
-@pytest.mark.parametrize(("arguments", "message"), [
-    ({"picture": np.zeros((4, 4))}, "picture must be a file, or a 2-D array"),
-    ({"picture": np.ones(4)}, "picture must be a file, or a 2-D array"),
-    ({"picture": np.full((4, 4), np.nan)}, "picture must be a file, or a 2-D array"),
-    ({"picture": "nowhere.png"}, "nowhere.png: no such file"),
-    ({"source": "lamp"}, r"\[source\] type must be one of"),
-    ({"settings": {"lens": {"sizes": [1, 2]}}}, "did you mean size"),
-    ({"settings": {"lens": {"size": [1, -2]}}}, r"\[lens\] size"),
-    ({"settings": {"glass": {}}}, r"\[glass\] is not a section"),
-    ({"rays": 0.5}, "rays must be a whole number"),
-])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"picture": np.zeros((4, 4))}, "picture must be a file, or a 2-D array"),
+        ({"picture": np.ones(4)}, "picture must be a file, or a 2-D array"),
+        ({"picture": np.full((4, 4), np.nan)}, "picture must be a file, or a 2-D array"),
+        ({"picture": "nowhere.png"}, "nowhere.png: no such file"),
+        ({"source": "lamp"}, r"\[source\] type must be one of"),
+        ({"settings": {"lens": {"sizes": [1, 2]}}}, "did you mean size"),
+        ({"settings": {"lens": {"size": [1, -2]}}}, r"\[lens\] size"),
+        ({"settings": {"glass": {}}}, r"\[glass\] is not a section"),
+        ({"rays": 0.5}, "rays must be a whole number"),
+    ],
+)
 def test_what_is_wrong_is_said_in_the_library_s_terms(arguments, message):
     with pytest.raises(InputError, match=message) as error:
         design(**{"picture": picture(), "mag": 2, "waves": "off"} | arguments)

@@ -117,12 +117,15 @@ def test_light_that_comes_through_the_sides_does_not_count():
 # Scenes without a way
 
 
-@pytest.mark.parametrize("scene", [
-    Scene(PlaneWave(), Lens(), Screen((30.0, 30.0), 300.0, (48, 48), shift=(2000.0, 0.0))),
-    Scene(Points(((0.0, 0.0, -50.0),)), Lens(index=1.05), Screen((30.0, 30.0), 100.0, (48, 48), shift=(0.0, 90.0))),
-    Scene(Disc((0.0, 0.0, -10.0), (2.0, 2.0), cone=5.0), Lens(), Screen((30.0, 30.0), 100.0, (48, 48), shift=(-300.0, 0.0))),
-    Scene(Disc(angle=2.0), Lens(), Screen((30.0, 30.0), 60.0, (48, 48), shift=(-300.0, 0.0))),
-])
+@pytest.mark.parametrize(
+    "scene",
+    [
+        Scene(PlaneWave(), Lens(), Screen((30.0, 30.0), 300.0, (48, 48), shift=(2000.0, 0.0))),
+        Scene(Points(((0.0, 0.0, -50.0),)), Lens(index=1.05), Screen((30.0, 30.0), 100.0, (48, 48), shift=(0.0, 90.0))),
+        Scene(Disc((0.0, 0.0, -10.0), (2.0, 2.0), cone=5.0), Lens(), Screen((30.0, 30.0), 100.0, (48, 48), shift=(-300.0, 0.0))),
+        Scene(Disc(angle=2.0), Lens(), Screen((30.0, 30.0), 60.0, (48, 48), shift=(-300.0, 0.0))),
+    ],
+)
 def test_a_picture_out_of_reach_is_refused(scene):
     with pytest.raises(InputError, match="no light can leave the lens for the picture: it would have to turn by at least"):
         refuse_unreachable(scene, blob())
@@ -197,9 +200,34 @@ def test_study_of_light(tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(tradeoff, "PARTS", (1.0, 1.8))
     monkeypatch.setattr(tradeoff, "NEAR_WEIGHTS", (0.0, 10.0))
     Image.fromarray((255 * blob()).astype(np.uint8)).save("blob.png")
-    assert cli.run(["design", "blob.png", "--source", "point", "--source-position", "0,0,-5", "--cone", "80", "--throw", "25",
-                    "--mag", "2", "--resolution", "32", "--quality", "draft", "--iterations", "1", "--waves", "off",
-                    "--quiet"]) == 0
+    assert (
+        cli.run(
+            [
+                "design",
+                "blob.png",
+                "--source",
+                "point",
+                "--source-position",
+                "0,0,-5",
+                "--cone",
+                "80",
+                "--throw",
+                "25",
+                "--mag",
+                "2",
+                "--resolution",
+                "32",
+                "--quality",
+                "draft",
+                "--iterations",
+                "1",
+                "--waves",
+                "off",
+                "--quiet",
+            ]
+        )
+        == 0
+    )
     capfd.readouterr()
     assert cli.run(["convergence", "blob.caustic", "--study", "light", "--seconds", "0.2", "--json", "--quiet"]) == 0
     found = json.loads(capfd.readouterr().out)
@@ -217,8 +245,12 @@ def test_study_of_light(tmp_path, monkeypatch, capfd):
 def test_study_of_light_from_infinity_varies_the_weight_alone(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     Image.fromarray((255 * blob()).astype(np.uint8)).save("blob.png")
-    assert cli.run(["design", "blob.png", "--resolution", "32", "--quality", "draft", "--iterations", "1", "--waves", "off",
-                    "--quiet"]) == 0
+    assert (
+        cli.run(
+            ["design", "blob.png", "--resolution", "32", "--quality", "draft", "--iterations", "1", "--waves", "off", "--quiet"]
+        )
+        == 0
+    )
     capfd.readouterr()
     assert cli.run(["convergence", "blob.caustic", "--study", "light", "--seconds", "0.1", "--json", "--quiet"]) == 0
     rows = json.loads(capfd.readouterr().out)["rows"]

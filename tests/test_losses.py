@@ -126,8 +126,9 @@ def test_blur_sees_how_far_light_has_to_go():
     assert float(soft(near, one)) < 0.7 * float(soft(far, one))
 
 
-@pytest.mark.parametrize("text", ["throughput", "diffusion", "uniformity",
-                                  "rms-light + 0.5 throughput + 2 * diffusion + 0.1 uniformity"])
+@pytest.mark.parametrize(
+    "text", ["throughput", "diffusion", "uniformity", "rms-light + 0.5 throughput + 2 * diffusion + 0.1 uniformity"]
+)
 def test_every_term_has_the_slope_of_differences(text):
     loss = Loss(text, TARGET, 0.0, 2)
     image, leaving = IMAGE.clone().requires_grad_(), FULL.clone().requires_grad_()
@@ -172,11 +173,14 @@ def test_diffusion_minds_what_alternates():
     assert float(Loss("diffusion", TARGET)(base + smooth, one)) < 1e-15
 
 
-@pytest.mark.parametrize("text, terms", [
-    ("rms", [(1.0, "rms")]),
-    ("rms-light + 0.1 laplacian", [(1.0, "rms-light"), (0.1, "laplacian")]),
-    ("2*rms+1e-3 * curvature".replace("2*rms", "2 * rms"), [(2.0, "rms"), (1e-3, "curvature")]),
-])
+@pytest.mark.parametrize(
+    "text, terms",
+    [
+        ("rms", [(1.0, "rms")]),
+        ("rms-light + 0.1 laplacian", [(1.0, "rms-light"), (0.1, "laplacian")]),
+        ("2*rms+1e-3 * curvature".replace("2*rms", "2 * rms"), [(2.0, "rms"), (1e-3, "curvature")]),
+    ],
+)
 def test_parse(text, terms):
     assert parse(text) == terms
 

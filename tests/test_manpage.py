@@ -60,9 +60,19 @@ def test_every_option_is_in_its_command_section(name, capsys):
 
 def test_sections_in_the_usual_order():
     heads = re.findall(r"^\.SH (.*)$", manpage.build(), re.M)
-    assert heads == ["NAME", "SYNOPSIS", "DESCRIPTION", "COMMANDS", "FILES", "ORIENTATION", "THE SAME AGAIN",
-                     "COMPLETION", "EXIT STATUS", "ENVIRONMENT",
-                     "EXAMPLES"]
+    assert heads == [
+        "NAME",
+        "SYNOPSIS",
+        "DESCRIPTION",
+        "COMMANDS",
+        "FILES",
+        "ORIENTATION",
+        "THE SAME AGAIN",
+        "COMPLETION",
+        "EXIT STATUS",
+        "ENVIRONMENT",
+        "EXAMPLES",
+    ]
 
 
 def test_no_line_is_taken_for_a_request_by_accident():

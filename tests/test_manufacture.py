@@ -203,8 +203,7 @@ def test_report_of_a_prism():
     assert f["landing_mm_per_thousandth_index"] == pytest.approx(1e-3 * by_index, rel=1e-3)
     assert f["steepest_incidence_deg"] == pytest.approx(math.degrees(b), rel=1e-6)
     steeper = surface(lambda x, y: 5 - 1.0 * x + 0 * y)
-    assert manufacture(*steeper)["internal_reflection_margin_deg"] == pytest.approx(
-        math.degrees(math.asin(1 / 1.5)) - 45, abs=1e-6)
+    assert manufacture(*steeper)["internal_reflection_margin_deg"] == pytest.approx(math.degrees(math.asin(1 / 1.5)) - 45, abs=1e-6)
 
 
 def test_report_of_other_light():

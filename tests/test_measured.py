@@ -175,8 +175,9 @@ def test_the_light_of_a_first_surface(name):
     assert np.abs(found[inner] / found[inner].mean() - exact[inner] / exact[inner].mean()).mean() < 0.05
     target = np.ones((16, 16))
     screen = Screen((30.0, 30.0), 100.0, (16, 16))
-    surface, other = (first_surface(Scene(source, lens, screen), target, HeightField.of(lens), 32).heights
-                      for source in (measured(rays), known))
+    surface, other = (
+        first_surface(Scene(source, lens, screen), target, HeightField.of(lens), 32).heights for source in (measured(rays), known)
+    )
     assert float((surface - other - (surface - other).mean()).abs().max()) < 0.1 * float(other.max() - other.min())
 
 
@@ -191,14 +192,17 @@ def test_rays_that_converge_have_no_first_surface_but_an_image():
     assert float(found.image.sum()) > 0.85
 
 
-@pytest.mark.parametrize(("what", "message"), [
-    (lambda: scene(measured(RaySet(np.array([[0.0, 0.0, 40.0]]), [[0, 0, 1]], [1]))), "must lie before the lens"),
-    (lambda: drawn(measured(RaySet(np.zeros((1, 3)), [[1, 0, 0.1]], [1]))), "none of its 1 rays meets the lens"),
-    (lambda: measured(RaySet(np.zeros((1, 3)), [[0, 0, -1]], [1])), "no ray that carries light towards"),
-    (lambda: measured(KNOWN["point"][0], power=0.0), "power"),
-    (lambda: rays_of(scene(measured(KNOWN["point"][0])), "halton", 9), "sampler"),
-    (lambda: settings.build_source(complete({"source": {"type": "rays"}}, 1.0)), "must be a ray file"),
-])
+@pytest.mark.parametrize(
+    ("what", "message"),
+    [
+        (lambda: scene(measured(RaySet(np.array([[0.0, 0.0, 40.0]]), [[0, 0, 1]], [1]))), "must lie before the lens"),
+        (lambda: drawn(measured(RaySet(np.zeros((1, 3)), [[1, 0, 0.1]], [1]))), "none of its 1 rays meets the lens"),
+        (lambda: measured(RaySet(np.zeros((1, 3)), [[0, 0, -1]], [1])), "no ray that carries light towards"),
+        (lambda: measured(KNOWN["point"][0], power=0.0), "power"),
+        (lambda: rays_of(scene(measured(KNOWN["point"][0])), "halton", 9), "sampler"),
+        (lambda: settings.build_source(complete({"source": {"type": "rays"}}, 1.0)), "must be a ray file"),
+    ],
+)
 def test_impossible_ones_are_refused(what, message):
     with pytest.raises(InputError, match=message):
         what()
@@ -221,8 +225,24 @@ def run(capfd, *arguments, code=0):
 @pytest.mark.parametrize(("form", "name"), [(tm25, "led.tm25ray"), (zemax, "LED.SDF"), (lighttools, "led.txt")])
 def test_a_design_from_a_file_stands_alone(here, capfd, form, name):
     Path(name).write_bytes(form(*cone_of(30_000, 12.0, (0.4, 0.4))))
-    base = ["design", "blob.png", "--resolution", "24", "--control", "12", "--rays", "6000", "--iterations", "8",
-            "--source", "rays", "--source-file", name, "--source-position", "0,0,-40"]
+    base = [
+        "design",
+        "blob.png",
+        "--resolution",
+        "24",
+        "--control",
+        "12",
+        "--rays",
+        "6000",
+        "--iterations",
+        "8",
+        "--source",
+        "rays",
+        "--source-file",
+        name,
+        "--source-position",
+        "0,0,-40",
+    ]
     figures, err = run(capfd, *base)
     assert figures["on_screen"] + sum(figures["lost"].values()) == pytest.approx(1.0, abs=1e-12)
     assert figures["rays"] < 30_000 and "the ray file is coarse for 24 x 24 pixels: its 30,000 rays" in err
@@ -244,8 +264,22 @@ def test_a_design_from_a_file_stands_alone(here, capfd, form, name):
 
 def test_another_file_is_another_design(here, capfd):
     Path("led.dat").write_bytes(zemax(*cone_of(5000, 12.0)))
-    base = ["design", "blob.png", "--resolution", "24", "--control", "12", "--rays", "2000", "--iterations", "2",
-            "--source", "rays", "--source-file", "led.dat"]
+    base = [
+        "design",
+        "blob.png",
+        "--resolution",
+        "24",
+        "--control",
+        "12",
+        "--rays",
+        "2000",
+        "--iterations",
+        "2",
+        "--source",
+        "rays",
+        "--source-file",
+        "led.dat",
+    ]
     run(capfd, *base)
     render = ["render", "blob.caustic", "-o", "a.png", "--source", "rays", "--source-file", "other.dat"]
     Path("other.dat").write_bytes(zemax(*cone_of(5000, 8.0)))
@@ -259,18 +293,26 @@ def test_another_file_is_another_design(here, capfd):
     assert "is not a ray file" in run(capfd, "render", "blob.caustic", code=2)
 
 
-@pytest.mark.parametrize(("arguments", "message"), [
-    (["--source", "rays"], "[source] file of type rays must be a ray file"),
-    (["--source", "rays", "--source-file", "none.dat"], "none.dat: no such file"),
-    (["--source", "rays", "--source-file", "cut.dat"], "cut.dat: is 10,203 bytes, but its header and"),
-    (["--source", "rays", "--source-file", "far.dat"], "--source-file: none of its 357 rays meets the lens"),
-    (["--source", "rays", "--source-file", "led.dat", "--source-position", "0,0,1"], "--source-position must lie before the lens"),
-    (["--source", "rays", "--source-file", "led.dat", "--source-position", "0,0,-9", "--source-position", "0,0,-8"],
-     "one [x, y, z]"),
-    (["--source", "rays", "--source-file", "led.dat", "--cone", "3"], "--cone belongs to --source"),
-    (["--source", "rays", "--source-file", "led.dat", "--waves", "on"], "--waves on: a ray file says nothing"),
-    (["--source", "point", "--source-file", "led.dat"], "--source-file belongs to --source disc or rays"),
-])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--source", "rays"], "[source] file of type rays must be a ray file"),
+        (["--source", "rays", "--source-file", "none.dat"], "none.dat: no such file"),
+        (["--source", "rays", "--source-file", "cut.dat"], "cut.dat: is 10,203 bytes, but its header and"),
+        (["--source", "rays", "--source-file", "far.dat"], "--source-file: none of its 357 rays meets the lens"),
+        (
+            ["--source", "rays", "--source-file", "led.dat", "--source-position", "0,0,1"],
+            "--source-position must lie before the lens",
+        ),
+        (
+            ["--source", "rays", "--source-file", "led.dat", "--source-position", "0,0,-9", "--source-position", "0,0,-8"],
+            "one [x, y, z]",
+        ),
+        (["--source", "rays", "--source-file", "led.dat", "--cone", "3"], "--cone belongs to --source"),
+        (["--source", "rays", "--source-file", "led.dat", "--waves", "on"], "--waves on: a ray file says nothing"),
+        (["--source", "point", "--source-file", "led.dat"], "--source-file belongs to --source disc or rays"),
+    ],
+)
 def test_bad_files_are_one_line(here, capfd, arguments, message):
     Path("led.dat").write_bytes(zemax(*cone_of(357, 12.0)))
     Path("cut.dat").write_bytes(zemax(*cone_of(357, 12.0))[:-1])

@@ -112,8 +112,10 @@ def wide(rng: np.random.Generator, count: int, half=HALF) -> np.ndarray:
     o = rng.uniform(-1.6, 1.6, (3, count)) * np.array([[half[0]], [half[1]], [0.5]]) - np.array([[0.0], [0.0], [0.6]])
     d = rng.standard_normal((3, count))
     d[2] = rng.choice([-0.1, 0.02, 0.2, 1.0], count) * abs(d[2])
-    d[:, ::2] = np.stack([rng.uniform(-half[k], half[k], (count + 1) // 2) for k in (0, 1)]
-                         + [rng.uniform(-0.5, 0.5, (count + 1) // 2)]) - o[:, ::2]  # half of them aimed at the surface
+    d[:, ::2] = (
+        np.stack([rng.uniform(-half[k], half[k], (count + 1) // 2) for k in (0, 1)] + [rng.uniform(-0.5, 0.5, (count + 1) // 2)])
+        - o[:, ::2]
+    )  # half of them aimed at the surface
     return np.concatenate([o, d])
 
 
@@ -224,8 +226,13 @@ def test_a_ray_that_begins_on_the_mesh_has_left_it():
     assert t == pytest.approx(1.0, abs=1e-15)
 
 
-@given(st.lists(st.integers(-3, 3), min_size=16, max_size=16), st.integers(0, 6), st.integers(0, 6), st.integers(-6, -4),
-       st.tuples(st.integers(-5, 5), st.integers(-5, 5), st.integers(-1, 9)))
+@given(
+    st.lists(st.integers(-3, 3), min_size=16, max_size=16),
+    st.integers(0, 6),
+    st.integers(0, 6),
+    st.integers(-6, -4),
+    st.tuples(st.integers(-5, 5), st.integers(-5, 5), st.integers(-1, 9)),
+)
 def test_whoever_begins_below_and_ends_above_has_crossed(heights, x, y, z, d):
     """Small whole numbers: rays along edges, diagonals and through vertices are the rule here, not the exception."""
     v = np.array(heights, dtype=float).reshape(4, 4)
@@ -281,10 +288,16 @@ def test_along_edges_and_parallel_to_triangles():
         ((-1, 0, -0.5, 1, 0, 1.5), 1.0),  # along a line of y, to the ridge
         ((-1, -1, -0.5, 1, 0.5, 1.0), 1.25),  # half a unit below the left side all the way, and out through the right one
         ((-1, 0.5, -0.25, 1, -0.5, 1.0), 1.125),
-        ((1, -1, -0.25, -1, 0, 0.75), 9 / 7), ((1, 0, -0.25, -1, 0.5, -0.5), math.inf),
-        ((0.5, 0.25, -1, 0, 0, 2), 0.75), ((0.0, 0.5, -1, 0, 0, 1), 2.0), ((1.0, 1.0, -1, 0, 0, 1), 1.0),
-        ((1.0, -0.9, -1, 0, 1, 1), 1.0), ((-1.0, 0.3, -0.5, 0, -0.5, 0.5), 1.0),  # along the aperture's borders
-        ((-0.5, -1, 0.25, 0, 1, 0.5), 0.5), ((-0.5, -1, 0.25, 1e-300, 1, 0.5), 0.5), ((0.5, 0.5, 0.0, 1e-320, 1e-320, 1), 0.5),
+        ((1, -1, -0.25, -1, 0, 0.75), 9 / 7),
+        ((1, 0, -0.25, -1, 0.5, -0.5), math.inf),
+        ((0.5, 0.25, -1, 0, 0, 2), 0.75),
+        ((0.0, 0.5, -1, 0, 0, 1), 2.0),
+        ((1.0, 1.0, -1, 0, 0, 1), 1.0),
+        ((1.0, -0.9, -1, 0, 1, 1), 1.0),
+        ((-1.0, 0.3, -0.5, 0, -0.5, 0.5), 1.0),  # along the aperture's borders
+        ((-0.5, -1, 0.25, 0, 1, 0.5), 0.5),
+        ((-0.5, -1, 0.25, 1e-300, 1, 0.5), 0.5),
+        ((0.5, 0.5, 0.0, 1e-320, 1e-320, 1), 0.5),
     ]
     rays = np.array([c[0] for c in cases], dtype=float).T
     for recursive in (True, False):
@@ -301,8 +314,9 @@ def test_planes_give_the_exact_time():
         for a, b, c in ((0.0, 0.0, 0.5), (0.3, -0.2, 0.1), (-1.0, 0.7, 3.0)):
             mesh = TriangleMesh(field, a * x[:, None] + b * y + c, *parts)
             count = 3000
-            rays = np.concatenate([rng.uniform(-1, 1, (2, count)), np.full((1, count), -6.0), rng.uniform(-0.4, 0.4, (2, count)),
-                                   np.ones((1, count))])
+            rays = np.concatenate(
+                [rng.uniform(-1, 1, (2, count)), np.full((1, count), -6.0), rng.uniform(-0.4, 0.4, (2, count)), np.ones((1, count))]
+            )
             rays[3, :200], rays[4, 100:300] = 0.0, 0.0
             expected = (a * rays[0] + b * rays[1] + c - rays[2]) / (rays[5] - a * rays[3] - b * rays[4])
             inside = (abs(rays[0] + expected * rays[3]) < HALF[0]) & (abs(rays[1] + expected * rays[4]) < HALF[1])

@@ -50,8 +50,7 @@ def naive_ssim(image, target):
             c1, c2 = (0.01 * peak) ** 2, (0.03 * peak) ** 2
             var = m["kk"] - m["k"] ** 2 + m["tt"] - m["t"] ** 2
             cov = m["kt"] - m["k"] * m["t"]
-            values[i, j] = ((2 * m["k"] * m["t"] + c1) * (2 * cov + c2)
-                            / ((m["k"] ** 2 + m["t"] ** 2 + c1) * (var + c2)))
+            values[i, j] = (2 * m["k"] * m["t"] + c1) * (2 * cov + c2) / ((m["k"] ** 2 + m["t"] ** 2 + c1) * (var + c2))
     if min(nx, ny) >= 2 * r + 1:
         values = {(i, j): v for (i, j), v in values.items() if r <= i < nx - r and r <= j < ny - r}
     return sum(values.values()) / len(values)
@@ -100,8 +99,14 @@ def test_black_target_has_no_peak():
 def test_more_noise_is_worse_by_every_figure():
     _, target = pictures((30, 30))
     noise = np.random.default_rng(1).random(target.shape)
-    found = [(metrics.relative_rms(target + a * noise, target), -metrics.psnr_db(target + a * noise, target),
-              -metrics.ssim(target + a * noise, target)) for a in (1.0, 10.0, 100.0)]
+    found = [
+        (
+            metrics.relative_rms(target + a * noise, target),
+            -metrics.psnr_db(target + a * noise, target),
+            -metrics.ssim(target + a * noise, target),
+        )
+        for a in (1.0, 10.0, 100.0)
+    ]
     assert all(np.diff(column).min() > 0 for column in zip(*found, strict=True))
 
 
@@ -129,12 +134,15 @@ def test_judge_accounts_for_all_light_and_is_strict_json(black):
     assert json.loads(json.dumps(found, allow_nan=False)) == found
 
 
-@pytest.mark.parametrize(("image", "target", "complaint"), [
-    (np.ones((3, 4)), np.ones((4, 3)), "same shape"),
-    (np.ones(3), np.ones(3), "2-D"),
-    (np.full((3, 4), np.nan), np.ones((3, 4)), "finite"),
-    (np.ones((3, 4)), np.full((3, 4), np.inf), "finite"),
-])
+@pytest.mark.parametrize(
+    ("image", "target", "complaint"),
+    [
+        (np.ones((3, 4)), np.ones((4, 3)), "same shape"),
+        (np.ones(3), np.ones(3), "2-D"),
+        (np.full((3, 4), np.nan), np.ones((3, 4)), "finite"),
+        (np.ones((3, 4)), np.full((3, 4), np.inf), "finite"),
+    ],
+)
 def test_what_cannot_be_compared_is_refused(image, target, complaint):
     for figure in (metrics.loss, metrics.relative_rms, metrics.psnr_db, metrics.ssim, metrics.on_target):
         with pytest.raises(InputError, match=complaint):

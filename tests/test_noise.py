@@ -153,8 +153,28 @@ def test_design_and_render_of_a_disc_say_their_noise(tmp_path, monkeypatch, capf
     monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
     write_blob()
     common = ["--threads", "1", "--json"]
-    assert cli.run(["design", "blob.png", "--source", "disc", "--resolution", "24", "--control", "12", "--rays", "4000",
-                    "--waves", "off", "--iterations", "20", *common]) == 0
+    assert (
+        cli.run(
+            [
+                "design",
+                "blob.png",
+                "--source",
+                "disc",
+                "--resolution",
+                "24",
+                "--control",
+                "12",
+                "--rays",
+                "4000",
+                "--waves",
+                "off",
+                "--iterations",
+                "20",
+                *common,
+            ]
+        )
+        == 0
+    )
     out, err = capfd.readouterr()
     figures = json.loads(out)
     assert 0 < figures["noise"] < 0.1 * figures["relative_rms"]

@@ -231,8 +231,9 @@ def test_heights_are_left_alone():
     assert math.isfinite(first.loss)
 
 
-@pytest.mark.parametrize("loss, max_slope", [("rms-light + 1e-3 laplacian", 0.0), ("rms + 0.01 curvature + 0.3 throughput", 0.0),
-                                             ("rms-light", 0.02)])
+@pytest.mark.parametrize(
+    "loss, max_slope", [("rms-light + 1e-3 laplacian", 0.0), ("rms + 0.01 curvature + 0.3 throughput", 0.0), ("rms-light", 0.02)]
+)
 @pytest.mark.parametrize("chunks", [1, 3])
 def test_penalties_have_the_slope_of_differences(loss, max_slope, chunks, monkeypatch):
     lens = Lens(control=(8, 7), degree=(3, 2), offset=Offset(5.0, (80.0, 80.0)))
@@ -245,8 +246,9 @@ def test_penalties_have_the_slope_of_differences(loss, max_slope, chunks, monkey
     if chunks > 1:
         monkeypatch.setattr("caustic_cli.inverse.objective.CHUNK", 3000)
     target = torch.rand(18, 15, generator=g, dtype=torch.float64)
-    function = Objective(scene, field, sampler, Filter("cosine", (5, 5)), target, loss, apron=3, max_slope=max_slope,
-                         dtype=torch.float64)
+    function = Objective(
+        scene, field, sampler, Filter("cosine", (5, 5)), target, loss, apron=3, max_slope=max_slope, dtype=torch.float64
+    )
     step = 1e-6
     difference = (function(heights + step * along).loss - function(heights - step * along).loss) / (2 * step)
     e = function(heights)
@@ -278,8 +280,18 @@ def test_oversampling_adds_up_smaller_pixels(chunks, monkeypatch):
     if chunks > 1:
         monkeypatch.setattr("caustic_cli.inverse.objective.CHUNK", 3000)
     sampler = Sampler("grid", (90, 90))
-    function = Objective(scene, field, sampler, Filter("cosine", (3, 3)), target, "rms-light", apron=2, oversample=3,
-                         filter_target=False, dtype=torch.float64)
+    function = Objective(
+        scene,
+        field,
+        sampler,
+        Filter("cosine", (3, 3)),
+        target,
+        "rms-light",
+        apron=2,
+        oversample=3,
+        filter_target=False,
+        dtype=torch.float64,
+    )
     fine = replace(scene.screen.grown((2, 2)), resolution=(66, 57))
     image = expose(scene, field, heights, sampler, Filter("cosine", (3, 3)), screen=fine).image
     pooled = sum(image[a::3, b::3] for a in range(3) for b in range(3))

@@ -209,8 +209,10 @@ def test_initial_states():
         last = parametrise(low, high, network, initial="random", degree=(1, 1)).weights[-1].detach()
         assert float(last.abs().max()) == pytest.approx(1 / math.sqrt(kernel), rel=0.02)  # 1 / sqrt(fan-in)
     for preconditioner in ("none", "laplacian"):
-        free = [parametrise(low, high, initial=initial, seed=1, preconditioner=preconditioner)().detach()
-                for initial in ("zero", "uniform", "random")]
+        free = [
+            parametrise(low, high, initial=initial, seed=1, preconditioner=preconditioner)().detach()
+            for initial in ("zero", "uniform", "random")
+        ]
         middle = 0.5 * (low + high)
         away = [float(((f - middle) / (high - low)).abs().max()) for f in free]
         assert away[0] < 1e-15

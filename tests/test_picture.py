@@ -27,8 +27,9 @@ def decode(code: float) -> float:
 
 
 def save(path: Path, array, mode: str | None = None, **options) -> Path:
-    Image.fromarray(np.asarray(array)).convert(mode).save(path, **options) if mode else Image.fromarray(
-        np.asarray(array)).save(path, **options)
+    Image.fromarray(np.asarray(array)).convert(mode).save(path, **options) if mode else Image.fromarray(np.asarray(array)).save(
+        path, **options
+    )
     return path
 
 
@@ -80,8 +81,9 @@ def test_colour_becomes_luminance_in_linear_light(tmp_path, linear):
     codes = np.array([[[255, 0, 0], [0, 255, 0], [0, 0, 255]], [[255, 255, 255], [10, 100, 200], [0, 0, 0]]], dtype=np.uint8)
     got = read_picture(save(tmp_path / "a.png", codes), linear).irradiance()
     curve = (lambda c: c) if linear else decode
-    expected = np.array([[sum(w * curve(c / 255) for w, c in zip((0.2126, 0.7152, 0.0722), pixel, strict=True))
-                          for pixel in row] for row in codes])
+    expected = np.array(
+        [[sum(w * curve(c / 255) for w, c in zip((0.2126, 0.7152, 0.0722), pixel, strict=True)) for pixel in row] for row in codes]
+    )
     assert got == pytest.approx(placed(expected), abs=CODE_16)
 
 
@@ -116,8 +118,16 @@ def test_1_bit(tmp_path):
     assert np.array_equal(got, placed(np.array([[0.0, 1.0, 0.0], [1.0, 1.0, 0.0]])))
 
 
-TURNS = {1: lambda a: a, 2: np.fliplr, 3: lambda a: np.rot90(a, 2), 4: np.flipud, 5: np.transpose,
-         6: lambda a: np.rot90(a, -1), 7: lambda a: np.rot90(a, 2).T, 8: np.rot90}
+TURNS = {
+    1: lambda a: a,
+    2: np.fliplr,
+    3: lambda a: np.rot90(a, 2),
+    4: np.flipud,
+    5: np.transpose,
+    6: lambda a: np.rot90(a, -1),
+    7: lambda a: np.rot90(a, 2).T,
+    8: np.rot90,
+}
 
 
 @pytest.mark.parametrize("orientation", TURNS)
@@ -161,9 +171,12 @@ def test_floating_point_tiff_is_linear_irradiance(tmp_path):
 shapes = hnp.array_shapes(min_dims=2, max_dims=2, min_side=2, max_side=6)
 
 
-@given(st.one_of(hnp.arrays(np.uint8, shapes), hnp.arrays(np.uint16, shapes),
-                 hnp.arrays(np.float64, shapes, elements=st.floats(0, 1e300))).filter(lambda a: a.any()),
-       st.sampled_from(["srgb", "linear"]))
+@given(
+    st.one_of(
+        hnp.arrays(np.uint8, shapes), hnp.arrays(np.uint16, shapes), hnp.arrays(np.float64, shapes, elements=st.floats(0, 1e300))
+    ).filter(lambda a: a.any()),
+    st.sampled_from(["srgb", "linear"]),
+)
 def test_write_then_read_is_lossless(values, encoding):
     encoding = "linear" if values.dtype == np.float64 else encoding
     before = Picture(values, encoding)
@@ -299,8 +312,15 @@ def test_white_level_clips_and_black_is_drawn(tmp_path):
     assert not np.asarray(Image.open(tmp_path / "a.png")).any()
 
 
-@pytest.mark.parametrize("array", [np.arange(6.0).reshape(2, 3), np.ones((400, 2), dtype=np.float32),
-                                   np.asfortranarray(np.arange(6.0).reshape(2, 3)), np.arange(6.0).reshape(3, 2).T])
+@pytest.mark.parametrize(
+    "array",
+    [
+        np.arange(6.0).reshape(2, 3),
+        np.ones((400, 2), dtype=np.float32),
+        np.asfortranarray(np.arange(6.0).reshape(2, 3)),
+        np.arange(6.0).reshape(3, 2).T,
+    ],
+)
 def test_npy_header_is_numpys_and_ours(tmp_path, array):
     write_npy(tmp_path / "a.npy", array)
     back = np.load(tmp_path / "a.npy", allow_pickle=False)

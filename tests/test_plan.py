@@ -108,11 +108,27 @@ def test_what_a_scene_has_is_simulated():
     plan = plan_of(scene, heights)
     assert {"secondary-intersection", "ghosts", "total-reflection"} <= set(plan.simulated)
     assert plan.requests == DETOURS
-    scene = scene_of(POINT, light=Light(10.0, (500.0, 600.0)), glass="PMMA", screen=Screen((16.0, 14.0), 60.0, (8, 8), (0.0, 5.0),
-                     (1.0, 0.0)), absorption=0.01, roughness=0.001)
+    scene = scene_of(
+        POINT,
+        light=Light(10.0, (500.0, 600.0)),
+        glass="PMMA",
+        screen=Screen((16.0, 14.0), 60.0, (8, 8), (0.0, 5.0), (1.0, 0.0)),
+        absorption=0.01,
+        roughness=0.001,
+    )
     plan = plan_of(scene, bumpy(scene, 0.1))
-    assert {"polarisation", "dispersion", "entrance", "intersection", "missed-surface", "absorption", "roughness", "fresnel",
-            "screen-tilt", "screen-shift"} <= set(plan.simulated)
+    assert {
+        "polarisation",
+        "dispersion",
+        "entrance",
+        "intersection",
+        "missed-surface",
+        "absorption",
+        "roughness",
+        "fresnel",
+        "screen-tilt",
+        "screen-shift",
+    } <= set(plan.simulated)
     assert plan.scene is scene
     assert not plan_of(scene_of(NARROW), bumpy(scene, 0.1))["missed-surface"].on
     assert plan_of(scene_of(Disc(angle=1.0)), bumpy(scene, 0.1))["source-size"].on
@@ -138,8 +154,14 @@ def test_a_plane_wave_without_effects_runs_the_bare_path(monkeypatch):
 @pytest.mark.parametrize("source", [None, POINT, Disc((0.0, 0.0, -30.0), (2.0, 1.0)), Disc(angle=1.0)])
 def test_overrides(source):
     """`none` leaves out all that can be; each name alone is simulated alone; toggling twice is the plan itself."""
-    scene = scene_of(source, light=Light(10.0, (500.0, 600.0)), glass="PMMA",
-                     screen=Screen((16.0, 14.0), 60.0, (8, 8), (0.0, 5.0), (1.0, 0.0)), absorption=0.01, roughness=0.001)
+    scene = scene_of(
+        source,
+        light=Light(10.0, (500.0, 600.0)),
+        glass="PMMA",
+        screen=Screen((16.0, 14.0), 60.0, (8, 8), (0.0, 5.0), (1.0, 0.0)),
+        absorption=0.01,
+        roughness=0.001,
+    )
     heights = bumpy(scene, 0.1)
     auto = plan_of(scene, heights)
     bare = plan_of(scene, heights, ())
@@ -158,8 +180,14 @@ def test_overrides(source):
 
 def test_leaving_out_matters_where_the_effect_is():
     """Each effect of this scene, left out: another image or another account."""
-    scene = scene_of(POINT, light=Light(10.0, (450.0, 650.0)), glass="N-SF11",
-                     screen=Screen((16.0, 14.0), 60.0, (16, 14), (0.0, 15.0), (1.0, 0.0)), absorption=0.01, roughness=0.001)
+    scene = scene_of(
+        POINT,
+        light=Light(10.0, (450.0, 650.0)),
+        glass="N-SF11",
+        screen=Screen((16.0, 14.0), 60.0, (16, 14), (0.0, 15.0), (1.0, 0.0)),
+        absorption=0.01,
+        roughness=0.001,
+    )
     heights = bumpy(scene, 0.25)
     plan = plan_of(scene, heights)
     whole, checked = image_of(plan, heights), 0

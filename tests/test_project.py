@@ -46,8 +46,9 @@ def designed(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(evaluation, "FINAL_RAYS", 10_000)
         patch.setattr(evaluation, "write_report", lambda *args: None)
-        project, first = workflow.begin(folder / "blob.npy", {}, config=folder / "c.toml", out=folder / "blob.caustic",
-                                        say=Reporter(quiet=True))
+        project, first = workflow.begin(
+            folder / "blob.npy", {}, config=folder / "c.toml", out=folder / "blob.caustic", say=Reporter(quiet=True)
+        )
         workflow.design(project, first, "cpu", Reporter(quiet=True), 0.0)
     return project.path
 
@@ -85,12 +86,21 @@ def refusal(arguments, capfd):
 
 def sample(seed=0) -> Checkpoint:
     g = torch.Generator().manual_seed(seed)
-    spaces = (SplineSpace(3, torch.tensor([0, 0, 0, 0, 0.3, 1, 1, 1, 1.0])),
-              SplineSpace(2, torch.tensor([0, 0, 0, 0.1, 0.6, 1, 1, 1.0])))
-    state = State(torch.rand(5, 5, generator=g, dtype=torch.float64) * 1e-7 + 1 / 3, 2, 7, 31,
-                  {"w.0": torch.rand(3, 2, generator=g), "b": torch.rand(4, generator=g, dtype=torch.float64)},
-                  {"0.step": torch.tensor(31.0), "k": torch.tensor(5), "empty": torch.zeros(0, 3)},
-                  [(1, 0, 0.1, 1.0, 0.5), (31, 2, 1e-300, 1 / 3, 1e9)], 12.25, "time limit")
+    spaces = (
+        SplineSpace(3, torch.tensor([0, 0, 0, 0, 0.3, 1, 1, 1, 1.0])),
+        SplineSpace(2, torch.tensor([0, 0, 0, 0.1, 0.6, 1, 1, 1.0])),
+    )
+    state = State(
+        torch.rand(5, 5, generator=g, dtype=torch.float64) * 1e-7 + 1 / 3,
+        2,
+        7,
+        31,
+        {"w.0": torch.rand(3, 2, generator=g), "b": torch.rand(4, generator=g, dtype=torch.float64)},
+        {"0.step": torch.tensor(31.0), "k": torch.tensor(5), "empty": torch.zeros(0, 3)},
+        [(1, 0, 0.1, 1.0, 0.5), (31, 2, 1e-300, 1 / 3, 1e9)],
+        12.25,
+        "time limit",
+    )
     return Checkpoint(state, spaces, {"seed": 0, "é": "ü"}, {"loss": 1 / 3, "lost": {"fresnel": 0.1}, "psnr_db": None})
 
 
@@ -135,6 +145,7 @@ def _changed(change):
     def apply(path):
         with h5py.File(path, "r+") as f:
             change(f)
+
     return apply
 
 
@@ -146,6 +157,7 @@ def _replace(name, value):
     def change(f):
         del f[name]
         f[name] = value
+
     return _changed(change)
 
 
@@ -230,21 +242,24 @@ def test_editing_the_resolution_keeps_the_light(copy, capfd):
     assert image.shape == (10, 14) and second["on_screen"] == pytest.approx(first["on_screen"], abs=1e-6)
 
 
-@pytest.mark.parametrize(("pattern", "replacement", "words"), [
-    (r"^control = \[9, 8\]", "control = [12, 12]", ["control", "[12, 12]", "[9, 8]"]),
-    (r"^degree = \[3, 3\]", "degree = [2, 2]", ["degree", "[2, 2]", "[3, 3]"]),
-    (r"^degree = \[3, 3\]", "degree = [0, 3]", ["degree", "1", "15"]),
-    (r"^index = .*$", "indx = 1.5", ["indx", "index"]),
-    (r"^format_version = 1", "format_version = 2", ["format_version"]),
-    (r"^size = \[10\.0, 10\.0\]", "size = [-1, 10]", ["[lens] size"]),
-    (r"^file = .*$", "file = '../target.npy'", ["file"]),
-    (r"^file = .*$", "file = 'none.png'", ["none.png"]),
-    (r"^file = .*$", "file = 'wave.png'", ["'wave.png'"]),
-    (r"^type = .*$", "type = 'sun'", ["[source] type", "plane"]),
-    (r"^flip = .*$", "flip = 'q'", ["[target] flip"]),
-    (r"^encoding = .*$", "encoding = 'moon'", ["[target] encoding"]),
-    (r"^\[lens\]$", "[lens", ["TOML"]),
-])
+@pytest.mark.parametrize(
+    ("pattern", "replacement", "words"),
+    [
+        (r"^control = \[9, 8\]", "control = [12, 12]", ["control", "[12, 12]", "[9, 8]"]),
+        (r"^degree = \[3, 3\]", "degree = [2, 2]", ["degree", "[2, 2]", "[3, 3]"]),
+        (r"^degree = \[3, 3\]", "degree = [0, 3]", ["degree", "1", "15"]),
+        (r"^index = .*$", "indx = 1.5", ["indx", "index"]),
+        (r"^format_version = 1", "format_version = 2", ["format_version"]),
+        (r"^size = \[10\.0, 10\.0\]", "size = [-1, 10]", ["[lens] size"]),
+        (r"^file = .*$", "file = '../target.npy'", ["file"]),
+        (r"^file = .*$", "file = 'none.png'", ["none.png"]),
+        (r"^file = .*$", "file = 'wave.png'", ["'wave.png'"]),
+        (r"^type = .*$", "type = 'sun'", ["[source] type", "plane"]),
+        (r"^flip = .*$", "flip = 'q'", ["[target] flip"]),
+        (r"^encoding = .*$", "encoding = 'moon'", ["[target] encoding"]),
+        (r"^\[lens\]$", "[lens", ["TOML"]),
+    ],
+)
 def test_a_bad_edit_is_refused_in_one_line(copy, capfd, pattern, replacement, words):
     edit(copy, pattern, replacement)
     before = sorted((p.name, p.read_bytes()) for p in copy.iterdir())

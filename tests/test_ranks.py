@@ -36,7 +36,8 @@ control = [9, 9]
 [design]
 start = "offset"
 dtype = "float64"
-""" + "".join(f"""
+""" + "".join(
+    f"""
 [[design.stages]]
 {source}
 control = [{net}, {net}]
@@ -44,7 +45,9 @@ rays = {rays}
 apron = 2
 iterations = 6
 tolerance = 0.0
-""" for source, net, rays in (("source = 'point'", 7, 1500), ("", 9, 3000)))
+"""
+    for source, net, rays in (("source = 'point'", 7, 1500), ("", 9, 3000))
+)
 
 
 @pytest.mark.skipif(not torch.distributed.is_available(), reason="this torch has no torch.distributed")
@@ -71,8 +74,11 @@ def test_two_ranks_design_what_one_process_does(tmp_path, monkeypatch):
 
 
 LENS = Lens((10.0, 8.0), 0.0, 1.5, (7, 6), (3, 2), offset=Offset(3.0))
-SOURCES = {"plane": PlaneWave(), "points": Points(((0.0, 0.0, -50.0), (1.0, 0.0, -40.0)), (1.0, 2.0)),
-           "profile": PlaneWave(1.0, np.arange(1.0, 7.0).reshape(2, 3))}
+SOURCES = {
+    "plane": PlaneWave(),
+    "points": Points(((0.0, 0.0, -50.0), (1.0, 0.0, -40.0)), (1.0, 2.0)),
+    "profile": PlaneWave(1.0, np.arange(1.0, 7.0).reshape(2, 3)),
+}
 
 
 @pytest.mark.parametrize("source", SOURCES)

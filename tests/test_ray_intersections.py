@@ -127,10 +127,13 @@ def test_hits_depend_on_nothing_but_ray_and_heights():
 def test_rays_are_put_in_order_of_their_span_products():
     field, fused, _ = surface()
     (x, y, _), _ = fan(1000, 0.1)
-    order, used = batches.order((x * fused.scale[0] + 0.5).numpy(), (y * fused.scale[1] + 0.5).numpy(), fused.geometry[0],
-                                fused.geometry[3])
-    at = [torch.searchsorted(s.breaks[1:-1], c / (2 * r) + 0.5, right=True)
-          for s, c, r in zip(field.spaces, (x, y), HALF, strict=True)]
+    order, used = batches.order(
+        (x * fused.scale[0] + 0.5).numpy(), (y * fused.scale[1] + 0.5).numpy(), fused.geometry[0], fused.geometry[3]
+    )
+    at = [
+        torch.searchsorted(s.breaks[1:-1], c / (2 * r) + 0.5, right=True)
+        for s, c, r in zip(field.spaces, (x, y), HALF, strict=True)
+    ]
     where = (at[0] * (len(fused.geometry[3]) - 1) + at[1])[torch.from_numpy(order).long()]
     assert bool((where.diff() >= 0).all())
     assert len(where.unique()) == used
@@ -271,8 +274,9 @@ def test_derivatives_by_heights_origin_and_direction(degrees, count, side):
     assert 20 < int(found.sum()) < count
     pulled = torch.autograd.grad(values, leaves, by)
     there = [c[found] for c in leaves[1:]]
-    plain = torch.autograd.grad(attached(field, leaves[0], there[:3], there[3:], values[0].detach()[found]), leaves,
-                                [b[found] for b in by])
+    plain = torch.autograd.grad(
+        attached(field, leaves[0], there[:3], there[3:], values[0].detach()[found]), leaves, [b[found] for b in by]
+    )
     for a, b in zip(pulled, plain, strict=True):
         assert float((a - b).norm() / b.norm()) < 1e-11
     with forward_ad.dual_level():

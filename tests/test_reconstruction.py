@@ -14,8 +14,11 @@ from caustic_cli.scene import Screen
 #: Not square, neither in pixels nor in their shape: 2 x 1.25 mm pixels.
 SCREEN = Screen((24.0, 8.75), 100.0, (12, 7))
 SIZES = [(1, 1), (3, 3), (3, 11), (11, 3), (5, 1), (1, 7)]
-FILTERS = ([Filter("bincount", s) for s in SIZES[:3]] + [Filter("cosine", s) for s in SIZES]
-           + [Filter("gaussian", s, a) for s in SIZES for a in ((0.0, 0.0), (1.0, 0.3), (1e-9, 40.0))])
+FILTERS = (
+    [Filter("bincount", s) for s in SIZES[:3]]
+    + [Filter("cosine", s) for s in SIZES]
+    + [Filter("gaussian", s, a) for s in SIZES for a in ((0.0, 0.0), (1.0, 0.3), (1e-9, 40.0))]
+)
 SMOOTH = [f for f in FILTERS if f.kind != "bincount" and max(f.size) > 1]
 
 

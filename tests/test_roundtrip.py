@@ -161,8 +161,9 @@ def test_lighttools(tmp_path, lens, rays, capsys):
     assert error < LIMIT
 
 
-@pytest.mark.parametrize(("write", "suffix", "options"), [(write_csv, "csv", {"delimiter": ",", "skiprows": 1}),
-                                                          (write_xyz, "xyz", {})])
+@pytest.mark.parametrize(
+    ("write", "suffix", "options"), [(write_csv, "csv", {"delimiter": ",", "skiprows": 1}), (write_xyz, "xyz", {})]
+)
 def test_points(tmp_path, lens, rays, capsys, write, suffix, options):
     path = tmp_path / f"lens.{suffix}"
     write(path, *lens)
@@ -293,10 +294,15 @@ def shaped(made, aperture: str, border: float):
 OUTLINES = [("rectangle", 0.0), ("rectangle", 1.5), ("circle", 0.0), ("circle", 1.5)]
 
 
-@pytest.mark.parametrize(("case", "outline"), [*((case, OUTLINES[0]) for case in CASES.values()),
-                                               *((CASES["square"], outline) for outline in OUTLINES[1:]),
-                                               (CASES["non-square net and aperture"], OUTLINES[1]),
-                                               (CASES["uneven knots"], OUTLINES[3])])
+@pytest.mark.parametrize(
+    ("case", "outline"),
+    [
+        *((case, OUTLINES[0]) for case in CASES.values()),
+        *((CASES["square"], outline) for outline in OUTLINES[1:]),
+        (CASES["non-square net and aperture"], OUTLINES[1]),
+        (CASES["uneven knots"], OUTLINES[3]),
+    ],
+)
 def test_step_is_closed(tmp_path, case, outline):
     """Every edge is used once each way, every reference exists, and the corners of every loop follow one another."""
     write_step(tmp_path / "lens.step", *shaped(make(**case), *outline))
@@ -384,8 +390,15 @@ def test_mitsuba_meshes(tmp_path, lens, rays, capsys):
     assert (np.einsum("ij,ij->i", sides.face_normals, sides.triangles_center * [1, 1, 0]) > 0).all()  # outward
 
 
-@pytest.mark.parametrize("source", [Points(((0.0, 0.0, -50.0),), intensity="lambertian"), Disc(angle=0.5),
-                                    Disc(intensity="uniform"), PlaneWave(profile=np.ones((2, 2)))])
+@pytest.mark.parametrize(
+    "source",
+    [
+        Points(((0.0, 0.0, -50.0),), intensity="lambertian"),
+        Disc(angle=0.5),
+        Disc(intensity="uniform"),
+        PlaneWave(profile=np.ones((2, 2))),
+    ],
+)
 def test_mitsuba_refuses_lights_it_has_not(tmp_path, lens, source):
     with pytest.raises(InputError, match="mitsuba"):
         write_mitsuba(tmp_path / "lens.xml", Scene(source, lens[0].lens, lens[0].screen), *lens[1:])
@@ -404,6 +417,7 @@ class FakeLightTools:
             if name == "GetMeshData":
                 return 0, arguments[1]
             return ("FreeformEntity_3", 0) if name == "DbGet" else 0
+
         return call
 
 
@@ -456,9 +470,20 @@ def test_the_lighttools_block_holds_the_points(tmp_path, lens):
 # all of them
 
 
-@pytest.mark.parametrize(("write", "name"), [
-    (write_lighttools, "a.npz"), (write_zemax, "a.dat"), (write_step, "a.step"), (write_stl, "a.stl"), (write_ply, "a.ply"),
-    (write_obj, "a.obj"), (write_csv, "a.csv"), (write_xyz, "a.xyz"), (write_mitsuba, "a.xml")])
+@pytest.mark.parametrize(
+    ("write", "name"),
+    [
+        (write_lighttools, "a.npz"),
+        (write_zemax, "a.dat"),
+        (write_step, "a.step"),
+        (write_stl, "a.stl"),
+        (write_ply, "a.ply"),
+        (write_obj, "a.obj"),
+        (write_csv, "a.csv"),
+        (write_xyz, "a.xyz"),
+        (write_mitsuba, "a.xml"),
+    ],
+)
 def test_bytes_repeat(tmp_path, write, name):
     made = []
     for folder in ("one", "two"):
@@ -499,17 +524,25 @@ def test_readers_refuse(tmp_path, lens):
     write_step(tmp_path / "lens.step", *lens)
     write_lighttools(tmp_path / "lens.npz", *lens)
     whole = (tmp_path / "lens.step").read_text()
-    texts = {"no.step": "no step", "inch.step": whole.replace("(.MILLI.,", "($,"), "cut.step": whole[: len(whole) // 9],
-             "bent.step": whole.replace("(-5.,-4.,", "(-5.1,-4.,", 1),
-             "two.step": whole.replace("ENDSEC;\nEND", re.search(r"#\d+=B_SPLINE_SURFACE.*", whole)[0] + "\nENDSEC;\nEND"),
-             "text.npz": "no archive", "lens.dxf": "no"}
+    texts = {
+        "no.step": "no step",
+        "inch.step": whole.replace("(.MILLI.,", "($,"),
+        "cut.step": whole[: len(whole) // 9],
+        "bent.step": whole.replace("(-5.,-4.,", "(-5.1,-4.,", 1),
+        "two.step": whole.replace("ENDSEC;\nEND", re.search(r"#\d+=B_SPLINE_SURFACE.*", whole)[0] + "\nENDSEC;\nEND"),
+        "text.npz": "no archive",
+        "lens.dxf": "no",
+    }
     for name, text in texts.items():
         (tmp_path / name).write_text(text)
     np.savez(tmp_path / "other.npz", a=np.ones(3))
     with np.load(tmp_path / "lens.npz") as data:
         arrays = dict(data)
-    for name, change in {"shape.npz": {"control_points": arrays["control_points"][:-1]}, "degree.npz": {"degrees": np.ones(3)},
-                         "nan.npz": {"control_points": arrays["control_points"] * np.nan}}.items():
+    for name, change in {
+        "shape.npz": {"control_points": arrays["control_points"][:-1]},
+        "degree.npz": {"degrees": np.ones(3)},
+        "nan.npz": {"control_points": arrays["control_points"] * np.nan},
+    }.items():
         np.savez(tmp_path / name, **{**arrays, **change})
     np.save(tmp_path / "flat.npy", np.ones(5))
     names = [*texts, "other.npz", "shape.npz", "degree.npz", "nan.npz", "flat.npy", "missing.npz"]

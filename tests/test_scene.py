@@ -155,9 +155,15 @@ def test_pixels():
 #: n_d and Abbe number V_d = (n_d - 1) / (n_F - n_C) as catalogues print them: Schott's data sheets; for silica and CaF2 the usual
 #: figures after Malitson; for plastics Sultanova's fits as refractiveindex.info prints them (index only).
 CATALOGUE = {
-    "N-BK7": (1.51680, 64.17), "N-F2": (1.62005, 36.43), "N-BAF10": (1.67003, 47.11), "N-SF11": (1.78472, 25.68),
-    "SILICA": (1.45846, 67.82), "CAF2": (1.43385, 95.0),
-    "PMMA": (1.4906, None), "PC": (1.5848, None), "PS": (1.5916, None),
+    "N-BK7": (1.51680, 64.17),
+    "N-F2": (1.62005, 36.43),
+    "N-BAF10": (1.67003, 47.11),
+    "N-SF11": (1.78472, 25.68),
+    "SILICA": (1.45846, 67.82),
+    "CAF2": (1.43385, 95.0),
+    "PMMA": (1.4906, None),
+    "PC": (1.5848, None),
+    "PS": (1.5916, None),
 }
 
 

@@ -16,10 +16,16 @@ INDEX = 1.5443  # table D.2
 
 number = st.floats(allow_nan=False)
 whole = st.integers(-(2**63), 2**63 - 1)
-VALUES = {"number": number, "whole": whole, "text": st.text(st.characters(exclude_categories=["Cs"]), max_size=12),
-          "flag": st.booleans(), "numbers": st.lists(number, min_size=2, max_size=2),
-          "wholes": st.lists(whole, min_size=2, max_size=2), "list": st.lists(number, max_size=5),
-          "points": st.lists(st.lists(number, min_size=3, max_size=3), min_size=1, max_size=3)}
+VALUES = {
+    "number": number,
+    "whole": whole,
+    "text": st.text(st.characters(exclude_categories=["Cs"]), max_size=12),
+    "flag": st.booleans(),
+    "numbers": st.lists(number, min_size=2, max_size=2),
+    "wholes": st.lists(whole, min_size=2, max_size=2),
+    "list": st.lists(number, max_size=5),
+    "points": st.lists(st.lists(number, min_size=3, max_size=3), min_size=1, max_size=3),
+}
 
 
 def some(keys):
@@ -66,31 +72,34 @@ def test_every_length_carries_its_unit():
     assert len(noted) > 40
 
 
-@pytest.mark.parametrize(("text", "words"), [
-    ("[lens]\ndegre = [3, 3]", ["[lens]", "degre", "degree"]),
-    ("[lense]\nindex = 1.5", ["lense", "lens"]),
-    ("[screen]\nresolutoin = [2, 2]", ["[screen]", "resolution"]),
-    ("[[design.stages]]\nblurr = 1.0", ["design.stages", "blurr", "blur"]),
-    ("[source]\nzzzzzz = 1", ["zzzzzz", "type", "power"]),
-    ("lens = 3", ["lens", "section"]),
-    ("[lens]\nindex = '1.5'", ["[lens] index", "number", "'1.5'"]),
-    ("[lens]\nindex = true", ["[lens] index", "number"]),
-    ("[lens]\nindex = nan", ["[lens] index", "nan"]),
-    ("[lens]\nsize = 10", ["[lens] size", "pair"]),
-    ("[lens]\nsize = [10]", ["[lens] size", "pair"]),
-    ("[lens]\nsize = [1, 2, 3]", ["[lens] size", "pair"]),
-    ("[lens]\nsize = [1, '2']", ["[lens] size", "number"]),
-    ("[lens]\ncontrol = [3.0, 3]", ["[lens] control", "whole"]),
-    ("[design]\nseed = 1.5", ["[design] seed", "whole"]),
-    ("[design]\nfilter_target = 1", ["[design] filter_target", "true or false"]),
-    ("[design]\nloss = 3", ["[design] loss", "text"]),
-    ("[design]\nstages = 3", ["stages", "tables"]),
-    ("[design]\nstages = []", ["stages"]),
-    ("format_version = 99", ["format_version", "99", "1"]),
-    ("format_version = 'one'", ["format_version", "one"]),
-    ("[lens", ["TOML"]),
-    ("a = 1\na = 2", ["TOML"]),
-])
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[lens]\ndegre = [3, 3]", ["[lens]", "degre", "degree"]),
+        ("[lense]\nindex = 1.5", ["lense", "lens"]),
+        ("[screen]\nresolutoin = [2, 2]", ["[screen]", "resolution"]),
+        ("[[design.stages]]\nblurr = 1.0", ["design.stages", "blurr", "blur"]),
+        ("[source]\nzzzzzz = 1", ["zzzzzz", "type", "power"]),
+        ("lens = 3", ["lens", "section"]),
+        ("[lens]\nindex = '1.5'", ["[lens] index", "number", "'1.5'"]),
+        ("[lens]\nindex = true", ["[lens] index", "number"]),
+        ("[lens]\nindex = nan", ["[lens] index", "nan"]),
+        ("[lens]\nsize = 10", ["[lens] size", "pair"]),
+        ("[lens]\nsize = [10]", ["[lens] size", "pair"]),
+        ("[lens]\nsize = [1, 2, 3]", ["[lens] size", "pair"]),
+        ("[lens]\nsize = [1, '2']", ["[lens] size", "number"]),
+        ("[lens]\ncontrol = [3.0, 3]", ["[lens] control", "whole"]),
+        ("[design]\nseed = 1.5", ["[design] seed", "whole"]),
+        ("[design]\nfilter_target = 1", ["[design] filter_target", "true or false"]),
+        ("[design]\nloss = 3", ["[design] loss", "text"]),
+        ("[design]\nstages = 3", ["stages", "tables"]),
+        ("[design]\nstages = []", ["stages"]),
+        ("format_version = 99", ["format_version", "99", "1"]),
+        ("format_version = 'one'", ["format_version", "one"]),
+        ("[lens", ["TOML"]),
+        ("a = 1\na = 2", ["TOML"]),
+    ],
+)
 def test_refused_by_name(text, words):
     with pytest.raises(InputError) as caught:
         parse(text, "there.toml")
@@ -154,8 +163,9 @@ def test_a_non_square_picture_keeps_its_shape():
     assert s["lens"]["radius"] == pytest.approx([reach / 2, reach / 0.5])
 
 
-@pytest.mark.parametrize(("width", "aspect", "expected"), [(24, 1.0, [24, 24]), (100, 2.0, [100, 200]), (100, 0.753, [100, 75]),
-                                                           (2, 0.01, [2, 2])])
+@pytest.mark.parametrize(
+    ("width", "aspect", "expected"), [(24, 1.0, [24, 24]), (100, 2.0, [100, 200]), (100, 0.753, [100, 75]), (2, 0.01, [2, 2])]
+)
 def test_resolution_counts_across(width, aspect, expected):
     assert complete({}, aspect, Derivation(resolution=(width,)))["screen"]["resolution"] == expected
 
@@ -214,28 +224,40 @@ def test_adam_has_one_stage(design):
     assert len(complete({"design": design}, 1.0)["design"]["stages"]) == 1
 
 
-@pytest.mark.parametrize(("given_", "shaped", "word"), [
-    ({}, {"mag": 0.0}, "mag"), ({}, {"mag": math.nan}, "mag"), ({}, {"mag": -3.0}, "mag"),
-    ({}, {"margin": -0.1}, "margin"), ({}, {"quality": "superb"}, "quality"),
-    ({"screen": {"z": 3.0}}, {}, "[screen] z"), ({"screen": {"z": math.inf}}, {}, "[screen] z"),
-    ({"lens": {"degree": [99, 99]}}, {}, "[lens] degree"), ({"lens": {"index": 1.0}}, {}, "[lens] index"),
-    ({"lens": {"glass": "wood"}}, {}, "wood"), ({"lens": {"size": [0.0, 1.0]}}, {}, "[lens] size"),
-    ({"screen": {"size": [0.0, 1.0]}}, {}, "[screen] size"),
-    ({"design": {"stages": [{"blur": 1.0}]}}, {"rays": 1000}, "rays"),
-])
+@pytest.mark.parametrize(
+    ("given_", "shaped", "word"),
+    [
+        ({}, {"mag": 0.0}, "mag"),
+        ({}, {"mag": math.nan}, "mag"),
+        ({}, {"mag": -3.0}, "mag"),
+        ({}, {"margin": -0.1}, "margin"),
+        ({}, {"quality": "superb"}, "quality"),
+        ({"screen": {"z": 3.0}}, {}, "[screen] z"),
+        ({"screen": {"z": math.inf}}, {}, "[screen] z"),
+        ({"lens": {"degree": [99, 99]}}, {}, "[lens] degree"),
+        ({"lens": {"index": 1.0}}, {}, "[lens] index"),
+        ({"lens": {"glass": "wood"}}, {}, "wood"),
+        ({"lens": {"size": [0.0, 1.0]}}, {}, "[lens] size"),
+        ({"screen": {"size": [0.0, 1.0]}}, {}, "[screen] size"),
+        ({"design": {"stages": [{"blur": 1.0}]}}, {"rays": 1000}, "rays"),
+    ],
+)
 def test_out_of_range(given_, shaped, word):
     with pytest.raises(InputError) as caught:
         complete(given_, 1.0, Derivation(**shaped))
     assert word in str(caught.value)
 
 
-@pytest.mark.parametrize(("change", "word"), [
-    ({"design": {"stages": [{"control": [9, 9]}]}}, "control"),
-    ({"design": {"stages": [{"alpha_per_mm2": 1.0, "alpha_per_pixel2": 1.0, "reconstruction": "gaussian"}]}}, "alpha"),
-    ({"design": {"stages": [{"reconstruction": "moon"}]}}, "reconstruction"),
-    ({"design": {"stages": [{"filter_size": [2, 2]}]}}, "filter"),
-    ({"design": {"stages": [{"rays": 0}]}}, "rays"),
-])
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"design": {"stages": [{"control": [9, 9]}]}}, "control"),
+        ({"design": {"stages": [{"alpha_per_mm2": 1.0, "alpha_per_pixel2": 1.0, "reconstruction": "gaussian"}]}}, "alpha"),
+        ({"design": {"stages": [{"reconstruction": "moon"}]}}, "reconstruction"),
+        ({"design": {"stages": [{"filter_size": [2, 2]}]}}, "filter"),
+        ({"design": {"stages": [{"rays": 0}]}}, "rays"),
+    ],
+)
 def test_stages_out_of_range(change, word):
     with pytest.raises(InputError) as caught:
         build_stages(complete(change, 1.0))

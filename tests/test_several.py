@@ -31,8 +31,13 @@ from caustic_cli.workflow import design as workflow
 from caustic_cli.workflow import evaluation
 
 SCREEN = Screen((40.0, 32.0), 100.0, (40, 32))
-MEMBERS = (PlaneWave(1.0), Points(((0.5, 0.0, -20.0),), (2.0,)), Disc((0.0, 1.0, -30.0), (2.0, 1.0), 0.5),
-           Measured(RaySet(*cone_of(100_000, 12.0)), (0.0, 0.0, -25.0), 3.0), Disc(angle=1.0, power=0.25))
+MEMBERS = (
+    PlaneWave(1.0),
+    Points(((0.5, 0.0, -20.0),), (2.0,)),
+    Disc((0.0, 1.0, -30.0), (2.0, 1.0), 0.5),
+    Measured(RaySet(*cone_of(100_000, 12.0)), (0.0, 0.0, -25.0), 3.0),
+    Disc(angle=1.0, power=0.25),
+)
 NONE = ((), ())
 GLASS = Lens(size=(10.0, 8.0), control=(8, 7), glass="N-BK7", index=1.5168)
 
@@ -66,8 +71,12 @@ def test_their_light_adds_up():
     torch.testing.assert_close(together.image, image, rtol=0, atol=1e-15)
     assert sampler.count == sum(one.count for one in sampler.members)
     for chunk in (1 << 20, 999):
-        whole = [(float(c.flux.sum()) if hasattr(c, "flux") and c.flux.ndim else float(c.flux) * math.prod(c.shape))
-                 if hasattr(c, "flux") else float(c.power.sum()) + c.lost["missed_lens"] for c in sampler.chunks(chunk)]
+        whole = [
+            (float(c.flux.sum()) if hasattr(c, "flux") and c.flux.ndim else float(c.flux) * math.prod(c.shape))
+            if hasattr(c, "flux")
+            else float(c.power.sum()) + c.lost["missed_lens"]
+            for c in sampler.chunks(chunk)
+        ]
         assert math.fsum(whole) == pytest.approx(1.0, abs=1e-12)
 
 
@@ -96,26 +105,32 @@ def test_the_coarsest_ray_file_speaks():
     assert "its 500 rays" in words
 
 
-@pytest.mark.parametrize(("what", "message"), [
-    (lambda: Several((MEMBERS[0],), (NONE,)), "must be 1 to 64 sources"),
-    (lambda: Several(MEMBERS[:2], (((500.0,), ()), NONE)), "said of every source, or of none"),
-    (lambda: settings.parse("source = 3", "a"), "source must be a section"),
-    (lambda: settings.parse("[[source]]\nsise = 3", "a"), r"\[source\] sise is not a key"),
-    (lambda: settings.parse("[[source]]\n[[source]]\nsise = 3", "a"), r"\[\[source\]\] sise is not a key"),
-    (lambda: settings.parse("[[source]]\n[[source]]\npolarisation = 3", "a"), r"\[\[source\]\] polarisation is not a key"),
-    (lambda: settings.parse("[source]\nalso = 3", "a"), r"\[\[source\]\] must be a list of tables"),
-    (lambda: complete(settings.parse("[[source]]\n[[source]]\ntype = 'sun'", "a"), 1.0), r"\[\[source\]\] type must be one of"),
-    (lambda: settings.build_light(complete({"source": {"also": [{"type": "point"}]}, "target": {"color": True}}, 1.0)),
-     "of a coloured picture must be one"),
-])
+@pytest.mark.parametrize(
+    ("what", "message"),
+    [
+        (lambda: Several((MEMBERS[0],), (NONE,)), "must be 1 to 64 sources"),
+        (lambda: Several(MEMBERS[:2], (((500.0,), ()), NONE)), "said of every source, or of none"),
+        (lambda: settings.parse("source = 3", "a"), "source must be a section"),
+        (lambda: settings.parse("[[source]]\nsise = 3", "a"), r"\[source\] sise is not a key"),
+        (lambda: settings.parse("[[source]]\n[[source]]\nsise = 3", "a"), r"\[\[source\]\] sise is not a key"),
+        (lambda: settings.parse("[[source]]\n[[source]]\npolarisation = 3", "a"), r"\[\[source\]\] polarisation is not a key"),
+        (lambda: settings.parse("[source]\nalso = 3", "a"), r"\[\[source\]\] must be a list of tables"),
+        (lambda: complete(settings.parse("[[source]]\n[[source]]\ntype = 'sun'", "a"), 1.0), r"\[\[source\]\] type must be one of"),
+        (
+            lambda: settings.build_light(complete({"source": {"also": [{"type": "point"}]}, "target": {"color": True}}, 1.0)),
+            "of a coloured picture must be one",
+        ),
+    ],
+)
 def test_impossible_ones_are_refused(what, message):
     with pytest.raises(InputError, match=message):
         what()
 
 
 def test_settings_go_round():
-    text = ("[[source]]\ntype = 'point'\npower = 3.0\nwavelengths = [620.0]\n"
-            "[[source]]\ntype = 'disc'\nwavelengths = [450.0, 500.0]\n")
+    text = (
+        "[[source]]\ntype = 'point'\npower = 3.0\nwavelengths = [620.0]\n[[source]]\ntype = 'disc'\nwavelengths = [450.0, 500.0]\n"
+    )
     full = complete(settings.parse(text, "a"), 1.0)
     assert settings.dump(full).count("[[source]]") == 2
     again = settings.parse(settings.dump(full), "b")
@@ -135,9 +150,11 @@ def test_a_design_in_several_lights(tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
     Path("led.dat").write_bytes(zemax(*cone_of(20_000, 12.0)))
     Path("led.csv").write_text("0,1\n30,0.5\n")
-    Path("two.toml").write_text("[[source]]\ntype = 'point'\npower = 2.0\nwavelengths = [620.0]\n[[source]]\ntype = 'rays'\n"
-                                "file = 'led.dat'\nwavelengths = [450.0]\n[[source]]\ntype = 'disc'\nintensity = 'led.csv'\n"
-                                "wavelengths = [500.0]\n[lens]\nglass = 'N-BK7'\n")
+    Path("two.toml").write_text(
+        "[[source]]\ntype = 'point'\npower = 2.0\nwavelengths = [620.0]\n[[source]]\ntype = 'rays'\n"
+        "file = 'led.dat'\nwavelengths = [450.0]\n[[source]]\ntype = 'disc'\nintensity = 'led.csv'\n"
+        "wavelengths = [500.0]\n[lens]\nglass = 'N-BK7'\n"
+    )
 
     def run(*arguments, code=0):
         assert cli.run([*arguments, "--json", "--quiet", "--threads", "1"]) == code
@@ -152,8 +169,17 @@ def test_a_design_in_several_lights(tmp_path, monkeypatch, capfd):
     assert {"source-2.dat", "intensity-3.csv"} <= {p.name for p in Path("blob.caustic").iterdir()}
     history = workflow.Project.open("blob.caustic").load().state.history
     assert history[-1][2] < history[0][2]
-    again = run("render", "blob.caustic", "--rays", "40000", "--force", "-o", "a.png", "--effects",
-                "entrance,intersection,fresnel,dispersion,source-size")
+    again = run(
+        "render",
+        "blob.caustic",
+        "--rays",
+        "40000",
+        "--force",
+        "-o",
+        "a.png",
+        "--effects",
+        "entrance,intersection,fresnel,dispersion,source-size",
+    )
     assert again["relative_rms"] == pytest.approx(figures["relative_rms"], rel=0.05)
     other = run("render", "blob.caustic", "--rays", "40000", "-o", "b.png", "--source", "plane", "--effects", "fresnel,dispersion")
     assert other["lost"]["missed_lens"] == 0.0  # another light is another light for all of it

@@ -31,18 +31,30 @@ INF = math.inf
 #: Source: kind, collimated, distant, half angle (degrees), nearest, centre, power, extent, several, extended, apart, sharp.
 FACTS = {
     "plane": (PlaneWave(2.0), ("plane", True, True, 0.0, -INF, (0, 0, -INF), 2.0, (0, 0), False, False, False, True)),
-    "point": (Points(((1.0, 2.0, -5.0),), (3.0,)),
-              ("point", False, False, 0.0, -5.0, (1, 2, -5), 3.0, (0, 0), False, False, False, True)),
-    "points": (Points(((0.0, 0.0, -5.0), (4.0, 0.0, -9.0)), (1.0, 3.0)),
-               ("point", False, False, 0.0, -5.0, (3, 0, -8), 4.0, (0, 0), True, True, True, False)),
-    "grid": (Points.grid((1.0, 0.0, -5.0), (2.0, 4.0), (3, 2), 6.0),
-             ("grid", False, False, 0.0, -5.0, (1, 0, -5), 6.0, (0, 0), True, True, False, False)),
-    "grid of one": (Points.grid((1.0, 0.0, -5.0), (2.0, 4.0), (1, 1)),
-                    ("grid", False, False, 0.0, -5.0, (1, 0, -5), 1.0, (0, 0), False, False, False, False)),
-    "disc": (Disc((1.0, 0.0, -8.0), (4.0, 3.0), 2.0),
-             ("disc", False, False, 0.0, -8.0, (1, 0, -8), 2.0, (2, 1.5), False, True, False, False)),
-    "disc of no size": (Disc((1.0, 0.0, -8.0), (0.0, 0.0)),
-                        ("disc", False, False, 0.0, -8.0, (1, 0, -8), 1.0, (0, 0), False, False, False, False)),
+    "point": (
+        Points(((1.0, 2.0, -5.0),), (3.0,)),
+        ("point", False, False, 0.0, -5.0, (1, 2, -5), 3.0, (0, 0), False, False, False, True),
+    ),
+    "points": (
+        Points(((0.0, 0.0, -5.0), (4.0, 0.0, -9.0)), (1.0, 3.0)),
+        ("point", False, False, 0.0, -5.0, (3, 0, -8), 4.0, (0, 0), True, True, True, False),
+    ),
+    "grid": (
+        Points.grid((1.0, 0.0, -5.0), (2.0, 4.0), (3, 2), 6.0),
+        ("grid", False, False, 0.0, -5.0, (1, 0, -5), 6.0, (0, 0), True, True, False, False),
+    ),
+    "grid of one": (
+        Points.grid((1.0, 0.0, -5.0), (2.0, 4.0), (1, 1)),
+        ("grid", False, False, 0.0, -5.0, (1, 0, -5), 1.0, (0, 0), False, False, False, False),
+    ),
+    "disc": (
+        Disc((1.0, 0.0, -8.0), (4.0, 3.0), 2.0),
+        ("disc", False, False, 0.0, -8.0, (1, 0, -8), 2.0, (2, 1.5), False, True, False, False),
+    ),
+    "disc of no size": (
+        Disc((1.0, 0.0, -8.0), (0.0, 0.0)),
+        ("disc", False, False, 0.0, -8.0, (1, 0, -8), 1.0, (0, 0), False, False, False, False),
+    ),
     "sun": (Disc(angle=0.5, power=2.0), ("disc", False, True, 0.25, -INF, (0, 0, -INF), 2.0, (0, 0), False, True, False, False)),
 }
 
@@ -70,12 +82,15 @@ def test_positions_and_parts():
     assert positions.tolist() == [[1, 0, -8]] and parts.tolist() == [1.0]
 
 
-@pytest.mark.parametrize(("name", "tangent", "round_"), [
-    ("point", math.hypot(6, 6) / 5, (math.hypot(1, 2) + 5) / 5),
-    ("points", math.hypot(5, 4) / 5, 1.0),  # the nearer; the other asks for hypot(9, 4) / 9, and for 9 / 9
-    ("grid", math.hypot(7, 6) / 5, (math.hypot(2, 2) + 5) / 5),
-    ("disc", math.hypot(8, 5.5) / 8, (math.hypot(3, 1.5) + 5) / 8),
-])
+@pytest.mark.parametrize(
+    ("name", "tangent", "round_"),
+    [
+        ("point", math.hypot(6, 6) / 5, (math.hypot(1, 2) + 5) / 5),
+        ("points", math.hypot(5, 4) / 5, 1.0),  # the nearer; the other asks for hypot(9, 4) / 9, and for 9 / 9
+        ("grid", math.hypot(7, 6) / 5, (math.hypot(2, 2) + 5) / 5),
+        ("disc", math.hypot(8, 5.5) / 8, (math.hypot(3, 1.5) + 5) / 8),
+    ],
+)
 def test_the_cone_over_a_lens(name, tangent, round_):
     """Half size 5 x 4; round, of radius 5."""
     s = FACTS[name][0]
@@ -84,11 +99,19 @@ def test_the_cone_over_a_lens(name, tangent, round_):
     assert Disc(cone=30.0).cone_over((5.0, 4.0), 0.0) == pytest.approx(math.pi / 6)
 
 
-@pytest.mark.parametrize(("name", "angle", "blur"), [
-    ("plane", 0.0, 0.0), ("point", 0.0, 0.0), ("points", None, 0.0), ("grid", None, 100.0 * 4 / 5), ("grid of one", 0.0, 0.0),
-    ("disc", 2.0 * math.degrees(math.atan(2 / 8)), 100.0 * 4 / 8), ("disc of no size", 0.0, 0.0),
-    ("sun", 0.5, 100.0 * math.radians(0.5)),
-])
+@pytest.mark.parametrize(
+    ("name", "angle", "blur"),
+    [
+        ("plane", 0.0, 0.0),
+        ("point", 0.0, 0.0),
+        ("points", None, 0.0),
+        ("grid", None, 100.0 * 4 / 5),
+        ("grid of one", 0.0, 0.0),
+        ("disc", 2.0 * math.degrees(math.atan(2 / 8)), 100.0 * 4 / 8),
+        ("disc of no size", 0.0, 0.0),
+        ("sun", 0.5, 100.0 * math.radians(0.5)),
+    ],
+)
 def test_what_extent_does(name, angle, blur):
     s = FACTS[name][0]
     assert s.blur(0.0, 100.0) == pytest.approx(blur)
@@ -137,7 +160,8 @@ def classes_asked_for(tree: ast.AST) -> set[str]:
         else:
             continue
         found |= {n.id for n in ast.walk(asked) if isinstance(n, ast.Name)} | {
-            n.attr for n in ast.walk(asked) if isinstance(n, ast.Attribute)}
+            n.attr for n in ast.walk(asked) if isinstance(n, ast.Attribute)
+        }
     return found
 
 
@@ -149,8 +173,11 @@ def test_the_reader_of_isinstance_sees_all_forms():
 def test_no_other_file_asks_for_the_class_of_a_source():
     files = [p for p in PACKAGE.rglob("*.py") if p.parent not in (PACKAGE / "scene" / "sources", PACKAGE / "optics" / "emission")]
     assert len(files) > 90
-    wrong = {str(p.relative_to(PACKAGE)): found for p in files
-             if (found := classes_asked_for(ast.parse(p.read_text("utf-8"))) & {"PlaneWave", "Points", "Disc"})}
+    wrong = {
+        str(p.relative_to(PACKAGE)): found
+        for p in files
+        if (found := classes_asked_for(ast.parse(p.read_text("utf-8"))) & {"PlaneWave", "Points", "Disc"})
+    }
     assert not wrong
 
 
@@ -184,8 +211,15 @@ def ring(monkeypatch):
     def build(table, profile):
         return Ring(tuple(table["position"][0]), table["size"][0], table["power"])
 
-    sources.register(SourceType("ring", "ring (of points)", ("position", "size"), build,
-                                lambda lens: {"position": [[0.0, 0.0, -20.0]], "size": [3.0, 3.0]}))
+    sources.register(
+        SourceType(
+            "ring",
+            "ring (of points)",
+            ("position", "size"),
+            build,
+            lambda lens: {"position": [[0.0, 0.0, -20.0]], "size": [3.0, 3.0]},
+        )
+    )
     emission.register("ring", Near.of_size)
 
 
@@ -209,8 +243,12 @@ def test_a_source_from_outside(ring, kernels, tmp_path):
     assert float(exposure.image.sum()) > 0.05
     assert float(exposure.image.sum()) + sum(exposure.lost.values()) == pytest.approx(1.0, abs=1e-12)
     grid = Points(tuple(map(tuple, source.points()[0])))  # the same as points that the package knows
-    same = expose(Scene(grid, lens, scene.screen), field, heights,
-                  emission.rays_of(Scene(grid, lens, scene.screen), "stratified", 30_000, seed=3))
+    same = expose(
+        Scene(grid, lens, scene.screen),
+        field,
+        heights,
+        emission.rays_of(Scene(grid, lens, scene.screen), "stratified", 30_000, seed=3),
+    )
     torch.testing.assert_close(exposure.image, same.image, rtol=1e-12, atol=1e-15)
 
     plan = compile_plan(scene, field, heights)

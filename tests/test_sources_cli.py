@@ -49,13 +49,16 @@ def run(capfd, *arguments, code=0):
     return json.loads(out) if code == 0 else err.strip()
 
 
-@pytest.mark.parametrize("source", [
-    ["--source", "point"],
-    ["--source", "point", "--source-position", "1,-1,-40", "--cone", "30"],
-    ["--source", "grid", "--source-grid", "2x3", "--source-size", "1"],
-    ["--source", "disc", "--source-size", "2x1"],
-    ["--source-angle", "0.5"],
-])
+@pytest.mark.parametrize(
+    "source",
+    [
+        ["--source", "point"],
+        ["--source", "point", "--source-position", "1,-1,-40", "--cone", "30"],
+        ["--source", "grid", "--source-grid", "2x3", "--source-size", "1"],
+        ["--source", "disc", "--source-size", "2x1"],
+        ["--source-angle", "0.5"],
+    ],
+)
 def test_every_source_designs_renders_and_exports(capfd, source):
     figures = run(capfd, "design", "blob.png", *source, *TINY, "--iterations", "8")
     history = workflow.Project.open("blob.caustic").load().state.history
@@ -77,10 +80,36 @@ def test_every_source_designs_renders_and_exports(capfd, source):
 def test_render_with_another_source(capfd):
     run(capfd, "design", "blob.png", *TINY, "--iterations", "3")
     plane = run(capfd, "render", "blob.caustic", "--rays", "40000", "--quiet", "-o", "a.png", "--npy", "a.npy")
-    far = run(capfd, "render", "blob.caustic", "--rays", "40000", "--quiet", "-o", "b.png", "--npy", "b.npy",
-              "--source", "point", "--source-position", "0,0,-1e6")
-    near = run(capfd, "render", "blob.caustic", "--rays", "40000", "--quiet", "-o", "c.png", "--source-position", "0,0,-60",
-               "--source", "disc")  # light that diverges this much lands elsewhere
+    far = run(
+        capfd,
+        "render",
+        "blob.caustic",
+        "--rays",
+        "40000",
+        "--quiet",
+        "-o",
+        "b.png",
+        "--npy",
+        "b.npy",
+        "--source",
+        "point",
+        "--source-position",
+        "0,0,-1e6",
+    )
+    near = run(
+        capfd,
+        "render",
+        "blob.caustic",
+        "--rays",
+        "40000",
+        "--quiet",
+        "-o",
+        "c.png",
+        "--source-position",
+        "0,0,-60",
+        "--source",
+        "disc",
+    )  # light that diverges this much lands elsewhere
     assert far["relative_rms"] == pytest.approx(plane["relative_rms"], rel=0.02)
     assert near["on_screen"] < 0.5 * far["on_screen"]
     a, b = np.load("a.npy"), np.load("b.npy")
@@ -102,16 +131,22 @@ def test_a_design_changes_its_source_and_resumes_inside_any_stage(capfd):
         assert bool((state.heights == whole.heights).all())
 
 
-@pytest.mark.parametrize("arguments, message", [
-    (["--source", "sun"], "--source must be one of plane, point, grid, disc, rays, got 'sun'"),
-    (["--source", "point", "--source-position", "1,2"], "--source-position must be 3 numbers parted by commas"),
-    (["--wavelengths", "abc"], "--wavelengths must be wavelengths in nm, each with a weight or without, like 450:2,550, got 'abc'"),
-    (["--source", "point", "--source-position", "0,0,5"], "--source-position must lie before the lens"),
-    (["--source", "grid", "--source-position", "0,0,-5", "--source-position", "1,0,-5"], "is its centre, one"),
-    (["--source", "point", "--cone", "95"], "--cone must be"),
-    (["--source", "grid", "--source-grid", "5000"], "--source-grid must be"),
-    (["--source", "disc", "--source-angle", "-1"], "--source-angle must be"),
-])
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["--source", "sun"], "--source must be one of plane, point, grid, disc, rays, got 'sun'"),
+        (["--source", "point", "--source-position", "1,2"], "--source-position must be 3 numbers parted by commas"),
+        (
+            ["--wavelengths", "abc"],
+            "--wavelengths must be wavelengths in nm, each with a weight or without, like 450:2,550, got 'abc'",
+        ),
+        (["--source", "point", "--source-position", "0,0,5"], "--source-position must lie before the lens"),
+        (["--source", "grid", "--source-position", "0,0,-5", "--source-position", "1,0,-5"], "is its centre, one"),
+        (["--source", "point", "--cone", "95"], "--cone must be"),
+        (["--source", "grid", "--source-grid", "5000"], "--source-grid must be"),
+        (["--source", "disc", "--source-angle", "-1"], "--source-angle must be"),
+    ],
+)
 def test_bad_sources_are_one_line(capfd, arguments, message):
     err = run(capfd, "design", "blob.png", *arguments, "--quiet", code=2)
     assert message in err and "\n" not in err
@@ -166,16 +201,20 @@ def test_a_stage_of_a_plane_wave_may_have_a_source_that_stands_somewhere(capfd):
     run(capfd, "render", "blob.caustic", "--rays", "4000", "--quiet")
     Path("schedule.toml").write_text(plane.replace('"point"', '"sun"'))
     assert run(capfd, "design", "blob.png", "--config", "schedule.toml", "-o", "x", code=2) == (
-        "caustic: [[design.stages]] source must be one of plane, point, grid, disc, rays, got 'sun'")
+        "caustic: [[design.stages]] source must be one of plane, point, grid, disc, rays, got 'sun'"
+    )
 
 
-@pytest.mark.parametrize(("options", "message"), [
-    (["--source-position", "0,0,-50"], "--source-position belongs to --source point, grid, disc or rays, got plane"),
-    (["--source", "point", "--source-size", "2"], "--source-size belongs to --source grid or disc, got point"),
-    (["--source", "disc", "--source-grid", "5"], "--source-grid belongs to --source grid, got disc"),
-    (["--source", "grid", "--source-angle", "1"], "--source-angle belongs to --source disc, got grid"),
-    (["--source-angle", "1", "--cone", "20"], "--cone has no meaning for a disc at infinity"),
-])
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--source-position", "0,0,-50"], "--source-position belongs to --source point, grid, disc or rays, got plane"),
+        (["--source", "point", "--source-size", "2"], "--source-size belongs to --source grid or disc, got point"),
+        (["--source", "disc", "--source-grid", "5"], "--source-grid belongs to --source grid, got disc"),
+        (["--source", "grid", "--source-angle", "1"], "--source-angle belongs to --source disc, got grid"),
+        (["--source-angle", "1", "--cone", "20"], "--cone has no meaning for a disc at infinity"),
+    ],
+)
 def test_options_that_the_source_would_ignore_are_refused(capfd, options, message):
     assert message in run(capfd, "design", "blob.png", *options, *TINY, code=2)
     assert not Path("blob.caustic").exists()
@@ -185,8 +224,20 @@ def test_options_that_the_source_would_ignore_are_refused(capfd, options, messag
 
 def test_an_option_may_be_meant_for_the_source_of_a_stage(capfd):
     Path("schedule.toml").write_text(SCHEDULE.replace('type = "grid"', 'type = "plane"').replace("position = [0, 0, -40]", ""))
-    run(capfd, "design", "blob.png", "--config", "schedule.toml", "--resolution", "24", "--source-position", "0,0,-40",
-        "--start", "offset", "--quiet")
+    run(
+        capfd,
+        "design",
+        "blob.png",
+        "--config",
+        "schedule.toml",
+        "--resolution",
+        "24",
+        "--source-position",
+        "0,0,-40",
+        "--start",
+        "offset",
+        "--quiet",
+    )
     project = workflow.Project.open("blob.caustic")
     assert project.settings["source"]["type"] == "plane"
     assert workflow.build_stages(project.settings)[0].source == Points(((0.0, 0.0, -40.0),))
@@ -194,7 +245,8 @@ def test_an_option_may_be_meant_for_the_source_of_a_stage(capfd):
 
 def test_a_refusal_names_no_file_that_was_never_written(capfd):
     assert run(capfd, "design", "blob.png", "--source", "point", "--source-position", "0,0,5", *TINY, code=2).startswith(
-        "caustic: --source-position must lie before the lens")
+        "caustic: --source-position must lie before the lens"
+    )
 
 
 @pytest.mark.parametrize("type", ["point", "grid"])
@@ -207,6 +259,7 @@ def test_a_bad_power_is_named_as_the_key_it_is(type, power):
 def test_a_tolerance_out_of_reach_is_refused_as_soon_as_it_is_foreseen(capfd):
     run(capfd, "design", "blob.png", *TINY, "--iterations", "1")
     began = time.monotonic()
-    assert "asks for more than 1e+11 rays" in run(capfd, "render", "blob.caustic", "--rays", "4000", "--tolerance", "1e-9",
-                                                  "--quiet", "--threads", "1", code=1)
+    assert "asks for more than 1e+11 rays" in run(
+        capfd, "render", "blob.caustic", "--rays", "4000", "--tolerance", "1e-9", "--quiet", "--threads", "1", code=1
+    )
     assert time.monotonic() - began < 20  # and not after the 1e11 rays, hours

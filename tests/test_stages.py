@@ -27,8 +27,15 @@ from caustic_cli.scene import Screen
 RAYS = 1500
 SCREEN = Screen((6.0, 4.0), 40.0, (31, 20), shift=(0.3, -0.2))
 TILTED = Screen((6.0, 4.0), 40.0, (31, 20), tilt=(20.0, -35.0), shift=(1.0, 2.0))
-FILTERS = [Filter("cosine", (3, 3)), Filter("cosine", (1, 5)), Filter("cosine", (11, 3)), Filter("gaussian", (3, 3), (0.01, 0.02)),
-           Filter("gaussian", (5, 3), (0.0, 2.6e-6)), Filter("gaussian", (3, 7), (0.3, 30.0)), Filter("cosine", (5, 1))]
+FILTERS = [
+    Filter("cosine", (3, 3)),
+    Filter("cosine", (1, 5)),
+    Filter("cosine", (11, 3)),
+    Filter("gaussian", (3, 3), (0.01, 0.02)),
+    Filter("gaussian", (5, 3), (0.0, 2.6e-6)),
+    Filter("gaussian", (3, 7), (0.3, 30.0)),
+    Filter("cosine", (5, 1)),
+]
 
 
 def numbers(seed: int, *shape: int) -> torch.Tensor:
@@ -46,6 +53,7 @@ def flat(out) -> list[torch.Tensor]:
 
 
 # Stages by name: (inputs, kernel, reference), functions of the inputs.
+
 
 def plain_interact(d, g, power, *, eta, reflects, fresnel, field=None):
     if reflects:
@@ -72,6 +80,7 @@ def interaction(constant: bool = False, polarised: bool = False, **options):
             gx, gy, power = ray[len(d) : len(d) + 3]
             e = {"field": tuple(ray[-3:])} if field else along
             return function(d_, (gx, gy), power, **options, **e)
+
         return called
 
     inputs = [*d, *(0.4 * numbers(2, 2, RAYS)), numbers(3, RAYS).abs(), *field]
@@ -98,8 +107,11 @@ def landing(screen: Screen, forward: float = 1.0, wild: bool = False):
     if wild:
         d = list(numbers(4, 3, RAYS))
         d = [c / torch.sqrt(sum(v * v for v in d)) for c in d]
-    return ([*numbers(2, 3, RAYS), *d], lambda *r: land(r[:3], r[3:], point, axes, forward),
-            lambda *r: plain_land(r[:3], r[3:], point, axes, forward))
+    return (
+        [*numbers(2, 3, RAYS), *d],
+        lambda *r: land(r[:3], r[3:], point, axes, forward),
+        lambda *r: plain_land(r[:3], r[3:], point, axes, forward),
+    )
 
 
 def splatting(filter: Filter):
@@ -115,15 +127,22 @@ def gridded(degree=(3, 2)):
 
 
 CASES = {
-    **{f"refract, {f}, eta {eta}": (interaction, {"eta": eta, "reflects": False, "fresnel": f})
-       for f in ("none", "schlick", "exact") for eta in (1.5, 1.0 / 1.5)},
-    **{f"refract, {f}, plane wave": (interaction, {"constant": True, "eta": 1.5, "reflects": False, "fresnel": f})
-       for f in ("none", "schlick", "exact")},
+    **{
+        f"refract, {f}, eta {eta}": (interaction, {"eta": eta, "reflects": False, "fresnel": f})
+        for f in ("none", "schlick", "exact")
+        for eta in (1.5, 1.0 / 1.5)
+    },
+    **{
+        f"refract, {f}, plane wave": (interaction, {"constant": True, "eta": 1.5, "reflects": False, "fresnel": f})
+        for f in ("none", "schlick", "exact")
+    },
     "refract, no other medium": (interaction, {"eta": 1.0, "reflects": False, "fresnel": "exact"}),
     "polarised": (interaction, {"polarised": True, "eta": 1.5, "reflects": False, "fresnel": "exact"}),
     "polarised, out of air": (interaction, {"polarised": True, "eta": 0.7, "reflects": False, "fresnel": "exact"}),
-    "polarised, plane wave": (interaction, {"constant": True, "polarised": True, "eta": 1.5, "reflects": False,
-                                            "fresnel": "exact"}),
+    "polarised, plane wave": (
+        interaction,
+        {"constant": True, "polarised": True, "eta": 1.5, "reflects": False, "fresnel": "exact"},
+    ),
     "mirror": (interaction, {"eta": 1.5, "reflects": True, "fresnel": "exact"}),
     "mirror, plane wave": (interaction, {"constant": True, "eta": 1.5, "reflects": True, "fresnel": "none"}),
     "land": (landing, {"screen": SCREEN}),
@@ -201,6 +220,7 @@ def test_each_derivative_alone(case):
 def test_torch_func(case):
     inputs, kernel, _ = case
     along = tuple(numbers(30 + k, *t.shape) for k, t in enumerate(inputs))
+
     def called(*t):
         return tuple(differentiable(kernel(*t)))
 
@@ -246,8 +266,17 @@ def test_two_threads_give_the_same(case):
         torch.testing.assert_close(a, b, rtol=1e-13, atol=1e-13 * float(b.abs().max()))
 
 
-@pytest.mark.parametrize("options", [{"fresnel": "schlick"}, {"fresnel": "exact"}, {"fresnel": "exact", "field": (0.6, 0.8, 0.0)},
-                                     {"fresnel": "none"}, {"fresnel": "none", "reflects": True}], ids=str)
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"fresnel": "schlick"},
+        {"fresnel": "exact"},
+        {"fresnel": "exact", "field": (0.6, 0.8, 0.0)},
+        {"fresnel": "none"},
+        {"fresnel": "none", "reflects": True},
+    ],
+    ids=str,
+)
 @pytest.mark.parametrize("eta", [1.5, 0.7])
 def test_light_against_the_normal(eta, options):
     """The same as in the scene turned over, z -> -z, where it runs along the normal: d_z, E_z and the slopes change sign."""

@@ -134,7 +134,8 @@ def test_the_advice_and_the_ratio_follow_from_the_rows(interaction):
     mesh, newton = row("mesh", 8, 1e-4, 1e-3), row("newton", None, 0.0, 1.3e-3)
     assert intersection._advice([mesh, newton], 5.5) == (
         "t-error 1e-09 mm costs 1.3 x the time of 0.0001 mm: newton in 1.3 ms against mesh with n_u = 8 in 1 ms;"
-        " at 1e-06 mm newton is 5.5 times as fast as the mesh")
+        " at 1e-06 mm newton is 5.5 times as fast as the mesh"
+    )
     assert intersection._advice([mesh, newton | {"seconds": 5e-4}], None).startswith("newton is the fastest way")
     assert intersection._advice([mesh], None).startswith("no method reaches")
 
@@ -222,10 +223,21 @@ def test_contenders_get_equal_time_and_an_independent_verdict():
 def test_the_contenders_of_a_project(small):
     scene, target, full = small
     plans = comparison.plans(scene, full)
-    assert [series for series, *_ in plans] == ["lbfgs, 19x19", "lbfgs, 11x11", "lbfgs, 7x7", "lbfgs, coarse to fine",
-                                           "adam, 19x19", "adam, sparse network, 19x19", "adam, dense network, 19x19"]
-    assert [(o.optimizer, o.network) for *_, o in plans[3:]] == [("lbfgs", "none"), ("adam", "none"), ("adam", "sparse"),
-                                                                ("adam", "dense")]
+    assert [series for series, *_ in plans] == [
+        "lbfgs, 19x19",
+        "lbfgs, 11x11",
+        "lbfgs, 7x7",
+        "lbfgs, coarse to fine",
+        "adam, 19x19",
+        "adam, sparse network, 19x19",
+        "adam, dense network, 19x19",
+    ]
+    assert [(o.optimizer, o.network) for *_, o in plans[3:]] == [
+        ("lbfgs", "none"),
+        ("adam", "none"),
+        ("adam", "sparse"),
+        ("adam", "dense"),
+    ]
     assert all(stages[-1].rays == 5000 and stages[-1].tolerance == 0 for _, stages, _ in plans)
     entry = contender(small, 1)
     assert tuple(entry.heights.shape) == (11, 11)
@@ -238,8 +250,11 @@ def test_transport_contends_where_a_design_would_begin_there():
     full = complete({"screen": {"resolution": [24, 24]}, "lens": {"control": [35, 35]}}, 1.0, Derivation(rays=5000))
     scene = build_scene(full)
     target = torch.from_numpy(comparison.disc(scene, tuple(full["target"]["size"])))
-    entries = {plan[0]: comparison.Entry(*plan, scene, target) for plan in comparison.plans(scene, full)
-               if plan[0] in ("lbfgs, 35x35", comparison.TRANSPORT)}
+    entries = {
+        plan[0]: comparison.Entry(*plan, scene, target)
+        for plan in comparison.plans(scene, full)
+        if plan[0] in ("lbfgs, 35x35", comparison.TRANSPORT)
+    }
     assert len(entries) == 2
     for entry in entries.values():
         entry.advance(0.0)

@@ -80,10 +80,12 @@ def test_focal_length_of_a_biconvex_singlet():
 
 def prism_and_lens(apex: float = 12.0) -> tuple[System, dict]:
     """A wedge, its first side upright, then a planoconvex lens of 40 mm focal length."""
-    elements = (Element("upright", Plane(), Aperture((3.0, 3.0)), behind=DENSE),
-                Element("wedge", Plane(), Aperture((9.0, 9.0)), pose=Pose((0, 0, 4.0), (0.0, apex))),
-                Element("front", WIDE, Aperture((9.0, 9.0)), behind=GLASS, pose=Pose((0, 0, 10.0))),
-                Element("back", Plane(), Aperture((20.0, 20.0)), pose=Pose((0, 0, 14.0))))
+    elements = (
+        Element("upright", Plane(), Aperture((3.0, 3.0)), behind=DENSE),
+        Element("wedge", Plane(), Aperture((9.0, 9.0)), pose=Pose((0, 0, 4.0), (0.0, apex))),
+        Element("front", WIDE, Aperture((9.0, 9.0)), behind=GLASS, pose=Pose((0, 0, 10.0))),
+        Element("back", Plane(), Aperture((20.0, 20.0)), pose=Pose((0, 0, 14.0))),
+    )
     return System((PlaneWave(),), elements, (Screen((40.0, 40.0), 50.0, (20, 20)),)), {"front": parabola(WIDE, 20.0)}
 
 
@@ -124,15 +126,23 @@ def test_a_folding_mirror_behind_a_lens():
 
 def doublet() -> tuple[System, dict]:
     """A cemented pair, then a singlet 15 mm behind: three media, five surfaces, four of them free."""
+
     def at(z):
         return Pose((0.0, 0.0, z))
 
-    elements = (Element("one", FIELD, FLAT, behind=GLASS), Element("two", WIDE, Aperture((9.0, 9.0)), behind=DENSE, pose=at(5.0)),
-                Element("three", WIDE, Aperture((9.0, 9.0)), pose=at(7.0)),
-                Element("four", WIDE, Aperture((9.0, 9.0)), behind=GLASS, pose=at(22.0)),
-                Element("five", Sphere(-70.0), Aperture((9.0, 9.0), round=True), pose=at(26.0)))
-    heights = {"one": parabola(FIELD, 45.0), "two": parabola(WIDE, -40.0), "three": parabola(WIDE, -150.0),
-               "four": parabola(WIDE, 90.0)}
+    elements = (
+        Element("one", FIELD, FLAT, behind=GLASS),
+        Element("two", WIDE, Aperture((9.0, 9.0)), behind=DENSE, pose=at(5.0)),
+        Element("three", WIDE, Aperture((9.0, 9.0)), pose=at(7.0)),
+        Element("four", WIDE, Aperture((9.0, 9.0)), behind=GLASS, pose=at(22.0)),
+        Element("five", Sphere(-70.0), Aperture((9.0, 9.0), round=True), pose=at(26.0)),
+    )
+    heights = {
+        "one": parabola(FIELD, 45.0),
+        "two": parabola(WIDE, -40.0),
+        "three": parabola(WIDE, -150.0),
+        "four": parabola(WIDE, 90.0),
+    }
     return System((PlaneWave(),), elements, (Screen((12.0, 12.0), 50.0, (20, 20)),)), heights
 
 
@@ -140,8 +150,13 @@ def test_two_lenses_in_line():
     """Height and angle of a ray 1 um off the axis, by matrices of paraxial optics with the index of every medium."""
     system, heights = doublet()
     vector = np.array([1e-3, 0.0])
-    for radius, n_in, n_out, gap in ((45.0, 1.0, N, 5.0), (-40.0, N, FLINT, 2.0), (-150.0, FLINT, 1.0, 15.0), (90.0, 1.0, N, 4.0),
-                                     (-70.0, N, 1.0, 0.0)):
+    for radius, n_in, n_out, gap in (
+        (45.0, 1.0, N, 5.0),
+        (-40.0, N, FLINT, 2.0),
+        (-150.0, FLINT, 1.0, 15.0),
+        (90.0, 1.0, N, 4.0),
+        (-70.0, N, 1.0, 0.0),
+    ):
         vector = np.array([[1, gap], [0, 1]]) @ np.array([[1, 0], [(n_in - n_out) / (n_out * radius), n_in / n_out]]) @ vector
     (out,) = trace(system, ray(1e-3), heights)
     assert float(out.origin[0]) == pytest.approx(vector[0], rel=1e-7)
@@ -152,15 +167,20 @@ def test_two_lenses_in_line():
 def tilted() -> tuple[System, dict]:
     """A lens turned about both axes and moved off the axis; its back is a B-spline too."""
     pose, behind = Pose((0.3, -0.2, 0.0), (8.0, -11.0)), Pose((0.3, -0.2, 5.0), (8.0, -11.0))
-    elements = (Element("front", WIDE, Aperture((9.0, 9.0)), behind=GLASS, pose=pose),
-                Element("back", HeightField(WIDE.spaces, (12.0, 12.0)), Aperture((12.0, 12.0)), pose=behind))
-    heights = {"front": parabola(WIDE, 35.0) + bumpy(WIDE, 0.02, 3),
-               "back": parabola(elements[1].surface, -50.0) + bumpy(WIDE, 0.02, 4)}
+    elements = (
+        Element("front", WIDE, Aperture((9.0, 9.0)), behind=GLASS, pose=pose),
+        Element("back", HeightField(WIDE.spaces, (12.0, 12.0)), Aperture((12.0, 12.0)), pose=behind),
+    )
+    heights = {
+        "front": parabola(WIDE, 35.0) + bumpy(WIDE, 0.02, 3),
+        "back": parabola(elements[1].surface, -50.0) + bumpy(WIDE, 0.02, 4),
+    }
     return System((PlaneWave(),), elements, (SCREEN,)), heights
 
 
-@pytest.mark.parametrize("make", [lambda: biconvex(40.0, -60.0, 4.0), prism_and_lens, doublet, tilted],
-                         ids=["biconvex", "prism", "two lenses", "tilted"])
+@pytest.mark.parametrize(
+    "make", [lambda: biconvex(40.0, -60.0, 4.0), prism_and_lens, doublet, tilted], ids=["biconvex", "prism", "two lenses", "tilted"]
+)
 def test_rays_against_an_independent_tracer(make):
     """Landing points to 1e-7 mm and optical path lengths to 1e-9: normals by differences across the knots of a quadratic leave
     that."""
@@ -204,12 +224,18 @@ SYSTEMS = {"biconvex": lambda: biconvex(40.0, -60.0, 4.0), "prism": prism_and_le
 
 def folded() -> tuple[System, dict]:
     """A lens, a B-spline mirror of 45 degrees, and a screen at its side."""
-    elements = (Element("front", FIELD, FLAT, behind=Medium(N, 0.01), roughness=0.001),
-                Element("back", WIDE, Aperture((9.0, 9.0)), pose=Pose((0, 0, 4.0))),
-                Element("fold", HeightField(FIELD.spaces, (12.0, 12.0)), Aperture((12.0, 12.0)), "reflect",
-                        pose=Pose((0, 0, 20.0), (0.0, 45.0))))
-    heights = {"front": parabola(FIELD, 30.0), "back": parabola(WIDE, -45.0),
-               "fold": bumpy(FIELD, 0.02, 5) + parabola(elements[2].surface, 400.0)}
+    elements = (
+        Element("front", FIELD, FLAT, behind=Medium(N, 0.01), roughness=0.001),
+        Element("back", WIDE, Aperture((9.0, 9.0)), pose=Pose((0, 0, 4.0))),
+        Element(
+            "fold", HeightField(FIELD.spaces, (12.0, 12.0)), Aperture((12.0, 12.0)), "reflect", pose=Pose((0, 0, 20.0), (0.0, 45.0))
+        ),
+    )
+    heights = {
+        "front": parabola(FIELD, 30.0),
+        "back": parabola(WIDE, -45.0),
+        "fold": bumpy(FIELD, 0.02, 5) + parabola(elements[2].surface, 400.0),
+    }
     aside = Placed(Screen((20.0, 20.0), 0.0, (20, 20)), Pose((-40.0, 0, 20.0), (0, -90.0)))
     return System((PlaneWave(),), elements, (aside,)), heights
 
@@ -222,8 +248,11 @@ SYSTEMS["folded"] = folded
 def test_energy_closes(name, source):
     """Image + losses = 1 to 1e-12, with ghosts, secondary intersections and polarisation too."""
     system, heights = SYSTEMS[name]()
-    for light, requests in ((Light(), Requests()), (Light(30.0), Requests()),
-                            (Light(), Requests.to("ghosts", "secondary-intersection"))):
+    for light, requests in (
+        (Light(), Requests()),
+        (Light(30.0), Requests()),
+        (Light(), Requests.to("ghosts", "secondary-intersection")),
+    ):
         lit = System((source,), system.elements, system.screens, light)
         (image,) = render(lit, heights, 2000, Filter("cosine", (3, 3)), requests=requests)
         assert bool(torch.isfinite(image.image).all())
@@ -235,8 +264,10 @@ def test_energy_closes(name, source):
 def test_several_sources_and_wavelengths_add_up():
     """Two sources of powers 1 and 3 at two wavelengths: the sum of four images, weighted."""
     system, heights = biconvex(40.0, -60.0, 4.0)
-    elements = tuple(Element(e.name, e.surface, e.aperture, behind=Medium(1.5, glass="N-BK7") if k == 0 else e.behind, pose=e.pose)
-                     for k, e in enumerate(system.elements))
+    elements = tuple(
+        Element(e.name, e.surface, e.aperture, behind=Medium(1.5, glass="N-BK7") if k == 0 else e.behind, pose=e.pose)
+        for k, e in enumerate(system.elements)
+    )
     light, point = Light(wavelengths=(450.0, 650.0), weights=(1.0, 2.0)), Points(((0.0, 1.0, -80.0),), (3.0,))
     (whole,) = render(System((PlaneWave(1.0), point), elements, (SCREEN,), light), heights, 1000)
     parts = 0.0
@@ -285,9 +316,16 @@ def test_gradients_of_every_surface(name, stray):
 def test_polarised_light_through_two_surfaces():
     """Crossed polarisations average to what tracks both; a Brewster plate lets p pass whole."""
     brewster = math.degrees(math.atan(N))
-    plate = tuple(Element(name, Plane(), Aperture((5.0, 5.0) if name == "in" else (30.0, 30.0)), behind=behind,
-                          pose=Pose((0.0, 0.0, z), (0.0, brewster)))
-                  for name, behind, z in (("in", GLASS, 0.0), ("out", Medium(), 4.0)))
+    plate = tuple(
+        Element(
+            name,
+            Plane(),
+            Aperture((5.0, 5.0) if name == "in" else (30.0, 30.0)),
+            behind=behind,
+            pose=Pose((0.0, 0.0, z), (0.0, brewster)),
+        )
+        for name, behind, z in (("in", GLASS, 0.0), ("out", Medium(), 4.0))
+    )
     for angle, passed in ((0.0, 1.0), (90.0, 1.0 - ((N * N - 1) / (N * N + 1)) ** 2)):
         system = System((PlaneWave(),), plate, (SCREEN,), Light(angle))
         (out,) = trace(system, ray(0.0), {})
@@ -296,8 +334,9 @@ def test_polarised_light_through_two_surfaces():
 
 def test_ghosts_of_three_surfaces():
     """A plane-parallel plate behind another: the six pairs of surfaces return R^2 (1 - R)^k of the light."""
-    elements = tuple(Element(f"{k}", Plane(), FLAT, behind=GLASS if k % 2 == 0 else Medium(), pose=Pose((0, 0, 3.0 * k)))
-                     for k in range(4))
+    elements = tuple(
+        Element(f"{k}", Plane(), FLAT, behind=GLASS if k % 2 == 0 else Medium(), pose=Pose((0, 0, 3.0 * k))) for k in range(4)
+    )
     system, r = System((PlaneWave(),), elements, (SCREEN,)), 0.04
     straight, *ghosts = trace(system, ray(0.0), {}, requests=Requests.to("ghosts"))
     assert float(straight.power) == pytest.approx((1 - r) ** 4, rel=1e-12)
@@ -343,8 +382,10 @@ def test_nurbs_are_the_parametric_surface_and_b_splines_with_equal_weights():
         return System((PlaneWave(),), (Element("front", front, FLAT, behind=GLASS), back), (SCREEN,))
 
     lens = {"front": parabola(FIELD, 40.0) + 0.05 * heights}
-    (plain,), (equal,), (bent,) = (render(system(s), lens, 2000, Filter("cosine", (3, 3)))
-                                   for s in (FIELD, Nurbs(FIELD, torch.full(FIELD.shape, 2.0)), surface))
+    (plain,), (equal,), (bent,) = (
+        render(system(s), lens, 2000, Filter("cosine", (3, 3)))
+        for s in (FIELD, Nurbs(FIELD, torch.full(FIELD.shape, 2.0)), surface)
+    )
     torch.testing.assert_close(equal.image, plain.image, rtol=0, atol=1e-12)
     assert float((bent.image - plain.image).abs().sum()) > 1e-3
     assert float(bent.image.sum()) + sum(bent.lost.values()) == pytest.approx(1.0, abs=1e-12)
@@ -370,8 +411,10 @@ def test_gradient_of_a_nurbs():
 
 def test_a_wavelength_at_every_medium():
     """A glass between two indices: Snell's law at each wavelength, and none where the medium has one index."""
-    elements = (Element("in", Plane(), FLAT, behind=Medium(1.5, glass="N-SF11"), pose=Pose((0, 0, 0), (0.0, 20.0))),
-                Element("out", Plane(), Aperture((30.0, 30.0)), behind=Medium(1.33), pose=Pose((0, 0, 5.0))))
+    elements = (
+        Element("in", Plane(), FLAT, behind=Medium(1.5, glass="N-SF11"), pose=Pose((0, 0, 0), (0.0, 20.0))),
+        Element("out", Plane(), Aperture((30.0, 30.0)), behind=Medium(1.33), pose=Pose((0, 0, 5.0))),
+    )
     system = System((PlaneWave(),), elements, (SCREEN,))
     for line in (450.0, 650.0, None):
         (out,) = trace(system, ray(0.0), {}, wavelength=line)

@@ -12,6 +12,7 @@ from caustic_cli.scene import Screen
 
 def brute(irradiance: np.ndarray, size, screen: Screen) -> np.ndarray:
     """Area averages by intersecting every pixel with every cell."""
+
     def shared(n_pixels, width, n_cells, cells_width):
         out = np.zeros((n_pixels, n_cells))
         for p in range(n_pixels):

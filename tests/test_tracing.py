@@ -82,8 +82,11 @@ def test_landing_points_are_the_closed_form(kind, degree, index, bumps):
     for seed in range(3):
         heights = heights_of(scene, bumps, seed)
         sample = single_sample(kind, (40, 30), seed)
-        u, v = ((a.reshape(-1).numpy() for a in torch.meshgrid(sample.u, sample.v, indexing="ij")) if sample.tensor
-                else (sample.u.numpy(), sample.v.numpy()))
+        u, v = (
+            (a.reshape(-1).numpy() for a in torch.meshgrid(sample.u, sample.v, indexing="ij"))
+            if sample.tensor
+            else (sample.u.numpy(), sample.v.numpy())
+        )
         x, y, square = closed_form(scene, heights, u, v)
         landing = land(scene, heights, sample)
         status = landing.statuses().numpy()
@@ -312,8 +315,9 @@ def test_mirrored_heights_give_the_mirrored_image():
 
 def test_exchanging_x_and_y_transposes_the_image():
     scene = scene_of()
-    turned = Scene(scene.source, replace(scene.lens, size=(8.0, 10.0), control=(7, 9), degree=(2, 3)),
-                   Screen((9.0, 12.0), 60.0, (11, 16)))
+    turned = Scene(
+        scene.source, replace(scene.lens, size=(8.0, 10.0), control=(7, 9), degree=(2, 3)), Screen((9.0, 12.0), 60.0, (11, 16))
+    )
     heights = heights_of(scene, 0.3)
     image = expose(scene, HeightField.of(scene.lens), heights, Sampler("grid", (32, 64)), Filter("cosine", (5, 3))).image
     other = expose(turned, HeightField.of(turned.lens), heights.T, Sampler("grid", (64, 32)), Filter("cosine", (3, 5))).image

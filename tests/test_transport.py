@@ -99,8 +99,9 @@ def test_gaussian_to_gaussian():
     assert np.abs(found.y - 1.5 * y)[core].max() < 0.15
 
 
-@pytest.mark.parametrize("target", [flame(), smooth(), np.random.default_rng(1).random((33, 70)) ** 4],
-                         ids=["flame", "smooth", "rough"])
+@pytest.mark.parametrize(
+    "target", [flame(), smooth(), np.random.default_rng(1).random((33, 70)) ** 4], ids=["flame", "smooth", "rough"]
+)
 def test_convex_and_the_map_is_its_gradient(target):
     found = solve(target)
     z = found.potential
@@ -189,16 +190,27 @@ def bad(value):
     return out
 
 
-@pytest.mark.parametrize("call", [
-    lambda: solve(np.zeros((5, 5))), lambda: solve(np.ones(5)), lambda: solve(bad(np.nan)), lambda: solve(bad(-1.0)),
-    lambda: solve(np.ones((0, 4))), lambda: solve(np.ones((4, 4)), source=bad(np.inf)), lambda: solve(np.ones((4, 4)), smooth=0.1),
-    lambda: solve(np.ones((4, 4)), half=(C, 0.0)), lambda: solve(np.ones((4, 4)), half=(C,)),
-    lambda: solve(np.ones((4, 4)), half="x"),
-    lambda: solve(np.ones((4, 4)), start=np.zeros((4, 4))),
-    lambda: surface(np.ones((4, 4)), index=0.9), lambda: surface(np.ones((4, 4)), z_screen=4.0),
-    lambda: surface(np.ones((4, 4)), directions=(np.zeros((65, 65)),) * 3), lambda: surface(np.ones((4, 4)), directions=(1.0, 2.0)),
-    lambda: surface(np.ones((4, 4)), half=(800.0, 800.0)),
-])
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: solve(np.zeros((5, 5))),
+        lambda: solve(np.ones(5)),
+        lambda: solve(bad(np.nan)),
+        lambda: solve(bad(-1.0)),
+        lambda: solve(np.ones((0, 4))),
+        lambda: solve(np.ones((4, 4)), source=bad(np.inf)),
+        lambda: solve(np.ones((4, 4)), smooth=0.1),
+        lambda: solve(np.ones((4, 4)), half=(C, 0.0)),
+        lambda: solve(np.ones((4, 4)), half=(C,)),
+        lambda: solve(np.ones((4, 4)), half="x"),
+        lambda: solve(np.ones((4, 4)), start=np.zeros((4, 4))),
+        lambda: surface(np.ones((4, 4)), index=0.9),
+        lambda: surface(np.ones((4, 4)), z_screen=4.0),
+        lambda: surface(np.ones((4, 4)), directions=(np.zeros((65, 65)),) * 3),
+        lambda: surface(np.ones((4, 4)), directions=(1.0, 2.0)),
+        lambda: surface(np.ones((4, 4)), half=(800.0, 800.0)),
+    ],
+)
 def test_bad_input_is_one_sentence(call):
     with pytest.raises(InputError) as caught:
         call()

@@ -19,9 +19,15 @@ from caustic_cli.scene import Disc, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies import verify
 
 RAYS = 400_000
-SOURCES = [PlaneWave(), PlaneWave(profile=np.array([[1.0, 2.0], [0.5, 3.0]])), Points(((1.0, -0.5, -60.0),)),
-           Points.grid((0.0, 0.0, -80.0), (2.0, 3.0), (2, 3), intensity="lambertian"), Disc((0.5, 0.0, -60.0), (2.0, 3.0)),
-           Disc((0.0, 0.0, -60.0), intensity="uniform", cone=4.0), Disc(angle=0.5)]
+SOURCES = [
+    PlaneWave(),
+    PlaneWave(profile=np.array([[1.0, 2.0], [0.5, 3.0]])),
+    Points(((1.0, -0.5, -60.0),)),
+    Points.grid((0.0, 0.0, -80.0), (2.0, 3.0), (2, 3), intensity="lambertian"),
+    Disc((0.5, 0.0, -60.0), (2.0, 3.0)),
+    Disc((0.0, 0.0, -60.0), intensity="uniform", cone=4.0),
+    Disc(angle=0.5),
+]
 NAMES = ["plane", "profile", "point", "grid", "disc", "disc with a cone", "sun"]
 
 
@@ -57,8 +63,10 @@ def test_noise_agrees():
     assert decision.z.shape == picture().shape
 
 
-@pytest.mark.parametrize("fault", [lambda a: a[::-1], lambda a: a[:, ::-1], lambda a: np.roll(a, 1, 0), lambda a: a**1.1,
-                                   lambda a: a + 0.5 * np.eye(30, 24)])
+@pytest.mark.parametrize(
+    "fault",
+    [lambda a: a[::-1], lambda a: a[:, ::-1], lambda a: np.roll(a, 1, 0), lambda a: a**1.1, lambda a: a + 0.5 * np.eye(30, 24)],
+)
 def test_faults_do_not(fault):
     assert not judged(picture(), fault(picture())).agree
 
@@ -129,8 +137,11 @@ def test_mitsuba_agrees(mitsuba, tmp_path, source, capsys):
     write_mitsuba(tmp_path / "lens.xml", scene, field, heights, (129, 129), dark=True)
     decision = verify.verify(tmp_path / "lens.xml", scene, field, heights, RAYS)
     with capsys.disabled():
-        print(f"\n  {source.kind if hasattr(source, 'kind') else 'plane'}: mean Z^2 {decision.figures['z_mean_square']:.3f},"
-              f" light {decision.figures['on_screen']:.5f} and {decision.figures['on_screen_render']:.5f}", end="")
+        print(
+            f"\n  {source.kind if hasattr(source, 'kind') else 'plane'}: mean Z^2 {decision.figures['z_mean_square']:.3f},"
+            f" light {decision.figures['on_screen']:.5f} and {decision.figures['on_screen_render']:.5f}",
+            end="",
+        )
     assert decision.agree, decision.figures
     verify.write_panels(tmp_path / "verify.png", decision, scene)
     assert (tmp_path / "verify.png").read_bytes()[1:4] == b"PNG"

@@ -30,8 +30,13 @@ SMALL = ["--lens-size", "2", "--throw", "60", "--mag", "2", "--resolution", "32"
 
 
 def scene_of(source=None, **lens) -> Scene:
-    given = {"size": (2.0, 2.0), "control": (19, 19), "offset": Offset(1.5, (16.0, 16.0)), "height_range": (-0.3, 0.3),
-             "min_thickness": 0.5}
+    given = {
+        "size": (2.0, 2.0),
+        "control": (19, 19),
+        "offset": Offset(1.5, (16.0, 16.0)),
+        "height_range": (-0.3, 0.3),
+        "min_thickness": 0.5,
+    }
     return Scene(source or PlaneWave(), Lens(**(given | lens)), Screen((5.0, 5.0), 60.0, (32, 32)), lens.pop("light", Light()))
 
 
@@ -119,8 +124,9 @@ def test_blur_and_details():
     seen = Resolution(0.7036, 0.0, 0.12, 30.0, 10.0)
     assert seen.resolvable == 43 and seen.matters
     assert seen.lens_for_all() == pytest.approx(58.6, abs=0.1)
-    assert seen.sentence() == ("light carries about 43 x 43 details here (diffraction 0.7 mm, source 0 mm, pixel 0.12 mm);"
-                               " a lens of 59 mm would carry 250")
+    assert seen.sentence() == (
+        "light carries about 43 x 43 details here (diffraction 0.7 mm, source 0 mm, pixel 0.12 mm); a lens of 59 mm would carry 250"
+    )
     assert not Resolution(0.7, 2.8, 0.12, 30.0, 10.0).matters  # the sun washes it out
     assert not Resolution(0.01, 0.0, 0.12, 30.0, 10.0).matters
     assert Resolution(0.01, 0.0, 0.12, 30.0, 10.0).resolvable == 250
@@ -134,9 +140,18 @@ def test_local_magnification_is_that_of_the_map():
     assert local_magnification(scene, HeightField.of(scene.lens), heights) == pytest.approx(1 + 58.5 * 0.5443 / 16.0, rel=0.02)
 
 
-@pytest.mark.parametrize(("extra", "stages"), [([], True), (["--waves", "off"], False), (["--resolution", "4"], False),
-                                               (["--resolution", "4", "--waves", "on"], True), (["--source-angle", "3"], False),
-                                               (["--network", "sparse"], False), (["--screen-tilt", "0,10"], False)])
+@pytest.mark.parametrize(
+    ("extra", "stages"),
+    [
+        ([], True),
+        (["--waves", "off"], False),
+        (["--resolution", "4"], False),
+        (["--resolution", "4", "--waves", "on"], True),
+        (["--source-angle", "3"], False),
+        (["--network", "sparse"], False),
+        (["--screen-tilt", "0,10"], False),
+    ],
+)
 def test_auto_is_by_the_scene(extra, stages, _here, capfd, monkeypatch):
     from caustic_cli.workflow import design as workflow  # noqa: PLC0415
 
@@ -151,14 +166,20 @@ def test_auto_is_by_the_scene(extra, stages, _here, capfd, monkeypatch):
 OWN = "[[design.stages]]\ncontrol = [19, 19]\nrays = 4096\niterations = 1\n"
 
 
-@pytest.mark.parametrize(("extra", "reason"), [
-    ([], ""), (["--waves", "off"], ""), (["--resolution", "4"], ""), (["--source-angle", "3"], ""),
-    (["--network", "sparse"], "a network is trained on rays alone; --network none refines it"),
-    (["--optimizer", "adam"], "adam was asked for, and the wave image takes lbfgs; --waves on adds"),
-    (["--screen-tilt", "0,10"], "on a tilted screen it takes many transforms for each wavelength; --waves on"),
-    (["--quality", "fine"], "5 iterations on it would take longer than this quality's time; --waves on"),
-    (["--config", "own.toml", "--control", "19"], "none of the given [[design.stages]] has waves; one with waves = [550.0]"),
-])
+@pytest.mark.parametrize(
+    ("extra", "reason"),
+    [
+        ([], ""),
+        (["--waves", "off"], ""),
+        (["--resolution", "4"], ""),
+        (["--source-angle", "3"], ""),
+        (["--network", "sparse"], "a network is trained on rays alone; --network none refines it"),
+        (["--optimizer", "adam"], "adam was asked for, and the wave image takes lbfgs; --waves on adds"),
+        (["--screen-tilt", "0,10"], "on a tilted screen it takes many transforms for each wavelength; --waves on"),
+        (["--quality", "fine"], "5 iterations on it would take longer than this quality's time; --waves on"),
+        (["--config", "own.toml", "--control", "19"], "none of the given [[design.stages]] has waves; one with waves = [550.0]"),
+    ],
+)
 def test_what_is_said_before_a_design(extra, reason, _here, capfd, monkeypatch):
     """One line on what light carries; one more where the wave image is left out although it matters, of why."""
     from caustic_cli.workflow import design as workflow  # noqa: PLC0415
@@ -176,8 +197,10 @@ def test_what_is_said_before_a_design(extra, reason, _here, capfd, monkeypatch):
     assert after == said[carried[0] + 1 : carried[0] + 2] and reason in after[0] if reason else not after
 
 
-@pytest.mark.parametrize(("waves", "own", "words"), [("on", {}, "none of them has waves"), ("maybe", {}, "auto, on, off"),
-                                                     ("off", {"waves": [550.0]}, "one of them has waves")])
+@pytest.mark.parametrize(
+    ("waves", "own", "words"),
+    [("on", {}, "none of them has waves"), ("maybe", {}, "auto, on, off"), ("off", {"waves": [550.0]}, "one of them has waves")],
+)
 def test_waves_and_own_stages_that_contradict_each_other(waves, own, words):
     with pytest.raises(InputError, match=words):
         completion.complete({"design": {"waves": waves, "stages": [{"rays": 100} | own]}}, 1.0)
@@ -244,8 +267,10 @@ def _render(capfd, project, *options) -> str:
 
 def test_resumed_within_a_wave_stage(_here, capfd):
     """Ten and ten iterations are twenty, bitwise, where the wave image is refined from the twelfth on."""
-    Path("two.toml").write_text("[lens]\ncontrol = [19, 19]\n[[design.stages]]\ncontrol = [19, 19]\nrays = 4096\niterations = 6\n"
-                                "[[design.stages]]\ncontrol = [19, 19]\nwaves = [500.0, 600.0]\niterations = 20\n")
+    Path("two.toml").write_text(
+        "[lens]\ncontrol = [19, 19]\n[[design.stages]]\ncontrol = [19, 19]\nrays = 4096\niterations = 6\n"
+        "[[design.stages]]\ncontrol = [19, 19]\nwaves = [500.0, 600.0]\niterations = 20\n"
+    )
     options = [*SMALL, "--config", "two.toml"]
     design(capfd, "blob.png", *options, "--iterations", 16, "-o", "whole")
     design(capfd, "blob.png", *options, "--iterations", 11, "-o", "parts")
@@ -282,6 +307,7 @@ def test_limits_are_kept(_here, capfd):
 
 def test_light_without_a_wave_image(_here, capfd, monkeypatch):
     """Auto does without and says so; on is an error of one line."""
+
     def refuse(*args, **kwargs):
         raise NoWaveImage("light crosses itself")
 

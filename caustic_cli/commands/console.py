@@ -95,14 +95,23 @@ class Reporter:
 
             yield tell
             return
-        bar = Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
-                       TextColumn("{task.fields[text]}"), TimeElapsedColumn(), TextColumn("left"),
-                       TimeRemainingColumn(), console=self.console, transient=True,
-                       disable=not self.console.is_terminal or self.console.quiet)
+        bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[text]}"),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+            console=self.console,
+            transient=True,
+            disable=not self.console.is_terminal or self.console.quiet,
+        )
         with bar:
             task = bar.add_task("", total=total, text="")
             yield lambda description="", text="", done=None, whole=None: bar.update(
-                task, description=description, text=text, completed=done, total=whole)
+                task, description=description, text=text, completed=done, total=whole
+            )
 
 
 #: The options by which this run was told of settings, by their path.
@@ -122,6 +131,7 @@ def speak(options: dict[str, str]) -> None:
 
 def named(text: str) -> str:
     """A text whose marked settings are called by the options that said them, and parameters by their options."""
+
     def name(path: str) -> str:
         return _spoken.get(path) or (plain_name(path) if "." in path else "--" + path.replace("_", "-"))
 
@@ -158,12 +168,17 @@ def _absolute(figures: dict, prefix: str) -> list[tuple[str, str]]:
     if figures.get(f"{prefix}peak_irradiance") is None:
         return []
     unit = figures["irradiance_unit"]
-    return [("illuminance" if unit == "lux" else "irradiance",
-             f"peak {figures[prefix + 'peak_irradiance']:.4g} {unit}, mean {figures[prefix + 'mean_irradiance']:.4g} {unit}")]
+    return [
+        (
+            "illuminance" if unit == "lux" else "irradiance",
+            f"peak {figures[prefix + 'peak_irradiance']:.4g} {unit}, mean {figures[prefix + 'mean_irradiance']:.4g} {unit}",
+        )
+    ]
 
 
 def figures_rows(figures: dict) -> list[tuple[str, str]]:
     """The JSON figures as a person reads them."""
+
     def number(key: str, form: str) -> str:
         value = figures.get(key)
         return "-" if value is None else format(value, form)
@@ -181,11 +196,16 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
         seen = f"relative RMS error {number('wave_relative_rms', '.4f')}, on the picture {number('wave_on_target', '.2%')}"
         if figures["wave_relative_rms"] is None:  # an archive has no picture to be like
             seen = f"on the screen {number('wave_on_screen', '.2%')}"
-        waves = [("of light as a wave", f"{seen}, {_wavelengths(figures['wave_wavelengths'])}"),
-                 *((f"{name} as a wave", value) for name, value in _absolute(figures, "wave_")),
-                 ("details light carries", number("resolvable", "d") + " across")]
-    least = [("least possible", number("least_relative_rms", ".4f") + ", behind the source's blur")] \
-        if "least_relative_rms" in figures else []
+        waves = [
+            ("of light as a wave", f"{seen}, {_wavelengths(figures['wave_wavelengths'])}"),
+            *((f"{name} as a wave", value) for name, value in _absolute(figures, "wave_")),
+            ("details light carries", number("resolvable", "d") + " across"),
+        ]
+    least = (
+        [("least possible", number("least_relative_rms", ".4f") + ", behind the source's blur")]
+        if "least_relative_rms" in figures
+        else []
+    )
     if "etendue_limit" in figures:
         least.append(("etendue limit", number("etendue_limit", ".2%") + " of the light on the lens"))
     return [

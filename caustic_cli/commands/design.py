@@ -22,13 +22,21 @@ EXAMPLES = """Examples:
 
 @options.from_table("design")
 def run(
-    target: Annotated[Path, typer.Argument(metavar="TARGET", help="The picture: an image file or a 2-D .npy of irradiance;"
-                                           " with --resume, the project.", show_default=False)],
+    target: Annotated[
+        Path,
+        typer.Argument(
+            metavar="TARGET",
+            help="The picture: an image file or a 2-D .npy of irradiance; with --resume, the project.",
+            show_default=False,
+        ),
+    ],
     given: dict[str, Any],
     config: Annotated[Path | None, typer.Option(metavar="FILE", help="TOML with any keys of project.toml; options win.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the project TARGET from its last checkpoint.")] = False,
-    out: Annotated[Path | None, typer.Option("-o", "--out", metavar="DIR", help="Project directory."
-                                             "  [default: TARGET's stem + .caustic, here]")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("-o", "--out", metavar="DIR", help="Project directory.  [default: TARGET's stem + .caustic, here]"),
+    ] = None,
     force: options.Force = False,
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -48,8 +56,10 @@ def run(
     if time_limit is not None and not time_limit > 0:
         raise InputError(f"--time-limit must be greater than 0 s, got {time_limit:g}")
     if resume and (names := _beside_resume(given, config)):
-        raise InputError(f"--resume goes on with a project as it is, so {', '.join(names)} cannot be given;"
-                         " --iterations and --time-limit can, and project.toml can be edited")
+        raise InputError(
+            f"--resume goes on with a project as it is, so {', '.join(names)} cannot be given;"
+            " --iterations and --time-limit can, and project.toml can be edited"
+        )
     if "source.angle" in given:
         given.setdefault("source.type", "disc")
     if given.get("design.network") in ("sparse", "dense"):

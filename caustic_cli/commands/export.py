@@ -18,18 +18,35 @@ EXAMPLES = """Examples:
   caustic export flame.caustic --format stl --tolerance 0.0001 -o flame.stl
 """
 
+
 def run(
     project: options.Project,
-    format: Annotated[str, typer.Option("--format", help="; ".join(f"{name} ({suffix}, {what})" for name, (suffix, _, what)
-                                                                   in FORMATS.items()) + ".")] = "lighttools",
-    output: Annotated[Path | None, typer.Option("-o", "--out", metavar="FILE", help="File to write."
-                                                "  [default: PROJECT's name + the format's suffix, here]")] = None,
-    samples: Annotated[str | None, typer.Option(metavar="N[xM]", help="Points along x and y.  [default: 4 a knot span, so"
-                                                " that every knot is a grid line]")] = None,
-    tolerance: Annotated[float | None, typer.Option(metavar="MM", help="stl, ply, obj, mitsuba: as many points as keep every"
-                                                    " triangle so close to the surface, instead of --samples.")] = None,
-    script: Annotated[bool, typer.Option("--script", help="lighttools: also write a Python script for its COM interface and an"
-                                         " .lts point block that rebuild the scene.")] = False,
+    format: Annotated[
+        str,
+        typer.Option("--format", help="; ".join(f"{name} ({suffix}, {what})" for name, (suffix, _, what) in FORMATS.items()) + "."),
+    ] = "lighttools",
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--out", metavar="FILE", help="File to write.  [default: PROJECT's name + the format's suffix, here]"),
+    ] = None,
+    samples: Annotated[
+        str | None,
+        typer.Option(metavar="N[xM]", help="Points along x and y.  [default: 4 a knot span, so that every knot is a grid line]"),
+    ] = None,
+    tolerance: Annotated[
+        float | None,
+        typer.Option(
+            metavar="MM",
+            help="stl, ply, obj, mitsuba: as many points as keep every triangle so close to the surface, instead of --samples.",
+        ),
+    ] = None,
+    script: Annotated[
+        bool,
+        typer.Option(
+            "--script",
+            help="lighttools: also write a Python script for its COM interface and an .lts point block that rebuild the scene.",
+        ),
+    ] = False,
     force: options.Force = False,
     json: options.Json = False,
     quiet: options.Quiet = False,

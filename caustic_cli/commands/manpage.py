@@ -148,8 +148,16 @@ are several sources; several tables
 are the stages of a design, one after another.
 """
 #: How a kind of setting is written.
-KINDS = {"number": "number", "whole": "whole number", "text": "text", "flag": "true or false", "numbers": "[x, y]",
-         "wholes": "[x, y], whole numbers", "list": "list of numbers", "points": "[x, y, z], or a list of such"}
+KINDS = {
+    "number": "number",
+    "whole": "whole number",
+    "text": "text",
+    "flag": "true or false",
+    "numbers": "[x, y]",
+    "wholes": "[x, y], whole numbers",
+    "list": "list of numbers",
+    "points": "[x, y, z], or a list of such",
+}
 
 
 def reference() -> str:
@@ -165,16 +173,23 @@ def reference() -> str:
 
 def _setting(row: Setting) -> str:
     low, high = (("" if math.isinf(v) else f"{v:g}") for v in (row.low, row.high))
-    bounds = f"{'greater than' if row.above else 'at least'} {low}" * bool(low) + " and " * bool(low and high) + \
-        f"at most {high}" * bool(high)
+    bounds = (
+        f"{'greater than' if row.above else 'at least'} {low}" * bool(low)
+        + " and " * bool(low and high)
+        + f"at most {high}" * bool(high)
+    )
     if row.choices:
         bounds = "one of " + ", ".join(choice or '""' for choice in row.choices)
     start = default_words(row)
-    facts = [f"{KINDS[row.kind]}{f', {row.unit}' if row.unit else ''}{f', {bounds}' if bounds else ''}.",
-             f"Default: {start}{f' ({row.why})' if row.why else ''}." if start != "none" or row.why else "",
-             f"Option: {row.option.name}." if row.option else ""]
-    return (f".TP\n\\fB{_plain(row.key)}\\fR\n{_plain(row.help[0].upper() + row.help[1:])}.\n.br\n"
-            f"{_plain(' '.join(filter(None, facts)))}\n")
+    facts = [
+        f"{KINDS[row.kind]}{f', {row.unit}' if row.unit else ''}{f', {bounds}' if bounds else ''}.",
+        f"Default: {start}{f' ({row.why})' if row.why else ''}." if start != "none" or row.why else "",
+        f"Option: {row.option.name}." if row.option else "",
+    ]
+    return (
+        f".TP\n\\fB{_plain(row.key)}\\fR\n{_plain(row.help[0].upper() + row.help[1:])}.\n.br\n"
+        f"{_plain(' '.join(filter(None, facts)))}\n"
+    )
 
 
 def pages() -> dict[str, str]:
@@ -185,13 +200,18 @@ def pages() -> dict[str, str]:
 
 def _page(name: str, command) -> str:
     summary = _plain((command.help or "").split(".")[0])
-    examples = "\n".join(line.strip().replace("\\", "\\e").replace("-", "\\-") for line in (command.epilog or "").splitlines()
-                         if line.strip().startswith("caustic"))
+    examples = "\n".join(
+        line.strip().replace("\\", "\\e").replace("-", "\\-")
+        for line in (command.epilog or "").splitlines()
+        if line.strip().startswith("caustic")
+    )
     options = _command(name, command).split("\n", 2)[2]
-    return (f'.TH CAUSTIC-{name.upper()} 1 "" "caustic {__version__}" "User Commands"\n.SH NAME\ncaustic\\-{name} \\- {summary}\n'
-            f".SH SYNOPSIS\n.B caustic {name}\n{_plain(_usage(command))} [OPTIONS]\n.SH DESCRIPTION\n{_plain(command.help or '')}\n"
-            f".SH OPTIONS\n{options}.SH EXAMPLES\n.nf\n{examples}\n.fi\n.SH SEE ALSO\n.BR caustic (1)\n"
-            "tells of files, orientation, exit status and environment.\n")
+    return (
+        f'.TH CAUSTIC-{name.upper()} 1 "" "caustic {__version__}" "User Commands"\n.SH NAME\ncaustic\\-{name} \\- {summary}\n'
+        f".SH SYNOPSIS\n.B caustic {name}\n{_plain(_usage(command))} [OPTIONS]\n.SH DESCRIPTION\n{_plain(command.help or '')}\n"
+        f".SH OPTIONS\n{options}.SH EXAMPLES\n.nf\n{examples}\n.fi\n.SH SEE ALSO\n.BR caustic (1)\n"
+        "tells of files, orientation, exit status and environment.\n"
+    )
 
 
 def _usage(command) -> str:

@@ -20,16 +20,25 @@ Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON objec
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", envvar="CAUSTIC_QUIET", help="Say nothing on stderr but errors.")]
 Debug = Annotated[bool, typer.Option("--debug", envvar="CAUSTIC_DEBUG", help="Show the traceback of an error.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace what is in the way.")]
-Seed = Annotated[int | None, typer.Option(envvar="CAUSTIC_SEED", help="Seed of every random number; the same seed gives the same"
-                                          " bytes.  [default: 0]")]
+Seed = Annotated[
+    int | None,
+    typer.Option(envvar="CAUSTIC_SEED", help="Seed of every random number; the same seed gives the same bytes.  [default: 0]"),
+]
 Device = Annotated[str, typer.Option(envvar="CAUSTIC_DEVICE", help="auto, cpu or cuda.")]
-Dtype = Annotated[str | None, typer.Option(envvar="CAUSTIC_DTYPE", help="Precision of the rays: float32 or float64. The CPU's"
-                                           " kernels are float64 always.")]
+Dtype = Annotated[
+    str | None,
+    typer.Option(envvar="CAUSTIC_DTYPE", help="Precision of the rays: float32 or float64. The CPU's kernels are float64 always."),
+]
 Threads = Annotated[int | None, typer.Option(envvar="CAUSTIC_THREADS", help="Threads to use; default: all cores.")]
-Progress = Annotated[str, typer.Option(envvar="CAUSTIC_PROGRESS", metavar="auto|json", help="json: everything on stderr but errors"
-                                       " is JSON, one object a line, and the work's progress is among it.")]
+Progress = Annotated[
+    str,
+    typer.Option(
+        envvar="CAUSTIC_PROGRESS",
+        metavar="auto|json",
+        help="json: everything on stderr but errors is JSON, one object a line, and the work's progress is among it.",
+    ),
+]
 Project = Annotated[Path, typer.Argument(help="Project directory made by caustic design.", show_default=False)]
-
 
 
 def from_table(command: str):
@@ -55,8 +64,11 @@ def from_table(command: str):
 
         parameters = []
         for name, parameter in own.items():
-            parameters += map(_parameter, rows, rows.values()) if name == "given" else \
-                [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)]
+            parameters += (
+                map(_parameter, rows, rows.values())
+                if name == "given"
+                else [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)]
+            )
         run.__signature__ = inspect.Signature(parameters)
         run.__annotations__ = {p.name: p.annotation for p in parameters}
         run.__doc__, run.__name__ = body.__doc__, body.__name__
@@ -129,8 +141,10 @@ def _spectrum(option: str, text: str) -> dict[str, Any]:
     """Wavelengths and their weights: "450:2,550"."""
     form = "wavelengths in nm, each with a weight or without, like 450:2,550"
     lines = [numbers(option, part, (1, 2), ":", form) for part in text.split(",")]
-    return {"source.wavelengths": [line[0] for line in lines],
-            "source.weights": [line[1] if len(line) == 2 else 1.0 for line in lines]}
+    return {
+        "source.wavelengths": [line[0] for line in lines],
+        "source.weights": [line[1] if len(line) == 2 else 1.0 for line in lines],
+    }
 
 
 def _power(option: str, text: str) -> dict[str, Any]:
@@ -161,8 +175,9 @@ COMMON = {row.option.name.lstrip("-"): row for row in table.TABLE.values() if ro
 UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
 
 
-def numbers(option: str, text: str, count: tuple[int, ...], separator: str = r"[xX×]", form: str = "",
-            unit: str = "") -> tuple[float, ...]:
+def numbers(
+    option: str, text: str, count: tuple[int, ...], separator: str = r"[xX×]", form: str = "", unit: str = ""
+) -> tuple[float, ...]:
     """Numbers parted by x ("10x8") or by what `separator` matches; `form` says what would be accepted.
 
     unit: mm for lengths, which may say another unit, the last one for all that say none: "10x8cm".
@@ -206,8 +221,9 @@ def power(option: str, text: str) -> tuple[float, str]:
     except ValueError:  # of two points
         value = math.nan
     if not 0 < value <= checks.POWER:
-        raise InputError(f"{option} must be a number greater than 0 and at most {checks.POWER:g}, of W or lm, like 2W or 100lm,"
-                         f" got {text!r}")
+        raise InputError(
+            f"{option} must be a number greater than 0 and at most {checks.POWER:g}, of W or lm, like 2W or 100lm, got {text!r}"
+        )
     return value, found[2] or "W"
 
 

@@ -20,33 +20,64 @@ EXAMPLES = """Examples:
 
 @options.from_table("render")
 def run(
-    project: Annotated[Path, typer.Argument(help="Project directory made by caustic design, or an .npz made by caustic export.",
-                                            show_default=False)],
+    project: Annotated[
+        Path,
+        typer.Argument(help="Project directory made by caustic design, or an .npz made by caustic export.", show_default=False),
+    ],
     given: dict[str, Any],
     rays: Annotated[str, typer.Option(metavar="N", help="Number of rays, independent of those of the design.")] = "1000000",
-    tolerance: Annotated[float | None, typer.Option(metavar="ERROR", help="Add rays until the image's noise, estimated,"
-                                                    " is below this relative RMS; --rays is where it begins.")] = None,
-    reconstruction: Annotated[str, typer.Option(help="bincount, gaussian or cosine; the figures are always by bincount.")]
-    = "bincount",
+    tolerance: Annotated[
+        float | None,
+        typer.Option(
+            metavar="ERROR",
+            help="Add rays until the image's noise, estimated, is below this relative RMS; --rays is where it begins.",
+        ),
+    ] = None,
+    reconstruction: Annotated[
+        str, typer.Option(help="bincount, gaussian or cosine; the figures are always by bincount.")
+    ] = "bincount",
     filter_size: Annotated[str, typer.Option(metavar="V[xW]", help="Filter size, odd, pixels.")] = "3",
     alpha: Annotated[float | None, typer.Option(help="Of the gaussian, 1/mm^2.  [default: 1 per pixel^2]")] = None,
     screen_at: Annotated[float | None, typer.Option(metavar="Z", help="Put the screen here instead, mm.")] = None,
-    effects: Annotated[str, typer.Option(metavar="auto|none|NAME[,NAME...]", help="Effects to simulate: what the scene calls"
-                                         " for, none that can be left out, or just these (--explain lists them).")] = "auto",
-    explain: Annotated[bool, typer.Option("--explain", help="Show which effects are simulated, why, what each costs, and what"
-                                          " leaving it out does.")] = False,
-    output: Annotated[Path | None, typer.Option("-o", "--out", metavar="PNG",
-                                                help="Image to write.  [default: render.png in PROJECT]")] = None,
-    npy: Annotated[Path | None, typer.Option(metavar="FILE", help="Also write the irradiance: power per pixel as a part "
-                                             "of the source's, float64, [i, j].")] = None,
-    verify: Annotated[str | None, typer.Option(metavar="mitsuba", help="Trace the same lens in Mitsuba 3 (pip install"
-                                               " 'caustic-cli[verify]') with as many rays and compare, pixel by pixel; writes"
-                                               " verify.png beside the image.  Exit status 1 if they disagree.")] = None,
-    report: Annotated[bool, typer.Option("--report", help="Also say what making the lens asks for: wall, stock, slopes, concave"
-                                         " radius, margin to internal reflection, sharpness, tolerances; writes report.json"
-                                         " beside the image.")] = False,
-    tool_radius: Annotated[float | None, typer.Option(metavar="MM", help="Radius of the tool that --report tries in concave"
-                                                      " places.")] = None,
+    effects: Annotated[
+        str,
+        typer.Option(
+            metavar="auto|none|NAME[,NAME...]",
+            help="Effects to simulate: what the scene calls for, none that can be left out, or just these (--explain lists them).",
+        ),
+    ] = "auto",
+    explain: Annotated[
+        bool,
+        typer.Option("--explain", help="Show which effects are simulated, why, what each costs, and what leaving it out does."),
+    ] = False,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--out", metavar="PNG", help="Image to write.  [default: render.png in PROJECT]")
+    ] = None,
+    npy: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Also write the irradiance: power per pixel as a part of the source's, float64, [i, j]."),
+    ] = None,
+    verify: Annotated[
+        str | None,
+        typer.Option(
+            metavar="mitsuba",
+            help="Trace the same lens in Mitsuba 3 (pip install"
+            " 'caustic-cli[verify]') with as many rays and compare, pixel by pixel; writes"
+            " verify.png beside the image.  Exit status 1 if they disagree.",
+        ),
+    ] = None,
+    report: Annotated[
+        bool,
+        typer.Option(
+            "--report",
+            help="Also say what making the lens asks for: wall, stock, slopes, concave"
+            " radius, margin to internal reflection, sharpness, tolerances; writes report.json"
+            " beside the image.",
+        ),
+    ] = False,
+    tool_radius: Annotated[
+        float | None, typer.Option(metavar="MM", help="Radius of the tool that --report tries in concave places.")
+    ] = None,
     force: options.Force = False,
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -80,8 +111,26 @@ def run(
 
     from caustic_cli.workflow.render import Request, render  # noqa: PLC0415
 
-    asked = Request(project, count, tolerance, reconstruction, size, alpha, given, screen_at, effects, explain, output, npy,
-                    verify is not None, report, tool_radius, force, seed, options.dtype_of(dtype or "float64"))
+    asked = Request(
+        project,
+        count,
+        tolerance,
+        reconstruction,
+        size,
+        alpha,
+        given,
+        screen_at,
+        effects,
+        explain,
+        output,
+        npy,
+        verify is not None,
+        report,
+        tool_radius,
+        force,
+        seed,
+        options.dtype_of(dtype or "float64"),
+    )
     try:
         figures = render(asked, device, say)
     except InputError as error:
@@ -107,12 +156,18 @@ def _show(title: str, figures: dict, say: console.Reporter) -> None:
         say.table("making the lens", rows(figures["report"]))
     if "verify" in figures:
         f = figures["verify"]
-        say.table(f"Mitsuba {f['mitsuba']}, {f['variant']}", [
-            ("decision", "agree" if f["agree"] else "DISAGREE"),
-            ("mean Z^2, beyond 3, largest", f"{f['z_mean_square']:.3f}, {f['z_beyond_3']:.2%}, {f['z_largest']:.2f}"
-                                            "  (of noise: 1, 0.27%, 4)"),
-            ("judged", f"{f['pixels']:,} of {f['pixel_side']} x {f['pixel_side']} pixels, {f['noise']:.1%} noise each"),
-            ("relative RMS beyond noise", f"{f['relative_rms_beyond_noise']:.4f} of {f['relative_rms']:.4f}"),
-            ("light on the screen", f"{f['on_screen']:.6f}, render {f['on_screen_render']:.6f} ({f['light_z']:.1f} sigma)"),
-            ("correlation, and turned", f"{f['correlation']:.5f}, {f['correlation_turned']:.5f}"),
-            ("image", f["image"])])
+        say.table(
+            f"Mitsuba {f['mitsuba']}, {f['variant']}",
+            [
+                ("decision", "agree" if f["agree"] else "DISAGREE"),
+                (
+                    "mean Z^2, beyond 3, largest",
+                    f"{f['z_mean_square']:.3f}, {f['z_beyond_3']:.2%}, {f['z_largest']:.2f}  (of noise: 1, 0.27%, 4)",
+                ),
+                ("judged", f"{f['pixels']:,} of {f['pixel_side']} x {f['pixel_side']} pixels, {f['noise']:.1%} noise each"),
+                ("relative RMS beyond noise", f"{f['relative_rms_beyond_noise']:.4f} of {f['relative_rms']:.4f}"),
+                ("light on the screen", f"{f['on_screen']:.6f}, render {f['on_screen_render']:.6f} ({f['light_z']:.1f} sigma)"),
+                ("correlation, and turned", f"{f['correlation']:.5f}, {f['correlation_turned']:.5f}"),
+                ("image", f["image"]),
+            ],
+        )

@@ -164,11 +164,15 @@ def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[st
     lens.setdefault("height_range", [-scale, scale])
     mirror = value_of(lens, "lens.mirror")
     if mirror and screen["z"] >= lens["thickness"] + lens["height_range"][0]:
-        raise InputError(f"⟨screen.z⟩ must lie before the mirror, which begins at"
-                         f" {lens['thickness'] + lens['height_range'][0]:.4g} mm, got {screen['z']:g} mm")
+        raise InputError(
+            f"⟨screen.z⟩ must lie before the mirror, which begins at"
+            f" {lens['thickness'] + lens['height_range'][0]:.4g} mm, got {screen['z']:g} mm"
+        )
     if not mirror and screen["z"] <= lens["thickness"] + lens["height_range"][1]:
-        raise InputError(f"⟨screen.z⟩ must lie behind the lens, which is up to"
-                         f" {lens['thickness'] + lens['height_range'][1]:.4g} mm thick, got {screen['z']:g} mm")
+        raise InputError(
+            f"⟨screen.z⟩ must lie behind the lens, which is up to"
+            f" {lens['thickness'] + lens['height_range'][1]:.4g} mm thick, got {screen['z']:g} mm"
+        )
     if "radius" not in lens:
         mag = tuple(t / w for t, w in zip(target["size"], lens["size"], strict=True))
         vergence = 0.0
@@ -190,24 +194,29 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
     spread = plain and held and not source.sharp and _shifts(s, source)
     design.setdefault("start", "transport" if plain and held and not source.apart else "offset")
     if design["start"] == "transport" and design["network"] != "none":
-        raise InputError("⟨design.start⟩ transport gives a surface, which a network cannot begin from; use start offset, or"
-                         " network none")
+        raise InputError(
+            "⟨design.start⟩ transport gives a surface, which a network cannot begin from; use start offset, or network none"
+        )
     quality = quality or _quality(design["time_limit"])
     # Sharp light's transport is right at every scale at once, if the net can hold it, and so is that of a source that shifts the
     # image, for the light behind its blur; otherwise from coarse to fine.
     moved = plain and held and design["start"] != "offset" and (source.sharp or spread)
     if "control" not in lens:
         spans = refinement_spans(max(screen["resolution"]), quality) if moved else DEFAULT_SPANS
-        lens["control"] = ([spans + p for p in degree] if design["network"] == "none" else [NETWORK_CONTROL] * 2)
+        lens["control"] = [spans + p for p in degree] if design["network"] == "none" else [NETWORK_CONTROL] * 2
     design.setdefault("preconditioner", "laplacian" if plain else "none")
     if "stages" in design:
         if given or rays:
-            raise InputError("⟨quality⟩ and ⟨rays⟩ shape the default stages, but the configuration brings [[design.stages]]"
-                             " of its own: change them there")
+            raise InputError(
+                "⟨quality⟩ and ⟨rays⟩ shape the default stages, but the configuration brings [[design.stages]]"
+                " of its own: change them there"
+            )
         design["stages"] = [_complete_stage(stage, s, _sampler(source)) for stage in design["stages"]]
         if asked != "auto" and any(stage.get("waves") for stage in design["stages"]) != (asked == "on"):
-            raise InputError(f"⟨design.waves⟩ {asked} and the given [[design.stages]] contradict each other: "
-                             + ("none of them has waves, such as waves = [550.0]" if asked == "on" else "one of them has waves"))
+            raise InputError(
+                f"⟨design.waves⟩ {asked} and the given [[design.stages]] contradict each other: "
+                + ("none of them has waves, such as waves = [550.0]" if asked == "on" else "one of them has waves")
+            )
         return
     nx, ny = screen["resolution"]
     sampler, base = _sampler(source), min(4_000_000, max(40_000, int(RAYS_PER_PIXEL * nx * ny)))
@@ -217,8 +226,16 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
     elif plain and "knots_u" not in lens:
         stages = coarse_to_fine(tuple(lens["control"]), degree, rays or base, (nx, ny), quality, sampler=sampler)
     else:
-        stages = [on_rays(lens["control"], rays or base, sampler, apron=math.ceil(0.04 * max(nx, ny)),
-                          iterations=default("design.stages.iterations"), tolerance=2e-3 if plain else 0.0)]
+        stages = [
+            on_rays(
+                lens["control"],
+                rays or base,
+                sampler,
+                apron=math.ceil(0.04 * max(nx, ny)),
+                iterations=default("design.stages.iterations"),
+                tolerance=2e-3 if plain else 0.0,
+            )
+        ]
     stages += _wave_stages(s, source, quality, lit)
     if design["loss"].strip() == "rms":  # eq. 5.2.1 knows the screen alone
         stages = [stage | {"apron": 0} for stage in stages]
@@ -284,8 +301,10 @@ def _resolution(s: Settings, source: Source) -> Resolution:
 def _wave_samples(s: Settings, seen: Resolution, lit: tuple[float, float]) -> float:
     """About how many samples the field of one wavelength needs: the bright part and its blur on each side, times the lens."""
     throw, shortest = abs(s["screen"]["z"]), min(s["source"].get("wavelengths", []) or BAND[:1]) * 1e-6
-    return math.prod(w * (part * t + 4.0 * seen.diffraction) / (shortest * throw)
-                     for w, t, part in zip(s["lens"]["size"], s["target"]["size"], lit, strict=True))
+    return math.prod(
+        w * (part * t + 4.0 * seen.diffraction) / (shortest * throw)
+        for w, t, part in zip(s["lens"]["size"], s["target"]["size"], lit, strict=True)
+    )
 
 
 def _quality(time_limit: float) -> str:
@@ -312,8 +331,13 @@ def _complete_stage(table: dict[str, Any], s: Settings, sampler: str) -> dict[st
 def _stage_base(s: Settings, sampler: str) -> Table:
     """What a stage of the user's own says where it says nothing."""
     nx, ny = s["screen"]["resolution"]
-    return on_rays(s["lens"]["control"], int(RAYS_PER_PIXEL * nx * ny), sampler, iterations=default("design.stages.iterations"),
-                   tolerance=default("design.stages.tolerance"))
+    return on_rays(
+        s["lens"]["control"],
+        int(RAYS_PER_PIXEL * nx * ny),
+        sampler,
+        iterations=default("design.stages.iterations"),
+        tolerance=default("design.stages.tolerance"),
+    )
 
 
 def filter_from(kind: str, size, screen: Screen, per_mm2: float | None = None, per_pixel2: float | None = None) -> Filter:
@@ -324,8 +348,11 @@ def filter_from(kind: str, size, screen: Screen, per_mm2: float | None = None, p
         size = (1, 1)
     alpha = (0.0, 0.0)
     if kind == "gaussian":
-        alpha = tuple(per_mm2 * w * w for w in screen.pixel) if per_mm2 is not None else (
-            (1.0 if per_pixel2 is None else per_pixel2,) * 2)
+        alpha = (
+            tuple(per_mm2 * w * w for w in screen.pixel)
+            if per_mm2 is not None
+            else ((1.0 if per_pixel2 is None else per_pixel2,) * 2)
+        )
     return Filter(kind, tuple(size), alpha)
 
 
@@ -339,19 +366,34 @@ def build_stages(settings: Settings) -> list[Stage]:
     if not stages:
         raise InputError("[[design.stages]] at least one stage is needed")
     if list(stages[-1].control) != list(settings["lens"]["control"]):
-        raise InputError(f"[[design.stages]] the last stage's control {list(stages[-1].control)} must be the lens' own,"
-                         f" {settings['lens']['control']}")
+        raise InputError(
+            f"[[design.stages]] the last stage's control {list(stages[-1].control)} must be the lens' own,"
+            f" {settings['lens']['control']}"
+        )
     return stages
 
 
 def stage_of(table: Table, settings: Settings) -> Stage:
     """The stage that a table of complete settings describes."""
     t = _stage_base(settings, "grid") | table
-    filter = filter_from(t["reconstruction"], t["filter_size"], build_screen(settings), t.get("alpha_per_mm2"),
-                         t.get("alpha_per_pixel2"))
+    filter = filter_from(
+        t["reconstruction"], t["filter_size"], build_screen(settings), t.get("alpha_per_mm2"), t.get("alpha_per_pixel2")
+    )
     source = build_source(settings, type=t["source"]) if "source" in t else None
-    return Stage(tuple(t["control"]), t["rays"], t["sampler"], filter, t["blur"], t["apron"], t["iterations"], t["tolerance"],
-                 source, t["oversample"], tuple(t.get("waves", ())), value_of(t, "design.stages.spread"))
+    return Stage(
+        tuple(t["control"]),
+        t["rays"],
+        t["sampler"],
+        filter,
+        t["blur"],
+        t["apron"],
+        t["iterations"],
+        t["tolerance"],
+        source,
+        t["oversample"],
+        tuple(t.get("waves", ())),
+        value_of(t, "design.stages.spread"),
+    )
 
 
 def build_options(settings: Settings) -> Options:
@@ -362,5 +404,17 @@ def build_options(settings: Settings) -> Options:
     for key in ("time_limit", "checkpoint_every"):  # which may be without end
         if not d[key] > 0:
             raise InputError(f"⟨design.{key}⟩ must be greater than 0 s, got {d[key]:g}")
-    return Options(d["loss"], d["optimizer"], d["lr"], d["network"], d["initial"], d["preconditioner"],
-                   d["filter_target"], d["seed"], getattr(torch, d["dtype"]), d["max_slope"], d["min_radius"], d["waves"] == "on")
+    return Options(
+        d["loss"],
+        d["optimizer"],
+        d["lr"],
+        d["network"],
+        d["initial"],
+        d["preconditioner"],
+        d["filter_target"],
+        d["seed"],
+        getattr(torch, d["dtype"]),
+        d["max_slope"],
+        d["min_radius"],
+        d["waves"] == "on",
+    )

@@ -17,21 +17,52 @@ Table = dict[str, Any]
 TOLERANCE, WAVE_TOLERANCE = 2e-3, 1e-3
 
 
-def on_rays(control: Sequence[int], rays: int, sampler: str, *, blur: float = 0.0, apron: int = 0, iterations: int = 30,
-            tolerance: float = TOLERANCE, oversample: int = 1) -> Table:
+def on_rays(
+    control: Sequence[int],
+    rays: int,
+    sampler: str,
+    *,
+    blur: float = 0.0,
+    apron: int = 0,
+    iterations: int = 30,
+    tolerance: float = TOLERANCE,
+    oversample: int = 1,
+) -> Table:
     """A stage on the ray image, reconstructed with a 3 x 3 cosine."""
-    return {"control": list(control), "rays": rays, "sampler": sampler, "reconstruction": "cosine", "filter_size": [3, 3],
-            "blur": blur, "apron": apron, "iterations": iterations, "tolerance": tolerance, "oversample": oversample}
+    return {
+        "control": list(control),
+        "rays": rays,
+        "sampler": sampler,
+        "reconstruction": "cosine",
+        "filter_size": [3, 3],
+        "blur": blur,
+        "apron": apron,
+        "iterations": iterations,
+        "tolerance": tolerance,
+        "oversample": oversample,
+    }
 
 
 def on_waves(control: Sequence[int], waves: Sequence[float], apron: int, iterations: int) -> Table:
     """A stage on the wave image at so many nanometres."""
-    return {"control": list(control), "waves": list(waves), "blur": default("design.stages.blur"), "apron": apron,
-            "iterations": iterations, "tolerance": WAVE_TOLERANCE}
+    return {
+        "control": list(control),
+        "waves": list(waves),
+        "blur": default("design.stages.blur"),
+        "apron": apron,
+        "iterations": iterations,
+        "tolerance": WAVE_TOLERANCE,
+    }
 
 
-def coarse_to_fine(control: tuple[int, int], degree: tuple[int, int], rays: int, resolution: tuple[int, int],
-                   quality: str = "standard", sampler: str = "lines") -> list[Table]:
+def coarse_to_fine(
+    control: tuple[int, int],
+    degree: tuple[int, int],
+    rays: int,
+    resolution: tuple[int, int],
+    quality: str = "standard",
+    sampler: str = "lines",
+) -> list[Table]:
     """The default stages for a picture of `resolution` pixels, ending on `control` points with `rays` rays.
 
     Blurs are 1/16 of the screen at first and halve down to none.  Control nets have a quarter, half and all of the
@@ -47,8 +78,16 @@ def coarse_to_fine(control: tuple[int, int], degree: tuple[int, int], rays: int,
     for k, (blur, part, few) in enumerate(zip(blurs, shrink, fewer, strict=True)):
         net = tuple(min(n, max(p + 1, -(-(n - p) // part) + p)) for n, p in zip(control, degree, strict=True))
         apron = math.ceil(pixels * (0.12 if blur > 1 else 0.04))
-        stages.append(on_rays(net, max(1, int(rays * few)), sampler, blur=round(blur, 6), apron=apron,
-                              iterations=late if k == len(blurs) - 1 else early))
+        stages.append(
+            on_rays(
+                net,
+                max(1, int(rays * few)),
+                sampler,
+                blur=round(blur, 6),
+                apron=apron,
+                iterations=late if k == len(blurs) - 1 else early,
+            )
+        )
     return stages
 
 
@@ -83,8 +122,14 @@ def transport_cells(rays: int, scattered: bool) -> int:
     return min(MOST_CELLS, max(LEAST_CELLS, round(math.sqrt(rays * (4 if scattered else 1)) / RAYS_PER_CELL)))
 
 
-def refinement(control: tuple[int, int], rays: int | None, resolution: tuple[int, int], quality: str = "standard",
-               scattered: bool = False, spread: bool = False) -> list[Table]:
+def refinement(
+    control: tuple[int, int],
+    rays: int | None,
+    resolution: tuple[int, int],
+    quality: str = "standard",
+    scattered: bool = False,
+    spread: bool = False,
+) -> list[Table]:
     """The default stages after a transport start, whose surface has every scale right already: full detail at once.
 
     Rays stand in a regular grid: under a smooth filter, which the render's finer pixels leave narrow, such sums are far more exact
@@ -103,9 +148,17 @@ def refinement(control: tuple[int, int], rays: int | None, resolution: tuple[int
     apron = 0 if spread else math.ceil(0.04 * max(resolution))
     stages = []
     for part, iterations in plan:
-        stages.append(on_rays(control, max(1, round(part * rays)), "grid", apron=apron,
-                              iterations=LONGER * iterations if spread else iterations, oversample=finer)
-                      | ({"spread": True} if spread else {}))
+        stages.append(
+            on_rays(
+                control,
+                max(1, round(part * rays)),
+                "grid",
+                apron=apron,
+                iterations=LONGER * iterations if spread else iterations,
+                oversample=finer,
+            )
+            | ({"spread": True} if spread else {})
+        )
     return stages
 
 

@@ -42,11 +42,15 @@ STAGE = in_section("design.stages")
 #: Keys that hold tables: their heading in the file, and what each may say.  Sources beside the first are those of [source] also;
 #: FIRST is the first's alone.
 FIRST = ("polarisation", "profile", "power_unit")
-TABLES = {("design", "stages"): ("design.stages", STAGE),
-          ("source", "also"): ("source", {k: v for k, v in SCHEMA["source"].items() if k not in FIRST})}
+TABLES = {
+    ("design", "stages"): ("design.stages", STAGE),
+    ("source", "also"): ("source", {k: v for k, v in SCHEMA["source"].items() if k not in FIRST}),
+}
 #: What a new project's file says where nothing else is said.
-DEFAULTS = {section: {key: row.default for key, row in keys.items() if row.written and row.default is not None}
-            for section, keys in SCHEMA.items()}
+DEFAULTS = {
+    section: {key: row.default for key, row in keys.items() if row.written and row.default is not None}
+    for section, keys in SCHEMA.items()
+}
 
 
 def parse(text: str, where: str) -> Settings:
@@ -84,6 +88,7 @@ def parse(text: str, where: str) -> Settings:
 
 def checked(given: Mapping[str, Any], where: str) -> Settings:
     """Settings given as Python values, NumPy's too, with the refusals of a file."""
+
     def plain(value):
         if isinstance(value, Mapping):
             return {str(k): plain(v) for k, v in value.items()}
@@ -154,8 +159,11 @@ def with_defaults(settings: Settings) -> Settings:
 
 def dump(settings: Settings) -> str:
     """TOML text in the schema's order, each key with its unit or meaning beside it."""
-    lines = ["# A caustic project: edit by hand as you like, then render it or resume its design.",
-             f"format_version = {FORMAT_VERSION}", f'created_by = "caustic {__version__}"']
+    lines = [
+        "# A caustic project: edit by hand as you like, then render it or resume its design.",
+        f"format_version = {FORMAT_VERSION}",
+        f'created_by = "caustic {__version__}"',
+    ]
     for section, keys in SCHEMA.items():
         first = settings.get(section, {})
         also = first.get("also", []) if section == "source" else []
@@ -199,9 +207,20 @@ def build_lens(settings: Settings) -> Lens:
         raise InputError("⟨lens.knots_u⟩ and knots_v go together: give both or neither")
     knots = (tuple(lens["knots_u"]), tuple(lens["knots_v"])) if "knots_u" in lens else None
     offset = Offset(lens["thickness"], tuple(lens["radius"]))
-    return Lens(tuple(lens["size"]), lens["z_in"], index_of(lens), tuple(lens["control"]), tuple(lens["degree"]), knots,
-                lens["min_thickness"], offset, tuple(lens["height_range"]), lens["fresnel"], glass=lens.get("glass"),
-                **{key: value_of(lens, f"lens.{key}") for key in ("absorption", "roughness", "mirror", "aperture", "border")})
+    return Lens(
+        tuple(lens["size"]),
+        lens["z_in"],
+        index_of(lens),
+        tuple(lens["control"]),
+        tuple(lens["degree"]),
+        knots,
+        lens["min_thickness"],
+        offset,
+        tuple(lens["height_range"]),
+        lens["fresnel"],
+        glass=lens.get("glass"),
+        **{key: value_of(lens, f"lens.{key}") for key in ("absorption", "roughness", "mirror", "aperture", "border")},
+    )
 
 
 def build_source(settings: Settings, profile: np.ndarray | None = None, type: str | None = None) -> Source:
@@ -226,8 +245,9 @@ def build_scene(settings: Settings, profile: np.ndarray | None = None) -> Scene:
 def build_screen(settings: Settings) -> Screen:
     """The screen that the [screen] section describes."""
     s = settings["screen"]
-    return Screen(tuple(s["size"]), s["z"], tuple(s["resolution"]), tuple(value_of(s, "screen.tilt")),
-                  tuple(value_of(s, "screen.shift")))
+    return Screen(
+        tuple(s["size"]), s["z"], tuple(s["resolution"]), tuple(value_of(s, "screen.tilt")), tuple(value_of(s, "screen.shift"))
+    )
 
 
 def build_light(settings: Settings) -> Light:
@@ -247,8 +267,7 @@ def refuse_unused(source: dict[str, Any], given: Iterable[str], stages: Sequence
     keys = [path.removeprefix("source.") for path in given if path.startswith("source.")]
     for key in filter(sources.used_by, keys):
         if not types & set(sources.used_by(key)):
-            raise InputError(f"⟨source.{key}⟩ belongs to ⟨source⟩ {sources.either(sources.used_by(key))},"
-                             f" got {source['type']}")
+            raise InputError(f"⟨source.{key}⟩ belongs to ⟨source⟩ {sources.either(sources.used_by(key))}, got {source['type']}")
     if len(types) == 1 and types <= set(sources.names()):
         idle = sources.type_of(*types).idle(source)
         for key in keys:

@@ -26,8 +26,9 @@ from caustic_cli.scene import Scene, Source
 FORMAT_VERSION = 1
 
 
-def write_lighttools(path: str | Path, scene: Scene, field: HeightField, heights: Tensor,
-                     samples: tuple[int, int] | None = None) -> None:
+def write_lighttools(
+    path: str | Path, scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None
+) -> None:
     """Write the archive whole or not at all.
 
     Keys: points, normals (N, 3); shape (2,); x (nx,), y (ny,), z (nx, ny); lens_half_size (2,), z_in, refractive_index;
@@ -106,8 +107,7 @@ def _of_plane(scene: Scene) -> dict[str, np.ndarray]:
 
 def _of_points(scene: Scene) -> dict[str, np.ndarray]:
     source, lens = scene.source, scene.lens
-    return {"cone_half_angle": _reals(np.degrees(source.cone_over(lens.half_size, lens.z_in, lens.round))),
-            **_intensity(source)}
+    return {"cone_half_angle": _reals(np.degrees(source.cone_over(lens.half_size, lens.z_in, lens.round))), **_intensity(source)}
 
 
 def _intensity(source: Source) -> dict[str, np.ndarray]:

@@ -147,8 +147,9 @@ def companions(path: str | Path) -> tuple[Path, Path]:
     return path.with_suffix(".py"), path.with_suffix(".lts.txt")
 
 
-def write_script(path: str | Path, scene: Scene, field: HeightField, heights: Tensor,
-                 samples: tuple[int, int] | None = None) -> None:
+def write_script(
+    path: str | Path, scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None
+) -> None:
     """Write script and block for the archive `path`, which `write_lighttools` wrote with the same arguments.
 
     Raises:
@@ -158,8 +159,9 @@ def write_script(path: str | Path, scene: Scene, field: HeightField, heights: Te
     if source.profile is not None:
         raise InputError("⟨script⟩: its source is uniform, so one with a profile cannot be written")
     if source.brightness is not None or source.rays is not None or not isinstance(source.intensity, str):
-        raise InputError("⟨script⟩: its source is evenly bright and uniform or Lambertian, so a picture, a table or a ray file"
-                         " cannot be written")
+        raise InputError(
+            "⟨script⟩: its source is evenly bright and uniform or Lambertian, so a picture, a table or a ray file cannot be written"
+        )
     if source.extent[0] != source.extent[1]:
         raise InputError("⟨script⟩: its disc is round, so an elliptical one cannot be written")
     if scene.lens.round:
@@ -184,5 +186,7 @@ def _write_block(path: Path, scene: Scene, grid: SurfaceGrid) -> None:
             rows = points.swapaxes(0, 1).reshape(-1, 3)
             for start in range(0, len(rows), WRAP):
                 file.write(" ".join(map(real, rows[start : start + WRAP].ravel())) + "\n")
-            file.write("0 1 4 CartesianMapper 1 0 0 0 0\nORAEndData;\nORAReadForeignData;\n"
-                       f"}} restore{name}: $FreeformSurface_{int(name == 'Rear')};\n")
+            file.write(
+                "0 1 4 CartesianMapper 1 0 0 0 0\nORAEndData;\nORAReadForeignData;\n"
+                f"}} restore{name}: $FreeformSurface_{int(name == 'Rear')};\n"
+            )

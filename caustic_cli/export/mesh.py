@@ -47,8 +47,9 @@ class Patch:
     normals: np.ndarray
 
 
-def closed_mesh(scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None,
-                tolerance: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+def closed_mesh(
+    scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None, tolerance: float | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) float64 mm and faces (F, 3) int64 of the solid.
 
     Args:
@@ -62,8 +63,9 @@ def closed_mesh(scene: Scene, field: HeightField, heights: Tensor, samples: tupl
     return solid(patch(scene.lens, field, heights, samples, tolerance).points, scene.lens)
 
 
-def patch(lens: Lens, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None,
-          tolerance: float | None = None) -> Patch:
+def patch(
+    lens: Lens, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None, tolerance: float | None = None
+) -> Patch:
     """The exit surface within the aperture, by samples or tolerance as of `closed_mesh`.
 
     Raises:
@@ -84,8 +86,10 @@ def _across(field: HeightField, heights: Tensor, samples: tuple[int, int] | None
         n, asked = max(checks.pair("⟨samples⟩", counts, lambda w, k: checks.whole(w, k, 2, MAX_SAMPLES))), "⟨samples⟩"
     else:
         checks.number("⟨tolerance⟩", tolerance, 0.0, open_low=True)
-        if any(int(torch.unique(s.knots[1:-1], return_counts=True)[1].max()) > s.degree for s in field.spaces) or \
-                min(s.degree for s in field.spaces) < 2:
+        if (
+            any(int(torch.unique(s.knots[1:-1], return_counts=True)[1].max()) > s.degree for s in field.spaces)
+            or min(s.degree for s in field.spaces) < 2
+        ):
             raise InputError("⟨tolerance⟩ of a round mesh needs a surface without kinks; give ⟨samples⟩")
         xx, xy, yy = second_derivative_bounds(field, heights)
         curvature, asked = (max(xx, yy) + xy) * STRETCH**2 / 6.0, f"⟨tolerance⟩ {tolerance:g}"
@@ -122,8 +126,9 @@ def triangles(points: np.ndarray) -> np.ndarray:
     nx, ny = points.shape[:2]
     number, flat = np.arange(nx * ny).reshape(nx, ny), points[..., :2]
     a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]  # corners of every cell, from +z
-    up, down = (((flat[one] - flat[two]) ** 2).sum(-1) for one, two in ((np.s_[1:, 1:], np.s_[:-1, :-1]),
-                                                                        (np.s_[1:, :-1], np.s_[:-1, 1:])))
+    up, down = (
+        ((flat[one] - flat[two]) ** 2).sum(-1) for one, two in ((np.s_[1:, 1:], np.s_[:-1, :-1]), (np.s_[1:, :-1], np.s_[:-1, 1:]))
+    )
     falling = (down < (1.0 - 1e-9) * up)[..., None]
     first = np.where(falling, np.stack([a, b, d], -1), np.stack([a, b, c], -1))
     second = np.where(falling, np.stack([b, c, d], -1), np.stack([a, c, d], -1))
@@ -182,5 +187,7 @@ def refuse_open(least: float, z_in: float) -> None:
         InputError: there is no solid.
     """
     if not least > z_in:
-        raise InputError(f"a solid needs its exit surface above the entrance at z_in = {z_in:g} mm everywhere,"
-                         f" got a least height of {least:.6g} mm; design with a larger min_thickness")
+        raise InputError(
+            f"a solid needs its exit surface above the entrance at z_in = {z_in:g} mm everywhere,"
+            f" got a least height of {least:.6g} mm; design with a larger min_thickness"
+        )

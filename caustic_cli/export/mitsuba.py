@@ -46,8 +46,15 @@ def companions(path: str | Path, round: bool = True) -> list[Path]:
     return [path.with_name(f"{path.stem}-{name}.ply") for name in ("exit", "sides", "holder")[: 3 if round else 2]]
 
 
-def write_mitsuba(path: str | Path, scene: Scene, field: HeightField, heights: Tensor,
-                  samples: tuple[int, int] | None = None, tolerance: float | None = None, dark: bool = False) -> None:
+def write_mitsuba(
+    path: str | Path,
+    scene: Scene,
+    field: HeightField,
+    heights: Tensor,
+    samples: tuple[int, int] | None = None,
+    tolerance: float | None = None,
+    dark: bool = False,
+) -> None:
     """Write the meshes and then the scene.  Arguments as of `closed_mesh`; `dark`: without its light, whatever that is.
 
     Raises:
@@ -68,25 +75,33 @@ def write_mitsuba(path: str | Path, scene: Scene, field: HeightField, heights: T
     away = 0.9 * (screen.z - float(points[:, 2].max()))
     width, height = screen.resolution[0], max(1, round(screen.resolution[0] * sy / sx))
     lines = [
-        f"<!-- {CREATED}; millimetres -->", '<scene version="3.0.0">',
+        f"<!-- {CREATED}; millimetres -->",
+        '<scene version="3.0.0">',
         f'<integrator type="ptracer"><integer name="max_depth" value="{DEPTH}"/></integrator>',
-        '<sensor type="perspective">', '  <string name="fov_axis" value="x"/>',
+        '<sensor type="perspective">',
+        '  <string name="fov_axis" value="x"/>',
         f'  <float name="fov" value="{real(2.0 * math.degrees(math.atan2(sx, away)))}"/>',
         f'  <float name="near_clip" value="{real(0.5 * away)}"/><float name="far_clip" value="{real(2.0 * away)}"/>',
         f'  <transform name="to_world"><scale x="-1"/><translate z="{real(screen.z - away)}"/></transform>',
         f'  <sampler type="independent"><integer name="sample_count" value="{SAMPLES}"/></sampler>',
         f'  <film type="hdrfilm"><integer name="width" value="{width}"/><integer name="height" value="{height}"/>',
-        '    <string name="pixel_format" value="luminance"/><rfilter type="box"/></film>', "</sensor>",
-        f'<shape type="{flat}" id="entrance">', f"  {glass}",
-        f'  <transform name="to_world">{spin}<scale x="{real(rx)}" y="{real(ry)}"/>'
-        f'<translate z="{real(lens.z_in)}"/></transform>', "</shape>",
+        '    <string name="pixel_format" value="luminance"/><rfilter type="box"/></film>',
+        "</sensor>",
+        f'<shape type="{flat}" id="entrance">',
+        f"  {glass}",
+        f'  <transform name="to_world">{spin}<scale x="{real(rx)}" y="{real(ry)}"/><translate z="{real(lens.z_in)}"/></transform>',
+        "</shape>",
         f'<shape type="ply" id="exit"><string name="filename" value="{exit_mesh.name}"/>{glass}</shape>',
         f'<shape type="ply" id="sides"><string name="filename" value="{sides.name}"/>'
         f'<boolean name="face_normals" value="true"/>{black}</shape>',
         *holder,
-        '<shape type="rectangle" id="screen">', '  <bsdf type="diffuse"><rgb name="reflectance" value="1"/></bsdf>',
+        '<shape type="rectangle" id="screen">',
+        '  <bsdf type="diffuse"><rgb name="reflectance" value="1"/></bsdf>',
         f'  <transform name="to_world">{spin}<scale x="{real(sx)}" y="{real(sy)}"/><translate z="{real(screen.z)}"/></transform>',
-        "</shape>", *light, "</scene>", "",
+        "</shape>",
+        *light,
+        "</scene>",
+        "",
     ]
     write_bytes(path, "\n".join(lines).encode())
 
@@ -101,17 +116,26 @@ def _strip(top: np.ndarray, low: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Between two loops (k, 3), counter-clockwise from +z: vertices, and triangles seen from outside."""
     high, below = np.arange(len(top)), len(top) + np.arange(len(low))
     after, after_below = np.roll(high, -1), np.roll(below, -1)
-    return np.concatenate([top, low]), np.concatenate([np.stack([below, after_below, after], -1),
-                                                       np.stack([below, after, high], -1)])
+    return np.concatenate([top, low]), np.concatenate(
+        [np.stack([below, after_below, after], -1), np.stack([below, after, high], -1)]
+    )
 
 
 def _holder(lens: Lens, black: str) -> list[str]:
     """Four black rectangles around the entrance."""
     (rx, ry), wide, lines = lens.half_size, WIDE * max(lens.half_size), []
-    for cx, cy, hx, hy in ((-(rx + wide) / 2, 0, (wide - rx) / 2, wide), ((rx + wide) / 2, 0, (wide - rx) / 2, wide),
-                           (0, -(ry + wide) / 2, rx, (wide - ry) / 2), (0, (ry + wide) / 2, rx, (wide - ry) / 2)):
-        lines += [f'<shape type="rectangle">{black}', f'  <transform name="to_world"><scale x="{real(hx)}" y="{real(hy)}"/>'
-                  f'<translate x="{real(cx)}" y="{real(cy)}" z="{real(lens.z_in)}"/></transform>', "</shape>"]
+    for cx, cy, hx, hy in (
+        (-(rx + wide) / 2, 0, (wide - rx) / 2, wide),
+        ((rx + wide) / 2, 0, (wide - rx) / 2, wide),
+        (0, -(ry + wide) / 2, rx, (wide - ry) / 2),
+        (0, (ry + wide) / 2, rx, (wide - ry) / 2),
+    ):
+        lines += [
+            f'<shape type="rectangle">{black}',
+            f'  <transform name="to_world"><scale x="{real(hx)}" y="{real(hy)}"/>'
+            f'<translate x="{real(cx)}" y="{real(cy)}" z="{real(lens.z_in)}"/></transform>',
+            "</shape>",
+        ]
     return lines
 
 
@@ -148,26 +172,34 @@ def _collimated(scene: Scene) -> list[str]:
         raise InputError("⟨format⟩ mitsuba: its collimated emitter is uniform, so a source with a profile cannot be written")
     (rx, ry), area = lens.half_size, lens.size[0] * lens.size[1] * (math.pi / 4.0 if lens.round else 1.0)
     radiance = real(source.power / area)
-    return [f'<shape type="{"disk" if lens.round else "rectangle"}" id="light">',
-            f'  <transform name="to_world"><scale x="{real(rx)}" y="{real(ry)}"/>'
-            f'<translate z="{real(lens.z_in - BEFORE)}"/></transform>',
-            f'  <emitter type="directionalarea"><rgb name="radiance" value="{radiance}"/></emitter>', "</shape>"]
+    return [
+        f'<shape type="{"disk" if lens.round else "rectangle"}" id="light">',
+        f'  <transform name="to_world"><scale x="{real(rx)}" y="{real(ry)}"/>'
+        f'<translate z="{real(lens.z_in - BEFORE)}"/></transform>',
+        f'  <emitter type="directionalarea"><rgb name="radiance" value="{radiance}"/></emitter>',
+        "</shape>",
+    ]
 
 
 def _area(scene: Scene) -> list[str]:
     """A disc that shines on everything."""
     source, lens = scene.source, scene.lens
     if source.distant or source.intensity != "lambertian" or source.cone is not None:
-        raise InputError("⟨format⟩ mitsuba: of discs only a Lambertian one without a cone of its own can be written, not one at"
-                         " infinity; render ⟨verify⟩ mitsuba traces them all")
+        raise InputError(
+            "⟨format⟩ mitsuba: of discs only a Lambertian one without a cone of its own can be written, not one at"
+            " infinity; render ⟨verify⟩ mitsuba traces them all"
+        )
     if source.brightness is not None:
         raise InputError("⟨format⟩ mitsuba: its disc is evenly bright, so one with a picture of its brightness cannot be written")
     (wx, wy), (x, y, z), cone = source.size, source.position, source.cone_over(lens.half_size, lens.z_in, lens.round)
     radiance = source.power / (math.pi * math.pi * wx * wy / 4.0 * math.sin(cone) ** 2)  # its cone just covers the lens
-    return ['<shape type="disk" id="light">',
-            f'  <transform name="to_world"><scale x="{real(wx / 2)}" y="{real(wy / 2)}"/>'
-            f'<translate x="{real(x)}" y="{real(y)}" z="{real(z)}"/></transform>',
-            f'  <emitter type="area"><rgb name="radiance" value="{real(radiance)}"/></emitter>', "</shape>"]
+    return [
+        '<shape type="disk" id="light">',
+        f'  <transform name="to_world"><scale x="{real(wx / 2)}" y="{real(wy / 2)}"/>'
+        f'<translate x="{real(x)}" y="{real(y)}" z="{real(z)}"/></transform>',
+        f'  <emitter type="area"><rgb name="radiance" value="{real(radiance)}"/></emitter>',
+        "</shape>",
+    ]
 
 
 def _spots(scene: Scene) -> list[str]:
@@ -179,10 +211,12 @@ def _spots(scene: Scene) -> list[str]:
     lines, degrees = [], math.degrees(cone)
     for (x, y, z), power in zip(source.positions, source.powers, strict=True):
         intensity = power / (4.0 * math.pi * math.sin(cone / 2.0) ** 2)
-        lines += ['<emitter type="spot">',
-                  f'  <transform name="to_world"><translate x="{real(x)}" y="{real(y)}" z="{real(z)}"/></transform>',
-                  f'  <rgb name="intensity" value="{real(intensity)}"/><float name="beam_width" value="{real(degrees)}"/>'
-                  f'<float name="cutoff_angle" value="{real(degrees * (1.0 + 1e-4))}"/></emitter>']
+        lines += [
+            '<emitter type="spot">',
+            f'  <transform name="to_world"><translate x="{real(x)}" y="{real(y)}" z="{real(z)}"/></transform>',
+            f'  <rgb name="intensity" value="{real(intensity)}"/><float name="beam_width" value="{real(degrees)}"/>'
+            f'<float name="cutoff_angle" value="{real(degrees * (1.0 + 1e-4))}"/></emitter>',
+        ]
     return lines
 
 

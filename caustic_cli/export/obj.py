@@ -13,8 +13,14 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 
 
-def write_obj(path: str | Path, scene: Scene, field: HeightField, heights: Tensor,
-              samples: tuple[int, int] | None = None, tolerance: float | None = None) -> None:
+def write_obj(
+    path: str | Path,
+    scene: Scene,
+    field: HeightField,
+    heights: Tensor,
+    samples: tuple[int, int] | None = None,
+    tolerance: float | None = None,
+) -> None:
     """Write the solid whole or not at all.  Arguments and errors as of `closed_mesh`; InputError also if it cannot be written."""
     vertices, faces = closed_mesh(scene, field, heights, samples, tolerance)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:

@@ -21,20 +21,36 @@ from caustic_cli.scene import Scene
 FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
 
 
-def write_ply(path: str | Path, scene: Scene, field: HeightField, heights: Tensor,
-              samples: tuple[int, int] | None = None, tolerance: float | None = None) -> None:
+def write_ply(
+    path: str | Path,
+    scene: Scene,
+    field: HeightField,
+    heights: Tensor,
+    samples: tuple[int, int] | None = None,
+    tolerance: float | None = None,
+) -> None:
     """Write the solid whole or not at all.  Arguments and errors as of `closed_mesh`; InputError also if it cannot be written."""
     write_mesh(path, *closed_mesh(scene, field, heights, samples, tolerance))
 
 
-def write_mesh(path: str | Path, vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None = None,
-               text: bool = True) -> None:
+def write_mesh(
+    path: str | Path, vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None = None, text: bool = True
+) -> None:
     """Write vertices (V, 3) mm, with unit normals (V, 3) if given, and triangles (F, 3)."""
     names = ("x", "y", "z") if normals is None else ("x", "y", "z", "nx", "ny", "nz")
     table = vertices if normals is None else np.concatenate([vertices, normals], 1)
-    head = ["ply", f"format {'ascii' if text else 'binary_little_endian'} 1.0", f"comment {CREATED}", "comment millimetres",
-            f"element vertex {len(vertices)}", *(f"property double {name}" for name in names),
-            f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
+    head = [
+        "ply",
+        f"format {'ascii' if text else 'binary_little_endian'} 1.0",
+        f"comment {CREATED}",
+        "comment millimetres",
+        f"element vertex {len(vertices)}",
+        *(f"property double {name}" for name in names),
+        f"element face {len(faces)}",
+        "property list uchar int vertex_indices",
+        "end_header",
+        "",
+    ]
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write("\n".join(head).encode())
         if text:

@@ -21,14 +21,12 @@ from caustic_cli.scene import Scene
 HEADER = "x_mm,y_mm,z_mm\n"
 
 
-def write_csv(path: str | Path, scene: Scene, field: HeightField, heights: Tensor,
-              samples: tuple[int, int] | None = None) -> None:
+def write_csv(path: str | Path, scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None) -> None:
     """Write the table whole or not at all.  Arguments and errors as of `sample_grid`; InputError also if it cannot be written."""
     _write(path, field, heights, samples, HEADER, "%.17g,%.17g,%.17g\n")
 
 
-def write_xyz(path: str | Path, scene: Scene, field: HeightField, heights: Tensor,
-              samples: tuple[int, int] | None = None) -> None:
+def write_xyz(path: str | Path, scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None) -> None:
     """Write the points whole or not at all, below a comment that begins with #; arguments and errors as of `write_csv`."""
     _write(path, field, heights, samples, f"# {CREATED}, millimetres\n", "%.17g %.17g %.17g\n")
 

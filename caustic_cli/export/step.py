@@ -73,8 +73,10 @@ class Entities:
         return self.add(f"LINE('',{self.point(a)},{vector})")
 
     def curve(self, degree: int, points: list[str], knots: np.ndarray) -> str:
-        return self.add(f"B_SPLINE_CURVE_WITH_KNOTS('',{degree},({','.join(points)}),.UNSPECIFIED.,.F.,.F.,"
-                        f"{','.join(_knots(knots))},.UNSPECIFIED.)")
+        return self.add(
+            f"B_SPLINE_CURVE_WITH_KNOTS('',{degree},({','.join(points)}),.UNSPECIFIED.,.F.,.F.,"
+            f"{','.join(_knots(knots))},.UNSPECIFIED.)"
+        )
 
     def edge(self, a: str, b: str, curve: str) -> str:
         return self.add(f"EDGE_CURVE('',{a},{b},{curve},.T.)")
@@ -123,8 +125,10 @@ def lens_solid(out: Entities, lens: Lens, field: HeightField, heights: Tensor, p
     su, sv = field.spaces
     points = [[out.point(p) for p in row] for row in poles]
     control = ",".join("(" + ",".join(row) + ")" for row in points)
-    exit_surface = out.add(f"B_SPLINE_SURFACE_WITH_KNOTS('',{su.degree},{sv.degree},({control}),.UNSPECIFIED.,.F.,.F.,.F.,"
-                           f"{','.join(_knots(su.knots.numpy(), sv.knots.numpy()))},.UNSPECIFIED.)")
+    exit_surface = out.add(
+        f"B_SPLINE_SURFACE_WITH_KNOTS('',{su.degree},{sv.degree},({control}),.UNSPECIFIED.,.F.,.F.,.F.,"
+        f"{','.join(_knots(su.knots.numpy(), sv.knots.numpy()))},.UNSPECIFIED.)"
+    )
     if lens.round:
         rim, lowest = _round_rim(out, field, heights)
     else:
@@ -178,8 +182,9 @@ def _round_rim(out: Entities, field: HeightField, heights: Tensor) -> tuple[Loop
         count *= 2
     corners = [on(np.array([0.0]))[0], on(np.array([np.pi]))[0]]
     vertices = [out.add(f"VERTEX_POINT('',{out.point(p)})") for p in corners]
-    edges = [(out.edge(vertices[k], vertices[1 - k], out.curve(3, [out.point(p) for p in c.c], c.t)), True)
-             for k, c in enumerate(curves)]
+    edges = [
+        (out.edge(vertices[k], vertices[1 - k], out.curve(3, [out.point(p) for p in c.c], c.t)), True) for k, c in enumerate(curves)
+    ]
     return Loop(corners, vertices, edges), min(float(c.c[:, 2].min()) for c in curves)
 
 
@@ -199,8 +204,10 @@ def _flat(out: Entities, lens: Lens, wider: float, z: float) -> Loop:
 
 def _walls(out: Entities, lens: Lens, upper: Loop, lower: Loop, wider: float) -> list[str]:
     """Upright faces between two loops: planes, or halves of a cylinder."""
-    posts = [(out.edge(a, b, out.line(p, q)), True)
-             for a, b, p, q in zip(lower.vertices, upper.vertices, lower.corners, upper.corners, strict=True)]
+    posts = [
+        (out.edge(a, b, out.line(p, q)), True)
+        for a, b, p, q in zip(lower.vertices, upper.vertices, lower.corners, upper.corners, strict=True)
+    ]
     outward = (0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0)
     if lens.round:
         place = out.placement((0, 0, lower.corners[0][2]), (0, 0, 1), (1, 0, 0))
@@ -223,10 +230,12 @@ def _product(out: Entities, solid: str, uncertainty: float) -> None:
     radian = out.add("(NAMED_UNIT(*)PLANE_ANGLE_UNIT()SI_UNIT($,.RADIAN.))")
     steradian = out.add("(NAMED_UNIT(*)SI_UNIT($,.STERADIAN.)SOLID_ANGLE_UNIT())")
     near = out.add(f"UNCERTAINTY_MEASURE_WITH_UNIT(LENGTH_MEASURE({real(uncertainty)}),{millimetre},'distance_accuracy_value','')")
-    context = out.add("(GEOMETRIC_REPRESENTATION_CONTEXT(3)"
-                      f"GLOBAL_UNCERTAINTY_ASSIGNED_CONTEXT(({near}))"
-                      f"GLOBAL_UNIT_ASSIGNED_CONTEXT(({millimetre},{radian},{steradian}))"
-                      "REPRESENTATION_CONTEXT('',''))")
+    context = out.add(
+        "(GEOMETRIC_REPRESENTATION_CONTEXT(3)"
+        f"GLOBAL_UNCERTAINTY_ASSIGNED_CONTEXT(({near}))"
+        f"GLOBAL_UNIT_ASSIGNED_CONTEXT(({millimetre},{radian},{steradian}))"
+        "REPRESENTATION_CONTEXT('',''))"
+    )
     origin = out.placement((0, 0, 0), (0, 0, 1), (1, 0, 0))
     shape = out.add(f"ADVANCED_BREP_SHAPE_REPRESENTATION('lens',({origin},{solid}),{context})")
     application = out.add("APPLICATION_CONTEXT('automotive design')")

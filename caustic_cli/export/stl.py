@@ -30,8 +30,14 @@ TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribu
 BLOCK = 1 << 20
 
 
-def write_stl(path: str | Path, scene: Scene, field: HeightField, heights: Tensor,
-              samples: tuple[int, int] | None = None, tolerance: float | None = None) -> None:
+def write_stl(
+    path: str | Path,
+    scene: Scene,
+    field: HeightField,
+    heights: Tensor,
+    samples: tuple[int, int] | None = None,
+    tolerance: float | None = None,
+) -> None:
     """Write the solid whole or not at all.  Arguments as of `closed_mesh`.
 
     Raises:
@@ -56,8 +62,10 @@ def _records(corners: np.ndarray) -> np.ndarray:
     normal = np.cross(exact[:, 1] - exact[:, 0], exact[:, 2] - exact[:, 0])
     length = np.linalg.norm(normal, axis=1, keepdims=True)  # twice the area
     if not (length > 0).all():
-        raise InputError("an STL file holds float32 numbers, in which neighbouring points of this lens coincide;"
-                         " give fewer ⟨samples⟩, or take another format")
+        raise InputError(
+            "an STL file holds float32 numbers, in which neighbouring points of this lens coincide;"
+            " give fewer ⟨samples⟩, or take another format"
+        )
     records = np.zeros(len(corners), TRIANGLE)
     records["normal"], records["corners"] = normal / length, corners
     return records

@@ -87,8 +87,10 @@ def grid_within(field: HeightField, heights: Tensor, tolerance: float) -> Surfac
         InputError: that takes too many points.
     """
     h = step_within(field, heights, tolerance)
-    lines = [_knot_lines(s, (s.breaks.diff() * 2.0 * r / h).ceil().clamp(1, MAX_SAMPLES).long())
-             for s, r in zip(field.spaces, field.half_size, strict=True)]
+    lines = [
+        _knot_lines(s, (s.breaks.diff() * 2.0 * r / h).ceil().clamp(1, MAX_SAMPLES).long())
+        for s, r in zip(field.spaces, field.half_size, strict=True)
+    ]
     return on_lines(field, heights, lines, f"⟨tolerance⟩ {tolerance:g}")
 
 
@@ -132,8 +134,9 @@ def on_lines(field: HeightField, heights: Tensor, lines: Sequence[Tensor], asked
         raise InputError(f"control heights must have shape {field.shape}, got {tuple(heights.shape)}")
     (su, sv), (rx, ry), (u, v) = field.spaces, field.half_size, lines
     if max(len(u), len(v)) > MAX_SAMPLES or len(u) * len(v) > MAX_POINTS:
-        raise InputError(f"{asked} must ask for at most {MAX_SAMPLES} points along an axis and {MAX_POINTS:.0e} in all,"
-                         f" got {len(u)} x {len(v)}")
+        raise InputError(
+            f"{asked} must ask for at most {MAX_SAMPLES} points along an axis and {MAX_POINTS:.0e} in all, got {len(u)} x {len(v)}"
+        )
     net = heights.detach().to("cpu", torch.float64)
     rows, slopes = _along(su, u, net), _along(su, u, net, 1) / (2.0 * rx)  # (nx, m)
     z, zy = _along(sv, v, rows.T).T, _along(sv, v, rows.T, 1).T / (2.0 * ry)

@@ -29,8 +29,9 @@ from caustic_cli.scene import Scene
 LEAST = 5
 
 
-def write_zemax(path: str | Path, scene: Scene, field: HeightField, heights: Tensor,
-                samples: tuple[int, int] | None = None) -> None:
+def write_zemax(
+    path: str | Path, scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None
+) -> None:
     """Write the grid whole or not at all.
 
     Args:
@@ -48,11 +49,15 @@ def write_zemax(path: str | Path, scene: Scene, field: HeightField, heights: Ten
     columns = grid.z - vertex, grid.zx, grid.zy, grid.zxy
     table = np.stack([c[:, ::-1].T.ravel() for c in columns], -1)
     lens = scene.lens
-    head = [f"! {CREATED}", "! Grid Sag, mm; base radius infinity, conic 0; interpolation bicubic",
-            f"! vertex {real(vertex - lens.z_in)} mm behind the flat entrance, index {real(lens.index)},"
-            f" screen {real(scene.screen.z - vertex)} mm behind the vertex",
-            *([f"! circular aperture of radius {real(lens.half_size[0])} mm"] if lens.round else []),
-            f"{nx} {ny} {real((grid.x[-1] - grid.x[0]) / (nx - 1))} {real((grid.y[-1] - grid.y[0]) / (ny - 1))} 0 0 0", ""]
+    head = [
+        f"! {CREATED}",
+        "! Grid Sag, mm; base radius infinity, conic 0; interpolation bicubic",
+        f"! vertex {real(vertex - lens.z_in)} mm behind the flat entrance, index {real(lens.index)},"
+        f" screen {real(scene.screen.z - vertex)} mm behind the vertex",
+        *([f"! circular aperture of radius {real(lens.half_size[0])} mm"] if lens.round else []),
+        f"{nx} {ny} {real((grid.x[-1] - grid.x[0]) / (nx - 1))} {real((grid.y[-1] - grid.y[0]) / (ny - 1))} 0 0 0",
+        "",
+    ]
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write("\r\n".join(head).encode())
         file.writelines(rows(table, "%.17g %.17g %.17g %.17g 0\r\n"))

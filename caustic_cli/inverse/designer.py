@@ -66,8 +66,9 @@ class Options:
         parse(self.loss)
         check_all("design", self, "max_slope", "min_radius", "network", "initial", "preconditioner", "optimizer", "lr", "seed")
         if self.optimizer == "lbfgs" and self.network != "none":
-            raise InputError("⟨design.optimizer⟩ lbfgs works on the heights themselves (network none);"
-                             " a network needs optimizer adam")
+            raise InputError(
+                "⟨design.optimizer⟩ lbfgs works on the heights themselves (network none); a network needs optimizer adam"
+            )
 
 
 @dataclass
@@ -106,11 +107,14 @@ class Designer:
         if not stages:
             raise InputError("[[design.stages]] at least one stage is needed")
         if scene.lens.knots is not None and any(s.control != scene.lens.control for s in stages):
-            raise InputError("[lens] knots: a lens with knots of its own is designed on its own net; every stage's control"
-                             f" must be {list(scene.lens.control)}")
+            raise InputError(
+                "[lens] knots: a lens with knots of its own is designed on its own net; every stage's control"
+                f" must be {list(scene.lens.control)}"
+            )
         if any(name == "throughput" for _, name in parse(options.loss)) and not all(s.apron for s in stages):
-            raise InputError("⟨design.loss⟩: throughput needs dark pixels around the screen that catch stray light; every stage"
-                             " needs an apron")
+            raise InputError(
+                "⟨design.loss⟩: throughput needs dark pixels around the screen that catch stray light; every stage needs an apron"
+            )
         self.scene, self.target, self.stages, self.options, self.device = scene, target, stages, options, device
         if options.network != "none" and any(s.waves for s in stages):
             raise InputError("⟨design.stages.waves⟩ needs network none: the wave image refines the heights themselves")
@@ -146,9 +150,16 @@ class Designer:
             module.load_state_dict(state.parameters)
         return module
 
-    def run(self, state: State, *, iterations: int = 0, time_limit: float = math.inf,
-            stop: Callable[[], bool] = lambda: False, on_iteration: Callable[[State], None] = lambda s: None,
-            notice: Callable[[str], None] = lambda text: None) -> State:
+    def run(
+        self,
+        state: State,
+        *,
+        iterations: int = 0,
+        time_limit: float = math.inf,
+        stop: Callable[[], bool] = lambda: False,
+        on_iteration: Callable[[State], None] = lambda s: None,
+        notice: Callable[[str], None] = lambda text: None,
+    ) -> State:
         """Go on from `state` until the stages are done.
 
         Args:
@@ -183,8 +194,13 @@ class Designer:
         Raises:
             CausticError: no surface near them obeys these.
         """
-        return within_limits(self.field(state.stage), state.heights, self._bounds(self.stages[state.stage]),
-                             self.options.max_slope, self.options.min_radius)
+        return within_limits(
+            self.field(state.stage),
+            state.heights,
+            self._bounds(self.stages[state.stage]),
+            self.options.max_slope,
+            self.options.min_radius,
+        )
 
     def _stage(self, state: State, k: int, limit: int, deadline: float, stop, on_iteration, notice, origin: float) -> bool:
         """Iterate stage k in place.  True: the stage is done; False: the whole design ends here, for `state.reason`."""
@@ -222,8 +238,10 @@ class Designer:
             told = method.taken_back > 0
             moved = method.step()
             if method.taken_back and not told:
-                notice(f"stage {k + 1}, iteration {state.total + 1}: a step led to where no light reaches the screen or the loss is"
-                       " not finite; it was taken back and a shorter one tried, as any such step will be")
+                notice(
+                    f"stage {k + 1}, iteration {state.total + 1}: a step led to where no light reaches the screen or the loss is"
+                    " not finite; it was taken back and a shorter one tried, as any such step will be"
+                )
             if not moved:
                 state.reason = "no progress"
                 return True
@@ -240,18 +258,43 @@ class Designer:
         if stage.source is not None:
             scene = replace(scene, source=stage.source)
         if stage.waves:
-            return WaveObjective(scene, self.field(k), heights.begun(), self.target, o.loss, wavelengths=stage.waves,
-                                 blur=stage.blur, apron=stage.apron, max_slope=o.max_slope, min_radius=o.min_radius,
-                                 dtype=o.dtype, device=self.device)
+            return WaveObjective(
+                scene,
+                self.field(k),
+                heights.begun(),
+                self.target,
+                o.loss,
+                wavelengths=stage.waves,
+                blur=stage.blur,
+                apron=stage.apron,
+                max_slope=o.max_slope,
+                min_radius=o.min_radius,
+                dtype=o.dtype,
+                device=self.device,
+            )
         if stage.spread and (spread := shift_of(scene, self.field(k), heights.begun())) is not None:
             expected = best_light(scene, grey(self.target.cpu().numpy()), spread, SMOOTH_STEPS).kept
             scene, rays, spread = regular_rays(scene, spread, stage, stream(o.seed, f"stage {k}"), self.device)
         else:
             rays, spread = rays_of(scene, stage.sampler, stage.rays, stream(o.seed, f"stage {k}"), self.device), ()
             expected = 1.0
-        return Objective(scene, self.field(k), rays, stage.filter, self.target, o.loss, blur=stage.blur,
-                         filter_target=o.filter_target, apron=stage.apron, max_slope=o.max_slope, min_radius=o.min_radius,
-                         oversample=stage.oversample, spread=spread, expected=expected, dtype=o.dtype)
+        return Objective(
+            scene,
+            self.field(k),
+            rays,
+            stage.filter,
+            self.target,
+            o.loss,
+            blur=stage.blur,
+            filter_target=o.filter_target,
+            apron=stage.apron,
+            max_slope=o.max_slope,
+            min_radius=o.min_radius,
+            oversample=stage.oversample,
+            spread=spread,
+            expected=expected,
+            dtype=o.dtype,
+        )
 
     def _next(self, state: State, k: int) -> State:
         """The state at the beginning of stage k: the same surface on its net."""
@@ -268,8 +311,16 @@ class Designer:
         low, high = self._bounds(self.stages[k])
         if self.stages[k].waves:
             return FreeHeights(low, high, start, counted=True)
-        return parametrise(low, high, o.network, start=start, degree=self.scene.lens.degree, initial=o.initial,
-                           preconditioner=o.preconditioner, seed=o.seed)
+        return parametrise(
+            low,
+            high,
+            o.network,
+            start=start,
+            degree=self.scene.lens.degree,
+            initial=o.initial,
+            preconditioner=o.preconditioner,
+            seed=o.seed,
+        )
 
     def _bounds(self, stage: Stage) -> tuple[Tensor, Tensor]:
         lens = replace(self.scene.lens, control=stage.control)
@@ -277,11 +328,13 @@ class Designer:
         low, high = lens.height_bounds(x.numpy(), y.numpy())
         screen = self.scene.screen
         if lens.mirror and low.min() <= screen.z + screen.depth:
-            raise InputError(f"⟨screen.z⟩ must lie before the mirror, whose surface may reach {low.min():.4g} mm,"
-                             f" got {screen.z:g} mm")
+            raise InputError(
+                f"⟨screen.z⟩ must lie before the mirror, whose surface may reach {low.min():.4g} mm, got {screen.z:g} mm"
+            )
         if not lens.mirror and high.max() >= screen.z - screen.depth:
-            raise InputError(f"⟨screen.z⟩ must lie behind the lens, whose surface may reach {high.max():.4g} mm,"
-                             f" got {screen.z:g} mm")
+            raise InputError(
+                f"⟨screen.z⟩ must lie behind the lens, whose surface may reach {high.max():.4g} mm, got {screen.z:g} mm"
+            )
         return torch.from_numpy(low), torch.from_numpy(high)
 
     @staticmethod

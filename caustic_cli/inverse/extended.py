@@ -45,8 +45,10 @@ class Limits:
         """What cannot be."""
         found = []
         if self.light is not None:
-            found.append(f"behind the source's blur the best light there can be is {self.light.bound:.3g} (proven) to"
-                         f" {self.light.error:.3g} (found) relative RMS from the picture")
+            found.append(
+                f"behind the source's blur the best light there can be is {self.light.bound:.3g} (proven) to"
+                f" {self.light.error:.3g} (found) relative RMS from the picture"
+            )
         if self.etendue is not None:
             found.append(f"etendue lets {self.etendue:.0%} of the light on the lens reach the screen")
         return "; ".join(found)
@@ -93,8 +95,9 @@ def centre_of(scene: Scene) -> Source:
     return source
 
 
-def regular_rays(scene: Scene, spread: Spread, stage: Stage, seed: int,
-                 device: str | torch.device) -> tuple[Scene, Rays | list[Rays], list[Convolution]]:
+def regular_rays(
+    scene: Scene, spread: Spread, stage: Stage, seed: int, device: str | torch.device
+) -> tuple[Scene, Rays | list[Rays], list[Convolution]]:
     """The rays of a stage that are spread: of the source's middle, or of a few of its points where its light does more than shift;
     with the scene that they are for, and what the image of each point's is convolved with."""
     pixel, each = scene.screen.pixel, math.ceil((spread.usual / (EXACT * max(spread.reach()))) ** 2)

@@ -62,8 +62,10 @@ def _square(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[
     x0, y0, z0 = source.centre
     h, t, n = lens.z_in - z0, z - lens.z_in, lens.inside
     if h <= 0:
-        raise InputError(f"⟨source.file⟩: its rays meet at z = {z0:.4g} mm, not before the lens, where a first surface by transport"
-                         " needs a source; ⟨start⟩ offset needs none")
+        raise InputError(
+            f"⟨source.file⟩: its rays meet at z = {z0:.4g} mm, not before the lens, where a first surface by transport"
+            " needs a source; ⟨start⟩ offset needs none"
+        )
     dx, dy = x[:, None] - x0, y[None, :] - y0
     rho = np.hypot(dx, dy)
     q = np.maximum(rho / (h + t / n), (rho - t / math.sqrt((n - 1.0) * (n + 1.0))) / h)

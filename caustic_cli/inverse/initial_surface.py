@@ -37,8 +37,10 @@ FEW_CELLS, WELL = 64, 0.7
 TRIED = (0.3, 0.45, 0.65, 1.5, 2.2, 3.3)
 #: Cells along which light has nowhere to go that are left out at most before the picture counts as out of reach.
 RETRIES = 4
-UNREACHED = ("no light of the source that meets the lens can be refracted to the picture by a surface over this aperture; a picture"
-             " nearer the light's way, or a source farther away, is needed")
+UNREACHED = (
+    "no light of the source that meets the lens can be refracted to the picture by a surface over this aperture; a picture"
+    " nearer the light's way, or a source farther away, is needed"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,9 +87,19 @@ class _Grid:
         scene = self.scene
         if not scene.source.distant and not light.all():
             options["darkest"] = DARKEST
-        return refracting_surface(light, self.target, scene.lens.half_size, scene.screen.half_size, scene.lens.effective_index,
-                                  scene.screen.z, mean, directions, centre=scene.screen.shift,
-                                  start=None if again is None else again.transport.potential, **options)
+        return refracting_surface(
+            light,
+            self.target,
+            scene.lens.half_size,
+            scene.screen.half_size,
+            scene.lens.effective_index,
+            scene.screen.z,
+            mean,
+            directions,
+            centre=scene.screen.shift,
+            start=None if again is None else again.transport.potential,
+            **options,
+        )
 
     def above(self, z: np.ndarray) -> np.ndarray:
         """Part of each cell's corners where the surface is not cut off."""
@@ -101,8 +113,16 @@ class _Grid:
         light, directions = incident(scene, self.x, self.y, z)
         surface = RectBivariateSpline(self.x, self.y, z)
         at = np.broadcast_arrays(self.x[:, None], self.y[None, :])
-        u, v, part = thrown(*at, z, surface(self.x, self.y, dx=1), surface(self.x, self.y, dy=1), directions,
-                            lens.effective_index, screen.z, "none" if lens.fresnel == "none" else "exact")
+        u, v, part = thrown(
+            *at,
+            z,
+            surface(self.x, self.y, dx=1),
+            surface(self.x, self.y, dy=1),
+            directions,
+            lens.effective_index,
+            screen.z,
+            "none" if lens.fresnel == "none" else "exact",
+        )
         on = (np.abs(u - screen.shift[0]) <= screen.half_size[0]) & (np.abs(v - screen.shift[1]) <= screen.half_size[1])
         return float((light * self.above(z) * _mean(np.where(on, part, 0.0))).sum() / on_lens) if on_lens > 0 else 0.0
 

@@ -33,8 +33,9 @@ STEPS = 400
 BLOCK = 4_000_000
 
 
-def within_limits(field: HeightField, heights: Tensor, bounds: tuple[Tensor, Tensor], max_slope: float = 0.0,
-                  min_radius: float = 0.0) -> Tensor:
+def within_limits(
+    field: HeightField, heights: Tensor, bounds: tuple[Tensor, Tensor], max_slope: float = 0.0, min_radius: float = 0.0
+) -> Tensor:
     """Heights (n, m) mm that obey all limits, as near to `heights` as a descent leaves them; the same where these do already.
 
     Args:
@@ -80,8 +81,10 @@ def _descend(limits: _Limits, heights: Tensor) -> Tensor:
 
 
 def _none(excess: float) -> CausticError:
-    return CausticError(f"no surface near the designed one obeys the limits: it still exceeds them by {excess:.1%};"
-                        " a larger ⟨max_slope⟩, a smaller ⟨min_radius⟩ or ⟨min_thickness⟩ may do")
+    return CausticError(
+        f"no surface near the designed one obeys the limits: it still exceeds them by {excess:.1%};"
+        " a larger ⟨max_slope⟩, a smaller ⟨min_radius⟩ or ⟨min_thickness⟩ may do"
+    )
 
 
 class _Limits:
@@ -91,8 +94,10 @@ class _Limits:
         self.low, self.high = bounds
         self.slope, self.radius, self.scale = slope, radius, 1e-3 * max(field.half_size)
         grids = [_grid(s, a_span) for s in field.spaces]
-        self.u, self.v = ([s.matrix(g, k) / (2.0 * r) ** k for k in range(3)]
-                          for s, g, r in zip(field.spaces, grids, field.half_size, strict=True))
+        self.u, self.v = (
+            [s.matrix(g, k) / (2.0 * r) ** k for k in range(3)]
+            for s, g, r in zip(field.spaces, grids, field.half_size, strict=True)
+        )
 
     def _shape(self, heights: Tensor, rows: slice = slice(None)) -> Iterator[Tensor]:
         """Slopes and radii beyond their limits, as parts of these."""
@@ -114,8 +119,14 @@ class _Limits:
         """The largest excess, 0 or less where all is obeyed."""
         step = max(1, BLOCK // len(self.v[0]))
         beyond = max(float((self.low - heights).max()), float((heights - self.high).max())) / self.scale
-        return max(beyond, *(float(term.max()) for start in range(0, len(self.u[0]), step)
-                             for term in self._shape(heights, slice(start, start + step))))
+        return max(
+            beyond,
+            *(
+                float(term.max())
+                for start in range(0, len(self.u[0]), step)
+                for term in self._shape(heights, slice(start, start + step))
+            ),
+        )
 
 
 def _grid(space: SplineSpace, a_span: int) -> Tensor:

@@ -43,7 +43,7 @@ def gaussian_matrix(n: int, sigma: float) -> Tensor:
 
 
 def parse(text: str) -> list[tuple[float, str]]:
-    """"rms-light + 0.1 laplacian" -> [(1.0, "rms-light"), (0.1, "laplacian")].
+    """ "rms-light + 0.1 laplacian" -> [(1.0, "rms-light"), (0.1, "laplacian")].
 
     Raises:
         InputError: an unknown name, a weight that is not a number of at least 0, or nothing that looks at the image.
@@ -56,8 +56,10 @@ def parse(text: str) -> list[tuple[float, str]]:
         except ValueError:
             value = math.nan
         if not (0.0 <= value < math.inf) or name not in LOSSES + PENALTIES:
-            raise InputError(f"⟨design.loss⟩ must be names with weights such as 'rms-light + 0.1 laplacian', of"
-                             f" {', '.join(LOSSES + PENALTIES)}; got {part.strip()!r}")
+            raise InputError(
+                f"⟨design.loss⟩ must be names with weights such as 'rms-light + 0.1 laplacian', of"
+                f" {', '.join(LOSSES + PENALTIES)}; got {part.strip()!r}"
+            )
         terms.append((value, name))
     if not any(weight > 0 and name in LOSSES for weight, name in terms):
         raise InputError(f"⟨design.loss⟩ must have one of {', '.join(LOSSES)} with a weight above 0, got {text!r}")
@@ -82,8 +84,9 @@ class Loss:
             self.blur = tuple(gaussian_matrix(n, blur).to(target) for n in target.shape)
         self.target = target / target.sum()
         self.region = target > 0 if region is None else region
-        beyond = [(torch.arange(n).to(target) - apron - 0.5 * (n - 2 * apron - 1)).abs() - 0.5 * (n - 2 * apron - 1)
-                  for n in target.shape]
+        beyond = [
+            (torch.arange(n).to(target) - apron - 0.5 * (n - 2 * apron - 1)).abs() - 0.5 * (n - 2 * apron - 1) for n in target.shape
+        ]
         self.distance = torch.maximum(*torch.broadcast_tensors(beyond[0][:, None], beyond[1][None, :])).clamp_min(0.0)
         self.apron = apron
 
@@ -97,8 +100,10 @@ class Loss:
         """
         total = image.sum()
         if not float(total.detach()) > 0:
-            raise NoLight("no light reaches the screen, so there is nothing to improve: every ray is reflected inside"
-                          " the lens or misses the screen; check index, throw, mag and screen size")
+            raise NoLight(
+                "no light reaches the screen, so there is nothing to improve: every ray is reflected inside"
+                " the lens or misses the screen; check index, throw, mag and screen size"
+            )
         entering = leaving if entering is None else entering
         square = sum(weight * self._square(name, image, leaving, entering, total) for weight, name in self.terms) + penalty
         pixels = self.target.numel()
@@ -114,8 +119,10 @@ class Loss:
         if name == "uniformity":
             inside = image[self.region]
             if not float(inside.detach().sum()) > 0:  # evenly dark is not what was asked for
-                raise NoLight("no light reaches the bright part of the picture, so there is nothing to make even; check throw,"
-                              " mag and screen size")
+                raise NoLight(
+                    "no light reaches the bright part of the picture, so there is nothing to make even; check throw,"
+                    " mag and screen size"
+                )
             return (inside / inside.mean()).var(correction=0)
         residual = image / (total if name == "rms" else leaving) - self.target
         if self.blur is not None:

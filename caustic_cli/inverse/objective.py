@@ -45,8 +45,9 @@ class Evaluation:
         return self.gradients[EXIT]
 
 
-def penalty_of(scene: Scene, field: HeightField, loss: str, max_slope: float, min_radius: float,
-               device: str | torch.device) -> Penalty:
+def penalty_of(
+    scene: Scene, field: HeightField, loss: str, max_slope: float, min_radius: float, device: str | torch.device
+) -> Penalty:
     """What a loss and the limits say of the surface itself."""
     terms = [(weight, name) for weight, name in parse(loss) if name in PENALTIES and weight > 0]
     return Penalty(scene, field, terms, max_slope, device, min_radius)
@@ -76,10 +77,25 @@ class Objective:
         dtype: precision of the rays.
     """
 
-    def __init__(self, scene: Scene, field: HeightField, sampler: Rays | Sequence[Rays], filter: Filter, target: Tensor,
-                 loss: str, *, blur: float = 0.0, filter_target: bool = True, apron: int = 0, max_slope: float = 0.0,
-                 min_radius: float = 0.0, oversample: int = 1, spread: Sequence[Convolution] = (), expected: float = 1.0,
-                 dtype: torch.dtype = torch.float32):
+    def __init__(
+        self,
+        scene: Scene,
+        field: HeightField,
+        sampler: Rays | Sequence[Rays],
+        filter: Filter,
+        target: Tensor,
+        loss: str,
+        *,
+        blur: float = 0.0,
+        filter_target: bool = True,
+        apron: int = 0,
+        max_slope: float = 0.0,
+        min_radius: float = 0.0,
+        oversample: int = 1,
+        spread: Sequence[Convolution] = (),
+        expected: float = 1.0,
+        dtype: torch.dtype = torch.float32,
+    ):
         self.samplers = list(sampler) if isinstance(sampler, Sequence) else [sampler]
         self.device = self.samplers[0].device
         self.spread, self.cut = list(spread), spread[0].cut if spread else 1
@@ -117,8 +133,10 @@ class Objective:
         """The source's image on screen and apron, from those of the rays of each of its points."""
         if not self.spread:
             return images[0]
-        return sum(torch.stack([spread(c) for c in image]) if image.ndim == 3 else spread(image)
-                   for spread, image in zip(self.spread, images, strict=True))
+        return sum(
+            torch.stack([spread(c) for c in image]) if image.ndim == 3 else spread(image)
+            for spread, image in zip(self.spread, images, strict=True)
+        )
 
     def _due(self, seen: Tensor, leaving: Tensor) -> Tensor:
         """Power that the loss holds against an image: all that leaves the lens; behind a source's blur what it sees, unless that
@@ -183,8 +201,11 @@ class Objective:
         gradients = [torch.zeros_like(heights) for heights in leaves]
         for k, part in parts or ((k, self._see(traced, parameters)) for k, traced in self.kept or self._tracers()):
             # Whole pixels, and what leaves a lens without reflections, do not depend on the heights at all.
-            pulls = [(value, by.to(value.dtype)) for value, by in zip(part, (by_image[k], by_leaving), strict=True)
-                     if value.requires_grad and by is not None]
+            pulls = [
+                (value, by.to(value.dtype))
+                for value, by in zip(part, (by_image[k], by_leaving), strict=True)
+                if value.requires_grad and by is not None
+            ]
             if pulls:
                 values, by = zip(*pulls, strict=True)
                 for gradient, more in zip(gradients, torch.autograd.grad(values, leaves, by, allow_unused=True), strict=True):

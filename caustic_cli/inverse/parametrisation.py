@@ -110,8 +110,10 @@ class NetworkHeights(Heights):
             layers += [(kernel, (kernel, size))]
         else:
             if 2 * size * size > MAX_DENSE:
-                raise InputError(f"⟨design.network⟩ dense needs {2 * size * size:.3g} weights for a {n} x {m} control net;"
-                                 f" at most {MAX_DENSE:.3g} are supported (16000 control points): use sparse or none")
+                raise InputError(
+                    f"⟨design.network⟩ dense needs {2 * size * size:.3g} weights for a {n} x {m} control net;"
+                    f" at most {MAX_DENSE:.3g} are supported (16000 control points): use sparse or none"
+                )
             layers += [(size, (size, size)), (size, (size, size))]
         generator = torch.Generator().manual_seed(seed)
         self.weights, self.biases = torch.nn.ParameterList(), torch.nn.ParameterList()
@@ -134,8 +136,17 @@ class NetworkHeights(Heights):
         return x.view(self.net)
 
 
-def parametrise(low: Tensor, high: Tensor, network: str = "none", *, start: Tensor | None = None, degree=(3, 3),
-                initial: str = "zero", preconditioner: str = "none", seed: int = 0) -> Heights:
+def parametrise(
+    low: Tensor,
+    high: Tensor,
+    network: str = "none",
+    *,
+    start: Tensor | None = None,
+    degree=(3, 3),
+    initial: str = "zero",
+    preconditioner: str = "none",
+    seed: int = 0,
+) -> Heights:
     """The parametrisation a design asks for.
 
     Raises:
@@ -155,6 +166,8 @@ def parametrise(low: Tensor, high: Tensor, network: str = "none", *, start: Tens
             start = module().detach()
         return FreeHeights(low, high, start, preconditioner == "laplacian")
     if start is not None or preconditioner != "none":
-        raise InputError(f"⟨design.network⟩ {network} begins from its own initial state with preconditioner none;"
-                         " a start surface or the laplacian preconditioner need network none")
+        raise InputError(
+            f"⟨design.network⟩ {network} begins from its own initial state with preconditioner none;"
+            " a start surface or the laplacian preconditioner need network none"
+        )
     return NetworkHeights(low, high, network, degree, initial, seed)

@@ -35,8 +35,15 @@ class Penalty:
         min_radius: least radius of curvature of concave places, mm, 0 for any.
     """
 
-    def __init__(self, scene: Scene, field: HeightField, terms: list[tuple[float, str]], max_slope: float = 0.0,
-                 device: str | torch.device = "cpu", min_radius: float = 0.0):
+    def __init__(
+        self,
+        scene: Scene,
+        field: HeightField,
+        terms: list[tuple[float, str]],
+        max_slope: float = 0.0,
+        device: str | torch.device = "cpu",
+        min_radius: float = 0.0,
+    ):
         self.terms, self.limit, self.radius = terms, max_slope, min_radius
         if min_radius > 0 and min(s.degree for s in field.spaces) < 2:
             raise InputError("⟨design.min_radius⟩ needs splines of degree 2 or more, which have a curvature")

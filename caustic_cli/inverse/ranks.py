@@ -93,5 +93,6 @@ def _call(collective, *arguments) -> None:
     try:
         collective(*arguments)
     except RuntimeError as error:
-        raise CausticError(f"rank {dist.get_rank()}: another rank has stopped, and what it said tells why"
-                           f" ({str(error).splitlines()[0][:200]})") from error
+        raise CausticError(
+            f"rank {dist.get_rank()}: another rank has stopped, and what it said tells why ({str(error).splitlines()[0][:200]})"
+        ) from error

@@ -30,8 +30,10 @@ def refuse_unreachable(scene: Scene, target: np.ndarray) -> None:
         return
     x, y, d = _in_glass(scene)
     if not len(x):
-        raise InputError("[source] none of its light meets the lens: its position, aim or cone point past the aperture of"
-                         f" {lens.size[0]:g} x {lens.size[1]:g} mm at z = {lens.z_in:g} mm")
+        raise InputError(
+            "[source] none of its light meets the lens: its position, aim or cone point past the aperture of"
+            f" {lens.size[0]:g} x {lens.size[1]:g} mm at z = {lens.z_in:g} mm"
+        )
     goal = _lit(scene, target)
     most = -1.0
     for height in (lens.offset.thickness, lens.z_in + lens.min_thickness):
@@ -43,9 +45,11 @@ def refuse_unreachable(scene: Scene, target: np.ndarray) -> None:
             most = max(most, float(((t * d[:, within, None]).sum(0) / np.sqrt((t * t).sum(0)))[t[2] > 0].max(initial=-1.0)))
     if not lens.inside * most > 1.0:
         turn, limit = (math.degrees(math.acos(min(1.0, c))) for c in (most, 1.0 / lens.inside))
-        raise InputError("[screen] no light can leave the lens for the picture: it would have to turn by at least"
-                         f" {turn:.3g} degrees, and glass of index {lens.inside:g} turns it by less than {limit:.3g}; a picture"
-                         " nearer the light's way, or a higher index, is needed")
+        raise InputError(
+            "[screen] no light can leave the lens for the picture: it would have to turn by at least"
+            f" {turn:.3g} degrees, and glass of index {lens.inside:g} turns it by less than {limit:.3g}; a picture"
+            " nearer the light's way, or a higher index, is needed"
+        )
 
 
 def _in_glass(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -69,8 +69,20 @@ class Start:
     seconds: float
 
 
-def surface(source, target, source_half, target_half, index, z_screen, thickness, directions=None, *, corrections=2,
-            centre=(0.0, 0.0), **options) -> Start:
+def surface(
+    source,
+    target,
+    source_half,
+    target_half,
+    index,
+    z_screen,
+    thickness,
+    directions=None,
+    *,
+    corrections=2,
+    centre=(0.0, 0.0),
+    **options,
+) -> Start:
     """Exit surface of a lens that throws `target` on the screen.
 
     Args:
@@ -177,8 +189,10 @@ def heights(map_: Transport, aim, x, y, d, index: float, z_screen: float, mean: 
         within = (index * (d[0] * tx + d[1] * ty + d[2] * tz) > forward * length) & (forward * tz > 0)  # t . N > 0
         if not within[lit].all():
             raise OutOfReach(lit & ~within)
-        rest = [np.where(within, (t / length - n * v) / np.where(within, lean, 1.0) - s, 0.0)
-                for t, v, s in zip((tx, ty), d, slope, strict=False)]
+        rest = [
+            np.where(within, (t / length - n * v) / np.where(within, lean, 1.0) - s, 0.0)
+            for t, v, s in zip((tx, ty), d, slope, strict=False)
+        ]
         z = main + integrate(*rest, step)
         z += mean - z.mean()
     return z
@@ -190,8 +204,10 @@ def integrate(sx: np.ndarray, sy: np.ndarray, step: tuple[float, float]) -> np.n
     hx, hy = step
     ax, ay = 0.5 * (sx[1:] + sx[:-1]) / hx, 0.5 * (sy[:, 1:] + sy[:, :-1]) / hy
     right = np.diff(ax, axis=0, prepend=0.0, append=0.0) + np.diff(ay, axis=1, prepend=0.0, append=0.0)
-    wave = -((2.0 * np.sin(0.5 * np.pi * np.arange(n) / n) / hx)[:, None] ** 2) - (
-        2.0 * np.sin(0.5 * np.pi * np.arange(m) / m) / hy) ** 2
+    wave = (
+        -((2.0 * np.sin(0.5 * np.pi * np.arange(n) / n) / hx)[:, None] ** 2)
+        - (2.0 * np.sin(0.5 * np.pi * np.arange(m) / m) / hy) ** 2
+    )
     wave[0, 0] = 1.0
     spectrum = dctn(right, norm="ortho") / wave
     spectrum[0, 0] = 0.0
@@ -213,7 +229,13 @@ def thrown(x, y, z, zx, zy, d, index: float, z_screen: float, fresnel: str = "no
         return value if isinstance(value, float) else torch.from_numpy(np.broadcast_to(value, shape).flatten())
 
     origin, slopes, mirror = [flat(c) for c in (x, y, z)], (flat(zx), flat(zy)), index == -1.0
-    out = backend.interact(tuple(map(flat, d)), slopes, torch.ones(z.size, dtype=torch.float64), eta=1.0 if mirror else index,
-                           reflects=mirror, fresnel=fresnel)
+    out = backend.interact(
+        tuple(map(flat, d)),
+        slopes,
+        torch.ones(z.size, dtype=torch.float64),
+        eta=1.0 if mirror else index,
+        reflects=mirror,
+        fresnel=fresnel,
+    )
     landing = backend.land(tuple(origin), out.direction, (0.0, 0.0, z_screen), IDENTITY, -1.0 if mirror else 1.0)[:2]
     return *(torch.where(out.passes, c, torch.nan).view(shape).numpy() for c in landing), out.power.view(shape).numpy()

@@ -33,8 +33,10 @@ def target_on_screen(irradiance: np.ndarray, size: tuple[float, float], screen: 
     """
     for name, picture, whole in zip(("width", "height"), size, screen.size, strict=True):
         if picture > whole * (1 + 1e-9):
-            raise InputError(f"⟨target.size⟩: the picture's {name} of {picture:g} mm must fit on the screen's {whole:g} mm"
-                             " (a smaller ⟨mag⟩, a larger ⟨screen_size⟩)")
+            raise InputError(
+                f"⟨target.size⟩: the picture's {name} of {picture:g} mm must fit on the screen's {whole:g} mm"
+                " (a smaller ⟨mag⟩, a larger ⟨screen_size⟩)"
+            )
     if "x" in flip:
         irradiance = irradiance[::-1]
     if "y" in flip:

@@ -90,8 +90,9 @@ def corners(n: int, half: float) -> np.ndarray:
     return np.linspace(-half, half, n + 1)
 
 
-def solve(source, target, source_half, target_half, *, start=None, smooth=1.5, tolerance=5e-3, most=10,
-          darkest=DARKEST) -> Transport:
+def solve(
+    source, target, source_half, target_half, *, start=None, smooth=1.5, tolerance=5e-3, most=10, darkest=DARKEST
+) -> Transport:
     """The map that carries `source` onto `target` at least quadratic cost.
 
     Args:

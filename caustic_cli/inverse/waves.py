@@ -66,9 +66,22 @@ class WaveObjective:
         NoWaveImage: no light, no single wavefront, or memory is short.
     """
 
-    def __init__(self, scene: Scene, field: HeightField, heights: Tensor, target: Tensor, loss: str, *,
-                 wavelengths: tuple[float, ...] = (), blur: float = 0.0, apron: int = 0, max_slope: float = 0.0,
-                 min_radius: float = 0.0, dtype: torch.dtype = torch.float32, device: str | torch.device = "cpu"):
+    def __init__(
+        self,
+        scene: Scene,
+        field: HeightField,
+        heights: Tensor,
+        target: Tensor,
+        loss: str,
+        *,
+        wavelengths: tuple[float, ...] = (),
+        blur: float = 0.0,
+        apron: int = 0,
+        max_slope: float = 0.0,
+        min_radius: float = 0.0,
+        dtype: torch.dtype = torch.float32,
+        device: str | torch.device = "cpu",
+    ):
         self.scene, self.field, self.apron, self.dtype = scene, field, apron, dtype
         self.middle = heights.detach().double().to(device)
         screen = scene.screen.grown((apron, apron))
@@ -125,8 +138,11 @@ class WaveObjective:
         ranks.all_reduce(image, leaving)
         image.requires_grad_()
         loss = self.loss(image, leaving, penalty)
-        by_image, direct = torch.autograd.grad(loss, (image, heights), allow_unused=True) if penalty.requires_grad else \
-            (*torch.autograd.grad(loss, (image,)), None)
+        by_image, direct = (
+            torch.autograd.grad(loss, (image, heights), allow_unused=True)
+            if penalty.requires_grad
+            else (*torch.autograd.grad(loss, (image,)), None)
+        )
         by_moved = {key: torch.zeros_like(z, dtype=torch.float64) for key, z in by.items()}
         for part, found in zip(self.parts, seen, strict=True):
             z = by[id(part.front)]

@@ -24,12 +24,21 @@ def open_archive(path: str | Path) -> tuple[Scene, HeightField, Tensor]:
     data = load_npz(path)
     field, heights = surface_of(data, path)
     try:
-        lens = Lens(size=tuple(2.0 * h for h in field.half_size), z_in=float(data["z_in"]), index=float(data["refractive_index"]),
-                    control=field.shape, degree=tuple(s.degree for s in field.spaces),
-                    knots=tuple(tuple(s.knots.tolist()) for s in field.spaces), fresnel=_text(data, "fresnel", "exact"),
-                    aperture=_text(data, "aperture", "rectangle"))
-        screen = Screen(tuple(2.0 * h for h in _reals(data, "screen_half_size", 2)), float(data["z_screen"]),
-                        tuple(int(n) for n in _reals(data, "resolution", 2)))
+        lens = Lens(
+            size=tuple(2.0 * h for h in field.half_size),
+            z_in=float(data["z_in"]),
+            index=float(data["refractive_index"]),
+            control=field.shape,
+            degree=tuple(s.degree for s in field.spaces),
+            knots=tuple(tuple(s.knots.tolist()) for s in field.spaces),
+            fresnel=_text(data, "fresnel", "exact"),
+            aperture=_text(data, "aperture", "rectangle"),
+        )
+        screen = Screen(
+            tuple(2.0 * h for h in _reals(data, "screen_half_size", 2)),
+            float(data["z_screen"]),
+            tuple(int(n) for n in _reals(data, "resolution", 2)),
+        )
         return Scene(_source(data), lens, screen, Light(unit=_text(data, "source_power_unit", "W"))), field, heights
     except KeyError as error:
         raise InputError(f"{path}: has no {error.args[0]}; an archive of caustic export ⟨format⟩ lighttools is needed") from error
@@ -59,8 +68,13 @@ def _disc(data: dict[str, np.ndarray]) -> Disc:
     power = float(data["source_power"][0])
     if "source_angle" in data:
         return Disc(power=power, angle=float(data["source_angle"]), brightness=data.get("source_brightness"))
-    return Disc(_positions(data)[0], tuple(_reals(data, "source_size", 2)), power, brightness=data.get("source_brightness"),
-                **_shining(data))
+    return Disc(
+        _positions(data)[0],
+        tuple(_reals(data, "source_size", 2)),
+        power,
+        brightness=data.get("source_brightness"),
+        **_shining(data),
+    )
 
 
 #: What makes a source of its keys in the archive, by its kind: see `export/lighttools.py`.

@@ -144,8 +144,9 @@ def _read_npy(path: Path, color: bool) -> Picture:
     _check_size(path, *array.shape[-2:])
     values = np.array(array, dtype=np.float64)
     if not np.isfinite(values).all():
-        raise InputError(f"{path}: holds {int((~np.isfinite(values)).sum())} values that are NaN or infinite;"
-                         " finite irradiance is needed")
+        raise InputError(
+            f"{path}: holds {int((~np.isfinite(values)).sum())} values that are NaN or infinite; finite irradiance is needed"
+        )
     if (values < 0).any():
         raise InputError(f"{path}: holds negative values (least {values.min():g}); irradiance must be at least 0")
     if values.size and values.max() > 1e300:

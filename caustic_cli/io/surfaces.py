@@ -29,7 +29,8 @@ SAME = 1e-9
 _POINT = re.compile(r"(#\d+)\s*=\s*CARTESIAN_POINT\s*\(\s*'[^']*'\s*,\s*\(([^()]*)\)\s*\)\s*;")
 _SURFACE = re.compile(
     r"B_SPLINE_SURFACE_WITH_KNOTS\s*\(\s*'[^']*'\s*,\s*(\d+)\s*,\s*(\d+)\s*,\s*\(((?:\s*\([#\d,\s]*\)\s*,?)+)\)"
-    r"\s*,[^()]*,\s*\(([\d,\s]*)\)\s*,\s*\(([\d,\s]*)\)\s*,\s*\(([^()]*)\)\s*,\s*\(([^()]*)\)\s*,")
+    r"\s*,[^()]*,\s*\(([\d,\s]*)\)\s*,\s*\(([\d,\s]*)\)\s*,\s*\(([^()]*)\)\s*,\s*\(([^()]*)\)\s*,"
+)
 
 
 def read_surface(path: str | Path, half_size: tuple[float, float]) -> tuple[HeightField, Tensor]:
@@ -52,8 +53,10 @@ def read_surface(path: str | Path, half_size: tuple[float, float]) -> tuple[Heig
     found = read_npz(path) if path.suffix.lower() == ".npz" else read_step(path)
     if any(abs(a - b) > SAME * b for a, b in zip(found[0].half_size, half_size, strict=True)):
         wide, high = (2.0 * r for r in found[0].half_size)
-        raise InputError(f"{path}: the lens is {wide:g} x {high:g} mm, not {2 * half_size[0]:g} x {2 * half_size[1]:g} mm;"
-                         " ⟨lens_size⟩ must be its own")
+        raise InputError(
+            f"{path}: the lens is {wide:g} x {high:g} mm, not {2 * half_size[0]:g} x {2 * half_size[1]:g} mm;"
+            " ⟨lens_size⟩ must be its own"
+        )
     return found
 
 
@@ -93,8 +96,9 @@ def surface_of(data: dict[str, np.ndarray], path: Path) -> tuple[HeightField, Te
     degrees, half = data["degrees"], data["lens_half_size"]
     if degrees.shape != (2,) or half.shape != (2,) or degrees.dtype.kind not in "iu" or not np.isfinite(half).all():
         raise InputError(f"{path}: degrees must be two whole numbers and lens_half_size two lengths in mm")
-    return _surface(path, data["control_points"], [int(p) for p in degrees], (data["knots_u"], data["knots_v"]),
-                    tuple(float(h) for h in half))
+    return _surface(
+        path, data["control_points"], [int(p) for p in degrees], (data["knots_u"], data["knots_v"]), tuple(float(h) for h in half)
+    )
 
 
 def read_step(path: Path) -> tuple[HeightField, Tensor]:
@@ -140,14 +144,21 @@ def _surface(path: Path, poles: np.ndarray, degrees: list[int], knots, half=None
         raise InputError(f"{path}: {error}") from error
     half = half or (float(poles[-1, 0, 0]), float(poles[0, -1, 1]))
     if (spaces[0].n, spaces[1].n) != poles.shape[:2]:
-        raise InputError(f"{path}: its knots and degrees belong to {spaces[0].n} x {spaces[1].n} control points,"
-                         f" not {poles.shape[0]} x {poles.shape[1]}")
+        raise InputError(
+            f"{path}: its knots and degrees belong to {spaces[0].n} x {spaces[1].n} control points,"
+            f" not {poles.shape[0]} x {poles.shape[1]}"
+        )
     field = HeightField(spaces, half)
     x, y = (c.numpy() for c in field.control_xy())
-    if not min(half) > 0 or np.abs(poles[..., 0] - x[:, None]).max() > SAME * half[0] or \
-            np.abs(poles[..., 1] - y[None, :]).max() > SAME * half[1]:
-        raise InputError(f"{path}: is no height field over an aperture centred on the axis: its control points must stand at the"
-                         " Greville abscissae, rows along +x")
+    if (
+        not min(half) > 0
+        or np.abs(poles[..., 0] - x[:, None]).max() > SAME * half[0]
+        or np.abs(poles[..., 1] - y[None, :]).max() > SAME * half[1]
+    ):
+        raise InputError(
+            f"{path}: is no height field over an aperture centred on the axis: its control points must stand at the"
+            " Greville abscissae, rows along +x"
+        )
     return field, torch.from_numpy(np.ascontiguousarray(poles[..., 2], dtype=np.float64))
 
 
@@ -158,8 +169,9 @@ def _read_heights(path: Path, half_size: tuple[float, float]) -> tuple[HeightFie
     except (OSError, ValueError, EOFError) as error:
         raise InputError(f"{path}: is not a readable .npy array; a 2-D one of heights in mm is needed") from error
     if z.ndim != 2 or z.dtype.kind not in "fiu" or not np.isfinite(z).all() or not 2 <= min(z.shape) <= max(z.shape) <= MAX_CONTROL:
-        raise InputError(f"{path}: must be a 2-D array of finite heights in mm, 2 to {MAX_CONTROL} along each axis, got shape"
-                         f" {z.shape}")
+        raise InputError(
+            f"{path}: must be a 2-D array of finite heights in mm, 2 to {MAX_CONTROL} along each axis, got shape {z.shape}"
+        )
     degrees = [min(3, n - 1) for n in z.shape]
     lines = [np.linspace(0.0, 1.0, n) for n in z.shape]
     spline = RectBivariateSpline(*lines, z.astype(float), kx=degrees[0], ky=degrees[1], s=0)

@@ -68,12 +68,14 @@ def bounds_of(scene: Scene, field: HeightField, heights: Tensor) -> Bounds:
     slope_ratio = slope * math.tan(out) if out < math.pi / 2.0 else (math.inf if slope > 0 else 0.0)
     reach = _reach(scene, inside, float(heights.min()), float(heights.max()))
     ghost, polarised = _ghost(scene, field, heights, inside, most), _polarised(incidence, critical, most)
-    return Bounds(incidence, inside, slope, lean, most, critical, slope_ratio, reach, ghost, polarised,
-                  Resolution.at(scene, field, heights))
+    return Bounds(
+        incidence, inside, slope, lean, most, critical, slope_ratio, reach, ghost, polarised, Resolution.at(scene, field, heights)
+    )
 
 
 def _polarised(incidence: float, critical: float, n: float) -> float:
     """|T_s - T_p| / (T_s + T_p) at the entrance times |R_s - R_p| / 2 at the exit, both at the greatest angles."""
+
     def split(sine: float, eta: float) -> tuple[float, float]:
         c, s = (math.sqrt(max(0.0, 1.0 - v * v)) for v in (sine, eta * sine))
         return reflectances(c, s, eta)
@@ -100,8 +102,9 @@ def _reach(scene: Scene, inside: float, lowest: float, top: float) -> float:
     if lens.round:
         far = np.hypot(*(np.abs(positions[:, k]) + extent[k] for k in (0, 1))) + wide
         return float((np.minimum(far, lens.half_size[0]) + drift).max()) / lens.half_size[0]
-    return max(float(((np.minimum(np.abs(positions[:, k]) + extent[k] + wide, r) + drift) / r).max())
-               for k, r in enumerate(lens.half_size))
+    return max(
+        float(((np.minimum(np.abs(positions[:, k]) + extent[k] + wide, r) + drift) / r).max()) for k, r in enumerate(lens.half_size)
+    )
 
 
 def _ghost(scene: Scene, field: HeightField, heights: Tensor, inside: float, n: float) -> float:
@@ -136,7 +139,6 @@ def _slopes(field: HeightField, heights: Tensor) -> tuple[Tensor, Tensor]:
     (su, sv), (rx, ry) = field.spaces, field.half_size
     gx, gy = (su.derivative_matrix() @ heights).abs() / (2 * rx), (heights @ sv.derivative_matrix().T).abs() / (2 * ry)
     p, q = su.degree, sv.degree
-    along = [torch.nn.functional.max_pool2d(g[None, None], window, 1)[0, 0]
-             for g, window in ((gx, (p, q + 1)), (gy, (p + 1, q)))]
+    along = [torch.nn.functional.max_pool2d(g[None, None], window, 1)[0, 0] for g, window in ((gx, (p, q + 1)), (gy, (p + 1, q)))]
     widths = [torch.diff(s.knots[s.degree : s.n + 1]).double() for s in (su, sv)]
     return torch.hypot(*along), widths[0][:, None] * widths[1][None, :]

@@ -68,8 +68,10 @@ def turned_back(pose: Pose, vector) -> tuple:
 
 def advanced(origin, direction, t: Tensor) -> tuple:
     """o + t d; where d is a plain 0, o itself."""
-    return tuple(o if isinstance(d, float) and d == 0.0 else o + (t if isinstance(d, float) and d == 1.0 else t * d)
-                 for o, d in zip(origin, direction, strict=True))
+    return tuple(
+        o if isinstance(d, float) and d == 0.0 else o + (t if isinstance(d, float) and d == 1.0 else t * d)
+        for o, d in zip(origin, direction, strict=True)
+    )
 
 
 def _less(value, shift: float):

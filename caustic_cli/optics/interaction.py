@@ -28,8 +28,16 @@ class Walker(Protocol):
     start: RayState
     backend: Any
 
-    def cross(self, k: int, state: RayState, heights: Tensor | None, *, forward: bool = True, reflects: bool | None = None,
-              straight: bool = True) -> Interaction:
+    def cross(
+        self,
+        k: int,
+        state: RayState,
+        heights: Tensor | None,
+        *,
+        forward: bool = True,
+        reflects: bool | None = None,
+        straight: bool = True,
+    ) -> Interaction:
         """Rays to element k and behind it."""
 
 
@@ -72,7 +80,13 @@ class Interaction:
 
     def returned(self) -> RayState:
         """The light that this refracting element reflects, at its surface."""
-        found = self.tracer.backend.interact(self.incoming, self.slopes, self.arriving, eta=1.0, reflects=True,
-                                             fresnel=self.element.fresnel, side=self.side)
-        return replace(self.state, direction=turned_back(self.element.pose, found.direction), power=self.arriving - self.departing,
-                       lost={}, sample=None)
+        found = self.tracer.backend.interact(
+            self.incoming, self.slopes, self.arriving, eta=1.0, reflects=True, fresnel=self.element.fresnel, side=self.side
+        )
+        return replace(
+            self.state,
+            direction=turned_back(self.element.pose, found.direction),
+            power=self.arriving - self.departing,
+            lost={},
+            sample=None,
+        )

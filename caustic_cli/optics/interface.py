@@ -32,8 +32,9 @@ class Departure(NamedTuple):
     passes: Tensor
 
 
-def interact(direction, slopes, power: Tensor, *, eta: float, reflects: bool, fresnel: str, polarised=None,
-             side: float = 1.0) -> Departure:
+def interact(
+    direction, slopes, power: Tensor, *, eta: float, reflects: bool, fresnel: str, polarised=None, side: float = 1.0
+) -> Departure:
     """Refract or reflect rays of N at a height field.
 
     Args:
@@ -47,9 +48,15 @@ def interact(direction, slopes, power: Tensor, *, eta: float, reflects: bool, fr
         side: +1 for rays from below the surface, -1 from above.
     """
     if side < 0:
-        flipped = interact((direction[0], direction[1], -direction[2]), [-g for g in slopes], power, eta=eta, reflects=reflects,
-                           fresnel=fresnel,
-                           polarised=None if polarised is None else (polarised[0], polarised[1], -polarised[2]))
+        flipped = interact(
+            (direction[0], direction[1], -direction[2]),
+            [-g for g in slopes],
+            power,
+            eta=eta,
+            reflects=reflects,
+            fresnel=fresnel,
+            polarised=None if polarised is None else (polarised[0], polarised[1], -polarised[2]),
+        )
         tx, ty, tz = flipped.direction
         return Departure((tx, ty, -tz), flipped.power, flipped.passes)
     gx, gy = slopes

@@ -99,8 +99,9 @@ def _primal(value: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def find(field, heights: Tensor, origin, direction, method: Method | None = None,
-         radius: float | None = None) -> tuple[Tensor, Tensor]:
+def find(
+    field, heights: Tensor, origin, direction, method: Method | None = None, radius: float | None = None
+) -> tuple[Tensor, Tensor]:
     """t (N,) float64 of the first hit, from below, of rays with a B-spline, and its `Status` (N,), by a method."""
     return backend_for(heights.device).find(field, heights, origin, direction, method or Method(), radius)
 
@@ -114,8 +115,9 @@ def within(status: Tensor, t: Tensor, origin, direction, radius: float | None) -
 
 
 @torch.no_grad()
-def reference(surface: Surface, heights: Tensor | None, origin, direction, side: float = 1.0,
-              radius: float | None = None) -> tuple[Tensor, Tensor]:
+def reference(
+    surface: Surface, heights: Tensor | None, origin, direction, side: float = 1.0, radius: float | None = None
+) -> tuple[Tensor, Tensor]:
     """Distances t (N,) to first hits and their `Status`, by Newton's method in plain torch."""
     h, middle = surface.centred(None if heights is None else heights.detach())
     tensors = [torch.as_tensor(c, dtype=torch.float64).detach() for c in (*origin, *direction)]
@@ -152,8 +154,9 @@ def reference(surface: Surface, heights: Tensor | None, origin, direction, side:
     slope = bound[0] * dx.abs() + bound[1] * dy.abs()
     unsafe = ((slope >= dz) & (status == Status.HIT) & ~at_once).nonzero()[:, 0]
     if len(unsafe):
-        found = _first_brackets(lambda t, of: f(t, unsafe[of])[0], low[unsafe], high[unsafe], f_low[unsafe],
-                                (dz + slope)[unsafe], (dz - slope)[unsafe])
+        found = _first_brackets(
+            lambda t, of: f(t, unsafe[of])[0], low[unsafe], high[unsafe], f_low[unsafe], (dz + slope)[unsafe], (dz - slope)[unsafe]
+        )
         low, high = low.index_copy(0, unsafe, found[0]), high.index_copy(0, unsafe, found[1])
         status = status.index_copy(0, unsafe, found[2])
         closed = closed.index_fill(0, unsafe, True)

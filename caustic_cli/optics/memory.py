@@ -27,8 +27,9 @@ def smaller(chunk: int, problem: BaseException) -> int:
     if not is_out_of_memory(problem):
         raise problem
     if chunk <= LEAST:
-        raise CausticError(f"out of memory, even with {chunk:,} rays at a time; a smaller ⟨control⟩ or ⟨resolution⟩ needs"
-                           " less") from problem
+        raise CausticError(
+            f"out of memory, even with {chunk:,} rays at a time; a smaller ⟨control⟩ or ⟨resolution⟩ needs less"
+        ) from problem
     if torch.cuda.is_available():
         torch.cuda.empty_cache()
     return max(LEAST, chunk // 4)

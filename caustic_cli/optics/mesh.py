@@ -57,8 +57,9 @@ class TriangleMesh:
         self._vertices = vertices_of(*field.spaces, heights, n_u, n_v).numpy()
         self._low, self._high = (box.numpy() for box in boxes_of(*field.spaces, heights))
 
-    def intersect(self, x: Tensor, y: Tensor, z: Tensor, dx: Tensor, dy: Tensor, dz: Tensor,
-                  recursive: bool = True) -> tuple[Tensor, Tensor, Tensor]:
+    def intersect(
+        self, x: Tensor, y: Tensor, z: Tensor, dx: Tensor, dy: Tensor, dz: Tensor, recursive: bool = True
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Times t (N,) of the rays' hits, infinite without; status (N,) int8, 0 for a hit; triangles tested (N,) int32.
 
         Args:

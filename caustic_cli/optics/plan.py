@@ -66,9 +66,16 @@ def compile_plan(scene: Scene, field: HeightField, heights: Tensor, wanted: Iter
     decisions = [effect.judge(scene, bounds) for effect in EFFECTS]
     if wanted is not None:
         chosen = frozenset(wanted)
-        decisions = [v if (v.name in chosen) == v.on or v.fixed else
-                    replace(v, on=not v.on, why=f"{'asked for' if not v.on else 'left out as asked'}; by itself"
-                            f" {'off' if not v.on else 'on'}: {v.why}") for v in decisions]
+        decisions = [
+            v
+            if (v.name in chosen) == v.on or v.fixed
+            else replace(
+                v,
+                on=not v.on,
+                why=f"{'asked for' if not v.on else 'left out as asked'}; by itself {'off' if not v.on else 'on'}: {v.why}",
+            )
+            for v in decisions
+        ]
     traced, requests = scene, NO_REQUESTS
     for effect, decision in zip(EFFECTS, decisions, strict=True):
         traced = effect.within(traced) if decision.on else effect.without(traced)

@@ -100,12 +100,19 @@ class RayState:
 
     def to(self, dtype: torch.dtype) -> RayState:
         """The same rays in another precision."""
+
         def cast(value):
             return value.to(dtype) if isinstance(value, Tensor) else value
 
-        return replace(self, origin=tuple(map(cast, self.origin)), direction=tuple(map(cast, self.direction)),
-                       power=cast(self.power), path=cast(self.path), lost=dict(self.lost),
-                       polarised=None if self.polarised is None else tuple(map(cast, self.polarised)))
+        return replace(
+            self,
+            origin=tuple(map(cast, self.origin)),
+            direction=tuple(map(cast, self.direction)),
+            power=cast(self.power),
+            path=cast(self.path),
+            lost=dict(self.lost),
+            polarised=None if self.polarised is None else tuple(map(cast, self.polarised)),
+        )
 
     @classmethod
     def on_axis(cls, sample: Sample, half_size: tuple[float, float], z: float) -> RayState:

@@ -58,8 +58,15 @@ class Resolution:
         wavelength = sum(w * p for w, p in zip(said, scene.light.parts, strict=True)) if said else GREEN
         throw = abs(screen.z - lens.z_in)
         distance = abs(screen.z - lens.offset.thickness)
-        return cls(diffraction_blur(wavelength, distance, magnification), scene.source.blur(lens.z_in, throw), max(screen.pixel),
-                   picture, lens.size[0], wavelength, bool(said))
+        return cls(
+            diffraction_blur(wavelength, distance, magnification),
+            scene.source.blur(lens.z_in, throw),
+            max(screen.pixel),
+            picture,
+            lens.size[0],
+            wavelength,
+            bool(said),
+        )
 
     @classmethod
     def before(cls, scene: Scene, picture: tuple[float, float]) -> Resolution:
@@ -106,8 +113,10 @@ class Resolution:
     def sentence(self) -> str:
         """What light carries here."""
         n = self.resolvable
-        text = (f"light carries about {n} x {n} details here (diffraction {self.diffraction:.2g} mm, source {self.source:.2g} mm,"
-                f" pixel {self.pixel:.2g} mm)")
+        text = (
+            f"light carries about {n} x {n} details here (diffraction {self.diffraction:.2g} mm, source {self.source:.2g} mm,"
+            f" pixel {self.pixel:.2g} mm)"
+        )
         larger = self.lens_for_all()
         return text + (f"; a lens of {larger:.2g} mm would carry {self.wanted}" if larger else "")
 

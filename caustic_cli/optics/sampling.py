@@ -70,8 +70,9 @@ def stream(seed: int, name: str) -> int:
     return zlib.crc32(f"{seed}/{name}".encode())
 
 
-def numbers(kind: str, shape: tuple[int, int], seed: int, dimensions: int, start: int, stop: int,
-            device: str | torch.device = "cpu") -> list[Tensor]:
+def numbers(
+    kind: str, shape: tuple[int, int], seed: int, dimensions: int, start: int, stop: int, device: str | torch.device = "cpu"
+) -> list[Tensor]:
     """Points of the unit cube for rays start..stop: `dimensions` tensors (stop - start,) float64.
 
     The first two fill nu x nv cells, over and over for more rays than cells; the others are independent, or Sobol's.
@@ -109,8 +110,7 @@ def _forwarded(engine: torch.quasirandom.SobolEngine, count: int) -> torch.quasi
     return engine
 
 
-def spread(seed: int, start: int, stop: int, shape: tuple[int, int], stratified: bool,
-           device: str | torch.device) -> list[Tensor]:
+def spread(seed: int, start: int, stop: int, shape: tuple[int, int], stratified: bool, device: str | torch.device) -> list[Tensor]:
     """Random u, v (stop - start,) of rays start..stop, anywhere, or one in each of nu x nv cells over and over."""
     k, (nu, nv) = torch.arange(start, stop, device=device), shape
     du, dv = random_numbers(seed, 0, k), random_numbers(seed, 1, k)

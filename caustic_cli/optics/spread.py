@@ -60,8 +60,7 @@ class Spread:
         cut = _cut(min((h for h in self.half if h > 0), default=max(self.reach()) / 2.0), pixel, most)
         return Convolution(torch.from_numpy(self.kernel(tuple(w / cut for w in pixel))), cut)
 
-    def parts_on(self, pixel: tuple[float, float], places: list[tuple[float, float]],
-                 most: int = MOST_CUT) -> list[Convolution]:
+    def parts_on(self, pixel: tuple[float, float], places: list[tuple[float, float]], most: int = MOST_CUT) -> list[Convolution]:
         """The same of parts of every position: of all that is nearest to each of these points of its frame, [-1, 1]^2, about it.
 
         Their kernels' sums are their parts of the whole times the number of parts.
@@ -207,14 +206,21 @@ def spread_of(lit: Lit, landing: Landing, device: str | torch.device = "cpu") ->
         (up, down), (high, low) = outer[2 * k : 2 * k + 2], moved[2 * k : 2 * k + 2]
         apart = up.position[k] - down.position[k]
         slope.append(float(high[k].mean() - low[k].mean()) / apart if apart else 0.0)
-    off = torch.cat([torch.hypot(*(m[k] - slope[k] * (mode.position[k] - centre.position[k]) for k in (0, 1)))
-                     for mode, m in zip(outer, moved, strict=True)])
+    off = torch.cat(
+        [
+            torch.hypot(*(m[k] - slope[k] * (mode.position[k] - centre.position[k]) for k in (0, 1)))
+            for mode, m in zip(outer, moved, strict=True)
+        ]
+    )
     error, usual = float(off.max()), float(torch.quantile(off, MOST))
     frame = tuple(c * f for c, f in zip(slope, source.frame, strict=True))
     if source.distant:
         half = tuple(abs(c) * math.sin(source.half_angle) for c in slope)
         return Spread(half, ((0.0, 0.0, 1.0),), error, usual, source.brightness, frame)
-    places = tuple((float(slope[0] * (p[0] - centre.position[0])), float(slope[1] * (p[1] - centre.position[1])), float(part))
-                   for p, part in zip(*source.points(), strict=True))
-    return Spread(tuple(abs(c) * e for c, e in zip(slope, source.extent, strict=True)), places, error, usual, source.brightness,
-                  frame)
+    places = tuple(
+        (float(slope[0] * (p[0] - centre.position[0])), float(slope[1] * (p[1] - centre.position[1])), float(part))
+        for p, part in zip(*source.points(), strict=True)
+    )
+    return Spread(
+        tuple(abs(c) * e for c, e in zip(slope, source.extent, strict=True)), places, error, usual, source.brightness, frame
+    )

@@ -137,9 +137,17 @@ class System:
         if lens.mirror:
             elements = (Element(EXIT, surface, aperture, "reflect", roughness=lens.roughness),)
         else:
-            elements = (Element(ENTRANCE, Plane(), aperture, behind=Medium(lens.index, lens.absorption, lens.glass),
-                                pose=Pose((0.0, 0.0, lens.z_in)), fresnel=lens.fresnel),
-                        Element(EXIT, surface, aperture, fresnel=lens.fresnel, roughness=lens.roughness))
+            elements = (
+                Element(
+                    ENTRANCE,
+                    Plane(),
+                    aperture,
+                    behind=Medium(lens.index, lens.absorption, lens.glass),
+                    pose=Pose((0.0, 0.0, lens.z_in)),
+                    fresnel=lens.fresnel,
+                ),
+                Element(EXIT, surface, aperture, fresnel=lens.fresnel, roughness=lens.roughness),
+            )
         return cls((scene.source,), elements, (scene.screen,), scene.light, lit=scene.pupil)
 
     @property
@@ -199,4 +207,3 @@ class System:
     def with_source(self, source: Source) -> System:
         """The same system in another light."""
         return replace(self, sources=(source,))
-

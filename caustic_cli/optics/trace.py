@@ -56,9 +56,19 @@ class Tracer:
         track: keep what became of every ray (`RayState.status`).
     """
 
-    def __init__(self, system: System, rays: Sample | RayState, dtype: torch.dtype = torch.float64,
-                 requests: Requests = NO_REQUESTS, like: Tracer | None = None, *, weight: float = 1.0, channel: int | None = None,
-                 wavelength: float | None = None, track: bool = False):
+    def __init__(
+        self,
+        system: System,
+        rays: Sample | RayState,
+        dtype: torch.dtype = torch.float64,
+        requests: Requests = NO_REQUESTS,
+        like: Tracer | None = None,
+        *,
+        weight: float = 1.0,
+        channel: int | None = None,
+        wavelength: float | None = None,
+        track: bool = False,
+    ):
         self.system, self.requests, self.weight, self.channel, self.track = system, requests, weight, channel, track
         self.media, self.sides = system.media(), system.sides()
         pupil = system.pupil
@@ -156,8 +166,16 @@ class Tracer:
 
     # One element.
 
-    def cross(self, k: int, state: RayState, heights: Tensor | None, *, forward: bool = True, reflects: bool | None = None,
-              straight: bool = True) -> Interaction:
+    def cross(
+        self,
+        k: int,
+        state: RayState,
+        heights: Tensor | None,
+        *,
+        forward: bool = True,
+        reflects: bool | None = None,
+        straight: bool = True,
+    ) -> Interaction:
         """Rays to element k and behind it.
 
         Args:
@@ -169,8 +187,17 @@ class Tracer:
         element = self.system.elements[k]
         n = [medium.index_at(state.wavelength) for medium in self.media[k : k + 2]]
         side = self.sides[k] if forward else -self.sides[k]
-        m = Interaction(self, k, element, forward, side, *(n if forward else n[::-1]),
-                    element.reflects if reflects is None else reflects, straight, state)
+        m = Interaction(
+            self,
+            k,
+            element,
+            forward,
+            side,
+            *(n if forward else n[::-1]),
+            element.reflects if reflects is None else reflects,
+            straight,
+            state,
+        )
         self._meet(m, heights)
         for action in self.actions:
             action.arrive(m)
@@ -221,8 +248,16 @@ class Tracer:
         polarised = None
         if state.polarised is not None:
             polarised = turned(element.pose, state.polarised)
-        found = self.backend.interact(m.incoming, m.slopes, m.arriving, eta=m.n_in / m.n_out, reflects=m.reflects,
-                                      fresnel=element.fresnel, polarised=polarised, side=m.side)
+        found = self.backend.interact(
+            m.incoming,
+            m.slopes,
+            m.arriving,
+            eta=m.n_in / m.n_out,
+            reflects=m.reflects,
+            fresnel=element.fresnel,
+            polarised=polarised,
+            side=m.side,
+        )
         m.passes = found.passes
         state.direction = turned_back(element.pose, found.direction)
         if not m.reflects:
@@ -246,8 +281,12 @@ class Tracer:
         e, pupil, z = m.element, self.system.pupil, m.state.origin[2]
         if m.index or not m.forward or not isinstance(z, float) or z + m.state.datum != pupil.z:
             return False
-        return (e.surface.flat and e.pose.upright and e.pose.position == (0.0, 0.0, pupil.z)
-                and (e.aperture.half_size, e.aperture.round) == (pupil.half_size, pupil.round))
+        return (
+            e.surface.flat
+            and e.pose.upright
+            and e.pose.position == (0.0, 0.0, pupil.z)
+            and (e.aperture.half_size, e.aperture.round) == (pupil.half_size, pupil.round)
+        )
 
     def _backed_up(self, o, d, state: RayState, element: Element, heights) -> tuple[tuple, RayState]:
         """Rays of a pupil that the first surface reaches through, from before it."""
@@ -296,9 +335,16 @@ class Tracer:
             return None
         element = self.system.elements[-1]
         surface, start, m = element.surface, self.start, self.media
-        plain = (isinstance(surface, HeightField) and not element.reflects and element.pose == Pose() and self.sides[-1] > 0
-                 and element.aperture.half_size == surface.half_size and isinstance(start.origin[2], float)
-                 and self.system.pupil.half_size == surface.half_size and (self.system.lit is not None or self.first > 0))
+        plain = (
+            isinstance(surface, HeightField)
+            and not element.reflects
+            and element.pose == Pose()
+            and self.sides[-1] > 0
+            and element.aperture.half_size == surface.half_size
+            and isinstance(start.origin[2], float)
+            and self.system.pupil.half_size == surface.half_size
+            and (self.system.lit is not None or self.first > 0)
+        )
         if not plain:
             return None
         eta = m[-2].index_at(start.wavelength) / m[-1].index_at(start.wavelength)
@@ -363,8 +409,16 @@ def trace(system: System, rays: Sample | RayState, parameters: Parameters, **opt
     return Tracer(system, rays, **options)(parameters)
 
 
-def tracers(scene: Scene, field: HeightField, sampler: Rays, dtype: torch.dtype, chunk: int, requests: Requests = NO_REQUESTS,
-            part: tuple[int, int] = (0, 1), **options) -> Iterator[Tracer]:
+def tracers(
+    scene: Scene,
+    field: HeightField,
+    sampler: Rays,
+    dtype: torch.dtype,
+    chunk: int,
+    requests: Requests = NO_REQUESTS,
+    part: tuple[int, int] = (0, 1),
+    **options,
+) -> Iterator[Tracer]:
     """Tracers of all rays of a sampler through a one-lens scene, chunk by chunk; of several bands, one after the other.
 
     part: (k, n) takes every n-th chunk from number k on, what one of n processes traces.
@@ -377,9 +431,17 @@ def tracers(scene: Scene, field: HeightField, sampler: Rays, dtype: torch.dtype,
             yield traced
 
 
-def expose(scene: Scene, field: HeightField, heights: Tensor, sampler: Rays, filter: Filter | None = None,
-           dtype: torch.dtype = torch.float64, screen: Screen | None = None, chunk: int = 1 << 19,
-           requests: Requests = NO_REQUESTS) -> Image:
+def expose(
+    scene: Scene,
+    field: HeightField,
+    heights: Tensor,
+    sampler: Rays,
+    filter: Filter | None = None,
+    dtype: torch.dtype = torch.float64,
+    screen: Screen | None = None,
+    chunk: int = 1 << 19,
+    requests: Requests = NO_REQUESTS,
+) -> Image:
     """Trace all rays of a sampler and collect them: the value of the one function every command asks about.
 
     Chunks are accumulated in float64, so neither memory nor rounding grows with the number of rays.  Where memory runs out,
@@ -401,9 +463,19 @@ def expose(scene: Scene, field: HeightField, heights: Tensor, sampler: Rays, fil
     return with_less(traced_by, chunk)
 
 
-def render(system: System, parameters: Parameters, rays: int, filter: Filter | None = None, *, kind: str = "stratified",
-           seed: int = 0, device: str | torch.device = "cpu", dtype: torch.dtype = torch.float64, chunk: int = 1 << 19,
-           requests: Requests = NO_REQUESTS) -> list[Image]:
+def render(
+    system: System,
+    parameters: Parameters,
+    rays: int,
+    filter: Filter | None = None,
+    *,
+    kind: str = "stratified",
+    seed: int = 0,
+    device: str | torch.device = "cpu",
+    dtype: torch.dtype = torch.float64,
+    chunk: int = 1 << 19,
+    requests: Requests = NO_REQUESTS,
+) -> list[Image]:
     """The image on every screen of a system, from about `rays` rays of every source at every wavelength.
 
     Args:
@@ -422,16 +494,27 @@ def render(system: System, parameters: Parameters, rays: int, filter: Filter | N
     screens = [s.screen if isinstance(s, Placed) else s for s in system.screens]
 
     def traced_by(size: int) -> list[Image]:
-        parts = (t for sampler, part in zip(samplers, system.parts, strict=True)
-                 for t in system_tracers(system, sampler, part, dtype, size, requests))
-        return _total(parts, parameters, system.screens, [s.resolution for s in screens], filter or Filter(),
-                      sum(s.count for s in samplers), device)
+        parts = (
+            t
+            for sampler, part in zip(samplers, system.parts, strict=True)
+            for t in system_tracers(system, sampler, part, dtype, size, requests)
+        )
+        return _total(
+            parts,
+            parameters,
+            system.screens,
+            [s.resolution for s in screens],
+            filter or Filter(),
+            sum(s.count for s in samplers),
+            device,
+        )
 
     return with_less(traced_by, chunk)
 
 
-def system_tracers(system: System, sampler: Rays, part: float, dtype: torch.dtype, chunk: int,
-                   requests: Requests = NO_REQUESTS) -> Iterator[Tracer]:
+def system_tracers(
+    system: System, sampler: Rays, part: float, dtype: torch.dtype, chunk: int, requests: Requests = NO_REQUESTS
+) -> Iterator[Tracer]:
     """Tracers of all rays of one of a system's sources, `part` of all power, at every wavelength, chunk by chunk."""
     lines = zip(system.light.wavelengths, system.light.parts, strict=True) if system.light.wavelengths else [(None, 1.0)]
     for wavelength, weight in lines:
@@ -441,8 +524,9 @@ def system_tracers(system: System, sampler: Rays, part: float, dtype: torch.dtyp
             yield traced
 
 
-def _total(parts: Iterator[Tracer], parameters: Parameters, screens, shapes, filter: Filter, rays: int,
-           device: str | torch.device) -> list[Image]:
+def _total(
+    parts: Iterator[Tracer], parameters: Parameters, screens, shapes, filter: Filter, rays: int, device: str | torch.device
+) -> list[Image]:
     """Sums over tracers, without derivatives: one image for each screen; rays are walked once for all."""
     images = [torch.zeros(shape, dtype=torch.float64, device=device) for shape in shapes]
     accounts, leaving = [dict.fromkeys(LOSSES, 0.0) for _ in screens], [0.0] * len(images)
@@ -467,8 +551,11 @@ def check_room(scene: Scene, heights: Tensor, screen: Screen) -> None:
     lean = f" and its tilt takes it {screen.depth:.4g} mm nearer" if screen.depth else ""
     if scene.lens.mirror:
         if float(heights.min()) <= screen.z + screen.depth:
-            raise InputError(f"⟨screen.z⟩ must lie before the mirror, whose surface reaches {float(heights.min()):.6g} mm,"
-                             f" got {screen.z:g} mm{lean}")
+            raise InputError(
+                f"⟨screen.z⟩ must lie before the mirror, whose surface reaches {float(heights.min()):.6g} mm,"
+                f" got {screen.z:g} mm{lean}"
+            )
     elif float(heights.max()) >= screen.z - screen.depth:
-        raise InputError(f"⟨screen.z⟩ must lie behind the lens, whose surface reaches {float(heights.max()):.6g} mm,"
-                         f" got {screen.z:g} mm{lean}")
+        raise InputError(
+            f"⟨screen.z⟩ must lie behind the lens, whose surface reaches {float(heights.max()):.6g} mm, got {screen.z:g} mm{lean}"
+        )

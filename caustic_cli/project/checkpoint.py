@@ -110,8 +110,9 @@ def _version(path: Path) -> int:
     In a process of its own: HDF5's library may crash over a damaged file.
     """
     try:
-        done = subprocess.run([sys.executable, "-P", "-c", PROBE, str(path.absolute())], capture_output=True, text=True,
-                              timeout=60, check=False)
+        done = subprocess.run(
+            [sys.executable, "-P", "-c", PROBE, str(path.absolute())], capture_output=True, text=True, timeout=60, check=False
+        )
         return int(done.stdout) if done.returncode == 0 else 0
     except (OSError, ValueError, subprocess.SubprocessError):
         return 0
@@ -144,8 +145,10 @@ def load(path: Path) -> Checkpoint:
         if version > FORMAT_VERSION:
             raise _Newer(path, version)
         if version == 0 or not data.startswith(SIGNATURE):
-            raise InputError(f"{path}: is damaged (its checksum is not that of its content) or not a caustic checkpoint; a whole"
-                             " checkpoints.h5 is needed")
+            raise InputError(
+                f"{path}: is damaged (its checksum is not that of its content) or not a caustic checkpoint; a whole"
+                " checkpoints.h5 is needed"
+            )
     try:
         with h5py.File(io.BytesIO(data), "r") as f:
             version = int(f.attrs["format_version"])
@@ -160,13 +163,19 @@ def load(path: Path) -> Checkpoint:
             state = State(
                 torch.from_numpy(_read(f, "lens/heights")),
                 **{k: int(group.attrs[k]) for k in ("stage", "iteration", "total")},
-                **{name: {k: torch.from_numpy(_read(f, f"state/{name}/{k}")) for k in group[name]}
-                   for name in ("parameters", "optimizer")},
+                **{
+                    name: {k: torch.from_numpy(_read(f, f"state/{name}/{k}")) for k in group[name]}
+                    for name in ("parameters", "optimizer")
+                },
                 history=[(int(r[0]), int(r[1]), *map(float, r[2:])) for r in rows],
-                seconds=float(group.attrs["seconds"]), reason=str(group.attrs["reason"]),
-                start=torch.from_numpy(_read(f, "start")) if "start" in f else None)
-            spaces = tuple(SplineSpace(int(p), torch.from_numpy(_read(f, f"lens/knots_{axis}")))
-                           for p, axis in zip(f["lens"].attrs["degree"], "uv", strict=True))
+                seconds=float(group.attrs["seconds"]),
+                reason=str(group.attrs["reason"]),
+                start=torch.from_numpy(_read(f, "start")) if "start" in f else None,
+            )
+            spaces = tuple(
+                SplineSpace(int(p), torch.from_numpy(_read(f, f"lens/knots_{axis}")))
+                for p, axis in zip(f["lens"].attrs["degree"], "uv", strict=True)
+            )
             texts = f.attrs["provenance"], f.attrs["results"], f.attrs.get("inputs", "{}")
             tables = [json.loads(text) for text in texts]
             if not all(isinstance(table, dict) for table in tables):
@@ -175,8 +184,9 @@ def load(path: Path) -> Checkpoint:
     except _Newer:
         raise
     except Exception as error:  # what a broken file makes HDF5 stumble over may be anything
-        raise InputError(f"{path}: is damaged or not a caustic checkpoint ({type(error).__name__});"
-                         " a whole checkpoints.h5 is needed") from error
+        raise InputError(
+            f"{path}: is damaged or not a caustic checkpoint ({type(error).__name__}); a whole checkpoints.h5 is needed"
+        ) from error
     if tuple(state.heights.shape) != (spaces[0].n, spaces[1].n) or not bool(torch.isfinite(state.heights).all()):
         raise InputError(f"{path}: is damaged (its heights do not fit its knots); a whole checkpoints.h5 is needed")
     return checkpoint

@@ -41,16 +41,19 @@ def check(path: Path, force: bool) -> None:
     if not is_project(path) and not all(_of_a_new_project(p) for p in path.iterdir()):
         raise InputError(f"{path}: exists and is not a caustic project; -o DIR chooses another place")
     if is_project(path) and not force:
-        raise InputError(f"{path}: holds a design already, of another picture or other options; ⟨resume⟩ goes on with it,"
-                         " ⟨force⟩ begins anew, -o DIR chooses another place")
+        raise InputError(
+            f"{path}: holds a design already, of another picture or other options; ⟨resume⟩ goes on with it,"
+            " ⟨force⟩ begins anew, -o DIR chooses another place"
+        )
 
 
 def _of_a_new_project(path: Path) -> bool:
     """Whether a file is what a project begins with: one may have been killed before its project.toml was written."""
-    return path.is_file() and (path.name.startswith((".target.", ".profile.", ".source", ".intensity", ".project.toml."))
-                               or (path.stem in ("target", "profile") and is_ours(path))
-                               or (path.stem.split("-")[0] in ("source", "intensity")
-                                   and any(map(is_ours, path.parent.glob("target.*")))))
+    return path.is_file() and (
+        path.name.startswith((".target.", ".profile.", ".source", ".intensity", ".project.toml."))
+        or (path.stem in ("target", "profile") and is_ours(path))
+        or (path.stem.split("-")[0] in ("source", "intensity") and any(map(is_ours, path.parent.glob("target.*"))))
+    )
 
 
 def settle(project: Project, force: bool) -> None:
@@ -110,7 +113,8 @@ def _lock(handle: int, directory: Path) -> None:
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
-        raise InputError(f"{directory}: another caustic design is at work there; wait until it is done, or -o DIR chooses"
-                         " another place") from error
+        raise InputError(
+            f"{directory}: another caustic design is at work there; wait until it is done, or -o DIR chooses another place"
+        ) from error
     except OSError:  # a network file system without locks: as on Windows
         return

@@ -1,7 +1,7 @@
 """A project directory: the scene and the design in text, the lens in a checkpoint, pictures and the source's files beside them.
 
-    NAME.caustic/  project.toml  checkpoints.h5  target.png (or target.npy)  render.png  wave.png  report.png
-                   source.tm25ray (or what else [source] file names)
+NAME.caustic/  project.toml  checkpoints.h5  target.png (or target.npy)  render.png  wave.png  report.png
+               source.tm25ray (or what else [source] file names)
 """
 
 from __future__ import annotations
@@ -69,13 +69,13 @@ class Project:
         """
         path = Path(path)
         if not path.is_dir() or not is_project(path):
-            raise InputError(f"{path}: is not a caustic project; a directory with a {TOML} is needed"
-                             " (caustic design makes one)")
+            raise InputError(f"{path}: is not a caustic project; a directory with a {TOML} is needed (caustic design makes one)")
         given = settings.read(path / TOML)
         try:
             goal = given.get("target", {})
-            picture = _picture(path, goal.get("file", "target.png"), goal.get("encoding", "srgb") == "linear",
-                               goal.get("color", False))
+            picture = _picture(
+                path, goal.get("file", "target.png"), goal.get("encoding", "srgb") == "linear", goal.get("color", False)
+            )
             light = given.get("source", {})
             profile = light.get("profile")
             for table in (light, *light.get("also", ())):
@@ -138,12 +138,16 @@ class Project:
         field = HeightField(state.spaces, scene.lens.half_size)
         degree = tuple(s.degree for s in state.spaces)
         if degree != scene.lens.degree:
-            raise self.error(f"⟨lens.degree⟩ {list(scene.lens.degree)} is not that of the designed lens,"
-                             f" {list(degree)}; design again to change it")
+            raise self.error(
+                f"⟨lens.degree⟩ {list(scene.lens.degree)} is not that of the designed lens,"
+                f" {list(degree)}; design again to change it"
+            )
         done = state.state.stage == len(self.settings["design"]["stages"]) - 1
         if done and field.shape != scene.lens.control:
-            raise self.error(f"⟨lens.control⟩ {list(scene.lens.control)} is not that of the designed lens,"
-                             f" {list(field.shape)}; design again to change it")
+            raise self.error(
+                f"⟨lens.control⟩ {list(scene.lens.control)} is not that of the designed lens,"
+                f" {list(field.shape)}; design again to change it"
+            )
         return field, state
 
     def write(self, path: Path | None = None) -> None:

@@ -44,12 +44,12 @@ class Scene:
 
     def __post_init__(self):
         if not self.lens.mirror and self.screen.z <= self.lens.z_in:
-            raise InputError(
-                f"⟨screen.z⟩ must lie behind the lens (beyond z_in = {self.lens.z_in:g} mm), got {self.screen.z:g} mm"
-            )
+            raise InputError(f"⟨screen.z⟩ must lie behind the lens (beyond z_in = {self.lens.z_in:g} mm), got {self.screen.z:g} mm")
         if self.source.nearest >= self.lens.z_in:
-            raise InputError(f"⟨source.position⟩ must lie before the lens (z below z_in = {self.lens.z_in:g} mm),"
-                             f" got z = {self.source.nearest:g} mm")
+            raise InputError(
+                f"⟨source.position⟩ must lie before the lens (z below z_in = {self.lens.z_in:g} mm),"
+                f" got z = {self.source.nearest:g} mm"
+            )
         if self.dispersive:
             for wavelength in self.light.wavelengths:
                 refractive_index(self.lens.glass, wavelength)
@@ -75,16 +75,21 @@ class Scene:
         if len(self.source.members) == 1:
             return (self,)
         spectra = self.source.spectra if self.light.wavelengths else [((), ())] * len(self.source.members)
-        return tuple(replace(self, source=one, light=replace(self.light, wavelengths=wavelengths, weights=weights))
-                     for one, (wavelengths, weights) in zip(self.source.members, spectra, strict=True))
+        return tuple(
+            replace(self, source=one, light=replace(self.light, wavelengths=wavelengths, weights=weights))
+            for one, (wavelengths, weights) in zip(self.source.members, spectra, strict=True)
+        )
 
     @property
     def bands(self) -> tuple[Band, ...]:
         """What has to be traced apart, by source, wavelength and polarisation: the scene itself where one trace says it all."""
         if len(self.source.members) > 1:
             each = zip(self.by_source, self.source.fractions, strict=True)
-            return tuple(replace(band, weight=fraction * band.weight, member=k)
-                         for k, (one, fraction) in enumerate(each) for band in one.bands)
+            return tuple(
+                replace(band, weight=fraction * band.weight, member=k)
+                for k, (one, fraction) in enumerate(each)
+                for band in one.bands
+            )
         states = (0.0, 90.0) if self.light.tracked and self.light.polarisation is None else (self.light.polarisation,)
         if not (self.dispersive or self.colored):
             if len(states) == 1:
@@ -93,6 +98,8 @@ class Scene:
         bands = []
         for k, (wavelength, part) in enumerate(zip(self.light.wavelengths, self.light.parts, strict=True)):
             lens = replace(self.lens, index=refractive_index(self.lens.glass, wavelength)) if self.dispersive else self.lens
-            bands += [Band(replace(self, lens=lens, light=Light(state)), part / len(states), k if self.colored else None)
-                      for state in states]
+            bands += [
+                Band(replace(self, lens=lens, light=Light(state)), part / len(states), k if self.colored else None)
+                for state in states
+            ]
         return tuple(bands)

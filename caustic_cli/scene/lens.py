@@ -39,8 +39,9 @@ class Offset:
                 raise InputError(f"⟨lens.radius⟩ must be a non-zero number or inf, got {r!r}")
 
     @classmethod
-    def for_magnification(cls, mag: tuple[float, float], index: float, throw: float, thickness: float,
-                          vergence: float = 0.0) -> Offset:
+    def for_magnification(
+        cls, mag: tuple[float, float], index: float, throw: float, thickness: float, vergence: float = 0.0
+    ) -> Offset:
         """The sphere that spreads light over `mag` times the aperture: rho = (n - 1) T / (mag - 1 - T V), T = z_screen - z_lens.
 
         For parallel light (V = 0) that is table 6.1's, erratum E12.  `throw` is z_screen, `thickness` is z_lens (mm);
@@ -115,8 +116,21 @@ class Lens:
     border: float = default("lens.border")
 
     def __post_init__(self):
-        check_all("lens", self, "size", "z_in", "index", "degree", "min_thickness", "height_range", "fresnel", "absorption",
-                  "roughness", "aperture", "border")
+        check_all(
+            "lens",
+            self,
+            "size",
+            "z_in",
+            "index",
+            "degree",
+            "min_thickness",
+            "height_range",
+            "fresnel",
+            "absorption",
+            "roughness",
+            "aperture",
+            "border",
+        )
         least = iter(self.degree)
         checks.pair("⟨lens.control⟩", self.control, lambda w, n: checks.whole(w, n, next(least) + 1, TABLE["lens.control"].high))
         if self.knots is not None:
@@ -127,8 +141,9 @@ class Lens:
         if not low < high:
             raise InputError(f"⟨lens.height_range⟩ must ascend, got [{low:g}, {high:g}]")
         if self.round and self.size[0] != self.size[1]:
-            raise InputError("⟨lens.size⟩ of a circular aperture must be its diameter, twice the same,"
-                             f" got {self.size[0]:g} x {self.size[1]:g}")
+            raise InputError(
+                f"⟨lens.size⟩ of a circular aperture must be its diameter, twice the same, got {self.size[0]:g} x {self.size[1]:g}"
+            )
 
     @property
     def half_size(self) -> tuple[float, float]:

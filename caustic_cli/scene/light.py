@@ -41,14 +41,16 @@ class Light:
             raise InputError(f"⟨source.wavelengths⟩ must be at most {MAX_WAVELENGTHS}, got {len(self.wavelengths)}")
         check("source.wavelengths", self.wavelengths)
         if self.weights and len(self.weights) != len(self.wavelengths):
-            raise InputError(f"⟨source.weights⟩ must be one for each of the {len(self.wavelengths)} wavelengths,"
-                             f" got {len(self.weights)}")
+            raise InputError(
+                f"⟨source.weights⟩ must be one for each of the {len(self.wavelengths)} wavelengths, got {len(self.weights)}"
+            )
         check("source.weights", self.weights)
         if self.weights and not sum(self.weights) > 0:
             raise InputError("⟨source.weights⟩ must not all be 0")
         if self.color and len(self.wavelengths) != len(RGB):
-            raise InputError(f"⟨source.wavelengths⟩ of a coloured picture are three, red, green and blue,"
-                             f" got {len(self.wavelengths)}")
+            raise InputError(
+                f"⟨source.wavelengths⟩ of a coloured picture are three, red, green and blue, got {len(self.wavelengths)}"
+            )
 
     @property
     def parts(self) -> tuple[float, ...]:

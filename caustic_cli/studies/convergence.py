@@ -44,7 +44,7 @@ _COMMON = {
     "sampler": "kind of rays",
     "rays": "rays traced",
     "error": "relative RMS against the reference, each image over its own mean, less the reference's own error in"
-             " quadrature; root mean square over the repeats",
+    " quadrature; root mean square over the repeats",
 }
 _TIMES = {
     "seconds": "wall time of sampling, tracing and reconstruction, s; median of the repeats",
@@ -53,9 +53,18 @@ _TIMES = {
 }
 
 
-def run_study(name: str, scene: Scene, field: HeightField, heights: Tensor, *, seed: int = 0,
-              dtype: torch.dtype | None = None, max_rays: int | None = None, repeats: int = 3,
-              progress: Callable[[int, int], None] | None = None) -> Study:
+def run_study(
+    name: str,
+    scene: Scene,
+    field: HeightField,
+    heights: Tensor,
+    *,
+    seed: int = 0,
+    dtype: torch.dtype | None = None,
+    max_rays: int | None = None,
+    repeats: int = 3,
+    progress: Callable[[int, int], None] | None = None,
+) -> Study:
     """Measure one of STUDIES on a lens.  Its errors repeat from run to run; its times do not.
 
     Args:
@@ -80,15 +89,16 @@ def run_study(name: str, scene: Scene, field: HeightField, heights: Tensor, *, s
 
 def study_rays(bench: Bench, dtype: torch.dtype) -> Study:
     """Error against the number of rays, for every sampler."""
-    settings = [Setting(kind, kind, bench.max_rays >> k, Filter(), dtype)
-                for k in range(6, -1, -1) for kind in SAMPLERS]
+    settings = [Setting(kind, kind, bench.max_rays >> k, Filter(), dtype) for k in range(6, -1, -1) for kind in SAMPLERS]
     bench.plan(settings)
     truth = bench.reference(Filter())
     rows = bench.measure(settings, lambda _, image, __: {"error": truth.error_of(image)})
     orders = _orders(bench, rows)
     best = min(rows, key=lambda row: row["error"])
-    advice = (f"a relative error of {best['error']:.2g} costs {best['seconds']:.2g} s with {best['rays']}"
-              f" {best['sampler']} rays; {_halving(orders[best['series']])}{haste(rows)}")
+    advice = (
+        f"a relative error of {best['error']:.2g} costs {best['seconds']:.2g} s with {best['rays']}"
+        f" {best['sampler']} rays; {_halving(orders[best['series']])}{haste(rows)}"
+    )
     return Study("rays", _COMMON | _TIMES, rows, orders, advice, _about(bench, dtype, truth))
 
 
@@ -99,13 +109,22 @@ def study_reconstruction(bench: Bench, dtype: torch.dtype) -> Study:
     quite that, because light is not even within a pixel and some is blurred in from beyond the frame: how far off it is
     stands beside it, as `kernel`.
     """
-    settings = [Setting(f.kind if f.size[0] == 1 else f"{f.kind} {f.size[0]}", "lines", bench.max_rays >> k, f, dtype)
-                for k in (4, 2, 0) for f in FILTERS]
+    settings = [
+        Setting(f.kind if f.size[0] == 1 else f"{f.kind} {f.size[0]}", "lines", bench.max_rays >> k, f, dtype)
+        for k in (4, 2, 0)
+        for f in FILTERS
+    ]
     bench.plan(settings, filtered=len(FILTERS) - 1)
     truth = bench.reference(Filter())
     own = {f: truth if f == Filter() else bench.reference(f) for f in FILTERS}
-    fixed = {f: {"bias": relative_rms(r.image, truth.image), "kernel": relative_rms(f.smooth(truth.image), r.image),
-                 "reference_error": r.error} for f, r in own.items()}
+    fixed = {
+        f: {
+            "bias": relative_rms(r.image, truth.image),
+            "kernel": relative_rms(f.smooth(truth.image), r.image),
+            "reference_error": r.error,
+        }
+        for f, r in own.items()
+    }
 
     def figures(s: Setting, image: Tensor, _) -> dict:
         return {"error": truth.error_of(image), "noise": own[s.filter].error_of(image), **fixed[s.filter]}
@@ -113,14 +132,18 @@ def study_reconstruction(bench: Bench, dtype: torch.dtype) -> Study:
     rows = bench.measure(settings, figures)
     for row, s in zip(rows, settings, strict=True):
         row |= {"filter": s.filter.kind, "size": s.filter.size[0]}
-    columns = _COMMON | {
-        "filter": "reconstruction filter",
-        "size": "its size, pixels along either axis",
-        "noise": "relative RMS against the filter's own reference: what more rays remove",
-        "bias": "relative RMS between the filter's own reference and the reference: what they do not",
-        "kernel": "relative RMS between the reference smoothed by Filter.smooth and the filter's own reference",
-        "reference_error": "estimated relative RMS of the filter's own reference",
-    } | _TIMES
+    columns = (
+        _COMMON
+        | {
+            "filter": "reconstruction filter",
+            "size": "its size, pixels along either axis",
+            "noise": "relative RMS against the filter's own reference: what more rays remove",
+            "bias": "relative RMS between the filter's own reference and the reference: what they do not",
+            "kernel": "relative RMS between the reference smoothed by Filter.smooth and the filter's own reference",
+            "reference_error": "estimated relative RMS of the filter's own reference",
+        }
+        | _TIMES
+    )
     parts = []
     for k in range(0, len(rows), len(FILTERS)):
         plain, best = rows[k], min(rows[k : k + len(FILTERS)], key=lambda row: row["error"])
@@ -137,8 +160,12 @@ def study_precision(bench: Bench, _dtype) -> Study:
 
     Both rows of a pair go by plain torch, so that they differ in nothing else: the CPU's kernels know float64 only.
     """
-    settings = [Setting(f"{kind} {_name(dtype)}", kind, bench.max_rays >> k, Filter(), dtype)
-                for k in (4, 2, 0) for kind in SAMPLERS for dtype in (torch.float64, torch.float32)]
+    settings = [
+        Setting(f"{kind} {_name(dtype)}", kind, bench.max_rays >> k, Filter(), dtype)
+        for k in (4, 2, 0)
+        for kind in SAMPLERS
+        for dtype in (torch.float64, torch.float32)
+    ]
     bench.plan(settings)
     truth = bench.reference(Filter())
 
@@ -151,17 +178,23 @@ def study_precision(bench: Bench, _dtype) -> Study:
     for double, single in zip(rows[::2], rows[1::2], strict=True):
         double |= {"dtype": "float64", "speedup": None}
         single |= {"dtype": "float32", "speedup": double["seconds"] / single["seconds"]}
-    columns = _COMMON | {
-        "dtype": "precision of the rays",
-        "difference": "relative RMS between the float32 and the float64 image of the same rays",
-        "speedup": "time of float64 over time of float32, both in plain torch",
-    } | _TIMES
+    columns = (
+        _COMMON
+        | {
+            "dtype": "precision of the rays",
+            "difference": "relative RMS between the float32 and the float64 image of the same rays",
+            "speedup": "time of float64 over time of float32, both in plain torch",
+        }
+        | _TIMES
+    )
     largest = rows[-2 * len(SAMPLERS) :]
     worst = max(largest[1::2], key=lambda row: row["difference"] / max(row["error"], truth.error))
     decision = "float32 is enough" if worst["difference"] <= NEGLIGIBLE * worst["error"] else "use float64"
-    advice = (f"float32 changes the image of {worst['rays']} {worst['sampler']} rays by {worst['difference']:.2g},"
-              f" where the rays leave an error of {worst['error']:.2g}, and is {worst['speedup']:.2g} times as fast"
-              f" in plain torch: {decision}{haste(rows)}")
+    advice = (
+        f"float32 changes the image of {worst['rays']} {worst['sampler']} rays by {worst['difference']:.2g},"
+        f" where the rays leave an error of {worst['error']:.2g}, and is {worst['speedup']:.2g} times as fast"
+        f" in plain torch: {decision}{haste(rows)}"
+    )
     return Study("precision", columns, rows, _orders(bench, rows), advice, _about(bench, None, truth))
 
 
@@ -184,11 +217,21 @@ def _halving(found: Order | None) -> str:
 def _about(bench: Bench, dtype: torch.dtype | None, truth: Reference) -> dict:
     """How a study was made; everything but the threads' speed follows from it."""
     seeds = [bench.seed + REFERENCE_SEED, bench.seed + REFERENCE_SEED + 1]
-    return {"version": __version__, "seed": bench.seed, "repeats": bench.repeats, "max_rays": bench.max_rays,
-            "dtype": "float32 and float64" if dtype is None else _name(dtype), "device": str(bench.heights.device),
-            "threads": torch.get_num_threads(), "reference_rays": truth.rays, "reference_sampler": "stratified",
-            "reference_seeds": seeds, "reference_dtype": "float64", "reference_error": truth.error,
-            "orders_of": "error"}
+    return {
+        "version": __version__,
+        "seed": bench.seed,
+        "repeats": bench.repeats,
+        "max_rays": bench.max_rays,
+        "dtype": "float32 and float64" if dtype is None else _name(dtype),
+        "device": str(bench.heights.device),
+        "threads": torch.get_num_threads(),
+        "reference_rays": truth.rays,
+        "reference_sampler": "stratified",
+        "reference_seeds": seeds,
+        "reference_dtype": "float64",
+        "reference_error": truth.error,
+        "orders_of": "error",
+    }
 
 
 def _name(dtype: torch.dtype) -> str:
@@ -197,5 +240,7 @@ def _name(dtype: torch.dtype) -> str:
 
 #: Every study by name: of a bench, with rays of a dtype.
 STUDIES: dict[str, Callable[[Bench, torch.dtype], Study]] = {
-    "rays": study_rays, "reconstruction": study_reconstruction, "precision": study_precision,
+    "rays": study_rays,
+    "reconstruction": study_reconstruction,
+    "precision": study_precision,
 }

@@ -57,17 +57,32 @@ def scaled(scene: Scene, field: HeightField, heights: Tensor, factor: float) -> 
     """Everything of a scene in plane light so many times as large, angles as they are."""
     lens, screen = scene.lens, scene.screen
     radius = tuple(factor * r for r in lens.offset.radius)
-    larger: Lens = replace(lens, size=tuple(factor * s for s in lens.size), z_in=factor * lens.z_in,
-                           min_thickness=factor * lens.min_thickness, offset=Offset(factor * lens.offset.thickness, radius),
-                           height_range=tuple(factor * h for h in lens.height_range), absorption=lens.absorption / factor,
-                           border=factor * lens.border)
-    wide = replace(screen, size=tuple(factor * s for s in screen.size), z=factor * screen.z,
-                   shift=tuple(factor * s for s in screen.shift))
+    larger: Lens = replace(
+        lens,
+        size=tuple(factor * s for s in lens.size),
+        z_in=factor * lens.z_in,
+        min_thickness=factor * lens.min_thickness,
+        offset=Offset(factor * lens.offset.thickness, radius),
+        height_range=tuple(factor * h for h in lens.height_range),
+        absorption=lens.absorption / factor,
+        border=factor * lens.border,
+    )
+    wide = replace(
+        screen, size=tuple(factor * s for s in screen.size), z=factor * screen.z, shift=tuple(factor * s for s in screen.shift)
+    )
     return replace(scene, lens=larger, screen=wide), HeightField(field.spaces, larger.half_size), factor * heights
 
 
-def run_diffraction(scene: Scene, field: HeightField, heights: Tensor, *, rays: int | None = None, seed: int = 0,
-                    dtype: torch.dtype | None = None, progress: Callable[[int, int], None] | None = None) -> Study:
+def run_diffraction(
+    scene: Scene,
+    field: HeightField,
+    heights: Tensor,
+    *,
+    rays: int | None = None,
+    seed: int = 0,
+    dtype: torch.dtype | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Study:
     """Ray image against wave image of a lens in plane light, at several sizes, wavelengths and source sizes."""
     plane = replace(scene, source=PlaneWave(scene.source.power), light=Light())
     own = plane.lens.size[0]
@@ -91,16 +106,33 @@ def run_diffraction(scene: Scene, field: HeightField, heights: Tensor, *, rays: 
             continue
         seconds = time.perf_counter() - began
         seen = Resolution.at(replace(one, light=Light(None, (wavelength,))), net, lifted)
-        rows.append({"series": series, "value": value, "error": reference.error_of(light.image.cpu()), "noise": reference.error,
-                     "blur": seen.blur / seen.pixel, "seconds": seconds, "rays_seconds": ray_seconds,
-                     "samples": max(light.samples)})
+        rows.append(
+            {
+                "series": series,
+                "value": value,
+                "error": reference.error_of(light.image.cpu()),
+                "noise": reference.error,
+                "blur": seen.blur / seen.pixel,
+                "seconds": seconds,
+                "rays_seconds": ray_seconds,
+                "samples": max(light.samples),
+            }
+        )
         if progress is not None:
             progress(k + 1, len(cases))
     if not rows:
         raise NoWaveImage("this lens has no wave image at any of the sizes, wavelengths and sources of the study")
-    about = {"version": __version__, "seed": seed, "repeats": 1, "rays": count, "device": str(heights.device),
-             "reference_error": max(r["noise"] for r in rows), "threads": torch.get_num_threads(),
-             "dtype": str(dtype or torch.float32).removeprefix("torch."), "lens": own}
+    about = {
+        "version": __version__,
+        "seed": seed,
+        "repeats": 1,
+        "rays": count,
+        "device": str(heights.device),
+        "reference_error": max(r["noise"] for r in rows),
+        "threads": torch.get_num_threads(),
+        "dtype": str(dtype or torch.float32).removeprefix("torch."),
+        "lens": own,
+    }
     return Study("diffraction", COLUMNS, rows, {}, _advice(rows), about, "value", PLOTS)
 
 
@@ -123,8 +155,10 @@ def _advice(rows: list[dict]) -> str:
     if found:
         return f"rays are within {ENOUGH:.0%} of light {' or '.join(found)}"
     best = min(rows, key=lambda r: r["error"])
-    return (f"rays are nowhere within {ENOUGH:.0%} of light here; closest, {best['error']:.2g}, at a {best['series']} of"
-            f" {best['value']:g}")
+    return (
+        f"rays are nowhere within {ENOUGH:.0%} of light here; closest, {best['error']:.2g}, at a {best['series']} of"
+        f" {best['value']:g}"
+    )
 
 
 def _from(rows: list[dict]) -> float | None:
@@ -140,8 +174,11 @@ def _from(rows: list[dict]) -> float | None:
 def draw_diffraction(study: Study, figure: Figure) -> None:
     """Error against what is varied, with the predicted blur in pixels."""
     figure.set_size_inches(10.8, 3.8)
-    titles = {"lens size": "lens size (mm), all angles alike", "wavelength": "wavelength (nm)",
-              "source size": "the source's full angle (degrees)"}
+    titles = {
+        "lens size": "lens size (mm), all angles alike",
+        "wavelength": "wavelength (nm)",
+        "source size": "the source's full angle (degrees)",
+    }
     for k, (series, label) in enumerate(titles.items()):
         axes = figure.add_subplot(1, 3, k + 1)
         rows = [r for r in study.rows if r["series"] == series]

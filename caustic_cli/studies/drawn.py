@@ -33,8 +33,11 @@ def emitted(scene: Scene, rays: int, rng: np.random.Generator) -> Iterator[tuple
             if source.brightness is not None:
                 dx, dy = source.frame[0] * _on_picture(source.brightness, n, rng)
             d = np.array([dx, dy, np.sqrt(1 - dx**2 - dy**2)])
-            x, y = ((2 * u - 1) * rx, (2 * v - 1) * ry) if not round_ else (rx * np.sqrt(u) * np.cos(2 * np.pi * v),
-                                                                            rx * np.sqrt(u) * np.sin(2 * np.pi * v))
+            x, y = (
+                ((2 * u - 1) * rx, (2 * v - 1) * ry)
+                if not round_
+                else (rx * np.sqrt(u) * np.cos(2 * np.pi * v), rx * np.sqrt(u) * np.sin(2 * np.pi * v))
+            )
             if source.profile is not None:
                 one = _profile(source.profile, x / rx, y / ry) / mean
             yield np.array([x, y, np.full(n, z_in)]) - d, d, one

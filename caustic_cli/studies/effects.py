@@ -59,8 +59,9 @@ COLUMNS = {
 }
 
 
-def measure_waves(plan: Plan, field: HeightField, heights: Tensor, *, rays: int = RAYS, repeats: int = WAVE_REPEATS,
-                  seed: int = 0) -> dict:
+def measure_waves(
+    plan: Plan, field: HeightField, heights: Tensor, *, rays: int = RAYS, repeats: int = WAVE_REPEATS, seed: int = 0
+) -> dict:
     """The same of what is seen in the wave image alone: the rounds' times of it, for without it nothing is done, and how the ray
     image differs from it."""
     times, light, clock = [], None, _clock(heights)
@@ -74,8 +75,14 @@ def measure_waves(plan: Plan, field: HeightField, heights: Tensor, *, rays: int 
     sampler = rays_of(plan.scene, "stratified", max(rays, RAYS_A_PIXEL * light.numel()), stream(seed, "effects"), heights.device)
     drawn = expose(plan.scene, field, heights, sampler, requests=plan.requests).image.cpu()
     drawn, light = drawn.flatten(0, -2), light.flatten(0, -2)
-    return {"error": relative_rms(drawn, light), "power": float(drawn.sum() - light.sum()), "seconds": min(times),
-            "seconds_min": min(times), "seconds_max": max(times), "whole": min(times)}
+    return {
+        "error": relative_rms(drawn, light),
+        "power": float(drawn.sum() - light.sum()),
+        "seconds": min(times),
+        "seconds_min": min(times),
+        "seconds_max": max(times),
+        "whole": min(times),
+    }
 
 
 def _clock(heights: Tensor) -> Callable[[], float]:
@@ -83,8 +90,17 @@ def _clock(heights: Tensor) -> Callable[[], float]:
     return time.perf_counter if heights.is_cuda else time.process_time
 
 
-def measure(with_: Plan, without: Plan, field: HeightField, heights: Tensor, *, rays: int = RAYS, repeats: int = REPEATS,
-            seed: int = 0, dtype: torch.dtype = torch.float64) -> dict:
+def measure(
+    with_: Plan,
+    without: Plan,
+    field: HeightField,
+    heights: Tensor,
+    *,
+    rays: int = RAYS,
+    repeats: int = REPEATS,
+    seed: int = 0,
+    dtype: torch.dtype = torch.float64,
+) -> dict:
     """Cost and error of the effect in which two plans differ: error, power, seconds, seconds_min, seconds_max, whole.
 
     Where only the plan without it leaves the fused kernels, both are timed by stages: the cost is that of the effect alone.
@@ -105,12 +121,26 @@ def measure(with_: Plan, without: Plan, field: HeightField, heights: Tensor, *, 
     images = [image(plan)[0].image.flatten(0, -2).cpu() for plan in (with_, without)]  # a round that only warms up
     times = [(image(with_)[1], image(without)[1]) for _ in range(repeats)]
     costs, least = [a - b for a, b in times], [min(column) for column in zip(*times, strict=True)]
-    return {"error": relative_rms(images[1], images[0]), "power": float(images[1].sum() - images[0].sum()),
-            "seconds": least[0] - least[1], "seconds_min": min(costs), "seconds_max": max(costs), "whole": least[0]}
+    return {
+        "error": relative_rms(images[1], images[0]),
+        "power": float(images[1].sum() - images[0].sum()),
+        "seconds": least[0] - least[1],
+        "seconds_min": min(costs),
+        "seconds_max": max(costs),
+        "whole": least[0],
+    }
 
 
-def explain(plan: Plan, scene: Scene, field: HeightField, heights: Tensor, *, rays: int = RAYS, seed: int = 0,
-            dtype: torch.dtype = torch.float64) -> list[dict]:
+def explain(
+    plan: Plan,
+    scene: Scene,
+    field: HeightField,
+    heights: Tensor,
+    *,
+    rays: int = RAYS,
+    seed: int = 0,
+    dtype: torch.dtype = torch.float64,
+) -> list[dict]:
     """A row for each effect of a plan of `scene`: name, on, why, bound, limit, cost_ms, cost_ms_range, error, power.
 
     error and power are those of leaving it out.  cost_ms of an effect that is off is what it would cost; cost_ms_range are the
@@ -121,13 +151,21 @@ def explain(plan: Plan, scene: Scene, field: HeightField, heights: Tensor, *, ra
     for effect in plan.effects:
         row = {"name": effect.name, "on": effect.on, "why": effect.why, "bound": effect.bound, "limit": effect.limit}
         if effect.fixed or not effect.present:
-            row |= {"cost_ms": 0.0, "error": None, "power": None} if effect.fixed and effect.on else \
-                {"cost_ms": 0.0, "error": 0.0, "power": 0.0}
+            row |= (
+                {"cost_ms": 0.0, "error": None, "power": None}
+                if effect.fixed and effect.on
+                else {"cost_ms": 0.0, "error": 0.0, "power": 0.0}
+            )
         else:
-            with_, without = (compile_plan(scene, field, heights, chosen)
-                              for chosen in (set(plan.simulated) | {effect.name}, set(plan.simulated) - {effect.name}))
-            found = measure_waves(with_, field, heights, rays=rays, seed=seed) if WAVES[effect.name] else \
-                measure(with_, without, field, heights, rays=rays, repeats=REPEATS, seed=seed, dtype=dtype)
+            with_, without = (
+                compile_plan(scene, field, heights, chosen)
+                for chosen in (set(plan.simulated) | {effect.name}, set(plan.simulated) - {effect.name})
+            )
+            found = (
+                measure_waves(with_, field, heights, rays=rays, seed=seed)
+                if WAVES[effect.name]
+                else measure(with_, without, field, heights, rays=rays, repeats=REPEATS, seed=seed, dtype=dtype)
+            )
             scale = 0.0 if FREE[effect.name] else 1e3
             cost, *extremes = (scale * found[k] for k in ("seconds", "seconds_min", "seconds_max"))
             row |= {"cost_ms": cost, "cost_ms_range": extremes, "error": found["error"], "power": found["power"]}
@@ -137,6 +175,7 @@ def explain(plan: Plan, scene: Scene, field: HeightField, heights: Tensor, *, ra
 
 def table(rows: list[dict]) -> list[str]:
     """The rows of `explain` as lines of text under their titles; a cost is 0 where the rounds do not agree on its sign."""
+
     def number(value: float | None, form: str) -> str:
         return "-" if value is None else format(value, form)
 
@@ -147,15 +186,34 @@ def table(rows: list[dict]) -> list[str]:
     cells = [("effect", "", "cost", "error", "power", "why")]
     for r in rows:
         quiet = not r["on"] and r["cost_ms_range"] == [0.0, 0.0]
-        cells.append((r["name"], "on" if r["on"] else "off", "-" if quiet else cost(r),
-                      "-" if quiet else number(r["error"], ".2g"), "-" if quiet else number(r["power"], "+.2%"), r["why"]))
+        cells.append(
+            (
+                r["name"],
+                "on" if r["on"] else "off",
+                "-" if quiet else cost(r),
+                "-" if quiet else number(r["error"], ".2g"),
+                "-" if quiet else number(r["power"], "+.2%"),
+                r["why"],
+            )
+        )
     widths = [max(len(row[k]) for row in cells) for k in range(5)]
-    return ["  ".join([*(f"{c:<{w}}" if k < 2 else f"{c:>{w}}" for k, (c, w) in enumerate(zip(row, widths, strict=False))), row[5]])
-            for row in cells]
+    return [
+        "  ".join([*(f"{c:<{w}}" if k < 2 else f"{c:>{w}}" for k, (c, w) in enumerate(zip(row, widths, strict=False))), row[5]])
+        for row in cells
+    ]
 
 
-def run_effects(scene: Scene, field: HeightField, heights: Tensor, *, rays: int | None = None, repeats: int | None = None,
-                seed: int = 0, dtype: torch.dtype | None = None, progress: Callable[[int, int], None] | None = None) -> Study:
+def run_effects(
+    scene: Scene,
+    field: HeightField,
+    heights: Tensor,
+    *,
+    rays: int | None = None,
+    repeats: int | None = None,
+    seed: int = 0,
+    dtype: torch.dtype | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Study:
     """Cost against error of every effect at a lens; what its scene lacks is put in, one effect at a time.
 
     Raises:
@@ -172,13 +230,24 @@ def run_effects(scene: Scene, field: HeightField, heights: Tensor, *, rays: int 
         if progress is not None:
             progress(k + 1, len(EFFECTS))
     told = sorted((r for r in rows if r["on"]), key=_matters, reverse=True)
-    advice = f"of what this scene has, {told[0]['series']} matters most ({_matters(told[0]):.2g})" if told else \
-        "this scene calls for no effect"
+    advice = (
+        f"of what this scene has, {told[0]['series']} matters most ({_matters(told[0]):.2g})"
+        if told
+        else "this scene calls for no effect"
+    )
     unfounded = max((_matters(r) for r in rows if not r["on"] and r["amount"] == "the scene's own"), default=0.0)
     advice += f"; what auto leaves out of it changes image or power by at most {unfounded:.2g}"
-    about = {"version": __version__, "seed": seed, "repeats": rounds[0], "wave_repeats": rounds[1], "rays": rays,
-             "device": str(heights.device), "reference_error": 0.0, "threads": torch.get_num_threads(),
-             "dtype": str(dtype or torch.float64).removeprefix("torch.")}
+    about = {
+        "version": __version__,
+        "seed": seed,
+        "repeats": rounds[0],
+        "wave_repeats": rounds[1],
+        "rays": rays,
+        "device": str(heights.device),
+        "reference_error": 0.0,
+        "threads": torch.get_num_threads(),
+        "dtype": str(dtype or torch.float64).removeprefix("torch."),
+    }
     return Study("effects", COLUMNS, rows, {}, advice, about, "rays", PLOTS)
 
 
@@ -187,8 +256,17 @@ def _matters(row: dict) -> float:
     return max(row["error"] or 0.0, abs(row["power"] or 0.0))
 
 
-def _row(effect: Decision, plan: Plan, scene: Scene, field: HeightField, heights: Tensor, rays: int, repeats: int, seed: int,
-         dtype: torch.dtype) -> dict | None:
+def _row(
+    effect: Decision,
+    plan: Plan,
+    scene: Scene,
+    field: HeightField,
+    heights: Tensor,
+    rays: int,
+    repeats: int,
+    seed: int,
+    dtype: torch.dtype,
+) -> dict | None:
     name, amount, bare = effect.name, "the scene's own", None
     if not effect.present:
         made = BY_NAME[name].sample(scene, heights)
@@ -200,12 +278,21 @@ def _row(effect: Decision, plan: Plan, scene: Scene, field: HeightField, heights
         return None
     with_ = compile_plan(scene, field, heights, set(plan.simulated) | {name})
     without = compile_plan(bare or scene, field, heights, None if bare else set(plan.simulated) - {name})
-    found = measure_waves(with_, field, heights, rays=rays, repeats=repeats, seed=seed) if WAVES[name] else \
-        measure(with_, without, field, heights, rays=rays, repeats=repeats, seed=seed, dtype=dtype)
+    found = (
+        measure_waves(with_, field, heights, rays=rays, repeats=repeats, seed=seed)
+        if WAVES[name]
+        else measure(with_, without, field, heights, rays=rays, repeats=repeats, seed=seed, dtype=dtype)
+    )
     if FREE[name]:
         found |= dict.fromkeys(("seconds", "seconds_min", "seconds_max"), 0.0)
-    return {"series": name, "on": effect.on, "why": effect.why, "bound": effect.bound, "limit": effect.limit,
-            "amount": amount} | found
+    return {
+        "series": name,
+        "on": effect.on,
+        "why": effect.why,
+        "bound": effect.bound,
+        "limit": effect.limit,
+        "amount": amount,
+    } | found
 
 
 def draw_effects(study: Study, figure: Figure) -> None:
@@ -216,12 +303,23 @@ def draw_effects(study: Study, figure: Figure) -> None:
     for k, row in enumerate(study.rows):
         colour, error = COLOURS[k % len(COLOURS)], max(_matters(row), floor)
         low, high = (1e3 * max(0.0, d) for d in (row["seconds"] - row["seconds_min"], row["seconds_max"] - row["seconds"]))
-        axes.errorbar([1e3 * row["seconds"]], [error], xerr=[[low], [high]], linestyle="", color=colour, elinewidth=0.6,
-                      marker=MARKERS[(k + k // len(COLOURS)) % len(MARKERS)], markerfacecolor=colour if row["on"] else "none",
-                      label=f"{row['series']}, {'on' if row['on'] else 'off'}, {row['amount']}")
-    axes.set(yscale="log", xlabel=f"cost (ms of processor time for {study.about['rays']:,} rays), and the rounds' range",
-             ylabel=f"left out: relative RMS or change of power, the larger (least drawn: {floor:.1g})",
-             title="effects: cost and error")
+        axes.errorbar(
+            [1e3 * row["seconds"]],
+            [error],
+            xerr=[[low], [high]],
+            linestyle="",
+            color=colour,
+            elinewidth=0.6,
+            marker=MARKERS[(k + k // len(COLOURS)) % len(MARKERS)],
+            markerfacecolor=colour if row["on"] else "none",
+            label=f"{row['series']}, {'on' if row['on'] else 'off'}, {row['amount']}",
+        )
+    axes.set(
+        yscale="log",
+        xlabel=f"cost (ms of processor time for {study.about['rays']:,} rays), and the rounds' range",
+        ylabel=f"left out: relative RMS or change of power, the larger (least drawn: {floor:.1g})",
+        title="effects: cost and error",
+    )
     axes.set_xscale("symlog", linthresh=1.0)
     axes.grid(which="major", linewidth=0.4)
     figure.legend(loc="outside right upper", fontsize="x-small")

@@ -47,5 +47,4 @@ def order(n: Sequence[float], error: Sequence[float], least: float = 0.0) -> Ord
 def pareto(cost: Sequence[float], error: Sequence[float]) -> list[bool]:
     """For every setting, whether no other one is at least as good in both and better in one."""
     points = list(zip(cost, error, strict=True))
-    return [not any(c <= cost_ and e <= error_ and (c, e) != (cost_, error_) for c, e in points)
-            for cost_, error_ in points]
+    return [not any(c <= cost_ and e <= error_ and (c, e) != (cost_, error_) for c, e in points) for cost_, error_ in points]

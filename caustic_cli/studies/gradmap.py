@@ -44,9 +44,17 @@ DIFFERENCE_PIXELS = 1e-4
 LEAST_STEP = 2e-12
 
 
-def gradient_image(scene: Scene, field: HeightField, heights: Tensor, control: tuple[int, int], *,
-                   sampler: Rays, filter: Filter, dtype: torch.dtype = torch.float64,
-                   chunk: int = 1 << 19) -> Tensor:
+def gradient_image(
+    scene: Scene,
+    field: HeightField,
+    heights: Tensor,
+    control: tuple[int, int],
+    *,
+    sampler: Rays,
+    filter: Filter,
+    dtype: torch.dtype = torch.float64,
+    chunk: int = 1 << 19,
+) -> Tensor:
     """dJ/dP_ij for control = (i, j): (n_x, n_y) float64, parts of the source's power per mm.
 
     Args:
@@ -60,9 +68,11 @@ def gradient_image(scene: Scene, field: HeightField, heights: Tensor, control: t
     """
     direction = _direction(field, control).to(sampler.device)
     if min(filter.reach) < 1:
-        raise InputError("the derivative of an image needs gaussian or cosine reconstruction with a filter size of 3 or"
-                         f" more along both axes, got {filter.kind} of size {filter.size[0]} x {filter.size[1]}, under"
-                         " which no pixel changes when a ray moves a little")
+        raise InputError(
+            "the derivative of an image needs gaussian or cosine reconstruction with a filter size of 3 or"
+            f" more along both axes, got {filter.kind} of size {filter.size[0]} x {filter.size[1]}, under"
+            " which no pixel changes when a ray moves a little"
+        )
     heights = heights.detach().to(sampler.device, torch.float64)
     total = torch.zeros(scene.screen.resolution, dtype=torch.float64, device=sampler.device)
     for band in scene.bands:
@@ -79,8 +89,7 @@ def gradient_image(scene: Scene, field: HeightField, heights: Tensor, control: t
     return total
 
 
-def difference_step(scene: Scene, field: HeightField, control: tuple[int, int],
-                    pixels: float = DIFFERENCE_PIXELS) -> float:
+def difference_step(scene: Scene, field: HeightField, control: tuple[int, int], pixels: float = DIFFERENCE_PIXELS) -> float:
     """Height in mm that moves no landing point by more than about `pixels` pixels.
 
     A ray turns by (n - 1) times the change of slope, at most |grad N_i N_j| per mm of height, over the throw.
@@ -99,8 +108,16 @@ def _step(scene: Scene, field: HeightField, heights: Tensor, control: tuple[int,
     return min(max(difference_step(scene, field, control), least), 0.5 * (scene.screen.z - float(heights.max())))
 
 
-def finite_difference(scene: Scene, field: HeightField, heights: Tensor, control: tuple[int, int], *,
-                      sampler: Rays, filter: Filter, step: float | None = None) -> Tensor:
+def finite_difference(
+    scene: Scene,
+    field: HeightField,
+    heights: Tensor,
+    control: tuple[int, int],
+    *,
+    sampler: Rays,
+    filter: Filter,
+    step: float | None = None,
+) -> Tensor:
     """The same derivative by central differences of two float64 renders with the same rays: (n_x, n_y), per mm.
 
     Every ray is traced by `expose`, so nothing but the physics is shared with `gradient_image`.  Float64 whatever the
@@ -132,8 +149,17 @@ class Comparison:
     step: float
 
 
-def compare(gradient: Tensor, scene: Scene, field: HeightField, heights: Tensor, control: tuple[int, int], *,
-            sampler: Rays, filter: Filter, step: float | None = None) -> Comparison:
+def compare(
+    gradient: Tensor,
+    scene: Scene,
+    field: HeightField,
+    heights: Tensor,
+    control: tuple[int, int],
+    *,
+    sampler: Rays,
+    filter: Filter,
+    step: float | None = None,
+) -> Comparison:
     """How far `gradient` (of `gradient_image` with the same rays and filter) is from `finite_difference`.
 
     A few 1e-8 are left with the cosine filter in float64; the truncated Gaussian has kinks (it is only C0), and leaves
@@ -162,8 +188,15 @@ def plot_gradient(path: str | Path, gradient: Tensor, scene: Scene, title: str) 
     limit = float(np.abs(g).max()) or 1.0
     (rx, ry), figure = scene.screen.half_size, Figure(figsize=(6.4, 5.2), dpi=150, layout="constrained")
     axes = figure.add_subplot()
-    shown = axes.imshow(np.ma.masked_equal(g, 0.0).T, origin="lower", extent=(-rx, rx, -ry, ry), cmap="coolwarm",
-                        vmin=-limit, vmax=limit, interpolation="nearest")  # the colour of 0 is grey: white stands out
+    shown = axes.imshow(
+        np.ma.masked_equal(g, 0.0).T,
+        origin="lower",
+        extent=(-rx, rx, -ry, ry),
+        cmap="coolwarm",
+        vmin=-limit,
+        vmax=limit,
+        interpolation="nearest",
+    )  # the colour of 0 is grey: white stands out
     axes.set(xlabel="x (mm)", ylabel="y (mm)", title=title, facecolor="white")
     figure.colorbar(shown, label="change of a pixel, parts of the source's power per mm of height")
     with atomic_path(path) as temporary:

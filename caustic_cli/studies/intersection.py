@@ -61,7 +61,7 @@ ROUGH, FINE, EQUAL = 1e-4, 1e-9, 1e-6
 
 COLUMNS = {
     "series": "method: mesh, looked for four rectangles of knot span products at a time; mesh, flat boxes, through all of them"
-              " one by one; newton; mesh+newton, which begins at the mesh's hit",
+    " one by one; newton; mesh+newton, which begins at the mesh's hit",
     "n_u": "parts that the mesh cuts every knot span into along either axis",
     "rays": "rays in all",
     "hits": "rays found to meet the surface",
@@ -182,12 +182,22 @@ def settings_of(field: HeightField, most: int | None = None) -> list[tuple[str, 
     most = most or max(COARSE[2], min(128, MOST_CELLS // max(spans)))
     parts = [2**k for k in range(int(math.log2(most)) + 1)]
     flat = parts if spans[0] * spans[1] <= MOST_FLAT else []
-    return [*(("mesh", n) for n in parts), *((f"mesh{FLAT}", n) for n in flat), ("newton", None),
-            *(("mesh+newton", n) for n in COARSE)]
+    return [
+        *(("mesh", n) for n in parts),
+        *((f"mesh{FLAT}", n) for n in flat),
+        ("newton", None),
+        *(("mesh+newton", n) for n in COARSE),
+    ]
 
 
-def run_intersection(case: Case, *, seed: int = 0, repeats: int | None = None, most: int | None = None,
-                     progress: Callable[[int, int], None] | None = None) -> Study:
+def run_intersection(
+    case: Case,
+    *,
+    seed: int = 0,
+    repeats: int | None = None,
+    most: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Study:
     """Measure all methods on the rays of a case, in turns.  The errors repeat from run to run, the times do not.
 
     Args:
@@ -218,14 +228,28 @@ def run_intersection(case: Case, *, seed: int = 0, repeats: int | None = None, m
     parts = [row["n_u"] for row in mesh]
     orders = {f"mesh, {name}": order(parts, [row[column] for row in mesh]) for name, column in FITTED.items()}
     newton, at_equal = next(row for row in rows if row["series"] == "newton"), seconds_at(mesh, EQUAL)
-    about = {"version": __version__, "source": case.source, "seed": seed, "repeats": repeats, "rays": case.rays.count,
-             "control": list(case.field.shape), "degree": [s.degree for s in case.field.spaces], "dtype": "float64",
-             "device": "cpu", "threads": torch.get_num_threads(), "reference": "newton in float64, two steps in longdouble",
-             "reference_bits": int(np.finfo(np.longdouble).nmant) + 1, "reference_error": residual,
-             "reference_hits": int(hit.sum()), "equal_error": EQUAL, "mesh_seconds": at_equal,
-             "newton_times_as_fast": None if at_equal is None else at_equal / newton["seconds"]}
-    return Study("intersection", COLUMNS, rows, orders, _advice(rows, about["newton_times_as_fast"]) + haste(rows), about,
-                 "n_u", PLOTS)
+    about = {
+        "version": __version__,
+        "source": case.source,
+        "seed": seed,
+        "repeats": repeats,
+        "rays": case.rays.count,
+        "control": list(case.field.shape),
+        "degree": [s.degree for s in case.field.spaces],
+        "dtype": "float64",
+        "device": "cpu",
+        "threads": torch.get_num_threads(),
+        "reference": "newton in float64, two steps in longdouble",
+        "reference_bits": int(np.finfo(np.longdouble).nmant) + 1,
+        "reference_error": residual,
+        "reference_hits": int(hit.sum()),
+        "equal_error": EQUAL,
+        "mesh_seconds": at_equal,
+        "newton_times_as_fast": None if at_equal is None else at_equal / newton["seconds"],
+    }
+    return Study(
+        "intersection", COLUMNS, rows, orders, _advice(rows, about["newton_times_as_fast"]) + haste(rows), about, "n_u", PLOTS
+    )
 
 
 def _evaluate(case: Case, prepared: Callable, series: str, n: int | None) -> tuple[Tensor, Tensor]:
@@ -244,8 +268,15 @@ def _errors(case: Case, t: Tensor, status: Tensor, truth: np.ndarray, hit: np.nd
     off, above = np.abs(t - truth)[both], np.abs(_above(case, t))[both]
     if not both.any():
         off = above = np.zeros(1)
-    return {"rays": len(t), "hits": int(found.sum()), "strayed": int((found != hit).sum()), "error": float(off.mean()),
-            "t_max": float(off.max()), "z_mean": float(above.mean()), "z_max": float(above.max())}
+    return {
+        "rays": len(t),
+        "hits": int(found.sum()),
+        "strayed": int((found != hit).sum()),
+        "error": float(off.mean()),
+        "t_max": float(off.max()),
+        "z_mean": float(above.mean()),
+        "z_max": float(above.max()),
+    }
 
 
 def seconds_at(rows: list[dict], error: float) -> float | None:
@@ -259,17 +290,22 @@ def seconds_at(rows: list[dict], error: float) -> float | None:
 
 def _advice(rows: list[dict], faster: float | None) -> str:
     """What accuracy costs here, in one sentence."""
-    rough, fine = (min((row for row in rows if row["error"] <= error), key=lambda row: row["seconds"], default=None)
-                   for error in (ROUGH, FINE))
+    rough, fine = (
+        min((row for row in rows if row["error"] <= error), key=lambda row: row["seconds"], default=None) for error in (ROUGH, FINE)
+    )
     if fine is None:
         best = min(rows, key=lambda row: row["error"])
         text = f"no method reaches a t-error of {FINE:g} mm; the least, {best['error']:.2g} mm, is that of {_named(best)}"
     elif fine is rough:
-        text = (f"{_named(fine)} is the fastest way to a t-error of {ROUGH:g} mm and reaches {fine['error']:.2g} mm at no extra"
-                f" cost, in {1e3 * fine['seconds']:.3g} ms")
+        text = (
+            f"{_named(fine)} is the fastest way to a t-error of {ROUGH:g} mm and reaches {fine['error']:.2g} mm at no extra"
+            f" cost, in {1e3 * fine['seconds']:.3g} ms"
+        )
     else:
-        text = (f"t-error {FINE:g} mm costs {fine['seconds'] / rough['seconds']:.2g} x the time of {ROUGH:g} mm: {_named(fine)}"
-                f" in {1e3 * fine['seconds']:.3g} ms against {_named(rough)} in {1e3 * rough['seconds']:.3g} ms")
+        text = (
+            f"t-error {FINE:g} mm costs {fine['seconds'] / rough['seconds']:.2g} x the time of {ROUGH:g} mm: {_named(fine)}"
+            f" in {1e3 * fine['seconds']:.3g} ms against {_named(rough)} in {1e3 * rough['seconds']:.3g} ms"
+        )
     return text if faster is None else f"{text}; at {EQUAL:g} mm newton is {faster:.2g} times as fast as the mesh"
 
 
@@ -293,22 +329,46 @@ def draw_convergence(study: Study, figure: Figure) -> None:
             found = study.orders[f"mesh, {word} {kind}"]
             y = np.array([row[column] for row in mesh])
             use = y > 0
-            axes.plot(n[use], y[use], linestyle=line, linewidth=1, color=style["mesh"]["color"], marker="o" if line == "-" else "^",
-                      markersize=5, markerfacecolor=None if line == "-" else "none", label=f"mesh, {word}{_fit_label(found)}")
+            axes.plot(
+                n[use],
+                y[use],
+                linestyle=line,
+                linewidth=1,
+                color=style["mesh"]["color"],
+                marker="o" if line == "-" else "^",
+                markersize=5,
+                markerfacecolor=None if line == "-" else "none",
+                label=f"mesh, {word}{_fit_label(found)}",
+            )
         for name, line in (("mesh+newton", "-"), ("newton", ":")):
             points = [row for row in table[name] if row[columns[0]] > 0]
             if points and name == "newton":
                 axes.axhline(points[0][columns[0]], color=style[name]["color"], linestyle=line, label=f"{name}, mean")
             elif points:
-                axes.plot([row["n_u"] for row in points], [row[columns[0]] for row in points], color=style[name]["color"],
-                          linewidth=1, marker=style[name]["marker"], markersize=5, label=f"{name}, mean")
+                axes.plot(
+                    [row["n_u"] for row in points],
+                    [row[columns[0]] for row in points],
+                    color=style[name]["color"],
+                    linewidth=1,
+                    marker=style[name]["marker"],
+                    markersize=5,
+                    label=f"{name}, mean",
+                )
         axes.set(xscale="log", yscale="log", ylabel=f"{kind} (mm)", title=f"{kind}, with the fitted orders")
     for name, rows in table.items():
         if name != "newton" and rows:
-            panels[1, 0].errorbar([row["n_u"] for row in rows], [row["seconds"] for row in rows], yerr=spread(rows), label=name,
-                                  **style[name])
-            panels[1, 1].plot([row["n_u"] for row in rows], [row["hits"] for row in rows], linewidth=1, label=name, markersize=5,
-                              color=style[name]["color"], marker=style[name]["marker"])
+            panels[1, 0].errorbar(
+                [row["n_u"] for row in rows], [row["seconds"] for row in rows], yerr=spread(rows), label=name, **style[name]
+            )
+            panels[1, 1].plot(
+                [row["n_u"] for row in rows],
+                [row["hits"] for row in rows],
+                linewidth=1,
+                label=name,
+                markersize=5,
+                color=style[name]["color"],
+                marker=style[name]["marker"],
+            )
     for axes, value in ((panels[1, 0], newton["seconds"]), (panels[1, 1], newton["hits"])):
         axes.axhline(value, color=style["newton"]["color"], linestyle=":", label="newton")
     panels[1, 0].set(xscale="log", yscale="log", ylabel="time (s): median, least and most", title="computation time")

@@ -57,8 +57,15 @@ class Lens:
     seconds: float
 
 
-def run_light(lenses: Iterable[Lens], count: int, *, rays: int | None = None, seed: int = 0, device: str = "cpu",
-              progress: Callable[[int, int], None] | None = None) -> Study:
+def run_light(
+    lenses: Iterable[Lens],
+    count: int,
+    *,
+    rays: int | None = None,
+    seed: int = 0,
+    device: str = "cpu",
+    progress: Callable[[int, int], None] | None = None,
+) -> Study:
     """Judge lenses one by one.
 
     Args:
@@ -73,17 +80,33 @@ def run_light(lenses: Iterable[Lens], count: int, *, rays: int | None = None, se
     for k, lens in enumerate(lenses):
         traced = checks.whole("⟨rays⟩", min(FINAL_RAYS, RAYS_PER_PIXEL * lens.target.size) if rays is None else rays, 256, 1 << 32)
         _, figures = retrace(lens.scene, lens.field, lens.heights, lens.target, rays=traced, seed=seed, device=device)
-        rows.append({"series": f"{lens.thickness:g} mm", "thickness": lens.thickness, "weight": lens.weight, "loss": lens.loss,
-                     "error": figures["relative_rms"], "noise": figures["noise"], "on_screen": figures["on_screen"],
-                     "seconds": lens.seconds})
+        rows.append(
+            {
+                "series": f"{lens.thickness:g} mm",
+                "thickness": lens.thickness,
+                "weight": lens.weight,
+                "loss": lens.loss,
+                "error": figures["relative_rms"],
+                "noise": figures["noise"],
+                "on_screen": figures["on_screen"],
+                "seconds": lens.seconds,
+            }
+        )
         if progress is not None:
             progress(k + 1, count)
     if not rows:
         raise CausticError("no lens of this scene sends any light to the picture")
     for row, front in zip(rows, pareto([1.0 - r["on_screen"] for r in rows], [r["error"] for r in rows]), strict=True):
         row["front"] = bool(front)
-    about = {"version": __version__, "seed": seed, "device": device, "threads": torch.get_num_threads(), "retrace_rays": traced,
-             "resolution": list(lens.scene.screen.resolution), "reference_error": max(r["noise"] or 0.0 for r in rows)}
+    about = {
+        "version": __version__,
+        "seed": seed,
+        "device": device,
+        "threads": torch.get_num_threads(),
+        "retrace_rays": traced,
+        "resolution": list(lens.scene.screen.resolution),
+        "reference_error": max(r["noise"] or 0.0 for r in rows),
+    }
     return Study("light", COLUMNS, rows, {}, _advice(rows), about, "on_screen", PLOTS)
 
 
@@ -97,7 +120,7 @@ def _advice(rows: list[dict]) -> str:
 
 
 def _words(row: dict) -> str:
-    made = f"thickness {row['thickness']:g} mm, loss \"{row['loss']}\""
+    made = f'thickness {row["thickness"]:g} mm, loss "{row["loss"]}"'
     return f"error {row['error']:.3g} with {row['on_screen']:.1%} of the light ({made})"
 
 
@@ -106,13 +129,28 @@ def draw_light(study: Study, figure: Figure) -> None:
     axes = figure.add_subplot()
     for series, style in styles(row["series"] for row in study.rows).items():
         mine = [row for row in study.rows if row["series"] == series]
-        axes.errorbar([100.0 * r["on_screen"] for r in mine], [r["error"] for r in mine], yerr=[r["noise"] or 0.0 for r in mine],
-                      label=f"thickness {series}", **style)
+        axes.errorbar(
+            [100.0 * r["on_screen"] for r in mine],
+            [r["error"] for r in mine],
+            yerr=[r["noise"] or 0.0 for r in mine],
+            label=f"thickness {series}",
+            **style,
+        )
     front = sorted((100.0 * r["on_screen"], r["error"]) for r in study.rows if r["front"])
-    axes.plot(*zip(*front, strict=True), linestyle=":", color="black", marker="o", markersize=11, markerfacecolor="none",
-              label="Pareto front")
-    axes.set(xlabel="light on the screen (% of the source's)", ylabel="relative RMS error of the picture",
-             title="light: picture against light")
+    axes.plot(
+        *zip(*front, strict=True),
+        linestyle=":",
+        color="black",
+        marker="o",
+        markersize=11,
+        markerfacecolor="none",
+        label="Pareto front",
+    )
+    axes.set(
+        xlabel="light on the screen (% of the source's)",
+        ylabel="relative RMS error of the picture",
+        title="light: picture against light",
+    )
     axes.set_ylim(bottom=0.0)
     axes.grid(which="major", linewidth=0.4)
     axes.legend(fontsize="small")

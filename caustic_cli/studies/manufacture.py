@@ -59,10 +59,13 @@ def manufacture(scene: Scene, field: HeightField, heights: Tensor, tool_radius: 
     where = [(2.0 * k / (n - 1) - 1.0) * r for k, n, r in zip(at, z.shape, field.half_size, strict=True)]
     radius = 1.0 / bent if bent > 0 else None
     found = {
-        "minimum_wall_mm": float(z.min()) - lens.z_in, "minimum_wall_bound_mm": float(heights.min()) - lens.z_in,
+        "minimum_wall_mm": float(z.min()) - lens.z_in,
+        "minimum_wall_bound_mm": float(heights.min()) - lens.z_in,
         "stock_height_mm": float(z.max()) - lens.z_in,
-        "maximum_slope": float(torch.hypot(*derivatives[:2]).max()), "maximum_slope_bound": field.slope_bound(heights),
-        "smallest_concave_radius_mm": radius, "smallest_concave_radius_at_mm": where if radius else None,
+        "maximum_slope": float(torch.hypot(*derivatives[:2]).max()),
+        "maximum_slope_bound": field.slope_bound(heights),
+        "smallest_concave_radius_mm": radius,
+        "smallest_concave_radius_at_mm": where if radius else None,
     }
     if tool_radius is not None:
         found |= {"tool_radius_mm": tool_radius, "tool_fits": radius is None or radius >= tool_radius}
@@ -73,9 +76,13 @@ def manufacture(scene: Scene, field: HeightField, heights: Tensor, tool_radius: 
     other = replace(scene, lens=replace(lens, index=lens.index + STEP))
     by_index = _moved(scene, other, field, heights, seed, 0.0) / STEP
     return found | {
-        "critical_angle_deg": critical, "steepest_incidence_deg": incidence, "internal_reflection_margin_deg": critical - incidence,
-        "sharpness_limit_mm": blur, "sharpness_limit_pixels": blur / pixel,
-        "landing_mm_per_mm_throw": by_throw, "landing_mm_per_thousandth_index": 1e-3 * by_index,
+        "critical_angle_deg": critical,
+        "steepest_incidence_deg": incidence,
+        "internal_reflection_margin_deg": critical - incidence,
+        "sharpness_limit_mm": blur,
+        "sharpness_limit_pixels": blur / pixel,
+        "landing_mm_per_mm_throw": by_throw,
+        "landing_mm_per_thousandth_index": 1e-3 * by_index,
         "throw_error_of_a_pixel_mm": pixel / by_throw if by_throw > 0 else None,
         "index_error_of_a_pixel": pixel / by_index if by_index > 0 else None,
     }
@@ -149,11 +156,17 @@ def rows(f: dict) -> list[tuple[str, str]]:
         ("stock height", f"{f['stock_height_mm']:.4f} mm"),
         ("maximum slope", f"{f['maximum_slope']:.4f} (surely below {f['maximum_slope_bound']:.4f})"),
         ("smallest concave radius", concave),
-        ("margin to internal reflection", f"{margin:.2f} degrees of {f['critical_angle_deg']:.2f}"
-                                          + ", LIGHT IS LOST" * (margin < 0)),
+        (
+            "margin to internal reflection",
+            f"{margin:.2f} degrees of {f['critical_angle_deg']:.2f}" + ", LIGHT IS LOST" * (margin < 0),
+        ),
         ("sharpness limit", f"{f['sharpness_limit_mm']:.3g} mm, {f['sharpness_limit_pixels']:.3g} pixels"),
-        ("throw wrong by 1 mm", f"light moves {f['landing_mm_per_mm_throw']:.3g} mm"
-                                f"{of_a_pixel('throw_error_of_a_pixel_mm', ' mm')}"),
-        ("index wrong by 0.001", f"light moves {f['landing_mm_per_thousandth_index']:.3g} mm"
-                                 f"{of_a_pixel('index_error_of_a_pixel', '')}"),
+        (
+            "throw wrong by 1 mm",
+            f"light moves {f['landing_mm_per_mm_throw']:.3g} mm{of_a_pixel('throw_error_of_a_pixel_mm', ' mm')}",
+        ),
+        (
+            "index wrong by 0.001",
+            f"light moves {f['landing_mm_per_thousandth_index']:.3g} mm{of_a_pixel('index_error_of_a_pixel', '')}",
+        ),
     ]

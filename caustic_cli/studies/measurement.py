@@ -104,8 +104,7 @@ class Bench:
 
     def image(self, setting: Setting, seed: int) -> Tensor:
         """The image that a setting makes with the rays of `seed`: (n_x, n_y) float64, colours added up."""
-        found = expose(self.scene, self.heightfield, self.heights, self.sampler(setting, seed), setting.filter,
-                       setting.dtype).image
+        found = expose(self.scene, self.heightfield, self.heights, self.sampler(setting, seed), setting.filter, setting.dtype).image
         return found.sum(0) if self.scene.colored else found
 
     def reference(self, filter: Filter) -> Reference:
@@ -120,8 +119,10 @@ class Bench:
             images.append(self.image(half, self.seed + REFERENCE_SEED + k))
             self._tick(half.rays)
         if not all(float(image.sum()) > 0 for image in images):
-            raise CausticError("no light reaches the screen, so there is no image to study: every ray is reflected"
-                               " inside the lens or misses the screen; check index, throw, mag and screen size")
+            raise CausticError(
+                "no light reaches the screen, so there is no image to study: every ray is reflected"
+                " inside the lens or misses the screen; check index, throw, mag and screen size"
+            )
         return Reference(sum(images) / 2.0, 2 * self.sampler(half, 0).count, relative_rms(*images) / 2.0)
 
     def measure(self, settings: Sequence[Setting], figures: Figures) -> list[dict]:

@@ -144,8 +144,7 @@ def _array(a) -> np.ndarray:
 def _pair(image, target) -> tuple[np.ndarray, np.ndarray]:
     image, target = _array(image), _array(target)
     if image.ndim != 2 or not image.size or image.shape != target.shape:
-        raise InputError("image and target must be 2-D pictures of the same shape,"
-                         f" got {image.shape} and {target.shape}")
+        raise InputError(f"image and target must be 2-D pictures of the same shape, got {image.shape} and {target.shape}")
     if not (np.isfinite(image).all() and np.isfinite(target).all()):
         raise InputError("image and target must hold finite numbers only, got NaN or infinity")
     return image, target

@@ -14,8 +14,18 @@ from caustic_cli.scene import Lens, Screen
 DARK = 1e-250
 
 
-def write_report(path: Path, target: np.ndarray, image: np.ndarray, heights: np.ndarray, history: np.ndarray,
-                 lens: Lens, screen: Screen, figures: dict, encoding: str, waves: np.ndarray | None = None) -> None:
+def write_report(
+    path: Path,
+    target: np.ndarray,
+    image: np.ndarray,
+    heights: np.ndarray,
+    history: np.ndarray,
+    lens: Lens,
+    screen: Screen,
+    figures: dict,
+    encoding: str,
+    waves: np.ndarray | None = None,
+) -> None:
     """Write the panels.
 
     Args:
@@ -36,6 +46,7 @@ def write_report(path: Path, target: np.ndarray, image: np.ndarray, heights: np.
     figure, axes = plt.subplots(2, across, figsize=(4.8 * across, 8.8), constrained_layout=True)
     extent = [-screen.half_size[0], screen.half_size[0], -screen.half_size[1], screen.half_size[1]]
     scale = target.sum() / target.max()
+
     def titled(name: str, relative: float | None) -> str:
         return name if relative is None else f"{name}\nrelative RMS error {relative:.3f}"
 
@@ -45,16 +56,22 @@ def write_report(path: Path, target: np.ndarray, image: np.ndarray, heights: np.
             title += f", {figures['least_relative_rms']:.3f} possible"
         shown = [(target, "target"), (image, title)]
     else:
-        shown = [(target, "target"), (image, titled("by rays", figures["relative_rms"])),
-                 (waves, titled("what light will do (waves)", figures["wave_relative_rms"]))]
+        shown = [
+            (target, "target"),
+            (image, titled("by rays", figures["relative_rms"])),
+            (waves, titled("what light will do (waves)", figures["wave_relative_rms"])),
+        ]
         image = waves
     for axis, (picture, title) in zip(axes[0], shown, strict=False):
         part = picture / max(picture.sum(), 1e-300)
         mean = figures["wave_mean_irradiance" if picture is waves else "mean_irradiance"]
         white = mean * picture.size / scale
         white = white if white > DARK else 1.0
-        norm = FuncNorm((lambda e, w=white: to_srgb(e / w), lambda v, w=white: w * to_linear(v)), 0.0, white, clip=True) \
-            if encoding == "srgb" else Normalize(0.0, white, clip=True)
+        norm = (
+            FuncNorm((lambda e, w=white: to_srgb(e / w), lambda v, w=white: w * to_linear(v)), 0.0, white, clip=True)
+            if encoding == "srgb"
+            else Normalize(0.0, white, clip=True)
+        )
         drawn = axis.imshow((part * scale * white).T, origin="lower", extent=extent, cmap="gray", norm=norm)
         if picture is not target:
             figure.colorbar(drawn, ax=axis, label=_irradiance_words(figures, "wave_" if picture is waves else ""))

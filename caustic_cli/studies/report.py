@@ -88,8 +88,7 @@ def write(study: Study, directory: str | Path) -> list[Path]:
     try:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{directory}: cannot be made ({error.strerror}); a directory you may write to is needed") \
-            from error
+        raise InputError(f"{directory}: cannot be made ({error.strerror}); a directory you may write to is needed") from error
     paths = paths_of(study.name, directory, study.plots)
     write_bytes(paths[0], as_csv(study).encode())
     write_bytes(paths[1], as_json(study).encode())
@@ -127,10 +126,12 @@ def draw_error_and_time(study: Study, figure: Figure) -> None:
     axes = figure.add_subplot()
     draw_front(axes, study)
     if study.about["reference_error"] > 0:
-        axes.axhline(study.about["reference_error"], color="grey", linewidth=0.8, linestyle="--",
-                     label="error of the reference")
-    axes.set(xlabel="time (s): median, least and most", ylabel="error: relative RMS against the reference",
-             title=f"{study.name}: error and time")
+        axes.axhline(study.about["reference_error"], color="grey", linewidth=0.8, linestyle="--", label="error of the reference")
+    axes.set(
+        xlabel="time (s): median, least and most",
+        ylabel="error: relative RMS against the reference",
+        title=f"{study.name}: error and time",
+    )
     axes.legend(fontsize="small")
 
 
@@ -151,8 +152,16 @@ def draw_front(axes: Axes, study: Study) -> None:
         axes.errorbar([row["seconds"] for row in mine], [row["error"] for row in mine], xerr=spread(mine), label=label, **style)
     best = pareto([row["seconds"] for row in rows], [row["error"] for row in rows])
     front = sorted((row["seconds"], row["error"]) for row, on in zip(rows, best, strict=True) if on)
-    axes.plot([seconds for seconds, _ in front], [error for _, error in front], linestyle=":", color="black",
-              marker="o", markersize=11, markerfacecolor="none", label="Pareto front")
+    axes.plot(
+        [seconds for seconds, _ in front],
+        [error for _, error in front],
+        linestyle=":",
+        color="black",
+        marker="o",
+        markersize=11,
+        markerfacecolor="none",
+        label="Pareto front",
+    )
     axes.grid(which="major", linewidth=0.4)
     plain_ticks(axes.xaxis)
 
@@ -167,8 +176,16 @@ def plain_ticks(axis: Axis) -> None:
 
 def styles(series: Iterable[str]) -> dict[str, dict]:
     """How the curve of each series looks, as options of `Axes.errorbar`."""
-    return {name: {"linewidth": 1, "elinewidth": 0.6, "markersize": 5, "color": COLOURS[k % len(COLOURS)],
-                   "marker": MARKERS[k % len(MARKERS)]} for k, name in enumerate(dict.fromkeys(series))}
+    return {
+        name: {
+            "linewidth": 1,
+            "elinewidth": 0.6,
+            "markersize": 5,
+            "color": COLOURS[k % len(COLOURS)],
+            "marker": MARKERS[k % len(MARKERS)],
+        }
+        for k, name in enumerate(dict.fromkeys(series))
+    }
 
 
 def spread(rows: list[dict]) -> list[list[float]] | None:

@@ -71,9 +71,19 @@ class Converged:
     traced: int
 
 
-def converge(scene: Scene, field: HeightField, heights: Tensor, tolerance: float, *, rays: int, seed: int = 0,
-             screen: Screen | None = None, device: str = "cpu", dtype: torch.dtype = torch.float64,
-             requests: Requests = NO_REQUESTS) -> Converged:
+def converge(
+    scene: Scene,
+    field: HeightField,
+    heights: Tensor,
+    tolerance: float,
+    *,
+    rays: int,
+    seed: int = 0,
+    screen: Screen | None = None,
+    device: str = "cpu",
+    dtype: torch.dtype = torch.float64,
+    requests: Requests = NO_REQUESTS,
+) -> Converged:
     """Trace BATCHES independent sets of rays, about `rays` in all, then more until the noise is at most `tolerance`.
 
     The relative RMS noise of the mean of B images J_k is sqrt(mean over pixels of var(J_k) / B) / mean(J).  Rays that converge with
@@ -87,8 +97,19 @@ def converge(scene: Scene, field: HeightField, heights: Tensor, tolerance: float
     while True:
         if each * BATCHES > held:
             raise CausticError(f"⟨tolerance⟩ {tolerance:g} asks for more rays than the file holds, {held:,}")
-        parts = [expose(light, field, heights, _rays(light, each, stream(seed, f"batch {k}"), device), None, dtype, screen,
-                        requests=requests) for k, light in enumerate(lights)]
+        parts = [
+            expose(
+                light,
+                field,
+                heights,
+                _rays(light, each, stream(seed, f"batch {k}"), device),
+                None,
+                dtype,
+                screen,
+                requests=requests,
+            )
+            for k, light in enumerate(lights)
+        ]
         traced += sum(p.rays for p in parts)
         images = torch.stack([p.image for p in parts])
         mean = images.mean(0)
@@ -102,8 +123,10 @@ def converge(scene: Scene, field: HeightField, heights: Tensor, tolerance: float
         foreseen = each * more if each > mean.numel() else 0.0  # too few rays a pixel foretell nothing
         each = int(each * min(32.0, more))
         if max(each, foreseen) * BATCHES > MOST_RAYS:
-            raise CausticError(f"⟨tolerance⟩ {tolerance:g} asks for more than {MOST_RAYS:.0e} rays: {traced:,} left an estimated"
-                               f" error of {error:.2g}; fewer pixels or a larger tolerance need fewer")
+            raise CausticError(
+                f"⟨tolerance⟩ {tolerance:g} asks for more than {MOST_RAYS:.0e} rays: {traced:,} left an estimated"
+                f" error of {error:.2g}; fewer pixels or a larger tolerance need fewer"
+            )
 
 
 def mean_of(parts: list[Image]) -> Image:
@@ -113,10 +136,23 @@ def mean_of(parts: list[Image]) -> Image:
     return Image(torch.stack([p.image for p in parts]).mean(0), leaving, lost, sum(p.rays for p in parts))
 
 
-def retrace(scene: Scene, field: HeightField, heights: Tensor, target: np.ndarray | None, *, rays: int, seed: int = 0,
-            filter: Filter | None = None, screen: Screen | None = None, device: str = "cpu",
-            dtype: torch.dtype = torch.float64, tolerance: float | None = None,
-            requests: Requests = NO_REQUESTS, noise: bool = True, quiet: float | None = None) -> tuple[Image, dict]:
+def retrace(
+    scene: Scene,
+    field: HeightField,
+    heights: Tensor,
+    target: np.ndarray | None,
+    *,
+    rays: int,
+    seed: int = 0,
+    filter: Filter | None = None,
+    screen: Screen | None = None,
+    device: str = "cpu",
+    dtype: torch.dtype = torch.float64,
+    tolerance: float | None = None,
+    requests: Requests = NO_REQUESTS,
+    noise: bool = True,
+    quiet: float | None = None,
+) -> tuple[Image, dict]:
     """Trace a lens with rays of its own; with `tolerance`, as many as that asks for (`converge`).  requests: of a plan.
 
     A plane wave's stratified rays leave little noise, which its figures hold.  All other light, and with `tolerance` that too, is
@@ -132,14 +168,16 @@ def retrace(scene: Scene, field: HeightField, heights: Tensor, target: np.ndarra
         with the rays that were traced; noise, of relative_rms, None without a target; error_estimate, the relative RMS noise of the
         image, None of a black one; those of `studies.irradiance`; with `tolerance` also rays_traced.
     """
+
     def trace(name: str, count: int, light: Scene = scene) -> Image:
         sampler = _rays(light, max(1, count), stream(seed, name), device)
         return expose(light, field, heights, sampler, None, dtype, screen, requests=requests)
 
     even = scene.source.collimated
     if tolerance is not None:
-        found = converge(scene, field, heights, tolerance, rays=rays, seed=seed, screen=screen, device=device, dtype=dtype,
-                         requests=requests)
+        found = converge(
+            scene, field, heights, tolerance, rays=rays, seed=seed, screen=screen, device=device, dtype=dtype, requests=requests
+        )
         counted = found.exposure
         figures = _judged_halves(counted, target, found.halves) | {"error_estimate": found.error, "rays_traced": found.traced}
     elif even:
@@ -161,8 +199,9 @@ def retrace(scene: Scene, field: HeightField, heights: Tensor, target: np.ndarra
     figures |= irradiance_figures(scene, counted.image, screen) | unit_figures(scene)
     if filter is None or filter.reach == (0, 0):
         return counted, figures
-    return expose(scene, field, heights, sampler_for(scene, counted.rays, seed, device), filter, dtype, screen,
-                  requests=requests), figures
+    return expose(
+        scene, field, heights, sampler_for(scene, counted.rays, seed, device), filter, dtype, screen, requests=requests
+    ), figures
 
 
 def _judged_halves(counted: Image, target: np.ndarray | None, halves: tuple[Image, Image]) -> dict:

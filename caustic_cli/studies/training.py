@@ -45,7 +45,7 @@ COLUMNS = {
     "iteration_min": "least of them, s",
     "iteration_max": "most of them, s",
     "loss": "the last iteration's own loss times the pixels, for rms a relative RMS (filtered, blurred in early stages); empty"
-            " before the first iteration",
+    " before the first iteration",
     "error": "relative RMS between the retraced image and the target, each over its own mean",
 }
 
@@ -80,9 +80,18 @@ class Contender(Protocol):
         """Iterate for so long, at least once."""
 
 
-def run_training(scene: Scene, target: np.ndarray, contenders: Sequence[Contender], *, seconds: float | None = None,
-                 seed: int = 0, rays: int | None = None, device: str = "cpu", about: dict | None = None,
-                 progress: Callable[[int, int], None] | None = None) -> Study:
+def run_training(
+    scene: Scene,
+    target: np.ndarray,
+    contenders: Sequence[Contender],
+    *,
+    seconds: float | None = None,
+    seed: int = 0,
+    rays: int | None = None,
+    device: str = "cpu",
+    about: dict | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Study:
     """Let all contenders run for the same time.  Neither errors nor times repeat: a faster machine gets further.
 
     Args:
@@ -118,16 +127,35 @@ def run_training(scene: Scene, target: np.ndarray, contenders: Sequence[Contende
         if k & (k - 1) == 0:
             judge()
     rows = [row for table in tables for row in table]
-    made = {"version": __version__, "seed": seed, "seconds_each": seconds, "rounds": ROUNDS, "retrace_rays": rays, "device": device,
-            "threads": torch.get_num_threads(), "resolution": list(scene.screen.resolution), "reference_error": 0.0}
+    made = {
+        "version": __version__,
+        "seed": seed,
+        "seconds_each": seconds,
+        "rounds": ROUNDS,
+        "retrace_rays": rays,
+        "device": device,
+        "threads": torch.get_num_threads(),
+        "resolution": list(scene.screen.resolution),
+        "reference_error": 0.0,
+    }
     return Study("design", COLUMNS, rows, {}, _advice(tables), made | (about or {}), "seconds", PLOTS)
 
 
 def _row(c: Contender, error: float) -> dict:
     steps = c.steps
-    return {"series": c.series, "optimizer": c.optimizer, "network": c.network, "control": "x".join(map(str, c.heights.shape)),
-            "iterations": c.iterations, "seconds": c.seconds, "iteration": statistics.median(steps) if steps else None,
-            "iteration_min": min(steps, default=None), "iteration_max": max(steps, default=None), "loss": c.loss, "error": error}
+    return {
+        "series": c.series,
+        "optimizer": c.optimizer,
+        "network": c.network,
+        "control": "x".join(map(str, c.heights.shape)),
+        "iterations": c.iterations,
+        "seconds": c.seconds,
+        "iteration": statistics.median(steps) if steps else None,
+        "iteration_min": min(steps, default=None),
+        "iteration_max": max(steps, default=None),
+        "loss": c.loss,
+        "error": error,
+    }
 
 
 def _advice(tables: list[list[dict]]) -> str:
@@ -142,8 +170,10 @@ def _advice(tables: list[list[dict]]) -> str:
     if second["error"] <= (1.0 + ALIKE) * last["error"]:
         return f"{text}, and {second['series']} is as good, {second['error']:.3g} after {second['seconds']:.2g} s"
     when = next(row["seconds"] for row in best if row["error"] <= second["error"])
-    return (f"{text}; the next, {second['series']}, ends at {second['error']:.3g} after {second['seconds']:.2g} s, which the best"
-            f" had passed by {when:.2g} s")
+    return (
+        f"{text}; the next, {second['series']}, ends at {second['error']:.3g} after {second['seconds']:.2g} s, which the best"
+        f" had passed by {when:.2g} s"
+    )
 
 
 def draw_design(study: Study, figure: Figure) -> None:
@@ -153,8 +183,9 @@ def draw_design(study: Study, figure: Figure) -> None:
     draw_front(axes, study)
     begin = max(row["error"] for row in study.rows if row["iterations"] == 0)
     axes.axhline(begin, color="grey", linewidth=0.8, linestyle="--", label=f"at the beginning, {begin:.2g}")
-    axes.set(xlabel="time in iterations (s)", ylabel="relative RMS between retraced image and target",
-             title="design: error and time")
+    axes.set(
+        xlabel="time in iterations (s)", ylabel="relative RMS between retraced image and target", title="design: error and time"
+    )
     plain_ticks(axes.yaxis)
     axes.legend(fontsize="small")
 

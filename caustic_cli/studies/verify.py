@@ -94,8 +94,14 @@ def verify(path: Path, scene: Scene, field: HeightField, heights: Tensor, rays: 
     mi.set_log_level(mi.LogLevel.Error)
     world = mi.load_file(str(path))
     image, squares = _trace(mi, world, scene, rays, seed)
-    renders = np.array([expose(scene, field, heights, rays_of(scene, "stratified", max(1, rays // BATCHES),
-                                                              stream(seed, f"verify {k}"))).image.numpy() for k in range(BATCHES)])
+    renders = np.array(
+        [
+            expose(
+                scene, field, heights, rays_of(scene, "stratified", max(1, rays // BATCHES), stream(seed, f"verify {k}"))
+            ).image.numpy()
+            for k in range(BATCHES)
+        ]
+    )
     if not (renders.sum() > 0 and image.sum() > 0):
         raise CausticError("no light reaches the screen, so there is nothing to verify")
     shift = TURN * (scene.screen.z - scene.lens.z_in) / min(scene.screen.pixel)
@@ -108,8 +114,10 @@ def _choose_variant() -> str:
     Tried in a process of its own: an LLVM older than Dr.Jit asks for does not raise, it aborts.  (A newer one is found with the
     environment variable DRJIT_LIBLLVM_PATH.)
     """
-    probe = ("import sys, mitsuba as mi, drjit as dr; mi.set_variant(sys.argv[1]);"
-             "print(dr.maximum(dr.arange(mi.Float, 9) if 'llvm' in mi.variant() else 1.0, 3.0))")
+    probe = (
+        "import sys, mitsuba as mi, drjit as dr; mi.set_variant(sys.argv[1]);"
+        "print(dr.maximum(dr.arange(mi.Float, 9) if 'llvm' in mi.variant() else 1.0, 3.0))"
+    )
     for variant in VARIANTS:
         if subprocess.run([sys.executable, "-c", probe, variant], capture_output=True, check=False).returncode == 0:
             import mitsuba as mi  # noqa: PLC0415
@@ -189,8 +197,9 @@ def _binned(x: np.ndarray, y: np.ndarray, value: np.ndarray, scene: Scene) -> np
 # the decision
 
 
-def compare(renders: np.ndarray, image: np.ndarray, squares: np.ndarray, rays: int, shift: float = 0.0,
-            about: dict | None = None) -> Decision:
+def compare(
+    renders: np.ndarray, image: np.ndarray, squares: np.ndarray, rays: int, shift: float = 0.0, about: dict | None = None
+) -> Decision:
     """Z-scores of Mitsuba's image against several renders, and whether they are noise.
 
     Args:
@@ -218,15 +227,31 @@ def compare(renders: np.ndarray, image: np.ndarray, squares: np.ndarray, rays: i
     own, other = _correlation(image, render), max(_correlation(image, t) for t in turned)
     total, of_noise = _rms(image, render), _noise(image, squares, renders)
     figures = {
-        **(about or {}), "rays": rays, "pixels": len(some), "pixel_side": side, "noise": float(spread),
-        "relative_rms": total, "noise_rms": of_noise, "relative_rms_beyond_noise": max(total**2 - of_noise**2, 0.0) ** 0.5,
-        "on_screen": float(image.sum()), "on_screen_render": float(render.sum()), "light_z": light,
-        "z_mean": float(some.mean()), "z_mean_square": chi2, "z_beyond_3": beyond, "z_largest": largest,
-        "correlation": own, "correlation_turned": other,
+        **(about or {}),
+        "rays": rays,
+        "pixels": len(some),
+        "pixel_side": side,
+        "noise": float(spread),
+        "relative_rms": total,
+        "noise_rms": of_noise,
+        "relative_rms_beyond_noise": max(total**2 - of_noise**2, 0.0) ** 0.5,
+        "on_screen": float(image.sum()),
+        "on_screen_render": float(render.sum()),
+        "light_z": light,
+        "z_mean": float(some.mean()),
+        "z_mean_square": chi2,
+        "z_beyond_3": beyond,
+        "z_largest": largest,
+        "correlation": own,
+        "correlation_turned": other,
     }
     figures["agree"] = bool(
-        chi2 <= 1 + CHI2 + 3 * (2 / len(some)) ** 0.5 and beyond <= 2 * NORMAL + 3 * (NORMAL / len(some)) ** 0.5
-        and largest < LARGEST and abs(light) < LIGHT and own >= other - TIE)
+        chi2 <= 1 + CHI2 + 3 * (2 / len(some)) ** 0.5
+        and beyond <= 2 * NORMAL + 3 * (NORMAL / len(some)) ** 0.5
+        and largest < LARGEST
+        and abs(light) < LIGHT
+        and own >= other - TIE
+    )
     return Decision(render, image, np.repeat(np.repeat(z, side, 0), side, 1), figures)
 
 
@@ -293,7 +318,10 @@ def write_panels(path: str | Path, decision: Decision, scene: Scene) -> None:
     drawn = axes[2].imshow(z.T, cmap="coolwarm", vmin=-4, vmax=4, **shown)
     figure.colorbar(drawn, ax=axes[2], label="standard deviations")
     f = decision.figures
-    axes[2].set(title=f"Mitsuba - caustic: mean Z² {f['z_mean_square']:.3f}, {'agree' if f['agree'] else 'DISAGREE'}",
-                xlabel="x on the screen (mm)", ylabel="y (mm)")
+    axes[2].set(
+        title=f"Mitsuba - caustic: mean Z² {f['z_mean_square']:.3f}, {'agree' if f['agree'] else 'DISAGREE'}",
+        xlabel="x on the screen (mm)",
+        ylabel="y (mm)",
+    )
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", metadata={"Software": SOFTWARE})

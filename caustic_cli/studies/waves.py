@@ -22,9 +22,17 @@ FINER = 1.25
 ASIDE = (0.99, 1.01)
 
 
-def wave_figures(scene: Scene, field: HeightField, heights: Tensor, target: np.ndarray | None, seen: Resolution, *,
-                 finer: float = FINER, dtype: torch.dtype = torch.float32,
-                 required: bool = True) -> tuple[WaveImage | None, dict]:
+def wave_figures(
+    scene: Scene,
+    field: HeightField,
+    heights: Tensor,
+    target: np.ndarray | None,
+    seen: Resolution,
+    *,
+    finer: float = FINER,
+    dtype: torch.dtype = torch.float32,
+    required: bool = True,
+) -> tuple[WaveImage | None, dict]:
     """The wave image of a lens at the scene's wavelengths, white light's where it says none, and its figures.
 
     Returns:
@@ -38,18 +46,31 @@ def wave_figures(scene: Scene, field: HeightField, heights: Tensor, target: np.n
     except NoWaveImage as error:
         if required:
             raise
-        return None, dict.fromkeys(("wave_relative_rms", "wave_on_target", "wave_on_screen",
-                                    "wave_peak_irradiance", "wave_mean_irradiance")) | {
-            "wave_wavelengths": [], "resolvable": seen.resolvable, "no_wave_image": str(error)}
+        return None, dict.fromkeys(
+            ("wave_relative_rms", "wave_on_target", "wave_on_screen", "wave_peak_irradiance", "wave_mean_irradiance")
+        ) | {"wave_wavelengths": [], "resolvable": seen.resolvable, "no_wave_image": str(error)}
     of = _judged(found, target)
     absolute = {f"wave_{name}": value for name, value in irradiance_figures(scene, found.image).items()}
-    return found, {"wave_relative_rms": of["relative_rms"], "wave_on_target": of["on_target"], "wave_on_screen": of["on_screen"],
-                   "wave_wavelengths": list(found.wavelengths), "resolvable": seen.resolvable,
-                   "wave_source_points": found.points, "wave_source_error": found.spread_error} | absolute
+    return found, {
+        "wave_relative_rms": of["relative_rms"],
+        "wave_on_target": of["on_target"],
+        "wave_on_screen": of["on_screen"],
+        "wave_wavelengths": list(found.wavelengths),
+        "resolvable": seen.resolvable,
+        "wave_source_points": found.points,
+        "wave_source_error": found.spread_error,
+    } | absolute
 
 
-def unseen_figures(scene: Scene, field: HeightField, heights: Tensor, target: np.ndarray, *, finer: float = FINER,
-                   dtype: torch.dtype = torch.float32) -> dict:
+def unseen_figures(
+    scene: Scene,
+    field: HeightField,
+    heights: Tensor,
+    target: np.ndarray,
+    *,
+    finer: float = FINER,
+    dtype: torch.dtype = torch.float32,
+) -> dict:
     """The same at other wavelengths than those that a scene says: between them, or beside a single one; of white light nothing.
 
     Returns:

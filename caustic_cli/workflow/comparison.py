@@ -108,13 +108,15 @@ class Entry:
             nonlocal steps
             steps += 1
 
-        self.state = self.designer.run(self.state, iterations=ENDLESS, on_iteration=count,
-                                       stop=lambda: steps > 0 and time.monotonic() >= end)
+        self.state = self.designer.run(
+            self.state, iterations=ENDLESS, on_iteration=count, stop=lambda: steps > 0 and time.monotonic() >= end
+        )
         self.done = self.state.reason != "interrupted"
 
 
-def entries_of(project: Project | None, device: str, dtype: torch.dtype | None = None,
-               seed: int | None = None) -> tuple[Scene, np.ndarray, list[Entry]]:
+def entries_of(
+    project: Project | None, device: str, dtype: torch.dtype | None = None, seed: int | None = None
+) -> tuple[Scene, np.ndarray, list[Entry]]:
     """Scene, target (n_x, n_y) and contenders of a project; without one, of a bright disc on fewer pixels and control points.
 
     Raises:
@@ -150,8 +152,9 @@ def picture_of_disc() -> np.ndarray:
     return (np.hypot(x[:, None], x) <= DISC).astype(float)
 
 
-def plans(scene: Scene, full: Settings, dtype: torch.dtype | None = None,
-          seed: int | None = None) -> list[tuple[str, list[Stage], Options]]:
+def plans(
+    scene: Scene, full: Settings, dtype: torch.dtype | None = None, seed: int | None = None
+) -> list[tuple[str, list[Stage], Options]]:
     """What every contender for a target is called, and how it designs; dtype and seed replace those of the settings.
 
     L-BFGS on the finished control net, on nets of half and a quarter of its knot spans, coarse to fine, and from transport where
@@ -168,18 +171,31 @@ def plans(scene: Scene, full: Settings, dtype: torch.dtype | None = None,
     options = replace(options, dtype=dtype or options.dtype, seed=options.seed if seed is None else seed)
     last = replace(last, blur=0.0, iterations=ENDLESS, tolerance=0.0, source=None)
     lens = scene.lens
-    nets = [lens.control] if lens.knots is not None else list(dict.fromkeys(
-        tuple(max(p + 1, math.ceil((n - p) / part) + p) for n, p in zip(lens.control, lens.degree, strict=True)) for part in PARTS))
+    nets = (
+        [lens.control]
+        if lens.knots is not None
+        else list(
+            dict.fromkeys(
+                tuple(max(p + 1, math.ceil((n - p) / part) + p) for n, p in zip(lens.control, lens.degree, strict=True))
+                for part in PARTS
+            )
+        )
+    )
     newton = replace(options, optimizer="lbfgs", network="none", initial="zero", preconditioner="laplacian")
     found = [(f"lbfgs, {_net(net)}", [replace(last, control=net)], newton) for net in nets]
     if len(nets) > 1:
-        stages = [stage_of(table, full) for table in coarse_to_fine(lens.control, lens.degree, last.rays, scene.screen.resolution,
-                                                                    sampler=last.sampler)]
+        stages = [
+            stage_of(table, full)
+            for table in coarse_to_fine(lens.control, lens.degree, last.rays, scene.screen.resolution, sampler=last.sampler)
+        ]
         stages = [replace(s, filter=last.filter, apron=0 if options.loss == "rms" else s.apron) for s in stages]
         stages[-1] = replace(stages[-1], iterations=ENDLESS, tolerance=0.0)
         found.append(("lbfgs, coarse to fine", stages, newton))
-    net = lens.control if lens.knots is not None else tuple(min(n, max(NETWORK_CONTROL, p + 1)) for n, p in
-                                                           zip(lens.control, lens.degree, strict=True))
+    net = (
+        lens.control
+        if lens.knots is not None
+        else tuple(min(n, max(NETWORK_CONTROL, p + 1)) for n, p in zip(lens.control, lens.degree, strict=True))
+    )
     if full["design"]["start"] == "transport":
         found.append((TRANSPORT, [replace(last, control=lens.control)], newton))
     adam = replace(options, optimizer="adam", initial="zero", preconditioner="none")

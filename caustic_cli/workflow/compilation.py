@@ -53,11 +53,15 @@ def compile_part(part: str) -> None:
 
 def shares(processes: int) -> list[list[str]]:
     """PARTS in so many lists that the longest takes as short as it can; it comes first."""
+
     def cost(parts: list[str]) -> float:
         return sum(PARTS[p] for p in parts) - (SAVED if set(parts) >= ALIKE else 0.0)
 
-    ways = [[[p for p, at in zip(PARTS, way, strict=True) if at == k] for k in range(processes)]
-            for way in itertools.product(range(processes), repeat=len(PARTS)) if len(set(way)) == processes]
+    ways = [
+        [[p for p, at in zip(PARTS, way, strict=True) if at == k] for k in range(processes)]
+        for way in itertools.product(range(processes), repeat=len(PARTS))
+        if len(set(way)) == processes
+    ]
     return sorted(min(ways, key=lambda lists: sorted(map(cost, lists), reverse=True)), key=cost, reverse=True)
 
 
@@ -67,8 +71,16 @@ def compile_side_by_side() -> None:
     mine, *others = shares(min(len(PARTS), cores))
     path = os.pathsep.join([str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
     env = os.environ | {"PYTHONPATH": path, "NUMBA_CACHE_DIR": str(cache.DIRECTORY.parent)}  # so that theirs is this one too
-    running = [subprocess.Popen([sys.executable, "-m", __name__, *parts], env=env,
-                                stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) for parts in others]
+    running = [
+        subprocess.Popen(
+            [sys.executable, "-m", __name__, *parts],
+            env=env,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        for parts in others
+    ]
     try:
         for part in mine:
             compile_part(part)
@@ -88,8 +100,7 @@ def compile_usual(device: str) -> None:
     backend_for(device).compile_plane()
 
 
-def compile_for(scene: Scene | None, device: str, say: Reporter, requests: Requests | None = None,
-                gradient: bool = False) -> None:
+def compile_for(scene: Scene | None, device: str, say: Reporter, requests: Requests | None = None, gradient: bool = False) -> None:
     """Have the CPU's kernels compiled that the light of a scene needs beyond the usual ones.
 
     Args:
@@ -102,8 +113,10 @@ def compile_for(scene: Scene | None, device: str, say: Reporter, requests: Reque
     wanted = [(scene, requests or NO_REQUESTS)]
     if scene is None:
         lens, screen = Lens(), Screen((30.0, 30.0))
-        wanted = [(Scene(Points(((0.0, 0.0, -50.0),)), lens, screen), NO_REQUESTS),
-                  (Scene(PlaneWave(), lens, screen), Requests(stages=True))]
+        wanted = [
+            (Scene(Points(((0.0, 0.0, -50.0),)), lens, screen), NO_REQUESTS),
+            (Scene(PlaneWave(), lens, screen), Requests(stages=True)),
+        ]
     with say.notify_if_slow("compiling the kernels that this scene needs, once: about half a minute"):
         try:
             for one, asked in wanted:

@@ -48,8 +48,15 @@ from caustic_cli.workflow.reporter import Reporter
 LEAST_PART = 0.25
 
 
-def begin(target: Path | Picture, given: Mapping[str, Any], *, config: Path | None = None, out: Path | None = None,
-          force: bool = False, say: Reporter) -> tuple[Project, torch.Tensor | None]:
+def begin(
+    target: Path | Picture,
+    given: Mapping[str, Any],
+    *,
+    config: Path | None = None,
+    out: Path | None = None,
+    force: bool = False,
+    say: Reporter,
+) -> tuple[Project, torch.Tensor | None]:
     """Check everything, then make the project directory, if there is to be one; also returns the first heights, None for the
     offset surface.
 
@@ -79,8 +86,9 @@ def begin(target: Path | Picture, given: Mapping[str, Any], *, config: Path | No
         if len(names) == 1:  # what is given replaces what the configuration says
             del said["lens"]["glass" if names[0] == "index" else "index"]
     goal = said.get("target", {})
-    picture = target if isinstance(target, Picture) else \
-        read_picture(target, goal.get("encoding") == "linear", goal.get("color", False))
+    picture = (
+        target if isinstance(target, Picture) else read_picture(target, goal.get("encoding") == "linear", goal.get("color", False))
+    )
     if goal.get("color", False):
         light = [float(c) for c in picture.irradiance().sum((1, 2))]
         said.setdefault("source", {}).setdefault("weights", [c / sum(light) for c in light])
@@ -92,16 +100,24 @@ def begin(target: Path | Picture, given: Mapping[str, Any], *, config: Path | No
     if light is not None:
         full["source"]["profile"] = f"profile{light.suffix}"
     attachments.named_in_project(full["source"])
-    project = Project(out, full, picture, light, uptodate.digest(full, picture, light),
-                      without_waves=without_waves(full, "stages" in said.get("design", {})))
+    project = Project(
+        out,
+        full,
+        picture,
+        light,
+        uptodate.digest(full, picture, light),
+        without_waves=without_waves(full, "stages" in said.get("design", {})),
+    )
     if out is not None:
         if not force and (same := uptodate.same_design(out, project.asked)):
             return replace(same[0], found=same[1]), None
         directory.check(out, force)  # before the transport, which may take a minute
     designer, goal = _designer(project, "cpu")  # builds and so checks scene, target, stages, options
     refuse_unreachable(designer.scene, grey(goal))
-    with say.notify_if_slow("solving the transport of the light to the picture; the first time, its kernels are compiled,"
-                            " which takes about half a minute"):
+    with say.notify_if_slow(
+        "solving the transport of the light to the picture; the first time, its kernels are compiled,"
+        " which takes about half a minute"
+    ):
         project, first = first_heights(project, said)
     if out is not None:
         directory.settle(project, force)
@@ -145,8 +161,10 @@ def design(project: Project, first: torch.Tensor | None, device: str, say: Repor
     """
     if project.found is not None:
         figures = uptodate.finished(project, project.found)
-        say.say(f"{project.path}: was designed from the same picture with the same options, so "
-                + ("there is nothing to do; ⟨force⟩ designs it anew" if figures else "it goes on from its checkpoint"))
+        say.say(
+            f"{project.path}: was designed from the same picture with the same options, so "
+            + ("there is nothing to do; ⟨force⟩ designs it anew" if figures else "it goes on from its checkpoint")
+        )
         if not figures:
             return resume(project, None, None, device, say, began)
         scene = project.scene()
@@ -184,11 +202,12 @@ def resume(project: Project, iterations: int | None, time_limit: float | None, d
         before = project.load() if begun else None
         state = before.state if begun else designer.begin(_solved(project, fixed=True)[0])
         if state.stage >= len(designer.stages):
-            raise project.error(f"has {len(designer.stages)} stages, but the checkpoint stands in stage"
-                             f" {state.stage + 1}")
+            raise project.error(f"has {len(designer.stages)} stages, but the checkpoint stands in stage {state.stage + 1}")
         if tuple(state.heights.shape) != designer.stages[state.stage].control:
-            raise project.error(f"stage {state.stage + 1} has control"
-                             f" {list(designer.stages[state.stage].control)}, but the checkpoint {list(state.heights.shape)}")
+            raise project.error(
+                f"stage {state.stage + 1} has control"
+                f" {list(designer.stages[state.stage].control)}, but the checkpoint {list(state.heights.shape)}"
+            )
         state = designer.restored(state)
         if iterations is not None:
             changed = project.settings["design"] | {"iterations": iterations}
@@ -211,8 +230,13 @@ def follow(device: str) -> None:
 def _on_cpu(state: State) -> State:
     """A state that can be sent."""
     start = None if state.start is None else state.start.cpu()
-    return replace(state, heights=state.heights.cpu(), start=start, parameters={k: v.cpu() for k, v in state.parameters.items()},
-                   optimizer={k: v.cpu() for k, v in state.optimizer.items()})
+    return replace(
+        state,
+        heights=state.heights.cpu(),
+        start=start,
+        parameters={k: v.cpu() for k, v in state.parameters.items()},
+        optimizer={k: v.cpu() for k, v in state.optimizer.items()},
+    )
 
 
 def sphere() -> tuple[Scene, HeightField, torch.Tensor]:
@@ -260,13 +284,16 @@ def _solved(project: Project, fixed: bool) -> tuple[torch.Tensor | None, float |
     if Path(start).suffix.lower() in SUFFIXES and not Path(start).is_dir():
         return onto(*read_surface(start, net.half_size), net), None
     if not is_project(Path(start)):
-        raise InputError("⟨design.start⟩ must be transport, offset, a project directory or a lens surface"
-                         f" ({', '.join(SUFFIXES)}), got {start!r}")
+        raise InputError(
+            "⟨design.start⟩ must be transport, offset, a project directory or a lens surface"
+            f" ({', '.join(SUFFIXES)}), got {start!r}"
+        )
     other = Project.open(start)
     field, checkpoint = other.lens(other.scene())
     if other.settings["lens"]["size"] != project.settings["lens"]["size"]:
-        raise InputError(f"⟨design.start⟩: the lens of {start} is {other.settings['lens']['size']} mm, not"
-                         f" {project.settings['lens']['size']} mm")
+        raise InputError(
+            f"⟨design.start⟩: the lens of {start} is {other.settings['lens']['size']} mm, not {project.settings['lens']['size']} mm"
+        )
     return onto(field, checkpoint.state.heights, net), None
 
 
@@ -287,8 +314,16 @@ def _make_room(full: Settings, said: Settings, first: torch.Tensor) -> bool:
     return changed
 
 
-def _run(project: Project, designer: Designer, target: np.ndarray, state: State, say: Reporter, began: float,
-         time_limit: float | None, device: str) -> Result:
+def _run(
+    project: Project,
+    designer: Designer,
+    target: np.ndarray,
+    state: State,
+    say: Reporter,
+    began: float,
+    time_limit: float | None,
+    device: str,
+) -> Result:
     chosen = project.settings["design"]
     limit = chosen["time_limit"] if time_limit is None else time_limit
     limit = max(LEAST_PART * limit, limit - (time.monotonic() - began))  # what the start took counts too
@@ -305,22 +340,35 @@ def _run(project: Project, designer: Designer, target: np.ndarray, state: State,
                 light = f"the wave image at {_listed(s.waves)} nm" if s.waves else f"{s.rays:,} rays, blur {s.blur:g} px"
                 say.say(f"stage {stage + 1}/{len(designer.stages)}: {s.control[0]} x {s.control[1]} control points, {light}")
             _, _, loss, on_screen, _ = now.history[-1]
-            show(f"stage {stage + 1}/{len(designer.stages)}",
-                 f"loss {loss * grey(target).size:.4f}  on screen {on_screen:.1%}", now.total, total)
+            show(
+                f"stage {stage + 1}/{len(designer.stages)}",
+                f"loss {loss * grey(target).size:.4f}  on screen {on_screen:.1%}",
+                now.total,
+                total,
+            )
             if time.monotonic() - saved >= chosen["checkpoint_every"]:
                 saved = time.monotonic()  # before the writing, which takes its time too
                 records.keep(now)
 
         records.keep(state)
         ranks.send((project.settings, project.picture, project.profile, _on_cpu(state), limit))
-        state = designer.run(state, iterations=chosen["iterations"], time_limit=limit, stop=lambda: bool(asked),
-                             on_iteration=on_iteration, notice=say.say)
+        state = designer.run(
+            state,
+            iterations=chosen["iterations"],
+            time_limit=limit,
+            stop=lambda: bool(asked),
+            on_iteration=on_iteration,
+            notice=say.say,
+        )
         records.keep(state)
         if not asked:
             state.heights = designer.within_limits(state)
         if asked:
-            raise Interrupted(f"interrupted after {state.total} iterations; {project.path / CHECKPOINT} is saved,"
-                              f" caustic design ⟨resume⟩ {project.path} goes on", 128 + asked[0])
+            raise Interrupted(
+                f"interrupted after {state.total} iterations; {project.path / CHECKPOINT} is saved,"
+                f" caustic design ⟨resume⟩ {project.path} goes on",
+                128 + asked[0],
+            )
         found = judge(project, designer, target, state, device)
         figures = found.figures | {"iterations": state.total, "seconds": time.monotonic() - began, "reason": found.state.reason}
         if project.path is not None:
@@ -359,8 +407,12 @@ class _Records:
 def provenance(project: Project, device: str) -> dict[str, Any]:
     """What made a lens: versions, device, threads, seed and the picture's hash."""
     return {
-        "caustic": __version__, "torch": torch.__version__, "numpy": np.__version__, "device": device,
-        "threads": torch.get_num_threads(), "seed": project.settings["design"]["seed"],
+        "caustic": __version__,
+        "torch": torch.__version__,
+        "numpy": np.__version__,
+        "device": device,
+        "threads": torch.get_num_threads(),
+        "seed": project.settings["design"]["seed"],
         "target_sha256": hashlib.sha256(np.ascontiguousarray(project.picture.values).tobytes()).hexdigest(),
     }
 

@@ -62,8 +62,18 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
         write_image(project.path / WAVE, found.waves, white_level(found.waves, target), encoding)
     history = np.array(state.history, dtype=float).reshape(-1, 5)
     surface = _surface(designer.field(found.state.stage), found.state.heights)
-    write_report(project.path / REPORT, grey(target), grey(found.image), surface, history, designer.scene.lens,
-                 designer.scene.screen, found.figures, encoding, None if found.waves is None else grey(found.waves))
+    write_report(
+        project.path / REPORT,
+        grey(target),
+        grey(found.image),
+        surface,
+        history,
+        designer.scene.lens,
+        designer.scene.screen,
+        found.figures,
+        encoding,
+        None if found.waves is None else grey(found.waves),
+    )
     return found
 
 

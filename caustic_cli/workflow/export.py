@@ -19,8 +19,9 @@ from caustic_cli.scene import Scene
 from caustic_cli.workflow.reporter import Reporter
 
 
-def export(project: Path, format: str, output: Path | None, script: bool, given: dict, force: bool,
-           say: Reporter) -> tuple[dict, bool]:
+def export(
+    project: Path, format: str, output: Path | None, script: bool, given: dict, force: bool, say: Reporter
+) -> tuple[dict, bool]:
     """Write the lens of a project.
 
     Args:

@@ -86,8 +86,15 @@ class Lens:
         found = self.field.at(self.heights, *(torch.from_numpy(c.ravel().copy()) for c in (x, y)))
         return tuple(c.numpy().reshape(x.shape) for c in found)
 
-    def render(self, rays: float = 1_000_000, *, seed: int = 0, tolerance: float | None = None, filter: Filter | None = None,
-               device: str = "cpu") -> Render:
+    def render(
+        self,
+        rays: float = 1_000_000,
+        *,
+        seed: int = 0,
+        tolerance: float | None = None,
+        filter: Filter | None = None,
+        device: str = "cpu",
+    ) -> Render:
         """Retrace the lens with rays of its own.
 
         Args:
@@ -96,12 +103,28 @@ class Lens:
             filter: reconstruction filter; None counts rays in pixels.
         """
         compile_for(self.scene, device, Listener())
-        exposure, figures = retrace(self.scene, self.field, self.heights, self.target, rays=_count(rays), seed=seed, filter=filter,
-                                    tolerance=tolerance, device=device)
+        exposure, figures = retrace(
+            self.scene,
+            self.field,
+            self.heights,
+            self.target,
+            rays=_count(rays),
+            seed=seed,
+            filter=filter,
+            tolerance=tolerance,
+            device=device,
+        )
         return Render(exposure.image.cpu().numpy(), figures)
 
-    def export(self, path: str | Path, format: str | None = None, *, samples: tuple[int, int] | None = None,
-               tolerance: float | None = None, script: bool = False) -> Path:
+    def export(
+        self,
+        path: str | Path,
+        format: str | None = None,
+        *,
+        samples: tuple[int, int] | None = None,
+        tolerance: float | None = None,
+        script: bool = False,
+    ) -> Path:
         """Write the lens for another program; the format follows from the suffix (.step, .stl, .npz, ...) unless it is named.
 
         Args:
@@ -124,16 +147,33 @@ class Lens:
         directory.check(project.path, force)
         directory.settle(project, force)
         with project.hold:
-            project.save(Checkpoint(self.state, self.field.spaces, workflow.provenance(project, "cpu"), self.figures,
-                                    uptodate.inputs(project)))
+            project.save(
+                Checkpoint(
+                    self.state, self.field.spaces, workflow.provenance(project, "cpu"), self.figures, uptodate.inputs(project)
+                )
+            )
         return project.path
 
 
-def design(picture: str | Path | np.ndarray | Tensor, *, source: str | Mapping[str, Any] | None = None, mag: float | None = None,
-           margin: float | None = None, throw: float | None = None, quality: str | None = None, rays: float | None = None,
-           settings: Mapping[str, Mapping[str, Any]] | None = None, linear: bool | None = None, waves: str | None = None,
-           time_limit: float | None = None, out: str | Path | None = None, force: bool = False, on_progress: Progress | None = None,
-           on_message: Callable[[str], None] | None = None, device: str = "cpu") -> Lens:
+def design(
+    picture: str | Path | np.ndarray | Tensor,
+    *,
+    source: str | Mapping[str, Any] | None = None,
+    mag: float | None = None,
+    margin: float | None = None,
+    throw: float | None = None,
+    quality: str | None = None,
+    rays: float | None = None,
+    settings: Mapping[str, Mapping[str, Any]] | None = None,
+    linear: bool | None = None,
+    waves: str | None = None,
+    time_limit: float | None = None,
+    out: str | Path | None = None,
+    force: bool = False,
+    on_progress: Progress | None = None,
+    on_message: Callable[[str], None] | None = None,
+    device: str = "cpu",
+) -> Lens:
     """The lens that throws a picture, as `caustic design` finds it.
 
     Args:
@@ -164,15 +204,32 @@ def design(picture: str | Path | np.ndarray | Tensor, *, source: str | Mapping[s
     if linear:
         sections["target"] = sections.get("target", {}) | {"encoding": "linear"}
     by = {"mag": mag, "margin": margin, "throw": throw, "quality": quality, "rays": None if rays is None else _count(rays)}
-    given = {f"{section}.{key}": value for section, values in schema.checked(sections, "settings").items()
-             for key, value in values.items()}
+    given = {
+        f"{section}.{key}": value
+        for section, values in schema.checked(sections, "settings").items()
+        for key, value in values.items()
+    }
     given |= {path: value for path, value in by.items() if value is not None}
-    return design_of(picture if isinstance(picture, str | Path) else _picture(picture), given,
-                     out=None if out is None else Path(out), force=force, say=Listener(on_progress, on_message), device=device)
+    return design_of(
+        picture if isinstance(picture, str | Path) else _picture(picture),
+        given,
+        out=None if out is None else Path(out),
+        force=force,
+        say=Listener(on_progress, on_message),
+        device=device,
+    )
 
 
-def design_of(target: str | Path | Picture, given: Mapping[str, Any], *, config: Path | None = None, out: Path | None = None,
-              force: bool = False, say: Reporter, device: str = "cpu") -> Lens:
+def design_of(
+    target: str | Path | Picture,
+    given: Mapping[str, Any],
+    *,
+    config: Path | None = None,
+    out: Path | None = None,
+    force: bool = False,
+    say: Reporter,
+    device: str = "cpu",
+) -> Lens:
     """The lens for a picture and settings by their paths in `config.table`: {"mag": 3, "lens.size": [20, 20]}.
 
     Args:
@@ -184,14 +241,21 @@ def design_of(target: str | Path | Picture, given: Mapping[str, Any], *, config:
     """
     began = time.monotonic()
     compile_usual(device)
-    project, first = workflow.begin(Path(target) if isinstance(target, str) else target, given, config=config, out=out, force=force,
-                                    say=say)
+    project, first = workflow.begin(
+        Path(target) if isinstance(target, str) else target, given, config=config, out=out, force=force, say=say
+    )
     compile_for(project.scene(), device, say, gradient=True)
     return _lens(workflow.design(project, first, device, say, began))
 
 
-def resume(path: str | Path, *, iterations: int | None = None, time_limit: float | None = None, say: Reporter | None = None,
-           device: str = "cpu") -> Lens:
+def resume(
+    path: str | Path,
+    *,
+    iterations: int | None = None,
+    time_limit: float | None = None,
+    say: Reporter | None = None,
+    device: str = "cpu",
+) -> Lens:
     """Go on with the design of a project directory from its last checkpoint.
 
     Args:
@@ -230,8 +294,16 @@ def render(lens: Lens | str | Path, rays: float = 1_000_000, **options: Any) -> 
     return (lens if isinstance(lens, Lens) else load(lens)).render(rays, **options)
 
 
-def trace(scene: Scene, heights: Tensor, rays: float = 250_000, *, sampler: str = "stratified", seed: int = 0,
-          filter: Filter | None = None, dtype: torch.dtype = torch.float64) -> Tensor:
+def trace(
+    scene: Scene,
+    heights: Tensor,
+    rays: float = 250_000,
+    *,
+    sampler: str = "stratified",
+    seed: int = 0,
+    filter: Filter | None = None,
+    dtype: torch.dtype = torch.float64,
+) -> Tensor:
     """The irradiance image of a lens as a differentiable function of its control heights.
 
     Args:

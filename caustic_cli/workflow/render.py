@@ -75,8 +75,20 @@ class Request:
     @property
     def asks(self) -> dict[str, object]:
         """What decides the outcome, by name; where it goes does not."""
-        names = ("rays", "tolerance", "reconstruction", "filter_size", "alpha", "screen_at", "effects", "explain", "report",
-                 "tool_radius", "seed", "dtype")
+        names = (
+            "rays",
+            "tolerance",
+            "reconstruction",
+            "filter_size",
+            "alpha",
+            "screen_at",
+            "effects",
+            "explain",
+            "report",
+            "tool_radius",
+            "seed",
+            "dtype",
+        )
         return {name: getattr(self, name) for name in names} | dict(self.given)
 
 
@@ -130,8 +142,9 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
             refuse_foreign(path, asked.force)
     made = Outputs(project, "render", asked.asks | {"device": device}, paths) if project and not asked.verify else None
     if made and not asked.force and (figures := made.found()):
-        say.say(f"{image_path}: is what the same options made of the same project, so there is nothing to do; ⟨force⟩ does it"
-                " again")
+        say.say(
+            f"{image_path}: is what the same options made of the same project, so there is nothing to do; ⟨force⟩ does it again"
+        )
         return figures | {"reused": True}
     lens = Opened(None, *archive) if project is None else _opened(project, asked)
     scene = lens.scene if asked.screen_at is None else replace(lens.scene, screen=replace(lens.scene.screen, z=asked.screen_at))
@@ -143,8 +156,19 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     if coarse := coarse_words(scene):
         say.say(coarse)
     compile_for(None if asked.explain else plan.scene, device, say, plan.requests)
-    exposure, figures = retrace(plan.scene, lens.field, lens.heights, lens.target, rays=asked.rays, filter=filter, device=device,
-                                seed=seed, dtype=asked.dtype, tolerance=asked.tolerance, requests=plan.requests)
+    exposure, figures = retrace(
+        plan.scene,
+        lens.field,
+        lens.heights,
+        lens.target,
+        rays=asked.rays,
+        filter=filter,
+        device=device,
+        seed=seed,
+        dtype=asked.dtype,
+        tolerance=asked.tolerance,
+        requests=plan.requests,
+    )
     image = exposure.image.cpu().numpy()
     write_image(image_path, image, white_level(image, lens.target), lens.encoding)
     if wave_path == asked.lens / WAVE:
@@ -156,8 +180,9 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
             figures |= _wave_image(plan, lens, device, wanted is not None, wave_path, wave_npy)
     figures |= {"iterations": lens.iterations, "seconds": time.monotonic() - began, "image": str(image_path)}
     if asked.explain:
-        figures["effects"] = effects_study.explain(plan, scene, lens.field, lens.heights.to(device),
-                                                   rays=min(asked.rays, effects_study.RAYS), seed=seed, dtype=asked.dtype)
+        figures["effects"] = effects_study.explain(
+            plan, scene, lens.field, lens.heights.to(device), rays=min(asked.rays, effects_study.RAYS), seed=seed, dtype=asked.dtype
+        )
     if sheet is not None:
         figures["report"] = manufacture.manufacture(scene, lens.field, lens.heights, asked.tool_radius, seed)
         manufacture.write_json(sheet, figures["report"])
@@ -172,14 +197,23 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
 def _opened(project: Project, asked: Request) -> Opened:
     scene = project.scene(dict(asked.given))
     target, (surface, checkpoint) = project.target(scene), project.lens(scene)
-    return Opened(project, scene, surface, checkpoint.state.heights, target, checkpoint.state.total,
-                  project.settings["target"]["encoding"], project.settings["design"]["seed"])
+    return Opened(
+        project,
+        scene,
+        surface,
+        checkpoint.state.heights,
+        target,
+        checkpoint.state.total,
+        project.settings["target"]["encoding"],
+        project.settings["design"]["seed"],
+    )
 
 
 def _wave_image(plan: Plan, lens: Opened, device: str, required: bool, path: Path, npy: Path | None) -> dict:
     """Write the wave image; its figures."""
-    light, figures = wave_figures(plan.scene, lens.field, lens.heights.to(device), lens.target, lens.resolution(plan.scene),
-                                  finer=1.0, required=required)
+    light, figures = wave_figures(
+        plan.scene, lens.field, lens.heights.to(device), lens.target, lens.resolution(plan.scene), finer=1.0, required=required
+    )
     if light is None:
         return figures
     image = light.image.cpu().numpy()

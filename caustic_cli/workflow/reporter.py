@@ -33,8 +33,11 @@ class Listener:
         on_message: called with each line.
     """
 
-    def __init__(self, on_progress: Callable[[str, str, int | None, int | None], None] | None = None,
-                 on_message: Callable[[str], None] | None = None):
+    def __init__(
+        self,
+        on_progress: Callable[[str, str, int | None, int | None], None] | None = None,
+        on_message: Callable[[str], None] | None = None,
+    ):
         self.on_progress, self.on_message = on_progress, on_message
 
     def say(self, text: str) -> None:
@@ -45,6 +48,7 @@ class Listener:
     @contextmanager
     def progress(self, total: int | None) -> Iterator[Tell]:
         """Pass every step on."""
+
         def tell(description: str = "", text: str = "", done: int | None = None, whole: int | None = None) -> None:
             if self.on_progress is not None:
                 self.on_progress(description, text, done, total if whole is None else whole)

@@ -30,8 +30,13 @@ LED, BEFORE, CONE, PIXELS = 2.0, 3.0, 90.0, 100
 
 def led() -> dict:
     """Settings of the scene of a study without a project."""
-    full = complete({"source": {"type": "disc", "position": [[0.0, 0.0, -BEFORE]], "size": [LED, LED], "cone": CONE},
-                     "screen": {"z": 25.0, "resolution": [PIXELS, PIXELS]}}, 1.0)
+    full = complete(
+        {
+            "source": {"type": "disc", "position": [[0.0, 0.0, -BEFORE]], "size": [LED, LED], "cone": CONE},
+            "screen": {"z": 25.0, "resolution": [PIXELS, PIXELS]},
+        },
+        1.0,
+    )
     full["target"] |= {"file": "target.npy", "encoding": "linear"}
     return full
 
@@ -66,8 +71,9 @@ def _designed(project: Project | None, full: dict, weights, parts, seconds: floa
                 state = designer.run(designer.begin(first), time_limit=seconds)
             except CausticError:
                 continue
-            yield Lens(thickness, weight, loss, scene, designer.field(state.stage), designer.within_limits(state), goal,
-                       state.seconds)
+            yield Lens(
+                thickness, weight, loss, scene, designer.field(state.stage), designer.within_limits(state), goal, state.seconds
+            )
 
 
 def _first(project: Project | None, own: dict) -> tuple[torch.Tensor | None, dict, np.ndarray]:

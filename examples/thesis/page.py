@@ -55,13 +55,16 @@ def draw(path: Path, book, rows: list[dict], pairs, mags, marks, pictures: Path)
     """Write the page."""
     figure = plt.figure(figsize=(13.0, 27.0), layout="constrained")
     parts = figure.subfigures(6, 1, height_ratios=[2.6, 8.4, 9.2, 3.0, 3.2, 4.6])
-    headings = ("6.1  Derivative of a render with respect to one control height (figure 6.1.1)",
-                "6.2.1  Circular top hat from a plane wave (figures 6.2.2 to 6.2.7)"
-                "\n(above a render: relative RMS | light on the screen | time)",
-                "6.2.2  Flame and faceted ball from a plane wave (figures 6.2.8 to 6.2.11)"
-                "\n(relief: heights without their best paraboloid)",
-                "6.3  B-spline intersection (figure 6.2.14)",
-                "6.4  A point source, then a grid of them (figures 6.4.2 to 6.4.4)", "Loss, light, time")
+    headings = (
+        "6.1  Derivative of a render with respect to one control height (figure 6.1.1)",
+        "6.2.1  Circular top hat from a plane wave (figures 6.2.2 to 6.2.7)"
+        "\n(above a render: relative RMS | light on the screen | time)",
+        "6.2.2  Flame and faceted ball from a plane wave (figures 6.2.8 to 6.2.11)"
+        "\n(relief: heights without their best paraboloid)",
+        "6.3  B-spline intersection (figure 6.2.14)",
+        "6.4  A point source, then a grid of them (figures 6.4.2 to 6.4.4)",
+        "Loss, light, time",
+    )
     for part, heading in zip(parts, headings, strict=True):
         part.suptitle(heading, fontsize=10, x=0.01, ha="left", weight="bold")
     _gradients(parts[0], book)
@@ -117,8 +120,13 @@ def _image_and_error(axes, image, target, about) -> None:
 def _pictures(part, book, mags, pictures) -> None:
     left, right = part.subfigures(1, 2, width_ratios=[1.0, 2.3])
     axes = left.subplots(3, 1)
-    losses(axes[0], book, {f"{p}-mag{m}": f"{p}, magnification {m}" for p in ("flame", "ball") for m in mags},
-           "the thesis' loop: relative RMS over the iterations", 250.0**2)
+    losses(
+        axes[0],
+        book,
+        {f"{p}-mag{m}": f"{p}, magnification {m}" for p in ("flame", "ball") for m in mags},
+        "the thesis' loop: relative RMS over the iterations",
+        250.0**2,
+    )
     for axis, name in zip(axes[1:], ("flame", "ball"), strict=True):
         show(axis, bright(picture(pictures / f"{name}.png")), f"{name}: target", limit=1.0)
     grid = right.subplots(4, 2 * len(mags))
@@ -162,8 +170,12 @@ def _intersection(part, book) -> None:
 def _point(part, book, pictures) -> None:
     axes = part.subplots(1, 6)
     show(axes[0], bright(picture(pictures / "flame.png")), "target (32 mm of 40)", limit=1.0)
-    for axis, key, label in zip(axes[1:4], ("point-grid", "own-point", "own-point-grid"),
-                                ("thesis: point, then grid", "our defaults: point", "our defaults: grid"), strict=True):
+    for axis, key, label in zip(
+        axes[1:4],
+        ("point-grid", "own-point", "own-point-grid"),
+        ("thesis: point, then grid", "our defaults: point", "our defaults: grid"),
+        strict=True,
+    ):
         show(axis, bright(book.arrays(key)["image"]), f"{label}\n{figures_of(book.rows[key])}", limit=1.0)
     show(axes[4], _relief(book.arrays("point-grid")["heights"]), "thesis: relief", "viridis")
     losses(axes[5], book, {"point-grid": "thesis", "own-point-grid": "our defaults"}, "relative RMS", 100.0**2)
@@ -173,8 +185,19 @@ def _table(part, rows) -> None:
     axis = part.subplots()
     axis.axis("off")
     head = ["experiment", "by", "loss (5.2.1)", "relative RMS", "on the screen", "lost to Fresnel", "iterations", "time (s)"]
-    cells = [[r["experiment"], r["by"], f"{r['loss']:.2e}", f"{r['relative_rms']:.3f}", f"{r['on_screen']:.1%}",
-              f"{r['fresnel']:.1%}", str(r["iterations"]), f"{r['seconds']:.0f}"] for r in rows]
+    cells = [
+        [
+            r["experiment"],
+            r["by"],
+            f"{r['loss']:.2e}",
+            f"{r['relative_rms']:.3f}",
+            f"{r['on_screen']:.1%}",
+            f"{r['fresnel']:.1%}",
+            str(r["iterations"]),
+            f"{r['seconds']:.0f}",
+        ]
+        for r in rows
+    ]
     found = axis.table(cells, colLabels=head, loc="upper left", cellLoc="left")
     found.auto_set_font_size(False)
     found.set_fontsize(7)

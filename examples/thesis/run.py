@@ -68,11 +68,20 @@ def finish(book: Book, name: str, project: Path, figures: dict, seconds: float, 
     image = project / "render.npy"
     seen = caustic("render", project, "--rays", "4e6", "--npy", image, "--force")
     heights, history = state(project)
-    about = {"relative_rms": seen["relative_rms"], "loss": seen["loss"], "on_screen": seen["on_screen"],
-             "fresnel": seen["lost"]["fresnel"], "iterations": figures["iterations"], "seconds": seconds}
+    about = {
+        "relative_rms": seen["relative_rms"],
+        "loss": seen["loss"],
+        "on_screen": seen["on_screen"],
+        "fresnel": seen["lost"]["fresnel"],
+        "iterations": figures["iterations"],
+        "seconds": seconds,
+    }
     book.keep(name, about, image=np.load(image), heights=heights, history=history, **more)
-    print(f"{name:24} loss {seen['loss']:.3e}  relative RMS {seen['relative_rms']:.3f}  on screen {seen['on_screen']:.1%}"
-          f"  {seconds:.0f} s", flush=True)
+    print(
+        f"{name:24} loss {seen['loss']:.3e}  relative RMS {seen['relative_rms']:.3f}  on screen {seen['on_screen']:.1%}"
+        f"  {seconds:.0f} s",
+        flush=True,
+    )
 
 
 def gradients(book: Book) -> None:
@@ -82,8 +91,23 @@ def gradients(book: Book) -> None:
             continue
         project, npy = book.folder / f"flat-{case}.caustic", book.folder / f"gradient-{case}.npy"
         caustic("design", PICTURES / "tophat.png", "--config", HERE / "flat.toml", "--degree", degree, "-o", project, "--force")
-        found = caustic("gradmap", project, "--control", "7,7", "--reconstruction", "gaussian", "--filter-size", filter_size,
-                        "--alpha", 1, "--rays", "1e6", "--npy", npy, "--force")
+        found = caustic(
+            "gradmap",
+            project,
+            "--control",
+            "7,7",
+            "--reconstruction",
+            "gaussian",
+            "--filter-size",
+            filter_size,
+            "--alpha",
+            1,
+            "--rays",
+            "1e6",
+            "--npy",
+            npy,
+            "--force",
+        )
         total = 100.0 * found["maps"][0]["sum"]  # the source's power is 100
         book.keep(f"gradient-{case}", {"sum": total, "seconds": found["seconds"]}, gradient=100.0 * np.load(npy))
         print(f"gradient ({case})  sum {total:.3e}", flush=True)
@@ -114,8 +138,9 @@ def own_design(book: Book, name: str, picture: str, config: Path, quick: bool, *
     scene, project, began = book.folder / f"{name}.toml", book.folder / f"{name}.caustic", time.monotonic()
     scene.write_text(text)
     quality = ("--waves", "off", *(("--quality", "draft") if quick else ()))  # judged by rays, as the thesis is
-    figures = caustic("design", PICTURES / picture, "--config", scene, "--min-thickness", 0, *quality, *more, "-o", project,
-                      "--force")
+    figures = caustic(
+        "design", PICTURES / picture, "--config", scene, "--min-thickness", 0, *quality, *more, "-o", project, "--force"
+    )
     finish(book, name, project, figures, time.monotonic() - began)
 
 

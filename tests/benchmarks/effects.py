@@ -58,9 +58,14 @@ class Elsewhere:
     def __init__(self, checkout: Path):
         benchmarks = checkout / "tests" / "benchmarks"
         paths = f"{checkout}{os.pathsep}{benchmarks}"
-        self.process = subprocess.Popen([sys.executable, str(benchmarks / "effects.py"), "--worker"], stdin=subprocess.PIPE,
-                                        stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": paths, **ONE},
-                                        cwd=checkout)
+        self.process = subprocess.Popen(
+            [sys.executable, str(benchmarks / "effects.py"), "--worker"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "PYTHONPATH": paths, **ONE},
+            cwd=checkout,
+        )
 
     def __call__(self) -> float:
         self.process.stdin.write("go\n")
@@ -103,11 +108,19 @@ def main(checkout: Path | None) -> None:
         here = Elsewhere(Path(__file__).resolve().parents[2])
         work |= {"this program, own process": here, "other checkout": other}
     times = in_turns(work, ROUNDS)
-    out = [f"Table D.2's setting, {BASE['rays']:,} rays, one thread, Python {platform.python_version()},"
-           f" torch {torch.__version__}; {ROUNDS} rounds. Compiling the plan, once: {1e3 * compiling:.1f} ms.", "",
-           "| iteration | ms of processor time, median | ratio of each round, median (quartiles) |", "| --- | --- | --- |"]
-    for name, base in (("bare", "bare"), ("by a plan", "bare"), ("other checkout", "other checkout"),
-                       ("this program, own process", "other checkout")):
+    out = [
+        f"Table D.2's setting, {BASE['rays']:,} rays, one thread, Python {platform.python_version()},"
+        f" torch {torch.__version__}; {ROUNDS} rounds. Compiling the plan, once: {1e3 * compiling:.1f} ms.",
+        "",
+        "| iteration | ms of processor time, median | ratio of each round, median (quartiles) |",
+        "| --- | --- | --- |",
+    ]
+    for name, base in (
+        ("bare", "bare"),
+        ("by a plan", "bare"),
+        ("other checkout", "other checkout"),
+        ("this program, own process", "other checkout"),
+    ):
         if name in times:
             out.append(f"| {name} | {1e3 * statistics.median(times[name]):.2f} | {ratio(times, name, base)} to {base} |")
     if other:
@@ -123,10 +136,16 @@ def main(checkout: Path | None) -> None:
         median = 1e3 * statistics.median(times["changed"])
         out.append(f"| {effect.name}, {with_it.words} | {median:.1f} | {ratio(times, 'changed', 'bare')} |")
     study = run_effects(own, field, heights, rays=BASE["rays"], repeats=EFFECT_ROUNDS)
-    out += ["", "| effect | in this scene | measured with | cost of a float64 image, ms | error of leaving it out | power |",
-            "| --- | --- | --- | --- | --- | --- |"]
-    out += [f"| {r['series']} | {'on' if r['on'] else 'off'} | {r['amount']} | {1e3 * r['seconds']:.1f} | {r['error']:.2g} |"
-            f" {r['power']:+.2%} |" for r in study.rows]
+    out += [
+        "",
+        "| effect | in this scene | measured with | cost of a float64 image, ms | error of leaving it out | power |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    out += [
+        f"| {r['series']} | {'on' if r['on'] else 'off'} | {r['amount']} | {1e3 * r['seconds']:.1f} | {r['error']:.2g} |"
+        f" {r['power']:+.2%} |"
+        for r in study.rows
+    ]
     text = "\n".join(out) + "\n"
     path = Path(__file__).parent / "results" / "effects.md"
     path.write_text(text, encoding="utf-8")

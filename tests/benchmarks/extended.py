@@ -57,9 +57,32 @@ def errors(name: str, blur: float) -> tuple[float, Deconvolved]:
 def designed(name: str, distance: float) -> dict:
     """Figures of `caustic design` under the disc."""
     with tempfile.TemporaryDirectory() as directory:
-        found = subprocess.run([sys.executable, "-m", "caustic_cli", "design", str(PICTURES / f"{name}.png"), "--source", "disc",
-                                "--source-position", f"0,0,{-distance}", "--source-size", str(DISC), "--mag", "3", "--margin", "0",
-                                "--linear", "--quiet", "--json", "--out", f"{directory}/lens"], check=True, capture_output=True)
+        found = subprocess.run(
+            [
+                sys.executable,
+                "-m",
+                "caustic_cli",
+                "design",
+                str(PICTURES / f"{name}.png"),
+                "--source",
+                "disc",
+                "--source-position",
+                f"0,0,{-distance}",
+                "--source-size",
+                str(DISC),
+                "--mag",
+                "3",
+                "--margin",
+                "0",
+                "--linear",
+                "--quiet",
+                "--json",
+                "--out",
+                f"{directory}/lens",
+            ],
+            check=True,
+            capture_output=True,
+        )
     return json.loads(found.stdout)
 
 

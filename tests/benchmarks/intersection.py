@@ -67,19 +67,24 @@ def main() -> None:
     t = torch.from_numpy(newton.t[hit])
     where = [c[torch.from_numpy(hit)] * t for c in directions]
     residual = (where[2] - 6.0 - field.at(heights, where[0], where[1])[0]).abs().max()
-    print(f"{RAYS:,} rays, {hit.mean():.3f} of them hit, {torch.get_num_threads()} threads, Mitsuba {mi.__version__},"
-          f" {mi.variant()}")
-    print(f"Newton                  {RAYS / statistics.median(took['newton']) / 1e6:6.2f} Mrays/s"
-          f"   largest |z - Z(x, y)| {float(residual):.1e} mm")
+    print(
+        f"{RAYS:,} rays, {hit.mean():.3f} of them hit, {torch.get_num_threads()} threads, Mitsuba {mi.__version__}, {mi.variant()}"
+    )
+    print(
+        f"Newton                  {RAYS / statistics.median(took['newton']) / 1e6:6.2f} Mrays/s"
+        f"   largest |z - Z(x, y)| {float(residual):.1e} mm"
+    )
     for n in cells:
         other = np.array(triangles(n), float)
         both = hit & np.isfinite(other)
         error = abs(other - newton.t)[both]
         ratio = [a / b for a, b in zip(took[n], took["newton"], strict=True)]
-        print(f"Mitsuba, {n:4} x {n:4} x 2  {RAYS / statistics.median(took[n]) / 1e6:6.2f} Mrays/s"
-              f"   error of t: rms {np.sqrt(np.mean(error**2)):.1e}, largest {error.max():.1e} mm;"
-              f" hit or missed otherwise {np.sum(hit != np.isfinite(other))};"
-              f"   Newton is {statistics.median(ratio):.2f} times as fast ({min(ratio):.2f} to {max(ratio):.2f})")
+        print(
+            f"Mitsuba, {n:4} x {n:4} x 2  {RAYS / statistics.median(took[n]) / 1e6:6.2f} Mrays/s"
+            f"   error of t: rms {np.sqrt(np.mean(error**2)):.1e}, largest {error.max():.1e} mm;"
+            f" hit or missed otherwise {np.sum(hit != np.isfinite(other))};"
+            f"   Newton is {statistics.median(ratio):.2f} times as fast ({min(ratio):.2f} to {max(ratio):.2f})"
+        )
 
 
 def mesh(field: HeightField, heights: torch.Tensor, n: int) -> mi.Mesh:

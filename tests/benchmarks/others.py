@@ -168,8 +168,11 @@ def _expose(vertices, faces, of_faces, of_vertices, smooth, low, cell, cells, pi
                 if squared <= 0.0:  # total reflection
                     continue
                 out = np.sqrt(squared)
-                weight = entrance * (1.0 - ((index * n_z - out) / (index * n_z + out)) ** 2 / 2.0
-                                     - ((index * out - n_z) / (index * out + n_z)) ** 2 / 2.0)
+                weight = entrance * (
+                    1.0
+                    - ((index * n_z - out) / (index * n_z + out)) ** 2 / 2.0
+                    - ((index * out - n_z) / (index * out + n_z)) ** 2 / 2.0
+                )
                 reflected += 1.0 - weight
                 turn = out - index * n_z
                 far = (throw - (a[2] + p * (b[2] - a[2]) + q * (c[2] - a[2]))) / (index + turn * n_z)
@@ -184,8 +187,20 @@ def expose(sheet: Sheet, smooth: bool, rays: float, pixels: int = PIXELS) -> tup
     """Image [i, j] in parts of the power in the lens' aperture, and the part that is on it or reflected by the surfaces."""
     low, size = sheet.vertices.min(0)[:2], np.ptp(sheet.vertices, axis=0)[:2]
     cells = np.maximum(1, np.rint(np.sqrt(rays / size.prod()) * size)).astype(np.int64)
-    image, reflected = _expose(sheet.vertices, sheet.faces, sheet.normals(), sheet.smooth(), smooth, low, size / cells, cells,
-                               pixels, INDEX, SCREEN / 2, THROW)
+    image, reflected = _expose(
+        sheet.vertices,
+        sheet.faces,
+        sheet.normals(),
+        sheet.smooth(),
+        smooth,
+        low,
+        size / cells,
+        cells,
+        pixels,
+        INDEX,
+        SCREEN / 2,
+        THROW,
+    )
     return image / cells.prod(), float(image.sum() + reflected) / float(cells.prod())
 
 

@@ -31,8 +31,12 @@ OTHERS = ("tall", "gradient", "text", "lines")
 
 
 def caustic(*arguments) -> dict:
-    done = subprocess.run([sys.executable, "-m", "caustic_cli", *map(str, arguments), "--json", "--quiet", "--force"],
-                          capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-m", "caustic_cli", *map(str, arguments), "--json", "--quiet", "--force"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     if done.returncode:
         raise SystemExit(done.stderr)
     return json.loads(done.stdout)
@@ -48,8 +52,13 @@ def pictures(folder: Path) -> dict[str, Path]:
     for k in range(6):
         ImageDraw.Draw(lines).line((50, 50 + 80 * k, 450, 80 + 70 * k), fill=255, width=3)
     ImageDraw.Draw(lines).ellipse((100, 100, 400, 400), outline=255, width=3)
-    made = {"portrait": hopper.crop((0, 0, hopper.width, hopper.width)).resize((500, 500)), "tall": hopper.resize((300, 360)),
-            "gradient": Image.fromarray(np.tile(np.arange(256, dtype=np.uint8), (256, 1))), "text": text, "lines": lines}
+    made = {
+        "portrait": hopper.crop((0, 0, hopper.width, hopper.width)).resize((500, 500)),
+        "tall": hopper.resize((300, 360)),
+        "gradient": Image.fromarray(np.tile(np.arange(256, dtype=np.uint8), (256, 1))),
+        "text": text,
+        "lines": lines,
+    }
     for name, image in made.items():
         image.save(folder / f"{name}.png")
     return {"flame": EXAMPLES / "flame.png", "ball": EXAMPLES / "ball.png", **{name: folder / f"{name}.png" for name in made}}
@@ -67,8 +76,17 @@ def row(picture: Path, quality: str, folder: Path, more: list[str]) -> list[str]
     waves = "-" if sharp.get("wave_relative_rms") is None else f"{sharp['wave_relative_rms']:.3f}"
     whole = 1.0 - sharp["lost"]["fresnel"]
     kept = "-" if sharp.get("wave_relative_rms") is None else f"{sharp['wave_on_target'] / whole:.3f}"
-    return [name, quality, waves, kept, f"{said['relative_rms']:.3f}", f"{sharp['relative_rms']:.3f}", f"{light:.4f}",
-            f"{sharp['on_target'] / sharp['on_screen']:.3f}", f"{seconds:.0f}"]
+    return [
+        name,
+        quality,
+        waves,
+        kept,
+        f"{said['relative_rms']:.3f}",
+        f"{sharp['relative_rms']:.3f}",
+        f"{light:.4f}",
+        f"{sharp['on_target'] / sharp['on_screen']:.3f}",
+        f"{seconds:.0f}",
+    ]
 
 
 def main() -> None:
@@ -82,8 +100,10 @@ def main() -> None:
         folder.mkdir(parents=True, exist_ok=True)
         known = pictures(folder)
         caustic("design", known["flame"], "--quality", "draft", "--time-limit", 1, *more, "-o", folder / "warm.caustic")
-        print("| picture | quality | as a wave | of its light on the picture | by rays | with 3.2e7 rays | light | of it on the"
-              " picture | seconds |\n| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
+        print(
+            "| picture | quality | as a wave | of its light on the picture | by rays | with 3.2e7 rays | light | of it on the"
+            " picture | seconds |\n| --- | --- | --- | --- | --- | --- | --- | --- | --- |"
+        )
         for name in options.pictures.split(","):
             for quality in options.qualities.split(","):
                 if name in MAIN or quality == "standard" or options.qualities != ",".join(QUALITIES):

@@ -25,9 +25,28 @@ ITERATIONS = 20
 def iteration(ranks: int, rays: str, project: Path) -> float:
     """Median seconds of an iteration of one design's last stage."""
     torchrun = ["torch.distributed.run", "--standalone", "--nproc-per-node", str(ranks)]
-    command = [sys.executable, "-m", *torchrun, "-m", "--", "caustic_cli", "design", str(FLAME),
-               "--mag", "3", "--rays", rays,
-               "--iterations", str(ITERATIONS), "--threads", "1", "--force", "--quiet", "-o", str(project)]
+    command = [
+        sys.executable,
+        "-m",
+        *torchrun,
+        "-m",
+        "--",
+        "caustic_cli",
+        "design",
+        str(FLAME),
+        "--mag",
+        "3",
+        "--rays",
+        rays,
+        "--iterations",
+        str(ITERATIONS),
+        "--threads",
+        "1",
+        "--force",
+        "--quiet",
+        "-o",
+        str(project),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise SystemExit(done.stderr)
@@ -50,8 +69,11 @@ def main() -> None:
             rounds = [[iteration(n, rays, Path(folder) / "flame.caustic") for n in counts] for _ in range(options.rounds)]
             for n, times in zip(counts, zip(*rounds, strict=True), strict=True):
                 faster = sorted(first[0] / own for first, own in zip(rounds, times, strict=True))
-                print(f"| {rays} | {n} | {1e3 * statistics.median(times):.0f} |"
-                      f" {statistics.median(faster):.2f} ({faster[0]:.2f} to {faster[-1]:.2f}) |", flush=True)
+                print(
+                    f"| {rays} | {n} | {1e3 * statistics.median(times):.0f} |"
+                    f" {statistics.median(faster):.2f} ({faster[0]:.2f} to {faster[-1]:.2f}) |",
+                    flush=True,
+                )
 
 
 if __name__ == "__main__":

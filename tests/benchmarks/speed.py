@@ -91,17 +91,26 @@ def against_torch() -> list[dict]:
     rows = []
     for filter, kind, alpha in ((3, "gaussian", ALPHA), (11, "gaussian", ALPHA), (11, "gaussian", 0.03), (3, "cosine", 0.0)):
         setting = {**BASE, "filter": filter, "kind": kind, "alpha": alpha}
-        work = {f"{part} {name}": make(kernels, **setting) for name, kernels in (("fused", ""), ("torch", "torch"))
-                for part, make in (("forward", forward), ("whole", objective))}
+        work = {
+            f"{part} {name}": make(kernels, **setting)
+            for name, kernels in (("fused", ""), ("torch", "torch"))
+            for part, make in (("forward", forward), ("whole", objective))
+        }
         times = interleaved(work)
-        ratio = {part: [t / f for t, f in zip(times[f"{part} torch"], times[f"{part} fused"], strict=True)]
-                 for part in ("forward", "whole")}
+        ratio = {
+            part: [t / f for t, f in zip(times[f"{part} torch"], times[f"{part} fused"], strict=True)]
+            for part in ("forward", "whole")
+        }
         row = {"filter": f"{kind} {filter}", "alpha_per_pixel2": alpha}
         for name in ("fused", "torch"):
             f, w = (statistics.median(times[f"{part} {name}"]) * 1e3 for part in ("forward", "whole"))
             row |= {f"{name}_forward_ms": f, f"{name}_backward_ms": w - f, f"{name}_whole_ms": w}
-        row |= {"ratio_forward": statistics.median(ratio["forward"]), "ratio_whole": statistics.median(ratio["whole"]),
-                "ratio_whole_least": min(ratio["whole"]), "ratio_whole_most": max(ratio["whole"])}
+        row |= {
+            "ratio_forward": statistics.median(ratio["forward"]),
+            "ratio_whole": statistics.median(ratio["whole"]),
+            "ratio_whole_least": min(ratio["whole"]),
+            "ratio_whole_most": max(ratio["whole"]),
+        }
         rows.append(row)
         print(row, flush=True)
     return rows
@@ -113,9 +122,10 @@ def scaling(name: str, values) -> list[dict]:
     work |= {str(v): objective("", **{**BASE, name: v}) for v in values}
     times = interleaved(work, 5)
     base = times.pop("base")
-    rows = [{name: v, "ms": statistics.median(t) * 1e3,
-             "ratio": statistics.median(a / b for a, b in zip(t, base, strict=True))}
-            for v, t in zip(values, times.values(), strict=True)]
+    rows = [
+        {name: v, "ms": statistics.median(t) * 1e3, "ratio": statistics.median(a / b for a, b in zip(t, base, strict=True))}
+        for v, t in zip(values, times.values(), strict=True)
+    ]
     print(name, rows, flush=True)
     return rows
 
@@ -166,6 +176,7 @@ def memory() -> list[dict]:
 
 def table(rows: list[dict]) -> str:
     """Rows as a Markdown table."""
+
     def cell(value) -> str:
         return f"{value:.3g}" if isinstance(value, float) else f"{value:,}" if isinstance(value, int) else str(value)
 
@@ -179,8 +190,13 @@ def plot(results: dict, path: Path) -> None:
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     figure = Figure(figsize=(15, 6.5), layout="constrained")
-    panels = dict(zip(("against_torch", "rays", "control", "degree", "pixels", "filter", "threads", "memory"),
-                      figure.subplots(2, 4).flat, strict=True))
+    panels = dict(
+        zip(
+            ("against_torch", "rays", "control", "degree", "pixels", "filter", "threads", "memory"),
+            figure.subplots(2, 4).flat,
+            strict=True,
+        )
+    )
     for name, axes in panels.items():
         rows = results[name]
         if name == "against_torch":

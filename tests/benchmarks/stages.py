@@ -76,8 +76,10 @@ def stages() -> dict:
         "interact, any direction, exact": (bend(d, "exact"), [*d, *g, power]),
         "land, plane wave": (lambda: land((x, y, z), d, (0.0, 0.0, 300.0), UPRIGHT, 1.0), [z, *d]),
         "land, any direction": (lambda: land((px, py, z), d, (0.0, 0.0, 300.0), UPRIGHT, 1.0), [px, py, z, *d]),
-        **{f"splat, {f.kind} {f.size[0]} x {f.size[1]}": (lambda f=f: splat_rays(px, py, power, SCREEN, f), [px, py, power])
-           for f in filters},
+        **{
+            f"splat, {f.kind} {f.size[0]} x {f.size[1]}": (lambda f=f: splat_rays(px, py, power, SCREEN, f), [px, py, power])
+            for f in filters
+        },
     }
 
 

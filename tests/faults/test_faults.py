@@ -25,8 +25,23 @@ from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
 from caustic_cli.workflow import design as workflow
 from caustic_cli.workflow import evaluation
 
-DESIGN = ["design", "blob.png", "--resolution", "16", "--control", "9", "--rays", "2000", "--start", "offset", "--iterations", "3",
-          "--quiet", "--threads", "1"]
+DESIGN = [
+    "design",
+    "blob.png",
+    "--resolution",
+    "16",
+    "--control",
+    "9",
+    "--rays",
+    "2000",
+    "--start",
+    "offset",
+    "--iterations",
+    "3",
+    "--quiet",
+    "--threads",
+    "1",
+]
 
 
 @pytest.fixture(autouse=True)
@@ -68,11 +83,15 @@ def test_a_full_disk_ends_in_1_with_what_was_there_before(capfd):
     run(DESIGN, capfd, 0)
     assert Path("blob.caustic/checkpoints.h5").stat().st_size > 9000 > Path("blob.caustic/project.toml").stat().st_size
     before = content("blob.caustic")
-    orders = [["design", "--resume", "blob.caustic", "--iterations", "5", "--quiet"], [*DESIGN, "-o", "new.caustic"],
-              *(["export", "blob.caustic", "--samples", "40", "--quiet", "--format", f] for f in ("lighttools", "stl"))]
+    orders = [
+        ["design", "--resume", "blob.caustic", "--iterations", "5", "--quiet"],
+        [*DESIGN, "-o", "new.caustic"],
+        *(["export", "blob.caustic", "--samples", "40", "--quiet", "--format", f] for f in ("lighttools", "stl")),
+    ]
     environment = {**os.environ, "PYTHONPATH": str(Path(cli.__file__).parents[1]), "CAUSTIC_KERNELS": "torch"}
-    done = subprocess.run([sys.executable, "-c", FULL], input=json.dumps(orders), capture_output=True, text=True, check=False,
-                          env=environment)
+    done = subprocess.run(
+        [sys.executable, "-c", FULL], input=json.dumps(orders), capture_output=True, text=True, check=False, env=environment
+    )
     assert done.stdout.split() == ["1"] * 4, done.stderr
     said = done.stderr.splitlines()
     assert len(said) == 4 and all("could not be written (File too large)" in line for line in said)
@@ -199,8 +218,10 @@ def scarce(monkeypatch, most: int) -> list:
         def __init__(self, system, rays, *rest, **options):
             tried.append(int(np.prod(rays.shape)))
             if tried[-1] > most:
-                raise RuntimeError("[enforce fail at alloc_cpu.cpp:121] data. DefaultCPUAllocator: can't allocate memory: you tried"
-                                   " to allocate 8388608 bytes. Error code 12 (Cannot allocate memory)")
+                raise RuntimeError(
+                    "[enforce fail at alloc_cpu.cpp:121] data. DefaultCPUAllocator: can't allocate memory: you tried"
+                    " to allocate 8388608 bytes. Error code 12 (Cannot allocate memory)"
+                )
             super().__init__(system, rays, *rest, **options)
 
     monkeypatch.setattr(trace, "Tracer", Tracer)

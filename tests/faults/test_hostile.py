@@ -39,8 +39,28 @@ def designed(tmp_path_factory):
         patch.setattr(evaluation, "FINAL_RAYS", 2000)
         patch.setattr(evaluation, "write_report", lambda *args: None)
         write_blob("blob.png", 16, (5, 6), 15.0)
-        assert cli.run(["design", "blob.png", "--resolution", "16", "--control", "9", "--rays", "2000", "--start", "offset",
-                        "--iterations", "2", "--quiet", "--threads", "1"]) == 0
+        assert (
+            cli.run(
+                [
+                    "design",
+                    "blob.png",
+                    "--resolution",
+                    "16",
+                    "--control",
+                    "9",
+                    "--rays",
+                    "2000",
+                    "--start",
+                    "offset",
+                    "--iterations",
+                    "2",
+                    "--quiet",
+                    "--threads",
+                    "1",
+                ]
+            )
+            == 0
+        )
     return folder / "blob.caustic"
 
 
@@ -52,8 +72,11 @@ def copy(designed, tmp_path, monkeypatch):
 
 def changes(data: bytes):
     """What may be done to `data` (see `changed`): bytes set, cut out or repeated, the end lost."""
-    return st.lists(st.tuples(st.integers(0, len(data) - 1), st.sampled_from(["set", "cut", "repeat", "end"]), st.integers(0, 255)),
-                    min_size=1, max_size=6)
+    return st.lists(
+        st.tuples(st.integers(0, len(data) - 1), st.sampled_from(["set", "cut", "repeat", "end"]), st.integers(0, 255)),
+        min_size=1,
+        max_size=6,
+    )
 
 
 def changed(data: bytes, how) -> bytes:
@@ -95,9 +118,21 @@ def array(value, **options) -> bytes:
     return out.getvalue()
 
 
-IMAGES = {"png": image("PNG"), "l.png": image("PNG", "LA"), "p.png": image("PNG", "P"), "16.png": image("PNG", "I;16"),
-          "jpg": image("JPEG"), "tif": image("TIFF", compression="tiff_lzw"), "f.tif": image("TIFF", "F"), "gif": image("GIF"),
-          "bmp": image("BMP"), "ppm": image("PPM"), "webp": image("WEBP"), "ico": image("ICO"), "tga": image("TGA")}
+IMAGES = {
+    "png": image("PNG"),
+    "l.png": image("PNG", "LA"),
+    "p.png": image("PNG", "P"),
+    "16.png": image("PNG", "I;16"),
+    "jpg": image("JPEG"),
+    "tif": image("TIFF", compression="tiff_lzw"),
+    "f.tif": image("TIFF", "F"),
+    "gif": image("GIF"),
+    "bmp": image("BMP"),
+    "ppm": image("PPM"),
+    "webp": image("WEBP"),
+    "ico": image("ICO"),
+    "tga": image("TGA"),
+}
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -150,8 +185,12 @@ def png(width: int, height: int) -> bytes:
         return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
 
     rows = zlib.compress(bytes(10**6), 9)
-    return (b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)) + chunk(b"IDAT", rows)
-            + chunk(b"IEND", b""))
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0))
+        + chunk(b"IDAT", rows)
+        + chunk(b"IEND", b"")
+    )
 
 
 def archive() -> bytes:
@@ -197,13 +236,65 @@ def test_pipes_and_devices_are_no_pictures(tmp_path, monkeypatch, capfd):
 # TOML
 
 NASTY = st.one_of(
-    st.sampled_from([0, -1, 1, 2, 3, 10**6, 2**63 - 1, -(2**63), 0.0, -0.0, 1e-320, 1e308, -1e308, float("inf"), float("-inf"),
-                     float("nan"), True, False, "", "/etc/passwd", "../x.png", "target.png", "a\0b", "\x1b[31m", "ü" * 300, "rms",
-                     [], [[]], {}, [0, 0], [1, -1], [10**6, 10**6], [1e308, 1e308], [float("nan")] * 2, ["a", "b"], [[0, 0, -50]],
-                     [[0, 0, 0]], {"a": {"b": 1}}, "project.toml", "checkpoints.h5", "grid", "point", "disc", "linear", "exact"]),
-    st.floats(), st.integers(-(2**63), 2**63 - 1), st.lists(st.floats(-10, 10), max_size=4), st.text(max_size=9))
-KEYS = [(s, k) for s, keys in toml.SCHEMA.items() for k in keys] + [("stage", k) for k in toml.STAGE] + [
-    ("design", "stages"), ("moon", "x"), ("lens", "moon"), ("format_version", None)]
+    st.sampled_from(
+        [
+            0,
+            -1,
+            1,
+            2,
+            3,
+            10**6,
+            2**63 - 1,
+            -(2**63),
+            0.0,
+            -0.0,
+            1e-320,
+            1e308,
+            -1e308,
+            float("inf"),
+            float("-inf"),
+            float("nan"),
+            True,
+            False,
+            "",
+            "/etc/passwd",
+            "../x.png",
+            "target.png",
+            "a\0b",
+            "\x1b[31m",
+            "ü" * 300,
+            "rms",
+            [],
+            [[]],
+            {},
+            [0, 0],
+            [1, -1],
+            [10**6, 10**6],
+            [1e308, 1e308],
+            [float("nan")] * 2,
+            ["a", "b"],
+            [[0, 0, -50]],
+            [[0, 0, 0]],
+            {"a": {"b": 1}},
+            "project.toml",
+            "checkpoints.h5",
+            "grid",
+            "point",
+            "disc",
+            "linear",
+            "exact",
+        ]
+    ),
+    st.floats(),
+    st.integers(-(2**63), 2**63 - 1),
+    st.lists(st.floats(-10, 10), max_size=4),
+    st.text(max_size=9),
+)
+KEYS = (
+    [(s, k) for s, keys in toml.SCHEMA.items() for k in keys]
+    + [("stage", k) for k in toml.STAGE]
+    + [("design", "stages"), ("moon", "x"), ("lens", "moon"), ("format_version", None)]
+)
 
 
 def test_project_toml(copy, capfd):
@@ -230,8 +321,11 @@ def test_project_toml(copy, capfd):
             else:
                 text.setdefault(section, {})[key] = value
         path.write_text(tomli_w.dumps(text), encoding="utf-8")
-        command = (["render", str(copy), "--rays", "300"] if render
-                   else ["export", str(copy), "--samples", "3", "--format", "stl", "-o", "lens.stl"])
+        command = (
+            ["render", str(copy), "--rays", "300"]
+            if render
+            else ["export", str(copy), "--samples", "3", "--format", "stl", "-o", "lens.stl"]
+        )
         codes.append(cli.run([*command, "--quiet"]))
         out, err = capfd.readouterr()
         assert codes[-1] in (0, 2) and out == "" and err.count("\n") == (codes[-1] == 2) and "\x1b" not in err, err
@@ -243,9 +337,36 @@ def test_project_toml(copy, capfd):
 
 
 @many
-@given(st.one_of(st.text(max_size=60), st.binary(max_size=60).map(lambda b: b.decode("latin1")),
-                 st.lists(st.sampled_from(["[lens]", "[[design.stages]]", "size", "=", "[", "]", "{", "}", "1", '"', "'''", "\n",
-                                           ".", "0x" + "f" * 40, "1" * 5000, "1979-05-27", "nan"]), max_size=12).map("".join)))
+@given(
+    st.one_of(
+        st.text(max_size=60),
+        st.binary(max_size=60).map(lambda b: b.decode("latin1")),
+        st.lists(
+            st.sampled_from(
+                [
+                    "[lens]",
+                    "[[design.stages]]",
+                    "size",
+                    "=",
+                    "[",
+                    "]",
+                    "{",
+                    "}",
+                    "1",
+                    '"',
+                    "'''",
+                    "\n",
+                    ".",
+                    "0x" + "f" * 40,
+                    "1" * 5000,
+                    "1979-05-27",
+                    "nan",
+                ]
+            ),
+            max_size=12,
+        ).map("".join),
+    )
+)
 @example("a=" + "[" * 5000)
 @example("[lens]\nsize = 0x" + "f" * 5000)
 @example("[source]\ntype = " + "9" * 5000)
@@ -264,8 +385,11 @@ def test_no_picture_beyond_the_project_is_opened(copy, capfd, file):
     path = copy / "project.toml"
     for key in ("file", "profile"):
         text = path.read_text()
-        text = text.replace('file = "target.png"', f"file = {file!r}") if key == "file" else text.replace(
-            "[source]", f"[source]\nprofile = {file!r}")
+        text = (
+            text.replace('file = "target.png"', f"file = {file!r}")
+            if key == "file"
+            else text.replace("[source]", f"[source]\nprofile = {file!r}")
+        )
         if key == "profile" and file == "":  # says that there is none
             continue
         folder = Path(shutil.copytree(copy, f"{key}.caustic"))
@@ -337,6 +461,7 @@ def _linked(kind):
     def change(f):
         del f["history"]
         f["history"] = kind
+
     return change
 
 
@@ -344,12 +469,17 @@ def _pickled(f):
     f["state/parameters/bomb"] = np.void(b"\x80\x04c__main__\nBomb\n.")
 
 
-CHECKPOINTS = {"a dataset of terabytes": _huge, "a compressed one": _squeezed, "data in another file": _outside,
-               "a link to another file": _linked(h5py.ExternalLink("../secret.h5", "history")),
-               "a link to itself": _linked(h5py.SoftLink("/history")), "opaque bytes": _pickled,
-               "a state that is no whole number": lambda f: f["state"].attrs.__setitem__("stage", "x"),
-               "endless heights": lambda f: f["lens/heights"].__setitem__((0, 0), np.inf),
-               "a degree of -1": lambda f: f["lens"].attrs.__setitem__("degree", [-1, 3])}
+CHECKPOINTS = {
+    "a dataset of terabytes": _huge,
+    "a compressed one": _squeezed,
+    "data in another file": _outside,
+    "a link to another file": _linked(h5py.ExternalLink("../secret.h5", "history")),
+    "a link to itself": _linked(h5py.SoftLink("/history")),
+    "opaque bytes": _pickled,
+    "a state that is no whole number": lambda f: f["state"].attrs.__setitem__("stage", "x"),
+    "endless heights": lambda f: f["lens/heights"].__setitem__((0, 0), np.inf),
+    "a degree of -1": lambda f: f["lens"].attrs.__setitem__("degree", [-1, 3]),
+}
 
 
 @pytest.mark.parametrize("kind", CHECKPOINTS)

@@ -46,10 +46,20 @@ class Server:
     def __init__(self, folder: Path):
         self.board, self.log = folder / "board", folder / "log"
         self.board.write_bytes(bytes(BOARD))
-        environment = {**os.environ, "PYTHONPATH": str(Path(cli.__file__).parents[1]), "CAUSTIC_KERNELS": "torch",
-                       "OMP_NUM_THREADS": "1"}
-        self.process = subprocess.Popen([sys.executable, Path(__file__).with_name("server.py"), self.board, self.log], cwd=folder,
-                                        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment)
+        environment = {
+            **os.environ,
+            "PYTHONPATH": str(Path(cli.__file__).parents[1]),
+            "CAUSTIC_KERNELS": "torch",
+            "OMP_NUM_THREADS": "1",
+        }
+        self.process = subprocess.Popen(
+            [sys.executable, Path(__file__).with_name("server.py"), self.board, self.log],
+            cwd=folder,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=environment,
+        )
 
     def __call__(self, arguments: list[str], after: float | None = None) -> tuple[int, np.ndarray]:
         """Run a command, kill it `after` so many seconds; its exit code (-9 when killed) and when each iteration was done."""
@@ -128,9 +138,11 @@ def test_a_killed_design_goes_on_and_nothing_is_lost(server):
 
 def test_a_killed_export_or_render_leaves_the_old_file_or_the_new(server):
     assert server([*DESIGN, "--iterations", "3"])[0] == 0, server.log.read_text()
-    outputs = {"lens.npz": ["export", "blob.caustic", "--samples", "301"],
-               "lens.stl": ["export", "blob.caustic", "--format", "stl"],
-               "image.png": ["render", "blob.caustic", "--rays", "200000"]}
+    outputs = {
+        "lens.npz": ["export", "blob.caustic", "--samples", "301"],
+        "lens.stl": ["export", "blob.caustic", "--format", "stl"],
+        "image.png": ["render", "blob.caustic", "--rays", "200000"],
+    }
     chance, whole, late = random.Random(KILLS), {}, 0
     for name, command in outputs.items():
         began = time.monotonic()

@@ -75,8 +75,10 @@ def main() -> int:
     if wrong:
         print(f"mitsuba_check: {wrong}", file=sys.stderr)
         return 2
-    print(f"Mitsuba {mi.__version__}, variant {choose_variant(options.variant)}, {options.rays:.3g} rays,"
-          f" {lens['shape'][0]} x {lens['shape'][1]} points, source: {lens['source_type']}")
+    print(
+        f"Mitsuba {mi.__version__}, variant {choose_variant(options.variant)}, {options.rays:.3g} rays,"
+        f" {lens['shape'][0]} x {lens['shape'][1]} points, source: {lens['source_type']}"
+    )
     scene = build(lens)
     halves = [trace(scene, lens, options.rays // 2, [options.seed, half]) for half in (0, 1)]
     image, render = (halves[0][0] + halves[1][0]) / 2, renders.mean(0)
@@ -97,8 +99,10 @@ def choose_variant(name: str | None) -> str:
     Tried in a process of its own: an LLVM older than 17 does not raise on what Dr.Jit asks of it, it aborts.
     (A newer one is found with the environment variable DRJIT_LIBLLVM_PATH.)
     """
-    probe = ("import sys, mitsuba as mi, drjit as dr; mi.set_variant(sys.argv[1]);"
-             "print(dr.maximum(dr.arange(mi.Float, 9) if 'llvm' in mi.variant() else 1.0, 3.0))")
+    probe = (
+        "import sys, mitsuba as mi, drjit as dr; mi.set_variant(sys.argv[1]);"
+        "print(dr.maximum(dr.arange(mi.Float, 9) if 'llvm' in mi.variant() else 1.0, 3.0))"
+    )
     for variant in (name,) if name else VARIANTS:
         if subprocess.run([sys.executable, "-c", probe, variant], capture_output=True, check=False).returncode == 0:
             mi.set_variant(variant)
@@ -275,8 +279,12 @@ def compare(render: np.ndarray, image: np.ndarray, noise: float, plane: bool) ->
     print(f"beyond noise           {beyond:.5f}  (at most {TOLERANCE})")
     turned = {"flipped in x": render[::-1], "flipped in y": render[:, ::-1], "turned by 180": render[::-1, ::-1]}
     if render.shape[0] == render.shape[1]:
-        turned |= {"transposed": render.T, "turned by 90": np.rot90(render), "turned by 270": np.rot90(render, 3),
-                   "transposed, turned": render.T[::-1, ::-1]}
+        turned |= {
+            "transposed": render.T,
+            "turned by 90": np.rot90(render),
+            "turned by 270": np.rot90(render, 3),
+            "transposed, turned": render.T[::-1, ::-1],
+        }
     own = correlation(image, render)
     print(f"correlation as it is   {own:.5f}")
     others = {name: correlation(image, other) for name, other in turned.items()}
@@ -292,8 +300,9 @@ def judge(renders: np.ndarray, image: np.ndarray, squares: np.ndarray, rays: int
         squares: sums of the squares of what each of Mitsuba's `rays` rays brings to a pixel.
     """
     nx, ny = image.shape
-    renders, image, squares = (a.reshape(*a.shape[:-2], nx // side, side, ny // side, side).sum((-3, -1))
-                               for a in (renders, image, squares))
+    renders, image, squares = (
+        a.reshape(*a.shape[:-2], nx // side, side, ny // side, side).sum((-3, -1)) for a in (renders, image, squares)
+    )
     render, scatter = renders.mean(0), renders.var(0, ddof=1) / len(renders)
     around = around_each(render)  # few renders tell a pixel's variance badly: as much a unit of light as its neighbours'
     scatter = render * around_each(scatter) / np.where(around > 0, around, 1.0)
@@ -309,9 +318,11 @@ def judge(renders: np.ndarray, image: np.ndarray, squares: np.ndarray, rays: int
     sums = renders.sum((1, 2))
     spread_of_light = squares.sum() - image.sum() ** 2 / rays + sums.var(ddof=1) / len(sums)
     light = (image.sum() - sums.mean()) / spread_of_light**0.5
-    print(f"judged                 {judged.sum()} of {judged.size} pixels of {side} x {side},"
-          f" {render[judged].sum() / render.sum():.4f} of the light, {np.sqrt(per_ray / np.mean(render[judged])):.3f} mean noise;"
-          f" render's part of the variance {np.mean(scatter[judged]) / np.mean((each * expected + scatter)[judged]):.2f}")
+    print(
+        f"judged                 {judged.sum()} of {judged.size} pixels of {side} x {side},"
+        f" {render[judged].sum() / render.sum():.4f} of the light, {np.sqrt(per_ray / np.mean(render[judged])):.3f} mean noise;"
+        f" render's part of the variance {np.mean(scatter[judged]) / np.mean((each * expected + scatter)[judged]):.2f}"
+    )
     most, off = NORMAL + 3 * np.sqrt(NORMAL / len(some)), CHI2 + 3 * np.sqrt(2 / len(some))
     related = NEIGHBOURS + 3 / np.sqrt(2 * len(some))
     print(f"beyond 3 sigma         {beyond:.5f}  (at most {most:.5f}; normal {NORMAL})")
@@ -319,8 +330,7 @@ def judge(renders: np.ndarray, image: np.ndarray, squares: np.ndarray, rays: int
     print(f"mean Z, largest |Z|    {some.mean():.4f}, {largest:.2f}  (below {LARGEST})")
     print(f"neighbours             {neighbours:.4f}  (below {related:.3f})")
     print(f"light                  Mitsuba - render = {image.sum() - sums.mean():.2e}, Z {light:.2f}  (below {LIGHT})")
-    return bool(abs(chi2 - 1) <= off and beyond <= most and largest < LARGEST and abs(neighbours) < related
-                and abs(light) < LIGHT)
+    return bool(abs(chi2 - 1) <= off and beyond <= most and largest < LARGEST and abs(neighbours) < related and abs(light) < LIGHT)
 
 
 def around_each(a: np.ndarray) -> np.ndarray:

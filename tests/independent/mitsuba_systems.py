@@ -90,9 +90,11 @@ def behind_mirror() -> tuple[System, dict]:
     along = rotation((0.0, turn))[:, 2]  # light goes along minus this behind the mirror
     there = np.array([0.0, 0.0, 10.0])
     front, back = (Pose(tuple(there - t * along), (0.0, turn)) for t in (16.0, 20.0))
-    elements = (Element("mirror", Sphere(-200.0), Aperture((8.0, 8.0)), "reflect", pose=Pose(tuple(there), (0.0, turn / 2))),
-                Element("front", WIDE, Aperture((9.0, 9.0)), behind=GLASS, pose=front),
-                Element("back", Plane(), Aperture((15.0, 15.0)), pose=back))
+    elements = (
+        Element("mirror", Sphere(-200.0), Aperture((8.0, 8.0)), "reflect", pose=Pose(tuple(there), (0.0, turn / 2))),
+        Element("front", WIDE, Aperture((9.0, 9.0)), behind=GLASS, pose=front),
+        Element("back", Plane(), Aperture((15.0, 15.0)), pose=back),
+    )
     aside = Placed(Screen((20.0, 20.0), 0.0, (20, 20)), Pose(tuple(there - 60.0 * along), (0.0, turn)))
     return System((PlaneWave(),), elements, (aside,)), {"front": parabola(WIDE, -35.0) + bumpy(WIDE, 0.02, 6)}
 
@@ -211,8 +213,11 @@ def compare(what: str, theirs: np.ndarray, their_power: np.ndarray, ours: np.nda
     distance = np.linalg.norm(theirs - ours, axis=1)[both]
     rms, power = float(np.sqrt(np.mean(distance**2))), float(abs(their_power - our_power)[both].max())
     good = bool(rms <= RMS and power <= POWER and apart == 0)
-    print(f"{what} {both.sum():>6} {len(both) - both.sum() - apart:>5} {apart:>5} {rms:>9.1e} {distance.max():>9.1e} {power:>9.1e}"
-          f"{'' if good else '  DISAGREE'}", flush=True)
+    print(
+        f"{what} {both.sum():>6} {len(both) - both.sum() - apart:>5} {apart:>5} {rms:>9.1e} {distance.max():>9.1e} {power:>9.1e}"
+        f"{'' if good else '  DISAGREE'}",
+        flush=True,
+    )
     return good
 
 

@@ -85,8 +85,9 @@ def splatted(nets, x, y, directions, power, fresnel: str, eta: float, filter: Fi
     along = [functions._NONE] * 2 if directions is None else [functions._strided(c.numpy()) for c in directions]
     rays = (*(functions._strided(a.numpy()) for a in (x, y)), *along, functions._strided(power.numpy()))
     ones = np.ones((1, 1))
-    return functions._splat(nets, (np.zeros(1, np.int64), ones, ones), True, rays, (eta, fresnel), HEIGHT, 0.0, SCREEN, filter,
-                            functions._Workspace())
+    return functions._splat(
+        nets, (np.zeros(1, np.int64), ones, ones), True, rays, (eta, fresnel), HEIGHT, 0.0, SCREEN, filter, functions._Workspace()
+    )
 
 
 def ours(kernels: str, dtype: torch.dtype, n: float, d, t, gx, gy, x, y) -> tuple[float, np.ndarray]:

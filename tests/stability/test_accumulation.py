@@ -28,16 +28,28 @@ def test_1e8_unit_weights_into_one_pixel(kernels, compare):
         image, _, lost = splatted([torch.zeros_like(at)] * 3, at, at, None, weights, "none", Lens().index, Filter())
         off = lost["off_screen"]
     assert float(off) == 0.0 and int((image > 0).sum()) == 1
-    compare("1e8 unit weights into one pixel", "the pixel, relative", 1.0 - naive / 100.0 / MORE,
-            abs(float(image.sum()) / 100.0 / MORE - 1.0), 1e-12)
+    compare(
+        "1e8 unit weights into one pixel",
+        "the pixel, relative",
+        1.0 - naive / 100.0 / MORE,
+        abs(float(image.sum()) / 100.0 / MORE - 1.0),
+        1e-12,
+    )
 
 
 def test_chunks_are_added_in_double(kernels):
     """9e4 rays in float32, in chunks: every one is there."""
     lens = Lens(size=(1.0, 1.0), control=(4, 4), fresnel="none")
     scene = Scene(PlaneWave(), lens, Screen((10.0, 10.0), 20.0, (3, 3)))
-    e = expose(scene, HeightField.of(lens), torch.full((4, 4), 5.0, dtype=torch.float64), Sampler("grid", (300, 300)), Filter(),
-               torch.float32, chunk=1 << 13)
+    e = expose(
+        scene,
+        HeightField.of(lens),
+        torch.full((4, 4), 5.0, dtype=torch.float64),
+        Sampler("grid", (300, 300)),
+        Filter(),
+        torch.float32,
+        chunk=1 << 13,
+    )
     assert e.rays == 90_000
     assert float(e.image[1, 1]) == pytest.approx(1.0, abs=1e-7)
 
@@ -48,8 +60,14 @@ def test_few_rays(count, kernels, dtype):
     lens = Lens(size=(1.0, 1.0), control=(4, 4), fresnel="none")
     scene = Scene(PlaneWave(), lens, Screen((2.0, 2.0), 20.0, (5, 5)))
     for kind in ("grid", "lines", "stratified", "uniform", "sobol"):
-        e = expose(scene, HeightField.of(lens), torch.full((4, 4), 5.0, dtype=torch.float64), Sampler(kind, (count, 1)),
-                   Filter("cosine", (3, 3)), dtype)
+        e = expose(
+            scene,
+            HeightField.of(lens),
+            torch.full((4, 4), 5.0, dtype=torch.float64),
+            Sampler(kind, (count, 1)),
+            Filter("cosine", (3, 3)),
+            dtype,
+        )
         assert float(e.image.sum()) + sum(e.lost.values()) == pytest.approx(1.0, abs=1e-6 if dtype == torch.float32 else 1e-14)
 
 

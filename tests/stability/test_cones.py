@@ -125,10 +125,18 @@ def test_from_afar_a_point_is_a_plane_wave(kernels, dtype, compare):
     compare("source 1e-6 to 1e6 mm before the lens", "place of the hit, mm", float(naive), float(off), 1e-9)
 
 
-@pytest.mark.parametrize("source", [Points(((0.0, 0.0, -1e-6),)), Disc((0.0, 0.0, -1e-6), (2.0, 1.0)), Disc(angle=1e-6),
-                                    Disc(angle=170.0), Points(((4.9, 3.9, -1e-6),), cone=89.0),
-                                    Points(((0.0, 0.0, -1e6),), cone=1e-6)], ids=["near", "near disc", "thin sun", "wide sun",
-                                                                                  "near the corner", "far and narrow"])
+@pytest.mark.parametrize(
+    "source",
+    [
+        Points(((0.0, 0.0, -1e-6),)),
+        Disc((0.0, 0.0, -1e-6), (2.0, 1.0)),
+        Disc(angle=1e-6),
+        Disc(angle=170.0),
+        Points(((4.9, 3.9, -1e-6),), cone=89.0),
+        Points(((0.0, 0.0, -1e6),), cone=1e-6),
+    ],
+    ids=["near", "near disc", "thin sun", "wide sun", "near the corner", "far and narrow"],
+)
 @pytest.mark.parametrize("count", [1, 1000])
 def test_energy_closes_and_nothing_is_negative(source, count, kernels, dtype):
     lens = Lens(size=(10.0, 8.0), control=(6, 6), index=1.5)

@@ -56,8 +56,13 @@ def test_before_the_critical_angle(kernels, dtype, d, compare):
     if near.all():
         total = float(sum(row[0] for row in expected))
         assert value == pytest.approx(total, rel=1e-5 if dtype == torch.float32 else 1e-6)
-    compare("critical angle, 0.1 to 1e-12 rad", "derivatives, in units of 30 eps / cos²(t)", naive(dtype),
-            float((error / allowed)[near].max()), 1.0)
+    compare(
+        "critical angle, 0.1 to 1e-12 rad",
+        "derivatives, in units of 30 eps / cos²(t)",
+        naive(dtype),
+        float((error / allowed)[near].max()),
+        1.0,
+    )
 
 
 def naive(dtype: torch.dtype) -> float:

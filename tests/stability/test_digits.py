@@ -34,8 +34,9 @@ def test_index_close_to_one(index, d, kernels, dtype, compare):
     eps = torch.finfo(dtype).eps
     bound = 300 * eps if d is None or kernels == "fused" else 300 * eps + 30 * eps / (index - 1.0)
     if d is None and index < 1.0 + 1e-8:
-        compare("index 1 + 1e-12 to 1.001", "derivative by the slope, relative", naive, error,
-                1e-4 if dtype == torch.float32 else 1e-12)
+        compare(
+            "index 1 + 1e-12 to 1.001", "derivative by the slope, relative", naive, error, 1e-4 if dtype == torch.float32 else 1e-12
+        )
     else:
         assert error < max(bound, 1e-4 if dtype == torch.float32 else 0.0)
 
@@ -68,7 +69,8 @@ def test_thickness_large_against_sag(thickness, source, kernels, dtype, compare)
         (rays,) = rays_of(s, "stratified", 900, 2).chunks()
         leaf = (sag + base).requires_grad_()
         part = Tracer(System.of(s, field), rays, torch.float64 if base == 0.0 else dtype).expose(
-            {EXIT: leaf}, s.screen, Filter("cosine", (3, 3)))
+            {EXIT: leaf}, s.screen, Filter("cosine", (3, 3))
+        )
         image = part.image.double()
         (by,) = torch.autograd.grad((image * weights).sum(), leaf)
         out.append((image.detach(), by))
@@ -148,8 +150,17 @@ def test_landing_beside_mpmath(kernels, dtype):
     g = np.linspace(-0.5, 0.5, 11)
     zero = np.zeros(11)
     value, found = ours(kernels, dtype, 1.5, None, zero + 0.3, g, 0.5 * g, zero + 1.0, zero)
-    rows = [exactly(1.5, (0, 0, 1), float(np.float32(0.3)) if dtype == torch.float32 else 0.3,
-                    *(float(np.float32(v)) if dtype == torch.float32 else float(v) for v in (a, 0.5 * a)), 1.0, 0.0) for a in g]
+    rows = [
+        exactly(
+            1.5,
+            (0, 0, 1),
+            float(np.float32(0.3)) if dtype == torch.float32 else 0.3,
+            *(float(np.float32(v)) if dtype == torch.float32 else float(v) for v in (a, 0.5 * a)),
+            1.0,
+            0.0,
+        )
+        for a in g
+    ]
     exact = np.array([[float(v) for v in row[1:]] for row in rows]).T
     close = 1e-5 if dtype == torch.float32 else 1e-12
     assert value == pytest.approx(float(mp.fsum(row[0] for row in rows)), rel=close)

@@ -78,8 +78,13 @@ def test_the_first_of_several_roots(angle, kernels, compare):
     assert not (status == Status.UNRESOLVED).any()
     wrong = ~np.isclose(found, expected, rtol=1e-9, atol=1e-9)
     naive = ~np.isclose(newton(z, b), expected, rtol=1e-6, atol=1e-6)
-    compare("grazing hits, several roots, 60 to 85°", "part of the rays with a wrong hit", naive[clear].mean(), wrong[clear].mean(),
-            1e-3)
+    compare(
+        "grazing hits, several roots, 60 to 85°",
+        "part of the rays with a wrong hit",
+        naive[clear].mean(),
+        wrong[clear].mean(),
+        1e-3,
+    )
 
 
 @pytest.mark.parametrize("angle", [60.0, 75.0, 85.0])
@@ -109,8 +114,13 @@ def test_derivatives_at_the_hits(angle, kernels, compare):
     shift = surface()
     shift[21] += step
     jump = (newton(spline(shift), b)[use] - newton(z, b)[use]).sum() / step
-    compare("grazing hits, several roots, 60 to 85°", "derivative by the heights, relative",
-            abs(jump - exact[21].sum()) / np.linalg.norm(exact), error, 1e-6)
+    compare(
+        "grazing hits, several roots, 60 to 85°",
+        "derivative by the heights, relative",
+        abs(jump - exact[21].sum()) / np.linalg.norm(exact),
+        error,
+        1e-6,
+    )
 
 
 def test_gentle_slopes_are_proved_safe_and_steep_ones_are_not(kernels):

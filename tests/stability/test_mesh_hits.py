@@ -69,8 +69,11 @@ def test_nothing_slips_between_triangles(recursive, compare):
     p = np.stack(np.broadcast_arrays(x[:, None], y[None, :], z), -1)
     parts = [p[1:-1, 1:-1]]
     for share in (0.1, 0.3, 0.6):
-        parts += [share * p[1:-2, 1:-1] + (1 - share) * p[2:-1, 1:-1], share * p[1:-1, 1:-2] + (1 - share) * p[1:-1, 2:-1],
-                  share * p[2:-1, 1:-2] + (1 - share) * p[1:-2, 2:-1]]
+        parts += [
+            share * p[1:-2, 1:-1] + (1 - share) * p[2:-1, 1:-1],
+            share * p[1:-1, 1:-2] + (1 - share) * p[1:-1, 2:-1],
+            share * p[2:-1, 1:-2] + (1 - share) * p[1:-2, 2:-1],
+        ]
     points = np.concatenate([part.reshape(-1, 3) for part in parts])
     missed, plain = 0, 0
     for kind in ("tilted", "upright"):
@@ -79,8 +82,9 @@ def test_nothing_slips_between_triangles(recursive, compare):
         missed += (~hit | (np.abs(o[:, 2] + np.where(hit, t, 0.0) * d[:, 2] - points[:, 2]) > 1e-12)).sum()
         plain += (~moller_trumbore(o, d, np.float32)).sum()
     assert len(points) > 1000
-    compare("mesh: rays through vertices and along edges", "part of the rays that slip through",
-            plain / len(points) / 2, missed, 0.0)
+    compare(
+        "mesh: rays through vertices and along edges", "part of the rays that slip through", plain / len(points) / 2, missed, 0.0
+    )
 
 
 @pytest.mark.parametrize("recursive", [True, False])

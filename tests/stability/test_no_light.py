@@ -95,10 +95,14 @@ def small(optimizer: str, lr: float = 1e-3, network: str = "none", index: float 
     lens = Lens(size=(10.0, 10.0), control=(8, 8), index=index, offset=Offset(5.0), height_range=(-4.0, 4.0))
     g = torch.Generator().manual_seed(0)
     target = torch.rand(12, 12, generator=g, dtype=torch.float64) + 0.2
-    return Designer(Scene(PlaneWave(), lens, Screen((size, size), 60.0, (12, 12))), target,
-                    [Stage((8, 8), 900, "grid", Filter("cosine", (3, 3)), 0.0, 0, 12)],
-                    Options(loss="rms", optimizer=optimizer, lr=lr, network=network,
-                            preconditioner="none" if optimizer == "adam" else "laplacian"))
+    return Designer(
+        Scene(PlaneWave(), lens, Screen((size, size), 60.0, (12, 12))),
+        target,
+        [Stage((8, 8), 900, "grid", Filter("cosine", (3, 3)), 0.0, 0, 12)],
+        Options(
+            loss="rms", optimizer=optimizer, lr=lr, network=network, preconditioner="none" if optimizer == "adam" else "laplacian"
+        ),
+    )
 
 
 class Holes(Objective):

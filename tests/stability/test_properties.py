@@ -46,9 +46,17 @@ def scenes(draw, roughest: float):
     far, aside = size * draw(logs(1e-7, 1e7)), size * draw(st.sampled_from([0.0, 0.3, 20.0, 1e4]))
     cone = draw(st.sampled_from([None, 1e-6, 0.1, 30.0, 89.0, 90.0]))
     options = {"cone": cone, "intensity": draw(st.sampled_from(["uniform", "lambertian"])), "aimed": draw(st.booleans())}
-    source = draw(st.sampled_from([PlaneWave(), Points(((aside, 0.0, -far), (0.0, -aside, -size)), **options),
-                                   Disc((aside, 0.0, -far), (0.2 * size, 0.1 * size), **options), Disc(angle=0.5),
-                                   Disc(angle=150.0)]))
+    source = draw(
+        st.sampled_from(
+            [
+                PlaneWave(),
+                Points(((aside, 0.0, -far), (0.0, -aside, -size)), **options),
+                Disc((aside, 0.0, -far), (0.2 * size, 0.1 * size), **options),
+                Disc(angle=0.5),
+                Disc(angle=150.0),
+            ]
+        )
+    )
     v = draw(st.sampled_from([1, 3, 5]))
     kind = draw(st.sampled_from(["bincount", "gaussian", "cosine"]))
     alpha = draw(st.sampled_from([0.0, 1e-9, 0.1, 30.0, 1e6]))
@@ -119,8 +127,11 @@ def gentle(seed: int, source: str, size: float, degree: int, symmetric: bool = F
     g = torch.Generator().manual_seed(seed)
     noise = torch.rand(lens.control, generator=g, dtype=torch.float64)
     heights = size * (0.3 + 0.01 * (noise + noise.flip(0) if symmetric else noise)) + 0.05 / size * (x[:, None] ** 2 + y**2)
-    light = {"plane": PlaneWave(), "point": Points(((0.0, 0.1 * size, -3.0 * size),)),
-             "disc": Disc((0.0, 0.0, -4.0 * size), (0.1 * size, 0.1 * size))}[source]
+    light = {
+        "plane": PlaneWave(),
+        "point": Points(((0.0, 0.1 * size, -3.0 * size),)),
+        "disc": Disc((0.0, 0.0, -4.0 * size), (0.1 * size, 0.1 * size)),
+    }[source]
     s = Scene(light, lens, Screen((4.0 * size, 4.0 * size), 3.0 * size, (10, 8)))
     weights = torch.rand(10, 8, generator=g, dtype=torch.float64)
     (rays,) = rays_of(s, "stratified", 150, seed).chunks()
@@ -154,8 +165,10 @@ def test_symmetric_scene_gives_a_symmetric_image(kernel, monkeypatch):
     @given(GENTLE)
     def check(drawn):
         s, heights, rays, _ = gentle(*drawn, symmetric=True)
-        total = sum(image_and_slope(*each, Filter("gaussian", (5, 3), (0.2, 0.4)), torch.float64, torch.ones(10, 8))[0]
-                    for each in ((s, heights, rays), mirrored(s, heights, rays)))
+        total = sum(
+            image_and_slope(*each, Filter("gaussian", (5, 3), (0.2, 0.4)), torch.float64, torch.ones(10, 8))[0]
+            for each in ((s, heights, rays), mirrored(s, heights, rays))
+        )
         assert float(total.sum()) > 0.2
         assert float((total - total.flip(0)).abs().max()) < 1e-11 * float(total.max())
 

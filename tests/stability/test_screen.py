@@ -12,10 +12,14 @@ from caustic_cli.optics.reconstruction import Filter, splat
 N = 1.5
 TILTS = [10.0**-k for k in range(1, 16)]
 D = (0.6, 0.0, 0.8)
-FILTERS = {"bincount": Filter(), "cosine": Filter("cosine", (3, 3)), "wide": Filter("cosine", (7, 5)),
-           "gaussian": Filter("gaussian", (5, 5), (0.3, 0.3)),
-           "narrow": Filter("gaussian", (3, 3), (1e4, 1e4)),
-           "flat": Filter("gaussian", (11, 11), (1e-9, 1e-9))}
+FILTERS = {
+    "bincount": Filter(),
+    "cosine": Filter("cosine", (3, 3)),
+    "wide": Filter("cosine", (7, 5)),
+    "gaussian": Filter("gaussian", (5, 5), (0.3, 0.3)),
+    "narrow": Filter("gaussian", (3, 3), (1e4, 1e4)),
+    "flat": Filter("gaussian", (11, 11), (1e-9, 1e-9)),
+}
 
 
 def slope_towards(tilt: float) -> float:
@@ -39,8 +43,13 @@ def test_parallel_to_the_screen(side, kernels, dtype, compare):
     away = torch.tensor([side * t for t in TILTS], dtype=dtype) * (1.0 + slope) * 0.0
     path = torch.where(away > 0, 10.0 / away, torch.zeros_like(away))
     (naive,) = torch.autograd.grad(path.sum(), slope)
-    compare("rays parallel to the screen", "derivatives, relative", float(naive.abs().max()), error,
-            1e-3 if dtype == torch.float32 else 1e-12)
+    compare(
+        "rays parallel to the screen",
+        "derivatives, relative",
+        float(naive.abs().max()),
+        error,
+        1e-3 if dtype == torch.float32 else 1e-12,
+    )
 
 
 def direct(kernels: str, dtype, x, y, filter: Filter, weights=None):

@@ -45,8 +45,10 @@ def exact(s: SplineSpace, x: float, heights) -> tuple[float, float, float]:
 
     for k in range(1, p + 1):
         before = n
-        n = [ratio(x - t[i], t[i + k] - t[i]) * n[i] + ratio(t[i + k + 1] - x, t[i + k + 1] - t[i + 1]) * n[i + 1]
-             for i in range(len(n) - 1)]
+        n = [
+            ratio(x - t[i], t[i + k] - t[i]) * n[i] + ratio(t[i + k + 1] - x, t[i + k + 1] - t[i + 1]) * n[i + 1]
+            for i in range(len(n) - 1)
+        ]
     slopes = [p * (ratio(before[i], t[i + p] - t[i]) - ratio(before[i + 1], t[i + p + 1] - t[i + 1])) for i in range(len(n))]
     h = [Fraction(float(v)) for v in heights]
     value, slope = (sum(a * b for a, b in zip(w, h, strict=True)) for w in (n, slopes))
@@ -97,8 +99,9 @@ def test_values_and_slopes(p, kind, dtype, compare):
     worst = 0.0
     for name, (z, zx) in found.items():
         assert bool(torch.isfinite(z).all() and torch.isfinite(zx).all()), name
-        worst = max(worst, float((z.double() - value).abs().max()) / eps,
-                    float(((zx.double() - slope).abs() / (size + 1.0)).max()) / eps)
+        worst = max(
+            worst, float((z.double() - value).abs().max()) / eps, float(((zx.double() - slope).abs() / (size + 1.0)).max()) / eps
+        )
     numpy = np.float32 if dtype == torch.float32 else np.float64
     if kind == "repeated":
         naive = float(np.abs(naive_basis(s, u.numpy(), numpy) @ heights.numpy() - value.numpy()).max())
@@ -125,8 +128,10 @@ def test_derivatives_by_the_heights_are_the_transpose(p, kind, dtype):
     g = torch.Generator().manual_seed(p)
     heights = torch.rand(s.n, s.n, generator=g, dtype=torch.float64)
     by = torch.rand(2, len(u), generator=g, dtype=torch.float64).to(dtype)
-    for call in (lambda h: HeightField((s, s), (1.0, 1.0)).prepare(Sample(u, v, False, SHARE), dtype)(h.to(dtype)),
-                 lambda h: scattered_surface(FusedSurface((s, s), (1.0, 1.0)), h, u.numpy(), v.numpy())):
+    for call in (
+        lambda h: HeightField((s, s), (1.0, 1.0)).prepare(Sample(u, v, False, SHARE), dtype)(h.to(dtype)),
+        lambda h: scattered_surface(FusedSurface((s, s), (1.0, 1.0)), h, u.numpy(), v.numpy()),
+    ):
         leaf = heights.clone().requires_grad_()
         z, zx, _ = call(leaf)
         (pulled,) = torch.autograd.grad((z * by[0]).sum() + 1e-3 * (zx * by[1]).sum(), leaf)

@@ -31,8 +31,15 @@ def pictures() -> dict[str, np.ndarray]:
     far = np.ones((N, N))
     far[3, 3] = 1e12
     islands = (np.indices((N, N)).sum(0) % 5 == 0) * 1.0
-    return {"one pixel": one, "a corner": corner, "16 bits": ramp, "1e12 in one pixel": far, "islands": islands,
-            "denormal": islands * 1e-310, "huge": ramp * 1e290}
+    return {
+        "one pixel": one,
+        "a corner": corner,
+        "16 bits": ramp,
+        "1e12 in one pixel": far,
+        "islands": islands,
+        "denormal": islands * 1e-310,
+        "huge": ramp * 1e290,
+    }
 
 
 @pytest.mark.parametrize("name", pictures())
@@ -63,8 +70,9 @@ def test_loss_and_derivative(name, loss, kernels, dtype, compare):
 
 
 @pytest.mark.parametrize("name", pictures())
-@pytest.mark.parametrize("source", [PlaneWave(), Points(((0.0, 0.0, -50.0),)), Points(((0.0, 0.0, -1e6),))],
-                         ids=["plane", "point", "far point"])
+@pytest.mark.parametrize(
+    "source", [PlaneWave(), Points(((0.0, 0.0, -50.0),)), Points(((0.0, 0.0, -1e6),))], ids=["plane", "point", "far point"]
+)
 def test_transport_start(name, source):
     """The first surface of a design is finite, and throws more light where the picture is bright than a flat lens would."""
     picture = pictures()[name]
@@ -94,8 +102,12 @@ def test_designs_of_extreme_pictures_write_finite_files(tmp_path, monkeypatch, c
     done = 0
     for name in ("spot8.png", "range16.png", "tiny.npy"):
         for more in ("", "--optimizer adam --lr 0.1"):
-            code = cli.run(shlex.split(f"design {name} --resolution 16 --control 10 --rays 900 --iterations 4 --threads 1 --quiet"
-                                       f" --json --force {more}"))
+            code = cli.run(
+                shlex.split(
+                    f"design {name} --resolution 16 --control 10 --rays 900 --iterations 4 --threads 1 --quiet"
+                    f" --json --force {more}"
+                )
+            )
             out, err = capfd.readouterr()
             assert code == 0, err
             figures = json.loads(out)

@@ -40,8 +40,10 @@ def disc(x: np.ndarray, y: np.ndarray, radius: float, fine: int = 16) -> np.ndar
     """Part of each even cell about points x (n,) and y (m,) that lies within a circle: (n, m)."""
     dx, dy = x[1] - x[0], y[1] - y[0]
     part = np.clip((radius - np.hypot(*np.meshgrid(x, y, indexing="ij"))) / min(dx, dy) + 0.5, 0.0, 1.0)
-    i, j = np.nonzero((np.hypot(*np.meshgrid(x, y, indexing="ij")) > radius - dx - dy)
-                      & (np.hypot(*np.meshgrid(x, y, indexing="ij")) < radius + dx + dy))
+    i, j = np.nonzero(
+        (np.hypot(*np.meshgrid(x, y, indexing="ij")) > radius - dx - dy)
+        & (np.hypot(*np.meshgrid(x, y, indexing="ij")) < radius + dx + dy)
+    )
     a = (np.arange(fine) + 0.5) / fine - 0.5
     inside = (x[i][:, None, None] + dx * a[:, None]) ** 2 + (y[j][:, None, None] + dy * a[None, :]) ** 2 <= radius**2
     part[i, j] = inside.mean((1, 2))
@@ -65,12 +67,19 @@ class Given:
         self.half, self.screen, self.resolution, self.wavelength = half, screen, resolution, wavelength
         pixel = tuple(2.0 * s / n for s, n in zip(screen, resolution, strict=True))
         watched = watched or screen
-        self.sampling = s = Sampling.of((tuple(-h for h in half), tuple(half)), (tuple(-w for w in watched), tuple(watched)), pixel,
-                                        distance, (wavelength,), finer)
+        self.sampling = s = Sampling.of(
+            (tuple(-h for h in half), tuple(half)),
+            (tuple(-w for w in watched), tuple(watched)),
+            pixel,
+            distance,
+            (wavelength,),
+            finer,
+        )
         self.x, self.y = (s.low[k] + s.step[k] * (np.arange(s.count[k]) + 0.5) for k in (0, 1))
         first, spacing = s.first(wavelength), s.spacing(wavelength)
-        self.masks = [cells(-screen[k], pixel[k], resolution[k], first[k], spacing[k], s.padded[k], torch.device("cpu"))
-                      for k in (0, 1)]
+        self.masks = [
+            cells(-screen[k], pixel[k], resolution[k], first[k], spacing[k], s.padded[k], torch.device("cpu")) for k in (0, 1)
+        ]
         #: Area of a cell over that of a pixel: by it power of unit incident irradiance becomes irradiance.
         self.scale = 1.0 / (pixel[0] * pixel[1])
 

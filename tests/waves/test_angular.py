@@ -18,10 +18,22 @@ INDEX = 1.5
 
 #: Lens, screen, throw, pixels, steps of the grid, all mm, and the relief.
 CASES = {
-    "structured": ((1.0, 1.0), (2.6, 2.6), 20.0, (52, 52), (3.4e-3, 3.4e-3),
-                   lambda x, y: (x * x + y * y) / 20.0 + 6e-4 * torch.cos(14.0 * x + 3.0 * y) * torch.sin(11.0 * y - 4.0 * x)),
-    "steep": ((0.6, 0.6), (3.6, 2.0), 8.0, (30, 20), (1.1e-3, 2.5e-3),
-              lambda x, y: 0.2 * x * x + 0.1 * y * y + 5e-3 * torch.cos(14.0 * x + 2.0 * y) + 2e-3 * torch.sin(9.0 * y + 3.0 * x)),
+    "structured": (
+        (1.0, 1.0),
+        (2.6, 2.6),
+        20.0,
+        (52, 52),
+        (3.4e-3, 3.4e-3),
+        lambda x, y: (x * x + y * y) / 20.0 + 6e-4 * torch.cos(14.0 * x + 3.0 * y) * torch.sin(11.0 * y - 4.0 * x),
+    ),
+    "steep": (
+        (0.6, 0.6),
+        (3.6, 2.0),
+        8.0,
+        (30, 20),
+        (1.1e-3, 2.5e-3),
+        lambda x, y: 0.2 * x * x + 0.1 * y * y + 5e-3 * torch.cos(14.0 * x + 2.0 * y) + 2e-3 * torch.sin(9.0 * y + 3.0 * x),
+    ),
 }
 
 
@@ -30,8 +42,12 @@ def test_against_the_angular_spectrum(name):
     """Relative RMS at most 0.01 over all pixels, sampled as an image is."""
     size, wide, throw, count, steps, shape = CASES[name]
     screen = Screen(wide, 0.3 + throw, count)
-    scene = Scene(PlaneWave(), Lens(size, control=(24, 16), index=INDEX, fresnel="none", offset=Offset(0.3)), screen,
-                  Light(wavelengths=(GREEN,)))
+    scene = Scene(
+        PlaneWave(),
+        Lens(size, control=(24, 16), index=INDEX, fresnel="none", offset=Offset(0.3)),
+        screen,
+        Light(wavelengths=(GREEN,)),
+    )
     field = HeightField.of(scene.lens)
     heights = 0.3 + spline_of(field, shape)
     found = wave_image(scene, field, heights).image.numpy()

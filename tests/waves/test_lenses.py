@@ -34,8 +34,12 @@ def spline_of(field: HeightField, function) -> torch.Tensor:
 
 
 def scene_of(size, screen: Screen, source=None, control=(6, 6), aperture="rectangle", light=None, **options) -> Scene:
-    lens = Lens((size, size) if isinstance(size, float) else size, control=control, aperture=aperture,
-                **({"fresnel": "none", "index": 1.5, "offset": Offset(2.0)} | options))
+    lens = Lens(
+        (size, size) if isinstance(size, float) else size,
+        control=control,
+        aperture=aperture,
+        **({"fresnel": "none", "index": 1.5, "offset": Offset(2.0)} | options),
+    )
     return Scene(source or PlaneWave(), lens, screen, light or Light(wavelengths=(GREEN,)))
 
 
@@ -50,13 +54,16 @@ def irradiance(found, screen: Screen, area: float) -> np.ndarray:
 
 
 def squares(screen: Screen, half, distance: float) -> np.ndarray:
-    one = [mean_over(lambda x, h=h: slit(x, h, LAMBDA, distance), c - s, c + s, n, 8)
-           for h, s, n, c in zip(half, screen.half_size, screen.resolution, screen.shift, strict=True)]
+    one = [
+        mean_over(lambda x, h=h: slit(x, h, LAMBDA, distance), c - s, c + s, n, 8)
+        for h, s, n, c in zip(half, screen.half_size, screen.resolution, screen.shift, strict=True)
+    ]
     return one[0][:, None] * one[1][None, :]
 
 
 def airy(screen: Screen, a: float, cone: float, wavelength: float) -> np.ndarray:
     """Airy's pattern of light that converges at the sine `cone` from a circle of radius a, in parts of the incident density."""
+
     def pattern(rho):
         x = np.maximum(2.0 * math.pi * cone / wavelength * rho, 1e-9)
         return (math.pi * a * cone / wavelength) ** 2 * (2.0 * j1(x) / x) ** 2
@@ -102,14 +109,18 @@ def test_airy_pattern_at_a_focus(kind):
     stop = Aperture((a, a), round=True)
     if kind == "biconvex":
         r1, r2 = 50.0, -50.0
-        elements = (Element("front", Sphere(r1), stop, behind=glass, fresnel="none"),
-                    Element("back", Sphere(r2), free, pose=Pose((0, 0, t)), fresnel="none"))
+        elements = (
+            Element("front", Sphere(r1), stop, behind=glass, fresnel="none"),
+            Element("back", Sphere(r2), free, pose=Pose((0, 0, t)), fresnel="none"),
+        )
     else:
         r1, r2 = math.inf, -25.0
         spline = HeightField((SplineSpace.uniform(8, 4),) * 2, (3.0, 3.0))
         back = Sphere(r2) if kind == "plano-convex" else spline
-        elements = (Element("front", Plane(), stop, behind=glass, fresnel="none"),
-                    Element("back", back, free, pose=Pose((0, 0, t)), fresnel="none"))
+        elements = (
+            Element("front", Plane(), stop, behind=glass, fresnel="none"),
+            Element("back", back, free, pose=Pose((0, 0, t)), fresnel="none"),
+        )
     heights = {} if kind != "spline" else {"back": spline_of(spline, lambda x, y: (x * x + y * y) / (2.0 * r2))}
     power = (n - 1) * (1 / r1 - 1 / r2 + (n - 1) * t / (n * r1 * r2))
     focus = t + (1 - (n - 1) * t / (n * r1)) / power
@@ -150,8 +161,9 @@ def test_mirror_and_lens():
     for mirror in (True, False):
         z = -f if mirror else f + 2.0
         screen = Screen((18 * width, 11 * width), z, (54, 33))
-        scene = scene_of(size, screen, mirror=mirror, index=2.0, offset=Offset(0.0 if mirror else 2.0),
-                         **({"z_in": -100.0} if mirror else {}))
+        scene = scene_of(
+            size, screen, mirror=mirror, index=2.0, offset=Offset(0.0 if mirror else 2.0), **({"z_in": -100.0} if mirror else {})
+        )
         field = HeightField.of(scene.lens)
         r = 2.0 * f if mirror else f
         heights = spline_of(field, lambda x, y, r=r, m=mirror: (0.0 if m else 2.0) - ((x - 0.1) ** 2 + y * y) / (2.0 * r))
@@ -173,8 +185,11 @@ def test_dispersion_changes_the_focus():
     heights = spline_of(field, lambda x, y: 2.0 - (x * x + y * y) / (2.0 * r))
     focus = {line.wavelength: 2.0 + r / (line.system.media()[1].index - 1.0) for line in lines_of(scene, field)}
     assert focus[650.0] - focus[450.0] > 1.0
-    peaks = {(a, b): float(wave_image(scene, field, heights, wavelengths=(a,), screen=replace(screen, z=focus[b])).image.max())
-             for a in lights for b in lights}
+    peaks = {
+        (a, b): float(wave_image(scene, field, heights, wavelengths=(a,), screen=replace(screen, z=focus[b])).image.max())
+        for a in lights
+        for b in lights
+    }
     assert peaks[450.0, 450.0] > 1.7 * peaks[450.0, 650.0]
     assert peaks[650.0, 650.0] > 1.7 * peaks[650.0, 450.0]
     both = wave_image(scene, field, heights, screen=replace(screen, z=focus[450.0]))
@@ -184,8 +199,10 @@ def test_dispersion_changes_the_focus():
 def test_sources_of_a_system_are_watched_where_their_light_goes():
     """Two points so far apart that light of either misses the other's half of the screen: the sum of the two alone."""
     field = HeightField((SplineSpace.uniform(6, 3),) * 2, (1.0, 1.0))
-    elements = (Element("front", Plane(), Aperture((0.5, 0.5)), behind=Medium(1.5)),
-                Element("back", field, Aperture((1.5, 1.5)), pose=Pose((0, 0, 0.5))))
+    elements = (
+        Element("front", Plane(), Aperture((0.5, 0.5)), behind=Medium(1.5)),
+        Element("back", field, Aperture((1.5, 1.5)), pose=Pose((0, 0, 0.5))),
+    )
     screen = Screen((6.0, 2.0), 30.0, (60, 20))
     heights = {"back": spline_of(field, lambda x, y: -(x * x + y * y) / 40.0)}
     points = [Points(((x, 0.0, -30.0),), (power,)) for x, power in ((2.0, 1.0), (-2.0, 3.0))]
@@ -226,8 +243,11 @@ def taylor(lines, heights: dict, screen, seed: int = 1, steps=(3.2e-5, 1.6e-5, 8
     return [*orders, left[-1] / abs(steps[-1] * slope)]
 
 
-SOURCES = {"plane": PlaneWave(), "point": Points(((0.1, -0.2, -20.0),)),
-           "lambertian": Points(((0.2, 0.1, -12.0),), cone=50.0, intensity="lambertian")}
+SOURCES = {
+    "plane": PlaneWave(),
+    "point": Points(((0.1, -0.2, -20.0),)),
+    "lambertian": Points(((0.2, 0.1, -12.0),), cone=50.0, intensity="lambertian"),
+}
 
 
 @pytest.mark.parametrize("source", SOURCES)
@@ -235,8 +255,10 @@ SOURCES = {"plane": PlaneWave(), "point": Points(((0.1, -0.2, -20.0),)),
 def test_taylor_of_a_lens(source, losses):
     """What is left falls with the square of the step, of power and path that change as feet move."""
     field = HeightField((SplineSpace.uniform(6, 3),) * 2, (1.5, 1.5))
-    elements = (Element("front", Plane(), Aperture((0.2, 0.2)), behind=Medium(1.5), fresnel=losses),
-                Element("back", field, Aperture((1.5, 1.5)), fresnel=losses, pose=Pose((0, 0, 0.5))))
+    elements = (
+        Element("front", Plane(), Aperture((0.2, 0.2)), behind=Medium(1.5), fresnel=losses),
+        Element("back", field, Aperture((1.5, 1.5)), fresnel=losses, pose=Pose((0, 0, 0.5))),
+    )
     screen = Screen((3.5, 3.0), 30.0, (12, 12))
     system = System((SOURCES[source],), elements, (screen,), Light(wavelengths=(GREEN,)))
     heights = spline_of(field, lambda x, y: (x * x + y * y) / 90.0 + 2e-3 * torch.cos(2.0 * x) * torch.sin(1.5 * y))
@@ -248,13 +270,18 @@ def test_taylor_of_a_lens(source, losses):
 def test_taylor_of_several_surfaces():
     """Both sides of a lens and a mirror behind it, by all heights at once."""
     field = HeightField((SplineSpace.uniform(5, 3),) * 2, (1.5, 1.5))
-    elements = (Element("front", field, Aperture((0.5, 0.5)), behind=Medium(1.5)),
-                Element("back", field, Aperture((1.5, 1.5)), pose=Pose((0, 0, 2.0))),
-                Element("fold", field, Aperture((1.5, 1.5)), "reflect", pose=Pose((0, 0, 12.0))))
+    elements = (
+        Element("front", field, Aperture((0.5, 0.5)), behind=Medium(1.5)),
+        Element("back", field, Aperture((1.5, 1.5)), pose=Pose((0, 0, 2.0))),
+        Element("fold", field, Aperture((1.5, 1.5)), "reflect", pose=Pose((0, 0, 12.0))),
+    )
     screen = Screen((1.5, 1.5), -25.0, (12, 12))
     system = System((PlaneWave(),), elements, (screen,), Light(wavelengths=(GREEN,)))
-    heights = {name: spline_of(field, lambda x, y, k=k: 0.05 + (x * x - 0.5 * y * y) / (90.0 + 40.0 * k)
-                               + 3e-4 * torch.cos(2.0 * x + k * y))
-               for k, name in enumerate(("front", "back", "fold"))}
+    heights = {
+        name: spline_of(
+            field, lambda x, y, k=k: 0.05 + (x * x - 0.5 * y * y) / (90.0 + 40.0 * k) + 3e-4 * torch.cos(2.0 * x + k * y)
+        )
+        for k, name in enumerate(("front", "back", "fold"))
+    }
     *orders, rest = taylor(lines_of_system(system), heights, screen)
     assert all(o > 1.5 for o in orders) and rest < 3e-3, (orders, rest)

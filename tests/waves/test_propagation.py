@@ -35,8 +35,9 @@ def test_slit_near(half, distance):
 def test_rectangle_near():
     """Sharp along both axes, sampled as an image is: 2e-2."""
     half, distance, screen, count = (0.8, 0.5), 60.0, (1.0, 0.7), (60, 44)
-    exact = [mean_over(lambda x, h=h: slit(x, h, LAMBDA, distance), -s, s, n, 8)
-             for h, s, n in zip(half, screen, count, strict=True)]
+    exact = [
+        mean_over(lambda x, h=h: slit(x, h, LAMBDA, distance), -s, s, n, 8) for h, s, n in zip(half, screen, count, strict=True)
+    ]
     found = Given(half, screen, count, distance, LAMBDA).power(FLAT, ONE)
     assert np.abs(found - exact[0][:, None] * exact[1][None, :]).max() < 2e-2
 
@@ -47,8 +48,10 @@ def test_rectangle_far():
     screen, count = (30.0, 20.0), (32, 32)
     given = Given(half, screen, count, distance, LAMBDA)
     peak = (4.0 * half[0] * half[1] / (LAMBDA * distance)) ** 2
-    one = [mean_over(lambda x, h=h: np.sinc(2.0 * h * x / (LAMBDA * distance)) ** 2, -s, s, n, 4)
-           for h, s, n in zip(half, screen, count, strict=True)]
+    one = [
+        mean_over(lambda x, h=h: np.sinc(2.0 * h * x / (LAMBDA * distance)) ** 2, -s, s, n, 4)
+        for h, s, n in zip(half, screen, count, strict=True)
+    ]
     # At the Fresnel number h^2 / lambda L = 0.006 the closed form itself is right to its square.
     assert np.abs(given.power(FLAT, ONE) - peak * one[0][:, None] * one[1][None, :]).max() < 1e-3 * peak
 
@@ -113,12 +116,12 @@ def test_cylindrical_lens_at_its_focus(pixel):
     width = LAMBDA * distance / (2.0 * half[0])
     screen = 0.5 * pixel * width * count
     given = Given(half, (screen, 0.2), (count, 8), distance, LAMBDA)
-    found = given.power(-given.x[:, None] ** 2 / (2.0 * distance), ONE)
+    found = given.power(-(given.x[:, None] ** 2) / (2.0 * distance), ONE)
     exact = mean_over(lambda x: np.sinc(x / width) ** 2, -screen, screen, count, 16) * 2.0 * half[0] / width
     along = mean_over(lambda y: slit(y, half[1], LAMBDA, distance), -0.2, 0.2, 8, 8)
     assert np.abs(found.sum(1) - exact * along.sum()).max() < 5e-3 * along.sum() * 2.0 * half[0] / width
     tight = Given(half, (screen, 0.2), (count, 8), distance, LAMBDA, finer=2.0)
-    found = tight.power(-tight.x[:, None] ** 2 / (2.0 * distance), ONE)
+    found = tight.power(-(tight.x[:, None] ** 2) / (2.0 * distance), ONE)
     assert np.abs(found.sum(1) - exact * along.sum()).max() < 1e-3 * along.sum() * 2.0 * half[0] / width
 
 
@@ -196,8 +199,10 @@ def test_energy_of_the_transform(dtype, tolerance):
     phase, amplitude = random_field(given, 1, dtype)
     s = given.sampling
     first, spacing = s.first(LAMBDA), s.spacing(LAMBDA)
-    whole = [cells(first[k] - spacing[k], spacing[k] * (n + 1) / 7, 7, first[k], spacing[k], n, torch.device("cpu")).to(dtype)
-             for k, n in enumerate(s.padded)]
+    whole = [
+        cells(first[k] - spacing[k], spacing[k] * (n + 1) / 7, 7, first[k], spacing[k], n, torch.device("cpu")).to(dtype)
+        for k, n in enumerate(s.padded)
+    ]
     for mask in whole:
         assert float(mask.sum(0).min()) == pytest.approx(1.0, abs=1e-5)
     found = power_on_pixels(phase, amplitude, s.padded, *whole)
@@ -259,8 +264,9 @@ def test_gradcheck():
     torch.manual_seed(1)
     phase, amplitude = torch.rand(5, 4, dtype=torch.float64) * 6.0, 0.3 + torch.rand(5, 4, dtype=torch.float64)
     rows, columns = torch.rand(3, 8, dtype=torch.float64), torch.rand(2, 6, dtype=torch.float64)
-    assert torch.autograd.gradcheck(lambda p, a: power_on_pixels(p, a, (8, 6), rows, columns),
-                                    (phase.requires_grad_(), amplitude.requires_grad_()))
+    assert torch.autograd.gradcheck(
+        lambda p, a: power_on_pixels(p, a, (8, 6), rows, columns), (phase.requires_grad_(), amplitude.requires_grad_())
+    )
 
 
 def loss_of(given: Given, phase, amplitude):

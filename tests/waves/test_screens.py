@@ -29,8 +29,10 @@ def wavy(scene, bump: float = 1e-3, spread: float = 60.0):
     """A gentle relief on a surface that spreads light."""
     field = HeightField.of(scene.lens)
     rx = scene.lens.half_size[0]
-    return field, spline_of(field, lambda x, y: 2.0 + (x * x + y * y) / (2.0 * spread)
-                            + bump * torch.cos(4.0 * x / rx + y / rx) * torch.sin(3.0 * y / rx))
+    return field, spline_of(
+        field,
+        lambda x, y: 2.0 + (x * x + y * y) / (2.0 * spread) + bump * torch.cos(4.0 * x / rx + y / rx) * torch.sin(3.0 * y / rx),
+    )
 
 
 def apart(a: np.ndarray, b: np.ndarray) -> float:
@@ -97,8 +99,9 @@ def test_a_screen_aside_is_a_part_of_the_whole():
     scene = scene_of(1.0, screen)
     field, heights = wavy(scene)
     whole = wave_image(scene, field, heights, finer=2.0).image.numpy()
-    part = wave_image(scene, field, heights, finer=2.0, screen=replace(screen, size=(0.8, 0.6), resolution=(16, 12),
-                                                                     shift=(0.5, -0.35))).image.numpy()
+    part = wave_image(
+        scene, field, heights, finer=2.0, screen=replace(screen, size=(0.8, 0.6), resolution=(16, 12), shift=(0.5, -0.35))
+    ).image.numpy()
     assert np.abs(part - whole[26:42, 11:23]).max() < 0.02 * whole.max()
 
 
@@ -133,8 +136,11 @@ def by_points(scene, field, heights, each: int):
 def test_spread_is_many_points(kind):
     """A convolution in place of a sum over points: 6 % relative RMS, of which 30 points leave about 4; its stated misplacement
     is below a quarter of a pixel."""
-    source = {"sun": Disc(angle=0.53), "disc": Disc((0.1, -0.1, -400.0), (3.0, 2.0)),
-              "grid": Points.grid((0.0, 0.0, -400.0), (3.0, 2.0), (4, 3))}[kind]
+    source = {
+        "sun": Disc(angle=0.53),
+        "disc": Disc((0.1, -0.1, -400.0), (3.0, 2.0)),
+        "grid": Points.grid((0.0, 0.0, -400.0), (3.0, 2.0), (4, 3)),
+    }[kind]
     screen = Screen((2.0, 2.0), 42.0, (20, 20))
     scene = scene_of(1.0, screen, source)
     field, heights = wavy(scene)
@@ -199,9 +205,13 @@ def test_spread_on_a_tilted_screen():
 # Energy
 
 
-SOURCES = {"plane": PlaneWave(), "profile": PlaneWave(1.0, np.array([[1.0, 2.0, 0.5], [0.2, 1.0, 3.0]])),
-           "uniform": Points(((0.2, -0.1, -9.0),)), "lambertian": Points(((0.2, 0.1, -5.0),), cone=60.0, intensity="lambertian"),
-           "narrow": Points(((0.0, 0.0, -10.0),), cone=2.0)}
+SOURCES = {
+    "plane": PlaneWave(),
+    "profile": PlaneWave(1.0, np.array([[1.0, 2.0, 0.5], [0.2, 1.0, 3.0]])),
+    "uniform": Points(((0.2, -0.1, -9.0),)),
+    "lambertian": Points(((0.2, 0.1, -5.0),), cone=60.0, intensity="lambertian"),
+    "narrow": Points(((0.0, 0.0, -10.0),), cone=2.0),
+}
 
 
 @pytest.mark.parametrize("aperture", ["rectangle", "circle"])
@@ -214,8 +224,9 @@ def test_leaving_is_what_rays_leave_with(source, aperture):
     found = wave_image(scene, field, heights)
     rays = expose(scene, field, heights, rays_of(scene, "stratified", 200_000))
     # Cells of the light that a step of a profile cuts are one or the other.
-    assert found.leaving == pytest.approx(rays.leaving, abs=1e-4 if source in ("plane", "profile") else 5e-4,
-                                          rel=2e-3 if source == "profile" else 1e-3)
+    assert found.leaving == pytest.approx(
+        rays.leaving, abs=1e-4 if source in ("plane", "profile") else 5e-4, rel=2e-3 if source == "profile" else 1e-3
+    )
     assert float(found.image.sum()) + found.off_screen == pytest.approx(found.leaving, abs=1e-12)
     on = float(rays.image.sum())
     assert float(found.image.sum()) == pytest.approx(on, abs=(0.02 if source == "narrow" else 0.01) * max(on, found.leaving * 0.1))
@@ -264,8 +275,15 @@ def test_focus_before_the_screen():
     assert float(found.image.sum()) == pytest.approx(1.0, abs=0.01)
 
 
-@pytest.mark.parametrize(("size", "wide", "pixels"), [((1.0, 1.0), (1.0, 1.0), (2, 2)), ((4.0, 0.1), (5.0, 0.5), (50, 3)),
-                                                      ((0.5, 0.5), (4.0, 0.05), (64, 2)), ((1e-2, 2.0), (8.0, 2.5), (40, 12))])
+@pytest.mark.parametrize(
+    ("size", "wide", "pixels"),
+    [
+        ((1.0, 1.0), (1.0, 1.0), (2, 2)),
+        ((4.0, 0.1), (5.0, 0.5), (50, 3)),
+        ((0.5, 0.5), (4.0, 0.05), (64, 2)),
+        ((1e-2, 2.0), (8.0, 2.5), (40, 12)),
+    ],
+)
 def test_odd_shapes(size, wide, pixels):
     """Few pixels, slender lenses and screens: finite, not negative, no more than there is."""
     screen = Screen(wide, 42.0, pixels)

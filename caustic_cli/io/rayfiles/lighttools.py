@@ -27,10 +27,27 @@ from caustic_cli.scene.sources.rayset import RaySet
 BEGIN, END = b"lt_startofdata", b"lt_endofdata"
 #: Bytes within which the rays must begin.
 HEADER = 1 << 16
-MILLIMETRES = {"millimeters": 1.0, "mm": 1.0, "centimeters": 10.0, "cm": 10.0, "meters": 1000.0, "m": 1000.0,
-               "micrometers": 1e-3, "microns": 1e-3, "um": 1e-3, "inches": 25.4, "in": 25.4, "feet": 304.8, "ft": 304.8}
-FLUXES = {"radiant_power": ("W", "radiant_flux"), "radiant_flux": ("W", "radiant_flux"),
-          "luminous_flux": ("lm", "luminous_flux"), "luminous_power": ("lm", "luminous_flux")}
+MILLIMETRES = {
+    "millimeters": 1.0,
+    "mm": 1.0,
+    "centimeters": 10.0,
+    "cm": 10.0,
+    "meters": 1000.0,
+    "m": 1000.0,
+    "micrometers": 1e-3,
+    "microns": 1e-3,
+    "um": 1e-3,
+    "inches": 25.4,
+    "in": 25.4,
+    "feet": 304.8,
+    "ft": 304.8,
+}
+FLUXES = {
+    "radiant_power": ("W", "radiant_flux"),
+    "radiant_flux": ("W", "radiant_flux"),
+    "luminous_flux": ("lm", "luminous_flux"),
+    "luminous_power": ("lm", "luminous_flux"),
+}
 #: Most columns of a ray: position, direction, flux, wavelength and Stokes parameters, and as many again.
 MOST_COLUMNS = 24
 
@@ -72,8 +89,14 @@ def parse(data: bytes) -> RaySet:
     table = _rows(data, first, stop, least) if first else np.zeros((0, least))
     unit_of_flux, key = FLUXES[kind]
     totals = _numbers(said.get(f"{key}", "0"), f"lt_{key}")
-    return RaySet(MILLIMETRES[unit] * table[:, 0:3], table[:, 3:6], table[:, 6], totals[0], unit_of_flux,
-                  table[:, 7] if colored == "wavelength" else None)
+    return RaySet(
+        MILLIMETRES[unit] * table[:, 0:3],
+        table[:, 3:6],
+        table[:, 6],
+        totals[0],
+        unit_of_flux,
+        table[:, 7] if colored == "wavelength" else None,
+    )
 
 
 def _header(data: bytes) -> dict[str, str]:

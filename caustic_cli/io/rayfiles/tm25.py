@@ -52,16 +52,21 @@ def parse(data: bytes) -> RaySet:
     version, _, lumens, watts, rays = struct.unpack_from("<iiffQ", data, 4)
     if version not in VERSIONS:
         swapped = struct.unpack_from(">i", data, 4)[0] in VERSIONS
-        raise InputError("has its bytes in big-endian order; TM-25 is little-endian" if swapped else
-                         f"is TM-25 of version {version}; 2013 and 2020 are read")
+        raise InputError(
+            "has its bytes in big-endian order; TM-25 is little-endian"
+            if swapped
+            else f"is TM-25 of version {version}; 2013 and 2020 are read"
+        )
     spectrum, single = struct.unpack_from("<if", data, 60)
     tables, more, text = struct.unpack_from("<iii", data, 76)
     flags = struct.unpack_from("<8i", data, 256)
     if not 0 <= spectrum <= 4:
         raise InputError(f"has a spectral data identifier of {spectrum}; TM-25 knows 0 to 4")
     if min(tables, more, text) < 0 or tables > MOST_TABLES:
-        raise InputError(f"counts {tables} spectral tables, {more} additional columns and {text} bytes of text; none may be"
-                         f" negative, and tables at most {MOST_TABLES:,}")
+        raise InputError(
+            f"counts {tables} spectral tables, {more} additional columns and {text} bytes of text; none may be"
+            f" negative, and tables at most {MOST_TABLES:,}"
+        )
     for name, flag in zip(FLAGS, flags, strict=True):
         if flag not in (0, 1):
             raise InputError(f"has a {name} flag of {flag}; 0 or 1 is needed")

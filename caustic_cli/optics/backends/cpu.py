@@ -41,8 +41,9 @@ class Numba(Torch):
         """float64."""
         return torch.float64
 
-    def scatter(self, seed: int, start: int, stop: int, shape: tuple[int, int], stratified: bool,
-                device: torch.device | str) -> list[Tensor]:
+    def scatter(
+        self, seed: int, start: int, stop: int, shape: tuple[int, int], stratified: bool, device: torch.device | str
+    ) -> list[Tensor]:
         """As the reference."""
         return list(functions.scattered_points([key(seed, d) for d in (0, 1)], [salt(0), salt(1)], start, stop, *shape, stratified))
 
@@ -80,8 +81,9 @@ class Numba(Torch):
 
         return meet
 
-    def find(self, field, heights: Tensor, origin, direction, method: intersection.Method,
-             radius: float | None) -> tuple[Tensor, Tensor]:
+    def find(
+        self, field, heights: Tensor, origin, direction, method: intersection.Method, radius: float | None
+    ) -> tuple[Tensor, Tensor]:
         """As the reference."""
         start, found = by_mesh(field, heights, origin, direction, method, radius)
         if found is not None:
@@ -104,15 +106,18 @@ class Numba(Torch):
         """As the reference."""
         if not len(origin[0]):
             return super().next_meetings(field, heights, origin, direction, below, round, step)
-        return next_meetings(FusedSurface(field.spaces, field.half_size), heights, origin, direction, below, round, step, HALVINGS,
-                             MOST_STEPS)
+        return next_meetings(
+            FusedSurface(field.spaces, field.half_size), heights, origin, direction, below, round, step, HALVINGS, MOST_STEPS
+        )
 
-    def interact(self, direction, slopes, power: Tensor, *, eta: float, reflects: bool, fresnel: str, polarised=None,
-                 side: float = 1.0) -> Departure:
+    def interact(
+        self, direction, slopes, power: Tensor, *, eta: float, reflects: bool, fresnel: str, polarised=None, side: float = 1.0
+    ) -> Departure:
         """As the reference, which does constant slopes itself; the kernel tells the side by the sign of d . N."""
         if not isinstance(slopes[0], Tensor):
-            return super().interact(direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, polarised=polarised,
-                                    side=side)
+            return super().interact(
+                direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, polarised=polarised, side=side
+            )
         direction, polarised = _components(direction), None if polarised is None else _components(polarised)
         return Departure(*interact(direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, field=polarised))
 
@@ -144,8 +149,9 @@ class PlaneImage:
     def __init__(self, field, rays: RayState, eta: float, fresnel: str, like: PlaneImage | None):
         s = rays.sample
         self.interface = eta, fresnel
-        self.kernel = functions.PlaneKernel(field.spaces, field.half_size, s.u, s.v, s.tensor, rays.power,
-                                            like.kernel if isinstance(like, PlaneImage) else None)
+        self.kernel = functions.PlaneKernel(
+            field.spaces, field.half_size, s.u, s.v, s.tensor, rays.power, like.kernel if isinstance(like, PlaneImage) else None
+        )
 
     def __call__(self, heights: Tensor, screen: Screen, filter: Filter) -> tuple[Tensor, Tensor, dict]:
         """Image, power that leaves the surface, and what was lost there."""
@@ -159,8 +165,15 @@ class RayImage:
     def __init__(self, field, rays: RayState, eta: float, fresnel: str, radius: float | None, like: RayImage | None):
         self.interface = eta, fresnel
         x, y, *direction = (c.contiguous() for c in rays.full((*rays.origin[:2], *rays.direction)))
-        self.kernel = functions.RayKernel(field.spaces, field.half_size, (x, y, rays.origin[2] + rays.datum), direction, rays.power,
-                                          radius, like.kernel if isinstance(like, RayImage) else None)
+        self.kernel = functions.RayKernel(
+            field.spaces,
+            field.half_size,
+            (x, y, rays.origin[2] + rays.datum),
+            direction,
+            rays.power,
+            radius,
+            like.kernel if isinstance(like, RayImage) else None,
+        )
 
     def __call__(self, heights: Tensor, screen: Screen, filter: Filter) -> tuple[Tensor, Tensor, dict]:
         """Image, power that leaves the surface, and what was lost there."""

@@ -27,8 +27,9 @@ class Torch:
         """The precision in which rays asked for in `dtype` are traced."""
         return dtype
 
-    def scatter(self, seed: int, start: int, stop: int, shape: tuple[int, int], stratified: bool,
-                device: torch.device | str) -> list[Tensor]:
+    def scatter(
+        self, seed: int, start: int, stop: int, shape: tuple[int, int], stratified: bool, device: torch.device | str
+    ) -> list[Tensor]:
         """Random points u, v of the unit square for rays start..stop, `stratified` in cells: see `sampling`."""
         return spread(seed, start, stop, shape, stratified, device)
 
@@ -53,8 +54,9 @@ class Torch:
         """A function of heights (n, m) mm: `SurfaceIntersection`s from below of rays that do not depend on them."""
         return lambda heights: intersection.meet_any(field, heights, origin, direction, 1.0)
 
-    def find(self, field, heights: Tensor, origin, direction, method: intersection.Method,
-             radius: float | None) -> tuple[Tensor, Tensor]:
+    def find(
+        self, field, heights: Tensor, origin, direction, method: intersection.Method, radius: float | None
+    ) -> tuple[Tensor, Tensor]:
         """`intersection.find`."""
         start, found = by_mesh(field, heights, origin, direction, method, radius)
         if found is not None:
@@ -71,8 +73,9 @@ class Torch:
         """Distances (N,) mm to the next intersection of rays that start on a B-spline, 0 for none: see `reintersection.again`."""
         return reintersection.reference(field, heights, origin, direction, below, round, step)
 
-    def interact(self, direction, slopes, power: Tensor, *, eta: float, reflects: bool, fresnel: str, polarised=None,
-                 side: float = 1.0) -> Departure:
+    def interact(
+        self, direction, slopes, power: Tensor, *, eta: float, reflects: bool, fresnel: str, polarised=None, side: float = 1.0
+    ) -> Departure:
         """What a surface does to rays: `interface.interact`."""
         return interact(direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, polarised=polarised, side=side)
 

@@ -21,8 +21,21 @@ from caustic_cli.optics.effects.source_size import SourceSize
 from caustic_cli.optics.effects.total_reflection import TotalReflection
 
 EFFECTS: tuple[Effect, ...] = (
-    SourceSize(), Polarisation(), Dispersion(), Entrance(), Intersection(), MissedSurface(), Absorption(), Roughness(), Fresnel(),
-    TotalReflection(), Mirror(), SecondaryIntersection(), Ghosts(), ScreenTilt(), ScreenShift(),
+    SourceSize(),
+    Polarisation(),
+    Dispersion(),
+    Entrance(),
+    Intersection(),
+    MissedSurface(),
+    Absorption(),
+    Roughness(),
+    Fresnel(),
+    TotalReflection(),
+    Mirror(),
+    SecondaryIntersection(),
+    Ghosts(),
+    ScreenTilt(),
+    ScreenShift(),
     Diffraction(),
 )
 

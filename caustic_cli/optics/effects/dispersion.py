@@ -23,11 +23,18 @@ class Dispersion(Effect):
         """On where several wavelengths meet a glass."""
         if scene.dispersive:
             indices = [band.scene.lens.index for band in scene.bands]
-            why = (f"{len(scene.light.wavelengths)} wavelengths in {scene.lens.glass}, whose index goes from {min(indices):.5f} to"
-                   f" {max(indices):.5f}")
+            why = (
+                f"{len(scene.light.wavelengths)} wavelengths in {scene.lens.glass}, whose index goes from {min(indices):.5f} to"
+                f" {max(indices):.5f}"
+            )
             return Decision(self.name, True, why, max(indices) - min(indices), 0.0)
-        why = "one wavelength" if not scene.light.wavelengths else "a mirror treats all wavelengths alike" if scene.lens.mirror \
+        why = (
+            "one wavelength"
+            if not scene.light.wavelengths
+            else "a mirror treats all wavelengths alike"
+            if scene.lens.mirror
             else "the lens has one index for all wavelengths"
+        )
         return Decision(self.name, False, why, 0.0, 0.0, present=False)
 
     def without(self, scene: Scene) -> Scene:

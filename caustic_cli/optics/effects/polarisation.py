@@ -31,8 +31,14 @@ class Polarisation(Effect):
         if b.incidence == 0:
             return Decision(self.name, False, "unpolarised light, which normal incidence leaves so", 0.0, NEGLIGIBLE)
         some = b.polarised > NEGLIGIBLE
-        return Decision(self.name, some, "unpolarised light; what the entrance polarises changes what the exit reflects by"
-                       f" {'up to' if some else 'at most'} {b.polarised:.1e}", b.polarised, NEGLIGIBLE)
+        return Decision(
+            self.name,
+            some,
+            "unpolarised light; what the entrance polarises changes what the exit reflects by"
+            f" {'up to' if some else 'at most'} {b.polarised:.1e}",
+            b.polarised,
+            NEGLIGIBLE,
+        )
 
     def without(self, scene: Scene) -> Scene:
         """Unpolarised light."""

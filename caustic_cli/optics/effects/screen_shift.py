@@ -22,8 +22,14 @@ class ScreenShift(Effect):
     def judge(self, scene: Scene, bounds) -> Decision:
         """By the distances."""
         (a, b), some = scene.screen.shift, any(scene.screen.shift)
-        return Decision(self.name, some, f"the screen is shifted by {a:g} and {b:g} mm" if some else "the screen is on the axis",
-                       max(abs(a), abs(b)), 0.0, present=some)
+        return Decision(
+            self.name,
+            some,
+            f"the screen is shifted by {a:g} and {b:g} mm" if some else "the screen is on the axis",
+            max(abs(a), abs(b)),
+            0.0,
+            present=some,
+        )
 
     def without(self, scene: Scene) -> Scene:
         """On the axis."""

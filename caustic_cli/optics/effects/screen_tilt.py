@@ -21,8 +21,14 @@ class ScreenTilt(Effect):
     def judge(self, scene: Scene, bounds) -> Decision:
         """By the angles."""
         (a, b), some = scene.screen.tilt, any(scene.screen.tilt)
-        return Decision(self.name, some, f"the screen is tilted by {a:g} and {b:g} degrees" if some else "the screen is upright",
-                       max(abs(a), abs(b)), 0.0, present=some)
+        return Decision(
+            self.name,
+            some,
+            f"the screen is tilted by {a:g} and {b:g} degrees" if some else "the screen is upright",
+            max(abs(a), abs(b)),
+            0.0,
+            present=some,
+        )
 
     def without(self, scene: Scene) -> Scene:
         """Upright."""

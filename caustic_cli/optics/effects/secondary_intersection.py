@@ -29,8 +29,13 @@ class SecondaryIntersection(Effect):
         if b.slope_ratio < 1.0:
             why = f"slopes up to {b.slope:.3g} are {b.slope_ratio:.3g} of what rays leaving slope_ratio at"
             return Decision(self.name, False, why, b.slope_ratio, 1.0)
-        return Decision(self.name, True, f"slopes up to {b.slope:.3g} may catch a ray that has left",
-                       b.slope_ratio if math.isfinite(b.slope_ratio) else None, 1.0)
+        return Decision(
+            self.name,
+            True,
+            f"slopes up to {b.slope:.3g} may catch a ray that has left",
+            b.slope_ratio if math.isfinite(b.slope_ratio) else None,
+            1.0,
+        )
 
     def request(self, scene: Scene, on: bool, bounds) -> Requests:
         """To look for them."""
@@ -65,8 +70,19 @@ class Again(Action):
         o, g, _ = touch(surface, heights, [c[at] for c in full[:3]], d, t[at])
 
         def leaving(o, d, power, account: dict) -> list[RayState]:
-            return [replace(state, origin=out_of(pose, o, state.datum), direction=turned_back(pose, d), power=power, path=0.0,
-                            polarised=None, status=None, lost={k: v.detach().sum() for k, v in account.items()}, sample=None)]
+            return [
+                replace(
+                    state,
+                    origin=out_of(pose, o, state.datum),
+                    direction=turned_back(pose, d),
+                    power=power,
+                    path=0.0,
+                    polarised=None,
+                    status=None,
+                    lost={k: v.detach().sum() for k, v in account.items()},
+                    sample=None,
+                )
+            ]
 
         if m.reflects:
             d = interact(d, g, power, eta=1.0, reflects=True, fresnel=element.fresnel, side=side).direction
@@ -79,7 +95,15 @@ class Again(Action):
         arriving = torch.where(through, entered.power, none)
         kept = arriving * torch.exp(-m.absorption * t) if m.absorption else arriving
         out = interact(entered.direction, g, kept, eta=eta, reflects=False, fresnel=fresnel, side=side)
-        return leaving(o, out.direction, out.power, {
-            "fresnel": torch.where(entered.passes, power - entered.power, none) + torch.where(out.passes, kept - out.power, none),
-            "missed_surface": entered.power - arriving, "absorbed": arriving - kept,
-            "total_internal_reflection": torch.where(out.passes, none, kept) + torch.where(entered.passes, none, power)})
+        return leaving(
+            o,
+            out.direction,
+            out.power,
+            {
+                "fresnel": torch.where(entered.passes, power - entered.power, none)
+                + torch.where(out.passes, kept - out.power, none),
+                "missed_surface": entered.power - arriving,
+                "absorbed": arriving - kept,
+                "total_internal_reflection": torch.where(out.passes, none, kept) + torch.where(entered.passes, none, power),
+            },
+        )

@@ -50,8 +50,12 @@ class Mode:
         (rx, ry), (px, py, pz) = pupil.half_size, self.position
         x, y = (2.0 * u - 1.0) * rx, (2.0 * v - 1.0) * ry
         if source.distant:
-            return RayState((x, y, pupil.z), tuple(torch.full_like(x, c) for c in self.position), self._even(u, v),
-                            path=index * (px * x + py * y))
+            return RayState(
+                (x, y, pupil.z),
+                tuple(torch.full_like(x, c) for c in self.position),
+                self._even(u, v),
+                path=index * (px * x + py * y),
+            )
         dx, dy, h = x - px, y - py, pupil.z - pz
         r = torch.sqrt(dx * dx + dy * dy + h * h)
         cone = source.cone_over(pupil.half_size, pupil.z, pupil.round)
@@ -113,8 +117,11 @@ def modes(scene: Lit, each: int) -> list[Mode]:
             found.append(Mode(scene, (dx, dy, math.sqrt(1.0 - dx * dx - dy * dy)), 1.0 / len(spread)))
         return found
     (positions, parts), spread = source.points(), _spots(source, each)
-    return [Mode(scene, (float(x + dx), float(y + dy), float(z)), float(part) / len(spread))
-            for (x, y, z), part in zip(positions, parts, strict=True) for dx, dy in spread]
+    return [
+        Mode(scene, (float(x + dx), float(y + dy), float(z)), float(part) / len(spread))
+        for (x, y, z), part in zip(positions, parts, strict=True)
+        for dx, dy in spread
+    ]
 
 
 def _spots(source: Source, each: int) -> list[tuple[float, float]]:

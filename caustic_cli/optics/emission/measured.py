@@ -93,8 +93,10 @@ def _meeting(source: Source, half_size: tuple[float, float], z: float, round: bo
     x, y, met = source.crossing(half_size, z, round)
     (met,) = np.nonzero(met)
     if not len(met):
-        raise InputError(f"⟨source.file⟩: none of its {source.rays.count:,} rays meets the lens, which stands along +z from them;"
-                         " ⟨source_position⟩ moves them")
+        raise InputError(
+            f"⟨source.file⟩: none of its {source.rays.count:,} rays meets the lens, which stands along +z from them;"
+            " ⟨source_position⟩ moves them"
+        )
     return x[met], y[met], met, source.rays.flux[met] / source.rays.flux.sum()
 
 
@@ -125,8 +127,10 @@ def coarse_words(scene: Scene) -> str | None:
     if worst is None or coarseness(worst)[0] <= WORTHY:
         return None
     (noise, wanted), (nx, ny), rays = coarseness(worst), scene.screen.resolution, worst.source.rays.count
-    return (f"the ray file is coarse for {nx} x {ny} pixels: its {rays:,} rays leave {noise:.0%} of noise, and it would take"
-            f" {_rounded(wanted)} to leave {WORTHY:.0%}")
+    return (
+        f"the ray file is coarse for {nx} x {ny} pixels: its {rays:,} rays leave {noise:.0%} of noise, and it would take"
+        f" {_rounded(wanted)} to leave {WORTHY:.0%}"
+    )
 
 
 def _rounded(count: int) -> str:

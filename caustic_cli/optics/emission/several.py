@@ -48,8 +48,10 @@ def several(scene: Lit, kind: str, rays: int, seed: int = 0, device: str | torch
     from caustic_cli.optics.emission import rays_of  # noqa: PLC0415  every way of drawing is registered there by now
 
     source = scene.source
-    members = tuple(rays_of(_Alone(one, scene.pupil), kind, max(1, round(rays * fraction)), seed + k, device)
-                    for k, (one, fraction) in enumerate(zip(source.members, source.fractions, strict=True)))
+    members = tuple(
+        rays_of(_Alone(one, scene.pupil), kind, max(1, round(rays * fraction)), seed + k, device)
+        for k, (one, fraction) in enumerate(zip(source.members, source.fractions, strict=True))
+    )
     return SeveralRays(members, source.fractions, device)
 
 

@@ -65,7 +65,8 @@ UINT = np.uintp
 # Where the rows of a batch's scratch begin, LANES numbers each: the rays, where they are in the span product, Horner's scheme,
 # Newton's step; in the adjoint slopes, and derivatives by distance, slopes, height and start.
 OU, OV, OZ, DU, DV, DZ, T, XI, ETA, ROW, SLOPE, HALF, Z, Z_XI, Z_ETA, H_XI, MIXED, H_ETA, G_U, G_V, BUSY, DONE = range(
-    0, 22 * LANES, LANES)
+    0, 22 * LANES, LANES
+)
 GX, GY, BY_T, BY_U, BY_V, BY_Z, BY_X, BY_Y = range(22 * LANES, 30 * LANES, LANES)
 ROWS = 30
 # Sizes of the scratch of Horner's scheme, for value and slopes, and for second derivatives; and of powers.
@@ -275,8 +276,36 @@ def _guess(ou, ov, oz, du, dv, dz, middle, thick, c, bu, mu, wu, bv, mv, wv):
 
 
 @njit(entry=True, **FAST)
-def meet(block, order, batched, ou, ov, oz, du, dv, dz, limits, slopes, round_, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y,
-         status, reach, gx, gy, met, where, blocks):
+def meet(
+    block,
+    order,
+    batched,
+    ou,
+    ov,
+    oz,
+    du,
+    dv,
+    dz,
+    limits,
+    slopes,
+    round_,
+    c,
+    bu,
+    mu,
+    wu,
+    bv,
+    mv,
+    wv,
+    scale_x,
+    scale_y,
+    status,
+    reach,
+    gx,
+    gy,
+    met,
+    where,
+    blocks,
+):
     """First hits of rays (N,): status, distances (-1 for none), dz/dx and dz/dy there into status, reach, gx, gy.
 
     order (N,): of the rays; batched: whether to look for batches; limits: least and largest control height; slopes: bounds of
@@ -284,8 +313,38 @@ def meet(block, order, batched, ou, ov, oz, du, dv, dz, limits, slopes, round_, 
     met, where (N,): the span products where they hit, counted row by row, -1 for none.
     """
     if block == ALL:
-        on_threads(blocks, (order, batched, ou, ov, oz, du, dv, dz, limits, slopes, round_, c, bu, mu, wu, bv, mv, wv, scale_x,
-                            scale_y, status, reach, gx, gy, met, where, blocks))
+        on_threads(
+            blocks,
+            (
+                order,
+                batched,
+                ou,
+                ov,
+                oz,
+                du,
+                dv,
+                dz,
+                limits,
+                slopes,
+                round_,
+                c,
+                bu,
+                mu,
+                wu,
+                bv,
+                mv,
+                wv,
+                scale_x,
+                scale_y,
+                status,
+                reach,
+                gx,
+                gy,
+                met,
+                where,
+                blocks,
+            ),
+        )
         return
     count, wide = len(ou), len(bv) - 1
     size, middle, thick = max(abs(limits[0]), abs(limits[1])), 0.5 * (limits[0] + limits[1]), 0.5 * (limits[1] - limits[0])
@@ -333,8 +392,9 @@ def meet(block, order, batched, ou, ov, oz, du, dv, dz, limits, slopes, round_, 
                     r = UINT(at[s])
                     w[OU + k], w[OV + k], w[OZ + k], w[T + k] = ou[r], ov[r], oz[r], start[s]
                     w[DU + k], w[DV + k], w[DZ + k] = du[r], dv[r], dz[r]
-                _settle(w, size, c, a, b, bounds, (bu[a], bu[a + 1]), (bv[b], bv[b + 1]), mu[a], wu[a], mv[b], wv[b], scale_x,
-                        scale_y)
+                _settle(
+                    w, size, c, a, b, bounds, (bu[a], bu[a + 1]), (bv[b], bv[b + 1]), mu[a], wu[a], mv[b], wv[b], scale_x, scale_y
+                )
                 for k in range(end - begin):
                     s, t = together[begin + k], w[T + k]
                     r = UINT(at[s])
@@ -388,8 +448,14 @@ def _tables(w, p, q, table):
         a0, a1 = table[at : at + LANES], table[at + LANES : at + 2 * LANES]
         c0, c1 = table[ec + at : ec + at + LANES], table[ec + at + LANES : ec + at + 2 * LANES]
         for k in range(LANES):
-            xi, by_z, by_xi, by_eta, power, slope = (s[k], s[LANES + k], s[2 * LANES + k], s[3 * LANES + k], s[4 * LANES + k],
-                                                     s[5 * LANES + k])
+            xi, by_z, by_xi, by_eta, power, slope = (
+                s[k],
+                s[LANES + k],
+                s[2 * LANES + k],
+                s[3 * LANES + k],
+                s[4 * LANES + k],
+                s[5 * LANES + k],
+            )
             a0[k], c0[k] = by_z * power + by_xi * slope, by_eta * power
             slope = slope * xi + power
             power *= xi
@@ -445,8 +511,35 @@ def _gather(table, p, q, total):
 
 
 @njit(entry=True, **FAST)
-def pull_back(block, met, where, by_t, by_gx, by_gy, ou, ov, du, dv, dz, t, gx, gy, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y,
-              grads, by_ox, by_oy, by_oz):
+def pull_back(
+    block,
+    met,
+    where,
+    by_t,
+    by_gx,
+    by_gy,
+    ou,
+    ov,
+    du,
+    dv,
+    dz,
+    t,
+    gx,
+    gy,
+    c,
+    bu,
+    mu,
+    wu,
+    bv,
+    mv,
+    wv,
+    scale_x,
+    scale_y,
+    grads,
+    by_ox,
+    by_oy,
+    by_oz,
+):
     """Adjoint of `meet`: derivatives by the coefficients (blocks, I, J, p + 1, q + 1), overwritten, and by the rays' starts.
 
     by_*: derivatives by distance and slopes (N,); met, where, t, gx, gy: as `meet` found them, t its reach; grads may have no
@@ -455,8 +548,37 @@ def pull_back(block, met, where, by_t, by_gx, by_gy, ou, ov, du, dv, dz, t, gx, 
     count, blocks, p, q, wide = len(t), len(grads), c.shape[2], c.shape[3], len(bv) - 1
     nets, starts = grads.shape[1] > 0, len(by_ox) > 0
     if block == ALL:
-        on_threads(blocks, (met, where, by_t, by_gx, by_gy, ou, ov, du, dv, dz, t, gx, gy, c, bu, mu, wu, bv, mv, wv, scale_x,
-                            scale_y, grads, by_ox, by_oy, by_oz))
+        on_threads(
+            blocks,
+            (
+                met,
+                where,
+                by_t,
+                by_gx,
+                by_gy,
+                ou,
+                ov,
+                du,
+                dv,
+                dz,
+                t,
+                gx,
+                gy,
+                c,
+                bu,
+                mu,
+                wu,
+                bv,
+                mv,
+                wv,
+                scale_x,
+                scale_y,
+                grads,
+                by_ox,
+                by_oy,
+                by_oz,
+            ),
+        )
         return
     w, grad, powers = np.zeros(ROWS * LANES), grads[block], np.empty((2, q))
     grad[:] = 0.0
@@ -524,15 +646,73 @@ def pull_back(block, met, where, by_t, by_gx, by_gy, ou, ov, du, dv, dz, t, gx, 
 
 
 @njit(entry=True, **FAST)
-def push(block, change, move_x, move_y, move_z, met, where, ou, ov, du, dv, dz, t, gx, gy, c, bu, mu, wu, bv, mv, wv, scale_x,
-         scale_y, out_t, out_x, out_y, blocks):
+def push(
+    block,
+    change,
+    move_x,
+    move_y,
+    move_z,
+    met,
+    where,
+    ou,
+    ov,
+    du,
+    dv,
+    dz,
+    t,
+    gx,
+    gy,
+    c,
+    bu,
+    mu,
+    wu,
+    bv,
+    mv,
+    wv,
+    scale_x,
+    scale_y,
+    out_t,
+    out_x,
+    out_y,
+    blocks,
+):
     """Tangents of the distances and slopes that `meet` found, into out_t, out_x, out_y (N,).
 
     change: of the coefficients; move_x, move_y, move_z (N,): of the rays' points that hit, at fixed t, mm; either may be empty.
     """
     if block == ALL:
-        on_threads(blocks, (change, move_x, move_y, move_z, met, where, ou, ov, du, dv, dz, t, gx, gy, c, bu, mu, wu, bv, mv, wv,
-                            scale_x, scale_y, out_t, out_x, out_y, blocks))
+        on_threads(
+            blocks,
+            (
+                change,
+                move_x,
+                move_y,
+                move_z,
+                met,
+                where,
+                ou,
+                ov,
+                du,
+                dv,
+                dz,
+                t,
+                gx,
+                gy,
+                c,
+                bu,
+                mu,
+                wu,
+                bv,
+                mv,
+                wv,
+                scale_x,
+                scale_y,
+                out_t,
+                out_x,
+                out_y,
+                blocks,
+            ),
+        )
         return
     count, wide = len(t), len(bv) - 1
     nets, moves = change.shape[0] > 0, len(move_x) > 0

@@ -22,7 +22,6 @@ TINY = 1e-3  # and below this from shorter ones
 MODERATE = 2.0
 
 
-
 @njit(inline="always", **FAST)
 def _exp(x):
     """exp(x) for |x| <= 2: exp(x / 8)^8, relative error about 1e-14, without a branch."""

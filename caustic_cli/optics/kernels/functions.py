@@ -98,8 +98,7 @@ class RayKernel:
         like: the kernel of another bundle through the same field, whose workspace serves both.
     """
 
-    def __init__(self, spaces, half_size, origin, direction, power: Tensor, radius: float | None,
-                 like: RayKernel | None = None):
+    def __init__(self, spaces, half_size, origin, direction, power: Tensor, radius: float | None, like: RayKernel | None = None):
         count = len(power)
         self.surface = FusedSurface(spaces, half_size) if like is None else like.surface
         self.workspace = _Workspace() if like is None else like.workspace
@@ -119,12 +118,32 @@ class RayKernel:
     def __call__(self, heights: Tensor, eta: float, fresnel: str, reference: float, screen: Screen, filter: Filter):
         """Control heights (n, m) mm float64; `reference` is where the screen's height is counted from, mm: see `_splat`."""
         nets = [t.view(self.shape) for t in self.hits(heights)]
-        return _splat(nets, self.rows, True, self.rays, (eta, fresnel), screen.z - reference, self.z - reference, screen, filter,
-                      self.workspace)
+        return _splat(
+            nets,
+            self.rows,
+            True,
+            self.rays,
+            (eta, fresnel),
+            screen.z - reference,
+            self.z - reference,
+            screen,
+            filter,
+            self.workspace,
+        )
 
 
-def _splat(nets, rows, apart: bool, rays, interface: tuple[float, str], height: float, start: float, screen: Screen,
-           filter: Filter, workspace: _Workspace) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+def _splat(
+    nets,
+    rows,
+    apart: bool,
+    rays,
+    interface: tuple[float, str],
+    height: float,
+    start: float,
+    screen: Screen,
+    filter: Filter,
+    workspace: _Workspace,
+) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
     """Call the kernel.  interface: n_in / n_out and the kind of Fresnel losses; start: height at which oblique rays begin, mm.
 
     Returns:
@@ -136,12 +155,21 @@ def _splat(nets, rows, apart: bool, rays, interface: tuple[float, str], height: 
     padded = padded[:, : ny + 4 * ry]  # beyond lies what rounds the scatter's steps up to four pixels
     image = padded[2 * rx : 2 * rx + nx, 2 * ry : 2 * ry + ny]
     lost = {"missed_surface": ledger[plane.MISSED]} if oblique else {}
-    return image, leaving, lost | {"fresnel": ledger[plane.FRESNEL], "total_internal_reflection": ledger[plane.REFLECTED],
-                                   "off_screen": ledger[plane.OFF_SCREEN] + padding(padded.detach(), filter.reach)}
+    return (
+        image,
+        leaving,
+        lost
+        | {
+            "fresnel": ledger[plane.FRESNEL],
+            "total_internal_reflection": ledger[plane.REFLECTED],
+            "off_screen": ledger[plane.OFF_SCREEN] + padding(padded.detach(), filter.reach),
+        },
+    )
 
 
-def _arguments(rays, interface: tuple[float, str], height: float, start: float, screen: Screen,
-               filter: Filter) -> tuple[bool, tuple]:
+def _arguments(
+    rays, interface: tuple[float, str], height: float, start: float, screen: Screen, filter: Filter
+) -> tuple[bool, tuple]:
     """Whether rays are oblique, and what `plane` takes after the nets."""
     eta, fresnel = interface
     oblique = rays[2] is not _NONE
@@ -194,8 +222,9 @@ def compile_splat() -> None:
 def compile_adjoint() -> None:
     """The adjoint of `compile_splat`'s kernel."""
     *nets, rows, apart, arguments, workspace = _example()
-    _adjoint(torch.zeros(_images(arguments, workspace)[0].shape[1:], dtype=torch.float64), 1.0, nets, rows, apart, arguments,
-             workspace)
+    _adjoint(
+        torch.zeros(_images(arguments, workspace)[0].shape[1:], dtype=torch.float64), 1.0, nets, rows, apart, arguments, workspace
+    )
 
 
 def _example() -> tuple:
@@ -203,8 +232,9 @@ def _example() -> tuple:
     space, at = SplineSpace.uniform(4, 3), torch.linspace(0.0, 1.0, 2, dtype=torch.float64)
     kernel = PlaneKernel((space, space), (1.0, 1.0), at, at, True, torch.tensor(0.25, dtype=torch.float64))
     (x, y, flux), net = kernel.rays, torch.zeros(4, 2, dtype=torch.float64)
-    _, arguments = _arguments((x, y, _NONE, _NONE, flux), (1.5, "exact"), 10.0, 0.0, Screen((10.0, 10.0), 10.0, (4, 4)),
-                              Filter("cosine", (3, 3)))
+    _, arguments = _arguments(
+        (x, y, _NONE, _NONE, flux), (1.5, "exact"), 10.0, 0.0, Screen((10.0, 10.0), 10.0, (4, 4)), Filter("cosine", (3, 3))
+    )
     return net, net, net, kernel.rows, False, arguments, kernel.workspace
 
 
@@ -243,8 +273,9 @@ class _Image(torch.autograd.Function):
         return torch.from_numpy(pixels.total(images)), torch.tensor(leaving.sum(), dtype=torch.float64), None
 
 
-def _adjoint(by_image: Tensor, by_leaving: float, nets, rows: tuple, apart: bool, arguments: tuple,
-             workspace: _Workspace) -> np.ndarray:
+def _adjoint(
+    by_image: Tensor, by_leaving: float, nets, rows: tuple, apart: bool, arguments: tuple, workspace: _Workspace
+) -> np.ndarray:
     """Derivatives by the three nets (n, b), a sum for each block: (3, blocks, n, b), or (3, 1, n, b) with `apart`."""
     scratch, shape = _images(arguments, workspace)[1], nets[0].shape
     sums = np.empty((3, 1, *shape)) if apart else workspace("nets", 3, len(scratch), *shape)

@@ -165,16 +165,19 @@ def intersect(block, ou, ov, oz, du, dv, dz, start, limits, slopes, c, bu, mu, w
 
 
 @njit(entry=True, **FAST)
-def intersect_again(block, ou, ov, oz, du, dv, dz, side, limits, slopes, round_, step, halvings, most, c, bu, mu, wu, bv, mv, wv,
-                    t, blocks):
+def intersect_again(
+    block, ou, ov, oz, du, dv, dz, side, limits, slopes, round_, step, halvings, most, c, bu, mu, wu, bv, mv, wv, t, blocks
+):
     """Next intersections of rays (N,) that start on the surface, into t (N,), 0 for none: the search of `reintersection.reference`.
 
     side: 1 above the surface, -1 under it; limits, slopes: as in `intersect`; round_: the surface ends at the circle inscribed
     in its aperture; step, halvings, most: least step (mm), bisections of the last one and most steps.
     """
     if block == ALL:
-        on_threads(blocks, (ou, ov, oz, du, dv, dz, side, limits, slopes, round_, step, halvings, most, c, bu, mu, wu, bv, mv, wv,
-                            t, blocks))
+        on_threads(
+            blocks,
+            (ou, ov, oz, du, dv, dz, side, limits, slopes, round_, step, halvings, most, c, bu, mu, wu, bv, mv, wv, t, blocks),
+        )
         return
     count, highest = len(ou), limits[1] if side > 0.0 else -limits[0]
     for k in range(block * count // blocks, (block + 1) * count // blocks):

@@ -16,8 +16,16 @@ __all__ = ["FAST", "PARALLEL", "njit", "prange"]
 #: Sums of products may be contracted, and zeros lose their sign; no sum is reordered, no NaN or infinity assumed away.
 FAST = {"fastmath": {"contract", "nsz"}}
 #: Loops over `prange` run in parallel, and nothing else: every array that is filled would be a parallel loop of its own.
-PARALLEL = {"prange": True, "comprehension": False, "reduction": False, "inplace_binop": False, "setitem": False, "numpy": False,
-            "stencil": False, "fusion": False}
+PARALLEL = {
+    "prange": True,
+    "comprehension": False,
+    "reduction": False,
+    "inplace_binop": False,
+    "setitem": False,
+    "numpy": False,
+    "stencil": False,
+    "fusion": False,
+}
 
 # Off by default in numba: it turns the steps of four neighbouring pixels in `plane` into vector instructions.
 numba.config.SLP_VECTORIZE = 1
@@ -33,8 +41,12 @@ def njit(*, entry: bool = False, parallel: bool = False, **options):
     """
     if parallel:
         options["parallel"] = dict(PARALLEL)  # numba empties the one it is given
-    options |= {"cache": cache.DIRECTORY is not None, "error_model": "numpy", "no_cfunc_wrapper": True,
-                "no_cpython_wrapper": not (entry or parallel)}
+    options |= {
+        "cache": cache.DIRECTORY is not None,
+        "error_model": "numpy",
+        "no_cfunc_wrapper": True,
+        "no_cpython_wrapper": not (entry or parallel),
+    }
 
     def decorate(function):
         before = numba.config.CACHE_DIR

@@ -291,8 +291,9 @@ def intersect(x, y, z, dx, dy, dz, xs, ys, n_u, n_v, vertices, low, high, recurs
                 if dz[n] > 0.0:
                     hit = start - f / dz[n]
             elif f < 0.0 and recursive:
-                hit, tested[n] = _descend(ray, (start, f, a, b, i, j), end, gx, gy, hx, hy, vertices, n_u, n_v, rows, cols, tree,
-                                          levels, nodes, times)
+                hit, tested[n] = _descend(
+                    ray, (start, f, a, b, i, j), end, gx, gy, hx, hy, vertices, n_u, n_v, rows, cols, tree, levels, nodes, times
+                )
             elif f < 0.0:
                 hit, tested[n] = _flat(ray, (start, f, a, b, i, j), end, gx, gy, hx, hy, vertices, n_u, n_v, low, high)
             if hit < math.inf:

@@ -241,8 +241,9 @@ def _cut(scratch, vx, vy):
 
 
 @njit(entry=True, **FAST)
-def forward(block, images, ledgers, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, flux, exit_, frame,
-            splat, oblique):
+def forward(
+    block, images, ledgers, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, flux, exit_, frame, splat, oblique
+):
     """Blocks' ledgers (blocks, COLUMNS), power by what became of it, and their images, whose `pixels.total` is the padded one.
 
     The surface comes by rows.  Row i of the sag is sum_k bu[i, k] net[first[i] + k], of dz/dx the same with du and net_x,
@@ -257,8 +258,29 @@ def forward(block, images, ledgers, scratch, first, bu, du, net, net_x, net_y, x
     itself, (a, b), whatever first, bu and du are.  oblique: True for them, None for rays along z, which are compiled apart.
     """
     if block == ALL:
-        on_threads(len(images), (images, ledgers, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, flux, exit_,
-                                 frame, splat, oblique))
+        on_threads(
+            len(images),
+            (
+                images,
+                ledgers,
+                scratch,
+                first,
+                bu,
+                du,
+                net,
+                net_x,
+                net_y,
+                x,
+                y,
+                along_x,
+                along_y,
+                flux,
+                exit_,
+                frame,
+                splat,
+                oblique,
+            ),
+        )
         return
     rows, blocks = len(x), len(images)
     vx, vy = splat.size_x, splat.size_y
@@ -277,8 +299,29 @@ def forward(block, images, ledgers, scratch, first, bu, du, net, net_x, net_y, x
 
 
 @njit(entry=True, **FAST)
-def backward(block, grad, grad_leaving, apart, nets, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, flux,
-             exit_, frame, splat, oblique):
+def backward(
+    block,
+    grad,
+    grad_leaving,
+    apart,
+    nets,
+    scratch,
+    first,
+    bu,
+    du,
+    net,
+    net_x,
+    net_y,
+    x,
+    y,
+    along_x,
+    along_y,
+    flux,
+    exit_,
+    frame,
+    splat,
+    oblique,
+):
     """Adjoint of `forward`: derivatives by the three nets, from those by the padded image and leaving power.
 
     nets (3, 1 if apart else blocks, n, b) are overwritten: the `pixels.total` of each is the derivative by a net (n, b).
@@ -289,8 +332,31 @@ def backward(block, grad, grad_leaving, apart, nets, scratch, first, bu, du, net
     if block == ALL:
         if apart and oblique is None:
             nets[:] = 0.0
-        on_threads(len(scratch), (grad, grad_leaving, apart, nets, scratch, first, bu, du, net, net_x, net_y, x, y, along_x,
-                                  along_y, flux, exit_, frame, splat, oblique))
+        on_threads(
+            len(scratch),
+            (
+                grad,
+                grad_leaving,
+                apart,
+                nets,
+                scratch,
+                first,
+                bu,
+                du,
+                net,
+                net_x,
+                net_y,
+                x,
+                y,
+                along_x,
+                along_y,
+                flux,
+                exit_,
+                frame,
+                splat,
+                oblique,
+            ),
+        )
         return
     rows, blocks = len(x), len(scratch)
     vx, vy = splat.size_x, splat.size_y
@@ -307,20 +373,65 @@ def backward(block, grad, grad_leaving, apart, nets, scratch, first, bu, du, net
         _share(v, splat, sx, sy, dx, dy)
         _gather(v, exit_, frame, splat, sx, sy, dx, dy, grad, grad_leaving, column, tilt)
         if oblique is not None:
-            oblique_refraction.pull(v, _oblique(i, surface, rays), exit_, nets[0, 0, i],
-                       nets[1, 0, i], nets[2, 0, i])
+            oblique_refraction.pull(v, _oblique(i, surface, rays), exit_, nets[0, 0, i], nets[1, 0, i], nets[2, 0, i])
             continue
         pull(v, exit_)
         spread(i, first, bu, du, v[T_SAG], v[T_GX], v[T_GY], nets[:, 0 if apart else block], apart)
 
 
 @njit(entry=True, **FAST)
-def tangent(block, t_net, t_net_x, t_net_y, images, leaving, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y,
-            flux, exit_, frame, splat, oblique):
+def tangent(
+    block,
+    t_net,
+    t_net_x,
+    t_net_y,
+    images,
+    leaving,
+    scratch,
+    first,
+    bu,
+    du,
+    net,
+    net_x,
+    net_y,
+    x,
+    y,
+    along_x,
+    along_y,
+    flux,
+    exit_,
+    frame,
+    splat,
+    oblique,
+):
     """Derivative of `forward` along (t_net, t_net_x, t_net_y): blocks' images, and leaving powers (blocks,)."""
     if block == ALL:
-        on_threads(len(images), (t_net, t_net_x, t_net_y, images, leaving, scratch, first, bu, du, net, net_x, net_y, x, y, along_x,
-                                 along_y, flux, exit_, frame, splat, oblique))
+        on_threads(
+            len(images),
+            (
+                t_net,
+                t_net_x,
+                t_net_y,
+                images,
+                leaving,
+                scratch,
+                first,
+                bu,
+                du,
+                net,
+                net_x,
+                net_y,
+                x,
+                y,
+                along_x,
+                along_y,
+                flux,
+                exit_,
+                frame,
+                splat,
+                oblique,
+            ),
+        )
         return
     rows, blocks = len(x), len(images)
     vx, vy = splat.size_x, splat.size_y
@@ -334,8 +445,7 @@ def tangent(block, t_net, t_net_x, t_net_y, images, leaving, scratch, first, bu,
             oblique_refraction.aim(v, _oblique(i, surface, rays), x[i], y[i], exit_, frame)
         _share(v, splat, sx, sy, dx, dy)
         if oblique is not None:
-            oblique_refraction.push(v, _oblique(i, surface, rays),
-                       (t_net[i], t_net_x[i], t_net_y[i]), exit_, frame)
+            oblique_refraction.push(v, _oblique(i, surface, rays), (t_net[i], t_net_x[i], t_net_y[i]), exit_, frame)
         else:
             combine(i, first, bu, du, t_net, t_net_x, t_net_y, v[T_SAG], v[T_GX], v[T_GY])
             push(v, exit_, frame)

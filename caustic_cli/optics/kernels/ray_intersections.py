@@ -24,9 +24,16 @@ from caustic_cli.optics.kernels.threads import ALL, on_threads
 BELOW = 0.01, 1e-3
 
 
-def hits_of_rays(surface: FusedSurface, heights: Tensor, origin: tuple[Tensor, Tensor, Tensor],
-                 direction: tuple[Tensor, Tensor, Tensor], *, side: float = 1.0, radius: float | None = None,
-                 rectangle: bool = True) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def hits_of_rays(
+    surface: FusedSurface,
+    heights: Tensor,
+    origin: tuple[Tensor, Tensor, Tensor],
+    direction: tuple[Tensor, Tensor, Tensor],
+    *,
+    side: float = 1.0,
+    radius: float | None = None,
+    rectangle: bool = True,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """First hits of rays, in the surface's own frame.
 
     Args:
@@ -103,8 +110,18 @@ def _rays(surface: FusedSurface, o, d) -> tuple[np.ndarray, ...]:
 
 class _HitsOfRays(torch.autograd.Function):
     @staticmethod
-    def forward(heights: Tensor, ox: Tensor, oy: Tensor, oz: Tensor, dx: Tensor, dy: Tensor, dz: Tensor, surface: FusedSurface,
-                radius: float, rectangle: bool):
+    def forward(
+        heights: Tensor,
+        ox: Tensor,
+        oy: Tensor,
+        oz: Tensor,
+        dx: Tensor,
+        dy: Tensor,
+        dz: Tensor,
+        surface: FusedSurface,
+        radius: float,
+        rectangle: bool,
+    ):
         h, middle = _sag(heights)
         low, high = float(h.min()), float(h.max())
         rays, way, n = _rays(surface, (ox, oy, oz - middle), (dx, dy, dz)), np.empty(len(ox)), blocks()
@@ -113,8 +130,21 @@ class _HitsOfRays(torch.autograd.Function):
         order, used = batches.order(*rays[:2], surface.geometry[0], surface.geometry[3])
         status, *out = batches.found(len(way))
         top = high + 1e-6 * (high - low)  # above what touches the hull's top, by whatever rounding
-        batches.meet(ALL, order, len(way) >= batches.CROWD * used, *rays, (low, top), surface.slope_bounds(h), radius,
-                     surface.coefficients(h), *surface.geometry, *surface.scale, status, *out, n)
+        batches.meet(
+            ALL,
+            order,
+            len(way) >= batches.CROWD * used,
+            *rays,
+            (low, top),
+            surface.slope_bounds(h),
+            radius,
+            surface.coefficients(h),
+            *surface.geometry,
+            *surface.scale,
+            status,
+            *out,
+            n,
+        )
         reach, gx, gy, met, where = (torch.from_numpy(a) for a in out)
         t = torch.from_numpy(way) + reach
         found = torch.from_numpy(status == batches.HIT) & (t > 0.0)
@@ -137,9 +167,21 @@ class _HitsOfRays(torch.autograd.Function):
         c = surface.coefficients(_sag(heights)[0])
         grads = surface.workspace() if wanted[0] else np.empty((blocks(), 0, *c.shape[1:]))
         starts = [torch.empty(len(t) if any(wanted[1:7]) else 0, dtype=torch.float64) for _ in range(3)]
-        batches.pull_back(ALL, met.numpy(), where.numpy(), *(b.double().contiguous().numpy() for b in by[:3]), ou, ov, *directions,
-                          *(a.detach().numpy() for a in (t, gx, gy)), c, *surface.geometry, *surface.scale, grads,
-                          *(a.numpy() for a in starts))
+        batches.pull_back(
+            ALL,
+            met.numpy(),
+            where.numpy(),
+            *(b.double().contiguous().numpy() for b in by[:3]),
+            ou,
+            ov,
+            *directions,
+            *(a.detach().numpy() for a in (t, gx, gy)),
+            c,
+            *surface.geometry,
+            *surface.scale,
+            grads,
+            *(a.numpy() for a in starts),
+        )
         out = [surface.pull(grads).to(heights.dtype) if wanted[0] else None]
         out += [a if w else None for a, w in zip(starts, wanted[1:4], strict=True)]
         out += [t * a if w else None for a, w in zip(starts, wanted[4:7], strict=True)]
@@ -157,7 +199,20 @@ class _HitsOfRays(torch.autograd.Function):
             starts, turns = ([none if m is None else m for m in tangents[k : k + 3]] for k in (1, 4))
             moves = [(o + t.detach() * d).detach().double().contiguous().numpy() for o, d in zip(starts, turns, strict=True)]
         out = [torch.empty_like(t) for _ in range(3)]
-        batches.push(ALL, change, *moves, met.numpy(), where.numpy(), ou, ov, *directions,
-                     *(a.detach().numpy() for a in (t, gx, gy)), c, *surface.geometry, *surface.scale, *(a.numpy() for a in out),
-                     blocks())
+        batches.push(
+            ALL,
+            change,
+            *moves,
+            met.numpy(),
+            where.numpy(),
+            ou,
+            ov,
+            *directions,
+            *(a.detach().numpy() for a in (t, gx, gy)),
+            c,
+            *surface.geometry,
+            *surface.scale,
+            *(a.numpy() for a in out),
+            blocks(),
+        )
         return *out, None, None, None

@@ -189,5 +189,14 @@ def pull_back(block, u, v, gz, gx, gy, bu, mu, wu, bv, mv, wv, scale_x, scale_y,
     powers = np.empty((2, grad.shape[3]))
     for k in range(block * count // blocks, (block + 1) * count // blocks):
         i, j = piece(u[k], bu), piece(v[k], bv)
-        push_powers(grad, i, j, (u[k] - mu[i]) * wu[i], (v[k] - mv[j]) * wv[j], gz[k], gx[k] * wu[i] * scale_x,
-                    gy[k] * wv[j] * scale_y, powers)
+        push_powers(
+            grad,
+            i,
+            j,
+            (u[k] - mu[i]) * wu[i],
+            (v[k] - mv[j]) * wv[j],
+            gz[k],
+            gx[k] * wu[i] * scale_x,
+            gy[k] * wv[j] * scale_y,
+            powers,
+        )

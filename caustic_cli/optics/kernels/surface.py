@@ -35,8 +35,9 @@ class FusedSurface:
 
     def slope_bounds(self, heights: Tensor) -> tuple[float, float]:
         """Bounds of |Z_u| and |Z_v| over [0, 1]^2, mm, from the control nets of the derivatives."""
-        return tuple(float((a.space.derivative_matrix() @ h).abs().max())
-                     for a, h in zip(self.axes, (heights, heights.T), strict=True))
+        return tuple(
+            float((a.space.derivative_matrix() @ h).abs().max()) for a, h in zip(self.axes, (heights, heights.T), strict=True)
+        )
 
     def workspace(self) -> np.ndarray:
         """Derivatives by the coefficients, a set for each block, to be overwritten."""
@@ -65,8 +66,9 @@ class _ScatteredSurface(torch.autograd.Function):
     @staticmethod
     def forward(heights: Tensor, surface: FusedSurface, u: np.ndarray, v: np.ndarray):
         out = [torch.empty(len(u), dtype=torch.float64) for _ in range(3)]
-        spline.evaluate(ALL, u, v, surface.coefficients(heights), *surface.geometry, *surface.scale, *(t.numpy() for t in out),
-                        blocks())
+        spline.evaluate(
+            ALL, u, v, surface.coefficients(heights), *surface.geometry, *surface.scale, *(t.numpy() for t in out), blocks()
+        )
         return tuple(out)
 
     @staticmethod
@@ -93,17 +95,36 @@ def _sag(heights: Tensor) -> tuple[Tensor, float]:
     return h - middle, middle
 
 
-def next_meetings(surface: FusedSurface, heights: Tensor, o, d, below: bool, round: bool, step: float, halvings: int,
-                  most: int) -> Tensor:
+def next_meetings(
+    surface: FusedSurface, heights: Tensor, o, d, below: bool, round: bool, step: float, halvings: int, most: int
+) -> Tensor:
     """The fused form of `reintersection.reference`: distances (N,) mm, 0 for none."""
     h, middle = _sag(heights)
-    rays = (o[0] * surface.scale[0] + 0.5, o[1] * surface.scale[1] + 0.5, o[2] - middle,
-            d[0] * surface.scale[0], d[1] * surface.scale[1], d[2])
+    rays = (
+        o[0] * surface.scale[0] + 0.5,
+        o[1] * surface.scale[1] + 0.5,
+        o[2] - middle,
+        d[0] * surface.scale[0],
+        d[1] * surface.scale[1],
+        d[2],
+    )
     t = np.empty(len(o[0]))
     heights = float(h.min()), float(h.max())
-    intersect.intersect_again(ALL, *(c.contiguous().numpy() for c in rays), -1.0 if below else 1.0, heights,
-                              surface.slope_bounds(h), round, step, halvings, most, surface.coefficients(h), *surface.geometry, t,
-                              blocks())
+    intersect.intersect_again(
+        ALL,
+        *(c.contiguous().numpy() for c in rays),
+        -1.0 if below else 1.0,
+        heights,
+        surface.slope_bounds(h),
+        round,
+        step,
+        halvings,
+        most,
+        surface.coefficients(h),
+        *surface.geometry,
+        t,
+        blocks(),
+    )
     return torch.from_numpy(t)
 
 
@@ -120,8 +141,9 @@ class RayIntersections:
         (x, y, self.z), (dx, dy, dz), (su, sv) = origin, direction, surface.scale
         if isinstance(self.z, Tensor):
             self.z = self.z.double().numpy()
-        self.rays = tuple(t.double().contiguous().numpy() for t in
-                          (x * su + 0.5, y * sv + 0.5, torch.empty_like(x), dx * su, dy * sv, dz))
+        self.rays = tuple(
+            t.double().contiguous().numpy() for t in (x * su + 0.5, y * sv + 0.5, torch.empty_like(x), dx * su, dy * sv, dz)
+        )
         self.radius = np.inf if radius is None else radius
         self.t, self.status = np.zeros(len(x)), np.zeros(len(x), np.int8)
         self.order, used = surface.order(x, y)
@@ -153,8 +175,19 @@ class RayIntersections:
         """Coefficients of the surface, and what `batches.meet` finds."""
         c, *bounds = self._shape(heights)
         out = batches.found(len(self.t))
-        batches.meet(ALL, self.order, self.batched, *self.rays, *bounds, self.radius, c, *self.surface.geometry,
-                     *self.surface.scale, *out, blocks())
+        batches.meet(
+            ALL,
+            self.order,
+            self.batched,
+            *self.rays,
+            *bounds,
+            self.radius,
+            c,
+            *self.surface.geometry,
+            *self.surface.scale,
+            *out,
+            blocks(),
+        )
         return c, *out
 
     def _shape(self, heights: Tensor) -> tuple:
@@ -182,9 +215,23 @@ class _Hits(torch.autograd.Function):
         heights, *found, met, where, c = ctx.saved_tensors
         surface, (ou, ov, _, *directions) = ctx.rays.surface, ctx.rays.rays
         grads, none = surface.workspace(), np.empty(0)
-        batches.pull_back(ALL, met.numpy(), where.numpy(), *(g.contiguous().numpy() for g in by[:3]), ou, ov, *directions,
-                          *(t.detach().numpy() for t in found), c.numpy(), *surface.geometry, *surface.scale, grads, none, none,
-                          none)
+        batches.pull_back(
+            ALL,
+            met.numpy(),
+            where.numpy(),
+            *(g.contiguous().numpy() for g in by[:3]),
+            ou,
+            ov,
+            *directions,
+            *(t.detach().numpy() for t in found),
+            c.numpy(),
+            *surface.geometry,
+            *surface.scale,
+            grads,
+            none,
+            none,
+            none,
+        )
         return surface.pull(grads).to(heights.dtype), None
 
     @staticmethod
@@ -192,7 +239,22 @@ class _Hits(torch.autograd.Function):
         _, *found, met, where, c = ctx.saved_tensors
         surface, (ou, ov, _, *directions), none = ctx.rays.surface, ctx.rays.rays, np.empty(0)
         out = [torch.empty(len(met), dtype=torch.float64) for _ in range(3)]
-        batches.push(ALL, surface.coefficients(tangent), none, none, none, met.numpy(), where.numpy(), ou, ov, *directions,
-                     *(t.detach().numpy() for t in found), c.numpy(), *surface.geometry, *surface.scale,
-                     *(t.numpy() for t in out), blocks())
+        batches.push(
+            ALL,
+            surface.coefficients(tangent),
+            none,
+            none,
+            none,
+            met.numpy(),
+            where.numpy(),
+            ou,
+            ov,
+            *directions,
+            *(t.detach().numpy() for t in found),
+            c.numpy(),
+            *surface.geometry,
+            *surface.scale,
+            *(t.numpy() for t in out),
+            blocks(),
+        )
         return *out, None, None, None

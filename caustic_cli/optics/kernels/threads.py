@@ -67,14 +67,16 @@ def on_threads(_, count, arguments):
     Raises:
         MemoryError: one of the calls failed; kernels raise nothing else.
     """
+
     def generate(context, builder, signature, values):
         place = cgutils.alloca_once_value(builder, values[1])
         called = ir.Function(builder.module, CALLED, builder.module.get_unique_name("on_threads"))
         called.linkage = "internal"
         inside, (packed, k) = ir.IRBuilder(called.append_basic_block()), called.args
         lent = _lent(context, inside, arguments, inside.load(inside.bitcast(packed, place.type)))
-        status, _ = context.call_conv.call_function(inside, builder.function, types.none, (types.intp, *arguments.types),
-                                                    [k, *cgutils.unpack_tuple(inside, lent)])
+        status, _ = context.call_conv.call_function(
+            inside, builder.function, types.none, (types.intp, *arguments.types), [k, *cgutils.unpack_tuple(inside, lent)]
+        )
         inside.ret(inside.zext(status.is_error, CALLED.return_type))
         addresses = [builder.ptrtoint(p, context.get_value_type(types.uintp)) for p in (called, place)]
         context.compile_internal(builder, _start, types.void(types.uintp, types.uintp, types.intp), [*addresses, values[0]])

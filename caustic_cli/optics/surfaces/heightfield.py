@@ -37,8 +37,9 @@ class HeightField(Surface):
         if lens.knots is None:
             spaces = tuple(SplineSpace.uniform(n, p) for n, p in zip(lens.control, lens.degree, strict=True))
         else:
-            spaces = tuple(SplineSpace(p, torch.as_tensor(t, dtype=torch.float64))
-                           for p, t in zip(lens.degree, lens.knots, strict=True))
+            spaces = tuple(
+                SplineSpace(p, torch.as_tensor(t, dtype=torch.float64)) for p, t in zip(lens.degree, lens.knots, strict=True)
+            )
         return cls(spaces, lens.half_size)
 
     @property
@@ -55,8 +56,16 @@ class HeightField(Surface):
         (su, sv), (rx, ry) = self.spaces, self.half_size
         if sample.tensor:
             return _TensorEvaluator(
-                *(m.to(dtype) for m in (su.matrix(sample.u), su.matrix(sample.u, 1) / (2 * rx),
-                                        sv.matrix(sample.v), sv.matrix(sample.v, 1) / (2 * ry))))
+                *(
+                    m.to(dtype)
+                    for m in (
+                        su.matrix(sample.u),
+                        su.matrix(sample.u, 1) / (2 * rx),
+                        sv.matrix(sample.v),
+                        sv.matrix(sample.v, 1) / (2 * ry),
+                    )
+                )
+            )
         i, bu = su.basis(sample.u)
         j, bv = sv.basis(sample.v)
         du, dv = su.basis(sample.u, 1)[1] / (2 * rx), sv.basis(sample.v, 1)[1] / (2 * ry)
@@ -79,8 +88,10 @@ class HeightField(Surface):
         """Upper bounds of |dz/dx| and |dz/dy|: the derivative's control net holds the derivative in its convex hull."""
         (su, sv), (rx, ry) = self.spaces, self.half_size
         h = heights.detach().double().cpu()
-        return (float((su.derivative_matrix() @ h).abs().max() / (2 * rx)),
-                float((h @ sv.derivative_matrix().T).abs().max() / (2 * ry)))
+        return (
+            float((su.derivative_matrix() @ h).abs().max() / (2 * rx)),
+            float((h @ sv.derivative_matrix().T).abs().max() / (2 * ry)),
+        )
 
     def hull(self, heights: Tensor) -> tuple[float, float]:
         """Least and largest control height: the surface lies in the hull of its net."""

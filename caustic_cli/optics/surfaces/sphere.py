@@ -49,8 +49,14 @@ class Sphere(Surface):
         k = self.curvature
         cosine = (1.0 - k * k * (x * x + y * y)).clamp_min(1.0 - EQUATOR**2).sqrt()
         zx, zy = k * x / cosine, k * y / cosine
-        values = {(0, 0): k * (x * x + y * y) / (1.0 + cosine), (1, 0): zx, (0, 1): zy,
-                  (2, 0): k * (1.0 + zx * zx) / cosine, (1, 1): k * zx * zy / cosine, (0, 2): k * (1.0 + zy * zy) / cosine}
+        values = {
+            (0, 0): k * (x * x + y * y) / (1.0 + cosine),
+            (1, 0): zx,
+            (0, 1): zy,
+            (2, 0): k * (1.0 + zx * zx) / cosine,
+            (1, 1): k * zx * zy / cosine,
+            (0, 2): k * (1.0 + zy * zy) / cosine,
+        }
         return [values[order] for order in orders]
 
     def hull(self, heights: None) -> tuple[float, float]:
@@ -78,5 +84,6 @@ class Sphere(Surface):
         found = met & (t >= 0) & (cosine > math.sqrt(1.0 - EQUATOR**2)) & (side * (dz * cosine - k * (x * dx + y * dy)) > 0)
         none, one = torch.zeros_like(t), torch.ones_like(t)
         cosine = torch.where(found, cosine, one)
-        return SurfaceIntersection(torch.where(found, t, none), torch.where(found, k * x / cosine, none),
-                   torch.where(found, k * y / cosine, none), found)
+        return SurfaceIntersection(
+            torch.where(found, t, none), torch.where(found, k * x / cosine, none), torch.where(found, k * y / cosine, none), found
+        )

@@ -87,9 +87,11 @@ class WaveImage:
 def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | None = None) -> list[Line]:
     """The light of a scene by wavelength and polarisation: its own, or these with equal parts; white where it has none."""
     if len(scene.source.members) > 1:
-        return [replace(line, part=fraction * line.part)
-                for one, fraction in zip(scene.by_source, scene.source.fractions, strict=True)
-                for line in lines_of(one, field, wavelengths)]
+        return [
+            replace(line, part=fraction * line.part)
+            for one, fraction in zip(scene.by_source, scene.source.fractions, strict=True)
+            for line in lines_of(one, field, wavelengths)
+        ]
     found, own, systems = [], scene.light.wavelengths, {}
     if wavelengths is not None or not own:
         given = wavelengths or white(WHITE_LINES)
@@ -114,13 +116,23 @@ def lines_of_system(system: System) -> list[Line]:
     """The same of any system, whose sources are taken one by one."""
     given = system.light.wavelengths or white(WHITE_LINES)
     parts = system.light.parts if system.light.wavelengths else (1.0 / len(given),) * len(given)
-    return [Line(wavelength, fraction * part, system.with_source(source), wavelength)
-            for source, fraction in zip(system.sources, system.parts, strict=True)
-            for wavelength, part in zip(given, parts, strict=True)]
+    return [
+        Line(wavelength, fraction * part, system.with_source(source), wavelength)
+        for source, fraction in zip(system.sources, system.parts, strict=True)
+        for wavelength, part in zip(given, parts, strict=True)
+    ]
 
 
-def wave_image(scene: Scene, field: HeightField, heights: Tensor, *, wavelengths: tuple[float, ...] | None = None,
-               screen: Screen | None = None, finer: float = 1.0, dtype: torch.dtype = torch.float32) -> WaveImage:
+def wave_image(
+    scene: Scene,
+    field: HeightField,
+    heights: Tensor,
+    *,
+    wavelengths: tuple[float, ...] | None = None,
+    screen: Screen | None = None,
+    finer: float = 1.0,
+    dtype: torch.dtype = torch.float32,
+) -> WaveImage:
     """The wave image of a one-lens scene at heights (n, m) mm; differentiable by them.
 
     Args:
@@ -135,8 +147,9 @@ def wave_image(scene: Scene, field: HeightField, heights: Tensor, *, wavelengths
     return image_of(lines, {EXIT: heights.double()}, screen or scene.screen, finer=finer, dtype=dtype)
 
 
-def image_of(lines: list[Line], parameters: Parameters, screen: Screen | Placed, *, finer: float = 1.0,
-             dtype: torch.dtype = torch.float32) -> WaveImage:
+def image_of(
+    lines: list[Line], parameters: Parameters, screen: Screen | Placed, *, finer: float = 1.0, dtype: torch.dtype = torch.float32
+) -> WaveImage:
     """The wave image of lines of light on one screen, the sources of a system one by one; see `wave_image`."""
     exact, by_source, found = any(h.requires_grad for h in parameters.values()), {}, []
     for line in lines:
@@ -144,9 +157,19 @@ def image_of(lines: list[Line], parameters: Parameters, screen: Screen | Placed,
     for light in by_source.values():
         imager = Imager.of(light, parameters, receiver_of(light[0].system, screen), finer, exact)
         found.append(imager.expose(light, parameters, dtype))
-    return found[0] if len(found) == 1 else WaveImage(
-        sum(w.image for w in found), sum(w.leaving for w in found), sum(w.off_screen for w in found), found[0].wavelengths,
-        sum(w.points for w in found), max(w.spread_error for w in found), max(w.samples for w in found))
+    return (
+        found[0]
+        if len(found) == 1
+        else WaveImage(
+            sum(w.image for w in found),
+            sum(w.leaving for w in found),
+            sum(w.off_screen for w in found),
+            found[0].wavelengths,
+            sum(w.points for w in found),
+            max(w.spread_error for w in found),
+            max(w.samples for w in found),
+        )
+    )
 
 
 def _alike(lines: list[Line]) -> list[list[Line]]:
@@ -177,8 +200,16 @@ class Imager:
     tapered: bool = True
 
     @classmethod
-    def of(cls, lines: list[Line], parameters: Parameters, receiver: Receiver, finer: float = 1.0,
-           exact: bool = False, watched: tuple | None = None, dense: bool = False) -> Imager:
+    def of(
+        cls,
+        lines: list[Line],
+        parameters: Parameters,
+        receiver: Receiver,
+        finer: float = 1.0,
+        exact: bool = False,
+        watched: tuple | None = None,
+        dense: bool = False,
+    ) -> Imager:
         """Look where the light goes, and choose samples for it.
 
         Args:
@@ -215,8 +246,10 @@ class Imager:
                 room = max(BESIDE * (high[k] - low[k]), spread.reach()[k] + receiver.pixel[k] if spread else 0.0)
                 lows[k] = min(lows[k], max(lands[0][k] - BLURS * blur, low[k] - room))
                 highs[k] = max(highs[k], min(lands[1][k] + BLURS * blur, high[k] + room))
-        light = (tuple(min(s.light[0][k] for s in surveys) for k in (0, 1)),
-                 tuple(max(s.light[1][k] for s in surveys) for k in (0, 1)))
+        light = (
+            tuple(min(s.light[0][k] for s in surveys) for k in (0, 1)),
+            tuple(max(s.light[1][k] for s in surveys) for k in (0, 1)),
+        )
         sampling = Sampling.of(light, (tuple(lows), tuple(highs)), receiver.pixel, distance, lengths, finer)
         spans = [len(s.breaks) - 1 for e in system.elements if isinstance(e.surface, HeightField) for s in e.surface.spaces]
         nodes = sampling.count if dense else tuple(min(n, max(LEAST_NODES, A_SPAN * max(spans, default=0))) for n in sampling.count)
@@ -236,9 +269,15 @@ class Imager:
                     leaving += line.part * power
         some = next(iter(images.values()))
         image = torch.stack([images.get(k, torch.zeros_like(some)) for k in range(3)]) if colours else some
-        return WaveImage(image, leaving, leaving - float(image.detach().sum()),
-                         tuple(dict.fromkeys(line.wavelength for line in lines)), len(self.modes(lines[0].system)),
-                         self.spread.error / math.sqrt(max(1, self.each)) if self.spread else 0.0, self.sampling.padded)
+        return WaveImage(
+            image,
+            leaving,
+            leaving - float(image.detach().sum()),
+            tuple(dict.fromkeys(line.wavelength for line in lines)),
+            len(self.modes(lines[0].system)),
+            self.spread.error / math.sqrt(max(1, self.each)) if self.spread else 0.0,
+            self.sampling.padded,
+        )
 
     def modes(self, system: System) -> list[Mode]:
         """Points that the source is taken as."""
@@ -276,8 +315,17 @@ class Imager:
         first, spacing = s.first(line.behind), s.spacing(line.behind)
         for k in (0, 1):
             width = self.receiver.pixel[k] / sub
-            found.append(cells(low[k] - beside[k] * width, width, sub * self.receiver.resolution[k] + 2 * beside[k], first[k],
-                               spacing[k], s.padded[k], device).to(dtype))
+            found.append(
+                cells(
+                    low[k] - beside[k] * width,
+                    width,
+                    sub * self.receiver.resolution[k] + 2 * beside[k],
+                    first[k],
+                    spacing[k],
+                    s.padded[k],
+                    device,
+                ).to(dtype)
+            )
         return tuple(found)
 
     def spread_out(self, image: Tensor, mode: int) -> Tensor:
@@ -305,8 +353,7 @@ class Imager:
         return self.spread_out(found, mode), front.power()
 
     @torch.no_grad()
-    def _by_blocks(self, line: Line, front: Wavefront, pieces: int, rows: Tensor, columns: Tensor,
-                   dtype: torch.dtype) -> Tensor:
+    def _by_blocks(self, line: Line, front: Wavefront, pieces: int, rows: Tensor, columns: Tensor, dtype: torch.dtype) -> Tensor:
         s, fine = self.sampling, front.on(self.sampling.low, self.sampling.step, self.sampling.count)
 
         def field(part: slice) -> Tensor:
@@ -319,5 +366,7 @@ class Imager:
         n, m = self.sampling.count
         needed = 4 * wide * self.sampling.samples + 48 * n * m + 160 * self.nodes[0] * self.nodes[1]
         if needed > memory_free():
-            raise NoWaveImage(f"a wave image of this scene takes about {needed / 2**30:.1f} GiB of memory, and"
-                               f" {memory_free() / 2**30:.1f} GiB are free: fewer pixels, a smaller screen or lens need less")
+            raise NoWaveImage(
+                f"a wave image of this scene takes about {needed / 2**30:.1f} GiB of memory, and"
+                f" {memory_free() / 2**30:.1f} GiB are free: fewer pixels, a smaller screen or lens need less"
+            )

@@ -87,8 +87,9 @@ def power_on_pixels(phase: Tensor, amplitude: Tensor, shape: tuple[int, int], ro
 
 
 @torch.no_grad()
-def power_by_blocks(field: Callable[[slice], Tensor], sampling: Sampling, pieces: int, rows: Tensor, columns: Tensor,
-                    block: int = BLOCK) -> tuple[Tensor, float]:
+def power_by_blocks(
+    field: Callable[[slice], Tensor], sampling: Sampling, pieces: int, rows: Tensor, columns: Tensor, block: int = BLOCK
+) -> tuple[Tensor, float]:
     """The same without derivatives for a field that is given block of rows by block of rows, complex (rows, m).
 
     Of the transform, a piece of the screen's columns and a block of it at a time take memory: (n, M / pieces) + (N, block).

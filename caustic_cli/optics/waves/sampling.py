@@ -49,8 +49,15 @@ class Sampling:
     distance: float
 
     @classmethod
-    def of(cls, light: tuple, landing: tuple, pixel: tuple[float, float], distance: float, wavelengths: tuple[float, ...],
-           finer: float = 1.0) -> Sampling:
+    def of(
+        cls,
+        light: tuple,
+        landing: tuple,
+        pixel: tuple[float, float],
+        distance: float,
+        wavelengths: tuple[float, ...],
+        finer: float = 1.0,
+    ) -> Sampling:
         """Samples that are enough at every wavelength.
 
         Args:
@@ -68,9 +75,11 @@ class Sampling:
             n = max(LEAST, math.ceil(finer * width * seen / (short * distance)))
             most = max(FINER * n * finer, A_PIXEL * finer * long * distance * n / (width * pixel[k]))
             if most > MOST:
-                raise NoWaveImage(f"a wave image of this scene needs {most:,.0f} samples along an axis, where {MOST:,} can be had,"
-                                   f" and {8 * most * most / 2**30:,.0f} GiB: a smaller lens or screen, or a longer throw, needs"
-                                   " fewer")
+                raise NoWaveImage(
+                    f"a wave image of this scene needs {most:,.0f} samples along an axis, where {MOST:,} can be had,"
+                    f" and {8 * most * most / 2**30:,.0f} GiB: a smaller lens or screen, or a longer throw, needs"
+                    " fewer"
+                )
             low.append(light[0][k])
             step.append(width / n)
             count.append(n)

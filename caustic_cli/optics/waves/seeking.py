@@ -32,15 +32,18 @@ def sought(optics, seen, at: tuple[Tensor, Tensor], shape: tuple[int, int], step
         if settled and (k + 1 >= AT_EDGES or not bool(behind.any())):
             break
         ahead = (hu + (x - f.x) / seen.scale[0], hv + (y - f.y) / seen.scale[1])
-        u, v = (torch.where(lit, a, torch.where(found, 0.5 * (h + b), h + INWARDS * (m - h)))
-                for a, h, b, m in zip(ahead, (hu, hv), held, middle, strict=True))
+        u, v = (
+            torch.where(lit, a, torch.where(found, 0.5 * (h + b), h + INWARDS * (m - h)))
+            for a, h, b, m in zip(ahead, (hu, hv), held, middle, strict=True)
+        )
     if bool(behind.any()):
         f = optics.feet(*held)
     return f, held, behind
 
 
-def _left(f, x: Tensor, y: Tensor, shape: tuple[int, int], step: tuple[float, float], u: Tensor, v: Tensor,
-          behind: Tensor) -> float:
+def _left(
+    f, x: Tensor, y: Tensor, shape: tuple[int, int], step: tuple[float, float], u: Tensor, v: Tensor, behind: Tensor
+) -> float:
     """Bound of the path left out where feet miss the grid by e: half e^2 times the wavefront's curvature there, mm."""
     inside = ~behind & (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
     if not bool(inside.any()):

@@ -28,8 +28,9 @@ from caustic_cli.optics.waves.wavefront import Wavefront
 STEP, MOST_PLANES, A_PIXEL = 0.2, 400, 4
 
 
-def power_on_tilted(r: Receiver, plane: Plane, s: Sampling, front: Wavefront, length: float, behind: float,
-                    dtype: torch.dtype) -> Tensor:
+def power_on_tilted(
+    r: Receiver, plane: Plane, s: Sampling, front: Wavefront, length: float, behind: float, dtype: torch.dtype
+) -> Tensor:
     """Power on a tilted screen's pixels of one wavefront, float64.
 
     length, behind: wavelength in vacuum and in the medium before the screen, mm.
@@ -39,8 +40,10 @@ def power_on_tilted(r: Receiver, plane: Plane, s: Sampling, front: Wavefront, le
     """
     e1, e2, e3 = plane.axes
     device = front.path.device
-    u, v = (r.low[k] + r.pixel[k] * (torch.arange(A_PIXEL * r.resolution[k], dtype=torch.float64, device=device) + 0.5) / A_PIXEL
-            for k in (0, 1))
+    u, v = (
+        r.low[k] + r.pixel[k] * (torch.arange(A_PIXEL * r.resolution[k], dtype=torch.float64, device=device) + 0.5) / A_PIXEL
+        for k in (0, 1)
+    )
     x, y, z = (dot(r.middle, e) + dot(r.axes[0], e) * u[:, None] + dot(r.axes[1], e) * v[None, :] for e in (e1, e2, e3))
     z = z - plane.z  # beyond the plane through the screen's middle
     facing = dot(r.axes[2], e3)
@@ -54,8 +57,10 @@ def power_on_tilted(r: Receiver, plane: Plane, s: Sampling, front: Wavefront, le
     residual = max(m[2] for m in maps) + 0.5 * behind / min(r.pixel)
     planes = max(1, math.ceil(2.0 * depth * residual / (2.0 * STEP * min(r.pixel))))
     if planes > MOST_PLANES:
-        raise NoWaveImage(f"a wave image of this tilted screen needs {planes} planes, at most {MOST_PLANES} are made: less tilt or"
-                           " larger pixels need fewer")
+        raise NoWaveImage(
+            f"a wave image of this tilted screen needs {planes} planes, at most {MOST_PLANES} are made: less tilt or"
+            " larger pixels need fewer"
+        )
     image = torch.zeros(u.numel(), v.numel(), dtype=torch.float64, device=device)
     height = 2.0 * depth / planes
     for k in range(planes):
@@ -63,8 +68,20 @@ def power_on_tilted(r: Receiver, plane: Plane, s: Sampling, front: Wavefront, le
         here = (z - at).abs() <= 0.5 * height * (1.0 + 1e-12)
         if not bool(here.any()):
             continue
-        image = image + _through(replace(s, distance=s.distance + at), path, amplitude, foot, maps, (x, y, z - at), (nx, ny, nz),
-                                 here, length, behind, dtype, r.pixel)
+        image = image + _through(
+            replace(s, distance=s.distance + at),
+            path,
+            amplitude,
+            foot,
+            maps,
+            (x, y, z - at),
+            (nx, ny, nz),
+            here,
+            length,
+            behind,
+            dtype,
+            r.pixel,
+        )
     cell = r.pixel[0] * r.pixel[1] / A_PIXEL**2
     n, m = r.resolution
     return image.view(n, A_PIXEL, m, A_PIXEL).sum((1, 3)) * cell
@@ -77,11 +94,14 @@ def _through(s, path, amplitude, foot, maps, point, normal, here, length, behind
     fields = [torch.fft.fft2(w, s=s.padded, norm="ortho") for w in moments]
     (dx, dy), (x0, y0) = s.spacing(behind), s.first(behind)
     x, y, z = point
-    grid_x, grid_y = (c0 + d * torch.arange(n, dtype=dtype, device=path.device)
-                      for c0, d, n in zip((x0, y0), (dx, dy), s.padded, strict=True))
+    grid_x, grid_y = (
+        c0 + d * torch.arange(n, dtype=dtype, device=path.device) for c0, d, n in zip((x0, y0), (dx, dy), s.padded, strict=True)
+    )
     density = (fields[0].real.square() + fields[0].imag.square()) / (dx * dy)
-    flux = [(grid * density - (fields[0].conj() * moved).real / (dx * dy)) / s.distance
-            for grid, moved in ((grid_x[:, None], fields[1]), (grid_y[None, :], fields[2]))]
+    flux = [
+        (grid * density - (fields[0].conj() * moved).real / (dx * dy)) / s.distance
+        for grid, moved in ((grid_x[:, None], fields[1]), (grid_y[None, :], fields[2]))
+    ]
     total = density * normal[2] + flux[0] * normal[0] + flux[1] * normal[1]
     for axis, width in ((0, pixel[0] / dx), (1, pixel[1] / dy)):  # what lies between the points of a pixel counts too
         half = int(0.5 * width / A_PIXEL)
@@ -89,8 +109,9 @@ def _through(s, path, amplitude, foot, maps, point, normal, here, length, behind
             size, pad = ((2 * half + 1, 1), (half, 0)) if axis == 0 else ((1, 2 * half + 1), (0, half))
             total = torch.nn.functional.avg_pool2d(total[None, None], size, 1, pad)[0, 0]
     thinner = [1.0 + z * b for _, b, _ in maps]
-    at_x, at_y = (((c - z * a) / t - c0) / d
-                  for c, (a, _, _), t, c0, d in zip((x, y), maps, thinner, (x0, y0), (dx, dy), strict=True))
+    at_x, at_y = (
+        ((c - z * a) / t - c0) / d for c, (a, _, _), t, c0, d in zip((x, y), maps, thinner, (x0, y0), (dx, dy), strict=True)
+    )
     n, m = s.padded
     spots = torch.stack([2.0 * at_y[here] / (m - 1) - 1.0, 2.0 * at_x[here] / (n - 1) - 1.0], -1).to(dtype)
     seen = torch.nn.functional.grid_sample(total[None, None], spots[None, None], mode="bicubic", align_corners=True)[0, 0, 0]
@@ -102,8 +123,10 @@ def _mean_map(front: Wavefront, distance: float) -> list[tuple[float, float, flo
     """For each axis (a, b, rest): light that lands at X has the slope a + b X, give or take rest."""
     weight, found = front.density, []
     n, m = weight.shape
-    foot = (front.low[0] + front.step[0] * (torch.arange(n).to(weight) + 0.5))[:, None].expand(n, m), \
-        (front.low[1] + front.step[1] * (torch.arange(m).to(weight) + 0.5))[None, :].expand(n, m)
+    foot = (
+        (front.low[0] + front.step[0] * (torch.arange(n).to(weight) + 0.5))[:, None].expand(n, m),
+        (front.low[1] + front.step[1] * (torch.arange(m).to(weight) + 0.5))[None, :].expand(n, m),
+    )
     lit = weight > 0
     for big, x in zip((front.big_x, front.big_y), foot, strict=True):
         q, c, w = ((big - x) / distance)[lit], big[lit], weight[lit] / weight[lit].sum()

@@ -162,8 +162,9 @@ def survey(optics: Optics) -> Survey:
         lit &= (2.0 * u - 1.0) ** 2 + (2.0 * v - 1.0) ** 2 <= 1.0 + 1e-12
     if int(lit.sum()) < 16:
         raise NoWaveImage("no light reaches the screen, so it has no wave image")
-    light, landing = (tuple(tuple(float(getattr(c[lit], w)()) for c in pair) for w in ("min", "max"))
-                      for pair in ((f.x, f.y), (f.big_x, f.big_y)))
+    light, landing = (
+        tuple(tuple(float(getattr(c[lit], w)()) for c in pair) for w in ("min", "max")) for pair in ((f.x, f.y), (f.big_x, f.big_y))
+    )
     scale, offset, lows, highs = [], [], [], []
     for k, (at, foot) in enumerate(((u[lit], f.x[lit]), (v[lit], f.y[lit]))):
         a, b = at - at.mean(), foot - foot.mean()
@@ -250,8 +251,15 @@ class Wavefront:
         return fine
 
 
-def wavefront(optics: Optics, seen: Survey, low: tuple[float, float], step: tuple[float, float], count: tuple[int, int],
-              sensitive: bool = False, exact: bool = False) -> Wavefront:
+def wavefront(
+    optics: Optics,
+    seen: Survey,
+    low: tuple[float, float],
+    step: tuple[float, float],
+    count: tuple[int, int],
+    sensitive: bool = False,
+    exact: bool = False,
+) -> Wavefront:
     """The light on a grid of `count` cells `step` wide from `low` on; differentiable by the heights in `optics.parameters`.
 
     exact: seek feet until rounding is all that is left.
@@ -293,8 +301,10 @@ def wavefront(optics: Optics, seen: Survey, low: tuple[float, float], step: tupl
     power = f.power.view(shape)
     crossed = torch.where((squeeze.detach() <= 0) & ~dark, power.detach(), torch.zeros_like(power))
     if float(crossed.sum()) > CROSSED * float(power.detach().sum()):
-        raise NoWaveImage("light crosses itself within the lens' own depth, so that no wavefront behind it stands for it;"
-                           " a flatter surface or a screen farther away has one")
+        raise NoWaveImage(
+            "light crosses itself within the lens' own depth, so that no wavefront behind it stands for it;"
+            " a flatter surface or a screen farther away has one"
+        )
     if bool((~dark).any()):
         power = torch.where(dark, filled(power.detach(), dark), power)
     by_x, by_y = torch.gradient(power.detach(), spacing=step, dim=(0, 1), edge_order=2)
@@ -302,8 +312,17 @@ def wavefront(optics: Optics, seen: Survey, low: tuple[float, float], step: tupl
     rx, ry = (abs(s) / 2.0 for s in seen.scale)
     edge_x, edge_y = (rx - torch.hypot(px, py * (rx / ry)), None) if pupil.round else (rx - px.abs(), ry - py.abs())
     landed = (c.detach().view(shape) for c in (f.big_x, f.big_y))
-    return Wavefront(low, step, path.view(shape), density, edge_x, edge_y, *landed, (~dark).double() if bool(dark.any()) else None,
-                     **{name: value.view(shape) for name, value in at.items()})
+    return Wavefront(
+        low,
+        step,
+        path.view(shape),
+        density,
+        edge_x,
+        edge_y,
+        *landed,
+        (~dark).double() if bool(dark.any()) else None,
+        **{name: value.view(shape) for name, value in at.items()},
+    )
 
 
 def _sensitive(optics: Optics, u: Tensor, v: Tensor) -> tuple[Feet, dict[str, Tensor]]:

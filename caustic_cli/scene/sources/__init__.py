@@ -18,8 +18,23 @@ from caustic_cli.scene.sources.points import Points
 from caustic_cli.scene.sources.section import COMMON, SourceType, Table
 from caustic_cli.scene.sources.several import Several, light_of_all, lights_of
 
-__all__ = ["COMMON", "Disc", "PlaneWave", "Points", "Source", "SourceType", "either", "in_words",
-           "light_of_all", "names", "own_keys", "register", "together", "type_of", "used_by"]
+__all__ = [
+    "COMMON",
+    "Disc",
+    "PlaneWave",
+    "Points",
+    "Source",
+    "SourceType",
+    "either",
+    "in_words",
+    "light_of_all",
+    "names",
+    "own_keys",
+    "register",
+    "together",
+    "type_of",
+    "used_by",
+]
 
 #: Files in the order in which messages and comments name their types; others follow by name.
 _FIRST = ("plane", "points", "disc")
@@ -75,7 +90,8 @@ def together(first: Source, section: Table) -> Source:
     return Several((first, *others), tuple((light.wavelengths, light.weights) for light in lights_of(section)))
 
 
-for _module in sorted((m.name for m in pkgutil.iter_modules(__path__)),
-                      key=lambda name: (_FIRST.index(name) if name in _FIRST else len(_FIRST), name)):
+for _module in sorted(
+    (m.name for m in pkgutil.iter_modules(__path__)), key=lambda name: (_FIRST.index(name) if name in _FIRST else len(_FIRST), name)
+):
     for _type in getattr(import_module(f"{__name__}.{_module}"), "TYPES", ()):
         register(_type)

@@ -89,8 +89,11 @@ class Disc(Source):
         cells = [(np.arange(n) + 0.5) * (2.0 / n) - 1.0 for n in self.brightness.shape]
         total = self.brightness.sum()
         (x, y, z), (fx, fy) = self.position, self.frame
-        return (x + fx * float(cells[0] @ self.brightness.sum(1) / total),
-                y + fy * float(cells[1] @ self.brightness.sum(0) / total), float(z))
+        return (
+            x + fx * float(cells[0] @ self.brightness.sum(1) / total),
+            y + fy * float(cells[1] @ self.brightness.sum(0) / total),
+            float(z),
+        )
 
     def points(self) -> tuple[np.ndarray, np.ndarray]:
         """Its middle."""
@@ -130,8 +133,9 @@ def _build(table: Table, _profile) -> Disc:
     light = content(table, "file", np.ndarray)
     if light is None and table.get("file"):
         raise InputError("⟨source.file⟩ of a disc must be a picture of its brightness, an image or a 2-D .npy")
-    return Disc(middle(table, "disc"), tuple(table["size"]), table["power"], angle=table.get("angle"), brightness=light,
-                **shining(table))
+    return Disc(
+        middle(table, "disc"), tuple(table["size"]), table["power"], angle=table.get("angle"), brightness=light, **shining(table)
+    )
 
 
 def _idle(table: Table) -> dict[str, str]:

@@ -46,8 +46,9 @@ class Distribution:
     def __post_init__(self):
         angles, values = np.asarray(self.angles, dtype=float), np.asarray(self.values, dtype=float)
         if not 2 <= len(angles) <= MOST_ANGLES or len(values) != len(angles):
-            raise InputError(f"must name 2 to {MOST_ANGLES:,} angles and an intensity for each, got {len(angles)} and"
-                             f" {len(values)}")
+            raise InputError(
+                f"must name 2 to {MOST_ANGLES:,} angles and an intensity for each, got {len(angles)} and {len(values)}"
+            )
         if angles[0] != 0 or not (np.diff(angles) > 0).all() or not angles[-1] <= 180:
             raise InputError("must have angles that ascend from 0 to at most 180 degrees")
         if not (np.isfinite(values) & (values >= 0) & (values <= 1e300)).all():

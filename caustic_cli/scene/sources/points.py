@@ -45,16 +45,16 @@ class Points(Source):
         if self.powers is None:
             object.__setattr__(self, "powers", (1.0 / len(self.positions),) * len(self.positions))
         if len(self.powers) != len(self.positions):
-            raise InputError(f"⟨source.powers⟩ must be one for each of the {len(self.positions)} positions,"
-                             f" got {len(self.powers)}")
+            raise InputError(f"⟨source.powers⟩ must be one for each of the {len(self.positions)} positions, got {len(self.powers)}")
         check("source.powers", self.powers)
         if not sum(self.powers) > 0:
             raise InputError("⟨source.powers⟩ must not all be 0")
         check_shining(self)
 
     @classmethod
-    def grid(cls, centre: Sequence[float], size: tuple[float, float], shape: tuple[int, int], power: float = 1.0,
-             **options) -> Points:
+    def grid(
+        cls, centre: Sequence[float], size: tuple[float, float], shape: tuple[int, int], power: float = 1.0, **options
+    ) -> Points:
         """shape = (N, M) equispaced points on a rectangle of full width and height `size` mm, borders included (fig. 6.4.1)."""
         centre = check("source.position", centre)
         check("source.size", size)

@@ -96,8 +96,10 @@ class Measured(Source):
 def _build(table: Table, _profile) -> Measured:
     rays, places = content(table, "file", RaySet), positions(table)
     if rays is None:
-        raise InputError("⟨source.file⟩ of type rays must be a ray file: IES TM-25 (.tm25ray), Zemax binary (.dat, .sdf) or"
-                         " LightTools text (.ray, .txt)")
+        raise InputError(
+            "⟨source.file⟩ of type rays must be a ray file: IES TM-25 (.tm25ray), Zemax binary (.dat, .sdf) or"
+            " LightTools text (.ray, .txt)"
+        )
     if len(places) != 1:
         raise InputError(f"⟨source.position⟩ of a ray file is that of its origin, one [x, y, z], got {len(places)}")
     return Measured(rays, places[0], table["power"])

@@ -66,15 +66,18 @@ class RaySet:
             raise InputError("holds no light: the flux of every ray is 0" if whole == 0 else "holds more flux than can be added up")
         if self.unit not in ("W", "lm"):
             raise InputError(f"the unit of flux must be W or lm, got {self.unit!r}")
-        for name, value in (("positions", positions), ("directions", directions / length[:, None]), ("flux", flux),
-                            ("total", float(self.total) if 0 < self.total < np.inf else whole)):
+        for name, value in (
+            ("positions", positions),
+            ("directions", directions / length[:, None]),
+            ("flux", flux),
+            ("total", float(self.total) if 0 < self.total < np.inf else whole),
+        ):
             object.__setattr__(self, name, value)
         if self.wavelengths is not None:
             wavelengths = np.asarray(self.wavelengths, dtype=np.float64)
             if wavelengths.shape != (n,):
                 raise InputError(f"wavelengths must be {n}, got {wavelengths.shape}")
-            _refuse(~((wavelengths >= SHORTEST) & (wavelengths <= LONGEST)),
-                    f"a wavelength outside {SHORTEST:g} to {LONGEST:g} nm")
+            _refuse(~((wavelengths >= SHORTEST) & (wavelengths <= LONGEST)), f"a wavelength outside {SHORTEST:g} to {LONGEST:g} nm")
             object.__setattr__(self, "wavelengths", wavelengths)
 
     @property

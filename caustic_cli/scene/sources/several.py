@@ -140,8 +140,10 @@ class Several(Source):
 def lights_of(section: Table, color: bool = False) -> list[Light]:
     """The light of each source of a [source] section: its own wavelengths, the first's polarisation and unit of power."""
     state, unit = section.get("polarisation"), section.get("power_unit", "W")
-    return [Light(state, tuple(t.get("wavelengths", ())), tuple(t.get("weights", ())), color=color, unit=unit)
-            for t in (section, *section.get("also", ()))]
+    return [
+        Light(state, tuple(t.get("wavelengths", ())), tuple(t.get("weights", ())), color=color, unit=unit)
+        for t in (section, *section.get("also", ()))
+    ]
 
 
 def light_of_all(section: Table, color: bool = False) -> Light:
