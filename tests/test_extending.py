@@ -177,7 +177,7 @@ EFFECT = Addition(
             "from caustic_cli.optics.effects.entrance import Entrance\n",
             "from caustic_cli.optics.effects.dust import Dust\nfrom caustic_cli.optics.effects.entrance import Entrance\n",
         ),
-        ("optics/effects/__init__.py", "SourceSize(), Polarisation(),", "SourceSize(), Dust(), Polarisation(),"),
+        ("optics/effects/__init__.py", "    SourceSize(),\n", "    SourceSize(),\n    Dust(),\n"),
     ),
     used="""
     import torch
