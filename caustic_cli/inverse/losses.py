@@ -101,8 +101,8 @@ class Loss:
         total = image.sum()
         if not float(total.detach()) > 0:
             raise NoLight(
-                "no light reaches the screen, so there is nothing to improve: every ray is reflected inside"
-                " the lens or misses the screen; check index, throw, mag and screen size"
+                "no light reaches the screen, so there is nothing to improve: every ray is absorbed or"
+                " reflected inside the lens, or misses the screen; check index, absorption, throw, mag and screen size"
             )
         entering = leaving if entering is None else entering
         square = sum(weight * self._square(name, image, leaving, entering, total) for weight, name in self.terms) + penalty

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.io.surfaces import load_npz, surface_of
+from caustic_cli.optics.bounds import refuse_without_glass
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Disc, Lens, Light, PlaneWave, Points, Scene, Screen, Source
 from caustic_cli.scene.sources.distribution import Distribution
@@ -39,7 +40,9 @@ def open_archive(path: str | Path) -> tuple[Scene, HeightField, Tensor]:
             float(data["z_screen"]),
             tuple(int(n) for n in _reals(data, "resolution", 2)),
         )
-        return Scene(_source(data), lens, screen, Light(unit=_text(data, "source_power_unit", "W"))), field, heights
+        scene = Scene(_source(data), lens, screen, Light(unit=_text(data, "source_power_unit", "W")))
+        refuse_without_glass(scene, field, heights)
+        return scene, field, heights
     except KeyError as error:
         raise InputError(f"{path}: has no {error.args[0]}; an archive of caustic export ⟨format⟩ lighttools is needed") from error
     except (TypeError, ValueError, IndexError) as error:

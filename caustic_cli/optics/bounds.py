@@ -19,8 +19,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from caustic_cli.errors import InputError
 from caustic_cli.optics.interface import reflectance, reflectances
-from caustic_cli.optics.resolution import Resolution
+from caustic_cli.optics.resolution import Resolution, paraxial
 from caustic_cli.optics.sampling import LARGEST_NORMAL
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
@@ -35,7 +36,8 @@ class Bounds:
     slope_ratio: of the slope bound to the exit ray's slope, a secondary intersection is impossible below 1; reach: how far rays get
     to the aperture's edge, in parts of its half width, at the greatest height; ghost: part of the power that is reflected twice
     inside; polarised: of unpolarised light, how much the exit's reflectance changes by what the entrance makes of s and p;
-    resolution: what diffraction, source and pixels let it show.
+    ghost_error: about what relative RMS that light adds to the image, see `ghost_error`; resolution: what diffraction, source and
+    pixels let it show.
     """
 
     incidence: float
@@ -47,8 +49,26 @@ class Bounds:
     slope_ratio: float
     reach: float
     ghost: float
+    ghost_error: float
     polarised: float
     resolution: Resolution
+
+
+def refuse_without_glass(scene: Scene, field: HeightField, heights: Tensor) -> None:
+    """Refuse a lens whose exit dips below its entrance: light would gain what it is absorbed over a negative thickness.
+
+    Raises:
+        InputError: how far it does.
+    """
+    lens = scene.lens
+    if lens.mirror or float(heights.min()) >= lens.z_in:  # the surface lies in the hull of its net
+        return
+    dip = lens.z_in - field.least(heights, lens.round)
+    if dip > 0:
+        raise InputError(
+            f"⟨lens.z_in⟩ of {lens.z_in:g} mm lies above a part of the exit surface, which dips {dip:.3g} mm below it; it must"
+            f" be at most {lens.z_in - dip:.6g} mm"
+        )
 
 
 def bounds_of(scene: Scene, field: HeightField, heights: Tensor) -> Bounds:
@@ -68,9 +88,9 @@ def bounds_of(scene: Scene, field: HeightField, heights: Tensor) -> Bounds:
     slope_ratio = slope * math.tan(out) if out < math.pi / 2.0 else (math.inf if slope > 0 else 0.0)
     reach = _reach(scene, inside, float(heights.min()), float(heights.max()))
     ghost, polarised = _ghost(scene, field, heights, inside, most), _polarised(incidence, critical, most)
-    return Bounds(
-        incidence, inside, slope, lean, most, critical, slope_ratio, reach, ghost, polarised, Resolution.at(scene, field, heights)
-    )
+    focused = ghost_error(scene, field, heights, ghost, most)
+    seen = Resolution.at(scene, field, heights)
+    return Bounds(incidence, inside, slope, lean, most, critical, slope_ratio, reach, ghost, focused, polarised, seen)
 
 
 def _polarised(incidence: float, critical: float, n: float) -> float:
@@ -132,6 +152,35 @@ def _ghost(scene: Scene, field: HeightField, heights: Tensor, inside: float, n: 
     both = part(inside + lean) * part(inside + 2.0 * lean)
     even = scene.source.collimated and scene.source.profile is None and not lens.round
     return float((both * area).sum() if even else both.max())
+
+
+def ghost_error(scene: Scene, field: HeightField, heights: Tensor, part: float, n: float) -> float:
+    """Relative RMS that the first ghost adds to the image, about, if `part` of the power is in it; n: index.
+
+    To first order a slope g turns light by (n - 1) g and its first ghost by (3 n - 1) g.  A ghost whose map x -> X has the
+    Jacobian J carries part / (A |det J|) to X, A the aperture's area, so that over a screen of area S the squares of its irradiance
+    have the mean part^2 S / A times the mean over the lens of 1 / |det J|.  The eigenvalues of J are taken as smaller by what the
+    first order may be wrong, and never below a pixel over the lens.
+    """
+    if part == 0.0:
+        return 0.0
+    lens, screen = scene.lens, scene.screen
+    light = paraxial(scene, field, heights)
+    gain = light.throw * (3.0 * n - 1.0)
+    x, y = light.x * light.straight + gain * light.gx, light.y * light.straight + gain * light.gy
+    on = ((x - screen.shift[0]).abs() <= screen.half_size[0]) & ((y - screen.shift[1]).abs() <= screen.half_size[1])
+    middle = light.straight + 0.5 * gain * (light.xx + light.yy)
+    split = 0.5 * gain * torch.hypot(light.xx - light.yy, 2.0 * light.xy)
+    slopes = light.gx.square() + light.gy.square()
+    wrong = abs((float(heights.max()) - lens.z_in) / light.throw) + 3.0 * n * n * slopes
+    least = [w / (2.0 * r) for w, r in zip(screen.pixel, lens.half_size, strict=True)]
+    both = [
+        (e.abs() - (e - light.straight).abs() * wrong).clamp_min(k)
+        for e, k in zip((middle - split, middle + split), least, strict=True)
+    ]
+    spread = torch.where(on, 1.0 / (both[0] * both[1]), 0.0).mean()
+    ratio = math.prod(screen.half_size) / math.prod(lens.half_size)
+    return part * math.sqrt(ratio * float(spread))
 
 
 def _slopes(field: HeightField, heights: Tensor) -> tuple[Tensor, Tensor]:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.optics.surfaces import HeightField
-from caustic_cli.optics.surfaces.base import SECOND
+from caustic_cli.optics.surfaces.base import FIRST, SECOND
 from caustic_cli.scene import Scene
 
 #: nm: the wavelength at which light without one is judged, and the band of white light.
@@ -56,11 +56,12 @@ class Resolution:
         lens, screen = scene.lens, scene.screen
         said = scene.light.wavelengths
         wavelength = sum(w * p for w, p in zip(said, scene.light.parts, strict=True)) if said else GREEN
-        throw = abs(screen.z - lens.z_in)
         distance = abs(screen.z - lens.offset.thickness)
+        # A point of the exit sees the source through the glass, which brings it nearer by what the index makes of the thickness.
+        seen_from = lens.z_in + (lens.offset.thickness - lens.z_in) / lens.inside
         return cls(
             diffraction_blur(wavelength, distance, magnification),
-            scene.source.blur(lens.z_in, throw),
+            scene.source.blur(seen_from, distance),
             max(screen.pixel),
             picture,
             lens.size[0],
@@ -121,17 +122,42 @@ class Resolution:
         return text + (f"; a lens of {larger:.2g} mm would carry {self.wanted}" if larger else "")
 
 
+@dataclass(frozen=True)
+class Paraxial:
+    """A lens to first order at even points of it: x, y (N,), mm; the surface's slopes gx, gy there and its second derivatives xx,
+    xy, yy, 1/mm; throw, mm; straight, what light that is not turned at all is magnified by.
+
+    Light that a slope g turns by c g lands at X = x straight + throw c g.
+    """
+
+    x: Tensor
+    y: Tensor
+    gx: Tensor
+    gy: Tensor
+    xx: Tensor
+    xy: Tensor
+    yy: Tensor
+    throw: float
+    straight: float
+
+
+def paraxial(scene: Scene, field: HeightField, heights: Tensor) -> Paraxial:
+    """The lens of a scene with these heights (n, m) mm at POINTS^2 points, in light of its source's centre."""
+    lens = scene.lens
+    distance = abs(scene.screen.z - lens.offset.thickness)
+    vergence = 0.0 if scene.source.distant else 1.0 / (lens.z_in - scene.source.centre[2] + lens.offset.thickness / lens.inside)
+    line = (torch.arange(POINTS, dtype=torch.float64, device=heights.device) + 0.5) * (2.0 / POINTS) - 1.0
+    x, y = (c.reshape(-1) * r for c, r in zip(torch.meshgrid(line, line, indexing="ij"), field.half_size, strict=True))
+    derivatives = field.at(heights.detach(), x, y, (*FIRST[1:], *SECOND))
+    return Paraxial(x, y, *derivatives, distance, 1.0 + distance * vergence)
+
+
 def local_magnification(scene: Scene, field: HeightField, heights: Tensor) -> float:
     """Root of the mean area over which a lens throws light, over its own: paraxial, from the surface's second derivatives.
 
     Light from s lands at X = s (1 + L / a) + L g grad h, a the distance of the source and g = n - 1, or 2 for a mirror.
     """
-    lens = scene.lens
-    distance = abs(scene.screen.z - lens.offset.thickness)
-    vergence = 0.0 if scene.source.distant else 1.0 / (lens.z_in - scene.source.centre[2] + lens.offset.thickness / lens.inside)
-    gain = distance * (2.0 if lens.mirror else lens.index - 1.0)
-    line = (torch.arange(POINTS, dtype=torch.float64, device=heights.device) + 0.5) * (2.0 / POINTS) - 1.0
-    x, y = (c.reshape(-1) * r for c, r in zip(torch.meshgrid(line, line, indexing="ij"), field.half_size, strict=True))
-    xx, xy, yy = (gain * d for d in field.at(heights.detach(), x, y, SECOND))
-    straight = 1.0 + distance * vergence
-    return float(((straight + xx) * (straight + yy) - xy * xy).abs().mean().sqrt())
+    light = paraxial(scene, field, heights)
+    gain = light.throw * (2.0 if scene.lens.mirror else scene.lens.index - 1.0)
+    xx, xy, yy = gain * light.xx, gain * light.xy, gain * light.yy
+    return float(((light.straight + xx) * (light.straight + yy) - xy * xy).abs().mean().sqrt())

@@ -1,8 +1,8 @@
 """An extended source that shifts the image: the image of its middle, convolved with its own shape.
 
-Light of a source point beside the middle lands shifted by (S_x dx, S_y dy), nearly alike for all of the lens.  How nearly is
-measured on the outermost points: `error` is the most by which light lands elsewhere than so shifted, `usual` what most of it
-keeps below.
+Light of a source point beside the middle that leaves the lens at the same point lands shifted by (S_x dx, S_y dy), nearly alike for
+all of the lens.  How nearly is measured on the outermost points: `error` is the most by which light lands elsewhere than so
+shifted, `usual` what most of it keeps below.
 """
 
 from __future__ import annotations
@@ -34,8 +34,11 @@ CELLS, MOST_CUT = 4.0, 4
 #: Points of an ellipse: least along an axis, and to a cell of an image.
 LEAST, A_CELL = 64, 6
 
-#: Where the light of a point of the source lands that passes points (N,) of the pupil: X, Y, mm, and its power.
-Landing = Callable[[Mode, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
+#: How often points of the pupil are corrected until light of another mode leaves the lens where the middle's does.
+CORRECTIONS = 3
+#: Where the light of a point of the source lands that passes points (N,) of the pupil: X, Y, mm, its power, and where it leaves the
+#: lens, mm.
+Landing = Callable[[Mode, Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]
 
 
 @dataclass(frozen=True)
@@ -170,11 +173,10 @@ def spread_at(scene: Scene, field: HeightField, heights: Tensor) -> Spread | Non
     where it does not."""
     system, parameters = System.of(scene, field), {EXIT: heights.detach().double()}
 
-    def landing(mode: Mode, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        rays = mode.through(u, v, system.before.index_at(None))
-        state = Tracer(system, rays).land(parameters, scene.screen)[0].spread()
-        x, y, _ = state.full(state.origin)
-        return x, y, state.power
+    def landing(mode: Mode, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        tracer = Tracer(system, mode.through(u, v, system.before.index_at(None)))
+        state, left = tracer.land(parameters, scene.screen)[0].spread(), tracer.last(parameters).state.spread()
+        return *state.full(state.origin)[:2], state.power, *left.full(left.origin)[:2]
 
     return spread_of(system, landing, heights.device)
 
@@ -193,10 +195,16 @@ def spread_of(lit: Lit, landing: Landing, device: str | torch.device = "cpu") ->
         return None
     line = torch.linspace(0.0, 1.0, POINTS, dtype=torch.float64, device=device)
     u, v = (c.reshape(-1) for c in torch.meshgrid(line, line, indexing="ij"))
-    (x, y, power), moved = landing(centre, u, v), []
+    (x, y, power, at_x, at_y), moved = landing(centre, u, v), []
     for mode in outer:
-        to_x, to_y, arriving = landing(mode, u, v)
-        lit_too = (power > 0) & (arriving > 0)
+        through_u, through_v = u, v
+        for _ in range(CORRECTIONS):
+            *_, left_x, left_y = landing(mode, through_u, through_v)
+            through_u = through_u - (left_x - at_x) / (2.0 * lit.pupil.half_size[0])
+            through_v = through_v - (left_y - at_y) / (2.0 * lit.pupil.half_size[1])
+        to_x, to_y, arriving, *_ = landing(mode, through_u, through_v)
+        within = ((through_u - 0.5).abs() <= 0.5) & ((through_v - 0.5).abs() <= 0.5)
+        lit_too = (power > 0) & (arriving > 0) & within
         if not bool(lit_too.any()):
             return None
         moved.append([(to_x - x)[lit_too], (to_y - y)[lit_too]])

@@ -21,6 +21,7 @@ from caustic_cli.errors import InputError, plain
 from caustic_cli.inverse.target import target_on_screen
 from caustic_cli.io.files import write_bytes
 from caustic_cli.io.picture import Picture, read_picture
+from caustic_cli.optics.bounds import refuse_without_glass
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.project import attachments, checkpoint
 from caustic_cli.project.checkpoint import Checkpoint
@@ -148,6 +149,10 @@ class Project:
                 f"⟨lens.control⟩ {list(scene.lens.control)} is not that of the designed lens,"
                 f" {list(field.shape)}; design again to change it"
             )
+        try:
+            refuse_without_glass(scene, field, state.state.heights)
+        except InputError as error:
+            raise self.error(f"{error}") from error
         return field, state
 
     def write(self, path: Path | None = None) -> None:

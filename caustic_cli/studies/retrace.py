@@ -32,6 +32,8 @@ MOST_TIMES = 4
 ORDER, SOBOL_ORDER = 0.75, 0.58
 #: A plane wave's noise is told by two images of one PROBE-th of its rays each.
 PROBE = 8
+#: By how much the account of the light may miss, by the precision of the rays: the rounding of their sums.
+ACCOUNT = {torch.float64: 1e-9, torch.float32: 1e-3}
 #: Most rays that tolerance may ask for in one go.
 MOST_RAYS = 10**11
 
@@ -196,12 +198,27 @@ def retrace(
             enough = quiet is None or target is None or figures["noise"] <= quiet * figures["relative_rms"]
             if enough or 2 * len(parts[0]) > MOST_TIMES or rays * len(parts[0]) >= _held(scene):
                 break
+    require_account(figures, dtype)
     figures |= irradiance_figures(scene, counted.image, screen) | unit_figures(scene)
     if filter is None or filter.reach == (0, 0):
         return counted, figures
     return expose(
         scene, field, heights, sampler_for(scene, counted.rays, seed, device), filter, dtype, screen, requests=requests
     ), figures
+
+
+def require_account(figures: dict, dtype: torch.dtype) -> None:
+    """Stop where the account of the light is impossible: a part outside [0, 1], or a sum that is not 1.
+
+    Raises:
+        CausticError: naming the parts.
+    """
+    parts = {"on_screen": figures["on_screen"], **figures["lost"]}
+    room = ACCOUNT[dtype]
+    if abs(math.fsum(parts.values()) - 1.0) <= room and all(-room <= part <= 1.0 + room for part in parts.values()):
+        return
+    listed = ", ".join(f"{name} {part:.6g}" for name, part in parts.items())
+    raise CausticError(f"the account of the light does not close, so nothing is written: {listed}")
 
 
 def _judged_halves(counted: Image, target: np.ndarray | None, halves: tuple[Image, Image]) -> dict:

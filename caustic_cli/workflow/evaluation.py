@@ -5,6 +5,7 @@ What the optimiser saw is no judge of what it did: it learns its own rays and it
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,7 +32,7 @@ REPORT_SAMPLES = 401
 LIKENESS = {"rms", "rms-light", "throughput"}
 #: Part of relative_rms that the noise of its rays may be.
 QUIET = 0.1
-#: From so many times the light on the screen, a lens may be less like its target than the start is.
+#: From so many times the light on the screen, a lens is kept although the surface it began from is more like the target.
 BRIGHTER = 1.01
 
 
@@ -104,7 +105,7 @@ def evaluate(designer: Designer, target: np.ndarray, state: State, device: str, 
     likeness = {name for _, name in parse(designer.options.loss)} <= LIKENESS
     if state.start is not None and likeness:
         start = designer.within_limits(replace(state, heights=designer.begun(state)))
-        _, began = trace(start, noise=False)
+        _, began = trace(start, noise=not scene.source.collimated)  # of other light, what the retrace has anyway
         of_start = None
         if refined:
             of_start, more = as_waves(start)
@@ -113,7 +114,12 @@ def evaluate(designer: Designer, target: np.ndarray, state: State, device: str, 
             state = replace(designer.showing(state, start), reason=f"{state.reason}; its start was better and is kept")
             exposure, judged = trace(start)
             figures, light = began | judged, of_start
+        elif _likeness(figures) > _likeness(began) and began["on_screen"] > 0:
+            brighter = figures["on_screen"] / began["on_screen"] - 1.0
+            state = replace(state, reason=f"{state.reason}; its start was more like the picture, but {brighter:.1%} darker")
         figures = figures | {"start_relative_rms": began["relative_rms"]}
+        if began["noise"] is not None:
+            figures |= {"start_noise": began["noise"]}
         if refined:
             figures |= {"start_wave_relative_rms": began["wave_relative_rms"]}
     bounds = limits(scene, grey(target), field, state.heights)
@@ -124,6 +130,13 @@ def evaluate(designer: Designer, target: np.ndarray, state: State, device: str, 
     if light is not None:
         figures |= unseen_figures(scene, field, state.heights.to(device), target)
     return Evaluation(state, figures, exposure.image.cpu().numpy(), None if light is None else light.image.cpu().numpy())
+
+
+def _likeness(figures: dict) -> float:
+    """The relative RMS error that a lens is judged by: of the wave image where that was refined; infinite of a black image."""
+    value = figures.get("wave_relative_rms")
+    value = figures["relative_rms"] if value is None else value
+    return math.inf if value is None else value
 
 
 def _worse(figures: dict, than: dict) -> bool:

@@ -23,12 +23,17 @@ class Ghosts(Effect):
     name = "ghosts"
 
     def judge(self, scene: Scene, b) -> Decision:
-        """By a bound of the power that is reflected twice."""
+        """By a bound of the power that is reflected twice, and by what its image, should that be small and bright, adds."""
         if scene.lens.mirror:
             return Decision(self.name, False, "there is no glass", present=False)
-        if b.ghost <= NEGLIGIBLE:
-            return Decision(self.name, False, f"at most {b.ghost:.2%} of the power is reflected twice", b.ghost, NEGLIGIBLE)
-        return Decision(self.name, True, f"up to {b.ghost:.2%} of the power may be reflected twice", b.ghost, NEGLIGIBLE)
+        amount = max(b.ghost, b.ghost_error)
+        if amount <= NEGLIGIBLE:
+            why = f"at most {b.ghost:.2%} of the power is reflected twice, which changes the image by about {b.ghost_error:.1g}"
+            return Decision(self.name, False, why, amount, NEGLIGIBLE)
+        if b.ghost_error > b.ghost:
+            why = f"{b.ghost:.2%} of the power, reflected twice, comes together: it may change the image by {b.ghost_error:.2g}"
+            return Decision(self.name, True, why, amount, NEGLIGIBLE)
+        return Decision(self.name, True, f"up to {b.ghost:.2%} of the power may be reflected twice", amount, NEGLIGIBLE)
 
     def request(self, scene: Scene, on: bool, bounds) -> Requests:
         """To trace them."""

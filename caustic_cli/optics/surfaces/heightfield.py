@@ -98,6 +98,17 @@ class HeightField(Surface):
         low, high = torch.aminmax(heights.detach())
         return float(low), float(high)
 
+    def least(self, heights: Tensor, round: bool = False, per_span: int = 8, most: int = 4001) -> float:
+        """The least height over the aperture, a rectangle or the circle within, mm: of `per_span` points a knot span, at most
+        `most` along an axis; never more than that of the corners and the centre."""
+        points = [torch.linspace(0.0, 1.0, min(most, per_span * (len(s.breaks) - 1) + 1), dtype=torch.float64) for s in self.spaces]
+        u, v = (s.matrix(p) for s, p in zip(self.spaces, points, strict=True))
+        z = u @ heights.detach().double().cpu() @ v.T
+        if round:
+            inside = (2.0 * points[0][:, None] - 1.0).square() + (2.0 * points[1][None, :] - 1.0).square() <= 1.0
+            z = z[inside]
+        return float(z.min())
+
     def centred(self, heights: Tensor) -> tuple[Tensor, float]:
         """Heights less their mean, and the mean: a sag small against the thickness keeps all its digits."""
         middle = float(heights.detach().double().mean())

@@ -102,10 +102,10 @@ class Optics:
             return parts[0]
         return Feet(*(torch.cat([getattr(p, name) for p in parts]) for name in Feet.__dataclass_fields__))
 
-    def landing(self, mode: Mode, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Where another mode's light lands, X, Y, mm, and its power."""
+    def landing(self, mode: Mode, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Where another mode's light lands, X, Y, mm, its power, and where it leaves the lens: its feet, mm."""
         f = replace(self, mode=mode).feet(u, v)
-        return f.big_x, f.big_y, f.power
+        return f.big_x, f.big_y, f.power, f.x, f.y
 
     def footed(self, m: Interaction) -> Feet:
         """Rays behind the last element by their feet."""

@@ -1,0 +1,141 @@
+"""Power is never made out of nothing, and none that matters is left out: surfaces without glass, ghosts that focus, accounts."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from helpers import write_blob
+
+from caustic_cli import cli
+from caustic_cli.config import settings
+from caustic_cli.config.completion import complete
+from caustic_cli.errors import CausticError, InputError
+from caustic_cli.optics.bounds import bounds_of, refuse_without_glass
+from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.plan import compile_plan
+from caustic_cli.optics.resolution import Resolution
+from caustic_cli.optics.spread import spread_at
+from caustic_cli.optics.surfaces import HeightField
+from caustic_cli.optics.trace import expose
+from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Scene, Screen
+from caustic_cli.studies.retrace import require_account
+from caustic_cli.workflow import evaluation
+
+
+def sphere(index: float, magnification: float, pixels: int = 100, **lens) -> tuple[Scene, HeightField, torch.Tensor]:
+    """A scene whose lens is the sphere of that magnification, on a screen of 12 mm or as wide as its light."""
+    offset = Offset.for_magnification((magnification, magnification), index, 300.0, 5.0)
+    scene = Scene(
+        PlaneWave(), Lens(index=index, offset=offset, control=(30, 30), **lens), Screen((12.0, 12.0), 300.0, (pixels, pixels))
+    )
+    field = HeightField.of(scene.lens)
+    x, y = (c.numpy() for c in field.control_xy())
+    return scene, field, torch.from_numpy(offset.thickness + offset.sag(x[:, None], y[None, :]))
+
+
+# surfaces without glass
+
+
+def test_a_surface_below_its_entrance_is_refused():
+    scene, field, heights = sphere(1.5, 3.0, z_in=4.9)
+    lowest = float(heights.min())
+    refuse_without_glass(scene, field, heights + 4.9 - lowest)
+    with pytest.raises(InputError, match=r"\[lens\] z_in of 4.9 mm lies above .* dips 0.0998 mm below it; it must be at most 4.80"):
+        refuse_without_glass(scene, field, heights + 4.8 - lowest)
+
+
+def test_a_corner_that_a_round_lens_has_not_may_dip():
+    heights = torch.full((8, 8), 2.0, dtype=torch.float64)
+    heights[0, 0] = -1.0
+    for aperture, refused in (("circle", False), ("rectangle", True)):
+        scene = Scene(PlaneWave(), Lens(control=(8, 8), aperture=aperture), Screen((12.0, 12.0), 300.0, (16, 16)))
+        if refused:
+            with pytest.raises(InputError, match="dips 1 mm"):
+                refuse_without_glass(scene, HeightField.of(scene.lens), heights)
+        else:
+            refuse_without_glass(scene, HeightField.of(scene.lens), heights)
+
+
+def test_projects_and_archives_without_glass_are_not_opened(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    write_blob()
+    small = ["--resolution", "24", "--control", "12", "--start", "offset", "--rays", "4000", "--iterations", "1", "--waves", "off"]
+    assert cli.run(["design", "blob.png", *small, "--quiet"]) == 0
+    assert cli.run(["export", "blob.caustic", "--quiet"]) == 0
+    toml = tmp_path / "blob.caustic" / "project.toml"
+    toml.write_text(toml.read_text().replace("z_in = 0.0", "z_in = 5.3"))
+    archive = dict(np.load("blob.npz"))
+    np.savez("blob.npz", **archive | {"z_in": np.array(5.3)})
+    capfd.readouterr()
+    for path in ("blob.caustic", "blob.npz"):
+        before = {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*")}
+        extra = ["--absorption", "500"] if path == "blob.caustic" else []
+        assert cli.run(["render", path, *extra, "--quiet"]) == 2
+        message = capfd.readouterr().err
+        assert message.count("\n") == 1 and path in message and "mm below it" in message
+        assert {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*")} == before
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {"on_screen": 1.45, "lost": {"absorbed": -0.45}},
+        {"on_screen": 0.5, "lost": {"absorbed": 0.4}},
+        {"on_screen": math.nan, "lost": {}},
+    ],
+)
+def test_an_impossible_account_stops_a_render(parts):
+    with pytest.raises(CausticError, match="does not close"):
+        require_account(parts, torch.float64)
+    require_account({"on_screen": 0.6, "lost": {"absorbed": 0.4}}, torch.float64)
+
+
+def test_weights_that_overflow_are_refused():
+    with pytest.raises(InputError, match=r"\[source\] weights must be"):
+        settings.build_light(complete({"source": {"wavelengths": [400.0, 500.0], "weights": [1e308, 1e308]}}, 1.0))
+
+
+# ghosts
+
+
+@pytest.mark.parametrize("index", [1.5, 1.9])
+@pytest.mark.parametrize("shape", ["focused", "near", "usual"])
+def test_what_a_ghost_adds_is_foreseen(index, shape):
+    """Where its first ghost comes to a point on the screen, where it nearly does, and of a lens that spreads."""
+    magnification = {"focused": 1.0 - (index - 1.0) / (3.0 * index - 1.0), "near": 0.95, "usual": 2.0}[shape]
+    scene, field, heights = sphere(index, magnification)
+    foreseen, images = bounds_of(scene, field, heights).ghost_error, []
+    for ghosts in (True, False):
+        names = {e.name for e in compile_plan(scene, field, heights).effects if e.on} - {"ghosts"} | (
+            {"ghosts"} if ghosts else set()
+        )
+        plan = compile_plan(scene, field, heights, names)
+        rays = rays_of(plan.scene, "stratified", 250_000, 1)
+        images.append(expose(plan.scene, field, heights, rays, None, torch.float64, requests=plan.requests).image)
+    added = float((images[0] - images[1]).square().mean().sqrt() / images[1].mean())
+    room = 3.0 if shape == "focused" else 1.4
+    assert added / 1.1 < foreseen < room * added or max(added, foreseen) < 2e-3  # light at the screen's border is not foreseen
+    assert compile_plan(scene, field, heights)["ghosts"].on == (foreseen > 0.01 or bounds_of(scene, field, heights).ghost > 0.01)
+    assert shape != "focused" or (compile_plan(scene, field, heights)["ghosts"].on and added > 0.05)
+
+
+# blur
+
+
+@pytest.mark.parametrize("source", [Disc(angle=0.533), Disc((0.0, 0.0, -500.0), (5.0, 5.0)), Disc((0.0, 0.0, -100.0), (1.0, 1.0))])
+def test_the_blur_of_a_source_knows_the_glass(source):
+    scene, field, heights = sphere(1.5, 3.0)
+    scene = Scene(source, scene.lens, scene.screen)
+    spread = spread_at(scene, field, heights)
+    assert Resolution.at(scene, field, heights).source == pytest.approx(2.0 * max(spread.half), rel=0.005)
+
+
+# a start that is better
+
+
+def test_a_brighter_lens_that_is_less_like_the_picture_says_so(monkeypatch):
+    figures = [{"relative_rms": e, "on_screen": s, "noise": None} for e, s in ((0.5, 0.9), (0.4, 0.8), (0.4, 0.895))]
+    brighter, start, alike = figures
+    assert not evaluation._worse(brighter, start) and evaluation._worse(brighter, alike)
+    assert evaluation._likeness(brighter) > evaluation._likeness(start)
