@@ -16,7 +16,8 @@ class Screen:
         size: full width and height (2 R_x, 2 R_y), mm.
         z: position, mm.
         resolution: pixels along x and y.
-        tilt: right-handed turns of the screen about its own centre, first about the fixed x axis, then about the fixed y axis, degrees.
+        tilt: right-handed turns of the screen about its own centre, first about the fixed x axis, then about the fixed y axis,
+            degrees.
         shift: of its middle from the axis along x and y, mm.
     """
 
