@@ -196,7 +196,8 @@ _ROWS = (
             why="table D.2 of the thesis", option=Option("--resolution", "N[xM]"), speaks_for=("screen.resolution",)),
     Setting("screen.resolution", "wholes", "pixels along x and y", low=2, high=16384, derived="250 across"),
     Setting("screen.tilt", "numbers", "turns of the screen about its own centre: about the fixed x axis, then about the"
-            " fixed y axis", "degrees", -85.0, 85.0, default=[0.0, 0.0], written=False, option=Option("--screen-tilt", "A,B", BOTH)),
+            " fixed y axis", "degrees", -85.0, 85.0, default=[0.0, 0.0], written=False,
+            option=Option("--screen-tilt", "A,B", BOTH)),
     Setting("screen.shift", "numbers", "shift of the screen's centre from the axis", "mm", -1e9, 1e9, default=[0.0, 0.0],
             written=False, option=Option("--screen-shift", "X,Y", BOTH)),
     # The target
