@@ -29,7 +29,7 @@ def number(where: str, value, low: float = -math.inf, high: float = math.inf, *,
     return value
 
 
-def whole(where: str, value, low: int, high: int) -> int:
+def whole(where: str, value, low: float, high: float) -> int:
     """`value` as an int in [low, high]."""
     if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
         raise InputError(f"{where} must be a whole number {low} to {high}, got {value!r}")

@@ -181,7 +181,8 @@ def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[st
         radius = Offset.for_magnification(mag, -1.0 if mirror else index, screen["z"], lens["thickness"], vergence).radius
         if vergence:  # light from nearby may ask for more than a sphere over this aperture can do
             least = STEEPEST * math.hypot(*lens["size"]) / 2.0
-            radius = [math.copysign(max(abs(r), least), r) for r in radius]
+            rx, ry = (math.copysign(max(abs(r), least), r) for r in radius)
+            radius = rx, ry
         lens["radius"] = list(radius)
 
 
@@ -348,11 +349,10 @@ def filter_from(kind: str, size, screen: Screen, per_mm2: float | None = None, p
         size = (1, 1)
     alpha = (0.0, 0.0)
     if kind == "gaussian":
-        alpha = (
-            tuple(per_mm2 * w * w for w in screen.pixel)
-            if per_mm2 is not None
-            else ((1.0 if per_pixel2 is None else per_pixel2,) * 2)
-        )
+        if per_mm2 is not None:
+            alpha = per_mm2 * screen.pixel[0] * screen.pixel[0], per_mm2 * screen.pixel[1] * screen.pixel[1]
+        else:
+            alpha = (1.0 if per_pixel2 is None else per_pixel2,) * 2
     return Filter(kind, tuple(size), alpha)
 
 

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 from torch import Tensor
 
+#: A tensor while rays are traced, a number of a whole exposure.
+Amount = TypeVar("Amount", bound=Tensor | float)
+
 
 @dataclass(frozen=True)
-class Image:
+class Image(Generic[Amount]):
     """Power on a screen's pixels and what became of the rest, as parts of the source's power.
 
     image: (n_x, n_y) float64, or (3, n_x, n_y) with colours; leaving: the power that left the last element, () or (3,); lost: by a
@@ -17,6 +21,6 @@ class Image:
     """
 
     image: Tensor
-    leaving: Tensor | float
-    lost: dict[str, Tensor] | dict[str, float]
+    leaving: Amount
+    lost: dict[str, Amount]
     rays: int = 0

@@ -80,6 +80,7 @@ class Interaction:
 
     def returned(self) -> RayState:
         """The light that this refracting element reflects, at its surface."""
+        assert self.arriving is not None and self.departing is not None
         found = self.tracer.backend.interact(
             self.incoming, self.slopes, self.arriving, eta=1.0, reflects=True, fresnel=self.element.fresnel, side=self.side
         )

@@ -76,12 +76,12 @@ def attach(surface: Surface, heights: Tensor | None, origin, direction, t: Tenso
     t = torch.where(found, t, torch.zeros_like(t)).double()
     x, y, z_ray = ox + t * dx, oy + t * dy, (oz - middle) + t * dz
     at = tuple(_primal(torch.as_tensor(c, dtype=torch.float64)).expand(t.shape) for c in (x, y))
-    inside = tuple(c.clamp(-r, r) for c, r in zip(at, surface.half_size, strict=True))
-    z, gx, gy = surface.evaluate(sag, *inside)
+    inside_x, inside_y = (c.clamp(-r, r) for c, r in zip(at, surface.half_size, strict=True))
+    z, gx, gy = surface.evaluate(sag, inside_x, inside_y)
     if not torch.is_grad_enabled():
         return t, torch.where(found, gx, torch.zeros_like(t)), torch.where(found, gy, torch.zeros_like(t))
     with torch.no_grad():
-        zxx, zxy, zyy = surface.at(sag if sag is None else sag.detach(), *inside, SECOND)
+        zxx, zxy, zyy = surface.at(sag if sag is None else sag.detach(), inside_x, inside_y, SECOND)
         sx, sy = _primal(gx), _primal(gy)
         fx, fy, fz = (_primal(torch.as_tensor(c, dtype=torch.float64)) for c in direction)
         c = fz - sx * fx - sy * fy

@@ -70,4 +70,5 @@ class TriangleMesh:
 
         rays = [a.detach().double().contiguous().numpy() for a in torch.broadcast_tensors(x, y, z, dx, dy, dz)]
         found = intersect(*rays, *self._breaks, *self.shape, self._vertices, self._low, self._high, recursive, blocks())
-        return tuple(torch.from_numpy(a) for a in found)
+        t, status, tests = (torch.from_numpy(a) for a in found)
+        return t, status, tests

@@ -105,7 +105,8 @@ def splat(x: Tensor, y: Tensor, weight: Tensor, screen: Screen, filter: Filter) 
         weight.sum().
     """
     x, y, weight = x.reshape(-1), y.reshape(-1), weight.reshape(-1)
-    first, weights, inside = [], [], None
+    first, weights = [], []
+    inside: Tensor | None = None
     for axis, at in ((0, x), (1, y)):
         n, r = screen.resolution[axis], filter.reach[axis]
         at = (at - screen.low[axis]) / screen.pixel[axis]
@@ -115,6 +116,7 @@ def splat(x: Tensor, y: Tensor, weight: Tensor, screen: Screen, filter: Filter) 
         first.append(i0.long() + r)  # index of the first share on the padded frame, whose origin is -2 r
         weights.append(filter.weights(at - i0, axis))
         inside = near if inside is None else inside & near
+    assert inside is not None
     kept = torch.where(inside, weight, torch.zeros_like(weight))
     (nx, ny), (rx, ry) = screen.resolution, filter.reach
     shape = (nx + 4 * rx, ny + 4 * ry)

@@ -202,7 +202,8 @@ class Sampler:
                 yield Sample(u[a : a + rows], v, True, one)
             return
         for a in range(first * size, self.count, step * size):
-            yield Sample(*numbers(self.kind, self.shape, self.seed, 2, a, min(a + size, self.count), self.device), False, one)
+            u, v = numbers(self.kind, self.shape, self.seed, 2, a, min(a + size, self.count), self.device)
+            yield Sample(u, v, False, one)
 
     def _irradiance(self, s: Sample) -> Tensor:
         if self.round:
@@ -212,6 +213,7 @@ class Sampler:
         return self._profile(s)
 
     def _profile(self, s: Sample) -> Tensor:
+        assert self.profile is not None
         profile = self.profile.to(self.device, torch.float64)
         a = (s.u * profile.shape[0]).long().clamp_max(profile.shape[0] - 1)
         b = (s.v * profile.shape[1]).long().clamp_max(profile.shape[1] - 1)

@@ -56,12 +56,13 @@ class Spread:
 
     def reach(self) -> tuple[float, float]:
         """How far it spreads, mm."""
-        return tuple(max(abs(s[k]) for s in self.shifts) + self.half[k] for k in (0, 1))
+        x, y = (max(abs(s[k]) for s in self.shifts) + self.half[k] for k in (0, 1))
+        return x, y
 
     def on(self, pixel: tuple[float, float], most: int = MOST_CUT) -> Convolution:
         """The same on an image of such pixels, mm, that are cut into 1, 2 or 4 along each axis, at most, if they are too wide."""
         cut = _cut(min((h for h in self.half if h > 0), default=max(self.reach()) / 2.0), pixel, most)
-        return Convolution(torch.from_numpy(self.kernel(tuple(w / cut for w in pixel))), cut)
+        return Convolution(torch.from_numpy(self.kernel((pixel[0] / cut, pixel[1] / cut))), cut)
 
     def parts_on(self, pixel: tuple[float, float], places: list[tuple[float, float]], most: int = MOST_CUT) -> list[Convolution]:
         """The same of parts of every position: of all that is nearest to each of these points of its frame, [-1, 1]^2, about it.
@@ -69,7 +70,7 @@ class Spread:
         Their kernels' sums are their parts of the whole times the number of parts.
         """
         cut = _cut(min(h for h in self.half if h > 0) / math.sqrt(len(places)), pixel, most)
-        cell = tuple(w / cut for w in pixel)
+        cell = (pixel[0] / cut, pixel[1] / cut)
         return [Convolution(torch.from_numpy(self.kernel(cell, (places, k))), cut) for k in range(len(places))]
 
     def kernel(self, cell: tuple[float, float], part: tuple[list[tuple[float, float]], int] | None = None) -> np.ndarray:
@@ -80,7 +81,8 @@ class Spread:
         """
         a, b = (math.ceil(r / w) + 1 for r, w in zip(self.reach(), cell, strict=True))
         if self.brightness is None:
-            half = tuple(math.sqrt(max(0.0, h * h - 2.0 / 3.0 * w * w)) for h, w in zip(self.half, cell, strict=True))
+            rx, ry = (math.sqrt(max(0.0, h * h - 2.0 / 3.0 * w * w)) for h, w in zip(self.half, cell, strict=True))
+            half = rx, ry
             x, y = _even_disc(half, cell)
             light = np.full(len(x), 1.0 / len(x))
         else:
@@ -141,7 +143,8 @@ class Convolution:
     @cached_property
     def beside(self) -> tuple[int, int]:
         """Cut pixels beside the screen, whole pixels of them, whose light reaches it."""
-        return tuple(self.cut * math.ceil((n // 2) / self.cut) for n in self.kernel.shape)
+        a, b = (self.cut * math.ceil((n // 2) / self.cut) for n in self.kernel.shape)
+        return a, b
 
     def __call__(self, image: Tensor) -> Tensor:
         """An image on cut pixels, with those beside, (a, b) -> that on the screen's pixels alone; differentiable."""
@@ -221,14 +224,14 @@ def spread_of(lit: Lit, landing: Landing, device: str | torch.device = "cpu") ->
         ]
     )
     error, usual = float(off.max()), float(torch.quantile(off, MOST))
-    frame = tuple(c * f for c, f in zip(slope, source.frame, strict=True))
+    sx, sy = slope
+    frame = sx * source.frame[0], sy * source.frame[1]
     if source.distant:
-        half = tuple(abs(c) * math.sin(source.half_angle) for c in slope)
-        return Spread(half, ((0.0, 0.0, 1.0),), error, usual, source.brightness, frame)
+        sine = math.sin(source.half_angle)
+        return Spread((abs(sx) * sine, abs(sy) * sine), ((0.0, 0.0, 1.0),), error, usual, source.brightness, frame)
     places = tuple(
         (float(slope[0] * (p[0] - centre.position[0])), float(slope[1] * (p[1] - centre.position[1])), float(part))
         for p, part in zip(*source.points(), strict=True)
     )
-    return Spread(
-        tuple(abs(c) * e for c, e in zip(slope, source.extent, strict=True)), places, error, usual, source.brightness, frame
-    )
+    ex, ey = source.extent
+    return Spread((abs(sx) * ex, abs(sy) * ey), places, error, usual, source.brightness, frame)

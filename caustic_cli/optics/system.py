@@ -134,6 +134,7 @@ class System:
         lens = scene.lens
         surface = surface or HeightField.of(lens)
         aperture = Aperture(lens.half_size, lens.round)
+        elements: tuple[Element, ...]
         if lens.mirror:
             elements = (Element(EXIT, surface, aperture, "reflect", roughness=lens.roughness),)
         else:
@@ -181,7 +182,8 @@ class System:
             cosine = sum(a * b for a, b in zip(axis, normal, strict=True))
             cosines.append(cosine)
             if element.reflects:
-                axis = tuple(a - 2.0 * cosine * b for a, b in zip(axis, normal, strict=True))
+                x, y, z = (a - 2.0 * cosine * b for a, b in zip(axis, normal, strict=True))
+                axis = x, y, z
         return cosines, axis
 
     def sides(self) -> tuple[float, ...]:

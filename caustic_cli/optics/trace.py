@@ -22,6 +22,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -85,7 +86,8 @@ class Tracer:
         self.actions: tuple[Action, ...] = tuple(a for a in made if a is not None)
         self.recorded = any(a.stray for a in self.actions)
         self.before: list[Interaction] = []
-        self.first, self._behind = 0, None
+        self.first = 0
+        self._behind: Interaction | None = None
         with torch.no_grad():
             while self.first < len(system.elements) and system.elements[self.first].surface.shape is None:
                 interaction = self.cross(self.first, state, None)
@@ -118,19 +120,20 @@ class Tracer:
 
     def last(self, parameters: Parameters) -> Interaction:
         """The rays at the last element, behind which they have gone straight on."""
-        return [self._behind, *self._walk(parameters)][-1]
+        return cast(Interaction, [self._behind, *self._walk(parameters)][-1])  # a system has at least one element
 
     @torch.no_grad()
     def exit_of(self, parameters: Parameters) -> tuple[tuple, tuple, Tensor]:
         """How rays arrive at the last element, whose surface is free, in its frame: slopes there, directions, powers."""
         last = self.last(parameters)
+        assert last.arriving is not None
         return last.slopes, last.incoming, last.arriving
 
     def land(self, parameters: Parameters, screen: Screen | Placed) -> list[RayState]:
         """The same on a screen: x and y of their origins are the screen's own coordinates, mm."""
         return [self.onto(state, screen) for state in self(parameters)]
 
-    def expose(self, parameters: Parameters, screen: Screen | Placed, filter: Filter) -> Image:
+    def expose(self, parameters: Parameters, screen: Screen | Placed, filter: Filter) -> Image[Tensor]:
         """Heights {name: (n, m) mm float64} -> image and energy account on a screen."""
         if self.fused is not None and isinstance(screen, Screen) and not any(screen.tilt):
             image, leaving, lost = self.fused(parameters[self.system.elements[-1].name], screen, filter)
@@ -139,20 +142,23 @@ class Tracer:
             return self._weighed(image, leaving, lost)
         return self.collect(self(parameters), screen, filter)
 
-    def collect(self, states: list[RayState], screen: Screen | Placed, filter: Filter) -> Image:
+    def collect(self, states: list[RayState], screen: Screen | Placed, filter: Filter) -> Image[Tensor]:
         """Image and energy account on a screen of rays behind the last element."""
-        image, leaving, lost = 0.0, 0.0, {}
+        image: Tensor | float = 0.0
+        leaving: Tensor | float = 0.0
+        lost: dict[str, Tensor | float] = {}
         for state in states:
             ray = self.onto(state, screen)
             frame = screen if isinstance(screen, Screen) else screen.screen
             part, off = self.backend.splat(*ray.origin[:2], ray.power, frame, filter)
+            assert ray.leaving is not None
             image, leaving = image + part, leaving + ray.leaving
             ray.book("off_screen", off)
             for name, value in ray.lost.items():
                 lost[name] = lost.get(name, 0.0) + (value.detach() if isinstance(value, Tensor) else value)
-        return self._weighed(image, leaving, lost)
+        return self._weighed(cast(Tensor, image), cast(Tensor, leaving), lost)
 
-    def _weighed(self, image: Tensor, leaving: Tensor, lost: dict) -> Image:
+    def _weighed(self, image: Tensor, leaving: Tensor, lost: dict) -> Image[Tensor]:
         w = self.weight
         if w != 1.0:
             image, leaving, lost = w * image, w * leaving, {name: w * value for name, value in lost.items()}
@@ -186,6 +192,7 @@ class Tracer:
         """
         element = self.system.elements[k]
         n = [medium.index_at(state.wavelength) for medium in self.media[k : k + 2]]
+        n_in, n_out = n if forward else n[::-1]
         side = self.sides[k] if forward else -self.sides[k]
         m = Interaction(
             self,
@@ -193,7 +200,8 @@ class Tracer:
             element,
             forward,
             side,
-            *(n if forward else n[::-1]),
+            n_in,
+            n_out,
             element.reflects if reflects is None else reflects,
             straight,
             state,
@@ -226,7 +234,8 @@ class Tracer:
         if hit is None:
             hit = prepared(heights) if prepared else element.surface.meet(heights, o, d, m.side)
         if state.power.dtype != self.dtype:  # the first surface is met in float64 whatever follows
-            state, hit = state.to(self.dtype), SurfaceIntersection(*(_cast(c, self.dtype) for c in hit[:3]), hit.found)
+            t, gx, gy = (_cast(c, self.dtype) for c in hit[:3])
+            state, hit = state.to(self.dtype), SurfaceIntersection(t, gx, gy, hit.found)
             o, d = (tuple(_cast(c, self.dtype) for c in v) for v in (o, d))
         m.local, m.incoming, m.slopes, m.length = advanced(o, d, hit.t), d, (hit.gx, hit.gy), hit.t
         if prepared is None or state.sample is None:  # a sample stands on the surface
@@ -244,14 +253,15 @@ class Tracer:
 
     def _interact(self, m: Interaction) -> Tensor:
         """Change the directions, and give the power that goes on."""
-        state, element = m.state, m.element
+        state, element, arriving = m.state, m.element, m.arriving
+        assert arriving is not None
         polarised = None
         if state.polarised is not None:
             polarised = turned(element.pose, state.polarised)
         found = self.backend.interact(
             m.incoming,
             m.slopes,
-            m.arriving,
+            arriving,
             eta=m.n_in / m.n_out,
             reflects=m.reflects,
             fresnel=element.fresnel,
@@ -262,7 +272,7 @@ class Tracer:
         state.direction = turned_back(element.pose, found.direction)
         if not m.reflects:
             with torch.no_grad():
-                gone = m.arriving - found.power
+                gone = arriving - found.power
                 if bool(found.passes.all()):
                     state.lose("fresnel", gone)
                 else:
@@ -270,7 +280,7 @@ class Tracer:
                     state.lose("fresnel", gone - totally)
                     state.lose("total_internal_reflection", totally)
             if self.track:
-                state.mark(~found.passes & (m.arriving > 0), Status.TOTAL_INTERNAL_REFLECTION)
+                state.mark(~found.passes & (arriving > 0), Status.TOTAL_INTERNAL_REFLECTION)
         if not any(isinstance(c, Tensor) for c in state.direction) and state.direction == (0.0, 0.0, 1.0):
             return found.power
         state.sample = None
@@ -441,7 +451,7 @@ def expose(
     screen: Screen | None = None,
     chunk: int = 1 << 19,
     requests: Requests = NO_REQUESTS,
-) -> Image:
+) -> Image[float]:
     """Trace all rays of a sampler and collect them: the value of the one function every command asks about.
 
     Chunks are accumulated in float64, so neither memory nor rounding grows with the number of rays.  Where memory runs out,
@@ -456,7 +466,7 @@ def expose(
     check_room(scene, heights, screen)
     shape = (3, *screen.resolution) if scene.colored else screen.resolution
 
-    def traced_by(size: int) -> Image:
+    def traced_by(size: int) -> Image[float]:
         parts = tracers(scene, field, sampler, dtype, size, requests)
         return _total(parts, {EXIT: heights}, [screen], [shape], filter, sampler.count, sampler.device)[0]
 
@@ -475,7 +485,7 @@ def render(
     dtype: torch.dtype = torch.float64,
     chunk: int = 1 << 19,
     requests: Requests = NO_REQUESTS,
-) -> list[Image]:
+) -> list[Image[float]]:
     """The image on every screen of a system, from about `rays` rays of every source at every wavelength.
 
     Args:
@@ -493,7 +503,7 @@ def render(
     samplers = [rays_of(system.with_source(s), kind, rays, seed, device) for s in system.sources]
     screens = [s.screen if isinstance(s, Placed) else s for s in system.screens]
 
-    def traced_by(size: int) -> list[Image]:
+    def traced_by(size: int) -> list[Image[float]]:
         parts = (
             t
             for sampler, part in zip(samplers, system.parts, strict=True)
@@ -526,7 +536,7 @@ def system_tracers(
 
 def _total(
     parts: Iterator[Tracer], parameters: Parameters, screens, shapes, filter: Filter, rays: int, device: str | torch.device
-) -> list[Image]:
+) -> list[Image[float]]:
     """Sums over tracers, without derivatives: one image for each screen; rays are walked once for all."""
     images = [torch.zeros(shape, dtype=torch.float64, device=device) for shape in shapes]
     accounts, leaving = [dict.fromkeys(LOSSES, 0.0) for _ in screens], [0.0] * len(images)

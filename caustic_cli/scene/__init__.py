@@ -96,8 +96,9 @@ class Scene:
                 return (Band(self),)
             return tuple(Band(replace(self, light=Light(state)), 1.0 / len(states)) for state in states)
         bands = []
+        glass = self.lens.glass if self.dispersive else None
         for k, (wavelength, part) in enumerate(zip(self.light.wavelengths, self.light.parts, strict=True)):
-            lens = replace(self.lens, index=refractive_index(self.lens.glass, wavelength)) if self.dispersive else self.lens
+            lens = self.lens if glass is None else replace(self.lens, index=refractive_index(glass, wavelength))
             bands += [
                 Band(replace(self, lens=lens, light=Light(state)), part / len(states), k if self.colored else None)
                 for state in states

@@ -50,7 +50,8 @@ class Offset:
         """
         reach = throw - thickness
         powers = [(m - 1.0 - reach * vergence) / ((index - 1.0) * reach) for m in mag]
-        return cls(thickness, tuple(math.inf if p == 0 else 1.0 / p for p in powers))
+        rho_x, rho_y = (math.inf if p == 0 else 1.0 / p for p in powers)
+        return cls(thickness, (rho_x, rho_y))
 
     def sag(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """f(x, y) - thickness at points x, y (broadcast), float64 mm.

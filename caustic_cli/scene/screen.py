@@ -51,7 +51,7 @@ class Screen:
         return self.shift[0] - self.half_size[0], self.shift[1] - self.half_size[1]
 
     @property
-    def axes(self) -> tuple[tuple[float, float, float], ...]:
+    def axes(self) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]:
         """Unit vectors along its x and y, and its normal."""
         (sa, ca), (sb, cb) = ((math.sin(t), math.cos(t)) for t in map(math.radians, self.tilt))
         return (cb, 0.0, -sb), (sb * sa, ca, cb * sa), (sb * ca, -sa, cb * ca)

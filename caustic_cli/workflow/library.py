@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -83,8 +83,9 @@ class Lens:
         rx, ry = self.scene.lens.half_size
         if not (np.isfinite(x).all() and np.isfinite(y).all() and (np.abs(x) <= rx).all() and (np.abs(y) <= ry).all()):
             raise InputError(f"points must lie on the aperture, x within +-{rx:g} mm and y within +-{ry:g} mm")
-        found = self.field.at(self.heights, *(torch.from_numpy(c.ravel().copy()) for c in (x, y)))
-        return tuple(c.numpy().reshape(x.shape) for c in found)
+        u, v = (torch.from_numpy(c.ravel().copy()) for c in (x, y))
+        z, zx, zy = (c.numpy().reshape(x.shape) for c in self.field.at(self.heights, u, v))
+        return z, zx, zy
 
     def render(
         self,
@@ -133,7 +134,7 @@ class Lens:
         """
         path = Path(path)
         name = format or BY_SUFFIX.get(path.suffix.lower())
-        if name not in BY_SUFFIX.values():
+        if name is None or name not in BY_SUFFIX.values():
             raise InputError(f"format must be one of {', '.join(BY_SUFFIX.values())}, got {format or path.suffix!r}")
         given = {key: value for key, value in (("samples", samples), ("tolerance", tolerance)) if value is not None}
         write(path, self.scene, self.field, self.heights, name, script, **given)
@@ -143,8 +144,9 @@ class Lens:
         """Write the lens as a project directory, which `load` and the command line open; force: replace a project there."""
         if self.project is None or self.state is None:
             raise InputError("an archive's lens has no picture and no design, so it cannot be saved as a project")
-        project = replace(self.project, path=Path(path))
-        directory.check(project.path, force)
+        place = Path(path)
+        project = replace(self.project, path=place)
+        directory.check(place, force)
         directory.settle(project, force)
         with project.hold:
             project.save(
@@ -152,7 +154,7 @@ class Lens:
                     self.state, self.field.spaces, workflow.provenance(project, "cpu"), self.figures, uptodate.inputs(project)
                 )
             )
-        return project.path
+        return place
 
 
 def design(
@@ -315,11 +317,11 @@ def trace(
     Returns:
         (n_x, n_y), or (3, n_x, n_y) of a coloured scene: power per pixel as a part of the source's.
     """
-    scene = replace(scene, lens=replace(scene.lens, control=tuple(heights.shape)))
+    scene = replace(scene, lens=replace(scene.lens, control=cast("tuple[int, int]", tuple(heights.shape))))
     filter = filter or Filter("cosine", (3, 3))
     drawn = rays_of(scene, sampler, _count(rays), seed, heights.device)
     parts = tracers(scene, HeightField.of(scene.lens), drawn, dtype, drawn.count)
-    return sum(part.expose({EXIT: heights}, scene.screen, filter).image for part in parts)
+    return cast(Tensor, sum(part.expose({EXIT: heights}, scene.screen, filter).image for part in parts))
 
 
 def _count(rays: float) -> int:

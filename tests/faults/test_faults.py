@@ -71,7 +71,6 @@ import json, resource, sys
 from caustic_cli import cli
 from caustic_cli.workflow import design as workflow
 from caustic_cli.workflow import evaluation
-from helpers import write_blob
 evaluation.FINAL_RAYS, evaluation.write_report = 5000, lambda *args: None
 resource.setrlimit(resource.RLIMIT_FSIZE, (9000, 9000))  # writing beyond fails as on a full disk
 for arguments in json.load(sys.stdin):

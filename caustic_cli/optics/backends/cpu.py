@@ -64,11 +64,11 @@ class Numba(Torch):
     def meet_spline(self, field, heights: Tensor, origin, direction, side: float) -> SurfaceIntersection:
         """As the reference."""
         rays = [torch.as_tensor(c, dtype=torch.float64) for c in (*origin, *direction)]
-        rays = [c.contiguous() for c in torch.broadcast_tensors(*rays)]
-        if not rays[0].numel():
+        ox, oy, oz, dx, dy, dz = (c.contiguous() for c in torch.broadcast_tensors(*rays))
+        if not ox.numel():
             return super().meet_spline(field, heights, origin, direction, side)
         surface = FusedSurface(field.spaces, field.half_size)
-        return SurfaceIntersection(*hits_of_rays(surface, heights, tuple(rays[:3]), tuple(rays[3:]), side=side))
+        return SurfaceIntersection(*hits_of_rays(surface, heights, (ox, oy, oz), (dx, dy, dz), side=side))
 
     def meet_fixed(self, field, origin, direction):
         """As the reference; what does not depend on the heights is prepared."""
@@ -148,8 +148,9 @@ class PlaneImage:
 
     def __init__(self, field, rays: RayState, eta: float, fresnel: str, like: PlaneImage | None):
         s = rays.sample
+        assert s is not None
         self.interface = eta, fresnel
-        self.kernel = functions.PlaneKernel(
+        self.kernel: functions.PlaneKernel = functions.PlaneKernel(
             field.spaces, field.half_size, s.u, s.v, s.tensor, rays.power, like.kernel if isinstance(like, PlaneImage) else None
         )
 
@@ -165,7 +166,7 @@ class RayImage:
     def __init__(self, field, rays: RayState, eta: float, fresnel: str, radius: float | None, like: RayImage | None):
         self.interface = eta, fresnel
         x, y, *direction = (c.contiguous() for c in rays.full((*rays.origin[:2], *rays.direction)))
-        self.kernel = functions.RayKernel(
+        self.kernel: functions.RayKernel = functions.RayKernel(
             field.spaces,
             field.half_size,
             (x, y, rays.origin[2] + rays.datum),

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -14,6 +17,9 @@ from caustic_cli.optics.sampling import Sample, spread
 from caustic_cli.optics.surfaces.base import SurfaceIntersection
 from caustic_cli.optics.tolerances import PARALLEL
 from caustic_cli.scene import Screen
+
+#: Heights, screen and filter -> image, power that leaves the surface, and what was lost there, by one kernel.
+Fused = Callable[[Tensor, Screen, Filter], tuple[Tensor, Tensor, dict]]
 
 
 class Torch:
@@ -104,13 +110,13 @@ class Torch:
         """`reconstruction.splat`."""
         return splat(x, y, weight, screen, filter)
 
-    def plane_image(self, *_, **__) -> None:
+    def plane_image(self, *_: Any, **__: Any) -> Fused | None:
         """No fused kernel for rays of a plane wave on a B-spline."""
-        return
+        return None
 
-    def ray_image(self, *_, **__) -> None:
+    def ray_image(self, *_: Any, **__: Any) -> Fused | None:
         """No fused kernel for other rays."""
-        return
+        return None
 
 
 def by_mesh(field, heights, origin, direction, method: intersection.Method, radius):
@@ -119,7 +125,8 @@ def by_mesh(field, heights, origin, direction, method: intersection.Method, radi
         return None, None
     mesh = TriangleMesh(field, heights, *method.parts)
     rays = [torch.as_tensor(c, dtype=torch.float64) for c in (*origin, *direction)]
-    start, missed, _ = mesh.intersect(*torch.broadcast_tensors(*rays), method.recursive)
+    ox, oy, oz, dx, dy, dz = torch.broadcast_tensors(*rays)
+    start, missed, _ = mesh.intersect(ox, oy, oz, dx, dy, dz, method.recursive)
     if method.name == "mesh":
         t = torch.where(missed == 0, start, torch.zeros_like(start))
         return start, (t, intersection.within(missed.long(), start, origin, direction, radius))

@@ -37,6 +37,7 @@ class MeanPlane(Action):
         surface = m.element.surface
         if not isinstance(surface, HeightField) or m.state.sample is not None:  # a plane wave's rays stand on the surface itself
             return None
+        assert heights is not None
         sag, mean = surface.centred(heights)
         t = (mean - origin[2]) / direction[2]
         x, y = (o + t * d for o, d in zip(origin[:2], direction[:2], strict=True))

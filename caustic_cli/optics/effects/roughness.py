@@ -51,8 +51,8 @@ class Roughness(Effect):
 class Facets(Action):
     """Adds to the slopes what each ray's facet has; the same in every walk of a tracer."""
 
-    def __init__(self):
-        self.noise: dict[int, tuple[Tensor, Tensor]] = {}
+    def __init__(self) -> None:
+        self.noise: dict[int, tuple[Tensor, ...]] = {}
 
     def arrive(self, m) -> None:
         """At the surface, on the straight way only."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import pkgutil
 from collections.abc import Callable
 from importlib import import_module
+from typing import cast
 
 import torch
 
@@ -46,7 +47,7 @@ def rays_of(scene: Lit, kind: str, rays: int, seed: int = 0, device: str | torch
 
 def of_member(rays: Rays, member: int | None) -> Rays:
     """The rays of one of several sources, by its number; all of them where that is None."""
-    return rays if member is None else rays.members[member]
+    return rays if member is None else cast(SeveralRays, rays).members[member]
 
 
 for _module in pkgutil.iter_modules(__path__):

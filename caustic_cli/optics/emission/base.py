@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar, Protocol
+from typing import ClassVar, Protocol, Self
 
 import torch
 from torch import Tensor
@@ -59,7 +59,7 @@ class Emission:
             raise InputError(f"sampler must be one of {', '.join(SAMPLERS)}, got {self.kind!r}")
 
     @classmethod
-    def of_size(cls, scene: Lit, kind: str, rays: int, seed: int = 0, device: str | torch.device = "cpu") -> Emission:
+    def of_size(cls, scene: Lit, kind: str, rays: int, seed: int = 0, device: str | torch.device = "cpu") -> Self:
         """About `rays` rays in cells as nearly square as whole numbers allow, at least one for each of its points."""
         aspect, each = scene.pupil.half_size[0] / scene.pupil.half_size[1], max(1, round(rays / _starts(scene)))
         nu = max(1, min(each, round(math.sqrt(each * aspect))))

@@ -103,7 +103,8 @@ def edges(scene: Lit) -> list[Mode]:
         for sign in (1.0, -1.0):
             point = at[np.argmax(sign * at[:, k])].copy()
             point[k] += sign * e
-            found.append(Mode(scene, tuple(map(float, point)), 1.0))
+            x, y, z = map(float, point)
+            found.append(Mode(scene, (x, y, z), 1.0))
     return found
 
 

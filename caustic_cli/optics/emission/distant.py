@@ -18,8 +18,8 @@ class Distant(Emission):
 
     dimensions: ClassVar[int] = 4
 
-    def _drawn(self, start: int, u: Tensor, v: Tensor, a: Tensor, b: Tensor) -> RayState:
-        (rx, ry), source = self.scene.pupil.half_size, self.scene.source
+    def _drawn(self, start: int, *draws: Tensor) -> RayState:
+        (u, v, a, b), (rx, ry), source = draws, self.scene.pupil.half_size, self.scene.source
         if source.brightness is None:
             sine = a.sqrt() * math.sin(source.half_angle)  # even over the projected solid angle: an evenly bright disc
             dx, dy = sine * torch.cos(2 * math.pi * b), sine * torch.sin(2 * math.pi * b)

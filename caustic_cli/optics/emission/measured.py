@@ -13,6 +13,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 import torch
@@ -25,6 +26,7 @@ from caustic_cli.optics.interface import reflectance
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import SAMPLERS, random_numbers
 from caustic_cli.scene import Scene, Source
+from caustic_cli.scene.sources.rays import Measured
 
 #: Bits of each coordinate in Morton's order: finer than a million rays stand apart.
 BITS = 12
@@ -62,7 +64,7 @@ class MeasuredRays:
     @cached_property
     def _drawn(self) -> tuple[Tensor, ...]:
         """Points of the pupil x, y, mm, directions, and parts of the source's power: (N,) each."""
-        source, pupil = self.scene.source, self.scene.pupil
+        source, pupil = _of_file(self.scene.source), self.scene.pupil
         x, y, met, part = _meeting(source, pupil.half_size, pupil.z, pupil.round)
         if self.rays < len(met):
             (rx, ry), chosen = pupil.half_size, random_numbers(self.seed, 0, torch.zeros(1, dtype=torch.int64))
@@ -88,7 +90,12 @@ class MeasuredRays:
             yield RayState((x, y, self.scene.pupil.z), (dx, dy, dz), power, lost={"missed_lens": lost})
 
 
-def _meeting(source: Source, half_size: tuple[float, float], z: float, round: bool) -> tuple[np.ndarray, ...]:
+def _of_file(source: Source) -> Measured:
+    """A source whose rays are those of a file, as what it is."""
+    return cast(Measured, source)
+
+
+def _meeting(source: Measured, half_size: tuple[float, float], z: float, round: bool) -> tuple[np.ndarray, ...]:
     """Where rays meet an aperture, x and y mm, their numbers in the file, and their parts of the power."""
     x, y, met = source.crossing(half_size, z, round)
     (met,) = np.nonzero(met)
@@ -112,9 +119,9 @@ def _morton(u: np.ndarray, v: np.ndarray) -> np.ndarray:
 def coarseness(scene: Scene) -> tuple[float, int] | None:
     """Noise of the image of all rays of a scene's file, in units of its mean pixel, and how many rays a file like it would have to
     hold for that to be WORTHY; None of a source that has as many as are asked for."""
-    source, lens = scene.source, scene.lens
-    if source.rays is None:
+    if scene.source.rays is None:
         return None
+    source, lens = _of_file(scene.source), scene.lens
     *_, part = _meeting(source, lens.half_size, lens.z_in, lens.round)
     equal = float(part.sum()) ** 2 / float((part * part).sum())  # so many rays of the same power
     noise = math.sqrt(math.prod(scene.screen.resolution) / equal)
@@ -123,10 +130,14 @@ def coarseness(scene: Scene) -> tuple[float, int] | None:
 
 def coarse_words(scene: Scene) -> str | None:
     """That a scene's ray file is too coarse for its picture, and how many rays it would take; None where it is not."""
-    worst = max((one for one in scene.by_source if one.source.rays is not None), key=lambda one: coarseness(one)[0], default=None)
-    if worst is None or coarseness(worst)[0] <= WORTHY:
+    noise, wanted, rays = 0.0, 0, 0
+    for one in scene.by_source:
+        found, file = coarseness(one), one.source.rays
+        if found is not None and file is not None and found[0] > noise:
+            (noise, wanted), rays = found, file.count
+    if noise <= WORTHY:
         return None
-    (noise, wanted), (nx, ny), rays = coarseness(worst), scene.screen.resolution, worst.source.rays.count
+    nx, ny = scene.screen.resolution
     return (
         f"the ray file is coarse for {nx} x {ny} pixels: its {rays:,} rays leave {noise:.0%} of noise, and it would take"
         f" {_rounded(wanted)} to leave {WORTHY:.0%}"
@@ -142,9 +153,9 @@ def _rounded(count: int) -> str:
 def irradiance(scene: Scene, x: np.ndarray, y: np.ndarray, height: float) -> np.ndarray | None:
     """Power of a ray file in the cells between corners x (n + 1,), y (m + 1,) of the plane at `height`, mm, behind the entrance:
     (n, m), smoothed over as many cells as hold SMOOTHED rays; None of a source that has no such rays."""
-    source, lens = scene.source, scene.lens
-    if source.rays is None:
+    if scene.source.rays is None:
         return None
+    source, lens = _of_file(scene.source), scene.lens
     at_x, at_y, met, part = _meeting(source, lens.half_size, lens.z_in, lens.round)
     d, n = source.rays.directions[met], lens.inside
     inside = np.sqrt(1.0 - (d[:, 0] ** 2 + d[:, 1] ** 2) / (n * n))
@@ -152,7 +163,7 @@ def irradiance(scene: Scene, x: np.ndarray, y: np.ndarray, height: float) -> np.
         part = part * (1.0 - reflectance("exact", d[:, 2], inside, 1.0 / n))
     way = (height - lens.z_in) / (n * inside)
     cells, _, _ = np.histogram2d(at_x + way * d[:, 0], at_y + way * d[:, 1], (x, y), weights=part)
-    lit = max(1, np.count_nonzero(cells))
+    lit = max(1, int(np.count_nonzero(cells)))
     sigma = math.sqrt(SMOOTHED * lit / (4.0 * math.pi * len(met)))
     return gaussian_filter(cells, [min(sigma, WIDEST * k) for k in cells.shape], mode="reflect")
 

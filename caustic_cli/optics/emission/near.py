@@ -48,7 +48,8 @@ class Near(Emission):
         """Where about its position each ray starts, mm along x and y, of the draws beyond the first two."""
         raise NotImplementedError
 
-    def _drawn(self, start: int, u: Tensor, v: Tensor, *aside: Tensor) -> RayState:
+    def _drawn(self, start: int, *draws: Tensor) -> RayState:
+        u, v, *aside = draws
         source, pupil = self.scene.source, self.scene.pupil
         (rx, ry), cone = pupil.half_size, source.cone_over(pupil.half_size, pupil.z, pupil.round)
         per, (positions, powers) = self.shape[0] * self.shape[1], self._points
@@ -102,10 +103,11 @@ class NearDisc(Near):
 
     dimensions: ClassVar[int] = 4
 
-    def _aside(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-        source = self.scene.source
+    def _aside(self, *draws: Tensor) -> tuple[Tensor, Tensor]:
+        (a, b), source = draws, self.scene.source
         if source.brightness is not None:
-            return tuple(w * c for w, c in zip(source.frame, bright_points(source.brightness, a, b), strict=True))
+            x, y = (w * c for w, c in zip(source.frame, bright_points(source.brightness, a, b), strict=True))
+            return x, y
         (ex, ey), turn = source.extent, 2 * math.pi * b
         return ex * a.sqrt() * torch.cos(turn), ey * a.sqrt() * torch.sin(turn)
 

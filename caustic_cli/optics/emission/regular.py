@@ -39,6 +39,7 @@ class RegularGrid(Emission):
 
     def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[RayState]:
         """As of an emission; powers sum to the mode's part of the light on the pupil, to the grid's accuracy."""
+        assert self.mode is not None
         (nu, nv), pupil = self.shape, self.scene.pupil
         shift = [(0.5 + self.number * s) % 1.0 for s in SHIFTS]
         cell = 4.0 * pupil.half_size[0] * pupil.half_size[1] / self.count

@@ -10,6 +10,7 @@ import torch
 from caustic_cli.optics.emission.base import Lit
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import Sample
+from caustic_cli.scene import Pupil, Source
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +40,8 @@ class SeveralRays:
 class _Alone:
     """What is lit, by one of its sources."""
 
-    source: object
-    pupil: object
+    source: Source
+    pupil: Pupil
 
 
 def several(scene: Lit, kind: str, rays: int, seed: int = 0, device: str | torch.device = "cpu") -> SeveralRays:

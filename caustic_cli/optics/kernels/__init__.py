@@ -16,9 +16,10 @@ def blocks() -> int:
     import numba  # noqa: PLC0415
 
     if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
-        numba.config.THREADING_LAYER_PRIORITY = THREADING
+        numba.config.THREADING_LAYER_PRIORITY = THREADING  # type: ignore[attr-defined]  # made as numba is loaded
     count = torch.get_num_threads()
-    numba.set_num_threads(max(1, min(count, numba.config.NUMBA_NUM_THREADS)))
+    most = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]  # made as numba is loaded
+    numba.set_num_threads(max(1, min(count, most)))
     if torch.get_num_threads() != count:  # numba's OpenMP layer resets the count it shares with torch when it starts
         torch.set_num_threads(count)
     return count

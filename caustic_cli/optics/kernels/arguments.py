@@ -16,7 +16,7 @@ class Exit(NamedTuple):
     oblique rays begin, height: of the screen, mm, both above the zero of the sag.
     """
 
-    index: float
+    index: float  # type: ignore[assignment]  # nobody asks an `Exit` for the place of a value
     fresnel: int
     start: float
     height: float

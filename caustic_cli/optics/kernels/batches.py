@@ -33,6 +33,8 @@ whatever method found t.  In reverse, where a loss L has the derivatives L_t, L_
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from llvmlite import ir
 from numba import carray, types
@@ -56,7 +58,7 @@ ALONE = 64
 #: Times that rays are handed to the next span product, steps with the terms of second order and with all terms.
 TURNS, FIRST_STEPS, STEPS = 4, 2, 5
 #: Sums over a batch, whose order is left to the compiler.
-_SUMS = {"fastmath": {"contract", "nsz", "reassoc"}}
+_SUMS: dict[str, Any] = {"fastmath": {"contract", "nsz", "reassoc"}}
 #: So far beyond its span product, in its widths, a polynomial is still evaluated; and so near the border hits are `_root`'s.
 BEYOND, MARGIN = 0.02, 1e-12
 #: An unsigned index is never taken to count from the end.

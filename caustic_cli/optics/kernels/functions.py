@@ -6,6 +6,8 @@ refracts, carries to the screen and splats.  All in float64, whatever precision 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -23,7 +25,7 @@ from caustic_cli.scene import Screen
 class _Workspace:
     """Arrays that the kernels overwrite, kept from one call to the next."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.arrays: dict[str, np.ndarray] = {}
 
     def __call__(self, name: str, *shape: int) -> np.ndarray:
@@ -51,12 +53,12 @@ class PlaneKernel:
     def __init__(self, spaces, half_size, u: Tensor, v: Tensor, tensor: bool, power: Tensor, like: PlaneKernel | None = None):
         (su, sv), (rx, ry) = spaces, half_size
         self.tensor, self.v = tensor, v
-        self.workspace = _Workspace() if like is None else like.workspace
+        self.workspace: _Workspace = _Workspace() if like is None else like.workspace
         if tensor:
             self.first, bu = su.basis(u)
             self.bu, self.du = bu.contiguous(), (su.basis(u, 1)[1] / (2.0 * rx)).contiguous()
             if like is not None and like.v is v:
-                self.along_v = like.along_v
+                self.along_v: AlongV = like.along_v
             else:
                 self.along_v = AlongV(sv, v, 1.0 / (2.0 * ry))
             x, y, shape = u[:, None], v[None, :], (len(u), len(v))
@@ -69,7 +71,7 @@ class PlaneKernel:
             self.first = torch.arange(shape[0])
             self.bu = self.du = torch.ones(shape[0], 1, dtype=torch.float64)
             self.points = (u.numpy(), v.numpy())
-            self.surface = FusedSurface(spaces, half_size) if like is None else like.surface
+            self.surface: FusedSurface = FusedSurface(spaces, half_size) if like is None else like.surface
             x, y, power = u.view(shape), v.view(shape), power.view(shape) if power.ndim else power
         self.shape = shape
         coordinates = ((2.0 * x - 1.0) * rx, (2.0 * y - 1.0) * ry, power)
@@ -78,6 +80,7 @@ class PlaneKernel:
 
     def __call__(self, sag: Tensor, eta: float, fresnel: str, height: float, screen: Screen, filter: Filter):
         """Control heights (n, m) float64 relative to some plane, mm, and the screen's height above it, mm: see `_splat`."""
+        nets: Sequence[Tensor]
         if self.tensor:
             net, net_y = self.along_v(sag)  # (n, m_v)
             nets = (net, net, net_y)
@@ -100,8 +103,8 @@ class RayKernel:
 
     def __init__(self, spaces, half_size, origin, direction, power: Tensor, radius: float | None, like: RayKernel | None = None):
         count = len(power)
-        self.surface = FusedSurface(spaces, half_size) if like is None else like.surface
-        self.workspace = _Workspace() if like is None else like.workspace
+        self.surface: FusedSurface = FusedSurface(spaces, half_size) if like is None else like.surface
+        self.workspace: _Workspace = _Workspace() if like is None else like.workspace
         self.shape = _layout(count)
         short = self.shape[0] * self.shape[1] - count
         # The image is a sum, so the rays come in the order in which their hits are found; without power they fill the last row.
@@ -299,4 +302,5 @@ def scattered_points(keys, salts, start: int, stop: int, nu: int, nv: int, strat
     """The points u, v of rays start..stop of a stratified or uniform `Sampler`: (stop - start,) float64 each."""
     blocks()
     keys, salts = (tuple(np.uint64(k) for k in pair) for pair in (keys, salts))
-    return tuple(torch.from_numpy(a) for a in points.scatter(keys, salts, start, stop, nu, nv, stratified))
+    u, v = (torch.from_numpy(a) for a in points.scatter(keys, salts, start, stop, nu, nv, stratified))
+    return u, v

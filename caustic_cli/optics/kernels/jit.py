@@ -6,6 +6,8 @@ leaves out for functions that only others call is half of that.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numba
 from numba import prange
 
@@ -14,7 +16,7 @@ from caustic_cli.optics.kernels import cache
 __all__ = ["FAST", "PARALLEL", "njit", "prange"]
 
 #: Sums of products may be contracted, and zeros lose their sign; no sum is reordered, no NaN or infinity assumed away.
-FAST = {"fastmath": {"contract", "nsz"}}
+FAST: dict[str, Any] = {"fastmath": {"contract", "nsz"}}
 #: Loops over `prange` run in parallel, and nothing else: every array that is filled would be a parallel loop of its own.
 PARALLEL = {
     "prange": True,
@@ -28,7 +30,7 @@ PARALLEL = {
 }
 
 # Off by default in numba: it turns the steps of four neighbouring pixels in `plane` into vector instructions.
-numba.config.SLP_VECTORIZE = 1
+numba.config.SLP_VECTORIZE = 1  # type: ignore[attr-defined]  # numba makes its settings as it is loaded
 
 
 def njit(*, entry: bool = False, parallel: bool = False, **options):

@@ -68,15 +68,9 @@ def splat_rays(x: Tensor, y: Tensor, weight: Tensor, screen: Screen, filter: Fil
     Returns:
         image (n_x, n_y), power per pixel; off_screen, the power that fell outside the frame; both float64 and differentiable.
     """
-    sizes = tuple(2 * r + 1 for r in filter.reach)
-    frame = Frame(
-        *screen.resolution,
-        *map(float, screen.low),
-        *map(float, screen.pixel),
-        KINDS[filter.kind],
-        *sizes,
-        *map(float, filter.alpha),
-    )
+    (low_x, low_y), (wide_x, wide_y), (alpha_x, alpha_y) = (map(float, pair) for pair in (screen.low, screen.pixel, filter.alpha))
+    size_x, size_y = (2 * r + 1 for r in filter.reach)
+    frame = Frame(*screen.resolution, low_x, low_y, wide_x, wide_y, KINDS[filter.kind], size_x, size_y, alpha_x, alpha_y)
     padded, outside = _Splat.apply(x, y, weight, frame)
     (nx, ny), (rx, ry) = screen.resolution, filter.reach
     padded = padded[:, : ny + 4 * ry]  # beyond lies what rounds the scatter's steps up to four pixels

@@ -35,9 +35,10 @@ class FusedSurface:
 
     def slope_bounds(self, heights: Tensor) -> tuple[float, float]:
         """Bounds of |Z_u| and |Z_v| over [0, 1]^2, mm, from the control nets of the derivatives."""
-        return tuple(
+        by_u, by_v = (
             float((a.space.derivative_matrix() @ h).abs().max()) for a, h in zip(self.axes, (heights, heights.T), strict=True)
         )
+        return by_u, by_v
 
     def workspace(self) -> np.ndarray:
         """Derivatives by the coefficients, a set for each block, to be overwritten."""
@@ -109,12 +110,11 @@ def next_meetings(
         d[2],
     )
     t = np.empty(len(o[0]))
-    heights = float(h.min()), float(h.max())
     intersect.intersect_again(
         ALL,
         *(c.contiguous().numpy() for c in rays),
         -1.0 if below else 1.0,
-        heights,
+        (float(h.min()), float(h.max())),
         surface.slope_bounds(h),
         round,
         step,

@@ -22,7 +22,8 @@ blocks()
 #: First argument of a kernel that is to do the whole.
 ALL = -1
 #: What is called by its address: (arguments, number) -> whether it failed.
-CALLED = ir.FunctionType(ir.IntType(8), [cgutils.voidptr_t, ir.IntType(types.intp.bitwidth)])
+BITS = types.intp.bitwidth  # type: ignore[attr-defined]  # of numba's own integers, which are not numpy's
+CALLED = ir.FunctionType(ir.IntType(8), [cgutils.voidptr_t, ir.IntType(BITS)])
 
 
 @intrinsic

@@ -62,7 +62,7 @@ def land(origin, direction, point: Vector, axes: tuple[Vector, Vector, Vector], 
         x, y: (N,) in the plane; of rays that are not on their way to it those of their origin, and meaningless.
         on_way: (N,) bool.
     """
-    plane = Plane(*(float(c) for vector in (point, *axes) for c in vector), float(forward))
+    plane = Plane._make([*(float(c) for vector in (point, *axes) for c in vector), float(forward)])
     return _Landing.apply(*origin, *direction, plane)
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -25,7 +26,7 @@ from caustic_cli.scene import Lens
 
 
 @dataclass(frozen=True, eq=False)
-class HeightField(Surface):
+class HeightField(Surface[Tensor]):
     """Spline spaces over an aperture of half widths (r_x, r_y) mm."""
 
     spaces: tuple[SplineSpace, SplineSpace]
@@ -35,12 +36,10 @@ class HeightField(Surface):
     def of(cls, lens: Lens) -> HeightField:
         """The field a lens describes."""
         if lens.knots is None:
-            spaces = tuple(SplineSpace.uniform(n, p) for n, p in zip(lens.control, lens.degree, strict=True))
+            u, v = (SplineSpace.uniform(n, p) for n, p in zip(lens.control, lens.degree, strict=True))
         else:
-            spaces = tuple(
-                SplineSpace(p, torch.as_tensor(t, dtype=torch.float64)) for p, t in zip(lens.degree, lens.knots, strict=True)
-            )
-        return cls(spaces, lens.half_size)
+            u, v = (SplineSpace(p, torch.as_tensor(t, dtype=torch.float64)) for p, t in zip(lens.degree, lens.knots, strict=True))
+        return cls((u, v), lens.half_size)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -49,7 +48,8 @@ class HeightField(Surface):
 
     def control_xy(self) -> tuple[Tensor, Tensor]:
         """Positions of the control points along x (n,) and y (m,), mm float64 (eq. 4.1.4)."""
-        return tuple((2.0 * s.greville - 1.0) * r for s, r in zip(self.spaces, self.half_size, strict=True))
+        x, y = ((2.0 * s.greville - 1.0) * r for s, r in zip(self.spaces, self.half_size, strict=True))
+        return x, y
 
     def prepare(self, sample: Sample, dtype: torch.dtype) -> Evaluator:
         """Everything about the surface at these rays that does not depend on the heights; values in `dtype`."""
@@ -77,11 +77,12 @@ class HeightField(Surface):
         u, v, out = 0.5 * (x / rx + 1.0), 0.5 * (y / ry + 1.0), []
         for a, b in orders:
             (i, bu), (j, bv) = su.basis(u, a), sv.basis(v, b)
-            corner, columns, total = i * sv.n + j, torch.arange(sv.degree + 1, device=flat.device), 0.0
+            corner, columns = i * sv.n + j, torch.arange(sv.degree + 1, device=flat.device)
+            total: Tensor | float = 0.0
             for k in range(su.degree + 1):  # one row of the local net at a time bounds the memory
                 at = (corner + k * sv.n)[:, None] + columns
                 total = total + bu[:, k] * (flat.index_select(0, at.reshape(-1)).view(at.shape) * bv).sum(1)
-            out.append(total / ((2.0 * rx) ** a * (2.0 * ry) ** b))
+            out.append(cast(Tensor, total) / ((2.0 * rx) ** a * (2.0 * ry) ** b))
         return out
 
     def slope_bounds(self, heights: Tensor) -> tuple[float, float]:
@@ -149,6 +150,9 @@ class _ScatteredEvaluator(Evaluator):
 
     def __call__(self, heights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         flat = heights.reshape(-1)
+        z: Tensor | float
+        zx: Tensor | float
+        zy: Tensor | float
         z = zx = zy = 0.0
         columns = torch.arange(self.bv.shape[1], device=flat.device)
         for a in range(self.bu.shape[1]):  # one row of the local net at a time bounds the memory
@@ -158,4 +162,4 @@ class _ScatteredEvaluator(Evaluator):
             z = z + self.bu[:, a] * value
             zx = zx + self.du[:, a] * value
             zy = zy + self.bu[:, a] * slope
-        return z, zx, zy
+        return cast("tuple[Tensor, Tensor, Tensor]", (z, zx, zy))

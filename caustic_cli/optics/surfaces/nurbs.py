@@ -20,7 +20,7 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 
 
 @dataclass(frozen=True, eq=False)
-class Nurbs(Surface):
+class Nurbs(Surface[Tensor]):
     """A rational height field.
 
     Args:
@@ -44,7 +44,7 @@ class Nurbs(Surface):
         return self.field.shape
 
     @property
-    def half_size(self) -> tuple[float, float]:
+    def half_size(self) -> tuple[float, float]:  # type: ignore[override]  # nobody sets a surface's
         """Half widths of the aperture, mm."""
         return self.field.half_size
 
@@ -75,7 +75,8 @@ class Nurbs(Surface):
         middle, half, least = 0.5 * (low + high), 0.5 * (high - low), float(self.weights.min())
         over = self.field.slope_bounds(self.weights * (heights.detach().double() - middle))
         under = self.field.slope_bounds(self.weights)
-        return tuple((a + half * w) / least for a, w in zip(over, under, strict=True))
+        x, y = ((a + half * w) / least for a, w in zip(over, under, strict=True))
+        return x, y
 
     def centred(self, heights: Tensor) -> tuple[Tensor, float]:
         """Heights less their mean: weights add up to one share, so the surface moves as its net."""

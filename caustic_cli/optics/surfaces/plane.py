@@ -12,7 +12,7 @@ from caustic_cli.optics.tolerances import PARALLEL
 
 
 @dataclass(frozen=True)
-class Plane(Surface):
+class Plane(Surface[None]):
     """z = 0 in its own frame; its element's pose places and tilts it."""
 
     flat = True

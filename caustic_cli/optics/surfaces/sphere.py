@@ -24,7 +24,7 @@ EQUATOR = 1.0 - 1e-9
 
 
 @dataclass(frozen=True)
-class Sphere(Surface):
+class Sphere(Surface[None]):
     """A spherical surface of signed radius R, mm, not 0; infinite for a plane.
 
     Args:

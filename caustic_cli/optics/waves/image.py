@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -93,9 +94,10 @@ def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | 
             for line in lines_of(one, field, wavelengths)
         ]
     found, own, systems = [], scene.light.wavelengths, {}
+    channels: list[int | None]
     if wavelengths is not None or not own:
         given = wavelengths or white(WHITE_LINES)
-        parts, channels = [1.0 / len(given)] * len(given), [None] * len(given)
+        parts, channels = (1.0 / len(given),) * len(given), [None] * len(given)
     else:
         given, parts = own, scene.light.parts
         channels = list(range(len(given))) if scene.colored else [None] * len(given)
@@ -151,7 +153,8 @@ def image_of(
     lines: list[Line], parameters: Parameters, screen: Screen | Placed, *, finer: float = 1.0, dtype: torch.dtype = torch.float32
 ) -> WaveImage:
     """The wave image of lines of light on one screen, the sources of a system one by one; see `wave_image`."""
-    exact, by_source, found = any(h.requires_grad for h in parameters.values()), {}, []
+    exact, found = any(h.requires_grad for h in parameters.values()), []
+    by_source: dict[int, list[Line]] = {}
     for line in lines:
         by_source.setdefault(id(line.system.source), []).append(line)
     for light in by_source.values():
@@ -161,7 +164,7 @@ def image_of(
         found[0]
         if len(found) == 1
         else WaveImage(
-            sum(w.image for w in found),
+            cast(Tensor, sum(w.image for w in found)),
             sum(w.leaving for w in found),
             sum(w.off_screen for w in found),
             found[0].wavelengths,
@@ -252,7 +255,9 @@ class Imager:
         )
         sampling = Sampling.of(light, (tuple(lows), tuple(highs)), receiver.pixel, distance, lengths, finer)
         spans = [len(s.breaks) - 1 for e in system.elements if isinstance(e.surface, HeightField) for s in e.surface.spaces]
-        nodes = sampling.count if dense else tuple(min(n, max(LEAST_NODES, A_SPAN * max(spans, default=0))) for n in sampling.count)
+        nodes, enough = sampling.count, max(LEAST_NODES, A_SPAN * max(spans, default=0))
+        if not dense:
+            nodes = min(nodes[0], enough), min(nodes[1], enough)
         return cls(system.source, receiver, plane, surveys[0], sampling, spread, nodes, each, upright, exact, watched is None)
 
     def expose(self, lines: list[Line], parameters: Parameters, dtype: torch.dtype = torch.float32) -> WaveImage:
@@ -290,15 +295,16 @@ class Imager:
     def front(self, line: Line, mode: Mode, parameters: Parameters, sensitive: bool = False) -> Wavefront:
         """The light of a mode behind the lens, on `nodes`."""
         optics, s = self.optics(line, mode, parameters), self.sampling
-        step = tuple(d * n / m for d, n, m in zip(s.step, s.count, self.nodes, strict=True))
+        dx, dy = (d * n / m for d, n, m in zip(s.step, s.count, self.nodes, strict=True))
         seen = survey(optics) if self.each else self.seen
-        return wavefront(optics, seen, s.low, step, self.nodes, sensitive, self.exact)
+        return wavefront(optics, seen, s.low, (dx, dy), self.nodes, sensitive, self.exact)
 
     def watched(self, front: Wavefront, length: float) -> Wavefront:
         """The part of it that lands where its transform at a wavelength in mm reaches."""
         if not self.tapered:
             return front
-        return front.within(self.sampling.middle, tuple(length * self.sampling.distance / d for d in self.sampling.step))
+        wide, high = (length * self.sampling.distance / d for d in self.sampling.step)
+        return front.within(self.sampling.middle, (wide, high))
 
     @cached_property
     def spreading(self) -> list[Convolution]:
@@ -326,7 +332,8 @@ class Imager:
                     device,
                 ).to(dtype)
             )
-        return tuple(found)
+        rows, columns = found
+        return rows, columns
 
     def spread_out(self, image: Tensor, mode: int) -> Tensor:
         """An image of a mode's light on cut pixels -> that of its part of the source on the screen's pixels."""

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -99,17 +100,15 @@ def power_by_blocks(
     """
     (n, _), (big, wide) = sampling.count, sampling.padded
     width = math.ceil(wide / pieces)
-    image, whole = 0.0, 0.0
+    image: Tensor | float = 0.0
+    whole = 0.0
     for left in range(0, wide, width):
-        half = []
-        for start in range(0, n, block):
-            u = field(slice(start, min(n, start + block)))
-            half.append(torch.fft.fft(u, n=wide, norm="ortho")[:, left : left + width].contiguous())
-        half = torch.cat(half)
+        blocks = (field(slice(start, min(n, start + block))) for start in range(0, n, block))
+        half = torch.cat([torch.fft.fft(u, n=wide, norm="ortho")[:, left : left + width].contiguous() for u in blocks])
         for start in range(0, half.shape[1], block):
             u = torch.fft.fft(half[:, start : start + block], n=big, dim=0, norm="ortho")
             power = u.real.square() + u.imag.square()
             whole += float(power.sum(dtype=torch.float64))
             at = slice(left + start, left + start + power.shape[1])
             image = image + ((rows @ power) @ columns[:, at].T).double()
-    return image, whole
+    return cast(Tensor, image), whole

@@ -67,9 +67,9 @@ class Receiver:
         u, _, n = self.axes
         if abs(dot(n, axis)) >= ACROSS:
             return Plane(self.axes, dot(self.middle, n))
-        along = tuple(a - dot(u, axis) * b for a, b in zip(u, axis, strict=True))
-        size = math.sqrt(dot(along, along))
-        e1 = tuple(a / size for a in along)
+        x, y, z = (a - dot(u, axis) * b for a, b in zip(u, axis, strict=True))
+        size = math.sqrt(dot((x, y, z), (x, y, z)))
+        e1 = (x / size, y / size, z / size)
         e2 = (axis[1] * e1[2] - axis[2] * e1[1], axis[2] * e1[0] - axis[0] * e1[2], axis[0] * e1[1] - axis[1] * e1[0])
         return Plane((e1, e2, axis), dot(self.middle, axis))
 
@@ -83,13 +83,14 @@ class Receiver:
         for a in (0, self.resolution[0]):
             for b in (0, self.resolution[1]):
                 x, y = self.low[0] + a * self.pixel[0], self.low[1] + b * self.pixel[1]
-                found.append(tuple(m + x * p + y * q for m, p, q in zip(self.middle, u, v, strict=True)))
+                sx, sy, sz = (m + x * p + y * q for m, p, q in zip(self.middle, u, v, strict=True))
+                found.append((sx, sy, sz))
         return found
 
     def extent(self, plane: Plane) -> tuple[tuple[float, float], tuple[float, float]]:
         """Where it lies on a plane seen along the plane's normal: lows and highs of X and Y, mm."""
-        at = [[dot(c, e) for e in plane.axes[:2]] for c in self.corners()]
-        return tuple(min(c[k] for c in at) for k in (0, 1)), tuple(max(c[k] for c in at) for k in (0, 1))
+        x, y = ([dot(c, e) for c in self.corners()] for e in plane.axes[:2])
+        return (min(x), min(y)), (max(x), max(y))
 
 
 def receiver_of(system: System, screen: Screen | Placed) -> Receiver:

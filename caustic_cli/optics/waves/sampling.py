@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import dataclass
+from typing import TypeVar
 
 from scipy.fft import next_fast_len
 
@@ -28,6 +29,10 @@ A_PIXEL = 6.0
 MOST, PIECE, OF_FREE = 1 << 17, 1 << 30, 0.3
 #: How often a piece is in memory at a time.
 COPIES = 2
+
+
+#: A count, or a length.
+Number = TypeVar("Number", int, float)
 
 
 class NoWaveImage(CausticError):
@@ -85,15 +90,16 @@ class Sampling:
             count.append(n)
             padded.append(_even(math.ceil(most)))
             middle.append(0.5 * (landing[0][k] + landing[1][k]))
-        return cls(tuple(low), tuple(step), tuple(count), tuple(padded), tuple(middle), distance)
+        return cls(_pair(low), _pair(step), _pair(count), _pair(padded), _pair(middle), distance)
 
     def spacing(self, wavelength: float) -> tuple[float, float]:
         """dX and dY on the screen at a wavelength in mm."""
-        return tuple(wavelength * self.distance / (n * d) for n, d in zip(self.padded, self.step, strict=True))
+        return _pair([wavelength * self.distance / (n * d) for n, d in zip(self.padded, self.step, strict=True)])
 
     def first(self, wavelength: float) -> tuple[float, float]:
         """X and Y of the screen's first sample at a wavelength in mm, so that all of them lie evenly about the middle."""
-        return tuple(m - 0.5 * (n - 1) * d for m, n, d in zip(self.middle, self.padded, self.spacing(wavelength), strict=True))
+        spacing = self.spacing(wavelength)
+        return _pair([m - 0.5 * (n - 1) * d for m, n, d in zip(self.middle, self.padded, spacing, strict=True)])
 
     def pieces(self, wide: int) -> int:
         """In how many pieces the transform has to be made, of numbers of `wide` bytes, where they are put together from blocks."""
@@ -103,6 +109,12 @@ class Sampling:
     def samples(self) -> int:
         """Of the transform."""
         return self.padded[0] * self.padded[1]
+
+
+def _pair(values: list[Number]) -> tuple[Number, Number]:
+    """One value for each axis."""
+    x, y = values
+    return x, y
 
 
 def _even(n: int) -> int:

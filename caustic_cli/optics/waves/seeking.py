@@ -27,7 +27,8 @@ def sought(optics, seen, at: tuple[Tensor, Tensor], shape: tuple[int, int], step
         f = optics.feet(hu, hv)
         lit = f.power > 0
         found, behind = found | lit, behind | ~lit
-        held = tuple(torch.where(lit | ~found, h, before) for h, before in zip((hu, hv), held, strict=True))
+        held_u, held_v = (torch.where(lit | ~found, h, before) for h, before in zip((hu, hv), held, strict=True))
+        held = held_u, held_v
         settled = _left(f, x, y, shape, step, u, v, behind) <= left
         if settled and (k + 1 >= AT_EDGES or not bool(behind.any())):
             break

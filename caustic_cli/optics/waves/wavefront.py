@@ -187,7 +187,7 @@ def survey(optics: Optics) -> Survey:
     weight = f.power.view(grid)
     magnification = float((weight * area).sum() / (weight * foot).sum()) ** 0.5
     mostly = tuple(tuple(float(torch.quantile(c[lit], q)) for c in (f.big_x, f.big_y)) for q in (FEW, 1.0 - FEW))
-    return Survey(light, landing, tuple(offset), tuple(scale), magnification, mostly)
+    return Survey(light, landing, (offset[0], offset[1]), (scale[0], scale[1]), magnification, mostly)
 
 
 def _jacobian(a: Tensor, b: Tensor, dx: float, dy: float) -> Tensor:
@@ -245,8 +245,9 @@ class Wavefront:
         x, y = (between(self.path.shape[k], self.low[k], self.step[k], low[k], step[k], count[k], self.path) for k in (0, 1))
         bright = self.density > 0  # at 0 a root has no derivative
         root = torch.where(bright, self.density, torch.ones_like(self.density)).sqrt() * bright * (step[0] * step[1]) ** 0.5
-        columns = self.path, root, self.edge_x, self.edge_y, self.shade
-        fine = Refined(*(None if c is None else interpolated(c, None, y) for c in columns), step, x)
+        path, root, edge_x = (interpolated(c, None, y) for c in (self.path, root, self.edge_x))
+        edge_y, shade = (None if c is None else interpolated(c, None, y) for c in (self.edge_y, self.shade))
+        fine = Refined(path, root, edge_x, edge_y, shade, step, x)
         self._fine = key, fine
         return fine
 
@@ -276,7 +277,7 @@ def wavefront(
     x, y = (c.reshape(-1) for c in torch.meshgrid(x, y, indexing="ij"))
     with torch.no_grad():
         f, held, behind = sought(optics, seen, (x, y), shape, step, left)
-    at = {}
+    at: dict[str, Tensor] = {}
     if sensitive:
         with torch.no_grad():
             f, at = _sensitive(optics, *held)
@@ -311,7 +312,7 @@ def wavefront(
     density = (power + torch.where(dark, torch.zeros_like(ex), by_x * ex + by_y * ey)).clamp_min(0.0) * squeeze.clamp_min(0.0)
     rx, ry = (abs(s) / 2.0 for s in seen.scale)
     edge_x, edge_y = (rx - torch.hypot(px, py * (rx / ry)), None) if pupil.round else (rx - px.abs(), ry - py.abs())
-    landed = (c.detach().view(shape) for c in (f.big_x, f.big_y))
+    big_x, big_y = (c.detach().view(shape) for c in (f.big_x, f.big_y))
     return Wavefront(
         low,
         step,
@@ -319,7 +320,8 @@ def wavefront(
         density,
         edge_x,
         edge_y,
-        *landed,
+        big_x,
+        big_y,
         (~dark).double() if bool(dark.any()) else None,
         **{name: value.view(shape) for name, value in at.items()},
     )

@@ -11,6 +11,7 @@ A type of its own says `kind` and `power`; a near one also `points`, and `extent
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,23 +29,38 @@ class Source:
     profile: relative irradiance over the aperture, (a, b), or None if even; cone: half-angle of the cone as the user said it,
     degrees, or None for the narrowest that covers the lens; intensity: uniform in solid angle, lambertian, or a table; aimed: rays
     are sampled on the lens instead of all over the cone; collimated: see above; rays: those of a file, None of a source that has as
-    many as are asked for; brightness: relative radiance over `frame`, (a, b) [i, j], or None if even over an ellipse.
+    many as are asked for; brightness: relative radiance over `frame`, (a, b) [i, j], or None if even over an ellipse; spectra: of
+    several sources, wavelengths, nm, and relative powers of each.
     """
 
     kind: str
-    power: float
     profile: np.ndarray | None = None
     cone: float | None = None
     intensity: str | Distribution = "uniform"
     aimed: bool = True
-    collimated: bool = False
     rays: RaySet | None = None
     brightness: np.ndarray | None = None
+    spectra: tuple[tuple[tuple[float, ...], tuple[float, ...]], ...] = ()
+
+    if TYPE_CHECKING:  # values of some types and properties of others: all that can be said of any is that they are read
+
+        @property
+        def power(self) -> float: ...
+
+        @property
+        def collimated(self) -> bool: ...
+    else:
+        collimated = False
 
     @property
     def members(self) -> tuple[Source, ...]:
         """The sources that it is made of: itself, unless it is several."""
         return (self,)
+
+    @property
+    def fractions(self) -> tuple[float, ...]:
+        """Part of all power of each of its members."""
+        return (1.0,)
 
     @property
     def even(self) -> bool:

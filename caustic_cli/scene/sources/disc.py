@@ -11,6 +11,7 @@ import numpy as np
 from caustic_cli.config.table import check, check_all
 from caustic_cli.errors import InputError
 from caustic_cli.scene.sources.base import Source
+from caustic_cli.scene.sources.distribution import Distribution
 from caustic_cli.scene.sources.plane import PlaneWave
 from caustic_cli.scene.sources.points import Points
 from caustic_cli.scene.sources.section import SourceType, Table, check_shining, content, middle, shining, standing
@@ -35,7 +36,7 @@ class Disc(Source):
     size: tuple[float, float] = (2.0, 2.0)
     power: float = 1.0
     cone: float | None = None
-    intensity: str = "lambertian"
+    intensity: str | Distribution = "lambertian"
     aimed: bool = True
     angle: float | None = None
     brightness: np.ndarray | None = field(default=None, compare=False)
@@ -63,7 +64,7 @@ class Disc(Source):
     @property
     def half_angle(self) -> float:
         """As of a source; with a picture, that of the outermost corner of its light."""
-        if not self.distant:
+        if self.angle is None:
             return 0.0
         half = math.radians(self.angle) / 2.0
         return half if self.brightness is None else math.asin(math.sin(half) * self._reach[2])
@@ -71,11 +72,14 @@ class Disc(Source):
     @property
     def frame(self) -> tuple[float, float]:
         """As of a source."""
-        return (math.sin(math.radians(self.angle) / 2.0),) * 2 if self.distant else (self.size[0] / 2.0, self.size[1] / 2.0)
+        if self.angle is None:
+            return self.size[0] / 2.0, self.size[1] / 2.0
+        return (math.sin(math.radians(self.angle) / 2.0),) * 2
 
     @cached_property
     def _reach(self) -> tuple[float, float, float]:
         """How far light of the picture is from its middle along x, along y and in all, in half widths."""
+        assert self.brightness is not None
         lit = self.brightness > 0
         far = [np.maximum(np.abs(edge[:-1]), np.abs(edge[1:])) for edge in (np.linspace(-1.0, 1.0, n + 1) for n in lit.shape)]
         corner = np.hypot(far[0][:, None], far[1][None, :])
@@ -119,7 +123,7 @@ class Disc(Source):
 
     def apparent_angle(self, z_in: float) -> float:
         """As of a source; of a far one, the very number that was given."""
-        return self.angle if self.distant else super().apparent_angle(z_in)
+        return super().apparent_angle(z_in) if self.angle is None else self.angle
 
     def pointlike(self) -> Source:
         """A plane wave, or a point in the middle."""

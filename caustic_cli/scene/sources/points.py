@@ -11,6 +11,7 @@ import numpy as np
 from caustic_cli.config.table import check
 from caustic_cli.errors import InputError
 from caustic_cli.scene.sources.base import Source
+from caustic_cli.scene.sources.distribution import Distribution
 from caustic_cli.scene.sources.section import SourceType, Table, check_shining, middle, positions, shining, standing
 
 #: Most point sources at once.
@@ -25,15 +26,15 @@ class Points(Source):
         positions: (x, y, z) of each, mm.
         powers: emitted into the cone by each, W; None for 1 W shared equally.
         cone: half-angle of the cone, degrees; None for the narrowest that covers the lens from every position.
-        intensity: uniform or lambertian.
+        intensity: uniform or lambertian, or a table.
         aimed: rays are sampled where they meet the lens, with the weights that this asks for; otherwise all over the cone.
         kind: point, or grid for points that stand for an extended source.
     """
 
     positions: tuple[tuple[float, float, float], ...]
-    powers: tuple[float, ...] | None = None
+    powers: tuple[float, ...] = None  # type: ignore[assignment]  # what None means is found on construction
     cone: float | None = None
-    intensity: str = "uniform"
+    intensity: str | Distribution = "uniform"
     aimed: bool = True
     kind: str = "point"
 

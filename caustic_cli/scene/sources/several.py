@@ -83,7 +83,8 @@ class Several(Source):
     @property
     def extent(self) -> tuple[float, float]:
         """The largest along each axis."""
-        return tuple(max((one.extent[k] for one in self._near), default=0.0) for k in (0, 1))
+        x, y = (max((one.extent[k] for one in self._near), default=0.0) for k in (0, 1))
+        return x, y
 
     @property
     def nearest(self) -> float:
