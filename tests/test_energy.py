@@ -1,6 +1,7 @@
 """Power is never made out of nothing, and none that matters is left out: surfaces without glass, ghosts that focus, accounts."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,11 +12,12 @@ from caustic_cli import cli
 from caustic_cli.config import settings
 from caustic_cli.config.completion import complete
 from caustic_cli.errors import CausticError, InputError
+from caustic_cli.inverse.extended import centre_of
 from caustic_cli.optics.bounds import bounds_of, refuse_without_glass
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.plan import compile_plan
 from caustic_cli.optics.resolution import Resolution
-from caustic_cli.optics.spread import spread_at
+from caustic_cli.optics.spread import Convolution, spread_at
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Scene, Screen
@@ -129,6 +131,34 @@ def test_the_blur_of_a_source_knows_the_glass(source):
     scene = Scene(source, scene.lens, scene.screen)
     spread = spread_at(scene, field, heights)
     assert Resolution.at(scene, field, heights).source == pytest.approx(2.0 * max(spread.half), rel=0.005)
+
+
+def test_an_image_spread_is_the_image_of_the_source():
+    """Of a lens with relief: the centre's image, convolved, beside rays from all of the disc in two independent halves, whose noise
+    the product of the differences does not have."""
+    scene, field, heights = sphere(1.5, 1.5)
+    x, y = field.control_xy()
+    heights = heights + 0.01 * torch.sin(1.3 * x)[:, None] * torch.sin(0.9 * y)[None, :]
+    disc = Scene(Disc((0.0, 0.0, -500.0), (5.0, 5.0), intensity="uniform"), scene.lens, Screen((30.0, 30.0), 300.0, (60, 60)))
+    spread = spread_at(disc, field, heights).on(disc.screen.pixel)
+    assert spread.cut == 4
+    fine = replace(disc, screen=replace(disc.screen, resolution=(240, 240)), source=centre_of(disc))
+
+    def image(scene: Scene, rays: int, seed: int) -> torch.Tensor:
+        found = expose(scene, field, heights, rays_of(scene, "sobol", rays, seed), None, torch.float64).image
+        return found / found.mean()
+
+    sharp, discs = image(fine, 2_000_000, 1), [image(disc, 1_000_000, seed) for seed in (2, 3)]
+
+    def square(kernel: Convolution) -> float:
+        seen = kernel.whole(sharp).reshape(60, 4, 60, 4).sum((1, 3))
+        first, second = (seen / seen.mean() - one for one in discs)
+        return float((first * second).mean())
+
+    assert abs(square(spread)) < 0.01**2
+    found = spread_at(disc, field, heights)
+    wider = replace(found, half=tuple(1.03 * h for h in found.half))
+    assert square(wider.on(disc.screen.pixel)) > 0.01**2  # 3 % are noticed
 
 
 # a start that is better

@@ -148,8 +148,8 @@ def paraxial(scene: Scene, field: HeightField, heights: Tensor) -> Paraxial:
     vergence = 0.0 if scene.source.distant else 1.0 / (lens.z_in - scene.source.centre[2] + lens.offset.thickness / lens.inside)
     line = (torch.arange(POINTS, dtype=torch.float64, device=heights.device) + 0.5) * (2.0 / POINTS) - 1.0
     x, y = (c.reshape(-1) * r for c, r in zip(torch.meshgrid(line, line, indexing="ij"), field.half_size, strict=True))
-    derivatives = field.at(heights.detach(), x, y, (*FIRST[1:], *SECOND))
-    return Paraxial(x, y, *derivatives, distance, 1.0 + distance * vergence)
+    gx, gy, xx, xy, yy = field.at(heights.detach(), x, y, (*FIRST[1:], *SECOND))
+    return Paraxial(x, y, gx, gy, xx, xy, yy, distance, 1.0 + distance * vergence)
 
 
 def local_magnification(scene: Scene, field: HeightField, heights: Tensor) -> float:

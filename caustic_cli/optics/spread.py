@@ -29,8 +29,9 @@ from caustic_cli.scene import Scene
 MOST = 0.8
 #: Points along each axis of the pupil whose light says how a source shifts the image.
 POINTS = 33
-#: Cells of an image in the half axes of an ellipse that are aimed at, and into how many a pixel is cut at most for that.
-CELLS, MOST_CUT = 4.0, 4
+#: Cells of an image in the half axes of an ellipse that are aimed at, and into how many a pixel is cut at most for that.  Light is
+#: taken to be in the middle of its cell: with 6 in a half axis that is wrong by 0.02 relative RMS, with 24 by 0.001.
+CELLS, MOST_CUT = 16.0, 4
 #: Points of an ellipse: least along an axis, and to a cell of an image.
 LEAST, A_CELL = 64, 6
 
