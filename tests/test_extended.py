@@ -157,7 +157,7 @@ def test_regular_rays_carry_the_light_of_the_source(kind, round_):
 
 
 @pytest.mark.parametrize("kind", SOURCES)
-@pytest.mark.parametrize("exact", [10.0, 1e-3], ids=["middle", "points"])
+@pytest.mark.parametrize("exact", [10.0, 1e-5], ids=["middle", "points"])
 def test_objective_sees_the_image_of_the_source(kind, exact, monkeypatch):
     """On its own regular rays, spread, the loss is that of very many rays drawn from all of the source; its gradient is right."""
     monkeypatch.setattr(extended, "EXACT", exact)

@@ -80,7 +80,6 @@ class Spread:
         Points of the ellipse are shared out linearly among cells, which widens it; its half axes are less by so much that its
         second moments stay what they are.  part: see `parts_on`, points and the number of one.
         """
-        a, b = (math.ceil(r / w) + 1 for r, w in zip(self.reach(), cell, strict=True))
         if self.brightness is None:
             rx, ry = (math.sqrt(max(0.0, h * h - 2.0 / 3.0 * w * w)) for h, w in zip(self.half, cell, strict=True))
             half = rx, ry
@@ -96,6 +95,11 @@ class Spread:
             mine = cKDTree(places).query(np.stack([x, y], 1))[1] == k
             x, y, light = x[mine] - places[k, 0], y[mine] - places[k, 1], light[mine] * len(places)
         x, y = (h / w * c for h, w, c in zip(half, cell, (x, y), strict=True))
+        # A part of the source may lie farther from its own point than the source from its middle.
+        a, b = (
+            max(math.ceil(r / w), math.ceil(float(np.abs(d).max() / w + np.abs(c).max(initial=0.0)))) + 1
+            for r, w, d, c in zip(self.reach(), cell, (dx, dy), (x, y), strict=True)
+        )
         at_x, at_y = (d[:, None] / w + c + n for d, c, w, n in ((dx, x, cell[0], a), (dy, y, cell[1], b)))
         i, j = np.floor(at_x).astype(int), np.floor(at_y).astype(int)
         found = np.zeros((2 * a + 2) * (2 * b + 2))

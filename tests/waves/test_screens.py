@@ -172,7 +172,7 @@ def test_where_a_source_does_more_than_shift():
     depths = scene_of(1.0, screen, Points(((0.0, 0.0, -50.0), (0.3, 0.0, -60.0))))
     field, heights = wavy(depths)
     assert wave_image(depths, field, heights).points == 2
-    wide = scene_of(1.0, replace(screen, size=(60.0, 60.0), resolution=(600, 600)), Disc((0.0, 0.0, -6.0), (4.0, 4.0)))
+    wide = scene_of(1.0, replace(screen, size=(80.0, 80.0), resolution=(600, 600)), Disc((0.0, 0.0, -3.0), (4.0, 4.0)))
     lines = lines_of(wide, field)
     imager = Imager.of(lines, {EXIT: heights}, receiver_of(lines[0].system, wide.screen))
     assert imager.spread.error < imager.spread.half[0] and 1 < len(imager.modes(lines[0].system)) <= 24
@@ -181,9 +181,9 @@ def test_where_a_source_does_more_than_shift():
 def test_parts_of_a_source_are_spread():
     """Where light is misplaced too far for one convolution, a few points, each spread by its part of the source, agree with thrice
     as many; one is off by more."""
-    screen = Screen((2.4, 2.4), 42.0, (40, 40))
-    scene = scene_of(1.0, screen, Disc(angle=1.2))
-    field, heights = wavy(scene, 0.004)
+    screen = Screen((6.0, 6.0), 42.0, (40, 40))
+    scene = scene_of(1.0, screen, Disc(angle=6.0))
+    field, heights = wavy(scene, 0.05)
     found, lines, at = wave_image(scene, field, heights), lines_of(scene, field), {EXIT: heights}
     imager = Imager.of(lines, at, receiver_of(lines[0].system, screen))
     assert found.points == imager.each > 1

@@ -103,9 +103,11 @@ class Optics:
         return Feet(*(torch.cat([getattr(p, name) for p in parts]) for name in Feet.__dataclass_fields__))
 
     def landing(self, mode: Mode, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Where another mode's light lands, X, Y, mm, its power, and where it leaves the lens: its feet, mm."""
-        f = replace(self, mode=mode).feet(u, v)
-        return f.big_x, f.big_y, f.power, f.x, f.y
+        """Where another mode's light lands, X, Y, mm, its power, and where it leaves the last element, mm."""
+        met = replace(self, mode=mode).interactions(u, v)
+        f, state = self.footed(met), met.state.spread()
+        x, y = (c.expand(len(u)) if isinstance(c, Tensor) else torch.full_like(u, c) for c in state.origin[:2])
+        return f.big_x, f.big_y, f.power, x, y
 
     def footed(self, m: Interaction) -> Feet:
         """Rays behind the last element by their feet."""
