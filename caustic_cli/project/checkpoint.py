@@ -201,13 +201,13 @@ def _load(path: Path, file: BinaryIO) -> Checkpoint:
                 raise ValueError("history")
             group = f["state"]
             state = State(
-                held.tensor("lens/heights"),
+                held.tensor("lens/heights").double(),
                 **{k: int(group.attrs[k]) for k in ("stage", "iteration", "total")},
                 **{name: {k: held.tensor(f"state/{name}/{k}") for k in group[name]} for name in ("parameters", "optimizer")},
                 history=[(int(r[0]), int(r[1]), *map(float, r[2:])) for r in rows],
                 seconds=float(group.attrs["seconds"]),
                 reason=str(group.attrs["reason"]),
-                start=held.tensor("start") if "start" in f else None,
+                start=held.tensor("start").double() if "start" in f else None,
             )
             if min(state.stage, state.iteration, state.total) < 0 or not 0 <= state.seconds < math.inf:
                 raise ValueError("state")
@@ -226,6 +226,7 @@ def _load(path: Path, file: BinaryIO) -> Checkpoint:
         raise InputError(
             f"{path}: is damaged or not a caustic checkpoint ({type(error).__name__}); a whole checkpoints.h5 is needed"
         ) from error
-    if tuple(state.heights.shape) != (spaces[0].n, spaces[1].n) or not bool(torch.isfinite(state.heights).all()):
+    nets = [state.heights] if state.start is None else [state.heights, state.start]
+    if tuple(state.heights.shape) != (spaces[0].n, spaces[1].n) or not all(bool(torch.isfinite(z).all()) for z in nets):
         raise InputError(f"{path}: is damaged (its heights do not fit its knots); a whole checkpoints.h5 is needed")
     return checkpoint
