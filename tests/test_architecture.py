@@ -16,7 +16,7 @@ PACKAGE = Path(__file__).resolve().parent.parent / "caustic_cli"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
 #: What a room may import from the package: commands -> workflow -> project -> config -> inverse -> optics -> scene -> errors, with
-#: studies and exports beside the inverse problem.  They write files and pictures, through io; nothing else below the project does.
+#: studies and exports beside the inverse problem.  They write files and pictures, through io, by which config reads project.toml.
 #: The table of settings is data that stands below every room.
 ALLOWED = {
     "scene": {"scene", "table", "errors"},
@@ -26,7 +26,7 @@ ALLOWED = {
     "export": {"export", "table", "optics", "scene", "errors", "io"},
     "studies": {"studies", "table", "optics", "scene", "errors", "io"},
     "table": {"table", "errors"},
-    "config": {"config", "table", "inverse", "optics", "scene", "errors"},
+    "config": {"config", "table", "inverse", "io", "optics", "scene", "errors"},
     "project": {"project", "table", "config", "inverse", "io", "optics", "scene", "errors"},
     "workflow": {"workflow", "table", "project", "config", "inverse", "studies", "export", "io", "optics", "scene", "errors"},
 }

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from rayfiles import cone_of, lighttools, tm25, zemax
 
 from caustic_cli.errors import InputError
-from caustic_cli.io.rayfiles import MAX_BYTES, parse_rays, read_bytes
+from caustic_cli.io.files import read_bytes
+from caustic_cli.io.rayfiles import MAX_BYTES, parse_rays
 from caustic_cli.scene.sources.rayset import RaySet
 
 RAYS = cone_of(50, 40.0, (1.0, 0.5))

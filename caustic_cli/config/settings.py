@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -20,13 +21,25 @@ import tomli_w
 from caustic_cli import __version__
 from caustic_cli.config.table import Setting, check, default, in_section
 from caustic_cli.errors import InputError
+from caustic_cli.io.files import read_bytes
 from caustic_cli.scene import Lens, Light, Offset, Scene, Screen, Source, sources
 from caustic_cli.scene.materials import refractive_index
 
 #: Settings by section and key.
 Settings = dict[str, dict[str, Any]]
 FORMAT_VERSION = 1
-MAX_BYTES = 1 << 24  # of a TOML file: a hundred thousand source points fit
+MAX_BYTES = 1 << 23  # of a TOML file: a hundred thousand source points fit
+ACCEPTED = "a TOML file is needed"
+#: Most names of a key joined by dots, most brackets within each other, and most keys and headings in all.
+MOST_NAMES, MOST_NESTED, MOST_KEYS = 4, 16, 20_000
+_NAME = r"""(?:"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+'|[A-Za-z0-9_+-]++)"""
+_DOT = r"[ \t]*+\.[ \t]*+"
+#: What of a TOML text matters to how deep it is.
+_TOKEN = re.compile(
+    r"""#[^\n]*+|\"{3}(?s:[^"\\]|\\.|"{1,2}(?!"))*+\"{3,5}|'{3}(?:[^']|'{1,2}(?!'))*+'{3,5}"""
+    rf"|(?P<names>{_NAME}(?:{_DOT}{_NAME}){{{MOST_NAMES}}})|(?!\"{{3}}|'{{3}}){_NAME}"
+    r"""|(?P<endless>["'])|(?P<open>[\[{])|(?P<close>[\]}])|(?P<equals>=)"""
+)
 
 
 def _schema() -> dict[str, dict[str, Setting]]:
@@ -59,9 +72,10 @@ def parse(text: str, where: str) -> Settings:
     Raises:
         InputError: naming `where` and the offending key.
     """
+    _refuse_deep(text, where)
     try:
         raw = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # besides TOML's own: digits without end, brackets without end
+    except ValueError as error:  # besides TOML's own: digits without end
         raise InputError(f"{where}: is not valid TOML: {error}") from error
     if not _fits(raw):
         raise InputError(f"{where}: holds a whole number of more than 64 bits")
@@ -84,6 +98,32 @@ def parse(text: str, where: str) -> Settings:
                 continue
             out[section][key] = _typed(f"{where}: [{section}] {key}", key, value, SCHEMA[section])
     return out
+
+
+def _refuse_deep(text: str, where: str) -> None:
+    """Refuse more than MOST_NAMES names joined by dots, MOST_NESTED brackets within each other, or MOST_KEYS keys and headings.
+
+    tomllib takes time in proportion to the square of such names, recurs over both, and takes a kilobyte for every key.  In one pass
+    that tells strings and comments from the rest as it does itself, and stops where one does not end, since it stops there too.
+    """
+    depth = keys = 0
+    for found in _TOKEN.finditer(text):
+        kind, wrong = found.lastgroup, ""
+        if kind == "endless":
+            return
+        if kind == "names":
+            wrong = f"joins more than {MOST_NAMES} names by dots; sections and keys have one or two"
+        elif kind == "close":
+            depth -= 1
+        elif kind is not None:
+            keys += kind == "equals" or depth == 0
+            depth += kind == "open"
+        if depth > MOST_NESTED:
+            wrong = f"has more than {MOST_NESTED} brackets within each other; lists of lists have two"
+        if keys > MOST_KEYS:
+            wrong = f"is beyond {MOST_KEYS:,} keys and headings, the most that are read"
+        if wrong:
+            raise InputError(f"{where}: line {text.count(chr(10), 0, found.start()) + 1} {wrong}")
 
 
 def checked(given: Mapping[str, Any], where: str) -> Settings:
@@ -276,14 +316,14 @@ def refuse_unused(source: dict[str, Any], given: Iterable[str], stages: Sequence
 
 
 def read(path: Path) -> Settings:
-    """Settings from a TOML file."""
+    """Settings from a TOML file of at most MAX_BYTES.
+
+    Raises:
+        InputError: there is none, it is too large, no text, or `parse` refuses it.
+    """
+    data = read_bytes(path, MAX_BYTES, ACCEPTED, least=0)
     try:
-        with open(path, "rb") as f:
-            text = f.read(MAX_BYTES + 1)
-        if len(text) > MAX_BYTES:
-            raise InputError(f"{path}: is too large; a TOML file of at most {MAX_BYTES:,} bytes is read")
-        return parse(text.decode().replace("\r\n", "\n"), str(path))
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file; a TOML file is needed") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as text ({error}); a TOML file is needed") from error
+        text = data.decode()
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: cannot be read as text ({error}); {ACCEPTED}") from error
+    return parse(text.replace("\r\n", "\n"), str(path))

@@ -19,6 +19,7 @@ from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse import ranks
 from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
 from caustic_cli.inverse.extended import best_light, regular_rays, shift_of
+from caustic_cli.inverse.lbfgs import UNFIT
 from caustic_cli.inverse.limits import within_limits
 from caustic_cli.inverse.losses import parse
 from caustic_cli.inverse.objective import Objective
@@ -147,6 +148,9 @@ class Designer:
     def _module(self, state: State) -> Heights:
         module = self._parametrise(state.stage, state.heights if self.options.network == "none" else None)
         if state.parameters:
+            own, held = ({k: tuple(v.shape) for k, v in part.items()} for part in (module.state_dict(), state.parameters))
+            if own != held:
+                raise InputError(UNFIT)
             module.load_state_dict(state.parameters)
         return module
 

@@ -12,8 +12,14 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from caustic_cli.errors import InputError
+
 #: f may stay this much above Armijo's line: the sufficient decrease constant c1, and the curvature constant c2.
 ARMIJO, CURVATURE = 1e-4, 0.9
+UNFIT = (
+    "the checkpoint's optimiser is another, or of another net, than ⟨design.optimizer⟩, ⟨design.network⟩ and ⟨lens.control⟩ say;"
+    " design again to change them"
+)
 MAX_EVALUATIONS = 12  # a line search
 FIRST_STEP = 0.1  # of the first direction, in units of f / |g|^2
 
@@ -59,7 +65,17 @@ class LBFGS:
         return out
 
     def load(self, state: dict[str, Tensor]) -> None:
-        """Go on from `state()`."""
+        """Go on from `state()`.
+
+        Raises:
+            InputError: it is that of another method, or of another number of unknowns.
+        """
+        n, shapes = self.x.numel(), {name: tuple(value.shape) for name, value in state.items()}
+        own: dict[str, tuple[int, ...]] = {"x": (n,), "g": (n,), "f": (0,) if shapes.get("f") == (0,) else (1,)}
+        if "s" in shapes:
+            own |= dict.fromkeys(("s", "y"), (*shapes["s"][:1], n))
+        if shapes != own:
+            raise InputError(UNFIT)
         self.x, self.g = state["x"].clone(), state["g"].clone()
         self.f = float(state["f"][0]) if len(state["f"]) else None
         # Rows are copied: sums over a vector depend, in the last bit, on how its memory is aligned.

@@ -10,8 +10,8 @@ import math
 import torch
 from torch import Tensor
 
-from caustic_cli.errors import CausticError
-from caustic_cli.inverse.lbfgs import LBFGS
+from caustic_cli.errors import CausticError, InputError
+from caustic_cli.inverse.lbfgs import LBFGS, UNFIT
 from caustic_cli.inverse.losses import NoLight
 from caustic_cli.inverse.objective import Evaluation, Objective
 from caustic_cli.inverse.parametrisation import Heights
@@ -76,6 +76,16 @@ class Adam:
         return out
 
     def load(self, state: dict[str, Tensor]) -> None:
+        """Go on from `state()`.
+
+        Raises:
+            InputError: it is that of another method, or of other parameters.
+        """
+        own = {}
+        for k, p in enumerate(self.heights.parameters()):
+            own |= {f"{k}.step": (), f"{k}.exp_avg": tuple(p.shape), f"{k}.exp_avg_sq": tuple(p.shape)}
+        if {name: tuple(value.shape) for name, value in state.items()} != own:
+            raise InputError(UNFIT)
         whole = self.adam.state_dict()
         whole["state"] = {}
         for key, value in state.items():

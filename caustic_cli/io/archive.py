@@ -8,11 +8,16 @@ import numpy as np
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.io.surfaces import load_npz, surface_of
+from caustic_cli.io.arrays import Archive, open_npz
+from caustic_cli.io.surfaces import ACCEPTED, surface_of
 from caustic_cli.optics.bounds import refuse_without_glass
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Disc, Lens, Light, PlaneWave, Points, Scene, Screen, Source
-from caustic_cli.scene.sources.distribution import Distribution
+from caustic_cli.scene.sources.distribution import MOST_ANGLES, Distribution
+from caustic_cli.scene.sources.points import MAX_POINTS
+
+#: Cells along an axis of a source's picture.
+MOST_CELLS = 1 << 16
 
 
 def open_archive(path: str | Path) -> tuple[Scene, HeightField, Tensor]:
@@ -21,86 +26,70 @@ def open_archive(path: str | Path) -> tuple[Scene, HeightField, Tensor]:
     Raises:
         InputError: it cannot be read, something is missing, or something is out of range.
     """
-    path = Path(path)
-    data = load_npz(path)
-    field, heights = surface_of(data, path)
-    try:
+    with open_npz(Path(path), ACCEPTED) as data:
+        field, heights = surface_of(data)
         lens = Lens(
             size=tuple(2.0 * h for h in field.half_size),
-            z_in=float(data["z_in"]),
-            index=float(data["refractive_index"]),
+            z_in=data.real("z_in"),
+            index=data.real("refractive_index"),
             control=field.shape,
             degree=tuple(s.degree for s in field.spaces),
             knots=tuple(tuple(s.knots.tolist()) for s in field.spaces),
-            fresnel=_text(data, "fresnel", "exact"),
-            aperture=_text(data, "aperture", "rectangle"),
+            fresnel=data.text("fresnel", "exact"),
+            aperture=data.text("aperture", "rectangle"),
         )
         screen = Screen(
-            tuple(2.0 * h for h in _reals(data, "screen_half_size", 2)),
-            float(data["z_screen"]),
-            tuple(int(n) for n in _reals(data, "resolution", 2)),
+            tuple(2.0 * h for h in data.reals("screen_half_size", 2).tolist()), data.real("z_screen"), data.wholes("resolution", 2)
         )
-        scene = Scene(_source(data), lens, screen, Light(unit=_text(data, "source_power_unit", "W")))
+        scene = Scene(_source(data), lens, screen, Light(unit=data.text("source_power_unit", "W")))
         refuse_without_glass(scene, field, heights)
         return scene, field, heights
-    except KeyError as error:
-        raise InputError(f"{path}: has no {error.args[0]}; an archive of caustic export ⟨format⟩ lighttools is needed") from error
-    except (TypeError, ValueError, IndexError) as error:
-        raise InputError(f"{path}: holds something of the wrong shape or type ({error})") from error
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
 
 
-def _source(data: dict[str, np.ndarray]) -> Source:
-    kind = data["source_type"].item()
+def _source(data: Archive) -> Source:
+    kind = data.text("source_type")
     if kind not in _READERS:
         raise InputError(f"source_type must be plane, point, grid or disc, got {kind!r}")
     return _READERS[kind](data)
 
 
-def _plane(data: dict[str, np.ndarray]) -> PlaneWave:
-    return PlaneWave(float(data["source_power"][0]), data.get("source_profile"))
+def _plane(data: Archive) -> PlaneWave:
+    return PlaneWave(_power(data), _picture(data, "source_profile"))
 
 
-def _points(data: dict[str, np.ndarray]) -> Points:
-    powers = data["source_power"]
-    return Points(_positions(data), tuple(float(p) for p in powers), kind=data["source_type"].item(), **_shining(data))
+def _points(data: Archive) -> Points:
+    powers = data.reals("source_power", None, most=MAX_POINTS).tolist()
+    return Points(_positions(data), tuple(powers), kind=data.text("source_type"), **_shining(data))
 
 
-def _disc(data: dict[str, np.ndarray]) -> Disc:
-    power = float(data["source_power"][0])
+def _disc(data: Archive) -> Disc:
+    brightness = _picture(data, "source_brightness")
     if "source_angle" in data:
-        return Disc(power=power, angle=float(data["source_angle"]), brightness=data.get("source_brightness"))
-    return Disc(
-        _positions(data)[0],
-        tuple(_reals(data, "source_size", 2)),
-        power,
-        brightness=data.get("source_brightness"),
-        **_shining(data),
-    )
+        return Disc(power=_power(data), angle=data.real("source_angle"), brightness=brightness)
+    size = tuple(data.reals("source_size", 2).tolist())
+    return Disc(_positions(data)[0], size, _power(data), brightness=brightness, **_shining(data))
 
 
 #: What makes a source of its keys in the archive, by its kind: see `export/lighttools.py`.
 _READERS = {"plane": _plane, "point": _points, "grid": _points, "disc": _disc}
 
 
-def _positions(data: dict[str, np.ndarray]) -> tuple[tuple[float, ...], ...]:
-    return tuple(tuple(float(v) for v in p) for p in data["source_positions"])
+def _power(data: Archive) -> float:
+    return float(data.reals("source_power", 1)[0])
 
 
-def _shining(data: dict[str, np.ndarray]) -> dict[str, object]:
-    intensity = data["source_intensity"].item()
+def _picture(data: Archive, name: str) -> np.ndarray | None:
+    """Relative irradiance or radiance, None where the archive has none."""
+    return data.reals(name, None, None, most=MOST_CELLS) if name in data else None
+
+
+def _positions(data: Archive) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(p) for p in data.reals("source_positions", None, 3, most=MAX_POINTS).tolist())
+
+
+def _shining(data: Archive) -> dict[str, object]:
+    intensity = data.text("source_intensity")
     if intensity == "table":
-        angles, values = np.asarray(data["source_intensity_table"], dtype=float).T.tolist()
+        angles, values = data.reals("source_intensity_table", None, 2, most=MOST_ANGLES).T.tolist()
         intensity = Distribution(tuple(angles), tuple(values))
-    return {"cone": float(data["cone_half_angle"]), "intensity": intensity}
-
-
-def _reals(data: dict[str, np.ndarray], key: str, count: int) -> list[float]:
-    if data[key].shape != (count,):
-        raise ValueError(f"{key} must be {count} numbers")
-    return [float(v) for v in data[key]]
-
-
-def _text(data: dict[str, np.ndarray], key: str, default: str) -> str:
-    return data[key].item() if key in data else default
+    return {"cone": data.real("cone_half_angle"), "intensity": intensity}

@@ -1,14 +1,21 @@
-"""Files are written whole or not at all: temporary file beside the target, fsync, rename."""
+"""Files are written whole or not at all: temporary file beside the target, fsync, rename.
+
+Only regular files, and links to them, are opened or replaced: a device, a pipe or a socket may have no end, keep its reader
+waiting, or be lost.  Each reader says how many bytes it reads at most, and a larger file is refused by its size alone.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import glob
 import os
+import stat
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 from caustic_cli.errors import CausticError, InputError
 
@@ -24,14 +31,93 @@ LEFT_BEHIND = 600.0
 
 
 @contextlib.contextmanager
+def naming(path: str | Path) -> Iterator[None]:
+    """Put the file's name before what is said of its content within the block."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def open_regular(path: str | Path, accepted: str, most: int) -> BinaryIO:
+    """A regular file of at most `most` bytes, opened for reading; whoever reads it closes it.
+
+    Raises:
+        InputError: there is none, it is something else or larger, or cannot be read; `accepted` says what is needed.
+    """
+
+    def opened(name, flags: int) -> int:
+        return os.open(name, flags | getattr(os, "O_NONBLOCK", 0))  # a pipe that takes its place meanwhile keeps nobody waiting
+
+    try:
+        _refuse_special(path, os.stat(path), accepted)  # before it is opened: that alone may set a device going
+        file = open(path, "rb", opener=opened)  # noqa: SIM115 (it is the caller's)
+        try:
+            found = os.fstat(file.fileno())
+            _refuse_special(path, found, accepted)
+            if found.st_size > most:
+                raise InputError(f"{path}: is {found.st_size:,} bytes; at most {most:,} are read; {accepted}")
+        except InputError:
+            file.close()
+            raise
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file; {accepted}") from error
+    except (OSError, ValueError) as error:  # a name too long, or with a zero byte
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error}); {accepted}") from error
+    return file
+
+
+def read_bytes(path: str | Path, most: int, accepted: str, least: int = 1) -> bytes:
+    """All of a regular file of `least` (0 or 1) to `most` bytes.
+
+    Raises:
+        InputError: there is none, it is empty, too large or cannot be read; `accepted` says what is needed.
+    """
+    with open_regular(path, accepted, most) as file:
+        try:
+            size = os.fstat(file.fileno()).st_size
+            data = file.read(size + 1)  # for which memory is taken at once
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror}); {accepted}") from error
+    if len(data) < least:
+        raise InputError(f"{path}: is empty; {accepted}")
+    if len(data) > size:
+        raise InputError(f"{path}: grew beyond {size:,} bytes while it was read; {accepted}")
+    return data
+
+
+def _refuse_special(path: str | Path, found: os.stat_result, needed: str) -> None:
+    """Refuse what is neither a regular file nor a link to one."""
+    if not stat.S_ISREG(found.st_mode):
+        kind = "a directory" if stat.S_ISDIR(found.st_mode) else "not a regular file"
+        raise InputError(f"{path}: is {kind}; {needed}")
+
+
+def refuse_special(path: str | Path) -> None:
+    """Refuse to write where something stands that is no regular file: renaming onto a device would remove it.
+
+    Raises:
+        InputError: there is a directory, a device, a pipe or a socket, or a link to one.
+    """
+    try:
+        found = os.stat(path)
+    except (OSError, ValueError):  # nothing there; what makes writing impossible is said where it is tried
+        return
+    _refuse_special(path, found, "a file name is needed")
+
+
+@contextlib.contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """A temporary path in the same directory; renamed onto `path` when the block ends well, removed when it does not.
 
     Raises:
-        InputError: the directory cannot be written to.
+        InputError: the directory cannot be written to, or something else than a regular file stands there.
         CausticError: the file could not be written, on a full disk for instance; what stood there before still does.
     """
     path = Path(path)
+    refuse_special(path)
     _sweep(path)
     try:
         handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=path.suffix, dir=path.parent)
@@ -71,12 +157,18 @@ def write_bytes(path: str | Path, data: bytes) -> None:
 
 
 def is_ours(path: str | Path) -> bool:
-    """Whether this program made the file: by our mark in a PNG, .npy, .npz, STL, JSON or text; nothing else is ours."""
-    with open(path, "rb") as f:
-        head = f.read(1024)
-        size = os.path.getsize(path)
-        f.seek(max(0, size - 1024))
-        tail = f.read()
+    """Whether this program made the file: by our mark in a PNG, .npy, .npz, STL, JSON or text; nothing else is ours.
+
+    Read are its first and last 1024 bytes.  What cannot be read is not ours.
+    """
+    try:
+        with open_regular(path, "", sys.maxsize) as f:
+            head = f.read(1024)
+            size = os.fstat(f.fileno()).st_size
+            f.seek(max(0, size - 1024))
+            tail = f.read(1024)
+    except (InputError, OSError):
+        return False
     if head.startswith(b"\x93NUMPY\x01\x00"):
         return int.from_bytes(head[8:10], "little") == NPY_HEADER - 10
     if head.startswith(b"\x89PNG"):
@@ -98,12 +190,11 @@ def refuse_foreign(path: str | Path, force: bool = False) -> None:
     """Stop before work begins when `path` cannot be written, or holds something this program did not make.
 
     Raises:
-        InputError: its directory is missing or read-only, it is a directory, it is foreign and `force` is false, or it
+        InputError: its directory is missing or read-only, it is no regular file, it is foreign and `force` is false, or it
             is what a project is made of.
     """
     path = Path(path)
-    if path.is_dir():
-        raise InputError(f"{path}: is a directory; a file name is needed")
+    refuse_special(path)
     if not path.parent.is_dir():
         raise InputError(f"{path}: its directory {path.parent} does not exist; make it first")
     if not os.access(path.parent, os.W_OK):

@@ -27,7 +27,7 @@ def parse_distribution(data: bytes, where: str) -> Distribution:
     rows: list[tuple[float, float]] = []
     named = False
     for number, line in enumerate(lines, 1):
-        cells = [c for c in re.split(r"[,;\s]+", line.partition("#")[0].strip()) if c]
+        cells = [c for c in re.split(r"[,;\s]+", line.partition("#")[0].strip(), maxsplit=2) if c]
         if not cells:
             continue
         row = _numbers(cells)

@@ -6,8 +6,10 @@ j along +y.  Pixel values are sRGB-encoded or linear; irradiance is always linea
 
 from __future__ import annotations
 
-import stat
+import os
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,11 +17,14 @@ import numpy as np
 from PIL import Image, ImageOps, PngImagePlugin
 
 from caustic_cli.errors import InputError
-from caustic_cli.io.files import NPY_HEADER, SOFTWARE, atomic_path
+from caustic_cli.io.arrays import open_npy
+from caustic_cli.io.files import NPY_HEADER, SOFTWARE, atomic_path, naming, open_regular
 
 ENCODINGS = ("srgb", "linear")
 #: Largest picture read, in pixels: a float64 copy of it is half a gigabyte.
 MAX_PIXELS = 8192 * 8192
+#: Largest image file read: its decoders may take in all of it at once.
+MAX_BYTES = 1 << 30
 ACCEPTED = "an image (PNG, JPEG, TIFF, ...) or a 2-D .npy array is needed"
 #: Luminance of linear sRGB primaries (IEC 61966-2-1, Rec. 709).
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
@@ -101,20 +106,7 @@ def read_picture(path: str | Path, linear: bool = False, color: bool = False) ->
         InputError: there is no such picture, or it is too large, too small, black, negative or not finite.
     """
     path = Path(path)
-    try:
-        mode = path.stat().st_mode
-        if not stat.S_ISREG(mode):
-            kind = "a directory" if stat.S_ISDIR(mode) else "not a regular file"
-            raise InputError(f"{path}: is {kind}; {ACCEPTED}")
-        picture = _read_npy(path, color) if path.suffix.lower() == ".npy" else _read_image(path, linear, color)
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file; {ACCEPTED}") from error
-    except PermissionError as error:
-        raise InputError(f"{path}: cannot be read (permission denied); {ACCEPTED}") from error
-    except (OSError, ValueError) as error:  # a name too long, or with a zero byte
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path}: cannot be read ({error}); {ACCEPTED}") from error
+    picture = _read_npy(path, color) if path.suffix.lower() == ".npy" else _read_image(path, linear, color)
     a, b = picture.irradiance_shape
     if min(a, b) < 2:
         raise InputError(f"{path}: is {a} x {b} pixels; a picture of at least 2 x 2 is needed")
@@ -123,53 +115,48 @@ def read_picture(path: str | Path, linear: bool = False, color: bool = False) ->
     return picture
 
 
-def _check_size(path: Path, width: int, height: int) -> None:
+def _check_size(width: int, height: int) -> None:
     if width * height > MAX_PIXELS:
-        raise InputError(f"{path}: is {width} x {height} pixels; at most {MAX_PIXELS} pixels (8192 x 8192) are read")
+        raise InputError(f"is {width} x {height} pixels; at most {MAX_PIXELS} pixels (8192 x 8192) are read")
 
 
 def _read_npy(path: Path, color: bool) -> Picture:
-    try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (FileNotFoundError, PermissionError):
-        raise
-    except Exception as error:  # what a broken header makes NumPy's parser stumble over may be anything
-        raise InputError(f"{path}: is not a readable .npy array ({type(error).__name__}); {ACCEPTED}") from error
-    if isinstance(array, np.lib.npyio.NpzFile):
-        array.close()
-    ours = isinstance(array, np.ndarray) and (array.ndim == 3 and len(array) == 3 if color else array.ndim == 2)
-    if not ours or array.dtype.kind not in "fiub":
-        shape = "an array (3, n_x, n_y)" if color else "a 2-D array"
-        raise InputError(f"{path}: a .npy target must be {shape} of real numbers")
-    _check_size(path, *array.shape[-2:])
-    values = np.array(array, dtype=np.float64)
-    if not np.isfinite(values).all():
-        raise InputError(
-            f"{path}: holds {int((~np.isfinite(values)).sum())} values that are NaN or infinite; finite irradiance is needed"
-        )
-    if (values < 0).any():
-        raise InputError(f"{path}: holds negative values (least {values.min():g}); irradiance must be at least 0")
-    if values.size and values.max() > 1e300:
-        raise InputError(f"{path}: holds values up to {values.max():g}; irradiance must be at most 1e300")
+    with open_npy(path, ACCEPTED) as stored:
+        shape = stored.shape
+        if not (len(shape) == 3 and shape[0] == 3 if color else len(shape) == 2) or stored.dtype.kind not in "fiub":
+            kind = "an array (3, n_x, n_y)" if color else "a 2-D array"
+            raise InputError(f"a .npy target must be {kind} of real numbers")
+        _check_size(*shape[-2:])
+        values = stored.read_reals()
+        if not np.isfinite(values).all():
+            raise InputError(
+                f"holds {int((~np.isfinite(values)).sum())} values that are NaN or infinite; finite irradiance is needed"
+            )
+        if (values < 0).any():
+            raise InputError(f"holds negative values (least {values.min():g}); irradiance must be at least 0")
+        if values.max() > 1e300:
+            raise InputError(f"holds values up to {values.max():g}; irradiance must be at most 1e300")
     return Picture(values, "linear")
 
 
 def _read_image(path: Path, linear: bool, color: bool) -> Picture:
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the size is checked below, in our words
-            with Image.open(path) as image:
-                _check_size(path, *image.size)
-                if image.format == "EPS":  # which Pillow would have Ghostscript draw
-                    raise InputError(f"{path}: is a drawing, not pixels; {ACCEPTED}")
-                image = ImageOps.exif_transpose(image)
-                image.load()
-    except (FileNotFoundError, PermissionError, InputError):
-        raise
-    except Image.DecompressionBombError as error:
-        raise InputError(f"{path}: is too large; at most {MAX_PIXELS} pixels (8192 x 8192) are read") from error
-    except Exception as error:  # what a broken file makes one of Pillow's many decoders stumble over may be anything
-        raise InputError(f"{path}: is not an image that can be read ({type(error).__name__}); {ACCEPTED}") from error
+    with open_regular(path, ACCEPTED, MAX_BYTES) as file, naming(path):
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of sizes, which are checked below, and of metadata, which nobody needs
+                with Image.open(file) as image:
+                    _check_size(*image.size)
+                    if image.format == "EPS":  # which Pillow would have Ghostscript draw
+                        raise InputError(f"is a drawing, not pixels; {ACCEPTED}")
+                    with _silent() if image.format == "TIFF" else nullcontext():
+                        image = ImageOps.exif_transpose(image)
+                        image.load()
+        except InputError:
+            raise
+        except Image.DecompressionBombError as error:
+            raise InputError(f"is too large; at most {MAX_PIXELS} pixels (8192 x 8192) are read") from error
+        except Exception as error:  # what a broken file makes one of Pillow's many decoders stumble over may be anything
+            raise InputError(f"is not an image that can be read ({type(error).__name__}); {ACCEPTED}") from error
     encoding = "linear" if linear else "srgb"
     if color and image.mode != "F" and not image.mode.startswith("I"):
         return Picture(_over_black(image, linear), encoding)
@@ -189,6 +176,23 @@ def _read_image(path: Path, linear: bool, color: bool) -> Picture:
     if image.mode in ("1", "L") and not transparent:
         return Picture(np.array(image.convert("L")), encoding)
     return Picture(_luminance(image, linear, transparent), encoding)
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Nothing is said on stderr within the block: libtiff says there what it finds wrong with a file, past Pillow and Python."""
+    try:
+        before = os.dup(2)
+    except OSError:  # closed
+        yield
+        return
+    try:
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+        yield
+    finally:
+        os.dup2(before, 2)
+        os.close(before)
 
 
 def _over_black(image: Image.Image, linear: bool) -> np.ndarray:

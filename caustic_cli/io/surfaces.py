@@ -5,8 +5,9 @@ Everything is mm in the scene's coordinates: heights above z = 0, aperture centr
 
 from __future__ import annotations
 
+import math
 import re
-import zipfile
+from array import array
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,12 @@ import torch
 from scipy.interpolate import RectBivariateSpline
 from torch import Tensor
 
+from caustic_cli.config.checks import LENGTH
 from caustic_cli.config.table import TABLE
 from caustic_cli.errors import InputError
-from caustic_cli.optics.bspline import SplineSpace
+from caustic_cli.io.arrays import Archive, open_npy, open_npz
+from caustic_cli.io.files import naming, read_bytes
+from caustic_cli.optics.bspline import MAX_DEGREE, SplineSpace
 from caustic_cli.optics.surfaces.heightfield import HeightField
 
 #: Most control points along one axis of a surface.
@@ -26,11 +30,22 @@ SUFFIXES = (".npz", ".step", ".stp", ".npy")
 #: Relative difference up to which two lengths, or poles and Greville abscissae, are the same.
 SAME = 1e-9
 
-_POINT = re.compile(r"(#\d+)\s*=\s*CARTESIAN_POINT\s*\(\s*'[^']*'\s*,\s*\(([^()]*)\)\s*\)\s*;")
-_SURFACE = re.compile(
-    r"B_SPLINE_SURFACE_WITH_KNOTS\s*\(\s*'[^']*'\s*,\s*(\d+)\s*,\s*(\d+)\s*,\s*\(((?:\s*\([#\d,\s]*\)\s*,?)+)\)"
-    r"\s*,[^()]*,\s*\(([\d,\s]*)\)\s*,\s*\(([\d,\s]*)\)\s*,\s*\(([^()]*)\)\s*,\s*\(([^()]*)\)\s*,"
+#: Largest STEP file read: a net of 1600 x 1600 control points as exported.
+MAX_STEP_BYTES = 1 << 28
+ACCEPTED = "an archive of caustic export ⟨format⟩ lighttools is needed"
+HEIGHTS = f"a 2-D .npy array of heights in mm, 2 to {MAX_CONTROL} along each axis, is needed"
+
+# Each pattern begins with characters of its own and never gives back what it has taken, so that reading a file takes time in
+# proportion to its length.  In a text without strings and comments:
+_STRING = re.compile(r"(?:'[^']*+')++|/\*(?:[^*]|\*(?!/))*+\*/|(?:'|/\*)(?s:.*)")
+_POINT = re.compile(
+    r"#(\d{1,18})\s*+=\s*+CARTESIAN_POINT\s*+\(\s*+''\s*+,\s*+\(([^(),]*+),([^(),]*+),([^(),]*+)\)\s*+\)\s*+;", re.A
 )
+_SURFACE = "B_SPLINE_SURFACE_WITH_KNOTS"
+_DEGREES = re.compile(r"\s*+\(\s*+''\s*+,\s*+(\d{1,4})\s*+,\s*+(\d{1,4})\s*+,\s*+\(", re.A)
+_ROW = re.compile(r"\s*+\(([#\d,\s]*+)\)\s*+(,?)", re.A)
+_FORM = re.compile(r"\s*+\)(?:\s*+,\s*+\.\w++\.){4}", re.A)
+_LIST = re.compile(r"\s*+,\s*+\(([^()]*+)\)", re.A)
 
 
 def read_surface(path: str | Path, half_size: tuple[float, float]) -> tuple[HeightField, Tensor]:
@@ -44,18 +59,17 @@ def read_surface(path: str | Path, half_size: tuple[float, float]) -> tuple[Heig
         InputError: no such file, it holds no such surface, or one of another size.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; a lens surface is needed: {', '.join(SUFFIXES)}")
-    if path.suffix.lower() not in SUFFIXES:
+    if path.suffix.lower() not in _READERS:
         raise InputError(f"{path}: a lens surface is read from {', '.join(SUFFIXES)}")
-    if path.suffix.lower() == ".npy":
-        return _read_heights(path, half_size)
-    found = read_npz(path) if path.suffix.lower() == ".npz" else read_step(path)
+    return _READERS[path.suffix.lower()](path, half_size)
+
+
+def _of_this_size(found: tuple[HeightField, Tensor], half_size: tuple[float, float]) -> tuple[HeightField, Tensor]:
+    """A surface that is as large as the aperture it must fill."""
     if any(abs(a - b) > SAME * b for a, b in zip(found[0].half_size, half_size, strict=True)):
         wide, high = (2.0 * r for r in found[0].half_size)
         raise InputError(
-            f"{path}: the lens is {wide:g} x {high:g} mm, not {2 * half_size[0]:g} x {2 * half_size[1]:g} mm;"
-            " ⟨lens_size⟩ must be its own"
+            f"the lens is {wide:g} x {high:g} mm, not {2 * half_size[0]:g} x {2 * half_size[1]:g} mm; ⟨lens_size⟩ must be its own"
         )
     return found
 
@@ -66,115 +80,148 @@ def onto(field: HeightField, heights: Tensor, net: HeightField) -> Tensor:
     return tu @ heights @ tv.T
 
 
-def load_npz(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of an archive.
-
-    Raises:
-        InputError: it cannot be read.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            return dict(archive)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, AttributeError) as error:
-        raise InputError(f"{path}: is not a readable .npz archive of plain arrays") from error
+def read_npz(path: Path, half_size: tuple[float, float]) -> tuple[HeightField, Tensor]:
+    """The exact B-spline of an archive made by `caustic export format lighttools`, over this aperture."""
+    with open_npz(path, ACCEPTED) as data:
+        return _of_this_size(surface_of(data), half_size)
 
 
-def read_npz(path: Path) -> tuple[HeightField, Tensor]:
-    """The exact B-spline of an archive made by `caustic export format lighttools`."""
-    return surface_of(load_npz(path), path)
-
-
-def surface_of(data: dict[str, np.ndarray], path: Path) -> tuple[HeightField, Tensor]:
+def surface_of(data: Archive) -> tuple[HeightField, Tensor]:
     """The surface that an archive's arrays describe.
 
     Raises:
-        InputError: something is missing or not a surface; `path` is named.
+        InputError: something is missing or not a surface.
     """
     missing = [key for key in ("control_points", "degrees", "knots_u", "knots_v", "lens_half_size") if key not in data]
     if missing:
-        raise InputError(f"{path}: has no {', '.join(missing)}; an archive of caustic export ⟨format⟩ lighttools is needed")
-    degrees, half = data["degrees"], data["lens_half_size"]
-    if degrees.shape != (2,) or half.shape != (2,) or degrees.dtype.kind not in "iu" or not np.isfinite(half).all():
-        raise InputError(f"{path}: degrees must be two whole numbers and lens_half_size two lengths in mm")
-    return _surface(
-        path, data["control_points"], [int(p) for p in degrees], (data["knots_u"], data["knots_v"]), tuple(float(h) for h in half)
-    )
+        raise InputError(f"has no {', '.join(missing)}; {ACCEPTED}")
+    degrees, half = data.wholes("degrees", 2), tuple(data.reals("lens_half_size", 2).tolist())
+    knots = [data.reals(key, None, most=MAX_CONTROL + MAX_DEGREE + 1) for key in ("knots_u", "knots_v")]
+    return _surface(data.reals("control_points", None, None, 3, most=MAX_CONTROL), degrees, knots, half)
 
 
-def read_step(path: Path) -> tuple[HeightField, Tensor]:
-    """The one B-spline surface of a STEP file whose poles stand at the Greville abscissae, in millimetres.
+def read_step(path: Path, half_size: tuple[float, float]) -> tuple[HeightField, Tensor]:
+    """The one B-spline surface of a STEP file whose poles stand at the Greville abscissae, in millimetres, over this aperture.
+
+    Read are files of at most MAX_STEP_BYTES, in time and memory proportional to their length: 20 s and 2.2 GB for the longest.
 
     Raises:
         InputError: there is none or more than one, it is no such height field, or the unit is another.
     """
-    try:
-        text = path.read_text("latin-1")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); a STEP file is needed") from error
-    if "ISO-10303-21" not in text[:1000]:
-        raise InputError(f"{path}: is not a STEP file, which begins with ISO-10303-21")
-    if not re.search(r"SI_UNIT\s*\(\s*\.MILLI\.\s*,\s*\.METRE\.\s*\)", text):
-        raise InputError(f"{path}: its lengths are not millimetres")
-    surfaces = _SURFACE.findall(text)
-    if len(surfaces) != 1 or "RATIONAL_B_SPLINE_SURFACE" in text:
-        raise InputError(f"{path}: must hold one B-spline surface, not rational, got {len(surfaces)} plain ones")
-    p, q, net, *numbers = surfaces[0]
-    try:
-        points = {name: [float(v) for v in at.split(",")] for name, at in _POINT.findall(text)}
-        rows = [[points[name] for name in re.findall(r"#\d+", row)] for row in re.findall(r"\(([^()]*)\)", net)]
-        counts = [[int(v) for v in part.split(",")] for part in numbers[:2]]
-        values = [[float(v) for v in part.split(",")] for part in numbers[2:]]
-        knots = [np.repeat(v, c) for v, c in zip(values, counts, strict=True)]
-        poles = np.array(rows, dtype=float)
-    except (KeyError, ValueError) as error:
-        raise InputError(f"{path}: its B-spline surface is damaged") from error
-    knots = [(t - t[0]) / (t[-1] - t[0]) if len(t) and t[-1] > t[0] else t for t in knots]
-    return _surface(path, poles, [int(p), int(q)], knots)
+    text = read_bytes(path, MAX_STEP_BYTES, "a STEP file is needed").decode("latin-1")
+    with naming(path):
+        if "ISO-10303-21" not in text[:1000]:
+            raise InputError("is not a STEP file, which begins with ISO-10303-21")
+        text = _STRING.sub("''", text)
+        if not re.search(r"SI_UNIT\s*+\(\s*+\.MILLI\.\s*+,\s*+\.METRE\.\s*+\)", text):
+            raise InputError("its lengths are not millimetres")
+        count = text.count(_SURFACE)
+        if count != 1 or "RATIONAL_B_SPLINE_SURFACE" in text:
+            raise InputError(f"must hold one B-spline surface, not rational, got {count} plain ones")
+        try:
+            poles, degrees, knots = _step_surface(text, text.index(_SURFACE) + len(_SURFACE))
+        except (ValueError, OverflowError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError("its B-spline surface is damaged") from error
+        return _of_this_size(_surface(poles, degrees, knots), half_size)
 
 
-def _surface(path: Path, poles: np.ndarray, degrees: list[int], knots, half=None) -> tuple[HeightField, Tensor]:
+def _step_surface(text: str, at: int) -> tuple[np.ndarray, list[int], list[np.ndarray]]:
+    """Poles (n, m, 3), degrees and knots of the surface whose arguments begin at `at`, taken one after another.
+
+    Raises:
+        ValueError: they are not there.
+    """
+    found, rows, more = _after(_DEGREES, text, at), [], ","
+    degrees, at = [int(found[1]), int(found[2])], found.end()
+    while more:
+        found = _after(_ROW, text, at)
+        if len(rows) == MAX_CONTROL or found[1].count(",") >= MAX_CONTROL:
+            raise InputError(f"has more than {MAX_CONTROL} control points a side, which are read at most")
+        rows.append(np.array([int(name.strip().removeprefix("#")) for name in found[1].split(",")], dtype=np.int64))
+        at, more = found.end(), found[2]
+    at, lists = _after(_FORM, text, at).end(), []
+    for _ in range(4):
+        found = _after(_LIST, text, at)
+        at = found.end()
+        lists.append([] if found[1].count(",") > MAX_CONTROL + MAX_DEGREE else found[1].split(","))
+    knots = [_knots(counts, values) for counts, values in zip(lists[:2], lists[2:], strict=True)]
+    if any(len(row) != len(rows[0]) for row in rows):
+        raise ValueError("rows of unequal length")
+    names, places = array("q"), array("d")
+    for point in _POINT.finditer(text):
+        names.append(int(point[1]))
+        places.extend((float(point[2]), float(point[3]), float(point[4])))
+    wanted, order = np.stack(rows), np.argsort(names, kind="stable")
+    known = np.asarray(names)[order]
+    where = np.searchsorted(known, wanted)
+    if not len(known) or not (known[np.minimum(where, len(known) - 1)] == wanted).all():
+        raise ValueError("a control point that is not there")
+    return np.asarray(places).reshape(-1, 3)[order][where], degrees, knots
+
+
+def _after(pattern: re.Pattern, text: str, at: int) -> re.Match:
+    """What a pattern takes from `at` on."""
+    found = pattern.match(text, at)
+    if found is None:
+        raise ValueError("an argument that is not there")
+    return found
+
+
+def _knots(counts: list[str], values: list[str]) -> np.ndarray:
+    """The knot vector on [0, 1] with these distinct knots, each so many times."""
+    if any(len(c.strip()) > 4 for c in counts):
+        raise ValueError("a multiplicity of more than four digits")
+    times, distinct = [int(c) for c in counts], [float(v) for v in values]
+    if not all(1 <= n <= MAX_DEGREE + 1 for n in times) or not all(map(math.isfinite, distinct)):
+        raise ValueError("a multiplicity that no spline has, or a knot that is not finite")
+    t = np.repeat(distinct, times)
+    with np.errstate(over="ignore"):
+        length = t[-1] - t[0]
+        return (t - t[0]) / length if 0 < length < math.inf else t
+
+
+def _surface(poles: np.ndarray, degrees, knots, half=None) -> tuple[HeightField, Tensor]:
     """The height field with these poles (n, m, 3); its half widths from the poles unless given."""
-    if poles.ndim != 3 or poles.shape[2] != 3 or poles.dtype.kind != "f" or not np.isfinite(poles).all():
-        raise InputError(f"{path}: control points must be finite numbers of shape n x m x 3, got {poles.shape}")
-    if max(poles.shape[:2]) > MAX_CONTROL:
-        raise InputError(f"{path}: has {poles.shape[0]} x {poles.shape[1]} control points; at most {MAX_CONTROL} a side are read")
-    try:
-        spaces = tuple(SplineSpace(p, torch.as_tensor(np.asarray(t, float))) for p, t in zip(degrees, knots, strict=True))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
+    if min(poles.shape) < 2 or not (np.abs(poles) <= LENGTH).all():
+        raise InputError(f"control points must be n x m x 3 numbers within +-{LENGTH:g} mm, n and m at least 2, got {poles.shape}")
+    spaces = tuple(SplineSpace(p, torch.as_tensor(t)) for p, t in zip(degrees, knots, strict=True))
     half = half or (float(poles[-1, 0, 0]), float(poles[0, -1, 1]))
     if (spaces[0].n, spaces[1].n) != poles.shape[:2]:
         raise InputError(
-            f"{path}: its knots and degrees belong to {spaces[0].n} x {spaces[1].n} control points,"
-            f" not {poles.shape[0]} x {poles.shape[1]}"
+            f"its knots and degrees belong to {spaces[0].n} x {spaces[1].n} control points, not {poles.shape[0]} x {poles.shape[1]}"
         )
     field = HeightField(spaces, half)
     x, y = (c.numpy() for c in field.control_xy())
     if (
         not min(half) > 0
-        or np.abs(poles[..., 0] - x[:, None]).max() > SAME * half[0]
-        or np.abs(poles[..., 1] - y[None, :]).max() > SAME * half[1]
+        or not np.abs(poles[..., 0] - x[:, None]).max() <= SAME * half[0]
+        or not np.abs(poles[..., 1] - y[None, :]).max() <= SAME * half[1]
     ):
         raise InputError(
-            f"{path}: is no height field over an aperture centred on the axis: its control points must stand at the"
+            "is no height field over an aperture centred on the axis: its control points must stand at the"
             " Greville abscissae, rows along +x"
         )
-    return field, torch.from_numpy(np.ascontiguousarray(poles[..., 2], dtype=np.float64))
+    return field, torch.from_numpy(np.ascontiguousarray(poles[..., 2]))
 
 
-def _read_heights(path: Path, half_size: tuple[float, float]) -> tuple[HeightField, Tensor]:
+def read_heights(path: Path, half_size: tuple[float, float]) -> tuple[HeightField, Tensor]:
     """The spline through heights on an even grid over the aperture, borders included."""
-    try:
-        z = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{path}: is not a readable .npy array; a 2-D one of heights in mm is needed") from error
-    if z.ndim != 2 or z.dtype.kind not in "fiu" or not np.isfinite(z).all() or not 2 <= min(z.shape) <= max(z.shape) <= MAX_CONTROL:
-        raise InputError(
-            f"{path}: must be a 2-D array of finite heights in mm, 2 to {MAX_CONTROL} along each axis, got shape {z.shape}"
-        )
-    degrees = [min(3, n - 1) for n in z.shape]
-    lines = [np.linspace(0.0, 1.0, n) for n in z.shape]
-    spline = RectBivariateSpline(*lines, z.astype(float), kx=degrees[0], ky=degrees[1], s=0)
+    with open_npy(path, HEIGHTS) as stored:
+        shape = stored.shape
+        if len(shape) != 2 or stored.dtype.kind not in "fiu" or not 2 <= min(shape) <= max(shape) <= MAX_CONTROL:
+            raise InputError(f"must be a 2-D array of heights in mm, 2 to {MAX_CONTROL} along each axis, got shape {shape}")
+        z = stored.read_reals()
+        if not (np.abs(z) <= LENGTH).all():
+            raise InputError(f"must hold heights within +-{LENGTH:g} mm")
+    degrees = [min(3, n - 1) for n in shape]
+    lines = [np.linspace(0.0, 1.0, n) for n in shape]
+    spline = RectBivariateSpline(*lines, z, kx=degrees[0], ky=degrees[1], s=0)
     spaces = tuple(SplineSpace(p, torch.from_numpy(t)) for p, t in zip(degrees, spline.get_knots(), strict=True))
-    heights = torch.from_numpy(spline.get_coeffs().reshape(z.shape))
+    heights = torch.from_numpy(spline.get_coeffs().reshape(shape))
     return HeightField(spaces, tuple(half_size)), heights
+
+
+#: What reads each kind of file.
+_READERS = {".npz": read_npz, ".step": read_step, ".stp": read_step, ".npy": read_heights}

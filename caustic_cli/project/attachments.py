@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from caustic_cli.io.files import read_bytes
 from caustic_cli.io.intensities import MOST_BYTES, TABLE, parse_distribution
 from caustic_cli.io.picture import read_picture
-from caustic_cli.io.rayfiles import ACCEPTED, MAX_BYTES, SUFFIXES, parse_rays, read_bytes
+from caustic_cli.io.rayfiles import ACCEPTED, MAX_BYTES, SUFFIXES, parse_rays
 from caustic_cli.scene.sources.section import Attached
 
 #: Keys of [source] that may name a file, and what it is called in a project.

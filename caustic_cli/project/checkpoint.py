@@ -11,17 +11,20 @@
 A file whose writer was killed cannot be read, so a checkpoint is never updated in place: it is written beside the old
 one and renamed.  Before the HDF5 data stands a block of SEAL bytes (HDF5 calls it the user block) with the sha256 of all
 that follows, so that nothing of a damaged file is believed.  Files of earlier versions have none.
+
+Read are at most MAX_BYTES; the checksum is taken in pieces, and datasets only as far as the file really holds them, none twice.
 """
 
 from __future__ import annotations
 
 import hashlib
-import io
 import json
+import math
 import subprocess
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import BinaryIO
 
 import h5py
 import numpy as np
@@ -30,13 +33,19 @@ import torch
 from caustic_cli import __version__
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import State
-from caustic_cli.io.files import write_bytes
+from caustic_cli.io.files import open_regular, write_bytes
 from caustic_cli.optics.bspline import SplineSpace
 
 FORMAT_VERSION = 1
 HISTORY = ("iteration", "stage", "loss", "on_screen", "seconds")
 #: Length of the block before the data, the least that HDF5 allows; and what an HDF5 file without one begins with.
 SEAL, SIGNATURE = 512, b"\x89HDF\r\n\x1a\n"
+SEALED = f"caustic checkpoint, HDF5 from byte {SEAL}, sha256 "
+#: Largest checkpoint read: a net of 4096 x 4096 with its 20 pairs of L-BFGS, or the largest network with Adam's moments, is 6.5 GB.
+MAX_BYTES = 1 << 33
+#: Most iterations of a history that is read.
+MOST_ITERATIONS = 10_000_000
+NEEDED = "a project with a designed lens is needed (caustic design makes one)"
 #: Reads every attribute of a file, then says its version.
 PROBE = """
 import sys, h5py
@@ -94,7 +103,27 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
 
 def seal(image: bytes) -> bytes:
     """The block that stands before an HDF5 image."""
-    return f"caustic checkpoint, HDF5 from byte {SEAL}, sha256 {hashlib.sha256(image).hexdigest()}\n".encode().ljust(SEAL)
+    return _block(hashlib.sha256(image).hexdigest())
+
+
+def _block(digest: str) -> bytes:
+    return f"{SEALED}{digest}\n".encode().ljust(SEAL)
+
+
+def _sealed(file: BinaryIO) -> bool:
+    """Whether a file begins with the checksum of all that follows."""
+    file.seek(0)
+    head = file.read(SEAL)
+    return head.startswith(SEALED.encode()) and head == _block(hashlib.file_digest(file, "sha256").hexdigest())
+
+
+def _begins(file: BinaryIO) -> tuple[bool, bool]:
+    """Whether HDF5 data begin at once, and whether they begin after a block."""
+    found = []
+    for at in (0, SEAL):
+        file.seek(at)
+        found.append(file.read(len(SIGNATURE)) == SIGNATURE)
+    return found[0], found[1]
 
 
 class _Newer(InputError):
@@ -118,62 +147,72 @@ def _version(path: Path) -> int:
         return 0
 
 
-def _read(f: h5py.File, name: str) -> np.ndarray:
-    """A dataset that lies in the file as it is: none elsewhere, none that grows when it is read."""
-    made = f[name].id.get_create_plist()
-    if made.get_external_count() or made.get_layout() not in (h5py.h5d.CONTIGUOUS, h5py.h5d.COMPACT):
-        raise ValueError(f"layout of {name}")
-    if f[name].dtype.kind not in "fiub" or f[name].nbytes > f.id.get_filesize():
-        raise ValueError(f"size of {name}")
-    return np.asarray(f[name][()])
+class _Contents:
+    """The datasets of a file that lie in it as they are: none elsewhere, none that grows when it is read, none read again."""
+
+    def __init__(self, file: h5py.File):
+        self.file, self.unread = file, file.id.get_filesize()
+
+    def read(self, name: str) -> np.ndarray:
+        found = self.file[name]
+        made = found.id.get_create_plist()
+        if made.get_external_count() or made.get_layout() not in (h5py.h5d.CONTIGUOUS, h5py.h5d.COMPACT):
+            raise ValueError(f"layout of {name}")
+        if found.dtype.kind not in "fiub" or found.nbytes > self.unread:
+            raise ValueError(f"size of {name}")
+        self.unread -= found.nbytes
+        return np.asarray(found[()])
+
+    def tensor(self, name: str) -> torch.Tensor:
+        return torch.from_numpy(self.read(name))
 
 
 def load(path: Path) -> Checkpoint:
     """Read a checkpoint.
 
     Raises:
-        InputError: it is missing, damaged, or of a newer version.
+        InputError: it is missing, no regular file, larger than MAX_BYTES, damaged, or of a newer version.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; a project with a designed lens is needed (caustic design makes one)")
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    if data[:SEAL] != seal(data[SEAL:]):
-        version = _version(path)
+    with open_regular(path, NEEDED, MAX_BYTES) as file:
+        return _load(path, file)
+
+
+def _load(path: Path, file: BinaryIO) -> Checkpoint:
+    if not _sealed(file):
+        at_once, later = _begins(file)
+        version = _version(path) if at_once or later else 0
         if version > FORMAT_VERSION:
             raise _Newer(path, version)
-        if version == 0 or not data.startswith(SIGNATURE):
+        if version == 0 or not at_once:
             raise InputError(
                 f"{path}: is damaged (its checksum is not that of its content) or not a caustic checkpoint; a whole"
                 " checkpoints.h5 is needed"
             )
     try:
-        with h5py.File(io.BytesIO(data), "r") as f:
+        with h5py.File(file, "r") as f:
             version = int(f.attrs["format_version"])
             if version > FORMAT_VERSION:
                 raise _Newer(path, version)
             if f.visititems_links(lambda name, link: None if isinstance(link, h5py.HardLink) else name):
                 raise ValueError("link")
-            rows = _read(f, "history")
-            if rows.ndim != 2 or rows.shape[1] != len(HISTORY):
+            held = _Contents(f)
+            rows = held.read("history")
+            if rows.ndim != 2 or rows.shape[1] != len(HISTORY) or len(rows) > MOST_ITERATIONS:
                 raise ValueError("history")
             group = f["state"]
             state = State(
-                torch.from_numpy(_read(f, "lens/heights")),
+                held.tensor("lens/heights").double(),
                 **{k: int(group.attrs[k]) for k in ("stage", "iteration", "total")},
-                **{
-                    name: {k: torch.from_numpy(_read(f, f"state/{name}/{k}")) for k in group[name]}
-                    for name in ("parameters", "optimizer")
-                },
+                **{name: {k: held.tensor(f"state/{name}/{k}") for k in group[name]} for name in ("parameters", "optimizer")},
                 history=[(int(r[0]), int(r[1]), *map(float, r[2:])) for r in rows],
                 seconds=float(group.attrs["seconds"]),
                 reason=str(group.attrs["reason"]),
-                start=torch.from_numpy(_read(f, "start")) if "start" in f else None,
+                start=held.tensor("start").double() if "start" in f else None,
             )
+            if min(state.stage, state.iteration, state.total) < 0 or not 0 <= state.seconds < math.inf:
+                raise ValueError("state")
             spaces = tuple(
-                SplineSpace(int(p), torch.from_numpy(_read(f, f"lens/knots_{axis}")))
+                SplineSpace(int(p), held.tensor(f"lens/knots_{axis}"))
                 for p, axis in zip(f["lens"].attrs["degree"], "uv", strict=True)
             )
             texts = f.attrs["provenance"], f.attrs["results"], f.attrs.get("inputs", "{}")
@@ -187,6 +226,7 @@ def load(path: Path) -> Checkpoint:
         raise InputError(
             f"{path}: is damaged or not a caustic checkpoint ({type(error).__name__}); a whole checkpoints.h5 is needed"
         ) from error
-    if tuple(state.heights.shape) != (spaces[0].n, spaces[1].n) or not bool(torch.isfinite(state.heights).all()):
+    nets = [state.heights] if state.start is None else [state.heights, state.start]
+    if tuple(state.heights.shape) != (spaces[0].n, spaces[1].n) or not all(bool(torch.isfinite(z).all()) for z in nets):
         raise InputError(f"{path}: is damaged (its heights do not fit its knots); a whole checkpoints.h5 is needed")
     return checkpoint

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from caustic_cli.errors import InputError
-from caustic_cli.io.files import LEFT_BEHIND, is_ours
+from caustic_cli.io.files import LEFT_BEHIND, PARTS, is_ours, refuse_special
 from caustic_cli.project.project import MADE, Project, is_project
 
 try:
@@ -69,6 +69,9 @@ def settle(project: Project, force: bool) -> None:
     try:
         if path.exists():
             project.hold.enter_context(locked(path))
+            for present in path.iterdir():
+                if present.name.startswith((*PARTS, *MADE)):
+                    refuse_special(present)  # before anything is removed
             for name in MADE:
                 (path / name).unlink(missing_ok=True)
             project.write(path)

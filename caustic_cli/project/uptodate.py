@@ -19,13 +19,15 @@ from caustic_cli import __version__
 from caustic_cli.config import settings
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import CausticError, InputError
-from caustic_cli.io.files import write_bytes
+from caustic_cli.io.files import open_regular, read_bytes, write_bytes
 from caustic_cli.io.picture import Picture
 from caustic_cli.project import attachments
-from caustic_cli.project.checkpoint import Checkpoint
+from caustic_cli.project.checkpoint import MAX_BYTES, Checkpoint
 from caustic_cli.project.project import CHECKPOINT, MADE, RENDER, WAVE, Project, is_project
 
 RECORD = ".outputs.json"
+#: Largest record read, in bytes; what is beyond has been written by somebody else, and is no record.
+MOST_RECORDED = 1 << 24
 
 
 def digest(full: Settings, *pictures: Picture | None) -> str:
@@ -109,18 +111,18 @@ class Outputs:
 
     def _held(self) -> dict:
         try:
-            held = json.loads(self.record.read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError):
+            held = json.loads(read_bytes(self.record, MOST_RECORDED, "").decode())
+        except (ValueError, RecursionError):  # InputError is a ValueError
             return {}
         return held if isinstance(held, dict) else {}
 
 
 def _hash(path: Path) -> str:
-    """sha256 of a file, "" if it cannot be read."""
+    """sha256 of a regular file of at most checkpoint.MAX_BYTES, "" if it cannot be read."""
     try:
-        with open(path, "rb") as f:
+        with open_regular(path, "", MAX_BYTES) as f:
             return hashlib.file_digest(f, "sha256").hexdigest()
-    except OSError:
+    except (InputError, OSError):
         return ""
 
 

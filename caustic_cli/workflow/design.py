@@ -208,6 +208,10 @@ def resume(project: Project, iterations: int | None, time_limit: float | None, d
                 f"stage {state.stage + 1} has control"
                 f" {list(designer.stages[state.stage].control)}, but the checkpoint {list(state.heights.shape)}"
             )
+        if state.start is not None and tuple(state.start.shape) != designer.stages[0].control:
+            raise project.error(
+                f"stage 1 has control {list(designer.stages[0].control)}, but the design began on {list(state.start.shape)}"
+            )
         state = designer.restored(state)
         if iterations is not None:
             changed = project.settings["design"] | {"iterations": iterations}

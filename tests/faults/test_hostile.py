@@ -495,3 +495,40 @@ def test_a_checkpoint_with_a_valid_checksum_may_still_be_hostile(copy, capfd, ki
     assert cli.run(["export", str(copy), "--quiet"]) == 2
     out, err = capfd.readouterr()
     assert out == "" and "checkpoints.h5" in err and err.count("\n") == 1
+
+
+def _shape(name):
+    def change(f):
+        del f[name]
+        f[name] = np.zeros((7, 7))
+
+    return change
+
+
+UNFIT = {
+    "parameters of another net": lambda f: [_shape(f"state/parameters/{name}")(f) for name in [*f["state/parameters"]]],
+    "parameters without a name of ours": lambda f: f["state/parameters"].__setitem__("more", np.zeros(3)),
+    "another number of unknowns": _shape("state/optimizer/x"),
+    "another optimiser": lambda f: f["state/optimizer"].__setitem__("0.exp_avg", np.zeros(3)),
+    "pairs of another length": _shape("state/optimizer/s"),
+    "a start on another net": _shape("start"),
+}
+
+
+@pytest.mark.parametrize("kind", UNFIT)
+def test_a_state_that_does_not_fit_the_design_is_refused(copy, capfd, kind):
+    path = copy / "checkpoints.h5"
+    path.write_bytes(path.read_bytes()[checkpoint.SEAL :])
+    with h5py.File(path, "r+") as f:
+        UNFIT[kind](f)
+    path.write_bytes(sealed(path.read_bytes()))
+    assert cli.run(["design", "--resume", str(copy), "--iterations", "4", "--quiet"]) == 2
+    assert capfd.readouterr().err.count("\n") == 1
+
+
+def test_a_design_goes_on_with_no_other_optimiser(copy, capfd):
+    path = copy / "project.toml"
+    path.write_text(path.read_text().replace('optimizer = "lbfgs"', 'optimizer = "adam"'))
+    assert cli.run(["design", "--resume", str(copy), "--iterations", "4", "--quiet"]) == 2
+    _out, err = capfd.readouterr()
+    assert "optimizer" in err and err.count("\n") == 1

@@ -32,7 +32,9 @@ class PlaneWave(Source):
         check("source.power", self.power)
         if self.profile is not None:
             e = np.asarray(self.profile, dtype=float)
-            if e.ndim != 2 or not np.isfinite(e).all() or (e < 0).any() or not e.sum() > 0:
+            with np.errstate(over="ignore"):
+                whole = e.sum()
+            if e.ndim != 2 or not np.isfinite(e).all() or (e < 0).any() or not 0 < whole < np.inf:
                 raise InputError("⟨source.profile⟩ must be a 2-D picture, finite, not negative, and not black all over")
             object.__setattr__(self, "profile", e)
 

@@ -1,0 +1,254 @@
+"""NumPy's arrays in files, `.npy` and `.npz`: the header first, and the data only where it says what is wanted.
+
+A .npy file is "\\x93NUMPY", two bytes of version, the length of the header, the header (a Python dictionary of descr, fortran_order
+and shape, as text) and the data.  A .npz archive is a ZIP file of them.  Neither is read by NumPy itself: its reader evaluates the
+header, allocates what that says, and decompresses what is there, whatever it is.
+
+Here a header is read by a pattern, has at most MOST_HEADER bytes, and is of numbers or text; an array has at most MOST_BYTES, all
+that is read of an archive MOST_IN_ALL, and its table of contents MOST_CONTENTS.  Members that nobody asks for are not touched.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import re
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from caustic_cli.errors import InputError
+from caustic_cli.io.files import naming, open_regular
+
+#: Bytes of a header; NumPy's own readers take 10,000.
+MOST_HEADER = 4096
+#: Bytes of an array: a picture of 8192 x 8192 in float64, in three colours.
+MOST_BYTES = 3 * 8 * 8192 * 8192
+#: Bytes of all arrays read of one archive: a net of 4096 x 4096 control points and a picture.
+MOST_IN_ALL = 1 << 30
+#: Bytes of an archive's table of contents: 20,000 members.
+MOST_CONTENTS = 1 << 20
+#: Bytes of a file: the points and normals of 50 million samples fit.
+MOST_OF_FILE = 1 << 33
+#: Axes of an array, digits of its size along one, and characters of a text.
+MOST_AXES, MOST_DIGITS, MOST_TEXT = 8, 18, 100
+#: Bytes decompressed at a time.
+PIECE = 1 << 20
+MAGIC = b"\x93NUMPY"
+#: What reading a damaged file may end in: of ZIP's table of contents and members, of their compression, and of the header.
+DAMAGED = (OSError, EOFError, ValueError, TypeError, OverflowError, RuntimeError, zipfile.BadZipFile, zlib.error, struct.error)
+
+_FIELD = re.compile(r"""["'](descr|fortran_order|shape)["']\s*:\s*(?:["']([^"']*)["']|(True|False)|\(([\d\s,L]*)\))\s*,?\s*""")
+_KIND = re.compile(r"[<>=|]?[biufcUS]\d{1,9}")
+
+
+@dataclass(frozen=True)
+class Stored:
+    """An array in a file, of which the header has been read.
+
+    shape, dtype: as the header says, the data being as long as that asks for; unread: bytes that may yet be read, in a list of one
+    number that arrays of an archive share; accepted: words for what is needed instead of a damaged file.
+    """
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    fortran: bool
+    file: BinaryIO
+    unread: list[int]
+    accepted: str
+
+    def read(self) -> np.ndarray:
+        """The array.
+
+        Raises:
+            InputError: it is longer than may be read, cut off, or damaged.
+        """
+        size = math.prod(self.shape) * self.dtype.itemsize
+        if size > self.unread[0]:
+            raise InputError(f"asks for {size:,} bytes; at most {self.unread[0]:,} more are read")
+        self.unread[0] -= size
+        data = bytearray(size)
+        view, at = memoryview(data), 0
+        with refusing(self.accepted):
+            while at < size:
+                piece = self.file.read(min(PIECE, size - at))
+                if not piece:
+                    raise ValueError("cut off")
+                view[at : at + len(piece)] = piece
+                at += len(piece)
+            return np.frombuffer(data, self.dtype).reshape(self.shape, order="F" if self.fortran else "C")
+
+    def read_reals(self) -> np.ndarray:
+        """An array of numbers as float64."""
+        values = self.read()
+        with np.errstate(invalid="ignore", over="ignore"):  # a signalling NaN; what float64 cannot hold becomes infinite
+            return values.astype(np.float64)
+
+
+@contextlib.contextmanager
+def refusing(accepted: str) -> Iterator[None]:
+    """Within the block, what DAMAGED lists becomes an InputError; RuntimeError is ZIP's own, that a password is needed."""
+    try:
+        yield
+    except DAMAGED as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"is not a readable .npy array, or .npz archive of such ({str(error)[:200]}); {accepted}") from error
+
+
+def _header(file: BinaryIO, size: int, unread: list[int], accepted: str, exact: bool) -> Stored:
+    """The header of an array at the beginning of a file of `size` bytes, which with `exact` ends where the array ends.
+
+    Raises:
+        ValueError: it is none, of neither numbers nor text, or asks for more than there is.
+    """
+    start = file.read(8)
+    if start[:6] != MAGIC or start[6:7] not in (b"\1", b"\2", b"\3"):
+        raise ValueError("no header of a .npy array")
+    width = 2 if start[6] == 1 else 4
+    length = int.from_bytes(file.read(width), "little")
+    if not 0 < length <= MOST_HEADER:
+        raise ValueError(f"a header of {length:,} bytes, where at most {MOST_HEADER:,} are read")
+    text = file.read(length).decode("latin-1").strip()
+    fields = text[1:-1].strip()
+    found = {m[1]: m for m in _FIELD.finditer(fields)}
+    if text[:1] + text[-1:] != "{}" or len(found) != 3 or _FIELD.sub("", fields):
+        raise ValueError("a header that cannot be read")
+    kind, order, shape = found["descr"][2], found["fortran_order"][3], found["shape"][4]
+    if kind is None or order is None or shape is None or not _KIND.fullmatch(kind):
+        raise ValueError("an array of neither numbers nor text")
+    numbers = [n.strip().rstrip("L") for n in shape.split(",")]
+    if len(numbers) > MOST_AXES or any(len(n) > MOST_DIGITS for n in numbers):
+        raise ValueError("a shape beyond all bounds")
+    dtype, sizes = np.dtype(kind), tuple(int(n) for n in (numbers if numbers[-1] else numbers[:-1]))
+    wanted, there = math.prod(sizes) * dtype.itemsize, size - 8 - width - length
+    if wanted > there or (exact and wanted < there) or not wanted:
+        raise ValueError(f"{there:,} bytes of data, where an array of shape {sizes} has {wanted:,}")
+    if wanted > MOST_BYTES:
+        raise ValueError(f"{wanted:,} bytes of data, where at most {MOST_BYTES:,} are read")
+    return Stored(sizes, dtype, order == "True", file, unread, accepted)
+
+
+@contextlib.contextmanager
+def open_npy(path: Path, accepted: str) -> Iterator[Stored]:
+    """The array of a .npy file, its header read; what is refused within the block is said of the file.
+
+    Raises:
+        InputError: there is none, it is no regular file, or damaged; `accepted` says what is needed.
+    """
+    with open_regular(path, accepted, MOST_OF_FILE) as file, naming(path):
+        with refusing(accepted):
+            size = os.fstat(file.fileno()).st_size
+            stored = _header(file, size, [MOST_BYTES], accepted, exact=False)
+        yield stored
+
+
+class _Bounded:
+    """A file whose every read is of at most MOST_CONTENTS bytes: ZIP's table of contents is read at once, by a length it says."""
+
+    def __init__(self, file: BinaryIO):
+        self.seek, self.tell, self.seekable, self.close, self._read = file.seek, file.tell, file.seekable, file.close, file.read
+
+    def read(self, size: int = -1) -> bytes:
+        data = self._read(MOST_CONTENTS + 1 if size is None or size < 0 else min(size, MOST_CONTENTS + 1))
+        if len(data) > MOST_CONTENTS:
+            raise ValueError(f"a table of contents of more than {MOST_CONTENTS:,} bytes")
+        return data
+
+
+class Archive:
+    """The arrays of a .npz archive by name, each read when it is asked for."""
+
+    def __init__(self, archive: zipfile.ZipFile, accepted: str):
+        self.accepted, self._zip, self._unread = accepted, archive, [MOST_IN_ALL]
+        self._members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._members
+
+    @contextlib.contextmanager
+    def open(self, name: str) -> Iterator[Stored]:
+        """An array, its header read.
+
+        Raises:
+            InputError: there is none of that name, or it is damaged, encrypted, or compressed otherwise than by deflate.
+        """
+        if name not in self:
+            raise InputError(f"has no {name}; {self.accepted}")
+        info = self._members[name]
+        with contextlib.ExitStack() as stack:
+            with refusing(self.accepted):
+                if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or info.flag_bits & 1:
+                    raise ValueError(f"{name} is encrypted, or compressed otherwise than by deflate")
+                member = stack.enter_context(self._zip.open(info))
+                stored = _header(member, info.file_size, self._unread, self.accepted, exact=True)
+            yield stored
+
+    def reals(self, name: str, *shape: int | None, most: int | None = None) -> np.ndarray:
+        """An array of finite numbers as float64.
+
+        Args:
+            shape: its size along each axis, None for any; most: of these.
+
+        Raises:
+            InputError: it is of another shape or kind, or damaged, or there is none.
+        """
+        with self.open(name) as stored:
+            _check(name, stored, shape, "fiub", "finite numbers")
+            if most is not None and max(stored.shape) > most:
+                raise InputError(f"{name} must be of at most {most} along each axis, got shape {stored.shape}")
+            values = stored.read_reals()
+        if not np.isfinite(values).all():
+            raise InputError(f"{name} must be finite numbers")
+        return values
+
+    def real(self, name: str) -> float:
+        """A finite number."""
+        return float(self.reals(name))
+
+    def wholes(self, name: str, count: int) -> tuple[int, ...]:
+        """So many whole numbers."""
+        with self.open(name) as stored:
+            _check(name, stored, (count,), "iu", "whole numbers")
+            return tuple(int(v) for v in stored.read())
+
+    def text(self, name: str, default: str | None = None) -> str:
+        """A text of at most MOST_TEXT characters; `default` where there is none of that name."""
+        if default is not None and name not in self:
+            return default
+        with self.open(name) as stored:
+            _check(name, stored, (), "U", "text")
+            if stored.dtype.itemsize > 4 * MOST_TEXT:
+                raise InputError(f"{name} must be a text of at most {MOST_TEXT} characters")
+            raw = stored.read().astype(stored.dtype.newbyteorder("<")).tobytes()
+        try:
+            return raw.decode("utf-32-le").rstrip("\0")
+        except UnicodeDecodeError as error:
+            raise InputError(f"{name} must be text") from error
+
+
+def _check(name: str, stored: Stored, shape: tuple[int | None, ...], kinds: str, what: str) -> None:
+    same = len(stored.shape) == len(shape) and all(b in (None, a) for a, b in zip(stored.shape, shape, strict=True))
+    if not same or stored.dtype.kind not in kinds:
+        form = " x ".join("n" if n is None else str(n) for n in shape)
+        raise InputError(f"{name} must be {what}{f' of shape {form}' if form else ''}, got {stored.dtype.name} {stored.shape}")
+
+
+@contextlib.contextmanager
+def open_npz(path: Path, accepted: str) -> Iterator[Archive]:
+    """The arrays of a .npz archive; what is refused within the block is said of the file.
+
+    Raises:
+        InputError: there is none, it is no regular file, or damaged; `accepted` says what is needed.
+    """
+    with open_regular(path, accepted, MOST_OF_FILE) as file, naming(path):
+        with refusing(accepted):
+            archive = Archive(zipfile.ZipFile(_Bounded(file)), accepted)
+        yield archive
