@@ -3,7 +3,8 @@
     python tests/benchmarks/extended.py            bounds, a minute; prints a Markdown table
     python tests/benchmarks/extended.py --designs  with designs at standard quality, judged without their rays' noise; five minutes
 
-Every point of the lens spreads its light over the same disc on the screen, throw times source size over distance wide.  So an
+Every point of the exit spreads its light over the same disc on the screen, as wide as the throw from there times the angle under
+which it sees the source through the glass.  So an
 image is light that is nowhere negative, convolved with that disc, and the least error is that of a constrained deconvolution
 (`caustic_cli.inverse.deconvolution`).  The interval is proven: the upper end by the light found, the lower by its dual.  Light is
 told apart by pixels, as the lens is judged; by halves of pixels a little less can be reached behind blurs of a few pixels.  A
@@ -30,6 +31,7 @@ from caustic_cli.scene import Screen
 
 PICTURES = Path(__file__).resolve().parents[2] / "examples"
 WIDTH, PIXELS, THROW, DISC = 30.0, 250, 300.0, 5.0  # mm; the default lens at magnification 3 without margin
+THICKNESS, INDEX = 5.0, 1.5443
 DISTANCES = (5000.0, 2500.0, 1000.0, 500.0)
 STEPS = 3000
 FINER = 4  # points to a pixel, along each axis, of the disc
@@ -94,8 +96,9 @@ if __name__ == "__main__":
     print("| --- | --- | --- | --- | --- |" + (" --- | --- |" if designs else ""))
     for name in ("ball", "flame"):
         for distance in DISTANCES:
-            first, best = errors(name, THROW * DISC / distance)
-            row = f"| {name} | {distance:g} | {THROW * DISC / distance:g} | {first:.3f} | {best.bound:.4f} to {best.error:.4f} |"
+            blur = (THROW - THICKNESS) * DISC / (distance + THICKNESS / INDEX)
+            first, best = errors(name, blur)
+            row = f"| {name} | {distance:g} | {blur:.3f} | {first:.3f} | {best.bound:.4f} to {best.error:.4f} |"
             if designs:
                 figures = designed(name, distance)
                 row += f" {figures['relative_rms']:.4f} ± {figures['noise']:.4f} | {figures['seconds']:.0f} s |"
