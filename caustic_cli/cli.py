@@ -10,6 +10,7 @@ import os
 import signal
 import sys
 import threading
+import warnings
 
 
 class Stopped(KeyboardInterrupt):
@@ -92,9 +93,22 @@ def _report(problem: Exception) -> int:
     elif isinstance(problem, OSError) and problem.strerror:
         console.error(f"{problem.filename or 'a file'}: {problem.strerror}")
         return 2 if problem.errno in (errno.ENAMETOOLONG, errno.ELOOP) else 1  # no name but the user's is like that
+    elif names := _variables_of(problem):
+        console.error(f"the environment's {', '.join(names)}: {problem}")
+        return 2
     else:
         console.error(f"internal error: {type(problem).__name__}: {problem} (run again with --debug and report it)")
     return 1
+
+
+def _variables_of(problem: Exception) -> list[str]:
+    """The variables of the environment that a library may have objected to."""
+    raised = problem.__traceback__
+    while raised is not None and raised.tb_next is not None:
+        raised = raised.tb_next
+    library = "" if raised is None else raised.tb_frame.f_globals.get("__name__", "").split(".")[0]
+    prefix = {"numba": "NUMBA_", "matplotlib": "MPL"}.get(library)
+    return sorted(name for name in os.environ if prefix and isinstance(problem, ValueError) and name.startswith(prefix))
 
 
 def main() -> None:
@@ -102,6 +116,8 @@ def main() -> None:
     try:
         _answer_signals()
         _open_streams()
+        if not sys.warnoptions:
+            warnings.simplefilter("ignore")  # libraries' own, which are for developers
         status = run(sys.argv[1:])
         _ignore_signals()
     except KeyboardInterrupt:  # while an error was told, or an interruption

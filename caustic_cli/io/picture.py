@@ -6,8 +6,11 @@ j along +y.  Pixel values are sRGB-encoded or linear; irradiance is always linea
 
 from __future__ import annotations
 
+import contextlib
+import os
 import stat
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -156,8 +159,8 @@ def _read_npy(path: Path, color: bool) -> Picture:
 
 def _read_image(path: Path, linear: bool, color: bool) -> Picture:
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the size is checked below, in our words
+        with warnings.catch_warnings(), _libraries_silent():
+            warnings.simplefilter("ignore")  # the size is checked below, in our words; what cannot be decoded is said there too
             with Image.open(path) as image:
                 _check_size(path, *image.size)
                 if image.format == "EPS":  # which Pillow would have Ghostscript draw
@@ -189,6 +192,24 @@ def _read_image(path: Path, linear: bool, color: bool) -> Picture:
     if image.mode in ("1", "L") and not transparent:
         return Picture(np.array(image.convert("L")), encoding)
     return Picture(_luminance(image, linear, transparent), encoding)
+
+
+@contextlib.contextmanager
+def _libraries_silent() -> Iterator[None]:
+    """Nothing is written to stderr meanwhile, as libtiff does by itself of what it cannot decode."""
+    try:
+        kept = os.dup(2)
+    except OSError:  # it is closed: nobody reads it anyway
+        yield
+        return
+    try:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, 2)
+        os.close(nowhere)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
 
 
 def _over_black(image: Image.Image, linear: bool) -> np.ndarray:
