@@ -1,69 +1,46 @@
-"""The `caustic` command: parses, calls, and turns errors into one line and an exit status.
+"""The `caustic` command: runs one command line, and turns errors and signals into one line and an exit status.
 
-Torch is loaded inside the commands' bodies only, so that --help answers at once.
+The parser and all that it needs are loaded by `run`, after `main` has begun to answer signals.
 """
 
 from __future__ import annotations
 
 import errno
 import os
+import signal
 import sys
-from typing import Annotated
-
-import typer
-
-from caustic_cli import __version__
-from caustic_cli.commands import console, convergence, design, export, gradmap, render
-from caustic_cli.errors import CausticError, InputError, Interrupted, is_out_of_memory
-
-DESCRIPTION = """Design free-form lenses that throw a picture as a caustic.
-
-Lengths are millimetres, angles degrees, wavelengths nanometres, powers watts. Results go to stdout, everything else to
-stderr. Exit status: 0 done; 1 could not finish; 2 bad usage or bad input; 130 or 143 interrupted, state saved.
-"""
-
-app = typer.Typer(
-    help=DESCRIPTION,
-    rich_markup_mode=None,
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
+import threading
+import warnings
 
 
-def _version(value: bool) -> None:
-    if value:
-        console.emit(f"caustic {__version__}")
-        raise typer.Exit()
+class Stopped(KeyboardInterrupt):
+    """A signal ended what was done.  A plain KeyboardInterrupt out of `exec` would have Python end itself by SIGINT, whatever came
+    of it."""
 
 
-@app.callback()
-def _root(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
-    ] = False,
-) -> None:
-    pass
-
-
-for _module in (design, render, gradmap, export, convergence):
-    app.command(epilog=_module.EXAMPLES)(_module.run)
-# Typer names a command after its function; each module's is `run`.
-for _info, _name in zip(app.registered_commands, ("design", "render", "gradmap", "export", "convergence"), strict=True):
-    _info.name = _name
-
-
-def parser():
-    """The parser of the whole command line."""
-    root = typer.main.get_command(app)
-    for command in root.commands.values():
-        for parameter in command.params:
-            parameter.show_envvar = False  # every option has a variable; the manual says how it is called
-    return root
+#: How a signal is called that ends a command.
+SIGNALS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
+#: Those that this process was sent.
+_sent: list[int] = []
+#: Seconds after which an interruption that was lost is tried again.
+AGAIN = 0.05
 
 
 def run(arguments: list[str]) -> int:
     """Run one command line and return its exit status."""
+    try:
+        return _run(arguments)
+    except KeyboardInterrupt:
+        return _interrupted()
+
+
+def _run(arguments: list[str]) -> int:
+    import typer  # noqa: PLC0415
+
+    from caustic_cli.commands import console  # noqa: PLC0415
+    from caustic_cli.commands.parser import parser  # noqa: PLC0415
+    from caustic_cli.errors import Interrupted  # noqa: PLC0415
+
     console.speak({})
     debug = "--debug" in arguments or bool(os.environ.get("CAUSTIC_DEBUG"))
     try:
@@ -82,13 +59,14 @@ def run(arguments: list[str]) -> int:
         return stop.code if isinstance(stop.code, int) else 1
     except typer.Exit as stop:
         return stop.exit_code
-    except (KeyboardInterrupt, typer.Abort):
-        console.error("interrupted")
-        return 130
+    except typer.Abort as stop:
+        raise KeyboardInterrupt from stop
     except Interrupted as stop:
         console.error(f"{stop}")
         return stop.status
     except Exception as problem:
+        if _sent:  # what an interruption became within numba's compiler, for instance
+            raise KeyboardInterrupt from problem
         if debug:
             raise
         return _report(problem)
@@ -96,6 +74,9 @@ def run(arguments: list[str]) -> int:
 
 def _report(problem: Exception) -> int:
     """Say in one line what went wrong; the exit status."""
+    from caustic_cli.commands import console  # noqa: PLC0415
+    from caustic_cli.errors import CausticError, InputError, is_out_of_memory  # noqa: PLC0415
+
     if isinstance(problem, CausticError):
         console.error(f"{problem}")
         return 2 if isinstance(problem, InputError) else 1
@@ -111,11 +92,84 @@ def _report(problem: Exception) -> int:
         console.error("out of memory; fewer --rays, a smaller --control or --resolution needs less")
     elif isinstance(problem, OSError) and problem.strerror:
         console.error(f"{problem.filename or 'a file'}: {problem.strerror}")
+        return 2 if problem.errno in (errno.ENAMETOOLONG, errno.ELOOP) else 1  # no name but the user's is like that
+    elif names := _variables_of(problem):
+        console.error(f"the environment's {', '.join(names)}: {problem}")
+        return 2
     else:
         console.error(f"internal error: {type(problem).__name__}: {problem} (run again with --debug and report it)")
     return 1
 
 
+def _variables_of(problem: Exception) -> list[str]:
+    """The variables of the environment that a library may have objected to."""
+    raised = problem.__traceback__
+    while raised is not None and raised.tb_next is not None:
+        raised = raised.tb_next
+    library = "" if raised is None else raised.tb_frame.f_globals.get("__name__", "").split(".")[0]
+    prefix = {"numba": "NUMBA_", "matplotlib": "MPL"}.get(library)
+    return sorted(name for name in os.environ if prefix and isinstance(problem, ValueError) and name.startswith(prefix))
+
+
 def main() -> None:
     """Entry point of the `caustic` script."""
-    sys.exit(run(sys.argv[1:]))
+    try:
+        _answer_signals()
+        _open_streams()
+        if not sys.warnoptions:
+            warnings.simplefilter("ignore")  # libraries' own, which are for developers
+        status = run(sys.argv[1:])
+        _ignore_signals()
+    except KeyboardInterrupt:  # while an error was told, or an interruption
+        status = _interrupted()
+    sys.exit(status)
+
+
+def _answer_signals() -> None:
+    """Have SIGNALS interrupt what is done, and not be lost where Python can pass no exception on."""
+
+    def answer(number: int, _frame) -> None:
+        _sent.append(number)
+        raise Stopped
+
+    def lost(what) -> None:
+        if not _sent:
+            sys.__unraisablehook__(what)
+        elif isinstance(what.exc_value, KeyboardInterrupt):  # in a function that C called back, of LLVM's for instance
+            again = threading.Timer(AGAIN, os.kill, (os.getpid(), _sent[0]))
+            again.daemon = True
+            again.start()
+
+    sys.unraisablehook = lost
+    for number in SIGNALS:
+        signal.signal(number, answer)
+
+
+def _ignore_signals() -> None:
+    """Nothing is left to be saved, and the process ends by itself."""
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+
+
+def _interrupted() -> int:
+    """Say in one line which signal ended the command; the exit status."""
+    if _sent:
+        _ignore_signals()
+    number = _sent[0] if _sent else signal.SIGINT
+    sys.stderr.write(f"caustic: {SIGNALS[number]}\n")
+    return 128 + number
+
+
+def _open_streams() -> None:
+    """Have standard streams that are closed read nothing and write nowhere: a file would take their numbers otherwise, and get
+    what libraries write to them."""
+    for number, mode in enumerate(("r", "w", "w")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.dup2(opened := os.open(os.devnull, os.O_RDWR), number)
+            if opened != number:
+                os.close(opened)
+            os.set_inheritable(number, True)
+            stream = open(number, mode, encoding="utf-8", closefd=False)  # noqa: SIM115 - it stays
+            setattr(sys, ("stdin", "stdout", "stderr")[number], stream)

@@ -18,7 +18,7 @@ from helpers import write_blob
 from PIL import Image
 
 from caustic_cli import __version__, cli
-from caustic_cli.commands import console
+from caustic_cli.commands import console, parser
 from caustic_cli.export import FORMATS
 from caustic_cli.workflow import evaluation
 
@@ -449,7 +449,7 @@ def test_help_ends_with_two_examples_that_parse(capfd, name):
     lines = [line.strip() for line in out.splitlines() if line.strip()]
     examples = lines[lines.index("Examples:") + 1 :]
     assert len(examples) == 2
-    root = typer.main.get_command(cli.app)
+    root = typer.main.get_command(parser.app)
     for example in examples:
         program, command, *arguments = shlex.split(example)
         assert (program, command) == ("caustic", name)
@@ -459,7 +459,7 @@ def test_help_ends_with_two_examples_that_parse(capfd, name):
 
 def test_every_option_has_help(capfd):
     checked = 0
-    for name, command in typer.main.get_command(cli.app).commands.items():
+    for name, command in typer.main.get_command(parser.app).commands.items():
         for parameter in command.params:
             assert parameter.help and parameter.help[0] != " ", (name, parameter.name)
             checked += 1

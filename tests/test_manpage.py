@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 import typer
 
-from caustic_cli.cli import app
 from caustic_cli.commands import manpage
+from caustic_cli.commands.parser import app
 from caustic_cli.config.table import TABLE
 
 PAGE = Path(__file__).parents[1] / "man" / "caustic.1"

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from caustic_cli.commands import console, options
+from caustic_cli.config import checks
 from caustic_cli.config.table import TABLE
 from caustic_cli.errors import InputError
 
@@ -48,7 +48,7 @@ def run(
     debug: options.Debug = False,
 ) -> None:
     """Find the lens whose caustic is the picture TARGET."""
-    speaks = os.environ.get("RANK", "0") == "0"  # under torchrun, the first of all
+    speaks = checks.rank_and_size()[0] == 0  # under torchrun, the first of all
     say = console.Reporter(quiet or not speaks, progress)
     iterations, time_limit = given.get("design.iterations"), given.get("design.time_limit")
     if iterations is not None and not 1 <= iterations <= 10**9:

@@ -12,8 +12,8 @@ import sys
 from pathlib import Path
 
 from caustic_cli import __version__
-from caustic_cli.cli import parser
 from caustic_cli.commands.options import default_words
+from caustic_cli.commands.parser import parser
 from caustic_cli.config.table import TABLE, Setting
 from caustic_cli.errors import plain_name
 from caustic_cli.io.files import write_bytes

@@ -1,8 +1,9 @@
-"""Validation shared by the scene's parts: one sentence saying what, where and what would be accepted."""
+"""Validation shared by the scene's parts, and of what torchrun says: one sentence saying what, where and what would be accepted."""
 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 
 from caustic_cli.errors import InputError
@@ -48,6 +49,34 @@ def choice(where: str, value, names: Sequence[str]) -> str:
     if value not in names:
         raise InputError(f"{where} must be one of {', '.join(names)}, got {value!r}")
     return value
+
+
+def of_environment(name: str, default: int | None, low: int, high: int) -> int:
+    """A variable of the environment as an int in [low, high]; without a default it has to be set.
+
+    Raises:
+        InputError: naming the variable, the accepted range and the value.
+    """
+    text = os.environ.get(name)
+    if text is None and default is not None:
+        return default
+    value = int(text) if text and text.isascii() and text.isdigit() and len(text) < 20 else None
+    if value is None or not low <= value <= high:
+        raise InputError(f"the environment's {name} must be a whole number {low} to {high}, got {text!r}")
+    return value
+
+
+def rank_and_size() -> tuple[int, int]:
+    """This process' rank, and how many there are, as torchrun says in the environment; 0 and 1 where it did not start this one.
+
+    Raises:
+        InputError: RANK or WORLD_SIZE is no such number.
+    """
+    size = of_environment("WORLD_SIZE", 1, 1, 10**6)
+    of_environment("RANK", 0, 0, 10**6)
+    if size == 1 or "MASTER_ADDR" not in os.environ:
+        return 0, 1
+    return of_environment("RANK", None, 0, size - 1), size
 
 
 def _range(low: float, high: float, open_low: bool) -> str:

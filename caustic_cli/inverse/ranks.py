@@ -8,6 +8,7 @@ process every function here does nothing.
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -15,7 +16,8 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from caustic_cli.errors import CausticError, Interrupted
+from caustic_cli.config import checks
+from caustic_cli.errors import CausticError, InputError, Interrupted
 
 
 @contextmanager
@@ -23,15 +25,28 @@ def process_group(device: str) -> Iterator[int]:
     """Meet the other ranks if torchrun started this process, over gloo on CPUs and nccl on GPUs; gives the rank.
 
     Rank 0 lets the others go when its block ends; when it fails, they learn it from their next sum.
+
+    Raises:
+        InputError: the environment says no such rank, number of ranks or place to meet.
+        CausticError: they do not meet there.
     """
-    if int(os.environ.get("WORLD_SIZE", "1")) == 1 or "MASTER_ADDR" not in os.environ:
+    if checks.rank_and_size()[1] == 1:
         yield 0
         return
+    place = f"{os.environ['MASTER_ADDR']}:{checks.of_environment('MASTER_PORT', None, 1, 65535)}"
     if not dist.is_available():
         raise CausticError("this torch was built without torch.distributed, which torchrun needs")
+    local = checks.of_environment("LOCAL_RANK", 0, 0, 10**6)
     if device == "cuda":
-        torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")) % torch.cuda.device_count())
-    dist.init_process_group("nccl" if device == "cuda" else "gloo")
+        torch.cuda.set_device(local % torch.cuda.device_count())
+    try:
+        _meet(device)
+    except (RuntimeError, ValueError, OSError) as error:
+        if "EADDRINUSE" in str(error):
+            raise InputError(
+                f"{place}: is in use; the environment's MASTER_PORT must be a free port for the ranks to meet"
+            ) from error
+        raise CausticError(f"{place}: the ranks did not meet there ({str(error).splitlines()[0][:200]})") from error
     rank = dist.get_rank()
     try:
         yield rank
@@ -39,6 +54,26 @@ def process_group(device: str) -> Iterator[int]:
         _say_goodbye(rank)
         raise
     _say_goodbye(rank)
+
+
+def _meet(device: str) -> None:
+    """Wait for the other ranks in a thread of its own: no signal is answered while C++ waits in the main one."""
+    failed: list[Exception] = []
+
+    def meet() -> None:
+        try:
+            if device == "cuda":
+                torch.cuda.set_device(current)
+            dist.init_process_group("nccl" if device == "cuda" else "gloo")
+        except Exception as error:  # whatever it is, it is the main thread's
+            failed.append(error)
+
+    current = torch.cuda.current_device() if device == "cuda" else None
+    waiting = threading.Thread(target=meet, daemon=True)
+    waiting.start()
+    waiting.join()
+    if failed:
+        raise failed[0]
 
 
 def _say_goodbye(rank: int) -> None:

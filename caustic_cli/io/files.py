@@ -120,7 +120,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     refuse_special(path)
     _sweep(path)
     try:
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=path.suffix, dir=path.parent)
+        prefix, suffix = _around(path)
+        handle, name = tempfile.mkstemp(prefix=prefix, suffix=suffix, dir=path.parent)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}); a directory you may write to is needed") from error
     os.close(handle)
@@ -142,9 +143,16 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         raise
 
 
+def _around(path: Path) -> tuple[str, str]:
+    """Beginning and end of a temporary file's name, not longer than a name may be even if that of `path` is as long."""
+    name, suffix = path.name.encode(errors="surrogateescape"), path.suffix.encode(errors="surrogateescape")
+    return f".{name[:200].decode(errors='ignore')}.", path.suffix if len(suffix) <= 40 else ""
+
+
 def _sweep(path: Path) -> None:
     """Remove what processes that were killed while they wrote `path` have left beside it."""
-    for left in path.parent.glob(f".{glob.escape(path.name)}.????????{path.suffix}"):
+    prefix, suffix = map(glob.escape, _around(path))
+    for left in path.parent.glob(f"{prefix}????????{suffix}"):
         with contextlib.suppress(OSError):  # another process was faster
             if left.is_file() and time.time() - left.stat().st_mtime > LEFT_BEHIND:
                 left.unlink()

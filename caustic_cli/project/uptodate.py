@@ -19,7 +19,7 @@ from caustic_cli import __version__
 from caustic_cli.config import settings
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import CausticError, InputError
-from caustic_cli.io.files import open_regular, read_bytes, write_bytes
+from caustic_cli.io.files import open_regular, read_bytes, refuse_foreign, write_bytes
 from caustic_cli.io.picture import Picture
 from caustic_cli.project import attachments
 from caustic_cli.project.checkpoint import MAX_BYTES, Checkpoint
@@ -102,6 +102,18 @@ class Outputs:
             return None
         _touch(self.paths)
         return held["figures"]
+
+    def refuse_foreign(self, force: bool) -> None:
+        """Stop before work begins where a file cannot be written, or holds what neither its mark nor the record says is ours: a
+        CSV has no room for a mark.
+
+        Raises:
+            InputError: as of `io.files.refuse_foreign`.
+        """
+        entries = [entry.get("files") for entry in self._held().values() if isinstance(entry, dict)]
+        ours = {found for files in entries if isinstance(files, list) for found in files if found and isinstance(found, str)}
+        for path in self.paths:
+            refuse_foreign(path, force or _hash(path) in ours)
 
     def keep(self, figures: dict) -> None:
         """Remember what was made."""

@@ -90,8 +90,8 @@ def write(study: Study, directory: str | Path) -> list[Path]:
     except OSError as error:
         raise InputError(f"{directory}: cannot be made ({error.strerror}); a directory you may write to is needed") from error
     paths = paths_of(study.name, directory, study.plots)
+    write_bytes(paths[1], as_json(study).encode())  # first: where the rest cannot be written, it says that the table is ours
     write_bytes(paths[0], as_csv(study).encode())
-    write_bytes(paths[1], as_json(study).encode())
     for path, draw in zip(paths[2:], study.plots.values(), strict=True):
         plot(study, path, draw)
     return paths

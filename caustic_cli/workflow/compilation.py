@@ -30,10 +30,11 @@ ALIKE, SAVED = {"adjoint", "splat"}, 2.2
 
 def kept() -> bool:
     """Whether an earlier run has compiled the kernels, as far as their names and times tell; or nothing can be kept anyway."""
-    if cache.DIRECTORY is None:
+    place = plane.backward.stats.cache_path
+    if cache.DIRECTORY is None or place is None:
         return True
-    path, written = Path(plane.backward.stats.cache_path), Path(plane.__file__).stat().st_mtime
-    return any(p.stat().st_mtime >= written for p in path.glob("plane.backward-*.nbi"))
+    written = Path(plane.__file__).stat().st_mtime
+    return any(p.stat().st_mtime >= written for p in Path(place).glob("plane.backward-*.nbi"))
 
 
 def compile_part(part: str) -> None:
@@ -71,24 +72,27 @@ def compile_side_by_side() -> None:
     mine, *others = shares(min(len(PARTS), cores))
     path = os.pathsep.join([str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
     env = os.environ | {"PYTHONPATH": path, "NUMBA_CACHE_DIR": str(cache.DIRECTORY.parent)}  # so that theirs is this one too
-    running = [
-        subprocess.Popen(
-            [sys.executable, "-m", __name__, *parts],
-            env=env,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        for parts in others
-    ]
+    running: list[subprocess.Popen] = []
     try:
+        for parts in others:
+            running.append(
+                subprocess.Popen(
+                    [sys.executable, "-m", __name__, *parts],
+                    env=env,
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    stderr=subprocess.DEVNULL,
+                )
+            )
         for part in mine:
             compile_part(part)
         for process in running:
             process.wait()
-    finally:
+    finally:  # also where this process is interrupted: nothing of it stays at work
         for process in running:
             process.terminate()
+        for process in running:
+            process.wait()
 
 
 def compile_usual(device: str) -> None:

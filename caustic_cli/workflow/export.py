@@ -11,7 +11,6 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.export import FORMATS
-from caustic_cli.io.files import refuse_foreign
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.project.project import Project
 from caustic_cli.project.uptodate import Outputs
@@ -41,14 +40,13 @@ def export(
     path = output or Path(project.resolve().stem + FORMATS[format][0])
     scene = opened.scene()
     written = files(path, scene, format, script)
-    for file in written:
-        refuse_foreign(file, force)
     if scene.lens.mirror:
         raise InputError(f"{project}: is a mirror, and the formats hold lenses: nothing is exported")
     made = Outputs(opened, "export", {"format": format, "script": script, **given}, written)
     if not force and (found := made.found()):
         say.say(f"{path}: is what the same options made of the same project, so there is nothing to do; ⟨force⟩ does it again")
         return found, True
+    made.refuse_foreign(force)
     field, checkpoint = opened.lens(scene)
     write(path, scene, field, checkpoint.state.heights, format, script, **given)
     more = {"beside": [str(file) for file in written[1:]]} if len(written) > 1 else {}

@@ -6,11 +6,16 @@ leaves out for functions that only others call is half of that.
 
 from __future__ import annotations
 
+import contextlib
+import pickle
+from pathlib import Path
 from typing import Any
 
 import numba
 from numba import prange
+from numba.core.caching import FunctionCache
 
+from caustic_cli.errors import InputError
 from caustic_cli.optics.kernels import cache
 
 __all__ = ["FAST", "PARALLEL", "njit", "prange"]
@@ -29,12 +34,29 @@ PARALLEL = {
     "fusion": False,
 }
 
+if numba.config.DISABLE_JIT:  # kernels call one another by address, which only compiled code has
+    raise InputError("the environment's NUMBA_DISABLE_JIT is set, and the kernels run compiled only; unset it")
+
 # Off by default in numba: it turns the steps of four neighbouring pixels in `plane` into vector instructions.
 numba.config.SLP_VECTORIZE = 1  # type: ignore[attr-defined]  # numba makes its settings as it is loaded
 
 
+class _Kept(FunctionCache):
+    """What numba keeps of a function; a file that cannot be read or written, on a full disk for instance, is as none."""
+
+    def load_overload(self, sig, target_context):
+        """The compiled code of a signature, None if none is kept."""
+        with contextlib.suppress(OSError, EOFError, pickle.PickleError):
+            return super().load_overload(sig, target_context)
+
+    def save_overload(self, sig, data):
+        """Keep the compiled code of a signature, if it can be."""
+        with contextlib.suppress(OSError, EOFError, pickle.PickleError):
+            super().save_overload(sig, data)
+
+
 def njit(*, entry: bool = False, parallel: bool = False, **options):
-    """The decorator of a function that is compiled when it is first called, and kept in `cache.DIRECTORY`.
+    """The decorator of a function that is compiled when it is first called, and kept in `cache.DIRECTORY` if it can be.
 
     Args:
         entry: Python calls it.  Otherwise only other such functions do, and it needs no wrapper for that.
@@ -44,18 +66,22 @@ def njit(*, entry: bool = False, parallel: bool = False, **options):
     if parallel:
         options["parallel"] = dict(PARALLEL)  # numba empties the one it is given
     options |= {
-        "cache": cache.DIRECTORY is not None,
         "error_model": "numpy",
         "no_cfunc_wrapper": True,
         "no_cpython_wrapper": not (entry or parallel),
     }
 
     def decorate(function):
-        before = numba.config.CACHE_DIR
-        try:  # numba looks at it here and now: what others compile in this process is kept where they want it
-            numba.config.CACHE_DIR = str(cache.DIRECTORY or "")
-            return numba.njit(**options)(function)
-        finally:
-            numba.config.CACHE_DIR = before
+        compiled, before = numba.njit(**options)(function), numba.config.CACHE_DIR
+        if cache.DIRECTORY is not None:
+            try:  # numba looks at it here and now: what others compile in this process is kept where they want it
+                numba.config.CACHE_DIR = str(cache.DIRECTORY)
+                with contextlib.suppress(RuntimeError):  # it cannot be written to after all: compiled anew in every process
+                    kept = _Kept(function)
+                    if cache.DIRECTORY in Path(kept.cache_path).parents:  # nor kept where numba would otherwise
+                        compiled._cache = kept  # as its option `cache` does
+            finally:
+                numba.config.CACHE_DIR = before
+        return compiled
 
     return decorate

@@ -1,0 +1,55 @@
+"""The parser of the whole command line; torch is loaded inside the commands' bodies only, so that --help answers at once."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from caustic_cli import __version__
+from caustic_cli.commands import console, convergence, design, export, gradmap, render
+
+DESCRIPTION = """Design free-form lenses that throw a picture as a caustic.
+
+Lengths are millimetres, angles degrees, wavelengths nanometres, powers watts. Results go to stdout, everything else to
+stderr. Exit status: 0 done; 1 could not finish; 2 bad usage or bad input; 130 or 143 interrupted, state saved.
+"""
+
+app = typer.Typer(
+    help=DESCRIPTION,
+    rich_markup_mode=None,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _version(value: bool) -> None:
+    if value:
+        console.emit(f"caustic {__version__}")
+        raise typer.Exit()
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    pass
+
+
+for _module in (design, render, gradmap, export, convergence):
+    app.command(epilog=_module.EXAMPLES)(_module.run)
+# Typer names a command after its function; each module's is `run`.
+for _info, _name in zip(app.registered_commands, ("design", "render", "gradmap", "export", "convergence"), strict=True):
+    _info.name = _name
+
+
+def parser():
+    """The parser, a Click group of the commands."""
+    root = typer.main.get_command(app)
+    for command in root.commands.values():
+        for parameter in command.params:
+            parameter.show_envvar = False  # every option has a variable; the manual says how it is called
+    return root

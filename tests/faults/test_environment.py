@@ -1,0 +1,131 @@
+"""What surrounds a command: closed streams, values in the environment, names too long, libraries that speak by themselves."""
+
+import io
+import os
+import shlex
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import write_blob
+from PIL import Image
+
+from caustic_cli import __version__, cli
+from caustic_cli.errors import InputError
+from caustic_cli.io import files
+from caustic_cli.io.picture import read_picture
+
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(cli.__file__).parents[1])}
+RANKS = {"MASTER_ADDR": "127.0.0.1", "RANK": "0", "WORLD_SIZE": "2"}
+LONG = 300 * "n"
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_blob("blob.png", 16, (5, 6), 15.0)
+
+
+def run(arguments, redirections="", **variables):
+    """A command in a process and a shell of its own."""
+    line = f"{shlex.join([sys.executable, '-m', 'caustic_cli', *arguments])} {redirections}"
+    return subprocess.run(
+        ["bash", "-c", line], env=ENVIRONMENT | variables, capture_output=True, text=True, check=False, timeout=60
+    )
+
+
+@pytest.mark.parametrize("redirections", [">&-", "2>&-", "<&-", ">&- 2>&-", "<&- >&- 2>&-"])
+def test_closed_streams(redirections):
+    done = run(["--version"], redirections)
+    out = "" if ">&- 2" in redirections or redirections == ">&-" else f"caustic {__version__}\n"
+    assert (done.returncode, done.stdout, done.stderr) == (0, out, "")
+    done = run(["render", "absent"], redirections)
+    assert (done.returncode, done.stdout) == (2, "") and done.stderr.count("\n") == ("2>&-" not in redirections)
+
+
+def test_no_file_takes_the_number_of_a_closed_stream():
+    program = "import os, sys; from caustic_cli import cli; cli.run = lambda a: os.open('blob.png', os.O_RDONLY); cli.main()"
+    done = subprocess.run(
+        ["bash", "-c", f"{shlex.join([sys.executable, '-c', program])} <&- >&- 2>&-"], env=ENVIRONMENT, check=False
+    )
+    assert done.returncode > 2
+
+
+BAD = [
+    {"RANK": "x"},
+    {"WORLD_SIZE": "banana"},
+    {"WORLD_SIZE": "0"},
+    RANKS | {"RANK": "-1"},
+    RANKS | {"RANK": "2"},
+    RANKS | {"MASTER_PORT": "x"},
+    RANKS | {"MASTER_PORT": "70000"},
+    {"NUMBA_DISABLE_JIT": "1"},
+    {"NUMBA_NUM_THREADS": "0"},
+]
+
+
+@pytest.mark.parametrize("variables", BAD, ids=lambda v: " ".join("=".join(pair) for pair in v.items()))
+def test_a_bad_value_in_the_environment_is_one_line(variables):
+    done = run(["design", "blob.png", "--quiet"], **variables)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1), done.stderr
+    assert done.stderr.startswith("caustic: ") and any(name in done.stderr for name in variables) and "internal" not in done.stderr
+
+
+@pytest.mark.skipif(not socket.has_dualstack_ipv6(), reason="torch listens on both")
+def test_a_port_in_use_is_one_line():
+    with socket.create_server(("::", 0), family=socket.AF_INET6, dualstack_ipv6=True) as server:
+        port = str(server.getsockname()[1])
+        done = run(["design", "blob.png", "--quiet"], **RANKS, MASTER_PORT=port, CAUSTIC_KERNELS="torch")
+    assert (done.returncode, done.stdout) == (2, "") and done.stderr.count("\n") == 1
+    assert f"127.0.0.1:{port}: is in use" in done.stderr and "MASTER_PORT" in done.stderr
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["design", "blob.png", "-o", LONG],
+        ["design", "--resume", LONG],
+        ["design", f"{LONG}.png"],
+        ["render", LONG],
+        ["export", LONG],
+        ["gradmap", LONG],
+        ["convergence", "-o", LONG],
+    ],
+    ids=lambda a: " ".join(a)[:20],
+)
+def test_a_name_that_is_too_long_is_bad_usage(arguments, capfd, monkeypatch):
+    monkeypatch.setenv("CAUSTIC_KERNELS", "torch")
+    assert cli.run([*arguments, "--quiet"]) == 2
+    out, err = capfd.readouterr()
+    assert out == "" and err.count("\n") == 1 and "too long" in err
+    assert [p.name for p in Path().iterdir()] == ["blob.png"]
+
+
+@pytest.mark.parametrize("name", [251 * "n" + ".npy", 127 * "é", "n." + 250 * "s"])
+def test_a_name_as_long_as_may_be_is_written(name):
+    for data in (b"one", b"two"):
+        files.write_bytes(name, data)
+        assert Path(name).read_bytes() == data
+    assert sorted(p.name for p in Path().iterdir()) == sorted([name, "blob.png"])
+
+
+def test_a_hostile_tiff_speaks_by_our_line_alone(capfd):
+    whole = io.BytesIO()
+    noise = np.random.default_rng(0).integers(0, 255, (40, 40)).astype(np.uint8)
+    Image.fromarray(noise).save(whole, format="TIFF", compression="tiff_lzw")
+    refused = 0
+    for k in range(8, len(whole.getvalue()), 23):
+        data = bytearray(whole.getvalue())
+        data[k : k + 3] = b"\xff\xff\xff"
+        Path("a.tif").write_bytes(data)
+        try:
+            read_picture(Path("a.tif"), False)
+        except InputError:
+            refused += 1
+    out, err = capfd.readouterr()
+    assert refused > 0 and (out, err) == ("", "")
+    os.write(2, b"heard")
+    assert capfd.readouterr().err == "heard"
