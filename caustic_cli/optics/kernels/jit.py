@@ -34,7 +34,7 @@ PARALLEL = {
     "fusion": False,
 }
 
-if numba.config.DISABLE_JIT:  # kernels call one another by address, which only compiled code has
+if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]  # kernels call one another by address, which only compiled code has
     raise InputError("the environment's NUMBA_DISABLE_JIT is set, and the kernels run compiled only; unset it")
 
 # Off by default in numba: it turns the steps of four neighbouring pixels in `plane` into vector instructions.
