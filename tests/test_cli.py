@@ -14,13 +14,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
-from helpers import write_blob
+from helpers import small_designs, write_blob
 from PIL import Image
 
 from caustic_cli import __version__, cli
 from caustic_cli.commands import console
 from caustic_cli.export import FORMATS
-from caustic_cli.workflow import evaluation
 
 COMMANDS = ("design", "render", "gradmap", "export", "convergence")
 SHARED_KEYS = {
@@ -67,7 +66,7 @@ def designed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cli")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        patch.setattr(evaluation, "FINAL_RAYS", 10_000)
+        small_designs(patch, 10_000, report=True)
         write_blob()
         text = "design blob.png --resolution 24 --control 12 --rays 4000 --iterations 2 --quiet"
         assert cli.run(shlex.split(text)) == 0
@@ -79,8 +78,7 @@ def here(designed, tmp_path, monkeypatch):
     folder = tmp_path / "here"
     shutil.copytree(designed, folder)
     monkeypatch.chdir(folder)
-    monkeypatch.setattr(evaluation, "FINAL_RAYS", 10_000)
-    monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
+    small_designs(monkeypatch, 10_000)
     return folder
 
 

@@ -12,13 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import begun
+from helpers import begun, small_designs
 from PIL import Image
 
 from caustic_cli import cli
 from caustic_cli.project import checkpoint
 from caustic_cli.workflow import design as workflow
-from caustic_cli.workflow import evaluation
 
 TINY = ["--resolution", "24", "--control", "12", "--rays", "4000", "--quiet", "--threads", "1"]
 
@@ -30,8 +29,7 @@ def _here(tmp_path, monkeypatch):
     y, x = np.mgrid[0:24, 0:24]
     light = 40 + 200 * np.exp(-((x - 8) ** 2 + (y - 9) ** 2) / 30.0)
     Image.fromarray(light.astype(np.uint8)).save("blob.png")
-    monkeypatch.setattr(evaluation, "FINAL_RAYS", 40_000)
-    monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
+    small_designs(monkeypatch, 40_000)
 
 
 def design(capfd, *arguments, code=0) -> dict:
@@ -330,7 +328,7 @@ def test_a_project_started_from_another_stands_on_its_own(capfd):
 
 @pytest.mark.parametrize("options", [[], ["--optimizer", "adam"]])
 def test_the_time_limit_ends_it(capfd, options):
-    figures = design(capfd, "blob.png", *TINY, *options, "--iterations", 1_000_000, "--time-limit", 0.2)
+    figures = design(capfd, "blob.png", *TINY, *options, "--iterations", 1_000_000, "--time-limit", 0.1)
     assert figures["reason"] in (["time limit"] if options else ["time limit", "no progress"])
     assert 1 <= figures["iterations"] < 100_000
     assert load("blob.caustic").state.total == figures["iterations"]

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import small_designs
 from PIL import Image
 
 from caustic_cli import cli
-from caustic_cli.workflow import evaluation
 
 ROOT = Path(__file__).resolve().parent.parent
 GUIDE = ROOT / "examples" / "guide"
@@ -63,7 +63,7 @@ def home(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         for name, value in SMALL.items():
             patch.setenv(name, value)
-        patch.setattr(evaluation, "FINAL_RAYS", 20_000)
+        small_designs(patch, 20_000)
         os.chdir(directory)
         for name in ("flame.png", "ball.png"):
             shutil.copy(ROOT / "examples" / name, directory)

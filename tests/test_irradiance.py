@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from helpers import write_blob
+from helpers import small_designs, write_blob
 
 from caustic_cli import cli
 from caustic_cli.commands.options import power
@@ -18,7 +18,6 @@ from caustic_cli.project.project import Project
 from caustic_cli.scene import Disc, Lens, Light, PlaneWave, Scene, Screen
 from caustic_cli.studies.irradiance import irradiance_figures, per_part, unit_figures
 from caustic_cli.studies.panels import write_report
-from caustic_cli.workflow import evaluation
 
 TINY = ["--resolution", "24", "--control", "12", "--rays", "4000", "--waves", "off", "--quiet", "--threads", "1", "--json"]
 RENDER = ["render", "blob.caustic", "--rays", "20000", "--quiet", "--threads", "1", "--json"]
@@ -48,7 +47,7 @@ BAD = [
 def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_blob()
-    monkeypatch.setattr(evaluation, "FINAL_RAYS", 40_000)
+    small_designs(monkeypatch, 40_000, report=True)
 
 
 def run(capfd, *arguments, code=0):
