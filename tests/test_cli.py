@@ -68,7 +68,7 @@ def designed(tmp_path_factory):
         patch.chdir(folder)
         small_designs(patch, 10_000, report=True)
         write_blob()
-        text = "design blob.png --resolution 24 --control 12 --rays 4000 --iterations 2 --quiet"
+        text = "design blob.png --resolution 24 --control 12 --rays 4000 --iterations 2 --quiet --lens-size 5 --throw 150"
         assert cli.run(shlex.split(text)) == 0
     return folder
 
@@ -149,7 +149,7 @@ BAD = {
     "render reconstruction": ("render blob.caustic --reconstruction moon", "moon"),
     "render filter": ("render blob.caustic --reconstruction cosine --filter-size 2", "filter"),
     "render alpha": ("render blob.caustic --alpha 1", "--alpha"),
-    "render screen in the lens": ("render blob.caustic --screen-at 3", "--screen-at"),
+    "render screen in the lens": ("render blob.caustic --screen-at 1", "--screen-at"),
     "render over a foreign file": ("render blob.caustic -o blob.png", "--force"),
     "render npy over a foreign file": ("render blob.caustic --npy notes.png", "--force"),
     "render dtype": ("render blob.caustic --dtype moon", "--dtype"),
@@ -399,7 +399,7 @@ def test_a_design_begins_from_an_exported_lens(here, capfd, file):
         surface = data["z"]
         np.save("lens.npy", surface)
     code, _, err = run(
-        f"design blob.png -o again --start {file} --resolution 24 --control 12 --rays 4000 --iterations 1"
+        f"design blob.png -o again --start {file} --lens-size 5 --throw 150 --resolution 24 --control 12 --rays 4000 --iterations 1"
         " --lr 1e-9 --optimizer adam --quiet",
         capfd,
     )

@@ -15,7 +15,21 @@ from caustic_cli.errors import InputError
 from caustic_cli.scene import Disc, Offset, Points
 from caustic_cli.workflow import design as workflow
 
-TINY = ["--resolution", "24", "--control", "12", "--rays", "4000", "--quiet", "--threads", "1"]
+TINY = [
+    "--resolution",
+    "24",
+    "--control",
+    "12",
+    "--rays",
+    "4000",
+    "--quiet",
+    "--threads",
+    "1",
+    "--lens-size",
+    "5",
+    "--throw",
+    "150",
+]
 SCHEDULE = """
 [source]
 type = "grid"
