@@ -22,7 +22,6 @@ import sys
 from caustic_cli import cli
 from caustic_cli.workflow import design as workflow
 from caustic_cli.workflow import evaluation
-from helpers import write_blob
 evaluation.FINAL_RAYS, evaluation.write_report = 5000, lambda *args: None
 sys.exit(cli.run(["design", "blob.png", "--config", "c.toml", "--quiet", "--threads", "1", "-o", "two"]))
 """
