@@ -18,7 +18,8 @@ settings.register_profile(
 settings.load_profile("caustic")
 
 
-#: Tests that take long: whole commands, kills, hard cases, documents.  `pytest -m "not slow"` is the inner loop.
+#: Tests that take long: whole commands, kills, hard cases, documents.  `pytest -m "not slow"` is the inner loop: less than a
+#: minute, and by test_export.py and test_several.py, which designs by a command, something of every part of the package.
 SLOW = (
     "benchmarks",
     "faults",
@@ -48,11 +49,9 @@ SLOW = (
     "test_sources_cli.py",
     "test_wave_design.py",
     "test_effects.py",
-    "test_export.py",
     "test_library.py",
     "test_noise.py",
     "test_roundtrip.py",
-    "test_several.py",
     "test_stages.py",
     "test_system.py",
     "test_verify.py",

@@ -1,9 +1,15 @@
-"""What tests of commands share: the picture they design for, and a design that ends where it begins."""
+"""What tests share: the picture they design for, small designs, a design that ends where it begins, and fewer combinations."""
 
+from collections.abc import Sequence
+from itertools import combinations, product
 from types import SimpleNamespace
 
 import numpy as np
 from PIL import Image
+
+from caustic_cli.config import plans
+from caustic_cli.inverse import initial_surface
+from caustic_cli.workflow import evaluation
 
 
 def write_blob(name: str = "blob.png", size: int = 24, centre: tuple[float, float] = (8, 9), width: float = 30.0) -> None:
@@ -19,3 +25,33 @@ def begun(project, *_) -> SimpleNamespace:
     return SimpleNamespace(
         project=project, scene=None, field=None, target=None, state=SimpleNamespace(heights=None), figures=figures
     )
+
+
+def small_designs(patch, rays: int, report: bool = False) -> None:
+    """For tests of what is done with a design: a first surface from 64 source cells across the lens in place of 256, `rays` for the
+    decision, and no report, whose drawing takes longer than all the rest, unless asked for.  patch: pytest's monkeypatch."""
+    patch.setattr(plans, "LEAST_CELLS", 64)
+    patch.setattr(initial_surface, "FEW_CELLS", 32)
+    patch.setattr(evaluation, "FINAL_RAYS", rays)
+    if not report:
+        patch.setattr(evaluation, "write_report", lambda *args: None)
+
+
+def pairwise(*lists: Sequence) -> list[tuple]:
+    """Rows with one value of each list, few of them, so that any two values of two lists meet in some row.
+
+    For parameters that may disturb one another in twos, not in threes.  Each row begins with a pair that is still missing and, list
+    by list, takes the value that meets most others for the first time: the same rows every time, 12 for four lists of 3, not 81.
+    """
+    columns = [range(len(one)) for one in lists]
+    missing = {((i, a), (j, b)) for (i, one), (j, other) in combinations(enumerate(columns), 2) for a, b in product(one, other)}
+    rows: list[tuple] = []
+    while missing:
+        row = dict(min(missing))
+        for k, column in enumerate(columns):
+            if k not in row:
+                met = [sum(tuple(sorted((own, (k, c)))) in missing for own in row.items()) for c in column]
+                row[k] = met.index(max(met))
+        missing -= {*combinations(sorted(row.items()), 2)}
+        rows.append(tuple(one[row[k]] for k, one in enumerate(lists)))
+    return rows

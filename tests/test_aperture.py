@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from helpers import small_designs
 from PIL import Image
 from test_export import make, signed_volume
 from test_verify import NAMES, SOURCES, scene_with
@@ -27,7 +28,6 @@ from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer, expose
 from caustic_cli.scene import Lens, PlaneWave, Points, Scene
 from caustic_cli.studies import verify
-from caustic_cli.workflow import evaluation
 
 
 def rounded(made, border: float = 0.0):
@@ -226,8 +226,7 @@ def test_an_archive_holds_the_whole_scene(tmp_path, source, aperture):
 @pytest.mark.parametrize("options", ["--lens-size 8 --aperture circle --border 1", "--lens-size 12x8 --border 0.5 --mag 2"])
 def test_from_picture_to_files(tmp_path, monkeypatch, capfd, options):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(evaluation, "FINAL_RAYS", 20_000)
-    monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
+    small_designs(monkeypatch, 20_000)
     y, x = np.mgrid[0:24, 0:40]
     Image.fromarray((40 + 200 * np.exp(-((x - 14) ** 2 + (y - 9) ** 2) / 60.0)).astype(np.uint8)).save("wide.png")
     text = f"design wide.png --resolution 40 --quality draft --control 35 --rays 30000 --iterations 4 --json --quiet {options}"
@@ -253,10 +252,10 @@ def test_mitsuba_agrees_on_round_lenses(tmp_path, source):
     write_mitsuba(tmp_path / "lens.xml", scene, field, heights, (257, 257), dark=True)
     assert all(p.is_file() for p in companions(tmp_path / "lens.xml"))
     try:
-        decision = verify.verify(tmp_path / "lens.xml", scene, field, heights, 400_000)
+        decision = verify.verify(tmp_path / "lens.xml", scene, field, heights, 100_000)
     except CausticError as error:
         pytest.skip(str(error))
     assert decision.agree, decision.figures
     square = replace(scene, lens=replace(scene.lens, aperture="rectangle"))
     if not isinstance(source, PlaneWave):
-        assert not verify.verify(tmp_path / "lens.xml", square, field, heights, 400_000).agree
+        assert not verify.verify(tmp_path / "lens.xml", square, field, heights, 100_000).agree

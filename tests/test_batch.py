@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from helpers import write_blob
+from helpers import small_designs, write_blob
 
 from caustic_cli import cli
 from caustic_cli.inverse.designer import Designer
@@ -40,7 +40,7 @@ ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(cli.__file__).parents[1])}
 def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     paint("blob.png", 5)
-    monkeypatch.setattr(evaluation, "FINAL_RAYS", 5000)
+    small_designs(monkeypatch, 5000, report=True)
     monkeypatch.setattr(evaluation, "write_report", lambda path, *rest: path.write_bytes(b"a report"))
 
 

@@ -14,13 +14,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
-from helpers import write_blob
+from helpers import small_designs, write_blob
 from PIL import Image
 
 from caustic_cli import __version__, cli
 from caustic_cli.commands import console, parser
 from caustic_cli.export import FORMATS
-from caustic_cli.workflow import evaluation
 
 COMMANDS = ("design", "render", "gradmap", "export", "convergence")
 SHARED_KEYS = {
@@ -67,9 +66,9 @@ def designed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cli")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        patch.setattr(evaluation, "FINAL_RAYS", 10_000)
+        small_designs(patch, 10_000, report=True)
         write_blob()
-        text = "design blob.png --resolution 24 --control 12 --rays 4000 --iterations 2 --quiet"
+        text = "design blob.png --resolution 24 --control 12 --rays 4000 --iterations 2 --quiet --lens-size 5 --throw 150"
         assert cli.run(shlex.split(text)) == 0
     return folder
 
@@ -79,8 +78,7 @@ def here(designed, tmp_path, monkeypatch):
     folder = tmp_path / "here"
     shutil.copytree(designed, folder)
     monkeypatch.chdir(folder)
-    monkeypatch.setattr(evaluation, "FINAL_RAYS", 10_000)
-    monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
+    small_designs(monkeypatch, 10_000)
     return folder
 
 
@@ -151,7 +149,7 @@ BAD = {
     "render reconstruction": ("render blob.caustic --reconstruction moon", "moon"),
     "render filter": ("render blob.caustic --reconstruction cosine --filter-size 2", "filter"),
     "render alpha": ("render blob.caustic --alpha 1", "--alpha"),
-    "render screen in the lens": ("render blob.caustic --screen-at 3", "--screen-at"),
+    "render screen in the lens": ("render blob.caustic --screen-at 1", "--screen-at"),
     "render over a foreign file": ("render blob.caustic -o blob.png", "--force"),
     "render npy over a foreign file": ("render blob.caustic --npy notes.png", "--force"),
     "render dtype": ("render blob.caustic --dtype moon", "--dtype"),
@@ -401,7 +399,7 @@ def test_a_design_begins_from_an_exported_lens(here, capfd, file):
         surface = data["z"]
         np.save("lens.npy", surface)
     code, _, err = run(
-        f"design blob.png -o again --start {file} --resolution 24 --control 12 --rays 4000 --iterations 1"
+        f"design blob.png -o again --start {file} --lens-size 5 --throw 150 --resolution 24 --control 12 --rays 4000 --iterations 1"
         " --lr 1e-9 --optimizer adam --quiet",
         capfd,
     )

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers import small_designs
 from PIL import Image
 
 from caustic_cli import cli
@@ -29,7 +30,6 @@ from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies.metrics import relative_rms
-from caustic_cli.workflow import evaluation
 
 SMALL = ["--lens-size", "2", "--throw", "60", "--mag", "2", "--resolution", "32", "--quiet", "--threads", "1"]
 
@@ -163,7 +163,7 @@ def test_objective_sees_the_image_of_the_source(kind, exact, monkeypatch):
     monkeypatch.setattr(extended, "EXACT", exact)
     scene = scene_of(SOURCES[kind])
     field, heights = HeightField.of(scene.lens), heights_of(scene)
-    stage = Stage((19, 19), 400_000, "grid", oversample=4, spread=True)
+    stage = Stage((19, 19), 200_000, "grid", oversample=4, spread=True)
     shifts = shift_of(scene, field, heights)
     traced, rays, kernels = regular_rays(scene, shifts, stage, 0, "cpu")
     assert (len(kernels) > 1) == (exact < 1.0)
@@ -180,7 +180,7 @@ def test_objective_sees_the_image_of_the_source(kind, exact, monkeypatch):
         oversample=4,
         dtype=torch.float64,
     )
-    image = expose(scene, field, heights, rays_of(scene, "sobol", 2_000_000)).image
+    image = expose(scene, field, heights, rays_of(scene, "sobol", 1 << 18)).image
     assert made(heights).loss * 32**2 == pytest.approx(relative_rms(image, target), rel=0.04)
     assert made(heights).on_screen == pytest.approx(float(image.sum()), rel=0.01)
     along = torch.randn(heights.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
@@ -237,7 +237,7 @@ def test_the_middle_shines_into_the_cone_of_the_whole():
 def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Image.fromarray((disc_on(32, 0.7) * 255).astype(np.uint8)).save("blob.png")
-    monkeypatch.setattr(evaluation, "FINAL_RAYS", 200_000)
+    small_designs(monkeypatch, 200_000)
 
 
 def design(capfd, *arguments) -> dict:

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import small_designs
 from PIL import Image
 
 from caustic_cli import cli
-from caustic_cli.workflow import evaluation
 
 ROOT = Path(__file__).resolve().parent.parent
 GUIDE = ROOT / "examples" / "guide"
@@ -26,6 +26,8 @@ SMALL = {
     for name, value in {
         "DESIGN_RESOLUTION": "24",
         "DESIGN_ITERATIONS": "2",
+        "DESIGN_LENS_SIZE": "6",
+        "DESIGN_THROW": "180",
         "DESIGN_WAVES": "off",
         "DESIGN_QUIET": "1",
         "DESIGN_THREADS": "1",
@@ -63,7 +65,7 @@ def home(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         for name, value in SMALL.items():
             patch.setenv(name, value)
-        patch.setattr(evaluation, "FINAL_RAYS", 20_000)
+        small_designs(patch, 20_000)
         os.chdir(directory)
         for name in ("flame.png", "ball.png"):
             shutil.copy(ROOT / "examples" / name, directory)
@@ -85,7 +87,7 @@ def home(tmp_path_factory):
 def test_the_commands_of_a_chapter_run(chapter, home, monkeypatch, capfd):
     monkeypatch.chdir(home)
     for arguments in commands(chapter):
-        few = ["1e5" if k and arguments[k - 1] == "--rays" and float(a) > 1e5 else a for k, a in enumerate(arguments)]
+        few = ["2e4" if k and arguments[k - 1] == "--rays" and float(a) > 2e4 else a for k, a in enumerate(arguments)]
         where = few.index("2>") if "2>" in few else len(few)
         status = cli.run(few[:where])
         assert status == 0, f"caustic {shlex.join(arguments)}\n{capfd.readouterr().err}"

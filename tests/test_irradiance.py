@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from helpers import write_blob
+from helpers import small_designs, write_blob
 
 from caustic_cli import cli
 from caustic_cli.commands.options import power
@@ -48,7 +48,7 @@ BAD = [
 def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_blob()
-    monkeypatch.setattr(evaluation, "FINAL_RAYS", 40_000)
+    small_designs(monkeypatch, 40_000)
 
 
 def run(capfd, *arguments, code=0):
@@ -134,6 +134,7 @@ def test_the_table_and_the_report_say_it_too(capfd, monkeypatch):
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     bars, plain = [], Figure.colorbar
+    monkeypatch.setattr(evaluation, "write_report", write_report)
 
     def colorbar(figure, drawn, **options):
         norm = drawn.norm

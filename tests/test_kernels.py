@@ -11,6 +11,7 @@ import numba
 import numpy as np
 import pytest
 import torch
+from helpers import pairwise
 
 from caustic_cli.optics.backends import backend_for, plain
 from caustic_cli.optics.bspline import SplineSpace
@@ -77,9 +78,9 @@ def entries(lost) -> dict[str, float]:
     return dict.fromkeys(ACCOUNT, 0.0) | {k: float(torch.as_tensor(v).detach()) for k, v in lost.items()}
 
 
-@pytest.mark.parametrize("kind", ["lines", "stratified"])
-@pytest.mark.parametrize("fresnel", ["none", "schlick", "exact"])
-@pytest.mark.parametrize("filter", FILTERS, ids=str)
+@pytest.mark.parametrize(
+    ("filter", "fresnel", "kind"), pairwise(FILTERS, ["none", "schlick", "exact"], ["lines", "stratified"]), ids=str
+)
 def test_value_and_gradient_in_float64(filter, fresnel, kind):
     pull = torch.randn(SCREEN.resolution, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     results = []

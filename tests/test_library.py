@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers import small_designs
 
 import caustic_cli
 from caustic_cli import cli, design, load, render, trace
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.scene import Lens, Offset, PlaneWave, Points, Scene, Screen
-from caustic_cli.workflow import evaluation
 
 SMALL = {"lens": {"size": [2.0, 2.0]}, "screen": {"z": 60.0, "resolution": [32, 32]}}
 
@@ -21,7 +21,7 @@ SMALL = {"lens": {"size": [2.0, 2.0]}, "screen": {"z": 60.0, "resolution": [32, 
 @pytest.fixture(autouse=True)
 def _quick(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(evaluation, "FINAL_RAYS", 40_000)
+    small_designs(monkeypatch, 40_000)
 
 
 def picture() -> np.ndarray:
@@ -33,7 +33,7 @@ def picture() -> np.ndarray:
 @pytest.fixture(scope="module")
 def lens():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(evaluation, "FINAL_RAYS", 40_000)
+        small_designs(patch, 40_000)
         return design(picture(), mag=2, settings=SMALL, quality="draft", waves="off")
 
 

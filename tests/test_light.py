@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from helpers import small_designs
 from PIL import Image
 
 from caustic_cli import cli
@@ -48,7 +49,7 @@ def beside(at) -> Scene:
 
 def traced(scene: Scene, first: First, target: np.ndarray):
     """Its image's error, and the part of the light on the lens that it holds."""
-    image = expose(scene, HeightField.of(scene.lens), first.heights, rays_of(scene, "stratified", 300_000, 3))
+    image = expose(scene, HeightField.of(scene.lens), first.heights, rays_of(scene, "stratified", 100_000, 3))
     return relative_rms(image.image.numpy(), target), float(image.image.sum()) / (1.0 - image.lost["missed_lens"]), image
 
 
@@ -197,6 +198,7 @@ def test_the_objective_knows_the_light_on_the_lens(source):
 
 def test_study_of_light(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
+    small_designs(monkeypatch, 40_000)
     monkeypatch.setattr(tradeoff, "PARTS", (1.0, 1.8))
     monkeypatch.setattr(tradeoff, "NEAR_WEIGHTS", (0.0, 10.0))
     Image.fromarray((255 * blob()).astype(np.uint8)).save("blob.png")
@@ -244,6 +246,7 @@ def test_study_of_light(tmp_path, monkeypatch, capfd):
 
 def test_study_of_light_from_infinity_varies_the_weight_alone(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
+    small_designs(monkeypatch, 40_000)
     Image.fromarray((255 * blob()).astype(np.uint8)).save("blob.png")
     assert (
         cli.run(
@@ -252,7 +255,7 @@ def test_study_of_light_from_infinity_varies_the_weight_alone(tmp_path, monkeypa
         == 0
     )
     capfd.readouterr()
-    assert cli.run(["convergence", "blob.caustic", "--study", "light", "--seconds", "0.1", "--json", "--quiet"]) == 0
+    assert cli.run(["convergence", "blob.caustic", "--study", "light", "--seconds", "0.05", "--json", "--quiet"]) == 0
     rows = json.loads(capfd.readouterr().out)["rows"]
     assert len({r["thickness"] for r in rows}) == 1 and len({r["weight"] for r in rows}) == len(rows) >= 5
     assert cli.run(["convergence", "--study", "light", "--seconds", "0"]) == 2

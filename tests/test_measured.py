@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import write_blob
+from helpers import small_designs, write_blob
 from rayfiles import cone_of, lighttools, tm25, zemax
 from test_emission import LENS, heights, scene
 
@@ -30,7 +30,6 @@ from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.rayset import RaySet
 from caustic_cli.studies.retrace import converge
 from caustic_cli.workflow import design as workflow
-from caustic_cli.workflow import evaluation
 
 AT = (0.5, -0.5, -30.0)
 #: The same light as rays and as the source that they are drawn from.
@@ -212,8 +211,7 @@ def test_impossible_ones_are_refused(what, message):
 def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_blob()
-    monkeypatch.setattr(evaluation, "FINAL_RAYS", 40_000)
-    monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
+    small_designs(monkeypatch, 40_000)
 
 
 def run(capfd, *arguments, code=0):

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from helpers import write_blob
+from helpers import small_designs, write_blob
 
 from caustic_cli import cli
 from caustic_cli.optics.emission import rays_of
@@ -18,7 +18,6 @@ from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies import metrics, noise
 from caustic_cli.studies.retrace import MOST_TIMES, retrace
-from caustic_cli.workflow import evaluation
 
 PIXELS = (40, 36)
 SOURCES = {"disc": Disc((0.0, 0.0, -100.0), (6.0, 6.0)), "point": Points(((0.0, 0.0, -100.0),)), "sun": Disc(angle=2.0)}
@@ -149,8 +148,7 @@ def test_sobol_points_do_not_depend_on_where_a_draw_begins():
 
 def test_design_and_render_of_a_disc_say_their_noise(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(evaluation, "FINAL_RAYS", 40_000)
-    monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
+    small_designs(monkeypatch, 40_000)
     write_blob()
     common = ["--threads", "1", "--json"]
     assert (

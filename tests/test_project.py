@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from helpers import small_designs
 from PIL import Image
 
 from caustic_cli import cli
@@ -21,7 +22,6 @@ from caustic_cli.project import checkpoint, directory, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.project import MADE, Project, beside
 from caustic_cli.workflow import design as workflow
-from caustic_cli.workflow import evaluation
 
 CONFIG = """
 [lens]
@@ -44,8 +44,7 @@ def designed(tmp_path_factory):
     np.save(folder / "blob.npy", np.exp(-((x[:, None] - 6) ** 2 + (x - 12) ** 2) / 20.0) + 0.1)
     (folder / "c.toml").write_text(CONFIG)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(evaluation, "FINAL_RAYS", 10_000)
-        patch.setattr(evaluation, "write_report", lambda *args: None)
+        small_designs(patch, 10_000)
         project, first = workflow.begin(
             folder / "blob.npy", {}, config=folder / "c.toml", out=folder / "blob.caustic", say=Reporter(quiet=True)
         )
@@ -322,8 +321,7 @@ def test_finished_where_every_image_stands_that_was_made(copy, results):
 def test_a_profile_weights_the_light(designed, tmp_path, monkeypatch, capfd):
     """Only the aperture's +x half shines, so light arrives on that side only, and all of it is accounted for."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(evaluation, "FINAL_RAYS", 10_000)
-    monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
+    small_designs(monkeypatch, 10_000)
     profile = np.zeros((4, 3))
     profile[2:] = 1.0
     np.save("half.npy", profile)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import write_blob
+from helpers import small_designs, write_blob
 
 from caustic_cli import cli
 from caustic_cli.inverse import ranks
@@ -16,7 +16,6 @@ from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.project import checkpoint
 from caustic_cli.scene import Lens, Offset, PlaneWave, Points, Scene, Screen
-from caustic_cli.workflow import evaluation
 
 DRIVER = """
 import sys
@@ -53,8 +52,7 @@ tolerance = 0.0
 def test_two_ranks_design_what_one_process_does(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("CAUSTIC_KERNELS", "torch")
-    monkeypatch.setattr(evaluation, "FINAL_RAYS", 5000)
-    monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
+    small_designs(monkeypatch, 5000)
     write_blob("blob.png", 16, (5, 6), 15.0)
     Path("c.toml").write_text(CONFIG)
     Path("two.py").write_text(DRIVER)

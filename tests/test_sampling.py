@@ -163,14 +163,14 @@ def test_random_numbers_are_uniform_in_one_and_two_dimensions():
 def test_random_numbers_have_no_lattice():
     """Every random walk 2 pi (k u + l v) ends near the origin: its squared length over N is exponential with mean 1.
 
-    624 wave vectors (half of them conjugates) in 63 spectra: the largest of 2e4 exceeds 25 with probability 3e-7.
+    624 wave vectors (half of them conjugates) in 21 spectra: the largest of 7e3 exceeds 25 with probability 1e-7.
     """
     k = torch.arange(RAYS // 4)
     strongest = []
-    for seed in SEEDS:
+    for seed in SEEDS[::3]:
         u, v, after = (random_numbers(s, d, k).numpy() for s, d in ((seed, 0), (seed, 1), (seed + 1, 0)))
         strongest += [lattice_strength(u, v), lattice_strength(u, after), lattice_strength(u[:-1], u[1:])]
-    assert len(strongest) == 63
+    assert len(strongest) == 21
     assert max(strongest) < 25
     assert min(strongest) > 1  # 312 exponential variables never all stay below 1
 

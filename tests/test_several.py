@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import write_blob
+from helpers import small_designs, write_blob
 from rayfiles import cone_of, zemax
 from test_emission import LENS, heights
 
@@ -28,7 +28,6 @@ from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.rayset import RaySet
 from caustic_cli.scene.sources.several import Several
 from caustic_cli.workflow import design as workflow
-from caustic_cli.workflow import evaluation
 
 SCREEN = Screen((40.0, 32.0), 100.0, (40, 32))
 MEMBERS = (
@@ -146,8 +145,7 @@ def test_settings_go_round():
 def test_a_design_in_several_lights(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     write_blob()
-    monkeypatch.setattr(evaluation, "FINAL_RAYS", 40_000)
-    monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
+    small_designs(monkeypatch, 40_000)
     Path("led.dat").write_bytes(zemax(*cone_of(20_000, 12.0)))
     Path("led.csv").write_text("0,1\n30,0.5\n")
     Path("two.toml").write_text(

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 import torch.autograd.forward_ad as fwd
+from helpers import pairwise
 from scipy.interpolate import BSpline
 
 from caustic_cli.config.table import TABLE
@@ -161,10 +162,7 @@ def test_concave_sphere_spreads_light_by_the_magnification():
 LENSES = {"gentle": 0.02, "off the screen": 0.4, "totally reflecting": 1.3}
 
 
-@pytest.mark.parametrize("kind", SAMPLERS)
-@pytest.mark.parametrize("f", FILTERS, ids=lambda f: f.kind)
-@pytest.mark.parametrize("fresnel", FRESNEL)
-@pytest.mark.parametrize("surface", LENSES)
+@pytest.mark.parametrize(("kind", "f", "fresnel", "surface"), pairwise(SAMPLERS, FILTERS, FRESNEL, [*LENSES]))
 def test_energy(kind, f, fresnel, surface):
     """Image + all losses = emitted power to 1e-12, and every loss that should occur does."""
     scene = scene_of(fresnel)

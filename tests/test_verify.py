@@ -135,7 +135,7 @@ def mitsuba():
 def test_mitsuba_agrees(mitsuba, tmp_path, source, capsys):
     scene, field, heights = scene_with(source)
     write_mitsuba(tmp_path / "lens.xml", scene, field, heights, (129, 129), dark=True)
-    decision = verify.verify(tmp_path / "lens.xml", scene, field, heights, RAYS)
+    decision = verify.verify(tmp_path / "lens.xml", scene, field, heights, RAYS // 2)
     with capsys.disabled():
         print(
             f"\n  {source.kind if hasattr(source, 'kind') else 'plane'}: mean Z^2 {decision.figures['z_mean_square']:.3f},"

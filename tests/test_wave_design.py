@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import begun
+from helpers import begun, small_designs
 from PIL import Image
 
 from caustic_cli import cli
@@ -24,7 +24,7 @@ from caustic_cli.optics.waves import NoWaveImage, wave_image
 from caustic_cli.scene import Disc, Lens, Light, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies import diffraction
 from caustic_cli.studies.metrics import relative_rms
-from caustic_cli.workflow import comparison, evaluation
+from caustic_cli.workflow import comparison
 
 SMALL = ["--lens-size", "2", "--throw", "60", "--mag", "2", "--resolution", "32", "--quiet", "--threads", "1"]
 
@@ -58,7 +58,7 @@ def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     y, x = np.mgrid[-1:1:32j, -1:1:32j]
     Image.fromarray(((np.hypot(x, y) < 0.7) * 255).astype(np.uint8)).save("blob.png")
-    monkeypatch.setattr(evaluation, "FINAL_RAYS", 40_000)
+    small_designs(monkeypatch, 40_000)
 
 
 def design(capfd, *arguments, code=0) -> dict | str:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import write_blob
+from helpers import small_designs, write_blob
 
 from caustic_cli import cli
 from caustic_cli.errors import CausticError
@@ -23,7 +23,6 @@ from caustic_cli.project import checkpoint, directory
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
 from caustic_cli.workflow import design as workflow
-from caustic_cli.workflow import evaluation
 
 DESIGN = [
     "design",
@@ -48,8 +47,7 @@ DESIGN = [
 def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_blob("blob.png", 16, (5, 6), 15.0)
-    monkeypatch.setattr(evaluation, "FINAL_RAYS", 5000)
-    monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
+    small_designs(monkeypatch, 5000)
 
 
 def run(arguments, capfd, code):

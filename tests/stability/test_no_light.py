@@ -7,6 +7,7 @@ import shlex
 import numpy as np
 import pytest
 import torch
+from helpers import small_designs
 
 from caustic_cli import cli
 from caustic_cli.errors import CausticError
@@ -24,7 +25,6 @@ from caustic_cli.optics.trace import expose
 from caustic_cli.project.checkpoint import load
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies.metrics import judge
-from caustic_cli.workflow import evaluation
 
 SCREEN = Screen((20.0, 20.0), 60.0, (12, 12))
 TARGET = torch.ones(12, 12, dtype=torch.float64)
@@ -178,8 +178,7 @@ def test_where_nothing_begins_it_stops_with_a_sentence():
 @pytest.fixture
 def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(evaluation, "FINAL_RAYS", 10_000)
-    monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
+    small_designs(monkeypatch, 10_000)
     np.save("spot.npy", np.eye(12))
     return tmp_path
 

@@ -7,6 +7,7 @@ import shlex
 import numpy as np
 import pytest
 import torch
+from helpers import small_designs
 from PIL import Image
 
 from caustic_cli import cli
@@ -20,7 +21,6 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.project.checkpoint import load
 from caustic_cli.scene import Lens, PlaneWave, Points, Scene, Screen
-from caustic_cli.workflow import evaluation
 
 N = 16
 
@@ -92,8 +92,7 @@ def test_transport_start(name, source):
 def test_designs_of_extreme_pictures_write_finite_files(tmp_path, monkeypatch, capfd):
     """The whole command: zeros and one bright pixel as 8-bit and 16-bit images and as .npy."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(evaluation, "FINAL_RAYS", 10_000)
-    monkeypatch.setattr(evaluation, "write_report", lambda *args: None)
+    small_designs(monkeypatch, 10_000)
     spot = np.zeros((N, N))
     spot[4, 11] = 1.0
     Image.fromarray((255 * spot).astype(np.uint8)).save("spot8.png")

@@ -192,7 +192,7 @@ def test_parts_of_a_source_are_spread():
 
 def test_spread_on_a_tilted_screen():
     """An extended source blurs a tilted screen too."""
-    screen = Screen((2.0, 2.0), 42.0, (16, 16), tilt=(0.0, 20.0))
+    screen = Screen((2.0, 2.0), 42.0, (10, 10), tilt=(0.0, 20.0))
     scene = scene_of(1.0, screen, Disc(angle=0.8))
     field, heights = wavy(scene)
     found, sharp = (wave_image(s, field, heights).image.numpy() for s in (scene, replace(scene, source=PlaneWave())))
