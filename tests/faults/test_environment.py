@@ -42,7 +42,7 @@ def test_closed_streams(redirections):
     done = run(["--version"], redirections)
     out = "" if ">&- 2" in redirections or redirections == ">&-" else f"caustic {__version__}\n"
     assert (done.returncode, done.stdout, done.stderr) == (0, out, "")
-    done = run(["render", "absent"], redirections)
+    done = run(["render", "absent", "--quiet"], redirections)
     assert (done.returncode, done.stdout) == (2, "") and done.stderr.count("\n") == ("2>&-" not in redirections)
 
 
