@@ -34,7 +34,6 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.waves import NoWaveImage
 from caustic_cli.scene import Scene
 
-OPTIMIZERS = ("lbfgs", "adam")
 #: A stage's flatness is judged over so many iterations.
 FLAT_SPAN = 10
 

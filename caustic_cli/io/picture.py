@@ -20,7 +20,6 @@ from caustic_cli.errors import InputError
 from caustic_cli.io.arrays import open_npy
 from caustic_cli.io.files import NPY_HEADER, SOFTWARE, atomic_path, naming, open_regular
 
-ENCODINGS = ("srgb", "linear")
 #: Largest picture read, in pixels: a float64 copy of it is half a gigabyte.
 MAX_PIXELS = 8192 * 8192
 #: Largest image file read: its decoders may take in all of it at once.
