@@ -40,7 +40,7 @@ def interaction():
 
 @pytest.fixture(scope="module")
 def small():
-    """A contest on 24 x 24 pixels."""
+    """A comparison on 24 x 24 pixels."""
     stages = [{"control": [19, 19], "rays": 5000, "apron": 1}]
     full = complete({"screen": {"resolution": [24, 24]}, "lens": {"control": [19, 19]}, "design": {"stages": stages}}, 1.0)
     scene = build_scene(full)

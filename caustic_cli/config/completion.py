@@ -191,9 +191,9 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
     degree = check("lens.degree", lens["degree"])
     plain = design["network"] == "none" and design["optimizer"] == "lbfgs"
     asked = check("design.waves", design["waves"])
-    held = "control" not in lens or min(n - p for n, p in zip(lens["control"], degree, strict=True)) >= LEAST_SPANS
-    spread = plain and held and not source.sharp and _shifts(s, source)
-    design.setdefault("start", "transport" if plain and held and not source.apart else "offset")
+    fine_net = "control" not in lens or min(n - p for n, p in zip(lens["control"], degree, strict=True)) >= LEAST_SPANS
+    spread = plain and fine_net and not source.sharp and _shifts(s, source)
+    design.setdefault("start", "transport" if plain and fine_net and not source.apart else "offset")
     if design["start"] == "transport" and design["network"] != "none":
         raise InputError(
             "⟨design.start⟩ transport gives a surface, which a network cannot begin from; use start offset, or network none"
@@ -201,7 +201,7 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
     quality = quality or _quality(design["time_limit"])
     # Sharp light's transport is right at every scale at once, if the net can hold it, and so is that of a source that shifts the
     # image, for the light behind its blur; otherwise from coarse to fine.
-    moved = plain and held and design["start"] != "offset" and (source.sharp or spread)
+    moved = plain and fine_net and design["start"] != "offset" and (source.sharp or spread)
     if "control" not in lens:
         spans = refinement_spans(max(screen["resolution"]), quality) if moved else DEFAULT_SPANS
         lens["control"] = [spans + p for p in degree] if design["network"] == "none" else [NETWORK_CONTROL] * 2

@@ -44,7 +44,7 @@ UNREACHED = (
 
 
 @dataclass(frozen=True, eq=False)
-class First:
+class InitialSurface:
     """A first surface: its control heights (n, m) mm float64, and the height of its middle, mm, where that was chosen, for a near
     source."""
 
@@ -164,7 +164,7 @@ class _Cut:
     short: float
 
 
-def first_surface(scene: Scene, target: np.ndarray, field: HeightField, cells: int = CELLS, fixed: bool = False) -> First:
+def first_surface(scene: Scene, target: np.ndarray, field: HeightField, cells: int = CELLS, fixed: bool = False) -> InitialSurface:
     """A lens that throws the picture, from the light of the source's centre.
 
     Args:
@@ -184,11 +184,11 @@ def first_surface(scene: Scene, target: np.ndarray, field: HeightField, cells: i
         for _ in range(1 if scene.source.distant else PASSES):
             found = grid.solved(*incident(scene, grid.x, grid.y, z), float(grid.offset.mean()), found)
             z = found.heights
-        return First(_net(grid, z, field))
+        return InitialSurface(_net(grid, z, field))
     few = _Grid.of(scene, target, min(cells, FEW_CELLS))
     best = _best(few, lens.offset.thickness, fixed)
     found = grid.cut(few.scaled(best.z, grid), best.middle, PASSES - 1)
-    return First(_net(grid, found.z, field).clamp_min(grid.floor), best.middle)  # a spline through a kink undershoots
+    return InitialSurface(_net(grid, found.z, field).clamp_min(grid.floor), best.middle)  # a spline through a kink undershoots
 
 
 def _best(grid: _Grid, middle: float, fixed: bool) -> _Cut:

@@ -1,4 +1,4 @@
-"""How far an image is from its target, and what is minded beside that (thesis 5.2, 6.4, 7.2).
+"""How far an image is from its target, and what is penalised besides (thesis 5.2, 6.4, 7.2).
 
 Every term is a dimensionless root mean square t; r is the relative residual N (J / P - T / sum T) on N pixels.
 

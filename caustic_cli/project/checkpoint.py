@@ -59,7 +59,7 @@ with h5py.File(sys.argv[1], "r") as f:
 class Checkpoint:
     """A design's state, the spline spaces of its heights, where it came from and, once finished, its figures.
 
-    inputs: digests of what it was made from, see `reuse`.
+    inputs: digests of what it was made from, see `uptodate`.
     """
 
     state: State
@@ -195,24 +195,24 @@ def _load(path: Path, file: BinaryIO) -> Checkpoint:
                 raise _Newer(path, version)
             if f.visititems_links(lambda name, link: None if isinstance(link, h5py.HardLink) else name):
                 raise ValueError("link")
-            held = _Contents(f)
-            rows = held.read("history")
+            contents = _Contents(f)
+            rows = contents.read("history")
             if rows.ndim != 2 or rows.shape[1] != len(HISTORY) or len(rows) > MOST_ITERATIONS:
                 raise ValueError("history")
             group = f["state"]
             state = State(
-                held.tensor("lens/heights").double(),
+                contents.tensor("lens/heights").double(),
                 **{k: int(group.attrs[k]) for k in ("stage", "iteration", "total")},
-                **{name: {k: held.tensor(f"state/{name}/{k}") for k in group[name]} for name in ("parameters", "optimizer")},
+                **{name: {k: contents.tensor(f"state/{name}/{k}") for k in group[name]} for name in ("parameters", "optimizer")},
                 history=[(int(r[0]), int(r[1]), *map(float, r[2:])) for r in rows],
                 seconds=float(group.attrs["seconds"]),
                 reason=str(group.attrs["reason"]),
-                start=held.tensor("start").double() if "start" in f else None,
+                start=contents.tensor("start").double() if "start" in f else None,
             )
             if min(state.stage, state.iteration, state.total) < 0 or not 0 <= state.seconds < math.inf:
                 raise ValueError("state")
             spaces = tuple(
-                SplineSpace(int(p), held.tensor(f"lens/knots_{axis}"))
+                SplineSpace(int(p), contents.tensor(f"lens/knots_{axis}"))
                 for p, axis in zip(f["lens"].attrs["degree"], "uv", strict=True)
             )
             texts = f.attrs["provenance"], f.attrs["results"], f.attrs.get("inputs", "{}")

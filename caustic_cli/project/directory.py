@@ -1,4 +1,4 @@
-"""The place of a project on disk: free or taken, born whole, and held by one design at a time.
+"""The place of a project on disk: free or taken, made whole, and locked by one design at a time.
 
 The lock is the operating system's on the directory itself, so it ends with the process that holds it, killed or not, and
 nothing of it is left behind.

@@ -95,13 +95,13 @@ class Outputs:
 
     def found(self) -> dict | None:
         """The figures of the time when the same was asked for, if every file is still what it was then; they are touched."""
-        held = self._held().get(self.key)
-        if not isinstance(held, dict) or held.get("asked") != self.asked or not isinstance(held.get("figures"), dict):
+        record = self._records().get(self.key)
+        if not isinstance(record, dict) or record.get("asked") != self.asked or not isinstance(record.get("figures"), dict):
             return None
-        if held.get("files") != [_hash(p) for p in self.paths]:
+        if record.get("files") != [_hash(p) for p in self.paths]:
             return None
         _touch(self.paths)
-        return held["figures"]
+        return record["figures"]
 
     def refuse_foreign(self, force: bool) -> None:
         """Stop before work begins where a file cannot be written, or holds what neither its mark nor the record says is ours: a
@@ -110,7 +110,7 @@ class Outputs:
         Raises:
             InputError: as of `io.files.refuse_foreign`.
         """
-        entries = [entry.get("files") for entry in self._held().values() if isinstance(entry, dict)]
+        entries = [entry.get("files") for entry in self._records().values() if isinstance(entry, dict)]
         ours = {found for files in entries if isinstance(files, list) for found in files if found and isinstance(found, str)}
         for path in self.paths:
             refuse_foreign(path, force or _hash(path) in ours)
@@ -119,14 +119,14 @@ class Outputs:
         """Remember what was made."""
         entry = {"asked": self.asked, "files": [_hash(p) for p in self.paths], "figures": figures}
         with contextlib.suppress(CausticError):  # a project that cannot be written to has no memory; the output is there
-            write_bytes(self.record, json.dumps(self._held() | {self.key: entry}, indent=1).encode())
+            write_bytes(self.record, json.dumps(self._records() | {self.key: entry}, indent=1).encode())
 
-    def _held(self) -> dict:
+    def _records(self) -> dict:
         try:
-            held = json.loads(read_bytes(self.record, MOST_RECORDED, "").decode())
+            record = json.loads(read_bytes(self.record, MOST_RECORDED, "").decode())
         except (ValueError, RecursionError):  # InputError is a ValueError
             return {}
-        return held if isinstance(held, dict) else {}
+        return record if isinstance(record, dict) else {}
 
 
 def _hash(path: Path) -> str:

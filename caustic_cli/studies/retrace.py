@@ -49,7 +49,7 @@ def _rays(scene: Scene, rays: int, seed: int, device: str) -> Rays:
     return rays_of(scene, "stratified" if even else "sobol", rays, seed, device)
 
 
-def _held(scene: Scene) -> int:
+def _available(scene: Scene) -> int:
     """Rays that the smallest of the scene's ray files holds; more than can be asked for where there is none."""
     return min((one.rays.count for one in scene.source.members if one.rays is not None), default=BATCHES * MOST_RAYS)
 
@@ -95,10 +95,10 @@ def converge(
         CausticError: MOST_RAYS or those of a file are not enough, or no light reaches the screen.
     """
     each, traced, order = max(1, rays // BATCHES), 0, ORDER if scene.source.collimated else SOBOL_ORDER
-    held, lights = _held(scene), [_part(scene, k, BATCHES) for k in range(BATCHES)]
+    available, lights = _available(scene), [_part(scene, k, BATCHES) for k in range(BATCHES)]
     while True:
-        if each * BATCHES > held:
-            raise CausticError(f"⟨tolerance⟩ {tolerance:g} asks for more rays than the file holds, {held:,}")
+        if each * BATCHES > available:
+            raise CausticError(f"⟨tolerance⟩ {tolerance:g} asks for more rays than the file holds, {available:,}")
         parts = [
             expose(
                 light,
@@ -196,7 +196,7 @@ def retrace(
             counted = mean_of(list(halves))
             figures = _judged_halves(counted, target, halves)
             enough = quiet is None or target is None or figures["noise"] <= quiet * figures["relative_rms"]
-            if enough or 2 * len(parts[0]) > MOST_TIMES or rays * len(parts[0]) >= _held(scene):
+            if enough or 2 * len(parts[0]) > MOST_TIMES or rays * len(parts[0]) >= _available(scene):
                 break
     require_account(figures, dtype)
     figures |= irradiance_figures(scene, counted.image, screen) | unit_figures(scene)

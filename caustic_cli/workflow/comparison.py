@@ -25,7 +25,7 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Scene
 
-#: A contest without a project: pixels across the screen, and control points, 64 spans and the degree.
+#: A comparison without a project: pixels across the screen, and control points, 64 spans and the degree.
 PIXELS, CONTROL = 96, 67
 #: Of its picture, a bright disc: cells across, and radius over half the width.
 CELLS, DISC = 480, 0.8

@@ -48,8 +48,8 @@ class Attached(str):
 
 def content(table: Table, key: str, kind: type) -> Any | None:
     """What the file holds that a key names, if it is of that kind; None if not, or if there is no such file."""
-    held = getattr(table.get(key), "content", None)
-    return held if isinstance(held, kind) else None
+    read = getattr(table.get(key), "content", None)
+    return read if isinstance(read, kind) else None
 
 
 def nothing(_lens: Table) -> dict[str, Any]:
