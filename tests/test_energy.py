@@ -1,6 +1,7 @@
 """Power is never made out of nothing, and none that matters is left out: surfaces without glass, ghosts that focus, accounts."""
 
 import math
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -14,14 +15,15 @@ from caustic_cli.config.completion import complete
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse.extended import centre_of
 from caustic_cli.optics.bounds import bounds_of, refuse_without_glass
+from caustic_cli.optics.effects import EFFECTS
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.plan import compile_plan
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.spread import Convolution, spread_at
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.trace import expose
-from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Scene, Screen
-from caustic_cli.studies.retrace import require_account
+from caustic_cli.scene import Disc, Lens, Light, Offset, PlaneWave, Points, Scene, Screen
+from caustic_cli.studies.retrace import require_account, retrace
 from caustic_cli.workflow import evaluation
 
 
@@ -169,3 +171,98 @@ def test_a_brighter_lens_that_is_less_like_the_picture_says_so(monkeypatch):
     brighter, start, alike = figures
     assert not evaluation._worse(brighter, start) and evaluation._worse(brighter, alike)
     assert evaluation._likeness(brighter) > evaluation._likeness(start)
+
+
+# accounts
+
+
+def random_scene(rng: np.random.Generator) -> tuple[Scene, HeightField, torch.Tensor]:
+    """A scene of any source, effects and shape, hostile ones among them; its lens may be rough, steep and thin."""
+
+    def one(*values):
+        return values[rng.integers(len(values))]
+
+    half = 10.0 ** rng.uniform(-1.0, 2.0)
+    round_, mirror = bool(rng.random() < 0.3), bool(rng.random() < 0.15)
+    degree = (int(rng.integers(1, 6)), int(rng.integers(1, 6)))
+    control = tuple(int(p + rng.integers(1, 12)) for p in degree)
+    thickness = half * 10.0 ** rng.uniform(-2.0, 0.7)
+    glass = None if mirror or rng.random() < 0.7 else one("N-BK7", "PMMA", "N-SF11")
+    lens = Lens(
+        size=(2.0 * half, 2.0 * half * (1.0 if round_ else rng.uniform(0.3, 3.0))),
+        index=float(one(1.0001, 1.33, 1.5, 1.9, 3.0, 5.0)),
+        glass=glass,
+        control=control,
+        degree=degree,
+        offset=Offset(thickness),
+        fresnel=one("none", "schlick", "exact"),
+        absorption=float(one(0.0, 0.0, 1e-3, 1.0, 1e3, 1e6)),
+        roughness=float(one(0.0, 0.0, 0.02, 0.5)),
+        mirror=mirror,
+        aperture="circle" if round_ else "rectangle",
+    )
+    heights = torch.from_numpy(thickness * np.maximum(0.0, 1.0 + one(0.0, 0.01, 0.3, 2.0) * rng.standard_normal(control)))
+    before = -half * 10.0 ** rng.uniform(-2.0, 4.0)
+    position = (float(rng.normal() * half), float(rng.normal() * half), before)
+    wide = (half * rng.uniform(0.0, 2.0), half * rng.uniform(0.0, 2.0))
+    cone = one(None, None, 90.0, 5.0)
+    shine = {"cone": cone, "intensity": one("uniform", "lambertian"), "aimed": bool(rng.random() < 0.7)}
+    source = one(
+        PlaneWave(float(rng.uniform(1e-6, 1e6))),
+        Points((position,), None, **shine),
+        Points((position, (0.0, 0.0, 2.0 * before)), (0.3, 5.0), **shine),
+        Points.grid(position, wide, (3, 4), 2.0, **shine),
+        Disc(position, wide, 3.0, **shine),
+        Disc(angle=float(one(0.0, 0.533, 20.0, 170.0))),
+    )
+    light = Light(
+        polarisation=one(None, None, 30.0),
+        wavelengths=one((), (450.0, 600.0)),
+        weights=(),
+        tracked=bool(rng.random() < 0.2),
+    )
+    away = (2.0 * thickness + 10.0 ** rng.uniform(-1.0, 4.0)) * (-1.0 if mirror else 1.0)
+    screen = Screen(
+        (10.0 ** rng.uniform(-2.0, 3.0),) * 2,
+        away,
+        (int(rng.integers(2, 40)), int(rng.integers(2, 40))),
+        one((0.0, 0.0), (20.0, -70.0)),
+        one((0.0, 0.0), (half, 3.0 * half)),
+    )
+    return Scene(source, lens, screen, light), HeightField.of(lens), heights
+
+
+def account_of(seed: int) -> dict[str, float] | None:
+    """Where the light of a random scene goes, None of a scene that is refused."""
+    rng = np.random.default_rng(seed)
+    try:
+        scene, field, heights = random_scene(rng)
+        refuse_without_glass(scene, field, heights)
+        wanted = None if rng.random() < 0.7 else {e.name for e in EFFECTS if rng.random() < 0.5}
+        plan = compile_plan(scene, field, heights, wanted)
+        _, figures = retrace(plan.scene, field, heights, None, rays=1000, seed=seed, requests=plan.requests, noise=False)
+    except InputError:
+        return None
+    return {"on_screen": figures["on_screen"], **figures["lost"]}
+
+
+def test_accounts_of_random_scenes():
+    """Every part in [0, 1], all together 1 to 1e-12.  `python tests/test_energy.py 1000` goes through so many."""
+    check_accounts(range(60))
+
+
+def check_accounts(seeds: range) -> int:
+    counted = 0
+    for seed in seeds:
+        account = account_of(seed)
+        if account is None:
+            continue
+        counted += 1
+        assert abs(math.fsum(account.values()) - 1.0) <= 1e-12, (seed, account)
+        assert all(-1e-12 <= part <= 1.0 + 1e-12 for part in account.values()), (seed, account)
+    assert counted > 0.7 * len(seeds)
+    return counted
+
+
+if __name__ == "__main__":
+    print(f"{check_accounts(range(int(sys.argv[1])))} accounts of {sys.argv[1]} scenes close")

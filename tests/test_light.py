@@ -16,7 +16,7 @@ from caustic_cli import cli
 from caustic_cli.errors import InputError
 from caustic_cli.inverse import initial_surface
 from caustic_cli.inverse.incidence import incident
-from caustic_cli.inverse.initial_surface import First, first_surface
+from caustic_cli.inverse.initial_surface import InitialSurface, first_surface
 from caustic_cli.inverse.losses import Loss
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.reach import refuse_unreachable
@@ -47,13 +47,13 @@ def beside(at) -> Scene:
     return Scene(Points((at,)), lens, Screen((38.0, 38.0), 300.0, (48, 48)))
 
 
-def traced(scene: Scene, first: First, target: np.ndarray):
+def traced(scene: Scene, first: InitialSurface, target: np.ndarray):
     """Its image's error, and the part of the light on the lens that it holds."""
     image = expose(scene, HeightField.of(scene.lens), first.heights, rays_of(scene, "stratified", 100_000, 3))
     return relative_rms(image.image.numpy(), target), float(image.image.sum()) / (1.0 - image.lost["missed_lens"]), image
 
 
-def foreseen(scene: Scene, first: First, target: np.ndarray) -> float:
+def foreseen(scene: Scene, first: InitialSurface, target: np.ndarray) -> float:
     """The part of the light on the lens that comes to the screen, as first surfaces are compared by."""
     grid = initial_surface._Grid.of(scene, target, 96)
     x, y = (torch.from_numpy(c.ravel().copy()) for c in np.meshgrid(grid.x, grid.y, indexing="ij"))

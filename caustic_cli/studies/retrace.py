@@ -100,15 +100,17 @@ def converge(
         if each * BATCHES > available:
             raise CausticError(f"⟨tolerance⟩ {tolerance:g} asks for more rays than the file holds, {available:,}")
         parts = [
-            expose(
-                light,
-                field,
-                heights,
-                _rays(light, each, stream(seed, f"batch {k}"), device),
-                None,
-                dtype,
-                screen,
-                requests=requests,
+            within_source(
+                expose(
+                    light,
+                    field,
+                    heights,
+                    _rays(light, each, stream(seed, f"batch {k}"), device),
+                    None,
+                    dtype,
+                    screen,
+                    requests=requests,
+                )
             )
             for k, light in enumerate(lights)
         ]
@@ -129,6 +131,17 @@ def converge(
                 f"⟨tolerance⟩ {tolerance:g} asks for more than {MOST_RAYS:.0e} rays: {traced:,} left an estimated"
                 f" error of {error:.2g}; fewer pixels or a larger tolerance need fewer"
             )
+
+
+def within_source(image: Image) -> Image:
+    """An image of no more light than the source has: few rays aimed at the lens may estimate a little more than all of it, and then
+    what they carry is scaled to all of it."""
+    missed = image.lost.get("missed_lens", 0.0)
+    if missed >= 0.0:
+        return image
+    scale = 1.0 / (1.0 - missed)
+    lost = {name: 0.0 if name == "missed_lens" else scale * part for name, part in image.lost.items()}
+    return Image(scale * image.image, scale * image.leaving, lost, image.rays)
 
 
 def mean_of(parts: list[Image]) -> Image:
@@ -173,7 +186,7 @@ def retrace(
 
     def trace(name: str, count: int, light: Scene = scene) -> Image:
         sampler = _rays(light, max(1, count), stream(seed, name), device)
-        return expose(light, field, heights, sampler, None, dtype, screen, requests=requests)
+        return within_source(expose(light, field, heights, sampler, None, dtype, screen, requests=requests))
 
     even = scene.source.collimated
     if tolerance is not None:

@@ -56,20 +56,19 @@ class Near(Emission):
         which = torch.arange(start, start + len(u), device=self.device) // per
         part = powers[which] / per  # emitted by each ray
         x0, y0, z0 = positions[which].unbind(1)
-        h, (ex, ey) = pupil.z - z0, source.extent
+        if aside:  # each point of the source has a cone of its own
+            across, along = self._aside(*aside)
+            x0, y0 = x0 + across, y0 + along
+        h = pupil.z - z0
         radius = h * math.tan(cone) if cone < math.pi / 2 else torch.full_like(h, math.inf)
         lows = [x0 - radius, y0 - radius]
         highs = [x0 + radius, y0 + radius]
         # From the source's foot to the edge of the lens.
         room = rx - torch.hypot(x0, y0) if pupil.round else torch.minimum(rx - x0.abs(), ry - y0.abs())
-        if aside:
-            lows, highs = [lows[0] - ex, lows[1] - ey], [highs[0] + ex, highs[1] + ey]
-            across, along = self._aside(*aside)
-            x0, y0 = x0 + across, y0 + along
         within = (lows[0] >= -rx) & (highs[0] <= rx) & (lows[1] >= -ry) & (highs[1] <= ry)
         if pupil.round:
             within &= torch.maximum(-lows[0], highs[0]) ** 2 + torch.maximum(-lows[1], highs[1]) ** 2 <= rx * rx
-        from_cone = within | (room >= max(ex, ey) + NEAR * h) if source.aimed else torch.ones_like(within)
+        from_cone = within | (room >= NEAR * h) if source.aimed else torch.ones_like(within)
 
         w = _drops(source.intensity, cone, u)
         sine, cosine = torch.sqrt(w * (2.0 - w)), 1.0 - w
