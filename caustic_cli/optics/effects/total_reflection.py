@@ -49,6 +49,7 @@ class Grazing(Action):
         fresnel = 0.0 if m.element.fresnel == "none" else 1.0  # at grazing incidence all is reflected
         back = torch.where(m.passes, torch.zeros_like(m.arriving), m.arriving)
         m.state.power = m.state.power + (1.0 - fresnel) * back
+        m.departing = m.departing + (1.0 - fresnel) * back  # of which no ghost is made
         m.state.lose("total_internal_reflection", -back.detach())
         m.state.lose("fresnel", fresnel * back.detach())
         m.passes = torch.ones_like(m.passes)
