@@ -44,6 +44,11 @@ class InputError(CausticError, ValueError):
     """Bad usage or bad input: the user can put it right (exit status 2)."""
 
 
+def no_project(path: object) -> InputError:
+    """What to raise where a project was to be."""
+    return InputError(f"{path}: is not a caustic project; a directory with a project.toml is needed (caustic design makes one)")
+
+
 class Interrupted(CausticError):
     """A signal asked the program to stop; the last state is on disk.
 

@@ -91,6 +91,8 @@ def run(
     precision = options.dtype_of(dtype) if dtype else None
     if output.exists() and not output.is_dir():
         raise InputError(f"{output}: is a file; a directory for CSV, JSON and PNG is needed")
+    if project is not None:
+        options.require_project(project)
     device = options.start_torch(device, threads, say)
 
     from caustic_cli.studies import diffraction, effects, intersection, light, report, training  # noqa: PLC0415

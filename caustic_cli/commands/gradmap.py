@@ -59,6 +59,7 @@ def run(
     count = options.rays("--rays", rays)
     size = options.both(options.counts("--filter-size", filter_size))
     points = [options.indices("--control", text) for text in control or []]
+    options.require_project(project)
     device = options.start_torch(device, threads, say)
 
     from caustic_cli.config.completion import filter_from  # noqa: PLC0415

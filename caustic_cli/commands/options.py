@@ -14,7 +14,7 @@ from caustic_cli.commands import console
 from caustic_cli.commands.console import Reporter
 from caustic_cli.config import checks, table
 from caustic_cli.config.table import Setting
-from caustic_cli.errors import InputError
+from caustic_cli.errors import InputError, no_project
 
 Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", envvar="CAUSTIC_QUIET", help="Say nothing on stderr but errors.")]
@@ -246,6 +246,16 @@ def rays(option: str, text: str) -> int:
     if value != int(value) or not 1 <= value <= 1e12:
         raise InputError(f"{option} must be a whole number 1 to 1e12 (2e6 is fine), got {text!r}")
     return int(value)
+
+
+def require_project(path: Path, archives: bool = False) -> None:
+    """Refuse what is no project, nor an archive where one will do, before anything is loaded or compiled for it.
+
+    Raises:
+        InputError: as of opening it.
+    """
+    if not (path / "project.toml").is_file() and not (archives and path.suffix.lower() == ".npz" and path.is_file()):
+        raise no_project(path)
 
 
 def start_torch(device: str, threads: int | None, say: Reporter):

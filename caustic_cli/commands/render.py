@@ -107,6 +107,7 @@ def run(
         given.setdefault("source.type", "disc")
     if screen_at is not None:
         console.speak(console.spoken() | {"screen.z": "--screen-at"})
+    options.require_project(project, archives=True)
     device = options.start_torch(device, threads, say)
 
     from caustic_cli.workflow.render import Request, render  # noqa: PLC0415
@@ -131,10 +132,7 @@ def run(
         seed,
         options.dtype_of(dtype or "float64"),
     )
-    try:
-        figures = render(asked, device, say)
-    except InputError as error:
-        raise InputError(f"{error}".replace("⟨screen.z⟩", "--screen-at") if screen_at is not None else f"{error}") from error
+    figures = render(asked, device, say)
     if not figures.pop("reused", False):
         _show(str(project), figures, say)
     if json:

@@ -17,7 +17,7 @@ import numpy as np
 from caustic_cli.config import settings
 from caustic_cli.config.completion import build_options, build_stages, complete
 from caustic_cli.config.settings import Settings
-from caustic_cli.errors import InputError, plain
+from caustic_cli.errors import InputError, no_project, plain
 from caustic_cli.inverse.target import target_on_screen
 from caustic_cli.io.files import write_bytes
 from caustic_cli.io.picture import Picture, read_picture
@@ -70,7 +70,7 @@ class Project:
         """
         path = Path(path)
         if not path.is_dir() or not is_project(path):
-            raise InputError(f"{path}: is not a caustic project; a directory with a {TOML} is needed (caustic design makes one)")
+            raise no_project(path)
         given = settings.read(path / TOML)
         try:
             goal = given.get("target", {})
