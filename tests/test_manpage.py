@@ -66,6 +66,7 @@ def test_sections_in_the_usual_order():
         "DESCRIPTION",
         "COMMANDS",
         "FILES",
+        "JSON",
         "ORIENTATION",
         "THE SAME AGAIN",
         "COMPLETION",

@@ -206,10 +206,15 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
         if "least_relative_rms" in figures
         else []
     )
+    start = []
+    if figures.get("start_relative_rms") is not None:
+        known = f", noise {figures['start_noise']:.2g}" if "start_noise" in figures else ""
+        start = [("of its start, by rays", f"{figures['start_relative_rms']:.4f}{known}")]
     if "etendue_limit" in figures:
         least.append(("etendue limit", number("etendue_limit", ".2%") + " of the light on the lens"))
     return [
         ("relative RMS error", number("relative_rms", ".4f") + of_rays),
+        *start,
         *least,
         ("loss (eq. 5.2.1)", number("loss", ".4e")),
         ("PSNR", number("psnr_db", ".2f") + " dB"),

@@ -59,6 +59,32 @@ The caustic as light makes it, where diffraction is simulated.
 .TP
 .I NAME.caustic/report.png
 Target, caustic, lens height, loss against time.
+.SH JSON
+With
+.BR \-\-json ,
+design and render print one object with these keys, among others.  A figure that is undefined is null.
+.TP
+.B loss, relative_rms, psnr_db, ssim
+Image against target, counted in pixels: eq. 5.2.1 of the thesis; that times the pixels, the RMS error over the mean; peak
+signal\-to\-noise ratio; structural similarity.
+.TP
+.B noise, error_estimate
+Standard error of relative_rms, and relative RMS noise of the image, that the retrace's own rays leave.
+.TP
+.B on_screen, on_target, lost
+Parts of the source's power on the screen, where the target is bright, and lost, by cause; on_screen and all of lost sum to 1.
+.TP
+.B wave_relative_rms, wave_on_target, resolvable
+The same of the wave image, where diffraction is simulated; details that light carries across the picture.
+.TP
+.B least_relative_rms, etendue_limit
+Behind an extended source's blur: the error of the best light found, and the most light that \['e]tendue lets through.
+.TP
+.B start_relative_rms, start_noise
+Of the surface that a design began from, by the same rays.
+.TP
+.B rays, iterations, seconds, image, project
+Rays traced, iterations done, wall time, files.
 .SH ORIENTATION
 Arrays are indexed [i, j], i along +x and j along +y.  Image files are the screen seen from +z: column 0 is the \-x edge,
 row 0 the +y edge.  Seen from the lens' side the picture is mirrored;

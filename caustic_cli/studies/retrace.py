@@ -215,9 +215,8 @@ def retrace(
     figures |= irradiance_figures(scene, counted.image, screen) | unit_figures(scene)
     if filter is None or filter.reach == (0, 0):
         return counted, figures
-    return expose(
-        scene, field, heights, sampler_for(scene, counted.rays, seed, device), filter, dtype, screen, requests=requests
-    ), figures
+    sampler = sampler_for(scene, counted.rays, seed, device)
+    return within_source(expose(scene, field, heights, sampler, filter, dtype, screen, requests=requests)), figures
 
 
 def require_account(figures: dict, dtype: torch.dtype) -> None:

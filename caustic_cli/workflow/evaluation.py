@@ -115,8 +115,11 @@ def evaluate(designer: Designer, target: np.ndarray, state: State, device: str, 
             exposure, judged = trace(start)
             figures, light = began | judged, of_start
         elif _likeness(figures) > _likeness(began) and began["on_screen"] > 0:
-            brighter = figures["on_screen"] / began["on_screen"] - 1.0
-            state = replace(state, reason=f"{state.reason}; its start was more like the picture, but {brighter:.1%} darker")
+            light_of = "wave_on_screen" if figures.get("wave_relative_rms") is not None else "on_screen"
+            brighter = figures[light_of] / began[light_of] - 1.0
+            state = replace(
+                state, reason=f"{state.reason}; its start was more like the picture; this lens is {brighter:.1%} brighter"
+            )
         figures = figures | {"start_relative_rms": began["relative_rms"]}
         if began["noise"] is not None:
             figures |= {"start_noise": began["noise"]}
