@@ -170,7 +170,6 @@ def test_a_brighter_lens_is_kept_though_its_start_was_more_like_the_picture():
     figures = [{"relative_rms": e, "on_screen": s, "noise": None} for e, s in ((0.5, 0.9), (0.4, 0.8), (0.4, 0.895))]
     brighter, start, alike = figures
     assert not evaluation._worse(brighter, start) and evaluation._worse(brighter, alike)
-    assert evaluation._likeness(brighter) > evaluation._likeness(start)
 
 
 # accounts

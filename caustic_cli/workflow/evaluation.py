@@ -5,7 +5,6 @@ What the optimiser saw is no judge of what it did: it learns its own rays and it
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -102,8 +101,8 @@ def evaluate(designer: Designer, target: np.ndarray, state: State, device: str, 
     if refined:
         light, more = as_waves(state.heights)
         figures |= more
-    likeness = {name for _, name in parse(designer.options.loss)} <= LIKENESS
-    if state.start is not None and likeness:
+    by_likeness = {name for _, name in parse(designer.options.loss)} <= LIKENESS
+    if state.start is not None and by_likeness:
         start = designer.within_limits(replace(state, heights=designer.begun(state)))
         _, began = trace(start, noise=not scene.source.collimated)  # of other light, what the retrace has anyway
         of_start = None
@@ -114,12 +113,12 @@ def evaluate(designer: Designer, target: np.ndarray, state: State, device: str, 
             state = replace(designer.showing(state, start), reason=f"{state.reason}; its start was better and is kept")
             exposure, judged = trace(start)
             figures, light = began | judged, of_start
-        elif _likeness(figures) > _likeness(began) and began["on_screen"] > 0:
-            light_of = "wave_on_screen" if figures.get("wave_relative_rms") is not None else "on_screen"
-            brighter = figures[light_of] / began[light_of] - 1.0
-            state = replace(
-                state, reason=f"{state.reason}; its start was more like the picture; this lens is {brighter:.1%} brighter"
-            )
+        elif began["on_screen"] > 0:
+            likeness, light_of = _keys(figures, began)
+            if figures[likeness] > began[likeness]:
+                brighter = figures[light_of] / began[light_of] - 1.0
+                why = f"its start was more like the picture; this lens is {brighter:.1%} brighter"
+                state = replace(state, reason=f"{state.reason}; {why}")
         figures = figures | {"start_relative_rms": began["relative_rms"]}
         if began["noise"] is not None:
             figures |= {"start_noise": began["noise"]}
@@ -135,19 +134,17 @@ def evaluate(designer: Designer, target: np.ndarray, state: State, device: str, 
     return Evaluation(state, figures, exposure.image.cpu().numpy(), None if light is None else light.image.cpu().numpy())
 
 
-def _likeness(figures: dict) -> float:
-    """The relative RMS error that a lens is judged by: of the wave image where that was refined; infinite of a black image."""
-    value = figures.get("wave_relative_rms")
-    value = figures["relative_rms"] if value is None else value
-    return math.inf if value is None else value
+def _keys(figures: dict, than: dict) -> tuple[str, str]:
+    """By which figures two lenses are compared, error and light: those of the wave image where both have one."""
+    as_waves = None not in (f.get("wave_relative_rms") for f in (figures, than))
+    return ("wave_relative_rms", "wave_on_screen") if as_waves else ("relative_rms", "on_screen")
 
 
 def _worse(figures: dict, than: dict) -> bool:
     """Whether a picture is less like its target without being brighter; a black one is worse than any other."""
     if than["on_screen"] == 0:
         return False
-    as_waves = None not in (f.get("wave_relative_rms") for f in (figures, than))
-    likeness, light = ("wave_relative_rms", "wave_on_screen") if as_waves else ("relative_rms", "on_screen")
+    likeness, light = _keys(figures, than)
     return figures["on_screen"] == 0 or (figures[likeness] > than[likeness] and figures[light] < BRIGHTER * than[light])
 
 
