@@ -7,31 +7,26 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, cast
 
-import numpy as np
 import torch
-from torch import Tensor
 
 from caustic_cli.config.completion import filter_from
 from caustic_cli.errors import InputError
 from caustic_cli.export.mitsuba import quick_samples, write_mitsuba
-from caustic_cli.io.archive import open_archive
 from caustic_cli.io.files import discard, refuse_foreign
 from caustic_cli.io.picture import write_image, write_npy
 from caustic_cli.optics.emission.measured import coarse_words
-from caustic_cli.optics.plan import Plan, compile_plan, parse_effects
-from caustic_cli.optics.resolution import Resolution
-from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.plan import Plan, parse_effects
 from caustic_cli.project.project import RENDER, WAVE, Project, beside
 from caustic_cli.project.uptodate import Outputs
 from caustic_cli.scene import Scene
 from caustic_cli.studies import effects as effects_study
 from caustic_cli.studies import manufacture
-from caustic_cli.studies.retrace import retrace, white_level
+from caustic_cli.studies.retrace import white_level
 from caustic_cli.studies.verify import require_mitsuba, verify, write_panels
-from caustic_cli.studies.waves import wave_figures
 from caustic_cli.workflow.compilation import compile_for
+from caustic_cli.workflow.lens import Lens, is_archive
 from caustic_cli.workflow.reporter import Reporter
 
 
@@ -92,26 +87,6 @@ class Request:
         return {name: getattr(self, name) for name in names} | dict(self.given)
 
 
-@dataclass(frozen=True)
-class Opened:
-    """A lens to render, with the project it is of (None of an archive), its target (n_x, n_y) and where that has got to."""
-
-    project: Project | None
-    scene: Scene
-    field: HeightField
-    heights: Tensor
-    target: np.ndarray | None = None
-    iterations: int | None = None
-    encoding: str = "srgb"
-    seed: int = 0
-
-    def resolution(self, scene: Scene) -> Resolution:
-        """What diffraction lets the scene show."""
-        if self.project is None:
-            return Resolution.at(scene, self.field, self.heights)
-        return Resolution.before(scene, tuple(self.project.settings["target"]["size"]))
-
-
 def render(asked: Request, device: str, say: Reporter) -> dict:
     """Trace a lens and write its irradiance image.
 
@@ -123,10 +98,10 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
         InputError: no lens there, a value out of range, or a file in the way; nothing was written.
     """
     began = time.monotonic()
-    wanted = parse_effects(asked.effects)
-    archive = open_archive(asked.lens) if asked.lens.suffix.lower() == ".npz" and asked.lens.is_file() else None
-    project = None if archive else Project.open(asked.lens)
-    if project is None and asked.given:
+    parse_effects(asked.effects)
+    archived = Lens.of_archive(asked.lens) if is_archive(asked.lens) else None
+    project = None if archived else Project.open(asked.lens)
+    if archived and asked.given:
         raise InputError(f"⟨{next(iter(asked.given))}⟩: an archive's source is fixed; render its project under another light")
     image_path = asked.image or (asked.lens / RENDER if project else Path(asked.lens.stem + ".png"))
 
@@ -146,30 +121,29 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
             f"{image_path}: is what the same options made of the same project, so there is nothing to do; ⟨force⟩ does it again"
         )
         return figures | {"reused": True}
-    lens = Opened(None, *archive) if project is None else _opened(project, asked)
-    scene = lens.scene if asked.screen_at is None else replace(lens.scene, screen=replace(lens.scene.screen, z=asked.screen_at))
+    lens = archived or Lens.of(cast(Project, project), asked.given)
+    if asked.screen_at is not None:
+        lens = replace(lens, scene=replace(lens.scene, screen=replace(lens.scene.screen, z=asked.screen_at)))
+    scene = lens.scene
     if asked.verify:
         require_mitsuba(scene)
     filter = filter_from(asked.reconstruction, asked.filter_size, scene.screen, asked.alpha)
     seed = lens.seed if asked.seed is None else asked.seed
-    plan = compile_plan(scene, lens.field, lens.heights, wanted)
+    plan = lens.plan(asked.effects)
     if coarse := coarse_words(scene):
         say.say(coarse)
-    compile_for(None if asked.explain else plan.scene, device, say, plan.requests)
-    exposure, figures = retrace(
-        plan.scene,
-        lens.field,
-        lens.heights,
-        lens.target,
-        rays=asked.rays,
-        filter=filter,
-        device=device,
+    if asked.explain:
+        compile_for(None, device, say)
+    image, figures = lens.render(
+        asked.rays,
         seed=seed,
-        dtype=asked.dtype,
         tolerance=asked.tolerance,
-        requests=plan.requests,
+        filter=filter,
+        effects=plan,
+        dtype=asked.dtype,
+        device=device,
+        say=say,
     )
-    image = exposure.image.cpu().numpy()
     write_image(image_path, image, white_level(image, lens.target), lens.encoding)
     if wave_path == asked.lens / WAVE:
         discard(wave_path)  # of what render.png was before
@@ -177,8 +151,12 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
         write_npy(asked.npy, image)
     if plan["diffraction"].on:
         with say.notify_if_slow("taking the wave image"):
-            figures |= _wave_image(plan, lens, device, wanted is not None, wave_path, wave_npy)
-    figures |= {"iterations": lens.iterations, "seconds": time.monotonic() - began, "image": str(image_path)}
+            figures |= _wave_image(plan, lens, device, asked.effects != "auto", wave_path, wave_npy)
+    figures |= {
+        "iterations": None if lens.state is None else lens.state.total,
+        "seconds": time.monotonic() - began,
+        "image": str(image_path),
+    }
     if asked.explain:
         figures["effects"] = effects_study.explain(
             plan, scene, lens.field, lens.heights.to(device), rays=min(asked.rays, effects_study.RAYS), seed=seed, dtype=asked.dtype
@@ -194,36 +172,18 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     return figures
 
 
-def _opened(project: Project, asked: Request) -> Opened:
-    scene = project.scene(dict(asked.given))
-    target, (surface, checkpoint) = project.target(scene), project.lens(scene)
-    return Opened(
-        project,
-        scene,
-        surface,
-        checkpoint.state.heights,
-        target,
-        checkpoint.state.total,
-        project.settings["target"]["encoding"],
-        project.settings["design"]["seed"],
-    )
-
-
-def _wave_image(plan: Plan, lens: Opened, device: str, required: bool, path: Path, npy: Path | None) -> dict:
+def _wave_image(plan: Plan, lens: Lens, device: str, required: bool, path: Path, npy: Path | None) -> dict:
     """Write the wave image; its figures."""
-    light, figures = wave_figures(
-        plan.scene, lens.field, lens.heights.to(device), lens.target, lens.resolution(plan.scene), finer=1.0, required=required
-    )
-    if light is None:
+    image, figures = lens.render_waves(effects=plan, required=required, device=device)
+    if not image.size:
         return figures
-    image = light.image.cpu().numpy()
     write_image(path, image, white_level(image, lens.target), lens.encoding)
     if npy is not None:
         write_npy(npy, image)
     return figures | {"wave_image": str(path)}
 
 
-def _verified(scene: Scene, lens: Opened, rays: int, seed: int, panels: Path) -> dict:
+def _verified(scene: Scene, lens: Lens, rays: int, seed: int, panels: Path) -> dict:
     """The figures of the comparison with Mitsuba; its picture is written to `panels`."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "lens.xml"

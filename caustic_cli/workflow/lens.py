@@ -1,0 +1,214 @@
+"""A lens in its scene, opened or just designed: its surface, its image, its files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from caustic_cli.errors import InputError
+from caustic_cli.export import BY_SUFFIX
+from caustic_cli.inverse.designer import State
+from caustic_cli.io.archive import open_archive
+from caustic_cli.optics.plan import Plan, compile_plan, parse_effects
+from caustic_cli.optics.reconstruction import Filter
+from caustic_cli.optics.resolution import Resolution
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.project import directory, uptodate
+from caustic_cli.project.checkpoint import Checkpoint
+from caustic_cli.project.project import Project
+from caustic_cli.scene import Scene
+from caustic_cli.studies.retrace import retrace
+from caustic_cli.studies.waves import wave_figures
+from caustic_cli.workflow import design as workflow
+from caustic_cli.workflow.compilation import compile_for
+from caustic_cli.workflow.export import write
+from caustic_cli.workflow.reporter import Listener, Reporter
+
+
+class Render(NamedTuple):
+    """image: power per pixel as a part of the source's, (n_x, n_y) or (3, n_x, n_y), float64; figures: as of `render json`."""
+
+    image: np.ndarray
+    figures: dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """A lens in its scene.
+
+    Attributes:
+        scene: source, lens, screen.
+        field: spline spaces of the exit surface over the aperture.
+        heights: its control heights (n, m), mm, float64.
+        target: (n_x, n_y) or (3, n_x, n_y) on the screen's pixels, None of an archive.
+        figures: of the design's own evaluation, by rays it was not designed with; empty of what was loaded unfinished.
+        project: settings and picture, None of an archive.
+        state: where its design stands.
+    """
+
+    scene: Scene
+    field: HeightField
+    heights: Tensor
+    target: np.ndarray | None
+    figures: dict[str, Any]
+    project: Project | None = None
+    state: State | None = None
+
+    def surface(self, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Height z, mm, and slopes dz/dx, dz/dy of the exit surface at points of the aperture, float64, of their common shape."""
+        x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
+        rx, ry = self.scene.lens.half_size
+        if not (np.isfinite(x).all() and np.isfinite(y).all() and (np.abs(x) <= rx).all() and (np.abs(y) <= ry).all()):
+            raise InputError(f"points must lie on the aperture, x within +-{rx:g} mm and y within +-{ry:g} mm")
+        u, v = (torch.from_numpy(c.ravel().copy()) for c in (x, y))
+        z, zx, zy = (c.numpy().reshape(x.shape) for c in self.field.at(self.heights, u, v))
+        return z, zx, zy
+
+    @classmethod
+    def of(cls, project: Project, given: Mapping[str, Any] | None = None) -> Lens:
+        """The lens of a project's last checkpoint; given: path in `config.table` -> value, which replace the project's settings."""
+        scene = project.scene(dict(given or {}))
+        target, (field, checkpoint) = project.target(scene), project.lens(scene)
+        return cls(scene, field, checkpoint.state.heights, target, dict(checkpoint.results), project, checkpoint.state)
+
+    @classmethod
+    def of_archive(cls, path: str | Path) -> Lens:
+        """The lens of an `.npz` as exported."""
+        return cls(*open_archive(path), None, {})
+
+    @property
+    def seed(self) -> int:
+        """Of its design's rays."""
+        return 0 if self.project is None else self.project.settings["design"]["seed"]
+
+    @property
+    def encoding(self) -> str:
+        """Of its picture's values, and of pictures of its images."""
+        return "srgb" if self.project is None else self.project.settings["target"]["encoding"]
+
+    def plan(self, effects: str = "auto") -> Plan:
+        """The effects to simulate: what the scene calls for, "none" that can be left out, or just those named."""
+        return compile_plan(self.scene, self.field, self.heights, parse_effects(effects))
+
+    def render(
+        self,
+        rays: float = 1_000_000,
+        *,
+        seed: int | None = None,
+        tolerance: float | None = None,
+        filter: Filter | None = None,
+        effects: str | Plan = "auto",
+        dtype: torch.dtype = torch.float64,
+        device: str = "cpu",
+        say: Reporter | None = None,
+    ) -> Render:
+        """Retrace the lens with rays of its own, under the effects that the scene calls for.
+
+        Args:
+            rays: how many; with `tolerance`, where the number begins.
+            seed: of the rays, the design's own unless given.
+            tolerance: relative RMS noise of the image that rays are added for.
+            filter: reconstruction filter; None counts rays in pixels.
+            effects: as of `plan`, or a plan.
+            dtype: of the ray arithmetic.
+        """
+        plan = effects if isinstance(effects, Plan) else self.plan(effects)
+        compile_for(plan.scene, device, say or Listener(), plan.requests)
+        exposure, figures = retrace(
+            plan.scene,
+            self.field,
+            self.heights,
+            self.target,
+            rays=count(rays),
+            seed=self.seed if seed is None else seed,
+            filter=filter,
+            tolerance=tolerance,
+            device=device,
+            dtype=dtype,
+            requests=plan.requests,
+        )
+        return Render(exposure.image.cpu().numpy(), figures)
+
+    def render_waves(self, *, effects: str | Plan = "auto", required: bool = True, device: str = "cpu") -> Render:
+        """The wave image at the scene's wavelengths; its figures alone where it is not `required` and out of reach (image empty).
+
+        Raises:
+            InputError: it is out of reach.
+        """
+        plan = effects if isinstance(effects, Plan) else self.plan(effects)
+        light, figures = wave_figures(
+            plan.scene, self.field, self.heights.to(device), self.target, self._resolution(plan.scene), finer=1.0, required=required
+        )
+        return Render(np.empty((0, 0)) if light is None else light.image.cpu().numpy(), figures)
+
+    def _resolution(self, scene: Scene) -> Resolution:
+        """What diffraction lets the scene show."""
+        if self.project is None:
+            return Resolution.at(scene, self.field, self.heights)
+        return Resolution.before(scene, tuple(self.project.settings["target"]["size"]))
+
+    def export(
+        self,
+        path: str | Path,
+        format: str | None = None,
+        *,
+        samples: tuple[int, int] | None = None,
+        tolerance: float | None = None,
+        script: bool = False,
+    ) -> Path:
+        """Write the lens for another program; the format follows from the suffix (.step, .stl, .npz, ...) unless it is named.
+
+        Args:
+            samples: points along x and y of sampled formats; tolerance: of meshes instead, mm.
+            script: of lighttools: also a script that rebuilds the scene.
+        """
+        path = Path(path)
+        name = format or BY_SUFFIX.get(path.suffix.lower())
+        if name is None or name not in BY_SUFFIX.values():
+            raise InputError(f"format must be one of {', '.join(BY_SUFFIX.values())}, got {format or path.suffix!r}")
+        given = {key: value for key, value in (("samples", samples), ("tolerance", tolerance)) if value is not None}
+        write(path, self.scene, self.field, self.heights, name, script, **given)
+        return path
+
+    def save(self, path: str | Path, force: bool = False) -> Path:
+        """Write the lens as a project directory, which `load` and the command line open; force: replace a project there."""
+        if self.project is None or self.state is None:
+            raise InputError("an archive's lens has no picture and no design, so it cannot be saved as a project")
+        place = Path(path)
+        project = replace(self.project, path=place)
+        directory.check(place, force)
+        directory.settle(project, force)
+        with project.hold:
+            project.save(
+                Checkpoint(
+                    self.state, self.field.spaces, workflow.provenance(project, "cpu"), self.figures, uptodate.inputs(project)
+                )
+            )
+        return place
+
+
+def load(path: str | Path) -> Lens:
+    """The lens of a project directory, or of an .npz archive as exported.
+
+    Raises:
+        InputError: there is none, or it is damaged.
+    """
+    return Lens.of_archive(path) if is_archive(Path(path)) else Lens.of(Project.open(path))
+
+
+def is_archive(path: Path) -> bool:
+    """Whether a path is that of an exported archive rather than of a project."""
+    return path.suffix.lower() == ".npz" and path.is_file()
+
+
+def count(rays: float) -> int:
+    """A number of rays, also given as 1e7."""
+    if not (isinstance(rays, int | float) and rays == int(rays) and 1 <= rays <= 1e12):
+        raise InputError(f"rays must be a whole number 1 to 1e12, got {rays!r}")
+    return int(rays)
