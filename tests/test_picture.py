@@ -15,6 +15,7 @@ from PIL import Image
 
 from caustic_cli.errors import InputError
 from caustic_cli.io import files
+from caustic_cli.io.files import Piped
 from caustic_cli.io.picture import Picture, read_picture, write_image, write_npy
 
 CODE_8 = 0.5 / 255 + 1e-12  # half a step of an 8-bit code
@@ -136,6 +137,43 @@ def test_exif_orientation_is_obeyed(tmp_path, orientation):
     exif[0x0112] = orientation
     got = read_picture(save(tmp_path / "a.png", ramp(), exif=exif)).values
     assert np.array_equal(got, TURNS[orientation](ramp()))
+
+
+def test_inverted_codes(tmp_path):
+    for dtype, top in ((np.uint8, 255), (np.uint16, 65535)):
+        got = read_picture(save(tmp_path / "a.png", ramp(dtype)), invert=True).values
+        assert np.array_equal(got, top - ramp(dtype))
+    np.save(tmp_path / "a.npy", np.array([[0.0, 1.0], [0.5, 4.0]]))
+    assert np.array_equal(read_picture(tmp_path / "a.npy", invert=True).irradiance(), [[4.0, 3.0], [3.5, 0.0]])
+
+
+@pytest.mark.parametrize("color", [False, True])
+@pytest.mark.parametrize("mode", ["LA", "RGBA", "PA"])
+def test_a_black_drawing_on_nothing(tmp_path, mode, color):
+    """Refused, with the way out; inverted, the drawing is bright and the ground dark."""
+    alpha = np.array([[0, 255], [255, 0]], dtype=np.uint8)
+    image = Image.merge("LA", [Image.new("L", (2, 2)), Image.fromarray(alpha)]).convert("RGBA")
+    if mode == "PA":
+        image = image.quantize(2)
+    image.convert(mode if mode != "PA" else image.mode).save(tmp_path / "a.png")
+    with pytest.raises(InputError, match=r"a\.png: is black on nothing, .*; invert takes dark as bright"):
+        read_picture(tmp_path / "a.png", color=color)
+    got = read_picture(tmp_path / "a.png", color=color, invert=True).irradiance()
+    assert got == pytest.approx(np.broadcast_to(placed(alpha / 255.0), got.shape), abs=CODE_16)
+    Image.new("RGBA", (2, 2), (255, 255, 255, 255)).save(tmp_path / "white.png")
+    with pytest.raises(InputError, match="is white all over"):
+        read_picture(tmp_path / "white.png", invert=True)
+
+
+def test_a_picture_that_is_piped_in(tmp_path):
+    save(tmp_path / "a.png", ramp())
+    np.save(tmp_path / "a.npy", np.arange(1.0, 7.0).reshape(2, 3))
+    for name in ("a.png", "a.npy"):
+        piped = Piped((tmp_path / name).read_bytes())
+        assert np.array_equal(read_picture(piped).irradiance(), read_picture(tmp_path / name).irradiance())
+    for data in (b"nonsense", b"\x93NUMPY nonsense"):
+        with pytest.raises(InputError, match=r"^standard input: .*image"):
+            read_picture(Piped(data))
 
 
 def test_npy_is_indexed_i_along_x(tmp_path):

@@ -9,7 +9,7 @@ import pytest
 from caustic_cli.config import checks
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
-from caustic_cli.scene.materials import D_LINE, GLASSES, refractive_index
+from caustic_cli.scene.materials import D_LINE, MATERIALS, material, refractive_index, rows
 
 INF, NAN = math.inf, math.nan
 
@@ -164,11 +164,44 @@ CATALOGUE = {
     "PMMA": (1.4906, None),
     "PC": (1.5848, None),
     "PS": (1.5916, None),
+    "WATER": (1.33344, 55.8),  # 20 degrees C
+    "SODA-LIME": (1.5234, None),
+    "NOA61": (1.5597, None),
 }
 
 
-def test_catalogue_covers_every_glass():
-    assert set(CATALOGUE) == set(GLASSES)
+def test_catalogue_covers_every_material():
+    assert set(CATALOGUE) == {name for name, material in MATERIALS.items() if not material.spread}
+
+
+@pytest.mark.parametrize(
+    ("called", "name"),
+    [
+        ("acrylic", "PMMA"),
+        ("Plexiglass", "PMMA"),
+        ("polycarbonate", "PC"),
+        ("water", "WATER"),
+        ("BK7", "N-BK7"),
+        ("n bk7", "N-BK7"),
+        ("Formlabs clear", "PRINT-RESIN"),
+        ("resin", "PRINT-RESIN"),
+        ("fused_silica", "SILICA"),
+        ("float glass", "SODA-LIME"),
+    ],
+)
+def test_materials_have_the_names_that_people_use(called, name):
+    assert material(called) is MATERIALS[name]
+
+
+def test_a_batch_s_index_and_dispersion_are_those_it_is_described_by():
+    resin = material("resin")
+    assert (resin.index(D_LINE), resin.abbe) == (pytest.approx(1.51, abs=1e-12), pytest.approx(50.0, rel=1e-9))
+    assert resin.spread > 0 and "1.51 +- 0.01" in dict((r[0], r[1]) for r in rows())["PRINT-RESIN"]
+
+
+def test_light_along_the_axis_is_totally_reflected_from_the_steepest_slope_on():
+    n, slope = refractive_index("acrylic"), material("acrylic").steepest
+    assert n * math.sin(math.atan(slope)) == pytest.approx(1.0, rel=1e-12)
 
 
 @pytest.mark.parametrize("glass", CATALOGUE)
@@ -188,10 +221,12 @@ def test_he_ne_is_not_the_d_line():
 
 
 def test_unknown_glass_and_wavelength():
-    with pytest.raises(InputError, match="did you mean N-BK7"):
-        refractive_index("BK7")
-    with pytest.raises(InputError, match="glass must be one of"):
+    with pytest.raises(InputError, match="did you mean PMMA"):
+        refractive_index("acryllic")
+    with pytest.raises(InputError, match=r"must be one of .*, got 'diamond'; of any other material, give its \[lens\] index"):
         refractive_index("diamond")
+    with pytest.raises(InputError, match=r"brass reflects: give \[lens\] mirror"):
+        refractive_index("brass")
     for wavelength in (300.0, 2600.0, NAN):
         with pytest.raises(InputError, match="wavelength for N-BK7 must be 310 to 2500 nm"):
             refractive_index("N-BK7", wavelength)

@@ -26,11 +26,20 @@ def run(
         Path,
         typer.Argument(
             metavar="TARGET",
-            help="The picture: an image file or a 2-D .npy of irradiance; with --resume, the project.",
+            help="The picture: an image file or a 2-D .npy of irradiance, - for standard input; with --resume, the project.",
             show_default=False,
         ),
     ],
     given: dict[str, Any],
+    preset: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Settings for what people make, plate-100 for instance (list: all of them); --config and options win.",
+            callback=options.listing("preset"),
+            is_eager=True,
+        ),
+    ] = None,
     config: Annotated[Path | None, typer.Option(metavar="FILE", help="TOML with any keys of project.toml; options win.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the project TARGET from its last checkpoint.")] = False,
     out: Annotated[
@@ -55,7 +64,7 @@ def run(
         raise InputError(f"--iterations must be a whole number 1 to 1e9, got {iterations}")
     if time_limit is not None and not time_limit > 0:
         raise InputError(f"--time-limit must be greater than 0 s, got {time_limit:g}")
-    if resume and (names := _beside_resume(given, config)):
+    if resume and (names := _beside_resume(given, preset, config)):
         raise InputError(
             f"--resume goes on with a project as it is, so {', '.join(names)} cannot be given;"
             " --iterations and --time-limit can, and project.toml can be edited"
@@ -64,12 +73,19 @@ def run(
         given.setdefault("source.type", "disc")
     if given.get("design.network") in ("sparse", "dense"):
         given.setdefault("design.optimizer", "adam")
-    path = out or Path(f"{target.stem or 'design'}.caustic")
+    piped = not resume and str(target) == "-"
+    path = out or Path(f"{'picture' if piped else target.stem or 'design'}.caustic")
+    picture: Any = target
     if not resume and speaks:
-        from caustic_cli.io.picture import read_picture  # noqa: PLC0415
+        from caustic_cli.config.presets import path_of  # noqa: PLC0415
+        from caustic_cli.io.files import read_stdin  # noqa: PLC0415
+        from caustic_cli.io.picture import ACCEPTED, MAX_BYTES, read_picture  # noqa: PLC0415
 
         # before torch is loaded and kernels are compiled for nothing
-        read_picture(target, "target.encoding" in given, given.get("target.color", False))
+        if preset is not None:
+            path_of(preset)
+        picture = read_stdin(ACCEPTED, MAX_BYTES) if piped else target
+        read_picture(picture, "target.encoding" in given, given.get("target.color", False), given.get("invert", False))
     device = options.start_torch(device, threads, say)
 
     from caustic_cli.inverse import ranks  # noqa: PLC0415
@@ -86,13 +102,14 @@ def run(
                 raise InputError(f"{target}: no such project; --resume needs a directory made by caustic design")
             lens = library.resume(project, iterations=iterations, time_limit=time_limit, say=say, device=device)
         else:
-            lens = library.design_of(target, given, config=config, out=path, force=force, say=say, device=device)
+            lens = library.design_of(picture, given, preset=preset, config=config, out=path, force=force, say=say, device=device)
     say.table(lens.figures["project"], [*console.figures_rows(lens.figures), ("ended by", lens.figures["reason"])])
     if json:
         console.emit_json(lens.figures)
 
 
-def _beside_resume(given: dict[str, Any], config: Path | None) -> list[str]:
+def _beside_resume(given: dict[str, Any], preset: str | None, config: Path | None) -> list[str]:
     """Options that a resumed project does not take."""
     others = [TABLE[path].option for path in given if path not in ("design.iterations", "design.time_limit")]
-    return [*(option.name for option in others if option), *(["--config"] if config is not None else [])]
+    files = [name for name, value in (("--preset", preset), ("--config", config)) if value is not None]
+    return [*(option.name for option in others if option), *files]

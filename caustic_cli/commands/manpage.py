@@ -14,9 +14,11 @@ from pathlib import Path
 from caustic_cli import __version__
 from caustic_cli.commands.options import default_words
 from caustic_cli.commands.parser import parser
+from caustic_cli.config import presets
 from caustic_cli.config.table import TABLE, Setting
 from caustic_cli.errors import plain_name
 from caustic_cli.io.files import write_bytes
+from caustic_cli.scene import materials
 
 HEAD = r""".TH CAUSTIC 1 "" "caustic {version}" "User Commands"
 .SH NAME
@@ -173,6 +175,14 @@ are several sources; several tables
 .B [[design.stages]]
 are the stages of a design, one after another.
 """
+MATERIALS = """.SH MATERIALS
+What [lens] glass may say, whatever the case, blanks and hyphens: refractive index at 587.6 nm, Abbe number, density, and the slope
+of a surface from which on light along the axis is totally reflected.  Where an index has a spread, batches differ: measure yours
+and say it as index.
+"""
+PRESETS = """.SH PRESETS
+What \\fB\\-\\-preset\\fR may say: files with some of these settings.
+"""
 #: How a kind of setting is written.
 KINDS = {
     "number": "number",
@@ -194,7 +204,18 @@ def reference() -> str:
         parts.append(f".SH {_plain(heading)}\n" + "".join(_setting(row) for row in TABLE.values() if row.section == section))
     parts.append(".SH FROM THE COMMAND LINE ALONE\nSettings are derived from these, and no project holds them.\n")
     parts.append("".join(_setting(row) for row in TABLE.values() if not row.section))
+    parts.append(MATERIALS + "".join(f".TP\n\\fB{_plain(name)}\\fR\n{_plain(text)}\n" for name, text in _materials()))
+    parts.append(PRESETS + "".join(f".TP\n\\fB{_plain(name)}\\fR\n{_plain(text)}\n" for name, text in presets.rows()))
     return "".join(parts) + ".SH SEE ALSO\n.BR caustic (1)\n"
+
+
+def _materials() -> list[tuple[str, str]]:
+    """Each material, and what is known of it."""
+    found = []
+    for name, index, abbe, density, slope, also in materials.rows():
+        facts = [f"n_d {index}", f"V_d {abbe}", "" if density == "-" else f"{density} g/cm^3", f"steepest slope {slope}"]
+        found.append((name, f"{', '.join(filter(None, facts))}{f'; also {also}' if also else ''}."))
+    return found
 
 
 def _setting(row: Setting) -> str:

@@ -84,8 +84,32 @@ def _parameter(name: str, row: Setting) -> inspect.Parameter:
     if not flag:
         words += f"  [default: {default_words(row)}]"
     kind = bool if flag else list[str] | None if row.kind == "points" else _scalar(row) | None
-    annotation = Annotated[kind, typer.Option(option.name, metavar=option.metavar, help=words)]
+    more: dict[str, Any] = {"callback": listing("glass"), "is_eager": True} if row.path == "lens.glass" else {}
+    annotation = Annotated[kind, typer.Option(option.name, metavar=option.metavar, help=words, **more)]
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False if flag else None, annotation=annotation)
+
+
+def listing(what: str):
+    """A callback of an option that prints all its values where it is given `list`."""
+
+    def show(value: str | None) -> str | None:
+        if value != "list":
+            return value
+        if what == "glass":
+            from caustic_cli.scene import materials  # noqa: PLC0415
+
+            heading = ("NAME", "n_d", "V_d", "g/cm^3", "steepest slope", "also")
+            table = [heading, *materials.rows()]
+        else:
+            from caustic_cli.config import presets  # noqa: PLC0415
+
+            table = presets.rows()
+        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+        for line in table:
+            console.emit("  ".join(f"{cell:<{width}}" for cell, width in zip(line, widths, strict=True)).rstrip())
+        raise typer.Exit()
+
+    return show
 
 
 def _capital(row: Setting) -> str:

@@ -6,6 +6,7 @@ Screen, picture and offset surface follow from the magnification; the stages fro
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -50,6 +51,7 @@ RAYS_PER_PIXEL = 9.0  # 750 x 750 rays on 250 x 250 pixels, tables D.1 and D.2
 DRAFT_SECONDS, FINE_SECONDS = 8.0, 60.0  # time limits below and from which another quality is the better use of the time
 STEEPEST = 1.25  # least radius of a derived sphere, in half diagonals of the lens: slopes up to 1.3
 WAVE_KEYS = ("control", "blur", "apron", "iterations", "tolerance")  # of a stage on rays that one on the wave image has too
+PLATE, WALL = 20.0, 3.0  # width beyond which a lens is a plate, as thin as its relief and this wall allow, mm
 COLOR_GLASS = "N-BK7"  # of a coloured picture, unless glass or index is said: dispersion has to be known
 
 
@@ -153,6 +155,12 @@ def _complete_source(source: dict[str, Any], lens: dict[str, Any], stages: list[
         source.pop(key)
 
 
+def first_thickness(size: Sequence[float]) -> float:
+    """Thickness that a lens is first solved with, mm, where none was said."""
+    width = max(size)
+    return width / 2.0 if width <= PLATE else WALL + width / 10.0
+
+
 def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[str, Any], source: Source) -> None:
     index, scale = index_of(lens), max(lens["size"]) / 10.0
     check("lens.index", index)
@@ -160,7 +168,7 @@ def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[st
         lens["index"] = index
     else:
         lens.setdefault("wavelength", default("lens.wavelength"))
-    lens.setdefault("thickness", 5.0 * scale)
+    lens.setdefault("thickness", first_thickness(lens["size"]))
     lens.setdefault("height_range", [-scale, scale])
     mirror = value_of(lens, "lens.mirror")
     if mirror and screen["z"] >= lens["thickness"] + lens["height_range"][0]:

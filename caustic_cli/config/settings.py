@@ -66,8 +66,15 @@ DEFAULTS = {
 }
 
 
-def parse(text: str, where: str) -> Settings:
+#: What settings are derived from, such as mag: a configuration may say it, before its first section; a project does not.
+PARAMETERS = in_section("")
+
+
+def parse(text: str, where: str, parameters: bool = False) -> Settings:
     """Settings from TOML text: every key known and of its type; defaults are not filled in.
+
+    Args:
+        parameters: PARAMETERS may be said too; they become the section "".
 
     Raises:
         InputError: naming `where` and the offending key.
@@ -85,6 +92,9 @@ def parse(text: str, where: str) -> Settings:
     raw.pop("created_by", None)
     out: Settings = {}
     for section, table in raw.items():
+        if parameters and section in PARAMETERS:
+            out.setdefault("", {})[section] = _typed(f"{where}: {section}", section, table, PARAMETERS)
+            continue
         if section not in SCHEMA:
             raise InputError(f"{where}: [{section}] is not a section{_near(section, SCHEMA)}")
         if section == "source" and isinstance(table, list) and table and isinstance(table[0], dict):
@@ -315,8 +325,20 @@ def refuse_unused(source: dict[str, Any], given: Iterable[str], stages: Sequence
                 raise InputError(f"⟨source.{key}⟩ {idle[key]}")
 
 
-def read(path: Path) -> Settings:
-    """Settings from a TOML file of at most MAX_BYTES.
+def merged(first: Settings, *others: Settings) -> Settings:
+    """Settings of which each replaces those before it, key by key; an index replaces a glass, and a glass an index."""
+    out = {section: dict(table) for section, table in first.items()}
+    for other in others:
+        if {"index", "glass"} & {*other.get("lens", {})}:
+            for key in ("index", "glass"):
+                out.get("lens", {}).pop(key, None)
+        for section, table in other.items():
+            out[section] = out.get(section, {}) | table
+    return out
+
+
+def read(path: Path, parameters: bool = False) -> Settings:
+    """Settings from a TOML file of at most MAX_BYTES; parameters: as of `parse`.
 
     Raises:
         InputError: there is none, it is too large, no text, or `parse` refuses it.
@@ -326,4 +348,4 @@ def read(path: Path) -> Settings:
         text = data.decode()
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: cannot be read as text ({error}); {ACCEPTED}") from error
-    return parse(text.replace("\r\n", "\n"), str(path))
+    return parse(text.replace("\r\n", "\n"), str(path), parameters)

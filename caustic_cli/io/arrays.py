@@ -25,7 +25,7 @@ from typing import BinaryIO
 import numpy as np
 
 from caustic_cli.errors import InputError
-from caustic_cli.io.files import naming, open_regular
+from caustic_cli.io.files import Piped, naming, open_regular
 
 #: Bytes of a header; NumPy's own readers take 10,000.
 MOST_HEADER = 4096
@@ -137,7 +137,7 @@ def _header(file: BinaryIO, size: int, unread: list[int], accepted: str, exact: 
 
 
 @contextlib.contextmanager
-def open_npy(path: Path, accepted: str) -> Iterator[Stored]:
+def open_npy(path: Path | Piped, accepted: str) -> Iterator[Stored]:
     """The array of a .npy file, its header read; what is refused within the block is said of the file.
 
     Raises:
@@ -145,7 +145,8 @@ def open_npy(path: Path, accepted: str) -> Iterator[Stored]:
     """
     with open_regular(path, accepted, MOST_OF_FILE) as file, naming(path):
         with refusing(accepted):
-            size = os.fstat(file.fileno()).st_size
+            size = file.seek(0, os.SEEK_END)
+            file.seek(0)
             stored = _header(file, size, [MOST_BYTES], accepted, exact=False)
         yield stored
 

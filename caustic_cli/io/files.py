@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import glob
+import io
 import os
 import stat
 import sys
@@ -25,13 +26,14 @@ MARK = SOFTWARE.encode()
 CREATED_BY = f"created by {SOFTWARE}"  # in a comment at the beginning of a text file
 #: How files begin that a project is made of.
 PARTS = ("project.toml", "checkpoints.h5", "target.", "profile.", "source.", "source-", "intensity.", "intensity-", ".outputs.json")
+NPY_MAGIC = b"\x93NUMPY"
 NPY_HEADER = 256  # bytes; NumPy itself pads to 64 or 128
 #: A temporary file nobody has written to for so many seconds was left by a killed process.
 LEFT_BEHIND = 600.0
 
 
 @contextlib.contextmanager
-def naming(path: str | Path) -> Iterator[None]:
+def naming(path: str | Path | Piped) -> Iterator[None]:
     """Put the file's name before what is said of its content within the block."""
     try:
         yield
@@ -39,12 +41,40 @@ def naming(path: str | Path) -> Iterator[None]:
         raise InputError(f"{path}: {error}") from error
 
 
-def open_regular(path: str | Path, accepted: str, most: int) -> BinaryIO:
-    """A regular file of at most `most` bytes, opened for reading; whoever reads it closes it.
+class Piped(bytes):
+    """What came through standard input, in place of a file's path."""
+
+    def __str__(self) -> str:
+        return "standard input"
+
+
+def read_stdin(accepted: str, most: int) -> Piped:
+    """All of standard input.
+
+    Raises:
+        InputError: it is closed, a terminal, empty, or more than `most` bytes; `accepted` says what is needed.
+    """
+    if sys.stdin is None or sys.stdin.closed:
+        raise InputError(f"standard input is closed; {accepted}")
+    if sys.stdin.isatty():
+        raise InputError(f"standard input is a terminal; {accepted}, piped in")
+    data = Piped(sys.stdin.buffer.read(most + 1))
+    if not data:
+        raise InputError(f"{data}: is empty; {accepted}")
+    if len(data) > most:
+        raise InputError(f"{data}: is more than {most:,} bytes, the most that are read; {accepted}")
+    return data
+
+
+def open_regular(path: str | Path | Piped, accepted: str, most: int) -> BinaryIO:
+    """A regular file of at most `most` bytes, opened for reading; whoever reads it closes it.  What was piped in is one in memory.
 
     Raises:
         InputError: there is none, it is something else or larger, or cannot be read; `accepted` says what is needed.
     """
+
+    if isinstance(path, Piped):
+        return io.BytesIO(path)
 
     def opened(name, flags: int) -> int:
         return os.open(name, flags | getattr(os, "O_NONBLOCK", 0))  # a pipe that takes its place meanwhile keeps nobody waiting

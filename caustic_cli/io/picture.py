@@ -18,7 +18,7 @@ from PIL import Image, ImageOps, PngImagePlugin
 
 from caustic_cli.errors import InputError
 from caustic_cli.io.arrays import open_npy
-from caustic_cli.io.files import NPY_HEADER, SOFTWARE, atomic_path, naming, open_regular
+from caustic_cli.io.files import NPY_HEADER, NPY_MAGIC, SOFTWARE, Piped, atomic_path, naming, open_regular
 
 #: Largest picture read, in pixels: a float64 copy of it is half a gigabyte.
 MAX_PIXELS = 8192 * 8192
@@ -95,22 +95,33 @@ class Picture:
             _write_png(path, Image.fromarray(self.values))
 
 
-def read_picture(path: str | Path, linear: bool = False, color: bool = False) -> Picture:
+def read_picture(path: str | Path | Piped, linear: bool = False, color: bool = False, invert: bool = False) -> Picture:
     """The picture at `path`, reduced to one channel of luminance, or with `color` as red, green and blue of 8 bits each.
 
     8- and 16-bit grey codes are kept as they are.  Colour becomes luminance, alpha lies over black, a camera's
     orientation tag is obeyed.  A .npy array, and a floating-point image, is linear irradiance.
 
+    Args:
+        invert: take what is dark as bright; alpha lies over white then.
+
     Raises:
         InputError: there is no such picture, or it is too large, too small, black, negative or not finite.
     """
-    path = Path(path)
-    picture = _read_npy(path, color) if path.suffix.lower() == ".npy" else _read_image(path, linear, color)
+    if isinstance(path, Piped):
+        array = path.startswith(NPY_MAGIC)
+    else:
+        path = Path(path)
+        array = path.suffix.lower() == ".npy"
+    picture = _read_npy(path, color) if array else _read_image(path, linear, color, invert)
+    if invert:
+        values = picture.values
+        top = values.max() if values.dtype == np.float64 else np.iinfo(values.dtype).max
+        picture = Picture(top - values, picture.encoding)
     a, b = picture.irradiance_shape
     if min(a, b) < 2:
         raise InputError(f"{path}: is {a} x {b} pixels; a picture of at least 2 x 2 is needed")
     if not picture.values.any():
-        raise InputError(f"{path}: is black all over; a picture with some light in it is needed")
+        raise InputError(f"{path}: is {'white' if invert else 'black'} all over; a picture with some light in it is needed")
     return picture
 
 
@@ -119,7 +130,7 @@ def _check_size(width: int, height: int) -> None:
         raise InputError(f"is {width} x {height} pixels; at most {MAX_PIXELS} pixels (8192 x 8192) are read")
 
 
-def _read_npy(path: Path, color: bool) -> Picture:
+def _read_npy(path: Path | Piped, color: bool) -> Picture:
     with open_npy(path, ACCEPTED) as stored:
         shape = stored.shape
         if not (len(shape) == 3 and shape[0] == 3 if color else len(shape) == 2) or stored.dtype.kind not in "fiub":
@@ -138,7 +149,7 @@ def _read_npy(path: Path, color: bool) -> Picture:
     return Picture(values, "linear")
 
 
-def _read_image(path: Path, linear: bool, color: bool) -> Picture:
+def _read_image(path: Path | Piped, linear: bool, color: bool, white: bool) -> Picture:
     with open_regular(path, ACCEPTED, MAX_BYTES) as file, naming(path):
         try:
             with warnings.catch_warnings():
@@ -158,7 +169,7 @@ def _read_image(path: Path, linear: bool, color: bool) -> Picture:
             raise InputError(f"is not an image that can be read ({type(error).__name__}); {ACCEPTED}") from error
     encoding = "linear" if linear else "srgb"
     if color and image.mode != "F" and not image.mode.startswith("I"):
-        return Picture(_over_black(image, linear), encoding)
+        return _lit(path, image, Picture(_over_ground(image, linear, white), encoding))
     if color:
         raise InputError(f"{path}: has no colours (mode {image.mode}); a colour image of 8 bits is needed")
     if image.mode == "F":
@@ -174,7 +185,14 @@ def _read_image(path: Path, linear: bool, color: bool) -> Picture:
     transparent = "transparency" in image.info or image.mode in ("LA", "La", "PA", "RGBA", "RGBa")
     if image.mode in ("1", "L") and not transparent:
         return Picture(np.array(image.convert("L")), encoding)
-    return Picture(_luminance(image, linear, transparent), encoding)
+    return _lit(path, image, Picture(_luminance(image, linear, transparent, white), encoding))
+
+
+def _lit(path: Path | Piped, image: Image.Image, picture: Picture) -> Picture:
+    """A picture of colour or transparency, unless it is a black drawing on nothing."""
+    if not picture.values.any() and len(set(image.convert("RGBA").getchannel("A").getextrema())) == 2:
+        raise InputError(f"{path}: is black on nothing, so that none of it is bright; ⟨invert⟩ takes dark as bright")
+    return picture
 
 
 @contextmanager
@@ -194,18 +212,19 @@ def _silent() -> Iterator[None]:
         os.close(before)
 
 
-def _over_black(image: Image.Image, linear: bool) -> np.ndarray:
-    """8-bit codes (rows, columns, 3) of a colour picture over black."""
+def _over_ground(image: Image.Image, linear: bool, white: bool) -> np.ndarray:
+    """8-bit codes (rows, columns, 3) of a colour picture over black, or over white."""
     codes = np.asarray(image.convert("RGBA"))
     if codes[..., 3].min() == 255:
         return codes[..., :3].copy()
     table = np.arange(256) / 255.0
-    light = (table if linear else to_linear(table))[codes[..., :3]] * (codes[..., 3:] / 255.0)
+    opaque = codes[..., 3:] / 255.0
+    light = (table if linear else to_linear(table))[codes[..., :3]] * opaque + white * (1.0 - opaque)
     return np.rint((light if linear else to_srgb(light)) * 255.0).astype(np.uint8)
 
 
-def _luminance(image: Image.Image, linear: bool, transparent: bool) -> np.ndarray:
-    """16-bit codes of the luminance of a colour or transparent picture over black: (rows, columns) uint16."""
+def _luminance(image: Image.Image, linear: bool, transparent: bool, white: bool) -> np.ndarray:
+    """16-bit codes of the luminance of a colour or transparent picture over black, or over white: (rows, columns) uint16."""
     codes = np.asarray(image.convert("RGBA" if transparent else "RGB"))
     table = np.arange(256) / 255.0
     table = table if linear else to_linear(table)
@@ -214,7 +233,8 @@ def _luminance(image: Image.Image, linear: bool, transparent: bool) -> np.ndarra
         strip = codes[k : k + 256]
         light = table[strip[..., :3]] @ LUMINANCE
         if transparent:
-            light = light * (strip[..., 3] / 255.0)
+            opaque = strip[..., 3] / 255.0
+            light = light * opaque + white * (1.0 - opaque)
         light = np.clip(light, 0.0, 1.0)
         out[k : k + 256] = np.rint((light if linear else to_srgb(light)) * 65535.0)
     return out
@@ -234,7 +254,7 @@ def write_npy(path: str | Path, array: np.ndarray) -> None:
     text = repr({"descr": np.lib.format.dtype_to_descr(array.dtype), "fortran_order": False, "shape": array.shape})
     header = text.ljust(NPY_HEADER - 11) + "\n"
     with atomic_path(path) as temporary, open(temporary, "wb") as f:
-        f.write(b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header.encode("latin1"))
+        f.write(NPY_MAGIC + b"\x01\x00" + len(header).to_bytes(2, "little") + header.encode("latin1"))
         f.write(array.tobytes())
 
 

@@ -25,11 +25,14 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Scene
+from caustic_cli.scene.materials import material
 
 #: Points looked at along each axis and a knot span, at most.
 MOST, A_SPAN = 2001, 4
 #: Rays of the sensitivities and of the angles inside the lens.
 RAYS = 100_000
+#: Bytes of a project (the optimiser's memory, most of it) and of a STEP file for each control height.
+PROJECT, STEP_FILE = 370, 92
 #: Errors by which the sensitivities are found: of the throw, relative; of the index.
 STEP = 1e-4
 
@@ -37,11 +40,11 @@ STEP = 1e-4
 def manufacture(scene: Scene, field: HeightField, heights: Tensor, tool_radius: float | None = None, seed: int = 0) -> dict:
     """Figures for JSON; None where there is none (no concave place, a point source's blur is 0).
 
-    Keys: minimum_wall_mm and _bound_mm, from the flat entrance; stock_height_mm, what a blank must have; maximum_slope and _bound;
-    smallest_concave_radius_mm and where, (x, y) mm; tool_radius_mm and tool_fits if one was given; critical_angle_deg,
-    steepest_incidence_deg inside the lens and internal_reflection_margin_deg; sharpness_limit_mm and _pixels, of the source's
-    size; landing_mm_per_mm_throw and landing_mm_per_thousandth_index, root mean square over the light, and the errors that move the
-    light by one pixel, throw_error_of_a_pixel_mm and index_error_of_a_pixel.
+    Keys: minimum_wall_mm and _bound_mm, from the flat entrance; stock_height_mm, what a blank must have; volume_cm3 and, of a known
+    material, mass_g; maximum_slope and _bound; smallest_concave_radius_mm and where, (x, y) mm; tool_radius_mm and tool_fits if one
+    was given; critical_angle_deg, steepest_incidence_deg inside the lens and internal_reflection_margin_deg; sharpness_limit_mm and
+    _pixels, of the source's size; landing_mm_per_mm_throw and landing_mm_per_thousandth_index, root mean square over the light, and
+    the errors that move the light by one pixel, throw_error_of_a_pixel_mm and index_error_of_a_pixel.
 
     Raises:
         InputError: the tool's radius is not above 0.
@@ -50,18 +53,22 @@ def manufacture(scene: Scene, field: HeightField, heights: Tensor, tool_radius: 
         raise InputError(f"⟨tool_radius⟩ must be greater than 0 mm, got {tool_radius:g}")
     lens, pixel = scene.lens, max(scene.screen.pixel)
     z, *derivatives = sampled(field, heights, [_points(s) for s in field.spaces])
+    inside = torch.ones_like(z, dtype=torch.bool)
     if lens.round:  # what lies beyond the circle takes the middle's place
         (u, v) = (torch.linspace(-1.0, 1.0, n, dtype=torch.float64) for n in z.shape)
-        beyond, at = u[:, None] ** 2 + v[None, :] ** 2 > 1.0, tuple(n // 2 for n in z.shape)
-        z, *derivatives = (torch.where(beyond, t[at], t) for t in (z, *derivatives))
+        inside, at = u[:, None] ** 2 + v[None, :] ** 2 <= 1.0, tuple(n // 2 for n in z.shape)
+        z, *derivatives = (torch.where(inside, t, t[at]) for t in (z, *derivatives))
     bends = curvature.largest(*derivatives)
     bent, at = float(bends.max()), divmod(int(bends.argmax()), bends.shape[1])
     where = [(2.0 * k / (n - 1) - 1.0) * r for k, n, r in zip(at, z.shape, field.half_size, strict=True)]
     radius = 1.0 / bent if bent > 0 else None
+    volume = 1e-3 * float(z[inside].mean() - lens.z_in) * math.prod(lens.size) * (math.pi / 4.0 if lens.round else 1.0)
     found = {
         "minimum_wall_mm": float(z.min()) - lens.z_in,
         "minimum_wall_bound_mm": float(heights.min()) - lens.z_in,
         "stock_height_mm": float(z.max()) - lens.z_in,
+        "volume_cm3": volume,
+        "mass_g": None if lens.glass is None or (density := material(lens.glass).density) is None else volume * density,
         "maximum_slope": float(torch.hypot(*derivatives[:2]).max()),
         "maximum_slope_bound": field.slope_bound(heights),
         "smallest_concave_radius_mm": radius,
@@ -86,6 +93,25 @@ def manufacture(scene: Scene, field: HeightField, heights: Tensor, tool_radius: 
         "throw_error_of_a_pixel_mm": pixel / by_throw if by_throw > 0 else None,
         "index_error_of_a_pixel": pixel / by_index if by_index > 0 else None,
     }
+
+
+def preview(scene: Scene, field: HeightField, heights: Tensor) -> str:
+    """What a design's first surface asks for, in one line; the finished one will be much like it."""
+    lens, (z, *derivatives) = scene.lens, sampled(field, heights, [_points(s) for s in field.spaces])
+    slope, bent = float(torch.hypot(*derivatives[:2]).max()), float(curvature.largest(*derivatives).max())
+    reflected = (
+        "" if lens.mirror else f" (light along the axis is totally reflected from {1.0 / math.sqrt(lens.index**2 - 1.0):.2f})"
+    )
+    size = heights.numel()
+    return (
+        f"first surface: wall {float(z.min()) - lens.z_in:.2f} mm, stock {float(z.max()) - lens.z_in:.2f} mm, slopes up to"
+        f" {slope:.2g}{reflected}, {f'concave radius down to {1.0 / bent:.2g} mm' if bent > 0 else 'nowhere concave'};"
+        f" files: project about {_megabytes(PROJECT * size)}, STEP {_megabytes(STEP_FILE * size)}"
+    )
+
+
+def _megabytes(size: float) -> str:
+    return f"{size / 1e6:.{0 if size >= 1e7 else 1}f} MB"
 
 
 def _points(space: SplineSpace) -> int:
@@ -154,6 +180,7 @@ def rows(f: dict) -> list[tuple[str, str]]:
     return [
         ("minimum wall", f"{f['minimum_wall_mm']:.4f} mm (surely above {f['minimum_wall_bound_mm']:.4f})"),
         ("stock height", f"{f['stock_height_mm']:.4f} mm"),
+        ("volume", f"{f['volume_cm3']:.4g} cm^3" + ("" if f["mass_g"] is None else f", {f['mass_g']:.4g} g")),
         ("maximum slope", f"{f['maximum_slope']:.4f} (surely below {f['maximum_slope_bound']:.4f})"),
         ("smallest concave radius", concave),
         (

@@ -20,8 +20,8 @@ import numpy as np
 import torch
 
 from caustic_cli import __version__
-from caustic_cli.config import settings
-from caustic_cli.config.completion import Derivation, build_options, build_stages, complete, without_waves
+from caustic_cli.config import presets, settings
+from caustic_cli.config.completion import PLATE, WALL, Derivation, build_options, build_stages, complete, without_waves
 from caustic_cli.config.plans import transport_cells
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import CausticError, InputError, Interrupted
@@ -32,6 +32,7 @@ from caustic_cli.inverse.extended import best_light, centre_of, limits, shift_of
 from caustic_cli.inverse.initial_surface import first_surface
 from caustic_cli.inverse.reach import refuse_unreachable
 from caustic_cli.inverse.target import grey
+from caustic_cli.io.files import Piped
 from caustic_cli.io.picture import Picture, read_picture
 from caustic_cli.io.surfaces import SUFFIXES, onto, read_surface
 from caustic_cli.optics.emission.measured import coarse_words
@@ -41,17 +42,21 @@ from caustic_cli.project import attachments, directory, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.project import CHECKPOINT, RENDER, Project, is_project
 from caustic_cli.scene import Scene
+from caustic_cli.studies.manufacture import preview
 from caustic_cli.workflow.evaluation import judge
 from caustic_cli.workflow.reporter import Reporter
 
+#: Part of a picture that is brighter than NEARLY of its maximum from which on it looks like a drawing on white.
+GROUND, NEARLY = 0.6, 0.98
 #: Part of a time limit that is left to the iterations, however long the start took.
 LEAST_PART = 0.25
 
 
 def begin(
-    target: Path | Picture,
+    target: Path | Piped | Picture,
     given: Mapping[str, Any],
     *,
+    preset: str | None = None,
     config: Path | None = None,
     out: Path | None = None,
     force: bool = False,
@@ -64,6 +69,7 @@ def begin(
 
     Args:
         given: path in `config.table` -> value, parameters such as "mag" among them.
+        preset: a name of `config.presets`, whose settings those of config replace.
         config: a TOML file of further settings, which those `given` replace.
         out: the directory; None for a design in memory.
         force: replace a project there.
@@ -71,23 +77,25 @@ def begin(
     Raises:
         InputError: something is wrong; nothing was written.
     """
-    said = settings.read(config) if config else {}
-    if "source" in said:
-        said["source"] = attachments.attached(said["source"], config.parent)
+    read = [settings.read(path, parameters=True) for path in (preset and presets.path_of(preset), config) if path]
+    for path, one in zip((p for p in (preset, config) if p), read, strict=True):
+        if "source" in one:
+            one["source"] = attachments.attached(one["source"], Path(path).parent)
+    chosen: Settings = {}
     for path, value in given.items():
         section, _, key = path.rpartition(".")
-        if section:
-            said.setdefault(section, {})[key] = value
-    by = Derivation(**{path: value for path, value in given.items() if "." not in path})
+        chosen.setdefault(section, {})[key] = value
+    said = settings.merged({}, *read, chosen)
+    parameters = said.pop("", {})
+    invert = parameters.pop("invert", False)
+    by = Derivation(**parameters)
     if "source" in said:
         said["source"] = attachments.attached(said["source"])
-    if "index" in said.get("lens", {}) and "glass" in said["lens"]:
-        names = [key for key in ("index", "glass") if f"lens.{key}" in given]
-        if len(names) == 1:  # what is given replaces what the configuration says
-            del said["lens"]["glass" if names[0] == "index" else "index"]
     goal = said.get("target", {})
     picture = (
-        target if isinstance(target, Picture) else read_picture(target, goal.get("encoding") == "linear", goal.get("color", False))
+        target
+        if isinstance(target, Picture)
+        else read_picture(target, goal.get("encoding") == "linear", goal.get("color", False), invert)
     )
     if goal.get("color", False):
         light = [float(c) for c in picture.irradiance().sum((1, 2))]
@@ -136,6 +144,9 @@ def first_heights(project: Project, said: Settings) -> tuple[Project, torch.Tens
     first, middle = _solved(project, fixed)
     if middle is not None:
         lens["thickness"] = middle
+    if first is not None and not fixed and (spare := _spare(lens, first)) > 0:
+        lens["thickness"] -= spare
+        first, middle = _solved(project, fixed=True)[0], lens["thickness"]
     if first is not None and _make_room(project.settings, said, first) and middle is None:
         _designer(project, "cpu")
         first, _ = _solved(project, fixed)
@@ -171,12 +182,15 @@ def design(project: Project, first: torch.Tensor | None, device: str, say: Repor
         return Result(project, scene, project.lens(scene)[0], project.target(scene), project.found.state, figures)
     with project.hold:
         designer, target = _designer(project, device)
-        _say_limits(project, designer, target, say)
+        _say_limits(project, designer, target, first, say)
         return _run(project, designer, target, designer.begin(first), say, began, None, device)
 
 
-def _say_limits(project: Project, designer: Designer, target: np.ndarray, say: Reporter) -> None:
-    """What no lens can do about diffraction and an extended source, before time is spent on it."""
+def _say_limits(project: Project, designer: Designer, target: np.ndarray, first: torch.Tensor | None, say: Reporter) -> None:
+    """What no lens can do about diffraction and an extended source, and what this one will be like, before time is spent on it."""
+    light = grey(project.picture.irradiance())
+    if (ground := float((light >= NEARLY * light.max()).mean())) > GROUND and light.min() < 0.5 * light.max():
+        say.say(f"{ground:.0%} of the picture are as bright as can be: of a drawing on white, ⟨invert⟩ makes the lines bright")
     if coarse := coarse_words(designer.scene):
         say.say(coarse)
     seen = Resolution.before(designer.scene, tuple(project.settings["target"]["size"]))
@@ -186,6 +200,8 @@ def _say_limits(project: Project, designer: Designer, target: np.ndarray, say: R
         say.say(words)
     if seen.matters and project.settings["design"]["waves"] == "auto" and project.without_waves:
         say.say(f"the wave image is not refined: {project.without_waves}")
+    field = designer.field(0)
+    say.say(preview(designer.scene, field, designer.begin(None).heights if first is None else first))
 
 
 def _listed(wavelengths: tuple[float, ...]) -> str:
@@ -299,6 +315,13 @@ def _solved(project: Project, fixed: bool) -> tuple[torch.Tensor | None, float |
             f"⟨design.start⟩: the lens of {start} is {other.settings['lens']['size']} mm, not {project.settings['lens']['size']} mm"
         )
     return onto(field, checkpoint.state.heights, net), None
+
+
+def _spare(lens: dict[str, Any], first: torch.Tensor) -> float:
+    """Glass that a plate has below its first surface beyond its wall, mm; 0 of a lens that is none."""
+    if max(lens["size"]) <= PLATE:
+        return 0.0
+    return max(0.0, float(first.min()) - lens["z_in"] - max(WALL, lens["min_thickness"]))
 
 
 def _make_room(full: Settings, said: Settings, first: torch.Tensor) -> bool:

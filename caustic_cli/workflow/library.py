@@ -25,6 +25,7 @@ from torch import Tensor
 
 from caustic_cli.config import settings as schema
 from caustic_cli.errors import InputError
+from caustic_cli.io.files import Piped
 from caustic_cli.io.picture import Picture
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.reconstruction import Filter
@@ -55,6 +56,8 @@ def design(
     linear: bool | None = None,
     waves: str | None = None,
     time_limit: float | None = None,
+    preset: str | None = None,
+    invert: bool = False,
     out: str | Path | None = None,
     force: bool = False,
     on_progress: Progress | None = None,
@@ -73,6 +76,8 @@ def design(
         linear: whether values of the file are irradiance rather than sRGB codes.
         waves: auto, on or off: refine the wave image after the ray image.
         time_limit: seconds for the optimisation.
+        preset: settings for what people make, by name: "plate-100", see `config.presets`.
+        invert: take what is dark in the picture file as bright.
         out: a project directory to keep checkpoints and pictures in; without it, no file is touched.
         force: replace a project there.
         on_progress, on_message: told while it works.
@@ -91,6 +96,7 @@ def design(
     if linear:
         sections["target"] = sections.get("target", {}) | {"encoding": "linear"}
     by = {"mag": mag, "margin": margin, "throw": throw, "quality": quality, "rays": None if rays is None else count(rays)}
+    by["invert"] = invert or None
     given = {
         f"{section}.{key}": value
         for section, values in schema.checked(sections, "settings").items()
@@ -100,6 +106,7 @@ def design(
     return design_of(
         picture if isinstance(picture, str | Path) else _picture(picture),
         given,
+        preset=preset,
         out=None if out is None else Path(out),
         force=force,
         say=Listener(on_progress, on_message),
@@ -108,9 +115,10 @@ def design(
 
 
 def design_of(
-    target: str | Path | Picture,
+    target: str | Path | Piped | Picture,
     given: Mapping[str, Any],
     *,
+    preset: str | None = None,
     config: Path | None = None,
     out: Path | None = None,
     force: bool = False,
@@ -120,7 +128,8 @@ def design_of(
     """The lens for a picture and settings by their paths in `config.table`: {"mag": 3, "lens.size": [20, 20]}.
 
     Args:
-        config: a TOML file of further settings, which those `given` replace.
+        preset: settings by name, see `config.presets`; config: a TOML file of further ones, which replace those of the preset, and
+            which those `given` replace.
         out, force, device: as of `design`; say: who is told while it works.
 
     Raises:
@@ -129,7 +138,7 @@ def design_of(
     began = time.monotonic()
     compile_usual(device)
     project, first = workflow.begin(
-        Path(target) if isinstance(target, str) else target, given, config=config, out=out, force=force, say=say
+        Path(target) if isinstance(target, str) else target, given, preset=preset, config=config, out=out, force=force, say=say
     )
     compile_for(project.scene(), device, say, gradient=True)
     return _lens(workflow.design(project, first, device, say, began))
