@@ -75,18 +75,17 @@ def _run(arguments: list[str]) -> int:
 def _report(problem: Exception) -> int:
     """Say in one line what went wrong; the exit status."""
     from caustic_cli.commands import console  # noqa: PLC0415
+    from caustic_cli.commands.help import answer  # noqa: PLC0415
     from caustic_cli.errors import CausticError, InputError, is_out_of_memory  # noqa: PLC0415
 
     if isinstance(problem, CausticError):
         console.error(f"{problem}")
         return 2 if isinstance(problem, InputError) else 1
     if hasattr(problem, "format_message"):  # a usage error of the command-line parser, whichever version wraps it
-        message = problem.format_message()
         if type(problem).__name__ == "NoArgsIsHelpError":  # no command at all: the message is the whole help
-            sys.stderr.write(message + "\n")
-            return 2
-        if message:
-            console.error(f"{message} (see caustic --help)")
+            sys.stderr.write(problem.format_message() + "\n")
+        elif message := answer(problem):
+            console.error(message)
         return 2
     if is_out_of_memory(problem):
         console.error("out of memory; fewer --rays, a smaller --control or --resolution needs less")

@@ -19,6 +19,7 @@ from PIL import Image
 
 from caustic_cli import __version__, cli
 from caustic_cli.commands import console, parser
+from caustic_cli.commands import help as help_of
 from caustic_cli.export import FORMATS
 
 COMMANDS = ("design", "render", "gradmap", "export", "convergence")
@@ -111,7 +112,6 @@ BAD = {
     "rays": (DESIGN + "--rays 1.5", "--rays"),
     "rays 0": (DESIGN + "--rays 0", "--rays"),
     "glass": (DESIGN + "--glass wood", "wood"),
-    "glass and index": (DESIGN + "--glass N-BK7 --index 1.5", "both"),
     "index": (DESIGN + "--index 1", "--index"),
     "lens size": (DESIGN + "--lens-size 0", "--lens-size"),
     "lens size text": (DESIGN + "--lens-size 10x10x10", "--lens-size"),
@@ -137,7 +137,7 @@ BAD = {
     "bad configuration": (DESIGN + "--config bad.toml", "degree"),
     "foreign directory": ("design blob.png -o folder", "folder"),
     "file in the way": ("design blob.png -o blob.png", "blob.png"),
-    "nowhere": ("design blob.png -o no/where/x.caustic", "no/where"),
+    "nowhere": ("design blob.png -o blob.png/x.caustic", "blob.png is not a directory"),
     "project in the way": ("design blob.png", "--force"),
     "resume of nothing": ("design --resume nothing.png", "nothing"),
     "unknown option": ("design blob.png --moon", "--moon"),
@@ -417,8 +417,8 @@ def test_an_archive_renders_like_its_project(here, capfd):
     code, out, err = run("render lens.npz --rays 9000 --npy b.npy --json --quiet", capfd)
     assert (code, err) == (0, "")
     figures = json.loads(out)
-    assert figures["image"] == "lens.png" and figures["relative_rms"] is None and figures["on_target"] is None
-    assert (np.load("a.npy") == np.load("b.npy")).all() and Path("lens.png").is_file()
+    assert figures["image"] == "lens-render.png" and figures["relative_rms"] is None and figures["on_target"] is None
+    assert (np.load("a.npy") == np.load("b.npy")).all() and Path("lens-render.png").is_file()
     assert run("render lens.npz --source point", capfd)[0] == 2
 
 
@@ -462,6 +462,50 @@ def test_every_option_has_help(capfd):
             assert parameter.help and parameter.help[0] != " ", (name, parameter.name)
             checked += 1
     assert checked > 60
+
+
+@pytest.mark.parametrize("command", help_of.BASICS)
+def test_help_is_grouped_and_begins_with_the_basics(capfd, command):
+    _, out, _ = run(f"{command} --help", capfd)
+    headings = [line[:-1] for line in out.splitlines() if line.endswith(":") and not line.startswith(" ")]
+    assert headings[:2] == ["Arguments", "Basics"] and len(headings) > 5
+    assert headings[2:] == [heading for heading in help_of.GROUPS if heading in headings]
+    options = {o for p in typer.main.get_command(parser.app).commands[command].params for o in p.opts if o.startswith("--")}
+    assert all(len(re.findall(rf"^  (-[a-z], )?{o}(?![-\w])", out, re.MULTILINE)) == 1 for o in options)
+
+
+@pytest.mark.parametrize(
+    ("text", "meant"),
+    [
+        ("design blob.png --magnification 3", "did you mean --mag?"),
+        ("design blob.png --material PMMA", "did you mean --glass?"),
+        ("design blob.png --lens-sizes 3", "did you mean --lens-size or --screen-size?"),
+        ("render blob.caustic --output x.png", "did you mean --out?"),
+        ("design -x.png", "a file whose name begins with a hyphen is given as ./-x.png"),
+        ("design", "(caustic design --help says more)"),
+        ("designn", "Did you mean 'design'? (caustic --help says more)"),
+        ("design made.caustic", "made.caustic: is a project, not a picture; caustic design --resume made.caustic goes on with it"),
+        ("render blob.png", "is a picture, not a project; caustic design blob.png makes its lens first"),
+        ("render made", "did you mean made.caustic?"),
+        ("design blob.png -o made.caustic --loss mse", "--loss must be names with weights"),
+    ],
+)
+def test_what_was_meant(tmp_path, monkeypatch, capfd, text, meant):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["caustic", *text.split()])
+    write_blob()
+    Path("made.caustic").mkdir()
+    Path("made.caustic/project.toml").touch()
+    code, out, err = run(text, capfd)
+    assert (code, out) == (2, "") and err.count("\n") == 1 and meant in err, err
+
+
+def test_a_place_in_a_new_directory(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    write_blob()
+    small = "--resolution 24 --control 12 --start offset --rays 4000 --iterations 1 --waves off --quiet"
+    assert run(f"design blob.png -o 'new place/deeper/x.caustic' --glass acrylic --index 1.49 {small}", capfd)[0] == 0
+    assert "index = 1.49" in Path("new place/deeper/x.caustic/project.toml").read_text()
 
 
 def test_alone_it_shows_its_help(capfd):

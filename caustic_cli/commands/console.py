@@ -22,6 +22,8 @@ from caustic_cli.errors import MARK, InputError, plain_name
 LONGEST_LINE = 4000
 #: Seconds between two lines of --progress json.
 LINE_EVERY = 0.5
+#: Columns that a bar and its clocks ask for beside the numbers.
+WIDE = 90
 
 
 class Reporter:
@@ -95,20 +97,17 @@ class Reporter:
 
             yield tell
             return
+        numbers = [TextColumn("{task.description}"), MofNCompleteColumn(), TextColumn("{task.fields[text]}")]
+        clocks = [TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn()]
+        columns = [numbers[0], BarColumn(), *numbers[1:], *clocks] if self.console.width >= WIDE else numbers
         bar = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[text]}"),
-            TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(),
+            *columns,
             console=self.console,
             transient=True,
             disable=not self.console.is_terminal or self.console.quiet,
         )
         with bar:
-            task = bar.add_task("", total=total, text="")
+            task = bar.add_task("beginning", total=total, text="")
             yield lambda description="", text="", done=None, whole=None: bar.update(
                 task, description=description, text=text, completed=done, total=whole
             )

@@ -81,6 +81,8 @@ def run(
         from caustic_cli.io.files import read_stdin  # noqa: PLC0415
         from caustic_cli.io.picture import ACCEPTED, MAX_BYTES, read_picture  # noqa: PLC0415
 
+        if (target / "project.toml").is_file():
+            raise InputError(f"{target}: is a project, not a picture; caustic design --resume {target} goes on with it")
         # before torch is loaded and kernels are compiled for nothing
         if preset is not None:
             path_of(preset)

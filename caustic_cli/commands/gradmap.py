@@ -29,8 +29,8 @@ def run(
     ] = None,
     rays: Annotated[str, typer.Option(metavar="N", help="Number of rays.")] = "1000000",
     reconstruction: Annotated[str, typer.Option(help="gaussian or cosine; bincount has no derivative.")] = "cosine",
-    filter_size: Annotated[str, typer.Option(metavar="V[xW]", help="Filter size, odd, pixels, 3 or more.")] = "3",
-    alpha: Annotated[float | None, typer.Option(help="Of the gaussian, 1/mm^2.  [default: 1 per pixel^2]")] = None,
+    filter_size: Annotated[str, typer.Option(metavar="V[xW]", help="Filter size, odd, 3 or more (pixels).")] = "3",
+    alpha: Annotated[float | None, typer.Option(help="Of the gaussian (1/mm^2).  [default: 1 per pixel^2]")] = None,
     check: Annotated[bool, typer.Option("--check", help="Compare with central differences.")] = False,
     output: Annotated[
         Path | None,

@@ -278,8 +278,14 @@ def require_project(path: Path, archives: bool = False) -> None:
     Raises:
         InputError: as of opening it.
     """
-    if not (path / "project.toml").is_file() and not (archives and path.suffix.lower() == ".npz" and path.is_file()):
-        raise no_project(path)
+    if (path / "project.toml").is_file() or (archives and path.suffix.lower() == ".npz" and path.is_file()):
+        return
+    beside = path.with_name(path.name + ".caustic")
+    if (beside / "project.toml").is_file():
+        raise InputError(f"{path}: is not a caustic project; did you mean {beside}?")
+    if path.is_file() and path.suffix.lower() in (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".gif", ".npy"):
+        raise InputError(f"{path}: is a picture, not a project; caustic design {path} makes its lens first")
+    raise no_project(path)
 
 
 def start_torch(device: str, threads: int | None, say: Reporter):

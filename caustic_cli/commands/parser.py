@@ -8,6 +8,7 @@ import typer
 
 from caustic_cli import __version__
 from caustic_cli.commands import console, convergence, design, export, gradmap, render
+from caustic_cli.commands.help import grouped
 
 DESCRIPTION = """Design free-form lenses that throw a picture as a caustic.
 
@@ -49,7 +50,8 @@ for _info, _name in zip(app.registered_commands, ("design", "render", "gradmap",
 def parser():
     """The parser, a Click group of the commands."""
     root = typer.main.get_command(app)
-    for command in root.commands.values():
+    for name, command in root.commands.items():
+        grouped(name, command)
         for parameter in command.params:
             parameter.show_envvar = False  # every option has a variable; the manual says how it is called
     return root

@@ -36,9 +36,9 @@ def run(
     reconstruction: Annotated[
         str, typer.Option(help="bincount, gaussian or cosine; the figures are always by bincount.")
     ] = "bincount",
-    filter_size: Annotated[str, typer.Option(metavar="V[xW]", help="Filter size, odd, pixels.")] = "3",
-    alpha: Annotated[float | None, typer.Option(help="Of the gaussian, 1/mm^2.  [default: 1 per pixel^2]")] = None,
-    screen_at: Annotated[float | None, typer.Option(metavar="Z", help="Put the screen here instead, mm.")] = None,
+    filter_size: Annotated[str, typer.Option(metavar="V[xW]", help="Filter size, odd (pixels).")] = "3",
+    alpha: Annotated[float | None, typer.Option(help="Of the gaussian (1/mm^2).  [default: 1 per pixel^2]")] = None,
+    screen_at: Annotated[float | None, typer.Option(metavar="Z", help="Put the screen here instead (mm).")] = None,
     effects: Annotated[
         str,
         typer.Option(
@@ -51,7 +51,13 @@ def run(
         typer.Option("--explain", help="Show which effects are simulated, why, what each costs, and what leaving it out does."),
     ] = False,
     output: Annotated[
-        Path | None, typer.Option("-o", "--out", metavar="PNG", help="Image to write.  [default: render.png in PROJECT]")
+        Path | None,
+        typer.Option(
+            "-o",
+            "--out",
+            metavar="PNG",
+            help="Image to write.  [default: render.png in PROJECT; of an archive, its name + -render.png, here]",
+        ),
     ] = None,
     npy: Annotated[
         Path | None,
@@ -76,7 +82,7 @@ def run(
         ),
     ] = False,
     tool_radius: Annotated[
-        float | None, typer.Option(metavar="MM", help="Radius of the tool that --report tries in concave places.")
+        float | None, typer.Option(metavar="MM", help="Radius of the tool that --report tries in concave places (mm).")
     ] = None,
     force: options.Force = False,
     json: options.Json = False,

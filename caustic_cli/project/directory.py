@@ -30,9 +30,9 @@ def check(path: Path, force: bool) -> None:
     Raises:
         InputError: it is no directory, not a project, a project without `force`, or cannot be written to.
     """
-    place = path if path.exists() else path.parent
-    if not place.exists() or not os.access(place, os.W_OK):
-        reason = "no such directory" if not place.exists() else "permission denied"
+    place = next(p for p in (path, *path.absolute().parents) if p.exists())
+    if not os.access(place, os.W_OK) or (not place.is_dir() and place != path):
+        reason = "permission denied" if place.is_dir() else f"{place} is not a directory"
         raise InputError(f"{path}: cannot be written to ({reason}); -o DIR chooses another place")
     if not path.exists():
         return
@@ -76,6 +76,7 @@ def settle(project: Project, force: bool) -> None:
                 (path / name).unlink(missing_ok=True)
             project.write(path)
             return
+        path.parent.mkdir(parents=True, exist_ok=True)
         for left in path.parent.glob(".*.caustic-new"):
             if time.time() - left.stat().st_mtime > LEFT_BEHIND:
                 shutil.rmtree(left, ignore_errors=True)

@@ -78,14 +78,16 @@ def begin(
         InputError: something is wrong; nothing was written.
     """
     read = [settings.read(path, parameters=True) for path in (preset and presets.path_of(preset), config) if path]
-    for path, one in zip((p for p in (preset, config) if p), read, strict=True):
-        if "source" in one:
-            one["source"] = attachments.attached(one["source"], Path(path).parent)
+    if config and "source" in read[-1]:
+        read[-1]["source"] = attachments.attached(read[-1]["source"], config.parent)
     chosen: Settings = {}
     for path, value in given.items():
         section, _, key = path.rpartition(".")
         chosen.setdefault(section, {})[key] = value
     said = settings.merged({}, *read, chosen)
+    if {"index", "glass"} <= {*said.get("lens", {})}:  # only where both are given beside each other
+        glass = said["lens"].pop("glass")
+        say.say(f"⟨lens.index⟩ {said['lens']['index']:g} is taken at every wavelength, and nothing of {glass}")
     parameters = said.pop("", {})
     invert = parameters.pop("invert", False)
     by = Derivation(**parameters)
@@ -116,11 +118,11 @@ def begin(
         uptodate.digest(full, picture, light),
         without_waves=without_waves(full, "stages" in said.get("design", {})),
     )
-    if out is not None:
-        if not force and (same := uptodate.same_design(out, project.asked)):
-            return replace(same[0], found=same[1]), None
-        directory.check(out, force)  # before the transport, which may take a minute
+    if out is not None and not force and (same := uptodate.same_design(out, project.asked)):
+        return replace(same[0], found=same[1]), None
     designer, goal = _designer(project, "cpu")  # builds and so checks scene, target, stages, options
+    if out is not None:
+        directory.check(out, force)  # before the transport, which may take a minute
     refuse_unreachable(designer.scene, grey(goal))
     with say.notify_if_slow(
         "solving the transport of the light to the picture; the first time, its kernels are compiled,"

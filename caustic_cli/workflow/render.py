@@ -103,7 +103,7 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     project = None if archived else Project.open(asked.lens)
     if archived and asked.given:
         raise InputError(f"⟨{next(iter(asked.given))}⟩: an archive's source is fixed; render its project under another light")
-    image_path = asked.image or (asked.lens / RENDER if project else Path(asked.lens.stem + ".png"))
+    image_path = asked.image or (asked.lens / RENDER if project else Path(asked.lens.stem + "-render.png"))
 
     def companion(name: str) -> Path:
         return image_path.with_name(name if asked.image is None else f"{image_path.stem}-{name}")
