@@ -2,13 +2,14 @@
 
 Only the command line turns these into exit codes; every other module raises them.  A setting that a sentence speaks of is named by
 its path in `config.table`, between marks: ⟨lens.size⟩, or ⟨mag⟩ of a parameter.  `plain`, and so str() of an error, says it as
-project.toml and the library do, [lens] size and mag; the command line says the option by which it was given.
+project.toml and the library do, [lens] size and mag; the command line says the option by which it was given.  What a sentence
+advises to set has a plus, ⟨+lens.size⟩, and the command line says its option whether it was given or not.
 """
 
 import re
 
 #: A marked path.
-MARK = re.compile(r"⟨([a-z_.]+)⟩")
+MARK = re.compile(r"⟨(\+?[a-z_.]+)⟩")
 #: Sections that are lists of tables in project.toml, and what they are called there.
 LISTS = {"design.stages": "[[design.stages]]", "source.also": "[[source]]"}
 
@@ -18,7 +19,7 @@ OUT_OF_MEMORY = ("out of memory", "not enough memory", "can't allocate memory", 
 
 def plain_name(path: str) -> str:
     """A path as project.toml says it: [lens] size; mag of a parameter without a section."""
-    section, _, key = path.rpartition(".")
+    section, _, key = path.removeprefix("+").rpartition(".")
     return f"{LISTS.get(section, f'[{section}]')} {key}" if section else key
 
 

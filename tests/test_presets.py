@@ -126,3 +126,12 @@ def test_figures_are_json(capfd):
     report = json.loads(capfd.readouterr().out)["report"]
     assert report["mass_g"] == pytest.approx(1.19 * report["volume_cm3"])
     assert report["volume_cm3"] == pytest.approx(0.1 * (report["stock_height_mm"] + report["minimum_wall_mm"]) / 2, rel=0.2)
+
+
+def test_a_long_picture_is_told_of_a_lens_of_its_own_shape(capfd):
+    Image.linear_gradient("L").resize((8, 80)).save("tall.png")
+    loud = [option for option in SMALL if option != "--quiet"]
+    assert cli.run(["design", "tall.png", *loud, "--start", "offset"]) == 0
+    assert "magnified 3 times along x and 30 times along y" in (err := capfd.readouterr().err) and "--lens-size 3.16x31.6" in err
+    assert cli.run(["design", "tall.png", *loud, "--start", "offset", "--lens-size", "3.16x31.6", "-o", "o.caustic"]) == 0
+    assert "magnified" not in capfd.readouterr().err

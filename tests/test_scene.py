@@ -223,9 +223,9 @@ def test_he_ne_is_not_the_d_line():
 def test_unknown_glass_and_wavelength():
     with pytest.raises(InputError, match="did you mean PMMA"):
         refractive_index("acryllic")
-    with pytest.raises(InputError, match=r"must be one of .*, got 'diamond'; of any other material, give its index"):
+    with pytest.raises(InputError, match=r"must be one of .*, got 'diamond'; of any other material, give its \[lens\] index"):
         refractive_index("diamond")
-    with pytest.raises(InputError, match=r"brass reflects: give mirror"):
+    with pytest.raises(InputError, match=r"brass reflects: give \[lens\] mirror"):
         refractive_index("brass")
     for wavelength in (300.0, 2600.0, NAN):
         with pytest.raises(InputError, match="wavelength for N-BK7 must be 310 to 2500 nm"):

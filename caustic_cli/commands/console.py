@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from caustic_cli.config.table import TABLE
 from caustic_cli.errors import MARK, InputError, plain_name
 
 #: Characters of an error line; more is what somebody put into a file.
@@ -132,6 +133,9 @@ def named(text: str) -> str:
     """A text whose marked settings are called by the options that said them, and parameters by their options."""
 
     def name(path: str) -> str:
+        row = TABLE.get(path[1:]) if path.startswith("+") else None
+        if row and row.option:
+            return row.option.name
         return _spoken.get(path) or (plain_name(path) if "." in path else "--" + path.replace("_", "-"))
 
     return MARK.sub(lambda found: name(found[1]), text)

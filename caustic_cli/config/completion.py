@@ -52,6 +52,7 @@ DRAFT_SECONDS, FINE_SECONDS = 8.0, 60.0  # time limits below and from which anot
 STEEPEST = 1.25  # least radius of a derived sphere, in half diagonals of the lens: slopes up to 1.3
 WAVE_KEYS = ("control", "blur", "apron", "iterations", "tolerance")  # of a stage on rays that one on the wave image has too
 PLATE, WALL = 20.0, 3.0  # width beyond which a lens is a plate, as thin as its relief and this wall allow, mm
+OBLONG = 2.5  # ratio of the magnifications along the axes from which on another shape of lens is advised
 COLOR_GLASS = "N-BK7"  # of a coloured picture, unless glass or index is said: dispersion has to be known
 
 
@@ -187,11 +188,20 @@ def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[st
         if source.nearest < lens["z_in"]:  # divergence at the surface, 1/mm; 0 from infinity
             vergence = 1.0 / (lens["z_in"] - source.centre[2] + (lens["thickness"] - lens["z_in"]) / (1.0 if mirror else index))
         radius = Offset.for_magnification(mag, -1.0 if mirror else index, screen["z"], lens["thickness"], vergence).radius
-        if vergence:  # light from nearby may ask for more than a sphere over this aperture can do
-            least = STEEPEST * math.hypot(*lens["size"]) / 2.0
-            rx, ry = (math.copysign(max(abs(r), least), r) for r in radius)
-            radius = rx, ry
-        lens["radius"] = list(radius)
+        least = STEEPEST * math.hypot(*lens["size"]) / 2.0  # what a long picture, or light from nearby, asks for may be more
+        lens["radius"] = [math.copysign(max(abs(r), least), r) for r in radius]
+
+
+def shape_words(s: Settings) -> str:
+    """Which lens would follow the shape of a long picture, where this one does not."""
+    (w, h), (a, b) = s["target"]["size"], s["lens"]["size"]
+    if OBLONG > h * a / (w * b) > 1.0 / OBLONG:
+        return ""
+    width = math.sqrt(a * b * w / h)
+    return (
+        f"the picture is magnified {w / a:.3g} times along x and {h / b:.3g} times along y; a lens of its own shape needs less"
+        f" depth: ⟨+lens.size⟩ {width:.3g}x{width * h / w:.3g}"
+    )
 
 
 def _complete_design(s: Settings, source: Source, quality: str | None, rays: int | None, lit: tuple[float, float]) -> None:

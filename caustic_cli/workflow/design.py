@@ -21,7 +21,7 @@ import torch
 
 from caustic_cli import __version__
 from caustic_cli.config import presets, settings
-from caustic_cli.config.completion import PLATE, WALL, Derivation, build_options, build_stages, complete, without_waves
+from caustic_cli.config.completion import PLATE, WALL, Derivation, build_options, build_stages, complete, shape_words, without_waves
 from caustic_cli.config.plans import transport_cells
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import CausticError, InputError, Interrupted
@@ -124,6 +124,8 @@ def begin(
     if out is not None:
         directory.check(out, force)  # before the transport, which may take a minute
     refuse_unreachable(designer.scene, grey(goal))
+    if words := shape_words(full):
+        say.say(words)
     with say.notify_if_slow(
         "solving the transport of the light to the picture; the first time, its kernels are compiled,"
         " which takes about half a minute"
