@@ -183,7 +183,9 @@ def test_files_say_what_they_are(path):
 def test_marks_name_settings(capfd):
     """Every mark in the sources is a path of the table, or an option of some command that no setting is."""
     options = {o for c in parser.parser().commands.values() for p in c.params for o in p.opts if o.startswith("--")}
-    marked = {name for p in FILES if p.name != "errors.py" for name in MARK.findall(p.read_text("utf-8"))}
+    advised = {name[1:] for p in FILES for name in MARK.findall(p.read_text("utf-8")) if name.startswith("+")}
+    assert advised and all(TABLE[path].option for path in advised)
+    marked = {name.lstrip("+") for p in FILES if p.name != "errors.py" for name in MARK.findall(p.read_text("utf-8"))}
     paths = {name.replace("source.also.", "source.") for name in marked if "." in name and not name.endswith(("_", "."))}
     assert len(paths) > 30 and paths <= set(TABLE)
     assert {"--" + name.replace("_", "-") for name in marked if "." not in name} <= options
