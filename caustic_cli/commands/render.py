@@ -68,7 +68,7 @@ def run(
         typer.Option(
             metavar="mitsuba",
             help="Trace the same lens in Mitsuba 3 (pip install"
-            " 'caustic-cli[verify]') with as many rays and compare, pixel by pixel; writes"
+            " mitsuba) with as many rays and compare, pixel by pixel; writes"
             " verify.png beside the image.  Exit status 1 if they disagree.",
         ),
     ] = None,

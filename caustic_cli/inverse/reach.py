@@ -8,6 +8,7 @@ height and, for light that leaves a thick lens by its sides, at the least one.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -50,6 +51,21 @@ def refuse_unreachable(scene: Scene, target: np.ndarray) -> None:
             f" {turn:.3g} degrees, and glass of index {lens.inside:g} turns it by less than {limit:.3g}; a picture"
             " nearer the light's way, or a higher index, is needed"
         )
+
+
+def largest_magnification(scene: Scene, picture: Sequence[float]) -> float | None:
+    """About how many times as wide as the lens a picture of this width and height, mm, can be made; None where that is not known.
+
+    Of parallel light: a map that does not fold sends a corner of the lens to the picture's, which is turned most.
+    """
+    lens = scene.lens
+    if lens.mirror or not scene.source.collimated:
+        return None
+    throw = scene.screen.z - lens.offset.thickness
+    reach = throw * math.tan(math.acos(1.0 / lens.inside))
+    corner, goal = np.array(lens.half_size), 0.5 * np.array(picture)
+    along, square = goal @ corner, goal @ goal  # |f goal - corner| = reach
+    return float((along + math.sqrt(along**2 - square * (corner @ corner - reach**2))) / square * goal[0] / corner[0])
 
 
 def _in_glass(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

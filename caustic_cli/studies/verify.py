@@ -58,7 +58,7 @@ def require_mitsuba(scene: Scene) -> None:
         InputError: Mitsuba is not installed, or the scene has what is not written for it, or other reflections than exact ones.
     """
     if find_spec("mitsuba") is None:
-        raise InputError("⟨verify⟩ mitsuba needs Mitsuba 3, which is not installed: pip install 'caustic-cli[verify]'")
+        raise InputError("⟨verify⟩ mitsuba needs Mitsuba 3, which is not installed: pip install mitsuba")
     if beyond_plain(scene):
         raise InputError(f"⟨verify⟩ mitsuba traces clear lenses and straight screens, not {', '.join(beyond_plain(scene))}")
     if scene.source.kind not in KINDS:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import math
 import signal
 import threading
 import time
@@ -30,7 +31,8 @@ from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.extended import best_light, centre_of, limits, shift_of
 from caustic_cli.inverse.initial_surface import first_surface
-from caustic_cli.inverse.reach import refuse_unreachable
+from caustic_cli.inverse.reach import largest_magnification, refuse_unreachable
+from caustic_cli.inverse.surface_from_map import OutOfReach
 from caustic_cli.inverse.target import grey
 from caustic_cli.io.files import Piped
 from caustic_cli.io.picture import Picture, read_picture
@@ -43,7 +45,7 @@ from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.project import CHECKPOINT, RENDER, Project, is_project
 from caustic_cli.scene import Scene
 from caustic_cli.studies.manufacture import preview
-from caustic_cli.workflow.evaluation import judge
+from caustic_cli.workflow.evaluation import expected_seconds, judge
 from caustic_cli.workflow.reporter import Reporter
 
 #: Part of a picture that is brighter than NEARLY of its maximum from which on it looks like a drawing on white.
@@ -130,7 +132,12 @@ def begin(
         "solving the transport of the light to the picture; the first time, its kernels are compiled,"
         " which takes about half a minute"
     ):
-        project, first = first_heights(project, said)
+        try:
+            project, first = first_heights(project, said)
+        except OutOfReach as error:
+            most = largest_magnification(designer.scene, project.settings["target"]["size"])
+            within = f"; ⟨+mag⟩ of at most about {most:.2g} is within reach at this throw" if most else ""
+            raise InputError(f"{error}{within}") from error
     if out is not None:
         directory.settle(project, force)
     return project, first
@@ -357,7 +364,10 @@ def _run(
 ) -> Result:
     chosen = project.settings["design"]
     limit = chosen["time_limit"] if time_limit is None else time_limit
-    limit = max(LEAST_PART * limit, limit - (time.monotonic() - began))  # what the start took counts too
+    hurry = math.isfinite(limit)
+    if hurry:  # the limit is the command's: what the start took counts, and what the evaluation will take
+        after = expected_seconds(designer, target, state, device)
+        limit = max(LEAST_PART * limit, limit - (time.monotonic() - began) - after)
     records = _Records(project, designer, device)
     total = chosen["iterations"] or sum(s.iterations for s in designer.stages)
     with _signals(project.path is not None) as asked, say.progress(total) as show:
@@ -400,7 +410,7 @@ def _run(
                 f" caustic design ⟨resume⟩ {project.path} goes on",
                 128 + asked[0],
             )
-        found = judge(project, designer, target, state, device)
+        found = judge(project, designer, target, state, device, hurry)
         figures = found.figures | {"iterations": state.total, "seconds": time.monotonic() - began, "reason": found.state.reason}
         if project.path is not None:
             figures |= {"image": str(project.path / RENDER), "project": str(project.path)}

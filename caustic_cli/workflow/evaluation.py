@@ -5,6 +5,7 @@ What the optimiser saw is no judge of what it did: it learns its own rays and it
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,6 +30,8 @@ from caustic_cli.studies.waves import unseen_figures, wave_figures
 REPORT_SAMPLES = 401
 #: Losses whose aim is the likeness itself; another may rightly pay for what it wants with likeness.
 LIKENESS = {"rms", "rms-light", "throughput"}
+#: For `expected_seconds`: part of FINAL_RAYS that are traced, retraces and wave images of an evaluation, and time of its report.
+PROBE, RETRACES, WAVE_IMAGES, REPORT_SECONDS = 16, 2.5, 4, 2.5
 #: Part of relative_rms that the noise of its rays may be.
 QUIET = 0.1
 #: From so many times the light on the screen, a lens is kept although the surface it began from is more like the target.
@@ -50,9 +53,10 @@ class Evaluation:
     waves: np.ndarray | None
 
 
-def judge(project: Project, designer: Designer, target: np.ndarray, state: State, device: str) -> Evaluation:
+def judge(project: Project, designer: Designer, target: np.ndarray, state: State, device: str, hurry: bool = False) -> Evaluation:
     """Evaluate the finished lens; write render.png, wave.png and report.png into the project, if it has a directory."""
-    found = evaluate(designer, target, state, device, project.settings["design"]["seed"], tuple(project.settings["target"]["size"]))
+    chosen = project.settings["design"]
+    found = evaluate(designer, target, state, device, chosen["seed"], tuple(project.settings["target"]["size"]), hurry)
     if project.path is None:
         return found
     encoding = project.settings["target"]["encoding"]
@@ -77,19 +81,49 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
     return found
 
 
-def evaluate(designer: Designer, target: np.ndarray, state: State, device: str, seed: int, size: tuple[float, float]) -> Evaluation:
+def expected_seconds(designer: Designer, target: np.ndarray, state: State, device: str) -> float:
+    """About how long `judge` will take in a hurry, s: by a retrace of few rays, and a wave image where one was refined."""
+    scene, field, began = designer.scene, designer.field(state.stage), time.monotonic()
+    retrace(scene, field, state.heights, target, rays=FINAL_RAYS // PROBE, device=device, noise=False)
+    seconds = RETRACES * PROBE * (time.monotonic() - began) + REPORT_SECONDS
+    if any(s.waves for s in designer.stages):
+        began = time.monotonic()
+        wave_figures(scene, field, state.heights.to(device), target, Resolution.before(scene, scene.screen.size), required=False)
+        seconds += WAVE_IMAGES * (time.monotonic() - began)
+    return seconds
+
+
+def evaluate(
+    designer: Designer,
+    target: np.ndarray,
+    state: State,
+    device: str,
+    seed: int,
+    size: tuple[float, float],
+    hurry: bool = False,
+) -> Evaluation:
     """Retrace the finished lens with rays that it was not designed with, and where diffraction was refined, as a wave.
 
     Where nothing but likeness was asked for, a lens that is worse than what the design began from is replaced by that: by the wave
     image where that was refined, whose figures are then there too.
 
     Args:
-        seed: of the rays; size: width and height of the picture, mm.
+        seed: of the rays; size: width and height of the picture, mm; hurry: leave the noise at what FINAL_RAYS make of it.
     """
     scene, field = designer.scene, designer.field(state.stage)
 
     def trace(heights: torch.Tensor, noise: bool = True):
-        return retrace(scene, field, heights, target, rays=FINAL_RAYS, device=device, seed=seed, noise=noise, quiet=QUIET)
+        return retrace(
+            scene,
+            field,
+            heights,
+            target,
+            rays=FINAL_RAYS,
+            device=device,
+            seed=seed,
+            noise=noise,
+            quiet=None if hurry else QUIET,
+        )
 
     refined = any(s.waves for s in designer.stages[: state.stage + 1])
     light, seen = None, Resolution.before(scene, size)

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from importlib import import_module
 
 from caustic_cli.config import checks
+from caustic_cli.errors import InputError
 from caustic_cli.scene.sources.base import Source
 from caustic_cli.scene.sources.disc import Disc
 from caustic_cli.scene.sources.plane import PlaneWave
@@ -51,12 +52,24 @@ def names() -> tuple[str, ...]:
     return tuple(_TYPES)
 
 
+#: What people call sources, and how each is said.
+CALLED = {
+    "sun": "sunlight is ⟨source⟩ disc with ⟨+source.angle⟩ 0.533",
+    "led": "an LED is ⟨source⟩ disc with ⟨+source.size⟩ 1x1, ⟨+source.position⟩ 0,0,-50 and ⟨+source.intensity⟩ lambertian",
+    "lambertian": "that is an ⟨+source.intensity⟩, of ⟨source⟩ point, grid or disc",
+    "laser": "a laser's parallel beam is ⟨source⟩ plane",
+    "lamp": "a lamp is ⟨source⟩ disc with ⟨+source.size⟩ and ⟨+source.position⟩",
+}
+
+
 def type_of(name: str, where: str = "⟨source.type⟩") -> SourceType:
     """The type of that name.
 
     Raises:
         InputError: naming `where` it was asked for: there is none.
     """
+    if name in CALLED and name not in _TYPES:
+        raise InputError(f"{where} must be one of {', '.join(names())}, got {name!r}: {CALLED[name]}")
     return _TYPES[checks.choice(where, name, names())]
 
 
