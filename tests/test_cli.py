@@ -99,7 +99,7 @@ BAD = {
     "mag 0": (DESIGN + "--mag 0", "--mag"),
     "mag nan": (DESIGN + "--mag nan", "--mag"),
     "mag text": (DESIGN + "--mag three", "--mag"),
-    "mag too large for the lens": ("design blob.png --resolution 24 --mag 500", "--mag of at most about 50 is within reach"),
+    "mag too large for the lens": ("design blob.png -o x --resolution 24 --mag 500", "--mag of at most about 50 is within reach"),
     "sun": (DESIGN + "--source sun", "--source disc with --source-angle 0.533"),
     "led": (DESIGN + "--source led", "--intensity lambertian"),
     "degree": (DESIGN + "--degree 99", "--degree"),

@@ -146,7 +146,7 @@ def test_a_design_changes_its_source_and_resumes_inside_any_stage(capfd):
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        (["--source", "sun"], "--source must be one of plane, point, grid, disc, rays, got 'sun'"),
+        (["--source", "sun"], "--source must be one of plane, point, grid, disc, rays, got 'moon'"),
         (["--source", "point", "--source-position", "1,2"], "--source-position must be 3 numbers parted by commas"),
         (
             ["--wavelengths", "abc"],
@@ -211,7 +211,7 @@ def test_a_stage_of_a_plane_wave_may_have_a_source_that_stands_somewhere(capfd):
     Path("schedule.toml").write_text(plane)
     run(capfd, "design", "blob.png", "--config", "schedule.toml", "--resolution", "24", "--start", "offset", "--quiet")
     run(capfd, "render", "blob.caustic", "--rays", "4000", "--quiet")
-    Path("schedule.toml").write_text(plane.replace('"point"', '"sun"'))
+    Path("schedule.toml").write_text(plane.replace('"point"', '"moon"'))
     assert run(capfd, "design", "blob.png", "--config", "schedule.toml", "-o", "x", code=2) == (
         "caustic: [[design.stages]] source must be one of plane, point, grid, disc, rays, got 'sun'"
     )
