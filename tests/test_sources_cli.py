@@ -213,7 +213,7 @@ def test_a_stage_of_a_plane_wave_may_have_a_source_that_stands_somewhere(capfd):
     run(capfd, "render", "blob.caustic", "--rays", "4000", "--quiet")
     Path("schedule.toml").write_text(plane.replace('"point"', '"moon"'))
     assert run(capfd, "design", "blob.png", "--config", "schedule.toml", "-o", "x", code=2) == (
-        "caustic: [[design.stages]] source must be one of plane, point, grid, disc, rays, got 'sun'"
+        "caustic: [[design.stages]] source must be one of plane, point, grid, disc, rays, got 'moon'"
     )
 
 
