@@ -63,6 +63,14 @@ def run(
         Path | None,
         typer.Option(metavar="FILE", help="Also write the irradiance: power per pixel as a part of the source's, float64, [i, j]."),
     ] = None,
+    html: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Also write a page that traces the lens itself in any browser, without a network: the lens in three dimensions,"
+            " the caustic as screen and light are moved, target and difference.",
+        ),
+    ] = None,
     verify: Annotated[
         str | None,
         typer.Option(
@@ -131,6 +139,7 @@ def run(
         explain,
         output,
         npy,
+        html,
         verify is not None,
         report,
         tool_radius,

@@ -9,11 +9,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, cast
 
+import numpy as np
 import torch
 
 from caustic_cli.config.completion import filter_from
 from caustic_cli.errors import InputError
 from caustic_cli.export.mitsuba import quick_samples, write_mitsuba
+from caustic_cli.export.page import refuse_untraceable
 from caustic_cli.io.files import discard, refuse_foreign
 from caustic_cli.io.picture import write_image, write_npy
 from caustic_cli.optics.emission.measured import coarse_words
@@ -25,6 +27,7 @@ from caustic_cli.studies import effects as effects_study
 from caustic_cli.studies import manufacture
 from caustic_cli.studies.retrace import white_level
 from caustic_cli.studies.verify import require_mitsuba, verify, write_panels
+from caustic_cli.workflow import page
 from caustic_cli.workflow.compilation import compile_for
 from caustic_cli.workflow.lens import Lens, is_archive
 from caustic_cli.workflow.reporter import Reporter
@@ -43,6 +46,7 @@ class Request:
         screen_at: the screen's z instead of the scene's, mm.
         effects: auto, none or names, see `optics.plan.parse_effects`; explain: measure what each costs.
         image, npy: files to write; None for render.png in the project, and for none.
+        html: file for a page that traces the lens itself, None for none.
         verify: compare with Mitsuba; report: say what making the lens asks for, tool_radius in mm.
         force: replace files that are not ours, and do again what is up to date.
         seed, dtype: of rays; None for the project's own and for float64.
@@ -60,6 +64,7 @@ class Request:
     explain: bool = False
     image: Path | None = None
     npy: Path | None = None
+    html: Path | None = None
     verify: bool = False
     report: bool = False
     tool_radius: float | None = None
@@ -111,7 +116,7 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     panels = companion("verify.png") if asked.verify else None
     sheet = companion("report.json") if asked.report else None
     wave_path, wave_npy = beside(image_path), beside(asked.npy) if asked.npy else None
-    paths = (image_path, asked.npy, panels, sheet, wave_path, wave_npy)
+    paths = (image_path, asked.npy, asked.html, panels, sheet, wave_path, wave_npy)
     for path in paths:
         if path is not None:
             refuse_foreign(path, asked.force)
@@ -127,6 +132,8 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     scene = lens.scene
     if asked.verify:
         require_mitsuba(scene)
+    if asked.html is not None:
+        refuse_untraceable(scene)
     filter = filter_from(asked.reconstruction, asked.filter_size, scene.screen, asked.alpha)
     seed = lens.seed if asked.seed is None else asked.seed
     plan = lens.plan(asked.effects)
@@ -149,9 +156,14 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
         discard(wave_path)  # of what render.png was before
     if asked.npy is not None:
         write_npy(asked.npy, image)
+    waves = None
     if plan["diffraction"].on:
         with say.notify_if_slow("taking the wave image"):
-            figures |= _wave_image(plan, lens, device, asked.effects != "auto", wave_path, wave_npy)
+            waves, more = _wave_image(plan, lens, device, asked.effects != "auto", wave_path, wave_npy)
+        figures |= more
+    if asked.html is not None:
+        page.write(asked.html, lens, plan, figures, waves, asked.lens.resolve().stem)
+        figures["page"] = str(asked.html)
     figures |= {
         "iterations": None if lens.state is None else lens.state.total,
         "seconds": time.monotonic() - began,
@@ -172,15 +184,17 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     return figures
 
 
-def _wave_image(plan: Plan, lens: Lens, device: str, required: bool, path: Path, npy: Path | None) -> dict:
-    """Write the wave image; its figures."""
+def _wave_image(
+    plan: Plan, lens: Lens, device: str, required: bool, path: Path, npy: Path | None
+) -> tuple[np.ndarray | None, dict]:
+    """Write the wave image; it, None where there is none, and its figures."""
     image, figures = lens.render_waves(effects=plan, required=required, device=device)
     if not image.size:
-        return figures
+        return None, figures
     write_image(path, image, white_level(image, lens.target), lens.encoding)
     if npy is not None:
         write_npy(npy, image)
-    return figures | {"wave_image": str(path)}
+    return image, figures | {"wave_image": str(path)}
 
 
 def _verified(scene: Scene, lens: Lens, rays: int, seed: int, panels: Path) -> dict:

@@ -1,0 +1,266 @@
+"""A lens as one HTML page that traces itself: `page.html`, `page.css` and `page.js`, and in them the lens, light and screen.
+
+The page holds the exit surface as a cloud of points on an even grid, heights and slopes, and traces from that in the browser
+whatever is to be seen, without a network.  Numbers are 16-bit codes between the least and the greatest value: a slope's last
+code moves light by 1/65,535 of the picture that all slopes together span, far less than a pixel.
+
+Notation
+    c[i, j]     codes, i along +x and j along +y; kept are their differences along both axes, modulo 2^16, which deflate well
+    i(theta)    intensity of a near source, part of its power per solid angle, 1/sr
+    s           |d - a| / 2 sin(theta_c / 2): how far a ray's direction is from the axis of its cone, in parts of the cone's edge
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import math
+import zlib
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from caustic_cli import __version__
+from caustic_cli.errors import InputError
+from caustic_cli.export.surface import sample_grid
+from caustic_cli.io.files import CREATED_BY, write_bytes
+from caustic_cli.optics.emission.brightness import bright_points
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.scene import Scene, Screen, Source
+
+#: Cells of the cloud across its longer side, the finest that fits; multiples of COARSEST, by which the page thins them out.
+CELLS = (1024, 768, 512, 384)
+COARSEST = 32
+#: Largest page, bytes: what mail takes; and what of it is for the cloud.
+MOST, MOST_CLOUD = 5_000_000, 3_400_000
+#: Pixels of the page's screen across, at most; a finer target is averaged down to them.
+PIXELS = 512
+#: Positions of a source, at most; of more, so many are taken evenly.
+PLACES = 1024
+#: Angles of an intensity's table, and points of a source's picture.
+ANGLES, BRIGHT = 257, 256
+#: What the page traces, by the names of effects; of others it says that it leaves them out.
+TRACED = frozenset(
+    {
+        "source-size",
+        "entrance",
+        "intersection",
+        "missed-surface",
+        "absorption",
+        "fresnel",
+        "total-reflection",
+        "mirror",
+        "screen-tilt",
+        "screen-shift",
+        "dispersion",
+    }
+)
+#: The plastic number's powers, whose multiples fill a square evenly (Roberts 2018).
+EVEN = (0.7548776662466927, 0.5698402909980532)
+
+
+def refuse_untraceable(scene: Scene) -> None:
+    """Stop before work begins where the page could not trace the light.
+
+    Raises:
+        InputError: the source is a ray file.
+    """
+    if any(one.rays is not None for one in scene.source.members):
+        raise InputError(
+            "⟨html⟩: the page traces plane waves, points, grids and discs, not the rays of a file; ⟨source.type⟩ renders it under"
+            " another light"
+        )
+
+
+def write_page(
+    path: str | Path,
+    scene: Scene,
+    field: HeightField,
+    heights: Tensor,
+    target: np.ndarray | None = None,
+    *,
+    title: str = "Lens",
+    rows: Sequence[tuple[str, str]] = (),
+    notes: Sequence[str] = (),
+    waves: np.ndarray | None = None,
+    encoding: str = "srgb",
+) -> None:
+    """Write the page.
+
+    Args:
+        scene: as a plan leaves it; what its effects are beyond TRACED is for `notes` to say.
+        heights: (n, m) control heights, mm.
+        target: (n_x, n_y) or (3, n_x, n_y) on the scene's screen, any scale; None for a page without it.
+        title: of the page; rows: names and figures in a table; notes: sentences below it.  Any text, which is escaped.
+        waves: the wave image, shown as it is; as `target`.
+        encoding: of the picture, srgb or linear, by which images are shown.
+
+    Raises:
+        InputError: the source is a ray file, or the file cannot be written.
+    """
+    refuse_untraceable(scene)
+    screen = _coarser(scene.screen)
+    lens = scene.lens
+    data = {
+        "title": title,
+        "lens": {
+            "size": list(lens.size),
+            "zIn": lens.z_in,
+            "round": lens.round,
+            "mirror": lens.mirror,
+            "fresnel": ["none", "schlick", "exact"].index("none" if lens.mirror else lens.fresnel),
+            "absorption": 0.0 if lens.mirror else lens.absorption,
+        },
+        "screen": {
+            "z": screen.z,
+            "low": list(screen.low),
+            "pixel": list(screen.pixel),
+            "resolution": list(screen.resolution),
+            "axes": [list(axis) for axis in screen.axes],
+        },
+        "lights": _lights(scene),
+        "encoding": encoding,
+        "target": None if target is None else _coded(_onto(target, screen)),
+        "waves": None if waves is None else _coded(_onto(waves, screen)),
+    }
+    words = {"title": html.escape(title), "rows": _table(rows), "notes": "".join(f"<p>{html.escape(note)}</p>" for note in notes)}
+    for cells in CELLS:
+        cloud = _cloud(scene, field, heights, cells)
+        if sum(len(part["data"]) for part in cloud.values() if part) <= MOST_CLOUD or cells == CELLS[-1]:
+            break
+    page = _assembled(words, data | {"cloud": cloud}).encode()
+    assert len(page) <= MOST, len(page)
+    write_bytes(path, page)
+
+
+def _assembled(words: dict[str, str], data: dict) -> str:
+    """The files of the page in one; a text in `data` cannot end the element that holds it, since none has a < of its own."""
+    here = resources.files(__name__)
+    style, script, page = ((here / f"page.{kind}").read_text("utf-8") for kind in ("css", "js", "html"))
+    held = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    parts = words | {"created": f"{CREATED_BY} {__version__}", "style": style, "script": script, "data": held}
+    pieces = page.split("@@")  # text, name, text, name, ..., text: what is put in is not looked at again
+    pieces[1::2] = [parts[name] for name in pieces[1::2]]
+    return "".join(pieces)
+
+
+def _table(rows: Sequence[tuple[str, str]]) -> str:
+    return "".join(f"<tr><th scope=row>{html.escape(name)}</th><td>{html.escape(value)}</td></tr>" for name, value in rows)
+
+
+def _cloud(scene: Scene, field: HeightField, heights: Tensor, cells: int) -> dict:
+    """The exit surface on an even grid over the aperture, and the profile of a plane wave there."""
+    longest = max(scene.lens.size)
+    counts = tuple(COARSEST * max(1, round(cells * w / longest / COARSEST)) + 1 for w in scene.lens.size)
+    grid = sample_grid(field, heights, counts)
+    profile = scene.source.profile
+    return {
+        "z": _coded(grid.z),
+        "zx": _coded(grid.zx),
+        "zy": _coded(grid.zy),
+        "profile": None if profile is None else _coded(_at_points(profile, counts)),
+    }
+
+
+def _at_points(profile: np.ndarray, counts: tuple[int, int]) -> np.ndarray:
+    """A profile's cells, over their mean, at the points of an even grid over the aperture, borders included."""
+    at = [np.minimum((np.linspace(0.0, 1.0, n) * m).astype(int), m - 1) for n, m in zip(counts, profile.shape, strict=True)]
+    return (profile / profile.mean())[np.ix_(*at)]
+
+
+def _coarser(screen: Screen) -> Screen:
+    """The screen with at most PIXELS pixels across."""
+    factor = max(1.0, max(screen.resolution) / PIXELS)
+    nx, ny = (max(1, round(n / factor)) for n in screen.resolution)
+    return Screen(screen.size, screen.z, (nx, ny), screen.tilt, screen.shift)
+
+
+def _onto(image: np.ndarray, screen: Screen) -> np.ndarray:
+    """An image's light, of all colours, on the pixels of a screen of the same size."""
+    grey = image.sum(0) if image.ndim == 3 else image
+    (a, b), (n, m) = grey.shape, screen.resolution
+    return _shares(a, n) @ grey @ _shares(b, m).T
+
+
+def _shares(fine: int, coarse: int) -> np.ndarray:
+    """Part of each of `fine` equal cells that lies in each of `coarse` ones over the same length: (coarse, fine)."""
+    if fine == coarse:
+        return np.eye(fine)
+    edges, own = np.arange(fine + 1) / fine, np.arange(coarse + 1) / coarse
+    ends = np.minimum(edges[None, 1:], own[1:, None]) - np.maximum(edges[None, :-1], own[:-1, None])
+    return np.clip(ends, 0.0, None) * fine
+
+
+def _coded(values: np.ndarray) -> dict:
+    """Codes of values (n, m): their differences' low bytes, then their high bytes, deflated, in base64."""
+    low, high = float(values.min()), float(values.max())
+    span = (high - low) or 1.0
+    codes = np.rint((values - low) * (65535.0 / span)).astype(np.int64)
+    steps = np.diff(np.diff(codes, axis=1, prepend=0), axis=0, prepend=0).astype(np.uint16)
+    deflated = zlib.compress((steps & 255).astype(np.uint8).tobytes() + (steps >> 8).astype(np.uint8).tobytes(), 9)
+    return {"shape": list(values.shape), "low": low, "step": span / 65535.0, "data": base64.b64encode(deflated).decode()}
+
+
+def _lights(scene: Scene) -> list[dict]:
+    """What shines: a part of all power each, at its refractive indices with their parts of its own."""
+    lights = []
+    for k, one in enumerate(scene.by_source):
+        indices: dict[float, float] = {}
+        for band in scene.bands:
+            if band.member in (None, k):
+                index = band.scene.lens.inside
+                indices[index] = indices.get(index, 0.0) + band.weight
+        total = math.fsum(indices.values())
+        lights.append(
+            {
+                "weight": scene.source.fractions[k],
+                "indices": [[index, part / total] for index, part in indices.items()],
+                **_source(one, one.source),
+            }
+        )
+    return lights
+
+
+def _source(scene: Scene, source: Source) -> dict:
+    """Places from the middle of the entrance, mm, with their parts; half widths about each; the cone and i(theta) by s."""
+    if source.distant:
+        wide = math.sin(source.half_angle)
+        return {"near": False, "places": [[0.0, 0.0, 0.0, 1.0]], "extent": [wide, wide], "picture": _picture(source)}
+    (places, parts), lens = source.points(), scene.lens
+    if len(places) > PLACES:
+        kept = np.linspace(0, len(places) - 1, PLACES).round().astype(int)
+        places, parts = places[kept], parts[kept] / parts[kept].sum()
+    cone = source.cone_over(lens.half_size, lens.z_in, lens.round)
+    angles = 2.0 * np.arcsin(np.linspace(0.0, 1.0, ANGLES) * math.sin(0.5 * cone))
+    return {
+        "near": True,
+        "places": [[x, y, z - lens.z_in, float(part)] for (x, y, z), part in zip(places.tolist(), parts, strict=True)],
+        "extent": list(source.frame if source.brightness is not None else source.extent),
+        "picture": _picture(source),
+        "chord": 2.0 * math.sin(0.5 * cone),
+        "cut": source.cone is not None,
+        "intensity": [float(f"{v:.7g}") for v in _intensity(source, angles, cone)],
+    }
+
+
+def _intensity(source: Source, angles: np.ndarray, cone: float) -> np.ndarray:
+    """i(theta) at angles from the axis, rad, within the cone."""
+    if isinstance(source.intensity, str):
+        lambertian = source.intensity == "lambertian"
+        whole = math.pi * (math.sin(cone) ** 2 if lambertian else 4.0 * math.sin(0.5 * cone) ** 2)
+        return (np.cos(angles) if lambertian else np.ones_like(angles)) / whole
+    return source.intensity.relative(angles) / source.intensity.flux(cone)
+
+
+def _picture(source: Source) -> list[list[float]] | None:
+    """Points of [-1, 1]^2, as many where the source is twice as bright; None of an ellipse that is even."""
+    if source.brightness is None:
+        return None
+    a, b = (torch.from_numpy(np.arange(1, BRIGHT + 1) * step % 1.0) for step in EVEN)
+    x, y = bright_points(source.brightness, a, b)
+    return torch.stack([x, y], -1).tolist()

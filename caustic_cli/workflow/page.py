@@ -1,0 +1,107 @@
+"""A lens as a page for whoever will make it: its names and figures beside what the page traces itself."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from caustic_cli import __version__
+from caustic_cli.export.page import TRACED, write_page
+from caustic_cli.export.surface import sample_grid
+from caustic_cli.optics.plan import Plan
+from caustic_cli.scene import Scene
+from caustic_cli.workflow.lens import Lens
+
+#: Points along each axis at which walls and slopes are looked at.
+SAMPLES = 601
+#: What is missing where the page does not trace an effect that the scene calls for.
+MISSING = {
+    "polarisation": "polarised light is taken as unpolarised",
+    "roughness": "the blur of a rough surface",
+    "ghosts": "ghost light, reflected inside the lens",
+    "secondary-intersection": "light that meets the exit a second time",
+    "diffraction": "diffraction: rays show folds of light sharper and brighter than waves make them",
+}
+
+
+def write(path: str | Path, lens: Lens, plan: Plan, figures: Mapping[str, Any], waves: np.ndarray | None, title: str) -> None:
+    """Write the page.
+
+    Args:
+        plan: of the lens' scene; figures: of its render; waves: its wave image, where that was taken; title: any text.
+
+    Raises:
+        InputError: the light cannot be traced on a page, or the file not be written.
+    """
+    scene = plan.scene
+    write_page(
+        path,
+        scene,
+        lens.field,
+        lens.heights,
+        lens.target,
+        title=title,
+        rows=[*_lens_rows(lens), *_light_rows(lens.scene), *_figure_rows(figures)],
+        notes=_notes(plan),
+        waves=waves,
+        encoding=lens.encoding,
+    )
+
+
+def _size(values: tuple[float, float], unit: str = " mm") -> str:
+    return " × ".join(f"{v:.6g}" for v in values) + unit
+
+
+def _lens_rows(lens: Lens) -> list[tuple[str, str]]:
+    """What it is made of, and how thick and steep it is within its aperture."""
+    one, grid = lens.scene.lens, sample_grid(lens.field, lens.heights, (SAMPLES, SAMPLES))
+    rx, ry = one.half_size
+    inside = (grid.x[:, None] / rx) ** 2 + (grid.y[None, :] / ry) ** 2 <= 1.0 if one.round else np.ones(grid.z.shape, dtype=bool)
+    z, slope = grid.z[inside], np.hypot(grid.zx, grid.zy)[inside]
+    depth = ("Depth of the surface", f"{z.max() - z.min():.4f} mm from its lowest to its highest point")
+    steepest = ("Steepest slope", f"{slope.max():.4f}, {math.degrees(math.atan(slope.max())):.2f}°")
+    size = f"round, {_size(one.size[:1])} across" if one.round else _size(one.size)
+    if one.mirror:
+        return [("Mirror", f"{size}; the side towards the light reflects"), depth, steepest]
+    return [
+        ("Lens", f"{size}; flat where light enters, free-form where it leaves"),
+        ("Refractive index", f"{one.index:.6g}" + (f" ({one.glass})" if one.glass else "")),
+        ("Wall", f"{z.min() - one.z_in:.4f} mm where it is thinnest, {z.max() - one.z_in:.4f} mm where it is thickest"),
+        depth,
+        steepest,
+    ]
+
+
+def _light_rows(scene: Scene) -> list[tuple[str, str]]:
+    source, screen = scene.source, scene.screen
+    centre = "" if source.distant else f", its middle at {', '.join(f'{c:.6g}' for c in source.centre)} mm"
+    return [
+        ("Light", f"{source.kind}: {source.extent_words(scene.lens.z_in)}{centre}"),
+        ("Throw", f"{abs(screen.z):.6g} mm from the lens’ origin to the screen"),
+        ("Screen", f"{_size(screen.size)}, {_size(screen.resolution, '')} pixels"),
+    ]
+
+
+def _figure_rows(figures: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """What the render found, by rays of its own."""
+    rms, noise, waves = (figures.get(key) for key in ("relative_rms", "noise", "wave_relative_rms"))
+    rows = [("Rendered", f"{figures['rays']:,} rays; {figures['on_screen']:.2%} of the light on the screen")]
+    if rms is not None:
+        rows.append(("Relative RMS error", f"{rms:.4f}" + ("" if noise is None else f" ± {noise:.2g}") + ", by rays"))
+    return rows if waves is None else [*rows, ("Error as a wave", f"{waves:.4f}, of what light will do")]
+
+
+def _notes(plan: Plan) -> list[str]:
+    missing = [MISSING[name] for name in plan.simulated if name not in TRACED]
+    notes = [f"Not traced on this page: {'; '.join(missing)}."] if missing else []
+    if plan.scene.colored:
+        notes.append("The picture is coloured; this page shows the light of all its colours together.")
+    notes.append(
+        "Pictures show the screen from behind, as through a translucent one: x to the right, y upwards. Light that leans along x"
+        f" travels towards +x. Made by caustic {__version__}."
+    )
+    return notes
