@@ -46,6 +46,14 @@ def run(
         Path | None,
         typer.Option("-o", "--out", metavar="DIR", help="Project directory.  [default: TARGET's stem + .caustic, here]"),
     ] = None,
+    movie: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Also record the design: the image at its iterations, as the optimiser sees it, then the finished lens'; .gif, or"
+            " .mp4 where ffmpeg is installed.",
+        ),
+    ] = None,
     force: options.Force = False,
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -76,6 +84,10 @@ def run(
     piped = not resume and str(target) == "-"
     path = out or Path(f"{'picture' if piped else target.stem or 'design'}.caustic")
     picture: Any = target
+    if movie is not None and speaks:
+        from caustic_cli.io.movie import refuse_unwritable  # noqa: PLC0415
+
+        refuse_unwritable(movie, force)
     if not resume and speaks:
         from caustic_cli.config.presets import path_of  # noqa: PLC0415
         from caustic_cli.io.files import read_stdin  # noqa: PLC0415
@@ -102,9 +114,13 @@ def run(
             project = target if target.is_dir() else path
             if not target.exists() and not project.exists():
                 raise InputError(f"{target}: no such project; --resume needs a directory made by caustic design")
-            lens = library.resume(project, iterations=iterations, time_limit=time_limit, say=say, device=device)
+            lens = library.resume(
+                project, iterations=iterations, time_limit=time_limit, movie=movie, force=force, say=say, device=device
+            )
         else:
-            lens = library.design_of(picture, given, preset=preset, config=config, out=path, force=force, say=say, device=device)
+            lens = library.design_of(
+                picture, given, preset=preset, config=config, out=path, force=force, movie=movie, say=say, device=device
+            )
     say.table(lens.figures["project"], [*console.figures_rows(lens.figures), ("ended by", lens.figures["reason"])])
     if json:
         console.emit_json(lens.figures)

@@ -78,7 +78,7 @@ class State:
     stage, iteration: index of the stage and iterations done in it; total: iterations done in all; heights (n, m) mm
     float64, the lens so far; parameters, optimizer: tensors by name, empty when a stage has yet to begin; history:
     rows (iteration, stage, loss, on_screen, seconds); seconds: spent so far; reason: why it ended, "" if it has not; start
-    (n_0, m_0), the heights it began from, on the first stage's net.
+    (n_0, m_0), the heights it began from, on the first stage's net; image, that the last iteration saw, of this run alone.
     """
 
     heights: Tensor
@@ -91,6 +91,7 @@ class State:
     seconds: float = 0.0
     reason: str = ""
     start: Tensor | None = None
+    image: Tensor | None = None
 
 
 class Designer:
@@ -253,7 +254,7 @@ class Designer:
                 raise CausticError("the heights stopped being finite; a smaller ⟨lr⟩ may help")
             state.iteration, state.total, state.seconds = state.iteration + 1, state.total + 1, time.monotonic() - origin
             state.history.append((state.total, k, method.loss, method.on_screen, state.seconds))
-            state.parameters, state.optimizer = heights.state_dict(), method.state()
+            state.parameters, state.optimizer, state.image = heights.state_dict(), method.state(), method.image
             on_iteration(state)
 
     def _objective(self, k: int, heights: Heights) -> Objective | WaveObjective:

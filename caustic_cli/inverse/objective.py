@@ -32,12 +32,13 @@ CHUNK, KEPT_RAYS = 1 << 20, 1 << 22
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Loss (units of eq. 5.2.1), its gradients over the heights of each surface (n, m) per mm, and the part of the light on the
-    screen."""
+    """Loss (units of eq. 5.2.1), its gradients over the heights of each surface (n, m) per mm, the part of the light on the
+    screen, and the image there that was judged, power per pixel, (n_x, n_y) or (3, n_x, n_y)."""
 
     loss: float
     gradients: dict[str, Tensor]
     on_screen: float
+    image: Tensor
 
     @property
     def gradient(self) -> Tensor:
@@ -217,7 +218,7 @@ class Objective:
                 gradient += more
         a = self.apron
         inner = seen.detach()[..., a : seen.shape[-2] - a, a : seen.shape[-1] - a]
-        return Evaluation(float(loss.detach()), dict(zip(parameters, gradients, strict=True)), float(inner.sum()))
+        return Evaluation(float(loss.detach()), dict(zip(parameters, gradients, strict=True)), float(inner.sum()), inner)
 
     def _see(self, traced: Tracer, parameters: Parameters) -> tuple[Tensor, Tensor]:
         """What a chunk adds to the image, and to the power that leaves the lens."""

@@ -28,7 +28,7 @@ class NotFinite(CausticError):
 
 
 class Adam:
-    """Adam on the loss itself, as the thesis runs it; `loss` and `on_screen` belong to the point before the step.
+    """Adam on the loss itself, as the thesis runs it; `loss`, `on_screen` and `image` belong to the point before the step.
 
     A step is looked at before it counts: where it leads to nothing finite, or to no light, half of it is tried, and so on, so
     that what a checkpoint holds has always been evaluated.  `taken_back` counts such steps.
@@ -36,6 +36,7 @@ class Adam:
 
     def __init__(self, objective: Objective, heights: Heights, lr: float):
         self.objective, self.heights, self.loss, self.on_screen = objective, heights, math.inf, 0.0
+        self.image: Tensor | None = None
         self.adam = torch.optim.Adam(heights.parameters(), lr=lr)
         self.here: tuple[Tensor, Evaluation] | None = None
         self.taken_back = 0
@@ -46,7 +47,7 @@ class Adam:
         self.adam.zero_grad()
         z.backward(e.gradient.to(z.device))
         self.adam.step()
-        self.loss, self.on_screen, self.here = e.loss, e.on_screen, None
+        self.loss, self.on_screen, self.image, self.here = e.loss, e.on_screen, e.image, None
         for halvings in range(MOST_HALVINGS):
             try:
                 self.here = self._look()
@@ -101,7 +102,8 @@ class Newtonlike:
         self.objective, self.heights = objective, heights
         (self.parameter,) = heights.parameters()
         self.pixels = objective.loss.target.numel()
-        self.seen: dict[float, float] = {}
+        self.seen: dict[float, tuple[float, Tensor]] = {}
+        self.image: Tensor | None = None
         self.taken_back = 0
         self.method = LBFGS(self._evaluate, self.parameter.detach().reshape(-1).clone())
         self.loss, self.on_screen = math.inf, 0.0
@@ -121,7 +123,8 @@ class Newtonlike:
         relative = e.loss * self.pixels
         (g,) = torch.autograd.grad(z, self.parameter, e.gradient.to(z.device) * (self.pixels * relative))
         value = 0.5 * relative * relative
-        self.seen[value] = e.on_screen
+        least = min(self.seen, default=value)  # what the search takes is the best it found, or the last
+        self.seen = {key: found for key, found in self.seen.items() if key == least} | {value: (e.on_screen, e.image)}
         return value, g.reshape(-1)
 
     def step(self) -> bool:
@@ -130,7 +133,7 @@ class Newtonlike:
         self.parameter.data = self.method.x.view(self.parameter.shape)
         if self.method.f is not None:
             self.loss = math.sqrt(2.0 * self.method.f) / self.pixels
-            self.on_screen = self.seen.get(self.method.f, self.on_screen)
+            self.on_screen, self.image = self.seen.get(self.method.f, (self.on_screen, self.image))
         return moved
 
     def state(self) -> dict[str, Tensor]:

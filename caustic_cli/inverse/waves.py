@@ -155,7 +155,7 @@ class WaveObjective:
             gradient = gradient + direct
         a = self.apron
         inner = image.detach()[..., a : image.shape[-2] - a, a : image.shape[-1] - a]
-        return Evaluation(float(loss.detach()), {EXIT: gradient}, float(inner.sum()))
+        return Evaluation(float(loss.detach()), {EXIT: gradient}, float(inner.sum()), inner)
 
     def _moved(self, front: Wavefront, change: Tensor) -> Tensor:
         """How far the surface moved where light of a wavefront meets it, (n, m) mm."""

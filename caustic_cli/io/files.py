@@ -195,7 +195,7 @@ def write_bytes(path: str | Path, data: bytes) -> None:
 
 
 def is_ours(path: str | Path) -> bool:
-    """Whether this program made the file: by our mark in a PNG, .npy, .npz, STL, JSON or text; nothing else is ours.
+    """Whether this program made the file: by our mark in a PNG, GIF, MP4, .npy, .npz, STL, JSON or text; nothing else is ours.
 
     Read are its first and last 1024 bytes.  What cannot be read is not ours.
     """
@@ -211,6 +211,8 @@ def is_ours(path: str | Path) -> bool:
         return int.from_bytes(head[8:10], "little") == NPY_HEADER - 10
     if head.startswith(b"\x89PNG"):
         return b"Software\x00" + MARK in head
+    if head[4:8] == b"ftyp":
+        return CREATED_BY.encode() + b" " in tail  # the comment of an MP4
     if head.startswith(b"PK"):
         return tail.endswith(MARK)  # the archive's comment
     if MARK in head[:80] and size == 84 + 50 * int.from_bytes(head[80:84], "little"):

@@ -242,10 +242,14 @@ def _luminance(image: Image.Image, linear: bool, transparent: bool, white: bool)
 
 def write_image(path: str | Path, irradiance: np.ndarray, white: float, encoding: str) -> None:
     """Write irradiance (n_x, n_y), [i, j], as an 8-bit grey PNG with `white` (and everything above) at 255; (3, n_x, n_y), RGB."""
+    _write_png(Path(path), Image.fromarray(codes_of(irradiance, white, encoding)))
+
+
+def codes_of(irradiance: np.ndarray, white: float, encoding: str) -> np.ndarray:
+    """Irradiance as 8-bit codes in image order, (rows, columns), or (rows, columns, 3) of colours, as `write_image` writes it."""
     value = np.clip(irradiance / white if white > 0 else np.zeros_like(irradiance), 0.0, 1.0)
     value = to_srgb(value) if encoding == "srgb" else value
-    codes = np.moveaxis(np.rint(value * 255.0).astype(np.uint8), (-1, -2), (0, 1))[::-1]
-    _write_png(Path(path), Image.fromarray(np.ascontiguousarray(codes)))
+    return np.ascontiguousarray(np.moveaxis(np.rint(value * 255.0).astype(np.uint8), (-1, -2), (0, 1))[::-1])
 
 
 def write_npy(path: str | Path, array: np.ndarray) -> None:

@@ -46,6 +46,7 @@ from caustic_cli.project.project import CHECKPOINT, RENDER, Project, is_project
 from caustic_cli.scene import Scene
 from caustic_cli.studies.manufacture import preview
 from caustic_cli.workflow.evaluation import expected_seconds, judge
+from caustic_cli.workflow.movie import Movie
 from caustic_cli.workflow.reporter import Reporter
 
 #: Part of a picture that is brighter than NEARLY of its maximum from which on it looks like a drawing on white.
@@ -176,8 +177,10 @@ class Result:
     figures: dict[str, Any]
 
 
-def design(project: Project, first: torch.Tensor | None, device: str, say: Reporter, began: float) -> Result:
-    """Run a new design from its first heights to its end.
+def design(
+    project: Project, first: torch.Tensor | None, device: str, say: Reporter, began: float, movie: Movie | None = None
+) -> Result:
+    """Run a new design from its first heights to its end; movie: records it.
 
     One that `begin` found needs no work, or goes on.
     """
@@ -188,13 +191,15 @@ def design(project: Project, first: torch.Tensor | None, device: str, say: Repor
             + ("there is nothing to do; ⟨force⟩ designs it anew" if figures else "it goes on from its checkpoint")
         )
         if not figures:
-            return resume(project, None, None, device, say, began)
+            return resume(project, None, None, device, say, began, movie)
+        if movie is not None:
+            say.say(f"{movie.path}: is not written, since nothing was designed")
         scene = project.scene()
         return Result(project, scene, project.lens(scene)[0], project.target(scene), project.found.state, figures)
     with project.hold:
         designer, target = _designer(project, device)
         _say_limits(project, designer, target, first, say)
-        return _run(project, designer, target, designer.begin(first), say, began, None, device)
+        return _run(project, designer, target, designer.begin(first), say, began, None, device, movie)
 
 
 def _say_limits(project: Project, designer: Designer, target: np.ndarray, first: torch.Tensor | None, say: Reporter) -> None:
@@ -220,7 +225,15 @@ def _listed(wavelengths: tuple[float, ...]) -> str:
     return ", ".join(f"{w:.4g}" for w in wavelengths)
 
 
-def resume(project: Project, iterations: int | None, time_limit: float | None, device: str, say: Reporter, began: float) -> Result:
+def resume(
+    project: Project,
+    iterations: int | None,
+    time_limit: float | None,
+    device: str,
+    say: Reporter,
+    began: float,
+    movie: Movie | None = None,
+) -> Result:
     """Go on from the last checkpoint; with nothing left to do, judge the lens again."""
     with project.hold:
         project.hold.enter_context(directory.locked(project.path))
@@ -246,7 +259,7 @@ def resume(project: Project, iterations: int | None, time_limit: float | None, d
             project.write_settings()
         if begun:
             project = replace(project, asked=uptodate.asked_of(project, before))
-        return _run(project, designer, target, state, say, began, time_limit, device)
+        return _run(project, designer, target, state, say, began, time_limit, device, movie)
 
 
 def follow(device: str) -> None:
@@ -265,6 +278,7 @@ def _on_cpu(state: State) -> State:
         state,
         heights=state.heights.cpu(),
         start=start,
+        image=None,
         parameters={k: v.cpu() for k, v in state.parameters.items()},
         optimizer={k: v.cpu() for k, v in state.optimizer.items()},
     )
@@ -361,6 +375,7 @@ def _run(
     began: float,
     time_limit: float | None,
     device: str,
+    movie: Movie | None = None,
 ) -> Result:
     chosen = project.settings["design"]
     limit = chosen["time_limit"] if time_limit is None else time_limit
@@ -387,6 +402,8 @@ def _run(
                 now.total,
                 total,
             )
+            if movie is not None:
+                movie.record(now, target, project.settings["target"]["encoding"], bool(designer.stages[stage].waves))
             if time.monotonic() - saved >= chosen["checkpoint_every"]:
                 saved = time.monotonic()  # before the writing, which takes its time too
                 records.keep(now)
@@ -405,6 +422,8 @@ def _run(
         if not asked:
             state.heights = designer.within_limits(state)
         if asked:
+            if movie is not None:
+                movie.write()
             raise Interrupted(
                 f"interrupted after {state.total} iterations; {project.path / CHECKPOINT} is saved,"
                 f" caustic design ⟨resume⟩ {project.path} goes on",
@@ -415,6 +434,11 @@ def _run(
         if project.path is not None:
             figures |= {"image": str(project.path / RENDER), "project": str(project.path)}
         records.keep(found.state, figures)
+        if movie is not None:
+            movie.finish(found.image if found.waves is None else found.waves, found.figures)
+            movie.write()
+            say.say(f"{movie.path}: {len(movie.frames)} frames of the design")
+            figures = figures | {"movie": str(movie.path)}
         if asked:
             raise Interrupted(f"interrupted when the design was done; {project.path} is whole", 128 + asked[0])
     return Result(project, designer.scene, designer.field(found.state.stage), target, found.state, figures)

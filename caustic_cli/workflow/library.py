@@ -37,6 +37,7 @@ from caustic_cli.scene import Scene
 from caustic_cli.workflow import design as workflow
 from caustic_cli.workflow.compilation import compile_for, compile_usual
 from caustic_cli.workflow.lens import Lens, Render, count, load
+from caustic_cli.workflow.movie import Movie
 from caustic_cli.workflow.reporter import Listener, Reporter
 
 #: Told of a design's progress: stage, what it is at, iterations done, and in all.
@@ -60,6 +61,7 @@ def design(
     invert: bool = False,
     out: str | Path | None = None,
     force: bool = False,
+    movie: str | Path | None = None,
     on_progress: Progress | None = None,
     on_message: Callable[[str], None] | None = None,
     device: str = "cpu",
@@ -80,6 +82,7 @@ def design(
         invert: take what is dark in the picture file as bright.
         out: a project directory to keep checkpoints and pictures in; without it, no file is touched.
         force: replace a project there.
+        movie: a GIF or MP4 file that shows the image at its iterations.
         on_progress, on_message: told while it works.
         device: cpu or cuda.
 
@@ -109,6 +112,7 @@ def design(
         preset=preset,
         out=None if out is None else Path(out),
         force=force,
+        movie=None if movie is None else Path(movie),
         say=Listener(on_progress, on_message),
         device=device,
     )
@@ -122,6 +126,7 @@ def design_of(
     config: Path | None = None,
     out: Path | None = None,
     force: bool = False,
+    movie: Path | None = None,
     say: Reporter,
     device: str = "cpu",
 ) -> Lens:
@@ -130,18 +135,18 @@ def design_of(
     Args:
         preset: settings by name, see `config.presets`; config: a TOML file of further ones, which replace those of the preset, and
             which those `given` replace.
-        out, force, device: as of `design`; say: who is told while it works.
+        out, force, movie, device: as of `design`; say: who is told while it works.
 
     Raises:
         InputError, CausticError: as of `design`.
     """
-    began = time.monotonic()
+    began, recorder = time.monotonic(), None if movie is None else Movie(movie, force)
     compile_usual(device)
     project, first = workflow.begin(
         Path(target) if isinstance(target, str) else target, given, preset=preset, config=config, out=out, force=force, say=say
     )
     compile_for(project.scene(), device, say, gradient=True)
-    return _lens(workflow.design(project, first, device, say, began))
+    return _lens(workflow.design(project, first, device, say, began, recorder))
 
 
 def resume(
@@ -149,6 +154,8 @@ def resume(
     *,
     iterations: int | None = None,
     time_limit: float | None = None,
+    movie: Path | None = None,
+    force: bool = False,
     say: Reporter | None = None,
     device: str = "cpu",
 ) -> Lens:
@@ -156,14 +163,15 @@ def resume(
 
     Args:
         iterations: in all, counted from the very first, instead of the project's; time_limit: s.
+        movie: as of `design`, of what is done from here on; force: replace one there.
 
     Raises:
         InputError: there is no project, or it was edited into another design.
     """
-    began, say = time.monotonic(), say or Listener()
+    began, say, recorder = time.monotonic(), say or Listener(), None if movie is None else Movie(movie, force)
     project = Project.open(path)
     compile_for(project.scene(), device, say, gradient=True)
-    return _lens(workflow.resume(project, iterations, time_limit, device, say, began))
+    return _lens(workflow.resume(project, iterations, time_limit, device, say, began, recorder))
 
 
 def _lens(done: workflow.Result) -> Lens:

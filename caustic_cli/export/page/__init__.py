@@ -38,6 +38,8 @@ CELLS = (1024, 768, 512, 384)
 COARSEST = 32
 #: Largest page, bytes: what mail takes; and what of it is for the cloud.
 MOST, MOST_CLOUD = 5_000_000, 3_400_000
+#: Of deflation; the highest takes twenty times as long for a fiftieth of the size.
+LEVEL = 6
 #: Pixels of the page's screen across, at most; a finer target is averaged down to them.
 PIXELS = 512
 #: Positions of a source, at most; of more, so many are taken evenly.
@@ -202,7 +204,7 @@ def _coded(values: np.ndarray) -> dict:
     span = (high - low) or 1.0
     codes = np.rint((values - low) * (65535.0 / span)).astype(np.int64)
     steps = np.diff(np.diff(codes, axis=1, prepend=0), axis=0, prepend=0).astype(np.uint16)
-    deflated = zlib.compress((steps & 255).astype(np.uint8).tobytes() + (steps >> 8).astype(np.uint8).tobytes(), 9)
+    deflated = zlib.compress((steps & 255).astype(np.uint8).tobytes() + (steps >> 8).astype(np.uint8).tobytes(), LEVEL)
     return {"shape": list(values.shape), "low": low, "step": span / 65535.0, "data": base64.b64encode(deflated).decode()}
 
 

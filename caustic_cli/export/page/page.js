@@ -19,7 +19,8 @@ const FRESNEL = { none: 0, schlick: 1, exact: 2 };
 const SMALLEST = 1e-3; // of a rectangle's sides, pixels: folded light has none
 const MARGIN = 8; // pixels beyond the screen that the graphics processor draws on, since points are dropped by their middle
 const SLICE = 14; // ms of work between two answers to the person
-const MOST_BEAMS = 200; // of one place of an extended source
+const BLUR = 2; // beams for each square pixel of the blur, and at most, of one place of an extended source
+const MOST_BEAMS = 300;
 const GOLDEN = Math.PI * (3 - Math.sqrt(5));
 const byId = (id) => document.getElementById(id);
 const square = (a) => a * a;
@@ -90,7 +91,7 @@ function beamsOf(setting, most = MOST_BEAMS) {
     const extent = extentOf(light, setting.size), places = light.places.length;
     const far = Math.abs(setting.z - held.lens.zIn);
     const blur = Math.max(...extent.map((e, k) => ((2 * e) / pixel[k]) * (light.near ? far / Math.abs(light.places[0][2]) : far)));
-    let count = blur < 0.2 ? 1 : Math.min(Math.max(8, Math.ceil(0.8 * blur * blur)), Math.ceil(most / Math.sqrt(places)));
+    let count = blur < 0.2 ? 1 : Math.min(Math.max(8, Math.ceil(BLUR * blur * blur)), Math.ceil(most / Math.sqrt(places)));
     if (light.picture && count > 1) count = Math.min(most, light.picture.length);
     light.places.forEach(([x, y, z, part], place) => {
       for (const [u, v] of spots(light, count, places, place)) {
@@ -141,7 +142,7 @@ function intensity(beam, ax, ay, az) {
 function traceRow(cloud, beam, z, i, thin, row) {
   const { lens, screen } = held, { ny } = cloud, { n, near, x0, y0, h } = beam, [rx, ry] = lens.size.map((s) => s / 2);
   const [[ux, uy, uz], [vx, vy, vz], [nx, nyy, nz]] = screen.axes;
-  const x = (2 * i / (cloud.nx - 1) - 1) * rx, room = 1 + 1e-9, { fresnel } = lens;
+  const x = (2 * i / (cloud.nx - 1) - 1) * rx, { fresnel } = lens;
   const flat = beam.near ? 1 : reflectance(fresnel, Math.sqrt(1 - square(beam.ax) - square(beam.ay)),
     Math.sqrt(1 - square(beam.ax / n) - square(beam.ay / n)), 1 / n);
   for (let j = 0, b = 0; j < ny; j += thin, b++) {
@@ -165,10 +166,7 @@ function traceRow(cloud, beam, z, i, thin, row) {
       ex = x - (t * dx) / dz; ey = y - (t * dy) / dz;
       w = 1;
     }
-    const inside = lens.round
-      ? ex * ex + ey * ey <= rx * rx * room && x * x + y * y <= rx * rx * room
-      : Math.abs(ex) <= rx * room && Math.abs(ey) <= ry * room;
-    w = inside ? w * beam.power : 0;
+    w *= beam.power;
     if (cloud.profile) w *= cloud.profile[k];
     // the exit: N = (-zx, -zy, 1), c = d . N, s = t . N
     const norm2 = 1 + zx * zx + zy * zy, c = dz - dx * zx - dy * zy;
@@ -195,14 +193,26 @@ function traceRow(cloud, beam, z, i, thin, row) {
   }
 }
 
-/** Share out the light of the cells between two rows of corners among the pixels. */
-function splatRow(p, q, count, image) {
-  const [mx, my] = held.screen.resolution;
+/** Part of a cell with its middle at x, y on the exit and sides along x and y from e to f on the entrance that both apertures pass. */
+function passed(x, y, e0, f0, e1, f1) {
+  const [rx, ry] = held.lens.size.map((s) => s / 2);
+  if (!held.lens.round) return within(e0, f0, rx) * within(e1, f1, ry);
+  const side = Math.sqrt(Math.abs((f0 - e0) * (f1 - e1))), edge = (r) => Math.min(1, Math.max(0, 0.5 + (rx - r) / side));
+  return Math.min(edge(Math.sqrt(x * x + y * y)), edge(0.5 * Math.sqrt(square(e0 + f0) + square(e1 + f1))));
+}
+
+/** Part of the way from e to f that lies within +-r. */
+const within = (e, f, r) => Math.min(1, Math.max(0, (Math.min(Math.max(e, f), r) - Math.max(Math.min(e, f), -r)) / Math.abs(f - e)));
+
+/** Share out the light of the cells between two rows of corners among the pixels; x: of their middles, dy: their width along y. */
+function splatRow(p, q, x, dy, count, image) {
+  const [mx, my] = held.screen.resolution, ry = held.lens.size[1] / 2;
   for (let b = 0; b + 1 < count; b++) {
     const c = b + 1;
     const cx = 0.25 * (p.px[b] + p.px[c] + q.px[b] + q.px[c]), cy = 0.25 * (p.py[b] + p.py[c] + q.py[b] + q.py[c]);
     if (!(cx > -1e6 && cx < 1e6 && cy > -1e6 && cy < 1e6)) continue; // also NaN
-    const w = 0.25 * (p.w[b] + p.w[c] + q.w[b] + q.w[c]);
+    const w = 0.25 * (p.w[b] + p.w[c] + q.w[b] + q.w[c]) * passed(x, (b + 0.5) * dy - ry, 0.5 * (p.ex[b] + p.ex[c]),
+      0.5 * (q.ex[b] + q.ex[c]), 0.5 * (p.ey[b] + q.ey[b]), 0.5 * (p.ey[c] + q.ey[c]));
     if (!(w > 0)) continue;
     const area = 0.5 * Math.abs((q.ex[c] - p.ex[b]) * (q.ey[b] - p.ey[c]) - (q.ex[b] - p.ex[c]) * (q.ey[c] - p.ey[b]));
     const wide = Math.max(SMALLEST, 0.5 * Math.sqrt(square(q.px[b] + q.px[c] - p.px[b] - p.px[c]) + square(p.px[c] + q.px[c] - p.px[b] - q.px[b])));
@@ -219,11 +229,12 @@ function splatRow(p, q, count, image) {
 /** The image of beams on a screen at z, a part of all power for each pixel; a generator that stops after every row. */
 function* tracedHere(cloud, beams, z, thin) {
   const [mx, my] = held.screen.resolution, image = new Float64Array(mx * my), count = (cloud.ny - 1) / thin + 1;
+  const [dx, dy] = [held.lens.size[0] / (cloud.nx - 1), held.lens.size[1] / (cloud.ny - 1)].map((d) => d * thin);
   let before = cornerRow(count), now = cornerRow(count);
   for (const beam of beams) {
     for (let i = 0; i < cloud.nx; i += thin) {
       traceRow(cloud, beam, z, i, thin, now);
-      if (i > 0) splatRow(before, now, count, image);
+      if (i > 0) splatRow(before, now, (i / thin - 0.5) * dx - held.lens.size[0] / 2, dy, count, image);
       [before, now] = [now, before];
       yield;
     }
@@ -271,9 +282,7 @@ bool corner(ivec2 at, out vec2 landing, out vec2 entrance, out float w) {
     d.xy = direction / n; d.z = sqrt(1.0 - dot(d.xy, d.xy)); entrance = xy - t * d.xy / d.z; w = 1.0;
     if (fresnel > 0) lost = reflectance(sqrt(1.0 - dot(direction, direction)), d.z, 1.0 / n);
   }
-  float room = 1.0 + 1e-6;
-  bool inside = isRound ? max(dot(entrance, entrance), dot(xy, xy)) <= radius.x * radius.x * room : all(lessThanEqual(abs(entrance), radius * room));
-  w = inside ? w * power * p.w : 0.0;
+  w *= power * p.w;
   float norm2 = 1.0 + dot(p.yz, p.yz), c = d.z - dot(d.xy, p.yz); vec3 o;
   if (isMirror) { float twice = 2.0 * c / norm2; o = vec3(d.xy + twice * p.yz, d.z - twice); }
   else {
@@ -289,6 +298,12 @@ bool corner(ivec2 at, out vec2 landing, out vec2 entrance, out float w) {
   landing = (vec2(dot(q, u), dot(q, v)) - low) / pixel;
   return way > 0.0;
 }
+float passed(vec2 exit, vec2 e, vec2 f) {
+  vec2 part = clamp((min(max(e, f), radius) - max(min(e, f), -radius)) / abs(f - e), 0.0, 1.0);
+  if (!isRound) return part.x * part.y;
+  float side = sqrt(abs((f.x - e.x) * (f.y - e.y)));
+  return clamp(0.5 + (radius.x - max(length(exit), 0.5 * length(e + f))) / side, 0.0, 1.0);
+}
 void main() {
   int along = (points.y - 1) / thin; ivec2 at = ivec2(gl_VertexID / along, gl_VertexID % along) * thin;
   vec2 a, b, c, d, ea, eb, ec, ed; float wa, wb, wc, wd;
@@ -297,7 +312,9 @@ void main() {
   vec2 middle = 0.25 * (a + b + c + d), across = c + d - a - b, upward = b + d - a - c;
   vec2 sides = clamp(0.5 * sqrt(across * across + upward * upward), vec2(smallest), vec2(largest));
   vec2 g = ed - ea, f = ec - eb; float area = 0.5 * abs(g.x * f.y - f.x * g.y);
-  each = 0.25 * (wa + wb + wc + wd) * area / (sides.x * sides.y);
+  vec2 exit = ((2.0 * vec2(at) + float(thin)) / vec2(points - 1) - 1.0) * radius;
+  float share = passed(exit, 0.5 * vec2(ea.x + eb.x, ea.y + ec.y), 0.5 * vec2(ec.x + ed.x, eb.y + ed.y));
+  each = 0.25 * (wa + wb + wc + wd) * share * area / (sides.x * sides.y);
   box = vec4(middle - 0.5 * sides, middle + 0.5 * sides);
   lit = lit && each > 0.0 && all(lessThan(abs(middle), vec2(1e6)));
   gl_Position = lit ? vec4((middle + frame.z) / frame.xy * 2.0 - 1.0, 0.0, 1.0) : vec4(2.0, 2.0, 2.0, 1.0);

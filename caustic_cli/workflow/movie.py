@@ -1,0 +1,109 @@
+"""A design as a movie: the image that the optimiser judged at its iterations, then that of the finished lens.
+
+An iteration's image is there anyway, so that recording takes no tracing: it is made of the design's own rays and filter, or of its
+waves where these are refined.  The last one is of the independent evaluation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from caustic_cli.inverse.designer import State
+from caustic_cli.io.movie import refuse_unwritable, write_movie
+from caustic_cli.io.picture import codes_of
+from caustic_cli.studies.metrics import relative_rms
+from caustic_cli.studies.retrace import white_level
+
+#: Frames that are kept: of a longer design every second, fourth, ... iteration.
+MOST = 160
+#: How long all of them are shown together, one at least and at most, and the finished lens, milliseconds.
+LENGTH, LEAST, LONGEST, LAST = 10_000, 60, 300, 2000
+#: Height of the picture, of a line of words and of their letters, pixels.
+HEIGHT, LINE, LETTERS = 480, 24, 15
+
+
+@dataclass(frozen=True)
+class Frame:
+    """codes: 8-bit, (rows, columns) or (rows, columns, 3); words: two lines below them."""
+
+    codes: np.ndarray
+    words: tuple[str, str]
+
+
+@dataclass(eq=False)
+class Movie:
+    """Records a design.
+
+    Args:
+        path: a .gif or .mp4; force: replace what is there.
+
+    Raises:
+        InputError: it could not be written, see `io.movie.refuse_unwritable`.
+    """
+
+    path: Path
+    force: bool = False
+    frames: list[Frame] = field(default_factory=list)
+
+    def __post_init__(self):
+        refuse_unwritable(self.path, self.force)
+        self._every, self._seen = 1, 0
+        self._target: np.ndarray | None = None
+        self._encoding = "srgb"
+        self._last = ""
+
+    def record(self, state: State, target: np.ndarray, encoding: str, waves: bool) -> None:
+        """Keep the image of the last iteration; waves: it is one of light as a wave."""
+        self._target, self._encoding, self._seen = target, encoding, self._seen + 1
+        total, stage, _, _, seconds = state.history[-1]
+        self._last = f"iteration {total}, {seconds:.1f} s"
+        if state.image is None or (self._seen - 1) % self._every:
+            return
+        if len(self.frames) >= MOST:
+            self.frames, self._every = self.frames[::2], 2 * self._every
+        image = state.image.cpu().numpy()
+        how = "light as a wave" if waves else "the design's own rays"
+        self._add(image, f"stage {stage + 1}, {self._last}", f"relative RMS error {self._error(image):.3f}, by {how}")
+
+    def finish(self, image: np.ndarray, figures: dict[str, Any]) -> None:
+        """The finished lens' image and the figures of its evaluation, which the last frame shows."""
+        waves = figures.get("wave_relative_rms")
+        error = figures["relative_rms"] if waves is None else waves
+        how = f"{figures['rays']:,} independent rays" if waves is None else "independent wave image"
+        self._add(image, f"finished after {self._last}" if self._last else "finished", f"relative RMS error {error:.3f}, {how}")
+
+    def write(self) -> None:
+        """Write the file, whole or not at all; nothing where nothing was recorded."""
+        if self.frames:
+            each = min(max(LENGTH // len(self.frames), LEAST), LONGEST)
+            shown = [_drawn(frame) for frame in self.frames]
+            write_movie(self.path, shown, [*[each] * (len(shown) - 1), LAST])
+
+    def _error(self, image: np.ndarray) -> float:
+        assert self._target is not None
+        grey, goal = (a.sum(0) if a.ndim == 3 else a for a in (image, self._target))
+        return relative_rms(grey, goal)
+
+    def _add(self, image: np.ndarray, *words: str) -> None:
+        white = white_level(image, self._target)
+        self.frames.append(Frame(codes_of(image, white, self._encoding), (words[0], words[1])))
+
+
+def _drawn(frame: Frame) -> Image.Image:
+    """The picture, enlarged, over its two lines of words, white on black."""
+    rows, columns = frame.codes.shape[:2]
+    width = max(320, round(HEIGHT * columns / rows / 2) * 2)
+    picture = Image.fromarray(frame.codes).resize((round(HEIGHT * columns / rows), HEIGHT), Image.Resampling.BILINEAR)
+    sheet = Image.new(picture.mode, (width, HEIGHT + 2 * LINE + 8))
+    sheet.paste(picture, ((width - picture.width) // 2, 0))
+    draw = ImageDraw.Draw(sheet)
+    font = ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"), LETTERS)
+    for k, (line, grey) in enumerate(zip(frame.words, (235, 170), strict=True)):
+        draw.text((10, HEIGHT + 4 + k * LINE), line, fill=grey if sheet.mode == "L" else (grey,) * 3, font=font)
+    return sheet

@@ -1,0 +1,196 @@
+"""The page of `caustic render --html`: what a browser traces from it is what `render` traces, and nothing else is in it."""
+
+import base64
+import json
+import math
+import re
+import shutil
+import subprocess
+import zlib
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers import small_designs, write_blob
+from rayfiles import cone_of, tm25
+
+from caustic_cli import cli, load
+from caustic_cli.errors import InputError
+from caustic_cli.export.page import MOST, _coded, _onto, refuse_untraceable, write_page
+from caustic_cli.io.files import is_ours
+from caustic_cli.scene import Screen
+from caustic_cli.studies.metrics import relative_rms
+
+#: Relative RMS by which page and render may differ; render's own noise is part of it.
+ALIKE = 0.05
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
+QUIET = ["--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync", "--disable-quic"]
+ENGINES = {"cpu": ["--disable-gpu"], "gpu": ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]}
+#: Effects of rays: the wave image, which takes longer than all the rest, is none of what is compared.
+RAYS = ["--effects", "source-size,entrance,intersection,missed-surface,fresnel,total-reflection"]
+#: What is designed, small, and by its name.
+DESIGNS = {
+    "plane": [],
+    "point": ["--source", "point", "--source-position", "0,0,-60"],
+    "mirror": ["--mirror"],
+    "round": ["--aperture", "circle"],
+}
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    """A directory with a project and its page for each of DESIGNS."""
+    directory = tmp_path_factory.mktemp("page")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(directory)
+        small_designs(patch, 20_000)
+        write_blob()
+        small = ["--resolution", "64", "--iterations", "3", "--waves", "off", "--threads", "1", "--quiet"]
+        for name, given in DESIGNS.items():
+            assert cli.run(["design", "blob.png", *small, *given, "-o", f"{name}.caustic"]) == 0
+            assert cli.run(["render", f"{name}.caustic", "--rays", "1e5", *RAYS, "--html", f"{name}.html", "--quiet"]) == 0
+    return directory
+
+
+def rendered(home: Path, name: str, *options: str) -> np.ndarray:
+    """The image by `caustic render`."""
+    made = home / "rendered.npy"
+    arguments = [
+        "render",
+        str(home / f"{name}.caustic"),
+        "--rays",
+        "2e6",
+        "-o",
+        str(home / "rendered.png"),
+        "--npy",
+        str(made),
+        *RAYS,
+    ]
+    assert cli.run([*arguments, *options, "--quiet", "--force", "--threads", "2"]) == 0
+    return np.load(made)
+
+
+def browsed(page: Path, setting: str, engine: str, profile: Path) -> str:
+    """The document after the page has traced a setting."""
+    if BROWSER is None:
+        pytest.skip("no Chromium or Chrome is installed")
+    command = [BROWSER, "--headless=new", "--no-sandbox", *QUIET, *ENGINES[engine], f"--user-data-dir={profile}"]
+    command += ["--virtual-time-budget=600000", "--dump-dom", f"{page.as_uri()}#engine={engine}&numbers&{setting}"]
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=300).stdout
+
+
+def traced(page: Path, setting: str, engine: str, profile: Path) -> tuple[np.ndarray, float]:
+    """The image that the page traces, in the order of a file, and the error that it says."""
+    document = browsed(page, setting, engine, profile)
+    found = re.search(r'<pre id="numbers"[^>]*data-engine="([^"]*)"[^>]*>([^<]*)<', document)
+    assert found, re.search(r'<p id="failure".*?</p>', document, re.S)[0]
+    if not found[1].startswith(engine):
+        pytest.skip("this browser has no graphics processor that adds up floating-point numbers, not even in software")
+    error = re.search(r'<dd id="rms">([0-9.]+)</dd>', document)
+    return np.frombuffer(base64.b64decode(found[2]), dtype=np.float32).astype(float), float(error[1])
+
+
+def leaning(distance: float, x: float, y: float) -> str:
+    """The place of a source at a distance whose light to the lens' middle leans by angles along x and y, degrees."""
+    way = np.array([math.tan(math.radians(x)), math.tan(math.radians(y)), 1.0])
+    return ",".join(f"{c:.9g}" for c in -distance * way / np.linalg.norm(way))
+
+
+CASES = {
+    "plane": ("plane", "", []),
+    "another throw": ("plane", "throw=240", ["--screen-at", "240"]),
+    "leaning light": ("plane", "leanx=1.5&leany=-1", ["--source", "point", "--source-position", leaning(1e5, 1.5, -1.0)]),
+    "the sun": ("plane", "size=0.533", ["--source-angle", "0.533"]),
+    "a point aside": ("point", "leanx=-2&leany=3&throw=330", ["--source-position", leaning(60.0, -2.0, 3.0), "--screen-at", "330"]),
+    "a disc": ("point", "size=1.5", ["--source", "disc", "--source-size", "1.5", "--source-position", "0,0,-60"]),
+    "mirror": ("mirror", "", []),
+    "round": ("round", "", []),
+}
+
+
+@pytest.mark.parametrize(
+    "case, engine", [(case, "cpu") for case in CASES if case != "the sun"] + [("a point aside", "gpu"), ("the sun", "gpu")]
+)
+def test_a_browser_traces_what_render_traces(case, engine, home, tmp_path):
+    name, setting, options = CASES[case]
+    (image, said), wanted = traced(home / f"{name}.html", setting, engine, tmp_path), rendered(home, name, *options)
+    image = image.reshape(wanted.shape)
+    target = load(home / f"{name}.caustic").target
+    assert relative_rms(image, wanted) < ALIKE < relative_rms(image, wanted[::-1])
+    assert said == pytest.approx(relative_rms(image, target), abs=6e-4)
+    if case not in ("leaning light", "a disc", "a point aside"):  # whose cones `render` widens until they cover the lens
+        assert image.sum() == pytest.approx(wanted.sum(), rel=0.01)
+
+
+def test_a_page_is_one_small_file_that_asks_for_nothing(home):
+    for name in DESIGNS:
+        page = home / f"{name}.html"
+        text = page.read_text("utf-8")
+        assert 50_000 < page.stat().st_size < MOST == 5_000_000
+        assert is_ours(page)
+        assert "default-src 'none'" in text
+        own = text.replace(re.search(r'id="data">(.*?)</script>', text, re.S)[1], "")
+        assert not re.findall(r"(?:src|href)\s*=|@import|url\(|https?:|fetch\(|XMLHttpRequest|import\(", own)
+
+
+def test_a_hostile_name_is_text(home, tmp_path):
+    lens, name = load(home / "plane.caustic"), "</title></script><script>alert(1)</script><img src=x onerror=alert(2)>@@data@@"
+    pages = []
+    for title in ("lens", name):
+        path = tmp_path / "page.html"
+        write_page(
+            path,
+            lens.scene,
+            lens.field,
+            lens.heights,
+            lens.target,
+            title=title,
+            rows=[(title, title)],
+            notes=[title],
+            encoding=title,
+        )
+        pages.append(path.read_text("utf-8"))
+    plain, hostile = (len(re.findall(r"<(?:/?script|/title|img)", page)) for page in pages)
+    assert plain == hostile > 4
+    held = json.loads(re.search(r'id="data">(.*?)</script>', pages[1], re.S)[1])
+    assert held["title"] == held["encoding"] == name
+
+
+def test_codes_are_the_values_to_half_a_step():
+    values = np.random.default_rng(1).normal(size=(7, 5)).cumsum(0)
+    coded = _coded(values)
+    data = np.frombuffer(zlib.decompress(base64.b64decode(coded["data"])), dtype=np.uint8).astype(int)
+    steps = (data[:35] + 256 * data[35:]).reshape(7, 5)
+    codes = np.cumsum(np.cumsum(steps, axis=0), axis=1) % 65536
+    assert np.abs(coded["low"] + coded["step"] * codes - values).max() <= 0.501 * coded["step"]
+
+
+def test_a_fine_screen_is_averaged_down():
+    image = np.random.default_rng(2).random((90, 60))
+    coarse = _onto(image, Screen((3.0, 2.0), resolution=(40, 30)))
+    assert coarse.shape == (40, 30) and coarse.sum() == pytest.approx(image.sum())
+    assert _onto(image, Screen((3.0, 2.0), resolution=(30, 20))) == pytest.approx(image.reshape(30, 3, 20, 3).sum((1, 3)))
+
+
+def test_the_same_again_is_no_work_and_others_files_stay(home, monkeypatch, capfd):
+    monkeypatch.chdir(home)
+    before = (home / "plane.html").stat().st_ino
+    assert cli.run(["render", "plane.caustic", "--rays", "1e5", *RAYS, "--html", "plane.html"]) == 0
+    assert "nothing to do" in capfd.readouterr().err and (home / "plane.html").stat().st_ino == before
+    (home / "mine.html").write_text("<p>mine</p>")
+    assert cli.run(["render", "plane.caustic", "--rays", "1e5", *RAYS, "--html", "mine.html"]) == 2
+    assert "was not made by caustic" in capfd.readouterr().err and (home / "mine.html").read_text() == "<p>mine</p>"
+
+
+def test_rays_of_a_file_are_refused(home, monkeypatch, capfd):
+    monkeypatch.chdir(home)
+    Path("led.tm25ray").write_bytes(tm25(*cone_of(2000, 0.05)))
+    light = ["--source", "rays", "--source-file", "led.tm25ray", "--source-position", "0,0,-60"]
+    assert cli.run(["render", "point.caustic", *light, "--html", "rays.html", "-o", "rays.png"]) == 2
+    assert "not the rays of a file" in capfd.readouterr().err and not Path("rays.html").exists() and not Path("rays.png").exists()
+    scene = load(home / "point.caustic").scene
+    refuse_untraceable(scene)
+    with pytest.raises(InputError, match="plane waves, points, grids and discs"):
+        refuse_untraceable(replace(scene, source=SimpleNamespace(members=(SimpleNamespace(rays=1),), nearest=-60.0)))
