@@ -100,8 +100,11 @@ def leaning(distance: float, x: float, y: float) -> str:
 
 CASES = {
     "plane": ("plane", "", []),
-    "another throw": ("plane", "throw=240", ["--screen-at", "240"]),
-    "leaning light": ("plane", "leanx=1.5&leany=-1", ["--source", "point", "--source-position", leaning(1e5, 1.5, -1.0)]),
+    "leaning light": (
+        "plane",
+        "throw=240&leanx=1.5&leany=-1",
+        ["--screen-at", "240", "--source", "point", "--source-position", leaning(1e5, 1.5, -1.0)],
+    ),
     "the sun": ("plane", "size=0.533", ["--source-angle", "0.533"]),
     "a point aside": ("point", "leanx=-2&leany=3&throw=330", ["--source-position", leaning(60.0, -2.0, 3.0), "--screen-at", "330"]),
     "a disc": ("point", "size=1.5", ["--source", "disc", "--source-size", "1.5", "--source-position", "0,0,-60"]),

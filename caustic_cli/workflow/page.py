@@ -81,7 +81,7 @@ def _light_rows(scene: Scene) -> list[tuple[str, str]]:
     centre = "" if source.distant else f", its middle at {', '.join(f'{c:.6g}' for c in source.centre)} mm"
     return [
         ("Light", f"{source.kind}: {source.extent_words(scene.lens.z_in)}{centre}"),
-        ("Throw", f"{abs(screen.z):.6g} mm from the lens’ origin to the screen"),
+        ("Throw", f"{abs(screen.z):.6g} mm from the origin, on the {'mirror' if scene.lens.mirror else 'lens'}, to the screen"),
         ("Screen", f"{_size(screen.size)}, {_size(screen.resolution, '')} pixels"),
     ]
 
@@ -100,8 +100,10 @@ def _notes(plan: Plan) -> list[str]:
     notes = [f"Not traced on this page: {'; '.join(missing)}."] if missing else []
     if plan.scene.colored:
         notes.append("The picture is coloured; this page shows the light of all its colours together.")
+    side = "from the mirror’s side" if plan.scene.lens.mirror else "from behind, as through a translucent one"
     notes.append(
-        "Pictures show the screen from behind, as through a translucent one: x to the right, y upwards. Light that leans along x"
+        f"Pictures show the screen {side}:"
+        " x to the right, y upwards. Light that leans along x"
         f" travels towards +x. Made by caustic {__version__}."
     )
     return notes

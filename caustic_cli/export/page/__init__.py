@@ -130,7 +130,14 @@ def write_page(
         "target": None if target is None else _coded(_onto(target, screen)),
         "waves": None if waves is None else _coded(_onto(waves, screen)),
     }
-    words = {"title": html.escape(title), "rows": _table(rows), "notes": "".join(f"<p>{html.escape(note)}</p>" for note in notes)}
+    kind = "mirror" if lens.mirror else "lens"
+    words = {
+        "title": html.escape(title),
+        "kind": kind,
+        "Kind": kind.capitalize(),
+        "rows": _table(rows),
+        "notes": "".join(f"<p>{html.escape(note)}</p>" for note in notes),
+    }
     for cells in CELLS:
         cloud = _cloud(scene, field, heights, cells)
         if sum(len(part["data"]) for part in cloud.values() if part) <= MOST_CLOUD or cells == CELLS[-1]:

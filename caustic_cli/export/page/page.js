@@ -19,8 +19,9 @@ const FRESNEL = { none: 0, schlick: 1, exact: 2 };
 const SMALLEST = 1e-3; // of a rectangle's sides, pixels: folded light has none
 const MARGIN = 8; // pixels beyond the screen that the graphics processor draws on, since points are dropped by their middle
 const SLICE = 14; // ms of work between two answers to the person
-const BLUR = 2; // beams for each square pixel of the blur, and at most, of one place of an extended source
+const BLUR = 3; // beams for each square pixel of the blur, and at most, of one place of an extended source
 const MOST_BEAMS = 300;
+const DEEPEST = 100; // times that the relief is shown as deep
 const GOLDEN = Math.PI * (3 - Math.sqrt(5));
 const byId = (id) => document.getElementById(id);
 const square = (a) => a * a;
@@ -443,7 +444,7 @@ function compared(image, target) {
 
 function solidView(canvas, cloud) {
   const { lens } = held, [rx, ry] = lens.size.map((s) => s / 2), { nx, ny } = cloud, count = nx * ny;
-  const view = { yaw: -0.5, pitch: -0.95, zoom: 1, relief: 1 };
+  const view = { yaw: -0.5, pitch: lens.mirror ? Math.PI - 0.95 : -0.95, zoom: 1, relief: 1 };
   const xs = Float64Array.from({ length: nx }, (_, i) => (2 * i / (nx - 1) - 1) * rx);
   const ys = Float64Array.from({ length: ny }, (_, j) => (2 * j / (ny - 1) - 1) * ry);
   // The least-squares fit of z by 1, x, y and x^2 + y^2 less its mean, which are orthogonal on this grid.
@@ -461,7 +462,7 @@ function solidView(canvas, cloud) {
   for (let i = 0, k = 0; i < nx; i++) {
     for (let j = 0; j < ny; j++, k++) rough += square(cloud.zx[k] - cx - 2 * cq * xs[i]) + square(cloud.zy[k] - cy - 2 * cq * ys[j]);
   }
-  const usual = Math.min(40, Math.max(1, 0.25 / Math.sqrt(rough / count || 1)));
+  const usual = Math.min(DEEPEST, Math.max(1, 0.25 / Math.sqrt(rough / count || 1)));
   const base = lens.mirror ? high + 0.2 * Math.max(...lens.size) : lens.zIn, size = Math.hypot(2 * rx, 2 * ry);
 
   function draw() {
@@ -523,7 +524,7 @@ function solidView(canvas, cloud) {
   let asked = false, moving = false, rest = 0;
   const redraw = () => { if (!asked) { asked = true; requestAnimationFrame(() => { asked = false; draw(); }); } };
   const move = () => { moving = true; redraw(); clearTimeout(rest); rest = setTimeout(() => { moving = false; redraw(); }, 150); };
-  const turn = (a, b) => { view.yaw += a; view.pitch = Math.max(-Math.PI, Math.min(0.6, view.pitch + b)); move(); };
+  const turn = (a, b) => { view.yaw += a; view.pitch += b; move(); };
   const enlarge = (by) => { view.zoom = Math.max(0.5, Math.min(3, view.zoom * by)); move(); };
   let last = null;
   canvas.addEventListener("pointerdown", (e) => { last = [e.clientX, e.clientY]; canvas.setPointerCapture(e.pointerId); });
@@ -539,8 +540,8 @@ function solidView(canvas, cloud) {
     if (act) { act(); e.preventDefault(); }
   });
   const slider = byId("relief"), say = () => { byId("relief-out").textContent = view.relief < 1.01 ? "true to scale" : `${view.relief.toFixed(1)} times as deep, about the best sphere`; };
-  slider.value = (100 * Math.log(usual)) / Math.log(40);
-  const set = () => { view.relief = 40 ** (slider.value / 100); say(); move(); };
+  slider.value = (100 * Math.log(usual)) / Math.log(DEEPEST);
+  const set = () => { view.relief = DEEPEST ** (slider.value / 100); say(); move(); };
   slider.addEventListener("input", set);
   new ResizeObserver(redraw).observe(canvas);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
@@ -572,7 +573,6 @@ async function start() {
   const { cloud, target, waves } = await unpacked(), range = ranges(), asked = new URLSearchParams(location.hash.slice(1));
   const names = ["throw", "leanx", "leany", "size"], touched = new Set();
   solidView(byId("solid"), cloud);
-  byId("side").textContent = "seen from behind it";
   byId("scale").textContent = `${held.screen.resolution.map((m, k) => tidy(m * held.screen.pixel[k], 4)).join(" × ")} mm, ${held.screen.resolution.join(" × ")} pixels.`;
   byId("size-name").textContent = held.lights[0].near ? "Size of the source" : "Angular size of the source";
   byId("size-unit").textContent = range.size.unit;
@@ -607,11 +607,15 @@ async function start() {
   }
   byId("controls").addEventListener("reset", () => { touched.clear(); setTimeout(() => { byId("gpu").checked = Boolean(graphics); sides(); trace(); }); });
   byId("controls").addEventListener("submit", (e) => e.preventDefault());
+  // From +z, as image files are: behind a lens' screen, and before a mirror's.
+  const views = held.lens.mirror ? ["seen from the mirror’s side", "seen from behind it"] : ["seen from behind it", "seen from the lens’ side"];
   const sides = () => {
-    const lensSide = byId("mirrored").checked;
-    document.querySelector(".panels").classList.toggle("mirrored", lensSide);
-    byId("side").textContent = lensSide ? "seen from the lens’ side" : "seen from behind it";
+    const other = byId("mirrored").checked;
+    document.querySelector(".panels").classList.toggle("mirrored", other);
+    byId("side").textContent = views[Number(other)];
   };
+  byId("other-side").textContent = views[1];
+  sides();
   byId("mirrored").addEventListener("change", sides);
   byId("gpu").addEventListener("change", () => trace());
 
