@@ -1,0 +1,121 @@
+"""The gallery: ten lenses of different kinds, designed by whole commands, with their pictures, times and figures.
+
+    python tests/benchmarks/gallery.py [--only NAME,...] [--quality draft|standard|fine] [-o DIR]
+
+writes examples/gallery: README.md, and for each lens a strip of target, image by rays, image of light as a wave where that is
+simulated, and relief.  About ten minutes on two cores.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from matplotlib import colormaps
+from PIL import Image, ImageDraw, ImageFont
+from quality import DATA, EXAMPLES, caustic, pictures
+
+from caustic_cli import load
+
+#: What each lens is for, its picture, and the options that make it.
+LENSES = {
+    "flame": ("The first command of the README: a plane wave, refined on what light does as a wave", "flame", ""),
+    "portrait": ("A photograph, by rays alone", "portrait", "--waves off"),
+    "logo": ("A black drawing on nothing, inverted", "logo", "--invert"),
+    "point": ("A point source 50 mm before the lens", "ball", "--source point"),
+    "disc": ("A disc of 5 mm at 1 m", "ball", "--source disc --source-size 5 --source-position 0,0,-1000"),
+    "plate": ("A 100 mm acrylic plate in sunlight, wall at 1 m", "portrait", "--preset plate-100"),
+    "mirror": ("A 100 mm mirror in sunlight, wall at 1 m", "flame", "--preset mirror-100"),
+    "led": ("A luminaire's lens 60 mm before an LED, wall at 2 m", "tophat", "--preset led-30"),
+    "laser": ("A round lens in a laser's beam, screen at 1 m", "lines", "--preset laser-25"),
+    "print": ("A lens of printing resin, a small LED 500 mm before it, wall at 300 mm", "portrait", "--preset print-50"),
+}
+#: Pixels along a panel's side.
+SIDE = 200
+
+
+def more_pictures(folder: Path) -> dict[str, Path]:
+    """Those that examples/ and the table of qualities do not have."""
+    logo = Image.new("RGBA", (500, 500))
+    draw = ImageDraw.Draw(logo)
+    draw.ellipse((60, 60, 440, 440), outline=(0, 0, 0, 255), width=28)
+    draw.text((250, 250), "f/2", fill=(0, 0, 0, 255), anchor="mm", font=ImageFont.truetype(f"{DATA}/fonts/ttf/DejaVuSans.ttf", 150))
+    logo.save(folder / "logo.png")
+    return {"tophat": EXAMPLES / "tophat.png", "logo": folder / "logo.png"}
+
+
+def relief(project: Path) -> Image.Image:
+    """The surface, less the quadric that fits it best, from dark to bright."""
+    lens = load(project)
+    rx, ry = lens.scene.lens.half_size
+    x, y = np.meshgrid(np.linspace(-rx, rx, SIDE), np.linspace(ry, -ry, SIDE))
+    z = lens.surface(x, y)[0]
+    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], -1).reshape(-1, 6)
+    z = z - (terms @ np.linalg.lstsq(terms, z.ravel(), rcond=None)[0]).reshape(z.shape)
+    low, high = np.percentile(z, (0.5, 99.5))
+    shown = colormaps["cividis"](np.clip((z - low) / max(high - low, 1e-12), 0.0, 1.0))[..., :3]
+    return Image.fromarray((shown * 255).astype(np.uint8))
+
+
+def strip(project: Path, path: Path) -> None:
+    """The lens' panels side by side."""
+    names = [name for name in ("render.png", "wave.png") if (project / name).exists()]
+    target = load(project).target
+    light = np.moveaxis(np.atleast_3d(target if target.ndim == 2 else np.moveaxis(target, 0, -1)), (0, 1), (1, 0))[::-1]
+    codes = (np.clip(light / np.percentile(light.max(-1), 99.9), 0.0, 1.0) ** (1 / 2.2) * 255).astype(np.uint8)
+    panels = [Image.fromarray(codes[..., 0] if codes.shape[-1] == 1 else codes), *(Image.open(project / name) for name in names)]
+    panels = [p.convert("RGB").resize((SIDE, round(SIDE * p.height / p.width)), Image.Resampling.LANCZOS) for p in panels]
+    panels.append(relief(project))
+    sheet = Image.new("RGB", (len(panels) * (SIDE + 8) - 8, max(p.height for p in panels)), "white")
+    for k, panel in enumerate(panels):
+        sheet.paste(panel, (k * (SIDE + 8), 0))
+    sheet.save(path, optimize=True)
+
+
+def row(name: str, picture: Path, quality: str, folder: Path, out: Path) -> str:
+    """Design, retrace with eight times the rays, draw; a part of the gallery's page."""
+    words, _, options = LENSES[name]
+    project = folder / f"{name}.caustic"
+    began = time.monotonic()
+    said = caustic("design", picture, *options.split(), "--quality", quality, "-o", project)
+    seconds = time.monotonic() - began
+    sharp = caustic("render", project, "--rays", "3.2e7" if said.get("least_relative_rms") is None else "8e6")
+    strip(project, out / f"{name}.png")
+    figures = [
+        f"relative RMS error by rays {sharp['relative_rms']:.3f} ± {sharp['noise']:.4f}",
+        f"of light as a wave {sharp['wave_relative_rms']:.3f}" if sharp.get("wave_relative_rms") is not None else "",
+        f"least possible behind the source's blur {said['least_relative_rms']:.3f}" if said.get("least_relative_rms") else "",
+        f"light on the picture {sharp['on_target']:.1%}",
+        f"designed in {seconds:.0f} s",
+    ]
+    command = f"caustic design {picture.name} {options}".strip() + (f" --quality {quality}" if quality != "standard" else "")
+    return f"## {words}\n\n![{words}]({name}.png)\n\n{'; '.join(filter(None, figures))}.\n\n```sh\n{command}\n```\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", default=",".join(LENSES), help="names of lenses, parted by commas")
+    parser.add_argument("--quality", default="standard", choices=("draft", "standard", "fine"))
+    parser.add_argument("-o", "--out", type=Path, default=EXAMPLES / "gallery", metavar="DIR")
+    given = parser.parse_args()
+    given.out.mkdir(parents=True, exist_ok=True)
+    parts = [
+        "# Gallery\n\nTen lenses by `python tests/benchmarks/gallery.py`, on two cores: target, image by rays, image of light as a wave"
+        " where that\nis simulated, and the lens' relief about the quadric that fits it best (each by a scale of its own). Figures"
+        " are by\nrays that no design saw.\n"
+    ]
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+        known = pictures(place) | more_pictures(place)
+        caustic("design", known["flame"], "--quality", "draft", "--time-limit", 1, "-o", place / "warm.caustic")
+        for name in given.only.split(","):
+            parts.append(row(name, known[LENSES[name][1]], given.quality, place, given.out))
+            print(parts[-1], flush=True)
+    (given.out / "README.md").write_text("\n".join(parts), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
