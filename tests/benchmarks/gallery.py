@@ -104,8 +104,8 @@ def main() -> None:
     given.out.mkdir(parents=True, exist_ok=True)
     parts = [
         "# Gallery\n\nTen lenses by `python tests/benchmarks/gallery.py`, on two cores: target, image by rays, image of light as"
-        " a wave where that\nis simulated, and the lens' relief about the quadric that fits it best (each by a scale of its own). Figures"
-        " are by\nrays that no design saw.\n"
+        " a wave where\nthat is simulated, and the lens' relief about the quadric that fits it best (each by a scale of its own)."
+        " Figures are\nby rays that no design saw.\n"
     ]
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
