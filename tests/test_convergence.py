@@ -15,8 +15,8 @@ from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import SAMPLERS
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
-from caustic_cli.studies.convergence import FILTERS, run_study
-from caustic_cli.studies.fit import order, pareto
+from caustic_cli.studies.convergence import FILTERS, run_study, single_precision
+from caustic_cli.studies.fit import knee, order, pareto
 from caustic_cli.studies.measurement import REFERENCE_FACTOR, Bench, Setting
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.report import as_json, plot, write
@@ -77,7 +77,21 @@ def test_order_keeps_to_the_range_asked_for_and_leaves_out_what_has_none():
 
 def test_pareto_front():
     cost, error = [1.0, 2.0, 3.0, 3.0, 1.0, 0.5], [5.0, 4.0, 4.5, 1.0, 5.0, 9.0]
-    assert pareto(cost, error) == [True, True, False, True, True, True]
+    assert pareto(cost, error) == [True, True, False, True, False, True]  # of two that are the same, one
+    assert pareto([1.0, 2.0, 3.0], [1.0, 0.99, 0.5], gain=0.02) == [True, False, True]  # what is gained is noise
+
+
+@pytest.mark.parametrize(
+    ("difference", "speedup", "words"),
+    [(0.001, 1.5, "float32 is enough"), (0.02, 1.5, "use float64"), (0.001, 0.98, "float32 gains nothing here")],
+)
+def test_advice_on_single_precision(difference, speedup, words):
+    assert single_precision({"difference": difference, "error": 0.05, "speedup": speedup}) == words
+
+
+def test_the_knee_is_the_cheapest_that_is_nearly_the_best():
+    seconds, error = [0.004, 0.017, 0.06, 0.23], [0.2, 0.053, 0.051, 0.049]
+    assert knee(seconds, error) == 1 and knee(seconds, error, near=0.0) == 3 and knee([1.0], [0.0]) == 0
 
 
 def test_orders_of_the_samplers(rays):
@@ -166,7 +180,7 @@ def test_single_precision_is_compared_on_the_same_rays(precision):
         assert single["difference"] < 0.2 * single["error"]  # other rays would be sqrt(2) apart
         assert single["error"] == pytest.approx(double["error"], rel=0.05)
         assert single["speedup"] > 0
-    assert "float32 is enough" in precision.advice or "use float64" in precision.advice
+    assert any(single_precision(row) in precision.advice for row in precision.rows if row["dtype"] == "float32")
 
 
 def test_progress_ends_where_it_said():

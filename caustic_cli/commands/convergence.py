@@ -19,8 +19,8 @@ EXAMPLES = """Examples:
 """
 
 STUDIES = ("intersection", "rays", "reconstruction", "precision", "effects", "design", "diffraction", "light")
-#: What the progress of a study counts.
-UNITS = {"intersection": "evaluations", "effects": "effects", "design": "turns", "diffraction": "cases", "light": "lenses"}
+#: Those whose --rays is that of their largest setting, also where all are made.
+BY_RAYS = ("rays", "reconstruction", "precision", "effects")
 
 
 def run(
@@ -43,7 +43,7 @@ def run(
             " effects: each on and off; design:"
             " optimisers, networks and control nets; diffraction: rays against waves over lens"
             " size, wavelength and source size; light: the picture against the light that is kept, over"
-            " thickness and the loss' weight of light."
+            " thickness and the loss' weight of light; all: one after the other."
         ),
     ] = "intersection",
     rays: Annotated[
@@ -78,15 +78,12 @@ def run(
 ) -> None:
     """Measure errors, and the time they took, for many settings in one run."""
     began, say = time.monotonic(), console.Reporter(quiet, progress)
-    if study not in STUDIES:
-        raise InputError(f"--study must be one of {', '.join(STUDIES)}, got {study!r}")
+    if study not in (*STUDIES, "all"):
+        raise InputError(f"--study must be one of {', '.join(STUDIES)} or all, got {study!r}")
+    names = STUDIES if study == "all" else (study,)
     count = options.rays("--rays", rays) if rays else None
-    for option, given, for_study in (
-        ("--seconds", seconds is not None, study in ("design", "light")),
-        ("--repeats", repeats is not None, study not in ("design", "diffraction", "light")),
-        ("--dtype", dtype is not None, study not in ("intersection", "light")),
-    ):
-        if given and not for_study:
+    for option, given in (("--seconds", seconds), ("--repeats", repeats), ("--dtype", dtype)):
+        if given is not None and not any(_takes(name, option) for name in names):
             raise InputError(f"{option} has no meaning for --study {study}: leave it out")
     precision = options.dtype_of(dtype) if dtype else None
     if output.exists() and not output.is_dir():
@@ -95,71 +92,46 @@ def run(
         options.require_project(project)
     device = options.start_torch(device, threads, say)
 
-    from caustic_cli.studies import diffraction, effects, intersection, light, report, training  # noqa: PLC0415
+    from caustic_cli.studies import report  # noqa: PLC0415
+    from caustic_cli.workflow.convergence import PLOTS, UNITS, Request, measure  # noqa: PLC0415
+    from caustic_cli.workflow.lens import load  # noqa: PLC0415
 
     if output.is_dir():
-        plots = {
-            "intersection": intersection.PLOTS,
-            "design": training.PLOTS,
-            "effects": effects.PLOTS,
-            "diffraction": diffraction.PLOTS,
-            "light": light.PLOTS,
-        }.get(study)
-        report.refuse_foreign_files(report.paths_of(study, output, plots), force)
-    opened = _open(project)
-    with say.progress(None) as show:
+        for name in names:
+            report.refuse_foreign_files(report.paths_of(name, output, PLOTS.get(name)), force)
+    lens, done = None if project is None else load(project), []
+    for name in names:
+        asked = Request(
+            count if study != "all" or name in BY_RAYS else None,
+            repeats if _takes(name, "--repeats") else None,
+            seconds if _takes(name, "--seconds") else None,
+            seed,
+            precision if _takes(name, "--dtype") else None,
+        )
+        start = time.monotonic()
+        with say.progress(None) as show:
 
-        def tell(done: int, whole: int) -> None:
-            show(study, UNITS.get(study, "rays"), done, whole)
+            def tell(part: int, whole: int, name: str = name, show=show) -> None:
+                show(name, UNITS.get(name, "rays"), part, whole)
 
-        if study == "intersection":
-            case = intersection.of_lens(*opened[1:], count, seed or 0) if opened else intersection.table_d3(count, seed or 0)
-            found = intersection.run_intersection(case, seed=seed or 0, repeats=repeats, progress=tell)
-        elif study == "design":
-            from caustic_cli.workflow import comparison  # noqa: PLC0415
+            found = measure(name, lens, asked, device, say, tell)
+        paths = report.write(found, output)
+        _show(found, paths, say)
+        done.append(_as_json(found, paths) | {"seconds": time.monotonic() - start})
+    if json:
+        console.emit_json(done[0] if study != "all" else {"study": "all", "studies": done, "seconds": time.monotonic() - began})
 
-            scene, target, entries = comparison.entries_of(opened[0] if opened else None, device, precision, seed)
-            found = training.run_training(
-                scene, target, entries, seconds=seconds, seed=seed or 0, rays=count, device=device, progress=tell
-            )
-        elif study == "light":
-            from caustic_cli.config import checks  # noqa: PLC0415
-            from caustic_cli.workflow import tradeoff  # noqa: PLC0415
 
-            each = checks.number("--seconds", light.SECONDS if seconds is None else seconds, 0.0, 1e6, open_low=True)
-            count_of, lenses = tradeoff.lenses(opened[0] if opened else None, each, device)
-            found = light.run_light(lenses, count_of, rays=count, seed=seed or 0, device=device, progress=tell)
-        elif study == "diffraction":
-            from caustic_cli.workflow.comparison import lens_of_disc  # noqa: PLC0415
+def _takes(study: str, option: str) -> bool:
+    """Whether an option has a meaning for a study."""
+    if option == "--seconds":
+        return study in ("design", "light")
+    if option == "--repeats":
+        return study not in ("design", "diffraction", "light")
+    return study not in ("intersection", "light")
 
-            scene, field, heights = opened[1:] if opened else lens_of_disc()
-            found = diffraction.run_diffraction(
-                scene, field, heights.to(device), rays=count, seed=seed or 0, dtype=precision, progress=tell
-            )
-        else:
-            from caustic_cli.studies.convergence import run_study  # noqa: PLC0415
-            from caustic_cli.workflow.compilation import compile_for  # noqa: PLC0415
-            from caustic_cli.workflow.design import sphere  # noqa: PLC0415
 
-            scene, field, heights = opened[1:] if opened else sphere()
-            if study == "effects":
-                compile_for(None, device, say)
-                found = effects.run_effects(
-                    scene, field, heights.to(device), rays=count, repeats=repeats, seed=seed or 0, dtype=precision, progress=tell
-                )
-            else:
-                found = run_study(
-                    study,
-                    scene,
-                    field,
-                    heights.to(device),
-                    seed=seed or 0,
-                    max_rays=count,
-                    repeats=3 if repeats is None else repeats,
-                    dtype=precision,
-                    progress=tell,
-                )
-    paths = report.write(found, output)
+def _show(found, paths: list[Path], say: console.Reporter) -> None:
     rows = [
         (
             name,
@@ -172,29 +144,16 @@ def run(
     if "source" in found.about:
         rows.insert(0, ("rays", f"{found.about['rays']:,} from {found.about['source']}"))
     say.table(
-        f"{study}: fitted orders" if found.orders else study,
+        f"{found.name}: fitted orders" if found.orders else found.name,
         [*rows, ("advice", found.advice), ("written", ", ".join(map(str, paths)))],
     )
-    if json:
-        console.emit_json(
-            {
-                "study": study,
-                "advice": found.advice,
-                "rows": found.rows,
-                "files": [str(p) for p in paths],
-                "orders": {k: None if o is None else o.exponent for k, o in found.orders.items()},
-                "seconds": time.monotonic() - began,
-            }
-        )
 
 
-def _open(path: Path | None) -> tuple | None:
-    """The project, its scene, its lens' field and heights; None for no path."""
-    if path is None:
-        return None
-    from caustic_cli.project.project import Project  # noqa: PLC0415
-
-    opened = Project.open(path)
-    scene = opened.scene()
-    field, checkpoint = opened.lens(scene)
-    return opened, scene, field, checkpoint.state.heights
+def _as_json(found, paths: list[Path]) -> dict:
+    return {
+        "study": found.name,
+        "advice": found.advice,
+        "rows": found.rows,
+        "files": [str(p) for p in paths],
+        "orders": {k: None if o is None else o.exponent for k, o in found.orders.items()},
+    }

@@ -24,7 +24,7 @@ from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import SAMPLERS
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
-from caustic_cli.studies.fit import Order, order
+from caustic_cli.studies.fit import Order, knee, order
 from caustic_cli.studies.measurement import REFERENCE_SEED, Bench, Reference, Setting, haste
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.report import Study
@@ -36,6 +36,8 @@ FILTERS = (Filter(), *(Filter(kind, (v, v), (1.0, 1.0)) for kind in ("gaussian",
 #: Single precision is enough where it changes the image by less than this part of the error its rays leave anyway:
 #: it then adds half a percent to it in quadrature.
 NEGLIGIBLE = 0.1
+#: A speedup below this is the noise of the times.
+FASTER = 1.1
 #: An order below this is no convergence: halving the error would take a thousand times the rays.
 STALLED = 0.1
 
@@ -94,11 +96,12 @@ def study_rays(bench: Bench, dtype: torch.dtype) -> Study:
     truth = bench.reference(Filter())
     rows = bench.measure(settings, lambda _, image, __: {"error": truth.error_of(image)})
     orders = _orders(bench, rows)
-    best = min(rows, key=lambda row: row["error"])
-    advice = (
-        f"a relative error of {best['error']:.2g} costs {best['seconds']:.2g} s with {best['rays']}"
-        f" {best['sampler']} rays; {_halving(orders[best['series']])}{haste(rows)}"
-    )
+    best = rows[knee([row["seconds"] for row in rows], [row["error"] for row in rows])]
+    least = min(rows, key=lambda row: row["error"])
+    advice = f"a relative error of {best['error']:.2g} costs {best['seconds']:.2g} s with {best['rays']} {best['sampler']} rays"
+    if least is not best:
+        advice += f", the least, {least['error']:.2g}, {least['seconds']:.2g} s with {least['rays']} {least['sampler']}"
+    advice += f"; {_halving(orders[best['series']])}{haste(rows)}"
     return Study("rays", _COMMON | _TIMES, rows, orders, advice, _about(bench, dtype, truth))
 
 
@@ -189,13 +192,19 @@ def study_precision(bench: Bench, _dtype) -> Study:
     )
     largest = rows[-2 * len(SAMPLERS) :]
     worst = max(largest[1::2], key=lambda row: row["difference"] / max(row["error"], truth.error))
-    decision = "float32 is enough" if worst["difference"] <= NEGLIGIBLE * worst["error"] else "use float64"
     advice = (
         f"float32 changes the image of {worst['rays']} {worst['sampler']} rays by {worst['difference']:.2g},"
         f" where the rays leave an error of {worst['error']:.2g}, and is {worst['speedup']:.2g} times as fast"
-        f" in plain torch: {decision}{haste(rows)}"
+        f" in plain torch: {single_precision(worst)}{haste(rows)}"
     )
     return Study("precision", columns, rows, _orders(bench, rows), advice, _about(bench, None, truth))
+
+
+def single_precision(row: dict) -> str:
+    """Whether float32 will do, by a row of it that knows difference, error and speedup."""
+    if row["speedup"] < FASTER:
+        return "float32 gains nothing here"
+    return "float32 is enough" if row["difference"] <= NEGLIGIBLE * row["error"] else "use float64"
 
 
 def _orders(bench: Bench, rows: list[dict], column: str = "error") -> dict[str, Order | None]:

@@ -44,7 +44,20 @@ def order(n: Sequence[float], error: Sequence[float], least: float = 0.0) -> Ord
     return Order(-slope, deviation, len(x), float(n[use].min()), float(n[use].max()))
 
 
-def pareto(cost: Sequence[float], error: Sequence[float]) -> list[bool]:
-    """For every setting, whether no other one is at least as good in both and better in one."""
-    points = list(zip(cost, error, strict=True))
-    return [not any(c <= cost_ and e <= error_ and (c, e) != (cost_, error_) for c, e in points) for cost_, error_ in points]
+def pareto(cost: Sequence[float], error: Sequence[float], gain: float = 0.0) -> list[bool]:
+    """For every setting, whether no other one is at least as good in both and better in one; of two that are the same, the first.
+
+    gain: part by which an error has to be less than that of every cheaper setting on the front, such as the errors' own noise.
+    """
+    front, least = set(), float("inf")
+    for k in sorted(range(len(cost)), key=lambda k: (cost[k], error[k])):
+        if error[k] < (1.0 - gain) * least:
+            front.add(k)
+            least = error[k]
+    return [k in front for k in range(len(cost))]
+
+
+def knee(cost: Sequence[float], error: Sequence[float], near: float = 0.25) -> int:
+    """The cheapest setting whose error is within this part of the least."""
+    enough = (1.0 + near) * min(error)
+    return min((k for k in range(len(cost)) if error[k] <= enough), key=lambda k: cost[k])

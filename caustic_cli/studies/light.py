@@ -96,7 +96,8 @@ def run_light(
             progress(k + 1, count)
     if not rows:
         raise CausticError("no lens of this scene sends any light to the picture")
-    for row, front in zip(rows, pareto([1.0 - r["on_screen"] for r in rows], [r["error"] for r in rows]), strict=True):
+    gain = min(0.5, max(((r["noise"] or 0.0) / r["error"] for r in rows if r["error"] > 0), default=0.0))
+    for row, front in zip(rows, pareto([1.0 - r["on_screen"] for r in rows], [r["error"] for r in rows], gain), strict=True):
         row["front"] = bool(front)
     about = {
         "version": __version__,

@@ -26,6 +26,10 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8
 MARKERS = "osD^vP<>"
 
 
+#: Part by which a slower setting has to lower the error to be on the front.
+GAIN = 0.02
+
+
 @dataclass(frozen=True)
 class Study:
     """What a study found.
@@ -150,7 +154,7 @@ def draw_front(axes: Axes, study: Study) -> None:
         if order is not None:
             label += f", {study.about['orders_of']} of order {order.exponent:.2f}"
         axes.errorbar([row["seconds"] for row in mine], [row["error"] for row in mine], xerr=spread(mine), label=label, **style)
-    best = pareto([row["seconds"] for row in rows], [row["error"] for row in rows])
+    best = pareto([row["seconds"] for row in rows], [row["error"] for row in rows], GAIN)
     front = sorted((row["seconds"], row["error"]) for row, on in zip(rows, best, strict=True) if on)
     axes.plot(
         [seconds for seconds, _ in front],

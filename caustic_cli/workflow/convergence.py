@@ -1,0 +1,96 @@
+"""Studies of what accuracy costs in time, each of a lens or of a scene of its own where none is given."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+
+from caustic_cli.config import checks
+from caustic_cli.studies import diffraction, effects, intersection, light, training
+from caustic_cli.studies.convergence import run_study
+from caustic_cli.studies.report import Study
+from caustic_cli.workflow import comparison, tradeoff
+from caustic_cli.workflow.compilation import compile_for
+from caustic_cli.workflow.design import sphere
+from caustic_cli.workflow.lens import Lens
+from caustic_cli.workflow.reporter import Reporter
+
+#: Plots of the studies that bring their own.
+PLOTS = {
+    "intersection": intersection.PLOTS,
+    "design": training.PLOTS,
+    "effects": effects.PLOTS,
+    "diffraction": diffraction.PLOTS,
+    "light": light.PLOTS,
+}
+#: What the progress of a study counts.
+UNITS = {"intersection": "evaluations", "effects": "effects", "design": "turns", "diffraction": "cases", "light": "lenses"}
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked of a study; None for its own default.
+
+    rays: of the largest setting; repeats: rounds; seconds: for each contender or lens; dtype: of the rays.
+    """
+
+    rays: int | None = None
+    repeats: int | None = None
+    seconds: float | None = None
+    seed: int | None = None
+    dtype: torch.dtype | None = None
+
+
+def measure(
+    name: str, lens: Lens | None, asked: Request, device: str, say: Reporter, progress: Callable[[int, int], None]
+) -> Study:
+    """Make a study.
+
+    Args:
+        lens: None for the study's own: the sphere a design begins from, the scene of table D.3, a bright disc.
+        progress: told how much of how much is done, in UNITS.
+
+    Raises:
+        InputError: a value out of range.
+    """
+    seed = asked.seed or 0
+    if name == "intersection":
+        case = (
+            intersection.of_lens(lens.scene, lens.field, lens.heights, asked.rays, seed)
+            if lens
+            else intersection.table_d3(asked.rays, seed)
+        )
+        return intersection.run_intersection(case, seed=seed, repeats=asked.repeats, progress=progress)
+    project = lens.project if lens else None
+    if name == "design":
+        scene, target, entries = comparison.entries_of(project, device, asked.dtype, asked.seed)
+        return training.run_training(
+            scene, target, entries, seconds=asked.seconds, seed=seed, rays=asked.rays, device=device, progress=progress
+        )
+    if name == "light":
+        each = checks.number("⟨seconds⟩", light.SECONDS if asked.seconds is None else asked.seconds, 0.0, 1e6, open_low=True)
+        count, lenses = tradeoff.lenses(project, each, device)
+        return light.run_light(lenses, count, rays=asked.rays, seed=seed, device=device, progress=progress)
+    other = comparison.lens_of_disc if name == "diffraction" else sphere
+    scene, field, heights = (lens.scene, lens.field, lens.heights) if lens else other()
+    heights = heights.to(device)
+    if name == "diffraction":
+        return diffraction.run_diffraction(scene, field, heights, rays=asked.rays, seed=seed, dtype=asked.dtype, progress=progress)
+    if name == "effects":
+        compile_for(None, device, say)
+        return effects.run_effects(
+            scene, field, heights, rays=asked.rays, repeats=asked.repeats, seed=seed, dtype=asked.dtype, progress=progress
+        )
+    return run_study(
+        name,
+        scene,
+        field,
+        heights,
+        seed=seed,
+        max_rays=asked.rays,
+        repeats=3 if asked.repeats is None else asked.repeats,
+        dtype=asked.dtype,
+        progress=progress,
+    )
