@@ -71,13 +71,13 @@ def refuse_without_glass(scene: Scene, field: HeightField, heights: Tensor) -> N
         )
 
 
-def bounds_of(scene: Scene, field: HeightField, heights: Tensor) -> Bounds:
-    """Bounds that hold for every ray of a scene at these heights (n, m) mm."""
+def bounds_of(scene: Scene, field: HeightField, heights: Tensor, steeper: float = 0.0) -> Bounds:
+    """Bounds that hold for every ray of a scene at these heights (n, m) mm; steeper: by how much slopes may exceed the spline's."""
     lens, indices = scene.lens, [band.scene.lens.inside for band in scene.bands]
     least, most = min(indices), max(indices)
     incidence = scene.source.incidence(scene.lens.half_size, scene.lens.z_in, scene.lens.round)
     inside = math.asin(min(1.0, math.sin(incidence) / least))
-    slope = field.slope_bound(heights)
+    slope = field.slope_bound(heights) + steeper
     lean = math.atan(slope + lens.roughness * LARGEST_NORMAL)
     i = inside + lean
     if lens.mirror:

@@ -55,14 +55,17 @@ def parse_effects(text: str) -> frozenset[str] | None:
     return frozenset(names)
 
 
-def compile_plan(scene: Scene, field: HeightField, heights: Tensor, wanted: Iterable[str] | None = None) -> Plan:
+def compile_plan(
+    scene: Scene, field: HeightField, heights: Tensor, wanted: Iterable[str] | None = None, steeper: float = 0.0
+) -> Plan:
     """The plan of a scene at heights (n, m) mm.
 
     Args:
         wanted: names of the effects to simulate instead of those that the scene calls for, or None; one without which there is
             no image stays on.
+        steeper: by how much the slopes of what is traced may exceed those of the spline.
     """
-    bounds = bounds_of(scene, field, heights)
+    bounds = bounds_of(scene, field, heights, steeper)
     decisions = [effect.judge(scene, bounds) for effect in EFFECTS]
     if wanted is not None:
         chosen = frozenset(wanted)

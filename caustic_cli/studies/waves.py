@@ -12,6 +12,7 @@ from caustic_cli.optics.image import Image
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.waves import NoWaveImage, WaveImage, wave_image
+from caustic_cli.optics.waves.image import Departure
 from caustic_cli.scene import Scene
 from caustic_cli.studies.irradiance import irradiance_figures
 from caustic_cli.studies.metrics import judge
@@ -32,8 +33,10 @@ def wave_figures(
     finer: float = FINER,
     dtype: torch.dtype = torch.float32,
     required: bool = True,
+    departure: Departure | None = None,
 ) -> tuple[WaveImage | None, dict]:
-    """The wave image of a lens at the scene's wavelengths, white light's where it says none, and its figures.
+    """The wave image of a lens at the scene's wavelengths, white light's where it says none, and its figures.  departure: of its
+    exit from the heights, as of `optics.waves.wave_image`.
 
     Returns:
         the image, None where there is none and `required` is false; and wave_relative_rms, wave_on_target (None without a target),
@@ -42,7 +45,7 @@ def wave_figures(
         wave_peak_irradiance and wave_mean_irradiance, as of a ray image.
     """
     try:
-        found = wave_image(scene, field, heights.detach(), finer=finer, dtype=dtype)
+        found = wave_image(scene, field, heights.detach(), finer=finer, dtype=dtype, departure=departure)
     except NoWaveImage as error:
         if required:
             raise

@@ -11,6 +11,7 @@ on (ghosts, secondary intersections, rough surfaces) is no part of it.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import cast
@@ -43,6 +44,9 @@ BLURS = 2.0
 ALLOWED = 0.25
 #: Points that stand for an extended source where its image is not simply spread, at most, and least of each of its positions.
 EACH, LEAST_EACH = 24, 4
+
+#: Points (N,) mm -> by how much a surface is higher there, mm.
+Departure = Callable[[Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True)
@@ -134,6 +138,7 @@ def wave_image(
     screen: Screen | None = None,
     finer: float = 1.0,
     dtype: torch.dtype = torch.float32,
+    departure: Departure | None = None,
 ) -> WaveImage:
     """The wave image of a one-lens scene at heights (n, m) mm; differentiable by them.
 
@@ -141,16 +146,23 @@ def wave_image(
         wavelengths: nm, in equal parts, instead of the scene's; a scene without any has white light.
         finer: samples more than are needed by so many times along each axis, on both planes.
         dtype: of the field; paths are float64.
+        departure: of the exit from those heights, see `Imager`.
 
     Raises:
         NoWaveImage: no light reaches the screen, light crosses itself within the lens, or memory is short.
     """
     lines = lines_of(scene, field, wavelengths)
-    return image_of(lines, {EXIT: heights.double()}, screen or scene.screen, finer=finer, dtype=dtype)
+    return image_of(lines, {EXIT: heights.double()}, screen or scene.screen, finer=finer, dtype=dtype, departure=departure)
 
 
 def image_of(
-    lines: list[Line], parameters: Parameters, screen: Screen | Placed, *, finer: float = 1.0, dtype: torch.dtype = torch.float32
+    lines: list[Line],
+    parameters: Parameters,
+    screen: Screen | Placed,
+    *,
+    finer: float = 1.0,
+    dtype: torch.dtype = torch.float32,
+    departure: Departure | None = None,
 ) -> WaveImage:
     """The wave image of lines of light on one screen, the sources of a system one by one; see `wave_image`."""
     exact, found = any(h.requires_grad for h in parameters.values()), []
@@ -158,7 +170,8 @@ def image_of(
     for line in lines:
         by_source.setdefault(id(line.system.source), []).append(line)
     for light in by_source.values():
-        imager = Imager.of(light, parameters, receiver_of(light[0].system, screen), finer, exact)
+        imager = Imager.of(light, parameters, receiver_of(light[0].system, screen), finer, exact, dense=departure is not None)
+        imager = replace(imager, departure=departure)
         found.append(imager.expose(light, parameters, dtype))
     return (
         found[0]
@@ -187,7 +200,9 @@ def _alike(lines: list[Line]) -> list[list[Line]]:
 class Imager:
     """What the images of a source's lines and modes have in common: where their light is watched, and how finely.
 
-    spread: of the light of a mode; each: modes for every position of the source, 0 for one that stands for all of it.
+    spread: of the light of a mode; each: modes for every position of the source, 0 for one that stands for all of it; departure:
+    how much higher the last surface is at points (N,) than its heights say, mm: small, fine structure, of which light takes the
+    path to first order and no change of its way.
     """
 
     source: Source
@@ -201,6 +216,7 @@ class Imager:
     upright: bool
     exact: bool = False
     tapered: bool = True
+    departure: Departure | None = None
 
     @classmethod
     def of(
@@ -297,7 +313,12 @@ class Imager:
         optics, s = self.optics(line, mode, parameters), self.sampling
         dx, dy = (d * n / m for d, n, m in zip(s.step, s.count, self.nodes, strict=True))
         seen = survey(optics) if self.each else self.seen
-        return wavefront(optics, seen, s.low, (dx, dy), self.nodes, sensitive, self.exact)
+        if self.departure is None:
+            return wavefront(optics, seen, s.low, (dx, dy), self.nodes, sensitive, self.exact)
+        found = wavefront(optics, seen, s.low, (dx, dy), self.nodes, True, self.exact)
+        assert found.sensitivity is not None and found.at_x is not None and found.at_y is not None
+        off = self.departure(found.at_x.reshape(-1), found.at_y.reshape(-1)).view(found.path.shape)
+        return replace(found, path=found.path + found.sensitivity * off)
 
     def watched(self, front: Wavefront, length: float) -> Wavefront:
         """The part of it that lands where its transform at a wavelength in mm reaches."""
