@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import math
 import re
@@ -75,6 +76,42 @@ def from_table(command: str):
         return run
 
     return decorate
+
+
+def from_fields(kind: type, parameter: str):
+    """Give a command an option for each field of a dataclass, in place of its parameter of that name.
+
+    The command gets a dictionary of those that were said.  Fields carry help and unit in their metadata.
+    """
+
+    def decorate(body):
+        own, rows = inspect.signature(body, eval_str=True).parameters, {row.name: row for row in dataclasses.fields(kind)}
+
+        def run(**values):
+            said = {name: value for name in rows if (value := values.pop(name)) is not None}
+            return body(**{parameter: said}, **values)
+
+        parameters = []
+        for name, one in own.items():
+            parameters += map(_of_field, rows.values()) if name == parameter else [one.replace(kind=inspect.Parameter.KEYWORD_ONLY)]
+        run.__signature__ = inspect.Signature(parameters)
+        run.__annotations__ = {p.name: p.annotation for p in parameters}
+        run.__doc__, run.__name__ = body.__doc__, body.__name__
+        return run
+
+    return decorate
+
+
+def _of_field(row: dataclasses.Field) -> inspect.Parameter:
+    """The option of a field."""
+    known, text = row.metadata, bool(row.metadata["choices"])
+    words = known["help"]
+    if row.default is not None:
+        words += f"  [default: {row.default if text else format(row.default, 'g')}]"
+    metavar = "|".join(known["choices"]) if text else known["unit"].upper()
+    option = typer.Option("--" + row.name.replace("_", "-"), metavar=metavar, help=f"gcode: {words}")
+    annotation = Annotated[str | None if text else float | None, option]
+    return inspect.Parameter(row.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
 
 
 def _parameter(name: str, row: Setting) -> inspect.Parameter:

@@ -246,8 +246,8 @@ _ROWS = (
             " on or off", choices=("auto", "on", "off"), default="auto", why="an effect is simulated where a scene calls for it",
             option=Option("--waves", "auto|on|off")),
     Setting("design.start", "text", "first surface: transport (optimal transport of the light to the picture), offset (the sphere"
-            " that follows from the magnification), or the lens of another project or of a file: .npz or .step as exported, .npy of"
-            " heights in mm", derived="transport; offset for a network, adam, several points or a small net",
+            " that follows from the magnification), or the lens of another project or of a file: .npz, .step or height map as"
+            " exported, .npy of heights in mm", derived="transport; offset for a network, adam, several points or a small net",
             option=Option("--start", "transport|offset|PROJECT|FILE")),
     Setting("design.iterations", "whole", "in all, counted from the very first; 0: what the stages say", low=0, high=10**9,
             default=0, derived="what the stages say", option=Option("--iterations")),

@@ -32,8 +32,8 @@ def write_lighttools(
     """Write the archive whole or not at all.
 
     Keys: points, normals (N, 3); shape (2,); x (nx,), y (ny,), z (nx, ny); lens_half_size (2,), z_in, refractive_index;
-    screen_half_size (2,), z_screen, resolution (2,); those of `_source`; fresnel unless exact; aperture if a circle;
-    control_points (n, m, 3) with x, y at the Greville abscissae, degrees (2,), knots_u, knots_v on [0, 1]; unit,
+    screen_half_size (2,), z_screen, resolution (2,); those of `_source`; fresnel unless exact; aperture if a circle; mirror, 1, of
+    one; control_points (n, m, 3) with x, y at the Greville abscissae, degrees (2,), knots_u, knots_v on [0, 1]; unit,
     format_version, created_by.
 
     Args:
@@ -61,6 +61,7 @@ def write_lighttools(
         "resolution": np.array(scene.screen.resolution, np.int64),
         **_source(scene),
         **({"aperture": np.array("circle")} if scene.lens.round else {}),
+        **({"mirror": np.array(1, np.int64)} if scene.lens.mirror else {}),
         **({} if scene.lens.fresnel == "exact" else {"fresnel": np.array(scene.lens.fresnel)}),
         "control_points": np.stack([x, y, heights.detach().double().cpu().numpy()], -1),
         "degrees": np.array([s.degree for s in field.spaces], np.int64),

@@ -1,4 +1,5 @@
-"""The lens as a closed, oriented triangle mesh: exit surface, walls along its border, flat entrance at z_in.
+"""The lens as a closed, oriented triangle mesh: exit surface, walls along its border, flat entrance at z_in; or a mirror, whose
+material lies above its surface and up to z_in.
 
 Corners run counter-clockwise seen from outside.  What the mesh formats (STL, PLY, OBJ) are made of.
 
@@ -15,7 +16,7 @@ A border, for the mount, is a flange around the aperture, half as high as the su
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -150,6 +151,10 @@ def solid(points: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         InputError: the surface reaches the entrance, so that there is no solid.
     """
+    if lens.mirror:  # the solid of the mirrored surface, mirrored back: outward stays outward when the corners' order turns
+        upside = replace(lens, mirror=False, z_in=-lens.z_in)
+        vertices, faces = solid(points * [1.0, 1.0, -1.0], upside)
+        return vertices * [1.0, 1.0, -1.0] + 0.0, faces[:, ::-1].copy()
     refuse_open(float(points[..., 2].min()), lens.z_in)
     nx, ny = points.shape[:2]
     numbers, vertices = rim_of(nx, ny), [points.reshape(-1, 3)]

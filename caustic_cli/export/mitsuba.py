@@ -6,6 +6,9 @@
     screen           white and diffuse; a camera between lens and screen sees it mirrored back, as from behind
     light            a plane wave as a collimated area, points as spots, a disc as a Lambertian area
 
+A mirror is its surface alone, a perfect `conductor` that is black behind; the camera stands between it and the screen, which light
+from the mirror lights on its +z side, and sees it as from +z.
+
 The integrator traces light (`ptracer`), four surfaces deep: entrance, exit, screen, camera.  With radiance L in the image,
 pi L times a pixel's area is its power.  Lengths are mm, so radiance is W / (mm^2 sr).
 """
@@ -20,13 +23,13 @@ import numpy as np
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.export.mesh import patch, refuse_open, rim_of, triangles
+from caustic_cli.export.mesh import Patch, patch, refuse_open, rim_of, triangles
 from caustic_cli.export.ply import write_mesh
 from caustic_cli.export.surface import STEPS_PER_SPAN
 from caustic_cli.export.text import CREATED, real
 from caustic_cli.io.files import write_bytes
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.scene import Lens, Scene
+from caustic_cli.scene import Lens, Scene, Screen
 from caustic_cli.scene.plain import beyond_plain
 
 #: Rays a pixel of the scene's own sampler, Mitsuba's `spp`.
@@ -38,11 +41,16 @@ DEPTH = 4
 RING = 1024
 #: Points along an axis of a mesh that Mitsuba loads in seconds.
 QUICK = 2048
+#: Half a turn, after which rectangles look to -z; what takes all light.
+SPIN = '<rotate x="1" angle="180"/>'
+BLACK = '<bsdf type="diffuse"><rgb name="reflectance" value="0"/></bsdf>'
 
 
-def companions(path: str | Path, round: bool = True) -> list[Path]:
-    """The meshes beside a scene file: of the exit surface, of the sides, and of a round lens' holder."""
+def companions(path: str | Path, round: bool = True, mirror: bool = False) -> list[Path]:
+    """The meshes beside a scene file: of the exit surface, of the sides, and of a round lens' holder; of a mirror."""
     path = Path(path)
+    if mirror:
+        return [path.with_name(f"{path.stem}-mirror.ply")]
     return [path.with_name(f"{path.stem}-{name}.ply") for name in ("exit", "sides", "holder")[: 3 if round else 2]]
 
 
@@ -61,20 +69,68 @@ def write_mitsuba(
         InputError: as `closed_mesh`; a light that Mitsuba has no emitter for; or the files cannot be written there.
     """
     light, surface = [] if dark else _light(scene), patch(scene.lens, field, heights, samples, tolerance)
+    if scene.lens.mirror:
+        _write_mirror(path, scene, surface, light)
+        return
     refuse_open(float(surface.points[..., 2].min()), scene.lens.z_in)
     exit_mesh, sides = companions(path, False)
     points, normals = (a.reshape(-1, 3) for a in (surface.points, surface.normals))
     write_mesh(exit_mesh, points, triangles(surface.points), normals, text=False)
     rim = points[rim_of(*surface.points.shape[:2])]
     write_mesh(sides, *_strip(rim, rim * [1.0, 1.0, 0.0] + [0.0, 0.0, scene.lens.z_in]), text=False)
-    lens, screen, spin = scene.lens, scene.screen, '<rotate x="1" angle="180"/>'  # rectangles look to -z
+    lens, screen = scene.lens, scene.screen
     glass = f'<bsdf type="dielectric"><float name="int_ior" value="{real(lens.index)}"/><float name="ext_ior" value="1"/></bsdf>'
-    black = '<bsdf type="diffuse"><rgb name="reflectance" value="0"/></bsdf>'
-    (rx, ry), (sx, sy) = lens.half_size, screen.half_size
-    flat, holder = ("disk", _round_holder(path, rx, lens.z_in, black)) if lens.round else ("rectangle", _holder(lens, black))
+    rx, ry = lens.half_size
+    flat, holder = ("disk", _round_holder(path, rx, lens.z_in, BLACK)) if lens.round else ("rectangle", _holder(lens, BLACK))
     away = 0.9 * (screen.z - float(points[:, 2].max()))
-    width, height = screen.resolution[0], max(1, round(screen.resolution[0] * sy / sx))
     lines = [
+        *_camera(screen, away, f'<scale x="-1"/><translate z="{real(screen.z - away)}"/>'),
+        f'<shape type="{flat}" id="entrance">',
+        f"  {glass}",
+        f'  <transform name="to_world">{SPIN}<scale x="{real(rx)}" y="{real(ry)}"/><translate z="{real(lens.z_in)}"/></transform>',
+        "</shape>",
+        f'<shape type="ply" id="exit"><string name="filename" value="{exit_mesh.name}"/>{glass}</shape>',
+        f'<shape type="ply" id="sides"><string name="filename" value="{sides.name}"/>'
+        f'<boolean name="face_normals" value="true"/>{BLACK}</shape>',
+        *holder,
+        *_screen(screen, SPIN),
+        *light,
+        "</scene>",
+        "",
+    ]
+    write_bytes(path, "\n".join(lines).encode())
+
+
+def _write_mirror(path: str | Path, scene: Scene, surface: Patch, light: list[str]) -> None:
+    """The scene of a mirror.
+
+    Raises:
+        InputError: light that comes through the screen.
+    """
+    screen, lens = scene.screen, scene.lens
+    if not scene.source.collimated and scene.source.nearest <= screen.z:
+        raise InputError("⟨format⟩ mitsuba: the screen would stand in the light of this mirror's source")
+    (mesh,) = companions(path, False, True)
+    points, normals = (a.reshape(-1, 3) for a in (surface.points, surface.normals))
+    write_mesh(mesh, points, triangles(surface.points)[:, ::-1], -normals, text=False)  # towards the light
+    away = 0.9 * (min(float(points[:, 2].min()), lens.z_in) - BEFORE - screen.z)
+    coated = f'<bsdf type="twosided"><bsdf type="conductor"><string name="material" value="none"/></bsdf>{BLACK}</bsdf>'
+    lines = [
+        *_camera(screen, away, f'<rotate y="1" angle="180"/><translate z="{real(screen.z + away)}"/>'),
+        f'<shape type="ply" id="mirror"><string name="filename" value="{mesh.name}"/>{coated}</shape>',
+        *_screen(screen, ""),
+        *(line.replace("</shape>", '<bsdf type="null"/></shape>') for line in light),
+        "</scene>",
+        "",
+    ]
+    write_bytes(path, "\n".join(lines).encode())
+
+
+def _camera(screen: Screen, away: float, place: str) -> list[str]:
+    """The scene's first lines: how light is traced, and a camera `away` mm from the screen, which fills its picture."""
+    sx, sy = screen.half_size
+    width, height = screen.resolution[0], max(1, round(screen.resolution[0] * sy / sx))
+    return [
         f"<!-- {CREATED}; millimetres -->",
         '<scene version="3.0.0">',
         f'<integrator type="ptracer"><integer name="max_depth" value="{DEPTH}"/></integrator>',
@@ -82,28 +138,23 @@ def write_mitsuba(
         '  <string name="fov_axis" value="x"/>',
         f'  <float name="fov" value="{real(2.0 * math.degrees(math.atan2(sx, away)))}"/>',
         f'  <float name="near_clip" value="{real(0.5 * away)}"/><float name="far_clip" value="{real(2.0 * away)}"/>',
-        f'  <transform name="to_world"><scale x="-1"/><translate z="{real(screen.z - away)}"/></transform>',
+        f'  <transform name="to_world">{place}</transform>',
         f'  <sampler type="independent"><integer name="sample_count" value="{SAMPLES}"/></sampler>',
         f'  <film type="hdrfilm"><integer name="width" value="{width}"/><integer name="height" value="{height}"/>',
         '    <string name="pixel_format" value="luminance"/><rfilter type="box"/></film>',
         "</sensor>",
-        f'<shape type="{flat}" id="entrance">',
-        f"  {glass}",
-        f'  <transform name="to_world">{spin}<scale x="{real(rx)}" y="{real(ry)}"/><translate z="{real(lens.z_in)}"/></transform>',
-        "</shape>",
-        f'<shape type="ply" id="exit"><string name="filename" value="{exit_mesh.name}"/>{glass}</shape>',
-        f'<shape type="ply" id="sides"><string name="filename" value="{sides.name}"/>'
-        f'<boolean name="face_normals" value="true"/>{black}</shape>',
-        *holder,
+    ]
+
+
+def _screen(screen: Screen, spin: str) -> list[str]:
+    """A white rectangle that looks to +z, or, spun, to -z."""
+    sx, sy = screen.half_size
+    return [
         '<shape type="rectangle" id="screen">',
         '  <bsdf type="diffuse"><rgb name="reflectance" value="1"/></bsdf>',
         f'  <transform name="to_world">{spin}<scale x="{real(sx)}" y="{real(sy)}"/><translate z="{real(screen.z)}"/></transform>',
         "</shape>",
-        *light,
-        "</scene>",
-        "",
     ]
-    write_bytes(path, "\n".join(lines).encode())
 
 
 def quick_samples(field: HeightField) -> tuple[int, int]:
@@ -158,8 +209,9 @@ def _light(scene: Scene) -> list[str]:
     Raises:
         InputError: Mitsuba has none like this.
     """
-    if beyond_plain(scene):
-        raise InputError(f"⟨format⟩ mitsuba is written for clear lenses and straight screens, not {', '.join(beyond_plain(scene))}")
+    beyond = [name for name in beyond_plain(scene) if name != "a mirror"]
+    if beyond:
+        raise InputError(f"⟨format⟩ mitsuba is written for clear lenses and straight screens, not {', '.join(beyond)}")
     if scene.source.kind not in _EMITTERS:
         raise InputError(f"⟨format⟩ mitsuba knows no source of type {scene.source.kind}")
     return _EMITTERS[scene.source.kind](scene)

@@ -1,4 +1,5 @@
-"""The lens as an exact solid in a STEP file (ISO 10303-21, application protocol 214): entrance plane, exit B-spline, four sides.
+"""The lens as an exact solid in a STEP file (ISO 10303-21, application protocol 214): entrance plane, exit B-spline, four sides; or
+a mirror, whose material lies above its surface and up to z_in.
 
 The exit surface's poles stand at the Greville abscissae with the control heights as they are, to the last bit; its borders are
 B-spline curves with the border's poles.  Each border lies in a plane x = const or y = const, which is a side.  Of a round lens
@@ -11,7 +12,7 @@ each face's outward normal, faces, shell, solid; then the product that readers l
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -44,20 +45,24 @@ ROUND_UNCERTAINTY, MOST_ON_RIM = 1e-6, 1 << 15
 
 
 class Entities:
-    """Numbered entities: `add` returns the reference "#7" of a new one."""
+    """Numbered entities: `add` returns the reference "#7" of a new one.
 
-    def __init__(self):
+    mirrored: with z the other way, for solids described from below.  Directions outward stay so; loops run the other way.
+    """
+
+    def __init__(self, mirrored: bool = False):
         self.lines: list[str] = []
+        self.up = -1.0 if mirrored else 1.0
 
     def add(self, text: str) -> str:
         self.lines.append(f"#{len(self.lines) + 1}={text};\n")
         return f"#{len(self.lines)}"
 
     def point(self, p) -> str:
-        return self.add(f"CARTESIAN_POINT('',{reals(p)})")
+        return self.add(f"CARTESIAN_POINT('',{reals((p[0], p[1], self.up * p[2] + 0.0))})")
 
     def direction(self, d) -> str:
-        return self.add(f"DIRECTION('',{reals(d)})")
+        return self.add(f"DIRECTION('',{reals((d[0], d[1], self.up * d[2] + 0.0))})")
 
     def placement(self, at, normal, along) -> str:
         return self.add(f"AXIS2_PLACEMENT_3D('',{self.point(at)},{self.direction(normal)},{self.direction(along)})")
@@ -83,13 +88,15 @@ class Entities:
 
     def bound(self, edges: list[tuple[str, bool]], outer: bool = True) -> str:
         """A loop of edges, each as it is or reversed."""
+        edges = edges if self.up > 0 else _reversed(edges)
         loop = [self.add(f"ORIENTED_EDGE('',*,*,{edge},{'.T.' if forward else '.F.'})") for edge, forward in edges]
         closed = self.add(f"EDGE_LOOP('',({','.join(loop)}))")
         return self.add(f"FACE_{'OUTER_' if outer else ''}BOUND('',{closed},.T.)")
 
-    def face(self, surface: str, *bounds: str) -> str:
-        """A face whose outward normal is the surface's, inside the first bound and outside the others."""
-        return self.add(f"ADVANCED_FACE('',({','.join(bounds)}),{surface},.T.)")
+    def face(self, surface: str, *bounds: str, along: bool = True) -> str:
+        """A face whose outward normal is the surface's, or, not `along`, the opposite, inside the first bound and outside the
+        others."""
+        return self.add(f"ADVANCED_FACE('',({','.join(bounds)}),{surface},{'.T.' if along else '.F.'})")
 
 
 @dataclass(frozen=True)
@@ -107,11 +114,14 @@ def write_step(path: str | Path, scene: Scene, field: HeightField, heights: Tens
     Raises:
         InputError: the surface reaches the entrance, or the file cannot be written there.
     """
-    net = heights.detach().double().cpu().numpy()
+    net, mirror = heights.detach().double().cpu().numpy(), scene.lens.mirror
+    if mirror:  # the solid of the mirrored surface, mirrored back
+        net, heights = -net, -heights
+        scene = replace(scene, lens=replace(scene.lens, z_in=-scene.lens.z_in))
     refuse_open(float(net.min()), scene.lens.z_in)
     x, y = (c.numpy() for c in field.control_xy())
     x, y = np.broadcast_arrays(x[:, None], y[None, :])
-    out = Entities()
+    out = Entities(mirror)
     solid = lens_solid(out, scene.lens, field, heights, np.stack([x, y, net], -1))
     _product(out, solid, ROUND_UNCERTAINTY if scene.lens.round else UNCERTAINTY)
     with atomic_path(path) as temporary, open(temporary, "w", encoding="ascii", newline="\n") as file:
@@ -135,7 +145,7 @@ def lens_solid(out: Entities, lens: Lens, field: HeightField, heights: Tensor, p
         grid = sample_grid(field, heights)
         rim = _rim(out, poles, points, field.spaces)
         lowest = min(float(edge.min()) for edge in (grid.z[0], grid.z[-1], grid.z[:, 0], grid.z[:, -1]))
-    faces, upper, z_in = [out.face(exit_surface, out.bound(rim.edges))], rim, lens.z_in
+    faces, upper, z_in = [out.face(exit_surface, out.bound(rim.edges), along=not lens.mirror)], rim, lens.z_in
     if lens.border > 0:
         high = z_in + FLANGE * (lowest - z_in)
         inner, upper = _flat(out, lens, 0.0, high), _flat(out, lens, lens.border, high)
@@ -196,7 +206,7 @@ def _flat(out: Entities, lens: Lens, wider: float, z: float) -> Loop:
     vertices = [out.add(f"VERTEX_POINT('',{out.point(p)})") for p in corners]
     around = corners[1:] + corners[:1]
     if lens.round:
-        circle = out.add(f"CIRCLE('',{out.placement((0, 0, z), (0, 0, 1), (1, 0, 0))},{real(rx)})")
+        circle = out.add(f"CIRCLE('',{out.placement((0, 0, z), (0, 0, out.up), (1, 0, 0))},{real(rx)})")  # the edges' own way
     curves = [circle if lens.round else out.line(a, b) for a, b in zip(corners, around, strict=True)]
     edges = [(out.edge(a, b, c), True) for a, b, c in zip(vertices, vertices[1:] + vertices[:1], curves, strict=True)]
     return Loop(corners, vertices, edges)
@@ -236,7 +246,7 @@ def _product(out: Entities, solid: str, uncertainty: float) -> None:
         f"GLOBAL_UNIT_ASSIGNED_CONTEXT(({millimetre},{radian},{steradian}))"
         "REPRESENTATION_CONTEXT('',''))"
     )
-    origin = out.placement((0, 0, 0), (0, 0, 1), (1, 0, 0))
+    origin = out.placement((0, 0, 0), (0, 0, out.up), (1, 0, 0))  # the file's own axes
     shape = out.add(f"ADVANCED_BREP_SHAPE_REPRESENTATION('lens',({origin},{solid}),{context})")
     application = out.add("APPLICATION_CONTEXT('automotive design')")
     out.add(f"APPLICATION_PROTOCOL_DEFINITION('international standard','automotive_design',2000,{application})")

@@ -37,6 +37,7 @@ def open_archive(path: str | Path) -> tuple[Scene, HeightField, Tensor]:
             knots=tuple(tuple(s.knots.tolist()) for s in field.spaces),
             fresnel=data.text("fresnel", "exact"),
             aperture=data.text("aperture", "rectangle"),
+            mirror="mirror" in data,
         )
         screen = Screen(
             tuple(2.0 * h for h in data.reals("screen_half_size", 2).tolist()), data.real("z_screen"), data.wholes("resolution", 2)

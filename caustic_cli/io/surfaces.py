@@ -1,4 +1,4 @@
-"""Lens surfaces from files, to begin a design from or to render: `.npz` and `.step` as exported, `.npy` of heights.
+"""Lens surfaces from files, to begin a design from or to render: `.npz`, `.step` and height maps as exported, `.npy` of heights.
 
 Everything is mm in the scene's coordinates: heights above z = 0, aperture centred on the axis.
 """
@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.interpolate import RectBivariateSpline
 from torch import Tensor
 
 from caustic_cli.config.checks import LENGTH
 from caustic_cli.config.table import TABLE
 from caustic_cli.errors import InputError
+from caustic_cli.io import heightmaps
 from caustic_cli.io.arrays import Archive, open_npy, open_npz
 from caustic_cli.io.files import naming, read_bytes
 from caustic_cli.optics.bspline import MAX_DEGREE, SplineSpace
@@ -26,7 +26,7 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 #: Most control points along one axis of a surface.
 MAX_CONTROL = int(TABLE["lens.control"].high)
 #: Kinds of file, by suffix.
-SUFFIXES = (".npz", ".step", ".stp", ".npy")
+SUFFIXES = (".npz", ".step", ".stp", ".npy", *heightmaps.SUFFIXES)
 #: Relative difference up to which two lengths, or poles and Greville abscissae, are the same.
 SAME = 1e-9
 
@@ -215,13 +215,17 @@ def read_heights(path: Path, half_size: tuple[float, float]) -> tuple[HeightFiel
         z = stored.read_reals()
         if not (np.abs(z) <= LENGTH).all():
             raise InputError(f"must hold heights within +-{LENGTH:g} mm")
-    degrees = [min(3, n - 1) for n in shape]
-    lines = [np.linspace(0.0, 1.0, n) for n in shape]
-    spline = RectBivariateSpline(*lines, z, kx=degrees[0], ky=degrees[1], s=0)
-    spaces = tuple(SplineSpace(p, torch.from_numpy(t)) for p, t in zip(degrees, spline.get_knots(), strict=True))
-    heights = torch.from_numpy(spline.get_coeffs().reshape(shape))
-    return HeightField(spaces, tuple(half_size)), heights
+    return heightmaps.interpolated(z, half_size)
+
+
+def read_heightmap(path: Path, half_size: tuple[float, float]) -> tuple[HeightField, Tensor]:
+    """The surface of a picture of heights and its JSON, over this aperture."""
+    found = heightmaps.read_heightmap(path, half_size)
+    with naming(path):
+        return _of_this_size(found, half_size)
 
 
 #: What reads each kind of file.
-_READERS = {".npz": read_npz, ".step": read_step, ".stp": read_step, ".npy": read_heights}
+_READERS = {".npz": read_npz, ".step": read_step, ".stp": read_step, ".npy": read_heights} | dict.fromkeys(
+    heightmaps.SUFFIXES, read_heightmap
+)

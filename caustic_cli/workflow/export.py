@@ -11,6 +11,9 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.export import FORMATS
+from caustic_cli.export.milling import Milling
+from caustic_cli.export.part import part_of
+from caustic_cli.io.heightmaps import beside
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.project.project import Project
 from caustic_cli.project.uptodate import Outputs
@@ -27,7 +30,7 @@ def export(
         format: a name of FORMATS.
         output: file to write, None for the project's name here.
         script: of lighttools: also the script that rebuilds the scene.
-        given: samples (n, m) or tolerance, mm, of the sampled formats.
+        given: samples (n, m) or tolerance, mm, of the sampled formats; mould, block; milling, a dictionary.
         force: replace files that are not ours, and do again what is up to date.
 
     Returns:
@@ -40,32 +43,65 @@ def export(
     path = output or Path(project.resolve().stem + FORMATS[format][0])
     scene = opened.scene()
     written = files(path, scene, format, script)
-    if scene.lens.mirror:
-        raise InputError(f"{project}: is a mirror, and the formats hold lenses: nothing is exported")
     made = Outputs(opened, "export", {"format": format, "script": script, **given}, written)
     if not force and (found := made.found()):
         say.say(f"{path}: is what the same options made of the same project, so there is nothing to do; ⟨force⟩ does it again")
         return found, True
     made.refuse_foreign(force)
     field, checkpoint = opened.lens(scene)
-    write(path, scene, field, checkpoint.state.heights, format, script, **given)
+    found = write(path, scene, field, checkpoint.state.heights, format, script, **given)
     more = {"beside": [str(file) for file in written[1:]]} if len(written) > 1 else {}
-    figures = {"file": str(path), "format": format, "bytes": path.stat().st_size, **more, "seconds": time.monotonic() - began}
+    figures = {
+        "file": str(path),
+        "format": format,
+        "bytes": path.stat().st_size,
+        **more,
+        "seconds": time.monotonic() - began,
+    } | found
     made.keep(figures)
     return figures, False
 
 
-def write(path: Path, scene: Scene, field: HeightField, heights: Tensor, format: str, script: bool = False, **given) -> None:
-    """Write a lens' files, see `files`; given: samples or tolerance."""
-    getattr(_home(format), f"write_{format}")(path, scene, field, heights, **given)
+def write(
+    path: Path,
+    scene: Scene,
+    field: HeightField,
+    heights: Tensor,
+    format: str,
+    script: bool = False,
+    mould: bool = False,
+    block: float | None = None,
+    milling: dict | None = None,
+    **given,
+) -> dict:
+    """Write a lens' files, see `files`; given: samples or tolerance; what of it goes into the figures."""
+    part = part_of(format, scene, field, heights, mould, block)
+    writer = getattr(_home(format), f"write_{format}")
+    if format == "gcode":
+        found = writer(path, part, Milling(**(milling or {})), **given)
+        return {"milling": found | _scallops(scene, field, found)}
+    if format == "heightmap":
+        found = writer(path, part, **given)
+        return {"heightmap": {key: value for key, value in found.items() if key != "spline"}}
+    if script and scene.lens.mirror:
+        raise InputError("⟨script⟩ builds lenses, not mirrors")
+    writer(path, part.scene, part.field, part.heights, **given)
     if script:
         import_module("caustic_cli.export.lighttools_script").write_script(path, scene, field, heights, **given)
+    return {}
+
+
+def _scallops(scene: Scene, field: HeightField, found: dict) -> dict:
+    """What scallops do to the light: see `studies.scallops`."""
+    return import_module("caustic_cli.studies.scallops").scallops(scene, found["step_over_mm"], found["tool_radius_mm"])
 
 
 def files(path: Path, scene: Scene, format: str, script: bool = False) -> list[Path]:
     """All that an export writes, the lens first."""
+    if format == "heightmap":
+        return [path, beside(path)]
     if format == "mitsuba":
-        return [path, *_home(format).companions(path, scene.lens.round)]
+        return [path, *_home(format).companions(path, scene.lens.round, scene.lens.mirror)]
     return [path, *import_module("caustic_cli.export.lighttools_script").companions(path)] if script else [path]
 
 

@@ -161,19 +161,23 @@ class Lens:
         samples: tuple[int, int] | None = None,
         tolerance: float | None = None,
         script: bool = False,
+        mould: bool = False,
+        block: float | None = None,
+        milling: dict | None = None,
     ) -> Path:
         """Write the lens for another program; the format follows from the suffix (.step, .stl, .npz, ...) unless it is named.
 
         Args:
             samples: points along x and y of sampled formats; tolerance: of meshes instead, mm.
             script: of lighttools: also a script that rebuilds the scene.
+            mould: the negative; block: least material behind a mirror or a mould, mm; milling: of gcode, see `export.milling`.
         """
         path = Path(path)
         name = format or BY_SUFFIX.get(path.suffix.lower())
         if name is None or name not in BY_SUFFIX.values():
             raise InputError(f"format must be one of {', '.join(BY_SUFFIX.values())}, got {format or path.suffix!r}")
-        given = {key: value for key, value in (("samples", samples), ("tolerance", tolerance)) if value is not None}
-        write(path, self.scene, self.field, self.heights, name, script, **given)
+        given: dict[str, Any] = {key: value for key, value in (("samples", samples), ("tolerance", tolerance)) if value is not None}
+        write(path, self.scene, self.field, self.heights, name, script, mould, block, milling, **given)
         return path
 
     def save(self, path: str | Path, force: bool = False) -> Path:

@@ -1,0 +1,116 @@
+"""The surface as a picture of heights, as programs for milling read it: 16-bit grey PNG, or TIFF of 32-bit floats, by the suffix.
+
+Pixels stand at points, borders included: column 0 is the edge at -x, the last one that at +x, row 0 the edge at +y, as the part is
+seen from +z.  Height = z_of_zero + value * mm_per_count, the same for both; a JSON file beside the picture says these numbers, how
+the part lies (`part`), and the net on which the surface is a spline, so that it can be read in again as that.
+
+Without samples there are so many points that a bilinear surface through them is within `TOLERANCE` of the spline, by bounds of its
+second derivatives, and at least two a knot span.  Heights are rounded to the nearest count: half a quantum.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, PngImagePlugin, TiffImagePlugin
+
+from caustic_cli.errors import InputError
+from caustic_cli.export.part import Part, surface_of
+from caustic_cli.export.surface import MAX_SAMPLES, SurfaceGrid, sample_grid, step_within
+from caustic_cli.export.text import CREATED
+from caustic_cli.io.files import SOFTWARE, atomic_path, write_bytes
+from caustic_cli.io.heightmaps import COUNTS, SUFFIXES, VERSION, beside
+
+#: mm by which a bilinear surface through the default points is off, at most.
+TOLERANCE = 1e-4
+#: Points a knot span of the default, at least.
+A_SPAN = 2
+
+
+def write_heightmap(path: str | Path, part: Part, samples: tuple[int, int] | None = None, tolerance: float | None = None) -> dict:
+    """Write the picture and then its JSON, each whole or not at all.
+
+    Args:
+        samples: (nx, ny) points; tolerance: mm of a bilinear surface through the points, instead.
+
+    Returns:
+        what the JSON says.
+
+    Raises:
+        InputError: another suffix, both samples and tolerance, too many points, or a file that cannot be written there.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise InputError(f"{path}: a height map is written as {', '.join(SUFFIXES)}")
+    if samples is not None and tolerance is not None:
+        raise InputError("⟨samples⟩ and ⟨tolerance⟩ both say how fine the map is: give one of them")
+    grid = sample_grid(part.field, part.heights, samples or _counts(part, TOLERANCE if tolerance is None else tolerance))
+    low, high = float(grid.z.min()), float(grid.z.max())
+    picture = np.ascontiguousarray(grid.z.T[::-1])  # rows from +y down
+    if suffix == ".png":
+        quantum = (high - low) / COUNTS or 1.0
+        scale, values = quantum, np.rint((picture - low) / quantum).astype(np.uint16)
+        info = PngImagePlugin.PngInfo()
+        info.add_text("Software", SOFTWARE)
+        more = {"format": "PNG", "pnginfo": info}
+    else:
+        scale, values = 1.0, (picture - low).astype(np.float32)
+        quantum = float(np.spacing(np.float32(high - low)))
+        tags = TiffImagePlugin.ImageFileDirectory_v2()
+        tags[270] = CREATED
+        more = {"format": "TIFF", "tiffinfo": tags}
+    with atomic_path(path) as temporary:
+        Image.fromarray(values).save(temporary, **more)
+    said = _said(part, grid, path.name, low, high, scale, quantum)
+    write_bytes(beside(path), (json.dumps(said, indent=1, allow_nan=False) + "\n").encode())
+    return said
+
+
+def _counts(part: Part, tolerance: float) -> tuple[int, int]:
+    step = step_within(part.field, part.heights, tolerance)
+    counts = [
+        max(math.ceil(2.0 * r / step), A_SPAN * (len(s.breaks) - 1)) + 1
+        for s, r in zip(part.field.spaces, part.field.half_size, strict=True)
+    ]
+    if max(counts) > MAX_SAMPLES:
+        raise InputError(f"⟨tolerance⟩ {tolerance:g} must ask for at most {MAX_SAMPLES} points along an axis, got {max(counts)}")
+    return counts[0], counts[1]
+
+
+def _said(part: Part, grid: SurfaceGrid, name: str, low: float, high: float, scale: float, quantum: float) -> dict:
+    """The JSON."""
+    (nx, ny), (rx, ry) = grid.z.shape, part.field.half_size
+    field, _ = surface_of(part)
+    enough = all(n >= A_SPAN * (len(s.breaks) - 1) + 1 for n, s in zip((nx, ny), field.spaces, strict=True))
+    spline = {
+        "degrees": [s.degree for s in field.spaces],
+        "knots_u": field.spaces[0].knots.tolist(),
+        "knots_v": field.spaces[1].knots.tolist(),
+    }
+    return {
+        "created_by": SOFTWARE,
+        "height_map": VERSION,
+        "file": name,
+        "part": part.kind,
+        "unit": "mm",
+        "columns": nx,
+        "rows": ny,
+        "mm_per_column": 2.0 * rx / (nx - 1),
+        "mm_per_row": 2.0 * ry / (ny - 1),
+        "x_of_column_0": -rx,
+        "y_of_row_0": ry,
+        "orientation": "seen from +z: columns run along +x, rows along -y; pixels are points, borders included",
+        "z_of_zero": low,
+        "mm_per_count": scale,
+        "quantum_mm": quantum,
+        "z_least": low,
+        "z_most": high,
+        "z_of_flat_face": part.lens.z_in,
+        "turned": part.turned,
+        "to_the_scene": "(x, -y, -z)" if part.turned else "(x, y, z)",
+        "round": part.lens.round,
+    } | ({"spline": spline} if enough else {})

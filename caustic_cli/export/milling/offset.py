@@ -1,0 +1,157 @@
+"""Where a tool may go: the lowest place of its tip over each point that cuts nowhere into the surface.
+
+Notation
+    q           the tool's axis in the plane, (x, y);  c  the point of the surface it touches;  D = q - c,  all mm
+    R           radius of the tool
+    C(q)        height of a ball's centre: max over c of F(c) = Z(c) + sqrt(R^2 - |D|^2), the surface's dilation by the ball
+    g, H        slopes and second derivatives of Z at c
+
+C is the offset surface along the normals where that can be reached, and lies above it where the surface is hollower than the tool:
+there the ball touches in two places and leaves what is between.  The place to begin from is that of the highest sample of a grid
+(`optics.envelope`, turned over).  Newton's method then makes grad F = g + D / S, S = sqrt(R^2 - |D|^2), vanish, with the second
+derivatives H - (1 + D D^T / S^2) / S; along an edge of the aperture only the derivative along it.  Where a ball touches in two
+places that are nearly as high, samples may tell the lower one: those of tools half a sample away, on all four sides, are tried too.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from scipy.ndimage import maximum_filter1d
+from torch import Tensor
+
+from caustic_cli.export.surface import on_lines
+from caustic_cli.optics.bspline import SplineSpace
+from caustic_cli.optics.curvature import ORDERS, largest
+from caustic_cli.optics.envelope import Envelope
+from caustic_cli.optics.surfaces.base import FIRST, SECOND
+from caustic_cli.optics.surfaces.heightfield import HeightField
+
+#: Samples a knot span, a tool's radius, and at most, from which the search for the point of contact begins.
+A_SPAN, A_RADIUS, MOST = 3, 40, 6001
+#: Two points of contact are not the same if they are so many samples apart.
+APART = 2.0
+#: Newton's steps, and the move, in parts of the radius, below which no more are made.
+STEPS, STILL = 12, 1e-10
+
+
+def shape_of(field: HeightField, heights: Tensor) -> tuple[float, float, float, float]:
+    """Least and largest height, mm, largest slope, and largest concave curvature, 1/mm, 0 for none; of samples."""
+    lines = [np.linspace(-r, r, min(801, 4 * (len(s.breaks) - 1) + 1)) for s, r in zip(field.spaces, field.half_size, strict=True)]
+    x, y = (torch.from_numpy(np.ascontiguousarray(c.ravel())) for c in np.meshgrid(*lines, indexing="ij"))
+    z, *derivatives = field.at(heights, x, y, ((0, 0), *ORDERS))
+    slope = float(torch.hypot(*derivatives[:2]).max())
+    return float(z.min()), float(z.max()), slope, max(0.0, float(largest(*derivatives).max()))
+
+
+class BallOffset:
+    """The lowest heights of a ball's tip over a surface.
+
+    Args:
+        heights: (n, m) mm; radius: of the ball, mm; allowance: left above the surface, mm.
+    """
+
+    def __init__(self, field: HeightField, heights: Tensor, radius: float, allowance: float = 0.0):
+        self.field, self.heights, self.radius, self.allowance = field, heights.detach().double().cpu(), radius, allowance
+        x, y, z = _samples(field, self.heights, radius)
+        points = np.stack([*np.broadcast_arrays(x[:, None], y[None, :]), -z], -1)
+        self.envelope = Envelope(radius, points[:-1].reshape(-1, 3), points[1:].reshape(-1, 3))
+        self.spacing = max(x[1] - x[0], y[1] - y[0])
+
+    def __call__(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Heights of the tip (N,) mm over points (N,) mm; NaN where the ball is beside the surface."""
+        low, cx, cy = self.envelope(x, y)
+        inside = np.isfinite(low)
+        q, c = torch.from_numpy(np.stack([x, y])), torch.from_numpy(np.stack([cx, cy]))
+        found = torch.full((len(x),), -torch.inf, dtype=torch.float64)
+        found[inside] = self._climb(q[:, inside], c[:, inside])
+        beside = 0.5 * self.spacing
+        for dx, dy in ((beside, 0.0), (-beside, 0.0), (0.0, beside), (0.0, -beside)):  # samples may miss the higher of two places
+            other, ox, oy = self.envelope(x + dx, y + dy)
+            apart = inside & np.isfinite(other) & (np.hypot(ox - cx, oy - cy) > APART * self.spacing)
+            apart &= np.hypot(ox - x, oy - y) < self.radius
+            if apart.any():
+                there = self._climb(q[:, apart], torch.from_numpy(np.stack([ox, oy])[:, apart]))
+                found[apart] = torch.maximum(found[apart], there)
+        tip = found.numpy() - self.radius + self.allowance
+        tip[~inside] = np.nan
+        return tip
+
+    def _climb(self, q: Tensor, c: Tensor) -> Tensor:
+        """F (N,) at the maximum near points c (2, N) of the surface, for tools at q."""
+        c, best, found = c.clone(), c.clone(), torch.full_like(c[0], -torch.inf)
+        busy = torch.arange(len(found))
+        limits = torch.tensor(self.field.half_size, dtype=torch.float64)[:, None]
+        for _ in range(STEPS):
+            if not len(busy):
+                break
+            at, d = c[:, busy], q[:, busy] - c[:, busy]
+            z, gx, gy, zxx, zxy, zyy = self.field.at(self.heights, *at, (*FIRST, *SECOND))
+            s = (self.radius**2 - d.square().sum(0)).clamp_min(1e-6 * self.radius**2).sqrt()
+            value = z + s
+            better = value >= found[busy]
+            found[busy[better]], best[:, busy[better]] = value[better], at[:, better]
+            fx, fy = gx + d[0] / s, gy + d[1] / s
+            hxx, hxy, hyy = zxx - (1.0 + (d[0] / s) ** 2) / s, zxy - d[0] * d[1] / s**3, zyy - (1.0 + (d[1] / s) ** 2) / s
+            held_x, held_y = ((at[k].abs() >= limits[k]) & (f * at[k] > 0) for k, f in ((0, fx), (1, fy)))
+            hxy = torch.where(held_x | held_y, 0.0, hxy)
+            hxx, hyy = torch.where(held_x, -1.0, hxx), torch.where(held_y, -1.0, hyy)
+            fx, fy = torch.where(held_x, 0.0, fx), torch.where(held_y, 0.0, fy)
+            determinant = hxx * hyy - hxy * hxy
+            falls = (hxx < 0) & (determinant > 0)  # else it is no maximum that Newton's step goes to: up the slope instead
+            safe = torch.where(falls, determinant, 1.0)
+            mx = torch.where(falls, -(hyy * fx - hxy * fy) / safe, self.radius * fx)
+            my = torch.where(falls, -(hxx * fy - hxy * fx) / safe, self.radius * fy)
+            scale = (self.spacing / torch.hypot(mx, my).clamp_min(1e-300)).clamp_max(1.0)
+            moved = torch.maximum(torch.minimum(at + torch.stack([mx * scale, my * scale]), limits), -limits)
+            c[:, busy] = torch.where(better, moved, 0.5 * (at + best[:, busy]))  # back half way where a step went too far
+            busy = busy[((c[:, busy] - at).abs().amax(0) > STILL * self.radius)]
+        return found
+
+
+class FlatOffset:
+    """The same of a flat end, on the safe side: the highest sample within reach, more what may lie between samples.
+
+    Arguments as of `BallOffset`.
+    """
+
+    def __init__(self, field: HeightField, heights: Tensor, radius: float, allowance: float = 0.0):
+        x, y, z = _samples(field, heights.detach().double().cpu(), radius)
+        self.step = np.array([x[1] - x[0], y[1] - y[0]])
+        half = 0.5 * math.hypot(*self.step)
+        reach = radius + 2.0 * half  # of the sample next to the tool's axis, over all samples next to what the tool covers
+        wide = np.ceil(reach / self.step).astype(int)
+        z = np.pad(z, [(n, n) for n in wide], constant_values=-np.inf)
+        self.low = np.array([x[0], y[0]]) - wide * self.step
+        self.highest = np.full(z.shape, -np.inf)
+        for k in range(-wide[0], wide[0] + 1):  # the disc by its chords
+            across = reach**2 - (k * self.step[0]) ** 2
+            if across >= 0:
+                chord = maximum_filter1d(z, 2 * int(math.sqrt(across) / self.step[1]) + 1, 1, mode="constant", cval=-np.inf)
+                to, of = slice(max(0, -k), len(z) - max(0, k)), slice(max(0, k), len(z) - max(0, -k))
+                np.maximum(self.highest[to], chord[of], out=self.highest[to])
+        self.more = half * field.slope_bound(heights) + allowance
+
+    def __call__(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """As of `BallOffset`."""
+        at = np.rint((np.stack([x, y], -1) - self.low) / self.step).astype(int)
+        beside = ((at < 0) | (at >= self.highest.shape)).any(1)
+        i, j = np.where(beside[:, None], 0, at).T
+        found = self.highest[i, j] + self.more
+        found[beside | ~np.isfinite(found)] = np.nan
+        return found
+
+
+def _samples(field: HeightField, heights: Tensor, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Grid lines (a,), (b,) over the aperture, borders included, and heights (a, b)."""
+
+    def line(space: SplineSpace, r: float) -> Tensor:
+        spans = len(space.breaks) - 1
+        return torch.linspace(
+            0.0, 1.0, min(MOST, max(A_SPAN * spans, math.ceil(2.0 * r * A_RADIUS / radius)) + 1), dtype=torch.float64
+        )
+
+    grid = on_lines(field, heights, [line(s, r) for s, r in zip(field.spaces, field.half_size, strict=True)])
+    return grid.x, grid.y, grid.z

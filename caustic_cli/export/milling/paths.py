@@ -1,0 +1,113 @@
+"""Where a tool goes: lines in the plane, and along them as many points as keep straight moves within a tolerance of a height.
+
+Lines go `over` mm beyond the aperture on all sides, so that a ball which leans on the edge of a slope gets there.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+#: Straight pieces of a spiral leave it by at most this part of the step-over.
+OFF = 0.02
+#: Halvings of a move, at most.
+HALVINGS = 14
+
+
+def spacing(path: str, half_size: tuple[float, float], over: float, step: float, round: bool) -> float:
+    """How far apart passes are of which a whole number fits, at most `step` mm.  path: raster, raster-y or spiral."""
+    if path == "spiral":
+        reach = min(half_size) + over
+        return step if round else reach / math.ceil(reach / step)
+    across = 2.0 * (half_size[1 if path == "raster" else 0] + over)
+    return across / math.ceil(across / step)
+
+
+def raster(half_size: tuple[float, float], over: float, step: float, round: bool, along: int = 0) -> Iterator[np.ndarray]:
+    """Passes there and back, at most `step` apart, each with its way to the next: points (k, 2) mm.  along: 0 for x, 1 for y.
+
+    Consecutive ones share a point: each begins where the one before ends.
+    """
+    across = half_size[1 - along] + over
+    count = max(1, math.ceil(2.0 * across / step))
+    lines = np.linspace(-across, across, count + 1)
+    if round:
+        lines = lines[1:-1] if count > 1 else lines[:1]
+    last = None
+    for k, at in enumerate(lines):
+        reach = math.sqrt(max(0.0, across * across - at * at)) if round else half_size[along] + over
+        ends = np.array([[-reach, at], [reach, at]])[:: 1 if k % 2 == 0 else -1, :: 1 if along == 0 else -1]
+        yield ends if last is None else np.concatenate([last[None], ends])
+        last = ends[-1]
+
+
+def spiral(half_size: tuple[float, float], over: float, step: float, round: bool, turns: int = 8) -> Iterator[np.ndarray]:
+    """One line from the middle outwards, some turns at a time: r = step t / (2 pi) over a circle, a rectangular one over a
+    rectangle.
+
+    On a rectangle's diagonals passes are 1.17 times as far apart as elsewhere.
+    """
+    points = _circular(half_size[0] + over, step) if round else _rectangular([r + over for r in half_size], step)
+    piece = max(2, len(points) * turns * step / (max(half_size) + over))
+    edges = np.unique(np.linspace(0, len(points) - 1, math.ceil(len(points) / piece) + 1).astype(int))
+    for first, last in itertools.pairwise(edges):
+        yield points[first : last + 1]
+
+
+def _circular(radius: float, step: float) -> np.ndarray:
+    end, at, found = 2.0 * math.pi * radius / step, 0.0, []
+    while at < end:
+        found.append(at)
+        r = max(step * at / (2.0 * math.pi), 0.25 * step)
+        at += min(0.5 * math.pi / 2.0, math.sqrt(8.0 * OFF * step / r))
+    angle = np.array([*found, *np.linspace(end, end + 2.0 * math.pi, math.ceil(2.0 * math.pi / (end - found[-2])) + 1)])
+    r = np.minimum(step * angle / (2.0 * math.pi), radius)  # and once around at the end
+    return np.stack([r * np.cos(angle), r * np.sin(angle)], -1)
+
+
+def _rectangular(half: list[float], step: float) -> np.ndarray:
+    """Rectangles of one shape, each side `step` further out than the one before it, that end at the outline."""
+    turns = math.ceil(min(half) / step)
+    longer = [h - min(half) for h in half]
+    points = [(-longer[0], -longer[1])]
+    for k in range(turns):
+        a, b = (min(half) * (k + 1) / turns + extra for extra in longer)
+        points += [(a, points[-1][1]), (a, b), (-a, b), (-a, -b)]
+    return np.array([*points, (half[0], -half[1])])
+
+
+def heightened(
+    line: np.ndarray, height: Callable[[np.ndarray, np.ndarray], np.ndarray], step: float, tolerance: float
+) -> np.ndarray:
+    """Points (m, 3) along a line of points (k, 2), with those heights.
+
+    Begins with moves of at most `step` and halves each whose middle is further than `tolerance` below or above the height there.
+    Points without a height are left out.
+    """
+    length = np.hypot(*np.diff(line, axis=0).T)
+    parts = np.maximum(1, np.ceil(length / step)).astype(int)
+    pieces = [
+        a + np.linspace(0.0, 1.0, n, endpoint=False)[:, None] * (b - a) for a, b, n in zip(line, line[1:], parts, strict=False)
+    ]
+    xy = np.concatenate([*pieces, line[-1:]])
+    z = height(*xy.T)
+    place = np.arange(len(xy), dtype=float)
+    begin, end = np.arange(len(xy) - 1), np.arange(1, len(xy))
+    for _ in range(HALVINGS):
+        middle = 0.5 * (xy[begin] + xy[end])
+        found = height(*middle.T)
+        with np.errstate(invalid="ignore"):
+            off = np.abs(found - 0.5 * (z[begin] + z[end])) > tolerance
+        if not off.any():
+            break
+        new = len(xy) + np.arange(off.sum())
+        b, e = begin[off], end[off]
+        xy, z = np.concatenate([xy, middle[off]]), np.concatenate([z, found[off]])
+        place = np.concatenate([place, 0.5 * (place[b] + place[e])])
+        begin, end = np.concatenate([b, new]), np.concatenate([new, e])
+    order = np.argsort(place, kind="stable")
+    points = np.column_stack([xy, z])[order]
+    return points[np.isfinite(points[:, 2])]

@@ -1,0 +1,145 @@
+"""Height maps in: a picture of heights and the JSON beside it, as `export format heightmap` writes them."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+from scipy.interpolate import RectBivariateSpline, make_lsq_spline
+from torch import Tensor
+
+from caustic_cli.config.checks import LENGTH
+from caustic_cli.config.table import TABLE
+from caustic_cli.errors import InputError
+from caustic_cli.io.files import naming, open_regular, read_bytes
+from caustic_cli.optics.bspline import MAX_DEGREE, SplineSpace
+from caustic_cli.optics.surfaces.heightfield import HeightField
+
+#: Suffixes of the pictures; counts of a PNG; number of the JSON's form.
+SUFFIXES = (".png", ".tif", ".tiff")
+COUNTS = 65535
+VERSION = 1
+#: Bytes of the JSON and of the picture; points of a map; control points of a net.
+MOST_JSON, MOST_BYTES, MOST_POINTS = 1 << 20, 1 << 30, 50_000_000
+MAX_CONTROL = int(TABLE["lens.control"].high)
+#: How far, in quanta, a map may be off the spline that its JSON says it is of: half of it is rounding.
+OFF = 0.75
+ACCEPTED = "a height map of caustic export is needed: a 16-bit grey PNG or a TIFF of 32-bit floats, with its JSON beside it"
+
+
+def beside(path: str | Path) -> Path:
+    """The JSON of a picture: NAME.png.json would hide what NAME.json is of, so the picture's suffix stays."""
+    path = Path(path)
+    return path.with_name(path.name + ".json")
+
+
+def read_heightmap(path: Path, half_size: tuple[float, float]) -> tuple[HeightField, Tensor]:
+    """The surface of a height map, in the scene's coordinates: control heights (n, m) mm on the net that its JSON says, the nearest
+    spline to the heights; else a cubic spline through them.
+
+    Raises:
+        InputError: no such files, or they hold none; heights that are off the net they say by more than their rounding.
+    """
+    said = _said(beside(path))
+    with naming(path):
+        values = _picture(path, said)
+    with naming(beside(path)):
+        z = said["z_of_zero"] + said["mm_per_count"] * values.astype(np.float64)[::-1].T  # [i, j], j along +y
+        z = -z[:, ::-1] if said["turned"] else z
+        if not (np.abs(z) <= LENGTH).all():
+            raise InputError(f"must hold heights within +-{LENGTH:g} mm")
+        half = -said["x_of_column_0"], said["y_of_row_0"]
+        return fitted(z, half, said["spline"], OFF * said["quantum_mm"]) if "spline" in said else interpolated(z, half)
+
+
+def interpolated(z: np.ndarray, half_size: tuple[float, float]) -> tuple[HeightField, Tensor]:
+    """The spline through heights (a, b) mm on an even grid over the aperture, borders included: cubic, or less through fewer."""
+    if not 2 <= min(z.shape) <= max(z.shape) <= MAX_CONTROL:
+        raise InputError(f"must have 2 to {MAX_CONTROL} heights along each axis, got {z.shape[0]} x {z.shape[1]}")
+    degrees = [min(3, n - 1) for n in z.shape]
+    spline = RectBivariateSpline(*(np.linspace(0.0, 1.0, n) for n in z.shape), z, kx=degrees[0], ky=degrees[1], s=0)
+    spaces = tuple(SplineSpace(p, torch.from_numpy(t)) for p, t in zip(degrees, spline.get_knots(), strict=True))
+    return HeightField(spaces, tuple(half_size)), torch.from_numpy(spline.get_coeffs().reshape(z.shape))
+
+
+def fitted(z: np.ndarray, half_size: tuple[float, float], net: dict, off: float) -> tuple[HeightField, Tensor]:
+    """The spline on a net next to heights (a, b) mm on an even grid, by least squares along either axis.
+
+    Raises:
+        InputError: no such net, too few heights for it, or some that are off by more than `off` mm.
+    """
+    degrees, knots = net["degrees"], (net["knots_u"], net["knots_v"])
+    spaces = tuple(SplineSpace(p, torch.tensor(t, dtype=torch.float64)) for p, t in zip(degrees, knots, strict=True))
+    heights = z
+    for space in spaces:  # along x, then along what was y
+        at = np.linspace(0.0, 1.0, len(heights))
+        try:
+            heights = make_lsq_spline(at, heights, space.knots.numpy(), space.degree).c.T
+        except (ValueError, np.linalg.LinAlgError) as error:
+            raise InputError(f"has too few heights for the net of {space.n} control points that it names") from error
+    found, net_heights = HeightField(spaces, tuple(half_size)), torch.from_numpy(np.ascontiguousarray(heights))
+    u, v = (s.matrix(torch.linspace(0.0, 1.0, n, dtype=torch.float64)) for s, n in zip(spaces, z.shape, strict=True))
+    worst = float((u @ net_heights @ v.T - torch.from_numpy(np.ascontiguousarray(z))).abs().max())
+    if worst > off:
+        raise InputError(
+            f"its heights are up to {worst:.3g} mm off the spline of the net that it names, more than rounding:"
+            ' of a map that has been edited, leave out "spline"'
+        )
+    return found, net_heights
+
+
+def _said(path: Path) -> dict[str, Any]:
+    """The JSON's numbers, checked."""
+    data = read_bytes(path, MOST_JSON, ACCEPTED)
+    with naming(path):
+        try:
+            said = json.loads(data)
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"is no JSON ({str(error)[:100]}); {ACCEPTED}") from error
+        if not isinstance(said, dict) or said.get("height_map") != VERSION or said.get("unit") != "mm":
+            raise InputError(f"says no height_map {VERSION} in mm; {ACCEPTED}")
+        for key in ("z_of_zero", "mm_per_count", "quantum_mm", "x_of_column_0", "y_of_row_0"):
+            value = said.get(key)
+            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or abs(value) > LENGTH:
+                raise InputError(f"{key} must be a number within +-{LENGTH:g}, got {str(value)[:40]!r}")
+        if not (said["x_of_column_0"] < 0 < said["y_of_row_0"] and said["quantum_mm"] > 0):
+            raise InputError("x_of_column_0 must be below 0, y_of_row_0 and quantum_mm above")
+        if not isinstance(said.get("turned"), bool):
+            raise InputError("turned must be true or false")
+        if "spline" in said:
+            _check_net(said["spline"])
+        return said
+
+
+def _check_net(net: object) -> None:
+    good = isinstance(net, dict) and isinstance(net.get("degrees"), list) and len(net["degrees"]) == 2
+    if good:
+        for p, key in zip(net["degrees"], ("knots_u", "knots_v"), strict=True):
+            t = net.get(key)
+            good &= isinstance(p, int) and not isinstance(p, bool) and 1 <= p <= MAX_DEGREE
+            good &= isinstance(t, list) and len(t) <= MAX_CONTROL + MAX_DEGREE + 1
+            good = good and all(isinstance(v, int | float) and not isinstance(v, bool) and 0 <= v <= 1 for v in t)
+    if not good:
+        raise InputError("spline must have degrees of two whole numbers, and knots_u and knots_v of numbers 0 to 1")
+
+
+def _picture(path: Path, said: dict) -> np.ndarray:
+    """Its values (rows, columns)."""
+    with open_regular(path, ACCEPTED, MOST_BYTES) as file:
+        try:
+            with Image.open(file, formats=("PNG", "TIFF")) as image:
+                size, mode = image.size, image.mode
+                if list(size) != [said.get("columns"), said.get("rows")] or math.prod(size) > MOST_POINTS:
+                    raise InputError(f"has {size[0]} x {size[1]} pixels, not what its JSON says, or too many; {ACCEPTED}")
+                if mode not in ("I;16", "I;16B", "I", "F"):
+                    raise InputError(f"has pixels of kind {mode}; {ACCEPTED}")
+                return np.asarray(image)
+        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(f"is no readable picture ({str(error)[:100]}); {ACCEPTED}") from error

@@ -1,0 +1,84 @@
+"""What the scallops of a ball-nose tool do to the light of a lens.
+
+Notation
+    R, s        radius of the tool and distance of its passes, mm
+    h           s^2 / (8 R), height of a scallop on a flat surface
+    g           s / (2 R) = sqrt(2 h / R), slope at the cusps; between two of them slopes are even from -g to g
+    n, T        refractive index (-1 for a mirror) and throw, mm
+    lambda      wavelength, mm
+
+Each scallop is a small lens: rays spread over a width b = 2 |n - 1| g T = |n - 1| T s / R across the passes, however fine they are.
+Light as a wave sees a grating of period s and depth h instead: orders lambda T / s apart on the screen, within the same b, and the
+part of the light that leaves the undisturbed order is that of a phase whose standard deviation is 2 pi |n - 1| sigma / lambda,
+sigma = h / sqrt(11.25) of a parabola: 1 - exp(-phi^2) where the heights are Gaussian, and for small ones.  So rays ask for slopes
+below a pixel's, and waves, where the orders do not fall upon one another, for a depth far below a wavelength: the latter is reached
+first.
+"""
+
+from __future__ import annotations
+
+import math
+
+from caustic_cli.optics.resolution import GREEN
+from caustic_cli.scene import Scene
+
+#: Standard deviation of a parabola's heights in parts of its depth: sqrt(4 / 45).
+PARABOLA = math.sqrt(4.0 / 45.0)
+#: The blur, in pixels, and the part of light scattered that a step-over is said for.
+PIXELS, SCATTERED = 0.5, 0.01
+
+
+def scallops(scene: Scene, step: float, radius: float) -> dict:
+    """Figures for JSON, of a step-over s and a tool of radius R, mm.
+
+    Keys: blur_mm and blur_pixels, of rays; scattered, the part of light as a wave that leaves its way, at wavelength_nm;
+    step_over_of_half_a_pixel_mm and scallop_of_half_a_pixel_mm, for which rays blur by half a pixel; step_over_of_waves_mm and
+    scallop_of_waves_mm, for which a hundredth of the light is scattered.
+    """
+    lens, screen = scene.lens, scene.screen
+    bend, throw = abs(lens.effective_index - 1.0), abs(screen.z - lens.offset.thickness)
+    pixel = max(screen.pixel)
+    said = scene.light.wavelengths
+    wavelength = sum(w * p for w, p in zip(said, scene.light.parts, strict=True)) if said else GREEN
+    blur = bend * throw * step / radius
+    phase = 2.0 * math.pi * bend * PARABOLA / (wavelength * 1e-6)  # standard deviation, rad, per mm of depth
+    fine = PIXELS * pixel * radius / (bend * throw)
+    shallow = math.sqrt(-math.log1p(-SCATTERED)) / phase
+    return {
+        "blur_mm": blur,
+        "blur_pixels": blur / pixel,
+        "scattered": -math.expm1(-((phase * step * step / (8.0 * radius)) ** 2)),
+        "wavelength_nm": wavelength,
+        "step_over_of_half_a_pixel_mm": fine,
+        "scallop_of_half_a_pixel_mm": fine * fine / (8.0 * radius),
+        "step_over_of_waves_mm": math.sqrt(8.0 * radius * shallow),
+        "scallop_of_waves_mm": shallow,
+    }
+
+
+def rows(f: dict) -> list[tuple[str, str]]:
+    """A program's figures as a person reads them."""
+    return [
+        ("program", f"{f['lines']:,} lines, {f['length_mm']:,.0f} mm of cut, about {_time(f['minutes'])}"),
+        (
+            "passes",
+            f"{f['step_over_mm']:.4g} mm apart, scallops up to {1e3 * f['scallop_mm']:.3g} µm,"
+            f" slopes up to {f['scallop_slope']:.3g}",
+        ),
+        ("unpolished, by rays", f"blurs over {f['blur_mm']:.3g} mm, {f['blur_pixels']:.3g} pixels, across the passes"),
+        ("as a wave", f"scatters {f['scattered']:.2%} of the light ({f['wavelength_nm']:.0f} nm)"),
+        (
+            "half a pixel by rays",
+            f"passes {1e3 * f['step_over_of_half_a_pixel_mm']:.3g} µm apart,"
+            f" scallops of {1e6 * f['scallop_of_half_a_pixel_mm']:.2g} nm",
+        ),
+        (
+            "1 % scattered as a wave",
+            f"passes {1e3 * f['step_over_of_waves_mm']:.3g} µm apart, scallops of {1e6 * f['scallop_of_waves_mm']:.3g} nm;"
+            " else polish as deep as the scallops",
+        ),
+    ]
+
+
+def _time(minutes: float) -> str:
+    return f"{minutes:.1f} minutes" if minutes < 100 else f"{minutes / 60:.1f} hours"
