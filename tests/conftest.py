@@ -52,6 +52,7 @@ SLOW = (
     "test_wave_design.py",
     "test_effects.py",
     "test_library.py",
+    "test_machine.py",
     "test_noise.py",
     "test_roundtrip.py",
     "test_stages.py",

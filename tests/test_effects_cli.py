@@ -118,14 +118,20 @@ def test_a_design_for_a_shifted_screen_hits_it(capfd):
     assert figures["on_target"] > 0.85 * (1 - figures["lost"]["fresnel"])
 
 
-def test_a_mirror_is_designed_and_not_exported_as_a_lens(capfd):
+def test_a_mirror_is_designed_and_exported_as_one(capfd):
     figures = run(capfd, "design", "blob.png", "--mirror", *TINY)
     assert figures["on_screen"] > 0.98 and figures["lost"]["fresnel"] == 0
     toml = settings.read(workflow.Path("blob.caustic/project.toml"))
     assert toml["lens"]["mirror"] and toml["screen"]["z"] == -90.0
     lens = run(capfd, "design", "blob.png", *TINY, "-o", "lens.caustic")
     assert figures["relative_rms"] < 1.2 * lens["relative_rms"]
-    assert "is a mirror" in run(capfd, "export", "blob.caustic", code=2)
+    run(capfd, "export", "blob.caustic", "-o", "mirror.npz")
+    again = run(capfd, "render", "mirror.npz", "--rays", "20000", "--effects", "none")
+    assert again["on_screen"] > 0.98 and again["lost"]["off_screen"] < 0.02
+    for name in ("mirror.tif", "mirror-map.png"):
+        said = run(capfd, "export", "blob.caustic", "--format", "heightmap", "-o", name)["heightmap"]
+        begun = run(capfd, "design", "blob.png", "--mirror", *TINY, "--start", name, "--iterations", "1", "-o", f"{name}.caustic")
+        assert said["turned"] and begun["start_relative_rms"] < 1.05 * figures["relative_rms"]
     assert "must lie before the mirror" in run(capfd, "render", "blob.caustic", "--screen-at", "20", code=2)
 
 

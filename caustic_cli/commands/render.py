@@ -90,7 +90,19 @@ def run(
         ),
     ] = False,
     tool_radius: Annotated[
-        float | None, typer.Option(metavar="MM", help="Radius of the tool that --report tries in concave places (mm).")
+        float | None,
+        typer.Option(
+            metavar="MM",
+            help="Radius of the tool that --report tries in concave places, and of a --cut whose program does not say it (mm).",
+        ),
+    ] = None,
+    cut: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Trace the surface that this program (G-code, as of caustic export --format gcode) leaves of its ball-nose tool,"
+            " scallops and all.",
+        ),
     ] = None,
     force: options.Force = False,
     json: options.Json = False,
@@ -108,8 +120,11 @@ def run(
     if tolerance is not None and not 0 < tolerance < 100:
         raise InputError(f"--tolerance must be greater than 0 and less than 100, got {tolerance:g}")
     size = options.both(options.counts("--filter-size", filter_size))
-    if tool_radius is not None and not (report and tool_radius > 0):
-        raise InputError(f"--tool-radius belongs to --report and must be greater than 0 mm, got {tool_radius:g}")
+    if tool_radius is not None and not ((report or cut) and tool_radius > 0):
+        raise InputError(f"--tool-radius belongs to --report and --cut and must be greater than 0 mm, got {tool_radius:g}")
+    designed = [name for name, given_ in (("--verify", verify), ("--explain", explain), ("--html", html)) if given_]
+    if cut and designed:
+        raise InputError(f"--cut goes without {designed[0]}, which looks at the surface as designed")
     if verify not in (None, "mitsuba"):
         raise InputError(f"--verify must be mitsuba, got {verify!r}")
     if verify and screen_at is not None:
@@ -143,6 +158,7 @@ def run(
         verify is not None,
         report,
         tool_radius,
+        cut,
         force,
         seed,
         options.dtype_of(dtype or "float64"),
@@ -159,6 +175,10 @@ def run(
 def _show(title: str, figures: dict, say: console.Reporter) -> None:
     """The figures, and what was asked for beside them, as a person reads them."""
     say.table(title, console.figures_rows(figures))
+    if "cut" in figures:
+        from caustic_cli.workflow.cut import rows as of_cut  # noqa: PLC0415
+
+        say.table(f"as {figures['cut']['program']} cuts it", of_cut(figures))
     if "effects" in figures:
         from caustic_cli.studies.effects import table  # noqa: PLC0415
 

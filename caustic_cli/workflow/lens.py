@@ -18,6 +18,7 @@ from caustic_cli.io.archive import open_archive
 from caustic_cli.optics.plan import Plan, compile_plan, parse_effects
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.resolution import Resolution
+from caustic_cli.optics.surfaces.cut import CutSurface
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.project import directory, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
@@ -27,6 +28,7 @@ from caustic_cli.studies.retrace import retrace
 from caustic_cli.studies.waves import wave_figures
 from caustic_cli.workflow import design as workflow
 from caustic_cli.workflow.compilation import compile_for
+from caustic_cli.workflow.cut import FINER, departure
 from caustic_cli.workflow.export import write
 from caustic_cli.workflow.reporter import Listener, Reporter
 
@@ -92,9 +94,10 @@ class Lens:
         """Of its picture's values, and of pictures of its images."""
         return "srgb" if self.project is None else self.project.settings["target"]["encoding"]
 
-    def plan(self, effects: str = "auto") -> Plan:
-        """The effects to simulate: what the scene calls for, "none" that can be left out, or just those named."""
-        return compile_plan(self.scene, self.field, self.heights, parse_effects(effects))
+    def plan(self, effects: str = "auto", steeper: float = 0.0) -> Plan:
+        """The effects to simulate: what the scene calls for, "none" that can be left out, or just those named; steeper: by how much
+        the slopes of what is traced may exceed the lens'."""
+        return compile_plan(self.scene, self.field, self.heights, parse_effects(effects), steeper)
 
     def render(
         self,
@@ -107,6 +110,7 @@ class Lens:
         dtype: torch.dtype = torch.float64,
         device: str = "cpu",
         say: Reporter | None = None,
+        cut: CutSurface | None = None,
     ) -> Render:
         """Retrace the lens with rays of its own, under the effects that the scene calls for.
 
@@ -117,12 +121,13 @@ class Lens:
             filter: reconstruction filter; None counts rays in pixels.
             effects: as of `plan`, or a plan.
             dtype: of the ray arithmetic.
+            cut: the surface that a tool left, instead of the lens' own (`workflow.cut`).
         """
         plan = effects if isinstance(effects, Plan) else self.plan(effects)
         compile_for(plan.scene, device, say or Listener(), plan.requests)
         exposure, figures = retrace(
             plan.scene,
-            self.field,
+            self.field if cut is None else cut,
             self.heights,
             self.target,
             rays=count(rays),
@@ -135,15 +140,25 @@ class Lens:
         )
         return Render(exposure.image.cpu().numpy(), figures)
 
-    def render_waves(self, *, effects: str | Plan = "auto", required: bool = True, device: str = "cpu") -> Render:
+    def render_waves(
+        self, *, effects: str | Plan = "auto", required: bool = True, device: str = "cpu", cut: CutSurface | None = None
+    ) -> Render:
         """The wave image at the scene's wavelengths; its figures alone where it is not `required` and out of reach (image empty).
+        cut: as of `render`.
 
         Raises:
             InputError: it is out of reach.
         """
         plan = effects if isinstance(effects, Plan) else self.plan(effects)
         light, figures = wave_figures(
-            plan.scene, self.field, self.heights.to(device), self.target, self._resolution(plan.scene), finer=1.0, required=required
+            plan.scene,
+            self.field,
+            self.heights.to(device),
+            self.target,
+            self._resolution(plan.scene),
+            finer=1.0 if cut is None else FINER,
+            required=required,
+            departure=None if cut is None else departure(cut, self.field, self.heights),
         )
         return Render(np.empty((0, 0)) if light is None else light.image.cpu().numpy(), figures)
 

@@ -20,6 +20,7 @@ from caustic_cli.io.files import discard, refuse_foreign
 from caustic_cli.io.picture import write_image, write_npy
 from caustic_cli.optics.emission.measured import coarse_words
 from caustic_cli.optics.plan import Plan, parse_effects
+from caustic_cli.optics.surfaces.cut import CutSurface
 from caustic_cli.project.project import RENDER, WAVE, Project, beside
 from caustic_cli.project.uptodate import Outputs
 from caustic_cli.scene import Scene
@@ -29,6 +30,7 @@ from caustic_cli.studies.retrace import white_level
 from caustic_cli.studies.verify import require_mitsuba, verify, write_panels
 from caustic_cli.workflow import page
 from caustic_cli.workflow.compilation import compile_for
+from caustic_cli.workflow.cut import compared, cut_surface, mark
 from caustic_cli.workflow.lens import Lens, is_archive
 from caustic_cli.workflow.reporter import Reporter
 
@@ -48,6 +50,7 @@ class Request:
         image, npy: files to write; None for render.png in the project, and for none.
         html: file for a page that traces the lens itself, None for none.
         verify: compare with Mitsuba; report: say what making the lens asks for, tool_radius in mm.
+        cut: a program for a mill, whose cut is traced instead of the surface as designed.
         force: replace files that are not ours, and do again what is up to date.
         seed, dtype: of rays; None for the project's own and for float64.
     """
@@ -68,6 +71,7 @@ class Request:
     verify: bool = False
     report: bool = False
     tool_radius: float | None = None
+    cut: Path | None = None
     force: bool = False
     seed: int | None = None
     dtype: torch.dtype = torch.float64
@@ -89,7 +93,8 @@ class Request:
             "seed",
             "dtype",
         )
-        return {name: getattr(self, name) for name in names} | dict(self.given)
+        cut = {"cut": mark(self.cut)} if self.cut else {}
+        return {name: getattr(self, name) for name in names} | cut | dict(self.given)
 
 
 def render(asked: Request, device: str, say: Reporter) -> dict:
@@ -136,7 +141,9 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
         refuse_untraceable(scene)
     filter = filter_from(asked.reconstruction, asked.filter_size, scene.screen, asked.alpha)
     seed = lens.seed if asked.seed is None else asked.seed
-    plan = lens.plan(asked.effects)
+    cut = None if asked.cut is None else cut_surface(asked.cut, scene, lens.field, asked.tool_radius)
+    deviation = {} if cut is None else compared(cut, lens.field, lens.heights, scene.lens.round)
+    plan = lens.plan(asked.effects, deviation.get("cut_slope_most", 0.0))
     if coarse := coarse_words(scene):
         say.say(coarse)
     if asked.explain:
@@ -150,7 +157,12 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
         dtype=asked.dtype,
         device=device,
         say=say,
+        cut=cut,
     )
+    if cut is not None:
+        nominal = lens.render(asked.rays, seed=seed, effects=plan, dtype=asked.dtype, device=device, say=say).figures
+        beside_it = {f"nominal_{name}": nominal[name] for name in ("relative_rms", "noise")}
+        figures["cut"] = {"program": str(asked.cut)} | beside_it | deviation
     write_image(image_path, image, white_level(image, lens.target), lens.encoding)
     if wave_path == asked.lens / WAVE:
         discard(wave_path)  # of what render.png was before
@@ -159,7 +171,7 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     waves = None
     if plan["diffraction"].on:
         with say.notify_if_slow("taking the wave image"):
-            waves, more = _wave_image(plan, lens, device, asked.effects != "auto", wave_path, wave_npy)
+            waves, more = _wave_image(plan, lens, device, asked.effects != "auto", wave_path, wave_npy, cut)
         figures |= more
     if asked.html is not None:
         page.write(asked.html, lens, plan, figures, waves, asked.lens.resolve().stem)
@@ -185,10 +197,10 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
 
 
 def _wave_image(
-    plan: Plan, lens: Lens, device: str, required: bool, path: Path, npy: Path | None
+    plan: Plan, lens: Lens, device: str, required: bool, path: Path, npy: Path | None, cut: CutSurface | None
 ) -> tuple[np.ndarray | None, dict]:
     """Write the wave image; it, None where there is none, and its figures."""
-    image, figures = lens.render_waves(effects=plan, required=required, device=device)
+    image, figures = lens.render_waves(effects=plan, required=required, device=device, cut=cut)
     if not image.size:
         return None, figures
     write_image(path, image, white_level(image, lens.target), lens.encoding)

@@ -1,0 +1,127 @@
+"""A lens as a program would cut it: the surface that a tool leaves, and how it differs from the design."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from caustic_cli.errors import InputError
+from caustic_cli.io.gcode import read_program
+from caustic_cli.optics.envelope import Envelope
+from caustic_cli.optics.surfaces.cut import CutSurface
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.scene import Scene
+
+#: Points at which the cut surface is compared with the design.
+POINTS = 400_000
+#: Samples of a wave image, finer than are needed for the screen by so many times: scallops scatter light beside it.
+FINER = 1.5
+#: mm by which a part may be off before it is taken for another one, in parts of its size.
+FAR = 0.05
+
+
+def cut_surface(path: Path, scene: Scene, field: HeightField, tool_radius: float | None = None) -> CutSurface:
+    """The surface that a program's ball-nose tools leave, in the scene's coordinates.
+
+    Args:
+        tool_radius: mm, of a program that does not say it.
+
+    Raises:
+        InputError: no such program, a tool whose radius nobody says, or none with a ball nose.
+    """
+    program, envelopes = read_program(path), []
+    for cut in program.cuts:
+        radius = cut.radius or tool_radius
+        if cut.kind == "flat end":  # roughs, above what is left in the end
+            continue
+        if radius is None:
+            raise InputError(f"{path}: does not say the radius of its ball-nose tool; ⟨tool_radius⟩ does")
+        centres = cut.tips + np.array([0.0, 0.0, radius])
+        top = math.inf if program.top is None else program.top
+        envelopes.append(Envelope(radius, *_near(centres, top + radius), top=top))
+    if not envelopes:
+        raise InputError(f"{path}: has no ball-nose tool, whose cut is known")
+    mirror = scene.lens.mirror
+    turned = mirror if program.turned is None else program.turned
+    zero = scene.lens.z_in if program.zero is None else program.zero
+    return CutSurface(tuple(envelopes), field.half_size, -zero if turned else zero, turned)
+
+
+def _near(centres: np.ndarray, top: float) -> tuple[np.ndarray, np.ndarray]:
+    """Begin and end of the moves that come below the top of the stock."""
+    begin, end = centres[:-1], centres[1:]
+    cuts = np.minimum(begin[:, 2], end[:, 2]) < top
+    return (begin[cuts], end[cuts]) if cuts.any() else (centres[:1], centres[:1])
+
+
+def compared(cut: CutSurface, field: HeightField, heights: Tensor, round: bool) -> dict:
+    """How a cut surface departs from the design, along +z where material is left, for JSON: cut_left_mm and cut_gouge_mm, the most
+    that is left and the most that is missing; cut_rms_mm about the mean; cut_slope_rms and cut_slope_most, of the departure.
+
+    Raises:
+        InputError: it is another part.
+    """
+    n = math.isqrt(POINTS)
+    line = torch.linspace(-1.0, 1.0, n, dtype=torch.float64) * (1.0 - 1e-9)
+    x, y = (c.reshape(-1) for c in torch.meshgrid(line * field.half_size[0], line * field.half_size[1], indexing="ij"))
+    if round:
+        inside = (x / field.half_size[0]) ** 2 + (y / field.half_size[1]) ** 2 <= 1.0
+        x, y = x[inside], y[inside]
+    z, gx, gy = cut.at(None, x, y)
+    nominal, hx, hy = field.at(heights, x, y)
+    off = (z - nominal) * (-1.0 if cut.turned else 1.0)
+    if float(off.abs().max()) > FAR * max(field.half_size):
+        raise InputError(
+            f"the program cuts another part than this: it is up to {float(off.abs().max()):.3g} mm off; export this lens' own"
+        )
+    slopes = torch.hypot(gx - hx, gy - hy)
+    return {
+        "cut_left_mm": float(off.max()),
+        "cut_gouge_mm": max(0.0, -float(off.min())),
+        "cut_rms_mm": float(off.std()),
+        "cut_slope_rms": float(slopes.square().mean().sqrt()),
+        "cut_slope_most": float(slopes.max()),
+    }
+
+
+def departure(cut: CutSurface, field: HeightField, heights: Tensor) -> Callable[[Tensor, Tensor], Tensor]:
+    """By how much a cut surface is higher than the design at points (N,) mm; beyond the aperture as beside it."""
+
+    def higher(x: Tensor, y: Tensor) -> Tensor:
+        x, y = (c.double().cpu().clamp(-r, r) for c, r in zip((x, y), field.half_size, strict=True))
+        return cut.at(None, x, y, [(0, 0)])[0] - field.at(heights, x, y, [(0, 0)])[0]
+
+    return higher
+
+
+def rows(figures: dict) -> list[tuple[str, str]]:
+    """The same as a person reads it, with the design's error beside the cut's."""
+    f, nominal = figures["cut"], []
+    if f.get("nominal_relative_rms") is not None:
+        nominal = [
+            (
+                "relative RMS error, by rays",
+                f"{figures['relative_rms']:.4f}; of the surface as designed {f['nominal_relative_rms']:.4f}",
+            )
+        ]
+    return [
+        *nominal,
+        ("left on the surface", f"up to {1e3 * f['cut_left_mm']:.3g} µm, RMS {1e3 * f['cut_rms_mm']:.3g} µm"),
+        ("cut too deep", f"up to {1e3 * f['cut_gouge_mm']:.3g} µm"),
+        ("slopes off by", f"RMS {f['cut_slope_rms']:.3g}, up to {f['cut_slope_most']:.3g}"),
+    ]
+
+
+def mark(path: Path) -> str:
+    """What tells one program from another of the same name."""
+    try:
+        with open(path, "rb") as file:
+            return f"{path} {hashlib.file_digest(file, 'sha256').hexdigest()}"
+    except OSError:
+        return str(path)
