@@ -122,7 +122,7 @@ def run(
     size = options.both(options.counts("--filter-size", filter_size))
     if tool_radius is not None and not ((report or cut) and tool_radius > 0):
         raise InputError(f"--tool-radius belongs to --report and --cut and must be greater than 0 mm, got {tool_radius:g}")
-    designed = [name for name, given_ in (("--verify", verify), ("--explain", explain), ("--html", html)) if given_]
+    designed = [name for name, there in (("--verify", verify), ("--explain", explain), ("--html", html)) if there]
     if cut and designed:
         raise InputError(f"--cut goes without {designed[0]}, which looks at the surface as designed")
     if verify not in (None, "mitsuba"):
