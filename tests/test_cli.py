@@ -160,6 +160,10 @@ BAD = {
     "gradmap bincount": ("gradmap blob.caustic --reconstruction bincount", "bincount"),
     "export format": ("export blob.caustic --format moon", "--format"),
     "export samples": ("export blob.caustic --samples 0", "--samples"),
+    "export suffix": ("export blob.caustic -o lens.iges", "its suffix names no format"),
+    "export against the suffix": ("export blob.caustic --format step -o x.stl", "step is written to .step or .stp, not to .stl"),
+    "export several to one": ("export blob.caustic --format step,stl -o x.step", "--out names one file"),
+    "render a jpeg": ("render blob.caustic -o x.jpg", ".png"),
     "export samples of a step": ("export blob.caustic --format step --samples 9", "--samples"),
     "export tolerance": ("export blob.caustic --format stl --tolerance 0", "--tolerance"),
     "export tolerance of a table": ("export blob.caustic --format zemax --tolerance 1", "--tolerance"),
@@ -508,6 +512,16 @@ def test_a_place_in_a_new_directory(tmp_path, monkeypatch, capfd):
     small = "--resolution 24 --control 12 --start offset --rays 4000 --iterations 1 --waves off --quiet"
     assert run(f"design blob.png -o 'new place/deeper/x.caustic' --glass acrylic --index 1.49 {small}", capfd)[0] == 0
     assert "index = 1.49" in Path("new place/deeper/x.caustic/project.toml").read_text()
+
+
+def test_several_formats_at_once_and_the_format_of_a_suffix(here, capfd):
+    code, out, err = run("export blob.caustic --format step,stl,heightmap --tolerance 0.01 --json --quiet", capfd)
+    assert (code, err) == (0, "")
+    assert [e["format"] for e in json.loads(out)["exports"]] == ["step", "stl", "heightmap"]
+    assert run("export blob.caustic -o named.stl --tolerance 0.01 --quiet", capfd)[0] == 0
+    assert Path("named.stl").read_bytes() == Path("blob.stl").read_bytes()
+    assert run("export blob.caustic -o named.stp --quiet", capfd)[0] == 0
+    assert Path("named.stp").read_text().startswith("ISO-10303-21;")
 
 
 def test_alone_it_shows_its_help(capfd):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,16 +10,14 @@ import typer
 
 from caustic_cli.commands import console, options
 from caustic_cli.errors import InputError
-from caustic_cli.export import FORMATS, UNSAMPLED, WITHIN
+from caustic_cli.export import FORMATS, MOULDS, UNSAMPLED, WITHIN, format_of
 from caustic_cli.export.milling import Milling
 
 EXAMPLES = """Examples:
 
   caustic export flame.caustic --format lighttools -o flame.npz
 
-  caustic export flame.caustic --format stl --tolerance 0.0001 -o flame.stl
-
-  caustic export flame.caustic --format gcode --tool-radius 2 --scallop 0.0005
+  caustic export flame.caustic --format step,gcode --tool-radius 2
 """
 
 
@@ -26,9 +25,14 @@ EXAMPLES = """Examples:
 def run(
     project: options.Project,
     format: Annotated[
-        str,
-        typer.Option("--format", help="; ".join(f"{name} ({suffix}, {what})" for name, (suffix, _, what) in FORMATS.items()) + "."),
-    ] = "lighttools",
+        str | None,
+        typer.Option(
+            "--format",
+            metavar="NAME[,NAME...]",
+            help="; ".join(f"{name} ({suffix}, {what})" for name, (suffix, _, what) in FORMATS.items())
+            + ".  [default: what --out's suffix says; lighttools]",
+        ),
+    ] = None,
     output: Annotated[
         Path | None,
         typer.Option("-o", "--out", metavar="FILE", help="File to write.  [default: PROJECT's name + the format's suffix, here]"),
@@ -67,41 +71,42 @@ def run(
     quiet: options.Quiet = False,
     debug: options.Debug = False,
 ) -> None:
-    """Write the lens of PROJECT in the format of another program."""
+    """Write the lens of PROJECT in the formats of other programs."""
     say = console.Reporter(quiet)
-    if format not in FORMATS:
-        raise InputError(f"--format must be one of {', '.join(FORMATS)}, got {format!r}")
-    given: dict = {"mould": True} if mould else {}
-    if block is not None:
-        if not 0 < block < 1e6:
-            raise InputError(f"--block must be greater than 0 mm, got {block:g}")
-        given["block"] = block
-    if milling:
-        if format != "gcode":
-            raise InputError(f"--{next(iter(milling)).replace('_', '-')} belongs to --format gcode, got {format}")
-        rough = [name for name in milling if name in ("roughing_tool", "roughing_radius", "allowance")]
-        if rough and "roughing" not in milling:
-            raise InputError(f"--{rough[0].replace('_', '-')} belongs to --roughing, which is not given")
-        if "scallop" in milling and "step_over" in milling:
-            raise InputError("--scallop and --step-over both say how far passes are apart: give one of them")
-        given["milling"] = milling
-        Milling(**milling)
-    if samples:
-        given["samples"] = tuple(options.both(options.counts("--samples", samples)))
-        if format in UNSAMPLED:
-            what = "step file holds the spline itself" if format == "step" else "program follows the spline itself"
-            raise InputError(f"--samples: a {what}, which has no samples")
-    if tolerance is not None:
-        if format not in WITHIN:
-            raise InputError(f"--tolerance belongs to --format {', '.join(WITHIN[:-1])} or {WITHIN[-1]}, got {format}")
-        given["tolerance"] = tolerance
-    if script and format != "lighttools":
-        raise InputError(f"--script belongs to --format lighttools, got {format}")
+    formats = [format_of(output)] if format is None and output else [name.strip() for name in (format or "lighttools").split(",")]
+    if output and len(formats) > 1:
+        raise InputError("--out names one file; several formats are written beside each other under the project's own name")
+    for name in formats:
+        format_of(output or Path(), name)
+    options_of = {
+        "--mould": (mould, MOULDS),
+        "--block": (block is not None, MOULDS),
+        "--samples": (samples, [name for name in FORMATS if name not in UNSAMPLED]),
+        "--tolerance": (tolerance is not None, WITHIN),
+        "--script": (script, ("lighttools",)),
+        **{f"--{name.replace('_', '-')}": (True, ("gcode",)) for name in milling},
+    }
+    for option, (given, takers) in options_of.items():
+        if given and not set(takers) & set(formats):
+            what = " (a spline, or a path along it, has no samples)" if option == "--samples" else ""
+            raise InputError(f"{option} belongs to --format {_either(takers)}, got {', '.join(formats)}{what}")
+    if block is not None and not 0 < block < 1e6:
+        raise InputError(f"--block must be greater than 0 mm, got {block:g}")
+    _check_milling(milling)
+    count = tuple(options.both(options.counts("--samples", samples))) if samples else None
+    given_of = {"mould": mould or None, "block": block, "samples": count, "tolerance": tolerance, "milling": milling or None}
 
     from caustic_cli.workflow.export import export  # noqa: PLC0415
 
-    figures, reused = export(project, format, output, script, given, force, say)
-    if not reused:
+    all_figures = []
+    for name in formats:
+        given = {
+            key: v for key, v in given_of.items() if v is not None and name in options_of.get(f"--{key}", (True, ("gcode",)))[1]
+        }
+        figures, reused = export(project, name, output, script and name == "lighttools", given, force, say)
+        all_figures.append(figures)
+        if reused:
+            continue
         for file in (figures["file"], *figures.get("beside", ())):
             say.say(f"{file}: {Path(file).stat().st_size:,} bytes")
         if "milling" in figures:
@@ -109,4 +114,19 @@ def run(
 
             say.table("milling", rows(figures["milling"]))
     if json:
-        console.emit_json(figures)
+        console.emit_json(all_figures[0] if len(formats) == 1 else {"exports": all_figures})
+
+
+def _either(names: Sequence[str]) -> str:
+    """Names in a clause."""
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"
+
+
+def _check_milling(given: dict[str, Any]) -> None:
+    """Refuse options of a mill that contradict each other or are out of range."""
+    rough = [name for name in given if name in ("roughing_tool", "roughing_radius", "allowance")]
+    if rough and "roughing" not in given:
+        raise InputError(f"--{rough[0].replace('_', '-')} belongs to --roughing, which is not given")
+    if "scallop" in given and "step_over" in given:
+        raise InputError("--scallop and --step-over both say how far passes are apart: give one of them")
+    Milling(**given)

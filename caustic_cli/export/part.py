@@ -22,16 +22,13 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
+from caustic_cli.export import AS_CUT, MOULDS, SOLIDS
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Lens, PlaneWave, Scene, Screen
 
 #: Least material behind the surface of a mirror or a mould, in parts of its larger side, unless said.
 BLOCK = 0.2
-#: Formats that are as cut.
-AS_CUT = ("heightmap", "gcode")
-#: Formats of solids, whose back a mirror needs.
-SOLIDS = ("step", "stl", "ply", "obj")
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +64,8 @@ def part_of(
     """
     lens, heights = scene.lens, heights.detach().double().cpu()
     kind = "mould" if mould else "mirror" if lens.mirror else "lens"
-    if mould and format not in (*SOLIDS, *AS_CUT):
-        raise InputError(f"⟨mould⟩ belongs to ⟨format⟩ {', '.join((*SOLIDS, *AS_CUT))}, got {format}")
+    if mould and format not in MOULDS:
+        raise InputError(f"⟨mould⟩ belongs to ⟨format⟩ {', '.join(MOULDS)}, got {format}")
     if block is not None and kind == "lens":
         raise InputError("⟨block⟩ belongs to mirrors and moulds: a lens ends at its flat entrance")
     if kind == "lens":

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.export import BY_SUFFIX
+from caustic_cli.export import format_of
 from caustic_cli.inverse.designer import State
 from caustic_cli.io.archive import open_archive
 from caustic_cli.optics.plan import Plan, compile_plan, parse_effects
@@ -188,9 +188,7 @@ class Lens:
             mould: the negative; block: least material behind a mirror or a mould, mm; milling: of gcode, see `export.milling`.
         """
         path = Path(path)
-        name = format or BY_SUFFIX.get(path.suffix.lower())
-        if name is None or name not in BY_SUFFIX.values():
-            raise InputError(f"format must be one of {', '.join(BY_SUFFIX.values())}, got {format or path.suffix!r}")
+        name = format_of(path, format)
         given: dict[str, Any] = {key: value for key, value in (("samples", samples), ("tolerance", tolerance)) if value is not None}
         write(path, self.scene, self.field, self.heights, name, script, mould, block, milling, **given)
         return path
