@@ -79,13 +79,7 @@ def parse(text: str, where: str, parameters: bool = False) -> Settings:
     Raises:
         InputError: naming `where` and the offending key.
     """
-    _refuse_deep(text, where)
-    try:
-        raw = tomllib.loads(text)
-    except ValueError as error:  # besides TOML's own: digits without end
-        raise InputError(f"{where}: is not valid TOML: {error}") from error
-    if not _fits(raw):
-        raise InputError(f"{where}: holds a whole number of more than 64 bits")
+    raw = toml_of(text, where)
     version = raw.pop("format_version", FORMAT_VERSION)
     if type(version) is not int or not 1 <= version <= FORMAT_VERSION:
         raise InputError(f"{where}: has format_version {version!r}; this caustic {__version__} reads 1 to {FORMAT_VERSION}")
@@ -96,7 +90,7 @@ def parse(text: str, where: str, parameters: bool = False) -> Settings:
             out.setdefault("", {})[section] = _typed(f"{where}: {section}", section, table, PARAMETERS)
             continue
         if section not in SCHEMA:
-            raise InputError(f"{where}: [{section}] is not a section{_near(section, SCHEMA)}")
+            raise InputError(f"{where}: [{section}] is not a section{near(section, SCHEMA)}")
         if section == "source" and isinstance(table, list) and table and isinstance(table[0], dict):
             table = {**table[0], "also": table[1:]}
         if not isinstance(table, dict):
@@ -108,6 +102,22 @@ def parse(text: str, where: str, parameters: bool = False) -> Settings:
                 continue
             out[section][key] = _typed(f"{where}: [{section}] {key}", key, value, SCHEMA[section])
     return out
+
+
+def toml_of(text: str, where: str) -> dict[str, Any]:
+    """What TOML text says, of any schema.
+
+    Raises:
+        InputError: it is no TOML, too deep, too long, or holds a whole number beyond 64 bits.
+    """
+    _refuse_deep(text, where)
+    try:
+        raw = tomllib.loads(text)
+    except ValueError as error:  # besides TOML's own: digits without end
+        raise InputError(f"{where}: is not valid TOML: {error}") from error
+    if not _fits(raw):
+        raise InputError(f"{where}: holds a whole number of more than 64 bits")
+    return raw
 
 
 def _refuse_deep(text: str, where: str) -> None:
@@ -168,7 +178,7 @@ def _tables(tables, where: str, name: str, keys: dict[str, Setting]) -> list[dic
 
 def _typed(where: str, key: str, value, keys: dict[str, Setting]):
     if key not in keys:
-        raise InputError(f"{where} is not a key{_near(key, keys)}")
+        raise InputError(f"{where} is not a key{near(key, keys)}")
     kind = keys[key].kind
     if kind == "text":
         if not isinstance(value, str):
@@ -197,7 +207,8 @@ def _numeric(where: str, value, whole: bool):
     return value if whole else float(value)
 
 
-def _near(name: str, known) -> str:
+def near(name: str, known) -> str:
+    """What a name that is not known may have been meant for."""
     close = difflib.get_close_matches(name, known, 1, 0.5)
     return f"; did you mean {close[0]}?" if close else f"; known are {', '.join(known)}"
 
@@ -343,9 +354,18 @@ def read(path: Path, parameters: bool = False) -> Settings:
     Raises:
         InputError: there is none, it is too large, no text, or `parse` refuses it.
     """
+    return parse(read_text(path), str(path), parameters)
+
+
+def read_text(path: Path) -> str:
+    """The text of a file of at most MAX_BYTES, its lines ended by a newline alone.
+
+    Raises:
+        InputError: there is none, it is too large, or no text.
+    """
     data = read_bytes(path, MAX_BYTES, ACCEPTED, least=0)
     try:
         text = data.decode()
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: cannot be read as text ({error}); {ACCEPTED}") from error
-    return parse(text.replace("\r\n", "\n"), str(path), parameters)
+    return text.replace("\r\n", "\n")

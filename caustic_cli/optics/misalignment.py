@@ -1,0 +1,190 @@
+"""A lens that is not quite what it was meant to be, nor quite where: the light of a scene with given errors on its screen.
+
+Everything is traced in the lens' own frame.  Source and screen are carried into it, p' = R (p - c - d) + c with the lens' axes as
+rows of R, its decentre d and its entrance's middle c; so rays are drawn on the lens' aperture as always, and those of one seed stand
+at the same points of it whatever the errors: the difference of two images is one of the errors, not of the rays.
+
+Light from infinity comes under the direction that its and the lens' tilt leave, over the whole aperture, its profile with it.  A near
+source keeps the axis of its emission along the lens', and its power in a solid angle.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from caustic_cli.errors import InputError
+from caustic_cli.optics.effects import NO_REQUESTS, Requests
+from caustic_cli.optics.emission import Rays, of_member
+from caustic_cli.optics.emission.base import intensity_of
+from caustic_cli.optics.frames import Pose, turned, turned_back
+from caustic_cli.optics.rays import RayState
+from caustic_cli.optics.surfaces import HeightField
+from caustic_cli.optics.system import EXIT, System
+from caustic_cli.optics.trace import Tracer
+from caustic_cli.scene import Scene, Source
+from caustic_cli.scene.sources import Disc, Points
+from caustic_cli.scene.sources.rays import Measured
+from caustic_cli.scene.sources.several import Several
+
+
+@dataclass(frozen=True)
+class Misalignment:
+    """Errors of one lens in its place, as of `scene.tolerances.KINDS`; mm, degrees, source_size a part of the size."""
+
+    index: float = 0.0
+    thickness: float = 0.0
+    throw: float = 0.0
+    source_shift: tuple[float, float] = (0.0, 0.0)
+    source_distance: float = 0.0
+    source_size: float = 0.0
+    source_tilt: tuple[float, float] = (0.0, 0.0)
+    lens_shift: tuple[float, float] = (0.0, 0.0)
+    lens_tilt: tuple[float, float] = (0.0, 0.0)
+    screen_shift: tuple[float, float] = (0.0, 0.0)
+    screen_tilt: tuple[float, float] = (0.0, 0.0)
+
+    @classmethod
+    def of(cls, values: Mapping[tuple[str, int], float]) -> Misalignment:
+        """From numbers by error and axis; errors that are none of a place or a scale are left out."""
+        found = {}
+        for f in fields(cls):
+            if isinstance(f.default, tuple):
+                found[f.name] = tuple(float(values.get((f.name, k), 0.0)) for k in (0, 1))
+            else:
+                found[f.name] = float(values.get((f.name, 0), 0.0))
+        return cls(**found)
+
+    def lens_pose(self, scene: Scene) -> Pose:
+        """Where the lens stands: turned about its entrance's middle, and shifted."""
+        return Pose((*self.lens_shift, scene.lens.z_in), self.lens_tilt)
+
+    def point(self, scene: Scene, point: Sequence[float]) -> tuple[float, float, float]:
+        """A point of the scene in the lens' frame."""
+        pose = self.lens_pose(scene)
+        x, y, z = turned(pose, tuple(p - o for p, o in zip(point, pose.position, strict=True)))
+        return x, y, z + scene.lens.z_in
+
+    def screen(self, scene: Scene) -> tuple[tuple[float, float, float], tuple]:
+        """The screen's middle and axes in the lens' frame."""
+        s, pose = scene.screen, self.lens_pose(scene)
+        tilt = (s.tilt[0] + self.screen_tilt[0], s.tilt[1] + self.screen_tilt[1])
+        middle = self.point(scene, (s.shift[0] + self.screen_shift[0], s.shift[1] + self.screen_shift[1], s.z + self.throw))
+        return middle, tuple(turned(pose, axis) for axis in Pose(tilt=tilt).axes)
+
+    def scene(self, scene: Scene) -> Scene:
+        """The scene with index, source and its size as they are, in the lens' frame; the direction of light from infinity and the
+        screen are not in it.
+
+        Raises:
+            InputError: the errors make an impossible scene.
+        """
+        lens = replace(scene.lens, index=scene.lens.index + self.index) if self.index else scene.lens
+        try:
+            return replace(scene, lens=lens, source=self._source(scene, scene.source))
+        except InputError as error:
+            raise InputError(f"an error takes the scene beyond what there can be: {error}") from error
+
+    def _source(self, scene: Scene, source: Source) -> Source:
+        shift = (*self.source_shift, self.source_distance)
+
+        def moved(position: Sequence[float]) -> tuple[float, float, float]:
+            return self.point(scene, tuple(p + s for p, s in zip(position, shift, strict=True)))
+
+        scale = 1.0 + self.source_size
+        if isinstance(source, Several):
+            return replace(source, members=tuple(self._source(scene, one) for one in source.members))
+        if isinstance(source, Points):
+            if source.kind == "grid" and self.source_size:
+                middle = np.array(source.centre)
+                places = [tuple(middle + (np.array(p) - middle) * scale) for p in source.positions]
+            else:
+                places = list(source.positions)
+            return replace(source, positions=tuple(moved(p) for p in places))
+        if isinstance(source, Disc):
+            if source.distant:
+                return replace(source, angle=source.angle * scale)
+            return replace(source, position=moved(source.position), size=(source.size[0] * scale, source.size[1] * scale))
+        if isinstance(source, Measured):
+            turn = np.array(self.lens_pose(scene).axes)
+            rays = source.rays
+            if any(self.lens_tilt):
+                rays = replace(rays, positions=rays.positions @ turn.T, directions=rays.directions @ turn.T)
+            return replace(source, rays=rays, position=moved(source.position))
+        return source
+
+    def brightness(self, scene: Scene, changed: Scene) -> float:
+        """What the power of a near source that shines into the narrowest cone is multiplied with, so that its power in a solid angle
+        stays: that cone follows the source's place."""
+        before, after = scene.source, changed.source
+        if before.distant or before.cone is not None or before.rays is not None or len(before.members) > 1:
+            return 1.0
+        axial = [
+            intensity_of(
+                s.source, s.source.cone_over(s.lens.half_size, s.lens.z_in, s.lens.round), torch.ones(1, dtype=torch.float64)
+            )
+            for s in (scene, changed)
+        ]
+        return float(axial[0]) / float(axial[1])
+
+    def directed(self, scene: Scene, source: Source, state: RayState) -> RayState:
+        """Rays of light from infinity, turned as source and lens are; others as they are."""
+        if not source.distant or not (any(self.source_tilt) or any(self.lens_tilt)):
+            return state
+        state = state.spread()
+        direction = turned(self.lens_pose(scene), turned_back(Pose(tilt=self.source_tilt), state.direction))
+        return replace(state, direction=direction, sample=None)
+
+
+@dataclass(frozen=True)
+class Landed:
+    """Rays on the screen: x, y on its own axes from its middle, mm, and power (N,), float64; channel: of a coloured image."""
+
+    x: Tensor
+    y: Tensor
+    power: Tensor
+    channel: int | None = None
+
+
+def landed(
+    scene: Scene,
+    field: HeightField,
+    heights: Tensor,
+    rays: Rays,
+    errors: Misalignment,
+    requests: Requests = NO_REQUESTS,
+    chunk: int = 1 << 19,
+) -> Iterator[Landed]:
+    """Rays of a scene with these errors on its screen, chunk by chunk.
+
+    Args:
+        heights: (n, m) mm, of the surface as made; its thickness error is added here.
+        rays: drawn for `errors.scene(scene)`.
+        requests: of the plan of the scene without errors.
+    """
+    changed = errors.scene(scene)
+    scale = errors.brightness(scene, changed)
+    point, axes = errors.screen(scene)
+    parameters = {EXIT: heights + errors.thickness}
+    with torch.no_grad():
+        for band, plain in zip(changed.bands, scene.bands, strict=True):
+            if errors.index and band.scene.lens.index == plain.scene.lens.index:  # the index of a glass, by its own formula
+                lens = replace(band.scene.lens, index=plain.scene.lens.index + errors.index)
+                band = replace(band, scene=replace(band.scene, lens=lens))
+            system = System.of(band.scene, field)
+            for state in of_member(rays, band.member).chunks(chunk):
+                if not isinstance(state, RayState):
+                    state = RayState.on_axis(state, system.pupil.half_size, system.pupil.z).spread()
+                state = errors.directed(scene, band.scene.source, state)
+                tracer = Tracer(system, state, torch.float64, requests)
+                forward = math.copysign(1.0, sum(a * b for a, b in zip(system.axis, axes[2], strict=True)))
+                for out in tracer(parameters):
+                    middle = (point[0], point[1], point[2] - out.datum)
+                    x, y, there = tracer.backend.land(out.origin, out.direction, middle, axes, forward)
+                    power = torch.where(there, out.power, torch.zeros_like(out.power)) * (band.weight * scale)
+                    yield Landed(x.double(), y.double(), power.double(), band.channel)

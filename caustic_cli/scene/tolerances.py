@@ -1,0 +1,170 @@
+"""How far a lens, its light and its screen may be off: a distribution for each error of making and of placing.
+
+An error is normal, of standard deviation sigma, or uniform within a half width; an error of two axes has one of each.  Errors are
+independent of each other.  Lengths are mm, angles degrees.
+
+The form error is a random surface, added to the exit: Gaussian, isotropic, of power spectral density f^-exponent between the
+frequencies 1 / longest and 1 / shortest, and nothing beyond.  Waviness is a sine of unknown phase, as a tool leaves it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from caustic_cli.config import checks
+from caustic_cli.errors import InputError
+
+NORMAL, UNIFORM = "sigma", "half_width"
+#: Fewest and most draws.
+LEAST_DRAWS, MOST_DRAWS = 10, 100_000
+
+
+@dataclass(frozen=True)
+class Kind:
+    """An error that there may be: its axes ("" of a scalar), unit, the largest width that is accepted, and what it is."""
+
+    axes: tuple[str, ...]
+    unit: str
+    most: float
+    help: str
+
+
+XY, ABOUT = ("x", "y"), ("x", "y")
+KINDS = {
+    "index": Kind(("",), "", 0.5, "refractive index, at every wavelength alike"),
+    "thickness": Kind(("",), "mm", 1e3, "of the lens: the exit as a whole stands farther from the entrance"),
+    "throw": Kind(("",), "mm", 1e6, "distance of the screen"),
+    "source_shift": Kind(XY, "mm", 1e6, "of a source that stands somewhere, across the axis"),
+    "source_distance": Kind(("",), "mm", 1e6, "of a source that stands somewhere, along the axis"),
+    "source_size": Kind(("",), "", 0.25, "width of a disc or grid, as a part of itself"),
+    "source_tilt": Kind(ABOUT, "degrees", 20.0, "direction of light from infinity: turns about the x and y axes"),
+    "lens_shift": Kind(XY, "mm", 1e4, "decentre of the lens, its entrance and exit together"),
+    "lens_tilt": Kind(ABOUT, "degrees", 10.0, "turns of the lens about the x and y axes through its entrance's middle"),
+    "screen_shift": Kind(XY, "mm", 1e6, "decentre of the screen"),
+    "screen_tilt": Kind(ABOUT, "degrees", 20.0, "turns of the screen about its own centre"),
+    "roughness": Kind(("",), "", 0.1, "RMS slope, along either axis, of what the exit scatters beyond the scene's own"),
+}
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """An error: name, of KINDS; distribution, NORMAL or UNIFORM; width, sigma or half width along each of its axes, its unit.
+
+    Raises:
+        InputError: a width is negative, too large, or there are too many.
+    """
+
+    name: str
+    distribution: str
+    width: tuple[float, ...]
+
+    def __post_init__(self):
+        kind, where = KINDS[self.name], f"[{self.name}] {self.distribution}"
+        if len(self.width) != len(kind.axes):
+            raise InputError(
+                f"{where} must be {'a number' if len(kind.axes) == 1 else 'a pair [x, y]'}, got {len(self.width)} numbers"
+            )
+        most = kind.most * (1.0 if self.distribution == NORMAL else 3.0)
+        for width in self.width:
+            checks.number(where, width, 0.0, most)
+
+
+@dataclass(frozen=True)
+class FormError:
+    """A random surface: rms, mm, over all realisations; exponent of its two-dimensional power spectral density; longest and shortest
+    wavelength in it, mm, the longest None for the lens' larger side."""
+
+    rms: float
+    exponent: float = 2.0
+    longest: float | None = None
+    shortest: float = 1.0
+
+    def __post_init__(self):
+        checks.number("[form_error] rms", self.rms, 0.0, 1.0)
+        checks.number("[form_error] exponent", self.exponent, 0.0, 10.0)
+        checks.number("[form_error] shortest", self.shortest, 0.0, 1e6, open_low=True)
+        if self.longest is not None:
+            checks.number("[form_error] longest", self.longest, 0.0, 1e6, open_low=True)
+            if not self.longest > self.shortest:
+                raise InputError(f"[form_error] longest must exceed shortest, {self.shortest:g} mm, got {self.longest:g} mm")
+
+
+@dataclass(frozen=True)
+class Waviness:
+    """A sine of this amplitude and period, mm, whose crests stand across `direction`, degrees from +x."""
+
+    amplitude: float
+    period: float
+    direction: float = 0.0
+
+    def __post_init__(self):
+        checks.number("[waviness] amplitude", self.amplitude, 0.0, 1.0)
+        checks.number("[waviness] period", self.period, 0.0, 1e6, open_low=True)
+        checks.number("[waviness] direction", self.direction, -360.0, 360.0)
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number of an error: name, "lens_shift x"; of which error and axis; unit; distribution and width; sigma, its standard
+    deviation."""
+
+    name: str
+    error: str
+    axis: int
+    unit: str
+    distribution: str
+    width: float
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation."""
+        return self.width if self.distribution == NORMAL else self.width / math.sqrt(3.0)
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """All errors, how many draws of them are taken, and the seed of these.
+
+    Raises:
+        InputError: nothing is off, an error stands twice, or a number is out of range.
+    """
+
+    errors: tuple[Tolerance, ...] = ()
+    form: FormError | None = None
+    waviness: Waviness | None = None
+    draws: int = 200
+    seed: int = 0
+
+    def __post_init__(self):
+        checks.whole("draws", self.draws, LEAST_DRAWS, MOST_DRAWS)
+        checks.whole("seed", self.seed, 0, 2**31 - 1)
+        names = [e.name for e in self.errors]
+        if len(set(names)) < len(names):
+            raise InputError(f"every error may stand once, got {', '.join(names)}")
+        if not (self.parameters or self.surface):
+            raise InputError("nothing is off: a width above 0 is needed of at least one error")
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The numbers that vary, those of width 0 left out."""
+        found = []
+        for error in self.errors:
+            kind = KINDS[error.name]
+            for axis, (label, width) in enumerate(zip(kind.axes, error.width, strict=True)):
+                if width > 0:
+                    name = f"{error.name} {label}".strip()
+                    found.append(Parameter(name, error.name, axis, kind.unit, error.distribution, width))
+        return tuple(found)
+
+    @property
+    def surface(self) -> tuple[str, ...]:
+        """Names of the errors of the surface itself, a new one in every draw."""
+        form = ("form_error",) if self.form is not None and self.form.rms > 0 else ()
+        return form + (("waviness",) if self.waviness is not None and self.waviness.amplitude > 0 else ())
+
+    @property
+    def shortest(self) -> float:
+        """The shortest wavelength of the surface's errors, mm; inf where there are none."""
+        form = self.form.shortest if self.form is not None and self.form.rms > 0 else math.inf
+        return min(form, self.waviness.period if self.waviness is not None and self.waviness.amplitude > 0 else math.inf)
