@@ -57,6 +57,7 @@ SLOW = (
     "test_roundtrip.py",
     "test_stages.py",
     "test_system.py",
+    "test_tolerances.py",
     "test_verify.py",
 )
 

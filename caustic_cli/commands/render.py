@@ -104,6 +104,14 @@ def run(
             " scallops and all.",
         ),
     ] = None,
+    tolerances: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Also study what errors of making and placing do, as this TOML says (like examples/tolerances.toml):"
+            " sensitivities, percentiles of error and light, worst offenders; writes tolerances.csv and .png beside the image.",
+        ),
+    ] = None,
     force: options.Force = False,
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -162,6 +170,7 @@ def run(
         force,
         seed,
         options.dtype_of(dtype or "float64"),
+        tolerances,
     )
     figures = render(asked, device, say)
     if not figures.pop("reused", False):
@@ -187,6 +196,10 @@ def _show(title: str, figures: dict, say: console.Reporter) -> None:
         from caustic_cli.studies.manufacture import rows  # noqa: PLC0415
 
         say.table("making the lens", rows(figures["report"]))
+    if "tolerances" in figures:
+        from caustic_cli.studies.tolerances import rows as of_tolerances  # noqa: PLC0415
+
+        say.table("tolerances", of_tolerances(figures["tolerances"]))
     if "verify" in figures:
         f = figures["verify"]
         say.table(

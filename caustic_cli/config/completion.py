@@ -43,6 +43,8 @@ from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.resolution import BAND, Resolution, white
 from caustic_cli.scene import Offset, Scene, Screen, Source, sources
 from caustic_cli.scene.light import RGB
+from caustic_cli.scene.sources.section import content
+from caustic_cli.scene.tolerances import Tolerances
 
 DEFAULT_RESOLUTION = 250
 DEFAULT_SPANS = 128  # knot spans of the finished net; 128 halve evenly through the stages
@@ -435,4 +437,5 @@ def build_options(settings: Settings) -> Options:
         d["max_slope"],
         d["min_radius"],
         d["waves"] == "on",
+        content(d, "robust", Tolerances),
     )

@@ -245,6 +245,8 @@ _ROWS = (
     Setting("design.waves", "text", "refine the wave image after the ray image: auto (where diffraction matters and time allows),"
             " on or off", choices=("auto", "on", "off"), default="auto", why="an effect is simulated where a scene calls for it",
             option=Option("--waves", "auto|on|off")),
+    Setting("design.robust", "text", "file of errors of making and placing, such as examples/tolerances.toml, that the last stage's"
+            " loss is taken over; empty for none", default="", written=False, option=Option("--robust", "FILE")),
     Setting("design.start", "text", "first surface: transport (optimal transport of the light to the picture), offset (the sphere"
             " that follows from the magnification), or the lens of another project or of a file: .npz, .step or height map as"
             " exported, .npy of heights in mm", derived="transport; offset for a network, adam, several points or a small net",

@@ -24,6 +24,7 @@ from caustic_cli.inverse.limits import within_limits
 from caustic_cli.inverse.losses import parse
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.parametrisation import FreeHeights, Heights, parametrise
+from caustic_cli.inverse.robust import RobustObjective
 from caustic_cli.inverse.schedule import Stage
 from caustic_cli.inverse.steps import Adam, Newtonlike
 from caustic_cli.inverse.target import grey
@@ -33,6 +34,7 @@ from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.waves import NoWaveImage
 from caustic_cli.scene import Scene
+from caustic_cli.scene.tolerances import Tolerances
 
 #: A stage's flatness is judged over so many iterations.
 FLAT_SPAN = 10
@@ -46,7 +48,8 @@ class Options:
     min_radius: least radius of concave places, mm, 0 for any;
     optimizer, lr: lbfgs, or adam with its learning rate; network, initial, preconditioner:
     see `parametrisation`; filter_target: filter the target as the render is filtered; seed: of rays and networks;
-    dtype: precision of the rays; waves: stages on the wave image have to be, see `NoWaveImage`.
+    dtype: precision of the rays; waves: stages on the wave image have to be, see `NoWaveImage`;
+    robust: errors for which the last stage is, see `robust`.
     """
 
     loss: str = "rms-light"
@@ -61,6 +64,7 @@ class Options:
     max_slope: float = 0.0
     min_radius: float = 0.0
     waves: bool = False
+    robust: Tolerances | None = None
 
     def __post_init__(self):
         parse(self.loss)
@@ -257,15 +261,26 @@ class Designer:
             state.parameters, state.optimizer, state.image = heights.state_dict(), method.state(), method.image
             on_iteration(state)
 
-    def _objective(self, k: int, heights: Heights) -> Objective | WaveObjective:
-        stage, o, scene = self.stages[k], self.options, self.scene
+    def _objective(self, k: int, heights: Heights) -> Objective | WaveObjective | RobustObjective:
+        o = self.options
+        if o.robust is None or k < len(self.stages) - 1:
+            return self._objective_in(self.scene, k, heights.begun())
+
+        def objective(scene: Scene, begun: Tensor) -> Objective | WaveObjective:
+            return self._objective_in(scene, k, begun)
+
+        return RobustObjective(objective, self.scene, self.field(k), heights.begun(), o.robust)
+
+    def _objective_in(self, scene: Scene, k: int, begun: Tensor) -> Objective | WaveObjective:
+        """That of stage k in a scene, for heights near `begun`."""
+        stage, o = self.stages[k], self.options
         if stage.source is not None:
             scene = replace(scene, source=stage.source)
         if stage.waves:
             return WaveObjective(
                 scene,
                 self.field(k),
-                heights.begun(),
+                begun,
                 self.target,
                 o.loss,
                 wavelengths=stage.waves,
@@ -276,7 +291,7 @@ class Designer:
                 dtype=o.dtype,
                 device=self.device,
             )
-        if stage.spread and (spread := shift_of(scene, self.field(k), heights.begun())) is not None:
+        if stage.spread and (spread := shift_of(scene, self.field(k), begun)) is not None:
             expected = best_light(scene, grey(self.target.cpu().numpy()), spread, SMOOTH_STEPS).kept
             scene, rays, spread = regular_rays(scene, spread, stage, stream(o.seed, f"stage {k}"), self.device)
         else:

@@ -3,8 +3,8 @@
     h(x, y) = sum over modes of sqrt(v_k) (a_k cos(2 pi f_k.(x, y)) + b_k sin(...)),    a_k, b_k normal,    v_k ~ |f_k|^-exponent
 
 with sum v_k = rms^2.  Frequencies stand on a grid of 1 / (PERIODS sizes): the field has no period within the aperture.  It is
-interpolated by the spline at the Greville abscissae, on a net of at least A_WAVE spans to the shortest wavelength: the lens' own, or
-one with knots inserted, in which the lens is the same surface.
+interpolated by the spline at the Greville abscissae, on a net of at least A_WAVE spans to the shortest wavelength: the lens' own,
+or one with knots inserted, in which the lens is the same surface.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ def refined(field: HeightField, heights: Tensor, shortest: float) -> tuple[Heigh
         if len(widths) * parts + space.degree > MOST_NET:
             least = A_WAVE * 2.0 * half / (MOST_NET - space.degree)
             raise InputError(
-                f"the shortest wavelength of an error of the surface must be at least {least:.2g} mm on this lens, got {shortest:g} mm"
+                "the shortest wavelength of an error of the surface must be at least"
+                f" {least:.2g} mm on this lens, got {shortest:g} mm"
             )
         low, step = space.breaks[:-1, None], space.breaks.diff()[:, None] / parts
         more = (low + step * torch.arange(1, parts)).reshape(-1)

@@ -1,11 +1,11 @@
 """A lens that is not quite what it was meant to be, nor quite where: the light of a scene with given errors on its screen.
 
 Everything is traced in the lens' own frame.  Source and screen are carried into it, p' = R (p - c - d) + c with the lens' axes as
-rows of R, its decentre d and its entrance's middle c; so rays are drawn on the lens' aperture as always, and those of one seed stand
-at the same points of it whatever the errors: the difference of two images is one of the errors, not of the rays.
+rows of R, its decentre d and its entrance's middle c; so rays are drawn on the lens' aperture as always, and those of one seed
+stand at the same points of it whatever the errors: the difference of two images is one of the errors, not of the rays.
 
-Light from infinity comes under the direction that its and the lens' tilt leave, over the whole aperture, its profile with it.  A near
-source keeps the axis of its emission along the lens', and its power in a solid angle.
+Light from infinity comes under the direction that its and the lens' tilt leave, over the whole aperture, its profile with it.  A
+near source keeps the axis of its emission along the lens', and its power in a solid angle.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -52,7 +53,7 @@ class Misalignment:
     @classmethod
     def of(cls, values: Mapping[tuple[str, int], float]) -> Misalignment:
         """From numbers by error and axis; errors that are none of a place or a scale are left out."""
-        found = {}
+        found: dict[str, Any] = {}
         for f in fields(cls):
             if isinstance(f.default, tuple):
                 found[f.name] = tuple(float(values.get((f.name, k), 0.0)) for k in (0, 1))
@@ -107,7 +108,7 @@ class Misalignment:
                 places = list(source.positions)
             return replace(source, positions=tuple(moved(p) for p in places))
         if isinstance(source, Disc):
-            if source.distant:
+            if source.angle is not None:
                 return replace(source, angle=source.angle * scale)
             return replace(source, position=moved(source.position), size=(source.size[0] * scale, source.size[1] * scale))
         if isinstance(source, Measured):
@@ -118,10 +119,26 @@ class Misalignment:
             return replace(source, rays=rays, position=moved(source.position))
         return source
 
+    def upright(self, scene: Scene) -> Scene:
+        """The nearest scene whose lens stands where it belongs, thickness aside.
+
+        Light from infinity comes along the axis, onto a screen that is moved by what its direction moves the picture by, and not
+        turned any further.
+
+        Raises:
+            InputError: as of `scene`.
+        """
+        changed, ((x, y, z), _) = self.scene(scene), self.screen(scene)
+        if scene.source.distant:
+            ahead = turned(self.lens_pose(scene), turned_back(Pose(tilt=self.source_tilt), (0.0, 0.0, 1.0)))
+            reach = z - scene.lens.offset.thickness
+            x, y = x - reach * ahead[0] / ahead[2], y - reach * ahead[1] / ahead[2]
+        return replace(changed, screen=replace(scene.screen, z=z, shift=(x, y)))
+
     def brightness(self, scene: Scene, changed: Scene) -> float:
-        """What the power of a near source that shines into the narrowest cone is multiplied with, so that its power in a solid angle
-        stays: that cone follows the source's place."""
-        before, after = scene.source, changed.source
+        """What the power of a near source that shines into the narrowest cone is multiplied with, since that cone follows the
+        source's place, so that its power in a solid angle stays."""
+        before = scene.source
         if before.distant or before.cone is not None or before.rays is not None or len(before.members) > 1:
             return 1.0
         axial = [
@@ -188,3 +205,17 @@ def landed(
                     x, y, there = tracer.backend.land(out.origin, out.direction, middle, axes, forward)
                     power = torch.where(there, out.power, torch.zeros_like(out.power)) * (band.weight * scale)
                     yield Landed(x.double(), y.double(), power.double(), band.channel)
+
+
+def idle(scene: Scene, error: str) -> str:
+    """Why an error means nothing in a scene, "" where it does."""
+    source = scene.source
+    if error in ("source_shift", "source_distance") and source.distant:
+        return "light from infinity stands nowhere; source_tilt is its direction"
+    if error == "source_tilt" and not source.distant:
+        return "the source stands somewhere; source_shift moves it"
+    if error == "source_size" and not (isinstance(source, Disc) or source.kind == "grid"):
+        return f"{source.label} has no size"
+    if error == "index" and scene.lens.mirror:
+        return "a mirror has no index"
+    return ""

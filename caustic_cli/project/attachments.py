@@ -1,4 +1,4 @@
-"""The files that [source] speaks of: read once, checked, and kept in the project under names of their own."""
+"""The files that [source] and [design] speak of: read once, checked, and kept in the project under names of their own."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from caustic_cli.config import settings, tolerances
 from caustic_cli.io.files import read_bytes
 from caustic_cli.io.intensities import MOST_BYTES, TABLE, parse_distribution
 from caustic_cli.io.picture import read_picture
 from caustic_cli.io.rayfiles import ACCEPTED, MAX_BYTES, SUFFIXES, parse_rays
 from caustic_cli.scene.sources.section import Attached
 
+#: What the file of [design] robust is called in a project.
+ERRORS = "tolerances.toml"
 #: Keys of [source] that may name a file, and what it is called in a project.
 STEMS = {"file": "source", "intensity": "intensity"}
 
@@ -37,17 +40,37 @@ def attached(source: Mapping[str, Any], folder: Path | None = None) -> dict[str,
     return found
 
 
-def named_in_project(source: dict[str, Any]) -> None:
-    """Rename the files of a section as a project calls them, those of further sources by their number."""
+def with_errors(design: Mapping[str, Any], folder: Path | None = None) -> dict[str, Any]:
+    """A [design] section whose `robust` carries what the file holds, if it names one; folder: as of `attached`.
+
+    Raises:
+        InputError: the file is missing, too large, or names no errors.
+    """
+    name = design.get("robust")
+    if not name or not isinstance(name, str) or isinstance(name, Attached):
+        return dict(design)
+    path = Path(name) if folder is None else folder / name
+    data = read_bytes(path, settings.MAX_BYTES, settings.ACCEPTED)
+    return {**design, "robust": Attached.of(name, data, tolerances.read(path))}
+
+
+def named_in_project(source: dict[str, Any], design: dict[str, Any]) -> None:
+    """Rename the files of both sections as a project calls them, those of further sources by their number."""
+    if isinstance(design.get("robust"), Attached):
+        design["robust"] = design["robust"].named(ERRORS)
     for k, table in enumerate((source, *source.get("also", ()))):
         for key, stem in STEMS.items():
             if isinstance(table.get(key), Attached):
                 table[key] = table[key].named(f"{stem}{f'-{k + 1}' if k else ''}{Path(table[key]).suffix.lower()}")
 
 
-def of(source: Mapping[str, Any]) -> list[Attached]:
-    """All files of a section."""
-    return [value for table in (source, *source.get("also", ())) for key in STEMS if isinstance(value := table.get(key), Attached)]
+def of(source: Mapping[str, Any], design: Mapping[str, Any] | None = None) -> list[Attached]:
+    """All files of the [source] section, and of [design] where that is given."""
+    robust = (design or {}).get("robust")
+    found = [robust] if isinstance(robust, Attached) else []
+    return found + [
+        value for table in (source, *source.get("also", ())) for key in STEMS if isinstance(value := table.get(key), Attached)
+    ]
 
 
 def _is_file(key: str, name: str) -> bool:

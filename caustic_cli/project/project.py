@@ -83,6 +83,9 @@ class Project:
                 for key in attachments.STEMS.keys() & table.keys():
                     _within(table[key])
             given["source"] = attachments.attached(light, path)
+            if (how := given.get("design", {})).get("robust"):
+                _within(how["robust"])
+                given["design"] = attachments.with_errors(how, path)
             full = complete(given, picture.aspect)
             build_stages(full), build_options(full)  # a project whose design is impossible is not opened for its lens either
             return cls(path, full, picture, _picture(path, profile, True) if profile else None, on_disk=True)
@@ -164,7 +167,7 @@ class Project:
         self.picture.write(path / self.settings["target"]["file"])
         if self.profile is not None:
             self.profile.write(path / self.settings["source"]["profile"])
-        for file in attachments.of(self.settings["source"]):
+        for file in attachments.of(self.settings["source"], self.settings["design"]):
             write_bytes(path / file, file.data)
         self.write_settings(path)
 

@@ -11,6 +11,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from statistics import NormalDist
+
+import numpy as np
 
 from caustic_cli.config import checks
 from caustic_cli.errors import InputError
@@ -72,8 +75,11 @@ class Tolerance:
 
 @dataclass(frozen=True)
 class FormError:
-    """A random surface: rms, mm, over all realisations; exponent of its two-dimensional power spectral density; longest and shortest
-    wavelength in it, mm, the longest None for the lens' larger side."""
+    """A random surface.
+
+    rms: mm, over all realisations; exponent: of its two-dimensional power spectral density; longest, shortest: wavelengths in it,
+    mm, the longest None for the lens' larger side.
+    """
 
     rms: float
     exponent: float = 2.0
@@ -168,3 +174,16 @@ class Tolerances:
         """The shortest wavelength of the surface's errors, mm; inf where there are none."""
         form = self.form.shortest if self.form is not None and self.form.rms > 0 else math.inf
         return min(form, self.waviness.period if self.waviness is not None and self.waviness.amplitude > 0 else math.inf)
+
+
+def hypercube(parameters: tuple[Parameter, ...], draws: int, seed: int, purpose: int = 0) -> np.ndarray:
+    """A Latin hypercube of the parameters: (draws, len(parameters)).
+
+    purpose: draws of two have nothing in common.
+    """
+    rng = np.random.default_rng([seed, purpose])
+    columns = []
+    for p in parameters:
+        u = (rng.permutation(draws) + rng.random(draws)) / draws
+        columns.append(p.width * (np.array([NormalDist().inv_cdf(v) for v in u]) if p.distribution == NORMAL else 2.0 * u - 1.0))
+    return np.stack(columns, 1) if columns else np.zeros((draws, 0))

@@ -83,6 +83,8 @@ def begin(
     read = [settings.read(path, parameters=True) for path in (preset and presets.path_of(preset), config) if path]
     if config and "source" in read[-1]:
         read[-1]["source"] = attachments.attached(read[-1]["source"], config.parent)
+    if config and "design" in read[-1]:
+        read[-1]["design"] = attachments.with_errors(read[-1]["design"], config.parent)
     chosen: Settings = {}
     for path, value in given.items():
         section, _, key = path.rpartition(".")
@@ -91,6 +93,8 @@ def begin(
     if {"index", "glass"} <= {*said.get("lens", {})}:  # only where both are given beside each other
         glass = said["lens"].pop("glass")
         say.say(f"⟨lens.index⟩ {said['lens']['index']:g} is taken at every wavelength, and nothing of {glass}")
+    if "design" in said:
+        said["design"] = attachments.with_errors(said["design"])
     parameters = said.pop("", {})
     invert = parameters.pop("invert", False)
     by = Derivation(**parameters)
@@ -112,7 +116,7 @@ def begin(
     full["target"] |= {"file": f"target{picture.suffix}", "encoding": picture.encoding}
     if light is not None:
         full["source"]["profile"] = f"profile{light.suffix}"
-    attachments.named_in_project(full["source"])
+    attachments.named_in_project(full["source"], full["design"])
     project = Project(
         out,
         full,

@@ -136,7 +136,7 @@ def evaluate(
         light, more = as_waves(state.heights)
         figures |= more
     by_likeness = {name for _, name in parse(designer.options.loss)} <= LIKENESS
-    if state.start is not None and by_likeness:
+    if state.start is not None and by_likeness and designer.options.robust is None:  # which pays for what it wants with likeness
         start = designer.within_limits(replace(state, heights=designer.begun(state)))
         _, began = trace(start, noise=not scene.source.collimated)  # of other light, what the retrace has anyway
         of_start = None

@@ -33,6 +33,8 @@ from caustic_cli.workflow.compilation import compile_for
 from caustic_cli.workflow.cut import compared, cut_surface, mark
 from caustic_cli.workflow.lens import Lens, is_archive
 from caustic_cli.workflow.reporter import Reporter
+from caustic_cli.workflow.tolerances import read as read_tolerances
+from caustic_cli.workflow.tolerances import tolerances
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,7 @@ class Request:
         cut: a program for a mill, whose cut is traced instead of the surface as designed.
         force: replace files that are not ours, and do again what is up to date.
         seed, dtype: of rays; None for the project's own and for float64.
+        tolerances: TOML file of errors whose effect is studied.
     """
 
     lens: Path
@@ -75,6 +78,7 @@ class Request:
     force: bool = False
     seed: int | None = None
     dtype: torch.dtype = torch.float64
+    tolerances: Path | None = None
 
     @property
     def asks(self) -> dict[str, object]:
@@ -94,7 +98,8 @@ class Request:
             "dtype",
         )
         cut = {"cut": mark(self.cut)} if self.cut else {}
-        return {name: getattr(self, name) for name in names} | cut | dict(self.given)
+        off = {} if self.tolerances is None else {"tolerances": read_tolerances(self.tolerances)}
+        return {name: getattr(self, name) for name in names} | cut | off | dict(self.given)
 
 
 def render(asked: Request, device: str, say: Reporter) -> dict:
@@ -123,7 +128,9 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     panels = companion("verify.png") if asked.verify else None
     sheet = companion("report.json") if asked.report else None
     wave_path, wave_npy = beside(image_path), beside(asked.npy) if asked.npy else None
-    paths = (image_path, asked.npy, asked.html, panels, sheet, wave_path, wave_npy)
+    off = None if asked.tolerances is None else read_tolerances(asked.tolerances)
+    draws = (companion("tolerances.csv"), companion("tolerances.png")) if off else (None, None)
+    paths = (image_path, asked.npy, asked.html, panels, sheet, wave_path, wave_npy, *draws)
     for path in paths:
         if path is not None:
             refuse_foreign(path, asked.force)
@@ -191,6 +198,8 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
         figures["report"] = manufacture.manufacture(scene, lens.field, lens.heights, asked.tool_radius, seed)
         manufacture.write_json(sheet, figures["report"])
         say.say(f"{sheet}: what making the lens asks for")
+    if off is not None and draws[0] is not None and draws[1] is not None:
+        figures["tolerances"] = tolerances(lens, plan, off, *draws, say)
     if panels is not None:
         figures["verify"] = _verified(scene, lens, asked.rays, seed, panels)
     if made:

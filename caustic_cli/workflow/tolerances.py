@@ -1,0 +1,65 @@
+"""The study of tolerances of a lens, from its file to its figures, table, CSV and plot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from caustic_cli.config import tolerances as schema
+from caustic_cli.errors import InputError
+from caustic_cli.optics.plan import Plan
+from caustic_cli.optics.resolution import Resolution
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.waves import wave_image
+from caustic_cli.scene import Scene
+from caustic_cli.scene.tolerances import Tolerances
+from caustic_cli.studies import tolerances as study
+from caustic_cli.workflow.lens import Lens
+from caustic_cli.workflow.reporter import Reporter
+
+
+def read(path: Path) -> Tolerances:
+    """Tolerances from a TOML file; see `config.tolerances`."""
+    return schema.read(path)
+
+
+def tolerances(lens: Lens, plan: Plan, asked: Tolerances, sheet: Path, plot: Path, say: Reporter) -> dict:
+    """Study a lens under errors; write all draws to `sheet`, CSV, and `plot`, PNG.
+
+    Of a lens that was refined on its wave image, that is judged; of others, the ray image.
+
+    Returns:
+        the figures for JSON, with the paths of both files.
+
+    Raises:
+        InputError: the lens has no picture to be like, or an error makes its scene impossible.
+    """
+    if lens.target is None:
+        raise InputError("⟨tolerances⟩ compares with the picture, which an archive does not hold; render its project")
+    refined = lens.figures.get("wave_relative_rms") is not None and plan["diffraction"].on
+    seen = Resolution.at(plan.scene, lens.field, lens.heights)
+    trials = study.Trials(
+        plan.scene,
+        lens.field,
+        lens.heights,
+        lens.target,
+        asked,
+        requests=plan.requests,
+        waves=_waves if refined else None,
+        near=seen.diffraction / max(plan.scene.screen.pixel) / 2.0,
+    )
+    with say.progress(None) as show:
+        found = study.study(trials, lambda what, done, whole: show("tolerances", what, done, whole))
+    figures = study.figures(found)
+    study.write_csv(sheet, found)
+    study.write_plot(plot, found)
+    for name, why in found.unused.items():
+        say.say(f"[{name}] of the tolerances is left out: {why}")
+    return figures | {"csv": str(sheet), "plot": str(plot)}
+
+
+def _waves(scene: Scene, field: HeightField, heights: Tensor) -> np.ndarray:
+    """The wave image, (n_x, n_y) or (3, n_x, n_y)."""
+    return wave_image(scene, field, heights).image.cpu().numpy()

@@ -1,0 +1,314 @@
+"""Errors of making and placing: their file, their draws, the surface's, the trace with them, the study, and designs for them."""
+
+import csv
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import misaligned
+import numpy as np
+import pytest
+import torch
+from helpers import small_designs, write_blob
+
+from caustic_cli import cli
+from caustic_cli.config import tolerances as schema
+from caustic_cli.errors import InputError
+from caustic_cli.inverse.losses import Loss
+from caustic_cli.inverse.objective import Evaluation
+from caustic_cli.inverse.robust import RobustObjective
+from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.form_error import FormErrors, refined
+from caustic_cli.optics.frames import Pose, turned_back
+from caustic_cli.optics.misalignment import Misalignment, landed
+from caustic_cli.optics.rays import RayState
+from caustic_cli.optics.surfaces import HeightField
+from caustic_cli.optics.system import EXIT
+from caustic_cli.optics.trace import Tracer
+from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
+from caustic_cli.scene.tolerances import KINDS, FormError, Waviness, hypercube
+from caustic_cli.studies import tolerances as study
+
+EXAMPLE = Path(__file__).parents[1] / "examples" / "tolerances.toml"
+ALL = Misalignment(0.003, 0.04, 2.0, (0.3, -0.2), 1.5, 0.1, (0.4, -0.3), (0.2, -0.1), (0.7, -0.5), (0.5, 0.3), (3.0, -2.0))
+
+
+def small(source=None, control=24) -> tuple[Scene, HeightField, torch.Tensor]:
+    """A concave lens with a little relief, 32 x 32 pixels."""
+    lens = Lens((10.0, 10.0), control=(control, control), offset=Offset(5.0, (80.0, 80.0)))
+    scene = Scene(source or PlaneWave(), lens, Screen((34.0, 34.0), 300.0, (32, 32)))
+    field = HeightField.of(lens)
+    x, y = (c.numpy() for c in field.control_xy())
+    relief = 0.004 * np.sin(0.7 * x)[:, None] * np.cos(0.5 * y)[None, :]
+    return scene, field, torch.from_numpy(5.0 + lens.offset.sag(x[:, None], y[None, :]) + relief)
+
+
+def test_the_example_is_read_and_names_every_error():
+    found = schema.read(EXAMPLE)
+    assert {e.name for e in found.errors} == set(KINDS) and found.form is not None and found.draws == 200
+    shift = next(p for p in found.parameters if p.name == "throw")
+    assert shift.distribution == "half_width" and shift.sigma == pytest.approx(3.0 / math.sqrt(3.0))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[thro]\nsigma = 1", "did you mean throw?"),
+        ("[throw]\nwidth = 1", "[throw] must say sigma (normal) or half_width (uniform)"),
+        ("[throw]\nsigma = 1\nhalf_width = 1", "one of them"),
+        ("[throw]\nsigma = [1, 2]", "[throw] sigma must be a number, got 2 numbers"),
+        ("[lens_tilt]\nsigma = 'a'", "must be a number or a pair of numbers"),
+        ("[lens_tilt]\nsigma = -1", "must be 0 to 10, got -1"),
+        ("[throw]\nsigma = 0", "nothing is off"),
+        ("draws = 3\n[throw]\nsigma = 1", "draws must be a whole number 10 to 100000, got 3"),
+        ("[form_error]\nexponent = 2", "rms is missing"),
+        ("[form_error]\nrms = 1e-4\nlongest = 1\nshortest = 2", "longest must exceed shortest"),
+        ("[waviness]\namplitude = 1e-4", "period is missing"),
+        ("throw = 1", "must be a section"),
+        ("[throw", "is not valid TOML"),
+    ],
+)
+def test_what_a_file_may_not_say(text, words):
+    with pytest.raises(InputError) as error:
+        schema.parse(text, "t.toml")
+    assert words in str(error.value) and str(error.value).startswith("t.toml: ") and "\n" not in str(error.value)
+
+
+def test_a_hypercube_has_one_draw_in_every_part():
+    parameters = schema.parse("[throw]\nhalf_width = 2\n[lens_tilt]\nsigma = [1, 2]", "t").parameters
+    drawn = hypercube(parameters, 50, 3)
+    assert sorted(np.floor((drawn[:, 0] + 2.0) / 4.0 * 50).astype(int)) == list(range(50))
+    assert drawn[:, 1:].std(0) == pytest.approx([1.0, 2.0], rel=0.05)
+    assert not np.allclose(drawn, hypercube(parameters, 50, 3, 1))
+
+
+def test_a_form_error_has_its_rms_and_its_spectrum():
+    """Of 24 realisations on the surface itself: RMS, power-law slope within the band, and next to nothing beyond it."""
+    _, field, _ = small(control=103)
+    errors = FormErrors(field, FormError(1e-4, 2.5, 10.0, 1.0), None)
+    n = 256
+    at = torch.linspace(-5.0, 5.0, n + 1, dtype=torch.float64)[:-1]
+    x, y = (c.reshape(-1) for c in torch.meshgrid(at, at, indexing="ij"))
+    power, squares = 0.0, []
+    window = np.hanning(n)[:, None] * np.hanning(n)[None, :]
+    for k in range(24):
+        h = field.at(errors.heights(np.random.default_rng(k), ("form_error",)), x, y, [(0, 0)])[0].view(n, n).numpy()
+        squares.append(np.mean(h * h))
+        power = power + np.abs(np.fft.fft2(h * window)) ** 2
+    assert math.sqrt(np.mean(squares)) == pytest.approx(1e-4, rel=0.08)  # 24 realisations of a few dozen strong modes: 4 %
+    f = np.fft.fftfreq(n, 10.0 / n)
+    radius = np.hypot(f[:, None], f[None, :])
+    rings = [(radius > r / 1.15) & (radius < r * 1.15) for r in (0.3, 0.45, 0.67)]
+    slope = np.polyfit(np.log([radius[r].mean() for r in rings]), np.log([power[r].mean() for r in rings]), 1)[0]
+    assert slope == pytest.approx(-2.5, abs=0.3)
+    assert power[radius > 1.5].sum() < 1e-3 * power.sum()
+    exact = errors.form_values(np.random.default_rng(0), at.numpy(), at.numpy())
+    spline = field.at(errors.heights(np.random.default_rng(0), ("form_error",)), x, y, [(0, 0)])[0].view(n, n).numpy()
+    assert np.abs(spline - exact).max() < 1e-6  # 1 % of the RMS
+
+
+def test_waviness_is_a_sine_across_its_direction():
+    _, field, heights = small()
+    field, _ = refined(field, heights, 1.0)
+    wave = FormErrors(field, None, Waviness(2e-4, 1.0, 90.0)).heights(np.random.default_rng(1), ("waviness",))
+    y = torch.linspace(-4.0, 4.0, 400, dtype=torch.float64)
+    along = field.at(wave, torch.zeros_like(y), y, [(0, 0), (1, 0)])
+    assert float(along[1].abs().max()) < 1e-9
+    assert float(along[0].max()) == pytest.approx(2e-4, rel=0.01) and float(along[0].min()) == pytest.approx(-2e-4, rel=0.01)
+    crossings = int((along[0].sign().diff() != 0).sum())
+    assert 15 <= crossings <= 17
+
+
+def test_a_refined_net_is_the_same_surface():
+    _, field, heights = small()
+    finer, net = refined(field, heights, 1.0)
+    assert finer.shape > field.shape
+    x, y = torch.rand(2, 500, dtype=torch.float64) * 9.8 - 4.9
+    for a, b in zip(field.at(heights, x, y), finer.at(net, x, y), strict=True):
+        assert float((a - b).abs().max()) < 1e-11
+    with pytest.raises(InputError, match="must be at least"):
+        refined(field, heights, 1e-3)
+
+
+def test_the_lens_frame_is_the_rooms():
+    """The same rays in the room's frame, where surfaces are turned and shifted, land at the same points."""
+    scene, field, heights = small()
+    rays = rays_of(scene, "stratified", 900, 4)
+    (here,) = landed(scene, field, heights, rays, ALL)
+    system, screen = misaligned.room(scene, field, ALL)
+    stand = ALL.lens_pose(scene)
+    (sample,) = rays.chunks()
+    on = RayState.on_axis(sample, scene.lens.half_size, scene.lens.z_in).spread()
+    inside = turned_back(stand, (on.origin[0], on.origin[1], torch.zeros_like(on.power)))
+    direction = turned_back(Pose(tilt=ALL.source_tilt), (0.0, 0.0, 1.0))
+    start = tuple(p + o - 3.0 * d for p, o, d in zip(inside, stand.position, direction, strict=True))
+    state = RayState(start, tuple(torch.full_like(on.power, d) for d in direction), on.power)
+    there = Tracer(system, state).land({EXIT: heights}, screen)[0]
+    lit = there.power > 0
+    assert int(lit.sum()) > 850
+    for a, b in ((here.x, there.origin[0]), (here.y, there.origin[1])):
+        assert float((a - b)[lit].abs().max()) < 1e-9
+
+
+def test_a_near_source_moves_against_the_lens():
+    """A source, a lens and a screen that are shifted alike are what they were; a wider disc is a wider disc."""
+    scene, field, heights = small(Points(((0.0, 0.0, -100.0),)))
+    together = Misalignment(source_shift=(0.4, 0.3), lens_shift=(0.4, 0.3), screen_shift=(0.4, 0.3))
+    found = [
+        next(iter(landed(scene, field, heights, rays_of(e.scene(scene), "sobol", 500, 1), e))) for e in (Misalignment(), together)
+    ]
+    assert float((found[0].x - found[1].x).abs().max()) < 1e-9 and float((found[0].power - found[1].power).abs().max()) < 1e-12
+    disc = replace(scene, source=Disc((0.0, 0.0, -100.0), (2.0, 3.0)))
+    assert Misalignment(source_size=0.1).scene(disc).source.size == pytest.approx((2.2, 3.3))
+    nearer = Misalignment(source_distance=10.0)
+    power = [
+        sum(float(p.power.sum()) for p in landed(scene, field, heights, rays_of(e.scene(scene), "sobol", 4000, 1), e))
+        for e in (Misalignment(), nearer)
+    ]
+    assert power[1] / power[0] == pytest.approx((100.0 / 90.0) ** 2, rel=0.01)  # the lens catches more of the same light
+
+
+def test_an_upright_scene_is_close():
+    """What a design for errors sees of a draw: within a pixel of 1 mm, of light moved by many."""
+    scene, field, heights = small()
+    e = replace(ALL, source_shift=(0.0, 0.0), source_distance=0.0, source_size=0.0, screen_tilt=(0.0, 0.0))
+    rays = rays_of(scene, "stratified", 400, 4)
+    (exact,) = landed(scene, field, heights, rays, e)
+    near = e.upright(scene)
+    (close,) = landed(near, field, heights + e.thickness, rays, Misalignment())
+    (still,) = landed(scene, field, heights, rays, Misalignment())
+    apart = [float(torch.hypot(exact.x - o.x, exact.y - o.y).mean()) for o in (close, still)]
+    assert apart[0] < 0.2 and apart[1] > 1.5
+
+
+def test_the_best_shift_is_found():
+    x = np.arange(48.0)
+    spot = np.exp(-((x[:, None] - 22.3) ** 2 + (x[None, :] - 25.6) ** 2) / 30.0)
+    there = np.exp(-((x[:, None] - 24.7) ** 2 + (x[None, :] - 22.6) ** 2) / 30.0)
+    _, shift = study.best_shift(there, spot)
+    assert shift == pytest.approx((2.4, -3.0), abs=0.02)
+
+
+def trials(text: str, source=None, rays=40_000) -> study.Trials:
+    scene, field, heights = small(source)
+    e = Misalignment()
+    target = sum(
+        misaligned.image(scene, field, heights, e, 40_000, np.random.default_rng(k)) if source is None else np.ones((32, 32))
+        for k in range(2)
+    )
+    return study.Trials(scene, field, heights, target, schema.parse(text, "t"), rays=rays)
+
+
+def test_percentiles_are_those_of_brute_force():
+    """60 draws beside 250 independent ones, each traced in the room's frame with random rays of its own."""
+    found = study.study(
+        t := trials("draws = 60\n[throw]\nsigma = 8\n[lens_tilt]\nsigma = 0.5\n[screen_shift]\nsigma = 0.7\n[index]\nsigma = 0.002")
+    )
+    quick = study.figures(found)
+    rng, brute = np.random.default_rng(7), []
+    for _ in range(250):
+        values = {(p.error, p.axis): float(p.sigma * rng.standard_normal()) for p in t.parameters}
+        e = Misalignment.of(values)
+        brute.append(misaligned.relative_rms(t.scene, t.field, t.heights, e, t.target[0], 6_000, rng))
+    error = math.hypot(quick["relative_rms"]["p95_standard_error"], study.percentile_error(np.array(brute), 0.95))
+    exact = float(np.quantile(brute, 0.95))
+    assert error < 0.12 * exact
+    assert quick["relative_rms"]["p95"] == pytest.approx(exact, abs=3.0 * error)
+    assert quick["relative_rms"]["p50"] == pytest.approx(np.quantile(brute, 0.5), rel=0.15)
+    assert quick["sensitivities"][0]["name"].startswith("screen_shift")
+    assert quick["offenders"][0]["name"].startswith("screen_shift")
+    assert quick["shifted_relative_rms"]["p95"] < 0.7 * quick["relative_rms"]["p95"]
+
+
+def test_roughness_blurs_as_facets_scatter():
+    """The Gaussian that stands for roughness, beside microfacets traced ray by ray."""
+    t = trials("[roughness]\nsigma = 0.005", rays=200_000)
+    blurred = np.mean(t.images({("roughness", 0): 0.005}), 0)[0]
+    rough = replace(t.scene, lens=replace(t.scene.lens, roughness=0.005))
+    traced = study.Trials(rough, t.field, t.heights, t.target, t.tolerances, rays=200_000)
+    facets, sharp = np.mean(traced.images({}), 0)[0], np.mean(t.images({}), 0)[0]
+    assert np.abs(blurred - facets).sum() < 0.7 * np.abs(sharp - facets).sum()
+
+
+def test_what_means_nothing_is_said():
+    found = study.study(trials("draws = 10\n[throw]\nsigma = 3\n[source_shift]\nsigma = 1", rays=2000))
+    assert list(found.unused) == ["source_shift"] and [p.name for p in found.parameters] == ["throw"]
+    with pytest.raises(InputError, match="means anything here"):
+        study.study(trials("[source_shift]\nsigma = 1", rays=2000))
+
+
+def test_the_loss_over_draws_and_its_gradient():
+    scene, field, heights = small()
+    target = torch.ones(32, 32, dtype=torch.float64)
+    weights = torch.from_numpy(np.random.default_rng(0).standard_normal(heights.shape))
+
+    class Square:
+        """A quadratic in the heights that knows its screen."""
+
+        def __init__(self, scene: Scene):
+            self.loss, self.throw = Loss("rms", target), scene.screen.z
+
+        def __call__(self, h: torch.Tensor) -> Evaluation:
+            d = (h - 5.0) * weights - 0.01 * self.throw
+            return Evaluation(float((d * d).sum()), {EXIT: 2.0 * d * weights}, 1.0)
+
+    errors = schema.parse("[throw]\nsigma = 5\n[thickness]\nsigma = 0.1", "t")
+    loss = RobustObjective(lambda s, _: Square(s), scene, field, heights, errors)
+    found, way = loss(heights), torch.from_numpy(np.random.default_rng(1).standard_normal(heights.shape))
+    ends = [loss(heights + sign * 1e-5 * way).loss for sign in (-1, 1)]
+    assert float((found.gradient * way).sum()) == pytest.approx((ends[1] - ends[0]) / 2e-5, rel=1e-5)
+    assert found.loss > Square(scene)(heights).loss
+    with pytest.raises(InputError, match="names no error"):
+        RobustObjective(lambda s, _: Square(s), scene, field, heights, schema.parse("[roughness]\nsigma = 0.01", "t"))
+
+
+def test_a_robust_design_and_its_study(tmp_path, monkeypatch, capsys):
+    """The file is kept in the project; the study is written, and not done twice; the last stage's loss is over draws."""
+    monkeypatch.chdir(tmp_path)
+    small_designs(monkeypatch, 20_000)
+    write_blob()
+    Path("errors.toml").write_text(
+        "draws = 12\n[throw]\nsigma = 4\n[screen_shift]\nsigma = [0.3, 0]\n[form_error]\nrms = 1e-5\nshortest = 4\n"
+    )
+    common = [
+        "blob.png",
+        *[
+            "--control",
+            "36",
+            "--resolution",
+            "24",
+            "--rays",
+            "20000",
+            "--iterations",
+            "3",
+            "--quality",
+            "draft",
+            "--waves",
+            "off",
+            "--json",
+        ],
+    ]
+    assert cli.run(["design", *common, "--robust", "errors.toml"]) == 0
+    robust = json.loads(capsys.readouterr().out)
+    assert cli.run(["design", *common, "-o", "plain.caustic"]) == 0
+    plain = json.loads(capsys.readouterr().out)
+    assert robust["relative_rms"] != plain["relative_rms"]
+    assert 'robust = "tolerances.toml"' in Path("blob.caustic/project.toml").read_text()
+    assert Path("blob.caustic/tolerances.toml").read_bytes() == Path("errors.toml").read_bytes()
+    assert cli.run(["design", "--resume", "blob.caustic", "--iterations", "4", "--json"]) == 0
+    capsys.readouterr()
+    ask = ["render", "blob.caustic", "--rays", "20000", "--tolerances", "errors.toml", "--json"]
+    assert cli.run(ask) == 0
+    out = json.loads(capsys.readouterr().out)["tolerances"]
+    assert (
+        out["draws"] == 12
+        and out["judged_by"] == "rays"
+        and {s["name"] for s in out["sensitivities"]} == {"throw", "screen_shift x", "form_error"}
+    )
+    lines = Path("blob.caustic/tolerances.csv").read_text().splitlines()
+    assert lines[0].startswith("# created by caustic") and len(list(csv.DictReader(lines[1:]))) == 12
+    assert Path("blob.caustic/tolerances.png").read_bytes()[:4] == b"\x89PNG"
+    assert cli.run(ask) == 0 and "nothing to do" in capsys.readouterr().err
+    assert cli.run(["render", "blob.caustic", "--tolerances", "none.toml"]) == 2
+    assert capsys.readouterr().err.startswith("caustic: none.toml: no such file")
