@@ -85,6 +85,10 @@ Behind an extended source's blur: the error of the best light found, and the mos
 .B start_relative_rms, start_noise
 Of the surface that a design began from, by the same rays.
 .TP
+.B tolerances
+Of a study of errors: draws, percentiles p5, p50 and p95 of relative_rms (as placed), shifted_relative_rms (after the best shift of
+the screen) and on_target, sensitivities, offenders, wave_check, csv, plot.
+.TP
 .B rays, iterations, seconds, image, project
 Rays traced, iterations done, wall time, files.
 .SH ORIENTATION

@@ -1,8 +1,8 @@
 """Percentiles over draws of errors beside brute force: `python tests/benchmarks/tolerances.py PROJECT TOLERANCES`.
 
-The study takes 200 draws, a Latin hypercube, of one set of rays in the lens' frame.  Brute force takes 5,000 independent draws, each
-traced in the room's frame with turned and shifted surfaces and random rays of its own (tests/misaligned.py).  For plane waves judged
-by rays, and errors of index and places; prints Markdown.
+The study takes 200 draws, a Latin hypercube, of one set of rays in the lens' frame.  Brute force takes 5,000 independent draws,
+each traced in the room's frame with turned and shifted surfaces and random rays of its own (tests/misaligned.py).  For plane waves
+judged by rays, and errors of index and places; prints Markdown.
 """
 
 from __future__ import annotations
