@@ -27,7 +27,7 @@ from caustic_cli.scene import Scene
 from caustic_cli.scene.tolerances import Tolerances, hypercube
 
 #: Pairs of opposite draws, the power of the mean over them, and their weight in all.
-PAIRS, POWER, WEIGHT = 2, 2.0, 0.2
+PAIRS, POWER, WEIGHT = 2, 2.0, 0.1
 #: Purpose of these draws.
 PURPOSE = 2
 

@@ -62,7 +62,7 @@ REALISATIONS = 4
 #: Number of the first of those realisations: beyond all draws.
 ALONE = 10**6
 #: Realisations of the surface's errors that have a wave image; draws take them in turn.
-REALISED = 12
+REALISED = 8
 #: Errors that a wave image of its own can have.
 WAVED = ("index", "thickness", "throw", "source_shift", "source_distance", "source_size")
 #: Part of the draws that count as the worst.
@@ -73,6 +73,8 @@ RESAMPLED = 400
 BACK = 4
 #: Pixels that its displacement is averaged over, at least.
 NEAR = 1.5
+#: Part of the rays that are enough for displacements, which are smooth.
+FEWER = 5
 #: So many times the rays of a draw judge the lens without errors, whose error is the smallest.
 NOMINAL = 8
 #: Slope of the exit, uniform over the lens, by which the effect of its roughness is told.
@@ -122,7 +124,7 @@ class Trials:
         self.field, self.heights = refined(field, heights.detach().double().cpu(), tolerances.shortest)
         self.target = target if target.ndim == 3 else target[None]
         self.waves = waves
-        self.rays, self.near = max(2, rays // 2), max(near, NEAR)
+        self.rays, self.near = max(2, rays // (2 if waves is None else FEWER)), max(near, NEAR)
         self.parameters = tuple(p for p in tolerances.parameters if not idle(scene, p.error))
         self.surfaces = FormErrors(self.field, tolerances.form, tolerances.waviness) if tolerances.surface else None
         self.gain: tuple[float, float] | None = None
@@ -342,8 +344,9 @@ def sensitivities(trials: Trials, told: Callable[[int], None] = lambda done: Non
             Sensitivity(p.name, p.unit, p.sigma, derivative, below.relative_rms, above.relative_rms, math.sqrt(max(0.0, adds)))
         )
         told(len(found))
+    first = ALONE if len(trials.tolerances.surface) > 1 else 0  # one error alone is that of the first draws
     for name in trials.tolerances.surface:
-        errors = [trials.judge({}, ALONE + k, (name,)).relative_rms for k in range(REALISATIONS)]
+        errors = [trials.judge({}, first + k, (name,)).relative_rms for k in range(REALISATIONS)]
         mean = math.sqrt(sum(e * e for e in errors) / len(errors))
         t = trials.tolerances
         sigma = t.form.rms if name == "form_error" and t.form else t.waviness.amplitude / math.sqrt(2.0) if t.waviness else 0.0
