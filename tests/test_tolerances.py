@@ -251,7 +251,7 @@ def test_the_loss_over_draws_and_its_gradient():
 
         def __call__(self, h: torch.Tensor) -> Evaluation:
             d = (h - 5.0) * weights - 0.01 * self.throw
-            return Evaluation(float((d * d).sum()), {EXIT: 2.0 * d * weights}, 1.0)
+            return Evaluation(float((d * d).sum()), {EXIT: 2.0 * d * weights}, 1.0, d)
 
     errors = schema.parse("[throw]\nsigma = 5\n[thickness]\nsigma = 0.1", "t")
     loss = RobustObjective(lambda s, _: Square(s), scene, field, heights, errors)

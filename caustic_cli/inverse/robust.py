@@ -79,7 +79,7 @@ class RobustObjective:
         self.loss = self.parts[0][0].loss
 
     def __call__(self, heights: Tensor) -> Evaluation:
-        """Value, gradient and the mean light on the screen at heights (n, m) mm float64."""
+        """Value, gradient and the mean light on the screen at heights (n, m) mm float64; the image without errors."""
         found = [part(heights + added) for part, added in self.parts]
         losses = torch.tensor([e.loss for e in found], dtype=torch.float64)
         share = torch.full_like(losses, WEIGHT / max(1, len(found) - 1))
@@ -89,7 +89,7 @@ class RobustObjective:
         weights = share * (losses / loss) ** (POWER - 1.0) if loss > 0 else torch.zeros_like(losses)
         gradient = sum(float(w) * e.gradient for w, e in zip(weights, found, strict=True))
         on_screen = sum(e.on_screen for e in found) / len(found)
-        return Evaluation(loss, {EXIT: torch.as_tensor(gradient)}, on_screen)
+        return Evaluation(loss, {EXIT: torch.as_tensor(gradient)}, on_screen, found[0].image)
 
 
 def _holds(field: HeightField, shortest: float) -> bool:
