@@ -9,6 +9,7 @@ simulated, and relief.  About ten minutes on two cores.
 from __future__ import annotations
 
 import argparse
+import re
 import tempfile
 import time
 from pathlib import Path
@@ -33,6 +34,13 @@ LENSES = {
     "laser": ("A round lens in a laser's beam, screen at 1 m", "lines", "--preset laser-25"),
     "print": ("A lens of printing resin, a small LED 500 mm before it, wall at 300 mm", "portrait", "--preset print-50"),
 }
+HEAD = """# Gallery
+
+Lenses by `python tests/benchmarks/gallery.py`, on two cores: target, image by rays, image of light as a wave where that is
+simulated, and the lens' relief about the quadric that fits it best (each by a scale of its own). Figures are by rays that no design
+saw.
+
+"""
 #: Pixels along a panel's side.
 SIDE = 200
 
@@ -102,19 +110,17 @@ def main() -> None:
     parser.add_argument("-o", "--out", type=Path, default=EXAMPLES / "gallery", metavar="DIR")
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
-    parts = [
-        "# Gallery\n\nTen lenses by `python tests/benchmarks/gallery.py`, on two cores: target, image by rays, image of light as"
-        " a wave where\nthat is simulated, and the lens' relief about the quadric that fits it best (each by a scale of its own)."
-        " Figures are\nby rays that no design saw.\n"
-    ]
+    page = given.out / "README.md"
+    parts = re.split(r"^(?=## )", page.read_text("utf-8"), flags=re.M)[1:] if page.exists() else []
+    kept = {name: part for part in parts for name in re.findall(r"\((\w+)\.png\)", part)}
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         known = pictures(place) | more_pictures(place)
         caustic("design", known["flame"], "--quality", "draft", "--time-limit", 1, "-o", place / "warm.caustic")
         for name in given.only.split(","):
-            parts.append(row(name, known[LENSES[name][1]], given.quality, place, given.out))
-            print(parts[-1], flush=True)
-    (given.out / "README.md").write_text("\n".join(parts), encoding="utf-8")
+            kept[name] = row(name, known[LENSES[name][1]], given.quality, place, given.out)
+            print(kept[name], flush=True)
+            page.write_text(HEAD + "\n".join(kept[name].strip() + "\n" for name in LENSES if name in kept), encoding="utf-8")
 
 
 if __name__ == "__main__":
