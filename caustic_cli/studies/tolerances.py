@@ -31,13 +31,14 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
+from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates, spline_filter
 from torch import Tensor
 
 from caustic_cli import __version__
@@ -75,6 +76,8 @@ BACK = 4
 NEAR = 1.5
 #: Part of the rays that are enough for displacements, which are smooth.
 FEWER = 5
+#: Light, of its mean over all pixels, that is enough to tell its displacement.
+LIT = 1e-3
 #: So many times the rays of a draw judge the lens without errors, whose error is the smallest.
 NOMINAL = 8
 #: Slope of the exit, uniform over the lens, by which the effect of its roughness is told.
@@ -147,8 +150,8 @@ class Trials:
             heights = self.heights + self.surface(number, which) if which and number is not None else self.heights
             pair = [self._image(self._rays(errors, heights, half)) for half in (0, 1)]
         else:
-            at = number % REALISED if which and number is not None else 0
-            pair = [self._moved(self._rays(errors, self.heights, 0), self._wave_image(at, which))] * 2
+            light = self._wave_image(number % REALISED if which and number is not None else 0, which)
+            pair = [self._moved(self._rays(errors, self.heights, 0), light)] * 2
         rough = abs(values.get(("roughness", 0), 0.0))
         if rough > 0:
             width = [rough * g / p for g, p in zip(self._gain(), self.scene.screen.pixel, strict=True)]
@@ -274,6 +277,18 @@ class Trials:
         return self.gain
 
 
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Within the block torch works in one thread: a draw's arrays are small, and several threads wait for each other on a machine
+    that has more to do."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
 def _part(scene: Scene, half: int) -> Scene:
     """One half of a ray file's light."""
     return replace(scene, source=scene.source.part(half, 2))
@@ -300,18 +315,14 @@ def best_shift(image: np.ndarray, target: np.ndarray) -> tuple[float, tuple[floa
 def displacement(sums: np.ndarray, near: float) -> tuple[np.ndarray, np.ndarray]:
     """Mean displacement on every pixel from the sums (3, n_x, n_y) over its rays of power, and of power times displacement.
 
-    It is averaged over `near` pixels, and farther where there is too little light.
+    It is averaged over `near` pixels; where there is too little light for that, it is that of the nearest pixel with enough.
     """
-    width, least = near, 1e-3 * sums[0].mean()
-    found, known = np.zeros((2, *sums.shape[1:])), np.zeros(sums.shape[1:], bool)
-    while True:
-        weight, x, y = (gaussian_filter(s, width, mode="constant") for s in sums)
-        enough = weight > least
-        u = np.stack([np.divide(c, weight, out=np.zeros_like(c), where=enough) for c in (x, y)])
-        found, known = np.where(known, found, u), known | enough
-        if known.all() or width > max(sums.shape):
-            return found[0], found[1]
-        width *= 3.0
+    weight, x, y = (gaussian_filter(s, near, mode="constant") for s in sums)
+    enough = weight > LIT * sums[0].mean()
+    if not enough.any():
+        return np.zeros_like(x), np.zeros_like(y)
+    at = tuple(distance_transform_edt(~enough, return_distances=False, return_indices=True))
+    return (x[at] / weight[at]), (y[at] / weight[at])
 
 
 @dataclass(frozen=True)

@@ -40,17 +40,17 @@ def tolerances(lens: Lens, plan: Plan, asked: Tolerances, sheet: Path, plot: Pat
         raise InputError("⟨tolerances⟩ compares with the picture, which an archive does not hold; render its project")
     refined = lens.figures.get("wave_relative_rms") is not None and plan["diffraction"].on
     seen = Resolution.at(plan.scene, lens.field, lens.heights)
-    trials = study.Trials(
-        plan.scene,
-        lens.field,
-        lens.heights,
-        lens.target,
-        asked,
-        requests=plan.requests,
-        waves=_waves if refined else None,
-        near=seen.diffraction / max(plan.scene.screen.pixel) / 2.0,
-    )
-    with say.progress(None) as show:
+    with study.one_thread(), say.progress(None) as show:
+        trials = study.Trials(
+            plan.scene,
+            lens.field,
+            lens.heights,
+            lens.target,
+            asked,
+            requests=plan.requests,
+            waves=_waves if refined else None,
+            near=seen.diffraction / max(plan.scene.screen.pixel) / 2.0,
+        )
         found = study.study(trials, lambda what, done, whole: show("tolerances", what, done, whole))
     figures = study.figures(found)
     study.write_csv(sheet, found)
