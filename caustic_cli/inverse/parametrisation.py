@@ -59,6 +59,10 @@ class Heights(torch.nn.Module):
     def forward(self) -> Tensor:
         return self.low + 0.5 * (1.0 + torch.tanh(self.raw().double())) * self.span
 
+    def begun(self) -> Tensor:
+        """The heights (n, m) that parameters are counted from, or where they are counted from none, those of now."""
+        return self().detach()
+
     def invert(self, heights: Tensor) -> Tensor:
         """Raw values (n, m) that give `heights`, kept SATURATION away from the bounds."""
         y = (2.0 * (heights - self.low) / self.span - 1.0).clamp(-1.0 + SATURATION, 1.0 - SATURATION)
@@ -93,7 +97,8 @@ class FreeHeights(Heights):
         return self.start + self.cu.T @ (self.scale * self.y) @ self.cv
 
     def begun(self) -> Tensor:
-        """The heights (n, m) that parameters are counted from."""
+        if self.start is None:
+            return super().begun()
         return self.low + 0.5 * (1.0 + torch.tanh(self.start.double())) * self.span
 
 

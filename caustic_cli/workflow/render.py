@@ -114,7 +114,7 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     """
     began = time.monotonic()
     parse_effects(asked.effects)
-    if asked.image is not None and asked.image.suffix.lower() != ".png":
+    if asked.image is not None and asked.image.suffix.lower() not in ("", ".png"):
         raise InputError(f"{asked.image}: ⟨out⟩ is a PNG, and its name must end in .png")
     archived = Lens.of_archive(asked.lens) if is_archive(asked.lens) else None
     project = None if archived else Project.open(asked.lens)

@@ -38,7 +38,7 @@ def _here(designed, tmp_path, monkeypatch):
 @pytest.mark.parametrize("format", FORMATS)
 def test_every_format_again(format, capfd):
     """The same is no work; with other options it takes the place of what it was; what is not ours, or edited, stays."""
-    more = [] if format == "step" else ["--samples", "11"]
+    more = {"step": [], "gcode": ["--step-over", "0.3"]}.get(format, ["--samples", "11"])
     export = ["export", "blob.caustic", "--format", format]
     assert cli.run([*export, "--json"]) == 0
     path = Path(json.loads(capfd.readouterr().out)["file"])

@@ -120,7 +120,7 @@ class Holes(Objective):
             raise NoLight("no light reaches the screen")
         nan = torch.full_like(e.gradient, math.nan)
         by = {EXIT: nan}
-        return type(e)(math.nan, by, 0.0) if self.how == "nan" else type(e)(e.loss, by, e.on_screen)
+        return type(e)(math.nan, by, 0.0, e.image) if self.how == "nan" else type(e)(e.loss, by, e.on_screen, e.image)
 
 
 @pytest.mark.parametrize("how", ["nan", "gradient", "dark"])
