@@ -146,7 +146,7 @@ def test_a_design_changes_its_source_and_resumes_inside_any_stage(capfd):
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        (["--source", "sun"], "--source must be one of plane, point, grid, disc, rays, got 'moon'"),
+        (["--source", "moon"], "--source must be one of plane, point, grid, disc, rays, got 'moon'"),
         (["--source", "point", "--source-position", "1,2"], "--source-position must be 3 numbers parted by commas"),
         (
             ["--wavelengths", "abc"],

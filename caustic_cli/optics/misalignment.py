@@ -29,7 +29,6 @@ from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Scene, Source
-from caustic_cli.scene.sources import Disc, Points
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.several import Several
 
@@ -100,24 +99,13 @@ class Misalignment:
         scale = 1.0 + self.source_size
         if isinstance(source, Several):
             return replace(source, members=tuple(self._source(scene, one) for one in source.members))
-        if isinstance(source, Points):
-            if source.kind == "grid" and self.source_size:
-                middle = np.array(source.centre)
-                places = [tuple(middle + (np.array(p) - middle) * scale) for p in source.positions]
-            else:
-                places = list(source.positions)
-            return replace(source, positions=tuple(moved(p) for p in places))
-        if isinstance(source, Disc):
-            if source.angle is not None:
-                return replace(source, angle=source.angle * scale)
-            return replace(source, position=moved(source.position), size=(source.size[0] * scale, source.size[1] * scale))
         if isinstance(source, Measured):
             turn = np.array(self.lens_pose(scene).axes)
             rays = source.rays
             if any(self.lens_tilt):
                 rays = replace(rays, positions=rays.positions @ turn.T, directions=rays.directions @ turn.T)
             return replace(source, rays=rays, position=moved(source.position))
-        return source
+        return source.misplaced(moved, scale)
 
     def upright(self, scene: Scene) -> Scene:
         """The nearest scene whose lens stands where it belongs, thickness aside.
@@ -214,7 +202,7 @@ def idle(scene: Scene, error: str) -> str:
         return "light from infinity stands nowhere; source_tilt is its direction"
     if error == "source_tilt" and not source.distant:
         return "the source stands somewhere; source_shift moves it"
-    if error == "source_size" and not (isinstance(source, Disc) or source.kind == "grid"):
+    if error == "source_size" and not source.sized:
         return f"{source.label} has no size"
     if error == "index" and scene.lens.mirror:
         return "a mirror has no index"

@@ -11,6 +11,7 @@ A type of its own says `kind` and `power`; a near one also `points`, and `extent
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -144,6 +145,15 @@ class Source:
     def label(self) -> str:
         """What to call it in a sentence."""
         return f"the {self.kind}"
+
+    @property
+    def sized(self) -> bool:
+        """Whether it has a width of its own."""
+        return False
+
+    def misplaced(self, place: Callable[[Sequence[float]], tuple[float, float, float]], scale: float) -> Source:
+        """The source with its positions where `place` (x, y, z) mm has them, and `scale` times as wide; from infinity, only that."""
+        return self
 
     def pointlike(self) -> Source:
         """The source without its extent: of all its light, that of its centre."""

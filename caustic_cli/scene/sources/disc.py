@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -126,6 +127,17 @@ class Disc(Source):
     def apparent_angle(self, z_in: float) -> float:
         """As of a source; of a far one, the very number that was given."""
         return super().apparent_angle(z_in) if self.angle is None else self.angle
+
+    @property
+    def sized(self) -> bool:
+        """By its size or its angle."""
+        return True
+
+    def misplaced(self, place: Callable[[Sequence[float]], tuple[float, float, float]], scale: float) -> Source:
+        """A disc elsewhere, and larger."""
+        if self.angle is not None:
+            return replace(self, angle=self.angle * scale)
+        return replace(self, position=place(self.position), size=(self.size[0] * scale, self.size[1] * scale))
 
     def pointlike(self) -> Source:
         """A plane wave, or a point in the middle."""

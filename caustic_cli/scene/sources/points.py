@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -101,6 +101,18 @@ class Points(Source):
     def blur(self, z_in: float, throw: float) -> float:
         """As of a source; points in places of their own blur nothing, each makes a sharp picture."""
         return super().blur(z_in, throw) if self.kind == "grid" else 0.0
+
+    @property
+    def sized(self) -> bool:
+        """A grid has a width; points are where they are said to be."""
+        return self.kind == "grid"
+
+    def misplaced(self, place: Callable[[Sequence[float]], tuple[float, float, float]], scale: float) -> Source:
+        """Points elsewhere, those of a grid also farther apart about its centre."""
+        centre = np.array(self.centre)
+        spread = scale if self.sized else 1.0
+        wide = [p if spread == 1.0 else tuple(centre + (np.array(p) - centre) * spread) for p in self.positions]
+        return replace(self, positions=tuple(place(p) for p in wide))
 
     def pointlike(self) -> Source:
         """One point in the middle of all."""
