@@ -152,7 +152,7 @@ class Source:
         return False
 
     def misplaced(self, place: Callable[[Sequence[float]], tuple[float, float, float]], scale: float) -> Source:
-        """The source with its positions where `place` (x, y, z) mm has them, and `scale` times as wide; from infinity, only that."""
+        """The source with its positions where `place` (x, y, z) mm has them, `scale` times as wide; from infinity, only that."""
         return self
 
     def pointlike(self) -> Source:
