@@ -31,14 +31,14 @@ LENSES = {
     "plate": ("A 100 mm acrylic plate in sunlight, wall at 1 m", "portrait", "--preset plate-100"),
     "mirror": ("A 100 mm mirror in sunlight, wall at 1 m", "flame", "--preset mirror-100"),
     "led": ("A luminaire's lens 60 mm before an LED, wall at 2 m", "tophat", "--preset led-30"),
-    "laser": ("A round lens in a laser's beam, screen at 1 m", "lines", "--preset laser-25"),
+    "laser": ("A round lens in a laser's beam, screen at 1 m", "flame", "--preset laser-25"),
     "print": ("A lens of printing resin, a small LED 500 mm before it, wall at 300 mm", "portrait", "--preset print-50"),
 }
 HEAD = """# Gallery
 
 Lenses by `python tests/benchmarks/gallery.py`, on two cores: target, image by rays, image of light as a wave where that is
 simulated, and the lens' relief about the quadric that fits it best (each by a scale of its own). Figures are by rays that no design
-saw.
+saw; the times were taken beside other work.
 
 """
 #: Pixels along a panel's side.
