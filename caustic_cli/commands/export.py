@@ -58,7 +58,8 @@ def run(
             metavar="MM", help="Of a mirror or a mould: least material behind the surface.  [default: a fifth of the larger side]"
         ),
     ] = None,
-    milling: dict[str, Any] = {},  # noqa: B006 (it stands for the options of Milling)
+    *,
+    milling: dict[str, Any],
     script: Annotated[
         bool,
         typer.Option(

@@ -184,9 +184,10 @@ class Trials:
 
     def _wave_image(self, number: int, which: tuple[str, ...]) -> list[np.ndarray]:
         """Spline coefficients of the wave image, colour by colour, of a realisation of the surface's errors."""
+        assert self.waves is not None
         if (number, which) not in self.smooth:
             heights = self.heights + self.surface(number, which) if which else self.heights
-            found = self._coloured(self.waves(self.scene, self.field, heights))  # type: ignore[misc]
+            found = self._coloured(self.waves(self.scene, self.field, heights))
             self.smooth[number, which] = [spline_filter(c, order=3) for c in found]
         return self.smooth[number, which]
 

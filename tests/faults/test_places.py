@@ -64,8 +64,11 @@ print(out.getvalue()[1:4].decode())
 
 
 def test_pictures_are_drawn_where_nothing_can_be_written():
-    """Also without a word about matplotlib's list of fonts."""
+    """Also without a word about matplotlib's list of fonts, and without one in the package."""
+    root = Path(__file__).parents[2]
+    before = {p for p in (root / "caustic_cli").rglob("*") if p.suffix == ".json"}
     environment = {k: v for k, v in os.environ.items() if k not in ("MPLCONFIGDIR", "XDG_CONFIG_HOME", "XDG_CACHE_HOME")}
-    places = {"HOME": "/proc/nonexistent", "NUMBA_CACHE_DIR": "/proc/nonexistent", "PYTHONPATH": str(Path(__file__).parents[2])}
+    places = {"HOME": "/proc/nonexistent", "NUMBA_CACHE_DIR": "/proc/nonexistent", "PYTHONPATH": str(root)}
     done = subprocess.run([sys.executable, "-c", DRAW], env=environment | places, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (0, "PNG\n", "")
+    assert {p for p in (root / "caustic_cli").rglob("*") if p.suffix == ".json"} == before

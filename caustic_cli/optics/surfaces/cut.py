@@ -7,6 +7,7 @@ Second derivatives are those of the ball, 1 / R across a pass: nothing smooths t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -37,13 +38,15 @@ class CutSurface(Surface[None]):
     base: float = 0.0
     turned: bool = False
 
-    def __post_init__(self):
+    @cached_property
+    def _survey(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Bounds of the height, mm, and of both slopes."""
         lines = [np.linspace(-r, r, SURVEY) for r in self.half_size]
         x, y = (torch.from_numpy(c.ravel()) for c in np.meshgrid(*lines, indexing="ij"))
         z, gx, gy = self.at(None, x, y)
         wide = BETWEEN * 2.0 * max(self.half_size) / (SURVEY - 1) * float(torch.hypot(gx, gy).max())
-        object.__setattr__(self, "_hull", (float(z.min()) - wide, float(z.max()) + wide))
-        object.__setattr__(self, "_slopes", tuple(BETWEEN * float(g.abs().max()) for g in (gx, gy)))
+        along, across = (BETWEEN * float(g.abs().max()) for g in (gx, gy))
+        return (float(z.min()) - wide, float(z.max()) + wide), (along, across)
 
     def at(self, heights: None, x: Tensor, y: Tensor, orders=FIRST) -> list[Tensor]:
         """Height and slopes; of higher derivatives there are none.
@@ -68,11 +71,11 @@ class CutSurface(Surface[None]):
 
     def hull(self, heights: None) -> tuple[float, float]:
         """From a survey of points, widened by what may lie between them."""
-        return self._hull  # type: ignore[attr-defined]  # set above
+        return self._survey[0]
 
     def slope_bounds(self, heights: None) -> tuple[float, float]:
         """From the same survey."""
-        return self._slopes  # type: ignore[attr-defined]
+        return self._survey[1]
 
     def meet(self, heights: None, origin, direction, side: float) -> SurfaceIntersection:
         """As of any surface; rays along the axis without a search."""
