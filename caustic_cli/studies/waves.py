@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import numpy as np
@@ -12,7 +13,7 @@ from caustic_cli.optics.image import Image
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.waves import NoWaveImage, WaveImage, wave_image
-from caustic_cli.optics.waves.image import Departure
+from caustic_cli.optics.waves.image import UNASKED, Departure
 from caustic_cli.scene import Scene
 from caustic_cli.studies.irradiance import irradiance_figures
 from caustic_cli.studies.metrics import judge
@@ -36,7 +37,7 @@ def wave_figures(
     departure: Departure | None = None,
 ) -> tuple[WaveImage | None, dict]:
     """The wave image of a lens at the scene's wavelengths, white light's where it says none, and its figures.  departure: of its
-    exit from the heights, as of `optics.waves.wave_image`.
+    exit from the heights, as of `optics.waves.wave_image`; required: take it however long that takes, or raise NoWaveImage.
 
     Returns:
         the image, None where there is none and `required` is false; and wave_relative_rms, wave_on_target (None without a target),
@@ -44,8 +45,9 @@ def wave_figures(
         points that the source was taken as, wave_source_error, by how much an extended source's light is misplaced so, mm, and
         wave_peak_irradiance and wave_mean_irradiance, as of a ray image.
     """
+    most = math.inf if required else UNASKED
     try:
-        found = wave_image(scene, field, heights.detach(), finer=finer, dtype=dtype, departure=departure)
+        found = wave_image(scene, field, heights.detach(), finer=finer, dtype=dtype, departure=departure, most=most)
     except NoWaveImage as error:
         if required:
             raise

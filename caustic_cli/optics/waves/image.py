@@ -34,6 +34,8 @@ from caustic_cli.scene import Light, Scene, Screen, Source
 from caustic_cli.scene.materials import refractive_index
 
 NM = 1e-6
+#: Samples of transforms that two cores take in a second; the most of a wave image that nobody asked for by name.
+A_SECOND, UNASKED = 1e8, 120e8
 #: Nodes at which rays are traced: to a knot span of the finest surface, and least along an axis.
 A_SPAN, LEAST_NODES = 3, 384
 #: The screen and so much of it on each side are watched, at most, where light lands beside it.
@@ -139,6 +141,7 @@ def wave_image(
     finer: float = 1.0,
     dtype: torch.dtype = torch.float32,
     departure: Departure | None = None,
+    most: float = math.inf,
 ) -> WaveImage:
     """The wave image of a one-lens scene at heights (n, m) mm; differentiable by them.
 
@@ -147,12 +150,14 @@ def wave_image(
         finer: samples more than are needed by so many times along each axis, on both planes.
         dtype: of the field; paths are float64.
         departure: of the exit from those heights, see `Imager`.
+        most: samples that its transforms may have together.
 
     Raises:
-        NoWaveImage: no light reaches the screen, light crosses itself within the lens, or memory is short.
+        NoWaveImage: no light reaches the screen, light crosses itself within the lens, or memory or `most` is short.
     """
     lines = lines_of(scene, field, wavelengths)
-    return image_of(lines, {EXIT: heights.double()}, screen or scene.screen, finer=finer, dtype=dtype, departure=departure)
+    parameters = {EXIT: heights.double()}
+    return image_of(lines, parameters, screen or scene.screen, finer=finer, dtype=dtype, departure=departure, most=most)
 
 
 def image_of(
@@ -163,6 +168,7 @@ def image_of(
     finer: float = 1.0,
     dtype: torch.dtype = torch.float32,
     departure: Departure | None = None,
+    most: float = math.inf,
 ) -> WaveImage:
     """The wave image of lines of light on one screen, the sources of a system one by one; see `wave_image`."""
     exact, found = any(h.requires_grad for h in parameters.values()), []
@@ -172,6 +178,11 @@ def image_of(
     for light in by_source.values():
         imager = Imager.of(light, parameters, receiver_of(light[0].system, screen), finer, exact, dense=departure is not None)
         imager = replace(imager, departure=departure)
+        if (samples := imager.sampling.samples * len(light) * len(imager.modes(light[0].system))) > most:
+            raise NoWaveImage(
+                f"a wave image of this scene takes {samples:.2g} samples, about {samples / A_SECOND / 60:.0f} minutes on two cores;"
+                " the effect diffraction, asked for by name, takes it"
+            )
         found.append(imager.expose(light, parameters, dtype))
     return (
         found[0]
