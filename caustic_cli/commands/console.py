@@ -204,6 +204,15 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
             *((f"{name} as a wave", value) for name, value in _absolute(figures, "wave_")),
             ("details light carries", number("resolvable", "d") + " across"),
         ]
+    behind = []
+    if figures.get("second_relative_rms") is not None:
+        error, known = number("second_relative_rms", ".4f"), figures.get("second_noise")
+        behind = [
+            ("second picture", f"relative RMS error {error}" + ("" if known is None else f", noise {known:.2g}")),
+            ("light on it", number("second_on_target", ".2%")),
+        ]
+    elif figures.get("angle_rms_mrad") is not None:
+        behind = [("directions off by", number("angle_rms_mrad", ".3g") + " mrad rms")]
     least = (
         [("least possible", number("least_relative_rms", ".4f") + ", behind the source's blur")]
         if "least_relative_rms" in figures
@@ -224,6 +233,7 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
         ("SSIM", number("ssim", ".4f")),
         ("light on the screen", number("on_screen", ".2%")),
         ("light on the picture", number("on_target", ".2%")),
+        *behind,
         ("lost", lost or "nothing"),
         *_absolute(figures, ""),
         *waves,

@@ -73,7 +73,7 @@ def run(
     opened = Project.open(project)
     scene = opened.scene()
     compile_for(scene, device, say)
-    field, checkpoint = opened.lens(scene)
+    scene, field, heights, _ = opened.lens(scene)
     points = points or [(field.shape[0] // 2, field.shape[1] // 2)]
     for i, j in points:
         if not (0 <= i < field.shape[0] and 0 <= j < field.shape[1]):
@@ -93,7 +93,7 @@ def run(
         raise InputError(f"--alpha belongs to --reconstruction gaussian, got {reconstruction}")
     filter = filter_from(reconstruction, size, scene.screen, alpha)
     sampler = sampler_for(scene, count, opened.settings["design"]["seed"] if seed is None else seed, device)
-    heights, maps = checkpoint.state.heights, []
+    maps = []
     for point, (image, data) in zip(points, files, strict=True):
         gradient = gradmap.gradient_image(
             scene, field, heights, point, sampler=sampler, filter=filter, dtype=options.dtype_of(dtype or "float64")

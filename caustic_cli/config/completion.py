@@ -15,12 +15,14 @@ import torch
 from caustic_cli.config.plans import (
     LEAST_SPANS,
     LEAST_WAVES,
+    TWO_SIDED_SPANS,
     Table,
     coarse_to_fine,
     on_rays,
     on_waves,
     refinement,
     refinement_spans,
+    two_sided,
     wave_refinement,
 )
 from caustic_cli.config.settings import (
@@ -54,6 +56,7 @@ DRAFT_SECONDS, FINE_SECONDS = 8.0, 60.0  # time limits below and from which anot
 STEEPEST = 1.25  # least radius of a derived sphere, in half diagonals of the lens: slopes up to 1.3
 WAVE_KEYS = ("control", "blur", "apron", "iterations", "tolerance")  # of a stage on rays that one on the wave image has too
 PLATE, WALL = 20.0, 3.0  # width beyond which a lens is a plate, as thin as its relief and this wall allow, mm
+THICK, SAG = 2.0, 0.45  # thickness over width of a lens with two free-form sides, and what of it each of them may take
 OBLONG = 2.5  # ratio of the magnifications along the axes from which on another shape of lens is advised
 COLOR_GLASS = "N-BK7"  # of a coloured picture, unless glass or index is said: dispersion has to be known
 
@@ -126,20 +129,22 @@ def complete(given: Settings, aspect: float, by: Derivation | None = None, lit: 
         s["source"]["also"] = [{**DEFAULTS["source"], **table} for table in s["source"]["also"]]
         for table in s["source"]["also"]:
             _complete_source(table, lens, [], "⟨source.also.type⟩")
+    _complete_second(s)
     if "size" not in target or mag is not None:
         if mag is None and "size" in screen:
             fit = min(screen["size"][0], screen["size"][1] / aspect) / (1.0 + margin)
         else:
-            fit = (mag or default("mag")) * lens["size"][0]
+            fit = (mag or _first_magnification(s)) * lens["size"][0]
         target["size"] = [fit, fit * aspect]
     if "size" not in screen:
         screen["size"] = [(1.0 + margin) * x for x in target["size"]]
     if "resolution" not in screen:
         nx = by.resolution[0] if by.resolution else DEFAULT_RESOLUTION
         screen["resolution"] = [nx, max(2, round(nx * screen["size"][1] / screen["size"][0]))]
+    _complete_farther(s)
     build_screen(s)
     source = build_source(s)
-    _complete_lens(lens, screen, target, source)
+    _complete_lens(lens, screen, target, source, sides=2 if "second" in s else 1)
     _complete_design(s, source, by.quality, by.rays, lit)
     return s
 
@@ -164,15 +169,17 @@ def first_thickness(size: Sequence[float]) -> float:
     return width / 2.0 if width <= PLATE else WALL + width / 10.0
 
 
-def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[str, Any], source: Source) -> None:
+def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[str, Any], source: Source, sides: int) -> None:
     index, scale = index_of(lens), max(lens["size"]) / 10.0
     check("lens.index", index)
     if "glass" not in lens:
         lens["index"] = index
     else:
         lens.setdefault("wavelength", default("lens.wavelength"))
-    lens.setdefault("thickness", first_thickness(lens["size"]))
-    lens.setdefault("height_range", [-scale, scale])
+    lens.setdefault("thickness", THICK * max(lens["size"]) if sides == 2 else first_thickness(lens["size"]))
+    lens.setdefault("height_range", [-scale, scale] if sides == 1 else [c * SAG * lens["thickness"] for c in (-1.0, 1.0)])
+    if sides == 2:
+        lens.setdefault("radius", [math.inf, math.inf])
     mirror = value_of(lens, "lens.mirror")
     if mirror and screen["z"] >= lens["thickness"] + lens["height_range"][0]:
         raise InputError(
@@ -194,6 +201,57 @@ def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[st
         lens["radius"] = [math.copysign(max(abs(r), least), r) for r in radius]
 
 
+def _first_magnification(s: Settings) -> float:
+    """Of the picture, where nobody said it; where light goes on parallel or to a focus, a beam's as wide as the lens."""
+    second = s.get("second", {})
+    if "focus" in second:
+        return abs(1.0 - s["screen"]["z"] / second["focus"][2])
+    return 1.0 if second.get("collimate") else default("mag")
+
+
+def _complete_second(s: Settings) -> None:
+    """What makes the lens' entrance free-form; nothing at all where nobody said anything of it."""
+    second = s.get("second", {})
+    said = [key for key in ("file", "collimate", "focus") if second.get(key)]
+    if not said:
+        for key in ("z", "size"):
+            if key in second:
+                raise InputError(f"⟨second.{key}⟩ belongs to ⟨+second.file⟩, which is not given")
+        s.pop("second", None)
+        return
+    if len(said) > 1:
+        raise InputError(f"⟨second.{said[0]}⟩ and ⟨second.{said[1]}⟩ both say what light does behind the picture: give one of them")
+    if "focus" in second:
+        places = second["focus"]
+        second["focus"] = list(check("second.focus", places[0] if len(places) == 1 else places))
+    if "file" in second and "z" not in second:
+        raise InputError("⟨second.file⟩ needs ⟨+second.z⟩, the distance of its screen")
+    design, source = s["design"], s["source"]
+    wrong = {
+        "lens.mirror": value_of(s["lens"], "lens.mirror"),
+        "target.color": value_of(s["target"], "target.color"),
+        "design.robust": design.get("robust", ""),
+        "design.network": design["network"] != "none",
+        "design.optimizer": design["optimizer"] != "lbfgs",
+    }
+    for path, given in wrong.items():
+        if given:
+            raise InputError(f"⟨{path}⟩ cannot be had with ⟨second.{said[0]}⟩, which needs two free-form sides of heights by lbfgs")
+    if source.get("also") or source["type"] == "rays":
+        raise InputError(f"⟨second.{said[0]}⟩ needs one source that is no ray file")
+
+
+def _complete_farther(s: Settings) -> None:
+    """Size of a second picture: that of a beam from the lens' edge through the first one's, farther on."""
+    second = s.get("second", {})
+    if "file" not in second:
+        return
+    check("second.z", second["z"])
+    grown, size, lens = second["z"] / s["screen"]["z"], s["target"]["size"], s["lens"]["size"]
+    second.setdefault("size", [max(0.1 * t, w + (t - w) * grown) for t, w in zip(size, lens, strict=True)])
+    check("second.size", second["size"])
+
+
 def shape_words(s: Settings) -> str:
     """Which lens would follow the shape of a long picture, where this one does not."""
     (w, h), (a, b) = s["target"]["size"], s["lens"]["size"]
@@ -213,12 +271,15 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
     asked = check("design.waves", design["waves"])
     fine_net = "control" not in lens or min(n - p for n, p in zip(lens["control"], degree, strict=True)) >= LEAST_SPANS
     spread = plain and fine_net and not source.sharp and _shifts(s, source)
-    design.setdefault("start", "transport" if plain and fine_net and not source.apart else "offset")
+    design.setdefault("start", "transport" if "second" in s or (plain and fine_net and not source.apart) else "offset")
     if design["start"] == "transport" and design["network"] != "none":
         raise InputError(
             "⟨design.start⟩ transport gives a surface, which a network cannot begin from; use start offset, or network none"
         )
     quality = quality or _quality(design["time_limit"])
+    if "second" in s:
+        _complete_two_sided(s, source, quality, rays)
+        return
     # Sharp light's transport is right at every scale at once, if the net can hold it, and so is that of a source that shifts the
     # image, for the light behind its blur; otherwise from coarse to fine.
     moved = plain and fine_net and design["start"] != "offset" and (source.sharp or spread)
@@ -261,6 +322,22 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
     if design["loss"].strip() == "rms":  # eq. 5.2.1 knows the screen alone
         stages = [stage | {"apron": 0} for stage in stages]
     design["stages"] = stages
+
+
+def _complete_two_sided(s: Settings, source: Source, quality: str, rays: int | None) -> None:
+    """How a lens with two free-form sides is designed."""
+    lens, screen, design = s["lens"], s["screen"], s["design"]
+    if design["start"] != "transport":
+        raise InputError(f"⟨design.start⟩ of two free-form sides must be transport, got {design['start']}")
+    if design["waves"] == "on":
+        raise InputError("⟨design.waves⟩ on: two free-form sides are refined by rays alone")
+    if "control" not in lens:
+        lens["control"] = [min(TWO_SIDED_SPANS, refinement_spans(max(screen["resolution"]), quality)) + p for p in lens["degree"]]
+    design.setdefault("preconditioner", "laplacian")
+    if "stages" not in design:
+        design["stages"] = two_sided(tuple(lens["control"]), rays, tuple(screen["resolution"]), quality)
+    else:
+        design["stages"] = [_complete_stage(stage, s, _sampler(source)) for stage in design["stages"]]
 
 
 def without_waves(s: Settings, given: bool) -> str:

@@ -162,6 +162,27 @@ def refinement(
     return stages
 
 
+#: The same of two free-form sides, whose rays are traced stage by stage: rays for each pixel, most, finer, iterations; and the most
+#: knot spans.
+TWO_SIDED = {
+    "draft": (8, 500_000, 2, 30),
+    "standard": (16, 1_000_000, 3, 80),
+    "fine": (32, 2_000_000, 4, 200),
+}
+TWO_SIDED_SPANS = 256
+
+
+def two_sided(control: tuple[int, int], rays: int | None, resolution: tuple[int, int], quality: str = "standard") -> list[Table]:
+    """The stage of two free-form sides after their start; arguments as of `refinement`."""
+    check("quality", quality)
+    each, most, finer, iterations = TWO_SIDED[quality]
+    pixels = resolution[0] * resolution[1]
+    rays = rays or max(LEAST_RAYS, min(most, each * pixels))
+    finer = max(1, min(finer, math.isqrt(rays // pixels)))
+    apron = math.ceil(0.04 * max(resolution))
+    return [on_rays(control, rays, "grid", apron=apron, iterations=iterations, oversample=finer)]
+
+
 #: What a quality means for the refinement on the wave image: wavelengths of white light, iterations of each stage, and how many
 #: seconds `waves = "auto"` may take for it on two cores.
 WAVES = {

@@ -22,7 +22,7 @@ from caustic_cli import __version__
 from caustic_cli.config.table import Setting, check, default, in_section
 from caustic_cli.errors import InputError
 from caustic_cli.io.files import read_bytes
-from caustic_cli.scene import Lens, Light, Offset, Scene, Screen, Source, sources
+from caustic_cli.scene import Lens, Light, Offset, Scene, Screen, Second, Source, sources
 from caustic_cli.scene.materials import refractive_index
 
 #: Settings by section and key.
@@ -44,13 +44,15 @@ _TOKEN = re.compile(
 
 def _schema() -> dict[str, dict[str, Setting]]:
     """Keys of every section: those of the table, and of [source] what types of source have of their own."""
-    found = {section: in_section(section) for section in ("source", "lens", "screen", "target", "design")}
+    found = {section: in_section(section) for section in ("source", "lens", "screen", "target", "second", "design")}
     found["source"]["type"] = replace(found["source"]["type"], help=sources.in_words())
     found["source"] |= {key: Setting(f"source.{key}", *spec) for key, spec in sources.own_keys().items()}
     return found
 
 
 SCHEMA = _schema()
+#: Sections without which a project is whole.
+OPTIONAL = ("second",)
 STAGE = in_section("design.stages")
 #: Keys that hold tables: their heading in the file, and what each may say.  Sources beside the first are those of [source] also;
 #: FIRST is the first's alone.
@@ -214,8 +216,9 @@ def near(name: str, known) -> str:
 
 
 def with_defaults(settings: Settings) -> Settings:
-    """Settings with every section present and constant defaults filled in."""
-    return {section: {**DEFAULTS[section], **settings.get(section, {})} for section in SCHEMA}
+    """Settings with every section present that a project must have, and constant defaults filled in."""
+    sections = [section for section in SCHEMA if section in settings or section not in OPTIONAL]
+    return {section: {**DEFAULTS[section], **settings.get(section, {})} for section in sections}
 
 
 def dump(settings: Settings) -> str:
@@ -228,7 +231,7 @@ def dump(settings: Settings) -> str:
     for section, keys in SCHEMA.items():
         first = settings.get(section, {})
         also = first.get("also", []) if section == "source" else []
-        for table in (first, *also):
+        for table in (first, *also) if section in settings or section not in OPTIONAL else ():
             lines += ["", f"[[{section}]]" if also else f"[{section}]", *_assignments(table, keys)]
     for stage in settings.get("design", {}).get("stages", []):
         lines += ["", "[[design.stages]]", *_assignments(stage, STAGE)]
@@ -300,7 +303,21 @@ def build_source(settings: Settings, profile: np.ndarray | None = None, type: st
 
 def build_scene(settings: Settings, profile: np.ndarray | None = None) -> Scene:
     """The whole scene; `profile` is the source's irradiance if [source] names one."""
-    return Scene(build_source(settings, profile), build_lens(settings), build_screen(settings), build_light(settings))
+    return Scene(
+        build_source(settings, profile), build_lens(settings), build_screen(settings), build_light(settings), build_second(settings)
+    )
+
+
+def build_second(settings: Settings) -> Second | None:
+    """What the [second] section says that light does behind the picture."""
+    s = settings.get("second", {})
+    if "file" in s:
+        screen = build_screen(settings)
+        margin = [a / b for a, b in zip(screen.size, settings["target"]["size"], strict=True)]
+        return Second(Screen((margin[0] * s["size"][0], margin[1] * s["size"][1]), s["z"], screen.resolution))
+    if "focus" in s:
+        return Second(focus=tuple(s["focus"]))
+    return Second() if s.get("collimate") else None
 
 
 def build_screen(settings: Settings) -> Screen:

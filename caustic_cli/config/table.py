@@ -147,11 +147,12 @@ _ROWS = (
     # The lens
     Setting("lens.size", "numbers", "full width and height of the lens' aperture", "mm", *LENS, default=[10.0, 10.0],
             why="table D.2 of the thesis, in millimetres", option=Option("--lens-size", "W[xH]")),
-    Setting("lens.z_in", "number", "flat entrance surface", "mm", -checks.LENGTH, checks.LENGTH, default=0.0,
+    Setting("lens.z_in", "number", "flat entrance surface, or the plane from which a free-form one is counted", "mm",
+            -checks.LENGTH, checks.LENGTH, default=0.0,
             why="the lens' origin"),
     Setting("lens.thickness", "number", "of the offset surface at the centre, from the lens' origin", "mm", -checks.LENGTH,
-            checks.LENGTH, derived="half the width of a lens up to 20 mm; of a wider one, what leaves a wall of 3 mm",
-            why="table D.2 of the thesis; a plate is thin",
+            checks.LENGTH, derived="half the width of a lens up to 20 mm; of a wider one, what leaves a wall of 3 mm; with two"
+            " free-form sides twice the width", why="table D.2 of the thesis; a plate is thin; between two sides light has to move",
             option=Option("--thickness", "MM")),
     Setting("lens.radius", "numbers", "radius of the offset along x and y; inf is flat, positive spreads light", "mm",
             derived="the sphere that spreads light over the picture", why="table 6.1 of the thesis"),
@@ -218,6 +219,17 @@ _ROWS = (
             default=False, option=Option("--invert")),
     Setting("target.color", "flag", "red, green and blue apart (611, 549, 464 nm), with the glass' index for each", default=False,
             written=False, option=Option("--color")),
+    # What light does behind the picture: the lens then has two free-form sides
+    Setting("second.file", "text", "another picture, which the light goes on to make on a screen farther on; in this directory",
+            option=Option("--second", "PICTURE")),
+    Setting("second.z", "number", "distance of that screen from the lens' origin", "mm", *DISTANCE,
+            option=Option("--second-at", "MM")),
+    Setting("second.size", "numbers", "width and height of that picture", "mm", *SCREEN,
+            derived="that of a beam from the lens' edge through the first picture's", option=Option("--second-size", "W[xH]")),
+    Setting("second.collimate", "flag", "the light leaves the picture parallel to the axis", default=False, written=False,
+            option=Option("--collimate")),
+    Setting("second.focus", "points", "point towards which the light leaves the picture", "mm", *DISTANCE,
+            option=Option("--focus", "X,Y,Z")),
     # How the lens is found
     Setting("quality", "text", "of the default stages: draft, standard or fine", choices=("draft", "standard", "fine"),
             derived="standard, or by the time limit", option=Option("--quality")),

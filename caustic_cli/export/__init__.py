@@ -24,6 +24,8 @@ MESHES = ("stl", "ply", "obj", "mitsuba")
 #: Formats of solids, whose back a mirror needs; those that lie as the part is cut; and those that can be its mould.
 SOLIDS, AS_CUT = ("step", "stl", "ply", "obj"), ("heightmap", "gcode")
 MOULDS = (*SOLIDS, *AS_CUT)
+#: Formats that hold both sides where both are free-form.
+TWO_SIDED = ("lighttools", *SOLIDS, "mitsuba")
 #: Formats whose tolerance says how finely they are sampled, and those that have no samples.
 WITHIN, UNSAMPLED = (*MESHES, "heightmap", "gcode"), ("step", "gcode")
 #: Further suffixes that a format goes by.

@@ -21,6 +21,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.export.surface import sample_grid
 from caustic_cli.io.files import MARK, atomic_path
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import front_of
 from caustic_cli.scene import Scene, Source
 
 FORMAT_VERSION = 1
@@ -33,8 +34,8 @@ def write_lighttools(
 
     Keys: points, normals (N, 3); shape (2,); x (nx,), y (ny,), z (nx, ny); lens_half_size (2,), z_in, refractive_index;
     screen_half_size (2,), z_screen, resolution (2,); those of `_source`; fresnel unless exact; aperture if a circle; mirror, 1, of
-    one; control_points (n, m, 3) with x, y at the Greville abscissae, degrees (2,), knots_u, knots_v on [0, 1]; unit,
-    format_version, created_by.
+    one; those of `_entrance` where it is free-form; control_points (n, m, 3) with x, y at the Greville abscissae, degrees (2,),
+    knots_u, knots_v on [0, 1]; unit, format_version, created_by.
 
     Args:
         heights: (n, m) control heights, mm.
@@ -67,6 +68,7 @@ def write_lighttools(
         "degrees": np.array([s.degree for s in field.spaces], np.int64),
         "knots_u": field.spaces[0].knots.numpy(),
         "knots_v": field.spaces[1].knots.numpy(),
+        **_entrance(scene),
         "unit": np.array("mm"),
         "format_version": np.array(FORMAT_VERSION, np.int64),
         "created_by": np.array(f"caustic {__version__}"),
@@ -75,6 +77,22 @@ def write_lighttools(
         np.savez(file, **arrays)  # dates every entry 1980-01-01
         with zipfile.ZipFile(file, "a") as archive:
             archive.comment = MARK
+
+
+def _entrance(scene: Scene) -> dict[str, np.ndarray]:
+    """Of a free-form entrance: entrance_control_points (n, m, 3), entrance_degrees, entrance_knots_u, entrance_knots_v."""
+    if scene.lens.front is None:
+        return {}
+    front = front_of(scene.lens)
+    x, y = (c.numpy() for c in front.field.control_xy())
+    x, y = np.broadcast_arrays(x[:, None], y[None, :])
+    u, v = front.field.spaces
+    return {
+        "entrance_control_points": np.stack([x, y, front.heights.numpy() + scene.lens.z_in], -1),
+        "entrance_degrees": np.array([u.degree, v.degree], np.int64),
+        "entrance_knots_u": u.knots.numpy(),
+        "entrance_knots_v": v.knots.numpy(),
+    }
 
 
 def _source(scene: Scene) -> dict[str, np.ndarray]:

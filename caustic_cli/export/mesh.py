@@ -1,5 +1,5 @@
-"""The lens as a closed, oriented triangle mesh: exit surface, walls along its border, flat entrance at z_in; or a mirror, whose
-material lies above its surface and up to z_in.
+"""The lens as a closed, oriented triangle mesh: exit surface, walls along its border, flat or free-form entrance; or a mirror,
+whose material lies above its surface and up to z_in.
 
 Corners run counter-clockwise seen from outside.  What the mesh formats (STL, PLY, OBJ) are made of.
 
@@ -33,6 +33,7 @@ from caustic_cli.export.surface import (
     second_derivative_bounds,
 )
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import front_of
 from caustic_cli.scene import Lens, Scene
 
 STRETCH = 1.28
@@ -61,7 +62,41 @@ def closed_mesh(
     Raises:
         InputError: samples and tolerance both; too few or too many points; or the surface reaches the entrance.
     """
+    if scene.lens.front is not None:
+        return _between(*(side.points for side in both_patches(scene.lens, field, heights, samples, tolerance)), scene.lens)
     return solid(patch(scene.lens, field, heights, samples, tolerance).points, scene.lens)
+
+
+def both_patches(
+    lens: Lens, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None, tolerance: float | None = None
+) -> tuple[Patch, Patch]:
+    """Free-form entrance and exit of a lens, on as many points, normals towards +z; arguments as of `closed_mesh`."""
+    entrance = front_of(lens)
+    surfaces = (entrance.field, entrance.heights + lens.z_in), (field, heights)
+    found = [patch(lens, *surface, samples, tolerance) for surface in surfaces]
+    shapes = [p.points.shape[:2] for p in found]
+    if shapes[0] != shapes[1]:
+        found = [patch(lens, *surface, (max(s[0] for s in shapes), max(s[1] for s in shapes))) for surface in surfaces]
+    return found[0], found[1]
+
+
+def _between(low: np.ndarray, high: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
+    """The closed mesh between two patches (nx, ny, 3) over the same points of the aperture.
+
+    Raises:
+        InputError: they touch, or there is a border, for which such a lens has no flat place.
+    """
+    if lens.border > 0:
+        raise InputError("⟨lens.border⟩ cannot be had where both sides are free-form: there is no flat entrance for its rim")
+    least = float((high[..., 2] - low[..., 2]).min())
+    if not least > 0:
+        raise InputError(f"a solid needs its exit above its entrance everywhere, got a least thickness of {least:.6g} mm")
+    nx, ny = high.shape[:2]
+    top, below = rim_of(nx, ny), nx * ny + rim_of(nx, ny)
+    after, after_below = np.roll(top, -1), np.roll(below, -1)
+    walls = [np.stack([below, after_below, after], -1), np.stack([below, after, top], -1)]
+    entrance = nx * ny + triangles(low)[:, ::-1]
+    return np.concatenate([high.reshape(-1, 3), low.reshape(-1, 3)]), np.concatenate([triangles(high), *walls, entrance])
 
 
 def patch(

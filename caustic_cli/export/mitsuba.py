@@ -23,7 +23,7 @@ import numpy as np
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.export.mesh import Patch, patch, refuse_open, rim_of, triangles
+from caustic_cli.export.mesh import Patch, both_patches, patch, refuse_open, rim_of, triangles
 from caustic_cli.export.ply import write_mesh
 from caustic_cli.export.surface import STEPS_PER_SPAN
 from caustic_cli.export.text import CREATED, real
@@ -46,12 +46,14 @@ SPIN = '<rotate x="1" angle="180"/>'
 BLACK = '<bsdf type="diffuse"><rgb name="reflectance" value="0"/></bsdf>'
 
 
-def companions(path: str | Path, round: bool = True, mirror: bool = False) -> list[Path]:
-    """The meshes beside a scene file: of the exit surface, of the sides, and of a round lens' holder; of a mirror."""
+def companions(path: str | Path, round: bool = True, mirror: bool = False, two_sided: bool = False) -> list[Path]:
+    """The meshes beside a scene file: of the exit surface, of the sides, of a round lens' holder, of a free-form entrance; of a
+    mirror."""
     path = Path(path)
     if mirror:
         return [path.with_name(f"{path.stem}-mirror.ply")]
-    return [path.with_name(f"{path.stem}-{name}.ply") for name in ("exit", "sides", "holder")[: 3 if round else 2]]
+    names = ["exit", "sides"] + ["holder"] * round + ["entrance"] * two_sided
+    return [path.with_name(f"{path.stem}-{name}.ply") for name in names]
 
 
 def write_mitsuba(
@@ -72,23 +74,33 @@ def write_mitsuba(
     if scene.lens.mirror:
         _write_mirror(path, scene, surface, light)
         return
-    refuse_open(float(surface.points[..., 2].min()), scene.lens.z_in)
+    front = None
+    if scene.lens.front is None:
+        refuse_open(float(surface.points[..., 2].min()), scene.lens.z_in)
+    else:
+        front, surface = both_patches(scene.lens, field, heights, samples, tolerance)
     exit_mesh, sides = companions(path, False)
     points, normals = (a.reshape(-1, 3) for a in (surface.points, surface.normals))
     write_mesh(exit_mesh, points, triangles(surface.points), normals, text=False)
     rim = points[rim_of(*surface.points.shape[:2])]
-    write_mesh(sides, *_strip(rim, rim * [1.0, 1.0, 0.0] + [0.0, 0.0, scene.lens.z_in]), text=False)
+    low = rim * [1.0, 1.0, 0.0] + [0.0, 0.0, scene.lens.z_in]
+    write_mesh(
+        sides, *_strip(rim, low if front is None else front.points.reshape(-1, 3)[rim_of(*front.points.shape[:2])]), text=False
+    )
     lens, screen = scene.lens, scene.screen
     glass = f'<bsdf type="dielectric"><float name="int_ior" value="{real(lens.index)}"/><float name="ext_ior" value="1"/></bsdf>'
     rx, ry = lens.half_size
     flat, holder = ("disk", _round_holder(path, rx, lens.z_in, BLACK)) if lens.round else ("rectangle", _holder(lens, BLACK))
     away = 0.9 * (screen.z - float(points[:, 2].max()))
+    place = f'<transform name="to_world">{SPIN}<scale x="{real(rx)}" y="{real(ry)}"/><translate z="{real(lens.z_in)}"/></transform>'
+    entrance = [f'<shape type="{flat}" id="entrance">', f"  {glass}", f"  {place}", "</shape>"]
+    if front is not None:
+        mesh = companions(path, lens.round, two_sided=True)[-1]
+        write_mesh(mesh, front.points.reshape(-1, 3), triangles(front.points)[:, ::-1], -front.normals.reshape(-1, 3), text=False)
+        entrance = [f'<shape type="ply" id="entrance"><string name="filename" value="{mesh.name}"/>{glass}</shape>']
     lines = [
         *_camera(screen, away, f'<scale x="-1"/><translate z="{real(screen.z - away)}"/>'),
-        f'<shape type="{flat}" id="entrance">',
-        f"  {glass}",
-        f'  <transform name="to_world">{SPIN}<scale x="{real(rx)}" y="{real(ry)}"/><translate z="{real(lens.z_in)}"/></transform>',
-        "</shape>",
+        *entrance,
         f'<shape type="ply" id="exit"><string name="filename" value="{exit_mesh.name}"/>{glass}</shape>',
         f'<shape type="ply" id="sides"><string name="filename" value="{sides.name}"/>'
         f'<boolean name="face_normals" value="true"/>{BLACK}</shape>',

@@ -1,5 +1,5 @@
-"""The lens as an exact solid in a STEP file (ISO 10303-21, application protocol 214): entrance plane, exit B-spline, four sides; or
-a mirror, whose material lies above its surface and up to z_in.
+"""The lens as an exact solid in a STEP file (ISO 10303-21, application protocol 214): entrance plane or B-spline, exit B-spline,
+four sides; or a mirror, whose material lies above its surface and up to z_in.
 
 The exit surface's poles stand at the Greville abscissae with the control heights as they are, to the last bit; its borders are
 B-spline curves with the border's poles.  Each border lies in a plane x = const or y = const, which is a side.  Of a round lens
@@ -21,12 +21,13 @@ from scipy.interpolate import make_interp_spline
 from torch import Tensor
 
 from caustic_cli import __version__
-from caustic_cli.export.mesh import FLANGE, refuse_open
+from caustic_cli.export.mesh import FLANGE, closed_mesh, refuse_open
 from caustic_cli.export.surface import sample_grid
 from caustic_cli.export.text import CREATED
 from caustic_cli.io.files import atomic_path
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import front_of
 from caustic_cli.scene import Lens, Scene
 
 HEAD = f"""ISO-10303-21;
@@ -118,11 +119,12 @@ def write_step(path: str | Path, scene: Scene, field: HeightField, heights: Tens
     if mirror:  # the solid of the mirrored surface, mirrored back
         net, heights = -net, -heights
         scene = replace(scene, lens=replace(scene.lens, z_in=-scene.lens.z_in))
-    refuse_open(float(net.min()), scene.lens.z_in)
-    x, y = (c.numpy() for c in field.control_xy())
-    x, y = np.broadcast_arrays(x[:, None], y[None, :])
+    if scene.lens.front is None:
+        refuse_open(float(net.min()), scene.lens.z_in)
+    else:
+        closed_mesh(scene, field, heights)  # which refuses what is no solid
     out = Entities(mirror)
-    solid = lens_solid(out, scene.lens, field, heights, np.stack([x, y, net], -1))
+    solid = lens_solid(out, scene.lens, field, heights, poles_of(field, net))
     _product(out, solid, ROUND_UNCERTAINTY if scene.lens.round else UNCERTAINTY)
     with atomic_path(path) as temporary, open(temporary, "w", encoding="ascii", newline="\n") as file:
         file.write(HEAD)
@@ -130,15 +132,27 @@ def write_step(path: str | Path, scene: Scene, field: HeightField, heights: Tens
         file.write(TAIL)
 
 
-def lens_solid(out: Entities, lens: Lens, field: HeightField, heights: Tensor, poles: np.ndarray) -> str:
-    """The solid under the surface with poles (n, m, 3)."""
+def poles_of(field: HeightField, net: np.ndarray) -> np.ndarray:
+    """(n, m, 3) mm: control heights (n, m) at the Greville abscissae."""
+    x, y = (c.numpy() for c in field.control_xy())
+    return np.stack([*np.broadcast_arrays(x[:, None], y[None, :]), net], -1)
+
+
+def _spline_surface(out: Entities, field: HeightField, poles: np.ndarray) -> tuple[str, list[list[str]]]:
+    """The surface with poles (n, m, 3), and its points."""
     su, sv = field.spaces
     points = [[out.point(p) for p in row] for row in poles]
     control = ",".join("(" + ",".join(row) + ")" for row in points)
-    exit_surface = out.add(
+    surface = out.add(
         f"B_SPLINE_SURFACE_WITH_KNOTS('',{su.degree},{sv.degree},({control}),.UNSPECIFIED.,.F.,.F.,.F.,"
         f"{','.join(_knots(su.knots.numpy(), sv.knots.numpy()))},.UNSPECIFIED.)"
     )
+    return surface, points
+
+
+def lens_solid(out: Entities, lens: Lens, field: HeightField, heights: Tensor, poles: np.ndarray) -> str:
+    """The solid under the surface with poles (n, m, 3)."""
+    exit_surface, points = _spline_surface(out, field, poles)
     if lens.round:
         rim, lowest = _round_rim(out, field, heights)
     else:
@@ -146,6 +160,15 @@ def lens_solid(out: Entities, lens: Lens, field: HeightField, heights: Tensor, p
         rim = _rim(out, poles, points, field.spaces)
         lowest = min(float(edge.min()) for edge in (grid.z[0], grid.z[-1], grid.z[:, 0], grid.z[:, -1]))
     faces, upper, z_in = [out.face(exit_surface, out.bound(rim.edges), along=not lens.mirror)], rim, lens.z_in
+    if lens.front is not None:
+        front = front_of(lens)
+        low = front.heights + z_in
+        entrance, points = _spline_surface(out, front.field, poles := poles_of(front.field, low.numpy()))
+        foot = _round_rim(out, front.field, low)[0] if lens.round else _rim(out, poles, points, front.field.spaces)
+        faces += _walls(out, lens, rim, foot, 0.0)
+        faces.append(out.face(entrance, out.bound(_reversed(foot.edges)), along=False))
+        shell = out.add(f"CLOSED_SHELL('',({','.join(faces)}))")
+        return out.add(f"MANIFOLD_SOLID_BREP('lens',{shell})")
     if lens.border > 0:
         high = z_in + FLANGE * (lowest - z_in)
         inner, upper = _flat(out, lens, 0.0, high), _flat(out, lens, lens.border, high)

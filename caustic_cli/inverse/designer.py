@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -28,6 +29,7 @@ from caustic_cli.inverse.robust import RobustObjective
 from caustic_cli.inverse.schedule import Stage
 from caustic_cli.inverse.steps import Adam, Newtonlike
 from caustic_cli.inverse.target import grey
+from caustic_cli.inverse.two_sided import TwoSidedObjective
 from caustic_cli.inverse.waves import WaveObjective
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.sampling import stream
@@ -106,9 +108,20 @@ class Designer:
         target: (n_x, n_y) irradiance on the scene's screen, not all zero.
         stages, options: how.
         device: where rays are traced.
+        second: (k_x, k_y) irradiance on the scene's second screen, where it has one.
+
+    Of two free-form sides heights are those of entrance and exit, (2, n, m).
     """
 
-    def __init__(self, scene: Scene, target: Tensor, stages: list[Stage], options: Options, device: str = "cpu"):
+    def __init__(
+        self,
+        scene: Scene,
+        target: Tensor,
+        stages: list[Stage],
+        options: Options,
+        device: str = "cpu",
+        second: Tensor | None = None,
+    ):
         if not stages:
             raise InputError("[[design.stages]] at least one stage is needed")
         if scene.lens.knots is not None and any(s.control != scene.lens.control for s in stages):
@@ -121,6 +134,7 @@ class Designer:
                 "⟨design.loss⟩: throughput needs dark pixels around the screen that catch stray light; every stage needs an apron"
             )
         self.scene, self.target, self.stages, self.options, self.device = scene, target, stages, options, device
+        self.second = second
         if options.network != "none" and any(s.waves for s in stages):
             raise InputError("⟨design.stages.waves⟩ needs network none: the wave image refines the heights themselves")
         for stage in stages:
@@ -202,13 +216,13 @@ class Designer:
         Raises:
             CausticError: no surface near them obeys these.
         """
-        return within_limits(
-            self.field(state.stage),
-            state.heights,
-            self._bounds(self.stages[state.stage]),
-            self.options.max_slope,
-            self.options.min_radius,
-        )
+        field, bounds, o = self.field(state.stage), self._bounds(self.stages[state.stage]), self.options
+        if state.heights.ndim == 2:
+            return within_limits(field, state.heights, bounds, o.max_slope, o.min_radius)
+        (low, low_exit), (high, high_exit) = bounds
+        # What is concave of an entrance, seen from outside, is convex from within.
+        entrance = within_limits(field, -state.heights[0], (-high, -low), o.max_slope, o.min_radius)
+        return torch.stack([-entrance, within_limits(field, state.heights[1], (low_exit, high_exit), o.max_slope, o.min_radius)])
 
     def _stage(self, state: State, k: int, limit: int, deadline: float, stop, on_iteration, notice, origin: float) -> bool:
         """Iterate stage k in place.  True: the stage is done; False: the whole design ends here, for `state.reason`."""
@@ -261,7 +275,7 @@ class Designer:
             state.parameters, state.optimizer, state.image = heights.state_dict(), method.state(), method.image
             on_iteration(state)
 
-    def _objective(self, k: int, heights: Heights) -> Objective | WaveObjective | RobustObjective:
+    def _objective(self, k: int, heights: Heights) -> Objective | WaveObjective | RobustObjective | TwoSidedObjective:
         o = self.options
         if o.robust is None or k < len(self.stages) - 1:
             return self._objective_in(self.scene, k, heights.begun())
@@ -271,7 +285,7 @@ class Designer:
 
         return RobustObjective(objective, self.scene, self.field(k), heights.begun(), o.robust)
 
-    def _objective_in(self, scene: Scene, k: int, begun: Tensor) -> Objective | WaveObjective:
+    def _objective_in(self, scene: Scene, k: int, begun: Tensor) -> Objective | WaveObjective | TwoSidedObjective:
         """That of stage k in a scene, for heights near `begun`."""
         stage, o = self.stages[k], self.options
         if stage.source is not None:
@@ -290,6 +304,23 @@ class Designer:
                 min_radius=o.min_radius,
                 dtype=o.dtype,
                 device=self.device,
+            )
+        if scene.second is not None:
+            targets = (self.target,) if self.second is None else (self.target, self.second)
+            return TwoSidedObjective(
+                scene,
+                self.field(k),
+                rays_of(scene, stage.sampler, stage.rays, stream(o.seed, f"stage {k}"), self.device),
+                stage.filter,
+                targets,
+                o.loss,
+                blur=stage.blur,
+                filter_target=o.filter_target,
+                apron=stage.apron,
+                max_slope=o.max_slope,
+                min_radius=o.min_radius,
+                oversample=stage.oversample,
+                dtype=o.dtype,
             )
         if stage.spread and (spread := shift_of(scene, self.field(k), begun)) is not None:
             expected = best_light(scene, grey(self.target.cpu().numpy()), spread, SMOOTH_STEPS).kept
@@ -354,6 +385,9 @@ class Designer:
             raise InputError(
                 f"⟨screen.z⟩ must lie behind the lens, whose surface may reach {high.max():.4g} mm, got {screen.z:g} mm"
             )
+        if self.scene.second is not None:
+            reach = np.full_like(low, lens.height_range[1])
+            low, high = np.stack([-reach, low]), np.stack([reach, high])
         return torch.from_numpy(low), torch.from_numpy(high)
 
     @staticmethod

@@ -14,6 +14,7 @@ f = I(q) (1 - R(q)) (1 + q^2)^(-3/2) |d(s_x, s_y) / d(x, y)|.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -39,6 +40,12 @@ def incident(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple
     """
     light, directions = _square(scene, x, y, z)
     return (light * _part_within(x, y, scene.lens.half_size[0]) if scene.lens.round else light), directions
+
+
+def on_entrance(scene: Scene, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, tuple | None]:
+    """The same in air, on the plane of the entrance: as if the lens there had the index 1 and no thickness."""
+    air = replace(scene, lens=replace(scene.lens, index=1.0 + 1e-9, glass=None, fresnel="none", front=None), second=None)
+    return incident(air, x, y, np.full((len(x), len(y)), scene.lens.z_in))
 
 
 def _part_within(x: np.ndarray, y: np.ndarray, radius: float, parts: int = 8) -> np.ndarray:

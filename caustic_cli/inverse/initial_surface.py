@@ -184,11 +184,12 @@ def first_surface(scene: Scene, target: np.ndarray, field: HeightField, cells: i
         for _ in range(1 if scene.source.distant else PASSES):
             found = grid.solved(*incident(scene, grid.x, grid.y, z), float(grid.offset.mean()), found)
             z = found.heights
-        return InitialSurface(_net(grid, z, field))
+        return InitialSurface(net_of(grid.x, grid.y, z, field))
     few = _Grid.of(scene, target, min(cells, FEW_CELLS))
     best = _best(few, lens.offset.thickness, fixed)
     found = grid.cut(few.scaled(best.z, grid), best.middle, PASSES - 1)
-    return InitialSurface(_net(grid, found.z, field).clamp_min(grid.floor), best.middle)  # a spline through a kink undershoots
+    net = net_of(grid.x, grid.y, found.z, field)
+    return InitialSurface(net.clamp_min(grid.floor), best.middle)  # a spline through a kink undershoots
 
 
 def _best(grid: _Grid, middle: float, fixed: bool) -> _Cut:
@@ -218,9 +219,9 @@ def _best(grid: _Grid, middle: float, fixed: bool) -> _Cut:
     return max(tried, key=lambda t: t[0])[1]
 
 
-def _net(grid: _Grid, z: np.ndarray, field: HeightField) -> Tensor:
-    """Control heights of the surface with these heights."""
-    spline = RectBivariateSpline(grid.x, grid.y, z)
+def net_of(x: np.ndarray, y: np.ndarray, z: np.ndarray, field: HeightField) -> Tensor:
+    """Control heights (n, m) of the surface with these heights at corners x (k,), y (l,): z (k, l), mm."""
+    spline = RectBivariateSpline(x, y, z)
     at = [torch.linalg.inv(s.matrix(s.greville)) for s in field.spaces]
     values = torch.from_numpy(spline(*(c.numpy() for c in field.control_xy())))
     net = at[0] @ values @ at[1].T

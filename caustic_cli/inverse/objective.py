@@ -22,7 +22,7 @@ from caustic_cli.optics.memory import smaller
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.spread import Convolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import EXIT
+from caustic_cli.optics.system import ENTRANCE, EXIT
 from caustic_cli.optics.trace import Parameters, Tracer, tracers
 from caustic_cli.scene import Scene
 
@@ -42,8 +42,8 @@ class Evaluation:
 
     @property
     def gradient(self) -> Tensor:
-        """That of a lens' exit."""
-        return self.gradients[EXIT]
+        """That of a lens' exit, or of both sides, (2, n, m)."""
+        return torch.stack([*self.gradients.values()]) if ENTRANCE in self.gradients else self.gradients[EXIT]
 
 
 def penalty_of(

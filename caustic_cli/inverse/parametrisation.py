@@ -42,7 +42,7 @@ def cosine_transform(n: int) -> Tensor:
 
 
 class Heights(torch.nn.Module):
-    """Control heights between two bounds; `forward()` gives (n, m) float64, mm.
+    """Control heights between two bounds; `forward()` gives (n, m) float64, mm; of two sides all are (2, n, m).
 
     Args:
         low, high: (n, m) bounds of the heights, mm.
@@ -84,7 +84,7 @@ class FreeHeights(Heights):
         self.register_buffer("start", raw if counted else None)
         self.y = torch.nn.Parameter(torch.zeros_like(raw) if counted else raw.clone())
         if laplacian:
-            n, m = low.shape
+            n, m = low.shape[-2:]
             self.cu, self.cv = cosine_transform(n).to(low), cosine_transform(m).to(low)
             lam = [4.0 * torch.sin(0.5 * math.pi * torch.arange(k).to(low) / k) ** 2 for k in (n, m)]
             total = lam[0][:, None] + lam[1][None, :]

@@ -103,8 +103,8 @@ def surface(
     began = time.perf_counter()
     shape = np.shape(source)
     mirror = index == -1.0
-    if not (mirror or 1.0 < index <= 5.0):
-        raise InputError(f"index must be more than 1 and at most 5, got {index!r}")
+    if not (mirror or 1.0 < index <= 5.0 or 0.2 <= index < 1.0):
+        raise InputError(f"index must be more than 1 and at most 5, or its inverse, got {index!r}")
     if not (np.isfinite(z_screen) and np.isfinite(thickness) and (z_screen < thickness if mirror else z_screen > thickness)):
         where = "before the mirror's" if mirror else "beyond the lens'"
         raise InputError(f"the screen at {z_screen!r} mm must lie {where} height of {thickness!r} mm")
@@ -176,7 +176,6 @@ def heights(map_: Transport, aim, x, y, d, index: float, z_screen: float, mean: 
     Raises:
         OutOfReach: no refraction sends light of a lit corner where it is aimed.
     """
-    forward, n = math.copysign(1.0, index), abs(index)
     step = float(x[1, 0] - x[0, 0]), float(y[0, 1] - y[0, 0])
     scale = 1.0 / ((index - 1.0) * (z_screen - mean))
     main = scale * (map_.potential - 0.5 * (x * x + y * y))
@@ -184,18 +183,31 @@ def heights(map_: Transport, aim, x, y, d, index: float, z_screen: float, mean: 
     z = main - main.mean() + mean
     for _ in range(REPEATS):
         tx, ty, tz = aim[0] - x, aim[1] - y, z_screen - z
-        length = np.sqrt(tx * tx + ty * ty + tz * tz)
-        lean = n * d[2] - tz / length  # N_z, up to a factor
-        within = (index * (d[0] * tx + d[1] * ty + d[2] * tz) > forward * length) & (forward * tz > 0)  # t . N > 0
+        within = refracted(tx, ty, tz, d, index)
         if not within[lit].all():
             raise OutOfReach(lit & ~within)
-        rest = [
-            np.where(within, (t / length - n * v) / np.where(within, lean, 1.0) - s, 0.0)
-            for t, v, s in zip((tx, ty), d, slope, strict=False)
-        ]
+        rest = [np.where(within, w - s, 0.0) for w, s in zip(slopes_to(tx, ty, tz, d, index), slope, strict=True)]
         z = main + integrate(*rest, step)
         z += mean - z.mean()
     return z
+
+
+def refracted(tx, ty, tz, d, index: float) -> np.ndarray:
+    """Where a surface can turn rays d towards (tx, ty, tz): from glass of that index into air, into glass of 1 / index, or by
+    reflection (-1)."""
+    forward = math.copysign(1.0, index)
+    turns = max(index, 1.0 / index) if index > 0 else index
+    length = np.sqrt(tx * tx + ty * ty + tz * tz)
+    return (turns * (d[0] * tx + d[1] * ty + d[2] * tz) > forward * length) & (forward * tz > 0)  # t . N > 0
+
+
+def slopes_to(tx, ty, tz, d, index: float) -> tuple[np.ndarray, np.ndarray]:
+    """Slopes of the surface that turns rays d towards (tx, ty, tz), see above; without meaning where none can (`refracted`)."""
+    n = abs(index)
+    length = np.sqrt(tx * tx + ty * ty + tz * tz)
+    lean = n * d[2] - tz / length  # N_z, up to a factor
+    lean = np.where(lean == 0.0, 1.0, lean)
+    return (tx / length - n * d[0]) / lean, (ty / length - n * d[1]) / lean
 
 
 def integrate(sx: np.ndarray, sy: np.ndarray, step: tuple[float, float]) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from caustic_cli.io.arrays import Archive, open_npz
 from caustic_cli.io.surfaces import ACCEPTED, surface_of
 from caustic_cli.optics.bounds import refuse_without_glass
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import front_from
 from caustic_cli.scene import Disc, Lens, Light, PlaneWave, Points, Scene, Screen, Source
 from caustic_cli.scene.sources.distribution import MOST_ANGLES, Distribution
 from caustic_cli.scene.sources.points import MAX_POINTS
@@ -39,6 +41,9 @@ def open_archive(path: str | Path) -> tuple[Scene, HeightField, Tensor]:
             aperture=data.text("aperture", "rectangle"),
             mirror="mirror" in data,
         )
+        if "entrance_control_points" in data:
+            entrance, low = surface_of(data, "entrance_")
+            lens = replace(lens, front=front_from(entrance, low - lens.z_in))
         screen = Screen(
             tuple(2.0 * h for h in data.reals("screen_half_size", 2).tolist()), data.real("z_screen"), data.wholes("resolution", 2)
         )

@@ -86,18 +86,19 @@ def read_npz(path: Path, half_size: tuple[float, float]) -> tuple[HeightField, T
         return _of_this_size(surface_of(data), half_size)
 
 
-def surface_of(data: Archive) -> tuple[HeightField, Tensor]:
-    """The surface that an archive's arrays describe.
+def surface_of(data: Archive, side: str = "") -> tuple[HeightField, Tensor]:
+    """The surface that an archive's arrays describe; side: what the names of its own begin with, such as "entrance_".
 
     Raises:
         InputError: something is missing or not a surface.
     """
-    missing = [key for key in ("control_points", "degrees", "knots_u", "knots_v", "lens_half_size") if key not in data]
+    own = {key: side + key for key in ("control_points", "degrees", "knots_u", "knots_v")}
+    missing = [key for key in (*own.values(), "lens_half_size") if key not in data]
     if missing:
         raise InputError(f"has no {', '.join(missing)}; {ACCEPTED}")
-    degrees, half = data.wholes("degrees", 2), tuple(data.reals("lens_half_size", 2).tolist())
-    knots = [data.reals(key, None, most=MAX_CONTROL + MAX_DEGREE + 1) for key in ("knots_u", "knots_v")]
-    return _surface(data.reals("control_points", None, None, 3, most=MAX_CONTROL), degrees, knots, half)
+    degrees, half = data.wholes(own["degrees"], 2), tuple(data.reals("lens_half_size", 2).tolist())
+    knots = [data.reals(own[key], None, most=MAX_CONTROL + MAX_DEGREE + 1) for key in ("knots_u", "knots_v")]
+    return _surface(data.reals(own["control_points"], None, None, 3, most=MAX_CONTROL), degrees, knots, half)
 
 
 def read_step(path: Path, half_size: tuple[float, float]) -> tuple[HeightField, Tensor]:

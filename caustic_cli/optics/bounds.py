@@ -2,8 +2,10 @@
 
 Notation
     L           bound of |grad Z|: the derivative of a spline is a spline, and lies within the hull of its control net
-    phi         atan L, the most that the surface's normal leans from z
+    phi         atan L, the most that the surface's normal leans from z; psi, the most that a free-form entrance's does
     theta       the most that rays lean from z inside the lens
+    a           the most that rays lean from z before the lens: theta = psi + asin(sin(a - psi) / n), since a ray that leans to one
+                side is turned furthest from z where the normal leans to that side most
     i, o        angles of incidence and refraction at the exit: i <= theta + phi, sin o = n sin i
 
 A ray leaves with at most theta + (o - i) from z, because refraction turns it more the larger i is.  Over a surface of slope L it
@@ -24,6 +26,7 @@ from caustic_cli.optics.interface import reflectance, reflectances
 from caustic_cli.optics.resolution import Resolution, paraxial
 from caustic_cli.optics.sampling import LARGEST_NORMAL
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import front_of
 from caustic_cli.scene import Scene
 
 
@@ -76,7 +79,8 @@ def bounds_of(scene: Scene, field: HeightField, heights: Tensor, steeper: float 
     lens, indices = scene.lens, [band.scene.lens.inside for band in scene.bands]
     least, most = min(indices), max(indices)
     incidence = scene.source.incidence(scene.lens.half_size, scene.lens.z_in, scene.lens.round)
-    inside = math.asin(min(1.0, math.sin(incidence) / least))
+    front = 0.0 if lens.front is None else math.atan(math.hypot(*front_of(lens).slope_bounds(None)))
+    inside = front + math.asin(max(-1.0, min(1.0, math.sin(incidence - front) / least)))
     slope = field.slope_bound(heights) + steeper
     lean = math.atan(slope + lens.roughness * LARGEST_NORMAL)
     i = inside + lean
@@ -87,8 +91,8 @@ def bounds_of(scene: Scene, field: HeightField, heights: Tensor, steeper: float 
         out = inside + math.asin(critical) - i if critical < 1.0 else math.pi / 2.0
     slope_ratio = slope * math.tan(out) if out < math.pi / 2.0 else (math.inf if slope > 0 else 0.0)
     reach = _reach(scene, inside, float(heights.min()), float(heights.max()))
-    ghost, polarised = _ghost(scene, field, heights, inside, most), _polarised(incidence, critical, most)
-    focused = ghost_error(scene, field, heights, ghost, most)
+    ghost, polarised = _ghost(scene, field, heights, inside + front, most), _polarised(incidence + front, critical, most)
+    focused = 0.0 if scene.two_sided else ghost_error(scene, field, heights, ghost, most)
     seen = Resolution.at(scene, field, heights)
     return Bounds(incidence, inside, slope, lean, most, critical, slope_ratio, reach, ghost, focused, polarised, seen)
 
@@ -110,11 +114,12 @@ def _reach(scene: Scene, inside: float, lowest: float, top: float) -> float:
     """How far from the axis rays can be at the surface's greatest height, in half widths of the aperture; infinite where the
     surface may dip below the entrance, which rays then never meet from below."""
     source, lens = scene.source, scene.lens
-    if source.collimated:
+    if scene.axial:
         return 1.0
     if lowest < lens.z_in:
         return math.inf
-    drift = (top - lens.z_in) * math.tan(inside)
+    low = min(0.0, front_of(lens).hull(None)[0]) if lens.front is not None else 0.0
+    drift = (top - lens.z_in - low) * math.tan(min(inside, 1.57))
     if source.distant:
         return 1.0 + drift / min(lens.half_size)
     positions, extent, cone = source.points()[0], source.extent, source.cone_over(lens.half_size, lens.z_in, lens.round)
@@ -150,7 +155,7 @@ def _ghost(scene: Scene, field: HeightField, heights: Tensor, inside: float, n: 
         return torch.where(square > 0, value, torch.ones_like(value))
 
     both = part(inside + lean) * part(inside + 2.0 * lean)
-    even = scene.source.collimated and scene.source.profile is None and not lens.round
+    even = scene.axial and scene.source.profile is None and not lens.round
     return float((both * area).sum() if even else both.max())
 
 

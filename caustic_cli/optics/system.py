@@ -14,13 +14,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
+import torch
+from torch import Tensor
+
 from caustic_cli.config import checks
 from caustic_cli.config.table import TABLE
 from caustic_cli.errors import InputError
 from caustic_cli.optics.frames import Pose
-from caustic_cli.optics.surfaces import HeightField, Plane, Surface
+from caustic_cli.optics.surfaces import Fixed, HeightField, Plane, Surface
 from caustic_cli.optics.tolerances import PARALLEL
-from caustic_cli.scene import Aperture, Light, Pupil, Scene, Screen, Source
+from caustic_cli.scene import Aperture, Front, Lens, Light, Pupil, Scene, Screen, Source
 from caustic_cli.scene.materials import refractive_index
 
 INTERACTIONS = ("refract", "reflect")
@@ -86,6 +89,28 @@ class Element:
         return self.interaction == "reflect"
 
 
+def front_of(lens: Lens) -> Fixed:
+    """The free-form entrance of a lens that has one."""
+    front = lens.front
+    assert front is not None
+    shape = (front.heights.shape[0], front.heights.shape[1])
+    field = HeightField.of(replace(lens, control=shape, degree=front.degree, knots=front.knots, front=None))
+    return Fixed(field, torch.from_numpy(front.heights))
+
+
+def sides_of(scene: Scene, field: HeightField, heights: Tensor) -> tuple[Scene, Tensor]:
+    """A scene and the heights (n, m) of its exit, from heights that may be those of both sides, (2, n, m)."""
+    if heights.ndim == 2:
+        return scene, heights
+    return replace(scene, lens=replace(scene.lens, front=front_from(field, heights[0]))), heights[1]
+
+
+def front_from(field: HeightField, heights: Tensor) -> Front:
+    """The entrance with these heights (n, m), counted from its plane, mm."""
+    u, v = field.spaces
+    return Front(heights.detach().cpu().double().numpy(), (u.degree, v.degree), (u.knots.tolist(), v.knots.tolist()))
+
+
 @dataclass(frozen=True)
 class Placed:
     """A screen anywhere: `screen` says its size, pixels and shift, `pose` where its middle stands and which way it looks."""
@@ -130,9 +155,11 @@ class System:
 
     @classmethod
     def of(cls, scene: Scene, surface: HeightField | None = None) -> System:
-        """A one-lens scene: a flat entrance and a B-spline exit, or a B-spline mirror."""
+        """A one-lens scene: a flat entrance and a B-spline exit, or a B-spline mirror; of two free-form sides the entrance is free,
+        on the exit's spline spaces, unless the lens says its heights."""
         lens = scene.lens
         surface = surface or HeightField.of(lens)
+        entrance = Plane() if not scene.two_sided else surface if lens.front is None else front_of(lens)
         aperture = Aperture(lens.half_size, lens.round)
         elements: tuple[Element, ...]
         if lens.mirror:
@@ -141,7 +168,7 @@ class System:
             elements = (
                 Element(
                     ENTRANCE,
-                    Plane(),
+                    entrance,
                     aperture,
                     behind=Medium(lens.index, lens.absorption, lens.glass),
                     pose=Pose((0.0, 0.0, lens.z_in)),
@@ -149,7 +176,7 @@ class System:
                 ),
                 Element(EXIT, surface, aperture, fresnel=lens.fresnel, roughness=lens.roughness),
             )
-        return cls((scene.source,), elements, (scene.screen,), scene.light, lit=scene.pupil)
+        return cls((scene.source,), elements, (scene.screen,), scene.light, lit=None if scene.two_sided else scene.pupil)
 
     @property
     def pupil(self) -> Pupil:

@@ -1,6 +1,6 @@
 """checkpoints.h5: the lens as designed so far and everything needed to go on (HDF5).
 
-    /lens/heights             (n, m) float64, mm; attributes degree (2,)
+    /lens/heights             (n, m) float64, mm, or (2, n, m) of entrance and exit; attributes degree (2,)
     /lens/knots_u, knots_v    knot vectors on [0, 1]
     /start                    (n_0, m_0) float64, mm: the heights it began from, on the first stage's net
     /state                    attributes stage, iteration, total, seconds, reason
@@ -227,6 +227,6 @@ def _load(path: Path, file: BinaryIO) -> Checkpoint:
             f"{path}: is damaged or not a caustic checkpoint ({type(error).__name__}); a whole checkpoints.h5 is needed"
         ) from error
     nets = [state.heights] if state.start is None else [state.heights, state.start]
-    if tuple(state.heights.shape) != (spaces[0].n, spaces[1].n) or not all(bool(torch.isfinite(z).all()) for z in nets):
+    if tuple(state.heights.shape[-2:]) != (spaces[0].n, spaces[1].n) or not all(bool(torch.isfinite(z).all()) for z in nets):
         raise InputError(f"{path}: is damaged (its heights do not fit its knots); a whole checkpoints.h5 is needed")
     return checkpoint

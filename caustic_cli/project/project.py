@@ -10,9 +10,10 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from torch import Tensor
 
 from caustic_cli.config import settings
 from caustic_cli.config.completion import build_options, build_stages, complete
@@ -23,13 +24,16 @@ from caustic_cli.io.files import write_bytes
 from caustic_cli.io.picture import Picture, read_picture
 from caustic_cli.optics.bounds import refuse_without_glass
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import sides_of
 from caustic_cli.project import attachments, checkpoint
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.scene import Scene, sources
 
 TOML, CHECKPOINT, RENDER, WAVE, REPORT = "project.toml", "checkpoints.h5", "render.png", "wave.png", "report.png"
-#: What a design makes beside its inputs; WAVE only where diffraction is simulated.
-MADE = (CHECKPOINT, RENDER, WAVE, REPORT)
+#: The image on the second screen, of a design that has one.
+FARTHER = "render-second.png"
+#: What a design makes beside its inputs; WAVE only where diffraction is simulated, FARTHER only where there are two screens.
+MADE = (CHECKPOINT, RENDER, WAVE, REPORT, FARTHER)
 
 
 def is_project(path: Path) -> bool:
@@ -42,19 +46,30 @@ def beside(path: Path) -> Path:
     return path.with_stem(Path(WAVE).stem if path.stem == Path(RENDER).stem else f"{path.stem}-wave")
 
 
+class Designed(NamedTuple):
+    """A designed lens: its scene, the spline spaces and heights (n, m) mm of its exit, and the checkpoint it comes from."""
+
+    scene: Scene
+    field: HeightField
+    heights: Tensor
+    checkpoint: Checkpoint
+
+
 @dataclass(frozen=True, eq=False)
 class Project:
     """An opened project: its directory, complete settings, target picture and source profile.
 
-    path: None of one that is in memory alone; on_disk: whether its settings were read from there; asked: digest of what its user
-    gave (`uptodate`); found: the checkpoint, where the same had been asked for before; hold: what lets go of the directory when the
-    design that works there is done; without_waves: see `config.completion.without_waves`.
+    path: None of one that is in memory alone; second: the picture on a screen farther on; on_disk: whether its settings were read
+    from there; asked: digest of what its user gave (`uptodate`); found: the checkpoint, where the same had been asked for before;
+    hold: what lets go of the directory when the design that works there is done; without_waves: see
+    `config.completion.without_waves`.
     """
 
     path: Path | None
     settings: Settings
     picture: Picture
     profile: Picture | None = None
+    second: Picture | None = None
     asked: str = ""
     found: Checkpoint | None = None
     hold: ExitStack = field(default_factory=ExitStack, repr=False)
@@ -87,8 +102,10 @@ class Project:
                 _within(how["robust"])
                 given["design"] = attachments.with_errors(how, path)
             full = complete(given, picture.aspect)
+            other = full.get("second", {}).get("file")
+            second = _picture(path, other, full["target"]["encoding"] == "linear") if other else None
             build_stages(full), build_options(full)  # a project whose design is impossible is not opened for its lens either
-            return cls(path, full, picture, _picture(path, profile, True) if profile else None, on_disk=True)
+            return cls(path, full, picture, _picture(path, profile, True) if profile else None, second, on_disk=True)
         except InputError as error:
             raise InputError(f"{path / TOML}: {error!s}") from error
 
@@ -124,6 +141,13 @@ class Project:
             return np.stack(parts)
         return target_on_screen(light, tuple(t["size"]), scene.screen, t["flip"])
 
+    def second_target(self, scene: Scene) -> np.ndarray | None:
+        """The second picture on its screen, (n_x, n_y); None where there is none."""
+        if self.second is None or scene.second is None or scene.second.screen is None:
+            return None
+        size, flip = tuple(self.settings["second"]["size"]), self.settings["target"]["flip"]
+        return target_on_screen(self.second.irradiance(), size, scene.second.screen, flip)
+
     def load(self) -> Checkpoint:
         """The design so far."""
         return checkpoint.load(self.path / CHECKPOINT)
@@ -132,8 +156,8 @@ class Project:
         """Write the design so far."""
         checkpoint.save(self.path / CHECKPOINT, state)
 
-    def lens(self, scene: Scene) -> tuple[HeightField, Checkpoint]:
-        """The designed surface over the scene's aperture.
+    def lens(self, scene: Scene) -> Designed:
+        """The designed surface over the scene's aperture, and that scene with the designed entrance, if that is free-form.
 
         Raises:
             InputError: there is none, or project.toml was edited to another net than the lens was designed on.
@@ -152,11 +176,15 @@ class Project:
                 f"⟨lens.control⟩ {list(scene.lens.control)} is not that of the designed lens,"
                 f" {list(field.shape)}; design again to change it"
             )
+        if (state.state.heights.ndim == 3) != (scene.second is not None):
+            has, says = ("two", "one") if scene.second is None else ("one", "two")
+            raise self.error(f"[second] says a lens with {says} free-form side(s), and the designed one has {has}; design again")
+        scene, heights = sides_of(scene, field, state.state.heights)
         try:
-            refuse_without_glass(scene, field, state.state.heights)
+            refuse_without_glass(scene, field, heights)
         except InputError as error:
             raise self.error(f"{error}") from error
-        return field, state
+        return Designed(scene, field, heights, state)
 
     def write(self, path: Path | None = None) -> None:
         """Write project.toml and the pictures to `path`, the project's own unless given; the directory exists.
@@ -167,6 +195,8 @@ class Project:
         self.picture.write(path / self.settings["target"]["file"])
         if self.profile is not None:
             self.profile.write(path / self.settings["source"]["profile"])
+        if self.second is not None:
+            self.second.write(path / self.settings["second"]["file"])
         for file in attachments.of(self.settings["source"], self.settings["design"]):
             write_bytes(path / file, file.data)
         self.write_settings(path)

@@ -23,7 +23,7 @@ from caustic_cli.io.files import open_regular, read_bytes, refuse_foreign, write
 from caustic_cli.io.picture import Picture
 from caustic_cli.project import attachments
 from caustic_cli.project.checkpoint import MAX_BYTES, Checkpoint
-from caustic_cli.project.project import CHECKPOINT, MADE, RENDER, WAVE, Project, is_project
+from caustic_cli.project.project import CHECKPOINT, FARTHER, MADE, RENDER, WAVE, Project, is_project
 
 RECORD = ".outputs.json"
 #: Largest record read, in bytes; what is beyond has been written by somebody else, and is no record.
@@ -46,7 +46,7 @@ def digest(full: Settings, *pictures: Picture | None) -> str:
 
 def inputs(project: Project) -> dict[str, str]:
     """What a checkpoint remembers: `asked`, the digest of what the user gave, and `settings`, of what became of it."""
-    return {"asked": project.asked, "settings": digest(project.settings, project.picture, project.profile)}
+    return {"asked": project.asked, "settings": digest(project.settings, project.picture, project.profile, project.second)}
 
 
 def asked_of(project: Project, checkpoint: Checkpoint) -> str:
@@ -70,7 +70,8 @@ def same_design(path: Path, asked: str) -> tuple[Project, Checkpoint] | None:
 def finished(project: Project, checkpoint: Checkpoint) -> dict | None:
     """The figures of a finished design whose files are all there, which are touched; None if something is left to do."""
     waves = checkpoint.results.get("wave_relative_rms") is not None
-    files = [project.path / name for name in MADE if name != WAVE or waves]
+    without = {name for name, there in ((WAVE, waves), (FARTHER, project.second is not None)) if not there}
+    files = [project.path / name for name in MADE if name not in without]
     if not checkpoint.results or not all(p.exists() for p in files):
         return None
     _touch(files)

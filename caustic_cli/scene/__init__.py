@@ -3,12 +3,28 @@
 from __future__ import annotations
 
 from caustic_cli.scene.aperture import Aperture, Pupil
+from caustic_cli.scene.front import Front, Second
 from caustic_cli.scene.lens import Lens, Offset
 from caustic_cli.scene.light import Light
 from caustic_cli.scene.screen import Screen
 from caustic_cli.scene.sources import Disc, PlaneWave, Points, Source
 
-__all__ = ["Aperture", "Band", "Disc", "Lens", "Light", "Offset", "PlaneWave", "Points", "Pupil", "Scene", "Screen", "Source"]
+__all__ = [
+    "Aperture",
+    "Band",
+    "Disc",
+    "Front",
+    "Lens",
+    "Light",
+    "Offset",
+    "PlaneWave",
+    "Points",
+    "Pupil",
+    "Scene",
+    "Screen",
+    "Second",
+    "Source",
+]
 
 from dataclasses import dataclass, field, replace
 
@@ -33,6 +49,8 @@ class Band:
 class Scene:
     """Source, lens and screen on one optical axis (z); lengths in mm, powers in the unit of `light`.
 
+    second: what light does behind the screen, of a lens with two free-form sides.
+
     Raises:
         InputError: the screen does not stand behind the lens, or the source not before it.
     """
@@ -41,8 +59,11 @@ class Scene:
     lens: Lens
     screen: Screen
     light: Light = field(default_factory=Light)
+    second: Second | None = None
 
     def __post_init__(self):
+        if self.second is not None:
+            self.second.check(self.screen)
         if not self.lens.mirror and self.screen.z <= self.lens.z_in:
             raise InputError(f"⟨screen.z⟩ must lie behind the lens (beyond z_in = {self.lens.z_in:g} mm), got {self.screen.z:g} mm")
         if self.source.nearest >= self.lens.z_in:
@@ -58,6 +79,20 @@ class Scene:
     def pupil(self) -> Pupil:
         """The lens' entrance."""
         return Pupil(self.lens.half_size, self.lens.z_in, self.lens.round)
+
+    @property
+    def axial(self) -> bool:
+        """Whether all light within the lens runs along the axis."""
+        return self.source.collimated and not self.two_sided
+
+    def onto(self, screen: Screen) -> Scene:
+        """The same light on another screen, with nothing said of what it does behind that."""
+        return replace(self, screen=screen, second=None)
+
+    @property
+    def two_sided(self) -> bool:
+        """Whether the lens' entrance is free-form, too."""
+        return self.second is not None or self.lens.front is not None
 
     @property
     def dispersive(self) -> bool:

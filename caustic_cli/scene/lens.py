@@ -17,6 +17,7 @@ import numpy as np
 from caustic_cli.config import checks
 from caustic_cli.config.table import TABLE, check, check_all, default
 from caustic_cli.errors import InputError
+from caustic_cli.scene.front import Front
 
 
 @dataclass(frozen=True)
@@ -97,6 +98,7 @@ class Lens:
         aperture: rectangle, or circle, the largest that fits into the size; the spline goes on beyond it, light and glass do not.
         border: width of a dark rim around the aperture, which the exported solid has for its mount, mm.
         mirror: the surface reflects, the light comes through air, and `index`, `fresnel` and `absorption` mean nothing.
+        front: the entrance where it is free-form, None for the plane.
     """
 
     size: tuple[float, float] = default("lens.size")
@@ -115,6 +117,7 @@ class Lens:
     mirror: bool = default("lens.mirror")
     aperture: str = default("lens.aperture")
     border: float = default("lens.border")
+    front: Front | None = None
 
     def __post_init__(self):
         check_all(

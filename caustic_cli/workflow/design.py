@@ -30,6 +30,7 @@ from caustic_cli.inverse import ranks
 from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.extended import best_light, centre_of, limits, shift_of
+from caustic_cli.inverse.initial_sides import first_sides
 from caustic_cli.inverse.initial_surface import first_surface
 from caustic_cli.inverse.reach import largest_magnification, refuse_unreachable
 from caustic_cli.inverse.surface_from_map import OutOfReach
@@ -113,6 +114,12 @@ def begin(
     light = read_picture((config.parent if config else Path()) / profile, linear=True) if profile else None
     full = complete(said, picture.aspect, by, picture.lit)
     settings.refuse_unused(full["source"], given, [stage.get("source") for stage in full["design"]["stages"]])
+    farther = full.get("second", {}).get("file")
+    second = None
+    if farther:
+        at = config.parent if config and "second" not in chosen else Path()
+        second = read_picture(at / farther, goal.get("encoding") == "linear", False, invert)
+        full["second"]["file"] = f"second{second.suffix}"
     full["target"] |= {"file": f"target{picture.suffix}", "encoding": picture.encoding}
     if light is not None:
         full["source"]["profile"] = f"profile{light.suffix}"
@@ -122,7 +129,8 @@ def begin(
         full,
         picture,
         light,
-        uptodate.digest(full, picture, light),
+        second,
+        uptodate.digest(full, picture, light, second),
         without_waves=without_waves(full, "stages" in said.get("design", {})),
     )
     if out is not None and not force and (same := uptodate.same_design(out, project.asked)):
@@ -130,7 +138,8 @@ def begin(
     designer, goal = _designer(project, "cpu")  # builds and so checks scene, target, stages, options
     if out is not None:
         directory.check(out, force)  # before the transport, which may take a minute
-    refuse_unreachable(designer.scene, grey(goal))
+    if designer.scene.second is None:
+        refuse_unreachable(designer.scene, grey(goal))
     if words := shape_words(full):
         say.say(words)
     with say.notify_if_slow(
@@ -158,6 +167,8 @@ def first_heights(project: Project, said: Settings) -> tuple[Project, torch.Tens
     fixed, project = "thickness" in said.get("lens", {}), replace(project, settings=copy.deepcopy(project.settings))
     lens = project.settings["lens"]
     first, middle = _solved(project, fixed)
+    if "second" in project.settings:
+        return project, _designer(project, "cpu")[0].within_limits(State(first))
     if middle is not None:
         lens["thickness"] = middle
     if first is not None and not fixed and (spare := _spare(lens, first)) > 0:
@@ -199,7 +210,7 @@ def design(
         if movie is not None:
             say.say(f"{movie.path}: is not written, since nothing was designed")
         scene = project.scene()
-        return Result(project, scene, project.lens(scene)[0], project.target(scene), project.found.state, figures)
+        return Result(project, scene, project.lens(scene).field, project.target(scene), project.found.state, figures)
     with project.hold:
         designer, target = _designer(project, device)
         _say_limits(project, designer, target, first, say)
@@ -218,6 +229,8 @@ def _say_limits(project: Project, designer: Designer, target: np.ndarray, first:
     words = limits(designer.scene, grey(target)).sentence()
     if words:
         say.say(words)
+    if designer.scene.second is not None:
+        return
     if seen.matters and project.settings["design"]["waves"] == "auto" and project.without_waves:
         say.say(f"the wave image is not refined: {project.without_waves}")
     field = designer.field(0)
@@ -247,12 +260,12 @@ def resume(
         state = before.state if begun else designer.begin(_solved(project, fixed=True)[0])
         if state.stage >= len(designer.stages):
             raise project.error(f"has {len(designer.stages)} stages, but the checkpoint stands in stage {state.stage + 1}")
-        if tuple(state.heights.shape) != designer.stages[state.stage].control:
+        if tuple(state.heights.shape[-2:]) != designer.stages[state.stage].control:
             raise project.error(
                 f"stage {state.stage + 1} has control"
                 f" {list(designer.stages[state.stage].control)}, but the checkpoint {list(state.heights.shape)}"
             )
-        if state.start is not None and tuple(state.start.shape) != designer.stages[0].control:
+        if state.start is not None and tuple(state.start.shape[-2:]) != designer.stages[0].control:
             raise project.error(
                 f"stage 1 has control {list(designer.stages[0].control)}, but the design began on {list(state.start.shape)}"
             )
@@ -302,7 +315,9 @@ def _designer(project: Project, device: str) -> tuple[Designer, np.ndarray]:
     scene = project.scene()
     target = project.target(scene)
     stages, chosen = build_stages(project.settings), build_options(project.settings)
-    return Designer(scene, torch.from_numpy(target), stages, chosen, device), target
+    second = project.second_target(scene)
+    farther = None if second is None else torch.from_numpy(second)
+    return Designer(scene, torch.from_numpy(target), stages, chosen, device, farther), target
 
 
 def _solved(project: Project, fixed: bool) -> tuple[torch.Tensor | None, float | None]:
@@ -320,6 +335,8 @@ def _solved(project: Project, fixed: bool) -> tuple[torch.Tensor | None, float |
     if start == "transport":
         designer, target = _designer(project, "cpu")
         scene, goal = designer.scene, grey(target)
+        if scene.second is not None:
+            return first_sides(scene, goal, project.second_target(scene), designer.field(0)), None
         cells = transport_cells(max(s.rays for s in designer.stages), not scene.source.collimated)
         spread = shift_of(scene) if designer.stages[0].spread else None
         if spread is not None:
@@ -338,12 +355,12 @@ def _solved(project: Project, fixed: bool) -> tuple[torch.Tensor | None, float |
             f" ({', '.join(SUFFIXES)}), got {start!r}"
         )
     other = Project.open(start)
-    field, checkpoint = other.lens(other.scene())
+    _, field, heights, _ = other.lens(other.scene())
     if other.settings["lens"]["size"] != project.settings["lens"]["size"]:
         raise InputError(
             f"⟨design.start⟩: the lens of {start} is {other.settings['lens']['size']} mm, not {project.settings['lens']['size']} mm"
         )
-    return onto(field, checkpoint.state.heights, net), None
+    return onto(field, heights, net), None
 
 
 def _spare(lens: dict[str, Any], first: torch.Tensor) -> float:
@@ -413,7 +430,7 @@ def _run(
                 records.keep(now)
 
         records.keep(state)
-        ranks.send((project.settings, project.picture, project.profile, _on_cpu(state), limit))
+        ranks.send((project.settings, project.picture, project.profile, project.second, _on_cpu(state), limit))
         state = designer.run(
             state,
             iterations=chosen["iterations"],

@@ -20,10 +20,12 @@ from caustic_cli.io.picture import write_image
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import sides_of
 from caustic_cli.optics.waves import WaveImage
-from caustic_cli.project.project import RENDER, REPORT, WAVE, Project
+from caustic_cli.project.project import FARTHER, RENDER, REPORT, WAVE, Project
 from caustic_cli.studies.panels import write_report
 from caustic_cli.studies.retrace import FINAL_RAYS, retrace, white_level
+from caustic_cli.studies.second import second_figures
 from caustic_cli.studies.waves import unseen_figures, wave_figures
 
 #: Points along each side of the aperture at which the report draws the surface.
@@ -44,13 +46,14 @@ class Evaluation:
 
     state: with the lens that was kept; figures: of the JSON table, with start_relative_rms where a start was retraced; image,
     waves: irradiance on the screen, power per pixel, by rays and as a wave (None where that was not refined), (n_x, n_y) or
-    (3, n_x, n_y), float64.
+    (3, n_x, n_y), float64; second: that on a second screen, None where there is none.
     """
 
     state: State
     figures: dict
     image: np.ndarray
     waves: np.ndarray | None
+    second: np.ndarray | None = None
 
 
 def judge(project: Project, designer: Designer, target: np.ndarray, state: State, device: str, hurry: bool = False) -> Evaluation:
@@ -64,8 +67,11 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
     discard(project.path / WAVE)  # of another lens
     if found.waves is not None:
         write_image(project.path / WAVE, found.waves, white_level(found.waves, target), encoding)
+    discard(project.path / FARTHER)
+    if found.second is not None and designer.second is not None:
+        write_image(project.path / FARTHER, found.second, white_level(found.second, designer.second.numpy()), encoding)
     history = np.array(state.history, dtype=float).reshape(-1, 5)
-    surface = _surface(designer.field(found.state.stage), found.state.heights)
+    surface = _surface(designer.field(found.state.stage), sides_of(designer.scene, designer.field(0), found.state.heights)[1])
     write_report(
         project.path / REPORT,
         grey(target),
@@ -84,7 +90,8 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
 def expected_seconds(designer: Designer, target: np.ndarray, state: State, device: str) -> float:
     """About how long `judge` will take in a hurry, s: by a retrace of few rays, and a wave image where one was refined."""
     scene, field, began = designer.scene, designer.field(state.stage), time.monotonic()
-    retrace(scene, field, state.heights, target, rays=FINAL_RAYS // PROBE, device=device, noise=False)
+    scene, heights = sides_of(scene, field, state.heights)
+    retrace(scene, field, heights, target, rays=FINAL_RAYS // PROBE, device=device, noise=False)
     seconds = RETRACES * PROBE * (time.monotonic() - began) + REPORT_SECONDS
     if any(s.waves for s in designer.stages):
         began = time.monotonic()
@@ -111,6 +118,8 @@ def evaluate(
         seed: of the rays; size: width and height of the picture, mm; hurry: leave the noise at what FINAL_RAYS make of it.
     """
     scene, field = designer.scene, designer.field(state.stage)
+    if scene.second is not None:
+        return _both_sides(designer, target, state, device, seed)
 
     def trace(heights: torch.Tensor, noise: bool = True):
         return retrace(
@@ -166,6 +175,23 @@ def evaluate(
     if light is not None:
         figures |= unseen_figures(scene, field, state.heights.to(device), target)
     return Evaluation(state, figures, exposure.image.cpu().numpy(), None if light is None else light.image.cpu().numpy())
+
+
+def _both_sides(designer: Designer, target: np.ndarray, state: State, device: str, seed: int) -> Evaluation:
+    """Of a lens with two free-form sides: what it throws on the screen, and what its light does behind that."""
+    field, farther = designer.field(state.stage), None if designer.second is None else designer.second.numpy()
+
+    def trace(heights: torch.Tensor):
+        scene, exit = sides_of(designer.scene, field, heights)
+        exposure, figures = retrace(scene, field, exit, target, rays=FINAL_RAYS, device=device, seed=seed)
+        second, more = second_figures(scene, field, exit, farther, rays=FINAL_RAYS, seed=seed, device=device)
+        return exposure.image.cpu().numpy(), second, figures | more
+
+    image, second, figures = trace(state.heights)
+    if state.start is not None:
+        began = trace(designer.begun(state))[2]
+        figures |= {f"start_{key}": began[key] for key in ("relative_rms", "second_relative_rms", "angle_rms_mrad") if key in began}
+    return Evaluation(state, figures, image, None, second)
 
 
 def _keys(figures: dict, than: dict) -> tuple[str, str]:

@@ -10,7 +10,7 @@ from types import ModuleType
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.export import FORMATS
+from caustic_cli.export import FORMATS, TWO_SIDED
 from caustic_cli.export.milling import Milling
 from caustic_cli.export.part import part_of
 from caustic_cli.io.heightmaps import beside
@@ -48,8 +48,8 @@ def export(
         say.say(f"{path}: is what the same options made of the same project, so there is nothing to do; ⟨force⟩ does it again")
         return found, True
     made.refuse_foreign(force)
-    field, checkpoint = opened.lens(scene)
-    found = write(path, scene, field, checkpoint.state.heights, format, script, **given)
+    scene, field, heights, _ = opened.lens(scene)
+    found = write(path, scene, field, heights, format, script, **given)
     more = {"beside": [str(file) for file in written[1:]]} if len(written) > 1 else {}
     figures = {
         "file": str(path),
@@ -75,6 +75,11 @@ def write(
     **given,
 ) -> dict:
     """Write a lens' files, see `files`; given: samples or tolerance; what of it goes into the figures."""
+    if scene.lens.front is not None and (script or mould or format not in TWO_SIDED):
+        raise InputError(
+            f"⟨format⟩ {format} holds one free-form side; of this lens, which has two, {', '.join(TWO_SIDED)} hold both, without"
+            " ⟨script⟩ or ⟨mould⟩"
+        )
     part = part_of(format, scene, field, heights, mould, block)
     writer = getattr(_home(format), f"write_{format}")
     if format == "gcode":
@@ -101,7 +106,7 @@ def files(path: Path, scene: Scene, format: str, script: bool = False) -> list[P
     if format == "heightmap":
         return [path, beside(path)]
     if format == "mitsuba":
-        return [path, *_home(format).companions(path, scene.lens.round, scene.lens.mirror)]
+        return [path, *_home(format).companions(path, scene.lens.round, scene.lens.mirror, scene.two_sided)]
     return [path, *import_module("caustic_cli.export.lighttools_script").companions(path)] if script else [path]
 
 

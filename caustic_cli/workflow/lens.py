@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from caustic_cli.config import checks
 from caustic_cli.errors import InputError
 from caustic_cli.export import format_of
 from caustic_cli.inverse.designer import State
@@ -20,6 +21,7 @@ from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.surfaces.cut import CutSurface
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import front_of
 from caustic_cli.project import directory, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.project import Project
@@ -62,22 +64,34 @@ class Lens:
     project: Project | None = None
     state: State | None = None
 
-    def surface(self, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Height z, mm, and slopes dz/dx, dz/dy of the exit surface at points of the aperture, float64, of their common shape."""
+    def surface(self, x: Any, y: Any, side: str = "exit") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Height z, mm, and slopes dz/dx, dz/dy of the exit surface at points of the aperture, float64, of their common shape.
+
+        side: exit, or entrance.
+        """
+        checks.choice("side", side, ("exit", "entrance"))
         x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
         rx, ry = self.scene.lens.half_size
         if not (np.isfinite(x).all() and np.isfinite(y).all() and (np.abs(x) <= rx).all() and (np.abs(y) <= ry).all()):
             raise InputError(f"points must lie on the aperture, x within +-{rx:g} mm and y within +-{ry:g} mm")
         u, v = (torch.from_numpy(c.ravel().copy()) for c in (x, y))
-        z, zx, zy = (c.numpy().reshape(x.shape) for c in self.field.at(self.heights, u, v))
+        if side == "exit":
+            found = self.field.at(self.heights, u, v)
+        elif self.scene.lens.front is not None:
+            found = front_of(self.scene.lens).at(None, u, v)
+            found[0] = found[0] + self.scene.lens.z_in
+        else:
+            found = [torch.full_like(u, self.scene.lens.z_in), torch.zeros_like(u), torch.zeros_like(u)]
+        z, zx, zy = (c.numpy().reshape(x.shape) for c in found)
         return z, zx, zy
 
     @classmethod
     def of(cls, project: Project, given: Mapping[str, Any] | None = None) -> Lens:
         """The lens of a project's last checkpoint; given: path in `config.table` -> value, which replace the project's settings."""
         scene = project.scene(dict(given or {}))
-        target, (field, checkpoint) = project.target(scene), project.lens(scene)
-        return cls(scene, field, checkpoint.state.heights, target, dict(checkpoint.results), project, checkpoint.state)
+        target = project.target(scene)
+        scene, field, heights, checkpoint = project.lens(scene)
+        return cls(scene, field, heights, target, dict(checkpoint.results), project, checkpoint.state)
 
     @classmethod
     def of_archive(cls, path: str | Path) -> Lens:

@@ -21,12 +21,13 @@ from caustic_cli.io.picture import write_image, write_npy
 from caustic_cli.optics.emission.measured import coarse_words
 from caustic_cli.optics.plan import Plan, parse_effects
 from caustic_cli.optics.surfaces.cut import CutSurface
-from caustic_cli.project.project import RENDER, WAVE, Project, beside
+from caustic_cli.project.project import FARTHER, RENDER, WAVE, Project, beside
 from caustic_cli.project.uptodate import Outputs
 from caustic_cli.scene import Scene
 from caustic_cli.studies import effects as effects_study
 from caustic_cli.studies import manufacture
 from caustic_cli.studies.retrace import white_level
+from caustic_cli.studies.second import second_figures
 from caustic_cli.studies.verify import require_mitsuba, verify, write_panels
 from caustic_cli.workflow import page
 from caustic_cli.workflow.compilation import compile_for
@@ -130,7 +131,10 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     wave_path, wave_npy = beside(image_path), beside(asked.npy) if asked.npy else None
     off = None if asked.tolerances is None else read_tolerances(asked.tolerances)
     draws = (companion("tolerances.csv"), companion("tolerances.png")) if off else (None, None)
-    paths = (image_path, asked.npy, asked.html, panels, sheet, wave_path, wave_npy, *draws)
+    in_project = asked.image is None and project is not None
+    farther = image_path.with_name(FARTHER) if in_project else image_path.with_stem(f"{image_path.stem}-second")
+    second = farther if project and project.second is not None else None
+    paths = (image_path, asked.npy, asked.html, panels, sheet, wave_path, wave_npy, second, *draws)
     for path in paths:
         if path is not None:
             refuse_foreign(path, asked.force)
@@ -173,6 +177,16 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
         beside_it = {f"nominal_{name}": nominal[name] for name in ("relative_rms", "noise")}
         figures["cut"] = {"program": str(asked.cut)} | beside_it | deviation
     write_image(image_path, image, white_level(image, lens.target), lens.encoding)
+    if scene.second is not None:
+        target = None if lens.project is None else lens.project.second_target(scene)
+        with say.notify_if_slow("following the light behind the picture"):
+            light, more = second_figures(
+                plan.scene, lens.field, lens.heights, target, rays=asked.rays, seed=seed, device=device, requests=plan.requests
+            )
+        figures |= more
+        if light is not None:
+            write_image(farther, light, white_level(light, target), lens.encoding)
+            figures["second_image"] = str(farther)
     if wave_path == asked.lens / WAVE:
         discard(wave_path)  # of what render.png was before
     if asked.npy is not None:

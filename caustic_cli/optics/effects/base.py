@@ -136,7 +136,7 @@ class GeneralWay(Effect):
 
     def request(self, scene: Scene, on: bool, bounds: Bounds) -> Requests:
         """Of a plane wave, to go by the general way; of others, not to."""
-        if on == scene.source.collimated:
+        if on == scene.axial:
             return Requests.to(self.name) if on else Requests.to(without=(self.name,))
         return NO_REQUESTS
 

@@ -1,4 +1,4 @@
-"""Refraction at the flat entrance."""
+"""Refraction at the entrance."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ class Entrance(GeneralWay):
 
     def judge(self, scene: Scene, b) -> Decision:
         """On where rays come oblique."""
-        angle, collimated = math.degrees(b.incidence), scene.source.collimated
+        angle, collimated = math.degrees(b.incidence), scene.axial
+        if scene.two_sided:
+            return Decision(self.name, True, "the entrance is free-form", fixed=True)
         if collimated or scene.lens.mirror or angle == 0:
             why = "there is no glass before a mirror" if scene.lens.mirror else "normal incidence on a flat entrance bends nothing"
             return Decision(self.name, not collimated and not scene.lens.mirror, why, angle, 0.0)

@@ -19,7 +19,7 @@ class Intersection(GeneralWay):
 
     def judge(self, scene: Scene, b) -> Decision:
         """On where rays run oblique inside the lens."""
-        if scene.source.collimated:
+        if scene.axial:
             return Decision(self.name, False, "rays of a plane wave are sampled on the surface itself", 0.0, 0.0)
         angle = math.degrees(b.inside)
         return Decision(self.name, True, f"rays cross the lens at up to {angle:.3g} degrees", angle, 0.0)

@@ -1,0 +1,30 @@
+"""How far light behind the lens strays from the way it should go: parallel to the axis, or towards a focus."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from caustic_cli.optics.rays import RayState
+from caustic_cli.optics.trace import Tracer
+from caustic_cli.scene import Scene
+
+
+def misdirection(traced: Tracer, state: RayState, scene: Scene) -> Tensor:
+    """Sum over rays behind the lens of power times the square of the tangent of their angle to the way they should go."""
+    ray = traced.onto(state, scene.screen)
+    dz = torch.as_tensor(ray.direction[2])
+    squares, focus = torch.zeros((), dtype=torch.float64), scene.second.focus if scene.second else None
+    for k in (0, 1):
+        tangent = ray.direction[k] / dz
+        if focus is not None:
+            tangent = tangent - (focus[k] - ray.origin[k]) / (focus[2] - scene.screen.z)
+        squares = squares + (ray.power * tangent.square()).sum(dtype=torch.float64)
+    return squares
+
+
+def rms_angle(squares: float, power: float) -> float:
+    """Root mean square of the angle, rad."""
+    return math.sqrt(squares / power) if power > 0 else math.nan

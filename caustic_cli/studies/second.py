@@ -1,0 +1,54 @@
+"""What light does behind the picture, of a lens with two free-form sides: another picture, or the directions it leaves in."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from caustic_cli.optics.direction import misdirection, rms_angle
+from caustic_cli.optics.effects import NO_REQUESTS, Requests
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import EXIT
+from caustic_cli.optics.trace import tracers
+from caustic_cli.scene import Scene
+from caustic_cli.studies.retrace import retrace, sampler_for
+
+#: Rays at a time.
+CHUNK = 1 << 19
+
+
+def second_figures(
+    scene: Scene,
+    field: HeightField,
+    heights: Tensor,
+    target: np.ndarray | None,
+    *,
+    rays: int,
+    seed: int,
+    device: str = "cpu",
+    requests: Requests = NO_REQUESTS,
+) -> tuple[np.ndarray | None, dict]:
+    """The image on the second screen, power per pixel (n_x, n_y) float64, None where there is none, and figures.
+
+    Args:
+        scene: with its lens' designed entrance; heights: (n, m) mm of the exit; target: irradiance on the second screen.
+
+    Returns:
+        figures: second_relative_rms, second_noise, second_on_target and second_on_screen of a second picture; angle_rms_mrad, the
+        root mean square over all light of the angle to the wanted direction, where light shall go on parallel or towards a focus.
+    """
+    second = scene.second
+    assert second is not None
+    if second.screen is not None:
+        elsewhere = scene.onto(second.screen)
+        exposure, found = retrace(elsewhere, field, heights, target, rays=rays, seed=seed, device=device, requests=requests)
+        names = ("relative_rms", "noise", "on_target", "on_screen")
+        return exposure.image.cpu().numpy(), {f"second_{name}": found[name] for name in names}
+    squares = power = 0.0
+    with torch.no_grad():
+        for traced in tracers(scene, field, sampler_for(scene, rays, seed, device), torch.float64, CHUNK, requests):
+            state = traced({EXIT: heights.to(device)})[0]
+            squares += traced.weight * float(misdirection(traced, state, scene))
+            power += traced.weight * float(state.power.sum())
+    return None, {"angle_rms_mrad": 1e3 * rms_angle(squares, power)}

@@ -1,0 +1,194 @@
+"""Lenses with two free-form sides: first surfaces, loss, design, what light does behind the picture, files."""
+
+import json
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from caustic_cli import cli, load
+from caustic_cli.export.mesh import closed_mesh
+from caustic_cli.inverse.initial_sides import first_sides
+from caustic_cli.inverse.two_sided import TwoSidedObjective
+from caustic_cli.io.archive import open_archive
+from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.reconstruction import Filter
+from caustic_cli.optics.surfaces import HeightField
+from caustic_cli.optics.system import ENTRANCE, EXIT, System, sides_of
+from caustic_cli.optics.trace import expose, render
+from caustic_cli.scene import Lens, Offset, PlaneWave, Points, Scene, Screen, Second
+from caustic_cli.studies.retrace import retrace
+from caustic_cli.studies.second import second_figures
+
+HALF, PIXELS = 6.0, 40
+NEAR = Screen((2 * HALF, 2 * HALF), 50.0, (PIXELS, PIXELS))
+FAR = Screen((26.0, 26.0), 400.0, (PIXELS, PIXELS))
+LENS = Lens((10.0, 10.0), control=(51, 51), offset=Offset(15.0), height_range=(-6.0, 6.0))
+
+
+def spots(*places, width=0.16) -> np.ndarray:
+    """Gaussian spots at places in parts of the screen, over a dim ground within a circle."""
+    u = (np.arange(PIXELS) + 0.5) / PIXELS * 2 - 1
+    x, y = np.meshgrid(u, u, indexing="ij")
+    light = 0.25 * (np.hypot(x, y) < 0.75) + sum(np.exp(-((x - a) ** 2 + (y - b) ** 2) / (2 * width**2)) for a, b in places)
+    return light * (np.hypot(x, y) < 0.75)
+
+
+ONE, TWO = spots((-0.3, 0.1), (0.35, -0.2)), spots((0.0, 0.3), width=0.3)
+
+
+def judged(scene, field, nets, second):
+    behind, exit = sides_of(scene, field, nets)
+    _, figures = retrace(behind, field, exit, ONE, rays=400_000)
+    return figures | second_figures(behind, field, exit, second, rays=400_000, seed=1)[1]
+
+
+@pytest.mark.parametrize("focus", [None, (0.5, -0.5, 800.0)])
+@pytest.mark.parametrize("source", [PlaneWave(), Points(((0.0, 0.0, -80.0),))])
+def test_first_sides_send_light_to_the_picture_and_on(focus, source):
+    scene = Scene(source, LENS, NEAR, second=Second(focus=focus))
+    field = HeightField.of(LENS)
+    found = judged(scene, field, first_sides(scene, ONE, None, field, 128), None)
+    assert found["relative_rms"] < 0.25 and found["angle_rms_mrad"] < 2.0
+    assert found["on_screen"] > 0.88 * (1.0 - found["lost"]["missed_lens"])
+
+
+def test_first_sides_of_two_pictures():
+    scene = Scene(PlaneWave(), LENS, NEAR, second=Second(FAR))
+    field = HeightField.of(LENS)
+    found = judged(scene, field, first_sides(scene, ONE, TWO, field, 128), TWO)
+    assert found["relative_rms"] < 0.35 and found["second_relative_rms"] < 0.7
+
+
+@pytest.mark.parametrize("second", [Second(), Second(FAR), Second(focus=(1.0, 2.0, 200.0))])
+def test_the_loss_has_the_gradients_of_both_sides(second):
+    """Against central differences along random directions, each side's own and both."""
+    scene, generator = Scene(PlaneWave(), LENS, NEAR, second=second), torch.Generator().manual_seed(1)
+    field = HeightField.of(LENS)
+    x, y = (c / 5.0 for c in field.control_xy())
+    nets = torch.stack(
+        [
+            0.1 * torch.cos(2.0 * x)[:, None] * y[None, :] + 0.8 * (x[:, None] ** 2 + y[None, :] ** 2),
+            15.0 - 0.9 * (x[:, None] ** 2 + y[None, :] ** 2),
+        ]
+    )
+    targets = [torch.from_numpy(ONE), torch.from_numpy(TWO)][: 2 if second.screen else 1]
+    objective = TwoSidedObjective(
+        scene,
+        field,
+        rays_of(scene, "grid", 40_000),
+        Filter("cosine", (5, 5)),
+        tuple(targets),
+        "rms-light + 0.01 laplacian",
+        apron=6,
+        max_slope=0.3,
+        dtype=torch.float64,
+    )
+    gradient = objective(nets).gradient
+    assert gradient.shape == nets.shape and (gradient.abs().amax((1, 2)) > 0).all()
+    for side in ((1.0, 0.0), (0.0, 1.0), (0.6, 0.8)):
+        way = torch.randn(nets.shape, generator=generator, dtype=torch.float64) * torch.tensor(side)[:, None, None]
+        step = 2e-6
+        ahead, behind = (objective(nets + s * step * way).loss for s in (1, -1))
+        assert (gradient * way).sum() == pytest.approx((ahead - behind) / (2 * step), rel=2e-3, abs=1e-9)
+
+
+def test_a_designed_entrance_traces_as_the_free_one():
+    scene = Scene(PlaneWave(), LENS, NEAR, second=Second())
+    field = HeightField.of(LENS)
+    nets = first_sides(scene, ONE, None, field, 64)
+    (free,) = render(System.of(scene, field), {ENTRANCE: nets[0], EXIT: nets[1]}, 40_000, kind="grid")
+    behind, exit = sides_of(scene, field, nets)
+    fixed = expose(behind, field, exit, rays_of(behind, "grid", 40_000))
+    assert torch.allclose(free.image, fixed.image, atol=1e-12) and free.lost == pytest.approx(fixed.lost, abs=1e-12)
+
+
+@pytest.fixture
+def _here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name, light in (("one", ONE), ("two", TWO)):
+        Image.fromarray((255 * light / light.max()).astype(np.uint8).T[::-1]).save(f"{name}.png")
+
+
+SMALL = (
+    "--linear",
+    "--throw",
+    "50",
+    "--mag",
+    "1.0",
+    "--margin",
+    "0.2",
+    "--resolution",
+    "40",
+    "--control",
+    "35",
+    "--quiet",
+    "--json",
+)
+
+
+def run(capfd, *arguments, code=0):
+    assert cli.run(list(map(str, arguments))) == code
+    out, err = capfd.readouterr()
+    return json.loads(out) if code == 0 else err.strip()
+
+
+def test_design_render_resume_and_files(_here, capfd):
+    made = run(capfd, "design", "one.png", *SMALL, "--collimate", "--iterations", "4", "-o", "p")
+    assert made["relative_rms"] < made["start_relative_rms"] < 0.5 and made["angle_rms_mrad"] < 5
+    settings = tomllib.loads(Path("p/project.toml").read_text())
+    assert settings["second"] == {"collimate": True} and settings["lens"]["thickness"] == 20.0
+    longer = run(capfd, "design", "--resume", "p", "--iterations", "6", "--quiet", "--json")
+    assert longer["iterations"] == 6 and longer["relative_rms"] < made["relative_rms"]
+    again = run(capfd, "render", "p", "--rays", "100000", "--quiet", "--json")
+    assert again["angle_rms_mrad"] == pytest.approx(longer["angle_rms_mrad"], rel=0.05)
+    lens = load("p")
+    lens.export("lens.npz")
+    scene, field, heights = open_archive("lens.npz")
+    assert np.array_equal(scene.lens.front.heights, lens.scene.lens.front.heights + 0.0)
+    a, b = (
+        expose(s, f, h, rays_of(s, "grid", 10_000)).image
+        for s, f, h in ((scene, field, heights), (lens.scene, lens.field, lens.heights))
+    )
+    assert torch.allclose(a, b, atol=1e-12)
+    lens.export("lens.step")
+    assert Path("lens.step").read_text().count("B_SPLINE_SURFACE_WITH_KNOTS") == 2
+    vertices, faces = closed_mesh(lens.scene, lens.field, lens.heights, (41, 41))
+    corners = vertices[faces]
+    volume = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6.0
+    line = np.linspace(-5, 5, 41)
+    top, low = (lens.surface(line[:, None], line[None, :], side)[0] for side in ("exit", "entrance"))
+    assert volume == pytest.approx(np.trapezoid(np.trapezoid(top - low, line), line), rel=1e-3)
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
+    assert "holds one free-form side" in run(capfd, "export", "p", "--format", "gcode", code=2)
+
+
+@pytest.mark.slow
+def test_two_pictures_by_the_command_line(_here, capfd):
+    options = ("--second", "two.png", "--second-at", "400", "--second-size", "26")
+    made = run(capfd, "design", "one.png", *SMALL, *options, "--iterations", "3", "-o", "p")
+    assert made["second_relative_rms"] < 0.6 and Path("p/render-second.png").exists() and Path("p/second.png").exists()
+    assert run(capfd, "design", "one.png", *SMALL, *options, "--iterations", "3", "-o", "p") == made  # nothing was done
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--second", "two.png"), "--second needs --second-at"),
+        (("--second-at", "400"), "--second-at belongs to --second"),
+        (("--collimate", "--focus", "0,0,300"), "--collimate and --focus both say"),
+        (("--collimate", "--mirror"), "--mirror cannot be had with --collimate"),
+        (("--focus", "0,0,20"), "must lie behind the picture's screen at 50 mm"),
+        (("--collimate", "--waves", "on"), "--waves on"),
+        (("--collimate", "--source", "point", "--start", "offset"), "must be transport"),
+        (("--second", "missing.png", "--second-at", "400"), "missing.png"),
+        (("--collimate", "--mag", "6"), "would have to come from beside the lens"),
+    ],
+)
+def test_bad_input_is_refused(_here, capfd, options, words):
+    said = run(capfd, "design", "one.png", *SMALL, *options, "-o", "p", code=2)
+    assert words in said and said.count("\n") == 0 and not Path("p").exists()
