@@ -86,6 +86,9 @@ class Project:
             if (how := given.get("design", {})).get("robust"):
                 _within(how["robust"])
                 given["design"] = attachments.with_errors(how, path)
+            if "shape_file" in (screen := given.get("screen", {})):
+                _within(screen["shape_file"])
+                given["screen"] = attachments.with_shape(screen, path)
             full = complete(given, picture.aspect)
             build_stages(full), build_options(full)  # a project whose design is impossible is not opened for its lens either
             return cls(path, full, picture, _picture(path, profile, True) if profile else None, on_disk=True)
@@ -109,6 +112,7 @@ class Project:
         for path, value in given.items():
             section, _, key = path.rpartition(".")
             changed[section][key] = value
+        changed["screen"] = attachments.with_shape(changed["screen"])
         _change(changed["source"], before, {path.rpartition(".")[2] for path in given if path.startswith("source.")})
         settings.refuse_unused(changed["source"], given)
         if changed["source"]["type"] not in sources.used_by("profile"):
@@ -167,7 +171,7 @@ class Project:
         self.picture.write(path / self.settings["target"]["file"])
         if self.profile is not None:
             self.profile.write(path / self.settings["source"]["profile"])
-        for file in attachments.of(self.settings["source"], self.settings["design"]):
+        for file in attachments.of(self.settings):
             write_bytes(path / file, file.data)
         self.write_settings(path)
 

@@ -34,7 +34,7 @@ class Scene:
     """Source, lens and screen on one optical axis (z); lengths in mm, powers in the unit of `light`.
 
     Raises:
-        InputError: the screen does not stand behind the lens, or the source not before it.
+        InputError: the screen does not stand behind the lens, or the source not before it; the screen does not fit on its sphere.
     """
 
     source: Source
@@ -45,6 +45,7 @@ class Scene:
     def __post_init__(self):
         if not self.lens.mirror and self.screen.z <= self.lens.z_in:
             raise InputError(f"⟨screen.z⟩ must lie behind the lens (beyond z_in = {self.lens.z_in:g} mm), got {self.screen.z:g} mm")
+        self.screen.refuse_beyond()
         if self.source.nearest >= self.lens.z_in:
             raise InputError(
                 f"⟨source.position⟩ must lie before the lens (z below z_in = {self.lens.z_in:g} mm),"
