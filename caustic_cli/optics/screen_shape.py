@@ -23,7 +23,7 @@ from caustic_cli.optics.surfaces import Cylinder, HeightField, Sphere, Surface
 from caustic_cli.scene import Screen
 from caustic_cli.scene.screen import Sags
 
-#: Part of a measured shape's width that it goes on for beyond each border, as steep as there: light beside the screen is seen.
+#: Part of a measured shape's width that it goes on for beyond each border, turned about that: light beside the screen is seen.
 BESIDE = 0.25
 #: Gauss points of a pixel along each axis, in parts of its width, at which its area is taken.
 GAUSS = (0.5 - 0.5 / math.sqrt(3.0), 0.5 + 0.5 / math.sqrt(3.0))
