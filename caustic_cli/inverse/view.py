@@ -64,23 +64,24 @@ class View:
         return land(origin, direction, (*s.shift, s.z), s.axes, forward)
 
     def picture(self, target: np.ndarray) -> tuple[np.ndarray, tuple[float, float], tuple[float, float]]:
-        """Power on even cells of the plane, FINER to a pixel, from that on the screen's pixels (n_x, n_y); half width and height of
-        these cells' frame, and its middle, mm.
+        """Power on even cells of the plane, FINER to a pixel, from that on the screen's pixels (n_x, n_y), not all black; half
+        width and height of these cells' frame, that of the bright pixels, and its middle, mm.
 
         Raises:
-            InputError: some of the screen turns away from the lens, which cannot light it.
+            InputError: some of the picture turns away from the lens, which cannot light it.
         """
         s = self.screen
-        x, y = (np.linspace(-h, h, n + 1) for h, n in zip(s.half_size, s.resolution, strict=True))
+        bright = [np.nonzero(target.any(axis))[0] for axis in (1, 0)]
+        x, y = (np.arange(b[0], b[-1] + 2) * w - h for b, w, h in zip(bright, s.pixel, s.half_size, strict=True))
         u, v = self.onto(x[:, None], y[None, :])
         if not _turned_alike(u, v):
             raise InputError(
-                "[screen] part of it turns away from the lens, which cannot light it; less tilt or curvature is needed"
+                "[screen] part of the picture turns away from the lens, which cannot light it; less tilt or curvature is needed"
             )
         low, high = (u.min(), v.min()), (u.max(), v.max())
         half = tuple(0.5 * float(b - a) for a, b in zip(low, high, strict=True))
         middle = tuple(0.5 * float(b + a) for a, b in zip(low, high, strict=True))
-        edges = [np.linspace(a, b, FINER * n + 1) for a, b, n in zip(low, high, s.resolution, strict=True)]
+        edges = [np.linspace(a, b, FINER * (len(c) - 1) + 1) for a, b, c in zip(low, high, (x, y), strict=True)]
         own = self.own(*np.broadcast_arrays(edges[0][:, None], edges[1][None, :]))
         return _integrals(target, s, *own), half, middle  # type: ignore[return-value]
 
