@@ -14,6 +14,7 @@ from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.reintersection import again
 from caustic_cli.optics.sampling import Sampler
+from caustic_cli.optics.screen_shape import reach
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer, check_room, expose, tracers
@@ -227,7 +228,8 @@ def test_a_tilted_screen(tilt):
             p, q, _ = np.linalg.solve(np.column_stack([axes[:, 0], axes[:, 1], [0, 0, -1.0]]), start - [1.5, -2.0, 60.0])
             assert float(x[i, j]) == pytest.approx(1.5 + p, abs=1e-11)
             assert float(y[i, j]) == pytest.approx(-2.0 + q, abs=1e-11)
-    assert screen.depth == pytest.approx(float(np.abs(axes[2, :2]) @ [15.0, 15.0]))
+    depth = float(np.abs(axes[2, :2]) @ [15.0, 15.0])
+    assert reach(screen) == (pytest.approx(-depth), pytest.approx(depth))
 
 
 @pytest.mark.parametrize("source", [None, POINT])

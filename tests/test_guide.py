@@ -71,6 +71,8 @@ def home(tmp_path_factory):
         for name in ("flame.png", "ball.png"):
             shutil.copy(ROOT / "examples" / name, directory)
         shutil.copytree(ROOT / "examples" / "thesis", directory / "thesis")
+        shutil.copy(ROOT / "examples" / "globe.toml", directory)
+        np.save(directory / "wave.npy", 0.5 * np.sin(np.linspace(0.0, 6.0, 40))[:, None] * np.cos(np.linspace(0.0, 4.0, 40)))
         x = np.linspace(0.0, 255.0, 64)
         Image.fromarray((0.5 * (x[:, None] + x[None, :])).astype(np.uint8)).save("portrait.jpg")
         for project, *more in (
@@ -127,7 +129,7 @@ def test_links_of_the_documents_lead_somewhere():
             if "://" not in link:
                 assert (path.parent / link).exists(), f"{path}: {link}"
                 checked += 1
-    assert checked > 20 and len(CHAPTERS) == 8
+    assert checked > 20 and len(CHAPTERS) == 9
 
 
 def test_the_readme_is_short_and_its_python_is_the_library():

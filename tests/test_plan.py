@@ -112,7 +112,7 @@ def test_what_a_scene_has_is_simulated():
         POINT,
         light=Light(10.0, (500.0, 600.0)),
         glass="PMMA",
-        screen=Screen((16.0, 14.0), 60.0, (8, 8), (0.0, 5.0), (1.0, 0.0)),
+        screen=Screen((16.0, 14.0), 60.0, (8, 8), (0.0, 5.0), (1.0, 0.0), (40.0, 40.0)),
         absorption=0.01,
         roughness=0.001,
     )
@@ -126,6 +126,7 @@ def test_what_a_scene_has_is_simulated():
         "absorption",
         "roughness",
         "fresnel",
+        "screen-shape",
         "screen-tilt",
         "screen-shift",
     } <= set(plan.simulated)
@@ -158,7 +159,7 @@ def test_overrides(source):
         source,
         light=Light(10.0, (500.0, 600.0)),
         glass="PMMA",
-        screen=Screen((16.0, 14.0), 60.0, (8, 8), (0.0, 5.0), (1.0, 0.0)),
+        screen=Screen((16.0, 14.0), 60.0, (8, 8), (0.0, 5.0), (1.0, 0.0), (40.0, 40.0)),
         absorption=0.01,
         roughness=0.001,
     )
@@ -205,6 +206,6 @@ def test_names():
     with pytest.raises(InputError, match="did you mean ghosts"):
         parse_effects("ghost")
     names = [effect.name for effect in EFFECTS]
-    assert len(set(names)) == len(names) == 16
+    assert len(set(names)) == len(names) == 17
     assert {effect.name for effect in EFFECTS if effect.free} == {"missed-surface", "total-reflection", "screen-shift"}
     assert replace(NO_REQUESTS, stages=True) == STAGES != NO_REQUESTS

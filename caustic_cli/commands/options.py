@@ -213,10 +213,21 @@ def _power(option: str, text: str) -> dict[str, Any]:
     return {"source.power": watts, "source.power_unit": unit}
 
 
+def _radius(option: str, text: str) -> dict[str, Any]:
+    """Radii of a screen: "60", of a sphere; "60,inf" or "inf,60", of a cylinder."""
+    form = "one number of mm, or two with inf for straight, like 60, 60,inf or -8cm"
+    parts = [part.strip() for part in text.split(",")]
+    if len(parts) > 2:
+        raise InputError(f"{option} must be {form}, got {text!r}")
+    radii = (math.inf if part == "inf" else numbers(option, part, (1,), unit="mm", form=form)[0] for part in parts)
+    return {"screen.radius": both(tuple(radii))}
+
+
 #: Options whose text is read in a way of their own.
 READERS = {
     "source.power": _power,
     "source.wavelengths": _spectrum,
+    "screen.radius": _radius,
     "rays": lambda option, text: {"rays": rays(option, text)},
     "screen_size": lambda option, text: {"screen_size": size(option, text)},
     "resolution": lambda option, text: {"resolution": counts(option, text)},

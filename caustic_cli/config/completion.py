@@ -366,6 +366,8 @@ def _not_by_default(s: Settings) -> str:
         return "a network is trained on rays alone; ⟨network⟩ none refines it"
     if design["optimizer"] != "lbfgs":
         return f"{design['optimizer']} was asked for, and the wave image takes lbfgs; ⟨waves⟩ on adds stages that use it"
+    if build_screen(s).curved:
+        return "a curved screen has no wave image"
     if any(s["screen"].get("tilt", ())):
         return "on a tilted screen it takes many transforms for each wavelength; ⟨waves⟩ on refines it all the same"
     return ""
@@ -378,6 +380,8 @@ def _wave_stages(s: Settings, source: Source, quality: str, lit: tuple[float, fl
         raise InputError("⟨design.waves⟩ on needs network none: the wave image refines the heights themselves")
     if asked == "on" and source.rays is not None:
         raise InputError("⟨design.waves⟩ on: a ray file says nothing of its light's phase, so that it has no wave image to refine")
+    if asked == "on" and build_screen(s).curved:
+        raise InputError("⟨design.waves⟩ on needs a plane screen: a curved one has no wave image to refine")
     if asked == "on" and len(source.members) > 1:
         raise InputError("⟨design.waves⟩ on needs one source: light of several is refined by rays alone")
     if asked == "off" or (asked == "auto" and _not_by_default(s)):

@@ -24,6 +24,8 @@ from caustic_cli.errors import InputError
 from caustic_cli.io.files import read_bytes
 from caustic_cli.scene import Lens, Light, Offset, Scene, Screen, Second, Source, sources
 from caustic_cli.scene.materials import refractive_index
+from caustic_cli.scene.screen import PLANE, Sags
+from caustic_cli.scene.sources.section import content
 
 #: Settings by section and key.
 Settings = dict[str, dict[str, Any]]
@@ -323,8 +325,17 @@ def build_second(settings: Settings) -> Second | None:
 def build_screen(settings: Settings) -> Screen:
     """The screen that the [screen] section describes."""
     s = settings["screen"]
+    sags = content(s, "shape_file", np.ndarray)
+    if "shape_file" in s and sags is None:
+        raise InputError(f"⟨screen.shape_file⟩ {s['shape_file']!r} was not read: a file of heights is needed")
     return Screen(
-        tuple(s["size"]), s["z"], tuple(s["resolution"]), tuple(value_of(s, "screen.tilt")), tuple(value_of(s, "screen.shift"))
+        tuple(s["size"]),
+        s["z"],
+        tuple(s["resolution"]),
+        tuple(value_of(s, "screen.tilt")),
+        tuple(value_of(s, "screen.shift")),
+        tuple(s.get("radius", PLANE)),
+        None if sags is None else Sags(sags, tuple(s["size"])),
     )
 
 

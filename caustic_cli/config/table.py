@@ -202,6 +202,12 @@ _ROWS = (
             option=Option("--screen-tilt", "A,B", BOTH)),
     Setting("screen.shift", "numbers", "shift of the screen's centre from the axis", "mm", -1e9, 1e9, default=[0.0, 0.0],
             written=False, option=Option("--screen-shift", "X,Y", BOTH)),
+    Setting("screen.radius", "numbers", "radii of curvature of a curved screen along x and y: the same for a sphere, inf along"
+            " one axis for a cylinder; positive bends the edges towards +z, away from a lens", "mm", derived="plane", written=False,
+            option=Option("--screen-radius", "R[,RY]", BOTH)),
+    Setting("screen.shape_file", "text", "file of a screen's shape, of which the project keeps a copy: heights in mm along +z on an"
+            " even grid over the screen, borders included; a 2-D .npy [i, j] or a .tif of 32-bit floats",
+            option=Option("--screen-shape", "FILE", BOTH)),
     # The target
     Setting("mag", "number", "width of the picture over width of the lens", low=1e-3, high=1e3, default=3.0,
             why="table 6.1 of the thesis", option=Option("--mag")),

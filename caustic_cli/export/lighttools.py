@@ -22,7 +22,7 @@ from caustic_cli.export.surface import sample_grid
 from caustic_cli.io.files import MARK, atomic_path
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import front_of
-from caustic_cli.scene import Scene, Source
+from caustic_cli.scene import Scene, Screen, Source
 
 FORMAT_VERSION = 1
 
@@ -33,9 +33,9 @@ def write_lighttools(
     """Write the archive whole or not at all.
 
     Keys: points, normals (N, 3); shape (2,); x (nx,), y (ny,), z (nx, ny); lens_half_size (2,), z_in, refractive_index;
-    screen_half_size (2,), z_screen, resolution (2,); those of `_source`; fresnel unless exact; aperture if a circle; mirror, 1, of
-    one; those of `_entrance` where it is free-form; control_points (n, m, 3) with x, y at the Greville abscissae, degrees (2,),
-    knots_u, knots_v on [0, 1]; unit, format_version, created_by.
+    screen_half_size (2,), z_screen, resolution (2,); those of `_screen` and `_source`; fresnel unless exact; aperture if a circle;
+    mirror, 1, of one; those of `_entrance` where it is free-form; control_points (n, m, 3) with x, y at the Greville abscissae,
+    degrees (2,), knots_u, knots_v on [0, 1]; unit, format_version, created_by.
 
     Args:
         heights: (n, m) control heights, mm.
@@ -60,6 +60,7 @@ def write_lighttools(
         "screen_half_size": _reals(scene.screen.half_size),
         "z_screen": _reals(scene.screen.z),
         "resolution": np.array(scene.screen.resolution, np.int64),
+        **_screen(scene.screen),
         **_source(scene),
         **({"aperture": np.array("circle")} if scene.lens.round else {}),
         **({"mirror": np.array(1, np.int64)} if scene.lens.mirror else {}),
@@ -93,6 +94,18 @@ def _entrance(scene: Scene) -> dict[str, np.ndarray]:
         "entrance_knots_u": u.knots.numpy(),
         "entrance_knots_v": v.knots.numpy(),
     }
+
+
+def _screen(screen: Screen) -> dict[str, np.ndarray]:
+    """What a screen has beyond its size and distance: `screen_tilt` (2,), degrees, `screen_shift` (2,), mm, and of a curved one
+    `screen_curvature` (2,), 1/mm along x and y, 0 along a cylinder, or `screen_sag` (a, b), mm along its normal, [i, j] on an
+    even grid over `screen_sag_half_size` (2,), mm about its middle."""
+    found = {f"screen_{key}": _reals(getattr(screen, key)) for key in ("tilt", "shift") if any(getattr(screen, key))}
+    if screen.rounded:
+        found["screen_curvature"] = 1.0 / _reals(screen.radius)
+    if screen.sags is not None:
+        found |= {"screen_sag": _reals(screen.sags.values), "screen_sag_half_size": 0.5 * _reals(screen.sags.size)}
+    return found
 
 
 def _source(scene: Scene) -> dict[str, np.ndarray]:

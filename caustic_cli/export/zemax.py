@@ -54,6 +54,7 @@ def write_zemax(
         "! Grid Sag, mm; base radius infinity, conic 0; interpolation bicubic",
         f"! vertex {real(vertex - lens.z_in)} mm behind the flat entrance, index {real(lens.index)},"
         f" screen {real(scene.screen.z - vertex)} mm behind the vertex",
+        *([f"! the screen is {scene.screen.shape_words()}, which this file leaves to you"] if scene.screen.curved else []),
         *([f"! circular aperture of radius {real(lens.half_size[0])} mm"] if lens.round else []),
         f"{nx} {ny} {real((grid.x[-1] - grid.x[0]) / (nx - 1))} {real((grid.y[-1] - grid.y[0]) / (ny - 1))} 0 0 0",
         "",

@@ -33,6 +33,7 @@ from caustic_cli.inverse.two_sided import TwoSidedObjective
 from caustic_cli.inverse.waves import WaveObjective
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.sampling import stream
+from caustic_cli.optics.screen_shape import reach
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.waves import NoWaveImage
 from caustic_cli.scene import Scene
@@ -377,17 +378,18 @@ class Designer:
         x, y = HeightField.of(lens).control_xy()
         low, high = lens.height_bounds(x.numpy(), y.numpy())
         screen = self.scene.screen
-        if lens.mirror and low.min() <= screen.z + screen.depth:
+        before, behind = reach(screen)
+        if lens.mirror and low.min() <= screen.z + behind:
             raise InputError(
                 f"⟨screen.z⟩ must lie before the mirror, whose surface may reach {low.min():.4g} mm, got {screen.z:g} mm"
             )
-        if not lens.mirror and high.max() >= screen.z - screen.depth:
+        if not lens.mirror and high.max() >= screen.z + before:
             raise InputError(
                 f"⟨screen.z⟩ must lie behind the lens, whose surface may reach {high.max():.4g} mm, got {screen.z:g} mm"
             )
         if self.scene.second is not None:
-            reach = np.full_like(low, lens.height_range[1])
-            low, high = np.stack([-reach, low]), np.stack([reach, high])
+            most = np.full_like(low, lens.height_range[1])
+            low, high = np.stack([-most, low]), np.stack([most, high])
         return torch.from_numpy(low), torch.from_numpy(high)
 
     @staticmethod

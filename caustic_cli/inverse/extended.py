@@ -17,6 +17,7 @@ from caustic_cli.inverse.schedule import Stage
 from caustic_cli.optics.emission import Rays, rays_of
 from caustic_cli.optics.emission.coherent import modes, spots
 from caustic_cli.optics.emission.regular import RegularGrid
+from caustic_cli.optics.screen_shape import normals, space
 from caustic_cli.optics.spread import Convolution, Spread, spread_at
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.scene import Scene, Source
@@ -72,7 +73,7 @@ def best_light(scene: Scene, target: np.ndarray, spread: Spread, steps: int | No
 def shift_of(scene: Scene, field: HeightField | None = None, heights: torch.Tensor | None = None) -> Spread | None:
     """How an extended source spreads its middle's image; None where it has no extent, does much else, or lights far more than the
     screen."""
-    if not scene.source.extended or scene.source.apart or any(scene.screen.tilt):
+    if not scene.source.extended or scene.source.apart or any(scene.screen.tilt) or scene.screen.curved:
         return None
     if heights is None:
         scene = replace(scene, lens=replace(scene.lens, control=(NET, NET), knots=None))
@@ -121,11 +122,12 @@ def etendue_limit(scene: Scene) -> float | None:
     elif min(source.extent) > 0 and len(source.points()[0]) == 1:
         a, b, part = _area(source.extent, True)
         x0, y0, z0 = source.points()[0][0]
-        given = cell * part * _seen(x, y, a + x0, b + y0, lens.z_in - z0).sum()
+        given = cell * part * _seen(x, y, (a + x0, b + y0, z0 - lens.z_in)).sum()
     else:
         return None
     a, b, part = _area(screen.half_size, False)
-    taken = cell * part * _seen(x, y, a + screen.shift[0], b + screen.shift[1], screen.z - lens.offset.thickness).sum()
+    px, py, pz = space(screen, a, b)
+    taken = cell * part * _seen(x, y, (px, py, pz - lens.offset.thickness), normals(screen, a, b)).sum()
     return min(1.0, float(taken / given)) if given > 0 else None
 
 
@@ -140,7 +142,9 @@ def _area(half: tuple[float, float], round: bool) -> tuple[np.ndarray, np.ndarra
     return x, y, area / len(x)
 
 
-def _seen(x: np.ndarray, y: np.ndarray, a: np.ndarray, b: np.ndarray, distance: float) -> np.ndarray:
-    """cos cos / r^2 between points of two parallel planes."""
-    r2 = (x[:, None] - a) ** 2 + (y[:, None] - b) ** 2 + distance * distance
-    return distance * distance / (r2 * r2)
+def _seen(x: np.ndarray, y: np.ndarray, point: tuple, normal: tuple = (0.0, 0.0, 1.0)) -> np.ndarray:
+    """cos cos / r^2 between points (x, y, 0) of the lens' plane and points of a surface with these normals, (len(x), points); a
+    normal's length is the area that its point stands for."""
+    dx, dy, dz = point[0] - x[:, None], point[1] - y[:, None], point[2]
+    r2 = dx * dx + dy * dy + dz * dz
+    return np.abs(dz) * np.abs(normal[0] * dx + normal[1] * dy + normal[2] * dz) / (r2 * r2)

@@ -20,6 +20,7 @@ from caustic_cli.inverse.incidence import incident
 from caustic_cli.inverse.surface_from_map import OutOfReach, Start, thrown
 from caustic_cli.inverse.surface_from_map import surface as refracting_surface
 from caustic_cli.inverse.transport import corners
+from caustic_cli.inverse.view import View
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 
@@ -87,19 +88,29 @@ class _Grid:
         scene = self.scene
         if not scene.source.distant and not light.all():
             options["darkest"] = DARKEST
+        view = self.view(mean)
+        target, half, centre = (
+            (self.target, scene.screen.half_size, scene.screen.shift) if view is None else view.picture(self.target)
+        )
         return refracting_surface(
             light,
-            self.target,
+            target,
             scene.lens.half_size,
-            scene.screen.half_size,
+            half,
             scene.lens.effective_index,
             scene.screen.z,
             mean,
             directions,
-            centre=scene.screen.shift,
+            centre=centre,
+            view=view,
             start=None if again is None else again.transport.potential,
             **options,
         )
+
+    def view(self, mean: float) -> View | None:
+        """The screen as a surface of this mean height sees it, None of an upright one, which lies in its plane."""
+        screen = self.scene.screen
+        return None if screen.upright else View(screen, mean, -1.0 if self.scene.lens.mirror else 1.0)
 
     def above(self, z: np.ndarray) -> np.ndarray:
         """Part of each cell's corners where the surface is not cut off."""
@@ -113,6 +124,7 @@ class _Grid:
         light, directions = incident(scene, self.x, self.y, z)
         surface = RectBivariateSpline(self.x, self.y, z)
         at = np.broadcast_arrays(self.x[:, None], self.y[None, :])
+        view = self.view(float(z.mean()))
         u, v, part = thrown(
             *at,
             z,
@@ -122,8 +134,10 @@ class _Grid:
             lens.effective_index,
             screen.z,
             "none" if lens.fresnel == "none" else "exact",
+            view,
         )
-        on = (np.abs(u - screen.shift[0]) <= screen.half_size[0]) & (np.abs(v - screen.shift[1]) <= screen.half_size[1])
+        u, v = (u - screen.shift[0], v - screen.shift[1]) if view is None else view.own(u, v)
+        on = (np.abs(u) <= screen.half_size[0]) & (np.abs(v) <= screen.half_size[1])
         return float((light * self.above(z) * _mean(np.where(on, part, 0.0))).sum() / on_lens) if on_lens > 0 else 0.0
 
     def cut(self, z: np.ndarray, middle: float, passes: int) -> _Cut:

@@ -14,6 +14,9 @@ SIAM Review 41, 1999).  z enters t, so this is repeated, always at the same mean
 The slopes needed are not quite a gradient.  What they miss moves the landing points by e(x, y), a smooth field that grows with
 the angles.  Each pixel of the picture is then moved by -e of the place that lights it, transported again, and the rays are
 sent to T + e, which a surface can do.
+
+On a tilted or curved screen T and e are places of the plane z_screen as the lens' middle sees them (`view`); rays are aimed at the
+point of the screen behind T, whose depth t knows, and landing points are taken back to that plane.
 """
 
 from __future__ import annotations
@@ -30,6 +33,7 @@ from scipy.ndimage import gaussian_filter
 
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.transport import Transport, corners, solve
+from caustic_cli.inverse.view import View
 from caustic_cli.optics.backends.reference import Torch
 from caustic_cli.optics.frames import IDENTITY
 from caustic_cli.optics.kernels.laguerre import prices
@@ -81,6 +85,7 @@ def surface(
     *,
     corrections=2,
     centre=(0.0, 0.0),
+    view: View | None = None,
     **options,
 ) -> Start:
     """Exit surface of a lens that throws `target` on the screen.
@@ -92,7 +97,8 @@ def surface(
         z_screen, thickness: the screen's plane and the surface's mean height, mm.
         directions: unit directions inside the glass at those corners, three (n + 1, m + 1) arrays, or None for (0, 0, 1).
         corrections: how often, at most, the picture is moved by what the rays miss and transported again.
-        centre: of the picture on the screen, mm.
+        centre: of the picture on the plane, mm.
+        view: of a screen that does not lie in that plane; target, centre and landing points are then as it sees them.
         options: of `transport.solve`.
 
     Raises:
@@ -118,8 +124,8 @@ def surface(
     pixel = [2.0 * h / s for h, s in zip(target_half, np.shape(target), strict=True)]
     aim, shift = (map_.x + centre[0], map_.y + centre[1]), np.zeros((2, *light.shape))
     for again in range(corrections + 1):
-        z = heights(map_, aim, x, y, d, index, z_screen, thickness, light > 0)
-        landing = land(z, x, y, d, index, z_screen)
+        z = heights(map_, aim, x, y, d, index, z_screen, thickness, light > 0, view)
+        landing = land(z, x, y, d, index, z_screen, view)
         off = np.nan_to_num(np.stack([w - t for w, t in zip(landing, aim, strict=True)]))
         miss = float(np.sqrt((light * (off**2).sum(0)).sum()))
         off = np.stack([gaussian_filter(w, EVEN) for w in off])
@@ -163,13 +169,16 @@ def _directions(directions, shape) -> tuple:
     return d
 
 
-def heights(map_: Transport, aim, x, y, d, index: float, z_screen: float, mean: float, lit: np.ndarray) -> np.ndarray:
+def heights(
+    map_: Transport, aim, x, y, d, index: float, z_screen: float, mean: float, lit: np.ndarray, view: View | None = None
+) -> np.ndarray:
     """Heights at the corners x (n + 1, 1), y (1, m + 1), mm, whose rays land at `aim` as nearly as a surface can.
 
     Args:
         map_: a map close to `aim` (two arrays, mm): its potential is taken as it is, and only the rest integrated.
         d, index, z_screen, mean: ray directions in the glass, its index, the screen's plane and the heights' mean, mm.
         lit: (n + 1, m + 1) bool, corners whose light counts; others that are out of reach take the map's own slope.
+        view: as of `surface`.
 
     A mirror's normal is parallel to d - t, as if the index were 1, and t runs back.
 
@@ -181,8 +190,9 @@ def heights(map_: Transport, aim, x, y, d, index: float, z_screen: float, mean: 
     main = scale * (map_.potential - 0.5 * (x * x + y * y))
     slope = scale * (map_.x - x), scale * (map_.y - y)
     z = main - main.mean() + mean
+    point = (*aim, z_screen) if view is None else view.points(*aim)
     for _ in range(REPEATS):
-        tx, ty, tz = aim[0] - x, aim[1] - y, z_screen - z
+        tx, ty, tz = point[0] - x, point[1] - y, point[2] - z
         within = refracted(tx, ty, tz, d, index)
         if not within[lit].all():
             raise OutOfReach(lit & ~within)
@@ -226,15 +236,18 @@ def integrate(sx: np.ndarray, sy: np.ndarray, step: tuple[float, float]) -> np.n
     return idctn(spectrum, norm="ortho")
 
 
-def land(z: np.ndarray, x, y, d, index: float, z_screen: float) -> tuple[np.ndarray, np.ndarray]:
-    """Landing points (n, m), mm, of the rays d through the bicubic spline of z; NaN where totally reflected."""
+def land(z: np.ndarray, x, y, d, index: float, z_screen: float, view: View | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Landing points (n, m), mm, of the rays d through the bicubic spline of z, NaN where totally reflected: on the plane z_screen,
+    as `view` sees them."""
     spline = RectBivariateSpline(x[:, 0], y[0], z, kx=min(3, len(z) - 1), ky=min(3, z.shape[1] - 1))
-    return thrown(x, y, z, spline(x[:, 0], y[0], dx=1), spline(x[:, 0], y[0], dy=1), d, index, z_screen)[:2]
+    return thrown(x, y, z, spline(x[:, 0], y[0], dx=1), spline(x[:, 0], y[0], dy=1), d, index, z_screen, view=view)[:2]
 
 
-def thrown(x, y, z, zx, zy, d, index: float, z_screen: float, fresnel: str = "none") -> tuple[np.ndarray, ...]:
+def thrown(
+    x, y, z, zx, zy, d, index: float, z_screen: float, fresnel: str = "none", view: View | None = None
+) -> tuple[np.ndarray, ...]:
     """Where rays d inside the glass land that leave it at (x, y, z) with slopes zx, zy, NaN where totally reflected, and the part
-    of each that passes."""
+    of each that passes.  view: as of `surface`; NaN where they miss its screen."""
     shape, backend = z.shape, Torch()  # too few rays to wait for a compiler
 
     def flat(value):
@@ -249,5 +262,10 @@ def thrown(x, y, z, zx, zy, d, index: float, z_screen: float, fresnel: str = "no
         reflects=mirror,
         fresnel=fresnel,
     )
-    landing = backend.land(tuple(origin), out.direction, (0.0, 0.0, z_screen), IDENTITY, -1.0 if mirror else 1.0)[:2]
-    return *(torch.where(out.passes, c, torch.nan).view(shape).numpy() for c in landing), out.power.view(shape).numpy()
+    if view is None:
+        landing = backend.land(tuple(origin), out.direction, (0.0, 0.0, z_screen), IDENTITY, -1.0 if mirror else 1.0)[:2]
+        passes = out.passes
+    else:
+        *own, there = view.land(tuple(origin), out.direction)
+        landing, passes = map(torch.from_numpy, view.onto(*(c.numpy() for c in own))), out.passes & there
+    return *(torch.where(passes, c, torch.nan).view(shape).numpy() for c in landing), out.power.view(shape).numpy()

@@ -6,6 +6,7 @@ import numpy as np
 from scipy import sparse
 
 from caustic_cli.errors import InputError
+from caustic_cli.optics.screen_shape import areas
 from caustic_cli.scene import Screen
 
 
@@ -21,7 +22,9 @@ def overlap(cells: np.ndarray, pixels: np.ndarray) -> sparse.csr_array:
 
 
 def target_on_screen(irradiance: np.ndarray, size: tuple[float, float], screen: Screen, flip: str = "") -> np.ndarray:
-    """Mean irradiance of a picture on each pixel of a screen, dark around the picture: (n_x, n_y) float64.
+    """Relative power on each pixel of a screen, dark around the picture: (n_x, n_y) float64.
+
+    That is the picture's mean irradiance there, and on a curved screen times the pixel's true area: see `optics.screen_shape`.
 
     Args:
         irradiance: (a, b), [i, j] with i along +x and j along +y, finite and not negative, any scale.
@@ -51,7 +54,8 @@ def target_on_screen(irradiance: np.ndarray, size: tuple[float, float], screen: 
         mean = covers @ mean if axis == 0 else (covers @ mean.T).T
     if not mean.sum() > 0:
         raise InputError("target is black all over: a picture with some light in it is needed")
-    return np.ascontiguousarray(mean)
+    true = areas(screen)
+    return np.ascontiguousarray(mean if true is None else mean * true)
 
 
 def grey(image: np.ndarray) -> np.ndarray:

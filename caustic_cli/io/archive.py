@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from caustic_cli.optics.bounds import refuse_without_glass
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import front_from
 from caustic_cli.scene import Disc, Lens, Light, PlaneWave, Points, Scene, Screen, Source
+from caustic_cli.scene.screen import MAX_SAGS, Sags
 from caustic_cli.scene.sources.distribution import MOST_ANGLES, Distribution
 from caustic_cli.scene.sources.points import MAX_POINTS
 
@@ -44,12 +46,31 @@ def open_archive(path: str | Path) -> tuple[Scene, HeightField, Tensor]:
         if "entrance_control_points" in data:
             entrance, low = surface_of(data, "entrance_")
             lens = replace(lens, front=front_from(entrance, low - lens.z_in))
-        screen = Screen(
-            tuple(2.0 * h for h in data.reals("screen_half_size", 2).tolist()), data.real("z_screen"), data.wholes("resolution", 2)
-        )
+        screen = _screen(data)
         scene = Scene(_source(data), lens, screen, Light(unit=data.text("source_power_unit", "W")))
         refuse_without_glass(scene, field, heights)
         return scene, field, heights
+
+
+def _screen(data: Archive) -> Screen:
+    sags = None
+    if "screen_sag" in data:
+        width, height = (2.0 * h for h in data.reals("screen_sag_half_size", 2).tolist())
+        sags = Sags(data.reals("screen_sag", None, None, most=MAX_SAGS), (width, height))
+    return Screen(
+        tuple(2.0 * h for h in data.reals("screen_half_size", 2).tolist()),
+        data.real("z_screen"),
+        data.wholes("resolution", 2),
+        *(tuple(data.reals(f"screen_{key}", 2).tolist()) if f"screen_{key}" in data else (0.0, 0.0) for key in ("tilt", "shift")),
+        _radius(data),
+        sags,
+    )
+
+
+def _radius(data: Archive) -> tuple[float, float]:
+    curvature = data.reals("screen_curvature", 2).tolist() if "screen_curvature" in data else [0.0, 0.0]
+    x, y = (1.0 / k if k else math.inf for k in curvature)
+    return x, y
 
 
 def _source(data: Archive) -> Source:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from PIL import Image
-from scipy.interpolate import RectBivariateSpline, make_lsq_spline
+from scipy.interpolate import make_lsq_spline
 from torch import Tensor
 
 from caustic_cli.config.checks import LENGTH
@@ -61,10 +61,7 @@ def interpolated(z: np.ndarray, half_size: tuple[float, float]) -> tuple[HeightF
     """The spline through heights (a, b) mm on an even grid over the aperture, borders included: cubic, or less through fewer."""
     if not 2 <= min(z.shape) <= max(z.shape) <= MAX_CONTROL:
         raise InputError(f"must have 2 to {MAX_CONTROL} heights along each axis, got {z.shape[0]} x {z.shape[1]}")
-    degrees = [min(3, n - 1) for n in z.shape]
-    spline = RectBivariateSpline(*(np.linspace(0.0, 1.0, n) for n in z.shape), z, kx=degrees[0], ky=degrees[1], s=0)
-    spaces = tuple(SplineSpace(p, torch.from_numpy(t)) for p, t in zip(degrees, spline.get_knots(), strict=True))
-    return HeightField(spaces, tuple(half_size)), torch.from_numpy(spline.get_coeffs().reshape(z.shape))
+    return HeightField.through(z, half_size)
 
 
 def fitted(z: np.ndarray, half_size: tuple[float, float], net: dict, off: float) -> tuple[HeightField, Tensor]:

@@ -25,6 +25,7 @@ from caustic_cli.optics.emission import Rays, of_member
 from caustic_cli.optics.emission.base import intensity_of
 from caustic_cli.optics.frames import Pose, turned, turned_back
 from caustic_cli.optics.rays import RayState
+from caustic_cli.optics.screen_shape import shape_of
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer
@@ -174,7 +175,7 @@ def landed(
     """
     changed = errors.scene(scene)
     scale = errors.brightness(scene, changed)
-    point, axes = errors.screen(scene)
+    (point, axes), shape = errors.screen(scene), shape_of(scene.screen)
     parameters = {EXIT: heights + errors.thickness}
     with torch.no_grad():
         for band, plain in zip(changed.bands, scene.bands, strict=True):
@@ -188,9 +189,10 @@ def landed(
                 state = errors.directed(scene, band.scene.source, state)
                 tracer = Tracer(system, state, torch.float64, requests)
                 forward = math.copysign(1.0, sum(a * b for a, b in zip(system.axis, axes[2], strict=True)))
+                land = tracer.backend.land if shape is None else shape.land
                 for out in tracer(parameters):
                     middle = (point[0], point[1], point[2] - out.datum)
-                    x, y, there = tracer.backend.land(out.origin, out.direction, middle, axes, forward)
+                    x, y, there = land(out.origin, out.direction, middle, axes, forward)
                     power = torch.where(there, out.power, torch.zeros_like(out.power)) * (band.weight * scale)
                     yield Landed(x.double(), y.double(), power.double(), band.channel)
 

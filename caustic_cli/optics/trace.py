@@ -38,6 +38,7 @@ from caustic_cli.optics.memory import with_less
 from caustic_cli.optics.rays import LOSSES, RayState, Status
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sample
+from caustic_cli.optics.screen_shape import reach, shape_of
 from caustic_cli.optics.surfaces import HeightField, SurfaceIntersection
 from caustic_cli.optics.system import EXIT, Element, Placed, System
 from caustic_cli.scene import Light, PlaneWave, Points, Scene, Screen
@@ -135,7 +136,7 @@ class Tracer:
 
     def expose(self, parameters: Parameters, screen: Screen | Placed, filter: Filter) -> Image[Tensor]:
         """Heights {name: (n, m) mm float64} -> image and energy account on a screen."""
-        if self.fused is not None and isinstance(screen, Screen) and not any(screen.tilt):
+        if self.fused is not None and isinstance(screen, Screen) and screen.upright:
             image, leaving, lost = self.fused(parameters[self.system.elements[-1].name], screen, filter)
             for name, value in self.start.lost.items():
                 lost[name] = lost.get(name, 0.0) + value
@@ -364,18 +365,23 @@ class Tracer:
         return self.backend.ray_image(surface, start, eta, element.fresnel, element.aperture.radius, before)
 
     def onto(self, state: RayState, screen: Screen | Placed) -> RayState:
-        """Rays straight on to a screen's plane; x and y of their origins are the screen's own coordinates, mm."""
+        """Rays straight on to a screen; x and y of their origins are the screen's own coordinates, mm."""
+        frame = screen if isinstance(screen, Screen) else screen.screen
+        (sx, sy), shape = frame.shift, shape_of(frame)
         if isinstance(screen, Placed):
-            axes, middle, shift = screen.pose.axes, screen.pose.position, screen.screen.shift
+            axes, middle = screen.pose.axes, screen.pose.position
+            if shape is not None:  # which stands about the screen's middle
+                px, py, pz = (m + sx * a + sy * b for m, a, b in zip(middle, *axes[:2], strict=True))
+                middle = (px, py, pz)
         else:
-            axes = screen.axes if any(screen.tilt) else IDENTITY
-            shift = screen.shift
-            middle = (*shift, screen.z) if any(screen.tilt) else (0.0, 0.0, screen.z)
+            axes = IDENTITY if screen.upright else screen.axes
+            middle = (0.0, 0.0, screen.z) if screen.upright else (sx, sy, screen.z)
         point = (middle[0], middle[1], middle[2] - state.datum)
         along = sum(a * b for a, b in zip(self.system.axis, axes[2], strict=True))
-        x, y, on_way = self.backend.land(state.origin, state.direction, point, axes, 1.0 if along >= 0 else -1.0)
-        if isinstance(screen, Screen) and any(screen.tilt):
-            x, y = x + shift[0], y + shift[1]
+        land = self.backend.land if shape is None else shape.land
+        x, y, on_way = land(state.origin, state.direction, point, axes, 1.0 if along >= 0 else -1.0)
+        if shape is not None or (isinstance(screen, Screen) and not screen.upright):
+            x, y = x + sx, y + sy
         weight = torch.where(on_way, state.power, torch.zeros_like(state.power))
         out = replace(state, origin=(x, y, 0.0), power=weight, lost=dict(state.lost), leaving=state.power.sum(dtype=torch.float64))
         out.lose("off_screen", (state.power - weight).detach())
@@ -391,7 +397,7 @@ def _cast(value, dtype: torch.dtype):
 def is_lowered(scene: Scene, field: HeightField, requests: Requests = NO_REQUESTS) -> bool:
     """Whether the light of a scene goes to its screen by a fused kernel."""
     few = next(iter(rays_of(scene, "grid", 4).chunks()))
-    return not any(scene.screen.tilt) and Tracer(System.of(scene, field), few, requests=requests).fused is not None
+    return scene.screen.upright and Tracer(System.of(scene, field), few, requests=requests).fused is not None
 
 
 def warm_up(scene: Scene, requests: Requests = NO_REQUESTS, gradient: bool = False) -> None:
@@ -553,19 +559,21 @@ def _total(
 
 
 def check_room(scene: Scene, heights: Tensor, screen: Screen) -> None:
-    """Refuse a screen that the surface reaches, the corners of a tilted one included.
+    """Refuse a screen that the surface reaches, the corners of a tilted or curved one included.
 
     Raises:
         InputError: saying how far the surface reaches.
     """
-    lean = f" and its tilt takes it {screen.depth:.4g} mm nearer" if screen.depth else ""
+    before, behind = reach(screen)
+    nearer = behind if scene.lens.mirror else -before
+    lean = f" and its {'shape' if screen.curved else 'tilt'} takes it {nearer:.4g} mm nearer" if nearer else ""
     if scene.lens.mirror:
-        if float(heights.min()) <= screen.z + screen.depth:
+        if float(heights.min()) <= screen.z + nearer:
             raise InputError(
                 f"⟨screen.z⟩ must lie before the mirror, whose surface reaches {float(heights.min()):.6g} mm,"
                 f" got {screen.z:g} mm{lean}"
             )
-    elif float(heights.max()) >= screen.z - screen.depth:
+    elif float(heights.max()) >= screen.z - nearer:
         raise InputError(
             f"⟨screen.z⟩ must lie behind the lens, whose surface reaches {float(heights.max()):.6g} mm, got {screen.z:g} mm{lean}"
         )

@@ -1,4 +1,4 @@
-"""The files that [source] and [design] speak of: read once, checked, and kept in the project under names of their own."""
+"""The files that [source], [screen] and [design] speak of: read once, checked, and kept in the project under names of their own."""
 
 from __future__ import annotations
 
@@ -11,10 +11,13 @@ from caustic_cli.io.files import read_bytes
 from caustic_cli.io.intensities import MOST_BYTES, TABLE, parse_distribution
 from caustic_cli.io.picture import read_picture
 from caustic_cli.io.rayfiles import ACCEPTED, MAX_BYTES, SUFFIXES, parse_rays
+from caustic_cli.io.sags import read_sags
 from caustic_cli.scene.sources.section import Attached
 
 #: What the file of [design] robust is called in a project.
 ERRORS = "tolerances.toml"
+#: What the file of [screen] shape_file is called, but for its suffix.
+SHAPE = "screen"
 #: Keys of [source] that may name a file, and what it is called in a project.
 STEMS = {"file": "source", "intensity": "intensity"}
 
@@ -54,8 +57,23 @@ def with_errors(design: Mapping[str, Any], folder: Path | None = None) -> dict[s
     return {**design, "robust": Attached.of(name, data, tolerances.read(path))}
 
 
-def named_in_project(source: dict[str, Any], design: dict[str, Any]) -> None:
-    """Rename the files of both sections as a project calls them, those of further sources by their number."""
+def with_shape(screen: Mapping[str, Any], folder: Path | None = None) -> dict[str, Any]:
+    """A [screen] section whose `shape_file` carries the heights in it, if it names one; folder: as of `attached`.
+
+    Raises:
+        InputError: the file is missing or holds no heights.
+    """
+    name = screen.get("shape_file")
+    if name is None or isinstance(name, Attached):
+        return dict(screen)
+    data, heights = read_sags(Path(name) if folder is None else folder / name)
+    return {**screen, "shape_file": Attached.of(name, data, heights)}
+
+
+def named_in_project(source: dict[str, Any], screen: dict[str, Any], design: dict[str, Any]) -> None:
+    """Rename the files of these sections as a project calls them, those of further sources by their number."""
+    if isinstance(shape := screen.get("shape_file"), Attached):
+        screen["shape_file"] = shape.named(f"{SHAPE}{Path(shape).suffix.lower()}")
     if isinstance(design.get("robust"), Attached):
         design["robust"] = design["robust"].named(ERRORS)
     for k, table in enumerate((source, *source.get("also", ()))):
@@ -64,11 +82,10 @@ def named_in_project(source: dict[str, Any], design: dict[str, Any]) -> None:
                 table[key] = table[key].named(f"{stem}{f'-{k + 1}' if k else ''}{Path(table[key]).suffix.lower()}")
 
 
-def of(source: Mapping[str, Any], design: Mapping[str, Any] | None = None) -> list[Attached]:
-    """All files of the [source] section, and of [design] where that is given."""
-    robust = (design or {}).get("robust")
-    found = [robust] if isinstance(robust, Attached) else []
-    return found + [
+def of(full: Mapping[str, Mapping[str, Any]]) -> list[Attached]:
+    """All files of complete settings."""
+    source, others = full["source"], (full["design"].get("robust"), full["screen"].get("shape_file"))
+    return [file for file in others if isinstance(file, Attached)] + [
         value for table in (source, *source.get("also", ())) for key in STEMS if isinstance(value := table.get(key), Attached)
     ]
 

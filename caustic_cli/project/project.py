@@ -101,6 +101,9 @@ class Project:
             if (how := given.get("design", {})).get("robust"):
                 _within(how["robust"])
                 given["design"] = attachments.with_errors(how, path)
+            if "shape_file" in (screen := given.get("screen", {})):
+                _within(screen["shape_file"])
+                given["screen"] = attachments.with_shape(screen, path)
             full = complete(given, picture.aspect)
             other = full.get("second", {}).get("file")
             second = _picture(path, other, full["target"]["encoding"] == "linear") if other else None
@@ -126,6 +129,7 @@ class Project:
         for path, value in given.items():
             section, _, key = path.rpartition(".")
             changed[section][key] = value
+        changed["screen"] = attachments.with_shape(changed["screen"])
         _change(changed["source"], before, {path.rpartition(".")[2] for path in given if path.startswith("source.")})
         settings.refuse_unused(changed["source"], given)
         if changed["source"]["type"] not in sources.used_by("profile"):
@@ -197,7 +201,7 @@ class Project:
             self.profile.write(path / self.settings["source"]["profile"])
         if self.second is not None:
             self.second.write(path / self.settings["second"]["file"])
-        for file in attachments.of(self.settings["source"], self.settings["design"]):
+        for file in attachments.of(self.settings):
             write_bytes(path / file, file.data)
         self.write_settings(path)
 

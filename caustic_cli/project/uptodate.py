@@ -36,7 +36,7 @@ def digest(full: Settings, *pictures: Picture | None) -> str:
     for picture in filter(None, pictures):
         found.update(f"{picture.values.shape}{picture.values.dtype}{picture.encoding}".encode())
         found.update(np.ascontiguousarray(picture.values).tobytes())
-    for file in attachments.of(full["source"], full["design"]):
+    for file in attachments.of(full):
         found.update(hashlib.sha256(file.data).digest())
     start = Path(full["design"]["start"])
     if is_project(start):
@@ -90,7 +90,8 @@ class Outputs:
         self.record, self.paths = project.path / RECORD, [p for p in paths if p is not None]
         given = {k: str(v) for k, v in sorted(options.items())}
         inputs = [digest(project.settings, project.picture, project.profile), _hash(project.path / CHECKPOINT)]
-        inputs += [_hash(Path(options[name])) for name in ("source.file", "source.intensity") if options.get(name)]
+        files = ("source.file", "source.intensity", "screen.shape_file")
+        inputs += [_hash(Path(options[name])) for name in files if options.get(name)]
         self.asked = hashlib.sha256(json.dumps([command, given, inputs]).encode()).hexdigest()
         self.key = " ".join(str(p.resolve()) for p in self.paths)
 

@@ -52,7 +52,7 @@ class Scene:
     second: what light does behind the screen, of a lens with two free-form sides.
 
     Raises:
-        InputError: the screen does not stand behind the lens, or the source not before it.
+        InputError: the screen does not stand behind the lens, or the source not before it; the screen does not fit on its sphere.
     """
 
     source: Source
@@ -66,6 +66,7 @@ class Scene:
             self.second.check(self.screen)
         if not self.lens.mirror and self.screen.z <= self.lens.z_in:
             raise InputError(f"⟨screen.z⟩ must lie behind the lens (beyond z_in = {self.lens.z_in:g} mm), got {self.screen.z:g} mm")
+        self.screen.refuse_beyond()
         if self.source.nearest >= self.lens.z_in:
             raise InputError(
                 f"⟨source.position⟩ must lie before the lens (z below z_in = {self.lens.z_in:g} mm),"

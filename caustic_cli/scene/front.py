@@ -50,8 +50,10 @@ class Second:
         Raises:
             InputError: saying where it lies.
         """
-        if any(screen.tilt):
-            raise InputError("⟨screen.tilt⟩ must be 0, 0 where light is said to do something behind the picture")
+        if not screen.upright or screen.curved:
+            raise InputError(
+                "where light is said to do something behind the picture, that must be on a plane screen without ⟨screen.tilt⟩"
+            )
         z = self.screen.z if self.screen is not None else self.focus[2] if self.focus is not None else None
         if z is not None and z <= screen.z:
             name = "z" if self.screen is not None else "focus"

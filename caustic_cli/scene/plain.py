@@ -16,5 +16,6 @@ def beyond_plain(scene: Scene) -> list[str]:
         "several wavelengths": len(light.wavelengths) > 1,
         "a tilted screen": any(screen.tilt),
         "a shifted screen": any(screen.shift),
+        "a curved screen": screen.curved,
     }
     return [name for name, there in found.items() if there]

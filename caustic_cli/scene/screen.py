@@ -1,11 +1,51 @@
-"""The screen: a rectangle of pixels, in the plane z = const unless it is tilted."""
+"""The screen: a rectangle of pixels, in the plane z = const unless it is tilted or curved.
+
+A curved screen is a height field S(x, y) over its own plane: its pixels are equal cells of x and y there, so that the picture is as
+seen from far away along the screen's normal.  S > 0 lies on the side of the normal, which an upright screen has along +z.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from caustic_cli.config.table import check_all, default
+from caustic_cli.errors import InputError
+
+#: Most points of a measured shape along an axis.
+MAX_SAGS = 4096
+#: Part of a sphere's or a cylinder's radius that the screen may reach from its middle: farther out light meets it edge on.
+STEEPEST = 0.98
+#: Radii of a plane screen.
+PLANE = (math.inf, math.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class Sags:
+    """Measured heights S of a screen: values (a, b) mm, [i, j] with i along +x, on an even grid over a rectangle of this full width
+    and height, mm, about the screen's middle, borders included.
+
+    Raises:
+        InputError: too few or too many values, or some that are not finite.
+    """
+
+    values: np.ndarray
+    size: tuple[float, float]
+
+    def __post_init__(self):
+        a, b = self.values.shape
+        if not 4 <= min(a, b) <= max(a, b) <= MAX_SAGS:
+            raise InputError(f"⟨screen.shape_file⟩ must have 4 to {MAX_SAGS} heights along each axis, got {a} x {b}")
+        if not np.isfinite(self.values).all():
+            raise InputError("⟨screen.shape_file⟩ must hold finite heights in mm")
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Sags) and self.values is other.values and self.size == other.size
+
+    def __hash__(self) -> int:
+        return hash((id(self.values), self.size))
 
 
 @dataclass(frozen=True)
@@ -19,6 +59,12 @@ class Screen:
         tilt: right-handed turns of the screen about its own centre, first about the fixed x axis, then about the fixed y axis,
             degrees.
         shift: of its middle from the axis along x and y, mm.
+        radius: of curvature along x and y, mm: both the same for a sphere, one of them inf for a cylinder; positive has its centre
+            on the side of the normal, so that the edges bend that way.
+        sags: a measured shape instead.
+
+    Raises:
+        InputError: a value out of range, or a radius of neither a sphere nor a cylinder.
     """
 
     size: tuple[float, float]
@@ -26,9 +72,63 @@ class Screen:
     resolution: tuple[int, int] = (250, 250)
     tilt: tuple[float, float] = default("screen.tilt")
     shift: tuple[float, float] = default("screen.shift")
+    radius: tuple[float, float] = PLANE
+    sags: Sags | None = None
 
     def __post_init__(self):
         check_all("screen", self, "size", "z", "resolution", "tilt", "shift")
+        if any(isinstance(r, bool) or not isinstance(r, int | float) or math.isnan(r) or r == 0 for r in self.radius):
+            raise InputError(f"⟨screen.radius⟩ must be non-zero numbers of mm or inf, got {list(self.radius)}")
+        if self.radius[0] != self.radius[1] and all(map(math.isfinite, self.radius)):
+            raise InputError(
+                "⟨screen.radius⟩ must be the same along x and y, of a sphere, or inf along one, of a cylinder,"
+                f" got {self.radius[0]:g} and {self.radius[1]:g} mm; any other shape is for ⟨screen.shape_file⟩"
+            )
+        if self.sags is not None and self.rounded:
+            raise InputError("⟨screen.radius⟩ and ⟨screen.shape_file⟩ are two shapes of one screen: give one of them")
+
+    @property
+    def rounded(self) -> bool:
+        """Whether it is a sphere or a cylinder."""
+        return any(map(math.isfinite, self.radius))
+
+    @property
+    def curved(self) -> bool:
+        """Whether it lies in no plane."""
+        return self.rounded or self.sags is not None
+
+    @property
+    def upright(self) -> bool:
+        """Whether it lies in the plane z = const."""
+        return not (self.curved or any(self.tilt))
+
+    @property
+    def uncurved(self) -> Screen:
+        """The plane screen in its place."""
+        return replace(self, radius=PLANE, sags=None) if self.curved else self
+
+    def refuse_beyond(self) -> None:
+        """Refuse a sphere or a cylinder that the screen does not lie on.
+
+        Raises:
+            InputError: saying how large its radius has to be.
+        """
+        bent = [(h, abs(r)) for h, r in zip(self.half_size, self.radius, strict=True) if math.isfinite(r)]
+        if bent and (far := math.hypot(*(h for h, _ in bent))) > STEEPEST * bent[0][1]:
+            raise InputError(
+                f"⟨screen.radius⟩ must be at least {far / STEEPEST:.4g} mm either way for a screen of {self.size[0]:g} x"
+                f" {self.size[1]:g} mm to lie on {'the sphere' if len(bent) == 2 else 'the cylinder'}, got {bent[0][1]:g} mm"
+            )
+
+    def shape_words(self) -> str:
+        """What shape it has: "a sphere of radius 60 mm"."""
+        if self.sags is not None:
+            a, b = self.sags.values.shape
+            return f"a measured shape of {a} x {b} heights"
+        finite = [r for r in self.radius if math.isfinite(r)]
+        if not finite:
+            return "plane"
+        return f"a {'sphere' if len(finite) == 2 else 'cylinder'} of radius {finite[0]:g} mm"
 
     @property
     def half_size(self) -> tuple[float, float]:
@@ -55,9 +155,3 @@ class Screen:
         """Unit vectors along its x and y, and its normal."""
         (sa, ca), (sb, cb) = ((math.sin(t), math.cos(t)) for t in map(math.radians, self.tilt))
         return (cb, 0.0, -sb), (sb * sa, ca, cb * sa), (sb * ca, -sa, cb * ca)
-
-    @property
-    def depth(self) -> float:
-        """How far a tilted screen reaches before and behind its middle, mm."""
-        along_x, along_y, _ = self.axes
-        return abs(along_x[2]) * self.half_size[0] + abs(along_y[2]) * self.half_size[1]

@@ -64,8 +64,10 @@ def write_report(
         image = waves
     for axis, (picture, title) in zip(axes[0], shown, strict=False):
         part = picture / max(picture.sum(), 1e-300)
-        mean = figures["wave_mean_irradiance" if picture is waves else "mean_irradiance"]
-        white = mean * picture.size / scale
+        peak, brightest = figures["wave_peak_irradiance" if picture is waves else "peak_irradiance"], picture
+        if picture is target:
+            brightest = shown[1][0]
+        white = peak / (brightest.max() or 1.0) * brightest.sum() / scale
         white = white if white > DARK else 1.0
         norm = (
             FuncNorm((lambda e, w=white: to_srgb(e / w), lambda v, w=white: w * to_linear(v)), 0.0, white, clip=True)

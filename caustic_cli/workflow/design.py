@@ -86,6 +86,8 @@ def begin(
         read[-1]["source"] = attachments.attached(read[-1]["source"], config.parent)
     if config and "design" in read[-1]:
         read[-1]["design"] = attachments.with_errors(read[-1]["design"], config.parent)
+    if config and "screen" in read[-1]:
+        read[-1]["screen"] = attachments.with_shape(read[-1]["screen"], config.parent)
     chosen: Settings = {}
     for path, value in given.items():
         section, _, key = path.rpartition(".")
@@ -96,6 +98,8 @@ def begin(
         say.say(f"⟨lens.index⟩ {said['lens']['index']:g} is taken at every wavelength, and nothing of {glass}")
     if "design" in said:
         said["design"] = attachments.with_errors(said["design"])
+    if "screen" in said:
+        said["screen"] = attachments.with_shape(said["screen"])
     parameters = said.pop("", {})
     invert = parameters.pop("invert", False)
     by = Derivation(**parameters)
@@ -123,7 +127,7 @@ def begin(
     full["target"] |= {"file": f"target{picture.suffix}", "encoding": picture.encoding}
     if light is not None:
         full["source"]["profile"] = f"profile{light.suffix}"
-    attachments.named_in_project(full["source"], full["design"])
+    attachments.named_in_project(full["source"], full["screen"], full["design"])
     project = Project(
         out,
         full,
@@ -405,6 +409,8 @@ def _run(
         after = expected_seconds(designer, target, state, device)
         limit = max(LEAST_PART * limit, limit - (time.monotonic() - began) - after)
     records = _Records(project, designer, device)
+    if movie is not None:
+        movie.screen = designer.scene.screen
     total = chosen["iterations"] or sum(s.iterations for s in designer.stages)
     with _signals(project.path is not None) as asked, say.progress(total) as show:
         stage, saved = -1, time.monotonic()

@@ -23,6 +23,7 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import sides_of
 from caustic_cli.optics.waves import WaveImage
 from caustic_cli.project.project import FARTHER, RENDER, REPORT, WAVE, Project
+from caustic_cli.studies.irradiance import irradiance
 from caustic_cli.studies.panels import write_report
 from caustic_cli.studies.retrace import FINAL_RAYS, retrace, white_level
 from caustic_cli.studies.second import second_figures
@@ -63,7 +64,8 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
     if project.path is None:
         return found
     encoding = project.settings["target"]["encoding"]
-    write_image(project.path / RENDER, found.image, white_level(found.image, target), encoding)
+    seen, aim = (irradiance(a, designer.scene.screen) for a in (found.image, target))
+    write_image(project.path / RENDER, seen, white_level(seen, aim), encoding)
     discard(project.path / WAVE)  # of another lens
     if found.waves is not None:
         write_image(project.path / WAVE, found.waves, white_level(found.waves, target), encoding)
@@ -74,8 +76,8 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
     surface = _surface(designer.field(found.state.stage), sides_of(designer.scene, designer.field(0), found.state.heights)[1])
     write_report(
         project.path / REPORT,
-        grey(target),
-        grey(found.image),
+        grey(aim),
+        grey(seen),
         surface,
         history,
         designer.scene.lens,

@@ -90,6 +90,8 @@ def write(
         return {"heightmap": {key: value for key, value in found.items() if key != "spline"}}
     if script and scene.lens.mirror:
         raise InputError("⟨script⟩ builds lenses, not mirrors")
+    if script and scene.screen.curved:
+        raise InputError("⟨script⟩ builds plane receivers, not curved screens, which the archive alone holds")
     writer(path, part.scene, part.field, part.heights, **given)
     if script:
         import_module("caustic_cli.export.lighttools_script").write_script(path, scene, field, heights, **given)

@@ -17,6 +17,8 @@ from PIL import Image, ImageDraw, ImageFont
 from caustic_cli.inverse.designer import State
 from caustic_cli.io.movie import refuse_unwritable, write_movie
 from caustic_cli.io.picture import codes_of
+from caustic_cli.scene import Screen
+from caustic_cli.studies.irradiance import irradiance
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.retrace import white_level
 
@@ -57,6 +59,8 @@ class Movie:
         self._target: np.ndarray | None = None
         self._encoding = "srgb"
         self._last = ""
+        #: Whose pixels' true areas turn power into what is shown.
+        self.screen: Screen | None = None
 
     def record(self, state: State, target: np.ndarray, encoding: str, waves: bool) -> None:
         """Keep the image of the last iteration; waves: it is one of light as a wave."""
@@ -91,8 +95,10 @@ class Movie:
         return relative_rms(grey, goal)
 
     def _add(self, image: np.ndarray, *words: str) -> None:
-        white = white_level(image, self._target)
-        self.frames.append(Frame(codes_of(image, white, self._encoding), (words[0], words[1])))
+        target = self._target
+        if self.screen is not None:
+            image, target = irradiance(image, self.screen), None if target is None else irradiance(target, self.screen)
+        self.frames.append(Frame(codes_of(image, white_level(image, target), self._encoding), (words[0], words[1])))
 
 
 def _drawn(frame: Frame) -> Image.Image:

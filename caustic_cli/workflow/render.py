@@ -26,6 +26,7 @@ from caustic_cli.project.uptodate import Outputs
 from caustic_cli.scene import Scene
 from caustic_cli.studies import effects as effects_study
 from caustic_cli.studies import manufacture
+from caustic_cli.studies.irradiance import irradiance
 from caustic_cli.studies.retrace import white_level
 from caustic_cli.studies.second import second_figures
 from caustic_cli.studies.verify import require_mitsuba, verify, write_panels
@@ -176,16 +177,25 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
         nominal = lens.render(asked.rays, seed=seed, effects=plan, dtype=asked.dtype, device=device, say=say).figures
         beside_it = {f"nominal_{name}": nominal[name] for name in ("relative_rms", "noise")}
         figures["cut"] = {"program": str(asked.cut)} | beside_it | deviation
-    write_image(image_path, image, white_level(image, lens.target), lens.encoding)
+    shown = irradiance(image, scene.screen)
+    aim = None if lens.target is None else irradiance(lens.target, scene.screen)
+    write_image(image_path, shown, white_level(shown, aim), lens.encoding)
     if scene.second is not None:
-        target = None if lens.project is None else lens.project.second_target(scene)
+        farther_target = None if lens.project is None else lens.project.second_target(scene)
         with say.notify_if_slow("following the light behind the picture"):
             light, more = second_figures(
-                plan.scene, lens.field, lens.heights, target, rays=asked.rays, seed=seed, device=device, requests=plan.requests
+                plan.scene,
+                lens.field,
+                lens.heights,
+                farther_target,
+                rays=asked.rays,
+                seed=seed,
+                device=device,
+                requests=plan.requests,
             )
         figures |= more
         if light is not None:
-            write_image(farther, light, white_level(light, target), lens.encoding)
+            write_image(farther, light, white_level(light, farther_target), lens.encoding)
             figures["second_image"] = str(farther)
     if wave_path == asked.lens / WAVE:
         discard(wave_path)  # of what render.png was before

@@ -70,8 +70,10 @@ def refuse_untraceable(scene: Scene) -> None:
     """Stop before work begins where the page could not trace the light.
 
     Raises:
-        InputError: the source is a ray file.
+        InputError: the source is a ray file, or the screen is curved.
     """
+    if scene.screen.curved:
+        raise InputError("⟨html⟩: the page traces light to plane screens, not to curved ones")
     if any(one.rays is not None for one in scene.source.members):
         raise InputError(
             "⟨html⟩: the page traces plane waves, points, grids and discs, not the rays of a file; ⟨source.type⟩ renders it under"
@@ -103,7 +105,7 @@ def write_page(
         encoding: of the picture, srgb or linear, by which images are shown.
 
     Raises:
-        InputError: the source is a ray file, or the file cannot be written.
+        InputError: as of `refuse_untraceable`, or the file cannot be written.
     """
     refuse_untraceable(scene)
     screen = _coarser(scene.screen)

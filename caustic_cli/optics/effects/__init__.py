@@ -14,6 +14,7 @@ from caustic_cli.optics.effects.mirror import Mirror
 from caustic_cli.optics.effects.missed_surface import MissedSurface
 from caustic_cli.optics.effects.polarisation import Polarisation
 from caustic_cli.optics.effects.roughness import Roughness
+from caustic_cli.optics.effects.screen_shape import ScreenShape
 from caustic_cli.optics.effects.screen_shift import ScreenShift
 from caustic_cli.optics.effects.screen_tilt import ScreenTilt
 from caustic_cli.optics.effects.secondary_intersection import SecondaryIntersection
@@ -34,6 +35,7 @@ EFFECTS: tuple[Effect, ...] = (
     Mirror(),
     SecondaryIntersection(),
     Ghosts(),
+    ScreenShape(),
     ScreenTilt(),
     ScreenShift(),
     Diffraction(),

@@ -15,7 +15,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import cast
 
+import numpy as np
 import torch
+from scipy.interpolate import RectBivariateSpline
 from torch import Tensor
 
 from caustic_cli.optics.backends import backend_for
@@ -40,6 +42,15 @@ class HeightField(Surface[Tensor]):
         else:
             u, v = (SplineSpace(p, torch.as_tensor(t, dtype=torch.float64)) for p, t in zip(lens.degree, lens.knots, strict=True))
         return cls((u, v), lens.half_size)
+
+    @classmethod
+    def through(cls, z: np.ndarray, half_size: tuple[float, float]) -> tuple[HeightField, Tensor]:
+        """The spline through heights (a, b) mm on an even grid over the aperture, borders included, and its control heights: cubic,
+        or of a lower degree through fewer."""
+        degrees = [min(3, n - 1) for n in z.shape]
+        spline = RectBivariateSpline(*(np.linspace(0.0, 1.0, n) for n in z.shape), z, kx=degrees[0], ky=degrees[1], s=0)
+        u, v = (SplineSpace(p, torch.from_numpy(t)) for p, t in zip(degrees, spline.get_knots(), strict=True))
+        return cls((u, v), half_size), torch.from_numpy(spline.get_coeffs().reshape(z.shape))
 
     @property
     def shape(self) -> tuple[int, int]:

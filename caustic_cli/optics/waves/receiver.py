@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from caustic_cli.errors import InputError
 from caustic_cli.optics.frames import IDENTITY, Axes
 from caustic_cli.optics.system import Placed, System
+from caustic_cli.optics.waves.sampling import NoWaveImage
 from caustic_cli.scene import Screen
 
 #: Cosine between a screen's normal and the axis from which it counts as lying across it.
@@ -98,7 +99,10 @@ def receiver_of(system: System, screen: Screen | Placed) -> Receiver:
 
     Raises:
         InputError: it stands along the light.
+        NoWaveImage: it is curved.
     """
+    if (screen if isinstance(screen, Screen) else screen.screen).curved:
+        raise NoWaveImage("a curved screen has no wave image: the field is taken on planes")
     found = Receiver.of(screen)
     if abs(dot(found.axes[2], system.axis)) < LEAST_COSINE:
         raise InputError("⟨screen.tilt⟩ leaves the screen along the light, where no wave image can be taken")

@@ -1,0 +1,52 @@
+"""A screen that is curved: a sphere, a cylinder, or a measured shape."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from torch import Tensor
+
+from caustic_cli.optics.effects.base import Amount, Decision, Effect
+from caustic_cli.optics.screen_shape import space
+from caustic_cli.scene import Scene
+
+#: Radius of the sphere that is measured where there is none, in screen widths.
+AMOUNT = 1.5
+#: Points along each axis of the screen at which it is seen how far light would land elsewhere.
+POINTS = 65
+
+
+def displacement(scene: Scene) -> float:
+    """How far light from the lens' middle to points of the screen would land from their places, were it plane, pixels at most."""
+    screen, lens = scene.screen, scene.lens
+    x, y = (np.linspace(-h, h, POINTS) for h in screen.half_size)
+    x, y = (c.ravel() for c in np.meshgrid(x, y, indexing="ij"))
+    point = np.stack(space(screen, x, y))
+    way = point - np.array([0.0, 0.0, lens.offset.thickness])[:, None]
+    axes = np.array(screen.axes)
+    back = axes[2] @ (point - np.array([*screen.shift, screen.z])[:, None]) / (axes[2] @ way)
+    return float(np.hypot(*(back * (axis @ way) / w for axis, w in zip(axes[:2], screen.pixel, strict=True))).max())
+
+
+class ScreenShape(Effect):
+    """Left out, the screen is plane."""
+
+    name = "screen-shape"
+
+    def judge(self, scene: Scene, bounds) -> Decision:
+        """By how far light would land elsewhere on the plane screen."""
+        if not scene.screen.curved:
+            return Decision(self.name, False, "the screen is plane", 0.0, 0.0, present=False)
+        off = displacement(scene)
+        why = f"the screen is {scene.screen.shape_words()}; left plane, light would land up to {off:.3g} pixels elsewhere"
+        return Decision(self.name, True, why, off, 0.0)
+
+    def without(self, scene: Scene) -> Scene:
+        """Plane."""
+        return replace(scene, screen=scene.screen.uncurved) if scene.screen.curved else scene
+
+    def sample(self, scene: Scene, heights: Tensor) -> Amount:
+        """A sphere."""
+        radius = AMOUNT * max(scene.screen.size)
+        return Amount(replace(scene, screen=replace(scene.screen, radius=(radius, radius))), None, f"a radius of {radius:.4g} mm")

@@ -1,0 +1,122 @@
+"""The shape of a curved screen: where rays meet it, where its points are, and how large its pixels are.
+
+Notation, in the screen's own frame, whose origin is its middle and whose axes are those of its plane (`Screen.axes`)
+    x, y    its own coordinates less its shift, in which pixels are equal cells;  S(x, y) its height, mm, see `scene.screen`
+    A       sqrt(1 + S_x^2 + S_y^2), the area of the screen over that of its plane
+
+Light on a pixel is power; irradiance is that over the pixel's true area, A times the cell's.  A picture looks right on a screen
+that scatters evenly where its values are irradiance, from wherever one looks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from caustic_cli.optics.surfaces import Cylinder, HeightField, Sphere, Surface
+from caustic_cli.scene import Screen
+from caustic_cli.scene.screen import Sags
+
+#: Part of a measured shape's width that it goes on for beyond each border, turned about that: light beside the screen is seen.
+BESIDE = 0.25
+#: Gauss points of a pixel along each axis, in parts of its width, at which its area is taken.
+GAUSS = (0.5 - 0.5 / math.sqrt(3.0), 0.5 + 0.5 / math.sqrt(3.0))
+#: Points along each axis by which it is found how far a screen reaches.
+SURVEY = 129
+
+
+@dataclass(frozen=True, eq=False)
+class ScreenShape:
+    """A surface in the screen's frame, and its heights where it has some."""
+
+    surface: Surface
+    heights: Tensor | None = None
+
+    def land(self, origin, direction, point, axes, forward: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Rays to the surface: arguments and what comes back as of the backends' `land`, with the screen's middle for `point`."""
+        like = next(c for c in (*origin, *direction) if isinstance(c, Tensor))
+        o = tuple(_dot([_double(c) - p for c, p in zip(origin, point, strict=True)], axis) for axis in axes)
+        d = tuple(_dot([_double(c) for c in direction], axis) for axis in axes)
+        o, d = (tuple(torch.as_tensor(c, dtype=torch.float64, device=like.device).expand(like.shape) for c in v) for v in (o, d))
+        heights = None if self.heights is None else self.heights.to(like.device)
+        hit = self.surface.meet(heights, o, d, forward)
+        x, y = (torch.where(hit.found, a + hit.t * b, a).to(like.dtype) for a, b in zip(o[:2], d[:2], strict=True))
+        return x, y, hit.found
+
+    def at(self, x: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
+        """S, S_x and S_y at points of a common shape, float64."""
+        rx, ry = self.surface.half_size
+        u, v = (torch.from_numpy(np.clip(c, -r, r).ravel()) for c, r in zip(np.broadcast_arrays(x, y), (rx, ry), strict=True))
+        return [c.numpy().reshape(np.broadcast_shapes(np.shape(x), np.shape(y))) for c in self.surface.at(self.heights, u, v)]
+
+
+def _double(value):
+    return value.double() if isinstance(value, Tensor) else value
+
+
+def _dot(vector: Sequence, axis: Sequence[float]):
+    return sum(c * a for c, a in zip(vector, axis, strict=True))
+
+
+def shape_of(screen: Screen) -> ScreenShape | None:
+    """The shape of a screen, None of a plane one."""
+    return _made(tuple(screen.radius), screen.sags) if screen.curved else None
+
+
+@lru_cache(maxsize=16)
+def _made(radius: tuple[float, float], sags: Sags | None) -> ScreenShape:
+    if sags is None:
+        if radius[0] == radius[1]:
+            return ScreenShape(Sphere(radius[0]))
+        bent = 0 if math.isfinite(radius[0]) else 1
+        return ScreenShape(Cylinder(radius[bent], bent))
+    beside = [math.ceil(BESIDE * n) for n in sags.values.shape]
+    values = np.pad(sags.values, [(k, k) for k in beside], mode="reflect", reflect_type="odd")
+    half = (0.5 * w * (1.0 + 2.0 * k / (n - 1)) for w, k, n in zip(sags.size, beside, sags.values.shape, strict=True))
+    return ScreenShape(*HeightField.through(values, tuple(half)))
+
+
+def space(screen: Screen, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points of a screen in space, mm, from coordinates along its own axes counted from its middle."""
+    shape, (ax, ay, n) = shape_of(screen), screen.axes
+    s = 0.0 if shape is None else shape.at(x, y)[0]
+    px, py, pz = (m + x * a + y * b + s * c for m, a, b, c in zip((*screen.shift, screen.z), ax, ay, n, strict=True))
+    return px, py, pz
+
+
+def normals(screen: Screen, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Normals there in space, of length A."""
+    shape, (ax, ay, n) = shape_of(screen), screen.axes
+    sx, sy = (0.0 * x, 0.0 * y) if shape is None else shape.at(x, y)[1:]
+    nx, ny, nz = (c - sx * a - sy * b for a, b, c in zip(ax, ay, n, strict=True))
+    return nx, ny, nz
+
+
+def areas(screen: Screen) -> np.ndarray | None:
+    """A of every pixel, (n_x, n_y); None of a plane screen, where it is 1."""
+    shape = shape_of(screen)
+    if shape is None:
+        return None
+    x, y = (
+        (np.arange(n)[:, None] + GAUSS).ravel() * w - h
+        for n, w, h in zip(screen.resolution, screen.pixel, screen.half_size, strict=True)
+    )
+    _, sx, sy = shape.at(x[:, None], y[None, :])
+    (n, m), k = screen.resolution, len(GAUSS)
+    return np.sqrt(1.0 + sx * sx + sy * sy).reshape(n, k, m, k).mean((1, 3))
+
+
+@lru_cache(maxsize=16)
+def reach(screen: Screen) -> tuple[float, float]:
+    """How far a screen goes before and behind its middle along the system's z, mm: at most 0, at least 0."""
+    if screen.upright:
+        return 0.0, 0.0
+    x, y = (np.linspace(-h, h, SURVEY) for h in screen.half_size)
+    z = space(screen, x[:, None], y[None, :])[2] - screen.z
+    return min(0.0, float(z.min())), max(0.0, float(z.max()))
