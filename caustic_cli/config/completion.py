@@ -230,10 +230,15 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
         raise InputError(
             "⟨design.start⟩ transport gives a surface, which a network cannot begin from; use start offset, or network none"
         )
+    if max(array) > 1 and (design["start"] == "offset" or not plain):
+        raise InputError(
+            "⟨lens.array⟩ needs ⟨start⟩ transport, which gives every lenslet its surface, or the lens of a file, network none and"
+            " optimizer lbfgs"
+        )
     quality = quality or _quality(design["time_limit"])
     # Sharp light's transport is right at every scale at once, if the net can hold it, and so is that of a source that shifts the
     # image, for the light behind its blur; otherwise from coarse to fine.
-    moved = plain and fine_net and design["start"] != "offset" and (source.sharp or spread)
+    moved = plain and fine_net and design["start"] != "offset" and (source.sharp or spread or max(array) > 1)
     if "control" not in lens:
         spans = refinement_spans(max(screen["resolution"]), quality) if moved else DEFAULT_SPANS
         lens["control"] = [spans + p for p in degree] if design["network"] == "none" else [NETWORK_CONTROL] * 2
