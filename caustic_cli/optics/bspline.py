@@ -41,7 +41,7 @@ def open_knots(n: int, degree: int, parts: int = 1) -> Tensor:
     spans -= degree - 1
     if rest or spans < 1:
         raise InputError(
-            f"{parts} splines of degree {degree} side by side need {parts} times {degree} or more control points, and one"
+            f"{parts} splines of degree {degree} side by side need {parts} times {degree} or more control points, and one, got {n}"
         )
     inner = torch.linspace(0.0, 1.0, parts * spans + 1, dtype=torch.float64)
     times = torch.ones(len(inner), dtype=torch.int64)

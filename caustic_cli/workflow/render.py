@@ -35,6 +35,7 @@ from caustic_cli.workflow.lens import Lens, is_archive
 from caustic_cli.workflow.reporter import Reporter
 from caustic_cli.workflow.tolerances import read as read_tolerances
 from caustic_cli.workflow.tolerances import tolerances
+from caustic_cli.workflow.wanted import wanted
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,7 @@ class Request:
         force: replace files that are not ours, and do again what is up to date.
         seed, dtype: of rays; None for the project's own and for float64.
         tolerances: TOML file of errors whose effect is studied.
+        want: picture of the illumination that an array's sources are to be as bright for.
     """
 
     lens: Path
@@ -79,6 +81,7 @@ class Request:
     seed: int | None = None
     dtype: torch.dtype = torch.float64
     tolerances: Path | None = None
+    want: Path | None = None
 
     @property
     def asks(self) -> dict[str, object]:
@@ -99,7 +102,8 @@ class Request:
         )
         cut = {"cut": mark(self.cut)} if self.cut else {}
         off = {} if self.tolerances is None else {"tolerances": read_tolerances(self.tolerances)}
-        return {name: getattr(self, name) for name in names} | cut | off | dict(self.given)
+        want = {"want": mark(self.want)} if self.want else {}
+        return {name: getattr(self, name) for name in names} | cut | off | want | dict(self.given)
 
 
 def render(asked: Request, device: str, say: Reporter) -> dict:
@@ -130,7 +134,8 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     wave_path, wave_npy = beside(image_path), beside(asked.npy) if asked.npy else None
     off = None if asked.tolerances is None else read_tolerances(asked.tolerances)
     draws = (companion("tolerances.csv"), companion("tolerances.png")) if off else (None, None)
-    paths = (image_path, asked.npy, asked.html, panels, sheet, wave_path, wave_npy, *draws)
+    lit = companion("wanted.png") if asked.want else None
+    paths = (image_path, asked.npy, asked.html, panels, sheet, wave_path, wave_npy, *draws, lit)
     for path in paths:
         if path is not None:
             refuse_foreign(path, asked.force)
@@ -200,6 +205,8 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
         say.say(f"{sheet}: what making the lens asks for")
     if off is not None and draws[0] is not None and draws[1] is not None:
         figures["tolerances"] = tolerances(lens, plan, off, *draws, say)
+    if asked.want is not None and lit is not None:
+        figures["want"] = wanted(lens, plan, asked.want, lit, asked.rays, seed, device, say)
     if panels is not None:
         figures["verify"] = _verified(scene, lens, asked.rays, seed, panels)
     if made:
