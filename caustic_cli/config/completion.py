@@ -39,6 +39,7 @@ from caustic_cli.config.table import check, default
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Options
 from caustic_cli.inverse.extended import shift_of
+from caustic_cli.inverse.lenslets import FROM_AFAR
 from caustic_cli.inverse.schedule import Stage
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.resolution import BAND, Resolution, white
@@ -100,7 +101,7 @@ def complete(given: Settings, aspect: float, by: Derivation | None = None, lit: 
     if value_of(target, "target.sheet"):
         array = check("lens.array", value_of(lens, "lens.array"))
         if max(array) == 1 or value_of(target, "target.color"):
-            raise InputError("⟨target.sheet⟩ needs ⟨lens.array⟩ and a picture without colours")
+            raise InputError("⟨target.sheet⟩ needs ⟨+lens.array⟩, and a picture without colours")
         aspect, lit = aspect * array[0] / array[1], (1.0, 1.0)
     mirror = value_of(lens, "lens.mirror")
     if by.throw is not None:
@@ -235,6 +236,8 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
             "⟨lens.array⟩ needs ⟨start⟩ transport, which gives every lenslet its surface, or the lens of a file, network none and"
             " optimizer lbfgs"
         )
+    if max(array) > 1 and design["start"] == "transport" and not source.distant:
+        raise InputError(FROM_AFAR)
     quality = quality or _quality(design["time_limit"])
     # Sharp light's transport is right at every scale at once, if the net can hold it, and so is that of a source that shifts the
     # image, for the light behind its blur; otherwise from coarse to fine.

@@ -33,6 +33,11 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT
 from caustic_cli.scene import Scene
 
+FROM_AFAR = (
+    "⟨lens.array⟩ needs light from infinity, which reaches every lenslet alike: ⟨+source.type⟩ plane, or a disc with"
+    " ⟨+source.angle⟩"
+)
+
 
 @dataclass(frozen=True, eq=False)
 class Lenslet:
@@ -61,10 +66,7 @@ def lenslets(scene: Scene, control: tuple[int, int] | None = None) -> list[Lensl
     """
     lens, screen = scene.lens, scene.screen
     if not scene.source.distant:
-        raise InputError(
-            f"⟨lens.array⟩ needs light from infinity, which all lenslets share: ⟨source⟩ plane, or a disc with ⟨source.angle⟩,"
-            f" got {scene.source.kind}"
-        )
+        raise InputError(FROM_AFAR)
     steps = [(n - 1) // k for n, k in zip(control or lens.control, lens.array, strict=True)]
     size = (lens.size[0] / lens.array[0], lens.size[1] / lens.array[1])
     own = replace(lens, size=size, control=(steps[0] + 1, steps[1] + 1), array=(1, 1))

@@ -35,7 +35,7 @@ from caustic_cli.workflow.lens import Lens, is_archive
 from caustic_cli.workflow.reporter import Reporter
 from caustic_cli.workflow.tolerances import read as read_tolerances
 from caustic_cli.workflow.tolerances import tolerances
-from caustic_cli.workflow.wanted import wanted
+from caustic_cli.workflow.wanted import illumination, wanted
 
 
 @dataclass(frozen=True)
@@ -149,6 +149,7 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     if asked.screen_at is not None:
         lens = replace(lens, scene=replace(lens.scene, screen=replace(lens.scene.screen, z=asked.screen_at)))
     scene = lens.scene
+    goal = None if asked.want is None else illumination(lens, asked.want)
     if asked.verify:
         require_mitsuba(scene)
     if asked.html is not None:
@@ -205,8 +206,8 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
         say.say(f"{sheet}: what making the lens asks for")
     if off is not None and draws[0] is not None and draws[1] is not None:
         figures["tolerances"] = tolerances(lens, plan, off, *draws, say)
-    if asked.want is not None and lit is not None:
-        figures["want"] = wanted(lens, plan, asked.want, lit, asked.rays, seed, device, say)
+    if goal is not None and lit is not None:
+        figures["want"] = wanted(lens, plan, goal, lit, asked.rays, seed, device, say)
     if panels is not None:
         figures["verify"] = _verified(scene, lens, asked.rays, seed, panels)
     if made:

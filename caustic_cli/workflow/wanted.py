@@ -18,29 +18,37 @@ from caustic_cli.workflow.lens import Lens
 from caustic_cli.workflow.reporter import Reporter
 
 
-def wanted(lens: Lens, plan: Plan, picture: Path, image: Path, rays: int, seed: int, device: str, say: Reporter) -> dict[str, Any]:
-    """Solve for the brightnesses and write the image that they give.
-
-    Args:
-        picture: the wanted illumination, laid over the screen like the project's own picture.
-        rays: of all lenslets together.
-
-    Returns:
-        the figures for JSON: `brightness`, N lists of M, in parts of the largest; `error`, relative RMS of the image, both scaled
-        to the same power; `kkt_residual`, see `studies.brightness`; `power`, the part of the source's that they take, if the
-        largest is one; `image`.
+def illumination(lens: Lens, picture: Path) -> np.ndarray:
+    """A wanted illumination on the screen's pixels (n_x, n_y), laid there like the project's own picture.
 
     Raises:
         InputError: the lens is no array, or an archive's; the picture cannot be read.
     """
-    scene, project = plan.scene, lens.project
+    scene, project = lens.scene, lens.project
     if project is None or not scene.lens.arrayed:
         raise InputError("⟨want⟩ is for a project whose lens is an array of lenslets (caustic design with ⟨+lens.array⟩)")
     if scene.colored:
         raise InputError("⟨want⟩ is of brightness alone, and the project's picture has colours")
     goal = project.settings["target"]
     light = read_picture(picture, goal["encoding"] == "linear")
-    asked = target_on_screen(light.irradiance(), tuple(goal["size"]), scene.screen, goal["flip"])
+    return target_on_screen(light.irradiance(), tuple(goal["size"]), scene.screen, goal["flip"])
+
+
+def wanted(
+    lens: Lens, plan: Plan, asked: np.ndarray, image: Path, rays: int, seed: int, device: str, say: Reporter
+) -> dict[str, Any]:
+    """Solve for the brightnesses and write the image that they give.
+
+    Args:
+        asked: of `illumination`.
+        rays: of all lenslets together.
+
+    Returns:
+        the figures for JSON: `brightness`, N lists of M, in parts of the largest; `error`, relative RMS of the image, both scaled
+        to the same power; `kkt_residual`, see `studies.brightness`; `power`, the part of the source's that they take, if the
+        largest is one; `image`.
+    """
+    scene = plan.scene
     parts, images = lenslets(scene, lens.field.shape), []
     with say.progress(len(parts)) as show:
         for k, one in enumerate(parts):
