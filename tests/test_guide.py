@@ -68,7 +68,7 @@ def home(tmp_path_factory):
             patch.setenv(name, value)
         small_designs(patch, 20_000)
         os.chdir(directory)
-        for name in ("flame.png", "ball.png"):
+        for name in ("flame.png", "ball.png", "array-sheet.png", "array-wanted.png"):
             shutil.copy(ROOT / "examples" / name, directory)
         shutil.copytree(ROOT / "examples" / "thesis", directory / "thesis")
         shutil.copy(ROOT / "examples" / "globe.toml", directory)
@@ -129,7 +129,7 @@ def test_links_of_the_documents_lead_somewhere():
             if "://" not in link:
                 assert (path.parent / link).exists(), f"{path}: {link}"
                 checked += 1
-    assert checked > 20 and len(CHAPTERS) == 9
+    assert checked > 20 and len(CHAPTERS) >= 9
 
 
 def test_the_readme_is_short_and_its_python_is_the_library():

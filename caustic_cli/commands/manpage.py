@@ -89,6 +89,10 @@ Of the surface that a design began from, by the same rays.
 Of a study of errors: draws, percentiles p5, p50 and p95 of relative_rms (as placed), shifted_relative_rms (after the best shift of
 the screen) and on_target, sensitivities, offenders, wave_check, csv, plot.
 .TP
+.B want
+Of an array and a wanted illumination: brightness of each lenslet's source in parts of the largest, N lists of M; error, relative
+RMS of the image that they give; kkt_residual; power, part of what all sources would take; image.
+.TP
 .B rays, iterations, seconds, image, project
 Rays traced, iterations done, wall time, files.
 .SH ORIENTATION

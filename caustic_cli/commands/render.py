@@ -112,6 +112,14 @@ def run(
             " sensitivities, percentiles of error and light, worst offenders; writes tolerances.csv and .png beside the image.",
         ),
     ] = None,
+    want: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PICTURE",
+            help="Of an array of lenslets: how bright each one's source has to be for this illumination (non-negative least"
+            " squares over the image of each lenslet alone); writes wanted.png beside the image.",
+        ),
+    ] = None,
     force: options.Force = False,
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -171,6 +179,7 @@ def run(
         seed,
         options.dtype_of(dtype or "float64"),
         tolerances,
+        want,
     )
     figures = render(asked, device, say)
     if not figures.pop("reused", False):
@@ -200,6 +209,10 @@ def _show(title: str, figures: dict, say: console.Reporter) -> None:
         from caustic_cli.studies.tolerances import rows as of_tolerances  # noqa: PLC0415
 
         say.table("tolerances", of_tolerances(figures["tolerances"]))
+    if "want" in figures:
+        from caustic_cli.workflow.wanted import rows as of_wanted  # noqa: PLC0415
+
+        say.table("brightness of the lenslets' sources", of_wanted(figures["want"]))
     if "verify" in figures:
         f = figures["verify"]
         say.table(

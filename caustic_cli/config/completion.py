@@ -18,6 +18,7 @@ from caustic_cli.config.plans import (
     TWO_SIDED_SPANS,
     Table,
     coarse_to_fine,
+    each_lenslet,
     on_rays,
     on_waves,
     refinement,
@@ -40,10 +41,12 @@ from caustic_cli.config.table import check, default
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Options
 from caustic_cli.inverse.extended import shift_of
+from caustic_cli.inverse.lenslets import FROM_AFAR
 from caustic_cli.inverse.schedule import Stage
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.resolution import BAND, Resolution, white
 from caustic_cli.scene import Offset, Scene, Screen, Source, sources
+from caustic_cli.scene.lens import array_control
 from caustic_cli.scene.light import RGB
 from caustic_cli.scene.sources.section import content
 from caustic_cli.scene.tolerances import Tolerances
@@ -98,6 +101,11 @@ def complete(given: Settings, aspect: float, by: Derivation | None = None, lit: 
     """
     s, by = with_defaults(given), by or Derivation()
     lens, screen, target = s["lens"], s["screen"], s["target"]
+    if value_of(target, "target.sheet"):
+        array = check("lens.array", value_of(lens, "lens.array"))
+        if max(array) == 1 or value_of(target, "target.color"):
+            raise InputError("⟨target.sheet⟩ needs ⟨+lens.array⟩, and a picture without colours")
+        aspect, lit = aspect * array[0] / array[1], (1.0, 1.0)
     mirror = value_of(lens, "lens.mirror")
     if by.throw is not None:
         screen["z"] = -by.throw if mirror else by.throw
@@ -180,7 +188,7 @@ def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[st
     lens.setdefault("height_range", [-scale, scale] if sides == 1 else [c * SAG * lens["thickness"] for c in (-1.0, 1.0)])
     if sides == 2:
         lens.setdefault("radius", [math.inf, math.inf])
-    mirror = value_of(lens, "lens.mirror")
+    mirror, array = value_of(lens, "lens.mirror"), check("lens.array", value_of(lens, "lens.array"))
     if mirror and screen["z"] >= lens["thickness"] + lens["height_range"][0]:
         raise InputError(
             f"⟨screen.z⟩ must lie before the mirror, which begins at"
@@ -192,11 +200,14 @@ def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[st
             f" {lens['thickness'] + lens['height_range'][1]:.4g} mm thick, got {screen['z']:g} mm"
         )
     if "radius" not in lens:
-        mag = tuple(t / w for t, w in zip(target["size"], lens["size"], strict=True))
+        # Lenslets side by side throw their pictures onto one another, as a lens that gathers the light of their middles.
+        across, along = (t / w if k == 1 else 0.0 for t, w, k in zip(target["size"], lens["size"], array, strict=True))
         vergence = 0.0
         if source.nearest < lens["z_in"]:  # divergence at the surface, 1/mm; 0 from infinity
             vergence = 1.0 / (lens["z_in"] - source.centre[2] + (lens["thickness"] - lens["z_in"]) / (1.0 if mirror else index))
-        radius = Offset.for_magnification(mag, -1.0 if mirror else index, screen["z"], lens["thickness"], vergence).radius
+        radius = Offset.for_magnification(
+            (across, along), -1.0 if mirror else index, screen["z"], lens["thickness"], vergence
+        ).radius
         least = STEEPEST * math.hypot(*lens["size"]) / 2.0  # what a long picture, or light from nearby, asks for may be more
         lens["radius"] = [math.copysign(max(abs(r), least), r) for r in radius]
 
@@ -230,6 +241,7 @@ def _complete_second(s: Settings) -> None:
     wrong = {
         "lens.mirror": value_of(s["lens"], "lens.mirror"),
         "target.color": value_of(s["target"], "target.color"),
+        "lens.array": max(value_of(s["lens"], "lens.array")) > 1,
         "design.robust": design.get("robust", ""),
         "design.network": design["network"] != "none",
         "design.optimizer": design["optimizer"] != "lbfgs",
@@ -269,23 +281,38 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
     degree = check("lens.degree", lens["degree"])
     plain = design["network"] == "none" and design["optimizer"] == "lbfgs"
     asked = check("design.waves", design["waves"])
+    array = value_of(lens, "lens.array")
     fine_net = "control" not in lens or min(n - p for n, p in zip(lens["control"], degree, strict=True)) >= LEAST_SPANS
+    fine_net = fine_net or max(array) > 1  # whose lenslets have to be solved for
     spread = plain and fine_net and not source.sharp and _shifts(s, source)
     design.setdefault("start", "transport" if "second" in s or (plain and fine_net and not source.apart) else "offset")
     if design["start"] == "transport" and design["network"] != "none":
         raise InputError(
             "⟨design.start⟩ transport gives a surface, which a network cannot begin from; use start offset, or network none"
         )
+    if max(array) > 1 and (design["start"] == "offset" or not plain):
+        raise InputError(
+            "⟨lens.array⟩ needs ⟨start⟩ transport, which gives every lenslet its surface, or the lens of a file, network none and"
+            " optimizer lbfgs"
+        )
+    if max(array) > 1 and design["start"] == "transport" and not source.distant:
+        raise InputError(FROM_AFAR)
     quality = quality or _quality(design["time_limit"])
     if "second" in s:
         _complete_two_sided(s, source, quality, rays)
         return
     # Sharp light's transport is right at every scale at once, if the net can hold it, and so is that of a source that shifts the
     # image, for the light behind its blur; otherwise from coarse to fine.
-    moved = plain and fine_net and design["start"] != "offset" and (source.sharp or spread)
+    moved = plain and fine_net and design["start"] != "offset" and (source.sharp or spread or max(array) > 1)
     if "control" not in lens:
         spans = refinement_spans(max(screen["resolution"]), quality) if moved else DEFAULT_SPANS
         lens["control"] = [spans + p for p in degree] if design["network"] == "none" else [NETWORK_CONTROL] * 2
+        lens["control"] = _of_array(lens["control"], degree, array)
+    elif (fits := _of_array(lens["control"], degree, array)) != list(lens["control"]):
+        raise InputError(
+            "⟨lens.control⟩ of an array must be lenslets times (spans + degree - 1) and one more along each axis, such as"
+            f" {fits[0]} x {fits[1]}, got {lens['control'][0]} x {lens['control'][1]}"
+        )
     design.setdefault("preconditioner", "laplacian" if plain else "none")
     if "stages" in design:
         if given or rays:
@@ -305,6 +332,8 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
     if moved:
         centre = source.pointlike() if spread else source
         stages = refinement(tuple(lens["control"]), rays, (nx, ny), quality, scattered=not centre.collimated, spread=spread)
+        if value_of(s["target"], "target.sheet"):
+            stages = each_lenslet(stages, math.prod(array), (nx, ny))
     elif plain and "knots_u" not in lens:
         stages = coarse_to_fine(tuple(lens["control"]), degree, rays or base, (nx, ny), quality, sampler=sampler)
     else:
@@ -340,6 +369,11 @@ def _complete_two_sided(s: Settings, source: Source, quality: str, rays: int | N
         design["stages"] = [_complete_stage(stage, s, _sampler(source)) for stage in design["stages"]]
 
 
+def _of_array(control: Sequence[int], degree: Sequence[int], array: Sequence[int]) -> list[int]:
+    """The least control points, so many or more, that an array of lenslets can have; of one lens, these."""
+    return [array_control(n, p, k) if k > 1 else n for n, p, k in zip(control, degree, array, strict=True)]
+
+
 def without_waves(s: Settings, given: bool) -> str:
     """Why `waves = "auto"` leaves the wave image out of complete settings although diffraction matters, and what puts it in.
 
@@ -368,6 +402,8 @@ def _not_by_default(s: Settings) -> str:
         return f"{design['optimizer']} was asked for, and the wave image takes lbfgs; ⟨waves⟩ on adds stages that use it"
     if build_screen(s).curved:
         return "a curved screen has no wave image"
+    if max(value_of(s["lens"], "lens.array")) > 1:
+        return "light of lenslets side by side interferes in fine fringes, which rays alone pass over; ⟨waves⟩ on refines it"
     if any(s["screen"].get("tilt", ())):
         return "on a tilted screen it takes many transforms for each wavelength; ⟨waves⟩ on refines it all the same"
     return ""
@@ -494,6 +530,7 @@ def stage_of(table: Table, settings: Settings) -> Stage:
         t["oversample"],
         tuple(t.get("waves", ())),
         value_of(t, "design.stages.spread"),
+        value_of(t, "design.stages.lenslets"),
     )
 
 

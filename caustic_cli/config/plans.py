@@ -183,6 +183,20 @@ def two_sided(control: tuple[int, int], rays: int | None, resolution: tuple[int,
     return [on_rays(control, rays, "grid", apron=apron, iterations=iterations, oversample=finer)]
 
 
+#: So many times the rays at most where every lenslet is judged by itself.
+MORE_LENSLETS = 4
+
+
+def each_lenslet(stages: list[Table], lenslets: int, resolution: tuple[int, int]) -> list[Table]:
+    """Stages after a transport start in which every lenslet of an array is judged by its own picture."""
+    found = []
+    for stage in stages:
+        rays = stage["rays"] * min(MORE_LENSLETS, lenslets)
+        finer = max(1, min(stage["oversample"], math.isqrt(rays // lenslets // (resolution[0] * resolution[1]))))
+        found.append(stage | {"rays": rays, "oversample": finer, "lenslets": True})
+    return found
+
+
 #: What a quality means for the refinement on the wave image: wavelengths of white light, iterations of each stage, and how many
 #: seconds `waves = "auto"` may take for it on two cores.
 WAVES = {

@@ -286,6 +286,7 @@ def build_lens(settings: Settings) -> Lens:
         lens["fresnel"],
         glass=lens.get("glass"),
         **{key: value_of(lens, f"lens.{key}") for key in ("absorption", "roughness", "mirror", "aperture", "border")},
+        array=tuple(value_of(lens, "lens.array")),
     )
 
 

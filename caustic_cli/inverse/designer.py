@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -21,6 +21,7 @@ from caustic_cli.inverse import ranks
 from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
 from caustic_cli.inverse.extended import best_light, regular_rays, shift_of
 from caustic_cli.inverse.lbfgs import UNFIT
+from caustic_cli.inverse.lenslets import ArrayObjective, lenslets
 from caustic_cli.inverse.limits import within_limits
 from caustic_cli.inverse.losses import parse
 from caustic_cli.inverse.objective import Objective
@@ -31,14 +32,16 @@ from caustic_cli.inverse.steps import Adam, Newtonlike
 from caustic_cli.inverse.target import grey
 from caustic_cli.inverse.two_sided import TwoSidedObjective
 from caustic_cli.inverse.waves import WaveObjective
-from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.emission import Rays, rays_of
 from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.screen_shape import reach
+from caustic_cli.optics.spread import Convolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.waves import NoWaveImage
 from caustic_cli.scene import Scene
 from caustic_cli.scene.tolerances import Tolerances
 
+AnyObjective = Objective | WaveObjective | ArrayObjective | TwoSidedObjective
 #: A stage's flatness is judged over so many iterations.
 FLAT_SPAN = 10
 
@@ -109,6 +112,7 @@ class Designer:
         target: (n_x, n_y) irradiance on the scene's screen, not all zero.
         stages, options: how.
         device: where rays are traced.
+        own: (n_x, n_y) of each lenslet of an array; or one for all, the target unless given.
         second: (k_x, k_y) irradiance on the scene's second screen, where it has one.
 
     Of two free-form sides heights are those of entrance and exit, (2, n, m).
@@ -121,6 +125,7 @@ class Designer:
         stages: list[Stage],
         options: Options,
         device: str = "cpu",
+        own: Sequence[Tensor] | None = None,
         second: Tensor | None = None,
     ):
         if not stages:
@@ -136,6 +141,9 @@ class Designer:
             )
         self.scene, self.target, self.stages, self.options, self.device = scene, target, stages, options, device
         self.second = second
+        self.own = list(own) if own else [target]
+        if any(s.lenslets and (s.waves or s.spread or not scene.lens.arrayed) for s in stages):
+            raise InputError("⟨design.stages.lenslets⟩ needs ⟨lens.array⟩, and neither waves nor spread in the same stage")
         if options.network != "none" and any(s.waves for s in stages):
             raise InputError("⟨design.stages.waves⟩ needs network none: the wave image refines the heights themselves")
         for stage in stages:
@@ -276,17 +284,17 @@ class Designer:
             state.parameters, state.optimizer, state.image = heights.state_dict(), method.state(), method.image
             on_iteration(state)
 
-    def _objective(self, k: int, heights: Heights) -> Objective | WaveObjective | RobustObjective | TwoSidedObjective:
+    def _objective(self, k: int, heights: Heights) -> AnyObjective | RobustObjective:
         o = self.options
         if o.robust is None or k < len(self.stages) - 1:
             return self._objective_in(self.scene, k, heights.begun())
 
-        def objective(scene: Scene, begun: Tensor) -> Objective | WaveObjective:
+        def objective(scene: Scene, begun: Tensor) -> Objective | WaveObjective | ArrayObjective:
             return self._objective_in(scene, k, begun)
 
         return RobustObjective(objective, self.scene, self.field(k), heights.begun(), o.robust)
 
-    def _objective_in(self, scene: Scene, k: int, begun: Tensor) -> Objective | WaveObjective | TwoSidedObjective:
+    def _objective_in(self, scene: Scene, k: int, begun: Tensor) -> AnyObjective:
         """That of stage k in a scene, for heights near `begun`."""
         stage, o = self.stages[k], self.options
         if stage.source is not None:
@@ -323,18 +331,41 @@ class Designer:
                 oversample=stage.oversample,
                 dtype=o.dtype,
             )
+        if stage.lenslets:
+            own = self.own * (math.prod(scene.lens.array) if len(self.own) == 1 else 1)
+            parts = lenslets(scene, stage.control)
+            rays = max(1, stage.rays // len(parts))
+            return ArrayObjective(parts, lambda n, lenslet: self._on_rays(lenslet.scene, k, lenslet.field, own[n], rays))
         if stage.spread and (spread := shift_of(scene, self.field(k), begun)) is not None:
             expected = best_light(scene, grey(self.target.cpu().numpy()), spread, SMOOTH_STEPS).kept
             scene, rays, spread = regular_rays(scene, spread, stage, stream(o.seed, f"stage {k}"), self.device)
         else:
-            rays, spread = rays_of(scene, stage.sampler, stage.rays, stream(o.seed, f"stage {k}"), self.device), ()
-            expected = 1.0
+            return self._on_rays(scene, k, self.field(k), self.target, stage.rays)
+        return self._traced(scene, k, self.field(k), self.target, rays, spread, expected)
+
+    def _on_rays(self, scene: Scene, k: int, field: HeightField, target: Tensor, count: int) -> Objective:
+        """That of stage k by so many rays of a scene's whole source."""
+        rays = rays_of(scene, self.stages[k].sampler, count, stream(self.options.seed, f"stage {k}"), self.device)
+        return self._traced(scene, k, field, target, rays, (), 1.0)
+
+    def _traced(
+        self,
+        scene: Scene,
+        k: int,
+        field: HeightField,
+        target: Tensor,
+        rays: Rays | Sequence[Rays],
+        spread: Sequence[Convolution],
+        expected: float,
+    ) -> Objective:
+        """That of stage k on the ray image, by these rays."""
+        stage, o = self.stages[k], self.options
         return Objective(
             scene,
-            self.field(k),
+            field,
             rays,
             stage.filter,
-            self.target,
+            target,
             o.loss,
             blur=stage.blur,
             filter_target=o.filter_target,

@@ -76,7 +76,7 @@ def shift_of(scene: Scene, field: HeightField | None = None, heights: torch.Tens
     if not scene.source.extended or scene.source.apart or any(scene.screen.tilt) or scene.screen.curved:
         return None
     if heights is None:
-        scene = replace(scene, lens=replace(scene.lens, control=(NET, NET), knots=None))
+        scene = replace(scene, lens=replace(scene.lens, control=(NET, NET), knots=None, array=(1, 1)))
         field = HeightField.of(scene.lens)
         x, y = (c.numpy() for c in field.control_xy())
         offset = scene.lens.offset

@@ -36,6 +36,7 @@ class Stage:
             rays.
         spread: the rays are those of the source's middle, and their image is spread by the source's, where that is what the source
             does.
+        lenslets: every lenslet of an array is judged by its own picture, with its part of the rays, see `lenslets.ArrayObjective`.
     """
 
     control: tuple[int, int]
@@ -50,6 +51,7 @@ class Stage:
     oversample: int = default("design.stages.oversample")
     waves: tuple[float, ...] = ()
     spread: bool = default("design.stages.spread")
+    lenslets: bool = default("design.stages.lenslets")
 
     def __post_init__(self):
         check_all("design.stages", self, "control", "rays", "blur", "apron", "iterations", "tolerance", "oversample", "waves")

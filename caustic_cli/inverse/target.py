@@ -58,6 +58,25 @@ def target_on_screen(irradiance: np.ndarray, size: tuple[float, float], screen: 
     return np.ascontiguousarray(mean if true is None else mean * true)
 
 
+def tiles(light: np.ndarray, array: tuple[int, int]) -> list[np.ndarray]:
+    """The pictures on a sheet (a, b) of N x M of them, [i, j] with i along +x and j along +y, j fastest.
+
+    Raises:
+        InputError: its pixels cannot be shared out, or one of them is black.
+    """
+    a, b = (size // n for size, n in zip(light.shape, array, strict=True))
+    if (a * array[0], b * array[1]) != light.shape or min(a, b) < 2:
+        raise InputError(
+            f"⟨target.sheet⟩ must hold {array[0]} x {array[1]} pictures of the same size, of 2 x 2 pixels or more; it has"
+            f" {light.shape[0]} x {light.shape[1]} pixels"
+        )
+    found = [light[i * a : (i + 1) * a, j * b : (j + 1) * b] for i in range(array[0]) for j in range(array[1])]
+    for k, tile in enumerate(found):
+        if not tile.any():
+            raise InputError(f"⟨target.sheet⟩: the picture of lenslet {k // array[1]}, {k % array[1]} is black all over")
+    return found
+
+
 def grey(image: np.ndarray) -> np.ndarray:
     """(n_x, n_y) of an image, the colours of a coloured one (3, n_x, n_y) added up."""
     return image if image.ndim == 2 else image.sum(0)

@@ -28,12 +28,26 @@ MAX_DEGREE = 15
 KNOT_RESOLUTION = 1e-12
 
 
-def open_knots(n: int, degree: int) -> Tensor:
-    """Open, equispaced knot vector on [0, 1] for `n` control points of `degree`: (n + degree + 1,), float64."""
+def open_knots(n: int, degree: int, parts: int = 1) -> Tensor:
+    """Open, equispaced knot vector on [0, 1] for `n` control points of `degree`: (n + degree + 1,), float64.
+
+    parts: of equal width that meet in height but not in slope: their borders are knots of multiplicity `degree`, so that each part
+    of s spans is a spline of its own over an open, equispaced knot vector, and shares one control point with the next:
+    n = parts (s + degree - 1) + 1.
+    """
     if n < degree + 1:
         raise InputError(f"a spline of degree {degree} needs at least {degree + 1} control points, got {n}")
-    inner = torch.linspace(0.0, 1.0, n - degree + 1, dtype=torch.float64)
-    return torch.cat([inner.new_zeros(degree), inner, inner.new_ones(degree)])
+    spans, rest = divmod(n - 1, parts)
+    spans -= degree - 1
+    if rest or spans < 1:
+        raise InputError(
+            f"{parts} splines of degree {degree} side by side need {parts} times {degree} or more control points, and one, got {n}"
+        )
+    inner = torch.linspace(0.0, 1.0, parts * spans + 1, dtype=torch.float64)
+    times = torch.ones(len(inner), dtype=torch.int64)
+    times[::spans] = degree
+    inner = inner.repeat_interleave(times)
+    return torch.cat([inner.new_zeros(1), inner, inner.new_ones(1)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,11 +89,11 @@ class SplineSpace:
                 raise InputError(f"distinct knots must be at least {KNOT_RESOLUTION:g} apart")
 
     @classmethod
-    def uniform(cls, n: int, degree: int) -> SplineSpace:
-        """Open and equispaced knots for `n` control points (the thesis' lenses)."""
+    def uniform(cls, n: int, degree: int, parts: int = 1) -> SplineSpace:
+        """Open and equispaced knots for `n` control points (the thesis' lenses); parts: as of `open_knots`."""
         if not 1 <= degree <= MAX_DEGREE:
             raise InputError(f"spline degree must be 1 to {MAX_DEGREE}, got {degree}")
-        return cls(degree, open_knots(n, degree))
+        return cls(degree, open_knots(n, degree, parts))
 
     @property
     def n(self) -> int:

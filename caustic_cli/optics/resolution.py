@@ -71,8 +71,9 @@ class Resolution:
 
     @classmethod
     def before(cls, scene: Scene, picture: tuple[float, float]) -> Resolution:
-        """What will hold of a lens for a picture of this width and height, mm, with the magnification it is to have."""
-        (w, h), (lw, lh) = picture, scene.lens.size
+        """What will hold of a lens for a picture of this width and height, mm, with the magnification that it, or each lenslet of
+        an array, is to have."""
+        (w, h), (lw, lh) = picture, (width / k for width, k in zip(scene.lens.size, scene.lens.array, strict=True))
         return cls.of(scene, w, math.sqrt(w * h / (lw * lh)))
 
     @classmethod

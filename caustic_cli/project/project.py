@@ -17,9 +17,9 @@ from torch import Tensor
 
 from caustic_cli.config import settings
 from caustic_cli.config.completion import build_options, build_stages, complete
-from caustic_cli.config.settings import Settings
+from caustic_cli.config.settings import Settings, value_of
 from caustic_cli.errors import InputError, no_project, plain
-from caustic_cli.inverse.target import target_on_screen
+from caustic_cli.inverse.target import target_on_screen, tiles
 from caustic_cli.io.files import write_bytes
 from caustic_cli.io.picture import Picture, read_picture
 from caustic_cli.optics.bounds import refuse_without_glass
@@ -139,6 +139,8 @@ class Project:
     def target(self, scene: Scene) -> np.ndarray:
         """The picture on the scene's screen, (n_x, n_y), or (3, n_x, n_y) of a coloured one."""
         t, light = self.settings["target"], self.picture.irradiance()
+        if value_of(t, "target.sheet"):
+            return np.mean([own / own.sum() for own in self.targets(scene)], axis=0)
         if light.ndim == 3:
             whole = target_on_screen(light.sum(0), tuple(t["size"]), scene.screen, t["flip"])
             parts = [target_on_screen(c, tuple(t["size"]), scene.screen, t["flip"]) if c.any() else 0.0 * whole for c in light]
@@ -151,6 +153,13 @@ class Project:
             return None
         size, flip = tuple(self.settings["second"]["size"]), self.settings["target"]["flip"]
         return target_on_screen(self.second.irradiance(), size, scene.second.screen, flip)
+
+    def targets(self, scene: Scene) -> list[np.ndarray]:
+        """The picture of each lenslet on the scene's screen, (n_x, n_y), j fastest; of a single picture, that alone."""
+        t, light = self.settings["target"], self.picture.irradiance()
+        if not value_of(t, "target.sheet"):
+            return [self.target(scene)]
+        return [target_on_screen(tile, tuple(t["size"]), scene.screen, t["flip"]) for tile in tiles(light, scene.lens.array)]
 
     def load(self) -> Checkpoint:
         """The design so far."""

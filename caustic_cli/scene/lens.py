@@ -77,6 +77,13 @@ class Offset:
         return total
 
 
+def array_control(n: int, degree: int, lenslets: int) -> int:
+    """The least number of control points, n or more, that so many lenslets side by side of equally many spans have; see
+    `open_knots`."""
+    spans = max(1, math.ceil((n - 1) / lenslets) - degree + 1)
+    return lenslets * (spans + degree - 1) + 1
+
+
 @dataclass(frozen=True)
 class Lens:
     """A lens of refractive index n with flat entrance and B-spline exit.
@@ -97,6 +104,7 @@ class Lens:
         glass: a name of `materials`, whose index changes with the wavelength; None for `index` at every wavelength.
         aperture: rectangle, or circle, the largest that fits into the size; the spline goes on beyond it, light and glass do not.
         border: width of a dark rim around the aperture, which the exported solid has for its mount, mm.
+        array: lenslets along x and y, side by side over the aperture, which meet in height; (1, 1) is one lens.
         mirror: the surface reflects, the light comes through air, and `index`, `fresnel` and `absorption` mean nothing.
         front: the entrance where it is free-form, None for the plane.
     """
@@ -117,6 +125,7 @@ class Lens:
     mirror: bool = default("lens.mirror")
     aperture: str = default("lens.aperture")
     border: float = default("lens.border")
+    array: tuple[int, int] = default("lens.array")
     front: Front | None = None
 
     def __post_init__(self):
@@ -134,6 +143,7 @@ class Lens:
             "roughness",
             "aperture",
             "border",
+            "array",
         )
         least = iter(self.degree)
         checks.pair("⟨lens.control⟩", self.control, lambda w, n: checks.whole(w, n, next(least) + 1, TABLE["lens.control"].high))
@@ -141,6 +151,8 @@ class Lens:
             for axis, t, n, p in zip("uv", self.knots, self.control, self.degree, strict=True):
                 if len(t) != n + p + 1:
                     raise InputError(f"⟨lens.knots_{axis}⟩ must have control + degree + 1 = {n + p + 1} entries, got {len(t)}")
+        if self.arrayed:
+            self._check_array()
         low, high = self.height_range
         if not low < high:
             raise InputError(f"⟨lens.height_range⟩ must ascend, got [{low:g}, {high:g}]")
@@ -148,6 +160,17 @@ class Lens:
             raise InputError(
                 f"⟨lens.size⟩ of a circular aperture must be its diameter, twice the same, got {self.size[0]:g} x {self.size[1]:g}"
             )
+
+    def _check_array(self) -> None:
+        if self.round:
+            raise InputError("⟨lens.aperture⟩ of an array must be a rectangle, which its lenslets fill")
+        if self.knots is not None:
+            raise InputError("⟨lens.array⟩ has knots of its own: give no knots_u and knots_v")
+
+    @property
+    def arrayed(self) -> bool:
+        """Whether it is an array of lenslets."""
+        return max(self.array) > 1
 
     @property
     def half_size(self) -> tuple[float, float]:

@@ -31,7 +31,8 @@ from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.extended import best_light, centre_of, limits, shift_of
 from caustic_cli.inverse.initial_sides import first_sides
-from caustic_cli.inverse.initial_surface import first_surface
+from caustic_cli.inverse.initial_surface import InitialSurface, first_surface
+from caustic_cli.inverse.lenslets import first_array
 from caustic_cli.inverse.reach import largest_magnification, refuse_unreachable
 from caustic_cli.inverse.surface_from_map import OutOfReach
 from caustic_cli.inverse.target import grey
@@ -54,6 +55,8 @@ from caustic_cli.workflow.reporter import Reporter
 GROUND, NEARLY = 0.6, 0.98
 #: Part of a time limit that is left to the iterations, however long the start took.
 LEAST_PART = 0.25
+#: Source cells along a lenslet, at least.
+LEAST_CELLS = 128
 
 
 def begin(
@@ -319,9 +322,10 @@ def _designer(project: Project, device: str) -> tuple[Designer, np.ndarray]:
     scene = project.scene()
     target = project.target(scene)
     stages, chosen = build_stages(project.settings), build_options(project.settings)
+    own = [torch.from_numpy(one) for one in project.targets(scene)]
     second = project.second_target(scene)
     farther = None if second is None else torch.from_numpy(second)
-    return Designer(scene, torch.from_numpy(target), stages, chosen, device, farther), target
+    return Designer(scene, torch.from_numpy(target), stages, chosen, device, own, farther), target
 
 
 def _solved(project: Project, fixed: bool) -> tuple[torch.Tensor | None, float | None]:
@@ -346,7 +350,12 @@ def _solved(project: Project, fixed: bool) -> tuple[torch.Tensor | None, float |
         if spread is not None:
             light = best_light(scene, goal, spread, SMOOTH_STEPS)
             scene, goal = replace(scene, source=centre_of(scene), screen=scene.screen.grown(light.beside)), light.light
-        found = first_surface(scene, goal, designer.field(0), cells, fixed)
+        if scene.lens.arrayed:
+            goals = [goal] if len(designer.own) == 1 else [grey(own.numpy()) for own in designer.own]
+            cells = max(LEAST_CELLS, cells // max(scene.lens.array))
+            found = InitialSurface(first_array(scene, goals, designer.stages[0].control, cells).heights)
+        else:
+            found = first_surface(scene, goal, designer.field(0), cells, fixed)
         lens = designer.scene.lens
         short = lens.z_in + lens.min_thickness - float(found.heights.min())
         return found.heights + 1.01 * short if fixed and short > 0 else found.heights, found.middle

@@ -37,6 +37,7 @@ from caustic_cli.workflow.lens import Lens, is_archive
 from caustic_cli.workflow.reporter import Reporter
 from caustic_cli.workflow.tolerances import read as read_tolerances
 from caustic_cli.workflow.tolerances import tolerances
+from caustic_cli.workflow.wanted import illumination, wanted
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,7 @@ class Request:
         force: replace files that are not ours, and do again what is up to date.
         seed, dtype: of rays; None for the project's own and for float64.
         tolerances: TOML file of errors whose effect is studied.
+        want: picture of the illumination that an array's sources are to be as bright for.
     """
 
     lens: Path
@@ -81,6 +83,7 @@ class Request:
     seed: int | None = None
     dtype: torch.dtype = torch.float64
     tolerances: Path | None = None
+    want: Path | None = None
 
     @property
     def asks(self) -> dict[str, object]:
@@ -101,7 +104,8 @@ class Request:
         )
         cut = {"cut": mark(self.cut)} if self.cut else {}
         off = {} if self.tolerances is None else {"tolerances": read_tolerances(self.tolerances)}
-        return {name: getattr(self, name) for name in names} | cut | off | dict(self.given)
+        want = {"want": mark(self.want)} if self.want else {}
+        return {name: getattr(self, name) for name in names} | cut | off | want | dict(self.given)
 
 
 def render(asked: Request, device: str, say: Reporter) -> dict:
@@ -135,7 +139,8 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     in_project = asked.image is None and project is not None
     farther = image_path.with_name(FARTHER) if in_project else image_path.with_stem(f"{image_path.stem}-second")
     second = farther if project and project.second is not None else None
-    paths = (image_path, asked.npy, asked.html, panels, sheet, wave_path, wave_npy, second, *draws)
+    lit = companion("wanted.png") if asked.want else None
+    paths = (image_path, asked.npy, asked.html, panels, sheet, wave_path, wave_npy, second, *draws, lit)
     for path in paths:
         if path is not None:
             refuse_foreign(path, asked.force)
@@ -149,6 +154,7 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     if asked.screen_at is not None:
         lens = replace(lens, scene=replace(lens.scene, screen=replace(lens.scene.screen, z=asked.screen_at)))
     scene = lens.scene
+    goal = None if asked.want is None else illumination(lens, asked.want)
     if asked.verify:
         require_mitsuba(scene)
     if asked.html is not None:
@@ -224,6 +230,8 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
         say.say(f"{sheet}: what making the lens asks for")
     if off is not None and draws[0] is not None and draws[1] is not None:
         figures["tolerances"] = tolerances(lens, plan, off, *draws, say)
+    if goal is not None and lit is not None:
+        figures["want"] = wanted(lens, plan, goal, lit, asked.rays, seed, device, say)
     if panels is not None:
         figures["verify"] = _verified(scene, lens, asked.rays, seed, panels)
     if made:

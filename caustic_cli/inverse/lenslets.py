@@ -1,0 +1,181 @@
+"""An array of lenslets: each is a lens of its own, designed in a frame of its own, and all of them are one surface.
+
+Notation
+    (N, M)   lenslets along x and y; a lenslet is w = size / (N, M) wide
+    c_ij     middle of lenslet i, j: ((i + 1/2) / N - 1/2, (j + 1/2) / M - 1/2) times the size, mm
+    s, p     knot spans of a lenslet and the degree, along each axis
+    P_ij     control net of a lenslet, s + p points along each axis: those from i (s + p - 1) on of the whole net, so that
+             neighbours share the ones on their border
+    h_ij     height that a lenslet is raised by, mm
+
+In the frame of lenslet i, j the screen is shifted by -c_ij, and nothing else is different.  Parallel light is thrown to the same
+places from any height, so the h_ij are free to make borders meet: they minimise the sum over all borders of the mean square of
+the two sides' control points.  What is left is shared by the two sides; how much that is, `Joined.gap` says.  Along a border the
+surface has a ridge: borders are knots of multiplicity p (`bspline.open_knots`), so that a lenslet's control points shape no other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from caustic_cli.errors import InputError
+from caustic_cli.inverse.initial_surface import CELLS, first_surface
+from caustic_cli.inverse.losses import ColorLoss, Loss
+from caustic_cli.inverse.objective import Evaluation
+from caustic_cli.inverse.robust import Plain
+from caustic_cli.inverse.target import overlap
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import EXIT
+from caustic_cli.scene import Scene
+
+FROM_AFAR = (
+    "⟨lens.array⟩ needs light from infinity, which reaches every lenslet alike: ⟨+source.type⟩ plane, or a disc with"
+    " ⟨+source.angle⟩"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Lenslet:
+    """One lenslet of an array.
+
+    scene, field: in its own frame, where it is a lens by itself, in its own part of the light; rows, columns: of its control points
+    in the whole net; share: its part of the light on the array.
+    """
+
+    scene: Scene
+    field: HeightField
+    rows: slice
+    columns: slice
+    share: float
+
+    def of(self, net: Tensor) -> Tensor:
+        """Its part of the array's control points."""
+        return net[self.rows, self.columns]
+
+
+def lenslets(scene: Scene, control: tuple[int, int] | None = None) -> list[Lenslet]:
+    """The lenslets of a scene's lens, j fastest; control: points of the array's net, the lens' own unless given.
+
+    Raises:
+        InputError: light does not come from infinity, or none falls on a lenslet.
+    """
+    lens, screen = scene.lens, scene.screen
+    if not scene.source.distant:
+        raise InputError(FROM_AFAR)
+    steps = [(n - 1) // k for n, k in zip(control or lens.control, lens.array, strict=True)]
+    size = (lens.size[0] / lens.array[0], lens.size[1] / lens.array[1])
+    own = replace(lens, size=size, control=(steps[0] + 1, steps[1] + 1), array=(1, 1))
+    light, found = _light(scene.source.profile, lens.array), []
+    for i in range(lens.array[0]):
+        for j in range(lens.array[1]):
+            middle = [((k + 0.5) / n - 0.5) * w for k, n, w in zip((i, j), lens.array, lens.size, strict=True)]
+            part, source = light[i][j], scene.source
+            if not part.sum() > 0:
+                raise InputError(f"⟨source.profile⟩ leaves lenslet {i}, {j} dark; each needs some light")
+            if source.profile is not None:
+                source = replace(source, profile=part)
+            shift = (screen.shift[0] - middle[0], screen.shift[1] - middle[1])
+            alone = replace(scene, source=source, lens=own, screen=replace(screen, shift=shift))
+            rows, columns = (slice(k * n, (k + 1) * n + 1) for k, n in zip((i, j), steps, strict=True))
+            found.append(Lenslet(alone, HeightField.of(own), rows, columns, float(part.sum())))
+    total = sum(lenslet.share for lenslet in found)
+    return [replace(lenslet, share=lenslet.share / total) for lenslet in found]
+
+
+def _light(profile: np.ndarray | None, array: tuple[int, int]) -> list[list[np.ndarray]]:
+    """The beam's irradiance over each lenslet, in cells of its own, of one unit."""
+    if profile is None:
+        return [[np.ones((1, 1))] * array[1]] * array[0]
+    cells = [max(1, -(-n // k)) for n, k in zip(profile.shape, array, strict=True)]
+    for axis in (0, 1):
+        edges, finer = (np.linspace(0.0, 1.0, n + 1) for n in (profile.shape[axis], cells[axis] * array[axis]))
+        covers = overlap(edges, finer)
+        profile = covers @ profile if axis == 0 else (covers @ profile.T).T
+    (a, b) = cells
+    return [[profile[i * a : (i + 1) * a, j * b : (j + 1) * b] for j in range(array[1])] for i in range(array[0])]
+
+
+@dataclass(frozen=True, eq=False)
+class Joined:
+    """heights: (n, m) of the whole array, mm; gap: largest difference of two lenslets' control points on their border, mm."""
+
+    heights: Tensor
+    gap: float
+
+
+def joined(nets: Sequence[Tensor], array: tuple[int, int]) -> Joined:
+    """The surface that lenslets with these control nets, j fastest, make together; its mean height is that of the nets."""
+    n, m = array
+    parts = torch.stack(list(nets)).double().view(n, m, *nets[0].shape)
+    steps = [parts[:-1, :, -1] - parts[1:, :, 0], parts[:, :-1, :, -1] - parts[:, 1:, :, 0]]  # (n - 1, m, k), (n, m - 1, k)
+    numbers = torch.arange(n * m).view(n, m)
+    before = torch.cat([numbers[:-1].reshape(-1), numbers[:, :-1].reshape(-1)])
+    behind = torch.cat([numbers[1:].reshape(-1), numbers[:, 1:].reshape(-1)])
+    wanted = torch.cat([s.mean(-1).reshape(-1) for s in steps])
+    equations = torch.zeros(len(wanted) + 1, n * m, dtype=torch.float64)
+    lines = torch.arange(len(wanted))
+    equations[lines, behind], equations[lines, before], equations[-1] = 1.0, -1.0, 1.0  # the last: no height on the whole
+    raised = torch.linalg.lstsq(equations, torch.cat([wanted, wanted.new_zeros(1)])[:, None]).solution.view(n, m)
+    parts = parts + raised[:, :, None, None]
+    gaps = [parts[:-1, :, -1] - parts[1:, :, 0], parts[:, :-1, :, -1] - parts[:, 1:, :, 0]]
+    (a, b) = parts.shape[2] - 1, parts.shape[3] - 1
+    net, count = torch.zeros(n * a + 1, m * b + 1, dtype=torch.float64), torch.zeros(n * a + 1, m * b + 1, dtype=torch.float64)
+    for i in range(n):
+        for j in range(m):
+            net[i * a : (i + 1) * a + 1, j * b : (j + 1) * b + 1] += parts[i, j]
+            count[i * a : (i + 1) * a + 1, j * b : (j + 1) * b + 1] += 1.0
+    return Joined(net / count, max((float(g.abs().max()) for g in gaps if g.numel()), default=0.0))
+
+
+def first_array(scene: Scene, targets: Sequence[np.ndarray], control: tuple[int, int], cells: int = CELLS) -> Joined:
+    """The array whose lenslets throw the pictures, each by its own transport.
+
+    Args:
+        scene: source, lens and screen of the whole.
+        targets: (n_x, n_y) irradiance on the screen, of each lenslet, j fastest; or one for all.
+        control: points of the array's net.
+        cells: source cells along a lenslet's longer side.
+
+    Raises:
+        InputError: as of `lenslets` and `first_surface`.
+    """
+    parts = lenslets(scene, control)
+    each = targets if len(targets) == len(parts) else [targets[0]] * len(parts)
+    return joined(
+        [first_surface(one.scene, goal, one.field, cells).heights for one, goal in zip(parts, each, strict=True)], scene.lens.array
+    )
+
+
+class ArrayObjective:
+    """The loss of an array as a function of its heights, every lenslet judged by its own picture.
+
+        L = sqrt(mean over lenslets of L_k^2),    L_k the loss of lenslet k as a lens by itself
+
+    so that no lenslet makes up for what another does wrong, and the image holds under any beam.  Borders belong to both sides.
+
+    Args:
+        parts: of the array.
+        objective: makes the loss of a lenslet, by its number.
+    """
+
+    def __init__(self, parts: Sequence[Lenslet], objective: Callable[[int, Lenslet], Plain]):
+        self.parts = list(parts)
+        self.each = [objective(k, one) for k, one in enumerate(self.parts)]
+        self.loss: Loss | ColorLoss = self.each[0].loss
+
+    def __call__(self, heights: Tensor) -> Evaluation:
+        """Value, gradient, light on the screen and image at heights (n, m) mm float64 of the array."""
+        found = [loss(one.of(heights)) for loss, one in zip(self.each, self.parts, strict=True)]
+        total = float(np.sqrt(np.mean([e.loss**2 for e in found])))
+        gradient = torch.zeros_like(found[0].gradient, device=found[0].gradient.device).new_zeros(heights.shape)
+        for e, one in zip(found, self.parts, strict=True):
+            gradient[one.rows, one.columns] += (e.loss / (total * len(found)) if total > 0 else 0.0) * e.gradient
+        shares = [one.share for one in self.parts]
+        image = torch.stack([share * e.image for share, e in zip(shares, found, strict=True)]).sum(0)
+        on_screen = sum(share * e.on_screen for share, e in zip(shares, found, strict=True))
+        return Evaluation(total, {EXIT: gradient}, on_screen, image)

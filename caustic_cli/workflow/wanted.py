@@ -1,0 +1,96 @@
+"""A wanted illumination by an array: the image of each lenslet alone, and the brightness of each one's source."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from caustic_cli.errors import InputError
+from caustic_cli.inverse.lenslets import lenslets
+from caustic_cli.inverse.target import target_on_screen
+from caustic_cli.io.picture import read_picture, write_image
+from caustic_cli.optics.plan import Plan, compile_plan
+from caustic_cli.studies.brightness import brightness
+from caustic_cli.studies.retrace import retrace, white_level
+from caustic_cli.workflow.lens import Lens
+from caustic_cli.workflow.reporter import Reporter
+
+
+def illumination(lens: Lens, picture: Path) -> np.ndarray:
+    """A wanted illumination on the screen's pixels (n_x, n_y), laid there like the project's own picture.
+
+    Raises:
+        InputError: the lens is no array, or an archive's; the picture cannot be read.
+    """
+    scene, project = lens.scene, lens.project
+    if project is None or not scene.lens.arrayed:
+        raise InputError("⟨want⟩ is for a project whose lens is an array of lenslets (caustic design with ⟨+lens.array⟩)")
+    if scene.colored:
+        raise InputError("⟨want⟩ is of brightness alone, and the project's picture has colours")
+    goal = project.settings["target"]
+    light = read_picture(picture, goal["encoding"] == "linear")
+    return target_on_screen(light.irradiance(), tuple(goal["size"]), scene.screen, goal["flip"])
+
+
+def wanted(
+    lens: Lens, plan: Plan, asked: np.ndarray, image: Path, rays: int, seed: int, device: str, say: Reporter
+) -> dict[str, Any]:
+    """Solve for the brightnesses and write the image that they give.
+
+    Args:
+        asked: of `illumination`.
+        rays: of all lenslets together.
+
+    Returns:
+        the figures for JSON: `brightness`, N lists of M, in parts of the largest; `error`, relative RMS of the image, both scaled
+        to the same power; `kkt_residual`, see `studies.brightness`; `power`, the part of the source's that they take, if the
+        largest is one; `image`.
+    """
+    scene = plan.scene
+    parts, images = lenslets(scene, lens.field.shape), []
+    with say.progress(len(parts)) as show:
+        for k, one in enumerate(parts):
+            show("lenslets", f"{k + 1} of {len(parts)}", k, len(parts))
+            heights = one.of(lens.heights)
+            alone = compile_plan(one.scene, one.field, heights)
+            found, _ = retrace(
+                alone.scene,
+                one.field,
+                heights.to(device),
+                None,
+                rays=max(1, rays // len(parts)),
+                seed=seed,
+                device=device,
+                requests=alone.requests,
+                noise=False,
+            )
+            images.append(one.share * found.image.cpu().numpy())
+    basis = np.stack([i.ravel() for i in images], -1)
+    on_screen = asked * (basis.sum() / asked.sum())
+    solved = brightness(basis, on_screen.ravel())
+    level = solved.brightness / solved.brightness.max()
+    seen = (basis @ level).reshape(asked.shape)
+    write_image(image, seen, white_level(seen, asked), lens.encoding)
+    error = np.sqrt(np.mean((seen / seen.mean() - asked / asked.mean()) ** 2))
+    return {
+        "brightness": level.reshape(scene.lens.array).tolist(),
+        "error": float(error),
+        "kkt_residual": solved.residual,
+        "power": float(np.dot(level, [one.share for one in parts])),
+        "image": str(image),
+    }
+
+
+def rows(figures: dict[str, Any]) -> list[tuple[str, str]]:
+    """As a person reads them: brightnesses as the lenslets stand seen from the screen's far side, +y up, +x to the right."""
+    level = np.array(figures["brightness"]).T[::-1]
+    lines = [("brightness" if k == 0 else "", "  ".join(f"{b:.4f}" for b in line)) for k, line in enumerate(level)]
+    return [
+        *lines,
+        ("relative RMS error", f"{figures['error']:.4f}"),
+        ("KKT residual", f"{figures['kkt_residual']:.1e}"),
+        ("power", f"{figures['power']:.1%} of all sources at the largest brightness"),
+        ("image", figures["image"]),
+    ]
