@@ -281,6 +281,8 @@ def without_waves(s: Settings, given: bool) -> str:
 def _not_by_default(s: Settings) -> str:
     """What `waves = "auto"` does not refine the wave image with, however long that takes, and what puts it in."""
     design = s["design"]
+    if "gradient" in s["lens"]:
+        return "the wave image is taken of lenses of one index"
     if s["source"]["type"] == "rays":
         return "a ray file says nothing of its light's phase"
     if s["source"].get("also"):
@@ -299,6 +301,8 @@ def _wave_stages(s: Settings, source: Source, quality: str, lit: tuple[float, fl
     design, lens, screen, asked = s["design"], s["lens"], s["screen"], s["design"]["waves"]
     if asked == "on" and design["network"] != "none":
         raise InputError("⟨design.waves⟩ on needs network none: the wave image refines the heights themselves")
+    if asked == "on" and "gradient" in lens:
+        raise InputError("⟨design.waves⟩ on needs a lens of one index, of which the wave image is taken")
     if asked == "on" and source.rays is not None:
         raise InputError("⟨design.waves⟩ on: a ray file says nothing of its light's phase, so that it has no wave image to refine")
     if asked == "on" and len(source.members) > 1:

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
+from caustic_cli.optics.gradient.fields import field_of
 from caustic_cli.optics.interface import reflectance, reflectances
 from caustic_cli.optics.resolution import Resolution, paraxial
 from caustic_cli.optics.sampling import LARGEST_NORMAL
@@ -76,7 +77,12 @@ def bounds_of(scene: Scene, field: HeightField, heights: Tensor, steeper: float 
     lens, indices = scene.lens, [band.scene.lens.inside for band in scene.bands]
     least, most = min(indices), max(indices)
     incidence = scene.source.incidence(scene.lens.half_size, scene.lens.z_in, scene.lens.round)
-    inside = math.asin(min(1.0, math.sin(incidence) / least))
+    bent = 0.0
+    if field_of_index := field_of(lens):
+        low, high, steepest = field_of_index.extremes(lens.half_size, lens.offset.thickness - lens.z_in)
+        least, most = least * low / lens.index, most * high / lens.index
+        bent = steepest * (lens.offset.thickness - lens.z_in) / low
+    inside = min(math.asin(min(1.0, math.sin(incidence) / least)) + bent, 0.5 * math.pi)
     slope = field.slope_bound(heights) + steeper
     lean = math.atan(slope + lens.roughness * LARGEST_NORMAL)
     i = inside + lean
@@ -110,7 +116,7 @@ def _reach(scene: Scene, inside: float, lowest: float, top: float) -> float:
     """How far from the axis rays can be at the surface's greatest height, in half widths of the aperture; infinite where the
     surface may dip below the entrance, which rays then never meet from below."""
     source, lens = scene.source, scene.lens
-    if source.collimated:
+    if source.collimated and not lens.gradient:
         return 1.0
     if lowest < lens.z_in:
         return math.inf

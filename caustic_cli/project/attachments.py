@@ -1,20 +1,27 @@
-"""The files that [source] and [design] speak of: read once, checked, and kept in the project under names of their own."""
+"""The files that [source], [lens] and [design] speak of: read once, checked, and kept in the project under names of their own."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from caustic_cli.config import settings, tolerances
+from caustic_cli.io.arrays import open_npy
 from caustic_cli.io.files import read_bytes
 from caustic_cli.io.intensities import MOST_BYTES, TABLE, parse_distribution
 from caustic_cli.io.picture import read_picture
 from caustic_cli.io.rayfiles import ACCEPTED, MAX_BYTES, SUFFIXES, parse_rays
+from caustic_cli.scene.gradient import MOST_VALUES, checked_volume
 from caustic_cli.scene.sources.section import Attached
 
 #: What the file of [design] robust is called in a project.
 ERRORS = "tolerances.toml"
+#: What the file of [lens] index_file is called in a project, and its largest size, bytes.
+INDEX, MOST_INDEX = "index.npy", 8 * MOST_VALUES + (1 << 12)
 #: Keys of [source] that may name a file, and what it is called in a project.
 STEMS = {"file": "source", "intensity": "intensity"}
 
@@ -54,8 +61,33 @@ def with_errors(design: Mapping[str, Any], folder: Path | None = None) -> dict[s
     return {**design, "robust": Attached.of(name, data, tolerances.read(path))}
 
 
-def named_in_project(source: dict[str, Any], design: dict[str, Any]) -> None:
-    """Rename the files of both sections as a project calls them, those of further sources by their number."""
+def with_index(lens: Mapping[str, Any], folder: Path | None = None) -> dict[str, Any]:
+    """A [lens] section whose `index_file` carries the control values in it, if it names one; folder: as of `attached`.
+
+    Raises:
+        InputError: the file is missing, too large, or holds no volume of refractive indices.
+    """
+    name = lens.get("index_file")
+    if not isinstance(name, str) or isinstance(name, Attached):
+        return dict(lens)
+    path = Path(name) if folder is None else folder / name
+    accepted = "a .npy array of (n, m) or (n, m, k) refractive indices is needed"
+    with open_npy(path, accepted) as stored:
+        values = checked_volume(stored.read_reals(), "the array")
+    return {**lens, "index_file": Attached.of(name, read_bytes(path, MOST_INDEX, accepted), values)}
+
+
+def index_attached(values: np.ndarray) -> Attached:
+    """Control values (n, m, k) as the file that a project keeps of them."""
+    held = io.BytesIO()
+    np.save(held, np.ascontiguousarray(values, dtype=np.float64))
+    return Attached.of(INDEX, held.getvalue(), values)
+
+
+def named_in_project(source: dict[str, Any], design: dict[str, Any], lens: dict[str, Any]) -> None:
+    """Rename the files of the sections as a project calls them, those of further sources by their number."""
+    if isinstance(lens.get("index_file"), Attached):
+        lens["index_file"] = lens["index_file"].named(INDEX)
     if isinstance(design.get("robust"), Attached):
         design["robust"] = design["robust"].named(ERRORS)
     for k, table in enumerate((source, *source.get("also", ()))):
@@ -64,10 +96,12 @@ def named_in_project(source: dict[str, Any], design: dict[str, Any]) -> None:
                 table[key] = table[key].named(f"{stem}{f'-{k + 1}' if k else ''}{Path(table[key]).suffix.lower()}")
 
 
-def of(source: Mapping[str, Any], design: Mapping[str, Any] | None = None) -> list[Attached]:
-    """All files of the [source] section, and of [design] where that is given."""
-    robust = (design or {}).get("robust")
-    found = [robust] if isinstance(robust, Attached) else []
+def of(
+    source: Mapping[str, Any], design: Mapping[str, Any] | None = None, lens: Mapping[str, Any] | None = None
+) -> list[Attached]:
+    """All files of the [source] section, and of [design] and [lens] where these are given."""
+    others = (design or {}).get("robust"), (lens or {}).get("index_file")
+    found = [one for one in others if isinstance(one, Attached)]
     return found + [
         value for table in (source, *source.get("also", ())) for key in STEMS if isinstance(value := table.get(key), Attached)
     ]

@@ -86,6 +86,9 @@ class Project:
             if (how := given.get("design", {})).get("robust"):
                 _within(how["robust"])
                 given["design"] = attachments.with_errors(how, path)
+            if index := given.get("lens", {}).get("index_file"):
+                _within(index)
+                given["lens"] = attachments.with_index(given["lens"], path)
             full = complete(given, picture.aspect)
             build_stages(full), build_options(full)  # a project whose design is impossible is not opened for its lens either
             return cls(path, full, picture, _picture(path, profile, True) if profile else None, on_disk=True)
@@ -167,7 +170,7 @@ class Project:
         self.picture.write(path / self.settings["target"]["file"])
         if self.profile is not None:
             self.profile.write(path / self.settings["source"]["profile"])
-        for file in attachments.of(self.settings["source"], self.settings["design"]):
+        for file in attachments.of(self.settings["source"], self.settings["design"], self.settings["lens"]):
             write_bytes(path / file, file.data)
         self.write_settings(path)
 

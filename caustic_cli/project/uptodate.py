@@ -36,7 +36,7 @@ def digest(full: Settings, *pictures: Picture | None) -> str:
     for picture in filter(None, pictures):
         found.update(f"{picture.values.shape}{picture.values.dtype}{picture.encoding}".encode())
         found.update(np.ascontiguousarray(picture.values).tobytes())
-    for file in attachments.of(full["source"], full["design"]):
+    for file in attachments.of(full["source"], full["design"], full["lens"]):
         found.update(hashlib.sha256(file.data).digest())
     start = Path(full["design"]["start"])
     if is_project(start):

@@ -17,6 +17,7 @@ import numpy as np
 from caustic_cli.config import checks
 from caustic_cli.config.table import TABLE, check, check_all, default
 from caustic_cli.errors import InputError
+from caustic_cli.scene.gradient import Gradient
 
 
 @dataclass(frozen=True)
@@ -96,6 +97,7 @@ class Lens:
         glass: a name of `materials`, whose index changes with the wavelength; None for `index` at every wavelength.
         aperture: rectangle, or circle, the largest that fits into the size; the spline goes on beyond it, light and glass do not.
         border: width of a dark rim around the aperture, which the exported solid has for its mount, mm.
+        gradient: how the index varies from place to place, `index` being that of its formula; None where it does not.
         mirror: the surface reflects, the light comes through air, and `index`, `fresnel` and `absorption` mean nothing.
     """
 
@@ -115,6 +117,7 @@ class Lens:
     mirror: bool = default("lens.mirror")
     aperture: str = default("lens.aperture")
     border: float = default("lens.border")
+    gradient: Gradient | None = None
 
     def __post_init__(self):
         check_all(
@@ -141,6 +144,8 @@ class Lens:
         low, high = self.height_range
         if not low < high:
             raise InputError(f"⟨lens.height_range⟩ must ascend, got [{low:g}, {high:g}]")
+        if self.gradient is not None and self.mirror:
+            raise InputError("⟨lens.gradient⟩ needs a lens: light never enters a mirror")
         if self.round and self.size[0] != self.size[1]:
             raise InputError(
                 f"⟨lens.size⟩ of a circular aperture must be its diameter, twice the same, got {self.size[0]:g} x {self.size[1]:g}"

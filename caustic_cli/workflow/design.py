@@ -85,6 +85,8 @@ def begin(
         read[-1]["source"] = attachments.attached(read[-1]["source"], config.parent)
     if config and "design" in read[-1]:
         read[-1]["design"] = attachments.with_errors(read[-1]["design"], config.parent)
+    if config and "lens" in read[-1]:
+        read[-1]["lens"] = attachments.with_index(read[-1]["lens"], config.parent)
     chosen: Settings = {}
     for path, value in given.items():
         section, _, key = path.rpartition(".")
@@ -100,6 +102,8 @@ def begin(
     by = Derivation(**parameters)
     if "source" in said:
         said["source"] = attachments.attached(said["source"])
+    if "lens" in said:
+        said["lens"] = attachments.with_index(said["lens"])
     goal = said.get("target", {})
     picture = (
         target
@@ -116,7 +120,7 @@ def begin(
     full["target"] |= {"file": f"target{picture.suffix}", "encoding": picture.encoding}
     if light is not None:
         full["source"]["profile"] = f"profile{light.suffix}"
-    attachments.named_in_project(full["source"], full["design"])
+    attachments.named_in_project(full["source"], full["design"], full["lens"])
     project = Project(
         out,
         full,

@@ -70,8 +70,10 @@ def refuse_untraceable(scene: Scene) -> None:
     """Stop before work begins where the page could not trace the light.
 
     Raises:
-        InputError: the source is a ray file.
+        InputError: the source is a ray file, or the lens' index varies.
     """
+    if scene.lens.gradient is not None:
+        raise InputError("⟨html⟩: the page traces lenses of one index, and this one's varies")
     if any(one.rays is not None for one in scene.source.members):
         raise InputError(
             "⟨html⟩: the page traces plane waves, points, grids and discs, not the rays of a file; ⟨source.type⟩ renders it under"

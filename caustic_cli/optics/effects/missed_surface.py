@@ -16,7 +16,7 @@ class MissedSurface(Effect):
 
     def judge(self, scene: Scene, b) -> Decision:
         """By how far rays get at the surface's greatest height."""
-        if scene.source.collimated:
+        if scene.source.collimated and not scene.lens.gradient:
             return Decision(self.name, False, "every ray of a plane wave is on the surface", b.reach, 1.0)
         if b.reach <= 1.0:
             return Decision(self.name, False, f"no ray gets beyond {b.reach:.4g} of the aperture's half width", b.reach, 1.0)
