@@ -55,6 +55,8 @@ STEEPEST = 1.25  # least radius of a derived sphere, in half diagonals of the le
 WAVE_KEYS = ("control", "blur", "apron", "iterations", "tolerance")  # of a stage on rays that one on the wave image has too
 PLATE, WALL = 20.0, 3.0  # width beyond which a lens is a plate, as thin as its relief and this wall allow, mm
 OBLONG = 2.5  # ratio of the magnifications along the axes from which on another shape of lens is advised
+#: Of a free gradient: range to either side of the index, degree of its splines, and rays a pixel at most, since they cost more.
+HALF_RANGE, INDEX_DEGREE, RAYS_BENT = 0.05, 3, 16
 COLOR_GLASS = "N-BK7"  # of a coloured picture, unless glass or index is said: dispersion has to be known
 
 
@@ -167,6 +169,8 @@ def first_thickness(size: Sequence[float]) -> float:
 def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[str, Any], source: Source) -> None:
     index, scale = index_of(lens), max(lens["size"]) / 10.0
     check("lens.index", index)
+    if lens.get("gradient") == "free":
+        _complete_blank(lens, screen, index)
     if "glass" not in lens:
         lens["index"] = index
     else:
@@ -194,6 +198,19 @@ def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[st
         lens["radius"] = [math.copysign(max(abs(r), least), r) for r in radius]
 
 
+def _complete_blank(lens: Table, screen: Table, index: float) -> None:
+    """What a flat blank has whose index is designed; its sides are the least net."""
+    if any(map(math.isfinite, lens.setdefault("radius", [math.inf, math.inf]))):
+        raise InputError(f"⟨lens.radius⟩ of a free gradient must be [inf, inf], two flat sides, got {lens['radius']}")
+    lens.setdefault("control", [p + 1 for p in check("lens.degree", lens["degree"])])
+    lens.setdefault("index_range", [max(1.0, index - HALF_RANGE), index + HALF_RANGE])
+    lens.setdefault("index_control", [min(1024, n + INDEX_DEGREE) for n in screen["resolution"]])
+    for key in ("index_range", "index_control", "index_layers"):
+        check(f"lens.{key}", value_of(lens, f"lens.{key}"))
+    if not lens["index_range"][0] < lens["index_range"][1]:
+        raise InputError(f"⟨lens.index_range⟩ must ascend, got {lens['index_range']}")
+
+
 def shape_words(s: Settings) -> str:
     """Which lens would follow the shape of a long picture, where this one does not."""
     (w, h), (a, b) = s["target"]["size"], s["lens"]["size"]
@@ -209,6 +226,9 @@ def shape_words(s: Settings) -> str:
 def _complete_design(s: Settings, source: Source, quality: str | None, rays: int | None, lit: tuple[float, float]) -> None:
     lens, screen, design, given = s["lens"], s["screen"], s["design"], quality
     degree = check("lens.degree", lens["degree"])
+    if lens.get("gradient") == "free":
+        _complete_index_design(s, source, quality or _quality(design["time_limit"]), rays)
+        return
     plain = design["network"] == "none" and design["optimizer"] == "lbfgs"
     asked = check("design.waves", design["waves"])
     fine_net = "control" not in lens or min(n - p for n, p in zip(lens["control"], degree, strict=True)) >= LEAST_SPANS
@@ -261,6 +281,23 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
     if design["loss"].strip() == "rms":  # eq. 5.2.1 knows the screen alone
         stages = [stage | {"apron": 0} for stage in stages]
     design["stages"] = stages
+
+
+def _complete_index_design(s: Settings, source: Source, quality: str, rays: int | None) -> None:
+    """How a free gradient is found: L-BFGS from transport, on rays."""
+    lens, screen, design = s["lens"], s["screen"], s["design"]
+    if not source.collimated:
+        raise InputError(f"⟨lens.gradient⟩ free is designed for light of ⟨source.type⟩ plane, got {s['source']['type']}")
+    for key, only in (("network", "none"), ("optimizer", "lbfgs"), ("loss", default("design.loss"))):
+        if design[key] != only:
+            raise InputError(f"⟨design.{key}⟩ of a free gradient must be {only}, got {design[key]}")
+    if check("design.waves", design["waves"]) == "on":
+        raise InputError("⟨design.waves⟩ on needs a lens of one index, of which the wave image is taken")
+    design["start"] = "offset"
+    design.setdefault("preconditioner", "laplacian")
+    if "stages" not in design:
+        last = refinement(tuple(lens["control"]), rays, tuple(screen["resolution"]), quality)[-1]
+        design["stages"] = [last | {"rays": rays or min(last["rays"], RAYS_BENT * math.prod(screen["resolution"]))}]
 
 
 def without_waves(s: Settings, given: bool) -> str:

@@ -84,6 +84,11 @@ def index_attached(values: np.ndarray) -> Attached:
     return Attached.of(INDEX, held.getvalue(), values)
 
 
+def index_of(lens: Mapping[str, Any]) -> np.ndarray | None:
+    """The control values that a [lens] section's `index_file` carries."""
+    return getattr(lens.get("index_file"), "content", None)
+
+
 def named_in_project(source: dict[str, Any], design: dict[str, Any], lens: dict[str, Any]) -> None:
     """Rename the files of the sections as a project calls them, those of further sources by their number."""
     if isinstance(lens.get("index_file"), Attached):

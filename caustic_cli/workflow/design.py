@@ -46,6 +46,7 @@ from caustic_cli.project.project import CHECKPOINT, RENDER, Project, is_project
 from caustic_cli.scene import Scene
 from caustic_cli.studies.manufacture import preview
 from caustic_cli.workflow.evaluation import expected_seconds, judge
+from caustic_cli.workflow.gradient import design_index, index_figures, is_free, limit_of
 from caustic_cli.workflow.movie import Movie
 from caustic_cli.workflow.reporter import Reporter
 
@@ -205,6 +206,8 @@ def design(
         scene = project.scene()
         return Result(project, scene, project.lens(scene)[0], project.target(scene), project.found.state, figures)
     with project.hold:
+        if is_free(project):
+            return _run_index(project, say, began, device)
         designer, target = _designer(project, device)
         _say_limits(project, designer, target, first, say)
         return _run(project, designer, target, designer.begin(first), say, began, None, device, movie)
@@ -244,6 +247,8 @@ def resume(
 ) -> Result:
     """Go on from the last checkpoint; with nothing left to do, judge the lens again."""
     with project.hold:
+        if is_free(project):
+            raise project.error("⟨lens.gradient⟩ free is designed in one go, and not resumed: design it anew, with more ⟨iterations⟩")
         project.hold.enter_context(directory.locked(project.path))
         designer, target = _designer(project, device)
         begun = (project.path / CHECKPOINT).exists()  # if not, it was killed before its first checkpoint
@@ -450,6 +455,23 @@ def _run(
         if asked:
             raise Interrupted(f"interrupted when the design was done; {project.path} is whole", 128 + asked[0])
     return Result(project, designer.scene, designer.field(found.state.stage), target, found.state, figures)
+
+
+def _run_index(project: Project, say: Reporter, began: float, device: str) -> Result:
+    """Design a free gradient, judge it, and keep both."""
+    with _signals(project.path is not None) as asked:
+        found = design_index(project, say, began, limit_of(project), lambda: bool(asked))
+        project, state = found.project, found.state
+        designer, target = _designer(project, device)
+        judged = judge(project, designer, target, state, device, math.isfinite(limit_of(project)))
+        figures = judged.figures | index_figures(project)
+        figures |= {"iterations": state.total, "seconds": time.monotonic() - began, "reason": state.reason}
+        if project.path is not None:
+            figures |= {"image": str(project.path / RENDER), "project": str(project.path)}
+        _Records(project, designer, device).keep(state, figures)
+        if asked:
+            raise Interrupted(f"interrupted after {state.total} iterations; {project.path} is whole", 128 + asked[0])
+    return Result(project, designer.scene, designer.field(0), target, state, figures)
 
 
 class _Records:
