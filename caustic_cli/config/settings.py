@@ -295,16 +295,17 @@ def build_gradient(lens: dict[str, Any], values: np.ndarray | None) -> Gradient 
         InputError: terms or a file are missing, or belong to another kind.
     """
     kind = lens.get("gradient")
+    if kind is None and not {"gradient_terms", "index_file"} & {*lens}:
+        return None
     if kind is not None:
         check("lens.gradient", kind)
-    formula, file = kind in KINDS, kind in ("volume", "free")
-    if "gradient_terms" in lens and not formula:
+    if "gradient_terms" in lens and kind not in KINDS:
         raise InputError(f"⟨lens.gradient_terms⟩ belong to ⟨lens.gradient⟩ {', '.join(KINDS)}, got {kind or 'none'}")
-    if "index_file" in lens and not file:
+    if "index_file" in lens and kind not in ("volume", "free"):
         raise InputError(f"⟨lens.index_file⟩ belongs to ⟨lens.gradient⟩ volume or free, got {kind or 'none'}")
     if kind == "volume" and values is None:
         raise InputError("⟨lens.gradient⟩ volume needs ⟨lens.index_file⟩, a .npy of control values")
-    if formula:
+    if kind is not None and kind in KINDS:
         return Gradient(kind, tuple(lens.get("gradient_terms", ())))
     return None if values is None else Gradient("volume", (), values)
 

@@ -56,8 +56,8 @@ INSIDE = 0.01
 class Blank:
     """A designed blank.
 
-    index: its field; start: what the design began from; history: (loss in units of eq. 5.2.1, part of the light on the screen) after
-    each iteration, the start first.
+    index: its field; start: what the design began from; history: loss, in units of eq. 5.2.1, and part of the light on the screen,
+    after each iteration.
     """
 
     index: SplineIndex
@@ -207,9 +207,7 @@ def _start(scene: Scene, target: np.ndarray, net: HeightField, cells: int) -> Te
         tangents = [s / np.sqrt(1.0 - sines[0] ** 2 - sines[1] ** 2) for s in sines]
         behind = screen.z - lens.offset.thickness
         rest = [c - 0.5 * t / lens.index * s for c, s in zip(away, sines, strict=True)]
-        throw = np.where(
-            np.hypot(*tangents) > 1e-12, behind * np.hypot(*away) / np.maximum(np.hypot(*rest), 1e-300), throw
-        )
+        throw = np.where(np.hypot(*tangents) > 1e-12, behind * np.hypot(*away) / np.maximum(np.hypot(*rest), 1e-300), throw)
     step = float(x[1] - x[0]), float(y[1] - y[0])
     values = integrate(sines[0] / t, sines[1] / t, step)
     spline = RectBivariateSpline(x, y, values)

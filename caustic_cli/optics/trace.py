@@ -310,7 +310,7 @@ class Tracer:
         )
         self.steps[medium] = found.steps
         m.local, m.incoming = seen(found.point, found.direction)
-        m.slopes, m.length, m.n_in = found.slopes, found.length, scale * found.index
+        m.slopes, m.length, m.n_in = found.slopes, found.length, scale * found.n
         met = found.found & element.aperture.holds(*m.local[:2])
         kept = torch.where(met, state.power, torch.zeros_like(state.power))
         state.lose("missed_surface", (state.power - kept).detach())

@@ -101,9 +101,7 @@ def named_in_project(source: dict[str, Any], design: dict[str, Any], lens: dict[
                 table[key] = table[key].named(f"{stem}{f'-{k + 1}' if k else ''}{Path(table[key]).suffix.lower()}")
 
 
-def of(
-    source: Mapping[str, Any], design: Mapping[str, Any] | None = None, lens: Mapping[str, Any] | None = None
-) -> list[Attached]:
+def of(source: Mapping[str, Any], design: Mapping[str, Any] | None = None, lens: Mapping[str, Any] | None = None) -> list[Attached]:
     """All files of the [source] section, and of [design] and [lens] where these are given."""
     others = (design or {}).get("robust"), (lens or {}).get("index_file")
     found = [one for one in others if isinstance(one, Attached)]

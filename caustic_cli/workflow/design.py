@@ -248,7 +248,7 @@ def resume(
     """Go on from the last checkpoint; with nothing left to do, judge the lens again."""
     with project.hold:
         if is_free(project):
-            raise project.error("⟨lens.gradient⟩ free is designed in one go, and not resumed: design it anew, with more ⟨iterations⟩")
+            raise project.error("⟨lens.gradient⟩ free is designed in one go: design it anew, with more ⟨iterations⟩")
         project.hold.enter_context(directory.locked(project.path))
         designer, target = _designer(project, device)
         begun = (project.path / CHECKPOINT).exists()  # if not, it was killed before its first checkpoint

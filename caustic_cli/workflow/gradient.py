@@ -52,6 +52,10 @@ def design_index(project: Project, say: Reporter, began: float, limit: float, st
     target, stage = project.target(blank), build_stages(project.settings)[-1]
     total = chosen["iterations"] or stage.iterations
     rows: list[tuple[int, int, float, float, float]] = []
+
+    def late() -> bool:
+        return time.monotonic() - began > limit
+
     say.say(
         f"index: {lens['index_control'][0]} x {lens['index_control'][1]} x {value_of(lens, 'lens.index_layers')} control values of"
         f" {lens['index_range'][0]:.4g} to {lens['index_range'][1]:.4g}, {stage.rays:,} rays"
@@ -62,7 +66,6 @@ def design_index(project: Project, say: Reporter, began: float, limit: float, st
             rows.append((k, 0, loss, on_screen, time.monotonic() - began))
             show("index", f"loss {loss * target.size:.4f}  on screen {on_screen:.1%}", k, total)
 
-        late = lambda: time.monotonic() - began > limit  # noqa: E731
         found = design_blank(
             blank,
             target,
@@ -82,7 +85,9 @@ def design_index(project: Project, say: Reporter, began: float, limit: float, st
     if project.path is not None:
         project.write()
     done = len(rows)
-    reason = "interrupted" if stop() else "time limit" if late() and done < total else "iterations" if done == total else "no progress"
+    reason = (
+        "interrupted" if stop() else "time limit" if late() and done < total else "iterations" if done == total else "no progress"
+    )
     flat = torch.full(tuple(lens["control"]), float(blank.lens.offset.thickness), dtype=torch.float64)
     seconds = rows[-1][-1] if rows else 0.0
     return Designed(project, State(flat, iteration=done, total=done, history=rows, seconds=seconds, reason=reason))

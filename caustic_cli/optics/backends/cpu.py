@@ -89,9 +89,9 @@ class Numba(Torch):
 
     def flow(self, field, coefficients: Tensor | None, point, momentum, time: Tensor, steps: int, order: int = ORDER) -> Flow:
         """As the reference; a B-spline volume and the formulas of a lens ray by ray."""
-        made = field.formula if time.numel() else None
-        if made is not None:
-            out = formula_flow(*made, LEAST_SQUARE, (*point, *momentum), time, WEIGHTS[order], steps)
+        if time.numel() and field.formula is not None:
+            terms, axial, squared = field.formula
+            out = formula_flow(terms, axial, squared, LEAST_SQUARE, (*point, *momentum), time, WEIGHTS[order], steps)
             return Flow(out[:3], out[3:6], out[6], out[7])
         if not isinstance(field, SplineIndex) or not time.numel():
             return super().flow(field, coefficients, point, momentum, time, steps, order)

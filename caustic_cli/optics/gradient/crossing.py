@@ -6,7 +6,8 @@ Notation, beside that of `integrator`
     delta   what is then missing to the surface, one more step: found by Newton's method, f(q(T + delta)) = 0
 
 T follows differentiably from the ray; a guess that misses by more than a step is moved by what it missed, and halved where the ray
-has turned away from the surface by then, which changes the steps and not the ray.  delta is differentiated at the root, d delta = -df / f'.
+has turned away from the surface by then, which changes the steps and not the ray.  delta is differentiated at the root,
+d delta = -df / f'.
 """
 
 from __future__ import annotations
@@ -31,13 +32,13 @@ ON_SURFACE, NEWTON, GUESSES = 1e-12, 12, 12
 class Crossing(NamedTuple):
     """Rays at the next surface.
 
-    point, direction: in the medium's frame, three (N,) each, mm and unit; index: n there; path, length: optical and geometric, mm;
+    point, direction: in the medium's frame, three (N,) each, mm and unit; n: there; path, length: optical and geometric, mm;
     slopes: of the surface, two (N,) or the number 0; found: whether the surface is met; steps: that were taken.
     """
 
     point: tuple
     direction: tuple
-    index: Tensor
+    n: Tensor
     path: Tensor
     length: Tensor
     slopes: tuple
@@ -118,7 +119,7 @@ def cross(
             if guess == GUESSES - 1 or not bool((far | astray).any()):
                 break
             moved = moved + torch.where(far, delta, torch.zeros_like(delta)) - torch.where(astray, 0.5 * (time + moved), 0.0 * time)
-    if torch.is_grad_enabled() and any(t.requires_grad for t in (*arrived.point, *arrived.momentum)) or (
+    if (torch.is_grad_enabled() and any(t.requires_grad for t in (*arrived.point, *arrived.momentum))) or (
         heights is not None and heights.requires_grad
     ):
         f, rate, _, _ = above(march(field, coefficients, arrived.point, arrived.momentum, delta, 1, order))

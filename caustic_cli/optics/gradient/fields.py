@@ -73,7 +73,7 @@ class IndexField(ABC):
         if not float(square.min()) >= LEAST_SQUARE:
             raise InputError("⟨lens.gradient_terms⟩ must leave the index above 0.5 all over the lens")
         n = square.sqrt()
-        steepest = float((sum(f * f for f in force).sqrt() / n).max()) * BETWEEN
+        steepest = float((square_of(force).sqrt() / n).max()) * BETWEEN
         return Extremes(float(n.min()), float(n.max()), steepest)
 
 
@@ -145,7 +145,7 @@ class FishEye(IndexField):
     def at(self, point: Point, coefficients: Tensor | None = None):
         """See the module."""
         away = [q - c for q, c in zip(point, self.centre, strict=True)]
-        n = self.n0 / (1.0 + sum(v * v for v in away) / self.radius**2)
+        n = self.n0 / (1.0 + square_of(away) / self.radius**2)
         k = n * n * n * (-2.0 / (self.n0 * self.radius**2))
         return n * n, tuple(k * v for v in away)
 
@@ -160,7 +160,7 @@ class Luneburg(IndexField):
     def at(self, point: Point, coefficients: Tensor | None = None):
         """See the module."""
         away = [q - c for q, c in zip(point, self.centre, strict=True)]
-        part = sum(v * v for v in away) / self.radius**2
+        part = square_of(away) / self.radius**2
         k = (part < 1.0).to(part) * (-1.0 / self.radius**2)
         return 2.0 - part.clamp_max(1.0), tuple(k * v for v in away)
 
@@ -252,6 +252,11 @@ def _made(gradient: Gradient, lens: Lens) -> IndexField:
     if gradient.kind == "volume":
         return SplineIndex(torch.as_tensor(gradient.volume), lens.half_size, lens.offset.thickness - lens.z_in)
     return (Radial if gradient.kind == "radial" else Axial)(lens.index, gradient.terms)
+
+
+def square_of(v: Sequence[Tensor]) -> Tensor:
+    """v . v of three components."""
+    return v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
 
 
 def _polynomial(constant: float, terms: Sequence[float], x: Tensor) -> tuple[Tensor, Tensor]:

@@ -35,7 +35,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from caustic_cli.errors import CausticError
-from caustic_cli.optics.gradient.fields import LEAST_SQUARE, IndexField
+from caustic_cli.optics.gradient.fields import LEAST_SQUARE, IndexField, square_of
 
 _S4 = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
 _S6 = (0.39216144400731413928, 0.33259913678935943860, -0.70624617255763935981, 0.082213596293550800230, 0.79854399093482996340)
@@ -50,15 +50,13 @@ PROBES, MOST_STEPS = 256, 1 << 14
 class Flow(NamedTuple):
     """Rays at their end: point q (mm) and momentum p, three (N,) each; optical path length S and length L, (N,) mm."""
 
-    point: tuple[Tensor, Tensor, Tensor]
-    momentum: tuple[Tensor, Tensor, Tensor]
+    point: tuple[Tensor, ...]
+    momentum: tuple[Tensor, ...]
     path: Tensor
     length: Tensor
 
 
-def flow(
-    field: IndexField, coefficients: Tensor | None, point, momentum, time: Tensor, steps: int, order: int = ORDER
-) -> Flow:
+def flow(field: IndexField, coefficients: Tensor | None, point, momentum, time: Tensor, steps: int, order: int = ORDER) -> Flow:
     """Rays after `time` (N,) mm of tau, in so many equal steps; the plain-torch reference, for any field.
 
     Differentiable once by the coefficients, points, momenta and times.
@@ -69,7 +67,7 @@ def flow(
 
 def drift(q, p, path: Tensor, a):
     """Straight on; see the module."""
-    return tuple(x + a * v for x, v in zip(q, p, strict=True)), path + 0.5 * a * _square(p)
+    return tuple(x + a * v for x, v in zip(q, p, strict=True)), path + 0.5 * a * square_of(p)
 
 
 def kick(field: IndexField, coefficients, q, p, path: Tensor, length: Tensor, b):
@@ -109,7 +107,7 @@ class _Flow(torch.autograd.Function):
 
         def drift_back(a):
             nonlocal q
-            rate = sum(x * v for x, v in zip(lq, p, strict=True)) + 0.5 * s * _square(p)
+            rate = sum(x * v for x, v in zip(lq, p, strict=True)) + 0.5 * s * square_of(p)
             for k in range(3):
                 lp[k] = lp[k] + a * (lq[k] + s * p[k])
             q = tuple(x - a * v for x, v in zip(q, p, strict=True))
@@ -144,7 +142,8 @@ def steps_for(
 
     Args:
         march: `flow` of a backend.
-        tolerance: root mean square, of points as a part of the way, and of directions.  The error of the larger number is 2^order times smaller.
+        tolerance: root mean square, of points as a part of the way, and of directions.  The error of twice as many steps is
+            2^order times smaller.
 
     Raises:
         CausticError: MOST_STEPS are not enough.
@@ -166,7 +165,3 @@ def steps_for(
                 break
             steps, before = 2 * steps, after
     raise CausticError(f"rays through the gradient index do not converge to {tolerance:g} with {MOST_STEPS:,} steps")
-
-
-def _square(v) -> Tensor:
-    return v[0] * v[0] + v[1] * v[1] + v[2] * v[2]

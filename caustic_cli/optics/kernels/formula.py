@@ -67,9 +67,7 @@ def _flow(block, terms, axial, squared, least, ray, time, weights, steps, out, b
         on_threads(blocks, (terms, axial, squared, least, ray, time, weights, steps, out, blocks))
         return
     count = len(time)
-    _flow_some(
-        block * count // blocks, (block + 1) * count // blocks, terms, axial, squared, least, ray, time, weights, steps, out
-    )
+    _flow_some(block * count // blocks, (block + 1) * count // blocks, terms, axial, squared, least, ray, time, weights, steps, out)
 
 
 @njit(**FAST)

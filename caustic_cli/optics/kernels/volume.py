@@ -12,7 +12,6 @@ does not change has a single piece and the function 1.  Beyond the box every bas
 
 from __future__ import annotations
 
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -48,8 +47,9 @@ class VolumeAxis:
 
 
 @njit(inline="always", **FAST)
-def _along(x, breaks, middles, over, first, matrices, place, out):
+def _along(x, axis, out):
     """First basis function at x, and into out (3, p + 1) the values, first and second derivatives by mm."""
+    breaks, middles, over, first, matrices, place = axis
     v = (x - place[0]) * place[1]
     u = min(max(v, 0.0), 1.0)
     beyond = v - u
@@ -123,21 +123,21 @@ def _curve(c, i, j, k, bu, bv, bw, nu, nv, nw):
 
 
 @njit(**FAST)
-def _flow_some(begin, end, c, ub, um, uo, uf, ux, up, vb, vm, vo, vf, vx, vp, wb, wm, wo, wf, wx, wp, ray, time, weights, steps, out):
+def _flow_some(begin, end, c, u, v, w, ray, time, weights, steps, out):
     bu, bv, bw = np.empty((3, WIDE)), np.empty((3, WIDE)), np.empty((3, WIDE))
-    nu, nv, nw = ux.shape[1], vx.shape[1], wx.shape[1]
+    nu, nv, nw = u[4].shape[1], v[4].shape[1], w[4].shape[1]
     for at in range(begin, end):
         x, y, z, px, py, pz = ray[0][at], ray[1][at], ray[2][at], ray[3][at], ray[4][at], ray[5][at]
         path, length, h = 0.0, 0.0, time[at] / steps
         for _ in range(steps):
-            for w in weights:
-                b = w * h
+            for part in weights:
+                b = part * h
                 a = 0.5 * b
                 path += 0.5 * a * (px * px + py * py + pz * pz)
                 x, y, z = x + a * px, y + a * py, z + a * pz
-                i = _along(x, ub, um, uo, uf, ux, up, bu)
-                j = _along(y, vb, vm, vo, vf, vx, vp, bv)
-                k = _along(z, wb, wm, wo, wf, wx, wp, bw)
+                i = _along(x, u, bu)
+                j = _along(y, v, bv)
+                k = _along(z, w, bw)
                 n, nx, ny, nz = _slope(c, i, j, k, bu, bv, bw, nu, nv, nw)
                 path += 0.5 * b * n * n
                 length += b * n
@@ -149,44 +149,40 @@ def _flow_some(begin, end, c, ub, um, uo, uf, ux, up, vb, vm, vo, vf, vx, vp, wb
 
 
 @njit(entry=True, **FAST)
-def _flow(block, c, ub, um, uo, uf, ux, up, vb, vm, vo, vf, vx, vp, wb, wm, wo, wf, wx, wp, ray, time, weights, steps, out, blocks):
+def _flow(block, c, u, v, w, ray, time, weights, steps, out, blocks):
     """q, p, S and L (8, N), from ray: q and p, six components."""
     if block == ALL:
         on_threads(
             blocks,
-            (c, ub, um, uo, uf, ux, up, vb, vm, vo, vf, vx, vp, wb, wm, wo, wf, wx, wp, ray, time, weights, steps, out, blocks),
+            (c, u, v, w, ray, time, weights, steps, out, blocks),
         )
         return
     count = len(time)
     begin, end = block * count // blocks, (block + 1) * count // blocks
-    _flow_some(
-        begin, end, c, ub, um, uo, uf, ux, up, vb, vm, vo, vf, vx, vp, wb, wm, wo, wf, wx, wp, ray, time, weights, steps, out
-    )
+    _flow_some(begin, end, c, u, v, w, ray, time, weights, steps, out)
 
 
 @njit(**FAST)
-def _pull_some(
-    begin, end, c, ub, um, uo, uf, ux, up, vb, vm, vo, vf, vx, vp, wb, wm, wo, wf, wx, wp, ends, time, weights, steps, by, out, by_c
-):
+def _pull_some(begin, end, c, u, v, w, ends, time, weights, steps, by, out, by_c):
     bu, bv, bw = np.empty((3, WIDE)), np.empty((3, WIDE)), np.empty((3, WIDE))
-    nu, nv, nw = ux.shape[1], vx.shape[1], wx.shape[1]
+    nu, nv, nw = u[4].shape[1], v[4].shape[1], w[4].shape[1]
     free = by_c.size > 0
     for at in range(begin, end):
         x, y, z, px, py, pz = ends[0][at], ends[1][at], ends[2][at], ends[3][at], ends[4][at], ends[5][at]
         lx, ly, lz, mx, my, mz = by[0][at], by[1][at], by[2][at], by[3][at], by[4][at], by[5][at]
         s, t, by_time, h = by[6][at], by[7][at], 0.0, time[at] / steps
         for _ in range(steps):
-            for w in weights:
-                b = w * h
+            for part in weights:
+                b = part * h
                 a = 0.5 * b
                 # drift
                 rate = 0.5 * (lx * px + ly * py + lz * pz + 0.5 * s * (px * px + py * py + pz * pz))
                 mx, my, mz = mx + a * (lx + s * px), my + a * (ly + s * py), mz + a * (lz + s * pz)
                 x, y, z = x - a * px, y - a * py, z - a * pz
                 # kick
-                i = _along(x, ub, um, uo, uf, ux, up, bu)
-                j = _along(y, vb, vm, vo, vf, vx, vp, bv)
-                k = _along(z, wb, wm, wo, wf, wx, wp, bw)
+                i = _along(x, u, bu)
+                j = _along(y, v, bv)
+                k = _along(z, w, bw)
                 n, nx, ny, nz, xx, xy, xz, yy, yz, zz = _curve(c, i, j, k, bu, bv, bw, nu, nv, nw)
                 dot = nx * mx + ny * my + nz * mz
                 rate += n * dot + 0.5 * s * n * n + t * n
@@ -207,31 +203,50 @@ def _pull_some(
                 rate += 0.5 * (lx * px + ly * py + lz * pz + 0.5 * s * (px * px + py * py + pz * pz))
                 mx, my, mz = mx + a * (lx + s * px), my + a * (ly + s * py), mz + a * (lz + s * pz)
                 x, y, z = x - a * px, y - a * py, z - a * pz
-                by_time += w * rate
+                by_time += part * rate
         out[0][at], out[1][at], out[2][at], out[3][at], out[4][at], out[5][at] = lx, ly, lz, mx, my, mz
         out[6][at] = by_time / steps
 
 
 @njit(entry=True, **FAST)
-def _flow_adjoint(
-    block, c, ub, um, uo, uf, ux, up, vb, vm, vo, vf, vx, vp, wb, wm, wo, wf, wx, wp, ends, time, weights, steps, by, out, by_c, blocks
-):
-    """Derivatives by q, p and time into out (7, N), and by the coefficients into by_c (blocks, n, m, k), from those by q, p, S, L."""
+def _flow_adjoint(block, c, u, v, w, ends, time, weights, steps, by, out, by_c, blocks):
+    """Derivatives by q, p and time into out (7, N), by the coefficients into by_c (blocks, n, m, k), from those by q, p, S, L."""
     if block == ALL:
         on_threads(
             blocks,
             (
-                c, ub, um, uo, uf, ux, up, vb, vm, vo, vf, vx, vp, wb, wm, wo, wf, wx, wp,
-                ends, time, weights, steps, by, out, by_c, blocks,
+                c,
+                u,
+                v,
+                w,
+                ends,
+                time,
+                weights,
+                steps,
+                by,
+                out,
+                by_c,
+                blocks,
             ),
-        )  # fmt: skip
+        )
         return
     count = len(time)
     begin, end = block * count // blocks, (block + 1) * count // blocks
     _pull_some(
-        begin, end, c, ub, um, uo, uf, ux, up, vb, vm, vo, vf, vx, vp, wb, wm, wo, wf, wx, wp,
-        ends, time, weights, steps, by, out, by_c[block],
-    )  # fmt: skip
+        begin,
+        end,
+        c,
+        u,
+        v,
+        w,
+        ends,
+        time,
+        weights,
+        steps,
+        by,
+        out,
+        by_c[block],
+    )
 
 
 def volume_flow(
@@ -252,7 +267,7 @@ class _VolumeFlow(torch.autograd.Function):
     @staticmethod
     def forward(axes, weights, steps, coefficients, time, *ray):
         out = np.empty((8, len(time)))
-        geometry = [a for axis in axes for a in axis.arrays]
+        geometry = [axis.arrays for axis in axes]
         rays = np.stack([component(v) for v in ray])
         _flow(ALL, component(coefficients), *geometry, rays, component(time), np.array(weights), steps, out, blocks())
         return tuple(torch.from_numpy(row) for row in out)
@@ -269,11 +284,20 @@ class _VolumeFlow(torch.autograd.Function):
         count, threads, free = len(time), blocks(), ctx.needs_input_grad[3]
         out = np.empty((7, count))
         by_c = np.zeros((threads, *coefficients.shape) if free else (threads, 0, 0, 0))
-        geometry = [a for axis in ctx.axes for a in axis.arrays]
+        geometry = [axis.arrays for axis in ctx.axes]
         stacked = [np.stack([component(v) for v in values]) for values in (ends, by)]
         _flow_adjoint(
-            ALL, component(coefficients), *geometry, stacked[0], component(time), np.array(ctx.weights), ctx.steps, stacked[1], out,
-            by_c, threads,
-        )  # fmt: skip
+            ALL,
+            component(coefficients),
+            *geometry,
+            stacked[0],
+            component(time),
+            np.array(ctx.weights),
+            ctx.steps,
+            stacked[1],
+            out,
+            by_c,
+            threads,
+        )
         rows = [torch.from_numpy(row) for row in out]
         return None, None, None, torch.from_numpy(by_c.sum(0)) if free else None, rows[6], *rows[:6]
