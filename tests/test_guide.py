@@ -127,7 +127,7 @@ def test_links_of_the_documents_lead_somewhere():
             if "://" not in link:
                 assert (path.parent / link).exists(), f"{path}: {link}"
                 checked += 1
-    assert checked > 20 and len(CHAPTERS) == 8
+    assert checked > 20 and len(CHAPTERS) == 9
 
 
 def test_the_readme_is_short_and_its_python_is_the_library():

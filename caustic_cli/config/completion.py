@@ -200,6 +200,8 @@ def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[st
 
 def _complete_blank(lens: Table, screen: Table, index: float) -> None:
     """What a flat blank has whose index is designed; its sides are the least net."""
+    if value_of(lens, "lens.mirror"):
+        raise InputError("⟨lens.gradient⟩ free needs a lens: light never enters a mirror")
     if any(map(math.isfinite, lens.setdefault("radius", [math.inf, math.inf]))):
         raise InputError(f"⟨lens.radius⟩ of a free gradient must be [inf, inf], two flat sides, got {lens['radius']}")
     lens.setdefault("control", [p + 1 for p in check("lens.degree", lens["degree"])])
@@ -288,6 +290,8 @@ def _complete_index_design(s: Settings, source: Source, quality: str, rays: int 
     lens, screen, design = s["lens"], s["screen"], s["design"]
     if not source.collimated:
         raise InputError(f"⟨lens.gradient⟩ free is designed for light of ⟨source.type⟩ plane, got {s['source']['type']}")
+    if value_of(s["target"], "target.color"):
+        raise InputError("⟨target.color⟩ is not for a free gradient, whose index is designed at one wavelength")
     for key, only in (("network", "none"), ("optimizer", "lbfgs"), ("loss", default("design.loss"))):
         if design[key] != only:
             raise InputError(f"⟨design.{key}⟩ of a free gradient must be {only}, got {design[key]}")

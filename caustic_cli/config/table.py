@@ -180,7 +180,8 @@ _ROWS = (
             1e6, default=0.0, written=False, option=Option("--border", "MM")),
     Setting("lens.gradient", "text", "index that varies within the lens: selfoc, radial or axial, by gradient_terms; volume, of an"
             " index_file; free, designed in place of the surface, on flat sides",
-            choices=("selfoc", "radial", "axial", "volume", "free"), derived="one index", option=Option("--gradient", "selfoc|radial|axial|volume|free")),
+            choices=("selfoc", "radial", "axial", "volume", "free"), derived="one index",
+            option=Option("--gradient", "selfoc|radial|axial|volume|free")),
     Setting("lens.gradient_terms", "list", "selfoc: g of n^2 = index^2 (1 - (g r)^2), 1/mm; radial: a, b, ... of index + a r^2"
             " + b r^4 + ...; axial: of index + a z + b z^2 + ..., z from the entrance, r and z in mm",
             option=Option("--gradient-terms", "A[,B...]")),

@@ -197,8 +197,16 @@ def design(
         figures = uptodate.finished(project, project.found)
         say.say(
             f"{project.path}: was designed from the same picture with the same options, so "
-            + ("there is nothing to do; ⟨force⟩ designs it anew" if figures else "it goes on from its checkpoint")
+            + (
+                "there is nothing to do; ⟨force⟩ designs it anew"
+                if figures
+                else "it is designed to its end"
+                if is_free(project)
+                else "it goes on from its checkpoint"
+            )
         )
+        if not figures and is_free(project):
+            return design(replace(project, asked=uptodate.asked_of(project, project.found), found=None), None, device, say, began)
         if not figures:
             return resume(project, None, None, device, say, began, movie)
         if movie is not None:
