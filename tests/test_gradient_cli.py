@@ -57,7 +57,7 @@ def test_a_blank_is_designed_kept_and_rendered(capfd):
     assert figures["relative_rms"] < 0.3 and figures["on_screen"] > 0.85 and figures["iterations"] == 3
     assert figures["on_screen"] + sum(figures["lost"].values()) == pytest.approx(1.0, abs=1e-9)
     values = np.load("free.caustic/index.npy")
-    assert values.shape == (27, 27, 1) and figures["index_least"] == values.min() < values.max() == figures["index_most"]
+    assert values.shape == (51, 51, 1) and figures["index_least"] == values.min() < values.max() == figures["index_most"]
     again = run(capfd, "render", "free.caustic", "--rays", "40000", "--quiet", "--threads", "1")
     assert again["relative_rms"] == pytest.approx(figures["relative_rms"], abs=0.02)
     anew = run(capfd, "design", "blob.png", "--gradient", "free", *TINY, "-o", "free.caustic")
@@ -67,7 +67,7 @@ def test_a_blank_is_designed_kept_and_rendered(capfd):
     assert "varies" in run(capfd, "export", "free.caustic", "--format", "lighttools", code=2)
     assert "varies" in run(capfd, "gradmap", "free.caustic", "--threads", "1", code=2)
     lens = load("free.caustic")
-    assert field_of(lens.scene.lens).shape == (27, 27, 1) and float(np.ptp(lens.surface(np.linspace(-4, 4, 9), 0.0)[0])) < 1e-12
+    assert field_of(lens.scene.lens).shape == (51, 51, 1) and float(np.ptp(lens.surface(np.linspace(-4, 4, 9), 0.0)[0])) < 1e-12
 
 
 def test_a_file_of_indices_is_kept(capfd):

@@ -55,8 +55,9 @@ STEEPEST = 1.25  # least radius of a derived sphere, in half diagonals of the le
 WAVE_KEYS = ("control", "blur", "apron", "iterations", "tolerance")  # of a stage on rays that one on the wave image has too
 PLATE, WALL = 20.0, 3.0  # width beyond which a lens is a plate, as thin as its relief and this wall allow, mm
 OBLONG = 2.5  # ratio of the magnifications along the axes from which on another shape of lens is advised
-#: Of a free gradient: range to either side of the index, degree of its splines, and rays a pixel at most, since they cost more.
-HALF_RANGE, INDEX_DEGREE, RAYS_BENT = 0.05, 3, 16
+#: Of a free gradient: range to either side of the index; degree of its splines, knot spans a pixel and the most of them; and rays a
+#: pixel at most, since they cost more.
+HALF_RANGE, INDEX_DEGREE, INDEX_SPANS, MOST_SPANS, RAYS_BENT = 0.05, 3, 2, 768, 16
 COLOR_GLASS = "N-BK7"  # of a coloured picture, unless glass or index is said: dispersion has to be known
 
 
@@ -206,7 +207,7 @@ def _complete_blank(lens: Table, screen: Table, index: float) -> None:
         raise InputError(f"⟨lens.radius⟩ of a free gradient must be [inf, inf], two flat sides, got {lens['radius']}")
     lens.setdefault("control", [p + 1 for p in check("lens.degree", lens["degree"])])
     lens.setdefault("index_range", [max(1.0, index - HALF_RANGE), index + HALF_RANGE])
-    lens.setdefault("index_control", [min(1024, n + INDEX_DEGREE) for n in screen["resolution"]])
+    lens.setdefault("index_control", [min(MOST_SPANS, INDEX_SPANS * n) + INDEX_DEGREE for n in screen["resolution"]])
     for key in ("index_range", "index_control", "index_layers"):
         check(f"lens.{key}", value_of(lens, f"lens.{key}"))
     if not lens["index_range"][0] < lens["index_range"][1]:

@@ -192,7 +192,7 @@ _ROWS = (
             derived="the index, 0.05 less to 0.05 more", why="what gradients in glass and printed polymers span",
             option=Option("--index-range", "LEAST,MOST")),
     Setting("lens.index_control", "wholes", "control values of a free gradient along x and y", low=4, high=1024,
-            derived="a knot span a pixel", option=Option("--index-control", "N[xM]")),
+            derived="two knot spans a pixel", why="as of a surface", option=Option("--index-control", "N[xM]")),
     Setting("lens.index_layers", "whole", "control values of a free gradient along z", low=1, high=64, default=1, written=False,
             why="in a thin blank only the index summed along a ray matters"),
     Setting("lens.control", "wholes", "control points of the finished lens", low=2, high=4096,
