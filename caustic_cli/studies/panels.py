@@ -85,7 +85,7 @@ def write_report(
     shown, unit, name = (
         (_without_sphere(heights, rx, ry) * 1e3, "µm", "lens height, best paraboloid removed")
         if volume is None
-        else (volume.mean(-1), "index", "control values of the index, mean along z")
+        else (volume.mean(-1), "index", "index, mean along z")
     )
     drawn = axes[1, 0].imshow(shown.T, origin="lower", extent=[-rx, rx, -ry, ry], cmap="viridis")
     figure.colorbar(drawn, ax=axes[1, 0], label=unit)
