@@ -206,6 +206,6 @@ def test_names():
     with pytest.raises(InputError, match="did you mean ghosts"):
         parse_effects("ghost")
     names = [effect.name for effect in EFFECTS]
-    assert len(set(names)) == len(names) == 17
+    assert len(set(names)) == len(names) == 18
     assert {effect.name for effect in EFFECTS if effect.free} == {"missed-surface", "total-reflection", "screen-shift"}
     assert replace(NO_REQUESTS, stages=True) == STAGES != NO_REQUESTS

@@ -223,8 +223,14 @@ def _radius(option: str, text: str) -> dict[str, Any]:
     return {"screen.radius": both(tuple(radii))}
 
 
+def _terms(option: str, text: str) -> dict[str, Any]:
+    """Numbers parted by commas, one or more."""
+    return {"lens.gradient_terms": list(numbers(option, text, (text.count(",") + 1,), ",", "numbers parted by commas"))}
+
+
 #: Options whose text is read in a way of their own.
 READERS = {
+    "lens.gradient_terms": _terms,
     "source.power": _power,
     "source.wavelengths": _spectrum,
     "screen.radius": _radius,

@@ -61,6 +61,9 @@ WAVE_KEYS = ("control", "blur", "apron", "iterations", "tolerance")  # of a stag
 PLATE, WALL = 20.0, 3.0  # width beyond which a lens is a plate, as thin as its relief and this wall allow, mm
 THICK, SAG = 2.0, 0.45  # thickness over width of a lens with two free-form sides, and what of it each of them may take
 OBLONG = 2.5  # ratio of the magnifications along the axes from which on another shape of lens is advised
+#: Of a free gradient: range to either side of the index; degree of its splines, knot spans a pixel and the most of them; and rays a
+#: pixel at most, since they cost more.
+HALF_RANGE, INDEX_DEGREE, INDEX_SPANS, MOST_SPANS, RAYS_BENT = 0.05, 3, 2, 768, 16
 COLOR_GLASS = "N-BK7"  # of a coloured picture, unless glass or index is said: dispersion has to be known
 
 
@@ -180,6 +183,8 @@ def first_thickness(size: Sequence[float]) -> float:
 def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[str, Any], source: Source, sides: int) -> None:
     index, scale = index_of(lens), max(lens["size"]) / 10.0
     check("lens.index", index)
+    if lens.get("gradient") == "free":
+        _complete_blank(lens, screen, index)
     if "glass" not in lens:
         lens["index"] = index
     else:
@@ -241,6 +246,7 @@ def _complete_second(s: Settings) -> None:
     wrong = {
         "lens.mirror": value_of(s["lens"], "lens.mirror"),
         "target.color": value_of(s["target"], "target.color"),
+        "lens.gradient": "gradient" in s["lens"],
         "lens.array": max(value_of(s["lens"], "lens.array")) > 1,
         "design.robust": design.get("robust", ""),
         "design.network": design["network"] != "none",
@@ -264,6 +270,21 @@ def _complete_farther(s: Settings) -> None:
     check("second.size", second["size"])
 
 
+def _complete_blank(lens: Table, screen: Table, index: float) -> None:
+    """What a flat blank has whose index is designed; its sides are the least net."""
+    if value_of(lens, "lens.mirror"):
+        raise InputError("⟨lens.gradient⟩ free needs a lens: light never enters a mirror")
+    if any(map(math.isfinite, lens.setdefault("radius", [math.inf, math.inf]))):
+        raise InputError(f"⟨lens.radius⟩ of a free gradient must be [inf, inf], two flat sides, got {lens['radius']}")
+    lens.setdefault("control", [p + 1 for p in check("lens.degree", lens["degree"])])
+    lens.setdefault("index_range", [max(1.0, index - HALF_RANGE), index + HALF_RANGE])
+    lens.setdefault("index_control", [min(MOST_SPANS, INDEX_SPANS * n) + INDEX_DEGREE for n in screen["resolution"]])
+    for key in ("index_range", "index_control", "index_layers"):
+        check(f"lens.{key}", value_of(lens, f"lens.{key}"))
+    if not lens["index_range"][0] < lens["index_range"][1]:
+        raise InputError(f"⟨lens.index_range⟩ must ascend, got {lens['index_range']}")
+
+
 def shape_words(s: Settings) -> str:
     """Which lens would follow the shape of a long picture, where this one does not."""
     (w, h), (a, b) = s["target"]["size"], s["lens"]["size"]
@@ -279,6 +300,9 @@ def shape_words(s: Settings) -> str:
 def _complete_design(s: Settings, source: Source, quality: str | None, rays: int | None, lit: tuple[float, float]) -> None:
     lens, screen, design, given = s["lens"], s["screen"], s["design"], quality
     degree = check("lens.degree", lens["degree"])
+    if lens.get("gradient") == "free":
+        _complete_index_design(s, source, quality or _quality(design["time_limit"]), rays)
+        return
     plain = design["network"] == "none" and design["optimizer"] == "lbfgs"
     asked = check("design.waves", design["waves"])
     array = value_of(lens, "lens.array")
@@ -374,6 +398,27 @@ def _of_array(control: Sequence[int], degree: Sequence[int], array: Sequence[int
     return [array_control(n, p, k) if k > 1 else n for n, p, k in zip(control, degree, array, strict=True)]
 
 
+def _complete_index_design(s: Settings, source: Source, quality: str, rays: int | None) -> None:
+    """How a free gradient is found: L-BFGS from transport, on rays."""
+    lens, screen, design = s["lens"], s["screen"], s["design"]
+    if not source.collimated:
+        raise InputError(f"⟨lens.gradient⟩ free is designed for light of ⟨source.type⟩ plane, got {s['source']['type']}")
+    if max(value_of(lens, "lens.array")) > 1:
+        raise InputError("⟨lens.array⟩ cannot be had with a free gradient, whose sides are flat")
+    if value_of(s["target"], "target.color"):
+        raise InputError("⟨target.color⟩ is not for a free gradient, whose index is designed at one wavelength")
+    for key, only in (("network", "none"), ("optimizer", "lbfgs"), ("loss", default("design.loss"))):
+        if design[key] != only:
+            raise InputError(f"⟨design.{key}⟩ of a free gradient must be {only}, got {design[key]}")
+    if check("design.waves", design["waves"]) == "on":
+        raise InputError("⟨design.waves⟩ on needs a lens of one index, of which the wave image is taken")
+    design["start"] = "offset"
+    design.setdefault("preconditioner", "laplacian")
+    if "stages" not in design:
+        last = refinement(tuple(lens["control"]), rays, tuple(screen["resolution"]), quality)[-1]
+        design["stages"] = [last | {"rays": rays or min(last["rays"], RAYS_BENT * math.prod(screen["resolution"]))}]
+
+
 def without_waves(s: Settings, given: bool) -> str:
     """Why `waves = "auto"` leaves the wave image out of complete settings although diffraction matters, and what puts it in.
 
@@ -392,6 +437,8 @@ def without_waves(s: Settings, given: bool) -> str:
 def _not_by_default(s: Settings) -> str:
     """What `waves = "auto"` does not refine the wave image with, however long that takes, and what puts it in."""
     design = s["design"]
+    if "gradient" in s["lens"]:
+        return "the wave image is taken of lenses of one index"
     if s["source"]["type"] == "rays":
         return "a ray file says nothing of its light's phase"
     if s["source"].get("also"):
@@ -414,6 +461,8 @@ def _wave_stages(s: Settings, source: Source, quality: str, lit: tuple[float, fl
     design, lens, screen, asked = s["design"], s["lens"], s["screen"], s["design"]["waves"]
     if asked == "on" and design["network"] != "none":
         raise InputError("⟨design.waves⟩ on needs network none: the wave image refines the heights themselves")
+    if asked == "on" and "gradient" in lens:
+        raise InputError("⟨design.waves⟩ on needs a lens of one index, of which the wave image is taken")
     if asked == "on" and source.rays is not None:
         raise InputError("⟨design.waves⟩ on: a ray file says nothing of its light's phase, so that it has no wave image to refine")
     if asked == "on" and build_screen(s).curved:

@@ -23,6 +23,7 @@ from caustic_cli.config.table import Setting, check, default, in_section
 from caustic_cli.errors import InputError
 from caustic_cli.io.files import read_bytes
 from caustic_cli.scene import Lens, Light, Offset, Scene, Screen, Second, Source, sources
+from caustic_cli.scene.gradient import KINDS, Gradient
 from caustic_cli.scene.materials import refractive_index
 from caustic_cli.scene.screen import PLANE, Sags
 from caustic_cli.scene.sources.section import content
@@ -273,6 +274,7 @@ def build_lens(settings: Settings) -> Lens:
         raise InputError("⟨lens.knots_u⟩ and knots_v go together: give both or neither")
     knots = (tuple(lens["knots_u"]), tuple(lens["knots_v"])) if "knots_u" in lens else None
     offset = Offset(lens["thickness"], tuple(lens["radius"]))
+    values = content(lens, "index_file", np.ndarray)
     return Lens(
         tuple(lens["size"]),
         lens["z_in"],
@@ -285,9 +287,32 @@ def build_lens(settings: Settings) -> Lens:
         tuple(lens["height_range"]),
         lens["fresnel"],
         glass=lens.get("glass"),
+        gradient=build_gradient(lens, values),
         **{key: value_of(lens, f"lens.{key}") for key in ("absorption", "roughness", "mirror", "aperture", "border")},
         array=tuple(value_of(lens, "lens.array")),
     )
+
+
+def build_gradient(lens: dict[str, Any], values: np.ndarray | None) -> Gradient | None:
+    """What the [lens] section says of an index that varies, None where it is one; values: of its index_file.
+
+    Raises:
+        InputError: terms or a file are missing, or belong to another kind.
+    """
+    kind = lens.get("gradient")
+    if kind is None and not {"gradient_terms", "index_file"} & {*lens}:
+        return None
+    if kind is not None:
+        check("lens.gradient", kind)
+    if "gradient_terms" in lens and kind not in KINDS:
+        raise InputError(f"⟨lens.gradient_terms⟩ belong to ⟨lens.gradient⟩ {', '.join(KINDS)}, got {kind or 'none'}")
+    if "index_file" in lens and kind not in ("volume", "free"):
+        raise InputError(f"⟨lens.index_file⟩ belongs to ⟨lens.gradient⟩ volume or free, got {kind or 'none'}")
+    if kind == "volume" and values is None:
+        raise InputError("⟨lens.gradient⟩ volume needs ⟨lens.index_file⟩, a .npy of control values")
+    if kind is not None and kind in KINDS:
+        return Gradient(kind, tuple(lens.get("gradient_terms", ())))
+    return None if values is None else Gradient("volume", (), values)
 
 
 def build_source(settings: Settings, profile: np.ndarray | None = None, type: str | None = None) -> Source:

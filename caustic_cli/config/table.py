@@ -181,6 +181,23 @@ _ROWS = (
             1e6, default=0.0, written=False, option=Option("--border", "MM")),
     Setting("lens.array", "wholes", "lenslets along x and y, side by side, each of which throws the whole picture", low=1, high=100,
             default=[1, 1], written=False, option=Option("--array", "N[xM]")),
+    Setting("lens.gradient", "text", "index that varies within the lens: selfoc, radial or axial, by gradient_terms; volume, of an"
+            " index_file; free, designed in place of the surface, on flat sides",
+            choices=("selfoc", "radial", "axial", "volume", "free"), derived="one index",
+            option=Option("--gradient", "selfoc|radial|axial|volume|free")),
+    Setting("lens.gradient_terms", "list", "selfoc: g of n^2 = index^2 (1 - (g r)^2), 1/mm; radial: a, b, ... of index + a r^2"
+            " + b r^4 + ...; axial: of index + a z + b z^2 + ..., z from the entrance, r and z in mm",
+            option=Option("--gradient-terms", "A[,B...]")),
+    Setting("lens.index_file", "text", "control values (n, m) or (n, m, k) of a B-spline volume of refractive index over aperture"
+            " and thickness, .npy, of which the project keeps a copy; of a free gradient, what was designed",
+            option=Option("--index-file", "FILE")),
+    Setting("lens.index_range", "numbers", "least and largest control value of a free gradient", low=1.0, high=5.0,
+            derived="the index, 0.05 less to 0.05 more", why="what gradients in glass and printed polymers span",
+            option=Option("--index-range", "LEAST,MOST")),
+    Setting("lens.index_control", "wholes", "control values of a free gradient along x and y", low=4, high=1024,
+            derived="two knot spans a pixel", why="as of a surface", option=Option("--index-control", "N[xM]")),
+    Setting("lens.index_layers", "whole", "control values of a free gradient along z", low=1, high=64, default=1, written=False,
+            why="in a thin blank only the index summed along a ray matters"),
     Setting("lens.control", "wholes", "control points of the finished lens", low=2, high=4096,
             derived="by picture and quality: two knot spans a pixel", why="finer than the picture: no limit to it",
             option=Option("--control", "N[xM]")),

@@ -20,6 +20,8 @@ FORMATS = {
     "gcode": (".nc", "milling.gcode", "program for a three-axis mill"),
     "mitsuba": (".xml", "mitsuba", "the whole scene for Mitsuba 3, ready to run, with two meshes beside it"),
 }
+#: Formats that say the lens' index.
+ONE_INDEX = ("lighttools", "zemax", "mitsuba")
 MESHES = ("stl", "ply", "obj", "mitsuba")
 #: Formats of solids, whose back a mirror needs; those that lie as the part is cut; and those that can be its mould.
 SOLIDS, AS_CUT = ("step", "stl", "ply", "obj"), ("heightmap", "gcode")

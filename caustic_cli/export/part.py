@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.export import AS_CUT, MOULDS, SOLIDS
+from caustic_cli.export import AS_CUT, FORMATS, MOULDS, ONE_INDEX, SOLIDS
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Lens, PlaneWave, Scene, Screen
@@ -64,6 +64,9 @@ def part_of(
     """
     lens, heights = scene.lens, heights.detach().double().cpu()
     kind = "mould" if mould else "mirror" if lens.mirror else "lens"
+    if lens.gradient is not None and format in ONE_INDEX:
+        shapes = ", ".join(name for name in FORMATS if name not in ONE_INDEX)
+        raise InputError(f"⟨format⟩ {format} holds one index, and this lens' varies; {shapes} hold its shape alone")
     if mould and format not in MOULDS:
         raise InputError(f"⟨mould⟩ belongs to ⟨format⟩ {', '.join(MOULDS)}, got {format}")
     if block is not None and kind == "lens":

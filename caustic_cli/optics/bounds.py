@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
+from caustic_cli.optics.gradient.fields import field_of
 from caustic_cli.optics.interface import reflectance, reflectances
 from caustic_cli.optics.resolution import Resolution, paraxial
 from caustic_cli.optics.sampling import LARGEST_NORMAL
@@ -79,8 +80,13 @@ def bounds_of(scene: Scene, field: HeightField, heights: Tensor, steeper: float 
     lens, indices = scene.lens, [band.scene.lens.inside for band in scene.bands]
     least, most = min(indices), max(indices)
     incidence = scene.source.incidence(scene.lens.half_size, scene.lens.z_in, scene.lens.round)
+    bent = 0.0
+    if field_of_index := field_of(lens):
+        low, high, steepest = field_of_index.extremes(lens.half_size, lens.offset.thickness - lens.z_in)
+        least, most = least * low / lens.index, most * high / lens.index
+        bent = steepest * (lens.offset.thickness - lens.z_in) / low
     front = 0.0 if lens.front is None else math.atan(math.hypot(*front_of(lens).slope_bounds(None)))
-    inside = front + math.asin(max(-1.0, min(1.0, math.sin(incidence - front) / least)))
+    inside = min(front + math.asin(max(-1.0, min(1.0, math.sin(incidence - front) / least))) + bent, 0.5 * math.pi)
     slope = field.slope_bound(heights) + steeper
     lean = math.atan(slope + lens.roughness * LARGEST_NORMAL)
     i = inside + lean

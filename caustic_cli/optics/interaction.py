@@ -37,6 +37,7 @@ class Walker(Protocol):
         forward: bool = True,
         reflects: bool | None = None,
         straight: bool = True,
+        parameters: Parameters = ...,
     ) -> Interaction:
         """Rays to element k and behind it."""
 
@@ -46,7 +47,8 @@ class Interaction:
     """Rays at one element: what effects see and change.
 
     tracer, index, element: whose and which; forward: whether light runs in the system's own direction; side: from which the
-    surface is met; n_in, n_out: refractive indices before and behind, in the light's direction; reflects; state: the rays, at the
+    surface is met; n_in, n_out: refractive indices before and behind, in the light's direction, (N,) where
+    the medium's varies; reflects; state: the rays, at the
     surface (origins in the system's frame, directions before it until `depart`, behind it from then on); local: their points in
     the element's frame; incoming: directions before it, in that frame; slopes: of the surface there; length: of the way to it, mm;
     lift: how far above the met point the rays go on, mm, where an effect says so; arriving, departing: power before and
@@ -59,8 +61,8 @@ class Interaction:
     element: Element
     forward: bool
     side: float
-    n_in: float
-    n_out: float
+    n_in: float | Tensor
+    n_out: float | Tensor
     reflects: bool
     straight: bool
     state: RayState

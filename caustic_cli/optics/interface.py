@@ -33,7 +33,7 @@ class Departure(NamedTuple):
 
 
 def interact(
-    direction, slopes, power: Tensor, *, eta: float, reflects: bool, fresnel: str, polarised=None, side: float = 1.0
+    direction, slopes, power: Tensor, *, eta: float | Tensor, reflects: bool, fresnel: str, polarised=None, side: float = 1.0
 ) -> Departure:
     """Refract or reflect rays of N at a height field.
 
@@ -41,7 +41,7 @@ def interact(
         direction: unit directions, three tensors (N,) or plain floats, with side d . N > 0.
         slopes: z_x, z_y at the hits, tensors or plain floats.
         power: (N,).
-        eta: n_in / n_out.
+        eta: n_in / n_out, a number, or (N,) of media whose index varies.
         reflects: a mirror, which keeps all power; otherwise the part is refracted that `fresnel` leaves.
         fresnel: none, schlick or exact.
         polarised: unit vectors of the field of linearly polarised light, as `direction`; None for unpolarised light.
@@ -69,7 +69,7 @@ def interact(
     return Departure(out, torch.where(passes, power * (1.0 - reflected), torch.zeros_like(power)), passes)
 
 
-def _flat(direction, power: Tensor, eta: float, fresnel: str, polarised) -> Departure:
+def _flat(direction, power: Tensor, eta: float | Tensor, fresnel: str, polarised) -> Departure:
     """At z = const Snell's law keeps n (d_x, d_y)."""
     dx, dy, dz = direction
     tx, ty = (d / (1.0 / eta) for d in (dx, dy))
@@ -85,7 +85,7 @@ def _flat(direction, power: Tensor, eta: float, fresnel: str, polarised) -> Depa
     return Departure((tx, ty, tz), torch.where(passes, power - reflected * power, torch.zeros_like(power)), passes)
 
 
-def _reflected(direction, normal, c, s, eta: float, fresnel: str, polarised):
+def _reflected(direction, normal, c, s, eta: float | Tensor, fresnel: str, polarised):
     """Part of the power reflected, of light polarised or not."""
     if polarised is not None and fresnel == "exact":
         (rs, rp), part = reflectances(c, s, eta), part_s(polarised, direction, normal)
@@ -97,7 +97,7 @@ def _reflected(direction, normal, c, s, eta: float, fresnel: str, polarised):
     return reflectance(fresnel, c / length, s / length, eta)
 
 
-def refract(d, slope_x: Tensor, slope_y: Tensor, eta: float):
+def refract(d, slope_x: Tensor, slope_y: Tensor, eta: float | Tensor):
     """Refract unit directions at a height field.
 
     Args:
@@ -127,13 +127,13 @@ def reflect(d, slope_x: Tensor, slope_y: Tensor):
     return (d[0] + twice * slope_x, d[1] + twice * slope_y, d[2] - twice), c
 
 
-def reflectances(c, s, eta: float):
+def reflectances(c, s, eta: float | Tensor):
     """(R_s, R_p), parts of s- and p-polarised power reflected, from c and s of `refract`: r_s^2, r_p^2 of `reflectance`."""
     rs, rp = (eta * c - s) / (eta * c + s), (c - eta * s) / (c + eta * s)
     return rs * rs, rp * rp
 
 
-def reflectance(kind: str, c, s, eta: float):
+def reflectance(kind: str, c, s, eta: float | Tensor):
     """Part of the power reflected, from c and s of `refract` (any common factor): none, schlick or exact (unpolarised).
 
     Exact: (r_s^2 + r_p^2) / 2 with r_s = (eta c - s) / (eta c + s), r_p = (c - eta s) / (c + eta s).
@@ -143,7 +143,7 @@ def reflectance(kind: str, c, s, eta: float):
         return torch.zeros_like(s) if isinstance(s, Tensor) else 0.0
     if kind == "schlick":
         r0 = ((eta - 1.0) / (eta + 1.0)) ** 2
-        x = 1.0 - (s if eta > 1 else c)
+        x = 1.0 - (torch.minimum(c, s) if isinstance(eta, Tensor) else s if eta > 1 else c)
         x2 = x * x
         return r0 + (1.0 - r0) * (x2 * x2 * x)
     rs, rp = reflectances(c, s, eta)

@@ -21,6 +21,7 @@ from caustic_cli.config import checks
 from caustic_cli.config.table import TABLE
 from caustic_cli.errors import InputError
 from caustic_cli.optics.frames import Pose
+from caustic_cli.optics.gradient.fields import IndexField, field_of
 from caustic_cli.optics.surfaces import Fixed, HeightField, Plane, Surface
 from caustic_cli.optics.tolerances import PARALLEL
 from caustic_cli.scene import Aperture, Front, Lens, Light, Pupil, Scene, Screen, Source
@@ -39,11 +40,14 @@ class Medium:
         index: refractive index; of a glass, that of rays without a wavelength.
         absorption: coefficient a, 1/mm: exp(-a t) passes t mm (Beer-Lambert).
         glass: a name of `materials`, whose index changes with the wavelength; None for `index` at every wavelength.
+        gradient: how its index varies from place to place, in the frame of the element that it lies behind; at a wavelength where
+            the glass has another index than `index`, that many times as large everywhere.  None where it does not.
     """
 
     index: float = 1.0
     absorption: float = 0.0
     glass: str | None = None
+    gradient: IndexField | None = None
 
     def __post_init__(self):
         checks.number("index", self.index, 1.0, 5.0)
@@ -142,6 +146,8 @@ class System:
     lit: Pupil | None = None
 
     def __post_init__(self):
+        if self.before.gradient is not None:
+            raise InputError("the medium before a system has no element whose frame its gradient could have; put one before it")
         if not self.elements or not self.sources:
             raise InputError("a system needs at least one source and one element")
         names = [e.name for e in self.elements]
@@ -170,7 +176,7 @@ class System:
                     ENTRANCE,
                     entrance,
                     aperture,
-                    behind=Medium(lens.index, lens.absorption, lens.glass),
+                    behind=Medium(lens.index, lens.absorption, lens.glass, field_of(lens)),
                     pose=Pose((0.0, 0.0, lens.z_in)),
                     fresnel=lens.fresnel,
                 ),
@@ -197,6 +203,13 @@ class System:
         for element in self.elements:
             media.append(media[-1] if element.reflects else element.behind)
         return tuple(media)
+
+    def owners(self) -> tuple[int | None, ...]:
+        """Of each of `media` the element that it lies behind, None before the first."""
+        found: list[int | None] = [None]
+        for k, element in enumerate(self.elements):
+            found.append(found[-1] if element.reflects else k)
+        return tuple(found)
 
     def _along(self) -> tuple[list[float], tuple[float, float, float]]:
         """Cosines between the axis and each element's own z, and the axis' direction behind the last.

@@ -22,6 +22,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
+from types import MappingProxyType
 from typing import cast
 
 import torch
@@ -32,8 +33,11 @@ from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.effects import EFFECTS, NO_REQUESTS, Action, Requests
 from caustic_cli.optics.emission import Rays, of_member, rays_of
 from caustic_cli.optics.frames import IDENTITY, Pose, advanced, into, out_of, turned, turned_back
+from caustic_cli.optics.gradient.crossing import cross, index_at
+from caustic_cli.optics.gradient.fields import IndexField
 from caustic_cli.optics.image import Image
 from caustic_cli.optics.interaction import Interaction, Parameters
+from caustic_cli.optics.interface import interact
 from caustic_cli.optics.memory import with_less
 from caustic_cli.optics.rays import LOSSES, RayState, Status
 from caustic_cli.optics.reconstruction import Filter
@@ -42,6 +46,14 @@ from caustic_cli.optics.screen_shape import reach, shape_of
 from caustic_cli.optics.surfaces import HeightField, SurfaceIntersection
 from caustic_cli.optics.system import EXIT, Element, Placed, System
 from caustic_cli.scene import Light, PlaneWave, Points, Scene, Screen
+
+#: No parameters at all.
+NOTHING: Parameters = MappingProxyType({})
+
+
+def index_name(element: Element) -> str:
+    """Under which `Parameters` have the coefficients of the index behind an element, where a design shapes it."""
+    return f"{element.name}.index"
 
 
 class Tracer:
@@ -73,6 +85,8 @@ class Tracer:
     ):
         self.system, self.requests, self.weight, self.channel, self.track = system, requests, weight, channel, track
         self.media, self.sides = system.media(), system.sides()
+        #: Steps through each medium of varying index, from the first rays that came through it.
+        self.steps: dict[int, int] = {} if like is None else dict(like.steps)
         pupil = system.pupil
         state = rays if isinstance(rays, RayState) else RayState.on_axis(rays, pupil.half_size, pupil.z)
         state = replace(state, lost=dict(state.lost), wavelength=wavelength)
@@ -90,7 +104,11 @@ class Tracer:
         self.first = 0
         self._behind: Interaction | None = None
         with torch.no_grad():
-            while self.first < len(system.elements) and system.elements[self.first].surface.shape is None:
+            while (
+                self.first < len(system.elements)
+                and system.elements[self.first].surface.shape is None
+                and not any(medium.gradient for medium in self.media[self.first : self.first + 2])
+            ):
                 interaction = self.cross(self.first, state, None)
                 if self.recorded:
                     self.before.append(interaction)
@@ -111,11 +129,16 @@ class Tracer:
                 states += action.stray_light(self, parameters, interactions)
         return states
 
+    @cached_property
+    def owners(self) -> tuple[int | None, ...]:
+        """As of the system."""
+        return self.system.owners()
+
     def _walk(self, parameters: Parameters) -> Iterator[Interaction]:
         """Straight on, from the first free surface to the last element."""
         state = self.start
         for k in range(self.first, len(self.system.elements)):
-            interaction = self.cross(k, state, parameters.get(self.system.elements[k].name))
+            interaction = self.cross(k, state, parameters.get(self.system.elements[k].name), parameters=parameters)
             yield interaction
             state = interaction.state
 
@@ -182,11 +205,13 @@ class Tracer:
         forward: bool = True,
         reflects: bool | None = None,
         straight: bool = True,
+        parameters: Parameters = NOTHING,
     ) -> Interaction:
         """Rays to element k and behind it.
 
         Args:
             heights: of its surface, None where it has none.
+            parameters: those of the media, see `index_name`; a medium's own where they are not there.
             forward: in the system's own direction, or back.
             reflects: None for what the element does.
             straight: whether this is the walk itself, or a stray_light.
@@ -207,7 +232,7 @@ class Tracer:
             straight,
             state,
         )
-        self._meet(m, heights)
+        self._meet(m, heights, parameters)
         for action in self.actions:
             action.arrive(m)
         m.arriving = m.state.power
@@ -216,16 +241,23 @@ class Tracer:
             action.depart(m)
         return m
 
-    def _meet(self, m: Interaction, heights: Tensor | None) -> None:
+    def _meet(self, m: Interaction, heights: Tensor | None, parameters: Parameters) -> None:
         """Carry the rays of a interaction to the surface."""
         element = m.element
+        ahead, behind = (m.index, m.index + 1) if m.forward else (m.index + 1, m.index)
+        if self.media[ahead].gradient is not None:
+            self._bend(m, ahead, heights, parameters)
+            self._leave_into(m, behind, parameters)
+            return
         prepared = self.meets if m.state is getattr(self, "start", None) else None  # for the rays that it was prepared for
         state = replace(m.state, lost=dict(m.state.lost))
         if m.index == self.first and m.forward and heights is not None:
             state = state.counted_from(element.pose.position[2] + element.surface.centred(heights)[1])
         if self._at_pupil(m):
+            state = state if self.media[behind].gradient is None else state.spread()
             o, d = into(element.pose, state.origin, state.direction, state.datum)
             m.state, m.local, m.incoming, m.slopes = state, o, d, (0.0, 0.0)
+            self._leave_into(m, behind, parameters)
             return
         state = state.spread()
         o, d = into(element.pose, state.origin, state.direction, state.datum)
@@ -251,6 +283,61 @@ class Tracer:
         state.origin = out_of(element.pose, m.local, state.datum)
         state.path = state.path + m.n_in * hit.t
         m.state = state
+        self._leave_into(m, behind, parameters)
+
+    def _bend(self, m: Interaction, medium: int, heights: Tensor | None, parameters: Parameters) -> None:
+        """Carry rays through a medium of varying index to the surface (`gradient.crossing`)."""
+        element, state = m.element, replace(m.state, lost=dict(m.state.lost)).spread()
+        name, pose, field, scale = self._medium(medium, state.wavelength)
+        point, direction = (
+            tuple(c.double() for c in state.full(v)) for v in into(pose, state.origin, state.direction, state.datum)
+        )
+
+        def seen(points, vectors):
+            o, d = out_of(pose, points, state.datum), turned_back(pose, vectors)
+            return into(element.pose, o, d, state.datum)
+
+        found = cross(
+            self.backend.flow,
+            field,
+            parameters.get(name),
+            point,
+            direction,
+            element.surface,
+            heights,
+            seen,
+            m.side,
+            self.steps.get(medium),
+        )
+        self.steps[medium] = found.steps
+        m.local, m.incoming = seen(found.point, found.direction)
+        m.slopes, m.length, m.n_in = found.slopes, found.length, scale * found.n
+        met = found.found & element.aperture.holds(*m.local[:2])
+        kept = torch.where(met, state.power, torch.zeros_like(state.power))
+        state.lose("missed_surface", (state.power - kept).detach())
+        if self.track:
+            state.mark(~met, Status.MISSED_SURFACE)
+        state.power, state.sample = kept, None
+        state.origin = out_of(element.pose, m.local, state.datum)
+        state.path = state.path + scale * found.path
+        m.state = state
+
+    def _leave_into(self, m: Interaction, medium: int, parameters: Parameters) -> None:
+        """Behind the surface, the index of a medium where it varies."""
+        if self.media[medium].gradient is None or m.reflects:
+            return
+        state = m.state
+        name, pose, field, scale = self._medium(medium, state.wavelength)
+        point = into(pose, tuple(c.double() for c in state.full(state.origin)), (0.0, 0.0, 1.0), state.datum)[0]
+        m.incoming = state.full(m.incoming)
+        m.n_out = scale * index_at(self.backend.flow, field, parameters.get(name), point)
+
+    def _medium(self, medium: int, wavelength: float | None) -> tuple[str, Pose, IndexField, float]:
+        """Of a medium of varying index: name of its coefficients, its frame, its field, and by what this wavelength scales it."""
+        owner, is_of = self.owners[medium], self.media[medium]
+        assert owner is not None and is_of.gradient is not None
+        element = self.system.elements[owner]
+        return index_name(element), element.pose, is_of.gradient, is_of.index_at(wavelength) / is_of.index
 
     def _interact(self, m: Interaction) -> Tensor:
         """Change the directions, and give the power that goes on."""
@@ -259,11 +346,12 @@ class Tracer:
         polarised = None
         if state.polarised is not None:
             polarised = turned(element.pose, state.polarised)
-        found = self.backend.interact(
+        eta = m.n_in / m.n_out
+        found = (self.backend.interact if isinstance(eta, float) else interact)(
             m.incoming,
             m.slopes,
             arriving,
-            eta=m.n_in / m.n_out,
+            eta=eta,
             reflects=m.reflects,
             fresnel=element.fresnel,
             polarised=polarised,
@@ -342,6 +430,8 @@ class Tracer:
 
     def _lowered(self, like: Tracer | None):
         """The rest of the system as one fused kernel, a function of heights, screen and filter; None where it is none such."""
+        if any(medium.gradient for medium in self.media):
+            return None
         if self.first != len(self.system.elements) - 1 or self.actions or self.track or self.start.polarised is not None:
             return None
         element = self.system.elements[-1]

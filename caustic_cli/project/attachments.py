@@ -1,23 +1,31 @@
-"""The files that [source], [screen] and [design] speak of: read once, checked, and kept in the project under names of their own."""
+"""The files that [source], [lens], [screen] and [design] speak of: read once, checked, and kept in the project under names of their
+own."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from caustic_cli.config import settings, tolerances
+from caustic_cli.io.arrays import open_npy
 from caustic_cli.io.files import read_bytes
 from caustic_cli.io.intensities import MOST_BYTES, TABLE, parse_distribution
 from caustic_cli.io.picture import read_picture
 from caustic_cli.io.rayfiles import ACCEPTED, MAX_BYTES, SUFFIXES, parse_rays
 from caustic_cli.io.sags import read_sags
+from caustic_cli.scene.gradient import MOST_VALUES, checked_volume
 from caustic_cli.scene.sources.section import Attached
 
 #: What the file of [design] robust is called in a project.
 ERRORS = "tolerances.toml"
 #: What the file of [screen] shape_file is called, but for its suffix.
 SHAPE = "screen"
+#: What the file of [lens] index_file is called in a project, and its largest size, bytes.
+INDEX, MOST_INDEX = "index.npy", 8 * MOST_VALUES + (1 << 12)
 #: Keys of [source] that may name a file, and what it is called in a project.
 STEMS = {"file": "source", "intensity": "intensity"}
 
@@ -70,10 +78,41 @@ def with_shape(screen: Mapping[str, Any], folder: Path | None = None) -> dict[st
     return {**screen, "shape_file": Attached.of(name, data, heights)}
 
 
-def named_in_project(source: dict[str, Any], screen: dict[str, Any], design: dict[str, Any]) -> None:
-    """Rename the files of these sections as a project calls them, those of further sources by their number."""
+def with_index(lens: Mapping[str, Any], folder: Path | None = None) -> dict[str, Any]:
+    """A [lens] section whose `index_file` carries the control values in it, if it names one; folder: as of `attached`.
+
+    Raises:
+        InputError: the file is missing, too large, or holds no volume of refractive indices.
+    """
+    name = lens.get("index_file")
+    if not isinstance(name, str) or isinstance(name, Attached):
+        return dict(lens)
+    path = Path(name) if folder is None else folder / name
+    accepted = "a .npy array of (n, m) or (n, m, k) refractive indices is needed"
+    with open_npy(path, accepted) as stored:
+        values = checked_volume(stored.read_reals(), "the array")
+    return {**lens, "index_file": Attached.of(name, read_bytes(path, MOST_INDEX, accepted), values)}
+
+
+def index_attached(values: np.ndarray) -> Attached:
+    """Control values (n, m, k) as the file that a project keeps of them."""
+    held = io.BytesIO()
+    np.save(held, np.ascontiguousarray(values, dtype=np.float64))
+    return Attached.of(INDEX, held.getvalue(), values)
+
+
+def index_of(lens: Mapping[str, Any]) -> np.ndarray | None:
+    """The control values that a [lens] section's `index_file` carries."""
+    return getattr(lens.get("index_file"), "content", None)
+
+
+def named_in_project(full: Mapping[str, dict[str, Any]]) -> None:
+    """Rename the files of complete settings as a project calls them, those of further sources by their number."""
+    source, lens, screen, design = (full[section] for section in ("source", "lens", "screen", "design"))
     if isinstance(shape := screen.get("shape_file"), Attached):
         screen["shape_file"] = shape.named(f"{SHAPE}{Path(shape).suffix.lower()}")
+    if isinstance(lens.get("index_file"), Attached):
+        lens["index_file"] = lens["index_file"].named(INDEX)
     if isinstance(design.get("robust"), Attached):
         design["robust"] = design["robust"].named(ERRORS)
     for k, table in enumerate((source, *source.get("also", ()))):
@@ -84,7 +123,8 @@ def named_in_project(source: dict[str, Any], screen: dict[str, Any], design: dic
 
 def of(full: Mapping[str, Mapping[str, Any]]) -> list[Attached]:
     """All files of complete settings."""
-    source, others = full["source"], (full["design"].get("robust"), full["screen"].get("shape_file"))
+    source = full["source"]
+    others = full["design"].get("robust"), full["screen"].get("shape_file"), full["lens"].get("index_file")
     return [file for file in others if isinstance(file, Attached)] + [
         value for table in (source, *source.get("also", ())) for key in STEMS if isinstance(value := table.get(key), Attached)
     ]

@@ -104,6 +104,9 @@ class Project:
             if "shape_file" in (screen := given.get("screen", {})):
                 _within(screen["shape_file"])
                 given["screen"] = attachments.with_shape(screen, path)
+            if index := given.get("lens", {}).get("index_file"):
+                _within(index)
+                given["lens"] = attachments.with_index(given["lens"], path)
             full = complete(given, picture.aspect)
             other = full.get("second", {}).get("file")
             second = _picture(path, other, full["target"]["encoding"] == "linear") if other else None

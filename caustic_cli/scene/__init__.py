@@ -84,7 +84,7 @@ class Scene:
     @property
     def axial(self) -> bool:
         """Whether all light within the lens runs along the axis."""
-        return self.source.collimated and not self.two_sided
+        return self.source.collimated and not self.two_sided and self.lens.gradient is None
 
     def onto(self, screen: Screen) -> Scene:
         """The same light on another screen, with nothing said of what it does behind that."""

@@ -18,6 +18,7 @@ from caustic_cli.config import checks
 from caustic_cli.config.table import TABLE, check, check_all, default
 from caustic_cli.errors import InputError
 from caustic_cli.scene.front import Front
+from caustic_cli.scene.gradient import Gradient
 
 
 @dataclass(frozen=True)
@@ -105,6 +106,7 @@ class Lens:
         aperture: rectangle, or circle, the largest that fits into the size; the spline goes on beyond it, light and glass do not.
         border: width of a dark rim around the aperture, which the exported solid has for its mount, mm.
         array: lenslets along x and y, side by side over the aperture, which meet in height; (1, 1) is one lens.
+        gradient: how the index varies from place to place, `index` being that of its formula; None where it does not.
         mirror: the surface reflects, the light comes through air, and `index`, `fresnel` and `absorption` mean nothing.
         front: the entrance where it is free-form, None for the plane.
     """
@@ -127,6 +129,7 @@ class Lens:
     border: float = default("lens.border")
     array: tuple[int, int] = default("lens.array")
     front: Front | None = None
+    gradient: Gradient | None = None
 
     def __post_init__(self):
         check_all(
@@ -156,6 +159,8 @@ class Lens:
         low, high = self.height_range
         if not low < high:
             raise InputError(f"⟨lens.height_range⟩ must ascend, got [{low:g}, {high:g}]")
+        if self.gradient is not None and self.mirror:
+            raise InputError("⟨lens.gradient⟩ needs a lens: light never enters a mirror")
         if self.round and self.size[0] != self.size[1]:
             raise InputError(
                 f"⟨lens.size⟩ of a circular aperture must be its diameter, twice the same, got {self.size[0]:g} x {self.size[1]:g}"

@@ -64,8 +64,11 @@ def gradient_image(
         dtype: precision of the ray arithmetic; chunks are summed in float64.
 
     Raises:
-        InputError: no such control point, or a filter without a derivative.
+        InputError: no such control point, a filter without a derivative, or an index that varies, through which rays have a
+            derivative in reverse mode only.
     """
+    if scene.lens.gradient is not None:
+        raise InputError("the image's derivative by one height is taken of lenses of one index, and this one's varies")
     direction = _direction(field, control).to(sampler.device)
     if min(filter.reach) < 1:
         raise InputError(

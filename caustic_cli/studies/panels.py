@@ -32,7 +32,7 @@ def write_report(
         target, image: (n_x, n_y) irradiance; drawn at the same exposure and in the picture's encoding, images beside a bar of
             what they are on the screen.
         heights: (a, b) surface heights on an even grid over the aperture, mm; the sphere that fits best is taken out,
-            because it hides the relief.
+            because it hides the relief; of a lens whose index is a volume, that is drawn instead.
         history: (k, 5) rows iteration, stage, loss, on_screen, seconds.
         waves: (n_x, n_y), the wave image, where there is one: light follows it, and errors are its errors.
     """
@@ -83,9 +83,15 @@ def write_report(
     figure.colorbar(drawn, ax=axes[0, -1], label="of the mean irradiance")
     axes[0, -1].set(title="error: too dark (blue), too bright (red)", xlabel="x on the screen (mm)", ylabel="y (mm)")
     rx, ry = lens.half_size
-    drawn = axes[1, 0].imshow(_without_sphere(heights, rx, ry).T * 1e3, origin="lower", extent=[-rx, rx, -ry, ry], cmap="viridis")
-    figure.colorbar(drawn, ax=axes[1, 0], label="µm")
-    axes[1, 0].set(title="lens height, best paraboloid removed", xlabel="x on the lens (mm)", ylabel="y (mm)")
+    volume = None if lens.gradient is None else lens.gradient.volume
+    shown, unit, name = (
+        (_without_sphere(heights, rx, ry) * 1e3, "µm", "lens height, best paraboloid removed")
+        if volume is None
+        else (volume.mean(-1), "index", "index, mean along z")
+    )
+    drawn = axes[1, 0].imshow(shown.T, origin="lower", extent=[-rx, rx, -ry, ry], cmap="viridis")
+    figure.colorbar(drawn, ax=axes[1, 0], label=unit)
+    axes[1, 0].set(title=name, xlabel="x on the lens (mm)", ylabel="y (mm)")
     for stage in np.unique(history[:, 1]):
         rows = history[history[:, 1] == stage]
         axes[1, 1].semilogy(rows[:, 4], rows[:, 2] * target.size, lw=1.5)

@@ -48,6 +48,7 @@ from caustic_cli.project.project import CHECKPOINT, RENDER, Project, is_project
 from caustic_cli.scene import Scene
 from caustic_cli.studies.manufacture import preview
 from caustic_cli.workflow.evaluation import expected_seconds, judge
+from caustic_cli.workflow.gradient import design_index, index_figures, is_free, limit_of
 from caustic_cli.workflow.movie import Movie
 from caustic_cli.workflow.reporter import Reporter
 
@@ -91,6 +92,8 @@ def begin(
         read[-1]["design"] = attachments.with_errors(read[-1]["design"], config.parent)
     if config and "screen" in read[-1]:
         read[-1]["screen"] = attachments.with_shape(read[-1]["screen"], config.parent)
+    if config and "lens" in read[-1]:
+        read[-1]["lens"] = attachments.with_index(read[-1]["lens"], config.parent)
     chosen: Settings = {}
     for path, value in given.items():
         section, _, key = path.rpartition(".")
@@ -108,6 +111,8 @@ def begin(
     by = Derivation(**parameters)
     if "source" in said:
         said["source"] = attachments.attached(said["source"])
+    if "lens" in said:
+        said["lens"] = attachments.with_index(said["lens"])
     goal = said.get("target", {})
     picture = (
         target
@@ -130,7 +135,7 @@ def begin(
     full["target"] |= {"file": f"target{picture.suffix}", "encoding": picture.encoding}
     if light is not None:
         full["source"]["profile"] = f"profile{light.suffix}"
-    attachments.named_in_project(full["source"], full["screen"], full["design"])
+    attachments.named_in_project(full)
     project = Project(
         out,
         full,
@@ -210,8 +215,16 @@ def design(
         figures = uptodate.finished(project, project.found)
         say.say(
             f"{project.path}: was designed from the same picture with the same options, so "
-            + ("there is nothing to do; ⟨force⟩ designs it anew" if figures else "it goes on from its checkpoint")
+            + (
+                "there is nothing to do; ⟨force⟩ designs it anew"
+                if figures
+                else "it is designed to its end"
+                if is_free(project)
+                else "it goes on from its checkpoint"
+            )
         )
+        if not figures and is_free(project):
+            return design(replace(project, asked=uptodate.asked_of(project, project.found), found=None), None, device, say, began)
         if not figures:
             return resume(project, None, None, device, say, began, movie)
         if movie is not None:
@@ -219,6 +232,8 @@ def design(
         scene = project.scene()
         return Result(project, scene, project.lens(scene).field, project.target(scene), project.found.state, figures)
     with project.hold:
+        if is_free(project):
+            return _run_index(project, say, began, device)
         designer, target = _designer(project, device)
         _say_limits(project, designer, target, first, say)
         return _run(project, designer, target, designer.begin(first), say, began, None, device, movie)
@@ -260,6 +275,8 @@ def resume(
 ) -> Result:
     """Go on from the last checkpoint; with nothing left to do, judge the lens again."""
     with project.hold:
+        if is_free(project):
+            raise project.error("⟨lens.gradient⟩ free is designed in one go: design it anew, with more ⟨iterations⟩")
         project.hold.enter_context(directory.locked(project.path))
         designer, target = _designer(project, device)
         begun = (project.path / CHECKPOINT).exists()  # if not, it was killed before its first checkpoint
@@ -478,6 +495,23 @@ def _run(
         if asked:
             raise Interrupted(f"interrupted when the design was done; {project.path} is whole", 128 + asked[0])
     return Result(project, designer.scene, designer.field(found.state.stage), target, found.state, figures)
+
+
+def _run_index(project: Project, say: Reporter, began: float, device: str) -> Result:
+    """Design a free gradient, judge it, and keep both."""
+    with _signals(project.path is not None) as asked:
+        found = design_index(project, say, began, limit_of(project), lambda: bool(asked))
+        project, state = found.project, found.state
+        designer, target = _designer(project, device)
+        judged = judge(project, designer, target, state, device, math.isfinite(limit_of(project)))
+        figures = judged.figures | index_figures(project)
+        figures |= {"iterations": state.total, "seconds": time.monotonic() - began, "reason": state.reason}
+        if project.path is not None:
+            figures |= {"image": str(project.path / RENDER), "project": str(project.path)}
+        _Records(project, designer, device).keep(state, figures)
+        if asked:
+            raise Interrupted(f"interrupted after {state.total} iterations; {project.path} is whole", 128 + asked[0])
+    return Result(project, designer.scene, designer.field(0), target, state, figures)
 
 
 class _Records:

@@ -70,10 +70,14 @@ def refuse_untraceable(scene: Scene) -> None:
     """Stop before work begins where the page could not trace the light.
 
     Raises:
-        InputError: the source is a ray file, or the screen is curved.
+        InputError: the source is a ray file, the screen is curved, or the lens' index or both its sides vary.
     """
     if scene.screen.curved:
         raise InputError("⟨html⟩: the page traces light to plane screens, not to curved ones")
+    if scene.lens.gradient is not None:
+        raise InputError("⟨html⟩: the page traces lenses of one index, and this one's varies")
+    if scene.two_sided:
+        raise InputError("⟨html⟩: the page traces lenses with a flat entrance, and this one's is free-form")
     if any(one.rays is not None for one in scene.source.members):
         raise InputError(
             "⟨html⟩: the page traces plane waves, points, grids and discs, not the rays of a file; ⟨source.type⟩ renders it under"

@@ -5,20 +5,26 @@ What has no kernel, or no rays, is done by the reference.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from caustic_cli.optics import intersection
 from caustic_cli.optics.backends.reference import Torch, by_mesh
+from caustic_cli.optics.gradient.fields import LEAST_SQUARE, SplineIndex
+from caustic_cli.optics.gradient.integrator import ORDER, WEIGHTS, Flow
 from caustic_cli.optics.interface import Departure
 from caustic_cli.optics.kernels import functions
+from caustic_cli.optics.kernels.formula import formula_flow
 from caustic_cli.optics.kernels.grid import GridSurface
 from caustic_cli.optics.kernels.interact import interact
 from caustic_cli.optics.kernels.ray_intersections import hits_of_rays
 from caustic_cli.optics.kernels.splat import splat_rays
 from caustic_cli.optics.kernels.surface import FusedSurface, RayIntersections, next_meetings, scattered_surface
 from caustic_cli.optics.kernels.transfer import land
+from caustic_cli.optics.kernels.volume import VolumeAxis, volume_flow
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.reintersection import HALVINGS, MOST_STEPS
@@ -80,6 +86,18 @@ class Numba(Torch):
             return SurfaceIntersection(torch.where(found, t, torch.zeros_like(t)), gx, gy, found)
 
         return meet
+
+    def flow(self, field, coefficients: Tensor | None, point, momentum, time: Tensor, steps: int, order: int = ORDER) -> Flow:
+        """As the reference; a B-spline volume and the formulas of a lens ray by ray."""
+        if time.numel() and field.formula is not None:
+            terms, axial, squared = field.formula
+            out = formula_flow(terms, axial, squared, LEAST_SQUARE, (*point, *momentum), time, WEIGHTS[order], steps)
+            return Flow(out[:3], out[3:6], out[6], out[7])
+        if not isinstance(field, SplineIndex) or not time.numel():
+            return super().flow(field, coefficients, point, momentum, time, steps, order)
+        values = field.coefficients if coefficients is None else coefficients
+        out = volume_flow(_axes(field), values, (*point, *momentum), time, WEIGHTS[order], steps)
+        return Flow(out[:3], out[3:6], out[6], out[7])
 
     def find(
         self, field, heights: Tensor, origin, direction, method: intersection.Method, radius: float | None
@@ -179,3 +197,10 @@ class RayImage:
     def __call__(self, heights: Tensor, screen: Screen, filter: Filter) -> tuple[Tensor, Tensor, dict]:
         """Image, power that leaves the surface, and what was lost there."""
         return self.kernel(heights, *self.interface, float(heights.detach().mean()), screen, filter)
+
+
+@lru_cache(maxsize=8)
+def _axes(field: SplineIndex) -> tuple[VolumeAxis, VolumeAxis, VolumeAxis]:
+    """The kernels' axes of a volume."""
+    x, y, z = (VolumeAxis(s, *place) for s, place in zip(field.spaces, field.frame, strict=True))
+    return x, y, z

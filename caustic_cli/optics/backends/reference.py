@@ -10,6 +10,7 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics import intersection, reintersection
+from caustic_cli.optics.gradient.integrator import ORDER, Flow, flow
 from caustic_cli.optics.interface import Departure, interact
 from caustic_cli.optics.mesh import TriangleMesh
 from caustic_cli.optics.reconstruction import Filter, splat
@@ -84,6 +85,10 @@ class Torch:
     ) -> Departure:
         """What a surface does to rays: `interface.interact`."""
         return interact(direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, polarised=polarised, side=side)
+
+    def flow(self, field, coefficients: Tensor | None, point, momentum, time: Tensor, steps: int, order: int = ORDER) -> Flow:
+        """Rays after `time` in a medium of varying index: `integrator.flow`."""
+        return flow(field, coefficients, point, momentum, time, steps, order)
 
     def land(self, origin, direction, point, axes, forward: float) -> tuple[Tensor, Tensor, Tensor]:
         """Rays to a plane.

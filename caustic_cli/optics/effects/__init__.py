@@ -9,6 +9,7 @@ from caustic_cli.optics.effects.dispersion import Dispersion
 from caustic_cli.optics.effects.entrance import Entrance
 from caustic_cli.optics.effects.fresnel import Fresnel
 from caustic_cli.optics.effects.ghosts import Ghosts
+from caustic_cli.optics.effects.gradient_index import GradientIndex
 from caustic_cli.optics.effects.intersection import Intersection
 from caustic_cli.optics.effects.mirror import Mirror
 from caustic_cli.optics.effects.missed_surface import MissedSurface
@@ -26,6 +27,7 @@ EFFECTS: tuple[Effect, ...] = (
     Polarisation(),
     Dispersion(),
     Entrance(),
+    GradientIndex(),
     Intersection(),
     MissedSurface(),
     Absorption(),

@@ -16,7 +16,7 @@ class Entrance(GeneralWay):
 
     def judge(self, scene: Scene, b) -> Decision:
         """On where rays come oblique."""
-        angle, collimated = math.degrees(b.incidence), scene.axial
+        angle, collimated = math.degrees(b.incidence), scene.source.collimated
         if scene.two_sided:
             return Decision(self.name, True, "the entrance is free-form", fixed=True)
         if collimated or scene.lens.mirror or angle == 0:

@@ -62,10 +62,10 @@ class Reflections(Action):
                     break
                 ghost = replace(m.returned(), lost={}, status=None, polarised=None)
                 for k in range(j - 1, i, -1):
-                    ghost = tracer.cross(k, ghost, heights[k], forward=False, straight=False).state
-                ghost = tracer.cross(i, ghost, heights[i], forward=False, straight=False).returned()
+                    ghost = tracer.cross(k, ghost, heights[k], forward=False, straight=False, parameters=parameters).state
+                ghost = tracer.cross(i, ghost, heights[i], forward=False, straight=False, parameters=parameters).returned()
                 for k in range(i + 1, len(elements)):
-                    ghost = tracer.cross(k, ghost, heights[k], straight=False).state
+                    ghost = tracer.cross(k, ghost, heights[k], straight=False, parameters=parameters).state
                 with torch.no_grad():
                     of_total = torch.where(totally, ghost.power, torch.zeros_like(ghost.power)).sum(dtype=torch.float64)
                     lost = {"total_internal_reflection": -of_total, "fresnel": of_total - ghost.power.sum(dtype=torch.float64)}

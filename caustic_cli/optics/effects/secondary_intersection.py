@@ -10,6 +10,7 @@ import math
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from caustic_cli.optics.effects.base import NO_REQUESTS, Action, Decision, Effect, Requests
 from caustic_cli.optics.frames import out_of, turned, turned_back
@@ -88,6 +89,8 @@ class Again(Action):
             d = interact(d, g, power, eta=1.0, reflects=True, fresnel=element.fresnel, side=side).direction
             return leaving(o, d, power, {})
         eta, fresnel = m.n_in / m.n_out, element.fresnel
+        if isinstance(eta, Tensor):  # of varying index: that where the ray left, and the short way back within is straight
+            eta = eta[at]
         entered = interact(d, g, power, eta=1.0 / eta, reflects=False, fresnel=fresnel, side=-side)
         t, through = again(surface, heights, o, entered.direction, below=side > 0, round=round_)
         none = torch.zeros_like(power)

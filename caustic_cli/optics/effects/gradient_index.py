@@ -1,0 +1,61 @@
+"""An index that varies within the lens: rays bend between its surfaces (thesis 7.2.1)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from torch import Tensor
+
+from caustic_cli.optics.effects.base import Amount, Decision, Effect
+from caustic_cli.optics.gradient.fields import field_of
+from caustic_cli.scene import Scene
+from caustic_cli.scene.gradient import Gradient
+
+#: Part of a pixel by which bending may move light without being simulated.
+UNSEEN = 0.05
+#: Angle, rad, by which a ray at the aperture's edge is turned where the effect is measured in a scene that has none.
+TURN = 0.01
+
+
+class GradientIndex(Effect):
+    """Left out, the lens has its own index everywhere."""
+
+    name = "gradient-index"
+
+    def judge(self, scene: Scene, bounds) -> Decision:
+        """By a bound of how far bending moves light on the screen, and by how much the index differs from the lens' own.
+
+        A ray through t mm turns by at most t |grad n| / n within, n times that behind the exit, over the way to the screen.
+        """
+        lens, field = scene.lens, field_of(scene.lens)
+        if field is None:
+            return Decision(self.name, False, "the lens has one index", 0.0, UNSEEN, present=False)
+        depth = lens.offset.thickness - lens.z_in
+        least, most, steepest = field.extremes(lens.half_size, depth)
+        turn = min(steepest * depth * most / least, 0.5 * math.pi)
+        moved = turn * (depth / (2.0 * least) + scene.screen.z - lens.offset.thickness) / min(scene.screen.pixel)
+        step = (max(most - lens.index, lens.index - least) / lens.index) * max(
+            abs(lens.half_size[0] / lens.offset.radius[0]), abs(lens.half_size[1] / lens.offset.radius[1])
+        )
+        moved += step * (scene.screen.z - lens.offset.thickness) / min(scene.screen.pixel)
+        why = (
+            f"the index goes from {least:.5g} to {most:.5g}, by up to {steepest:.3g} per mm, which moves light by up to"
+            f" {moved:.3g} pixels"
+        )
+        return Decision(self.name, moved > UNSEEN, why, moved, UNSEEN)
+
+    def without(self, scene: Scene) -> Scene:
+        """One index."""
+        return scene if scene.lens.gradient is None else replace(scene, lens=replace(scene.lens, gradient=None))
+
+    def sample(self, scene: Scene, heights: Tensor) -> Amount | None:
+        """A radial gradient, whose index falls towards the edge by little."""
+        lens = scene.lens
+        if lens.mirror:
+            return None
+        depth, edge = lens.offset.thickness - lens.z_in, min(lens.half_size)
+        if not depth > 0:
+            return None
+        gradient = Gradient("radial", (-TURN / (2.0 * depth * edge),))
+        return Amount(replace(scene, lens=replace(lens, gradient=gradient)), None, f"{TURN:g} rad at the edge")

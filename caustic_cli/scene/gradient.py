@@ -1,0 +1,67 @@
+"""A refractive index that varies within the lens (thesis 7.2.1): what [lens] gradient says, as plain data.
+
+Notation
+    n_0     the lens' index;  r  distance from the axis, mm;  z  counted from the entrance, mm
+    selfoc  n^2 = n_0^2 (1 - (g r)^2), terms (g,), 1/mm: a rod that images with the pitch 2 pi / g (Merchand, Gradient Index Optics)
+    radial  n = n_0 + a_1 r^2 + a_2 r^4 + ..., terms (a_1, a_2, ...), mm^-2k
+    axial   n = n_0 + a_1 z + a_2 z^2 + ..., terms (a_1, a_2, ...), mm^-k
+    volume  control values (n, m, k) of a B-spline volume over aperture and thickness; k = 1 is an index that z does not change
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from caustic_cli.errors import InputError
+
+KINDS = ("selfoc", "radial", "axial")
+#: Of a B-spline volume: least and largest control value, and most of them.
+INDEX, MOST_VALUES = (1.0, 5.0), 50_000_000
+#: Degree of a volume along every axis, or one less than its control values there.
+DEGREE = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Gradient:
+    """See above.
+
+    Args:
+        kind: selfoc, radial, axial or volume.
+        terms: of a formula.
+        volume: (n, m, k) or (n, m) float64 control values.
+
+    Raises:
+        InputError: an unknown kind, terms of another number, or a volume that is none.
+    """
+
+    kind: str
+    terms: tuple[float, ...] = ()
+    volume: np.ndarray | None = None
+
+    def __post_init__(self):
+        if self.kind == "volume":
+            object.__setattr__(self, "volume", checked_volume(self.volume))
+            return
+        if self.kind not in KINDS:
+            raise InputError(f"⟨lens.gradient⟩ must be {', '.join(KINDS)}, volume or free, got {self.kind!r}")
+        if not self.terms or (self.kind == "selfoc" and len(self.terms) != 1):
+            wanted = "one number, g in 1/mm" if self.kind == "selfoc" else "at least one number"
+            raise InputError(f"⟨lens.gradient_terms⟩ of {self.kind} must be {wanted}, got {list(self.terms)}")
+
+
+def checked_volume(values: np.ndarray | None, where: str = "⟨lens.index_file⟩") -> np.ndarray:
+    """Control values (n, m, k) float64 of (n, m, k) or (n, m).
+
+    Raises:
+        InputError: they are no such array, or beyond INDEX.
+    """
+    array = np.asarray(values, dtype=np.float64) if isinstance(values, np.ndarray) else np.empty(0)
+    array = array[:, :, None] if array.ndim == 2 else array
+    if array.ndim != 3 or min(array.shape[:2]) < 2 or array.size > MOST_VALUES:
+        raise InputError(f"{where} must be an array of (n, m) or (n, m, k) control values, n and m at least 2, got {array.shape}")
+    low, high = INDEX
+    if not (np.isfinite(array).all() and array.min() >= low and array.max() <= high):
+        raise InputError(f"{where} must have refractive indices of {low:g} to {high:g}, got {array.min():g} to {array.max():g}")
+    return array

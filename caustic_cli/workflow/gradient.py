@@ -1,0 +1,110 @@
+"""The design of a free gradient from beginning to end: a flat blank's index by `inverse.gradient_blank`, judged as any lens is.
+
+The project keeps the control values beside project.toml, in the file that [lens] index_file names; its checkpoint holds the flat
+side.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from caustic_cli.config.completion import build_stages
+from caustic_cli.config.plans import transport_cells
+from caustic_cli.config.settings import value_of
+from caustic_cli.inverse.designer import State
+from caustic_cli.inverse.gradient_blank import design_blank
+from caustic_cli.project import attachments
+from caustic_cli.project.project import Project
+from caustic_cli.workflow.reporter import Reporter
+
+
+def is_free(project: Project) -> bool:
+    """Whether a project's index is designed, not its surface."""
+    return project.settings["lens"].get("gradient") == "free"
+
+
+@dataclass(frozen=True)
+class Designed:
+    """The project with the index it now has, and where the design ended."""
+
+    project: Project
+    state: State
+
+
+def design_index(project: Project, say: Reporter, began: float, limit: float, stop: Callable[[], bool]) -> Designed:
+    """Find the index of a project's flat blank.
+
+    Args:
+        began: of the command, as `time.monotonic` counts; limit: s, of the command; stop: asked before every iteration.
+
+    Raises:
+        InputError: as of `design_blank`.
+    """
+    lens, chosen = project.settings["lens"], project.settings["design"]
+    blank = replace(project, settings=_without_index(project.settings)).scene()
+    target, stage = project.target(blank), build_stages(project.settings)[-1]
+    total = chosen["iterations"] or stage.iterations
+    rows: list[tuple[int, int, float, float, float]] = []
+
+    def late() -> bool:
+        return time.monotonic() - began > limit
+
+    say.say(
+        f"index: {lens['index_control'][0]} x {lens['index_control'][1]} x {value_of(lens, 'lens.index_layers')} control values of"
+        f" {lens['index_range'][0]:.4g} to {lens['index_range'][1]:.4g}, {stage.rays:,} rays"
+    )
+    with say.progress(total) as show:
+
+        def on_iteration(k: int, loss: float, on_screen: float, _image: Any) -> None:
+            rows.append((k, 0, loss, on_screen, time.monotonic() - began))
+            show("index", f"loss {loss * target.size:.4f}  on screen {on_screen:.1%}", k, total)
+
+        found = design_blank(
+            blank,
+            target,
+            tuple(lens["index_control"]),
+            value_of(lens, "lens.index_layers"),
+            tuple(lens["index_range"]),
+            cells=transport_cells(stage.rays, False),
+            iterations=total,
+            rays=stage.rays,
+            seed=chosen["seed"],
+            on_iteration=on_iteration,
+            stop=lambda: stop() or late(),
+        )
+    values = found.index.coefficients.numpy()
+    settings = project.settings | {"lens": lens | {"index_file": attachments.index_attached(values)}}
+    project = replace(project, settings=settings)
+    if project.path is not None:
+        project.write()
+    done = len(rows)
+    reason = (
+        "interrupted" if stop() else "time limit" if late() and done < total else "iterations" if done == total else "no progress"
+    )
+    flat = torch.full(tuple(lens["control"]), float(blank.lens.offset.thickness), dtype=torch.float64)
+    seconds = rows[-1][-1] if rows else 0.0
+    return Designed(project, State(flat, iteration=done, total=done, history=rows, seconds=seconds, reason=reason))
+
+
+def index_figures(project: Project) -> dict[str, float]:
+    """Least and largest control value of a designed index."""
+    values = attachments.index_of(project.settings["lens"])
+    return {"index_least": float(np.min(values)), "index_most": float(np.max(values))} if values is not None else {}
+
+
+def limit_of(project: Project) -> float:
+    """The design's time limit, s, less a third for what judges it."""
+    limit = project.settings["design"]["time_limit"]
+    return limit if math.isinf(limit) else 2.0 * limit / 3.0
+
+
+def _without_index(settings: dict) -> dict:
+    lens = {key: value for key, value in settings["lens"].items() if key != "index_file"}
+    return settings | {"lens": lens}

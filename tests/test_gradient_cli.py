@@ -1,0 +1,158 @@
+"""Lenses whose index varies, on the command line: given by a formula or a file, or designed in place of the surface."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers import small_designs, write_blob
+
+from caustic_cli import cli, load
+from caustic_cli.inverse.gradient_blank import blank_system, design_blank
+from caustic_cli.optics.effects import EFFECTS
+from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.gradient import field_of
+from caustic_cli.optics.gradient.fields import SplineIndex
+from caustic_cli.optics.plan import compile_plan
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import System
+from caustic_cli.optics.trace import Tracer, expose, render
+from caustic_cli.scene import Lens, Offset, PlaneWave, Points, Scene, Screen
+from caustic_cli.scene.gradient import Gradient
+
+TINY = ("--resolution", "24", "--iterations", "3", "--threads", "1", "--quiet")
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    small_designs(monkeypatch, 40_000)
+    write_blob()
+
+
+def run(capfd, *arguments: str, code: int = 0):
+    """The JSON of a command, or the message of one that fails."""
+    status = cli.run([*arguments, "--json"])
+    out, err = capfd.readouterr()
+    assert status == code, err
+    return json.loads(out) if code == 0 else err.strip().splitlines()[-1]
+
+
+def scene_of(gradient=None, pixels: int = 24, radius=(np.inf, np.inf), **options) -> Scene:
+    lens = Lens(control=(4, 4), offset=Offset(5.0, radius), gradient=gradient, **options)
+    return Scene(PlaneWave(), lens, Screen((38.4, 38.4), 300.0, (pixels, pixels)))
+
+
+def flat(scene: Scene) -> torch.Tensor:
+    return torch.full(scene.lens.control, scene.lens.offset.thickness, dtype=torch.float64)
+
+
+def test_a_blank_is_designed_kept_and_rendered(capfd):
+    """By transport nearly at once; the project opens again with the same image; the same design again is the same index."""
+    figures = run(capfd, "design", "blob.png", "--gradient", "free", *TINY, "-o", "free.caustic")
+    assert figures["relative_rms"] < 0.3 and figures["on_screen"] > 0.85 and figures["iterations"] == 3
+    assert figures["on_screen"] + sum(figures["lost"].values()) == pytest.approx(1.0, abs=1e-9)
+    values = np.load("free.caustic/index.npy")
+    assert values.shape == (51, 51, 1) and figures["index_least"] == values.min() < values.max() == figures["index_most"]
+    again = run(capfd, "render", "free.caustic", "--rays", "40000", "--quiet", "--threads", "1")
+    assert again["relative_rms"] == pytest.approx(figures["relative_rms"], abs=0.02)
+    anew = run(capfd, "design", "blob.png", "--gradient", "free", *TINY, "-o", "free.caustic")
+    assert anew["index_least"] == figures["index_least"]
+    assert "in one go" in run(capfd, "design", "--resume", "free.caustic", code=2)
+    assert run(capfd, "export", "free.caustic", "--format", "stl", "-o", "blank.stl")["bytes"] > 1000
+    assert "varies" in run(capfd, "export", "free.caustic", "--format", "lighttools", code=2)
+    assert "varies" in run(capfd, "gradmap", "free.caustic", "--threads", "1", code=2)
+    lens = load("free.caustic")
+    assert field_of(lens.scene.lens).shape == (51, 51, 1) and float(np.ptp(lens.surface(np.linspace(-4, 4, 9), 0.0)[0])) < 1e-12
+
+
+def test_a_file_of_indices_is_kept(capfd):
+    """As given: in the project under its own name, and what `volume` traces."""
+    rows = 1.5 + 1e-3 * np.add.outer(np.arange(6.0), np.arange(5.0))
+    np.save("mine.npy", rows)
+    options = ("--gradient", "volume", "--index-file", "mine.npy", "--control", "6", "--quality", "draft")
+    run(capfd, "design", "blob.png", *options, *TINY, "-o", "volume.caustic")
+    Path("mine.npy").unlink()
+    assert np.array_equal(np.load("volume.caustic/index.npy"), rows)
+    held = field_of(load("volume.caustic").scene.lens)
+    assert isinstance(held, SplineIndex) and np.array_equal(held.coefficients[:, :, 0].numpy(), rows)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--gradient", "free", "--index-range", "1.54,1.542"), "thickness"),
+        (("--gradient", "free", "--index-range", "1.6,1.5"), "ascend"),
+        (("--gradient", "free", "--source", "point"), "plane"),
+        (("--gradient", "free", "--waves", "on"), "one index"),
+        (("--gradient", "free", "--loss", "rms"), "rms-light"),
+        (("--gradient", "free", "--mirror"), "mirror"),
+        (("--gradient", "lens"), "must be one of"),
+        (("--gradient", "selfoc"), "gradient_terms"),
+        (("--gradient", "selfoc", "--gradient-terms", "0.1,x"), "parted by commas"),
+        (("--gradient-terms", "0.1"), "--gradient"),
+        (("--gradient", "volume"), "index_file"),
+        (("--gradient", "volume", "--index-file", "blob.png"), "npy"),
+        (("--gradient", "volume", "--index-file", "none.npy"), "none.npy"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_a_line(capfd, options, words):
+    message = run(capfd, "design", "blob.png", *TINY, *options, "-o", "x.caustic", code=2)
+    assert words in message and not (Path("x.caustic") / "index.npy").exists()
+
+
+def test_a_design_comes_nearer_to_the_picture():
+    """By rays that it has not seen; the flat exit of a plane and of a height field are one; layers along z share the work."""
+    scene, (x, y) = scene_of(), np.meshgrid(*(np.linspace(-1.0, 1.0, 24),) * 2, indexing="ij")
+    target = np.where((np.abs(x) < 0.6) & (np.abs(y) < 0.5), 1.0 + 0.6 * np.sin(5.0 * x) * np.cos(4.0 * y), 0.0)
+
+    def error(index) -> float:
+        (image,) = render(blank_system(scene, index), {}, 200_000, seed=9)
+        j = image.image.numpy()
+        return float(np.sqrt(np.mean((j / j.mean() - target / target.mean()) ** 2)))
+
+    found = design_blank(scene, target, (28, 28), 2, cells=20, iterations=10)
+    assert error(found.index) < 0.9 * error(found.start) < 0.35 and found.index.shape == (28, 28, 2)
+    losses = [loss for loss, _ in found.history]
+    assert losses == sorted(losses, reverse=True)
+    held = scene_of(Gradient("volume", (), found.index.coefficients.numpy()))
+    (image,) = render(blank_system(scene, found.index), {}, 4000)
+    by_net = expose(held, HeightField.of(held.lens), flat(held), rays_of(held, "stratified", 4000))
+    assert torch.allclose(by_net.image, image.image, atol=1e-9)
+
+
+def test_the_effect_knows_whether_bending_matters():
+    """By a bound on how far light moves: that of no ray is larger; below the limit leaving it out changes next to nothing."""
+    weak, strong = scene_of(Gradient("radial", (-1e-8,))), scene_of(Gradient("radial", (-1e-3,)))
+    for scene, on in ((weak, False), (strong, True), (scene_of(), False)):
+        plan = compile_plan(scene, HeightField.of(scene.lens), flat(scene))
+        decision = plan["gradient-index"]
+        assert decision.on == on and (plan.scene.lens.gradient is not None) == on
+        assert "index" in decision.why
+        if scene.lens.gradient is None:
+            assert not decision.present
+            continue
+        (effect,) = (e for e in EFFECTS if e.name == "gradient-index")
+        landed = []
+        for one in (scene, effect.without(scene)):
+            field = HeightField.of(one.lens)
+            (sample,) = rays_of(one, "stratified", 400).chunks()
+            from_system = Tracer(System.of(one, field), sample)
+            landed.append(torch.stack(from_system.land({"exit": flat(one)}, one.screen)[0].origin[:2]))
+        moved = float(torch.hypot(*(landed[0] - landed[1])).max()) / min(scene.screen.pixel)
+        assert moved <= decision.bound <= 30.0 * moved
+    assert not compile_plan(strong, HeightField.of(strong.lens), flat(strong), {"diffraction"})["diffraction"].on
+
+
+def test_bounds_hold_where_rays_bend():
+    """No ray leans more inside, and none is totally reflected, where the plan proves it."""
+    scene = replace(scene_of(Gradient("radial", (4e-3,))), source=Points(((0.0, 0.0, -60.0),)))
+    field = HeightField.of(scene.lens)
+    plan = compile_plan(scene, field, flat(scene))
+    assert plan["gradient-index"].on and not plan["total-reflection"].on
+    image = expose(plan.scene, field, flat(scene), rays_of(scene, "stratified", 4000))
+    assert image.lost["total_internal_reflection"] == 0.0 and image.lost["missed_surface"] > 0.0 and plan["missed-surface"].on
