@@ -45,10 +45,10 @@ REPEATS, HEIGHTS = 2, 6
 DARK, LIT = 1e-2, 1e-3
 #: Light to which a black picture is lifted where it is paired with another, in parts of its mean.
 DARKEST = 0.02
-#: Cells along each axis on which two pictures are paired.
-PAIRED = 256
-#: Cells along the lens' longer side.
-CELLS = 256
+#: Cells along each axis on which two pictures are paired, and into how many a pixel is cut at most.
+PAIRED, CUT = 256, 2
+#: Cells along the lens' longer side, to a pixel, and at least and most.
+A_PIXEL, CELLS = 2, (96, 256)
 #: Part of the picture's light that may come from beside the exit's aperture.
 BESIDE = 0.02
 
@@ -83,19 +83,22 @@ class Sides:
     exit: np.ndarray
 
 
-def first_sides(scene: Scene, target: np.ndarray, second: np.ndarray | None, field: HeightField, cells: int = CELLS) -> Tensor:
+def first_sides(
+    scene: Scene, target: np.ndarray, second: np.ndarray | None, field: HeightField, cells: int | None = None
+) -> Tensor:
     """Control heights (2, n, m) mm of entrance and exit, which send the light of the source's centre to the picture and on.
 
     Args:
         scene: with a `second`; target, second: irradiance on its screen, and on that of its `second` if it has one.
-        field: spline spaces of both sides; cells: along the lens' longer side.
+        field: spline spaces of both sides; cells: along the lens' longer side, None for as many as the picture needs.
 
     Raises:
         InputError: as of `sides`; or a picture out of reach of refraction.
     """
     lens, behind = scene.lens, scene.second
     assert behind is not None
-    half = lens.half_size
+    half, (least, most) = lens.half_size, CELLS
+    cells = cells or min(most, max(least, A_PIXEL * max(target.shape)))
     shape = tuple(max(3, round(cells * r / max(half))) for r in half)
     x, y = (corners(n, h) for n, h in zip(shape, half, strict=True))
     near = Picture(target, scene.screen.half_size, scene.screen.z, scene.screen.shift)
@@ -225,9 +228,9 @@ def _spread(points: np.ndarray, values: np.ndarray, x: np.ndarray, y: np.ndarray
 
 
 def _cells(picture: Picture) -> Picture:
-    """The same light on about PAIRED cells along each axis: pixels cut, or added up with black ones beyond the high edges."""
+    """The same light on about PAIRED cells along each axis or fewer: pixels cut, or added up with black ones beyond the high edges."""
     light = picture.light
-    cut = [max(1, round(PAIRED / n)) for n in light.shape]
+    cut = [min(CUT, max(1, round(PAIRED / n))) for n in light.shape]
     light = np.repeat(np.repeat(light, cut[0], 0), cut[1], 1)
     by = [max(1, round(n / PAIRED)) for n in light.shape]
     light = np.pad(light, [(0, -n % b) for n, b in zip(light.shape, by, strict=True)])
