@@ -24,7 +24,7 @@ def begun(project, *_) -> SimpleNamespace:
     """In place of `workflow.design._run`: what was begun, without an iteration."""
     figures = {"lost": {}, "image": "", "reason": "", "project": str(project.path)}
     return SimpleNamespace(
-        project=project, scene=None, field=None, target=None, state=SimpleNamespace(heights=None), figures=figures
+        project=project, scene=None, field=None, heights=None, target=None, state=SimpleNamespace(heights=None), figures=figures
     )
 
 

@@ -150,7 +150,7 @@ def test_a_designed_lens_obeys_its_limits(tmp_path, monkeypatch, capfd):
     found = {}
     for name in ("free", "bound"):
         project = Project.open(Path(name))
-        field, checkpoint = project.lens(project.scene())
+        _, field, _, checkpoint = project.lens(project.scene())
         found[name] = samples(field, checkpoint.state.heights)
     low, steep, bent = found["free"]
     assert steep > 0.05 and bent > 1 / 12

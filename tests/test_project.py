@@ -209,7 +209,7 @@ def test_open_gives_back_what_was_written(copy):
     before = (copy / "project.toml").read_bytes(), (copy / "target.npy").read_bytes()
     project.write()
     assert ((copy / "project.toml").read_bytes(), (copy / "target.npy").read_bytes()) == before
-    field, state = project.lens(project.scene())
+    _, field, _, state = project.lens(project.scene())
     assert field.shape == (9, 8) and state.state.total == 4 and state.results["iterations"] == 4
     assert state.provenance["seed"] == 0 and len(state.provenance["target_sha256"]) == 64
 

@@ -204,7 +204,7 @@ def bad(value):
         lambda: solve(np.ones((4, 4)), half=(C,)),
         lambda: solve(np.ones((4, 4)), half="x"),
         lambda: solve(np.ones((4, 4)), start=np.zeros((4, 4))),
-        lambda: surface(np.ones((4, 4)), index=0.9),
+        lambda: surface(np.ones((4, 4)), index=1.0),
         lambda: surface(np.ones((4, 4)), z_screen=4.0),
         lambda: surface(np.ones((4, 4)), directions=(np.zeros((65, 65)),) * 3),
         lambda: surface(np.ones((4, 4)), directions=(1.0, 2.0)),

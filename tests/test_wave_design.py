@@ -298,7 +298,7 @@ def test_limits_are_kept(_here, capfd):
     from caustic_cli.project.project import Project  # noqa: PLC0415
 
     project = Project.open("p")
-    field, checkpoint = project.lens(project.scene())
+    _, field, _, checkpoint = project.lens(project.scene())
     u = torch.linspace(-0.999, 0.999, 301, dtype=torch.float64)
     x, y = (c.reshape(-1) for c in torch.meshgrid(u, u, indexing="ij"))
     _, gx, gy = field.evaluate(checkpoint.state.heights, x, y)

@@ -226,7 +226,7 @@ class Designer:
             CausticError: no surface near them obeys these.
         """
         field, bounds, o = self.field(state.stage), self._bounds(self.stages[state.stage]), self.options
-        if state.heights.ndim == 2:
+        if self.scene.second is None:
             return within_limits(field, state.heights, bounds, o.max_slope, o.min_radius)
         (low, low_exit), (high, high_exit) = bounds
         # What is concave of an entrance, seen from outside, is convex from within.

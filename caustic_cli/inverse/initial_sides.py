@@ -228,7 +228,7 @@ def _spread(points: np.ndarray, values: np.ndarray, x: np.ndarray, y: np.ndarray
 
 
 def _cells(picture: Picture) -> Picture:
-    """The same light on about PAIRED cells along each axis or fewer: pixels cut, or added up with black ones beyond the high edges."""
+    """The same light on about PAIRED cells along an axis, or fewer: pixels cut, or added up; black beyond the high edges."""
     light = picture.light
     cut = [min(CUT, max(1, round(PAIRED / n))) for n in light.shape]
     light = np.repeat(np.repeat(light, cut[0], 0), cut[1], 1)

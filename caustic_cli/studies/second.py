@@ -14,8 +14,8 @@ from caustic_cli.optics.trace import tracers
 from caustic_cli.scene import Scene
 from caustic_cli.studies.retrace import retrace, sampler_for
 
-#: Rays at a time.
-CHUNK = 1 << 19
+#: Rays at a time, and those that tell directions.
+CHUNK, ENOUGH = 1 << 19, 500_000
 
 
 def second_figures(
@@ -47,7 +47,7 @@ def second_figures(
         return exposure.image.cpu().numpy(), {f"second_{name}": found[name] for name in names}
     squares = power = 0.0
     with torch.no_grad():
-        for traced in tracers(scene, field, sampler_for(scene, rays, seed, device), torch.float64, CHUNK, requests):
+        for traced in tracers(scene, field, sampler_for(scene, min(rays, ENOUGH), seed, device), torch.float64, CHUNK, requests):
             state = traced({EXIT: heights.to(device)})[0]
             squares += traced.weight * float(misdirection(traced, state, scene))
             power += traced.weight * float(state.power.sum())

@@ -42,6 +42,7 @@ from caustic_cli.io.surfaces import SUFFIXES, onto, read_surface
 from caustic_cli.optics.emission.measured import coarse_words
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import sides_of
 from caustic_cli.project import attachments, directory, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.project import CHECKPOINT, RENDER, Project, is_project
@@ -194,11 +195,15 @@ def first_heights(project: Project, said: Settings) -> tuple[Project, torch.Tens
 
 @dataclass(frozen=True)
 class Result:
-    """A design that is done: its project, its lens, and the figures of the JSON table."""
+    """A design that is done: its project, its lens, and the figures of the JSON table.
+
+    scene: with its designed entrance, if that is free-form; heights: (n, m) mm of the exit.
+    """
 
     project: Project
     scene: Scene
     field: HeightField
+    heights: torch.Tensor
     target: np.ndarray
     state: State
     figures: dict[str, Any]
@@ -230,7 +235,9 @@ def design(
         if movie is not None:
             say.say(f"{movie.path}: is not written, since nothing was designed")
         scene = project.scene()
-        return Result(project, scene, project.lens(scene).field, project.target(scene), project.found.state, figures)
+        target = project.target(scene)
+        scene, field, heights, checkpoint = project.lens(scene)
+        return Result(project, scene, field, heights, target, checkpoint.state, figures)
     with project.hold:
         if is_free(project):
             return _run_index(project, say, began, device)
@@ -494,7 +501,9 @@ def _run(
             figures = figures | {"movie": str(movie.path)}
         if asked:
             raise Interrupted(f"interrupted when the design was done; {project.path} is whole", 128 + asked[0])
-    return Result(project, designer.scene, designer.field(found.state.stage), target, found.state, figures)
+    field = designer.field(found.state.stage)
+    scene, heights = sides_of(designer.scene, field, found.state.heights)
+    return Result(project, scene, field, heights, target, found.state, figures)
 
 
 def _run_index(project: Project, say: Reporter, began: float, device: str) -> Result:
@@ -511,7 +520,7 @@ def _run_index(project: Project, say: Reporter, began: float, device: str) -> Re
         _Records(project, designer, device).keep(state, figures)
         if asked:
             raise Interrupted(f"interrupted after {state.total} iterations; {project.path} is whole", 128 + asked[0])
-    return Result(project, designer.scene, designer.field(0), target, state, figures)
+    return Result(project, designer.scene, designer.field(0), state.heights, target, state, figures)
 
 
 class _Records:

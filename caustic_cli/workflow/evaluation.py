@@ -35,6 +35,8 @@ REPORT_SAMPLES = 401
 LIKENESS = {"rms", "rms-light", "throughput"}
 #: For `expected_seconds`: part of FINAL_RAYS that are traced, retraces and wave images of an evaluation, and time of its report.
 PROBE, RETRACES, WAVE_IMAGES, REPORT_SECONDS = 16, 2.5, 4, 2.5
+#: Fewer rays, by this factor, judge the first surfaces of a lens with two free-form sides.
+STARTS = 4
 #: Part of relative_rms that the noise of its rays may be.
 QUIET = 0.1
 #: From so many times the light on the screen, a lens is kept although the surface it began from is more like the target.
@@ -73,7 +75,7 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
     if found.second is not None and designer.second is not None:
         write_image(project.path / FARTHER, found.second, white_level(found.second, designer.second.numpy()), encoding)
     history = np.array(state.history, dtype=float).reshape(-1, 5)
-    surface = _surface(designer.field(found.state.stage), sides_of(designer.scene, designer.field(0), found.state.heights)[1])
+    surface = _surface(designer.field(found.state.stage), found.state.heights[-1] if designer.scene.second else found.state.heights)
     write_report(
         project.path / REPORT,
         grey(aim),
@@ -92,7 +94,9 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
 def expected_seconds(designer: Designer, target: np.ndarray, state: State, device: str) -> float:
     """About how long `judge` will take in a hurry, s: by a retrace of few rays, and a wave image where one was refined."""
     scene, field, began = designer.scene, designer.field(state.stage), time.monotonic()
-    scene, heights = sides_of(scene, field, state.heights)
+    heights = state.heights
+    if scene.second is not None:
+        scene, heights = sides_of(scene, field, heights)
     retrace(scene, field, heights, target, rays=FINAL_RAYS // PROBE, device=device, noise=False)
     seconds = RETRACES * PROBE * (time.monotonic() - began) + REPORT_SECONDS
     if any(s.waves for s in designer.stages):
@@ -183,15 +187,15 @@ def _both_sides(designer: Designer, target: np.ndarray, state: State, device: st
     """Of a lens with two free-form sides: what it throws on the screen, and what its light does behind that."""
     field, farther = designer.field(state.stage), None if designer.second is None else designer.second.numpy()
 
-    def trace(heights: torch.Tensor):
+    def trace(heights: torch.Tensor, rays: int = FINAL_RAYS):
         scene, exit = sides_of(designer.scene, field, heights)
-        exposure, figures = retrace(scene, field, exit, target, rays=FINAL_RAYS, device=device, seed=seed)
-        second, more = second_figures(scene, field, exit, farther, rays=FINAL_RAYS, seed=seed, device=device)
+        exposure, figures = retrace(scene, field, exit, target, rays=rays, device=device, seed=seed, noise=rays == FINAL_RAYS)
+        second, more = second_figures(scene, field, exit, farther, rays=rays, seed=seed, device=device)
         return exposure.image.cpu().numpy(), second, figures | more
 
     image, second, figures = trace(state.heights)
     if state.start is not None:
-        began = trace(designer.begun(state))[2]
+        began = trace(designer.begun(state), FINAL_RAYS // STARTS)[2]
         figures |= {f"start_{key}": began[key] for key in ("relative_rms", "second_relative_rms", "angle_rms_mrad") if key in began}
     return Evaluation(state, figures, image, None, second)
 

@@ -30,7 +30,7 @@ from caustic_cli.io.picture import Picture
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import EXIT, sides_of
+from caustic_cli.optics.system import EXIT
 from caustic_cli.optics.trace import tracers
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Scene
@@ -175,8 +175,7 @@ def resume(
 
 
 def _lens(done: workflow.Result) -> Lens:
-    scene, heights = sides_of(done.scene, done.field, done.state.heights)
-    return Lens(scene, done.field, heights, done.target, done.figures, done.project, done.state)
+    return Lens(done.scene, done.field, done.heights, done.target, done.figures, done.project, done.state)
 
 
 def render(lens: Lens | str | Path, rays: float = 1_000_000, **options: Any) -> Render:
