@@ -164,6 +164,10 @@ def test_design_render_resume_and_files(_here, capfd):
     assert volume == pytest.approx(np.trapezoid(np.trapezoid(top - low, line), line), rel=1e-3)
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
+    for study in ("--report", "--tolerances", "--html"):
+        files = {"--tolerances": ["t.toml"], "--html": ["page.html"]}.get(study, [])
+        Path("t.toml").write_text("[index]\nsigma = 0.001\n")
+        assert "entrance" in run(capfd, "render", "p", study, *files, "--quiet", "--force", code=2), study
     assert "holds one free-form side" in run(capfd, "export", "p", "--format", "gcode", code=2)
 
 
@@ -171,7 +175,11 @@ def test_design_render_resume_and_files(_here, capfd):
 def test_two_pictures_by_the_command_line(_here, capfd):
     options = ("--second", "two.png", "--second-at", "400", "--second-size", "26")
     made = run(capfd, "design", "one.png", *SMALL, *options, "--iterations", "3", "-o", "p")
-    assert made["second_relative_rms"] < made["start_second_relative_rms"] and Path("p/render-second.png").exists() and Path("p/second.png").exists()
+    assert (
+        made["second_relative_rms"] < made["start_second_relative_rms"]
+        and Path("p/render-second.png").exists()
+        and Path("p/second.png").exists()
+    )
     assert run(capfd, "design", "one.png", *SMALL, *options, "--iterations", "3", "-o", "p") == made  # nothing was done
 
 

@@ -59,6 +59,9 @@ The caustic by rays, as last rendered.
 .I NAME.caustic/wave.png
 The caustic as light makes it, where diffraction is simulated.
 .TP
+.IR NAME.caustic/second.png ", " render\-second.png
+The second picture as used, and as last rendered, of a lens with two.
+.TP
 .I NAME.caustic/report.png
 Target, caustic, lens height, loss against time.
 .SH JSON
@@ -81,6 +84,11 @@ The same of the wave image, where diffraction is simulated; details that light c
 .TP
 .B least_relative_rms, etendue_limit
 Behind an extended source's blur: the error of the best light found, and the most light that \['e]tendue lets through.
+.TP
+.B second_relative_rms, second_noise, second_on_target, second_on_screen, second_image
+The same of a second picture behind the first; of light that shall leave that parallel or towards a focus,
+.BR angle_rms_mrad ,
+the root mean square of its angle to that way.
 .TP
 .B start_relative_rms, start_noise
 Of the surface that a design began from, by the same rays.

@@ -88,12 +88,12 @@ def surface(
     view: View | None = None,
     **options,
 ) -> Start:
-    """Exit surface of a lens that throws `target` on the screen.
+    """Surface of a lens that throws `target` on a plane behind it.
 
     Args:
         source: irradiance of the exit surface, seen along z, (n, m), any unit; where it is 0, the surface just goes on.
         target: the picture, (k, l), any unit; half sizes in mm as for `transport.solve`.
-        index: of the glass, with 1 outside; -1 for a mirror.
+        index: of the glass, with 1 outside; one over it for a surface that light enters the glass by; -1 for a mirror.
         z_screen, thickness: the screen's plane and the surface's mean height, mm.
         directions: unit directions inside the glass at those corners, three (n + 1, m + 1) arrays, or None for (0, 0, 1).
         corrections: how often, at most, the picture is moved by what the rays miss and transported again.

@@ -1,4 +1,4 @@
-"""The lens: flat entrance at z_in, a B-spline exit surface over a rectangular aperture (thesis 4.1).
+"""The lens: flat or B-spline entrance at z_in, a B-spline exit surface over a rectangular aperture (thesis 4.1).
 
 Notation
     r_x, r_y     half widths of the aperture [-r_x, r_x] x [-r_y, r_y], mm

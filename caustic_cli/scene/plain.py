@@ -10,6 +10,7 @@ def beyond_plain(scene: Scene) -> list[str]:
     lens, screen, light = scene.lens, scene.screen, scene.light
     found = {
         "a mirror": lens.mirror,
+        "an index that varies": lens.gradient is not None,
         "absorption": lens.absorption > 0,
         "roughness": lens.roughness > 0,
         "polarised light": light.polarisation is not None,

@@ -159,6 +159,7 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
         require_mitsuba(scene)
     if asked.html is not None:
         refuse_untraceable(scene)
+    _refuse_unknown(asked, scene)
     filter = filter_from(asked.reconstruction, asked.filter_size, scene.screen, asked.alpha)
     seed = lens.seed if asked.seed is None else asked.seed
     cut = None if asked.cut is None else cut_surface(asked.cut, scene, lens.field, asked.tool_radius)
@@ -237,6 +238,18 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     if made:
         made.keep(figures)
     return figures
+
+
+def _refuse_unknown(asked: Request, scene: Scene) -> None:
+    """Refuse studies that know lenses of one index with a flat entrance alone.
+
+    Raises:
+        InputError: saying which.
+    """
+    beyond = "a free-form entrance" if scene.two_sided else "an index that varies" if scene.lens.gradient is not None else ""
+    for name, given in (("tolerances", asked.tolerances is not None), ("report", asked.report)):
+        if given and beyond:
+            raise InputError(f"⟨{name}⟩ knows lenses of one index with a flat entrance, and this one has {beyond}")
 
 
 def _wave_image(
