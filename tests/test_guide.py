@@ -41,7 +41,7 @@ SMALL = {
 }
 #: Lines that need what no chapter makes, and studies of minutes, which tests of their own run smaller.
 NEEDS_MORE = ("--verify", "--source-file led.tm25ray", "--study diffraction", "led.caustic --study light", "--explain")
-NEEDS_MORE += ("--tolerances", "--robust", "--gradient free")
+NEEDS_MORE += ("--tolerances", "--robust", "blank.caustic")
 
 
 def blocks(path: Path, language: str) -> list[str]:

@@ -236,10 +236,9 @@ def _collimated(scene: Scene) -> list[str]:
         raise InputError("⟨format⟩ mitsuba: its collimated emitter is uniform, so a source with a profile cannot be written")
     (rx, ry), area = lens.half_size, lens.size[0] * lens.size[1] * (math.pi / 4.0 if lens.round else 1.0)
     radiance = real(source.power / area)
-    lowest = lens.z_in + (0.0 if lens.front is None else min(0.0, float(lens.front.heights.min())))
     return [
         f'<shape type="{"disk" if lens.round else "rectangle"}" id="light">',
-        f'  <transform name="to_world"><scale x="{real(rx)}" y="{real(ry)}"/><translate z="{real(lowest - BEFORE)}"/></transform>',
+        f'  <transform name="to_world"><scale x="{real(rx)}" y="{real(ry)}"/><translate z="{real(lens.lowest - BEFORE)}"/></transform>',
         f'  <emitter type="directionalarea"><rgb name="radiance" value="{radiance}"/></emitter>',
         "</shape>",
     ]

@@ -188,6 +188,11 @@ class Lens:
         return self.aperture == "circle"
 
     @property
+    def lowest(self) -> float:
+        """z that no part of the entrance lies below, mm."""
+        return self.z_in + (0.0 if self.front is None else min(0.0, float(self.front.heights.min())))
+
+    @property
     def inside(self) -> float:
         """Refractive index before the free-form surface: the glass', or 1 before a mirror."""
         return 1.0 if self.mirror else self.index

@@ -17,7 +17,7 @@ TABLE = 20_001
 def emitted(scene: Scene, rays: int, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Starts and directions (3, N) of independent rays, batch by batch, and what each carries: 1 on average over all of them."""
     source, (rx, ry), z_in = scene.source, scene.lens.half_size, scene.lens.z_in
-    round_ = scene.lens.round
+    round_, lowest = scene.lens.round, scene.lens.lowest
     if source.profile is not None:
         line = (np.arange(2000) + 0.5) / 1000 - 1
         x, y = np.meshgrid(line, line, indexing="ij")
@@ -40,7 +40,7 @@ def emitted(scene: Scene, rays: int, rng: np.random.Generator) -> Iterator[tuple
             )
             if source.profile is not None:
                 one = _profile(source.profile, x / rx, y / ry) / mean
-            yield np.array([x, y, np.full(n, z_in)]) - d, d, one
+            yield np.array([x, y, np.full(n, z_in)]) - (1 + (z_in - lowest) / d[2]) * d, d, one
             continue
         cone = source.cone_over((rx, ry), z_in, round_)
         if source.intensity == "lambertian":
@@ -54,7 +54,7 @@ def emitted(scene: Scene, rays: int, rng: np.random.Generator) -> Iterator[tuple
         d = np.array([sine * np.cos(2 * np.pi * b), sine * np.sin(2 * np.pi * b), np.sqrt(1 - sine**2)])
         o = STARTS[source.kind](source, u, v, rng)
         near = d[2] > 1e-6  # from 1 mm or less before the entrance: single precision knows no far origin
-        yield o + d * np.where(near, np.maximum((z_in - o[2]) / np.where(near, d[2], 1) - 1, 0), 0), d, one
+        yield o + d * np.where(near, np.maximum((lowest - o[2]) / np.where(near, d[2], 1) - 1, 0), 0), d, one
 
 
 def _on_points(source: Source, u: np.ndarray, _v: np.ndarray, rng: np.random.Generator) -> np.ndarray:
