@@ -238,7 +238,8 @@ def _collimated(scene: Scene) -> list[str]:
     radiance = real(source.power / area)
     return [
         f'<shape type="{"disk" if lens.round else "rectangle"}" id="light">',
-        f'  <transform name="to_world"><scale x="{real(rx)}" y="{real(ry)}"/><translate z="{real(lens.lowest - BEFORE)}"/></transform>',
+        f'  <transform name="to_world"><scale x="{real(rx)}" y="{real(ry)}"/>'
+        f'<translate z="{real(lens.lowest - BEFORE)}"/></transform>',
         f'  <emitter type="directionalarea"><rgb name="radiance" value="{radiance}"/></emitter>',
         "</shape>",
     ]
