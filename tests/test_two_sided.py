@@ -171,6 +171,13 @@ def test_design_render_resume_and_files(_here, capfd):
     assert "holds one free-form side" in run(capfd, "export", "p", "--format", "gcode", code=2)
 
 
+def test_mitsuba_traces_both_sides(_here, capfd):
+    pytest.importorskip("mitsuba")
+    run(capfd, "design", "one.png", *SMALL, "--collimate", "--iterations", "2", "-o", "p")
+    found = run(capfd, "render", "p", "--verify", "mitsuba", "--rays", "200000", "--quiet", "--json")["verify"]
+    assert found["agree"] and 0.9 < found["z_mean_square"] < 1.1
+
+
 @pytest.mark.slow
 def test_two_pictures_by_the_command_line(_here, capfd):
     options = ("--second", "two.png", "--second-at", "400", "--second-size", "26")

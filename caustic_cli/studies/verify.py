@@ -92,7 +92,7 @@ def verify(path: Path, scene: Scene, field: HeightField, heights: Tensor, rays: 
     import mitsuba as mi  # noqa: PLC0415
 
     mi.set_log_level(mi.LogLevel.Error)
-    world = mi.load_file(str(path))
+    world = mi.load_file(str(path), optimize=False)  # which would make one mesh of entrance and exit, without a name
     image, squares = _trace(mi, world, scene, rays, seed)
     renders = np.array(
         [
