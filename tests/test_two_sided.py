@@ -171,6 +171,12 @@ def test_design_render_resume_and_files(_here, capfd):
     assert "holds one free-form side" in run(capfd, "export", "p", "--format", "gcode", code=2)
 
 
+def test_the_image_changes_with_a_height_of_the_exit_as_differences_say(_here, capfd):
+    run(capfd, "design", "one.png", *SMALL, "--collimate", "--iterations", "1", "-o", "p")
+    (found,) = run(capfd, "gradmap", "p", "--check", "--rays", "40000", "--quiet", "--json")["maps"]
+    assert found["largest"] > 0 and found["check"]["relative_error"] < 1e-3
+
+
 def test_mitsuba_traces_both_sides(_here, capfd):
     pytest.importorskip("mitsuba")
     run(capfd, "design", "one.png", *SMALL, "--collimate", "--iterations", "2", "-o", "p")
@@ -201,9 +207,12 @@ def test_two_pictures_by_the_command_line(_here, capfd):
         (("--collimate", "--waves", "on"), "--waves on"),
         (("--collimate", "--source", "point", "--start", "offset"), "must be transport"),
         (("--second", "missing.png", "--second-at", "400"), "missing.png"),
+        (("--collimate", "--config", "waves.toml"), "without waves or spread"),
         (("--collimate", "--mag", "6"), "would have to come from beside the lens"),
     ],
 )
 def test_bad_input_is_refused(_here, capfd, options, words):
-    said = run(capfd, "design", "one.png", *SMALL, *options, "-o", "p", code=2)
+    Path("waves.toml").write_text("[[design.stages]]\nwaves = [550.0]\n")
+    small = [a for a in SMALL if "waves.toml" not in options or a not in ("--rays", "40000")]
+    said = run(capfd, "design", "one.png", *small, *options, "-o", "p", code=2)
     assert words in said and said.count("\n") == 0 and not Path("p").exists()

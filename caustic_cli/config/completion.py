@@ -300,6 +300,11 @@ def shape_words(s: Settings) -> str:
 def _complete_design(s: Settings, source: Source, quality: str | None, rays: int | None, lit: tuple[float, float]) -> None:
     lens, screen, design, given = s["lens"], s["screen"], s["design"], quality
     degree = check("lens.degree", lens["degree"])
+    if "stages" in design and (given or rays):
+        raise InputError(
+            "⟨quality⟩ and ⟨rays⟩ shape the default stages, but the configuration brings [[design.stages]]"
+            " of its own: change them there"
+        )
     if lens.get("gradient") == "free":
         _complete_index_design(s, source, quality or _quality(design["time_limit"]), rays)
         return
@@ -339,11 +344,6 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
         )
     design.setdefault("preconditioner", "laplacian" if plain else "none")
     if "stages" in design:
-        if given or rays:
-            raise InputError(
-                "⟨quality⟩ and ⟨rays⟩ shape the default stages, but the configuration brings [[design.stages]]"
-                " of its own: change them there"
-            )
         design["stages"] = [_complete_stage(stage, s, _sampler(source)) for stage in design["stages"]]
         if asked != "auto" and any(stage.get("waves") for stage in design["stages"]) != (asked == "on"):
             raise InputError(
@@ -389,8 +389,10 @@ def _complete_two_sided(s: Settings, source: Source, quality: str, rays: int | N
     design.setdefault("preconditioner", "laplacian")
     if "stages" not in design:
         design["stages"] = two_sided(tuple(lens["control"]), rays, tuple(screen["resolution"]), quality)
-    else:
-        design["stages"] = [_complete_stage(stage, s, _sampler(source)) for stage in design["stages"]]
+        return
+    design["stages"] = [_complete_stage(stage, s, _sampler(source)) for stage in design["stages"]]
+    if any(stage.get(key) for stage in design["stages"] for key in ("waves", "spread")):
+        raise InputError("[[design.stages]] of two free-form sides are on the rays of the whole source, without waves or spread")
 
 
 def _of_array(control: Sequence[int], degree: Sequence[int], array: Sequence[int]) -> list[int]:

@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -316,21 +317,8 @@ class Designer:
             )
         if scene.second is not None:
             targets = (self.target,) if self.second is None else (self.target, self.second)
-            return TwoSidedObjective(
-                scene,
-                self.field(k),
-                rays_of(scene, stage.sampler, stage.rays, stream(o.seed, f"stage {k}"), self.device),
-                stage.filter,
-                targets,
-                o.loss,
-                blur=stage.blur,
-                filter_target=o.filter_target,
-                apron=stage.apron,
-                max_slope=o.max_slope,
-                min_radius=o.min_radius,
-                oversample=stage.oversample,
-                dtype=o.dtype,
-            )
+            rays = rays_of(scene, stage.sampler, stage.rays, stream(o.seed, f"stage {k}"), self.device)
+            return TwoSidedObjective(scene, self.field(k), rays, stage.filter, targets, o.loss, **self._how(k))
         if stage.lenslets:
             own = self.own * (math.prod(scene.lens.array) if len(self.own) == 1 else 1)
             parts = lenslets(scene, stage.control)
@@ -359,24 +347,23 @@ class Designer:
         expected: float,
     ) -> Objective:
         """That of stage k on the ray image, by these rays."""
-        stage, o = self.stages[k], self.options
+        how = self._how(k)
         return Objective(
-            scene,
-            field,
-            rays,
-            stage.filter,
-            target,
-            o.loss,
-            blur=stage.blur,
-            filter_target=o.filter_target,
-            apron=stage.apron,
-            max_slope=o.max_slope,
-            min_radius=o.min_radius,
-            oversample=stage.oversample,
-            spread=spread,
-            expected=expected,
-            dtype=o.dtype,
+            scene, field, rays, self.stages[k].filter, target, self.options.loss, spread=spread, expected=expected, **how
         )
+
+    def _how(self, k: int) -> dict[str, Any]:
+        """What stage k and the options say of any objective on rays."""
+        stage, o = self.stages[k], self.options
+        return {
+            "blur": stage.blur,
+            "filter_target": o.filter_target,
+            "apron": stage.apron,
+            "max_slope": o.max_slope,
+            "min_radius": o.min_radius,
+            "oversample": stage.oversample,
+            "dtype": o.dtype,
+        }
 
     def _next(self, state: State, k: int) -> State:
         """The state at the beginning of stage k: the same surface on its net."""

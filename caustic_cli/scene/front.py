@@ -50,10 +50,8 @@ class Second:
         Raises:
             InputError: saying where it lies.
         """
-        if not screen.upright or screen.curved:
-            raise InputError(
-                "where light is said to do something behind the picture, that must be on a plane screen without ⟨screen.tilt⟩"
-            )
+        if not screen.upright:
+            raise InputError("the screen of a lens with two free-form sides must be plane and upright, without ⟨screen.tilt⟩")
         z = self.screen.z if self.screen is not None else self.focus[2] if self.focus is not None else None
         if z is not None and z <= screen.z:
             name = "z" if self.screen is not None else "focus"

@@ -6,8 +6,8 @@ Notation
     dJ/dP_ij    (n_x, n_y), parts of the source's power per mm
 
 The rays are constants and J = sum over rays, so the tangent of the image is the sum of the tangents of chunks.  A plane
-wave's rays are sampled on the surface itself: those outside the support of N_i N_j have no tangent at all and are not
-traced, so the cost is that of the rays under one basis function.  Pixels they cannot reach stay exactly 0.
+wave's rays behind a flat entrance are sampled on the surface itself: those outside the support of N_i N_j have no tangent at
+all and are not traced, so the cost is that of the rays under one basis function.  Pixels they cannot reach stay exactly 0.
 
 Shares that a ray keeps within the frame sum to its weight, so dJ/dP_ij sums to 0 where nothing is reflected and no ray
 crosses the frame's border.  Bincount has a derivative of 0 almost everywhere and is refused.
@@ -81,7 +81,7 @@ def gradient_image(
     for band in scene.bands:
         system, traced = System.of(band.scene, field), None
         for rays in of_member(sampler, band.member).chunks(chunk):
-            if isinstance(rays, Sample):
+            if isinstance(rays, Sample) and scene.axial:
                 rays = _under(field, control, rays)
                 if not all(rays.shape):
                     continue

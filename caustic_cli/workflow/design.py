@@ -130,7 +130,7 @@ def begin(
     farther = full.get("second", {}).get("file")
     second = None
     if farther:
-        at = config.parent if config and "second" not in chosen else Path()
+        at = config.parent if config and "file" not in chosen.get("second", {}) else Path()
         second = read_picture(at / farther, goal.get("encoding") == "linear", False, invert)
         full["second"]["file"] = f"second{second.suffix}"
     full["target"] |= {"file": f"target{picture.suffix}", "encoding": picture.encoding}

@@ -18,7 +18,7 @@ class Fixed(Surface[None]):
     heights: Tensor
 
     @property
-    def half_size(self) -> tuple[float, float]:  # type: ignore[override]
+    def half_size(self) -> tuple[float, float]:  # type: ignore[override]  # nobody sets a surface's
         """Of the field, mm."""
         return self.field.half_size
 
