@@ -8,8 +8,8 @@ Notation
 A picture on a second screen pairs p with q: rays of one wavefront go from p to q by the gradient of a convex function, to first
 order in their angles, and only one such map carries the one picture to the other (Brenier 1991).  Light that leaves the picture
 parallel or towards a focus is paired by that.  Either way the ray of p comes from e(p), on the straight line through p and q.  The
-picture's light put there is what the entrance has to send to the exit, by transport, as if the exit were a screen in the glass; and
-the exit turns each ray from d to t.  Its slopes are integrated in the least-squares sense, dark places counting little.
+picture's light put there is what the entrance has to send to the exit, by transport, as if the exit were a curved screen in the
+glass; and the exit turns each ray from d to t: it is fitted to the slopes which that asks for where rays meet it.
 
 The entrance turns light into the glass, the exit out of it: by Snell's law both are the one formula of `surface_from_map`, with
 the indices 1 / n and n.
@@ -22,33 +22,38 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.fft import dctn, idctn
-from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator, RectBivariateSpline
-from scipy.ndimage import gaussian_filter
-from scipy.sparse.linalg import LinearOperator, cg
+from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+from scipy.ndimage import gaussian_filter, map_coordinates
 from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.incidence import on_entrance
 from caustic_cli.inverse.initial_surface import net_of
-from caustic_cli.inverse.surface_from_map import integrate, slopes_to, surface
+from caustic_cli.inverse.surface_from_map import slopes_to, surface
+from caustic_cli.inverse.surface_from_slopes import fitted
 from caustic_cli.inverse.transport import corners, solve
+from caustic_cli.inverse.view import View
+from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.scene import Scene
+from caustic_cli.optics.system import EXIT, sides_of
+from caustic_cli.optics.trace import tracers
+from caustic_cli.scene import Scene, Screen
+from caustic_cli.scene.screen import Sags
 
 #: Points a cell of the exit, along each axis, that stand for the picture's light there; most to a pixel; cells over which it is
 #: smoothed.
 PARTS, MOST_PARTS, SMOOTH = 6, 32, 0.7
-#: How often both surfaces are solved for, each time with the exit of the time before; and its heights within each.
-REPEATS, HEIGHTS = 2, 6
-#: What slopes count where no light goes, against where some does; below which part of the mean light that is.
-DARK, LIT = 1e-2, 1e-3
+#: How often both surfaces are solved for, each time with the exit of the time before; steps for where a ray leaves that; and how
+#: often the first exit is fitted.
+REPEATS, HEIGHTS, FIRST_FITS = 3, 6, 2
+#: Rays that the exit is fitted to, for each of its controls; and at a time.
+RAYS_A_CONTROL, CHUNK = 4, 1 << 19
 #: Light to which a black picture is lifted where it is paired with another, in parts of its mean.
 DARKEST = 0.02
 #: Cells along each axis on which two pictures are paired, and into how many a pixel is cut at most.
 PAIRED, CUT = 256, 2
 #: Cells along the lens' longer side, to a pixel, and at least and most.
-A_PIXEL, CELLS = 2, (96, 256)
+A_PIXEL, CELLS = 2, (96, 512)
 #: Part of the picture's light that may come from beside the exit's aperture.
 BESIDE = 0.02
 
@@ -76,11 +81,32 @@ class Picture:
 
 
 @dataclass(frozen=True, eq=False)
-class Sides:
-    """Heights of both surfaces at the corners of cells over the aperture, (n + 1, m + 1) mm, the entrance's from its plane."""
+class _Aperture:
+    """Lines x (n + 1,), y (m + 1,) between cells over the aperture, mm."""
 
-    entrance: np.ndarray
-    exit: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+
+    @classmethod
+    def of(cls, half: tuple[float, float], cells: int) -> _Aperture:
+        """So many cells along the longer side."""
+        x, y = (corners(max(3, round(cells * r / max(half))), r) for r in half)
+        return cls(x, y)
+
+    @property
+    def corners(self) -> list[np.ndarray]:
+        """Coordinates of the cells' corners, (n + 1, m + 1) each, mm."""
+        return np.meshgrid(self.x, self.y, indexing="ij")
+
+    def at(self, values: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Values at corners, linear between them and the nearest beyond, at points, mm."""
+        places = [(c - line[0]) / (line[1] - line[0]) for c, line in zip((x, y), (self.x, self.y), strict=True)]
+        return map_coordinates(values, places, order=1, mode="nearest")
+
+    def heights(self, field: HeightField, net: Tensor) -> np.ndarray:
+        """A surface's heights at the corners, (n + 1, m + 1) mm."""
+        u, v = (s.matrix(torch.from_numpy(0.5 * (c / c[-1] + 1.0))) for s, c in zip(field.spaces, (self.x, self.y), strict=True))
+        return (u @ net @ v.T).numpy()
 
 
 def first_sides(
@@ -93,22 +119,34 @@ def first_sides(
         field: spline spaces of both sides; cells: along the lens' longer side, None for as many as the picture needs.
 
     Raises:
-        InputError: as of `sides`; or a picture out of reach of refraction.
+        InputError: light of the picture comes from beside the exit, or refraction cannot send it there.
     """
-    lens, behind = scene.lens, scene.second
+    lens, behind, thickness = scene.lens, scene.second, scene.lens.offset.thickness
     assert behind is not None
-    half, (least, most) = lens.half_size, CELLS
-    cells = cells or min(most, max(least, A_PIXEL * max(target.shape)))
-    shape = tuple(max(3, round(cells * r / max(half))) for r in half)
-    x, y = (corners(n, h) for n, h in zip(shape, half, strict=True))
+    least, most = CELLS
+    grid = _Aperture.of(lens.half_size, cells or min(most, max(least, A_PIXEL * max(target.shape))))
     near = Picture(target, scene.screen.half_size, scene.screen.z, scene.screen.shift)
     if second is not None and behind.screen is not None:
         slopes = slopes_behind(near, Picture(second, behind.screen.half_size, behind.screen.z))
     else:
         slopes = slopes_towards(near, behind.focus)
-    light, directions = on_entrance(scene, x, y)
-    found = sides(light, directions, half, lens.index, lens.z_in, lens.offset.thickness, near, slopes)
-    return torch.stack([net_of(x, y, z, field) for z in (found.entrance, found.exit)])
+    (px, py), lit = near.corners, near.lit
+    nets = torch.stack([torch.zeros(field.shape, dtype=torch.float64), torch.full(field.shape, thickness, dtype=torch.float64)])
+    exit = None
+    for k in range(REPEATS):
+        at = np.full(px.shape, thickness)
+        for _ in range(HEIGHTS):
+            ex, ey = px - slopes[0] * (near.z - at), py - slopes[1] * (near.z - at)
+            if exit is None:
+                break
+            at = grid.at(exit, ex, ey)
+        on_exit = _on_exit(near.light, ex, ey, grid)
+        aim = _spread(np.stack([ex[lit], ey[lit]], -1), np.stack([px[lit], py[lit]], -1), *grid.corners)
+        nets[0] = net_of(grid.x, grid.y, _entrance(scene, grid, on_exit, exit), field)
+        for _ in range(1 if k else FIRST_FITS):
+            nets[1] = _exit(scene, field, nets, grid, aim)
+        exit = grid.heights(field, nets[1])
+    return nets
 
 
 def slopes_behind(near: Picture, far: Picture) -> tuple[np.ndarray, np.ndarray]:
@@ -136,77 +174,70 @@ def slopes_towards(near: Picture, focus: tuple[float, float, float] | None) -> t
     return (focus[0] - x) / (focus[2] - near.z), (focus[1] - y) / (focus[2] - near.z)
 
 
-def sides(
-    light: np.ndarray,
-    directions,
-    half: tuple[float, float],
-    index: float,
-    z_in: float,
-    thickness: float,
-    near: Picture,
-    slopes: tuple[np.ndarray, np.ndarray],
-) -> Sides:
-    """Both surfaces of a lens.
+def _entrance(scene: Scene, grid: _Aperture, on_exit: np.ndarray, exit: np.ndarray | None) -> np.ndarray:
+    """Heights of the entrance at the corners of the aperture's cells, from its plane, which send light to the exit's.
 
     Args:
-        light: irradiance of the entrance plane, (n, m), any unit.
-        directions: unit ones there, at the cells' corners, None for along z.
-        half: of the aperture, mm; index: of the glass; z_in, thickness: of the entrance plane and the exit's mean height, mm.
-        near: the picture; slopes: of the light behind it, `slopes_behind` or `slopes_towards`.
-
-    Raises:
-        InputError: light of the picture comes from beside the exit, or the entrance cannot send it there.
+        on_exit: light on the cells there, any unit; exit: the exit's heights at their corners, None for a plane.
     """
-    x, y = (corners(n, h) for n, h in zip(light.shape, half, strict=True))
-    u, v = np.meshgrid(x, y, indexing="ij")
-    step = float(x[1] - x[0]), float(y[1] - y[0])
-    z = np.full(u.shape, thickness)
-    px, py = near.corners
-    lit = near.lit
-    for _ in range(REPEATS):
-        spline = RectBivariateSpline(x, y, z)
-
-        def height(a, b, spline=spline):
-            return spline(np.clip(a, -half[0], half[0]), np.clip(b, -half[1], half[1]), grid=False)
-
-        at = np.full(px.shape, thickness)
-        for _ in range(HEIGHTS):
-            ex, ey = px - slopes[0] * (near.z - at), py - slopes[1] * (near.z - at)
-            at = height(ex, ey)
-        on_exit = _on_exit(near.light, ex, ey, x, y)
-        front = surface(light, on_exit, half, half, 1.0 / index, thickness, z_in, directions, corrections=1)
-        dx, dy, dz = front.x - u, front.y - v, thickness - front.heights
-        rise = height(front.x, front.y) - thickness
-        length = np.sqrt(dx * dx + dy * dy + dz * dz)
-        comes = np.stack([front.x + dx / dz * rise, front.y + dy / dz * rise], -1), np.stack([dx, dy, dz], -1) / length[..., None]
-        passes = np.isfinite(comes[0]).all(-1)
-        d = _spread(comes[0][passes], comes[1][passes], u, v)
-        d = d / np.sqrt((d * d).sum(0))
-        aim = _spread(np.stack([ex[lit], ey[lit]], -1), np.stack([px[lit], py[lit]], -1), u, v)
-        on = np.pad(on_exit > LIT * on_exit.mean(), 1)
-        weight = np.where(on[1:, 1:] | on[:-1, 1:] | on[1:, :-1] | on[:-1, :-1], 1.0, DARK)
-        for _ in range(HEIGHTS):
-            z = thickness + _weighed(*slopes_to(aim[0] - u, aim[1] - v, near.z - z, d, index), step, weight)
-    return Sides(front.heights - z_in, z)
+    lens = scene.lens
+    light, directions = on_entrance(scene, grid.x, grid.y)
+    z, half, centre, view = lens.offset.thickness, lens.half_size, (0.0, 0.0), None
+    if exit is not None:
+        view = View(Screen(lens.size, z, on_exit.shape, sags=Sags(exit - z, lens.size)), lens.z_in)
+        on_exit, half, centre = view.picture(on_exit)
+    found = surface(
+        light,
+        on_exit,
+        lens.half_size,
+        half,
+        1.0 / lens.index,
+        z,
+        lens.z_in,
+        directions,
+        corrections=1,
+        centre=centre,
+        view=view,
+    )
+    return found.heights - lens.z_in
 
 
-def _on_exit(light: np.ndarray, ex: np.ndarray, ey: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Light of a picture whose pixels' corners come from points of the exit, on cells between lines x and y there.
+def _exit(scene: Scene, field: HeightField, nets: Tensor, grid: _Aperture, aim: np.ndarray) -> Tensor:
+    """The net (n, m) of an exit that turns light which comes through the entrance towards its places on the screen.
+
+    Args:
+        nets: of both sides, (2, n, m) mm; aim: places for light of the exit's points at the corners of cells, (2, ...) mm.
+    """
+    lit, net = sides_of(scene, field, nets)
+    rays = []
+    for traced in tracers(lit, field, rays_of(lit, "grid", RAYS_A_CONTROL * net.numel()), torch.float64, CHUNK):
+        last = traced.last({EXIT: net})
+        rays.append(torch.stack([*last.state.full(last.local), *last.state.full(last.incoming), last.arriving]))
+    found = torch.cat(rays, 1)
+    x, y, z, dx, dy, dz, power = found[:, found[6] > 0].numpy()
+    px, py = (grid.at(a, x, y) for a in aim)
+    slopes = slopes_to(px - x, py - y, scene.screen.z - z, (dx, dy, dz), scene.lens.index)
+    return fitted(field, *((torch.from_numpy(a), torch.from_numpy(b)) for a, b in ((x, y), slopes)), torch.from_numpy(power), net)
+
+
+def _on_exit(light: np.ndarray, ex: np.ndarray, ey: np.ndarray, grid: _Aperture) -> np.ndarray:
+    """Light of a picture whose pixels' corners come from points of the exit, on cells over the aperture.
 
     Raises:
         InputError: too much of it comes from beside them.
     """
-    width = [np.median(np.hypot(*(np.diff(c, axis=k) for c in (ex, ey)))) / (a[1] - a[0]) for k, a in enumerate((x, y))]
+    lines = grid.x, grid.y
+    width = [np.median(np.hypot(*(np.diff(c, axis=k) for c in (ex, ey)))) / (a[1] - a[0]) for k, a in enumerate(lines)]
     count = min(MOST_PARTS, max(1, math.ceil(PARTS * max(width))))
     parts = (np.arange(count) + 0.5) / count
-    total = np.zeros((len(x) - 1, len(y) - 1))
+    total = np.zeros([len(a) - 1 for a in lines])
     for a in parts:
         for b in parts:
             at = [
                 (1 - a) * (1 - b) * c[:-1, :-1] + a * (1 - b) * c[1:, :-1] + (1 - a) * b * c[:-1, 1:] + a * b * c[1:, 1:]
                 for c in (ex, ey)
             ]
-            total += np.histogram2d(at[0].ravel(), at[1].ravel(), bins=(x, y), weights=light.ravel())[0]
+            total += np.histogram2d(at[0].ravel(), at[1].ravel(), bins=lines, weights=light.ravel())[0]
     beside = 1.0 - total.sum() / (count**2 * light.sum())
     if beside > BESIDE:
         reach = [float(np.abs(c[:-1, :-1][light > 0]).max()) for c in (ex, ey)]
@@ -239,36 +270,3 @@ def _cells(picture: Picture) -> Picture:
     half = picture.half[0] * grown[0], picture.half[1] * grown[1]
     x, y = (c + g - h for c, g, h in zip(picture.centre, half, picture.half, strict=True))
     return Picture(light, half, picture.z, (x, y))
-
-
-def _weighed(sx: np.ndarray, sy: np.ndarray, step: tuple[float, float], weight: np.ndarray) -> np.ndarray:
-    """The surface of mean 0 whose differences are nearest to the slopes, each squared miss times a weight: conjugate gradients with
-    the unweighted problem's solution as preconditioner."""
-    n, m = sx.shape
-    wx, wy = np.minimum(weight[1:], weight[:-1]) / step[0] ** 2, np.minimum(weight[:, 1:], weight[:, :-1]) / step[1] ** 2
-
-    def divergence(gx: np.ndarray, gy: np.ndarray) -> np.ndarray:
-        return -(np.diff(gx, axis=0, prepend=0.0, append=0.0) + np.diff(gy, axis=1, prepend=0.0, append=0.0)).ravel()
-
-    def laplacian(z: np.ndarray) -> np.ndarray:
-        z = z.reshape(n, m)
-        return divergence(wx * np.diff(z, axis=0), wy * np.diff(z, axis=1))
-
-    modes = [(2.0 * np.sin(0.5 * np.pi * np.arange(k) / k) / h) ** 2 for k, h in zip((n, m), step, strict=True)]
-    spectrum = modes[0][:, None] + modes[1]
-    spectrum[0, 0] = np.inf
-
-    def inverse(r: np.ndarray) -> np.ndarray:
-        return idctn(dctn(r.reshape(n, m), norm="ortho") / spectrum, norm="ortho").ravel()
-
-    right = divergence(wx * 0.5 * (sx[1:] + sx[:-1]) * step[0], wy * 0.5 * (sy[:, 1:] + sy[:, :-1]) * step[1])
-    shape = (n * m, n * m)
-    z, _ = cg(
-        LinearOperator(shape, matvec=laplacian),
-        right,
-        x0=integrate(sx, sy, step).ravel(),
-        M=LinearOperator(shape, matvec=inverse),
-        rtol=1e-6,
-        maxiter=200,
-    )
-    return z.reshape(n, m) - z.mean()
