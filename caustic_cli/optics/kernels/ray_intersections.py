@@ -11,6 +11,8 @@ and t is counted from o nevertheless.  The search and the derivatives are those 
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -79,7 +81,7 @@ def enter_alone(ray, floor, circle, scale_x, scale_y):
         a, b, beyond = dx * dx + dy * dy, x * dx + y * dy, x * x + y * y - circle * circle
         root = b * b - a * beyond
         if root >= 0.0 and a > 0.0:  # the roots by sums without cancellation
-            far = -b - np.sqrt(root) if b > 0.0 else -b + np.sqrt(root)
+            far = -b - math.sqrt(root) if b > 0.0 else -b + math.sqrt(root)
             one, two = far / a, beyond / far if far != 0.0 else 0.0
             first, last = max(first, min(one, two)), min(last, max(one, two))
         elif beyond > 0.0:

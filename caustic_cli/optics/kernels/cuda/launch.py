@@ -32,6 +32,20 @@ class _Within:
         return getattr(_get_kernel_context(), name)
 
 
+def _max(a, b):
+    """Python's `max` of two, which numba's own target for CUDA (0.68) cannot compile."""
+    return b if b > a else a
+
+
+def _min(a, b):
+    """Python's `min` of two."""
+    return b if b < a else a
+
+
+#: What stands on the device for builtins of that name.
+STAND_INS = {"max": _max, "min": _min}
+
+
 @cache
 def device(function: CPUDispatcher | Callable) -> Callable:
     """A function for kernels to call: the plain Python of one that is compiled for the CPU, and of all that it calls.
@@ -42,6 +56,8 @@ def device(function: CPUDispatcher | Callable) -> Callable:
     names = dict(plain.__globals__)
     for name in plain.__code__.co_names:
         value = names.get(name)
+        if name in STAND_INS and value is None:
+            names[name] = device(STAND_INS[name])
         if isinstance(value, CPUDispatcher):
             names[name] = device(value)
         elif SIMULATED and value is cuda:

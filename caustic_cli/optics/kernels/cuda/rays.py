@@ -21,32 +21,34 @@ refract_batch, refract_pull, refract_push = (
 )
 mirror_batch, mirror_pull, mirror_push = (device(f) for f in (mirror.reflect_batch, mirror.pull_batch, mirror.push_batch))
 land_batch, land_pull, land_push = (device(f) for f in (transfer.land_batch, transfer.pull_batch, transfer.push_batch))
+#: Rows of a batch's scratch, as numba wants the sizes of local arrays: names of numbers.
+REFRACTION, MIRROR, TRANSFER = refraction.ROWS, mirror.ROWS, transfer.ROWS
 
 
 @cuda.jit
 def _refract(count, ray, surface, out, passes):
-    v, (tx, ty, tz, after) = cuda.local.array((refraction.ROWS, 1), float64), out
+    v, (tx, ty, tz, after) = cuda.local.array((REFRACTION, 1), float64), out
     for k in range(cuda.grid(1), count, cuda.gridsize(1)):
         refract_batch(v, k, 1, ray, surface, (tx, ty, tz), after, passes)
 
 
 @cuda.jit
 def _refract_adjoint(count, ray, surface, given, out):
-    v = cuda.local.array((refraction.ROWS, 1), float64)
+    v = cuda.local.array((REFRACTION, 1), float64)
     for k in range(cuda.grid(1), count, cuda.gridsize(1)):
         refract_pull(v, k, 1, ray, surface, given, out)
 
 
 @cuda.jit
 def _refract_tangent(count, ray, surface, along, out):
-    v = cuda.local.array((refraction.ROWS, 1), float64)
+    v = cuda.local.array((REFRACTION, 1), float64)
     for k in range(cuda.grid(1), count, cuda.gridsize(1)):
         refract_push(v, k, 1, ray, surface, along, out)
 
 
 @cuda.jit
 def _reflect(count, ray, surface, out, passes):
-    v = cuda.local.array((mirror.ROWS, 1), float64)
+    v = cuda.local.array((MIRROR, 1), float64)
     for k in range(cuda.grid(1), count, cuda.gridsize(1)):
         mirror_batch(v, k, 1, ray, out)
         passes[k] = True
@@ -54,35 +56,35 @@ def _reflect(count, ray, surface, out, passes):
 
 @cuda.jit
 def _reflect_adjoint(count, ray, surface, given, out):
-    v = cuda.local.array((mirror.ROWS, 1), float64)
+    v = cuda.local.array((MIRROR, 1), float64)
     for k in range(cuda.grid(1), count, cuda.gridsize(1)):
         mirror_pull(v, k, 1, ray, given, out)
 
 
 @cuda.jit
 def _reflect_tangent(count, ray, surface, along, out):
-    v = cuda.local.array((mirror.ROWS, 1), float64)
+    v = cuda.local.array((MIRROR, 1), float64)
     for k in range(cuda.grid(1), count, cuda.gridsize(1)):
         mirror_push(v, k, 1, ray, along, out)
 
 
 @cuda.jit
 def _land(count, ray, surface, out, on_way):
-    v, (x, y) = cuda.local.array((transfer.ROWS, 1), float64), out
+    v, (x, y) = cuda.local.array((TRANSFER, 1), float64), out
     for k in range(cuda.grid(1), count, cuda.gridsize(1)):
         land_batch(v, k, 1, ray, surface, x, y, on_way)
 
 
 @cuda.jit
 def _land_adjoint(count, ray, surface, given, out):
-    v = cuda.local.array((transfer.ROWS, 1), float64)
+    v = cuda.local.array((TRANSFER, 1), float64)
     for k in range(cuda.grid(1), count, cuda.gridsize(1)):
         land_pull(v, k, 1, ray, surface, given, out)
 
 
 @cuda.jit
 def _land_tangent(count, ray, surface, along, out):
-    v = cuda.local.array((transfer.ROWS, 1), float64)
+    v = cuda.local.array((TRANSFER, 1), float64)
     for k in range(cuda.grid(1), count, cuda.gridsize(1)):
         land_push(v, k, 1, ray, surface, along, out)
 
