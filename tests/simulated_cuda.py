@@ -2,7 +2,8 @@
 
 `test_cuda.py` runs this file in a process of its own with NUMBA_ENABLE_CUDASIM=1, which numba reads as it is loaded.
 
-Bounds.  Both sides round differently, some 1e-16 per operation: values agree to 1e-12 of the largest, gradients and tangents to 1e-11.
+Bounds.  Both sides round differently, some 1e-16 per operation: values agree to 1e-12 of the largest, gradients and tangents to
+1e-11.
 """
 
 from __future__ import annotations
@@ -178,9 +179,9 @@ def test_stages_mirror():
     inputs = [*directions(1), *(0.4 * numbers(2, 2, RAYS))]
 
     def by(backend):
-        return lambda dx, dy, dz, gx, gy: backend.interact(
-            (dx, dy, dz), (gx, gy), torch.ones_like(gx), eta=1.0, reflects=True, fresnel="none"
-        ).direction
+        return lambda dx, dy, dz, gx, gy: (
+            backend.interact((dx, dy, dz), (gx, gy), torch.ones_like(gx), eta=1.0, reflects=True, fresnel="none").direction
+        )
 
     compare(by(Cuda()), by(Torch()), inputs)
 
@@ -229,6 +230,14 @@ def test_surface_at_a_sample(kind, launched):
 def test_surface_at_points(degree):
     _, field, heights = lens(degree=degree)
     x, y = 5.0 * (2.0 * torch.rand(2, RAYS, generator=torch.Generator().manual_seed(2), dtype=torch.float64) - 1.0)
+    by = [lambda h, one=one: one.spline_at(field, h, x, y) for one in (Cuda(), Torch())]
+    compare(*by, (heights,))
+
+
+def test_surface_beyond_its_edge():
+    """The bound of the gradient's sums grows with the powers there."""
+    _, field, heights = lens(degree=(3, 5))
+    x, y = torch.linspace(-9.0, 14.0, 50, dtype=torch.float64), torch.linspace(20.0, -7.0, 50, dtype=torch.float64)
     by = [lambda h, one=one: one.spline_at(field, h, x, y) for one in (Cuda(), Torch())]
     compare(*by, (heights,))
 

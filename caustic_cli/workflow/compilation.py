@@ -1,5 +1,5 @@
-"""The device that traces, and its kernels.  The first run on a machine compiles the CPU's: their parts side by side, in processes of
-their own.
+"""The device that traces, and its kernels.  The first run on a machine compiles the CPU's: their parts side by side, in processes
+of their own.
 
 What they have compiled they keep in `kernels.cache.DIRECTORY`, where this process finds it afterwards; what another has not
 compiled after all, it compiles itself.

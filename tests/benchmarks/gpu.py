@@ -1,12 +1,12 @@
 """Rays per second with gradient on a CUDA device, by kernels and in plain torch there.
 
-    python tests/benchmarks/gpu.py [--rays N] [--rounds N]      a minute or two, the first compiling of each kernel included; Markdown
+    python tests/benchmarks/gpu.py [--rays N] [--rounds N]      the first compiling included; prints Markdown
 
 An iteration is the image of a plane wave's rays by a lens, and the gradient of a function of it by the control heights, everything
-float64 and on the device.  It is measured against the count of rays, the control net, the filter, and for a point source, whose rays
-are intersected; the rest is table D.2's setting with a cubic net of 128 x 128 and 250 x 250 pixels.  Every figure is a median over
-rounds.  Beside each stand how far image and gradient are from the CPU's (norm of the difference over the norm) and whether two runs
-are the same bits.  Without a device it says so and ends with status 2.
+float64 and on the device.  It is measured against the count of rays, the control net, the filter, and for a point source, whose
+rays are intersected; the rest is table D.2's setting with a cubic net of 128 x 128 and 250 x 250 pixels.  Every figure is a median
+over rounds.  Beside each stand how far image and gradient are from the CPU's (norm of the difference over the norm) and whether two
+runs are the same bits.  Without a device it says so and ends with status 2.
 """
 
 from __future__ import annotations
@@ -95,7 +95,8 @@ def settings(rays: int) -> dict[str, dict]:
 
 def rows(device: str, rays: int, rounds: int) -> None:
     """Print a table."""
-    print("| setting | rays/s by kernels | rays/s in plain torch | ratio | from the CPU's | repeats bitwise |\n|---|---|---|---|---|---|")
+    columns = ["setting", "rays/s by kernels", "rays/s in plain torch", "ratio", "from the CPU's", "repeats bitwise"]
+    print(f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|")
     for name, setting in settings(rays).items():
         by_kernels = Iteration(device, **setting)
         mine = seconds(by_kernels, rounds)

@@ -55,7 +55,7 @@ class Cuda(Torch):
     def interact(
         self, direction, slopes, power: Tensor, *, eta: float, reflects: bool, fresnel: str, polarised=None, side: float = 1.0
     ) -> Departure:
-        """As the reference, which does constant slopes and varying indices itself; the kernel tells the side by the sign of d . N."""
+        """As the reference, which does constant slopes and varying indices; the kernel tells the side by the sign of d . N."""
         if not isinstance(slopes[0], Tensor) or isinstance(eta, Tensor):
             return super().interact(
                 direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, polarised=polarised, side=side

@@ -1,8 +1,8 @@
 """Rays refracted at the exit, carried to the screen and splatted there, in one kernel of a CUDA device.
 
 The functions of `kernels.plane`, with their notation: what becomes of a ray and all that is differentiated come from there, from
-`axial_refraction` and from `oblique_refraction`, a row of one ray at a time.  A kernel is made for each filter, so that its loops over
-pixels have a known length.
+`axial_refraction` and from `oblique_refraction`, a row of one ray at a time.  A kernel is made for each filter, so that its loops
+over pixels have a known length.
 """
 
 from __future__ import annotations
@@ -139,15 +139,13 @@ def lands(v, frame, height, vx, vy):
     rx, ry, low_x, low_y, high_x, high_y = limits(frame.pixels_x, frame.pixels_y, vx, vy)
     x, y = v[PX, 0], v[PY, 0]
     inside = x >= low_x and x < high_x and y >= low_y and y < high_y and height > v[SAG, 0]
-    return (True, int(math.floor(x)) + rx, int(math.floor(y)) + ry) if inside else (False, 0, 0)
+    return (True, math.floor(x) + rx, math.floor(y) + ry) if inside else (False, 0, 0)
 
 
 @cache
 def _kernels(slanted: bool, kind: int, vx: int, vy: int):
     """Forward, adjoint and tangent for rays along z or of any direction, and a filter."""
-    bend, unbend, move = (
-        (bend_oblique, unbend_oblique, move_oblique) if slanted else (bend_axial, unbend_axial, move_axial)
-    )
+    bend, unbend, move = (bend_oblique, unbend_oblique, move_oblique) if slanted else (bend_axial, unbend_axial, move_axial)
     ray_rows, room = oblique.ROWS if slanted else 1, vy + -vy % 4
 
     @cuda.jit

@@ -29,8 +29,9 @@ VECTORS = splat.VECTORS + splat.SCRATCH
 def splat_rays(x: Tensor, y: Tensor, weight: Tensor, screen: Screen, filter: Filter) -> tuple[Tensor, Tensor]:
     """`kernels.splat.splat_rays` of tensors on the device."""
     (nx, ny), (rx, ry) = screen.resolution, filter.reach
-    sizes = (2 * rx + 1, 2 * ry + 1)
-    frame = Frame(int(nx), int(ny), *map(float, (*screen.low, *screen.pixel)), KINDS[filter.kind], *sizes, *map(float, filter.alpha))
+    (low_x, low_y), (wide_x, wide_y), (alpha_x, alpha_y) = (map(float, pair) for pair in (screen.low, screen.pixel, filter.alpha))
+    kernel = KINDS[filter.kind], 2 * rx + 1, 2 * ry + 1
+    frame = Frame(int(nx), int(ny), low_x, low_y, wide_x, wide_y, *kernel, alpha_x, alpha_y)
     padded, outside = _Splat.apply(x, y, weight, frame)
     padded = padded[:, : ny + 4 * ry]  # beyond lies what rounds the gather's steps up to four pixels
     return padded[2 * rx : 2 * rx + nx, 2 * ry : 2 * ry + ny], outside + padding(padded, filter.reach)
@@ -42,7 +43,7 @@ def lands(v, frame):
     rx, ry, low_x, low_y, high_x, high_y = limits(frame.pixels_x, frame.pixels_y, frame.size_x, frame.size_y)
     x, y = v[PX, 0], v[PY, 0]
     inside = x >= low_x and x < high_x and y >= low_y and y < high_y
-    return (True, int(math.floor(x)) + rx, int(math.floor(y)) + ry) if inside else (False, 0, 0)
+    return (True, math.floor(x) + rx, math.floor(y) + ry) if inside else (False, 0, 0)
 
 
 @cache

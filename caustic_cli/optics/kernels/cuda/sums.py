@@ -1,8 +1,8 @@
 """Sums that repeat bitwise, whatever order a device's threads add in: 64-bit fixed point.
 
-Sums of integers do not depend on their order, those of floating-point numbers do.  So a term x is added as the nearest whole number
-of units 2^-k, by the device's atomic addition of integers.  With a bound B >= sum |x| over all terms of any one sum, k is the largest
-for which
+Sums of integers do not depend on their order, those of floating-point numbers do.  So a term x is added as the nearest whole
+number of units 2^-k, by the device's atomic addition of integers.  With a bound B >= sum |x| over all terms of any one sum, k is
+the largest for which
 
     B 2^k <= 2^62,    and then    |sum| <= sum (|x| 2^k + 1/2) <= 2^62 + N / 2 < 2^63
 
@@ -35,7 +35,7 @@ def unit_of(bound: Tensor) -> Tensor:
 
 def units(x: float, unit: float) -> int:
     """A term in whole units; 0 for what no bound holds: NaN, or more than the bound, whose sum is NaN in any case."""
-    return int(math.floor(x * unit + 0.5)) if abs(x * unit) <= LARGEST else 0
+    return math.floor(x * unit + 0.5) if abs(x * unit) <= LARGEST else 0
 
 
 def value_of(total: Tensor, unit: Tensor) -> Tensor:

@@ -1,9 +1,11 @@
 """The height field on a CUDA device, at points and where rays meet it: differentiable functions of heights and rays.
 
 The functions of `kernels.surface` and `kernels.ray_intersections`, with their notation; formulas are in `kernels.spline`,
-`kernels.intersect` and `kernels.batches`.  Here each ray goes its own way, by the scalar functions of those files.  Derivatives by
-the polynomials' coefficients are sums over rays, in fixed point (`sums`): with |xi|, |eta| <= 1/2 no power of them and no derivative
-of a power exceeds 1, so that sum (|by_z| + |by_xi| + |by_eta|) bounds every one of them.
+`kernels.intersect` and `kernels.batches`.  Here each ray goes its own way, by the scalar functions of those files.
+
+Derivatives by the polynomials' coefficients are sums over rays, in fixed point (`sums`).  With |xi|, |eta| <= 1/2 no power of them
+and no derivative of a power exceeds 1, so that sum (|by_z| + |by_xi| + |by_eta|) bounds every one of them; where points lie beyond
+the surface, at most |xi| = x > 1/2 from the middle of a piece, powers reach max(x, 1)^p and their derivatives p times that.
 """
 
 from __future__ import annotations
@@ -27,6 +29,10 @@ piece, jet, push_powers, value_at = (device(f) for f in (spline.piece, spline.je
 meet_alone, beyond = device(batches.meet_alone), device(batches.beyond)
 pull_alone, push_alone = device(batches.pull_alone), device(batches.push_alone)
 enter_alone, units = device(ray_intersections.enter_alone), device(sums.units)
+
+
+#: What xi may be beyond 1/2 by rounding, for which the bound of sums has room.
+ROUNDING = 1e-3
 
 
 class Axis(NamedTuple):
@@ -56,6 +62,12 @@ class Axis(NamedTuple):
         for k in range(rows.shape[1]):
             out[self.control[:, k]] += rows[:, k]
         return out
+
+    def largest_power(self, at: Tensor) -> Tensor:
+        """() bound of powers of xi at points (N,) in [0, 1] or beyond, and of their derivatives."""
+        degree = self.matrices.shape[1] - 1
+        x = 0.5 + ((at - 0.5).abs().max() - 0.5).clamp(min=0.0) * self.inverse.max()
+        return torch.where(x > 0.5 + ROUNDING, degree * x.clamp(min=1.0) ** degree, torch.ones_like(x))
 
 
 class DeviceSurface:
@@ -88,7 +100,8 @@ class DeviceSurface:
         """Derivatives by the heights (n, m), from those by height and slopes at points in [0, 1]^2 of span products `where` (-1:
         none), all (N,)."""
         steep_x, steep_y = self.steepest
-        unit = sums.unit_of(by_z.abs().sum() + steep_x * by_x.abs().sum() + steep_y * by_y.abs().sum())
+        bound = by_z.abs().sum() + steep_x * by_x.abs().sum() + steep_y * by_y.abs().sum()
+        unit = sums.unit_of(bound * self.u.largest_power(u) * self.v.largest_power(v))
         shape = (len(self.u.control), len(self.v.control), self.u.control.shape[1], self.v.control.shape[1])
         total = torch.zeros(shape, dtype=torch.int64, device=u.device)
         start(_pull(*shape[2:]), len(u), (u, v, by_z, by_x, by_y), where, self.geometry, self.scale, unit, total)
