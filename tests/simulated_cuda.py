@@ -314,6 +314,22 @@ def test_plane_image(kind, launched, monkeypatch):
     check_trace(scene, field, heights, kind, FILTERS[:3], launched, monkeypatch)
 
 
+def test_plane_image_by_taylor(monkeypatch):
+    """The remainder of first order is of second: (f(h + e d) - f(h) - e <g, d>) / e^2 does not depend on e."""
+    monkeypatch.setenv("CAUSTIC_KERNELS", "cuda")
+    scene, field, heights = lens()
+    kernel = traced(scene, field, "lines", 200)(nullcontext)
+    kernel.filter, along = Filter("cosine", (5, 5)), numbers(5, *heights.shape)
+    by_image = numbers(6, *scene.screen.resolution)
+    leaf = heights.clone().requires_grad_()
+    image = kernel(leaf)[0]
+    slope = float((torch.autograd.grad((image * by_image).sum(), leaf)[0] * along).sum())
+    moved = (float(((kernel(heights + e * along)[0] - image.detach()) * by_image).sum()) for e in (2e-5, 1e-5))
+    remainders = [m - e * slope for m, e in zip(moved, (2e-5, 1e-5), strict=True)]
+    assert abs(remainders[0]) < 0.05 * abs(2e-5 * slope)
+    assert remainders[0] / remainders[1] == pytest.approx(4.0, rel=0.1)
+
+
 def test_plane_image_with_losses(launched, monkeypatch):
     """Total reflection, Fresnel losses and light beside the screen."""
     scene, field, heights = lens(bump=0.5)

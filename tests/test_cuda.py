@@ -122,6 +122,9 @@ def test_the_backend_of_a_device(kernels, name, monkeypatch):
     monkeypatch.setattr(backends, "_made", lambda name: name)
     assert backends.backend_for("cuda:0") == name
     assert backends.backend_for("cpu") == "numba"
+    monkeypatch.setenv("CAUSTIC_KERNELS", "cuda")  # without the simulator only of a device
+    monkeypatch.delenv("NUMBA_ENABLE_CUDASIM", raising=False)
+    assert (backends.backend_for("cpu"), backends.backend_for("cuda:0")) == ("numba", name)
     monkeypatch.setenv("CAUSTIC_KERNELS", "torch")
     assert backends.backend_for("cuda:0") == "torch"
 

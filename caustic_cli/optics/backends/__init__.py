@@ -32,7 +32,7 @@ def backend_for(device: torch.device | str):
     if kernels == "torch":
         return _made("torch")
     if torch.device(device).type == "cpu":
-        return _made("cuda" if kernels == "cuda" else "numba")
+        return _made("cuda" if kernels == "cuda" and os.environ.get("NUMBA_ENABLE_CUDASIM") == "1" else "numba")
     return _made("cuda" if cuda_kernels() else "torch")
 
 
@@ -40,9 +40,9 @@ def backend_for(device: torch.device | str):
 def cuda_kernels() -> bool:
     """Whether the kernels of a CUDA device can be compiled here: numba finds a device and a compiler for it, as the extra `cuda`
     brings one."""
-    from numba import cuda  # noqa: PLC0415
+    from numba import config, cuda  # noqa: PLC0415
 
-    return cuda.is_available()
+    return not config.ENABLE_CUDASIM and cuda.is_available()  # type: ignore[attr-defined]  # numba makes its settings as it is loaded
 
 
 @contextlib.contextmanager
