@@ -271,6 +271,16 @@ def test_surface_met_by_no_ray():
     assert all(float(g.abs().max()) == 0.0 for g in gradients(by[0], (heights,)))
 
 
+def test_surface_at_nothing_and_met_by_nothing():
+    _, field, heights = lens()
+    none = torch.zeros(0, dtype=torch.float64)
+    leaf = heights.clone().requires_grad_()
+    assert all(t.shape == (0,) for t in Cuda().spline_at(field, leaf, none, none))
+    assert Cuda().meet_spline(field, leaf, (none, none, none), (none, none, none), 1.0).found.shape == (0,)
+    image, outside = Cuda().splat(none, none, none, SCREEN, FILTERS[1])
+    assert float(image.abs().sum()) == float(outside) == 0.0
+
+
 # A whole trace by one kernel.
 
 

@@ -38,6 +38,8 @@ class Cuda(Torch):
 
     def spline_at(self, field, heights: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """As the reference."""
+        if not len(x):
+            return super().spline_at(field, heights, x, y)
         u, v = ((0.5 * (c.detach().double() / r + 1.0)).contiguous() for c, r in zip((x, y), field.half_size, strict=True))
         return surface_at(surface_of(field, u.device), heights, u, v)
 
@@ -45,6 +47,8 @@ class Cuda(Torch):
         """As the reference."""
         rays = [torch.as_tensor(c, dtype=torch.float64, device=heights.device) for c in (*origin, *direction)]
         ox, oy, oz, dx, dy, dz = torch.broadcast_tensors(*rays)
+        if not ox.numel():
+            return super().meet_spline(field, heights, origin, direction, side)
         surface = surface_of(field, heights.device)
         return SurfaceIntersection(*hits_of_rays(surface, heights, (ox, oy, oz), (dx, dy, dz), side=side))
 

@@ -9,6 +9,7 @@ the device's: that is how they are tested where there is no device.
 from __future__ import annotations
 
 import types
+import warnings
 from collections.abc import Callable
 from functools import cache
 
@@ -21,6 +22,9 @@ from torch import Tensor
 SIMULATED = bool(numba.config.ENABLE_CUDASIM)  # type: ignore[attr-defined]  # numba makes its settings as it is loaded
 #: Threads in a block, and most blocks: enough to fill the largest device several times over; few where each is a thread of Python.
 THREADS, BLOCKS = (8, 2) if SIMULATED else (128, 4096)
+# numba warns of every grid that leaves a device idle, as that of a few rays does.
+numba.config.CUDA_LOW_OCCUPANCY_WARNINGS = False  # type: ignore[attr-defined]  # as above
+warnings.filterwarnings("ignore", "Grid size .* will likely result in GPU under-utilization")
 
 
 class _Within:
