@@ -152,6 +152,7 @@ def test_the_benchmark_without_a_device():
     assert done.stderr.splitlines() == ["gpu.py: there is no CUDA device here, and no figure without one"]
 
 
+@pytest.mark.slow
 def test_the_benchmark_measures_iterations(monkeypatch, capsys):
     """What it would do on a device, on the CPU's kernels and a few rays: the table is complete, and both sides agree."""
     monkeypatch.syspath_prepend(str(HERE / "benchmarks"))
