@@ -143,7 +143,7 @@ What the command line says wins.
 The same for the options that most commands share.
 .TP
 .B CAUSTIC_KERNELS
-"torch" runs the plain-torch reference instead of the compiled kernels.
+"torch" runs the plain-torch reference instead of the compiled kernels, on a CUDA device too, where --dtype float32 counts then.
 .TP
 .B NUMBA_CACHE_DIR
 Directory to keep the compiled kernels in; default: caustic in XDG_CACHE_HOME or in ~/.cache. Where nothing can be written there, it

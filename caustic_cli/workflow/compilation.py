@@ -1,4 +1,5 @@
-"""The first run on a machine compiles the kernels: their parts side by side, in processes of their own.
+"""The device that traces, and its kernels.  The first run on a machine compiles the CPU's: their parts side by side, in processes
+of their own.
 
 What they have compiled they keep in `kernels.cache.DIRECTORY`, where this process finds it afterwards; what another has not
 compiled after all, it compiles itself.
@@ -13,9 +14,10 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from caustic_cli.errors import is_out_of_memory
-from caustic_cli.optics.backends import backend_for
+from caustic_cli.optics.backends import backend_for, cuda_kernels
 from caustic_cli.optics.effects import NO_REQUESTS, Requests
 from caustic_cli.optics.kernels import cache, functions, plane
 from caustic_cli.optics.trace import warm_up
@@ -26,6 +28,22 @@ from caustic_cli.workflow.reporter import Reporter
 PARTS = {"adjoint": 5.0, "transport": 5.5, "splat": 4.0, "surface": 2.8}
 #: Parts that call the same functions, and how much sooner they are compiled one after the other in one process, s.
 ALIKE, SAVED = {"adjoint", "splat"}, 2.2
+
+
+def choose_device(asked: str, say: Reporter) -> str:
+    """The device for auto, cpu or cuda, which is at hand: auto takes a CUDA device where torch finds one and numba its kernels."""
+    if asked == "cpu" or not torch.cuda.is_available():
+        return "cpu"
+    name, kernels = torch.cuda.get_device_name(), cuda_kernels()
+    if kernels:
+        say.say(f"tracing on {name}, by kernels")
+        return "cuda"
+    lacking = "numba has no kernels for it (pip install 'caustic-cli[cuda]' brings what they need)"
+    if asked == "auto":
+        say.say(f"tracing on the CPU: there is {name}, but {lacking}")
+        return "cpu"
+    say.say(f"tracing on {name} in plain torch: {lacking}")
+    return "cuda"
 
 
 def kept() -> bool:

@@ -7,8 +7,9 @@ Stages, each with its adjoint and tangent
     land                      to a plane
     splat                     onto pixels
 
-`reference.Torch` does every stage in plain torch, on any device; `cpu.Numba` does them by kernels.  No caller asks which it has.
-CAUSTIC_KERNELS=torch asks for the reference.
+`reference.Torch` does every stage in plain torch, on any device; `cpu.Numba` and `cuda.Cuda` do them by kernels.  No caller asks
+which it has.  CAUSTIC_KERNELS=torch asks for the reference; CAUSTIC_KERNELS=cuda for the device's kernels on a CPU too, in numba's
+simulator (NUMBA_ENABLE_CUDASIM=1), which is for tests.
 """
 
 from __future__ import annotations
@@ -22,13 +23,26 @@ from importlib import import_module
 import torch
 
 #: Name -> module and class, looked up when they are needed: they know surfaces, which know this, and numba is slow to load.
-BACKENDS = {"torch": ("reference", "Torch"), "numba": ("cpu", "Numba")}
+BACKENDS = {"torch": ("reference", "Torch"), "numba": ("cpu", "Numba"), "cuda": ("cuda", "Cuda")}
 
 
 def backend_for(device: torch.device | str):
     """The backend for tensors on `device`."""
-    plain = torch.device(device).type != "cpu" or os.environ.get("CAUSTIC_KERNELS", "") == "torch"
-    return _made("torch" if plain else "numba")
+    kernels = os.environ.get("CAUSTIC_KERNELS", "")
+    if kernels == "torch":
+        return _made("torch")
+    if torch.device(device).type == "cpu":
+        return _made("cuda" if kernels == "cuda" and os.environ.get("NUMBA_ENABLE_CUDASIM") == "1" else "numba")
+    return _made("cuda" if cuda_kernels() else "torch")
+
+
+@cache
+def cuda_kernels() -> bool:
+    """Whether the kernels of a CUDA device can be compiled here: numba finds a device and a compiler for it, as the extra `cuda`
+    brings one."""
+    from numba import config, cuda  # noqa: PLC0415
+
+    return not config.ENABLE_CUDASIM and cuda.is_available()  # type: ignore[attr-defined]  # numba makes its settings as it is loaded
 
 
 @contextlib.contextmanager

@@ -277,6 +277,27 @@ def _guess(ou, ov, oz, du, dv, dz, middle, thick, c, bu, mu, wu, bv, mv, wv):
     return t, piece(ou + t * du, bu), piece(ov + t * dv, bv)
 
 
+@njit(inline="always", **FAST)
+def meet_alone(ray, limits, slopes, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y):
+    """What `meet` finds of one ray, but for a circular aperture: status, span product (-1: none), reach, dz/dx, dz/dy."""
+    ou, ov, oz, du, dv, dz = ray
+    slope = slopes[0] * abs(du) + slopes[1] * abs(dv)
+    t, status = _root((ou, ov, oz, du, dv, dz), -1.0, limits, slope, c, bu, mu, wu, bv, mv, wv)
+    where, reach, gx, gy = -1, -1.0, 0.0, 0.0
+    if status == HIT:
+        u, v = ou + t * du, ov + t * dv
+        _, zu, zv = _value(c, u, v, bu, mu, wu, bv, mv, wv)
+        where, reach, gx, gy = piece(u, bu) * (len(bv) - 1) + piece(v, bv), t, zu * scale_x, zv * scale_y
+    return status, where, reach, gx, gy
+
+
+@njit(inline="always", **FAST)
+def beyond(ou, ov, du, dv, reach, round_, scale_x, scale_y):
+    """Whether a hit is farther from the axis than `round_`, mm."""
+    x, y = (ou - 0.5 + reach * du) / scale_x, (ov - 0.5 + reach * dv) / scale_y
+    return x * x + y * y > round_ * round_
+
+
 @njit(entry=True, **FAST)
 def meet(
     block,
@@ -416,19 +437,16 @@ def meet(
             lone += 1
         for k in range(lone):
             r = alone[k]
-            slope = slopes[0] * abs(du[r]) + slopes[1] * abs(dv[r])
-            t, status[r] = _root((ou[r], ov[r], oz[r], du[r], dv[r], dz[r]), -1.0, limits, slope, c, bu, mu, wu, bv, mv, wv)
-            met[to], where[to], reach[r], gx[r], gy[r] = r, -1, -1.0, 0.0, 0.0
-            if status[r] == HIT:
-                u, v = ou[r] + t * du[r], ov[r] + t * dv[r]
-                _, zu, zv = _value(c, u, v, bu, mu, wu, bv, mv, wv)
-                where[to], reach[r], gx[r], gy[r] = piece(u, bu) * wide + piece(v, bv), t, zu * scale_x, zv * scale_y
+            ray = (ou[r], ov[r], oz[r], du[r], dv[r], dz[r])
+            met[to] = r
+            status[r], where[to], reach[r], gx[r], gy[r] = meet_alone(
+                ray, limits, slopes, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y
+            )
             to += 1
         if round_ < np.inf:  # beyond a circular aperture there is the lens' side
             for k in range(first, last):
                 r = met[k]
-                x, y = (ou[r] - 0.5 + reach[r] * du[r]) / scale_x, (ov[r] - 0.5 + reach[r] * dv[r]) / scale_y
-                if status[r] == HIT and x * x + y * y > round_ * round_:
+                if status[r] == HIT and beyond(ou[r], ov[r], du[r], dv[r], reach[r], round_, scale_x, scale_y):
                     where[k], status[r], reach[r], gx[r], gy[r] = -1, MISSED, -1.0, 0.0, 0.0
         first = last
 
@@ -510,6 +528,32 @@ def _gather(table, p, q, total):
             total[a + 1, b + 1] += s5
             total[a + 1, b + 2] += s6
             total[a + 1, b + 3] += s7
+
+
+@njit(inline="always", **FAST)
+def pull_alone(c, i, j, xi, eta, wi, wj, by_t, by_u, by_v, direction, gx, gy, scale_x, scale_y):
+    """X, Y and L_Z of one ray in (u, v, z)-space; by_u, by_v: derivatives by Z_u and Z_v."""
+    du, dv, dz = direction
+    xx, xy, yy = curvatures(c, i, j, xi, eta)
+    xx, xy, yy = xx * wi * wi, xy * wi * wj, yy * wj * wj
+    by_x, by_y = by_u * xx + by_v * xy, by_u * xy + by_v * yy
+    cosine = max(dz - gx * du / scale_x - gy * dv / scale_y, LEAST_COSINE)
+    return by_x, by_y, (by_t + by_x * du + by_y * dv) / cosine
+
+
+@njit(inline="always", **FAST)
+def push_alone(c, i, j, xi, eta, wi, wj, change, move, direction, gx, gy, scale_x, scale_y):
+    """Tangents of distance and slopes of one ray.
+
+    change: those of Z, Z_xi and Z_eta at a fixed point; move: that of the point at fixed t, mm.
+    """
+    (z, z_xi, z_eta), (x, y, up), (du, dv, dz) = change, move, direction
+    uu, uv, vv = curvatures(c, i, j, xi, eta)
+    uu, uv, vv = uu * wi * wi, uv * wi * wj, vv * wj * wj
+    z += gx * x + gy * y - up
+    along = z / max(dz - gx * du / scale_x - gy * dv / scale_y, LEAST_COSINE)
+    u, v = x * scale_x + along * du, y * scale_y + along * dv
+    return along, (z_xi * wi + uu * u + uv * v) * scale_x, (z_eta * wj + uv * u + vv * v) * scale_y
 
 
 @njit(entry=True, **FAST)
@@ -602,12 +646,10 @@ def pull_back(
             for k in range(begin, end):
                 r = met[k]
                 xi, eta = (ou[r] + t[r] * du[r] - mi) * wi, (ov[r] + t[r] * dv[r] - mj) * wj
-                xx, xy, yy = curvatures(c, a, b, xi, eta)
-                xx, xy, yy = xx * wi * wi, xy * wi * wj, yy * wj * wj
                 by_u, by_v = by_gx[r] * scale_x, by_gy[r] * scale_y
-                by_x, by_y = by_u * xx + by_v * xy, by_u * xy + by_v * yy
-                cosine = max(dz[r] - gx[r] * du[r] / scale_x - gy[r] * dv[r] / scale_y, LEAST_COSINE)
-                by_z = (by_t[r] + by_x * du[r] + by_y * dv[r]) / cosine
+                by_x, by_y, by_z = pull_alone(
+                    c, a, b, xi, eta, wi, wj, by_t[r], by_u, by_v, (du[r], dv[r], dz[r]), gx[r], gy[r], scale_x, scale_y
+                )
                 if nets:
                     push_powers(grad, a, b, xi, eta, by_z, by_u * wi, by_v * wj, powers)
                 if starts:
@@ -725,15 +767,11 @@ def push(
             continue
         i, j = where[k] // wide, where[k] % wide
         xi, eta = (ou[r] + t[r] * du[r] - mu[i]) * wu[i], (ov[r] + t[r] * dv[r] - mv[j]) * wv[j]
-        uu, uv, vv = curvatures(c, i, j, xi, eta)
-        uu, uv, vv = uu * wu[i] * wu[i], uv * wu[i] * wv[j], vv * wv[j] * wv[j]
-        z, zu, zv, x, y = 0.0, 0.0, 0.0, 0.0, 0.0
+        by_net, move = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
         if nets:
-            z, zu, zv = jet(change, i, j, xi, eta)
+            by_net = jet(change, i, j, xi, eta)
         if moves:
-            x, y = move_x[r], move_y[r]
-            z += gx[r] * x + gy[r] * y - move_z[r]
-        along = z / max(dz[r] - gx[r] * du[r] / scale_x - gy[r] * dv[r] / scale_y, LEAST_COSINE)
-        u, v = x * scale_x + along * du[r], y * scale_y + along * dv[r]
-        out_t[r] = along
-        out_x[r], out_y[r] = (zu * wu[i] + uu * u + uv * v) * scale_x, (zv * wv[j] + uv * u + vv * v) * scale_y
+            move = (move_x[r], move_y[r], move_z[r])
+        out_t[r], out_x[r], out_y[r] = push_alone(
+            c, i, j, xi, eta, wu[i], wv[j], by_net, move, (du[r], dv[r], dz[r]), gx[r], gy[r], scale_x, scale_y
+        )

@@ -113,7 +113,8 @@ def _root(ray, start, limits, slope, c, bu, mu, wu, bv, mv, wv):
         closed = True
     t = start if start >= 0.0 else (0.5 * (z_low + z_high) - oz) / dz
     t = min(max(t, low), high)
-    size = max(abs(z_low), abs(z_high), abs(oz))
+    size = max(abs(z_low), abs(z_high))
+    size = max(size, abs(oz))
     close, narrow = FEW_ULP * size, FEW_ULP * max(high, size)
     for _ in range(MOST_STEPS):
         z, zu, zv = _value(c, ou + t * du, ov + t * dv, bu, mu, wu, bv, mv, wv)

@@ -29,18 +29,23 @@ def _m(v, j):
     return h, 2.0 * (v[DZ, j] - v[DX, j] * gx - v[DY, j] * gy) * h
 
 
+@njit(inline="always", **FAST)
+def reflect_batch(v, start, count, ray, t):
+    """A batch of `reflect`."""
+    for i in range(5):
+        load(ray[i], start, count, v[i])
+    for j in range(count):
+        _, m = _m(v, j)
+        v[BY_TX, j], v[BY_TY, j], v[BY_TZ, j] = v[DX, j] + m * v[GX, j], v[DY, j] + m * v[GY, j], v[DZ, j] - m
+    for i in range(3):
+        store(v[BY_TX + i], start, count, t[i])
+
+
 @njit(**FAST)
 def _reflect_some(begin, end, ray, t):
     v = np.empty((ROWS, BATCH))
     for start in range(begin, end, BATCH):
-        count = min(BATCH, end - start)
-        for i in range(5):
-            load(ray[i], start, count, v[i])
-        for j in range(count):
-            _, m = _m(v, j)
-            v[BY_TX, j], v[BY_TY, j], v[BY_TZ, j] = v[DX, j] + m * v[GX, j], v[DY, j] + m * v[GY, j], v[DZ, j] - m
-        for i in range(3):
-            store(v[BY_TX + i], start, count, t[i])
+        reflect_batch(v, start, min(BATCH, end - start), ray, t)
 
 
 @njit(entry=True, **FAST)
@@ -53,27 +58,32 @@ def reflect(block, ray, t, blocks):
     _reflect_some(block * count // blocks, (block + 1) * count // blocks, ray, t)
 
 
+@njit(inline="always", **FAST)
+def pull_batch(v, start, count, ray, given, out):
+    """A batch of `reflect_adjoint`."""
+    for i in range(5):
+        load(ray[i], start, count, v[i])
+    for i in range(3):
+        load(given[i], start, count, v[BY_TX + i])
+    for j in range(count):
+        (h, m), gx, gy, tx, ty = _m(v, j), v[GX, j], v[GY, j], v[BY_TX, j], v[BY_TY, j]
+        # t
+        by_m = gx * tx + gy * ty - v[BY_TZ, j]
+        # m
+        by_c, by_norm2 = 2.0 * h * by_m, -m * h * by_m
+        # d . N and |N|^2
+        v[BY_DX, j], v[BY_DY, j], v[BY_DZ, j] = tx - by_c * gx, ty - by_c * gy, v[BY_TZ, j] + by_c
+        v[BY_GX, j] = m * tx - by_c * v[DX, j] + 2.0 * gx * by_norm2
+        v[BY_GY, j] = m * ty - by_c * v[DY, j] + 2.0 * gy * by_norm2
+    for i in range(5):
+        store(v[BY_DX + i], start, count, out[i])
+
+
 @njit(**FAST)
 def _pull_some(begin, end, ray, given, out):
     v = np.empty((ROWS, BATCH))
     for start in range(begin, end, BATCH):
-        count = min(BATCH, end - start)
-        for i in range(5):
-            load(ray[i], start, count, v[i])
-        for i in range(3):
-            load(given[i], start, count, v[BY_TX + i])
-        for j in range(count):
-            (h, m), gx, gy, tx, ty = _m(v, j), v[GX, j], v[GY, j], v[BY_TX, j], v[BY_TY, j]
-            # t
-            by_m = gx * tx + gy * ty - v[BY_TZ, j]
-            # m
-            by_c, by_norm2 = 2.0 * h * by_m, -m * h * by_m
-            # d . N and |N|^2
-            v[BY_DX, j], v[BY_DY, j], v[BY_DZ, j] = tx - by_c * gx, ty - by_c * gy, v[BY_TZ, j] + by_c
-            v[BY_GX, j] = m * tx - by_c * v[DX, j] + 2.0 * gx * by_norm2
-            v[BY_GY, j] = m * ty - by_c * v[DY, j] + 2.0 * gy * by_norm2
-        for i in range(5):
-            store(v[BY_DX + i], start, count, out[i])
+        pull_batch(v, start, min(BATCH, end - start), ray, given, out)
 
 
 @njit(entry=True, **FAST)
@@ -85,23 +95,28 @@ def reflect_adjoint(block, ray, given, out, count, blocks):
     _pull_some(block * count // blocks, (block + 1) * count // blocks, ray, given, out)
 
 
+@njit(inline="always", **FAST)
+def push_batch(v, start, count, ray, along, out):
+    """A batch of `reflect_tangent`."""
+    for i in range(5):
+        load(ray[i], start, count, v[i])
+        load(along[i], start, count, v[BY_DX + i])
+    for j in range(count):
+        (h, m), gx, gy, ux, uy = _m(v, j), v[GX, j], v[GY, j], v[BY_GX, j], v[BY_GY, j]
+        d_c = v[BY_DZ, j] - v[BY_DX, j] * gx - v[BY_DY, j] * gy - v[DX, j] * ux - v[DY, j] * uy
+        d_m = 2.0 * h * (d_c - m * (gx * ux + gy * uy))
+        v[BY_TX, j] = v[BY_DX, j] + d_m * gx + m * ux
+        v[BY_TY, j] = v[BY_DY, j] + d_m * gy + m * uy
+        v[BY_TZ, j] = v[BY_DZ, j] - d_m
+    for i in range(3):
+        store(v[BY_TX + i], start, count, out[i])
+
+
 @njit(**FAST)
 def _push_some(begin, end, ray, along, out):
     v = np.empty((ROWS, BATCH))
     for start in range(begin, end, BATCH):
-        count = min(BATCH, end - start)
-        for i in range(5):
-            load(ray[i], start, count, v[i])
-            load(along[i], start, count, v[BY_DX + i])
-        for j in range(count):
-            (h, m), gx, gy, ux, uy = _m(v, j), v[GX, j], v[GY, j], v[BY_GX, j], v[BY_GY, j]
-            d_c = v[BY_DZ, j] - v[BY_DX, j] * gx - v[BY_DY, j] * gy - v[DX, j] * ux - v[DY, j] * uy
-            d_m = 2.0 * h * (d_c - m * (gx * ux + gy * uy))
-            v[BY_TX, j] = v[BY_DX, j] + d_m * gx + m * ux
-            v[BY_TY, j] = v[BY_DY, j] + d_m * gy + m * uy
-            v[BY_TZ, j] = v[BY_DZ, j] - d_m
-        for i in range(3):
-            store(v[BY_TX + i], start, count, out[i])
+        push_batch(v, start, min(BATCH, end - start), ray, along, out)
 
 
 @njit(entry=True, **FAST)

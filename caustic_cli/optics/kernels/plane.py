@@ -59,6 +59,16 @@ FRESNEL, REFLECTED, OFF_SCREEN, LEAVING, MISSED, COLUMNS = range(6)  # of the le
 
 
 @njit(inline="always", **FAST)
+def carry(v, exit_, frame):
+    """Powers and landing points of a row of rays along z, from SAG, GX, GY, FLUX, X and Y."""
+    n, height, fresnel = exit_.index, exit_.height, exit_.fresnel
+    powers(fresnel, v[GX], v[GY], v[FLUX], n, v[POWER])
+    reach(v[SAG], v[GX], v[GY], n, height, v[REACH])
+    landing(v[REACH], v[GX], v[X], frame.low_x, frame.pixel_x, v[PX])
+    landing(v[REACH], v[GY], v[Y], frame.low_y, frame.pixel_y, v[PY])
+
+
+@njit(inline="always", **FAST)
 def _bend(v, i, surface, rays, exit_, frame):
     """The surface, powers and landing points of row i, of rays along z."""
     (first, bu, du, net, net_x, net_y), (x, y, _, _, flux) = surface, rays
@@ -66,11 +76,7 @@ def _bend(v, i, surface, rays, exit_, frame):
     load(flux[i], v[FLUX])
     load(x[i], v[X])
     load(y[i], v[Y])
-    n, height, fresnel = exit_.index, exit_.height, exit_.fresnel
-    powers(fresnel, v[GX], v[GY], v[FLUX], n, v[POWER])
-    reach(v[SAG], v[GX], v[GY], n, height, v[REACH])
-    landing(v[REACH], v[GX], v[X], frame.low_x, frame.pixel_x, v[PX])
-    landing(v[REACH], v[GY], v[Y], frame.low_y, frame.pixel_y, v[PY])
+    carry(v, exit_, frame)
 
 
 @njit(inline="always", **FAST)
@@ -81,7 +87,7 @@ def _oblique(i, surface, rays):
 
 
 @njit(inline="always", **FAST)
-def _share(v, splat, sx, sy, dx, dy):
+def share(v, splat, sx, sy, dx, dy):
     """Shares of one row's rays among pixels, and their slopes unless dx and dy are empty."""
     scratch = v[VECTORS:]
     if splat.size_x > 1:
@@ -149,7 +155,7 @@ def _scatter(vectors, exit_, frame, splat, sx, sy, image, ledger, column):
 
 
 @njit(**FAST)
-def _gather(vectors, exit_, frame, splat, sx, sy, dx, dy, grad, grad_leaving, column, tilt):
+def gather(vectors, exit_, frame, splat, sx, sy, dx, dy, grad, grad_leaving, column, tilt):
     """Derivatives by each ray's power and pixel coordinates, from those by the padded image."""
     vx, vy, height, scale_x, scale_y = splat.size_x, splat.size_y, exit_.height, 1.0 / frame.pixel_x, 1.0 / frame.pixel_y
     rx, ry, low_x, low_y, high_x, high_y = limits(frame.pixels_x, frame.pixels_y, vx, vy)
@@ -294,7 +300,7 @@ def forward(
             _bend(v, i, surface, rays, exit_, frame)
         else:
             oblique_refraction.aim(v, _oblique(i, surface, rays), x[i], y[i], exit_, frame)
-        _share(v, splat, sx, sy, dx[:0], dy[:0])
+        share(v, splat, sx, sy, dx[:0], dy[:0])
         _scatter(v, exit_, frame, splat, sx, sy, images[block], ledgers[block], column)
 
 
@@ -370,8 +376,8 @@ def backward(
             _bend(v, i, surface, rays, exit_, frame)
         else:
             oblique_refraction.aim(v, _oblique(i, surface, rays), x[i], y[i], exit_, frame)
-        _share(v, splat, sx, sy, dx, dy)
-        _gather(v, exit_, frame, splat, sx, sy, dx, dy, grad, grad_leaving, column, tilt)
+        share(v, splat, sx, sy, dx, dy)
+        gather(v, exit_, frame, splat, sx, sy, dx, dy, grad, grad_leaving, column, tilt)
         if oblique is not None:
             oblique_refraction.pull(v, _oblique(i, surface, rays), exit_, nets[0, 0, i], nets[1, 0, i], nets[2, 0, i])
             continue
@@ -443,7 +449,7 @@ def tangent(
             _bend(v, i, surface, rays, exit_, frame)
         else:
             oblique_refraction.aim(v, _oblique(i, surface, rays), x[i], y[i], exit_, frame)
-        _share(v, splat, sx, sy, dx, dy)
+        share(v, splat, sx, sy, dx, dy)
         if oblique is not None:
             oblique_refraction.push(v, _oblique(i, surface, rays), (t_net[i], t_net_x[i], t_net_y[i]), exit_, frame)
         else:

@@ -11,6 +11,8 @@ and t is counted from o nevertheless.  The search and the derivatives are those 
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -68,6 +70,30 @@ def _stretch(o, d, first, last):
     return (first, last) if o >= 0.0 and o <= 1.0 else (np.inf, -np.inf)
 
 
+@njit(inline="always", **FAST)
+def enter_alone(ray, floor, circle, scale_x, scale_y):
+    """o_u, o_v, o_z and the way of one ray, as of `enter`."""
+    ou, ov, oz, du, dv, dz = ray
+    first, last = _stretch(ou, du, 0.0, np.inf)
+    first, last = _stretch(ov, dv, first, last)
+    if circle < np.inf:
+        x, y, dx, dy = (ou - 0.5) / scale_x, (ov - 0.5) / scale_y, du / scale_x, dv / scale_y
+        a, b, beyond = dx * dx + dy * dy, x * dx + y * dy, x * x + y * y - circle * circle
+        root = b * b - a * beyond
+        if root >= 0.0 and a > 0.0:  # the roots by sums without cancellation
+            far = -b - math.sqrt(root) if b > 0.0 else -b + math.sqrt(root)
+            one, two = far / a, beyond / far if far != 0.0 else 0.0
+            first, last = max(first, min(one, two)), min(last, max(one, two))
+        elif beyond > 0.0:
+            last = -np.inf
+    if not (first <= last and dz > 0.0):
+        return -1.0, ov, oz, 0.0
+    t = max(first, min((floor - oz) / dz, last))
+    if t > 0.0:
+        return min(max(ou + t * du, 0.0), 1.0), min(max(ov + t * dv, 0.0), 1.0), oz + t * dz, t
+    return ou, ov, oz, 0.0
+
+
 @njit(entry=True, **FAST)
 def enter(block, ou, ov, oz, du, dv, dz, floor, circle, scale_x, scale_y, way, blocks):
     """Take rays (N,) to where they enter the box, ou, ov, oz overwritten; way (N,): how far that is.
@@ -79,27 +105,8 @@ def enter(block, ou, ov, oz, du, dv, dz, floor, circle, scale_x, scale_y, way, b
         return
     count = len(ou)
     for k in range(block * count // blocks, (block + 1) * count // blocks):
-        first, last = _stretch(ou[k], du[k], 0.0, np.inf)
-        first, last = _stretch(ov[k], dv[k], first, last)
-        if circle < np.inf:
-            x, y, dx, dy = (ou[k] - 0.5) / scale_x, (ov[k] - 0.5) / scale_y, du[k] / scale_x, dv[k] / scale_y
-            a, b, beyond = dx * dx + dy * dy, x * dx + y * dy, x * x + y * y - circle * circle
-            root = b * b - a * beyond
-            if root >= 0.0 and a > 0.0:  # the roots by sums without cancellation
-                far = -b - np.sqrt(root) if b > 0.0 else -b + np.sqrt(root)
-                one, two = far / a, beyond / far if far != 0.0 else 0.0
-                first, last = max(first, min(one, two)), min(last, max(one, two))
-            elif beyond > 0.0:
-                last = -np.inf
-        way[k] = 0.0
-        if not (first <= last and dz[k] > 0.0):
-            ou[k] = -1.0
-            continue
-        t = max(first, min((floor - oz[k]) / dz[k], last))
-        if t > 0.0:
-            ou[k], ov[k] = min(max(ou[k] + t * du[k], 0.0), 1.0), min(max(ov[k] + t * dv[k], 0.0), 1.0)
-            oz[k] += t * dz[k]
-            way[k] = t
+        ray = (ou[k], ov[k], oz[k], du[k], dv[k], dz[k])
+        ou[k], ov[k], oz[k], way[k] = enter_alone(ray, floor, circle, scale_x, scale_y)
 
 
 def _rays(surface: FusedSurface, o, d) -> tuple[np.ndarray, ...]:

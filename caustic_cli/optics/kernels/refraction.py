@@ -118,25 +118,31 @@ def _prepare(v, count, surface):
     _reflectance(v, count, surface.eta, surface.fresnel)
 
 
+@njit(inline="always", **FAST)
+def refract_batch(v, start, count, ray, surface, t, after, passes):
+    """A batch of `refract`."""
+    eta = surface.eta
+    _load(ray, start, count, v)
+    _prepare(v, count, surface)
+    for j in range(count):
+        gamma = v[SIDE, j] * (1.0 - eta) * (1.0 + eta) / (v[S, j] + eta * v[C, j])
+        v[BY_TX, j] = eta * v[DX, j] - gamma * v[GX, j]
+        v[BY_TY, j] = eta * v[DY, j] - gamma * v[GY, j]
+        v[BY_TZ, j] = eta * v[DZ, j] + gamma
+        v[BY_AFTER, j] = v[P, j] * (1.0 - v[R, j]) if v[PASSES, j] > 0.0 else 0.0
+    for i in range(3):
+        store(v[BY_TX + i], start, count, t[i])
+    store(v[BY_AFTER], start, count, after)
+    batch = passes[start : start + count]
+    for j in range(count):
+        batch[j] = v[PASSES, j] > 0.0
+
+
 @njit(**FAST)
 def _refract_some(begin, end, ray, surface, t, after, passes):
-    v, eta = np.empty((ROWS, BATCH)), surface.eta
+    v = np.empty((ROWS, BATCH))
     for start in range(begin, end, BATCH):
-        count = min(BATCH, end - start)
-        _load(ray, start, count, v)
-        _prepare(v, count, surface)
-        for j in range(count):
-            gamma = v[SIDE, j] * (1.0 - eta) * (1.0 + eta) / (v[S, j] + eta * v[C, j])
-            v[BY_TX, j] = eta * v[DX, j] - gamma * v[GX, j]
-            v[BY_TY, j] = eta * v[DY, j] - gamma * v[GY, j]
-            v[BY_TZ, j] = eta * v[DZ, j] + gamma
-            v[BY_AFTER, j] = v[P, j] * (1.0 - v[R, j]) if v[PASSES, j] > 0.0 else 0.0
-        for i in range(3):
-            store(v[BY_TX + i], start, count, t[i])
-        store(v[BY_AFTER], start, count, after)
-        batch = passes[start : start + count]
-        for j in range(count):
-            batch[j] = v[PASSES, j] > 0.0
+        refract_batch(v, start, min(BATCH, end - start), ray, surface, t, after, passes)
 
 
 @njit(entry=True, **FAST)
@@ -200,20 +206,25 @@ def _pull_part(v, count):
         v[BY_GY, j] += v[DZ, j] * bx - v[DX, j] * bz
 
 
+@njit(inline="always", **FAST)
+def pull_batch(v, start, count, ray, surface, given, out):
+    """A batch of `refract_adjoint`."""
+    _load(ray, start, count, v)
+    for i in range(4):
+        load(given[i], start, count, v[BY_TX + i])
+    _prepare(v, count, surface)
+    _pull(v, count, surface.eta)
+    if surface.polarised:
+        _pull_part(v, count)
+    for i in range(9):
+        store(v[BY_DX + i], start, count, out[i])
+
+
 @njit(**FAST)
 def _pull_some(begin, end, ray, surface, given, out):
     v = np.empty((ROWS, BATCH))
     for start in range(begin, end, BATCH):
-        count = min(BATCH, end - start)
-        _load(ray, start, count, v)
-        for i in range(4):
-            load(given[i], start, count, v[BY_TX + i])
-        _prepare(v, count, surface)
-        _pull(v, count, surface.eta)
-        if surface.polarised:
-            _pull_part(v, count)
-        for i in range(9):
-            store(v[BY_DX + i], start, count, out[i])
+        pull_batch(v, start, min(BATCH, end - start), ray, surface, given, out)
 
 
 @njit(entry=True, **FAST)
@@ -256,18 +267,23 @@ def _push(v, count, eta, polarised):
         v[BY_AFTER, j] = passes * (v[BY_P, j] * (1.0 - v[R, j]) - v[P, j] * d_r)
 
 
+@njit(inline="always", **FAST)
+def push_batch(v, start, count, ray, surface, along, out):
+    """A batch of `refract_tangent`."""
+    _load(ray, start, count, v)
+    for i in range(9):
+        load(along[i], start, count, v[BY_DX + i])
+    _prepare(v, count, surface)
+    _push(v, count, surface.eta, surface.polarised)
+    for i in range(4):
+        store(v[BY_TX + i], start, count, out[i])
+
+
 @njit(**FAST)
 def _push_some(begin, end, ray, surface, along, out):
     v = np.empty((ROWS, BATCH))
     for start in range(begin, end, BATCH):
-        count = min(BATCH, end - start)
-        _load(ray, start, count, v)
-        for i in range(9):
-            load(along[i], start, count, v[BY_DX + i])
-        _prepare(v, count, surface)
-        _push(v, count, surface.eta, surface.polarised)
-        for i in range(4):
-            store(v[BY_TX + i], start, count, out[i])
+        push_batch(v, start, min(BATCH, end - start), ray, surface, along, out)
 
 
 @njit(entry=True, **FAST)

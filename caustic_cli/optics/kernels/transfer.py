@@ -82,21 +82,27 @@ def _path(ray, start, count, plane, v):
         v[K, j], v[OVER, j], v[ON_WAY, j] = k if on_way else 0.0, over, 1.0 if on_way else 0.0
 
 
+@njit(inline="always", **FAST)
+def land_batch(v, start, count, ray, plane, x, y, on_way):
+    """A batch of `_land`."""
+    px, py, pz, ax, ay, az, bx, by, bz, _, _, _, _ = plane
+    _path(ray, start, count, plane, v)
+    for j in range(count):
+        k = v[K, j]
+        rx, ry, rz = (v[OX, j] - px) + k * v[DX, j], (v[OY, j] - py) + k * v[DY, j], (v[OZ, j] - pz) + k * v[DZ, j]
+        v[X, j], v[Y, j] = rx * ax + ry * ay + rz * az, rx * bx + ry * by + rz * bz
+    store(v[X], start, count, x)
+    store(v[Y], start, count, y)
+    batch = on_way[start : start + count]
+    for j in range(count):
+        batch[j] = v[ON_WAY, j] > 0.0
+
+
 @njit(**FAST)
 def _land_some(begin, end, ray, plane, x, y, on_way):
-    v, (px, py, pz, ax, ay, az, bx, by, bz, _, _, _, _) = np.empty((ROWS, BATCH)), plane
+    v = np.empty((ROWS, BATCH))
     for start in range(begin, end, BATCH):
-        count = min(BATCH, end - start)
-        _path(ray, start, count, plane, v)
-        for j in range(count):
-            k = v[K, j]
-            rx, ry, rz = (v[OX, j] - px) + k * v[DX, j], (v[OY, j] - py) + k * v[DY, j], (v[OZ, j] - pz) + k * v[DZ, j]
-            v[X, j], v[Y, j] = rx * ax + ry * ay + rz * az, rx * bx + ry * by + rz * bz
-        store(v[X], start, count, x)
-        store(v[Y], start, count, y)
-        batch = on_way[start : start + count]
-        for j in range(count):
-            batch[j] = v[ON_WAY, j] > 0.0
+        land_batch(v, start, min(BATCH, end - start), ray, plane, x, y, on_way)
 
 
 @njit(entry=True, **FAST)
@@ -109,26 +115,32 @@ def _land(block, ray, plane, x, y, on_way, blocks):
     _land_some(block * count // blocks, (block + 1) * count // blocks, ray, plane, x, y, on_way)
 
 
+@njit(inline="always", **FAST)
+def pull_batch(v, start, count, ray, plane, given, out):
+    """A batch of `_land_adjoint`."""
+    _, _, _, ax, ay, az, bx, by, bz, nx, ny, nz, _ = plane
+    _path(ray, start, count, plane, v)
+    load(given[0], start, count, v[X])
+    load(given[1], start, count, v[Y])
+    for j in range(count):
+        k, x, y = v[K, j], v[X, j], v[Y, j]
+        # x and y
+        rx, ry, rz = x * ax + y * bx, x * ay + y * by, x * az + y * bz
+        # r
+        by_k = rx * v[DX, j] + ry * v[DY, j] + rz * v[DZ, j]
+        # k
+        by_away = by_k * v[OVER, j] if v[ON_WAY, j] > 0.0 else 0.0
+        v[BY_OX, j], v[BY_OY, j], v[BY_OZ, j] = rx - by_away * nx, ry - by_away * ny, rz - by_away * nz
+        v[BY_DX, j], v[BY_DY, j], v[BY_DZ, j] = k * v[BY_OX, j], k * v[BY_OY, j], k * v[BY_OZ, j]
+    for i in range(6):
+        store(v[BY_OX + i], start, count, out[i])
+
+
 @njit(**FAST)
 def _pull_some(begin, end, ray, plane, given, out):
-    v, (_, _, _, ax, ay, az, bx, by, bz, nx, ny, nz, _) = np.empty((ROWS, BATCH)), plane
+    v = np.empty((ROWS, BATCH))
     for start in range(begin, end, BATCH):
-        count = min(BATCH, end - start)
-        _path(ray, start, count, plane, v)
-        load(given[0], start, count, v[X])
-        load(given[1], start, count, v[Y])
-        for j in range(count):
-            k, x, y = v[K, j], v[X, j], v[Y, j]
-            # x and y
-            rx, ry, rz = x * ax + y * bx, x * ay + y * by, x * az + y * bz
-            # r
-            by_k = rx * v[DX, j] + ry * v[DY, j] + rz * v[DZ, j]
-            # k
-            by_away = by_k * v[OVER, j] if v[ON_WAY, j] > 0.0 else 0.0
-            v[BY_OX, j], v[BY_OY, j], v[BY_OZ, j] = rx - by_away * nx, ry - by_away * ny, rz - by_away * nz
-            v[BY_DX, j], v[BY_DY, j], v[BY_DZ, j] = k * v[BY_OX, j], k * v[BY_OY, j], k * v[BY_OZ, j]
-        for i in range(6):
-            store(v[BY_OX + i], start, count, out[i])
+        pull_batch(v, start, min(BATCH, end - start), ray, plane, given, out)
 
 
 @njit(entry=True, **FAST)
@@ -140,23 +152,29 @@ def _land_adjoint(block, ray, plane, given, out, count, blocks):
     _pull_some(block * count // blocks, (block + 1) * count // blocks, ray, plane, given, out)
 
 
+@njit(inline="always", **FAST)
+def push_batch(v, start, count, ray, plane, along, out):
+    """A batch of `_land_tangent`."""
+    _, _, _, ax, ay, az, bx, by, bz, nx, ny, nz, _ = plane
+    _path(ray, start, count, plane, v)
+    for i in range(6):
+        load(along[i], start, count, v[BY_OX + i])
+    for j in range(count):
+        k = v[K, j]
+        # the hit moves as the point at a fixed k does, and along d back into the plane
+        rx, ry, rz = v[BY_OX, j] + k * v[BY_DX, j], v[BY_OY, j] + k * v[BY_DY, j], v[BY_OZ, j] + k * v[BY_DZ, j]
+        d_k = -(rx * nx + ry * ny + rz * nz) * v[OVER, j] * v[ON_WAY, j]
+        rx, ry, rz = rx + d_k * v[DX, j], ry + d_k * v[DY, j], rz + d_k * v[DZ, j]
+        v[X, j], v[Y, j] = rx * ax + ry * ay + rz * az, rx * bx + ry * by + rz * bz
+    store(v[X], start, count, out[0])
+    store(v[Y], start, count, out[1])
+
+
 @njit(**FAST)
 def _push_some(begin, end, ray, plane, along, out):
-    v, (_, _, _, ax, ay, az, bx, by, bz, nx, ny, nz, _) = np.empty((ROWS, BATCH)), plane
+    v = np.empty((ROWS, BATCH))
     for start in range(begin, end, BATCH):
-        count = min(BATCH, end - start)
-        _path(ray, start, count, plane, v)
-        for i in range(6):
-            load(along[i], start, count, v[BY_OX + i])
-        for j in range(count):
-            k = v[K, j]
-            # the hit moves as the point at a fixed k does, and along d back into the plane
-            rx, ry, rz = v[BY_OX, j] + k * v[BY_DX, j], v[BY_OY, j] + k * v[BY_DY, j], v[BY_OZ, j] + k * v[BY_DZ, j]
-            d_k = -(rx * nx + ry * ny + rz * nz) * v[OVER, j] * v[ON_WAY, j]
-            rx, ry, rz = rx + d_k * v[DX, j], ry + d_k * v[DY, j], rz + d_k * v[DZ, j]
-            v[X, j], v[Y, j] = rx * ax + ry * ay + rz * az, rx * bx + ry * by + rz * bz
-        store(v[X], start, count, out[0])
-        store(v[Y], start, count, out[1])
+        push_batch(v, start, min(BATCH, end - start), ray, plane, along, out)
 
 
 @njit(entry=True, **FAST)

@@ -1,0 +1,131 @@
+"""Stages by kernels of a CUDA device: float64 whatever is asked, and every sum the same from run to run.
+
+What has no kernel here, or no rays, is done by the reference, on the device too.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from caustic_cli.optics.backends.reference import Torch
+from caustic_cli.optics.interface import Departure
+from caustic_cli.optics.kernels.cuda import rays as by_ray
+from caustic_cli.optics.kernels.cuda import sums
+from caustic_cli.optics.kernels.cuda.image import Light, expose
+from caustic_cli.optics.kernels.cuda.splat import splat_rays
+from caustic_cli.optics.kernels.cuda.surface import hits_of_rays, surface_at, surface_of
+from caustic_cli.optics.rays import RayState
+from caustic_cli.optics.reconstruction import Filter
+from caustic_cli.optics.sampling import Sample
+from caustic_cli.optics.surfaces.base import SurfaceIntersection
+from caustic_cli.scene import Screen
+
+
+class Cuda(Torch):
+    """See the package."""
+
+    name = "cuda"
+
+    def precision(self, dtype: torch.dtype) -> torch.dtype:
+        """float64."""
+        return torch.float64
+
+    def spline_on(self, field, sample: Sample, dtype: torch.dtype):
+        """As the reference."""
+        surface, u, v = surface_of(field, sample.u.device), *_points(sample)
+        return lambda sag: surface_at(surface, sag, u, v)
+
+    def spline_at(self, field, heights: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """As the reference."""
+        if not len(x):
+            return super().spline_at(field, heights, x, y)
+        u, v = ((0.5 * (c.detach().double() / r + 1.0)).contiguous() for c, r in zip((x, y), field.half_size, strict=True))
+        return surface_at(surface_of(field, u.device), heights, u, v)
+
+    def meet_spline(self, field, heights: Tensor, origin, direction, side: float) -> SurfaceIntersection:
+        """As the reference."""
+        rays = [torch.as_tensor(c, dtype=torch.float64, device=heights.device) for c in (*origin, *direction)]
+        ox, oy, oz, dx, dy, dz = torch.broadcast_tensors(*rays)
+        if not ox.numel():
+            return super().meet_spline(field, heights, origin, direction, side)
+        surface = surface_of(field, heights.device)
+        return SurfaceIntersection(*hits_of_rays(surface, heights, (ox, oy, oz), (dx, dy, dz), side=side))
+
+    def meet_fixed(self, field, origin, direction):
+        """As the reference."""
+        return lambda heights: self.meet_spline(field, heights, origin, direction, 1.0)
+
+    def interact(
+        self, direction, slopes, power: Tensor, *, eta: float, reflects: bool, fresnel: str, polarised=None, side: float = 1.0
+    ) -> Departure:
+        """As the reference, which does constant slopes and varying indices; the kernel tells the side by the sign of d . N."""
+        if not isinstance(slopes[0], Tensor) or isinstance(eta, Tensor):
+            return super().interact(
+                direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, polarised=polarised, side=side
+            )
+        return Departure(*by_ray.interact(direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, field=polarised))
+
+    def land(self, origin, direction, point, axes, forward: float) -> tuple[Tensor, Tensor, Tensor]:
+        """As the reference."""
+        return by_ray.land(origin, direction, point, axes, forward)
+
+    def splat(self, x: Tensor, y: Tensor, weight: Tensor, screen: Screen, filter: Filter) -> tuple[Tensor, Tensor]:
+        """As the reference."""
+        return splat_rays(x, y, weight, screen, filter)
+
+    def plane_image(self, field, rays: RayState, eta: float, fresnel: str, like: PlaneImage | None) -> PlaneImage:
+        """The fused kernel of a plane wave's rays on a B-spline: a function of heights, screen and filter."""
+        return PlaneImage(field, rays, eta, fresnel)
+
+    def ray_image(self, field, rays: RayState, eta: float, fresnel: str, radius: float | None, like: RayImage | None) -> RayImage:
+        """The fused kernel of any rays below a B-spline."""
+        return RayImage(field, rays, eta, fresnel, radius)
+
+
+def _points(sample: Sample) -> tuple[Tensor, Tensor]:
+    """u, v (N,) of all rays of a sample."""
+    u, v = (sample.u[:, None], sample.v[None, :]) if sample.tensor else (sample.u, sample.v)
+    u, v = (c.expand(sample.shape).reshape(-1).double().contiguous() for c in (u, v))
+    return u, v
+
+
+class PlaneImage:
+    """See `Cuda.plane_image`."""
+
+    def __init__(self, field, rays: RayState, eta: float, fresnel: str):
+        sample = rays.sample
+        assert sample is not None
+        self.u, self.v = _points(sample)
+        (rx, ry), none = field.half_size, self.u[:0]
+        power = rays.power.double().expand(sample.shape).reshape(-1).contiguous()
+        self.surface, self.interface = surface_of(field, self.u.device), (eta, fresnel)
+        self.light = Light((2.0 * self.u - 1.0) * rx, (2.0 * self.v - 1.0) * ry, (none, none), power, False)
+        self.unit = sums.unit_of(power.abs().sum())
+
+    def __call__(self, heights: Tensor, screen: Screen, filter: Filter) -> tuple[Tensor, Tensor, dict]:
+        """Image, power that leaves the surface, and what was lost there."""
+        middle = heights.detach().double().mean()
+        sag = surface_at(self.surface, heights - middle, self.u, self.v)
+        place = torch.stack([torch.zeros_like(middle), screen.z - middle])
+        return expose(sag, self.light, self.unit, place, *self.interface, screen, filter)
+
+
+class RayImage:
+    """See `Cuda.ray_image`."""
+
+    def __init__(self, field, rays: RayState, eta: float, fresnel: str, radius: float | None):
+        x, y, *direction = (c.double().contiguous() for c in rays.full((*rays.origin[:2], *rays.direction)))
+        self.surface, self.interface, self.radius = surface_of(field, x.device), (eta, fresnel), radius
+        self.z, self.direction, power = rays.origin[2] + rays.datum, direction, rays.power.double().contiguous()
+        self.light = Light(x, y, (direction[0], direction[1]), power, True)
+        self.unit = sums.unit_of(power.abs().sum())
+
+    def __call__(self, heights: Tensor, screen: Screen, filter: Filter) -> tuple[Tensor, Tensor, dict]:
+        """Image, power that leaves the surface, and what was lost there."""
+        origin = (self.light.x, self.light.y, torch.full_like(self.light.x, self.z))
+        t, gx, gy, found = hits_of_rays(self.surface, heights, origin, self.direction, radius=self.radius)
+        middle = heights.detach().double().mean()
+        place = torch.stack([self.z - middle, screen.z - middle])
+        hits = (torch.where(found, t, -torch.ones_like(t)), gx, gy)
+        return expose(hits, self.light, self.unit, place, *self.interface, screen, filter)

@@ -1,0 +1,325 @@
+"""Rays refracted at the exit, carried to the screen and splatted there, in one kernel of a CUDA device.
+
+The functions of `kernels.plane`, with their notation: what becomes of a ray and all that is differentiated come from there, from
+`axial_refraction` and from `oblique_refraction`, a row of one ray at a time.  A kernel is made for each filter, so that its loops
+over pixels have a known length.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple
+
+import torch
+from numba import cuda, float64, int64
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from caustic_cli.optics.kernels import axial_refraction, filter_weights, pixels, plane
+from caustic_cli.optics.kernels import oblique_refraction as oblique
+from caustic_cli.optics.kernels.arguments import Exit, Frame, Splat
+from caustic_cli.optics.kernels.axial_refraction import (
+    BY_POWER,
+    BY_PX,
+    BY_PY,
+    FLUX,
+    GX,
+    GY,
+    LEAN_X,
+    LEAN_Y,
+    OVER_X,
+    OVER_Y,
+    POWER,
+    PX,
+    PY,
+    SAG,
+    T_GX,
+    T_GY,
+    T_POWER,
+    T_SAG,
+    X,
+    Y,
+)
+from caustic_cli.optics.kernels.cuda import sums
+from caustic_cli.optics.kernels.cuda.launch import device, start
+from caustic_cli.optics.kernels.cuda.scatter import scatter, scatter_tangent, size_of_tangent, units
+from caustic_cli.optics.kernels.oblique_refraction import MISSED_POWER
+from caustic_cli.optics.kernels.plane import COLUMNS, FRESNEL, LEAVING, MISSED, OFF_SCREEN, REFLECTED
+from caustic_cli.optics.reconstruction import Filter, padding
+from caustic_cli.scene import Screen
+
+limits, share, gather = device(pixels.limits), device(plane.share), device(plane.gather)
+carry, pull_axial, push_axial = device(plane.carry), device(axial_refraction.pull), device(axial_refraction.push)
+aim_batch, pull_batch, push_oblique = device(oblique._aim), device(oblique._pull), device(oblique.push)
+VECTORS = axial_refraction.VECTORS + axial_refraction.SCRATCH
+
+
+class Setting(NamedTuple):
+    """What a kernel takes beside arrays: index and kind of Fresnel losses, as of an `Exit`, a `Frame`, and alpha of the filter."""
+
+    index: float  # type: ignore[assignment]  # nobody asks a `Setting` for the place of a value
+    fresnel: int
+    frame: Frame
+    alpha_x: float
+    alpha_y: float
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """Rays below the exit, (N,) each on the device: where they begin, mm, what of their directions lies across, and their powers.
+
+    oblique: whether they have a direction each; else all run along z, and `along` is empty.
+    """
+
+    x: Tensor
+    y: Tensor
+    along: tuple[Tensor, Tensor]
+    power: Tensor
+    oblique: bool
+
+    @property
+    def rays(self) -> tuple[Tensor, ...]:
+        """As the kernels take them."""
+        return (self.x, self.y, *self.along, self.power)
+
+
+@device
+def bend_axial(v, w, k, hits, rays, exit_, frame):
+    """Power and landing point of ray k, of rays along z, into the rows v."""
+    (sag, gx, gy), (x, y, _, _, power) = hits, rays
+    v[SAG, 0], v[GX, 0], v[GY, 0], v[X, 0], v[Y, 0], v[FLUX, 0] = sag[k], gx[k], gy[k], x[k], y[k], power[k]
+    carry(v, exit_, frame)
+
+
+@device
+def bend_oblique(v, w, k, hits, rays, exit_, frame):
+    """The same of rays of any direction, by rows w of their own."""
+    (t, gx, gy), (x, y, dx, dy, power) = hits, rays
+    w[oblique.REACH, 0], w[oblique.GX, 0], w[oblique.GY, 0] = t[k], gx[k], gy[k]
+    w[oblique.DX, 0], w[oblique.DY, 0], w[oblique.PART, 0] = dx[k], dy[k], power[k]
+    w[oblique.X, 0], w[oblique.Y, 0] = x[k], y[k]
+    aim_batch(w, 1, exit_, frame)
+    v[SAG, 0], v[POWER, 0], v[FLUX, 0] = w[oblique.OUT_SAG, 0], w[oblique.OUT_POWER, 0], power[k]
+    v[PX, 0], v[PY, 0] = w[oblique.OUT_PX, 0], w[oblique.OUT_PY, 0]
+
+
+@device
+def unbend_axial(v, w, exit_):
+    """Derivatives by the surface in T_SAG, T_GX, T_GY."""
+    pull_axial(v, exit_)
+
+
+@device
+def unbend_oblique(v, w, exit_):
+    """Derivatives by distance and slopes in T_SAG, T_GX, T_GY."""
+    w[oblique.OUT_SAG, 0], w[oblique.OUT_POWER, 0] = v[POWER, 0], v[BY_POWER, 0]
+    w[oblique.OUT_PX, 0], w[oblique.OUT_PY, 0] = v[BY_PX, 0], v[BY_PY, 0]
+    pull_batch(w, 1, exit_)
+    v[T_SAG, 0], v[T_GX, 0], v[T_GY, 0] = w[oblique.BY_REACH, 0], w[oblique.BY_GX, 0], w[oblique.BY_GY, 0]
+
+
+@device
+def move_axial(v, w, exit_, frame):
+    """Tangents of power and landing point in T_POWER, BY_PX, BY_PY, from T_SAG, T_GX, T_GY."""
+    push_axial(v, exit_, frame)
+
+
+@device
+def move_oblique(v, w, exit_, frame):
+    """The same from the tangents of distance and slopes."""
+    ray = (w[oblique.REACH], w[oblique.GX], w[oblique.GY], w[oblique.DX], w[oblique.DY])
+    push_oblique(v, ray, (v[T_SAG], v[T_GX], v[T_GY]), exit_, frame)
+
+
+@device
+def lands(v, frame, height, vx, vy):
+    """Whether a ray that leaves the lens reaches into the frame, and the first of its pixels; False for NaN too."""
+    rx, ry, low_x, low_y, high_x, high_y = limits(frame.pixels_x, frame.pixels_y, vx, vy)
+    x, y = v[PX, 0], v[PY, 0]
+    inside = x >= low_x and x < high_x and y >= low_y and y < high_y and height > v[SAG, 0]
+    return (True, math.floor(x) + rx, math.floor(y) + ry) if inside else (False, 0, 0)
+
+
+@cache
+def _kernels(slanted: bool, kind: int, vx: int, vy: int):
+    """Forward, adjoint and tangent for rays along z or of any direction, and a filter."""
+    bend, unbend, move = (bend_oblique, unbend_oblique, move_oblique) if slanted else (bend_axial, unbend_axial, move_axial)
+    ray_rows, room = oblique.ROWS if slanted else 1, vy + -vy % 4
+
+    @cuda.jit
+    def forward(hits, rays, setting, place, unit, image, ledger):
+        """Adds to `image` and `ledger`, both in units; place: start and height of an `Exit`."""
+        v, w = cuda.local.array((VECTORS, 1), float64), cuda.local.array((ray_rows, 1), float64)
+        sx, sy, none = (cuda.local.array((vx, 1), float64), cuda.local.array((vy, 1), float64), cuda.local.array((1, 1), float64))
+        own, block = cuda.local.array(COLUMNS, int64), cuda.shared.array(COLUMNS, int64)
+        exit_, frame = Exit(setting.index, setting.fresnel, place[0], place[1]), setting.frame
+        splat, scale = Splat(kind, vx, vy, setting.alpha_x, setting.alpha_y), unit[0]
+        for c in range(COLUMNS):
+            own[c] = 0
+        for c in range(cuda.threadIdx.x, COLUMNS, cuda.blockDim.x):
+            block[c] = 0
+        cuda.syncthreads()
+        for k in range(cuda.grid(1), len(rays[4]), cuda.gridsize(1)):
+            bend(v, w, k, hits, rays, exit_, frame)
+            emitted, weight = v[FLUX, 0], v[POWER, 0]
+            if weight < 0.0:
+                own[MISSED if weight == MISSED_POWER else REFLECTED] += units(emitted, scale)
+                continue
+            own[FRESNEL] += units(emitted - weight, scale)
+            own[LEAVING] += units(weight, scale)
+            inside, i, j = lands(v, frame, exit_.height, vx, vy)
+            if not inside:
+                own[OFF_SCREEN] += units(weight, scale)
+                continue
+            share(v, splat, sx, sy, none[:0], none[:0])
+            scatter(image, i, j, weight * v[OVER_X, 0] * v[OVER_Y, 0], sx, sy, scale)
+        for c in range(COLUMNS):
+            cuda.atomic.add(block, c, own[c])
+        cuda.syncthreads()
+        for c in range(cuda.threadIdx.x, COLUMNS, cuda.blockDim.x):
+            cuda.atomic.add(ledger, c, block[c])
+
+    @cuda.jit
+    def adjoint(hits, rays, setting, place, grad, by_leaving, out):
+        """Derivatives by distance (or sag) and slopes into `out`, from those by the padded image and the leaving power."""
+        v, w = cuda.local.array((VECTORS, 1), float64), cuda.local.array((ray_rows, 1), float64)
+        sx, dx = cuda.local.array((vx, 1), float64), cuda.local.array((vx, 1), float64)
+        sy, dy = cuda.local.array((vy, 1), float64), cuda.local.array((vy, 1), float64)
+        column, tilt = cuda.local.array(room, float64), cuda.local.array(room, float64)
+        exit_, frame = Exit(setting.index, setting.fresnel, place[0], place[1]), setting.frame
+        splat, (by_t, by_gx, by_gy) = Splat(kind, vx, vy, setting.alpha_x, setting.alpha_y), out
+        for b in range(room):
+            column[b], tilt[b] = 0.0, 0.0
+        for k in range(cuda.grid(1), len(rays[4]), cuda.gridsize(1)):
+            bend(v, w, k, hits, rays, exit_, frame)
+            share(v, splat, sx, sy, dx, dy)
+            gather(v, exit_, frame, splat, sx, sy, dx, dy, grad, by_leaving[0], column, tilt)
+            unbend(v, w, exit_)
+            by_t[k], by_gx[k], by_gy[k] = v[T_SAG, 0], v[T_GX, 0], v[T_GY, 0]
+
+    @cuda.jit
+    def tangent(hits, along, rays, setting, place, unit, sizes, image, leaving):
+        """Each ray's part of the bound into `sizes`; or, where that is empty, adds to `image` and `leaving` in units."""
+        v, w = cuda.local.array((VECTORS, 1), float64), cuda.local.array((ray_rows, 1), float64)
+        sx, dx = cuda.local.array((vx, 1), float64), cuda.local.array((vx, 1), float64)
+        sy, dy = cuda.local.array((vy, 1), float64), cuda.local.array((vy, 1), float64)
+        exit_, frame = Exit(setting.index, setting.fresnel, place[0], place[1]), setting.frame
+        splat, (d_t, d_gx, d_gy) = Splat(kind, vx, vy, setting.alpha_x, setting.alpha_y), along
+        for k in range(cuda.grid(1), len(rays[4]), cuda.gridsize(1)):
+            bend(v, w, k, hits, rays, exit_, frame)
+            v[T_SAG, 0], v[T_GX, 0], v[T_GY, 0] = d_t[k], d_gx[k], d_gy[k]
+            weight, size = v[POWER, 0], 0.0
+            if weight >= 0.0:
+                move(v, w, exit_, frame)
+                change = v[T_POWER, 0]
+                size = abs(change)
+                if not len(sizes):
+                    cuda.atomic.add(leaving, 0, units(change, unit[0]))
+                inside, i, j = lands(v, frame, exit_.height, vx, vy)
+                if inside:
+                    share(v, splat, sx, sy, dx, dy)
+                    over = v[OVER_X, 0] * v[OVER_Y, 0]
+                    move_x, move_y = over * weight * v[BY_PX, 0], over * weight * v[BY_PY, 0]
+                    change = over * change - move_x * v[LEAN_X, 0] - move_y * v[LEAN_Y, 0]
+                    if len(sizes):
+                        size += size_of_tangent(change, move_x, move_y, sx, sy, dx, dy)
+                    else:
+                        scatter_tangent(image, i, j, change, move_x, move_y, sx, sy, dx, dy, unit[0])
+            if len(sizes):
+                sizes[k] = size
+
+    return forward, adjoint, tangent
+
+
+class Splatting(NamedTuple):
+    """Everything but the hits: light, its sums' unit, start and height of the `Exit` (2,), the kernels and what they take."""
+
+    light: Light
+    unit: Tensor
+    place: Tensor
+    setting: Setting
+    kernels: tuple
+    shape: tuple[int, int]
+
+
+def expose(
+    hits, light: Light, unit: Tensor, place: Tensor, eta: float, fresnel: str, screen: Screen, filter: Filter
+) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+    """The image of rays, from where they meet the exit.
+
+    Args:
+        hits: distances along the rays to their hits, mm, -1 for none, or for rays along z the sag; dz/dx and dz/dy there; (N,).
+        unit: of sums of the light's powers, see `sums`.
+        place: (2,) float64 on the device, the heights where oblique rays begin and of the screen, above the zero of the sag, mm.
+
+    Returns:
+        image (n_x, n_y) and the power leaving the lens (), float64, differentiable; what was lost, by name.
+    """
+    (nx, ny), (rx, ry) = screen.resolution, filter.reach
+    vx, vy, kind = 2 * rx + 1, 2 * ry + 1, filter_weights.KINDS[filter.kind]
+    frame = Frame(int(nx), int(ny), *map(float, screen.low), *map(float, screen.pixel))
+    setting = Setting(float(eta), axial_refraction.FRESNEL[fresnel], frame, *map(float, filter.alpha))
+    shape = (nx + 4 * rx, ny + 4 * ry + -vy % 4)  # with room for the gather's steps of four pixels
+    how = Splatting(light, unit, place, setting, _kernels(light.oblique, kind, vx, vy), shape)
+    padded, leaving, ledger = _Image.apply(*hits, how)
+    padded = padded[:, : ny + 4 * ry]
+    lost = {"missed_surface": ledger[MISSED]} if light.oblique else {}
+    lost |= {"fresnel": ledger[FRESNEL], "total_internal_reflection": ledger[REFLECTED]}
+    lost["off_screen"] = ledger[OFF_SCREEN] + padding(padded.detach(), filter.reach)
+    return padded[2 * rx : 2 * rx + nx, 2 * ry : 2 * ry + ny], leaving, lost
+
+
+class _Image(torch.autograd.Function):
+    """Distance (or sag) and slopes -> padded image, power leaving the lens (), ledger."""
+
+    @staticmethod
+    def forward(t: Tensor, gx: Tensor, gy: Tensor, how: Splatting):
+        image = torch.zeros(how.shape, dtype=torch.int64, device=t.device)
+        ledger = torch.zeros(COLUMNS, dtype=torch.int64, device=t.device)
+        hits = tuple(c.detach().contiguous() for c in (t, gx, gy))
+        start(how.kernels[0], len(t), hits, how.light.rays, how.setting, how.place, how.unit, image, ledger)
+        ledger = sums.value_of(ledger, how.unit)
+        return sums.value_of(image, how.unit), ledger[LEAVING].clone(), ledger
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        *hits, ctx.how = inputs
+        ctx.save_for_backward(*hits)
+        ctx.save_for_forward(*hits)
+        ctx.mark_non_differentiable(output[2])
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, by_image, by_leaving, _):
+        hits, how = tuple(c.contiguous() for c in ctx.saved_tensors), ctx.how
+        out = tuple(torch.empty_like(hits[0]) for _ in range(3))
+        grad, by = by_image.contiguous(), by_leaving.reshape(1)
+        start(how.kernels[1], len(hits[0]), hits, how.light.rays, how.setting, how.place, grad, by, out)
+        return *out, None
+
+    @staticmethod
+    def jvp(ctx, *along):
+        hits = ctx.saved_tensors
+        moves = (torch.zeros_like(h) if a is None else a for h, a in zip(hits, along[:3], strict=True))
+        return *_Pushed.apply(ctx.how, *(v.detach() for v in (*hits, *moves))), None
+
+
+class _Pushed(torch.autograd.Function):
+    """The tangent of `_Image`, a function of its own because within torch.func a tensor's numbers are within reach only there."""
+
+    @staticmethod
+    def forward(how: Splatting, *values):
+        hits, along = (tuple(v.contiguous() for v in part) for part in (values[:3], values[3:]))
+        image = torch.zeros(how.shape, dtype=torch.int64, device=hits[0].device)
+        sizes, leaving = torch.zeros_like(hits[0]), image.new_zeros(1)
+        given = (hits, along, how.light.rays, how.setting, how.place)
+        start(how.kernels[2], len(sizes), *given, how.unit, sizes, image, leaving)
+        unit = sums.unit_of(sizes.sum())
+        start(how.kernels[2], len(sizes), *given, unit, sizes[:0], image, leaving)
+        return sums.value_of(image, unit), sums.value_of(leaving, unit)[0].clone()
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        pass
