@@ -7,6 +7,7 @@ Everything that does not depend on the heights (basis matrices, filtered target,
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -118,6 +119,15 @@ class Objective:
                 self.kept = list(self._tracers())
             except (MemoryError, RuntimeError) as error:
                 self.chunk = smaller(self.chunk, error)
+
+    def moved(self, scene: Scene, rays: Rays | None = None) -> Objective:
+        """The same in a scene whose screen stands elsewhere; with `rays`, those of its source, where that does too."""
+        other = copy.copy(self)
+        other.scene, other.screen = scene, replace(self.screen, z=scene.screen.z)
+        if rays is not None:
+            other.samplers = [rays]
+            other.kept = None if self.kept is None else list(other._tracers())
+        return other
 
     @property
     def whole(self) -> bool:
