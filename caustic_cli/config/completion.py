@@ -56,6 +56,7 @@ from caustic_cli.scene.tolerances import Tolerances
 DEFAULT_RESOLUTION = 250
 DEFAULT_SPANS = 128  # knot spans of the finished net; 128 halve evenly through the stages
 NETWORK_CONTROL = 50  # table D.2
+OVER_WIDTH = 32  # neurons a layer of a network over a range: caustic convergence, study design, networks
 RAYS_PER_PIXEL = 9.0  # 750 x 750 rays on 250 x 250 pixels, tables D.1 and D.2
 DRAFT_SECONDS, FINE_SECONDS = 8.0, 60.0  # time limits below and from which another quality is the better use of the time
 STEEPEST = 1.25  # least radius of a derived sphere, in half diagonals of the lens: slopes up to 1.3
@@ -212,6 +213,8 @@ def _complete_over(over: Ranges, s: Settings, given: Settings) -> None:
         design["initial"] = "zero-last"
     if design["network"] != "none":
         design.setdefault("preconditioner", "laplacian")
+    if design["network"] == "dense":
+        design.setdefault("network_width", OVER_WIDTH)
 
 
 def first_thickness(size: Sequence[float]) -> float:
@@ -354,7 +357,8 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
     fine_net = "control" not in lens or min(n - p for n, p in zip(lens["control"], degree, strict=True)) >= LEAST_SPANS
     fine_net = fine_net or max(array) > 1  # whose lenslets have to be solved for
     spread = plain and fine_net and not source.sharp and _shifts(s, source)
-    design.setdefault("start", "transport" if "second" in s or (plain and fine_net and not source.apart) else "offset")
+    counted = plain or (design["network"] != "none" and design.get("preconditioner") == "laplacian")  # from any first surface
+    design.setdefault("start", "transport" if "second" in s or (counted and fine_net and not source.apart) else "offset")
     if design["start"] != "offset" and design["network"] != "none" and design.get("preconditioner") != "laplacian":
         raise InputError(
             f"⟨design.start⟩ {design['start']} gives a surface, which a network can begin from only with"
@@ -376,7 +380,8 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
     moved = plain and fine_net and design["start"] != "offset" and (source.sharp or spread or max(array) > 1)
     if "control" not in lens:
         spans = refinement_spans(max(screen["resolution"]), quality) if moved else DEFAULT_SPANS
-        lens["control"] = [spans + p for p in degree] if design["network"] == "none" else [NETWORK_CONTROL] * 2
+        of_network = [DEFAULT_SPANS + p for p in degree] if value_of(design, "design.over") else [NETWORK_CONTROL] * 2
+        lens["control"] = [spans + p for p in degree] if design["network"] == "none" else of_network
         lens["control"] = _of_array(lens["control"], degree, array)
     elif (fits := _of_array(lens["control"], degree, array)) != list(lens["control"]):
         raise InputError(

@@ -284,9 +284,9 @@ _ROWS = (
     Setting("design.over", "text", "ranges over which a network is trained, which takes their values as inputs and so gives a lens"
             " for each: throw, source.x, source.y, source.z = LOW:HIGH, parted by commas", "mm", default="", written=False,
             option=Option("--over", "KEY=LOW:HIGH[,...]")),
-    Setting("design.initial", "text", "parameters at first: zero, uniform (+-1e-4), random, or zero-last (random but for a network's"
-            " last layer, which is zero: it begins at its first surface)", choices=("zero", "uniform", "random", "zero-last"),
-            default="zero"),
+    Setting("design.initial", "text", "parameters at first: zero, uniform (+-1e-4), random, or zero-last (random but for the last"
+            " layer of a network, which is zero: it begins at its first surface)",
+            choices=("zero", "uniform", "random", "zero-last"), default="zero"),
     Setting("design.preconditioner", "text", "none or laplacian", choices=("none", "laplacian"),
             derived="laplacian of heights by lbfgs, and of a network trained over a range",
             option=Option("--preconditioner", "none|laplacian")),

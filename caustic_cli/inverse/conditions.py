@@ -113,7 +113,8 @@ class Ranges:
     def scaled(self, values: Sequence[Sequence[float]] | np.ndarray) -> Tensor:
         """Rows of values (k, d), mm, as the network's inputs (k, d) in [-1, 1], float64."""
         low, high = (np.array([getattr(one, end) for one in self.each]) for end in ("low", "high"))
-        return torch.from_numpy((2.0 * np.asarray(values, dtype=np.float64) - low - high) / (high - low))
+        width = np.where(high > low, high - low, 1.0)  # of a range of one value, whose input is 0
+        return torch.from_numpy((2.0 * np.asarray(values, dtype=np.float64) - low - high) / width)
 
     def drawn(self, seed: int, iteration: int, count: int) -> np.ndarray:
         """Values (count, d) of one iteration: a Latin hypercube, one in each of `count` equal parts of every range."""

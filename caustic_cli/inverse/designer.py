@@ -75,7 +75,7 @@ class Options:
     min_radius: float = 0.0
     waves: bool = False
     robust: Tolerances | None = None
-    architecture: Architecture = Architecture()
+    architecture: Architecture = field(default_factory=Architecture)
     over: Ranges | None = None
     inputs: bool = True
 
@@ -363,17 +363,20 @@ class Designer:
             expected = best_light(scene, grey(self.target.cpu().numpy()), spread, SMOOTH_STEPS).kept
             scene, rays, spread = regular_rays(scene, spread, stage, stream(o.seed, f"stage {k}"), self.device)
         else:
-            found = self._on_rays(scene, k, self.field(k), self.target, stage.rays)
-            return found if o.over is None else RangeObjective(found, o.over, lambda s: self._rays(s, k, stage.rays), self._seed(k))
+            found: AnyObjective = self._on_rays(scene, k, self.field(k), self.target, stage.rays)
+            return (
+                found
+                if o.over is None
+                else RangeObjective(
+                    found, o.over, lambda s, seed: rays_of(s, stage.sampler, stage.rays, seed, self.device), self._seed(k)
+                )
+            )
         return self._traced(scene, k, self.field(k), self.target, rays, spread, expected)
 
     def _on_rays(self, scene: Scene, k: int, field: HeightField, target: Tensor, count: int) -> Objective:
         """That of stage k by so many rays of a scene's whole source."""
-        return self._traced(scene, k, field, target, self._rays(scene, k, count), (), 1.0)
-
-    def _rays(self, scene: Scene, k: int, count: int) -> Rays:
-        """So many rays of a scene for stage k."""
-        return rays_of(scene, self.stages[k].sampler, count, self._seed(k), self.device)
+        rays = rays_of(scene, self.stages[k].sampler, count, self._seed(k), self.device)
+        return self._traced(scene, k, field, target, rays, (), 1.0)
 
     def _seed(self, k: int) -> int:
         """Of all random numbers of stage k."""

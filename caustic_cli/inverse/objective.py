@@ -120,13 +120,11 @@ class Objective:
             except (MemoryError, RuntimeError) as error:
                 self.chunk = smaller(self.chunk, error)
 
-    def moved(self, scene: Scene, rays: Rays | None = None) -> Objective:
-        """The same in a scene whose screen stands elsewhere; with `rays`, those of its source, where that does too."""
+    def moved(self, scene: Scene, rays: Rays) -> Objective:
+        """The same in a scene whose screen or source stands elsewhere, by other rays; the target is not filtered anew."""
         other = copy.copy(self)
-        other.scene, other.screen = scene, replace(self.screen, z=scene.screen.z)
-        if rays is not None:
-            other.samplers = [rays]
-            other.kept = None if self.kept is None else list(other._tracers())
+        other.scene, other.screen, other.samplers = scene, replace(self.screen, z=scene.screen.z), [rays]
+        other.kept = None if self.kept is None else list(other._tracers())
         return other
 
     @property
