@@ -50,7 +50,7 @@ def run(
         bool,
         typer.Option(
             "--networks",
-            help="Of design: a grid of networks instead, by layers, width, activation, learning rate and preconditioner, all trained"
+            help="Of design: a grid of networks, by layers, width, activation, learning rate and preconditioner, all trained"
             " alike; of a project designed --over a range, over that, beside one lens for all of it and a network for each value.",
         ),
     ] = False,

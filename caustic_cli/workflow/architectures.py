@@ -25,7 +25,8 @@ from caustic_cli.workflow.comparison import disc
 from caustic_cli.workflow.design import first_heights
 
 #: The grid: hidden layers, neurons in each, activations, learning rates, and what the outputs are.
-LAYERS, WIDTHS, ACTIVATIONS, RATES, OUTPUTS = (1, 2, 3), (16, 64, 256), ("tanh", "silu"), (1e-3, 3e-3), ("none", "laplacian")
+LAYERS, WIDTHS, ACTIVATIONS, RATES = (1, 2, 3), (16, 128), ("tanh", "silu"), (3e-4, 1e-3, 3e-3)
+OUTPUTS = ("none", "laplacian")
 #: Without a project: pixels across the screen, and control points.
 PIXELS, CONTROL = 48, 35
 #: Rays of a retrace per pixel.
@@ -90,7 +91,7 @@ def candidates(
 ) -> list[Candidate]:
     """The grid for a project's picture and scene, or without one for a bright disc; and what it is compared with.
 
-    Of a project whose network is trained over a range, all are, from its own first surface with its own preconditioner and rate;
+    Of a project whose network is trained over a range, all are, from its own first surface with its activation and preconditioner;
     beside them stand the same network without inputs, which is one lens for the whole range, and one for each value alone.  Of any
     other, networks begin at the offset surface, and heights by Adam stand beside them.
 
@@ -132,8 +133,8 @@ def candidates(
         return Candidate(about, designers, first, target, count, base.seed)
 
     over, found = own.over, []
-    outputs = OUTPUTS if over is None else (own.preconditioner,)
-    for output, lr, act, layers, width in itertools.product(outputs, RATES, ACTIVATIONS, LAYERS, WIDTHS):
+    outputs, activations = (OUTPUTS, ACTIVATIONS) if over is None else ((own.preconditioner,), (own.architecture.activation,))
+    for output, lr, act, layers, width in itertools.product(outputs, RATES, activations, LAYERS, WIDTHS):
         options = replace(
             base, network="dense", initial="zero-last", preconditioner=output, lr=lr, architecture=Architecture(layers, width, act)
         )
