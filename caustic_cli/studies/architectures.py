@@ -110,7 +110,8 @@ def run_architectures(
         "threads": torch.get_num_threads(),
         "reference_error": 0.0,
     }
-    return Study("networks", COLUMNS, rows, {}, _advice(rows), made | (about or {}), "seconds", PLOTS)
+    advice = _advice(rows) + (f"; {len(failed)} of {len(candidates)} could not be trained" if failed else "")
+    return Study("networks", COLUMNS, rows, {}, advice, made | (about or {}), "seconds", PLOTS)
 
 
 def last_round(rows: Sequence[dict]) -> list[dict]:
@@ -130,10 +131,9 @@ def _advice(rows: Sequence[dict]) -> str:
         if len(of) > 1:
             listed = ", ".join(f"{value} {of[value]:.3g}" for value in sorted(of, key=lambda value: of[value]))
             parts.append(f"by {key} at best {listed}")
-    for name, words in (("none", "no network"),):
-        free = [row["error"] for row in rows if row["network"] == name]
-        if free:
-            parts.append(f"{words} {min(free):.3g}")
+    free = [row["error"] for row in rows if row["network"] == "none"]
+    if free:
+        parts.append(f"no network {min(free):.3g}")
     for name, words in (("none", "one lens for the whole range"), ("alone", "networks for each value alone")):
         of_range = [row["error"] for row in rows if row["inputs"] == name]
         if of_range:
@@ -160,8 +160,8 @@ def draw_architectures(study: Study, figure: Figure) -> None:
                 ]
                 mine.sort(key=lambda row: row["width"])
                 axes.errorbar([row["width"] for row in mine], [row["error"] for row in mine], label=name, **style)
-            for row, line_style in zip(_beside(rows, preconditioner, lr), ("--", ":", "-."), strict=False):
-                axes.axhline(row["error"], color="black", linewidth=0.9, linestyle=line_style, label=row["series"].split(",")[0])
+            for row, dashes in zip(_beside(rows, preconditioner), ("--", ":"), strict=False):
+                axes.axhline(row["error"], color="black", linewidth=0.9, linestyle=dashes, label=row["series"].split(",")[0])
             axes.set(xscale="log", yscale="log", title=f"preconditioner {preconditioner}, lr {lr:g}")
             axes.title.set_fontsize("medium")
             axes.set_xticks(sorted({row["width"] for row in grid}), labels=[f"{n}" for n in sorted({row["width"] for row in grid})])
@@ -170,7 +170,8 @@ def draw_architectures(study: Study, figure: Figure) -> None:
             plain_ticks(axes.yaxis)
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize="small")
-    figure.supxlabel("neurons in each hidden layer", fontsize="medium")
+    for axes in panels[-1]:
+        axes.set_xlabel("neurons in each hidden layer")
     figure.supylabel(f"relative RMS of the retraced image, {rows[0]['iterations']} iterations", fontsize="medium")
 
 
@@ -178,14 +179,11 @@ def _layers(n: int) -> str:
     return f"{n} layer{'s' if n > 1 else ''}"
 
 
-def _beside(rows: Sequence[dict], preconditioner: str, lr: float) -> list[dict]:
-    """What a panel's networks are compared with: no network trained alike, and the other ways to be trained over a range."""
-    return [
-        row
-        for row in rows
-        if (row["network"] == "none" and (row["preconditioner"], row["lr"]) == (preconditioner, lr))
-        or row["inputs"] in ("none", "alone")
-    ]
+def _beside(rows: Sequence[dict], preconditioner: str) -> list[dict]:
+    """What networks are compared with: no network, at its best learning rate, and the other ways to be trained over a range."""
+    free = [row for row in rows if row["network"] == "none" and row["preconditioner"] == preconditioner]
+    best = [min(free, key=lambda row: row["error"])] if free else []
+    return best + [row for row in rows if row["inputs"] in ("none", "alone")]
 
 
 #: Endings of the pictures' names, and what draws them.

@@ -25,8 +25,10 @@ from caustic_cli.workflow.comparison import disc
 from caustic_cli.workflow.design import first_heights
 
 #: The grid: hidden layers, neurons in each, activations, learning rates, and what the outputs are.
-LAYERS, WIDTHS, ACTIVATIONS, RATES = (1, 2, 3), (16, 128), ("tanh", "silu"), (3e-4, 1e-3, 3e-3)
+LAYERS, WIDTHS, ACTIVATIONS, RATES = (1, 2, 3), (16, 64, 256), ("tanh", "silu"), (3e-4, 1e-3, 3e-3)
 OUTPUTS = ("none", "laplacian")
+#: Learning rates of the heights themselves, which a step moves by as much and no more.
+FREE_RATES = (1e-3, 1e-2, 1e-1)
 #: Without a project: pixels across the screen, and control points.
 PIXELS, CONTROL = 48, 35
 #: Rays of a retrace per pixel.
@@ -140,7 +142,7 @@ def candidates(
         )
         found.append(made(f"{layers} x {width} {act}", options, "" if over is None else "range"))
     if over is None:
-        for output, lr in itertools.product(OUTPUTS, RATES):
+        for output, lr in itertools.product(OUTPUTS, FREE_RATES):
             free = replace(base, network="none", initial="zero", preconditioner=output, lr=lr, architecture=Architecture())
             found.append(made("no network", free))
         return found
