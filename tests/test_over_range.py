@@ -394,7 +394,7 @@ def test_over_a_range_one_lens_for_all_and_networks_alone_stand_beside(few, capf
         capfd, "convergence", "z", "--study", "design", "--networks", "--rays", 5000, "--threads", 1, "--quiet", "-o", "out"
     )
     last = [row for row in found["rows"] if row["iterations"] == 6]
-    assert [row["inputs"] for row in last] == ["range"] * 4 + ["none", "alone"]
+    assert [row["inputs"] for row in last] == ["range"] * 5 + ["none", "alone"]
     assert all(row["worst"] >= row["error"] > 0 for row in last) and "one lens for the whole range" in found["advice"]
     assert last[-1]["parameters"] == len(JUDGED) * last[-2]["parameters"]
     for more, sentence in ((["--study", "rays"], "--networks belongs to --study design"), (["--repeats", "2"], "--repeats has no")):

@@ -56,7 +56,7 @@ from caustic_cli.scene.tolerances import Tolerances
 DEFAULT_RESOLUTION = 250
 DEFAULT_SPANS = 128  # knot spans of the finished net; 128 halve evenly through the stages
 NETWORK_CONTROL = 50  # table D.2
-OVER_WIDTH = 32  # neurons a layer of a network over a range: caustic convergence, study design, networks
+OVER_WIDTH = 128  # neurons a layer of a network over a range: caustic convergence, study design, networks
 RAYS_PER_PIXEL = 9.0  # 750 x 750 rays on 250 x 250 pixels, tables D.1 and D.2
 DRAFT_SECONDS, FINE_SECONDS = 8.0, 60.0  # time limits below and from which another quality is the better use of the time
 STEEPEST = 1.25  # least radius of a derived sphere, in half diagonals of the lens: slopes up to 1.3

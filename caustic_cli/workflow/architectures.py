@@ -94,7 +94,7 @@ def candidates(
     """The grid for a project's picture and scene, or without one for a bright disc; and what it is compared with.
 
     Of a project whose network is trained over a range, all are, from its own first surface with its activation and preconditioner;
-    beside them stand the same network without inputs, which is one lens for the whole range, and one for each value alone.  Of any
+    beside them stand its own, the same without inputs, which is one lens for the whole range, and one for each value alone.  Of any
     other, networks begin at the offset surface, and heights by Adam stand beside them.
 
     Raises:
@@ -146,6 +146,7 @@ def candidates(
             free = replace(base, network="none", initial="zero", preconditioner=output, lr=lr, architecture=Architecture())
             found.append(made("no network", free))
         return found
+    found.append(made("as designed", replace(own, dtype=base.dtype, seed=base.seed), "range"))
     blind = replace(own, dtype=base.dtype, seed=base.seed, inputs=False)
     found.append(made("one lens for all", blind, "none"))
     alone = [
