@@ -56,7 +56,7 @@ from caustic_cli.scene.tolerances import Tolerances
 DEFAULT_RESOLUTION = 250
 DEFAULT_SPANS = 128  # knot spans of the finished net; 128 halve evenly through the stages
 NETWORK_CONTROL = 50  # table D.2
-OVER_WIDTH = 128  # neurons a layer of a network over a range: caustic convergence, study design, networks
+OVER_WIDTH, OVER_ITERATIONS = 128, 200  # of a network over a range: caustic convergence, study design, networks
 RAYS_PER_PIXEL = 9.0  # 750 x 750 rays on 250 x 250 pixels, tables D.1 and D.2
 DRAFT_SECONDS, FINE_SECONDS = 8.0, 60.0  # time limits below and from which another quality is the better use of the time
 STEEPEST = 1.25  # least radius of a derived sphere, in half diagonals of the lens: slopes up to 1.3
@@ -404,6 +404,9 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
         stages = refinement(tuple(lens["control"]), rays, (nx, ny), quality, scattered=not centre.collimated, spread=spread)
         if value_of(s["target"], "target.sheet"):
             stages = each_lenslet(stages, math.prod(array), (nx, ny))
+    elif value_of(design, "design.over"):
+        last = refinement(tuple(lens["control"]), rays or base, (nx, ny), quality)[-1]
+        stages = [last | {"iterations": OVER_ITERATIONS, "tolerance": 0.0}]
     elif plain and "knots_u" not in lens:
         stages = coarse_to_fine(tuple(lens["control"]), degree, rays or base, (nx, ny), quality, sampler=sampler)
     else:

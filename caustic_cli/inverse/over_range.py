@@ -2,9 +2,9 @@
 
     L_t = 1/K sum over k of L(heights(v_k); scene at v_k),    v_1 .. v_K the values of iteration t (`Ranges.drawn`)
 
-which is the stochastic gradient of the loss' mean over the ranges.  Rays are drawn anew, too: a net finer than the picture learns
-rays by heart that stay the same, and the retraced error grows while the loss still falls.  Both follow from seed and iteration
-alone, so that a resumed design draws the same.
+which is the stochastic gradient of the loss' mean over the ranges.  Rays are drawn anew, too, where they are random: a net finer
+than the picture learns random rays by heart that stay the same, and the retraced error grows while the loss still falls.  Both
+follow from seed and iteration alone, so that a resumed design draws the same.
 """
 
 from __future__ import annotations
