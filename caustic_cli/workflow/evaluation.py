@@ -101,7 +101,9 @@ def expected_seconds(designer: Designer, target: np.ndarray, state: State, devic
     if scene.second is not None:
         scene, heights = sides_of(scene, field, heights)
     retrace(scene, field, heights, target, rays=FINAL_RAYS // PROBE, device=device, noise=False)
-    seconds = RETRACES * PROBE * (time.monotonic() - began) + REPORT_SECONDS
+    over = designer.options.over
+    retraces = RETRACES + (0.0 if over is None else 2.0 * len(over.judged()) / OVER)
+    seconds = retraces * PROBE * (time.monotonic() - began) + REPORT_SECONDS
     if any(s.waves for s in designer.stages):
         began = time.monotonic()
         wave_figures(scene, field, state.heights.to(device), target, Resolution.before(scene, scene.screen.size), required=False)
