@@ -338,6 +338,9 @@ def test_contradictions_of_networks_are_refused():
         build_options(complete(complete_options, 1.0))
     with pytest.raises(InputError, match="network_layers must be a whole number 1 to 16"):
         Architecture(0)
+    counted = complete({"design": {"network": "dense", "optimizer": "adam", "preconditioner": "laplacian"}}, 1.0)["design"]
+    assert (counted["initial"], counted["start"]) == ("zero-last", "transport")
+    assert complete({}, 1.0)["design"]["initial"] == "zero"
     with pytest.raises(InputError, match="begin from only with"):
         complete({"design": {"network": "dense", "optimizer": "adam", "start": "transport"}}, 1.0)
 

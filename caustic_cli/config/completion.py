@@ -144,6 +144,9 @@ def complete(given: Settings, aspect: float, by: Derivation | None = None, lit: 
     _complete_source(s["source"], lens, [stage.get("source", "") for stage in s["design"].get("stages", [])])
     if over:
         _complete_over(over, s, given)
+    counted = s["design"]["network"] != "none" and s["design"].get("preconditioner") == "laplacian"
+    if (over or counted) and "initial" not in given.get("design", {}):
+        s["design"]["initial"] = "zero-last"
     if "also" in s["source"]:
         s["source"]["also"] = [{**DEFAULTS["source"], **table} for table in s["source"]["also"]]
         for table in s["source"]["also"]:
@@ -193,8 +196,8 @@ def _put_in_the_middle(over: Ranges, s: Settings, given: Settings, by: Derivatio
 
 
 def _complete_over(over: Ranges, s: Settings, given: Settings) -> None:
-    """What a network that is trained over ranges has beside them: its source at their middle, and how it begins."""
-    source, design, said = s["source"], s["design"], given.get("design", {})
+    """What a network that is trained over ranges has beside them: its source at their middle, its outputs and its width."""
+    source, design = s["source"], s["design"]
     middle = {key.removeprefix("source."): v for key, v in zip(over.keys, over.middle, strict=True) if key != "throw"}
     if middle:
         if source["type"] not in ("point", "grid") or len(source["position"]) != 1 or source.get("also"):
@@ -209,8 +212,6 @@ def _complete_over(over: Ranges, s: Settings, given: Settings) -> None:
                 f" {','.join(f'{c:g}' for c in place)}, got {','.join(f'{c:g}' for c in source['position'][0])}"
             )
         source["position"] = [place]
-    if "initial" not in said:
-        design["initial"] = "zero-last"
     if design["network"] != "none":
         design.setdefault("preconditioner", "laplacian")
     if design["network"] == "dense":

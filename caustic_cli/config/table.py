@@ -286,7 +286,8 @@ _ROWS = (
             option=Option("--over", "KEY=LOW:HIGH[,...]")),
     Setting("design.initial", "text", "parameters at first: zero, uniform (+-1e-4), random, or zero-last (random but for the last"
             " layer of a network, which is zero: it begins at its first surface)",
-            choices=("zero", "uniform", "random", "zero-last"), default="zero"),
+            choices=("zero", "uniform", "random", "zero-last"), default="zero",
+            derived="zero; zero-last of a preconditioned network"),
     Setting("design.preconditioner", "text", "none or laplacian", choices=("none", "laplacian"),
             derived="laplacian of heights by lbfgs, and of a network trained over a range",
             option=Option("--preconditioner", "none|laplacian")),
