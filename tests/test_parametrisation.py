@@ -117,6 +117,17 @@ def test_a_dense_network_too_large_is_refused_before_it_is_made():
         parametrise(*bounds(n, n), "dense")
 
 
+@pytest.mark.parametrize("network", ["sparse", "dense"])
+def test_a_preconditioned_network_gives_the_coordinates_that_heights_have(network):
+    low, high = bounds()
+    start = low + 0.3 * (high - low)
+    module = parametrise(low, high, network, degree=(1, 1), initial="random", seed=4, preconditioner="laplacian", start=start)
+    plain = parametrise(low, high, network, degree=(1, 1), initial="random", seed=4)
+    free = parametrise(low, high, preconditioner="laplacian", start=start)
+    free.y.data = plain.raw().detach().double()
+    torch.testing.assert_close(module().detach(), free().detach(), rtol=0, atol=1e-12)
+
+
 def set_randomly(module, seed: int = 3) -> None:
     g = torch.Generator().manual_seed(seed)
     for p in module.parameters():
@@ -225,7 +236,6 @@ REFUSED = {
     "initial": ({"initial": "ones"}, "initial must be one of"),
     "preconditioner": ({"preconditioner": "jacobi"}, "preconditioner must be one of"),
     "start": ({"network": "sparse", "start": torch.zeros(N, M)}, "begins from its own initial state"),
-    "laplacian": ({"network": "dense", "preconditioner": "laplacian"}, "preconditioner need network none"),
 }
 
 

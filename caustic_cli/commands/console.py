@@ -23,6 +23,8 @@ from caustic_cli.errors import MARK, InputError, plain_name
 LONGEST_LINE = 4000
 #: Seconds between two lines of --progress json.
 LINE_EVERY = 0.5
+#: What is said of a lens that a network gives, beside the values that it is for.
+OF_LENS = ("relative_rms", "noise", "on_screen", "middle_relative_rms")
 #: Columns that a bar and its clocks ask for beside the numbers.
 WIDE = 90
 
@@ -222,6 +224,12 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
     if figures.get("start_relative_rms") is not None:
         known = f", noise {figures['start_noise']:.2g}" if "start_noise" in figures else ""
         start = [("of its start, by rays", f"{figures['start_relative_rms']:.4f}{known}")]
+    for row in figures.get("over", ()):
+        values = ", ".join(f"{key} {row[key]:g}" for key in row if key not in OF_LENS)
+        known = "" if row["noise"] is None else f", noise {row['noise']:.2g}"
+        start.append(
+            (f"lens for {values}", f"{row['relative_rms']:.4f}{known}; that for the middle {row['middle_relative_rms']:.4f}")
+        )
     if "etendue_limit" in figures:
         least.append(("etendue limit", number("etendue_limit", ".2%") + " of the light on the lens"))
     return [

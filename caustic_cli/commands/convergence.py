@@ -46,6 +46,14 @@ def run(
             " thickness and the loss' weight of light; all: one after the other."
         ),
     ] = "intersection",
+    networks: Annotated[
+        bool,
+        typer.Option(
+            "--networks",
+            help="Of design: a grid of networks, by layers, width, activation, learning rate and preconditioner, all trained"
+            " alike; of a project designed --over a range, over that, beside one lens for all of it and a network for each value.",
+        ),
+    ] = False,
     rays: Annotated[
         str | None,
         typer.Option(
@@ -63,7 +71,10 @@ def run(
         ),
     ] = None,
     seconds: Annotated[
-        float | None, typer.Option(help="Of design: for each contender.  [default: 4]  Of light: for each lens.  [default: 10]")
+        float | None,
+        typer.Option(
+            help="Of design: for each contender, of --networks on average.  [default: 4]  Of light: for each lens.  [default: 10]"
+        ),
     ] = None,
     output: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Where CSV, JSON and PNG go.")] = Path("convergence"),
     force: options.Force = False,
@@ -80,7 +91,9 @@ def run(
     began, say = time.monotonic(), console.Reporter(quiet, progress)
     if study not in (*STUDIES, "all"):
         raise InputError(f"--study must be one of {', '.join(STUDIES)} or all, got {study!r}")
-    names = STUDIES if study == "all" else (study,)
+    if networks and study != "design":
+        raise InputError(f"--networks belongs to --study design, got {study}")
+    names = STUDIES if study == "all" else ("networks",) if networks else (study,)
     count = options.rays("--rays", rays) if rays else None
     for option, given in (("--seconds", seconds), ("--repeats", repeats), ("--dtype", dtype)):
         if given is not None and not any(_takes(name, option) for name in names):
@@ -125,9 +138,9 @@ def run(
 def _takes(study: str, option: str) -> bool:
     """Whether an option has a meaning for a study."""
     if option == "--seconds":
-        return study in ("design", "light")
+        return study in ("design", "networks", "light")
     if option == "--repeats":
-        return study not in ("design", "diffraction", "light")
+        return study not in ("design", "networks", "diffraction", "light")
     return study not in ("intersection", "light")
 
 

@@ -67,6 +67,7 @@ def run(
             help="lighttools: also write a Python script for its COM interface and an .lts point block that rebuild the scene.",
         ),
     ] = False,
+    at: options.At = None,
     force: options.Force = False,
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -104,7 +105,7 @@ def run(
         given = {
             key: v for key, v in given_of.items() if v is not None and name in options_of.get(f"--{key}", (True, ("gcode",)))[1]
         }
-        figures, reused = export(project, name, output, script and name == "lighttools", given, force, say)
+        figures, reused = export(project, name, output, script and name == "lighttools", given, force, say, at)
         all_figures.append(figures)
         if reused:
             continue

@@ -45,6 +45,7 @@ def run(
         Path | None,
         typer.Option(metavar="FILE", help="Also write the derivative, parts of the source's power per mm, float64, [i, j]."),
     ] = None,
+    at: options.At = None,
     force: options.Force = False,
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -70,7 +71,7 @@ def run(
     from caustic_cli.studies.retrace import sampler_for  # noqa: PLC0415
     from caustic_cli.workflow.compilation import compile_for  # noqa: PLC0415
 
-    opened = Project.open(project)
+    opened = Project.open(project).at(at)
     scene = opened.scene()
     compile_for(scene, device, say)
     scene, field, heights, _ = opened.lens(scene)

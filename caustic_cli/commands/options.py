@@ -21,6 +21,13 @@ Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON objec
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", envvar="CAUSTIC_QUIET", help="Say nothing on stderr but errors.")]
 Debug = Annotated[bool, typer.Option("--debug", envvar="CAUSTIC_DEBUG", help="Show the traceback of an error.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace what is in the way.")]
+At = Annotated[
+    str | None,
+    typer.Option(
+        metavar="KEY=VALUE[,...]",
+        help="Of a network trained --over a range: the lens for this value, like throw=300 (mm).  [default: the middle]",
+    ),
+]
 Seed = Annotated[
     int | None,
     typer.Option(envvar="CAUSTIC_SEED", help="Seed of every random number; the same seed gives the same bytes.  [default: 0]"),
@@ -243,6 +250,8 @@ HELP = {
     "target.encoding": "Pixel values are irradiance as they are, not sRGB-encoded.",
     "design.iterations": "Iterations in all; with --resume, counted from the very first.",
     "source.position": "Point (may be repeated), centre of a grid or disc, or origin of a ray file (mm).",
+    "design.over": "Train a network over ranges (mm), whose values are its inputs, so that it gives a lens for each, which --at of"
+    " the other commands names: throw=250:350; also source.x, source.y, source.z.",
     "target.flip": "Mirror the picture along x, y or xy, for a viewer on the lens' side.",
     "lens.mirror": "The surface reflects; the screen stands on the source's side, --throw before it.",
     "source.wavelengths": "The source's spectrum: wavelengths (nm) and relative powers; a --glass refracts each by its own index.",

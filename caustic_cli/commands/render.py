@@ -38,6 +38,7 @@ def run(
     ] = "bincount",
     filter_size: Annotated[str, typer.Option(metavar="V[xW]", help="Filter size, odd (pixels).")] = "3",
     alpha: Annotated[float | None, typer.Option(help="Of the gaussian (1/mm^2).  [default: 1 per pixel^2]")] = None,
+    at: options.At = None,
     screen_at: Annotated[float | None, typer.Option(metavar="Z", help="Put the screen here instead (mm).")] = None,
     effects: Annotated[
         str,
@@ -180,6 +181,7 @@ def run(
         options.dtype_of(dtype or "float64"),
         tolerances,
         want,
+        at,
     )
     figures = render(asked, device, say)
     if not figures.pop("reused", False):

@@ -39,9 +39,11 @@ from caustic_cli.config.settings import (
 )
 from caustic_cli.config.table import check, default
 from caustic_cli.errors import InputError
+from caustic_cli.inverse.conditions import Ranges
 from caustic_cli.inverse.designer import Options
 from caustic_cli.inverse.extended import shift_of
 from caustic_cli.inverse.lenslets import FROM_AFAR
+from caustic_cli.inverse.parametrisation import Architecture
 from caustic_cli.inverse.schedule import Stage
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.resolution import BAND, Resolution, white
@@ -54,6 +56,7 @@ from caustic_cli.scene.tolerances import Tolerances
 DEFAULT_RESOLUTION = 250
 DEFAULT_SPANS = 128  # knot spans of the finished net; 128 halve evenly through the stages
 NETWORK_CONTROL = 50  # table D.2
+OVER_WIDTH, OVER_ITERATIONS = 128, 200  # of a network over a range: caustic convergence, study design, networks
 RAYS_PER_PIXEL = 9.0  # 750 x 750 rays on 250 x 250 pixels, tables D.1 and D.2
 DRAFT_SECONDS, FINE_SECONDS = 8.0, 60.0  # time limits below and from which another quality is the better use of the time
 STEEPEST = 1.25  # least radius of a derived sphere, in half diagonals of the lens: slopes up to 1.3
@@ -126,6 +129,9 @@ def complete(given: Settings, aspect: float, by: Derivation | None = None, lit: 
         s["source"].setdefault("wavelengths", list(RGB))
         if "index" not in lens:
             lens.setdefault("glass", COLOR_GLASS)
+    over = Ranges.parse(value_of(s["design"], "design.over"))
+    if over and "throw" in over.keys:
+        _put_in_the_middle(over, s, given, by)
     mag, margin = by.mag, default("margin") if by.margin is None else by.margin
     check("lens.size", lens["size"])
     check("screen.z", screen["z"])
@@ -136,6 +142,11 @@ def complete(given: Settings, aspect: float, by: Derivation | None = None, lit: 
     check("target.flip", target["flip"])
     check("target.encoding", target["encoding"])
     _complete_source(s["source"], lens, [stage.get("source", "") for stage in s["design"].get("stages", [])])
+    if over:
+        _complete_over(over, s, given)
+    counted = s["design"]["network"] != "none" and s["design"].get("preconditioner") == "laplacian"
+    if (over or counted) and "initial" not in given.get("design", {}):
+        s["design"]["initial"] = "zero-last"
     if "also" in s["source"]:
         s["source"]["also"] = [{**DEFAULTS["source"], **table} for table in s["source"]["also"]]
         for table in s["source"]["also"]:
@@ -172,6 +183,39 @@ def _complete_source(source: dict[str, Any], lens: dict[str, Any], stages: list[
             source.setdefault(key, value)
     for key in set(DEFAULTS["source"]).difference(sources.COMMON, *(type.keys for type in types)):
         source.pop(key)
+
+
+def _put_in_the_middle(over: Ranges, s: Settings, given: Settings, by: Derivation) -> None:
+    """The screen of a network that is trained over throws: at their middle, and nowhere else."""
+    screen, z = s["screen"], over.middle[over.keys.index("throw")]
+    z = -z if value_of(s["lens"], "lens.mirror") else z
+    said = by.throw is not None or "z" in given.get("screen", {})
+    if said and not math.isclose(screen["z"], z, rel_tol=1e-9):
+        raise InputError(f"⟨screen.z⟩ must be the middle of ⟨design.over⟩ throw, {z:g} mm, or not be said, got {screen['z']:g} mm")
+    screen["z"] = z
+
+
+def _complete_over(over: Ranges, s: Settings, given: Settings) -> None:
+    """What a network that is trained over ranges has beside them: its source at their middle, its outputs and its width."""
+    source, design = s["source"], s["design"]
+    middle = {key.removeprefix("source."): v for key, v in zip(over.keys, over.middle, strict=True) if key != "throw"}
+    if middle:
+        if source["type"] not in ("point", "grid") or len(source["position"]) != 1 or source.get("also"):
+            key = next(iter(middle))
+            raise InputError(f"⟨design.over⟩ source.{key} needs ⟨+source.type⟩ point, of one place, or grid, got {source['type']}")
+        place = [middle.get(axis, c) for axis, c in zip("xyz", source["position"][0], strict=True)]
+        if "position" in given.get("source", {}) and not all(
+            math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-9) for a, b in zip(place, source["position"][0], strict=True)
+        ):
+            raise InputError(
+                "⟨source.position⟩ must have the middle of ⟨design.over⟩ where that names it,"
+                f" {','.join(f'{c:g}' for c in place)}, got {','.join(f'{c:g}' for c in source['position'][0])}"
+            )
+        source["position"] = [place]
+    if design["network"] != "none":
+        design.setdefault("preconditioner", "laplacian")
+    if design["network"] == "dense":
+        design.setdefault("network_width", OVER_WIDTH)
 
 
 def first_thickness(size: Sequence[float]) -> float:
@@ -314,10 +358,12 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
     fine_net = "control" not in lens or min(n - p for n, p in zip(lens["control"], degree, strict=True)) >= LEAST_SPANS
     fine_net = fine_net or max(array) > 1  # whose lenslets have to be solved for
     spread = plain and fine_net and not source.sharp and _shifts(s, source)
-    design.setdefault("start", "transport" if "second" in s or (plain and fine_net and not source.apart) else "offset")
-    if design["start"] == "transport" and design["network"] != "none":
+    counted = plain or (design["network"] != "none" and design.get("preconditioner") == "laplacian")  # from any first surface
+    design.setdefault("start", "transport" if "second" in s or (counted and fine_net and not source.apart) else "offset")
+    if design["start"] != "offset" and design["network"] != "none" and design.get("preconditioner") != "laplacian":
         raise InputError(
-            "⟨design.start⟩ transport gives a surface, which a network cannot begin from; use start offset, or network none"
+            f"⟨design.start⟩ {design['start']} gives a surface, which a network can begin from only with"
+            " ⟨+design.preconditioner⟩ laplacian; use that, start offset, or network none"
         )
     if max(array) > 1 and (design["start"] == "offset" or not plain):
         raise InputError(
@@ -335,7 +381,8 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
     moved = plain and fine_net and design["start"] != "offset" and (source.sharp or spread or max(array) > 1)
     if "control" not in lens:
         spans = refinement_spans(max(screen["resolution"]), quality) if moved else DEFAULT_SPANS
-        lens["control"] = [spans + p for p in degree] if design["network"] == "none" else [NETWORK_CONTROL] * 2
+        of_network = [DEFAULT_SPANS + p for p in degree] if value_of(design, "design.over") else [NETWORK_CONTROL] * 2
+        lens["control"] = [spans + p for p in degree] if design["network"] == "none" else of_network
         lens["control"] = _of_array(lens["control"], degree, array)
     elif (fits := _of_array(lens["control"], degree, array)) != list(lens["control"]):
         raise InputError(
@@ -358,6 +405,9 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
         stages = refinement(tuple(lens["control"]), rays, (nx, ny), quality, scattered=not centre.collimated, spread=spread)
         if value_of(s["target"], "target.sheet"):
             stages = each_lenslet(stages, math.prod(array), (nx, ny))
+    elif value_of(design, "design.over"):
+        last = refinement(tuple(lens["control"]), rays or base, (nx, ny), quality)[-1]
+        stages = [last | {"iterations": OVER_ITERATIONS, "tolerance": 0.0}]
     elif plain and "knots_u" not in lens:
         stages = coarse_to_fine(tuple(lens["control"]), degree, rays or base, (nx, ny), quality, sampler=sampler)
     else:
@@ -607,4 +657,6 @@ def build_options(settings: Settings) -> Options:
         d["min_radius"],
         d["waves"] == "on",
         content(d, "robust", Tolerances),
+        Architecture(*(value_of(d, f"design.{key}") for key in ("network_layers", "network_width", "activation"))),
+        Ranges.parse(value_of(d, "design.over")),
     )

@@ -19,6 +19,7 @@ from torch import Tensor
 from caustic_cli.config.table import check_all
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse import ranks
+from caustic_cli.inverse.conditions import Ranges
 from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
 from caustic_cli.inverse.extended import best_light, regular_rays, shift_of
 from caustic_cli.inverse.lbfgs import UNFIT
@@ -26,7 +27,8 @@ from caustic_cli.inverse.lenslets import ArrayObjective, lenslets
 from caustic_cli.inverse.limits import within_limits
 from caustic_cli.inverse.losses import parse
 from caustic_cli.inverse.objective import Objective
-from caustic_cli.inverse.parametrisation import FreeHeights, Heights, parametrise
+from caustic_cli.inverse.over_range import AdamOverRange, RangeObjective
+from caustic_cli.inverse.parametrisation import Architecture, FreeHeights, Heights, parametrise
 from caustic_cli.inverse.robust import RobustObjective
 from caustic_cli.inverse.schedule import Stage
 from caustic_cli.inverse.steps import Adam, Newtonlike
@@ -42,7 +44,7 @@ from caustic_cli.optics.waves import NoWaveImage
 from caustic_cli.scene import Scene
 from caustic_cli.scene.tolerances import Tolerances
 
-AnyObjective = Objective | WaveObjective | ArrayObjective | TwoSidedObjective
+AnyObjective = Objective | WaveObjective | ArrayObjective | TwoSidedObjective | RangeObjective
 #: A stage's flatness is judged over so many iterations.
 FLAT_SPAN = 10
 
@@ -56,7 +58,8 @@ class Options:
     optimizer, lr: lbfgs, or adam with its learning rate; network, initial, preconditioner:
     see `parametrisation`; filter_target: filter the target as the render is filtered; seed: of rays and networks;
     dtype: precision of the rays; waves: stages on the wave image have to be, see `NoWaveImage`;
-    robust: errors for which the last stage is, see `robust`.
+    robust: errors for which the last stage is, see `robust`; architecture: of a dense network; over: ranges over which a network
+    is trained, and inputs: whether it sees where in them it is, or is one lens for all.
     """
 
     loss: str = "rms-light"
@@ -72,6 +75,9 @@ class Options:
     min_radius: float = 0.0
     waves: bool = False
     robust: Tolerances | None = None
+    architecture: Architecture = field(default_factory=Architecture)
+    over: Ranges | None = None
+    inputs: bool = True
 
     def __post_init__(self):
         parse(self.loss)
@@ -80,6 +86,21 @@ class Options:
             raise InputError(
                 "⟨design.optimizer⟩ lbfgs works on the heights themselves (network none); a network needs optimizer adam"
             )
+        if self.network != "dense" and self.architecture != Architecture():
+            raise InputError(
+                "⟨design.network_layers⟩, ⟨design.network_width⟩ and ⟨design.activation⟩ belong to ⟨+design.network⟩ dense,"
+                f" got {self.network}"
+            )
+        if self.over is None:
+            return
+        if self.network == "none":
+            raise InputError("⟨design.over⟩ needs a network, which gives a lens for every value: ⟨+design.network⟩ dense or sparse")
+        if self.initial == "zero":
+            raise InputError(
+                "⟨design.initial⟩ zero leaves the inputs of a network without any effect, for good: zero-last, uniform or random"
+            )
+        if self.robust is not None:
+            raise InputError("⟨design.robust⟩ cannot be had with ⟨design.over⟩, which is a mean over scenes already")
 
 
 @dataclass
@@ -147,8 +168,15 @@ class Designer:
             raise InputError("⟨design.stages.lenslets⟩ needs ⟨lens.array⟩, and neither waves nor spread in the same stage")
         if options.network != "none" and any(s.waves for s in stages):
             raise InputError("⟨design.stages.waves⟩ needs network none: the wave image refines the heights themselves")
+        if options.over and any(s.spread or s.source for s in stages):
+            raise InputError("⟨design.over⟩ needs stages on the rays of the scene's own source, without spread")
         for stage in stages:
             self._bounds(stage)  # refuse an impossible lens before any work
+
+    @property
+    def scenes(self) -> list[Scene]:
+        """The scene; of a network over ranges, that at all their ends."""
+        return [self.scene] if self.options.over is None else self.options.over.ends(self.scene)
 
     def field(self, stage: int) -> HeightField:
         """The spline spaces of a stage."""
@@ -172,6 +200,12 @@ class Designer:
     def restored(self, state: State) -> State:
         """A saved state as the loop left it, see `showing`."""
         return replace(state, heights=self._module(state)().detach()) if state.parameters else state
+
+    def heights_at(self, state: State, values: Sequence[float]) -> Tensor:
+        """The lens (n, m), mm, that a network gives for values of its ranges, in their order."""
+        assert self.options.over is not None
+        heights = self._module(state)(self.options.over.scaled([values])).detach()
+        return self.within_limits(replace(state, heights=heights.reshape(state.heights.shape)))
 
     def _module(self, state: State) -> Heights:
         module = self._parametrise(state.stage, state.heights if self.options.network == "none" else None)
@@ -264,7 +298,8 @@ class Designer:
                     state.reason = "no wave image"
                     return True
                 adam = self.options.optimizer == "adam" and not stage.waves
-                method = (Adam if adam else Newtonlike)(objective, heights, self.options.lr)
+                kind = AdamOverRange if self.options.over else Adam if adam else Newtonlike
+                method = kind(objective, heights, self.options.lr)
                 if state.optimizer:
                     method.load(state.optimizer)
             told = method.taken_back > 0
@@ -328,13 +363,24 @@ class Designer:
             expected = best_light(scene, grey(self.target.cpu().numpy()), spread, SMOOTH_STEPS).kept
             scene, rays, spread = regular_rays(scene, spread, stage, stream(o.seed, f"stage {k}"), self.device)
         else:
-            return self._on_rays(scene, k, self.field(k), self.target, stage.rays)
+            found: AnyObjective = self._on_rays(scene, k, self.field(k), self.target, stage.rays)
+            return (
+                found
+                if o.over is None
+                else RangeObjective(
+                    found, o.over, lambda s, seed: rays_of(s, stage.sampler, stage.rays, seed, self.device), self._seed(k)
+                )
+            )
         return self._traced(scene, k, self.field(k), self.target, rays, spread, expected)
 
     def _on_rays(self, scene: Scene, k: int, field: HeightField, target: Tensor, count: int) -> Objective:
         """That of stage k by so many rays of a scene's whole source."""
-        rays = rays_of(scene, self.stages[k].sampler, count, stream(self.options.seed, f"stage {k}"), self.device)
+        rays = rays_of(scene, self.stages[k].sampler, count, self._seed(k), self.device)
         return self._traced(scene, k, field, target, rays, (), 1.0)
+
+    def _seed(self, k: int) -> int:
+        """Of all random numbers of stage k."""
+        return stream(self.options.seed, f"stage {k}")
 
     def _traced(
         self,
@@ -389,22 +435,25 @@ class Designer:
             initial=o.initial,
             preconditioner=o.preconditioner,
             seed=o.seed,
+            architecture=o.architecture,
+            inputs=len(o.over.each) if o.over and o.inputs else 0,
         )
 
     def _bounds(self, stage: Stage) -> tuple[Tensor, Tensor]:
         lens = replace(self.scene.lens, control=stage.control)
         x, y = HeightField.of(lens).control_xy()
         low, high = lens.height_bounds(x.numpy(), y.numpy())
-        screen = self.scene.screen
-        before, behind = reach(screen)
-        if lens.mirror and low.min() <= screen.z + behind:
-            raise InputError(
-                f"⟨screen.z⟩ must lie before the mirror, whose surface may reach {low.min():.4g} mm, got {screen.z:g} mm"
-            )
-        if not lens.mirror and high.max() >= screen.z + before:
-            raise InputError(
-                f"⟨screen.z⟩ must lie behind the lens, whose surface may reach {high.max():.4g} mm, got {screen.z:g} mm"
-            )
+        for scene in self.scenes:
+            screen = scene.screen
+            before, behind = reach(screen)
+            if lens.mirror and low.min() <= screen.z + behind:
+                raise InputError(
+                    f"⟨screen.z⟩ must lie before the mirror, whose surface may reach {low.min():.4g} mm, got {screen.z:g} mm"
+                )
+            if not lens.mirror and high.max() >= screen.z + before:
+                raise InputError(
+                    f"⟨screen.z⟩ must lie behind the lens, whose surface may reach {high.max():.4g} mm, got {screen.z:g} mm"
+                )
         if self.scene.second is not None:
             most = np.full_like(low, lens.height_range[1])
             low, high = np.stack([-most, low]), np.stack([most, high])

@@ -7,6 +7,7 @@ Everything that does not depend on the heights (basis matrices, filtered target,
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -118,6 +119,13 @@ class Objective:
                 self.kept = list(self._tracers())
             except (MemoryError, RuntimeError) as error:
                 self.chunk = smaller(self.chunk, error)
+
+    def moved(self, scene: Scene, rays: Rays) -> Objective:
+        """The same in a scene whose screen or source stands elsewhere, by other rays; the target is not filtered anew."""
+        other = copy.copy(self)
+        other.scene, other.screen, other.samplers = scene, replace(self.screen, z=scene.screen.z), [rays]
+        other.kept = None if self.kept is None else list(other._tracers())
+        return other
 
     @property
     def whole(self) -> bool:

@@ -7,7 +7,11 @@
               s_kl = 1 / (lambda_k + lambda_l), lambda_k = 4 sin^2(pi k / 2n), the inverse Laplacian of the control net;
               or raw = start + y, counted from the start
     sparse    1 -> a tanh layer of control-net size -> a locally connected layer, kernel (2p + 1) x (2q + 1), own weights
-    dense     1 -> three tanh layers of control-net size joined by two full matrices
+    dense     1 -> hidden layers, fully connected -> a fully connected layer of control-net size; in the thesis two hidden layers
+              of control-net size and tanh, which eq. 5.1.1 makes three
+
+A network may have further inputs c beside the 1, which its first layer sees through weights of their own: a lens for each c
+(`conditions`).  With the Laplacian preconditioner its outputs are the coordinates y above, not raw values.
 
 The caustic responds to the Laplacian of the surface: in the preconditioned coordinates every length scale of the
 picture pulls equally hard, and L-BFGS needs tens of iterations where a plain gradient needs thousands.
@@ -15,22 +19,51 @@ picture pulls equally hard, and L-BFGS needs tens of iterations where a plain gr
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from caustic_cli.config import checks
+from caustic_cli.config.table import check, default
 from caustic_cli.errors import InputError
 
 NETWORKS = ("none", "sparse", "dense")
-INITIAL = ("zero", "uniform", "random")
+#: zero-last: random but for the last layer of a network, which is zero: it begins at its first surface, and learns from there.
+INITIAL = ("zero", "uniform", "random", "zero-last")
 PRECONDITIONERS = ("none", "laplacian")
 #: tanh is inverted no closer than this to its limits: raw stays below 8.4 and a gradient remains.
 SATURATION = 1e-7
 UNIFORM_SPREAD = 1e-4  # thesis 6.2.1
-#: Most weights of the dense network: 2 n^4 of them for an n x n net (erratum E10); 5e8 are 6 GB with Adam's moments.
+ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
+    "tanh": torch.tanh,
+    "relu": torch.relu,
+    "silu": torch.nn.functional.silu,
+    "sine": torch.sin,
+}
+#: Most weights of the dense network: 2 n^4 of the thesis' for an n x n net (erratum E10); 5e8 are 6 GB with Adam's moments.
 MAX_DENSE = 500_000_000
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """Of a dense network: hidden layers, neurons in each (0 for as many as control points), and their activation.
+
+    Raises:
+        InputError: out of range, see the table.
+    """
+
+    layers: int = default("design.network_layers")
+    width: int = default("design.network_width")
+    activation: str = default("design.activation")
+
+    def __post_init__(self):
+        check("design.network_layers", self.layers)
+        check("design.network_width", self.width)
+        check("design.activation", self.activation)
 
 
 def cosine_transform(n: int) -> Tensor:
@@ -41,8 +74,25 @@ def cosine_transform(n: int) -> Tensor:
     return c
 
 
+class InverseLaplacian:
+    """y (.., n, m) -> C_u^T (s o y) C_v, the coordinates in which the caustic's response is well conditioned."""
+
+    def __init__(self, like: Tensor):
+        n, m = like.shape[-2:]
+        self.cu, self.cv = cosine_transform(n).to(like), cosine_transform(m).to(like)
+        lam = [4.0 * torch.sin(0.5 * math.pi * torch.arange(k).to(like) / k) ** 2 for k in (n, m)]
+        total = lam[0][:, None] + lam[1][None, :]
+        total[0, 0] = math.inf  # the mean height moves no light: leave it where the start put it
+        self.scale = float(lam[0][1] + lam[1][1]) / total
+
+    def __call__(self, y: Tensor) -> Tensor:
+        return self.cu.T @ (self.scale * y) @ self.cv
+
+
 class Heights(torch.nn.Module):
     """Control heights between two bounds; `forward()` gives (n, m) float64, mm; of two sides all are (2, n, m).
+
+    Those of a network with inputs (k, d) are (k, n, m); without them, as of inputs 0, (n, m).
 
     Args:
         low, high: (n, m) bounds of the heights, mm.
@@ -52,12 +102,12 @@ class Heights(torch.nn.Module):
         super().__init__()
         self.low, self.span = low, high - low
 
-    def raw(self) -> Tensor:
+    def raw(self, inputs: Tensor | None = None) -> Tensor:
         """Unbounded values (n, m); 0 gives the middle of the range."""
         raise NotImplementedError
 
-    def forward(self) -> Tensor:
-        return self.low + 0.5 * (1.0 + torch.tanh(self.raw().double())) * self.span
+    def forward(self, inputs: Tensor | None = None) -> Tensor:
+        return self.low + 0.5 * (1.0 + torch.tanh(self.raw(inputs).double())) * self.span
 
     def begun(self) -> Tensor:
         """The heights (n, m) that parameters are counted from, or where they are counted from none, those of now."""
@@ -79,22 +129,14 @@ class FreeHeights(Heights):
 
     def __init__(self, low: Tensor, high: Tensor, start: Tensor | None = None, laplacian: bool = False, counted: bool = False):
         super().__init__(low, high)
-        self.laplacian, counted = laplacian, counted or laplacian
+        self.laplacian, counted = InverseLaplacian(low) if laplacian else None, counted or laplacian
         raw = torch.zeros_like(low) if start is None else self.invert(start)
         self.register_buffer("start", raw if counted else None)
         self.y = torch.nn.Parameter(torch.zeros_like(raw) if counted else raw.clone())
-        if laplacian:
-            n, m = low.shape[-2:]
-            self.cu, self.cv = cosine_transform(n).to(low), cosine_transform(m).to(low)
-            lam = [4.0 * torch.sin(0.5 * math.pi * torch.arange(k).to(low) / k) ** 2 for k in (n, m)]
-            total = lam[0][:, None] + lam[1][None, :]
-            total[0, 0] = math.inf  # the mean height moves no light: leave it where the start put it
-            self.scale = float(lam[0][1] + lam[1][1]) / total
 
-    def raw(self) -> Tensor:
-        if not self.laplacian:
-            return self.y if self.start is None else self.start + self.y
-        return self.start + self.cu.T @ (self.scale * self.y) @ self.cv
+    def raw(self, inputs: Tensor | None = None) -> Tensor:
+        y = self.y if self.laplacian is None else self.laplacian(self.y)
+        return y if self.start is None else self.start + y
 
     def begun(self) -> Tensor:
         if self.start is None:
@@ -103,42 +145,77 @@ class FreeHeights(Heights):
 
 
 class NetworkHeights(Heights):
-    """A network with trivial input 1 (5.1.1), float32 weights, tanh everywhere."""
+    """A network with input 1 (5.1.1), and `inputs` more, float32 weights.
 
-    def __init__(self, low: Tensor, high: Tensor, kind: str, degree: tuple[int, int], initial: str, seed: int):
+    Args:
+        kind: sparse or dense; degree: of the spline, for the kernel of a sparse one.
+        start: (n, m) heights that a preconditioned network is counted from, or None for the middle of the range.
+        laplacian: its outputs are coordinates of the preconditioner.
+    """
+
+    def __init__(
+        self,
+        low: Tensor,
+        high: Tensor,
+        kind: str,
+        degree: tuple[int, int],
+        initial: str,
+        seed: int,
+        architecture: Architecture,
+        inputs: int = 0,
+        start: Tensor | None = None,
+        laplacian: bool = False,
+    ):
         super().__init__(low, high)
         self.kind, self.degree = kind, degree
+        self.activation = ACTIVATIONS[architecture.activation]
         n, m = self.net = tuple(low.shape)
         size, kernel = n * m, (2 * degree[0] + 1) * (2 * degree[1] + 1)
-        layers = [(1, (size,))]  # (fan-in, weight shape)
         if kind == "sparse":
-            layers += [(kernel, (kernel, size))]
+            layers = [(1, (size,), size), (kernel, (kernel, size), size)]  # (fan-in, shape of weights, of biases)
         else:
-            if 2 * size * size > MAX_DENSE:
+            widths = [architecture.width or size] * architecture.layers + [size]
+            weights = sum(a * b for a, b in itertools.pairwise(widths))
+            if weights > MAX_DENSE:
                 raise InputError(
-                    f"⟨design.network⟩ dense needs {2 * size * size:.3g} weights for a {n} x {m} control net;"
-                    f" at most {MAX_DENSE:.3g} are supported (16000 control points): use sparse or none"
+                    f"⟨design.network⟩ dense needs {weights:.3g} weights for a {n} x {m} control net; at most {MAX_DENSE:.3g} are"
+                    " supported (16000 control points unless ⟨+design.network_width⟩ says less): use sparse or none"
                 )
-            layers += [(size, (size, size)), (size, (size, size))]
+            layers = [(1, (widths[0],), widths[0])]
+            layers += [(a, (b, a), b) for a, b in itertools.pairwise(widths)]
         generator = torch.Generator().manual_seed(seed)
-        self.weights, self.biases = torch.nn.ParameterList(), torch.nn.ParameterList()
-        for fan_in, shape in layers:
-            spread = {"zero": 0.0, "uniform": UNIFORM_SPREAD, "random": 1.0 / math.sqrt(fan_in)}[initial]
-            for group, s in ((self.weights, shape), (self.biases, (size,))):
-                group.append(torch.nn.Parameter(((2.0 * torch.rand(s, generator=generator) - 1.0) * spread).to(low.device)))
 
-    def raw(self) -> Tensor:
-        x = torch.tanh(self.weights[0] + self.biases[0])  # input 1
-        for k in range(1, len(self.weights)):
-            if k > 1:
-                x = torch.tanh(x)
+        def parameter(shape: tuple[int, ...], spread: float) -> torch.nn.Parameter:
+            return torch.nn.Parameter(((2.0 * torch.rand(shape, generator=generator) - 1.0) * spread).to(low.device))
+
+        def spread(fan_in: int, last: bool) -> float:
+            random = 1.0 / math.sqrt(fan_in)
+            return {"zero": 0.0, "uniform": UNIFORM_SPREAD, "random": random, "zero-last": 0.0 if last else random}[initial]
+
+        self.weights, self.biases = torch.nn.ParameterList(), torch.nn.ParameterList()
+        for k, (fan_in, shape, width) in enumerate(layers):
+            of_layer = spread(fan_in, k == len(layers) - 1)
+            self.weights.append(parameter(shape, of_layer))
+            self.biases.append(parameter((width,), of_layer))
+        self.seen = parameter((layers[0][2], inputs), spread(1, False)) if inputs else None  # of the inputs, in the first layer
+        self.laplacian = InverseLaplacian(low) if laplacian else None
+        self.register_buffer("start", (torch.zeros_like(low) if start is None else self.invert(start)) if laplacian else None)
+
+    def raw(self, inputs: Tensor | None = None) -> Tensor:
+        x = self.weights[0] + self.biases[0]  # input 1: (width,)
+        if inputs is not None and self.seen is not None:
+            x = x + inputs.to(x) @ self.seen.T  # (k, width)
+        for weights, biases in zip(self.weights[1:], self.biases[1:], strict=True):
+            x = self.activation(x)
             if self.kind == "sparse":
                 p, q = self.degree
-                near = torch.nn.functional.unfold(x.view(1, 1, *self.net), (2 * p + 1, 2 * q + 1), padding=(p, q))[0]
-                x = (self.weights[k] * near).sum(0) + self.biases[k]  # near: (kernel, n m), zero beyond the net
+                net = x.view(-1, 1, *self.net)
+                near = torch.nn.functional.unfold(net, (2 * p + 1, 2 * q + 1), padding=(p, q))  # (k, kernel, n m), zero beyond
+                x = (weights * near).sum(-2).view(x.shape) + biases
             else:
-                x = self.weights[k] @ x + self.biases[k]
-        return x.view(self.net)
+                x = torch.nn.functional.linear(x, weights, biases)
+        y = x.view(*x.shape[:-1], *self.net)
+        return y if self.laplacian is None else self.start + self.laplacian(y.double())
 
 
 def parametrise(
@@ -151,17 +228,19 @@ def parametrise(
     initial: str = "zero",
     preconditioner: str = "none",
     seed: int = 0,
+    architecture: Architecture | None = None,
+    inputs: int = 0,
 ) -> Heights:
-    """The parametrisation a design asks for.
+    """The parametrisation a design asks for; inputs: how many a network has beside the 1.
 
     Raises:
-        InputError: an unknown name, a start or a preconditioner given to a network, or a network too large.
+        InputError: an unknown name, a start given to a network that is not counted from one, or a network too large.
     """
     checks.choice("⟨design.network⟩", network, NETWORKS)
     checks.choice("⟨design.initial⟩", initial, INITIAL)
     checks.choice("⟨design.preconditioner⟩", preconditioner, PRECONDITIONERS)
     if network == "none":
-        if start is None and initial != "zero":
+        if start is None and initial in ("uniform", "random"):
             spread = UNIFORM_SPREAD if initial == "uniform" else 1.0
             noise = torch.rand(low.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
             module = FreeHeights(low, high, None, False)
@@ -170,9 +249,10 @@ def parametrise(
                 return module
             start = module().detach()
         return FreeHeights(low, high, start, preconditioner == "laplacian")
-    if start is not None or preconditioner != "none":
+    if start is not None and preconditioner == "none":
         raise InputError(
-            f"⟨design.network⟩ {network} begins from its own initial state with preconditioner none;"
-            " a start surface or the laplacian preconditioner need network none"
+            f"⟨design.network⟩ {network} begins from its own initial state; a start surface needs network none, or"
+            " ⟨+design.preconditioner⟩ laplacian, which counts from one"
         )
-    return NetworkHeights(low, high, network, degree, initial, seed)
+    shape, laplacian = architecture or Architecture(), preconditioner == "laplacian"
+    return NetworkHeights(low, high, network, degree, initial, seed, shape, inputs, start, laplacian)

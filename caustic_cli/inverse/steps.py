@@ -6,6 +6,7 @@ Both look at a step before it counts, and take it back where it leads to nothing
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -64,11 +65,21 @@ class Adam:
         Raises:
             NotFinite, NoLight: something there is not finite, or no light reaches the screen.
         """
-        z = self.heights()
-        e = self.objective(z.detach()) if bool(torch.isfinite(z).all()) else None
+        z, objective = self._judged()
+        e = objective(z.detach()) if bool(torch.isfinite(z).all()) else None
         if e is None or not math.isfinite(e.loss) or not bool(torch.isfinite(e.gradient).all()):
             raise NotFinite
         return z, e
+
+    def _judged(self) -> tuple[Tensor, Callable[[Tensor], Evaluation]]:
+        """Heights, with their graph, and what judges them."""
+        return self.heights(), self.objective
+
+    @property
+    def steps(self) -> int:
+        """Taken so far, those before a checkpoint included."""
+        state = self.adam.state_dict()["state"]
+        return int(state[0]["step"]) if state else 0
 
     def state(self) -> dict[str, Tensor]:
         out = {}

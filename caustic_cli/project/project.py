@@ -8,17 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from caustic_cli.config import settings
 from caustic_cli.config.completion import build_options, build_stages, complete
 from caustic_cli.config.settings import Settings, value_of
 from caustic_cli.errors import InputError, no_project, plain
+from caustic_cli.inverse.conditions import Ranges
+from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.target import target_on_screen, tiles
 from caustic_cli.io.files import write_bytes
 from caustic_cli.io.picture import Picture, read_picture
@@ -62,7 +65,7 @@ class Project:
     path: None of one that is in memory alone; second: the picture on a screen farther on; on_disk: whether its settings were read
     from there; asked: digest of what its user gave (`uptodate`); found: the checkpoint, where the same had been asked for before;
     hold: what lets go of the directory when the design that works there is done; without_waves: see
-    `config.completion.without_waves`.
+    `config.completion.without_waves`; values: those of a network's ranges that its scene and lens are for, None for their middle.
     """
 
     path: Path | None
@@ -75,6 +78,7 @@ class Project:
     hold: ExitStack = field(default_factory=ExitStack, repr=False)
     without_waves: str = ""
     on_disk: bool = False
+    values: tuple[float, ...] | None = None
 
     @classmethod
     def open(cls, path: str | Path) -> Project:
@@ -119,8 +123,31 @@ class Project:
         """An error about its settings, which names the file if they are in one."""
         return InputError(f"{self.path / TOML}: {plain(words)}" if self.on_disk else words)
 
+    @property
+    def over(self) -> Ranges | None:
+        """Over which its network is trained, None where it is none such."""
+        return Ranges.parse(value_of(self.settings["design"], "design.over"))
+
+    def at(self, text: str | None) -> Project:
+        """The same with scene and lens for "throw=300" (`Ranges.values`) of a network that is trained over a range.
+
+        Raises:
+            InputError: it is not, or the values are not within its ranges.
+        """
+        if text is None:
+            return self
+        if self.over is None:
+            raise InputError(
+                f"⟨at⟩ {text} needs a network that was trained over a range (⟨+design.over⟩), and this lens is for one scene"
+            )
+        return replace(self, values=self.over.values(text))
+
     def scene(self, given: Mapping[str, Any] | None = None) -> Scene:
-        """The scene it describes; `given`, path -> value, replaces some of its settings."""
+        """The scene it describes, at its values; `given`, path -> value, replaces some of its settings."""
+        scene = self._scene(given)
+        return scene if self.values is None or self.over is None else self.over.scene(scene, self.values)
+
+    def _scene(self, given: Mapping[str, Any] | None) -> Scene:
         profile = None if self.profile is None else self.profile.irradiance()
         if not given:
             try:
@@ -128,6 +155,7 @@ class Project:
             except InputError as error:
                 raise self.error(f"{error}") from error
         changed = {section: dict(values) for section, values in self.settings.items()}
+        changed["design"].pop("over", None)  # it says nothing of another light
         before = changed["source"]["type"]
         for path, value in given.items():
             section, _, key = path.rpartition(".")
@@ -195,12 +223,21 @@ class Project:
         if (state.state.heights.ndim == 3) != (scene.second is not None):
             has, says = ("two", "one") if scene.second is None else ("one", "two")
             raise self.error(f"[second] says a lens with {says} free-form side(s), and the designed one has {has}; design again")
-        scene, heights = sides_of(scene, field, state.state.heights)
+        scene, heights = sides_of(scene, field, state.state.heights if self.values is None else self._trained(state.state))
         try:
             refuse_without_glass(scene, field, heights)
         except InputError as error:
             raise self.error(f"{error}") from error
         return Designed(scene, field, heights, state)
+
+    def _trained(self, state: State) -> Tensor:
+        """The lens (n, m), mm, that its network gives for its values."""
+        if not state.parameters:
+            raise self.error("holds no network yet: design it first")
+        middle = self._scene(None)
+        target = torch.from_numpy(self.target(middle))
+        designer = Designer(middle, target, build_stages(self.settings), build_options(self.settings))
+        return designer.heights_at(state, self.values or ())
 
     def write(self, path: Path | None = None) -> None:
         """Write project.toml and the pictures to `path`, the project's own unless given; the directory exists.

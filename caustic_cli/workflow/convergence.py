@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import torch
 
 from caustic_cli.config import checks
-from caustic_cli.studies import diffraction, effects, intersection, light, training
+from caustic_cli.studies import architectures, diffraction, effects, intersection, light, training
 from caustic_cli.studies.convergence import run_study
 from caustic_cli.studies.report import Study
+from caustic_cli.workflow import architectures as networks
 from caustic_cli.workflow import comparison, tradeoff
 from caustic_cli.workflow.compilation import compile_for
 from caustic_cli.workflow.design import sphere
@@ -21,12 +22,20 @@ from caustic_cli.workflow.reporter import Reporter
 PLOTS = {
     "intersection": intersection.PLOTS,
     "design": training.PLOTS,
+    "networks": architectures.PLOTS,
     "effects": effects.PLOTS,
     "diffraction": diffraction.PLOTS,
     "light": light.PLOTS,
 }
 #: What the progress of a study counts.
-UNITS = {"intersection": "evaluations", "effects": "effects", "design": "turns", "diffraction": "cases", "light": "lenses"}
+UNITS = {
+    "intersection": "evaluations",
+    "effects": "effects",
+    "design": "turns",
+    "networks": "turns",
+    "diffraction": "cases",
+    "light": "lenses",
+}
 
 
 @dataclass(frozen=True)
@@ -68,6 +77,11 @@ def measure(
         scene, target, entries = comparison.entries_of(project, device, asked.dtype, asked.seed)
         return training.run_training(
             scene, target, entries, seconds=asked.seconds, seed=seed, rays=asked.rays, device=device, progress=progress
+        )
+    if name == "networks":
+        compared = networks.candidates(project, device, asked.dtype, asked.seed, asked.rays)
+        return architectures.run_architectures(
+            compared, seconds=asked.seconds, about={"seed": seed, "device": device}, progress=progress
         )
     if name == "light":
         each = checks.number("⟨seconds⟩", light.SECONDS if asked.seconds is None else asked.seconds, 0.0, 1e6, open_low=True)

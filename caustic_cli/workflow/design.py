@@ -152,7 +152,8 @@ def begin(
     if out is not None:
         directory.check(out, force)  # before the transport, which may take a minute
     if designer.scene.second is None:
-        refuse_unreachable(designer.scene, grey(goal))
+        for scene in designer.scenes:
+            refuse_unreachable(scene, grey(goal))
     if words := shape_words(full):
         say.say(words)
     with say.notify_if_slow(

@@ -28,6 +28,7 @@ from caustic_cli.studies.panels import write_report
 from caustic_cli.studies.retrace import FINAL_RAYS, retrace, white_level
 from caustic_cli.studies.second import second_figures
 from caustic_cli.studies.waves import unseen_figures, wave_figures
+from caustic_cli.workflow import over_range
 
 #: Points along each side of the aperture at which the report draws the surface.
 REPORT_SAMPLES = 401
@@ -37,6 +38,8 @@ LIKENESS = {"rms", "rms-light", "throughput"}
 PROBE, RETRACES, WAVE_IMAGES, REPORT_SECONDS = 16, 2.5, 4, 2.5
 #: Fewer rays, by this factor, judge the first surfaces of a lens with two free-form sides.
 STARTS = 4
+#: Fewer rays, by this factor, judge each of the lenses that a network gives.
+OVER = 4
 #: Part of relative_rms that the noise of its rays may be.
 QUIET = 0.1
 #: From so many times the light on the screen, a lens is kept although the surface it began from is more like the target.
@@ -98,7 +101,9 @@ def expected_seconds(designer: Designer, target: np.ndarray, state: State, devic
     if scene.second is not None:
         scene, heights = sides_of(scene, field, heights)
     retrace(scene, field, heights, target, rays=FINAL_RAYS // PROBE, device=device, noise=False)
-    seconds = RETRACES * PROBE * (time.monotonic() - began) + REPORT_SECONDS
+    over = designer.options.over
+    retraces = RETRACES + (0.0 if over is None else 2.0 * len(over.judged()) / OVER)
+    seconds = retraces * PROBE * (time.monotonic() - began) + REPORT_SECONDS
     if any(s.waves for s in designer.stages):
         began = time.monotonic()
         wave_figures(scene, field, state.heights.to(device), target, Resolution.before(scene, scene.screen.size), required=False)
@@ -151,7 +156,8 @@ def evaluate(
         light, more = as_waves(state.heights)
         figures |= more
     by_likeness = {name for _, name in parse(designer.options.loss)} <= LIKENESS
-    if state.start is not None and by_likeness and designer.options.robust is None:  # which pays for what it wants with likeness
+    for_one = designer.options.robust is None and designer.options.over is None  # others pay for what they want with likeness
+    if state.start is not None and by_likeness and for_one:
         start = designer.within_limits(replace(state, heights=designer.begun(state)))
         _, began = trace(start, noise=not scene.source.collimated)  # of other light, what the retrace has anyway
         of_start = None
@@ -180,6 +186,8 @@ def evaluate(
         figures |= {"etendue_limit": bounds.etendue}
     if light is not None:
         figures |= unseen_figures(scene, field, state.heights.to(device), target)
+    if designer.options.over is not None:
+        figures |= {"over": over_range.errors(designer, state, target, rays=FINAL_RAYS // OVER, seed=seed, device=device)}
     return Evaluation(state, figures, exposure.image.cpu().numpy(), None if light is None else light.image.cpu().numpy())
 
 

@@ -22,7 +22,7 @@ from caustic_cli.workflow.reporter import Reporter
 
 
 def export(
-    project: Path, format: str, output: Path | None, script: bool, given: dict, force: bool, say: Reporter
+    project: Path, format: str, output: Path | None, script: bool, given: dict, force: bool, say: Reporter, at: str | None = None
 ) -> tuple[dict, bool]:
     """Write the lens of a project.
 
@@ -32,6 +32,7 @@ def export(
         script: of lighttools: also the script that rebuilds the scene.
         given: samples (n, m) or tolerance, mm, of the sampled formats; mould, block; milling, a dictionary.
         force: replace files that are not ours, and do again what is up to date.
+        at: values of the ranges that a network was trained over, "throw=300", which the file's own name then says.
 
     Returns:
         file, format, bytes, seconds and what was written beside it; whether an earlier run of the same had made all of it.
@@ -39,11 +40,13 @@ def export(
     Raises:
         InputError: no lens there, one that the format cannot hold, or a file in the way; nothing was written.
     """
-    began, opened = time.monotonic(), Project.open(project)
-    path = output or Path(project.resolve().stem + FORMATS[format][0])
+    began, opened = time.monotonic(), Project.open(project).at(at)
+    which = "" if at is None else f"-{at.replace(' ', '').replace(',', '-').replace('=', '-')}"
+    path = output or Path(project.resolve().stem + which + FORMATS[format][0])
     scene = opened.scene()
     written = files(path, scene, format, script)
-    made = Outputs(opened, "export", {"format": format, "script": script, **given}, written)
+    values = {"at": at} if at is not None else {}
+    made = Outputs(opened, "export", {"format": format, "script": script, **values, **given}, written)
     if not force and (found := made.found()):
         say.say(f"{path}: is what the same options made of the same project, so there is nothing to do; ⟨force⟩ does it again")
         return found, True

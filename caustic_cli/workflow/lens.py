@@ -87,7 +87,8 @@ class Lens:
 
     @classmethod
     def of(cls, project: Project, given: Mapping[str, Any] | None = None) -> Lens:
-        """The lens of a project's last checkpoint; given: path in `config.table` -> value, which replace the project's settings."""
+        """The lens of a project's last checkpoint, for the project's values; given: path in `config.table` -> value, which replace
+        the project's settings."""
         scene = project.scene(dict(given or {}))
         target = project.target(scene)
         scene, field, heights, checkpoint = project.lens(scene)
@@ -224,13 +225,24 @@ class Lens:
         return place
 
 
-def load(path: str | Path) -> Lens:
+def load(path: str | Path, at: str | None = None) -> Lens:
     """The lens of a project directory, or of an .npz archive as exported.
 
+    at: of a network trained over a range, what the lens is for: "throw=300"; the middle where it says nothing.
+
     Raises:
-        InputError: there is none, or it is damaged.
+        InputError: there is none, it is damaged, or `at` is none of its values.
     """
-    return Lens.of_archive(path) if is_archive(Path(path)) else Lens.of(Project.open(path))
+    if is_archive(Path(path)):
+        refuse_at(at)
+        return Lens.of_archive(path)
+    return Lens.of(Project.open(path).at(at))
+
+
+def refuse_at(at: str | None) -> None:
+    """Refuse values of a network's ranges where there is no network."""
+    if at is not None:
+        raise InputError(f"⟨at⟩ {at} needs a project, whose network gives a lens for every value; an archive holds one lens")
 
 
 def is_archive(path: Path) -> bool:

@@ -33,7 +33,7 @@ from caustic_cli.studies.verify import require_mitsuba, verify, write_panels
 from caustic_cli.workflow import page
 from caustic_cli.workflow.compilation import compile_for
 from caustic_cli.workflow.cut import compared, cut_surface, mark
-from caustic_cli.workflow.lens import Lens, is_archive
+from caustic_cli.workflow.lens import Lens, is_archive, refuse_at
 from caustic_cli.workflow.reporter import Reporter
 from caustic_cli.workflow.tolerances import read as read_tolerances
 from caustic_cli.workflow.tolerances import tolerances
@@ -60,6 +60,7 @@ class Request:
         seed, dtype: of rays; None for the project's own and for float64.
         tolerances: TOML file of errors whose effect is studied.
         want: picture of the illumination that an array's sources are to be as bright for.
+        at: values of the ranges that a network was trained over, "throw=300"; None for their middle.
     """
 
     lens: Path
@@ -84,6 +85,7 @@ class Request:
     dtype: torch.dtype = torch.float64
     tolerances: Path | None = None
     want: Path | None = None
+    at: str | None = None
 
     @property
     def asks(self) -> dict[str, object]:
@@ -101,6 +103,7 @@ class Request:
             "tool_radius",
             "seed",
             "dtype",
+            "at",
         )
         cut = {"cut": mark(self.cut)} if self.cut else {}
         off = {} if self.tolerances is None else {"tolerances": read_tolerances(self.tolerances)}
@@ -123,7 +126,9 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     if asked.image is not None and asked.image.suffix.lower() not in ("", ".png"):
         raise InputError(f"{asked.image}: ⟨out⟩ is a PNG, and its name must end in .png")
     archived = Lens.of_archive(asked.lens) if is_archive(asked.lens) else None
-    project = None if archived else Project.open(asked.lens)
+    if archived:
+        refuse_at(asked.at)
+    project = None if archived else Project.open(asked.lens).at(asked.at)
     if archived and asked.given:
         raise InputError(f"⟨{next(iter(asked.given))}⟩: an archive's source is fixed; render its project under another light")
     image_path = asked.image or (asked.lens / RENDER if project else Path(asked.lens.stem + "-render.png"))

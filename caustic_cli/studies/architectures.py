@@ -1,0 +1,190 @@
+"""Which network of heights learns best: a grid of architectures, each trained alike (the thesis' outlook, 7.2).
+
+Candidates are trained for the same numbers of iterations, ROUNDS one after the other, on the same picture from the same first lens,
+and their lenses are retraced with the same rays, which none has seen.  So errors repeat from run to run, and times do not; a time
+limit ends the study after a round that all have been through.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import torch
+from matplotlib.figure import Figure
+
+from caustic_cli import __version__
+from caustic_cli.config import checks
+from caustic_cli.errors import CausticError
+from caustic_cli.studies.report import Study, plain_ticks, styles
+
+#: Iterations in all after each round.
+ROUNDS = (25, 50, 100, 200)
+#: Seconds for each candidate, unless said.
+SECONDS = 4.0
+#: Errors this close, relatively, are called equal.
+ALIKE = 0.02
+
+COLUMNS = {
+    "series": "what is trained",
+    "network": "dense, or none for the heights themselves",
+    "inputs": "range: a network trained over a range, which sees where in it it is; none: over a range, but one lens for all of it;"
+    " alone: one network for each value that is judged; empty where there is no range",
+    "layers": "hidden layers",
+    "width": "neurons in each",
+    "activation": "of the hidden layers",
+    "preconditioner": "laplacian: outputs are the coordinates in which the caustic's response is well conditioned; none: heights",
+    "lr": "learning rate of Adam",
+    "parameters": "weights and biases, or heights",
+    "iterations": "of Adam",
+    "seconds": "spent in iterations, s",
+    "loss": "the last iteration's own loss times the pixels",
+    "error": "relative RMS between the retraced image and the target; over a range, the root mean square over the values judged",
+    "worst": "over a range, the largest of these",
+    "noise": "standard error of `error` that the retrace's own rays leave",
+}
+
+
+class Candidate(Protocol):
+    """A network in training.
+
+    about: its columns, as far as they do not change; seconds: spent; loss: of the last iteration, times the pixels.
+    """
+
+    about: dict[str, Any]
+    seconds: float
+    loss: float | None
+
+    def reach(self, iterations: int) -> None:
+        """Go on to so many iterations in all.
+
+        Raises:
+            CausticError: it cannot: its loss is not finite, or no light reaches the screen.
+        """
+
+    def judged(self) -> dict[str, float]:
+        """error, worst and noise."""
+
+
+def run_architectures(
+    candidates: Sequence[Candidate],
+    *,
+    seconds: float | None = None,
+    about: dict | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Study:
+    """Train all candidates.
+
+    Args:
+        seconds: for each on average, None for SECONDS: no round is begun when all of them together have had that.
+        about: more to be told of how it was made.
+        progress: told (turns done, in all) after each.
+
+    Raises:
+        InputError: numbers out of range.
+        CausticError: none of them can be trained.
+    """
+    seconds = checks.number("⟨seconds⟩", SECONDS if seconds is None else seconds, 0.0, 1e6, open_low=True)
+    began, rows, left, failed = time.monotonic(), [], list(candidates), {}
+    for k, iterations in enumerate(ROUNDS):
+        for i, c in enumerate(list(left)):
+            try:
+                c.reach(iterations)
+                rows.append({**c.about, "iterations": iterations, "seconds": c.seconds, "loss": c.loss, **c.judged()})
+            except CausticError as error:
+                failed[c.about["series"]] = str(error)
+                left.remove(c)
+            if progress is not None:
+                progress(k * len(candidates) + i + 1, len(ROUNDS) * len(candidates))
+        if not left or time.monotonic() - began > seconds * len(candidates):
+            break
+    if not left:
+        raise CausticError(f"none of the networks could be trained: {next(iter(failed.values()))}")
+    rows.sort(key=lambda row: [c.about["series"] for c in candidates].index(row["series"]))
+    made = {
+        "version": __version__,
+        "seconds_each": seconds,
+        "rounds": list(ROUNDS),
+        "failed": failed,
+        "threads": torch.get_num_threads(),
+        "reference_error": 0.0,
+    }
+    advice = _advice(rows) + (f"; {len(failed)} of {len(candidates)} could not be trained" if failed else "")
+    return Study("networks", COLUMNS, rows, {}, advice, made | (about or {}), "seconds", PLOTS)
+
+
+def last_round(rows: Sequence[dict]) -> list[dict]:
+    """The rows of the most iterations."""
+    most = max(row["iterations"] for row in rows)
+    return [row for row in rows if row["iterations"] == most]
+
+
+def _advice(rows: Sequence[dict]) -> str:
+    """The best, what every choice is worth beside it, and what conditioning is, in one sentence."""
+    rows = last_round(rows)
+    grid = [row for row in rows if row["network"] == "dense" and row["inputs"] in ("", "range")]
+    best = min(grid, key=lambda row: row["error"])
+    parts = [f"after {best['iterations']} iterations {best['series']} has the least error of the networks, {best['error']:.3g}"]
+    for key in ("preconditioner", "lr", "activation", "layers", "width"):
+        of = {value: min(row["error"] for row in grid if row[key] == value) for value in {row[key] for row in grid}}
+        if len(of) > 1:
+            listed = ", ".join(f"{value} {of[value]:.3g}" for value in sorted(of, key=lambda value: of[value]))
+            parts.append(f"by {key} at best {listed}")
+    free = [row["error"] for row in rows if row["network"] == "none"]
+    if free:
+        parts.append(f"no network {min(free):.3g}")
+    for name, words in (("none", "one lens for the whole range"), ("alone", "networks for each value alone")):
+        of_range = [row["error"] for row in rows if row["inputs"] == name]
+        if of_range:
+            parts.append(f"{words} {min(of_range):.3g}")
+    return "; ".join(parts)
+
+
+def draw_architectures(study: Study, figure: Figure) -> None:
+    """Error of the last round against width; panels by preconditioner and learning rate, curves by layers and activation."""
+    rows = last_round(study.rows)
+    grid = [row for row in rows if row["network"] == "dense" and row["inputs"] in ("", "range")]
+    down, across = (sorted({row[key] for row in grid}) for key in ("preconditioner", "lr"))
+    figure.set_size_inches(2.2 + 3.4 * len(across), 1.4 + 2.8 * len(down))
+    panels = figure.subplots(len(down), len(across), sharex=True, sharey=True, squeeze=False)
+    of = styles(f"{row['activation']}, {_layers(row['layers'])}" for row in grid)
+    for line, preconditioner in zip(panels, down, strict=True):
+        for axes, lr in zip(line, across, strict=True):
+            for name, style in of.items():
+                mine = [
+                    row
+                    for row in grid
+                    if (row["preconditioner"], row["lr"]) == (preconditioner, lr)
+                    and f"{row['activation']}, {_layers(row['layers'])}" == name
+                ]
+                mine.sort(key=lambda row: row["width"])
+                axes.errorbar([row["width"] for row in mine], [row["error"] for row in mine], label=name, **style)
+            for row, dashes in zip(_beside(rows, preconditioner), ("--", ":"), strict=False):
+                axes.axhline(row["error"], color="black", linewidth=0.9, linestyle=dashes, label=row["series"].split(",")[0])
+            axes.set(xscale="log", yscale="log", title=f"preconditioner {preconditioner}, lr {lr:g}")
+            axes.title.set_fontsize("medium")
+            axes.set_xticks(sorted({row["width"] for row in grid}), labels=[f"{n}" for n in sorted({row["width"] for row in grid})])
+            axes.minorticks_off()
+            axes.grid(which="major", linewidth=0.4)
+            plain_ticks(axes.yaxis)
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize="small")
+    for axes in panels[-1]:
+        axes.set_xlabel("neurons in each hidden layer")
+    figure.supylabel(f"relative RMS of the retraced image, {rows[0]['iterations']} iterations", fontsize="medium")
+
+
+def _layers(n: int) -> str:
+    return f"{n} layer{'s' if n > 1 else ''}"
+
+
+def _beside(rows: Sequence[dict], preconditioner: str) -> list[dict]:
+    """What networks are compared with: no network, at its best learning rate, and the other ways to be trained over a range."""
+    free = [row for row in rows if row["network"] == "none" and row["preconditioner"] == preconditioner]
+    best = [min(free, key=lambda row: row["error"])] if free else []
+    return best + [row for row in rows if row["inputs"] in ("none", "alone")]
+
+
+#: Endings of the pictures' names, and what draws them.
+PLOTS = {"": draw_architectures}

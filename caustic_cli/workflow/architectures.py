@@ -1,0 +1,160 @@
+"""The networks that `convergence study design networks` trains against each other."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from caustic_cli.config.completion import build_options, build_stages, complete
+from caustic_cli.config.settings import build_scene
+from caustic_cli.errors import InputError
+from caustic_cli.inverse.conditions import Range, Ranges
+from caustic_cli.inverse.designer import Designer, Options
+from caustic_cli.inverse.parametrisation import Architecture
+from caustic_cli.project.project import Project
+from caustic_cli.scene import Scene
+from caustic_cli.studies.retrace import retrace
+from caustic_cli.workflow import over_range
+from caustic_cli.workflow.comparison import disc
+from caustic_cli.workflow.design import first_heights
+
+#: The grid: hidden layers, neurons in each, activations, learning rates, and what the outputs are.
+LAYERS, WIDTHS, ACTIVATIONS, RATES = (1, 2, 3), (16, 64, 256), ("tanh", "silu"), (3e-4, 1e-3, 3e-3)
+OUTPUTS = ("none", "laplacian")
+#: Learning rates of the heights themselves, which a step moves by as much and no more.
+FREE_RATES = (1e-3, 1e-2, 1e-1)
+#: Without a project: pixels across the screen, and control points.
+PIXELS, CONTROL = 48, 35
+#: Rays of a retrace per pixel.
+RAYS_PER_PIXEL = 64
+
+
+class Candidate:
+    """A `studies.architectures.Candidate`: one design, or several for as many values, which share its columns.
+
+    Args:
+        about: columns that do not change.
+        designers: whose lenses are judged, each over its own ranges or in its own scene.
+        first: heights (n, m) mm that all begin from, None for the offset surface.
+        target: (n_x, n_y).
+        rays, seed: of the retrace.
+    """
+
+    def __init__(
+        self, about: dict[str, Any], designers: list[Designer], first: Tensor | None, target: np.ndarray, rays: int, seed: int
+    ):
+        self.designers, self.target, self.rays, self.seed = designers, target, rays, seed
+        self.states = [one.begin(first) for one in designers]
+        count = sum(v.numel() for state in self.states for name, v in state.parameters.items() if name != "start")
+        self.about = about | {"parameters": count}
+
+    @property
+    def seconds(self) -> float:
+        """Spent so far, on all of them."""
+        return sum(state.seconds for state in self.states)
+
+    @property
+    def loss(self) -> float | None:
+        """Mean of the last iterations', times the pixels."""
+        losses = [state.history[-1][2] for state in self.states if state.history]
+        return self.target.size * sum(losses) / len(losses) if losses else None
+
+    def reach(self, iterations: int) -> None:
+        """Go on to so many iterations in all."""
+        self.states = [one.run(state, iterations=iterations) for one, state in zip(self.designers, self.states, strict=True)]
+
+    def judged(self) -> dict[str, float]:
+        """error, worst and noise."""
+        found = []
+        for designer, state in zip(self.designers, self.states, strict=True):
+            if designer.options.over is not None:
+                found += over_range.errors(
+                    designer, state, self.target, rays=self.rays, seed=self.seed, device=designer.device, middle=False
+                )
+                continue
+            field, device = designer.field(state.stage), designer.device
+            found.append(
+                retrace(designer.scene, field, state.heights, self.target, rays=self.rays, seed=self.seed, device=device)[1]
+            )
+        errors, noises = (np.array([row[key] or 0.0 for row in found]) for key in ("relative_rms", "noise"))
+        error = float(np.sqrt(np.mean(errors**2)))
+        noise = float(np.sqrt(np.sum((errors * noises) ** 2)) / (error * len(found))) if error > 0 else 0.0
+        return {"error": error, "worst": float(errors.max()), "noise": noise}
+
+
+def candidates(
+    project: Project | None, device: str, dtype: torch.dtype | None = None, seed: int | None = None, rays: int | None = None
+) -> list[Candidate]:
+    """The grid for a project's picture and scene, or without one for a bright disc; and what it is compared with.
+
+    Of a project whose network is trained over a range, all are, from its own first surface with its activation and preconditioner;
+    beside them stand its own, the same without inputs, which is one lens for the whole range, and one for each value alone.  Of any
+    other, networks begin at the offset surface, and heights by Adam stand beside them.
+
+    Raises:
+        InputError: no stage is on rays, or there are two free-form sides.
+    """
+    first: Tensor | None = None
+    if project is None:
+        full = complete({"screen": {"resolution": [PIXELS] * 2}, "lens": {"control": [CONTROL] * 2}}, 1.0)
+        scene = build_scene(full)
+        target = disc(scene, tuple(full["target"]["size"]))
+    else:
+        if project.over is not None and project.settings["design"]["start"] != "offset":
+            project, first = first_heights(project, project.settings)
+        full, scene = project.settings, project.scene()
+        target = project.target(scene)
+    stages = [s for s in build_stages(full) if not s.waves]
+    if not stages or scene.second is not None or scene.lens.arrayed:
+        raise InputError("⟨networks⟩ are compared on the rays of a lens with one free-form side, and this project has none such")
+    stage = replace(stages[-1], blur=0.0, iterations=10**9, tolerance=0.0, source=None, spread=False, control=scene.lens.control)
+    own, goal = build_options(full), torch.from_numpy(target)
+    base = replace(own, dtype=dtype or own.dtype, seed=own.seed if seed is None else seed, optimizer="adam", robust=None)
+    count = rays or RAYS_PER_PIXEL * math.prod(scene.screen.resolution)
+
+    def made(name: str, options: Options, inputs: str = "", each: list[tuple[Scene, Options]] | None = None) -> Candidate:
+        dense = options.network == "dense"
+        shape = options.architecture
+        about = {
+            "series": f"{name}, {options.preconditioner}, lr {options.lr:g}",
+            "network": options.network,
+            "inputs": inputs,
+            "layers": shape.layers if dense else None,
+            "width": (shape.width or math.prod(scene.lens.control)) if dense else None,
+            "activation": shape.activation if dense else None,
+            "preconditioner": options.preconditioner,
+            "lr": options.lr,
+        }
+        designers = [Designer(one, goal, [stage], how, device) for one, how in each or [(scene, options)]]
+        return Candidate(about, designers, first, target, count, base.seed)
+
+    over, found = own.over, []
+    outputs, activations = (OUTPUTS, ACTIVATIONS) if over is None else ((own.preconditioner,), (own.architecture.activation,))
+    for output, lr, act, layers, width in itertools.product(outputs, RATES, activations, LAYERS, WIDTHS):
+        options = replace(
+            base, network="dense", initial="zero-last", preconditioner=output, lr=lr, architecture=Architecture(layers, width, act)
+        )
+        found.append(made(f"{layers} x {width} {act}", options, "" if over is None else "range"))
+    if over is None:
+        for output, lr in itertools.product(OUTPUTS, FREE_RATES):
+            free = replace(base, network="none", initial="zero", preconditioner=output, lr=lr, architecture=Architecture())
+            found.append(made("no network", free))
+        return found
+    found.append(made("as designed", replace(own, dtype=base.dtype, seed=base.seed), "range"))
+    blind = replace(own, dtype=base.dtype, seed=base.seed, inputs=False)
+    found.append(made("one lens for all", blind, "none"))
+    alone = [
+        (
+            over.scene(scene, values),
+            replace(blind, over=Ranges(tuple(Range(k, v, v) for k, v in zip(over.keys, values, strict=True)))),
+        )
+        for values in over.judged()
+    ]
+    found.append(made("each value alone", blind, "alone", alone))
+    return found
