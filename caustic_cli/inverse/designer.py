@@ -405,6 +405,12 @@ class Designer:
             raise InputError(
                 f"⟨screen.z⟩ must lie behind the lens, whose surface may reach {high.max():.4g} mm, got {screen.z:g} mm"
             )
+        ahead = [e.extent[0] for e in self.scene.behind[:1]]
+        if ahead and high.max() >= ahead[0]:
+            raise InputError(
+                f"⟨element.z⟩ of the element behind the lens must lie beyond {high.max():.4g} mm, which the lens' surface may reach,"
+                f" got a body from {ahead[0]:.4g} mm on"
+            )
         if self.scene.second is not None:
             most = np.full_like(low, lens.height_range[1])
             low, high = np.stack([-most, low]), np.stack([most, high])

@@ -9,6 +9,9 @@ A ray of tangent q crosses the entrance at h q from the axis through the source 
 q' = q / sqrt(n^2 (1 + q^2) - q^2) by Snell; t is the height of p above the entrance.  So the point p is reached by the q with
 h q + t q' = |(x - x_0, y - y_0)|, unless that has to come in by the lens' sides, and
 f = I(q) (1 - R(q)) (1 + q^2)^(-3/2) |d(s_x, s_y) / d(x, y)|.
+
+Where other lenses stand before the lens, rays are traced through them: from (a, b) of the pupil, which the source lights with
+irradiance g(a, b), to p, which is solved for (a, b) by Newton's method; then f = T g |d(a, b) / d(x, y)|, T what passes.
 """
 
 from __future__ import annotations
@@ -17,16 +20,23 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from scipy.interpolate import RegularGridInterpolator
 
 from caustic_cli.errors import InputError
+from caustic_cli.inverse.relayed import bare, opened, passed
 from caustic_cli.inverse.target import overlap
 from caustic_cli.optics.emission.measured import irradiance
 from caustic_cli.optics.interface import reflectance
+from caustic_cli.optics.system import ENTRANCE, System
 from caustic_cli.scene import Scene
 from caustic_cli.scene.sources.distribution import relative
 
 #: Newton steps for q; its function is concave, so from the greater of two lower bounds each step stays below the root.
 STEPS = 40
+#: Of points of the pupil, mm, over which a trace is differentiated; cells of it along each axis; how wide the light of its middle is
+#: at the exit at least, in parts of what it was.
+_STEP, CELLS, LEAST_GROWTH = 1e-5, 128, 1e-3
+_STEPS = _STEP * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])[:, :, None, None]
 
 
 def incident(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, tuple | None]:
@@ -38,7 +48,7 @@ def incident(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple
     Raises:
         InputError: the source stands behind the entrance.
     """
-    light, directions = _square(scene, x, y, z)
+    light, directions = (_through if scene.before else _square)(scene, x, y, z)
     return (light * _part_within(x, y, scene.lens.half_size[0]) if scene.lens.round else light), directions
 
 
@@ -46,6 +56,72 @@ def on_entrance(scene: Scene, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray,
     """The same in air, on the plane of the entrance: as if the lens there had the index 1 and no thickness."""
     air = replace(scene, lens=replace(scene.lens, index=1.0 + 1e-9, glass=None, fresnel="none", front=None), second=None)
     return incident(air, x, y, np.full((len(x), len(y)), scene.lens.z_in))
+
+
+def _through(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, tuple]:
+    """The same over the whole rectangle, through the lenses before the lens."""
+    pupil, lens, whole = scene.pupil, scene.lens, System.of(bare(scene))
+    names = [e.name for e in whole.elements]
+    system = opened(whole, 0, names.index(ENTRANCE) + 1)
+    first = scene.before[0].extent[0]
+
+    def arrive(a: np.ndarray, b: np.ndarray):
+        """Where rays of the pupil meet the heights, their directions in the glass, where they entered it, and what passes."""
+        d = _from_source(scene, a, b)
+        back = (pupil.z - first) / d[2] + 1e-6  # the first surface may reach through the pupil
+        state = passed(system, (a - back * d[0], b - back * d[1], pupil.z - back * d[2]), d)
+        dx, dy, dz = (c.numpy().reshape(a.shape) for c in state.full(state.direction))
+        ex, ey = (c.numpy().reshape(a.shape) for c in state.origin[:2])
+        over = (z - lens.z_in) / dz
+        return (ex + over * dx, ey + over * dy), (dx, dy, dz), (ex, ey), state.power.numpy().reshape(a.shape)
+
+    small = 1e-3 * min(pupil.half_size)
+    goal = np.stack(np.broadcast_arrays(x[:, None], y[None, :]))
+    zero = np.zeros_like(goal[0])
+    grown = [(arrive(small + zero, zero)[0][0] / small), (arrive(zero, small + zero)[0][1] / small)]
+    if not all((np.abs(g) > LEAST_GROWTH).all() for g in grown):
+        raise InputError("⟨element.radius⟩: the lenses before the lens focus their light into it; a first surface needs it spread out")
+    at = np.stack([c / g for c, g in zip(goal, grown, strict=True)])
+    for _ in range(STEPS):
+        here, by_a, by_b = (np.stack(arrive(*(at + s))[0]) for s in _STEPS)
+        ja, jb, off = (by_a - here) / _STEP, (by_b - here) / _STEP, goal - here
+        with np.errstate(divide="ignore", invalid="ignore"):
+            move = np.stack([jb[1] * off[0] - jb[0] * off[1], ja[0] * off[1] - ja[1] * off[0]]) / (ja[0] * jb[1] - ja[1] * jb[0])
+        known = np.isfinite(move).all(0)
+        at = at + np.where(known, move, 0.0)
+        if not known.any() or np.abs(off[:, known]).max() <= 1e-9 * max(lens.half_size):
+            break
+    _, d, entered, part = arrive(*at)
+    ga, gb = (np.gradient(c, x, y) for c in at)
+    power = part * np.abs(ga[0] * gb[1] - ga[1] * gb[0])
+    for where, half, round_ in ((at, pupil.half_size, pupil.round), (entered, lens.half_size, lens.round)):
+        far = np.hypot(*where) / half[0] if round_ else np.maximum(*(np.abs(c) / h for c, h in zip(where, half, strict=True)))
+        power = np.where(known & (far <= 1 + 1e-9), power, 0.0)
+    power = power * _on_pupil(scene, *at)
+    light = 0.25 * (power[1:, 1:] + power[:-1, 1:] + power[1:, :-1] + power[:-1, :-1])
+    return light, tuple(np.where(known, c, axis) for c, axis in zip(d, (0.0, 0.0, 1.0), strict=True))
+
+
+def _from_source(scene: Scene, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Unit directions of the light of the source's middle at points of the pupil."""
+    if scene.source.distant:
+        return np.zeros_like(a), np.zeros_like(a), np.ones_like(a)
+    x0, y0, z0 = scene.source.centre
+    dx, dy, h = a - x0, b - y0, scene.pupil.z - z0
+    length = np.sqrt(dx * dx + dy * dy + h * h)
+    return dx / length, dy / length, h / length
+
+
+def _on_pupil(scene: Scene, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Irradiance there, between the middles of CELLS x CELLS cells."""
+    pupil = scene.pupil
+    size = (2.0 * pupil.half_size[0], 2.0 * pupil.half_size[1])
+    lens = replace(scene.lens, size=size, z_in=pupil.z, aperture="circle" if pupil.round else "rectangle", border=0.0)
+    edges = [np.linspace(-h, h, CELLS + 1) for h in pupil.half_size]
+    light = on_entrance(replace(scene, lens=lens, elements=()), *edges)[0]
+    middles = [0.5 * (e[1:] + e[:-1]) for e in edges]
+    points = np.stack([np.clip(c, m[0], m[-1]) for c, m in zip((a, b), middles, strict=True)], -1)
+    return RegularGridInterpolator(middles, light)(points)
 
 
 def _part_within(x: np.ndarray, y: np.ndarray, radius: float, parts: int = 8) -> np.ndarray:

@@ -17,7 +17,8 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.incidence import incident
-from caustic_cli.inverse.surface_from_map import OutOfReach, Start, thrown
+from caustic_cli.inverse.relayed import Relayed
+from caustic_cli.inverse.surface_from_map import OutOfReach, Seen, Start, thrown
 from caustic_cli.inverse.surface_from_map import surface as refracting_surface
 from caustic_cli.inverse.transport import corners
 from caustic_cli.inverse.view import View
@@ -86,7 +87,7 @@ class _Grid:
     def solved(self, light: np.ndarray, directions, mean: float, again: Start | None = None, **options) -> Start:
         """The surface of this mean height that sends the light to the picture."""
         scene = self.scene
-        if not scene.source.distant and not light.all():
+        if not light.all() and (scene.before or not scene.source.distant):
             options["darkest"] = DARKEST
         view = self.view(mean)
         target, half, centre = (
@@ -107,9 +108,11 @@ class _Grid:
             **options,
         )
 
-    def view(self, mean: float) -> View | None:
+    def view(self, mean: float) -> Seen | None:
         """The screen as a surface of this mean height sees it, None of an upright one, which lies in its plane."""
         screen = self.scene.screen
+        if self.scene.behind:
+            return Relayed(self.scene, mean)
         return None if screen.upright else View(screen, mean, -1.0 if self.scene.lens.mirror else 1.0)
 
     def above(self, z: np.ndarray) -> np.ndarray:
@@ -193,9 +196,9 @@ def first_surface(scene: Scene, target: np.ndarray, field: HeightField, cells: i
     """
     grid, lens = _Grid.of(scene, target, cells), scene.lens
     z = grid.offset
-    if scene.source.distant or lens.mirror:
+    if scene.source.distant or lens.mirror or scene.elements:
         found = None
-        for _ in range(1 if scene.source.distant else PASSES):
+        for _ in range(1 if scene.source.distant and not scene.before else PASSES):
             found = grid.solved(*incident(scene, grid.x, grid.y, z), float(grid.offset.mean()), found)
             z = found.heights
         return InitialSurface(net_of(grid.x, grid.y, z, field))

@@ -109,6 +109,8 @@ def begin(
         said["screen"] = attachments.with_shape(said["screen"])
     parameters = said.pop("", {})
     invert = parameters.pop("invert", False)
+    if "elements" in parameters:  # those of the command line, instead of a configuration's
+        said["element"] = {"list": parameters.pop("elements")}
     by = Derivation(**parameters)
     if "source" in said:
         said["source"] = attachments.attached(said["source"])
@@ -151,7 +153,7 @@ def begin(
     designer, goal = _designer(project, "cpu")  # builds and so checks scene, target, stages, options
     if out is not None:
         directory.check(out, force)  # before the transport, which may take a minute
-    if designer.scene.second is None:
+    if designer.scene.second is None and not designer.scene.elements:
         refuse_unreachable(designer.scene, grey(goal))
     if words := shape_words(full):
         say.say(words)
@@ -254,7 +256,8 @@ def _say_limits(project: Project, designer: Designer, target: np.ndarray, first:
     if coarse := coarse_words(designer.scene):
         say.say(coarse)
     seen = Resolution.before(designer.scene, tuple(project.settings["target"]["size"]))
-    say.say(seen.sentence())
+    if not designer.scene.elements:
+        say.say(seen.sentence())
     words = limits(designer.scene, grey(target)).sentence()
     if words:
         say.say(words)
