@@ -362,6 +362,11 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
     if "second" in s:
         _complete_two_sided(s, source, quality, rays)
         return
+    if any(table.get("free", "none") != "none" for table in elements_of(s)) and design["start"] != "transport":
+        raise InputError(
+            f"⟨design.start⟩ of several free surfaces must be transport, got {design['start']}; a small net or several points"
+            " have no such start"
+        )
     # Sharp light's transport is right at every scale at once, if the net can hold it, and so is that of a source that shifts the
     # image, for the light behind its blur; otherwise from coarse to fine.
     moved = plain and fine_net and design["start"] != "offset" and (source.sharp or spread or max(array) > 1)

@@ -124,6 +124,12 @@ def sides_of(scene: Scene, field: HeightField, heights: Tensor) -> tuple[Scene, 
     return replace(scene, lens=lens, elements=elements), heights[-1]
 
 
+def traced_of(scene: Scene, field: HeightField, heights: Tensor) -> tuple[Scene, HeightField, Tensor]:
+    """`sides_of`, with the exit's field: what a trace takes."""
+    scene, exit = sides_of(scene, field, heights)
+    return scene, field, exit
+
+
 def front_from(field: HeightField, heights: Tensor) -> Front:
     """A surface with these heights (n, m), counted from its vertex' plane, mm."""
     u, v = field.spaces

@@ -109,6 +109,11 @@ class Scene:
         return (*(["entrance"] if self.second is not None else beside), "exit")
 
     @property
+    def jointly(self) -> bool:
+        """Whether a design shapes other surfaces beside the exit: heights are then (k, n, m), in the sequence of `shaped`."""
+        return len(self.shaped) > 1
+
+    @property
     def pupil(self) -> Pupil:
         """What the source lights: the lens' entrance, or the first element before it."""
         first = next(iter(self.before), None)

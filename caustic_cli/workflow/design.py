@@ -192,7 +192,9 @@ def first_heights(project: Project, said: Settings) -> tuple[Project, torch.Tens
     if first is not None and _make_room(project.settings, said, first) and middle is None:
         _designer(project, "cpu")
         first, _ = _solved(project, fixed)
-    return project, None if first is None else _designer(project, "cpu")[0].within_limits(State(first))
+    designer = _designer(project, "cpu")[0]
+    whole = designer.whole(first)
+    return project, None if whole is None else designer.within_limits(State(whole))
 
 
 @dataclass(frozen=True)
@@ -261,7 +263,7 @@ def _say_limits(project: Project, designer: Designer, target: np.ndarray, first:
     words = limits(designer.scene, grey(target)).sentence()
     if words:
         say.say(words)
-    if designer.scene.second is not None:
+    if designer.scene.jointly:
         return
     if seen.matters and project.settings["design"]["waves"] == "auto" and project.without_waves:
         say.say(f"the wave image is not refined: {project.without_waves}")
@@ -291,7 +293,7 @@ def resume(
         designer, target = _designer(project, device)
         begun = (project.path / CHECKPOINT).exists()  # if not, it was killed before its first checkpoint
         before = project.load() if begun else None
-        state = before.state if begun else designer.begin(_solved(project, fixed=True)[0])
+        state = before.state if begun else designer.begin(designer.whole(_solved(project, fixed=True)[0]))
         if state.stage >= len(designer.stages):
             raise project.error(f"has {len(designer.stages)} stages, but the checkpoint stands in stage {state.stage + 1}")
         if tuple(state.heights.shape[-2:]) != designer.stages[state.stage].control:
