@@ -239,7 +239,9 @@ def _element(option: str, text: str) -> dict[str, Any]:
     keys = {key: row for key, row in rows.items() if key != "type"}
     kind, *words = text.split() or [""]
     if kind not in rows["type"].choices:
-        raise InputError(f"{option} must begin with {' or '.join(rows['type'].choices)}, like 'mirror z=150 tilt=45,0', got {text!r}")
+        raise InputError(
+            f"{option} must begin with {' or '.join(rows['type'].choices)}, like 'mirror z=150 tilt=45,0', got {text!r}"
+        )
     found: dict[str, Any] = {"type": kind}
     for word in words:
         key, equals, value = word.partition("=")

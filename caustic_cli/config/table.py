@@ -42,10 +42,10 @@ class Setting:
     """A row of the table.
 
     path: see the module; kind: number, whole, text, flag, numbers (a pair), wholes (a pair), list (of numbers), points ([x, y, z]
-    or a list of such), tables (a list of tables in words); help: what it is, for comments, options and the reference; unit; low, high, above: range of each number,
-    `above` if low itself is excluded; choices: of a text; default: None where there is none or it is derived; derived: how it then
-    follows; why: the reason for the default; written: whether a new project's file says a default; option: of the command line;
-    speaks_for: other paths that the same option sets.
+    or a list of such), tables (a list of tables in words); help: what it is, for comments, options and the reference; unit; low,
+    high, above: range of each number, `above` if low itself is excluded; choices: of a text; default: None where there is none or
+    it is derived; derived: how it then follows; why: the reason for the default; written: whether a new project's file says a
+    default; option: of the command line; speaks_for: other paths that the same option sets.
     """
 
     path: str

@@ -420,17 +420,15 @@ class Designer:
         ahead = [e.extent[0] for e in self.scene.behind[:1]]
         if ahead and high.max() >= ahead[0]:
             raise InputError(
-                f"⟨element.z⟩ of the element behind the lens must lie beyond {high.max():.4g} mm, which the lens' surface may reach,"
-                f" got a body from {ahead[0]:.4g} mm on"
+                f"⟨element.z⟩ of the element behind the lens must lie beyond {high.max():.4g} mm, which the lens' surface may"
+                f" reach, got a body from {ahead[0]:.4g} mm on"
             )
         if self.scene.second is not None:
             most = np.full_like(low, lens.height_range[1])
             low, high = np.stack([-most, low]), np.stack([most, high])
         elif self.scene.jointly:
             field = HeightField.of(lens)
-            others = [
-                (sphere_net(e, side, field).numpy(), room_of(e, lens)) for e in self.scene.elements for side in e.shaped
-            ]
+            others = [(sphere_net(e, side, field).numpy(), room_of(e, lens)) for e in self.scene.elements for side in e.shaped]
             low = np.stack([*(net - room for net, room in others), low])
             high = np.stack([*(net + room for net, room in others), high])
         return torch.from_numpy(low), torch.from_numpy(high)

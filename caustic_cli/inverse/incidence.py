@@ -33,8 +33,8 @@ from caustic_cli.scene.sources.distribution import relative
 
 #: Newton steps for q; its function is concave, so from the greater of two lower bounds each step stays below the root.
 STEPS = 40
-#: Of points of the pupil, mm, over which a trace is differentiated; cells of it along each axis; how wide the light of its middle is
-#: at the exit at least, in parts of what it was.
+#: Distance of points of the pupil over which a trace is differentiated, mm; cells of it along each axis; how wide the light of its
+#: middle is at the exit at least, in parts of what it was.
 _STEP, CELLS, LEAST_GROWTH = 1e-5, 128, 1e-3
 _STEPS = _STEP * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])[:, :, None, None]
 
@@ -80,7 +80,9 @@ def _through(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple
     zero = np.zeros_like(goal[0])
     grown = [(arrive(small + zero, zero)[0][0] / small), (arrive(zero, small + zero)[0][1] / small)]
     if not all((np.abs(g) > LEAST_GROWTH).all() for g in grown):
-        raise InputError("⟨element.radius⟩: the lenses before the lens focus their light into it; a first surface needs it spread out")
+        raise InputError(
+            "⟨element.radius⟩: the lenses before the lens focus their light into it; a first surface needs it spread out"
+        )
     at = np.stack([c / g for c, g in zip(goal, grown, strict=True)])
     for _ in range(STEPS):
         here, by_a, by_b = (np.stack(arrive(*(at + s))[0]) for s in _STEPS)

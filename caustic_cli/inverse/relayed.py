@@ -7,10 +7,10 @@ Notation
     L               distance of the screen along the axis
     u = s L X / B   the screen as a plane at L, s = +-1: without anything behind the exit, u = X
 
-Light that a lens turns by a slope g leaves with q = q_0 + (n - 1) g, so that u = s ((L A / B) x + L q): the map x -> u that a surface can
-make is, to first order, the gradient of a potential, as that to a bare screen is (`surface_from_map`), but with L A / B for 1.  The
-sign s is that of A / B, by which the map asks for least of the surface; lenses that turn the image over are so allowed for.
-Beyond the first order, q is found by Newton's method, with derivatives by differences.
+Light that a lens turns by a slope g leaves with q = q_0 + (n - 1) g, so that u = s ((L A / B) x + L q): the map x -> u that a
+surface can make is, to first order, the gradient of a potential, as that to a bare screen is (`surface_from_map`), but with L A / B
+for 1. The sign s is that of A / B, by which the map asks for least of the surface: lenses may turn the image over. Beyond the first
+order, q is found by Newton's method, with derivatives by differences.
 """
 
 from __future__ import annotations
@@ -97,7 +97,9 @@ class Relayed:
         q = reach / self.distance * np.array([[0.0, 0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 0.0, 1.0]])
         found = self._from(x, y, np.full(5, self.eye), q)
         if not np.isfinite(found).all():
-            raise InputError("[[element]] light along the axis does not get from the lens to the screen; its mirrors and radii bar it")
+            raise InputError(
+                "[[element]] light along the axis does not get from the lens to the screen; its mirrors and radii bar it"
+            )
         a = np.array([found[0, 1] - found[0, 0], found[1, 2] - found[1, 0]]) / reach
         b = np.array([found[0, 3] - found[0, 0], found[1, 4] - found[1, 0]]) / (reach / self.distance)
         if (np.abs(b) < IMAGED * self.distance).any():
@@ -144,8 +146,8 @@ class Relayed:
         return u / self.scale[0] - shift[0], v / self.scale[1] - shift[1]
 
     def towards(self, u: np.ndarray, v: np.ndarray) -> Callable[..., tuple]:
-        """Directions, of any length, that points x, y, z of the exit have to send light in for it to land at u; where none is found,
-        those of the first order."""
+        """Directions, of any length, that points x, y, z of the exit have to send light in for it to land at u; where none is
+        found, those of the first order."""
         (a, b), scale, pixel = self.first_order, self.scale, min(self.scene.screen.pixel)
         aim, found = np.stack([u / scale[0], v / scale[1]]), None
         steps = STEP * np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])[:, :, None]  # (2, 3, 1)

@@ -32,8 +32,8 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import gaussian_filter
 
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.transport import Transport, corners, solve
 from caustic_cli.inverse.relayed import Relayed
+from caustic_cli.inverse.transport import Transport, corners, solve
 from caustic_cli.inverse.view import View
 from caustic_cli.optics.backends.reference import Torch
 from caustic_cli.optics.frames import IDENTITY

@@ -118,7 +118,7 @@ def sides_of(scene: Scene, field: HeightField, heights: Tensor) -> tuple[Scene, 
     fronts = {name: front_from(field, h) for name, h in zip(scene.shaped, heights[:-1], strict=False)}
     lens = replace(scene.lens, front=fronts[ENTRANCE]) if ENTRANCE in fronts else scene.lens
     elements = tuple(
-        replace(e, fronts=tuple(fronts.get(surface_name(k, side)) for side in SIDES)) if e.shaped else e
+        replace(e, fronts=(fronts.get(surface_name(k, SIDES[0])), fronts.get(surface_name(k, SIDES[1])))) if e.shaped else e
         for k, e in enumerate(scene.elements)
     )
     return replace(scene, lens=lens, elements=elements), heights[-1]
@@ -136,7 +136,9 @@ def front_from(field: HeightField, heights: Tensor) -> Front:
     return Front(heights.detach().cpu().double().numpy(), (u.degree, v.degree), (u.knots.tolist(), v.knots.tolist()))
 
 
-def _elements_of(component: Component, number: int, leg: Leg, scene: Scene, spaces: tuple[SplineSpace, SplineSpace]) -> list[Element]:
+def _elements_of(
+    component: Component, number: int, leg: Leg, scene: Scene, spaces: tuple[SplineSpace, SplineSpace]
+) -> list[Element]:
     """The surfaces of a lens or a mirror on a straight part of the axis; a free one without heights is on these spline spaces."""
     found, glass = [], Medium(component.index, component.absorption, component.glass)
     for side in component.sides:
@@ -206,8 +208,8 @@ class System:
 
     @classmethod
     def of(cls, scene: Scene, surface: HeightField | None = None) -> System:
-        """A scene: a lens of flat entrance and B-spline exit, or a B-spline mirror, between other lenses and folding mirrors.  What is
-        free beside the exit is on its spline spaces, unless the scene says its heights: of two free-form sides the entrance."""
+        """A scene: a lens of flat entrance and B-spline exit, or a B-spline mirror, between other lenses and folding mirrors.  What
+        is free beside the exit is on its spline spaces, unless the scene says its heights: of two free-form sides the entrance."""
         lens = scene.lens
         surface = surface or HeightField.of(lens)
         entrance = Plane() if not scene.two_sided else surface if lens.front is None else front_of(lens)

@@ -122,6 +122,11 @@ class Scene:
         return Pupil(self.lens.half_size, self.lens.z_in, self.lens.round)
 
     @property
+    def lowest(self) -> float:
+        """z that no surface lies below where light comes from the source, mm."""
+        return min([e.extent[0] for e in self.before[:1]] + [self.lens.lowest])
+
+    @property
     def glasses(self) -> tuple[str, ...]:
         """Materials by name of the lens and of other lenses, whose indices change with the wavelength."""
         named = (None if self.lens.mirror else self.lens.glass, *(e.glass for e in self.elements))
@@ -185,7 +190,5 @@ class Scene:
         bands = []
         for k, (wavelength, part) in enumerate(zip(self.light.wavelengths, self.light.parts, strict=True)):
             scene = self.at(wavelength) if self.dispersive else self
-            bands += [
-                Band(replace(scene, light=Light(state)), part / len(states), k if self.colored else None) for state in states
-            ]
+            bands += [Band(replace(scene, light=Light(state)), part / len(states), k if self.colored else None) for state in states]
         return tuple(bands)

@@ -10,6 +10,7 @@ A mirror of R > 0 bulges towards the light and spreads it; one of R < 0 is hollo
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -72,7 +73,8 @@ class Component:
                 raise InputError(f"⟨element.radius⟩ must be non-zero numbers of mm or inf, got {list(self.radius)}")
         if self.round and self.size[0] != self.size[1]:
             raise InputError(
-                f"⟨element.size⟩ of a circular aperture must be its diameter, twice the same, got {self.size[0]:g} x {self.size[1]:g}"
+                "⟨element.size⟩ of a circular aperture must be its diameter, twice the same, got"
+                f" {self.size[0]:g} x {self.size[1]:g}"
             )
         for side, r in zip(self.sides, self.radius, strict=False):
             if self.reach > STEEPEST * abs(r):
@@ -169,7 +171,7 @@ class Component:
 
 def surface_name(number: int, side: str) -> str:
     """Of a surface of the element of this number, counted from 0, among those of a system."""
-    return f"element {number + 1} {side}"
+    return f"element-{number + 1}-{side}"
 
 
 def check_places(elements: Sequence[Component], lens: tuple[float, float], source: float, screen: float) -> None:
@@ -192,7 +194,7 @@ def check_places(elements: Sequence[Component], lens: tuple[float, float], sourc
     own = ("the free-form lens", *lens)
     before = [b for b in bodies if b[1] < lens[0]]
     sequence = [*before, own, *bodies[len(before) :]]
-    for (name, _, high), (other, low, _) in zip(sequence, sequence[1:], strict=False):
+    for (name, _, high), (other, low, _) in itertools.pairwise(sequence):
         if low < high:
             raise InputError(
                 f"⟨element.z⟩: {other} begins at {low:.4g} mm, before {name} ends at {high:.4g} mm; [[element]] tables stand in the"
@@ -217,4 +219,3 @@ def refuse_beside(wrong: dict[str, bool]) -> None:
     for path, there in wrong.items():
         if there:
             raise InputError(f"⟨{path}⟩ cannot be had with [[element]]: beside other lenses and mirrors it is not worked out")
-
