@@ -239,7 +239,11 @@ class Designer:
         if not self.scene.jointly:
             return within_limits(field, state.heights, bounds, o.max_slope, o.min_radius)
         found = []
-        for name, heights, low, high in zip(self.scene.shaped, state.heights, *bounds, strict=True):
+        halves = [e.half_size for e in self.scene.elements for _ in e.shaped] or [field.half_size]
+        for name, half, heights, low, high in zip(
+            self.scene.shaped, [*halves, field.half_size], state.heights, *bounds, strict=True
+        ):
+            field = replace(field, half_size=half)
             if name.endswith(("entrance", "front")):  # what is concave of these, seen from outside, is convex from within
                 found.append(-within_limits(field, -heights, (-high, -low), o.max_slope, o.min_radius))
             else:

@@ -53,7 +53,7 @@ class Leg:
 
     def at(self, x: float, y: float, z: float) -> tuple[float, float, float]:
         """A point of its own coordinates in those of the system, mm."""
-        if self.frame == IDENTITY:
+        if self == Leg():
             return x, y, z
         a, b, c = (o + x * u + y * v + z * w for o, u, v, w in zip(self.origin, *self.frame, strict=True))
         return a, b, c
