@@ -36,7 +36,8 @@ STEPS = 40
 #: Distance of points of the pupil over which a trace is differentiated, mm; cells of it along each axis; how wide the light of its
 #: middle is at the exit at least, in parts of what it was.
 _STEP, CELLS, LEAST_GROWTH = 1e-5, 128, 1e-3
-_STEPS = _STEP * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])[:, :, None, None]
+#: Most of Newton's steps for (a, b), and how near to its corner a ray has to come, in parts of the lens' half width.
+TRACED_STEPS, FOUND = 12, 1e-7
 
 
 def incident(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, tuple | None]:
@@ -65,35 +66,40 @@ def _through(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple
     system = opened(whole, 0, names.index(ENTRANCE) + 1)
     first = scene.before[0].extent[0]
 
-    def arrive(a: np.ndarray, b: np.ndarray):
-        """Where rays of the pupil meet the heights, their directions in the glass, where they entered it, and what passes."""
-        d = _from_source(scene, a, b)
+    def arrive(at: np.ndarray, z: np.ndarray):
+        """Where rays of the pupil's points (2, N) meet heights z, their directions in the glass, where they entered it, and what
+        passes."""
+        d = _from_source(scene, *at)
         back = (pupil.z - first) / d[2] + 1e-6  # the first surface may reach through the pupil
-        state = passed(system, (a - back * d[0], b - back * d[1], pupil.z - back * d[2]), d)
-        dx, dy, dz = (c.numpy().reshape(a.shape) for c in state.full(state.direction))
-        ex, ey = (c.numpy().reshape(a.shape) for c in state.origin[:2])
-        over = (z - lens.z_in) / dz
-        return (ex + over * dx, ey + over * dy), (dx, dy, dz), (ex, ey), state.power.numpy().reshape(a.shape)
+        state = passed(system, (at[0] - back * d[0], at[1] - back * d[1], pupil.z - back * d[2]), d)
+        inside = np.stack([c.numpy().reshape(z.shape) for c in state.full(state.direction)])
+        entered = np.stack([c.numpy().reshape(z.shape) for c in state.origin[:2]])
+        return entered + (z - lens.z_in) / inside[2] * inside[:2], inside, entered, state.power.numpy().reshape(z.shape)
 
-    small = 1e-3 * min(pupil.half_size)
-    goal = np.stack(np.broadcast_arrays(x[:, None], y[None, :]))
-    zero = np.zeros_like(goal[0])
-    grown = [(arrive(small + zero, zero)[0][0] / small), (arrive(zero, small + zero)[0][1] / small)]
-    if not all((np.abs(g) > LEAST_GROWTH).all() for g in grown):
+    small, middle = 1e-3 * min(pupil.half_size), np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    start = arrive(small * middle, np.full(3, float(z.mean())))[0]
+    grown = np.array([start[0, 1] - start[0, 0], start[1, 2] - start[1, 0]]) / small
+    if not (np.abs(grown) > LEAST_GROWTH).all():
         raise InputError(
             "⟨element.radius⟩: the lenses before the lens focus their light into it; a first surface needs it spread out"
         )
-    at = np.stack([c / g for c, g in zip(goal, grown, strict=True)])
-    for _ in range(STEPS):
-        here, by_a, by_b = (np.stack(arrive(*(at + s))[0]) for s in _STEPS)
-        ja, jb, off = (by_a - here) / _STEP, (by_b - here) / _STEP, goal - here
+    shape, flat = z.shape, z.ravel()
+    goal = np.stack([c.ravel() for c in np.broadcast_arrays(x[:, None], y[None, :])])
+    at, left = goal / grown[:, None], np.arange(z.size)
+    for _ in range(TRACED_STEPS):  # of the corners that are left; those that no ray gets to stay
+        here, by_a, by_b = np.moveaxis(arrive(at[:, None, left] + _STEP * middle[:, :, None], np.stack([flat[left]] * 3))[0], 1, 0)
+        ja, jb, off = (by_a - here) / _STEP, (by_b - here) / _STEP, goal[:, left] - here
         with np.errstate(divide="ignore", invalid="ignore"):
             move = np.stack([jb[1] * off[0] - jb[0] * off[1], ja[0] * off[1] - ja[1] * off[0]]) / (ja[0] * jb[1] - ja[1] * jb[0])
         known = np.isfinite(move).all(0)
-        at = at + np.where(known, move, 0.0)
-        if not known.any() or np.abs(off[:, known]).max() <= 1e-9 * max(lens.half_size):
+        at[:, left] += np.where(known, move, 0.0)
+        left = left[~known | (np.abs(off).max(0) > FOUND * max(lens.half_size))]
+        if not len(left):
             break
-    _, d, entered, part = arrive(*at)
+    _, d, entered, part = arrive(at, flat)
+    known = np.ones(z.size, dtype=bool)
+    known[left] = False
+    known, at, d, entered, part = (c.reshape(*c.shape[:-1], *shape) for c in (known, at, d, entered, part))
     ga, gb = (np.gradient(c, x, y) for c in at)
     power = part * np.abs(ga[0] * gb[1] - ga[1] * gb[0])
     for where, half, round_ in ((at, pupil.half_size, pupil.round), (entered, lens.half_size, lens.round)):
