@@ -274,7 +274,7 @@ _ROWS = (
     Setting("element.absorption", "number", "a in exp(-a t) through t mm of its glass", "1/mm", 0.0, 1e6, default=0.0,
             written=False),
     Setting("element.size", "numbers", "full width and height of its aperture", "mm", *LENS,
-            derived="what the beam from the lens to the picture takes, and a fifth more"),
+            derived="the lens' own before it; behind it a fifth more than a straight beam to the picture takes"),
     Setting("element.aperture", "text", "shape of its aperture: rectangle, or circle, the largest within size",
             choices=("rectangle", "circle"), default="rectangle", written=False),
     Setting("element.tilt", "numbers", "turns of a mirror about x or about y", "degrees", -85.0, 85.0),

@@ -36,6 +36,8 @@ STEPS = 40
 #: Distance of points of the pupil over which a trace is differentiated, mm; cells of it along each axis; how wide the light of its
 #: middle is at the exit at least, in parts of what it was.
 _STEP, CELLS, LEAST_GROWTH = 1e-5, 128, 1e-3
+#: Largest sine of what goes on beside the light.
+STEEPEST = 0.6
 #: Most of Newton's steps for (a, b), and how near to its corner a ray has to come, in parts of the lens' half width.
 TRACED_STEPS, FOUND = 12, 1e-7
 
@@ -107,7 +109,21 @@ def _through(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple
         power = np.where(known & (far <= 1 + 1e-9), power, 0.0)
     power = power * _on_pupil(scene, *at)
     light = 0.25 * (power[1:, 1:] + power[:-1, 1:] + power[1:, :-1] + power[:-1, :-1])
-    return light, tuple(np.where(known, c, axis) for c, axis in zip(d, (0.0, 0.0, 1.0), strict=True))
+    return light, _goes_on(d, known & (power > 0), goal.reshape(2, *shape) / np.array(lens.half_size)[:, None, None])
+
+
+def _goes_on(d: np.ndarray, lit: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Unit directions (3, n, m) where corners are lit, and elsewhere those of a cubic fitted to them: a jump would be one of the
+    surface's slopes; at: places in parts of the aperture."""
+    terms = np.stack([at[0] ** i * at[1] ** j for i in range(4) for j in range(4 - i)], -1)
+    found = d[:2].copy()
+    if lit.any():
+        found[:, ~lit] = (terms[~lit] @ np.linalg.lstsq(terms[lit], d[:2, lit].T, rcond=None)[0]).T
+    else:
+        found[:] = 0.0
+    sine = np.hypot(*found)
+    found *= np.minimum(1.0, STEEPEST / np.maximum(sine, STEEPEST))
+    return found[0], found[1], np.sqrt(1.0 - (found * found).sum(0))
 
 
 def _from_source(scene: Scene, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
