@@ -6,12 +6,14 @@ project.toml and the library do, [lens] size and mag; the command line says the 
 advises to set has a plus, ⟨+lens.size⟩, and the command line says its option whether it was given or not.
 """
 
+import difflib
 import re
+from collections.abc import Iterable
 
 #: A marked path.
 MARK = re.compile(r"⟨(\+?[a-z_.]+)⟩")
 #: Sections that are lists of tables in project.toml, and what they are called there.
-LISTS = {"design.stages": "[[design.stages]]", "source.also": "[[source]]"}
+LISTS = {"design.stages": "[[design.stages]]", "source.also": "[[source]]", "element": "[[element]]"}
 
 #: How torch says that memory is short: on a CPU (its allocator, a failed mmap) and on a CUDA device.
 OUT_OF_MEMORY = ("out of memory", "not enough memory", "can't allocate memory", "Cannot allocate memory")
@@ -26,6 +28,12 @@ def plain_name(path: str) -> str:
 def plain(text: str) -> str:
     """A text without its marks."""
     return MARK.sub(lambda found: plain_name(found[1]), text)
+
+
+def near(name: str, known: Iterable[str]) -> str:
+    """What a name that is not known may have been meant for."""
+    close = difflib.get_close_matches(name, known, 1, 0.5)
+    return f"; did you mean {close[0]}?" if close else f"; known are {', '.join(known)}"
 
 
 class CausticError(Exception):

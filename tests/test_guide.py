@@ -75,7 +75,8 @@ def home(tmp_path_factory):
         for name in ("flame.png", "ball.png", "array-sheet.png", "array-wanted.png"):
             shutil.copy(ROOT / "examples" / name, directory)
         shutil.copytree(ROOT / "examples" / "thesis", directory / "thesis")
-        shutil.copy(ROOT / "examples" / "globe.toml", directory)
+        for name in ("globe.toml", "folded.toml"):
+            shutil.copy(ROOT / "examples" / name, directory)
         np.save(directory / "wave.npy", 0.5 * np.sin(np.linspace(0.0, 6.0, 40))[:, None] * np.cos(np.linspace(0.0, 4.0, 40)))
         x = np.linspace(0.0, 255.0, 64)
         Image.fromarray((0.5 * (x[:, None] + x[None, :])).astype(np.uint8)).save("portrait.jpg")

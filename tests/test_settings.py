@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from caustic_cli.config import settings
 from caustic_cli.config.completion import Derivation, build_options, build_stages, complete
-from caustic_cli.config.settings import SCHEMA, STAGE, build_lens, build_scene, dump, parse
+from caustic_cli.config.settings import ELEMENT, SCHEMA, STAGE, build_lens, build_scene, dump, parse
 from caustic_cli.errors import InputError
 
 INDEX = 1.5443  # table D.2
@@ -34,10 +34,13 @@ def some(keys):
 
 @st.composite
 def written(draw):
-    s = {section: draw(some(keys)) for section, keys in SCHEMA.items()}
+    s = {section: draw(some(keys)) for section, keys in SCHEMA.items() if keys}
     stages = draw(st.lists(some(STAGE).filter(bool), max_size=2))
     if stages:
         s["design"]["stages"] = stages
+    elements = draw(st.lists(some(ELEMENT).filter(bool), max_size=2))
+    if elements:
+        s["element"] = {"list": elements}
     return s
 
 
@@ -54,7 +57,7 @@ def test_dump_is_toml_any_reader_reads(s):
     raw = tomllib.loads(dump(s))
     assert raw.pop("format_version") == 1
     assert raw.pop("created_by").startswith("caustic ")
-    assert raw == s
+    assert raw == s | ({"element": s["element"]["list"]} if "element" in s else {})
 
 
 def test_complete_settings_round_trip():

@@ -28,6 +28,7 @@ GROUPS = {
 #: Where an option belongs that no section places, by its name.
 PLACED = {
     **dict.fromkeys(("mag", "margin", "invert"), "Picture"),
+    "element": "Lens",
     **dict.fromkeys(("throw", "screen_size", "resolution", "screen_at"), "Screen"),
     **dict.fromkeys(("quality", "rays", "config", "preset", "resume", "robust"), "Design"),
     **dict.fromkeys(("absorption", "roughness", "polarisation", "wavelengths", "waves", "effects", "explain"), "Effects"),

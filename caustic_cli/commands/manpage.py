@@ -209,6 +209,7 @@ KINDS = {
     "wholes": "[x, y], whole numbers",
     "list": "list of numbers",
     "points": "[x, y, z], or a list of such",
+    "tables": "several tables",
 }
 
 

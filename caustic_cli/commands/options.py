@@ -15,7 +15,7 @@ from caustic_cli.commands import console
 from caustic_cli.commands.console import Reporter
 from caustic_cli.config import checks, table
 from caustic_cli.config.table import Setting
-from caustic_cli.errors import InputError, no_project
+from caustic_cli.errors import InputError, near, no_project
 
 Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", envvar="CAUSTIC_QUIET", help="Say nothing on stderr but errors.")]
@@ -127,7 +127,7 @@ def _parameter(name: str, row: Setting) -> inspect.Parameter:
     words = HELP.get(row.path) or f"{_capital(row)}{f' ({row.unit})' if row.unit else ''}."
     if not flag:
         words += f"  [default: {default_words(row)}]"
-    kind = bool if flag else list[str] | None if row.kind == "points" else _scalar(row) | None
+    kind = bool if flag else list[str] | None if row.kind in ("points", "tables") else _scalar(row) | None
     more: dict[str, Any] = {"callback": listing("glass"), "is_eager": True} if row.path == "lens.glass" else {}
     annotation = Annotated[kind, typer.Option(option.name, metavar=option.metavar, help=words, **more)]
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False if flag else None, annotation=annotation)
@@ -235,8 +235,49 @@ def _terms(option: str, text: str) -> dict[str, Any]:
     return {"lens.gradient_terms": list(numbers(option, text, (text.count(",") + 1,), ",", "numbers parted by commas"))}
 
 
+def _elements(option: str, texts: list[str]) -> dict[str, Any]:
+    """Lenses and mirrors: "lens z=-40 thickness=4 radius=50,inf glass=N-BK7"."""
+    return {"elements": [_element(option, text) for text in texts]}
+
+
+def _element(option: str, text: str) -> dict[str, Any]:
+    """The [[element]] table that a text says."""
+    rows = table.in_section("element")
+    keys = {key: row for key, row in rows.items() if key != "type"}
+    kind, *words = text.split() or [""]
+    if kind not in rows["type"].choices:
+        raise InputError(
+            f"{option} must begin with {' or '.join(rows['type'].choices)}, like 'mirror z=150 tilt=45,0', got {text!r}"
+        )
+    found: dict[str, Any] = {"type": kind}
+    for word in words:
+        key, equals, value = word.partition("=")
+        if not equals or not value:
+            raise InputError(f"{option} {text!r}: {word!r} must be KEY=VALUE without blanks, like z=-40")
+        if key not in keys:
+            raise InputError(f"{option} {text!r}: {key} is not a key{near(key, keys)}")
+        if key in found:
+            raise InputError(f"{option} {text!r}: says {key} twice")
+        found[key] = _element_value(f"{option} {text!r}: {key}", keys[key], value, kind)
+    return found
+
+
+def _element_value(where: str, row: Setting, text: str, kind: str) -> Any:
+    """A value of one of its keys."""
+    if row.kind == "text":
+        return text
+    if row.kind == "number":
+        return numbers(where, text, (1,), unit=row.unit, form="a number")[0]
+    if row.key == "size":
+        return both(size(where, text))
+    alone = (1, 2) if row.key == "radius" and kind == "mirror" else (2,)
+    form = "two numbers parted by a comma, like " + ("50,inf" if row.key == "radius" else "45,0")
+    return both(numbers(where, text, alone, ",", form, unit=row.unit, endless=row.key == "radius"))
+
+
 #: Options whose text is read in a way of their own.
 READERS = {
+    "elements": _elements,
     "lens.gradient_terms": _terms,
     "source.power": _power,
     "source.wavelengths": _spectrum,
@@ -263,11 +304,17 @@ UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
 
 
 def numbers(
-    option: str, text: str, count: tuple[int, ...], separator: str = r"[xX×]", form: str = "", unit: str = ""
+    option: str,
+    text: str,
+    count: tuple[int, ...],
+    separator: str = r"[xX×]",
+    form: str = "",
+    unit: str = "",
+    endless: bool = False,
 ) -> tuple[float, ...]:
     """Numbers parted by x ("10x8") or by what `separator` matches; `form` says what would be accepted.
 
-    unit: mm for lengths, which may say another unit, the last one for all that say none: "10x8cm".
+    unit: mm for lengths, which may say another unit, the last one for all that say none: "10x8cm"; endless: inf is a number too.
 
     Raises:
         InputError: naming the option.
@@ -282,7 +329,7 @@ def numbers(
         values = tuple(float(p) for p in parts)
     except ValueError:
         values = ()
-    if len(values) not in count or not all(math.isfinite(v) for v in values):
+    if len(values) not in count or not all(math.isfinite(v) or (endless and math.isinf(v)) for v in values):
         usual = "a number or two like 10x8" if separator.startswith("[x") else f"{max(count)} numbers parted by commas"
         raise InputError(f"{option} must be {form or usual}, got {text!r}")
     return values if unit != "mm" else tuple(v * scale for v, scale in zip(values, scales, strict=True))

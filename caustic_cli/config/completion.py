@@ -33,6 +33,7 @@ from caustic_cli.config.settings import (
     build_light,
     build_screen,
     build_source,
+    elements_of,
     index_of,
     value_of,
     with_defaults,
@@ -48,6 +49,7 @@ from caustic_cli.inverse.schedule import Stage
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.resolution import BAND, Resolution, white
 from caustic_cli.scene import Offset, Scene, Screen, Source, sources
+from caustic_cli.scene.elements import refuse_beside
 from caustic_cli.scene.lens import array_control
 from caustic_cli.scene.light import RGB
 from caustic_cli.scene.sources.section import content
@@ -63,6 +65,7 @@ STEEPEST = 1.25  # least radius of a derived sphere, in half diagonals of the le
 WAVE_KEYS = ("control", "blur", "apron", "iterations", "tolerance")  # of a stage on rays that one on the wave image has too
 PLATE, WALL = 20.0, 3.0  # width beyond which a lens is a plate, as thin as its relief and this wall allow, mm
 THICK, SAG = 2.0, 0.45  # thickness over width of a lens with two free-form sides, and what of it each of them may take
+BEAM = 1.2  # width of another lens or a mirror over that of a beam from the lens' edges to the picture's
 OBLONG = 2.5  # ratio of the magnifications along the axes from which on another shape of lens is advised
 #: Of a free gradient: range to either side of the index; degree of its splines, knot spans a pixel and the most of them; and rays a
 #: pixel at most, since they cost more.
@@ -164,6 +167,7 @@ def complete(given: Settings, aspect: float, by: Derivation | None = None, lit: 
         nx = by.resolution[0] if by.resolution else DEFAULT_RESOLUTION
         screen["resolution"] = [nx, max(2, round(nx * screen["size"][1] / screen["size"][0]))]
     _complete_farther(s)
+    _complete_elements(s)
     build_screen(s)
     source = build_source(s)
     _complete_lens(lens, screen, target, source, sides=2 if "second" in s else 1)
@@ -314,6 +318,34 @@ def _complete_farther(s: Settings) -> None:
     check("second.size", second["size"])
 
 
+def _complete_elements(s: Settings) -> None:
+    """Sizes of other lenses and mirrors, and what cannot be had with them."""
+    tables, design = [dict(table) for table in elements_of(s)], s["design"]
+    if not tables:
+        s.pop("element", None)
+        return
+    s["element"] = {"list": tables}
+    free = any(table.get("free", "none") != "none" for table in tables)
+    refuse_beside(
+        {
+            "second.file": "second" in s,
+            "design.robust": bool(design.get("robust")),
+            "design.waves": design["waves"] == "on",
+            "design.network": free and design["network"] != "none",
+            "design.optimizer": free and design["optimizer"] != "lbfgs",
+            "target.color": free and value_of(s["target"], "target.color"),
+        },
+    )
+    lens, picture, throw = s["lens"]["size"], s["target"]["size"], abs(s["screen"]["z"])
+    for table in tables:
+        if "z" in table:
+            along = min(1.0, max(0.0, check("element.z", table["z"]) / throw))
+            size = [BEAM * (a + (b - a) * along) if along else a for a, b in zip(lens, picture, strict=True)]
+            lean = [math.cos(math.radians(t)) for t in check("element.tilt", table.get("tilt", (0.0, 0.0)))]
+            size = [w / c for w, c in zip(size, lean[::-1], strict=True)]
+            table.setdefault("size", [max(size)] * 2 if table.get("aperture") == "circle" else size)
+
+
 def _complete_blank(lens: Table, screen: Table, index: float) -> None:
     """What a flat blank has whose index is designed; its sides are the least net."""
     if value_of(lens, "lens.mirror"):
@@ -357,7 +389,7 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
     array = value_of(lens, "lens.array")
     fine_net = "control" not in lens or min(n - p for n, p in zip(lens["control"], degree, strict=True)) >= LEAST_SPANS
     fine_net = fine_net or max(array) > 1  # whose lenslets have to be solved for
-    spread = plain and fine_net and not source.sharp and _shifts(s, source)
+    spread = plain and fine_net and not source.sharp and not elements_of(s) and _shifts(s, source)
     counted = plain or (design["network"] != "none" and design.get("preconditioner") == "laplacian")  # from any first surface
     design.setdefault("start", "transport" if "second" in s or (counted and fine_net and not source.apart) else "offset")
     if design["start"] != "offset" and design["network"] != "none" and design.get("preconditioner") != "laplacian":
@@ -376,6 +408,11 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
     if "second" in s:
         _complete_two_sided(s, source, quality, rays)
         return
+    if any(table.get("free", "none") != "none" for table in elements_of(s)) and design["start"] != "transport":
+        raise InputError(
+            f"⟨design.start⟩ of several free surfaces must be transport, got {design['start']}; a small net or several points"
+            " have no such start"
+        )
     # Sharp light's transport is right at every scale at once, if the net can hold it, and so is that of a source that shifts the
     # image, for the light behind its blur; otherwise from coarse to fine.
     moved = plain and fine_net and design["start"] != "offset" and (source.sharp or spread or max(array) > 1)
@@ -400,7 +437,9 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
         return
     nx, ny = screen["resolution"]
     sampler, base = _sampler(source), min(4_000_000, max(40_000, int(RAYS_PER_PIXEL * nx * ny)))
-    if moved:
+    if moved and elements_of(s):
+        stages = two_sided(tuple(lens["control"]), rays, (nx, ny), quality)
+    elif moved:
         centre = source.pointlike() if spread else source
         stages = refinement(tuple(lens["control"]), rays, (nx, ny), quality, scattered=not centre.collimated, spread=spread)
         if value_of(s["target"], "target.sheet"):
@@ -491,6 +530,8 @@ def _not_by_default(s: Settings) -> str:
     design = s["design"]
     if "gradient" in s["lens"]:
         return "the wave image is taken of lenses of one index"
+    if elements_of(s):
+        return "the wave image is taken of a lens by itself"
     if s["source"]["type"] == "rays":
         return "a ray file says nothing of its light's phase"
     if s["source"].get("also"):

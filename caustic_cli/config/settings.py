@@ -6,7 +6,6 @@ Here keys and types are checked, ranges where the scene and the stages are built
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 import tomllib
@@ -20,9 +19,9 @@ import tomli_w
 
 from caustic_cli import __version__
 from caustic_cli.config.table import Setting, check, default, in_section
-from caustic_cli.errors import InputError
+from caustic_cli.errors import InputError, near
 from caustic_cli.io.files import read_bytes
-from caustic_cli.scene import Lens, Light, Offset, Scene, Screen, Second, Source, sources
+from caustic_cli.scene import Component, Lens, Light, Offset, Scene, Screen, Second, Source, sources
 from caustic_cli.scene.gradient import KINDS, Gradient
 from caustic_cli.scene.materials import refractive_index
 from caustic_cli.scene.screen import PLANE, Sags
@@ -50,18 +49,20 @@ def _schema() -> dict[str, dict[str, Setting]]:
     found = {section: in_section(section) for section in ("source", "lens", "screen", "target", "second", "design")}
     found["source"]["type"] = replace(found["source"]["type"], help=sources.in_words())
     found["source"] |= {key: Setting(f"source.{key}", *spec) for key, spec in sources.own_keys().items()}
+    found["element"] = {}  # a list of tables, kept as the section's only key, "list"
     return found
 
 
 SCHEMA = _schema()
 #: Sections without which a project is whole.
-OPTIONAL = ("second",)
-STAGE = in_section("design.stages")
+OPTIONAL = ("second", "element")
+STAGE, ELEMENT = in_section("design.stages"), in_section("element")
 #: Keys that hold tables: their heading in the file, and what each may say.  Sources beside the first are those of [source] also;
 #: FIRST is the first's alone.
 FIRST = ("polarisation", "profile", "power_unit")
 TABLES = {
     ("design", "stages"): ("design.stages", STAGE),
+    ("element", "list"): ("element", ELEMENT),
     ("source", "also"): ("source", {k: v for k, v in SCHEMA["source"].items() if k not in FIRST}),
 }
 #: What a new project's file says where nothing else is said.
@@ -72,7 +73,7 @@ DEFAULTS = {
 
 
 #: What settings are derived from, such as mag: a configuration may say it, before its first section; a project does not.
-PARAMETERS = in_section("")
+PARAMETERS = {key: row for key, row in in_section("").items() if row.kind != "tables"}
 
 
 def parse(text: str, where: str, parameters: bool = False) -> Settings:
@@ -98,6 +99,9 @@ def parse(text: str, where: str, parameters: bool = False) -> Settings:
             raise InputError(f"{where}: [{section}] is not a section{near(section, SCHEMA)}")
         if section == "source" and isinstance(table, list) and table and isinstance(table[0], dict):
             table = {**table[0], "also": table[1:]}
+        if section == "element":
+            out[section] = {"list": _tables(table, where, *TABLES["element", "list"])}
+            continue
         if not isinstance(table, dict):
             raise InputError(f"{where}: {section} must be a section, written [{section}]")
         out[section] = {}
@@ -212,12 +216,6 @@ def _numeric(where: str, value, whole: bool):
     return value if whole else float(value)
 
 
-def near(name: str, known) -> str:
-    """What a name that is not known may have been meant for."""
-    close = difflib.get_close_matches(name, known, 1, 0.5)
-    return f"; did you mean {close[0]}?" if close else f"; known are {', '.join(known)}"
-
-
 def with_defaults(settings: Settings) -> Settings:
     """Settings with every section present that a project must have, and constant defaults filled in."""
     sections = [section for section in SCHEMA if section in settings or section not in OPTIONAL]
@@ -234,8 +232,10 @@ def dump(settings: Settings) -> str:
     for section, keys in SCHEMA.items():
         first = settings.get(section, {})
         also = first.get("also", []) if section == "source" else []
-        for table in (first, *also) if section in settings or section not in OPTIONAL else ():
+        for table in (first, *also) if keys and (section in settings or section not in OPTIONAL) else ():
             lines += ["", f"[[{section}]]" if also else f"[{section}]", *_assignments(table, keys)]
+    for element in elements_of(settings):
+        lines += ["", "[[element]]", *_assignments(element, ELEMENT)]
     for stage in settings.get("design", {}).get("stages", []):
         lines += ["", "[[design.stages]]", *_assignments(stage, STAGE)]
     return "\n".join(lines) + "\n"
@@ -251,6 +251,11 @@ def _toml(value) -> str:
     if isinstance(value, list | tuple):
         return "[" + ", ".join(_toml(v) for v in value) + "]"
     return tomli_w.dumps({"k": value})[len("k = ") :].strip()
+
+
+def elements_of(settings: Settings) -> list[dict[str, Any]]:
+    """The [[element]] tables."""
+    return settings.get("element", {}).get("list", [])
 
 
 def value_of(table: Mapping[str, Any], path: str) -> Any:
@@ -332,7 +337,42 @@ def build_source(settings: Settings, profile: np.ndarray | None = None, type: st
 def build_scene(settings: Settings, profile: np.ndarray | None = None) -> Scene:
     """The whole scene; `profile` is the source's irradiance if [source] names one."""
     return Scene(
-        build_source(settings, profile), build_lens(settings), build_screen(settings), build_light(settings), build_second(settings)
+        build_source(settings, profile),
+        build_lens(settings),
+        build_screen(settings),
+        build_light(settings),
+        build_second(settings),
+        build_elements(settings),
+    )
+
+
+def build_elements(settings: Settings) -> tuple[Component, ...]:
+    """The lenses and mirrors that the [[element]] tables describe; their sizes must be there."""
+    return tuple(_element(table, settings["lens"]) for table in elements_of(settings))
+
+
+def _element(table: dict[str, Any], lens: dict[str, Any]) -> Component:
+    kind = check("element.type", table.get("type", "lens"))
+    for key in ("z", "size"):
+        if key not in table:
+            raise InputError(f"⟨element.{key}⟩ must be said of every [[element]]")
+    only = ("thickness", "index", "glass", "absorption") if kind == "mirror" else ()
+    for key in only:
+        if key in table:
+            raise InputError(f"⟨element.{key}⟩ is for lenses: light never enters a mirror")
+    if {"index", "glass"} <= {*table}:
+        raise InputError("[[element]] takes index or glass, not both")
+    glass = table.get("glass")
+    index = refractive_index(glass, value_of(lens, "lens.wavelength")) if glass else value_of(table, "element.index")
+    return Component(
+        kind,
+        table["z"],
+        tuple(table["size"]),
+        radius=tuple(table.get("radius", PLANE)),
+        index=index,
+        glass=glass,
+        tilt=tuple(table.get("tilt", (0.0, 0.0))),
+        **{key: value_of(table, f"element.{key}") for key in ("thickness", "absorption", "aperture", "free")},
     )
 
 

@@ -42,10 +42,10 @@ class Setting:
     """A row of the table.
 
     path: see the module; kind: number, whole, text, flag, numbers (a pair), wholes (a pair), list (of numbers), points ([x, y, z]
-    or a list of such); help: what it is, for comments, options and the reference; unit; low, high, above: range of each number,
-    `above` if low itself is excluded; choices: of a text; default: None where there is none or it is derived; derived: how it then
-    follows; why: the reason for the default; written: whether a new project's file says a default; option: of the command line;
-    speaks_for: other paths that the same option sets.
+    or a list of such), tables (a list of tables in words); help: what it is, for comments, options and the reference; unit; low,
+    high, above: range of each number, `above` if low itself is excluded; choices: of a text; default: None where there is none or
+    it is derived; derived: how it then follows; why: the reason for the default; written: whether a new project's file says a
+    default; option: of the command line; speaks_for: other paths that the same option sets.
     """
 
     path: str
@@ -257,6 +257,29 @@ _ROWS = (
             option=Option("--collimate")),
     Setting("second.focus", "points", "point towards which the light leaves the picture", "mm", *DISTANCE,
             option=Option("--focus", "X,Y,Z")),
+    # Other lenses and folding mirrors, [[element]]
+    Setting("elements", "tables", "a lens or a folding mirror beside the free-form lens, in the words of an [[element]] table:"
+            " 'lens z=-40 thickness=4 radius=50,inf glass=N-BK7', 'mirror z=150 tilt=45,0'; may be repeated, in the order in which"
+            " light meets them", derived="none", option=Option("--element", "'TYPE KEY=VALUE...'")),
+    Setting("element.type", "text", "lens of two surfaces, or mirror, behind which the axis is folded", choices=("lens", "mirror"),
+            derived="lens"),
+    Setting("element.z", "number", "of its first vertex; behind a mirror z counts on along the folded axis", "mm", *DISTANCE),
+    Setting("element.thickness", "number", "of a lens, between its vertices", "mm", 0.0, checks.LENGTH, above=True, default=4.0,
+            written=False, why="a usual small lens"),
+    Setting("element.radius", "numbers", "radii of curvature of front and back, of a mirror the first alone; positive where the"
+            " centre lies behind the surface, inf for flat", "mm", derived="flat"),
+    Setting("element.index", "number", "refractive index of a lens", low=1.0, high=5.0, above=True, default=1.5168, written=False,
+            why="N-BK7 at the d line"),
+    Setting("element.glass", "text", "material instead of an index, as lens.glass"),
+    Setting("element.absorption", "number", "a in exp(-a t) through t mm of its glass", "1/mm", 0.0, 1e6, default=0.0,
+            written=False),
+    Setting("element.size", "numbers", "full width and height of its aperture", "mm", *LENS,
+            derived="the lens' own before it; behind it a fifth more than a straight beam to the picture takes"),
+    Setting("element.aperture", "text", "shape of its aperture: rectangle, or circle, the largest within size",
+            choices=("rectangle", "circle"), default="rectangle", written=False),
+    Setting("element.tilt", "numbers", "turns of a mirror about x or about y", "degrees", -85.0, 85.0),
+    Setting("element.free", "text", "which of its surfaces the design shapes: none, front, back or both",
+            choices=("none", "front", "back", "both"), default="none", written=False, why="what can be bought"),
     # How the lens is found
     Setting("quality", "text", "of the default stages: draft, standard or fine", choices=("draft", "standard", "fine"),
             derived="standard, or by the time limit", option=Option("--quality")),

@@ -13,8 +13,8 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from caustic_cli.config.settings import near, read_text, toml_of
-from caustic_cli.errors import InputError
+from caustic_cli.config.settings import read_text, toml_of
+from caustic_cli.errors import InputError, near
 from caustic_cli.scene.tolerances import KINDS, NORMAL, UNIFORM, FormError, Tolerance, Tolerances, Waviness
 
 SURFACES: dict[str, tuple[str, type]] = {"form_error": ("form", FormError), "waviness": ("waviness", Waviness)}

@@ -23,6 +23,7 @@ from caustic_cli.io.files import MARK, atomic_path
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import front_of
 from caustic_cli.scene import Scene, Screen, Source
+from caustic_cli.scene.elements import SIDES
 
 FORMAT_VERSION = 1
 
@@ -34,8 +35,8 @@ def write_lighttools(
 
     Keys: points, normals (N, 3); shape (2,); x (nx,), y (ny,), z (nx, ny); lens_half_size (2,), z_in, refractive_index;
     screen_half_size (2,), z_screen, resolution (2,); those of `_screen` and `_source`; fresnel unless exact; aperture if a circle;
-    mirror, 1, of one; those of `_entrance` where it is free-form; control_points (n, m, 3) with x, y at the Greville abscissae,
-    degrees (2,), knots_u, knots_v on [0, 1]; unit, format_version, created_by.
+    mirror, 1, of one; those of `_elements` beside it; those of `_entrance` where it is free-form; control_points (n, m, 3) with
+    x, y at the Greville abscissae, degrees (2,), knots_u, knots_v on [0, 1]; unit, format_version, created_by.
 
     Args:
         heights: (n, m) control heights, mm.
@@ -70,6 +71,7 @@ def write_lighttools(
         "knots_u": field.spaces[0].knots.numpy(),
         "knots_v": field.spaces[1].knots.numpy(),
         **_entrance(scene),
+        **_elements(scene),
         "unit": np.array("mm"),
         "format_version": np.array(FORMAT_VERSION, np.int64),
         "created_by": np.array(f"caustic {__version__}"),
@@ -94,6 +96,32 @@ def _entrance(scene: Scene) -> dict[str, np.ndarray]:
         "entrance_knots_u": u.knots.numpy(),
         "entrance_knots_v": v.knots.numpy(),
     }
+
+
+def _elements(scene: Scene) -> dict[str, np.ndarray]:
+    """Of k other lenses and mirrors, in the order in which light meets them: element_type, element_aperture, k words with commas
+    between them; element_z, element_thickness, element_index, element_absorption (k,); element_curvature (k, 2), 1/mm, of front
+    and back; element_size, element_tilt (k, 2), degrees; of designed surfaces element_1_front_heights (n, m) from their vertex'
+    plane, mm, with their degrees, knots_u and knots_v.  Behind a mirror z counts along the folded axis."""
+    found, elements = {}, scene.elements
+    if not elements:
+        return {}
+    for key, name in (("type", "kind"), ("aperture", "aperture")):
+        found[f"element_{key}"] = np.array(",".join(getattr(e, name) for e in elements))
+    for key in ("z", "thickness", "index", "absorption", "size", "tilt"):
+        found[f"element_{key}"] = _reals([getattr(e, key) for e in elements])
+    found["element_curvature"] = 1.0 / _reals([e.radius for e in elements])
+    for k, e in enumerate(elements):
+        for side, front in zip(SIDES, e.fronts, strict=True):
+            if front is not None and front.knots is not None:
+                name = f"element_{k + 1}_{side}_"
+                found |= {
+                    f"{name}heights": _reals(front.heights),
+                    f"{name}degrees": np.array(front.degree, np.int64),
+                    f"{name}knots_u": _reals(front.knots[0]),
+                    f"{name}knots_v": _reals(front.knots[1]),
+                }
+    return found
 
 
 def _screen(screen: Screen) -> dict[str, np.ndarray]:

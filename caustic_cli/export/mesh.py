@@ -24,6 +24,7 @@ from torch import Tensor
 
 from caustic_cli.config import checks
 from caustic_cli.errors import InputError
+from caustic_cli.export.bodies import bodies
 from caustic_cli.export.surface import (
     MAX_POINTS,
     MAX_SAMPLES,
@@ -52,19 +53,31 @@ class Patch:
 def closed_mesh(
     scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None, tolerance: float | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) float64 mm and faces (F, 3) int64 of the solid.
+    """Vertices (V, 3) float64 mm and faces (F, 3) int64 of the solid, and of those of other elements.
 
     Args:
         heights: (n, m) control heights, mm.
-        samples: (nx, ny) points on the exit surface, or None for a grid on the knots (`sample_grid`).
+        samples: (nx, ny) points on the exit surface, or None for a grid on the knots (`sample_grid`); other elements have theirs.
         tolerance: mm, instead of samples: as many points as keep every triangle so close to the exit surface (chord error).
 
     Raises:
         InputError: samples and tolerance both; too few or too many points; or the surface reaches the entrance.
     """
-    if scene.lens.front is not None:
-        return _between(*(side.points for side in both_patches(scene.lens, field, heights, samples, tolerance)), scene.lens)
-    return solid(patch(scene.lens, field, heights, samples, tolerance).points, scene.lens)
+    parts = [lens_mesh(scene.lens, field, heights, samples, tolerance)]
+    for body in bodies(scene):
+        vertices, faces = lens_mesh(body.lens, body.field, body.heights, None, tolerance)
+        parts.append((body.placed(vertices), faces))
+    counts = np.cumsum([0, *(len(v) for v, _ in parts)])
+    return np.concatenate([v for v, _ in parts]), np.concatenate([f + k for (_, f), k in zip(parts, counts, strict=False)])
+
+
+def lens_mesh(
+    lens: Lens, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None, tolerance: float | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """That of one lens or mirror."""
+    if lens.front is not None:
+        return _between(*(side.points for side in both_patches(lens, field, heights, samples, tolerance)), lens)
+    return solid(patch(lens, field, heights, samples, tolerance).points, lens)
 
 
 def both_patches(

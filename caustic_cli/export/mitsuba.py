@@ -2,6 +2,8 @@
 `NAME-sides.ply` and a round lens' `NAME-holder.ply` (binary, float64).
 
     entrance, exit   the lens, smooth `dielectric`; the exit surface is a mesh with its normals at the vertices
+    element-1-front  surfaces of other lenses, and mirrors, with black sides and a black frame; behind a mirror the screen and the
+                     camera stand on the folded axis
     sides, holder    black: what leaves by the sides or goes past the lens is lost, as in a render
     screen           white and diffuse; a camera between lens and screen sees it mirrored back, as from behind
     light            a plane wave as a collimated area, points as spots, a disc as a Lambertian area
@@ -17,19 +19,23 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from torch import Tensor
 
 from caustic_cli.errors import InputError
+from caustic_cli.export.bodies import bodies
 from caustic_cli.export.mesh import Patch, both_patches, patch, refuse_open, rim_of, triangles
 from caustic_cli.export.ply import write_mesh
 from caustic_cli.export.surface import STEPS_PER_SPAN
 from caustic_cli.export.text import CREATED, real
 from caustic_cli.io.files import write_bytes
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.scene import Lens, Scene, Screen
+from caustic_cli.optics.system import System
+from caustic_cli.scene import Component, Lens, Scene, Screen
+from caustic_cli.scene.elements import surface_name
 from caustic_cli.scene.plain import beyond_plain
 
 #: Rays a pixel of the scene's own sampler, Mitsuba's `spp`.
@@ -41,18 +47,24 @@ DEPTH = 4
 RING = 1024
 #: Points along an axis of a mesh that Mitsuba loads in seconds.
 QUICK = 2048
+#: Width of the black frame around other elements, in parts of their own.
+FRAME = 1.5
 #: Half a turn, after which rectangles look to -z; what takes all light.
 SPIN = '<rotate x="1" angle="180"/>'
 BLACK = '<bsdf type="diffuse"><rgb name="reflectance" value="0"/></bsdf>'
 
 
-def companions(path: str | Path, round: bool = True, mirror: bool = False, two_sided: bool = False) -> list[Path]:
+def companions(
+    path: str | Path, round: bool = True, mirror: bool = False, two_sided: bool = False, elements: Sequence[Component] = ()
+) -> list[Path]:
     """The meshes beside a scene file: of the exit surface, of the sides, of a round lens' holder, of a free-form entrance; of a
-    mirror."""
+    mirror; and of other elements, with what is black about them."""
     path = Path(path)
     if mirror:
         return [path.with_name(f"{path.stem}-mirror.ply")]
     names = ["exit", "sides"] + ["holder"] * round + ["entrance"] * two_sided
+    for k, element in enumerate(elements):
+        names += [surface_name(k, side) for side in element.sides] + [f"element-{k + 1}-black"]
     return [path.with_name(f"{path.stem}-{name}.ply") for name in names]
 
 
@@ -88,10 +100,10 @@ def write_mitsuba(
         sides, *_strip(rim, low if front is None else front.points.reshape(-1, 3)[rim_of(*front.points.shape[:2])]), text=False
     )
     lens, screen = scene.lens, scene.screen
-    glass = f'<bsdf type="dielectric"><float name="int_ior" value="{real(lens.index)}"/><float name="ext_ior" value="1"/></bsdf>'
+    glass, onto, surfaces = _glass(lens.index), _onto(scene), len(System.of(scene).elements)
     rx, ry = lens.half_size
     flat, holder = ("disk", _round_holder(path, rx, lens.z_in, BLACK)) if lens.round else ("rectangle", _holder(lens, BLACK))
-    away = 0.9 * (screen.z - float(points[:, 2].max()))
+    away = 0.9 * (screen.z - max(float(points[:, 2].max()), *(e.extent[1] for e in scene.behind), -math.inf))
     place = f'<transform name="to_world">{SPIN}<scale x="{real(rx)}" y="{real(ry)}"/><translate z="{real(lens.z_in)}"/></transform>'
     entrance = [f'<shape type="{flat}" id="entrance">', f"  {glass}", f"  {place}", "</shape>"]
     if front is not None:
@@ -99,18 +111,52 @@ def write_mitsuba(
         write_mesh(mesh, front.points.reshape(-1, 3), triangles(front.points)[:, ::-1], -front.normals.reshape(-1, 3), text=False)
         entrance = [f'<shape type="ply" id="entrance"><string name="filename" value="{mesh.name}"/>{glass}</shape>']
     lines = [
-        *_camera(screen, away, f'<scale x="-1"/><translate z="{real(screen.z - away)}"/>'),
+        *_camera(screen, away, f'<scale x="-1"/><translate z="{real(screen.z - away)}"/>{onto}', surfaces + 2),
         *entrance,
         f'<shape type="ply" id="exit"><string name="filename" value="{exit_mesh.name}"/>{glass}</shape>',
         f'<shape type="ply" id="sides"><string name="filename" value="{sides.name}"/>'
         f'<boolean name="face_normals" value="true"/>{BLACK}</shape>',
         *holder,
-        *_screen(screen, SPIN),
+        *_others(path, scene),
+        *_screen(screen, SPIN, onto),
         *light,
         "</scene>",
         "",
     ]
     write_bytes(path, "\n".join(lines).encode())
+
+
+def _others(path: str | Path, scene: Scene) -> list[str]:
+    """Other lenses and mirrors: their surfaces, and black sides and a black frame around each, which stop light beside it."""
+    lines = []
+    for body in bodies(scene):
+        patches = both_patches(body.lens, body.field, body.heights)
+        black = Path(path).with_name(f"{Path(path).stem}-element-{body.number + 1}-black.ply")
+        rims = [p.points.reshape(-1, 3)[rim_of(*p.points.shape[:2])] for p in patches]
+        outer = rims[0] * [FRAME, FRAME, 1.0]
+        frame, around = _strip(outer, rims[0])
+        sides, walls = _strip(rims[1], rims[0])
+        write_mesh(black, body.placed(np.concatenate([frame, sides])), np.concatenate([around, walls + len(frame)]), text=False)
+        coating = _glass(body.component.index)
+        if body.component.mirror:
+            coating = f'<bsdf type="twosided"><bsdf type="conductor"><string name="material" value="none"/></bsdf>{BLACK}</bsdf>'
+        for side, seen in zip(body.component.sides, patches, strict=False):
+            name = surface_name(body.number, side)
+            mesh = Path(path).with_name(f"{Path(path).stem}-{name}.ply")
+            faces, normals = triangles(seen.points), seen.normals.reshape(-1, 3)
+            if side == "front":  # out of the glass, or towards the light
+                faces, normals = faces[:, ::-1], -normals
+            write_mesh(mesh, body.placed(seen.points.reshape(-1, 3)), faces, body.turned(normals), text=False)
+            lines.append(f'<shape type="ply" id="{name}"><string name="filename" value="{mesh.name}"/>{coating}</shape>')
+        lines.append(
+            f'<shape type="ply"><string name="filename" value="{black.name}"/>'
+            f'<boolean name="face_normals" value="true"/><bsdf type="twosided">{BLACK}</bsdf></shape>'
+        )
+    return lines
+
+
+def _glass(index: float) -> str:
+    return f'<bsdf type="dielectric"><float name="int_ior" value="{real(index)}"/><float name="ext_ior" value="1"/></bsdf>'
 
 
 def _write_mirror(path: str | Path, scene: Scene, surface: Patch, light: list[str]) -> None:
@@ -138,14 +184,23 @@ def _write_mirror(path: str | Path, scene: Scene, surface: Patch, light: list[st
     write_bytes(path, "\n".join(lines).encode())
 
 
-def _camera(screen: Screen, away: float, place: str) -> list[str]:
+def _onto(scene: Scene) -> str:
+    """The transformation onto the part of a folded axis that the screen stands on; nothing for a straight one."""
+    leg = System.of(scene).leg
+    if leg is None:
+        return ""
+    rows = [[*(axis[k] for axis in leg.frame), leg.origin[k]] for k in range(3)]
+    return f'<matrix value="{" ".join(real(v) for row in (*rows, (0.0, 0.0, 0.0, 1.0)) for v in row)}"/>'
+
+
+def _camera(screen: Screen, away: float, place: str, depth: int = DEPTH) -> list[str]:
     """The scene's first lines: how light is traced, and a camera `away` mm from the screen, which fills its picture."""
     sx, sy = screen.half_size
     width, height = screen.resolution[0], max(1, round(screen.resolution[0] * sy / sx))
     return [
         f"<!-- {CREATED}; millimetres -->",
         '<scene version="3.0.0">',
-        f'<integrator type="ptracer"><integer name="max_depth" value="{DEPTH}"/></integrator>',
+        f'<integrator type="ptracer"><integer name="max_depth" value="{depth}"/></integrator>',
         '<sensor type="perspective">',
         '  <string name="fov_axis" value="x"/>',
         f'  <float name="fov" value="{real(2.0 * math.degrees(math.atan2(sx, away)))}"/>',
@@ -158,13 +213,14 @@ def _camera(screen: Screen, away: float, place: str) -> list[str]:
     ]
 
 
-def _screen(screen: Screen, spin: str) -> list[str]:
-    """A white rectangle that looks to +z, or, spun, to -z."""
+def _screen(screen: Screen, spin: str, onto: str = "") -> list[str]:
+    """A white rectangle that looks to +z, or, spun, to -z; onto: a folded axis."""
     sx, sy = screen.half_size
     return [
         '<shape type="rectangle" id="screen">',
         '  <bsdf type="diffuse"><rgb name="reflectance" value="1"/></bsdf>',
-        f'  <transform name="to_world">{spin}<scale x="{real(sx)}" y="{real(sy)}"/><translate z="{real(screen.z)}"/></transform>',
+        f'  <transform name="to_world">{spin}<scale x="{real(sx)}" y="{real(sy)}"/><translate z="{real(screen.z)}"/>{onto}'
+        "</transform>",
         "</shape>",
     ]
 
@@ -231,15 +287,15 @@ def _light(scene: Scene) -> list[str]:
 
 def _collimated(scene: Scene) -> list[str]:
     """A plane wave: an area as wide as the lens."""
-    source, lens = scene.source, scene.lens
+    source, pupil = scene.source, scene.pupil
     if source.profile is not None:
         raise InputError("⟨format⟩ mitsuba: its collimated emitter is uniform, so a source with a profile cannot be written")
-    (rx, ry), area = lens.half_size, lens.size[0] * lens.size[1] * (math.pi / 4.0 if lens.round else 1.0)
+    (rx, ry), area = pupil.half_size, 4.0 * math.prod(pupil.half_size) * (math.pi / 4.0 if pupil.round else 1.0)
     radiance = real(source.power / area)
     return [
-        f'<shape type="{"disk" if lens.round else "rectangle"}" id="light">',
+        f'<shape type="{"disk" if pupil.round else "rectangle"}" id="light">',
         f'  <transform name="to_world"><scale x="{real(rx)}" y="{real(ry)}"/>'
-        f'<translate z="{real(lens.lowest - BEFORE)}"/></transform>',
+        f'<translate z="{real(scene.lowest - BEFORE)}"/></transform>',
         f'  <emitter type="directionalarea"><rgb name="radiance" value="{radiance}"/></emitter>',
         "</shape>",
     ]
@@ -247,7 +303,7 @@ def _collimated(scene: Scene) -> list[str]:
 
 def _area(scene: Scene) -> list[str]:
     """A disc that shines on everything."""
-    source, lens = scene.source, scene.lens
+    source, pupil = scene.source, scene.pupil
     if source.distant or source.intensity != "lambertian" or source.cone is not None:
         raise InputError(
             "⟨format⟩ mitsuba: of discs only a Lambertian one without a cone of its own can be written, not one at"
@@ -255,7 +311,7 @@ def _area(scene: Scene) -> list[str]:
         )
     if source.brightness is not None:
         raise InputError("⟨format⟩ mitsuba: its disc is evenly bright, so one with a picture of its brightness cannot be written")
-    (wx, wy), (x, y, z), cone = source.size, source.position, source.cone_over(lens.half_size, lens.z_in, lens.round)
+    (wx, wy), (x, y, z), cone = source.size, source.position, source.cone_over(pupil.half_size, pupil.z, pupil.round)
     radiance = source.power / (math.pi * math.pi * wx * wy / 4.0 * math.sin(cone) ** 2)  # its cone just covers the lens
     return [
         '<shape type="disk" id="light">',
@@ -268,10 +324,10 @@ def _area(scene: Scene) -> list[str]:
 
 def _spots(scene: Scene) -> list[str]:
     """A spot a point.  Mitsuba's fall off towards their rim, so they are even a little beyond the cone."""
-    source, lens = scene.source, scene.lens
+    source, pupil = scene.source, scene.pupil
     if source.intensity != "uniform":
         raise InputError("⟨format⟩ mitsuba: its spots shine evenly, so points of another intensity cannot be written")
-    cone = source.cone_over(lens.half_size, lens.z_in, lens.round)
+    cone = source.cone_over(pupil.half_size, pupil.z, pupil.round)
     lines, degrees = [], math.degrees(cone)
     for (x, y, z), power in zip(source.positions, source.powers, strict=True):
         intensity = power / (4.0 * math.pi * math.sin(cone / 2.0) ** 2)

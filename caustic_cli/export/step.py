@@ -1,6 +1,8 @@
 """The lens as an exact solid in a STEP file (ISO 10303-21, application protocol 214): entrance plane or B-spline, exit B-spline,
 four sides; or a mirror, whose material lies above its surface and up to z_in.
 
+Other lenses and mirrors are solids of their own beside it, see `bodies`.
+
 The exit surface's poles stand at the Greville abscissae with the control heights as they are, to the last bit; its borders are
 B-spline curves with the border's poles.  Each border lies in a plane x = const or y = const, which is a side.  Of a round lens
 the same surface is cut by a cylinder, along a curve through many points.  A border for the mount is a flange, as in `mesh`.  mm.
@@ -21,11 +23,13 @@ from scipy.interpolate import make_interp_spline
 from torch import Tensor
 
 from caustic_cli import __version__
+from caustic_cli.export.bodies import bodies
 from caustic_cli.export.mesh import FLANGE, closed_mesh, refuse_open
 from caustic_cli.export.surface import sample_grid
 from caustic_cli.export.text import CREATED
 from caustic_cli.io.files import atomic_path
 from caustic_cli.optics.bspline import SplineSpace
+from caustic_cli.optics.frames import Pose, out_of, turned_back
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import front_of
 from caustic_cli.scene import Lens, Scene
@@ -54,16 +58,17 @@ class Entities:
     def __init__(self, mirrored: bool = False):
         self.lines: list[str] = []
         self.up = -1.0 if mirrored else 1.0
+        self.pose = Pose()  # of the solid that is being described
 
     def add(self, text: str) -> str:
         self.lines.append(f"#{len(self.lines) + 1}={text};\n")
         return f"#{len(self.lines)}"
 
     def point(self, p) -> str:
-        return self.add(f"CARTESIAN_POINT('',{reals((p[0], p[1], self.up * p[2] + 0.0))})")
+        return self.add(f"CARTESIAN_POINT('',{reals(out_of(self.pose, (p[0], p[1], self.up * p[2] + 0.0), 0.0))})")
 
     def direction(self, d) -> str:
-        return self.add(f"DIRECTION('',{reals((d[0], d[1], self.up * d[2] + 0.0))})")
+        return self.add(f"DIRECTION('',{reals(turned_back(self.pose, (d[0], d[1], self.up * d[2] + 0.0)))})")
 
     def placement(self, at, normal, along) -> str:
         return self.add(f"AXIS2_PLACEMENT_3D('',{self.point(at)},{self.direction(normal)},{self.direction(along)})")
@@ -121,11 +126,16 @@ def write_step(path: str | Path, scene: Scene, field: HeightField, heights: Tens
         scene = replace(scene, lens=replace(scene.lens, z_in=-scene.lens.z_in))
     if scene.lens.front is None:
         refuse_open(float(net.min()), scene.lens.z_in)
-    else:
+    if scene.lens.front is not None or scene.elements:
         closed_mesh(scene, field, heights)  # which refuses what is no solid
     out = Entities(mirror)
-    solid = lens_solid(out, scene.lens, field, heights, poles_of(field, net))
-    _product(out, solid, ROUND_UNCERTAINTY if scene.lens.round else UNCERTAINTY)
+    solids = [lens_solid(out, scene.lens, field, heights, poles_of(field, net))]
+    for body in bodies(scene):
+        out.pose = body.pose
+        solids.append(lens_solid(out, body.lens, body.field, body.heights, poles_of(body.field, body.heights.numpy())))
+    out.pose = Pose()
+    rounded = scene.lens.round or any(e.round for e in scene.elements)
+    _product(out, solids, ROUND_UNCERTAINTY if rounded else UNCERTAINTY)
     with atomic_path(path) as temporary, open(temporary, "w", encoding="ascii", newline="\n") as file:
         file.write(HEAD)
         file.writelines(out.lines)
@@ -257,8 +267,8 @@ def _reversed(edges: list[tuple[str, bool]]) -> list[tuple[str, bool]]:
     return [(edge, not forward) for edge, forward in edges[::-1]]
 
 
-def _product(out: Entities, solid: str, uncertainty: float) -> None:
-    """Units, and the product whose shape the solid is."""
+def _product(out: Entities, solids: list[str], uncertainty: float) -> None:
+    """Units, and the product whose shape the solids are."""
     millimetre = out.add("(LENGTH_UNIT()NAMED_UNIT(*)SI_UNIT(.MILLI.,.METRE.))")
     radian = out.add("(NAMED_UNIT(*)PLANE_ANGLE_UNIT()SI_UNIT($,.RADIAN.))")
     steradian = out.add("(NAMED_UNIT(*)SI_UNIT($,.STERADIAN.)SOLID_ANGLE_UNIT())")
@@ -270,7 +280,7 @@ def _product(out: Entities, solid: str, uncertainty: float) -> None:
         "REPRESENTATION_CONTEXT('',''))"
     )
     origin = out.placement((0, 0, 0), (0, 0, out.up), (1, 0, 0))  # the file's own axes
-    shape = out.add(f"ADVANCED_BREP_SHAPE_REPRESENTATION('lens',({origin},{solid}),{context})")
+    shape = out.add(f"ADVANCED_BREP_SHAPE_REPRESENTATION('lens',({origin},{','.join(solids)}),{context})")
     application = out.add("APPLICATION_CONTEXT('automotive design')")
     out.add(f"APPLICATION_PROTOCOL_DEFINITION('international standard','automotive_design',2000,{application})")
     discipline = out.add(f"PRODUCT_CONTEXT('',{application},'mechanical')")

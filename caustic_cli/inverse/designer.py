@@ -22,6 +22,7 @@ from caustic_cli.inverse import ranks
 from caustic_cli.inverse.conditions import Ranges
 from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
 from caustic_cli.inverse.extended import best_light, regular_rays, shift_of
+from caustic_cli.inverse.initial_surface import room_of, sphere_net
 from caustic_cli.inverse.lbfgs import UNFIT
 from caustic_cli.inverse.lenslets import ArrayObjective, lenslets
 from caustic_cli.inverse.limits import within_limits
@@ -137,7 +138,7 @@ class Designer:
         own: (n_x, n_y) of each lenslet of an array; or one for all, the target unless given.
         second: (k_x, k_y) irradiance on the scene's second screen, where it has one.
 
-    Of two free-form sides heights are those of entrance and exit, (2, n, m).
+    Where several surfaces are shaped together, heights are those of all, (k, n, m): see `Scene.shaped`.
     """
 
     def __init__(
@@ -181,6 +182,14 @@ class Designer:
     def field(self, stage: int) -> HeightField:
         """The spline spaces of a stage."""
         return HeightField.of(replace(self.scene.lens, control=self.stages[stage].control))
+
+    def whole(self, heights: Tensor | None) -> Tensor | None:
+        """Heights of the exit (n, m) on the first stage's net with those of the spheres that surfaces of other elements begin as,
+        (k, n, m); others as they are."""
+        if heights is None or heights.ndim == 3 or not self.scene.jointly:
+            return heights
+        others = [sphere_net(e, side, self.field(0)) for e in self.scene.elements for side in e.shaped]
+        return torch.stack([*others, heights])
 
     def begin(self, heights: Tensor | None = None) -> State:
         """A fresh state: the parametrisation's own beginning, or `heights` (n, m) mm on the first stage's net."""
@@ -261,12 +270,19 @@ class Designer:
             CausticError: no surface near them obeys these.
         """
         field, bounds, o = self.field(state.stage), self._bounds(self.stages[state.stage]), self.options
-        if self.scene.second is None:
+        if not self.scene.jointly:
             return within_limits(field, state.heights, bounds, o.max_slope, o.min_radius)
-        (low, low_exit), (high, high_exit) = bounds
-        # What is concave of an entrance, seen from outside, is convex from within.
-        entrance = within_limits(field, -state.heights[0], (-high, -low), o.max_slope, o.min_radius)
-        return torch.stack([-entrance, within_limits(field, state.heights[1], (low_exit, high_exit), o.max_slope, o.min_radius)])
+        found = []
+        halves = [e.half_size for e in self.scene.elements for _ in e.shaped] or [field.half_size]
+        for name, half, heights, low, high in zip(
+            self.scene.shaped, [*halves, field.half_size], state.heights, *bounds, strict=True
+        ):
+            field = replace(field, half_size=half)
+            if name.endswith(("entrance", "front")):  # what is concave of these, seen from outside, is convex from within
+                found.append(-within_limits(field, -heights, (-high, -low), o.max_slope, o.min_radius))
+            else:
+                found.append(within_limits(field, heights, (low, high), o.max_slope, o.min_radius))
+        return torch.stack(found)
 
     def _stage(self, state: State, k: int, limit: int, deadline: float, stop, on_iteration, notice, origin: float) -> bool:
         """Iterate stage k in place.  True: the stage is done; False: the whole design ends here, for `state.reason`."""
@@ -454,9 +470,20 @@ class Designer:
                 raise InputError(
                     f"⟨screen.z⟩ must lie behind the lens, whose surface may reach {high.max():.4g} mm, got {screen.z:g} mm"
                 )
+        ahead = [e.extent[0] for e in self.scene.behind[:1]]
+        if ahead and high.max() >= ahead[0]:
+            raise InputError(
+                f"⟨element.z⟩ of the element behind the lens must lie beyond {high.max():.4g} mm, which the lens' surface may"
+                f" reach, got a body from {ahead[0]:.4g} mm on"
+            )
         if self.scene.second is not None:
             most = np.full_like(low, lens.height_range[1])
             low, high = np.stack([-most, low]), np.stack([most, high])
+        elif self.scene.jointly:
+            field = HeightField.of(lens)
+            others = [(sphere_net(e, side, field).numpy(), room_of(e, lens)) for e in self.scene.elements for side in e.shaped]
+            low = np.stack([*(net - room for net, room in others), low])
+            high = np.stack([*(net + room for net, room in others), high])
         return torch.from_numpy(low), torch.from_numpy(high)
 
     @staticmethod

@@ -57,7 +57,7 @@ class Limits:
 
 def limits(scene: Scene, target: np.ndarray, field: HeightField | None = None, heights: torch.Tensor | None = None) -> Limits:
     """What the source of a scene lets any lens do, by the spread of this lens, or of the offset surface; target: (n, m)."""
-    if not scene.source.extended or scene.source.apart:
+    if not scene.source.extended or scene.source.apart or scene.elements:
         return Limits(None, None)
     spread = shift_of(scene, field, heights)
     seen = spread is not None and max(spread.reach()) > LEAST_REACH * max(scene.screen.pixel)
@@ -73,7 +73,7 @@ def best_light(scene: Scene, target: np.ndarray, spread: Spread, steps: int | No
 def shift_of(scene: Scene, field: HeightField | None = None, heights: torch.Tensor | None = None) -> Spread | None:
     """How an extended source spreads its middle's image; None where it has no extent, does much else, or lights far more than the
     screen."""
-    if not scene.source.extended or scene.source.apart or any(scene.screen.tilt) or scene.screen.curved:
+    if not scene.source.extended or scene.source.apart or any(scene.screen.tilt) or scene.screen.curved or scene.elements:
         return None
     if heights is None:
         scene = replace(scene, lens=replace(scene.lens, control=(NET, NET), knots=None, array=(1, 1)))

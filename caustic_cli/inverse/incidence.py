@@ -9,6 +9,9 @@ A ray of tangent q crosses the entrance at h q from the axis through the source 
 q' = q / sqrt(n^2 (1 + q^2) - q^2) by Snell; t is the height of p above the entrance.  So the point p is reached by the q with
 h q + t q' = |(x - x_0, y - y_0)|, unless that has to come in by the lens' sides, and
 f = I(q) (1 - R(q)) (1 + q^2)^(-3/2) |d(s_x, s_y) / d(x, y)|.
+
+Where other lenses stand before the lens, rays are traced through them: from (a, b) of the pupil, which the source lights with
+irradiance g(a, b), to p, which is solved for (a, b) by Newton's method; then f = T g |d(a, b) / d(x, y)|, T what passes.
 """
 
 from __future__ import annotations
@@ -17,16 +20,26 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from scipy.interpolate import RegularGridInterpolator
 
 from caustic_cli.errors import InputError
+from caustic_cli.inverse.relayed import bare, opened, passed
 from caustic_cli.inverse.target import overlap
 from caustic_cli.optics.emission.measured import irradiance
 from caustic_cli.optics.interface import reflectance
+from caustic_cli.optics.system import ENTRANCE, System
 from caustic_cli.scene import Scene
 from caustic_cli.scene.sources.distribution import relative
 
 #: Newton steps for q; its function is concave, so from the greater of two lower bounds each step stays below the root.
 STEPS = 40
+#: Distance of points of the pupil over which a trace is differentiated, mm; cells of it along each axis; how wide the light of its
+#: middle is at the exit at least, in parts of what it was.
+_STEP, CELLS, LEAST_GROWTH = 1e-5, 128, 1e-3
+#: Largest sine of what goes on beside the light.
+STEEPEST = 0.6
+#: Most of Newton's steps for (a, b), and how near to its corner a ray has to come, in parts of the lens' half width.
+TRACED_STEPS, FOUND = 12, 1e-7
 
 
 def incident(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, tuple | None]:
@@ -38,7 +51,7 @@ def incident(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple
     Raises:
         InputError: the source stands behind the entrance.
     """
-    light, directions = _square(scene, x, y, z)
+    light, directions = (_through if scene.before else _square)(scene, x, y, z)
     return (light * _part_within(x, y, scene.lens.half_size[0]) if scene.lens.round else light), directions
 
 
@@ -46,6 +59,93 @@ def on_entrance(scene: Scene, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray,
     """The same in air, on the plane of the entrance: as if the lens there had the index 1 and no thickness."""
     air = replace(scene, lens=replace(scene.lens, index=1.0 + 1e-9, glass=None, fresnel="none", front=None), second=None)
     return incident(air, x, y, np.full((len(x), len(y)), scene.lens.z_in))
+
+
+def _through(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, tuple]:
+    """The same over the whole rectangle, through the lenses before the lens."""
+    pupil, lens, whole = scene.pupil, scene.lens, System.of(bare(scene))
+    names = [e.name for e in whole.elements]
+    system = opened(whole, 0, names.index(ENTRANCE) + 1)
+    first = scene.before[0].extent[0]
+
+    def arrive(at: np.ndarray, z: np.ndarray):
+        """Where rays of the pupil's points (2, N) meet heights z, their directions in the glass, where they entered it, and what
+        passes."""
+        d = _from_source(scene, *at)
+        back = (pupil.z - first) / d[2] + 1e-6  # the first surface may reach through the pupil
+        state = passed(system, (at[0] - back * d[0], at[1] - back * d[1], pupil.z - back * d[2]), d)
+        inside = np.stack([c.numpy().reshape(z.shape) for c in state.full(state.direction)])
+        entered = np.stack([c.numpy().reshape(z.shape) for c in state.origin[:2]])
+        return entered + (z - lens.z_in) / inside[2] * inside[:2], inside, entered, state.power.numpy().reshape(z.shape)
+
+    small, middle = 1e-3 * min(pupil.half_size), np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    start = arrive(small * middle, np.full(3, float(z.mean())))[0]
+    grown = np.array([start[0, 1] - start[0, 0], start[1, 2] - start[1, 0]]) / small
+    if not (np.abs(grown) > LEAST_GROWTH).all():
+        raise InputError(
+            "⟨element.radius⟩: the lenses before the lens focus their light into it; a first surface needs it spread out"
+        )
+    shape, flat = z.shape, z.ravel()
+    goal = np.stack([c.ravel() for c in np.broadcast_arrays(x[:, None], y[None, :])])
+    at, left = goal / grown[:, None], np.arange(z.size)
+    for _ in range(TRACED_STEPS):  # of the corners that are left; those that no ray gets to stay
+        here, by_a, by_b = np.moveaxis(arrive(at[:, None, left] + _STEP * middle[:, :, None], np.stack([flat[left]] * 3))[0], 1, 0)
+        ja, jb, off = (by_a - here) / _STEP, (by_b - here) / _STEP, goal[:, left] - here
+        with np.errstate(divide="ignore", invalid="ignore"):
+            move = np.stack([jb[1] * off[0] - jb[0] * off[1], ja[0] * off[1] - ja[1] * off[0]]) / (ja[0] * jb[1] - ja[1] * jb[0])
+        known = np.isfinite(move).all(0)
+        at[:, left] += np.where(known, move, 0.0)
+        left = left[~known | (np.abs(off).max(0) > FOUND * max(lens.half_size))]
+        if not len(left):
+            break
+    _, d, entered, part = arrive(at, flat)
+    known = np.ones(z.size, dtype=bool)
+    known[left] = False
+    known, at, d, entered, part = (c.reshape(*c.shape[:-1], *shape) for c in (known, at, d, entered, part))
+    ga, gb = (np.gradient(c, x, y) for c in at)
+    power = part * np.abs(ga[0] * gb[1] - ga[1] * gb[0])
+    for where, half, round_ in ((at, pupil.half_size, pupil.round), (entered, lens.half_size, lens.round)):
+        far = np.hypot(*where) / half[0] if round_ else np.maximum(*(np.abs(c) / h for c, h in zip(where, half, strict=True)))
+        power = np.where(known & (far <= 1 + 1e-9), power, 0.0)
+    power = power * _on_pupil(scene, *at)
+    light = 0.25 * (power[1:, 1:] + power[:-1, 1:] + power[1:, :-1] + power[:-1, :-1])
+    return light, _goes_on(d, known & (power > 0), goal.reshape(2, *shape) / np.array(lens.half_size)[:, None, None])
+
+
+def _goes_on(d: np.ndarray, lit: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Unit directions (3, n, m) where corners are lit, and elsewhere those of a cubic fitted to them: a jump would be one of the
+    surface's slopes; at: places in parts of the aperture."""
+    terms = np.stack([at[0] ** i * at[1] ** j for i in range(4) for j in range(4 - i)], -1)
+    found = d[:2].copy()
+    if lit.any():
+        found[:, ~lit] = (terms[~lit] @ np.linalg.lstsq(terms[lit], d[:2, lit].T, rcond=None)[0]).T
+    else:
+        found[:] = 0.0
+    sine = np.hypot(*found)
+    found *= np.minimum(1.0, STEEPEST / np.maximum(sine, STEEPEST))
+    return found[0], found[1], np.sqrt(1.0 - (found * found).sum(0))
+
+
+def _from_source(scene: Scene, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Unit directions of the light of the source's middle at points of the pupil."""
+    if scene.source.distant:
+        return np.zeros_like(a), np.zeros_like(a), np.ones_like(a)
+    x0, y0, z0 = scene.source.centre
+    dx, dy, h = a - x0, b - y0, scene.pupil.z - z0
+    length = np.sqrt(dx * dx + dy * dy + h * h)
+    return dx / length, dy / length, h / length
+
+
+def _on_pupil(scene: Scene, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Irradiance there, between the middles of CELLS x CELLS cells."""
+    pupil = scene.pupil
+    size = (2.0 * pupil.half_size[0], 2.0 * pupil.half_size[1])
+    lens = replace(scene.lens, size=size, z_in=pupil.z, aperture="circle" if pupil.round else "rectangle", border=0.0)
+    edges = [np.linspace(-h, h, CELLS + 1) for h in pupil.half_size]
+    light = on_entrance(replace(scene, lens=lens, elements=()), *edges)[0]
+    middles = [0.5 * (e[1:] + e[:-1]) for e in edges]
+    points = np.stack([np.clip(c, m[0], m[-1]) for c, m in zip((a, b), middles, strict=True)], -1)
+    return RegularGridInterpolator(middles, light)(points)
 
 
 def _part_within(x: np.ndarray, y: np.ndarray, radius: float, parts: int = 8) -> np.ndarray:

@@ -8,7 +8,7 @@ taken that keeps most.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -17,12 +17,15 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.incidence import incident
-from caustic_cli.inverse.surface_from_map import OutOfReach, Start, thrown
+from caustic_cli.inverse.relayed import Relayed
+from caustic_cli.inverse.surface_from_map import OutOfReach, Seen, Start, thrown
 from caustic_cli.inverse.surface_from_map import surface as refracting_surface
 from caustic_cli.inverse.transport import corners
 from caustic_cli.inverse.view import View
+from caustic_cli.optics.surfaces import Sphere
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.scene import Scene
+from caustic_cli.scene import Component, Lens, Scene
+from caustic_cli.scene.elements import SIDES
 
 #: Source cells along the lens' longer side: a picture of 250 x 250 pixels is resolved, and they are cheap.
 CELLS = 256
@@ -38,6 +41,8 @@ FEW_CELLS, WELL = 64, 0.7
 TRIED = (0.3, 0.45, 0.65, 1.5, 2.2, 3.3)
 #: Cells along which light has nowhere to go that are left out at most before the picture counts as out of reach.
 RETRIES = 4
+#: Part of another lens' least thickness that each of its surfaces may take.
+GLASS = 0.45
 UNREACHED = (
     "no light of the source that meets the lens can be refracted to the picture by a surface over this aperture; a picture"
     " nearer the light's way, or a source farther away, is needed"
@@ -86,7 +91,7 @@ class _Grid:
     def solved(self, light: np.ndarray, directions, mean: float, again: Start | None = None, **options) -> Start:
         """The surface of this mean height that sends the light to the picture."""
         scene = self.scene
-        if not scene.source.distant and not light.all():
+        if not light.all() and (scene.before or not scene.source.distant):
             options["darkest"] = DARKEST
         view = self.view(mean)
         target, half, centre = (
@@ -107,9 +112,11 @@ class _Grid:
             **options,
         )
 
-    def view(self, mean: float) -> View | None:
+    def view(self, mean: float) -> Seen | None:
         """The screen as a surface of this mean height sees it, None of an upright one, which lies in its plane."""
         screen = self.scene.screen
+        if self.scene.behind:
+            return Relayed(self.scene, mean)
         return None if screen.upright else View(screen, mean, -1.0 if self.scene.lens.mirror else 1.0)
 
     def above(self, z: np.ndarray) -> np.ndarray:
@@ -193,9 +200,9 @@ def first_surface(scene: Scene, target: np.ndarray, field: HeightField, cells: i
     """
     grid, lens = _Grid.of(scene, target, cells), scene.lens
     z = grid.offset
-    if scene.source.distant or lens.mirror:
+    if scene.source.distant or lens.mirror or scene.elements:
         found = None
-        for _ in range(1 if scene.source.distant else PASSES):
+        for _ in range(1 if scene.source.distant and not scene.before else PASSES):
             found = grid.solved(*incident(scene, grid.x, grid.y, z), float(grid.offset.mean()), found)
             z = found.heights
         return InitialSurface(net_of(grid.x, grid.y, z, field))
@@ -241,6 +248,23 @@ def net_of(x: np.ndarray, y: np.ndarray, z: np.ndarray, field: HeightField) -> T
     net = at[0] @ values @ at[1].T
     # Through points, a spline of high degree over knots that repeat overshoots; one that has them as its net never does.
     return net if float(net.max() - net.min()) <= OVERSHOOT * float(values.max() - values.min()) else values
+
+
+def sphere_net(element: Component, side: str, field: HeightField) -> Tensor:
+    """Control heights (n, m) of the sphere that a side of another lens or mirror is, on the exit's spline spaces over its aperture,
+    from its vertex' plane, mm."""
+    x, y = (corners(2 * n, h) for n, h in zip(field.shape, element.half_size, strict=True))
+    radius = element.radius[SIDES.index(side)]
+    points = (torch.from_numpy(c) for c in np.broadcast_arrays(x[:, None], y[None, :]))
+    z = Sphere(radius, element.reach).at(None, *points, orders=((0, 0),))[0] if np.isfinite(radius) else torch.zeros(len(x), len(y))
+    return net_of(x, y, z.numpy(), replace(field, half_size=element.half_size))
+
+
+def room_of(element: Component, lens: Lens) -> float:
+    """How far a design may take a surface of another lens or mirror from its sphere, mm: as far as the exit from its own, and never
+    through the glass."""
+    thinnest = element.thickness + min(0.0, element.sag("back") - element.sag("front")) if not element.mirror else np.inf
+    return min(lens.height_range[1], GLASS * thinnest)
 
 
 def _mean(v: np.ndarray) -> np.ndarray:

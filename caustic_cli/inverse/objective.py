@@ -23,7 +23,7 @@ from caustic_cli.optics.memory import smaller
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.spread import Convolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import ENTRANCE, EXIT
+from caustic_cli.optics.system import EXIT
 from caustic_cli.optics.trace import Parameters, Tracer, tracers
 from caustic_cli.scene import Scene
 
@@ -43,8 +43,8 @@ class Evaluation:
 
     @property
     def gradient(self) -> Tensor:
-        """That of a lens' exit, or of both sides, (2, n, m)."""
-        return torch.stack([*self.gradients.values()]) if ENTRANCE in self.gradients else self.gradients[EXIT]
+        """That of a lens' exit, or of all surfaces, (k, n, m)."""
+        return torch.stack([*self.gradients.values()]) if len(self.gradients) > 1 else self.gradients[EXIT]
 
 
 def penalty_of(
@@ -161,8 +161,8 @@ class Objective:
                 yield k, traced
 
     def __call__(self, heights: Tensor) -> Evaluation:
-        """`evaluate` at the heights (n, m) mm float64 of a lens' exit."""
-        return self.evaluate({EXIT: heights})
+        """`evaluate` at the heights (n, m) mm float64 of a lens' exit, or at those of all surfaces that are `shaped`, (k, n, m)."""
+        return self.evaluate({EXIT: heights} if heights.ndim == 2 else dict(zip(self.scene.shaped, heights, strict=True)))
 
     def evaluate(self, parameters: Parameters) -> Evaluation:
         """Value and gradients at heights {name of a surface: (n, m) mm float64}.

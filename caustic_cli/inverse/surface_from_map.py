@@ -32,12 +32,14 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import gaussian_filter
 
 from caustic_cli.errors import InputError
+from caustic_cli.inverse.relayed import Relayed
 from caustic_cli.inverse.transport import Transport, corners, solve
 from caustic_cli.inverse.view import View
 from caustic_cli.optics.backends.reference import Torch
 from caustic_cli.optics.frames import IDENTITY
 from caustic_cli.optics.kernels.laguerre import prices
 
+Seen = View | Relayed  # how the lens sees a screen that is not simply the plane z_screen
 EVEN = 2.0  # cells over which e is smoothed: at a kink of phi the rays miss by the spline's own width, which is no error of T
 ENOUGH = 0.05  # pixels of e, root mean square, that are left alone
 REPEATS = 4  # of the heights; each takes another factor of about angle^2 / throw off the error
@@ -85,7 +87,7 @@ def surface(
     *,
     corrections=2,
     centre=(0.0, 0.0),
-    view: View | None = None,
+    view: Seen | None = None,
     **options,
 ) -> Start:
     """Surface of a lens that throws `target` on a plane behind it.
@@ -170,7 +172,7 @@ def _directions(directions, shape) -> tuple:
 
 
 def heights(
-    map_: Transport, aim, x, y, d, index: float, z_screen: float, mean: float, lit: np.ndarray, view: View | None = None
+    map_: Transport, aim, x, y, d, index: float, z_screen: float, mean: float, lit: np.ndarray, view: Seen | None = None
 ) -> np.ndarray:
     """Heights at the corners x (n + 1, 1), y (1, m + 1), mm, whose rays land at `aim` as nearly as a surface can.
 
@@ -187,12 +189,17 @@ def heights(
     """
     step = float(x[1, 0] - x[0, 0]), float(y[0, 1] - y[0, 0])
     scale = 1.0 / ((index - 1.0) * (z_screen - mean))
-    main = scale * (map_.potential - 0.5 * (x * x + y * y))
-    slope = scale * (map_.x - x), scale * (map_.y - y)
+    if view is None:
+        main = scale * (map_.potential - 0.5 * (x * x + y * y))
+        slope = scale * (map_.x - x), scale * (map_.y - y)
+    else:
+        cx, cy = view.straight
+        main = scale * (view.sign * map_.potential - 0.5 * (cx * x * x + cy * y * y))
+        slope = scale * (view.sign * map_.x - cx * x), scale * (view.sign * map_.y - cy * y)
     z = main - main.mean() + mean
-    point = (*aim, z_screen) if view is None else view.points(*aim)
+    towards = None if view is None else view.towards(*aim)
     for _ in range(REPEATS):
-        tx, ty, tz = point[0] - x, point[1] - y, point[2] - z
+        tx, ty, tz = (aim[0] - x, aim[1] - y, z_screen - z) if towards is None else towards(x, y, z)
         within = refracted(tx, ty, tz, d, index)
         if not within[lit].all():
             raise OutOfReach(lit & ~within)
@@ -236,7 +243,7 @@ def integrate(sx: np.ndarray, sy: np.ndarray, step: tuple[float, float]) -> np.n
     return idctn(spectrum, norm="ortho")
 
 
-def land(z: np.ndarray, x, y, d, index: float, z_screen: float, view: View | None = None) -> tuple[np.ndarray, np.ndarray]:
+def land(z: np.ndarray, x, y, d, index: float, z_screen: float, view: Seen | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Landing points (n, m), mm, of the rays d through the bicubic spline of z, NaN where totally reflected: on the plane z_screen,
     as `view` sees them."""
     spline = RectBivariateSpline(x[:, 0], y[0], z, kx=min(3, len(z) - 1), ky=min(3, z.shape[1] - 1))
@@ -244,7 +251,7 @@ def land(z: np.ndarray, x, y, d, index: float, z_screen: float, view: View | Non
 
 
 def thrown(
-    x, y, z, zx, zy, d, index: float, z_screen: float, fresnel: str = "none", view: View | None = None
+    x, y, z, zx, zy, d, index: float, z_screen: float, fresnel: str = "none", view: Seen | None = None
 ) -> tuple[np.ndarray, ...]:
     """Where rays d inside the glass land that leave it at (x, y, z) with slopes zx, zy, NaN where totally reflected, and the part
     of each that passes.  view: as of `surface`; NaN where they miss its screen."""
@@ -266,6 +273,10 @@ def thrown(
         landing = backend.land(tuple(origin), out.direction, (0.0, 0.0, z_screen), IDENTITY, -1.0 if mirror else 1.0)[:2]
         passes = out.passes
     else:
-        *own, there = view.land(tuple(origin), out.direction)
-        landing, passes = map(torch.from_numpy, view.onto(*(c.numpy() for c in own))), out.passes & there
+        landing = map(torch.from_numpy, view.seen(*(tuple(map(_array, v)) for v in (origin, out.direction))))
+        passes = out.passes
     return *(torch.where(passes, c, torch.nan).view(shape).numpy() for c in landing), out.power.view(shape).numpy()
+
+
+def _array(value):
+    return value if isinstance(value, float) else value.numpy()

@@ -12,6 +12,7 @@ plane, cell by cell with its power.  What depth is left beyond the first order i
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,6 +57,19 @@ class View:
         found = space(self.screen, np.where(there, x, 0.0), np.where(there, y, 0.0))
         return tuple(np.where(there, a, b) for a, b in zip(found, (u, v, self.screen.z), strict=True))  # type: ignore[return-value]
 
+    sign, straight = 1.0, (1.0, 1.0)  # see `relayed`: nothing stands between the lens and the screen
+
+    def towards(self, u: np.ndarray, v: np.ndarray) -> Callable[..., tuple]:
+        """From points x, y, z of the exit to those of the screen behind (u, v), of any length."""
+        px, py, pz = self.points(u, v)
+        return lambda x, y, z: (px - x, py - y, pz - z)
+
+    def seen(self, origin: tuple, direction: tuple) -> tuple[np.ndarray, np.ndarray]:
+        """(u, v) of rays, components (N,), NaN where they miss the screen."""
+        *own, there = self.land(*(tuple(_tensor(c) for c in v) for v in (origin, direction)))
+        u, v = self.onto(*(c.numpy() for c in own))
+        return np.where(there, u, np.nan), np.where(there, v, np.nan)
+
     def land(self, origin, direction) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Rays, components (N,) float64 or numbers, to the screen: x, y (N,) mm, and whether they get there."""
         s, shape = self.screen, shape_of(self.screen)
@@ -84,6 +98,10 @@ class View:
         edges = [np.linspace(a, b, FINER * (len(c) - 1) + 1) for a, b, c in zip(low, high, (x, y), strict=True)]
         own = self.own(*np.broadcast_arrays(edges[0][:, None], edges[1][None, :]))
         return _integrals(target, s, *own), half, middle  # type: ignore[return-value]
+
+
+def _tensor(value):
+    return value if isinstance(value, float) else torch.from_numpy(value)
 
 
 def _integrals(target: np.ndarray, screen: Screen, x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -11,11 +11,13 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.io.arrays import Archive, open_npz
-from caustic_cli.io.surfaces import ACCEPTED, surface_of
+from caustic_cli.io.surfaces import ACCEPTED, MAX_CONTROL, surface_of
 from caustic_cli.optics.bounds import refuse_without_glass
+from caustic_cli.optics.bspline import MAX_DEGREE
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import front_from
-from caustic_cli.scene import Disc, Lens, Light, PlaneWave, Points, Scene, Screen, Source
+from caustic_cli.scene import Component, Disc, Front, Lens, Light, PlaneWave, Points, Scene, Screen, Source
+from caustic_cli.scene.elements import SIDES
 from caustic_cli.scene.screen import MAX_SAGS, Sags
 from caustic_cli.scene.sources.distribution import MOST_ANGLES, Distribution
 from caustic_cli.scene.sources.points import MAX_POINTS
@@ -47,9 +49,50 @@ def open_archive(path: str | Path) -> tuple[Scene, HeightField, Tensor]:
             entrance, low = surface_of(data, "entrance_")
             lens = replace(lens, front=front_from(entrance, low - lens.z_in))
         screen = _screen(data)
-        scene = Scene(_source(data), lens, screen, Light(unit=data.text("source_power_unit", "W")))
+        light = Light(unit=data.text("source_power_unit", "W"))
+        scene = Scene(_source(data), lens, screen, light, elements=_elements(data))
         refuse_without_glass(scene, field, heights)
         return scene, field, heights
+
+
+def _elements(data: Archive) -> tuple[Component, ...]:
+    """Other lenses and mirrors; see `export/lighttools.py`."""
+    if "element_type" not in data:
+        return ()
+    kinds, apertures = (data.text(f"element_{key}").split(",") for key in ("type", "aperture"))
+    count = len(kinds)
+    if len(apertures) != count:
+        raise InputError(f"element_aperture must name {count} apertures, got {len(apertures)}")
+    z, thickness, index, absorption = (
+        data.reals(f"element_{key}", count).tolist() for key in ("z", "thickness", "index", "absorption")
+    )
+    size, tilt, bent = (data.reals(f"element_{key}", count, 2).tolist() for key in ("size", "tilt", "curvature"))
+    return tuple(
+        Component(
+            kinds[k],
+            z[k],
+            tuple(size[k]),
+            thickness[k],
+            tuple(1.0 / c if c else math.inf for c in bent[k]),
+            index[k],
+            absorption[k],
+            aperture=apertures[k],
+            tilt=tuple(tilt[k]),
+            fronts=tuple(_front(data, f"element_{k + 1}_{side}_") for side in SIDES),
+        )
+        for k in range(count)
+    )
+
+
+def _front(data: Archive, name: str) -> Front | None:
+    """A designed surface of one of them."""
+    if f"{name}heights" not in data:
+        return None
+    heights, degree = data.reals(f"{name}heights", None, None, most=MAX_CONTROL), data.wholes(f"{name}degrees", 2)
+    u, v = (data.reals(f"{name}knots_{axis}", None, most=MAX_CONTROL + MAX_DEGREE + 1).tolist() for axis in "uv")
+    if [len(u), len(v)] != [n + p + 1 for n, p in zip(heights.shape, degree, strict=True)]:
+        raise InputError(f"{name}knots must have control + degree + 1 entries along each axis")
+    return Front(heights, degree, (u, v))
 
 
 def _screen(data: Archive) -> Screen:

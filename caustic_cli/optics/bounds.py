@@ -27,7 +27,7 @@ from caustic_cli.optics.interface import reflectance, reflectances
 from caustic_cli.optics.resolution import Resolution, paraxial
 from caustic_cli.optics.sampling import LARGEST_NORMAL
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import front_of
+from caustic_cli.optics.system import System, front_of
 from caustic_cli.scene import Scene
 
 
@@ -79,7 +79,8 @@ def bounds_of(scene: Scene, field: HeightField, heights: Tensor, steeper: float 
     """Bounds that hold for every ray of a scene at these heights (n, m) mm; steeper: by how much slopes may exceed the spline's."""
     lens, indices = scene.lens, [band.scene.lens.inside for band in scene.bands]
     least, most = min(indices), max(indices)
-    incidence = scene.source.incidence(scene.lens.half_size, scene.lens.z_in, scene.lens.round)
+    pupil = scene.pupil
+    incidence = _through(scene, scene.source.incidence(pupil.half_size, pupil.z, pupil.round))
     bent = 0.0
     if field_of_index := field_of(lens):
         low, high, steepest = field_of_index.extremes(lens.half_size, lens.offset.thickness - lens.z_in)
@@ -98,9 +99,20 @@ def bounds_of(scene: Scene, field: HeightField, heights: Tensor, steeper: float 
     slope_ratio = slope * math.tan(out) if out < math.pi / 2.0 else (math.inf if slope > 0 else 0.0)
     reach = _reach(scene, inside, float(heights.min()), float(heights.max()))
     ghost, polarised = _ghost(scene, field, heights, inside + front, most), _polarised(incidence + front, critical, most)
-    focused = 0.0 if scene.two_sided else ghost_error(scene, field, heights, ghost, most)
+    focused = 0.0 if scene.two_sided or scene.elements else ghost_error(scene, field, heights, ghost, most)
     seen = Resolution.at(scene, field, heights)
     return Bounds(incidence, inside, slope, lean, most, critical, slope_ratio, reach, ghost, focused, polarised, seen)
+
+
+def _through(scene: Scene, lean: float) -> float:
+    """The most that rays lean from z behind the lenses before the lens, which leaned so much at most before them."""
+    system = System.of(scene) if scene.before else None
+    for k, element in enumerate(system.elements[: 2 * len(scene.before)] if system else ()):
+        assert system is not None
+        normal = math.atan(math.hypot(*element.surface.slope_bounds(None))) if element.surface.shape is None else 0.5 * math.pi
+        before, behind = (medium.index for medium in system.media()[k : k + 2])
+        lean = normal + math.asin(min(1.0, before / behind * math.sin(min(lean + normal, 0.5 * math.pi))))
+    return min(lean, 0.5 * math.pi)
 
 
 def _polarised(incidence: float, critical: float, n: float) -> float:
@@ -122,7 +134,7 @@ def _reach(scene: Scene, inside: float, lowest: float, top: float) -> float:
     source, lens = scene.source, scene.lens
     if scene.axial:
         return 1.0
-    if lowest < lens.z_in:
+    if lowest < lens.z_in or scene.before:
         return math.inf
     low = min(0.0, front_of(lens).hull(None)[0]) if lens.front is not None else 0.0
     drift = (top - lens.z_in - low) * math.tan(min(inside, 1.57))
@@ -144,6 +156,9 @@ def _ghost(scene: Scene, field: HeightField, heights: Tensor, inside: float, n: 
     lens, kind = scene.lens, scene.lens.fresnel
     if lens.mirror:
         return 0.0
+    if scene.elements:  # of every pair of refracting surfaces, at normal incidence
+        surfaces, n = 2 + sum(len(e.sides) for e in scene.elements if not e.mirror), max(n, *(e.index for e in scene.elements))
+        return 0.0 if kind == "none" else surfaces * (surfaces - 1) / 2 * ((n - 1.0) / (n + 1.0)) ** 4
     slope, area = _slopes(field, heights.detach().double().cpu())
     lean = torch.atan(slope + lens.roughness * LARGEST_NORMAL)
 

@@ -19,23 +19,58 @@ Axes = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float
 
 @dataclass(frozen=True)
 class Pose:
-    """Where an element stands: its origin, mm, and right-handed turns first about its x, then about its y axis, degrees."""
+    """Where an element stands: its origin, mm, and right-handed turns first about its x, then about its y axis, degrees; these in a
+    frame that is turned already."""
 
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     tilt: tuple[float, float] = (0.0, 0.0)
+    frame: Axes = IDENTITY
 
     @cached_property
     def axes(self) -> Axes:
         """Unit vectors along its x, y and z."""
         if not any(self.tilt):
-            return IDENTITY
+            return self.frame
         (sa, ca), (sb, cb) = ((math.sin(t), math.cos(t)) for t in map(math.radians, self.tilt))
-        return (cb, 0.0, -sb), (sb * sa, ca, cb * sa), (sb * ca, -sa, cb * ca)
+        own = (cb, 0.0, -sb), (sb * sa, ca, cb * sa), (sb * ca, -sa, cb * ca)
+        if self.frame == IDENTITY:
+            return own
+        x, y, z = (tuple(sum(a * f[k] for a, f in zip(axis, self.frame, strict=True)) for k in range(3)) for axis in own)
+        return x, y, z  # type: ignore[return-value]
 
     @property
     def upright(self) -> bool:
         """Whether nothing is tilted."""
-        return not any(self.tilt)
+        return not any(self.tilt) and self.frame == IDENTITY
+
+
+@dataclass(frozen=True)
+class Leg:
+    """A straight part of an axis that mirrors fold: where its z = 0 would be, mm, and its frame, whose z runs along it."""
+
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    frame: Axes = IDENTITY
+
+    def at(self, x: float, y: float, z: float) -> tuple[float, float, float]:
+        """A point of its own coordinates in those of the system, mm."""
+        if self == Leg():
+            return x, y, z
+        a, b, c = (o + x * u + y * v + z * w for o, u, v, w in zip(self.origin, *self.frame, strict=True))
+        return a, b, c
+
+    def pose(self, z: float, tilt: tuple[float, float] = (0.0, 0.0)) -> Pose:
+        """Of an element at z, turned."""
+        return Pose(self.at(0.0, 0.0, z), tilt, self.frame)
+
+    def folded(self, z: float, tilt: tuple[float, float]) -> Leg:
+        """The next one, behind a mirror at z that is turned about x or about y.
+
+        A mirror turned by t turns the axis by 2 t - 180 degrees, for t > 0, about the same line; the frame goes with it.
+        """
+        turn = tuple(2.0 * t - math.copysign(180.0, t) if t else 0.0 for t in tilt)
+        frame, vertex = Pose(tilt=turn, frame=self.frame).axes, self.at(0.0, 0.0, z)  # type: ignore[arg-type]
+        x, y, w = (v - z * c for v, c in zip(vertex, frame[2], strict=True))
+        return Leg((x, y, w), frame)
 
 
 def into(pose: Pose, origin, direction, datum: float) -> tuple[tuple, tuple]:

@@ -79,8 +79,8 @@ class Resolution:
     @classmethod
     def at(cls, scene: Scene, field: HeightField, heights: Tensor) -> Resolution:
         """The same of a lens with these heights (n, m) mm, by its own local magnification; the picture is the screen.  Of two
-        free-form sides by that which it is to have."""
-        if scene.two_sided:
+        free-form sides, or beside other elements, by that which it is to have."""
+        if scene.two_sided or scene.elements:
             return cls.before(scene, scene.screen.size)
         return cls.of(scene, scene.screen.size[0], local_magnification(scene, field, heights))
 

@@ -20,11 +20,13 @@ from torch import Tensor
 from caustic_cli.config import checks
 from caustic_cli.config.table import TABLE
 from caustic_cli.errors import InputError
-from caustic_cli.optics.frames import Pose
+from caustic_cli.optics.bspline import SplineSpace
+from caustic_cli.optics.frames import Leg, Pose
 from caustic_cli.optics.gradient.fields import IndexField, field_of
-from caustic_cli.optics.surfaces import Fixed, HeightField, Plane, Surface
+from caustic_cli.optics.surfaces import Fixed, HeightField, Plane, Sphere, Surface
 from caustic_cli.optics.tolerances import PARALLEL
-from caustic_cli.scene import Aperture, Front, Lens, Light, Pupil, Scene, Screen, Source
+from caustic_cli.scene import Aperture, Component, Front, Lens, Light, Pupil, Scene, Screen, Source
+from caustic_cli.scene.elements import SIDES, surface_name
 from caustic_cli.scene.materials import refractive_index
 
 INTERACTIONS = ("refract", "reflect")
@@ -95,24 +97,67 @@ class Element:
 
 def front_of(lens: Lens) -> Fixed:
     """The free-form entrance of a lens that has one."""
-    front = lens.front
-    assert front is not None
-    shape = (front.heights.shape[0], front.heights.shape[1])
-    field = HeightField.of(replace(lens, control=shape, degree=front.degree, knots=front.knots, front=None))
-    return Fixed(field, torch.from_numpy(front.heights))
+    assert lens.front is not None
+    return _fixed(lens.front, lens.half_size)
+
+
+def _fixed(front: Front, half_size: tuple[float, float]) -> Fixed:
+    """The surface with these heights over an aperture."""
+    if front.knots is None:
+        u, v = (SplineSpace.uniform(n, p) for n, p in zip(front.heights.shape, front.degree, strict=True))
+    else:
+        u, v = (SplineSpace(p, torch.as_tensor(t, dtype=torch.float64)) for p, t in zip(front.degree, front.knots, strict=True))
+    return Fixed(HeightField((u, v), half_size), torch.from_numpy(front.heights))
 
 
 def sides_of(scene: Scene, field: HeightField, heights: Tensor) -> tuple[Scene, Tensor]:
-    """A scene and the heights (n, m) of its exit, from heights that may be those of both sides, (2, n, m)."""
+    """A scene and the heights (n, m) of its exit, from heights that may be those of all `shaped` surfaces, (k, n, m), which the
+    scene then says."""
     if heights.ndim == 2:
         return scene, heights
-    return replace(scene, lens=replace(scene.lens, front=front_from(field, heights[0]))), heights[1]
+    fronts = {name: front_from(field, h) for name, h in zip(scene.shaped, heights[:-1], strict=False)}
+    lens = replace(scene.lens, front=fronts[ENTRANCE]) if ENTRANCE in fronts else scene.lens
+    elements = tuple(
+        replace(e, fronts=(fronts.get(surface_name(k, SIDES[0])), fronts.get(surface_name(k, SIDES[1])))) if e.shaped else e
+        for k, e in enumerate(scene.elements)
+    )
+    return replace(scene, lens=lens, elements=elements), heights[-1]
+
+
+def traced_of(scene: Scene, field: HeightField, heights: Tensor) -> tuple[Scene, HeightField, Tensor]:
+    """`sides_of`, with the exit's field: what a trace takes."""
+    scene, exit = sides_of(scene, field, heights)
+    return scene, field, exit
 
 
 def front_from(field: HeightField, heights: Tensor) -> Front:
-    """The entrance with these heights (n, m), counted from its plane, mm."""
+    """A surface with these heights (n, m), counted from its vertex' plane, mm."""
     u, v = field.spaces
     return Front(heights.detach().cpu().double().numpy(), (u.degree, v.degree), (u.knots.tolist(), v.knots.tolist()))
+
+
+def _elements_of(
+    component: Component, number: int, leg: Leg, scene: Scene, spaces: tuple[SplineSpace, SplineSpace]
+) -> list[Element]:
+    """The surfaces of a lens or a mirror on a straight part of the axis; a free one without heights is on these spline spaces."""
+    found, glass = [], Medium(component.index, component.absorption, component.glass)
+    for side in component.sides:
+        front, radius = component.fronts[SIDES.index(side)], component.radius[SIDES.index(side)]
+        surface: Surface
+        if front is not None:
+            surface = _fixed(front, component.half_size)
+        elif side in component.shaped:
+            surface = HeightField(spaces, component.half_size)
+        else:
+            surface = Sphere(radius, component.reach) if math.isfinite(radius) else Plane()
+        pose = leg.pose(component.vertex(side), component.tilt)
+        name, opening = surface_name(number, side), component.opening
+        if component.mirror:
+            found.append(Element(name, surface, opening, "reflect", pose=pose))
+        else:
+            behind = glass if side == "front" else AIR
+            found.append(Element(name, surface, opening, behind=behind, pose=pose, fresnel=scene.lens.fresnel))
+    return found
 
 
 @dataclass(frozen=True)
@@ -133,6 +178,7 @@ class System:
         screens: each collects all light that gets to its plane, as if the others were not there.
         before: the medium before the first element.
         lit: the pupil that the sources light; None for the first element's aperture.
+        leg: the straight part of a folded axis that a `Screen` stands on; None where no mirror folds it.
 
     Raises:
         InputError: no element or source, two of one name, a first aperture that is infinite, or an element along the axis.
@@ -144,6 +190,7 @@ class System:
     light: Light = field(default_factory=Light)
     before: Medium = AIR
     lit: Pupil | None = None
+    leg: Leg | None = None
 
     def __post_init__(self):
         if self.before.gradient is not None:
@@ -161,8 +208,8 @@ class System:
 
     @classmethod
     def of(cls, scene: Scene, surface: HeightField | None = None) -> System:
-        """A one-lens scene: a flat entrance and a B-spline exit, or a B-spline mirror; of two free-form sides the entrance is free,
-        on the exit's spline spaces, unless the lens says its heights."""
+        """A scene: a lens of flat entrance and B-spline exit, or a B-spline mirror, between other lenses and folding mirrors.  What
+        is free beside the exit is on its spline spaces, unless the scene says its heights: of two free-form sides the entrance."""
         lens = scene.lens
         surface = surface or HeightField.of(lens)
         entrance = Plane() if not scene.two_sided else surface if lens.front is None else front_of(lens)
@@ -182,7 +229,22 @@ class System:
                 ),
                 Element(EXIT, surface, aperture, fresnel=lens.fresnel, roughness=lens.roughness),
             )
-        return cls((scene.source,), elements, (scene.screen,), scene.light, lit=None if scene.two_sided else scene.pupil)
+        lit, leg = None if scene.two_sided or scene.before else scene.pupil, Leg()
+        if scene.elements:
+            first, number = elements, len(scene.before)
+            elements = tuple(e for k, c in enumerate(scene.before) for e in _elements_of(c, k, leg, scene, surface.spaces)) + first
+            for k, component in enumerate(scene.behind, number):
+                elements += tuple(_elements_of(component, k, leg, scene, surface.spaces))
+                leg = leg.folded(component.z, component.tilt) if component.mirror else leg
+        return cls((scene.source,), elements, (scene.screen,), scene.light, lit=lit, leg=leg if leg != Leg() else None)
+
+    def placed(self, screen: Screen) -> Placed:
+        """A screen on the folded axis: its own tilt, shift and shape are those that it would have on a straight one."""
+        assert self.leg is not None
+        (sx, sy), turned = screen.shift, Pose(tilt=screen.tilt, frame=self.leg.frame)
+        middle = self.leg.at(sx, sy, screen.z)  # about which a tilted one is turned; its coordinates are counted from the axis
+        x, y, z = (m - sx * a - sy * b for m, a, b in zip(middle, *turned.axes[:2], strict=True))
+        return Placed(screen, replace(turned, position=(x, y, z)))
 
     @property
     def pupil(self) -> Pupil:

@@ -148,10 +148,10 @@ class Tracer:
 
     @torch.no_grad()
     def exit_of(self, parameters: Parameters) -> tuple[tuple, tuple, Tensor]:
-        """How rays arrive at the last element, whose surface is free, in its frame: slopes there, directions, powers."""
-        last = self.last(parameters)
-        assert last.arriving is not None
-        return last.slopes, last.incoming, last.arriving
+        """How rays arrive at a lens' exit, in its frame: slopes there, directions, powers."""
+        exit = next((m for m in self._walk(parameters) if m.element.name == EXIT), None) or self.last(parameters)
+        assert exit.arriving is not None
+        return exit.slopes, exit.incoming, exit.arriving
 
     def land(self, parameters: Parameters, screen: Screen | Placed) -> list[RayState]:
         """The same on a screen: x and y of their origins are the screen's own coordinates, mm."""
@@ -456,6 +456,8 @@ class Tracer:
 
     def onto(self, state: RayState, screen: Screen | Placed) -> RayState:
         """Rays straight on to a screen; x and y of their origins are the screen's own coordinates, mm."""
+        if isinstance(screen, Screen) and self.system.leg is not None:
+            screen = self.system.placed(screen)
         frame = screen if isinstance(screen, Screen) else screen.screen
         (sx, sy), shape = frame.shift, shape_of(frame)
         if isinstance(screen, Placed):

@@ -220,9 +220,11 @@ class Project:
                 f"⟨lens.control⟩ {list(scene.lens.control)} is not that of the designed lens,"
                 f" {list(field.shape)}; design again to change it"
             )
-        if (state.state.heights.ndim == 3) != (scene.second is not None):
-            has, says = ("two", "one") if scene.second is None else ("one", "two")
-            raise self.error(f"[second] says a lens with {says} free-form side(s), and the designed one has {has}; design again")
+        has, says = state.state.heights.shape[0] if state.state.heights.ndim == 3 else 1, len(scene.shaped)
+        if has != says:
+            raise self.error(
+                f"[second] and [[element]] say {says} free-form surface(s), and what was designed has {has}; design again"
+            )
         scene, heights = sides_of(scene, field, state.state.heights if self.values is None else self._trained(state.state))
         try:
             refuse_without_glass(scene, field, heights)

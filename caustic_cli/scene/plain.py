@@ -11,7 +11,7 @@ def beyond_plain(scene: Scene) -> list[str]:
     found = {
         "a mirror": lens.mirror,
         "an index that varies": lens.gradient is not None,
-        "absorption": lens.absorption > 0,
+        "absorption": lens.absorption > 0 or any(e.absorption > 0 for e in scene.elements),
         "roughness": lens.roughness > 0,
         "polarised light": light.polarisation is not None,
         "several wavelengths": len(light.wavelengths) > 1,

@@ -16,8 +16,8 @@ TABLE = 20_001
 
 def emitted(scene: Scene, rays: int, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Starts and directions (3, N) of independent rays, batch by batch, and what each carries: 1 on average over all of them."""
-    source, (rx, ry), z_in = scene.source, scene.lens.half_size, scene.lens.z_in
-    round_, lowest = scene.lens.round, scene.lens.lowest
+    source, pupil, lowest = scene.source, scene.pupil, scene.lowest
+    (rx, ry), z_in, round_ = pupil.half_size, pupil.z, pupil.round
     if source.profile is not None:
         line = (np.arange(2000) + 0.5) / 1000 - 1
         x, y = np.meshgrid(line, line, indexing="ij")

@@ -29,8 +29,10 @@ from torch import Tensor
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.io.files import SOFTWARE, atomic_path
 from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.frames import Leg
 from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import System
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Scene
 from caustic_cli.scene.plain import beyond_plain
@@ -38,7 +40,6 @@ from caustic_cli.studies.drawn import KINDS, emitted
 from caustic_cli.studies.retrace import BATCHES
 
 VARIANTS = ("llvm_ad_mono", "llvm_ad_rgb", "scalar_rgb")  # the scalar one works everywhere and takes minutes
-SHAPES = ("entrance", "exit", "screen")
 #: Angle, rad, by which normals interpolated within triangles may turn the light.
 TURN = 1e-5
 #: Least rays expected of a judged pixel, least part of the light on judged pixels, and most pixels along a side taken together.
@@ -136,51 +137,56 @@ def _trace(mi, world, scene: Scene, rays: int, seed: int) -> tuple[np.ndarray, n
     shapes = {shape.id(): shape for shape in world.shapes()}
     follow = _follow if "scalar" not in mi.variant() else _follow_scalar
     image, squares = np.zeros((2, *scene.screen.resolution))
+    system = System.of(scene)
+    surfaces, leg = [(e.name, e.reflects) for e in system.elements], system.leg or Leg()
     for start, direction, share in emitted(scene, rays, rng):
-        x, y, weight = follow(mi, world, shapes, start, direction)
+        *points, weight = follow(mi, world, shapes, [*surfaces, ("screen", False)], start, direction)
+        x, y = (sum((p - o) * a for p, o, a in zip(points, leg.origin, axis, strict=True)) for axis in leg.frame[:2])
         image += _binned(x, y, weight * share, scene)
         squares += _binned(x, y, (weight * share) ** 2, scene)
     return image / rays, squares / rays**2
 
 
-def _follow(mi, world, shapes, start: np.ndarray, direction: np.ndarray):
-    """Landing x, y (mm) and weight of the rays, all at once; weight 0 where lost."""
+def _follow(mi, world, shapes, surfaces: list[tuple[str, bool]], start: np.ndarray, direction: np.ndarray):
+    """Landing x, y, z (mm) and weight of the rays, all at once, which meet these shapes, or are reflected by them; weight 0 where
+    lost."""
     ray = mi.Ray3f(mi.Point3f(*map(mi.Float, start)), mi.Vector3f(*map(mi.Float, direction)))
     weight, active = mi.Float(1.0), mi.Bool(True)
-    for name in SHAPES:
+    for name, reflects in surfaces:
         hit = world.ray_intersect(ray, active)
         active &= hit.is_valid() & (hit.shape == mi.ShapePtr(shapes[name]))
         if name != "screen":
-            ray, passed = _refract(mi, hit, active)
+            ray, passed = _onwards(mi, hit, active, reflects)
             weight *= passed
-    return np.array(hit.p.x), np.array(hit.p.y), np.where(np.array(active), np.array(weight), 0.0)
+    return *(np.array(c) for c in (hit.p.x, hit.p.y, hit.p.z)), np.where(np.array(active), np.array(weight), 0.0)
 
 
-def _follow_scalar(mi, world, _shapes, start: np.ndarray, direction: np.ndarray):
+def _follow_scalar(mi, world, _shapes, surfaces: list[tuple[str, bool]], start: np.ndarray, direction: np.ndarray):
     """The same, ray by ray."""
-    out = np.zeros((3, start.shape[1]))
+    out = np.zeros((4, start.shape[1]))
     for k in range(start.shape[1]):
         ray, weight = mi.Ray3f(mi.Point3f(*start[:, k]), mi.Vector3f(*direction[:, k])), 1.0
-        for name in SHAPES:
+        for name, reflects in surfaces:
             hit = world.ray_intersect(ray)
             if not hit.is_valid() or hit.shape.id() != name:
                 break
             if name == "screen":
-                out[:, k] = hit.p.x, hit.p.y, weight
+                out[:, k] = hit.p.x, hit.p.y, hit.p.z, weight
             else:
-                ray, passed = _refract(mi, hit, True)
+                ray, passed = _onwards(mi, hit, True, reflects)
                 weight *= passed
     return out
 
 
-def _refract(mi, hit, active):
-    """The transmitted ray and its share of the power, by Mitsuba's BSDF.
+def _onwards(mi, hit, active, reflects: bool):
+    """The transmitted ray and its share of the power, or the reflected one of a mirror, by Mitsuba's BSDF.
 
     Component 1 of `dielectric` is transmission; chosen alone, its sample is the refracted direction and its weight the Fresnel
     transmittance, 0 on total reflection.  Importance mode: power of light, not radiance scaled by the index.
     """
     context = mi.BSDFContext(mi.TransportMode.Importance)
-    context.component = 1
+    if not reflects:
+        context.component = 1
     sample, weight = hit.bsdf().sample(context, hit, 0.5, mi.Point2f(0.5), active)
     return hit.spawn_ray(hit.to_world(sample.wo)), weight[0]
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from caustic_cli.config import checks
+from caustic_cli.errors import InputError
 from caustic_cli.studies import architectures, diffraction, effects, intersection, light, training
 from caustic_cli.studies.convergence import run_study
 from caustic_cli.studies.report import Study
@@ -27,6 +28,8 @@ PLOTS = {
     "diffraction": diffraction.PLOTS,
     "light": light.PLOTS,
 }
+#: Studies that trace whatever a scene has.
+OF_ANY_SCENE = ("rays", "reconstruction", "precision")
 #: What the progress of a study counts.
 UNITS = {
     "intersection": "evaluations",
@@ -62,8 +65,13 @@ def measure(
         progress: told how much of how much is done, in UNITS.
 
     Raises:
-        InputError: a value out of range.
+        InputError: a value out of range, or a study that knows a lens by itself, of one that has other elements beside it.
     """
+    if lens and lens.scene.elements and name not in OF_ANY_SCENE:
+        raise InputError(
+            f"⟨study⟩ {name} knows a lens by itself, and this one has [[element]] tables; of such scenes there are"
+            f" {', '.join(OF_ANY_SCENE)}"
+        )
     seed = asked.seed or 0
     if name == "intersection":
         case = (

@@ -109,6 +109,8 @@ def begin(
         said["screen"] = attachments.with_shape(said["screen"])
     parameters = said.pop("", {})
     invert = parameters.pop("invert", False)
+    if "elements" in parameters:  # those of the command line, instead of a configuration's
+        said["element"] = {"list": parameters.pop("elements")}
     by = Derivation(**parameters)
     if "source" in said:
         said["source"] = attachments.attached(said["source"])
@@ -151,7 +153,7 @@ def begin(
     designer, goal = _designer(project, "cpu")  # builds and so checks scene, target, stages, options
     if out is not None:
         directory.check(out, force)  # before the transport, which may take a minute
-    if designer.scene.second is None:
+    if designer.scene.second is None and not designer.scene.elements:
         for scene in designer.scenes:
             refuse_unreachable(scene, grey(goal))
     if words := shape_words(full):
@@ -191,7 +193,9 @@ def first_heights(project: Project, said: Settings) -> tuple[Project, torch.Tens
     if first is not None and _make_room(project.settings, said, first) and middle is None:
         _designer(project, "cpu")
         first, _ = _solved(project, fixed)
-    return project, None if first is None else _designer(project, "cpu")[0].within_limits(State(first))
+    designer = _designer(project, "cpu")[0]
+    whole = designer.whole(first)
+    return project, None if whole is None else designer.within_limits(State(whole))
 
 
 @dataclass(frozen=True)
@@ -255,11 +259,12 @@ def _say_limits(project: Project, designer: Designer, target: np.ndarray, first:
     if coarse := coarse_words(designer.scene):
         say.say(coarse)
     seen = Resolution.before(designer.scene, tuple(project.settings["target"]["size"]))
-    say.say(seen.sentence())
+    if not designer.scene.elements:
+        say.say(seen.sentence())
     words = limits(designer.scene, grey(target)).sentence()
     if words:
         say.say(words)
-    if designer.scene.second is not None:
+    if designer.scene.jointly:
         return
     if seen.matters and project.settings["design"]["waves"] == "auto" and project.without_waves:
         say.say(f"the wave image is not refined: {project.without_waves}")
@@ -289,7 +294,7 @@ def resume(
         designer, target = _designer(project, device)
         begun = (project.path / CHECKPOINT).exists()  # if not, it was killed before its first checkpoint
         before = project.load() if begun else None
-        state = before.state if begun else designer.begin(_solved(project, fixed=True)[0])
+        state = before.state if begun else designer.begin(designer.whole(_solved(project, fixed=True)[0]))
         if state.stage >= len(designer.stages):
             raise project.error(f"has {len(designer.stages)} stages, but the checkpoint stands in stage {state.stage + 1}")
         if tuple(state.heights.shape[-2:]) != designer.stages[state.stage].control:

@@ -20,7 +20,7 @@ from caustic_cli.io.picture import write_image
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import sides_of
+from caustic_cli.optics.system import sides_of, traced_of
 from caustic_cli.optics.waves import WaveImage
 from caustic_cli.project.project import FARTHER, RENDER, REPORT, WAVE, Project
 from caustic_cli.studies.irradiance import irradiance
@@ -78,7 +78,9 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
     if found.second is not None and designer.second is not None:
         write_image(project.path / FARTHER, found.second, white_level(found.second, designer.second.numpy()), encoding)
     history = np.array(state.history, dtype=float).reshape(-1, 5)
-    surface = _surface(designer.field(found.state.stage), found.state.heights[-1] if designer.scene.second else found.state.heights)
+    surface = _surface(
+        designer.field(found.state.stage), found.state.heights[-1] if designer.scene.jointly else found.state.heights
+    )
     write_report(
         project.path / REPORT,
         grey(aim),
@@ -97,10 +99,7 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
 def expected_seconds(designer: Designer, target: np.ndarray, state: State, device: str) -> float:
     """About how long `judge` will take in a hurry, s: by a retrace of few rays, and a wave image where one was refined."""
     scene, field, began = designer.scene, designer.field(state.stage), time.monotonic()
-    heights = state.heights
-    if scene.second is not None:
-        scene, heights = sides_of(scene, field, heights)
-    retrace(scene, field, heights, target, rays=FINAL_RAYS // PROBE, device=device, noise=False)
+    retrace(*traced_of(scene, field, state.heights), target, rays=FINAL_RAYS // PROBE, device=device, noise=False)
     over = designer.options.over
     retraces = RETRACES + (0.0 if over is None else 2.0 * len(over.judged()) / OVER)
     seconds = retraces * PROBE * (time.monotonic() - began) + REPORT_SECONDS
@@ -134,9 +133,7 @@ def evaluate(
 
     def trace(heights: torch.Tensor, noise: bool = True):
         return retrace(
-            scene,
-            field,
-            heights,
+            *traced_of(scene, field, heights),
             target,
             rays=FINAL_RAYS,
             device=device,

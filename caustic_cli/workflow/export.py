@@ -83,6 +83,10 @@ def write(
             f"⟨format⟩ {format} holds one free-form side; of this lens, which has two, {', '.join(TWO_SIDED)} hold both, without"
             " ⟨script⟩ or ⟨mould⟩"
         )
+    if scene.elements and (script or format == "zemax"):
+        raise InputError(
+            f"⟨format⟩ {format} holds a lens by itself; with other elements {', '.join(TWO_SIDED)} hold the scene, without ⟨script⟩"
+        )
     part = part_of(format, scene, field, heights, mould, block)
     writer = getattr(_home(format), f"write_{format}")
     if format == "gcode":
@@ -111,7 +115,7 @@ def files(path: Path, scene: Scene, format: str, script: bool = False) -> list[P
     if format == "heightmap":
         return [path, beside(path)]
     if format == "mitsuba":
-        return [path, *_home(format).companions(path, scene.lens.round, scene.lens.mirror, scene.two_sided)]
+        return [path, *_home(format).companions(path, scene.lens.round, scene.lens.mirror, scene.two_sided, scene.elements)]
     return [path, *import_module("caustic_cli.export.lighttools_script").companions(path)] if script else [path]
 
 

@@ -14,7 +14,7 @@ Lengths are millimetres, angles degrees, wavelengths nanometres, powers watts; a
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -53,7 +53,7 @@ def design(
     throw: float | None = None,
     quality: str | None = None,
     rays: float | None = None,
-    settings: Mapping[str, Mapping[str, Any]] | None = None,
+    settings: Mapping[str, Mapping[str, Any] | Sequence[Mapping[str, Any]]] | None = None,
     linear: bool | None = None,
     waves: str | None = None,
     time_limit: float | None = None,
@@ -74,7 +74,8 @@ def design(
         mag: width of the picture over that of the lens; margin: dark border around it, part of its width in all.
         throw: distance of the screen from the lens' origin, mm.
         quality: draft, standard or fine; rays: of the last stage.
-        settings: further sections and keys of project.toml: {"lens": {"size": [20, 20]}, "design": {"max_slope": 0.5}}.
+        settings: further sections and keys of project.toml: {"lens": {"size": [20, 20]}, "design": {"max_slope": 0.5}},
+            and tables of other elements: {"element": [{"type": "mirror", "z": 120.0, "tilt": [45, 0]}]}.
         linear: whether values of the file are irradiance rather than sRGB codes.
         waves: auto, on or off: refine the wave image after the ray image.
         time_limit: seconds for the optimisation.
@@ -90,7 +91,9 @@ def design(
         InputError: a value out of range, or a picture that no lens of this scene can throw.
         CausticError: the design could not be finished.
     """
-    sections: dict[str, dict[str, Any]] = {section: dict(values) for section, values in (settings or {}).items()}
+    sections: dict[str, Any] = {
+        section: dict(values) if isinstance(values, Mapping) else list(values) for section, values in (settings or {}).items()
+    }
     if source is not None:
         sections["source"] = sections.get("source", {}) | ({"type": source} if isinstance(source, str) else dict(source))
     design = {key: value for key, value in (("waves", waves), ("time_limit", time_limit)) if value is not None}

@@ -252,6 +252,7 @@ def _refuse_unknown(asked: Request, scene: Scene) -> None:
         InputError: saying which.
     """
     beyond = "a free-form entrance" if scene.two_sided else "an index that varies" if scene.lens.gradient is not None else ""
+    beyond = "other elements beside it" if scene.elements else beyond
     for name, given in (("tolerances", asked.tolerances is not None), ("report", asked.report)):
         if given and beyond:
             raise InputError(f"⟨{name}⟩ knows lenses of one index with a flat entrance, and this one has {beyond}")

@@ -21,13 +21,16 @@ class Absorption(Effect):
 
     def judge(self, scene: Scene, bounds) -> Decision:
         """By the coefficient."""
-        a = 0.0 if scene.lens.mirror else scene.lens.absorption
+        a = 0.0 if scene.lens.mirror else max(scene.lens.absorption, *(e.absorption for e in scene.elements), 0.0)
         why = f"the glass absorbs {a:g} per mm" if a > 0 else "the glass is clear"
         return Decision(self.name, a > 0, why, a, 0.0, present=a > 0)
 
     def without(self, scene: Scene) -> Scene:
         """Clear glass."""
-        return replace(scene, lens=replace(scene.lens, absorption=0.0)) if scene.lens.absorption else scene
+        if not (scene.lens.absorption or any(e.absorption for e in scene.elements)):
+            return scene
+        clear = tuple(replace(e, absorption=0.0) for e in scene.elements)
+        return replace(scene, lens=replace(scene.lens, absorption=0.0), elements=clear)
 
     def sample(self, scene: Scene, heights: Tensor) -> Amount | None:
         """A little."""

@@ -26,6 +26,8 @@ class Diffraction(Effect):
         if scene.lens.gradient is not None:
             why = "the wave image is taken of lenses of one index"
             return Decision(self.name, False, why, r.widened, WIDENED, fixed=True)
+        if scene.elements:
+            return Decision(self.name, False, "the wave image is taken of a lens by itself", r.widened, WIDENED, fixed=True)
         light = f"{r.wavelength:.4g} nm" if r.said else f"{r.wavelength:g} nm, as the scene says no wavelength,"
         why = f"light of {light} blurs over {r.diffraction:.2g} mm, the source over {r.source:.2g} mm, a pixel is {r.pixel:.2g} mm"
         return Decision(self.name, r.matters, why, r.widened, WIDENED)

@@ -22,9 +22,10 @@ class Dispersion(Effect):
     def judge(self, scene: Scene, bounds) -> Decision:
         """On where several wavelengths meet a glass."""
         if scene.dispersive:
-            indices = [band.scene.lens.index for band in scene.bands]
+            spans = {glass: [refractive_index(glass, w) for w in scene.light.wavelengths] for glass in scene.glasses}
+            glass, indices = max(spans.items(), key=lambda item: max(item[1]) - min(item[1]))
             why = (
-                f"{len(scene.light.wavelengths)} wavelengths in {scene.lens.glass}, whose index goes from {min(indices):.5f} to"
+                f"{len(scene.light.wavelengths)} wavelengths in {glass}, whose index goes from {min(indices):.5f} to"
                 f" {max(indices):.5f}"
             )
             return Decision(self.name, True, why, max(indices) - min(indices), 0.0)
@@ -42,7 +43,8 @@ class Dispersion(Effect):
         if not scene.dispersive:
             return scene
         light = scene.light if scene.light.color else replace(scene.light, wavelengths=(), weights=())
-        return replace(scene, lens=replace(scene.lens, glass=None), light=light)
+        elements = tuple(replace(e, glass=None) for e in scene.elements)
+        return replace(scene, lens=replace(scene.lens, glass=None), light=light, elements=elements)
 
     def sample(self, scene: Scene, heights: Tensor) -> Amount | None:
         """Three lines in the lens' glass, or a common one."""

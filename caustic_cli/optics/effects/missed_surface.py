@@ -16,6 +16,8 @@ class MissedSurface(Effect):
 
     def judge(self, scene: Scene, b) -> Decision:
         """By how far rays get at the surface's greatest height."""
+        if scene.elements:
+            return Decision(self.name, True, "the apertures of other elements may stop light", fixed=True)
         if scene.axial:
             return Decision(self.name, False, "every ray of a plane wave is on the surface", b.reach, 1.0)
         if b.reach <= 1.0:

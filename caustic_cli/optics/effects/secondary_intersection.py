@@ -27,6 +27,10 @@ class SecondaryIntersection(Effect):
 
     def judge(self, scene: Scene, b) -> Decision:
         """By whether a slope can catch a ray."""
+        if scene.behind:
+            return Decision(
+                self.name, False, "it is looked for at a last surface alone, and light goes on to others", present=False
+            )
         if b.slope_ratio < 1.0:
             why = f"slopes up to {b.slope:.3g} are {b.slope_ratio:.3g} of what rays leaving slope_ratio at"
             return Decision(self.name, False, why, b.slope_ratio, 1.0)

@@ -1,0 +1,122 @@
+"""Other lenses and mirrors of a scene as solids, each in a frame of its own: a lens between two surfaces, a mirror as a plate
+behind one.
+
+All surfaces are written as B-splines.  That of a sphere is interpolated at degree DEGREE on twice as many knots until it departs
+from the sphere, within the aperture, by less than CLOSE mm.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from caustic_cli.errors import InputError
+from caustic_cli.optics.bspline import SplineSpace
+from caustic_cli.optics.frames import Leg, Pose, out_of, turned_back
+from caustic_cli.optics.surfaces import Sphere
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import front_from
+from caustic_cli.scene import Component, Front, Lens, Scene
+from caustic_cli.scene.elements import PLATE, SIDES
+
+#: Of a sphere's spline: degree, control points along an axis at first and at most, and largest departure, mm.
+DEGREE, FIRST, MOST, CLOSE = 5, 16, 256, 1e-8
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A solid between a lens' free-form entrance and an exit, field and heights (n, m) mm, that stands at `pose`.
+
+    component: what it is of; number: of the element, counted from 0.
+    """
+
+    component: Component
+    number: int
+    lens: Lens
+    field: HeightField
+    heights: Tensor
+    pose: Pose
+
+    def placed(self, points: np.ndarray) -> np.ndarray:
+        """Points (..., 3) of its own frame in the scene, mm."""
+        return np.stack(out_of(self.pose, tuple(np.moveaxis(points, -1, 0)), 0.0), -1)
+
+    def turned(self, vectors: np.ndarray) -> np.ndarray:
+        """Vectors (..., 3) likewise."""
+        return np.stack(turned_back(self.pose, tuple(np.moveaxis(vectors, -1, 0))), -1)
+
+
+def bodies(scene: Scene) -> Iterator[Body]:
+    """The solids beside the free-form lens, in the order in which light meets them.
+
+    Raises:
+        InputError: a sphere too steep to be written as a spline.
+    """
+    leg = Leg()
+    for number, component in enumerate(scene.elements):
+        entrance = _side(component, "front")
+        if component.mirror:
+            most = float(entrance.heights.max())
+            exit = _constant(max(0.0, most) + PLATE)
+        else:
+            exit = _side(component, "back")
+            exit = Front(exit.heights + component.thickness, exit.degree, exit.knots)
+        spaces = [
+            SplineSpace.uniform(n, p) if exit.knots is None else SplineSpace(p, torch.as_tensor(exit.knots[k], dtype=torch.float64))
+            for k, (n, p) in enumerate(zip(exit.heights.shape, exit.degree, strict=True))
+        ]
+        field = HeightField((spaces[0], spaces[1]), component.half_size)
+        lens = Lens(
+            component.size,
+            0.0,
+            max(component.index, 1.0 + 1e-9),
+            field.shape,
+            exit.degree,
+            exit.knots,
+            aperture=component.aperture,
+            front=entrance,
+        )
+        pose = leg.pose(component.z, component.tilt)
+        yield Body(component, number, lens, field, torch.from_numpy(exit.heights), pose)
+        leg = leg.folded(component.z, component.tilt) if component.mirror else leg
+
+
+def _side(component: Component, side: str) -> Front:
+    """A surface of a lens or mirror, from its vertex' plane."""
+    front, radius = component.fronts[SIDES.index(side)], component.radius[SIDES.index(side)]
+    if front is not None:
+        return front
+    if math.isinf(radius):
+        return _constant(0.0)
+    sphere, count = Sphere(radius, component.reach), FIRST
+    while count <= MOST:
+        space = SplineSpace.uniform(count, DEGREE)
+        field = HeightField((space, space), component.half_size)
+        x, y = field.control_xy()
+        inverse = torch.linalg.inv(space.matrix(space.greville))
+        net = inverse @ _sag(sphere, x, y) @ inverse.T
+        line = [torch.linspace(-h, h, 4 * count + 1, dtype=torch.float64) for h in component.half_size]
+        fine = [0.5 * (c / h + 1.0) for c, h in zip(line, component.half_size, strict=True)]
+        off = (space.matrix(fine[0]) @ net @ space.matrix(fine[1]).T - _sag(sphere, *line)).abs()
+        if component.round:
+            off = off[line[0][:, None].square() + line[1][None, :].square() <= component.half_size[0] ** 2]
+        if float(off.max()) <= CLOSE:
+            return front_from(field, net)
+        count *= 2
+    raise InputError(f"⟨element.radius⟩ of {radius:g} mm is too steep within its aperture to be written as a spline")
+
+
+def _sag(sphere: Sphere, x: Tensor, y: Tensor) -> Tensor:
+    """Over a grid, (n, m) mm."""
+    a, b = torch.broadcast_tensors(x[:, None], y[None, :])
+    return sphere.at(None, a.reshape(-1), b.reshape(-1), ((0, 0),))[0].reshape(a.shape)
+
+
+def _constant(z: float) -> Front:
+    """A plane."""
+    return Front(np.full((2, 2), z), (1, 1))

@@ -1,0 +1,221 @@
+"""Lenses and folding mirrors beside the free-form lens, on its axis.
+
+Notation
+    z       where the first vertex meets the axis, mm; behind a mirror it goes on counting along the folded axis
+    R       radius of curvature, mm: positive where the centre lies behind the surface, along the light's way; inf for a plane
+    sag     R - sign(R) sqrt(R^2 - r^2), height of a sphere over its vertex at distance r from the axis
+
+A mirror of R > 0 bulges towards the light and spreads it; one of R < 0 is hollow and gathers it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from caustic_cli.config.table import check, default
+from caustic_cli.errors import InputError
+from caustic_cli.scene.aperture import Aperture
+from caustic_cli.scene.front import Front
+from caustic_cli.scene.materials import refractive_index
+
+#: Part of a sphere's radius that an aperture may reach from the axis: farther out light meets it edge on.
+STEEPEST = 0.95
+#: Least turn of a mirror, degrees: one that stands straight across the axis sends the light back into the lens.
+LEAST_TILT = 5.0
+#: Thickness of the plate that a mirror is made as, mm.
+PLATE = 3.0
+SIDES = ("front", "back")
+
+
+@dataclass(frozen=True)
+class Component:
+    """A lens of two surfaces, or a mirror; see above.
+
+    Args:
+        kind: lens or mirror.
+        z: of its first vertex, mm.
+        size: full width and height of its aperture, mm.
+        thickness: between the vertices of a lens, mm.
+        radius: (front, back), mm; of a mirror the first alone.
+        index: refractive index of a lens.
+        absorption: coefficient of its glass, 1/mm.
+        glass: a name of `materials`, whose index changes with the wavelength; None for `index` at every wavelength.
+        aperture: rectangle, or circle, the largest within size.
+        tilt: turns of a mirror about x or about y, degrees.
+        free: which of its surfaces a design shapes: none, front, back or both.
+        fronts: what a design has made of them: heights of (front, back) from their vertices' planes, None of a sphere.
+
+    Raises:
+        InputError: a value out of range, surfaces that cross within the aperture, or a mirror that does not turn the axis aside.
+    """
+
+    kind: str
+    z: float
+    size: tuple[float, float]
+    thickness: float = default("element.thickness")
+    radius: tuple[float, float] = (math.inf, math.inf)
+    index: float = default("element.index")
+    absorption: float = default("element.absorption")
+    glass: str | None = None
+    aperture: str = default("element.aperture")
+    tilt: tuple[float, float] = (0.0, 0.0)
+    free: str = default("element.free")
+    fronts: tuple[Front | None, Front | None] = (None, None)
+
+    def __post_init__(self):
+        for key, value in (("type", self.kind), *((k, getattr(self, k)) for k in ("z", "size", "aperture", "free", "tilt"))):
+            check(f"element.{key}", value)
+        for r in self.radius:
+            if isinstance(r, bool) or not isinstance(r, int | float) or math.isnan(r) or r == 0:
+                raise InputError(f"⟨element.radius⟩ must be non-zero numbers of mm or inf, got {list(self.radius)}")
+        if self.round and self.size[0] != self.size[1]:
+            raise InputError(
+                "⟨element.size⟩ of a circular aperture must be its diameter, twice the same, got"
+                f" {self.size[0]:g} x {self.size[1]:g}"
+            )
+        for side, r in zip(self.sides, self.radius, strict=False):
+            if self.reach > STEEPEST * abs(r):
+                raise InputError(
+                    f"⟨element.radius⟩ of the {side} of the {self.kind} at z = {self.z:g} mm must be at least"
+                    f" {self.reach / STEEPEST:.4g} mm either way for its aperture to lie on the sphere, got {r:g} mm"
+                )
+        if self.mirror:
+            self._check_mirror()
+        else:
+            self._check_lens()
+
+    def _check_lens(self) -> None:
+        for key in ("thickness", "index", "absorption"):
+            check(f"element.{key}", getattr(self, key))
+        if any(self.tilt):
+            raise InputError("⟨element.tilt⟩ is for mirrors: a lens stands square to the axis")
+        rim = self.thickness + self.sag("back") - self.sag("front")
+        if rim <= 0:
+            raise InputError(
+                f"⟨element.thickness⟩ of the lens at z = {self.z:g} mm must be more than {self.thickness - rim:.4g} mm for glass at"
+                f" the rim of its aperture, got {self.thickness:g} mm"
+            )
+
+    def _check_mirror(self) -> None:
+        if self.free in ("back", "both"):
+            raise InputError(f"⟨element.free⟩ of a mirror must be none or front, its only surface, got {self.free}")
+        turned = [abs(t) for t in self.tilt if t]
+        if len(turned) != 1 or turned[0] < LEAST_TILT:
+            raise InputError(
+                "⟨element.tilt⟩ of a mirror must turn it about x or about y, one of them, by at least"
+                f" {LEAST_TILT:g} degrees, such as [45, 0], got {list(self.tilt)}"
+            )
+
+    @property
+    def mirror(self) -> bool:
+        """Whether it reflects."""
+        return self.kind == "mirror"
+
+    @property
+    def sides(self) -> tuple[str, ...]:
+        """Its surfaces."""
+        return SIDES[:1] if self.mirror else SIDES
+
+    @property
+    def shaped(self) -> tuple[str, ...]:
+        """Those of its surfaces that a design shapes."""
+        return tuple(side for side in self.sides if self.free in (side, "both"))
+
+    @property
+    def round(self) -> bool:
+        """Whether the aperture is a circle."""
+        return self.aperture == "circle"
+
+    @property
+    def half_size(self) -> tuple[float, float]:
+        """Half widths, mm."""
+        return self.size[0] / 2.0, self.size[1] / 2.0
+
+    @property
+    def opening(self) -> Aperture:
+        """The aperture of each of its surfaces."""
+        return Aperture(self.half_size, self.round)
+
+    @property
+    def reach(self) -> float:
+        """How far the aperture reaches from the axis, mm."""
+        return self.half_size[0] if self.round else math.hypot(*self.half_size)
+
+    def sag(self, side: str) -> float:
+        """Of a side at the rim of the aperture, mm."""
+        k = 1.0 / self.radius[SIDES.index(side)]
+        return k * self.reach**2 / (1.0 + math.sqrt(1.0 - (k * self.reach) ** 2))
+
+    def vertex(self, side: str) -> float:
+        """z of a side's vertex, mm."""
+        return self.z if side == "front" else self.z + self.thickness
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """Between which z it stands, mm; a mirror, which leans, is taken at its vertex."""
+        if self.mirror:
+            return self.z, self.z
+        low, high = (
+            self.sag(side) if f is None else float(f.heights.min() if side == "front" else f.heights.max())
+            for side, f in zip(SIDES, self.fronts, strict=True)
+        )
+        return self.z + min(0.0, low), self.z + self.thickness + max(0.0, high)
+
+    def at(self, wavelength: float) -> Component:
+        """The same in light of a wavelength, nm."""
+        return self if self.glass is None else replace(self, index=refractive_index(self.glass, wavelength))
+
+
+def surface_name(number: int, side: str) -> str:
+    """Of a surface of the element of this number, counted from 0, among those of a system."""
+    return f"element-{number + 1}-{side}"
+
+
+def check_places(elements: Sequence[Component], lens: tuple[float, float], source: float, screen: float) -> None:
+    """Refuse elements that do not stand one behind the other, clear of the free-form lens.
+
+    Args:
+        lens: where the lens begins, and where its exit's middle is, mm; source, screen: how far back the source reaches, and where
+            the screen is.
+
+    Raises:
+        InputError: saying which, and where it would be accepted.
+    """
+    bodies = [(f"the {e.kind} of [[element]] {k + 1}", *e.extent) for k, e in enumerate(elements)]
+    for (_, low, _), e in zip(bodies, elements, strict=True):
+        if e.mirror and low < lens[0]:
+            raise InputError(
+                f"⟨element.z⟩ of a mirror must lie behind the lens (beyond {lens[1]:g} mm), got {low:g} mm: the lens stands on its"
+                " source's axis, so that a mirror before it is the source turned"
+            )
+    own = ("the free-form lens", *lens)
+    before = [b for b in bodies if b[1] < lens[0]]
+    sequence = [*before, own, *bodies[len(before) :]]
+    for (name, _, high), (other, low, _) in itertools.pairwise(sequence):
+        if low < high:
+            raise InputError(
+                f"⟨element.z⟩: {other} begins at {low:.4g} mm, before {name} ends at {high:.4g} mm; [[element]] tables stand in the"
+                " order in which light meets them, clear of each other"
+            )
+    if before and source >= before[0][1]:
+        raise InputError(
+            f"⟨source.position⟩ must lie before {before[0][0]}, which begins at {before[0][1]:.4g} mm, got z = {source:g} mm"
+        )
+    if screen <= sequence[-1][2]:
+        raise InputError(
+            f"⟨screen.z⟩ must lie behind {sequence[-1][0]}, along the axis beyond {sequence[-1][2]:.4g} mm, got {screen:g} mm"
+        )
+
+
+def refuse_beside(wrong: dict[str, bool]) -> None:
+    """Refuse what cannot be had with elements beside the lens: settings by path, and whether they are there.
+
+    Raises:
+        InputError: naming the setting.
+    """
+    for path, there in wrong.items():
+        if there:
+            raise InputError(f"⟨{path}⟩ cannot be had with [[element]]: beside other lenses and mirrors it is not worked out")

@@ -1,0 +1,460 @@
+"""Lenses and folding mirrors beside the free-form lens: paraxial optics, folded axes, first surfaces, gradients, designs, files."""
+
+import json
+import math
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from caustic_cli import cli, load
+from caustic_cli.errors import InputError
+from caustic_cli.export.bodies import CLOSE, bodies
+from caustic_cli.export.mesh import closed_mesh
+from caustic_cli.inverse.incidence import incident
+from caustic_cli.inverse.initial_surface import first_surface, sphere_net
+from caustic_cli.inverse.objective import Objective
+from caustic_cli.inverse.relayed import Relayed
+from caustic_cli.io.archive import open_archive
+from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.frames import Leg
+from caustic_cli.optics.plan import compile_plan
+from caustic_cli.optics.rays import RayState
+from caustic_cli.optics.reconstruction import Filter
+from caustic_cli.optics.surfaces import HeightField, Sphere
+from caustic_cli.optics.system import EXIT, System, sides_of
+from caustic_cli.optics.trace import Tracer, expose, render
+from caustic_cli.scene import Component, Lens, Light, Offset, PlaneWave, Points, Scene, Screen
+from caustic_cli.studies.retrace import retrace
+
+PIXELS = 32
+LENS = Lens((10.0, 10.0), control=(35, 35), offset=Offset(5.0), fresnel="none")
+SCREEN = Screen((38.0, 38.0), 300.0, (PIXELS, PIXELS))
+SCENE = Scene(PlaneWave(), LENS, SCREEN)
+FIELD = HeightField.of(LENS)
+
+
+def thick(z: float, size: float = 12.0, radius=(60.0, -90.0), thickness: float = 4.0, index: float = 1.6, **more) -> Component:
+    return Component("lens", z, (size, size), thickness, radius, index, **more)
+
+
+def mirror(z: float, tilt, radius: float = math.inf, size: float = 70.0) -> Component:
+    return Component("mirror", z, (size, size), radius=(radius, math.inf), tilt=tilt)
+
+
+def matrix(radius, thickness: float, index: float) -> np.ndarray:
+    """Of a thick lens, vertex to vertex: (x, tangent) to (x, tangent), by its two refractions and the way between."""
+    front, back = ((n - 1) / n if n == index else 1 - index for n in (index, 1.0))
+    first = np.array([[1, 0], [-front / radius[0], 1 / index]])
+    last = np.array([[1, 0], [-back / radius[1], index]])
+    return last @ [[1, thickness], [0, 1]] @ first
+
+
+def straight(distance: float) -> np.ndarray:
+    return np.array([[1.0, distance], [0.0, 1.0]])
+
+
+def paraxial_rays(scene: Scene, x: float, tangent: float) -> tuple[float, float]:
+    """Where a ray close to the axis of a scene with a flat lens leaves its last element, counted there, and its tangent."""
+    one = torch.ones(1, dtype=torch.float64)
+    system = System.of(scene, FIELD)
+    length = math.hypot(1.0, tangent)
+    start = scene.before[0].z if scene.before else LENS.z_in
+    rays = RayState((x * one, 0.0 * one, start * one), (tangent / length * one, 0.0 * one, one / length), one)
+    (state,) = Tracer(system, rays)({EXIT: torch.full((35, 35), 5.0, dtype=torch.float64)})
+    dx, _, dz = state.full(state.direction)
+    last = scene.behind[-1].vertex("back") if scene.behind else 5.0
+    return float(state.origin[0] + (last - state.origin[2] - state.datum) * dx / dz), float(dx / dz)
+
+
+def test_a_thick_lens_has_the_focus_and_the_principal_planes_of_the_lens_makers_formula():
+    radius, t, n = (60.0, -90.0), 4.0, 1.6
+    scene = replace(SCENE, elements=(thick(-30.0, radius=radius, thickness=t, index=n),))
+    power = (n - 1.0) * (1.0 / radius[0] - 1.0 / radius[1] + (n - 1.0) * t / (n * radius[0] * radius[1]))
+    x, tangent = paraxial_rays(scene, 1e-4, 0.0)
+    assert -tangent / 1e-4 == pytest.approx(power, rel=1e-8)
+    # Back focus, counted from the last vertex through the plate of the free-form lens, brings the second principal plane.
+    back = 1.0 / power * (1.0 - t * (n - 1.0) / (n * radius[0]))
+    reached = back + x / tangent  # 0 where the ray would cross the axis, less what it has gone
+    assert reached == pytest.approx(26.0 + 5.0 / LENS.index, rel=1e-7)
+
+
+def test_two_lenses_in_line_are_their_system_matrix():
+    one, two = thick(-40.0), thick(60.0, 25.0, (-70.0, 200.0), 6.0, 1.5)
+    scene = replace(SCENE, elements=(one, two))
+    plate = straight(5.0 / LENS.index)
+    system = matrix((-70.0, 200.0), 6.0, 1.5) @ straight(55.0) @ plate @ straight(36.0) @ matrix((60.0, -90.0), 4.0, 1.6)
+    for x, tangent in ((1e-4, 0.0), (0.0, 1e-5), (5e-5, -2e-6)):
+        assert paraxial_rays(scene, x, tangent) == pytest.approx(tuple(system @ [x, tangent]), rel=1e-7, abs=1e-14)
+
+
+def test_the_screen_seen_through_what_follows_is_that_of_the_matrix():
+    two = thick(60.0, 25.0, (-70.0, 200.0), 6.0, 1.5)
+    seen = Relayed(replace(SCENE, elements=(two,)), 5.0)
+    a, b = (straight(300.0 - 66.0) @ matrix((-70.0, 200.0), 6.0, 1.5) @ straight(55.0))[0]
+    assert seen.first_order[0] == pytest.approx([a, a], rel=1e-6) and seen.first_order[1] == pytest.approx([b, b], rel=1e-6)
+    u, v = np.array([[3.0, -4.0]]), np.array([[1.0, 2.0]])
+    x, y, z = np.array([[2.0, -3.0]]), np.array([[0.5, 4.0]]), np.full((1, 2), 5.1)
+    t = np.stack(seen.towards(u, v)(x, y, z))
+    found = seen.seen(tuple(c.ravel() for c in (x, y, z)), tuple(c.ravel() for c in t / np.linalg.norm(t, axis=0)))
+    assert np.allclose(np.stack(found), [u.ravel(), v.ravel()], atol=1e-5)
+
+
+def wavy(scale: float = 0.05) -> torch.Tensor:
+    x, y = (c / 5.0 for c in FIELD.control_xy())
+    return 5.0 + scale * (torch.cos(3.0 * x)[:, None] * torch.sin(2.0 * y + 0.4)[None, :] + 0.5 * (x[:, None] - y[None, :] ** 2))
+
+
+@pytest.mark.parametrize(("tilt", "axis"), [((45.0, 0.0), 1), ((-40.0, 0.0), 1), ((0.0, 50.0), 0)])
+@pytest.mark.parametrize("how", [{}, {"radius": (60.0, 60.0)}, {"tilt": (10.0, 20.0)}])
+def test_a_folded_scene_has_the_image_of_the_straight_one_mirrored_in_the_plane_of_the_fold(tilt, axis, how):
+    """A mirror that is turned about x mirrors y, and the other way round; a screen leans and is shifted in its own frame."""
+    shift, lean = np.array([3.0, 1.0]), np.array(how.get("tilt", (0.0, 0.0)))
+    screen = replace(SCREEN, shift=tuple(shift), **how)
+    turned = replace(
+        screen,
+        shift=tuple(np.where(np.arange(2) == axis, -shift, shift)),
+        tilt=tuple(np.where(np.arange(2) == 1 - axis, -lean, lean)) if axis == 1 else tuple(lean * [1.0, -1.0]),
+    )
+    rays = rays_of(SCENE, "stratified", 20_000, 1)
+    plain = expose(replace(SCENE, screen=screen), FIELD, wavy(), rays, Filter("cosine", (3, 3)))
+    folded = replace(SCENE, screen=turned, elements=(mirror(120.0, tilt),))
+    found = expose(folded, FIELD, wavy(), rays, Filter("cosine", (3, 3)))
+    assert torch.allclose(found.image.flip(axis), plain.image, atol=1e-9 * float(plain.image.max()))
+    assert found.lost["off_screen"] == pytest.approx(plain.lost["off_screen"], abs=1e-9)
+
+
+def test_two_mirrors_make_a_periscope_whose_picture_is_upright():
+    rays = rays_of(SCENE, "stratified", 20_000, 1)
+    plain = expose(SCENE, FIELD, wavy(), rays)
+    system = System.of(replace(SCENE, elements=(mirror(100.0, (45.0, 0.0)), mirror(200.0, (-45.0, 0.0)))), FIELD)
+    assert system.leg is not None and np.allclose(system.leg.frame, np.eye(3), atol=1e-15)
+    assert np.allclose(system.leg.at(0.0, 0.0, 300.0), [0.0, 100.0, 200.0])
+    scene = replace(SCENE, elements=(mirror(100.0, (45.0, 0.0)), mirror(200.0, (-45.0, 0.0))))
+    assert torch.allclose(expose(scene, FIELD, wavy(), rays).image, plain.image, atol=1e-12)
+
+
+def test_a_folded_axis_is_that_of_the_reflected_ray():
+    leg, normal = Leg().folded(70.0, (35.0, 0.0)), np.array([0.0, -math.sin(math.radians(35)), math.cos(math.radians(35))])
+    axis = np.array([0.0, 0.0, 1.0])
+    assert np.allclose(leg.frame[2], axis - 2.0 * normal[2] * normal)
+    assert np.allclose(leg.at(0.0, 0.0, 70.0), [0.0, 0.0, 70.0])
+    assert np.linalg.det(np.array(leg.frame)) == pytest.approx(1.0)
+
+
+def test_a_hollow_mirror_focuses_at_half_its_radius():
+    """Of rays close to the axis, square to the plane of incidence: the sagittal focus, f / cos."""
+    hollow = mirror(50.0, (30.0, 0.0), radius=-200.0)
+    at = 100.0 / math.cos(math.radians(30.0))
+    seen = Relayed(replace(SCENE, elements=(hollow,), screen=replace(SCREEN, z=50.0 + at)), 5.0)
+    a, _ = seen.first_order
+    assert abs(a[0]) < 1e-6  # parallel rays of any x meet there
+    tangential = Relayed(
+        replace(SCENE, elements=(hollow,), screen=replace(SCREEN, z=50.0 + 100.0 * math.cos(math.radians(30)))), 5.0
+    )
+    assert abs(tangential.first_order[0][1]) < 1e-4  # and of any y
+
+
+ALL = (
+    thick(-30.0, 12.0, (80.0, -80.0), free="back"),
+    thick(40.0, 20.0, (math.inf, -120.0), free="both"),
+    mirror(110.0, (40.0, 0.0), radius=900.0, size=60.0),
+)
+
+
+def test_the_loss_has_the_gradients_of_all_surfaces_together():
+    """Taylor's remainder along a direction in all of them falls with the square of the step; and each by central differences."""
+    scene = replace(SCENE, elements=(*ALL[:2], replace(ALL[2], free="front")), lens=replace(LENS, fresnel="exact"))
+    assert scene.shaped == ("element-1-back", "element-2-front", "element-2-back", "element-3-front", "exit")
+    nets = [sphere_net(e, side, FIELD) for e in scene.elements for side in e.shaped]
+    nets = torch.stack([*nets, wavy(0.01)])
+    target = torch.ones(PIXELS, PIXELS, dtype=torch.float64)
+    target[10:20, 8:24] = 3.0
+    rays = rays_of(scene, "grid", 20_000)
+    objective = Objective(
+        scene, FIELD, rays, Filter("cosine", (5, 5)), target, "rms-light", apron=6, oversample=1, dtype=torch.float64
+    )
+    found, generator = objective(nets), torch.Generator().manual_seed(3)
+    assert found.gradient.shape == nets.shape and (found.gradient.abs().amax((1, 2)) > 0).all()
+    ways = torch.randn(nets.shape, generator=generator, dtype=torch.float64)
+    for k in range(len(nets)):
+        way = torch.zeros_like(ways)
+        way[k] = ways[k]
+        ahead, behind = (objective(nets + s * 1e-6 * way).loss for s in (1, -1))
+        assert float((found.gradient * way).sum()) == pytest.approx((ahead - behind) / 2e-6, rel=1e-3)
+    slope = float((found.gradient * ways).sum())
+    remainders = [abs(objective(nets + h * ways).loss - found.loss - h * slope) for h in (4e-6, 2e-6, 1e-6)]
+    orders = np.log2(np.array(remainders[:-1]) / remainders[1:])
+    assert (orders > 1.8).all(), (remainders, orders)
+
+
+def test_designed_surfaces_trace_as_the_free_ones_and_as_the_spheres_that_they_began_as():
+    scene = replace(SCENE, elements=ALL)
+    nets = torch.stack([*(sphere_net(e, s, FIELD) for e in ALL for s in e.shaped), wavy()])
+    (free,) = render(System.of(scene, FIELD), dict(zip(scene.shaped, nets, strict=True)), 20_000, kind="grid")
+    fixed, exit = sides_of(scene, FIELD, nets)
+    rays = rays_of(fixed, "grid", 20_000)
+    found = expose(fixed, FIELD, exit, rays)
+    assert torch.allclose(free.image, found.image, atol=1e-12) and free.lost == pytest.approx(found.lost, abs=1e-12)
+    spheres = replace(scene, elements=tuple(replace(e, free="none") for e in ALL))
+    smooth = Filter("cosine", (5, 5))
+    a, b = (expose(s, FIELD, exit, rays, smooth).image for s in (fixed, spheres))
+    assert float((a - b).abs().max()) < 1e-3 * float(b.max())  # a net of 35 points is that near a sphere
+
+
+def picture() -> np.ndarray:
+    u = (np.arange(PIXELS) + 0.5) / PIXELS * 2 - 1
+    x, y = np.meshgrid(u, u, indexing="ij")
+    light = 0.3 + np.exp(-((x - 0.2) ** 2 + (y + 0.1) ** 2) / 0.05) + 0.7 * np.exp(-((x + 0.35) ** 2 + (y - 0.3) ** 2) / 0.02)
+    return light * (np.maximum(abs(x), abs(y)) < 0.78)
+
+
+@pytest.mark.parametrize(
+    ("source", "elements"),
+    [
+        (PlaneWave(), (thick(-30.0, 10.0, (120.0, math.inf), 3.0, 1.5),)),
+        (Points(((0.0, 0.0, -150.0),)), (thick(-30.0, 10.0, (60.0, -60.0), 4.0, 1.5),)),
+        (PlaneWave(), (thick(60.0, 26.0, (150.0, -150.0), 6.0, 1.5),)),
+        (PlaneWave(), (thick(60.0, 30.0, (70.0, -70.0), 8.0, 1.6),)),  # which turns the image over
+        (PlaneWave(), (mirror(120.0, (0.0, -45.0)),)),
+        (PlaneWave(), (mirror(120.0, (45.0, 0.0), radius=-1500.0),)),
+        (Points(((1.0, -0.5, -120.0),)), (mirror(90.0, (50.0, 0.0)), thick(150.0, 60.0, (400.0, math.inf), 8.0, 1.5))),
+    ],
+)
+def test_first_surfaces_are_about_as_good_as_without(source, elements):
+    """By a retrace, against that of the same picture and a plane wave without anything beside the lens."""
+
+    def error(scene: Scene) -> float:
+        found = first_surface(scene, picture(), FIELD, 96)
+        return retrace(scene, FIELD, found.heights, picture(), rays=200_000, noise=False)[1]["relative_rms"]
+
+    bare = error(SCENE)
+    assert error(replace(SCENE, source=source, elements=elements)) < bare + 0.07 < 0.12
+
+
+def test_light_through_a_field_lens_is_that_of_traced_rays():
+    """Power on cells of the exit, by counting rays; all that passes the entrance's aperture is there."""
+    scene = replace(SCENE, source=Points(((0.5, 0.0, -90.0),)), elements=(thick(-25.0, 10.0, (40.0, -200.0)),))
+    line = np.linspace(-5.0, 5.0, 21)
+    light, directions = incident(scene, line, line, np.full((21, 21), 5.0))
+    found = []
+    for rays in rays_of(scene, "stratified", 400_000, 2).chunks(1 << 20):
+        (state,) = Tracer(System.of(scene, FIELD), rays)({EXIT: torch.full((35, 35), 5.0, dtype=torch.float64)})
+        found.append(np.histogram2d(*(c.numpy() for c in state.origin[:2]), bins=[line, line], weights=state.power.numpy())[0])
+    counted = np.sum(found, axis=0)
+    bright = counted > 0.3 * counted.max()
+    light, counted = light / light.sum(), counted / counted.sum()
+    assert bright.sum() > 100 and np.abs(light[bright] / counted[bright] - 1.0).mean() < 0.05
+    assert all(np.isfinite(c).all() for c in directions)
+
+
+def test_effects_know_of_all_glasses_and_apertures():
+    glass = thick(-30.0, 8.0, (60.0, -90.0), glass="N-SF11", absorption=0.02)
+    lens = replace(LENS, fresnel="exact")
+    scene = replace(SCENE, lens=lens, elements=(glass, mirror(120.0, (45.0, 0.0))), light=Light(None, (450.0, 650.0)))
+    plan = compile_plan(scene, FIELD, wavy())
+    assert {"absorption", "dispersion", "fresnel", "missed-surface"} <= {*plan.simulated}
+    image = expose(scene, FIELD, wavy(), rays_of(scene, "stratified", 20_000))
+    lost = image.lost
+    # both surfaces of both lenses reflect, at nearly normal incidence
+    n, m = (sum(b.scene.at(w).elements[0].index for b, w in zip(scene.bands, (450.0, 650.0), strict=True)) / 2, lens.index)
+    passed = (1 - ((n - 1) / (n + 1)) ** 2) ** 2 * (1 - ((m - 1) / (m + 1)) ** 2) ** 2
+    assert 1.0 - lost["absorbed"] - lost["fresnel"] == pytest.approx(passed * math.exp(-0.02 * 4.0), rel=5e-3)
+    assert float(image.image.sum()) + sum(lost.values()) == pytest.approx(1.0, abs=1e-12)
+    narrow = replace(scene, elements=(replace(glass, size=(8.0, 8.0)), replace(scene.elements[1], size=(8.0, 8.0))))
+    assert expose(narrow, FIELD, wavy(), rays_of(narrow, "stratified", 20_000)).lost["missed_surface"] > 0.1
+
+
+@pytest.mark.parametrize("aperture", ["rectangle", "circle"])
+def test_solids_are_closed_and_their_spheres_are_spheres(aperture):
+    elements = (thick(-30.0, 12.0, (30.0, math.inf), aperture=aperture), mirror(110.0, (40.0, 0.0), radius=-500.0, size=40.0))
+    scene = replace(SCENE, elements=elements)
+    vertices, faces = closed_mesh(scene, FIELD, wavy(), (41, 41))
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
+    corners = vertices[faces]
+    volume = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6.0
+    body, plate = bodies(scene)
+    (own,) = (closed_mesh(SCENE, FIELD, wavy(), (41, 41)),)
+    bare = own[0][own[1]]
+    without = np.einsum("ij,ij->i", bare[:, 0], np.cross(bare[:, 1], bare[:, 2])).sum() / 6.0
+    r, t = 6.0, 4.0
+    if aperture == "circle":  # a cylinder less the cap that the sphere's front leaves of it, by the cap's formula
+        sag = 30.0 - math.sqrt(900.0 - r * r)
+        of_lens = math.pi * r * r * (t - sag) + math.pi * sag * (3 * r * r + sag * sag) / 6.0
+        most = 40.0 * 40.0 * 3.0 * 1.3
+        assert of_lens < volume - without < of_lens + most
+    z = body.lens.front
+    assert z is not None and plate.lens.front is not None
+    field = HeightField(body.field.spaces, body.field.half_size)
+    assert field.half_size == (6.0, 6.0)
+    sphere, net = Sphere(30.0), torch.from_numpy(z.heights)
+    spline = System.of(replace(scene, elements=(replace(elements[0], fronts=(z, None)),))).elements[0].surface
+    line = torch.linspace(-4.2, 4.2, 50, dtype=torch.float64)
+    assert float((spline.at(None, line, 0.7 * line)[0] - sphere.at(None, line, 0.7 * line)[0]).abs().max()) <= CLOSE
+    assert net.shape[0] >= 16
+    # The mirror's plate leans as the mirror does: its corners lie behind its surface's plane by at most its thickness and sag.
+    normal = np.array(plate.pose.axes[2])
+    own = vertices[vertices[:, 2] > 60.0]
+    depth = (own - np.array(plate.pose.position)) @ normal
+    back = 3.0 + max(0.0, float(plate.lens.front.heights.max()))
+    assert depth.min() > -1.0 and depth.max() == pytest.approx(back, abs=1e-9)
+
+
+@pytest.fixture
+def _here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    light = picture()
+    Image.fromarray((255 * light / light.max()).astype(np.uint8).T[::-1]).save("one.png")
+
+
+SMALL = ("--linear", "--resolution", "32", "--control", "35", "--rays", "40000", "--quiet", "--json")
+FIELD_LENS = "lens z=-30 thickness=4 radius=150,inf glass=N-BK7"
+
+
+def run(capfd, *arguments, code=0):
+    assert cli.run(list(map(str, arguments))) == code, capfd.readouterr().err
+    out, err = capfd.readouterr()
+    return json.loads(out) if code == 0 else err.strip()
+
+
+def test_design_render_resume_and_files(_here, capfd):
+    mirror_text = "mirror z=150 tilt=45,0"
+    made = run(
+        capfd, "design", "one.png", *SMALL, "--element", FIELD_LENS, "--element", mirror_text, "--iterations", "4", "-o", "p"
+    )
+    assert made["relative_rms"] < made["start_relative_rms"] < 0.4 and made["on_screen"] > 0.8
+    settings = tomllib.loads(Path("p/project.toml").read_text())
+    assert [e["type"] for e in settings["element"]] == ["lens", "mirror"]
+    assert settings["element"][0]["radius"] == [150.0, math.inf] and settings["element"][0]["size"] == [10.0, 10.0]
+    again = run(capfd, "render", "p", "--rays", "200000", "--effects", "fresnel", "--quiet", "--json")
+    assert again["relative_rms"] == pytest.approx(made["relative_rms"], rel=0.05)
+    lens = load("p")
+    lens.export("lens.npz")
+    scene, field, heights = open_archive("lens.npz")
+    a, b = (
+        expose(s, f, h, rays_of(s, "grid", 10_000)).image
+        for s, f, h in ((scene, field, heights), (lens.scene, lens.field, lens.heights))
+    )
+    assert torch.allclose(a, b, atol=1e-12)
+    lens.export("lens.step")
+    text = Path("lens.step").read_text()
+    assert text.count("MANIFOLD_SOLID_BREP") == 3 and text.count("B_SPLINE_SURFACE_WITH_KNOTS") == 5
+    for study in ("--report", "--tolerances", "--html"):
+        files = {"--tolerances": ["t.toml"], "--html": ["page.html"]}.get(study, [])
+        Path("t.toml").write_text("[index]\nsigma = 0.001\n")
+        said = run(capfd, "render", "p", study, *files, "--quiet", "--force", code=2)
+        assert "element" in said, study
+    assert "lens by itself" in run(capfd, "export", "p", "--format", "zemax", code=2)
+
+
+def test_surfaces_of_two_lenses_are_shaped_together(_here, capfd):
+    beside = ("--element", "lens z=60 thickness=6 radius=150,-150 index=1.5 size=26 free=both")
+    fixed = ("--element", beside[1].removesuffix(" free=both"))
+    one = run(capfd, "design", "one.png", *SMALL, *fixed, "--iterations", "8", "-o", "one")
+    both = run(capfd, "design", "one.png", *SMALL, *beside, "--iterations", "8", "-o", "p")
+    assert both["start_relative_rms"] == pytest.approx(one["start_relative_rms"], rel=0.02)
+    assert both["relative_rms"] < 1.1 * one["relative_rms"] and both["relative_rms"] < 0.8 * both["start_relative_rms"]
+    lens = load("p")
+    assert lens.state is not None and lens.state.heights.shape == (3, 35, 35)
+    assert lens.scene.elements[0].fronts[0] is not None and torch.equal(lens.heights, lens.state.heights[-1])
+    begun = torch.stack([sphere_net(lens.scene.elements[0], side, lens.field) for side in ("front", "back")])
+    assert (lens.state.heights[:2] - begun).abs().amax((1, 2)).min() > 1e-6
+    figures = run(capfd, "render", "p", "--rays", "400000", "--effects", "fresnel", "--quiet", "--json")
+    assert figures["relative_rms"] == pytest.approx(both["relative_rms"], rel=0.06)
+    longer = run(capfd, "design", "--resume", "p", "--iterations", "12", "--quiet", "--json")
+    assert longer["iterations"] == 12 and longer["relative_rms"] < 1.02 * both["relative_rms"]
+    (found,) = run(capfd, "gradmap", "p", "--check", "--rays", "40000", "--quiet", "--json")["maps"]
+    assert found["largest"] > 0 and found["check"]["relative_error"] < 1e-3
+    lens = load("p")
+    lens.export("lens.npz")
+    scene, field, heights = open_archive("lens.npz")
+    a, b = (
+        expose(s, f, h, rays_of(s, "grid", 10_000)).image
+        for s, f, h in ((scene, field, heights), (lens.scene, lens.field, lens.heights))
+    )
+    assert torch.allclose(a, b, atol=1e-12)
+    text = Path("p/project.toml").read_text()
+    Path("p/project.toml").write_text(text.replace('free = "both"', 'free = "none"'))
+    assert "free-form surface" in run(capfd, "render", "p", code=2)
+
+
+@pytest.mark.parametrize("text", [FIELD_LENS, "mirror z=150 tilt=45,0"])
+def test_mitsuba_traces_them(_here, capfd, text):
+    pytest.importorskip("mitsuba")
+    run(capfd, "design", "one.png", *SMALL, "--element", text, "--iterations", "2", "-o", "p")
+    found = run(capfd, "render", "p", "--verify", "mitsuba", "--rays", "400000", "--quiet", "--json")["verify"]
+    assert found["agree"] and 0.9 < found["z_mean_square"] < 1.1
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("prism z=3", "must begin with lens or mirror"),
+        ("lens", "⟨z⟩ must be said"),
+        ("lens z", "must be KEY=VALUE"),
+        ("lens zz=3", "zz is not a key; did you mean z?"),
+        ("lens z=3 z=4", "says z twice"),
+        ("lens z=three", "must be a number"),
+        ("lens z=-30 radius=50", "two numbers parted by a comma"),
+        ("lens z=-30 radius=5,inf", "must be at least"),
+        ("lens z=-30 radius=50,-0", "non-zero"),
+        ("lens z=-30 thickness=0.1 radius=30,-30", "glass at the rim"),
+        ("lens z=-30 tilt=10,0", "is for mirrors"),
+        ("lens z=-30 index=1.5 glass=BK7", "index or glass, not both"),
+        ("lens z=-30 index=0.5", "greater than 1"),
+        ("lens z=-30 glass=brass", "reflects"),
+        ("lens z=2", "in the order in which light meets them"),
+        ("lens z=-60", "⟨source.position⟩ must lie before"),
+        ("lens z=299", "⟨screen.z⟩ must lie behind"),
+        ("mirror z=150", "turn it about x or about y"),
+        ("mirror z=150 tilt=45,45", "turn it about x or about y"),
+        ("mirror z=150 tilt=45,0 thickness=3", "is for lenses"),
+        ("mirror z=150 tilt=45,0 free=back", "its only surface"),
+        ("mirror z=-60 tilt=45,0", "the source turned"),
+        ("lens z=-30 aperture=circle size=10x8", "its diameter"),
+        ("lens z=30 free=top", "must be one of"),
+    ],
+)
+def test_bad_elements_are_refused(_here, capfd, text, words):
+    source = ("--source", "point", "--source-position", "0,0,-58")
+    said = run(capfd, "design", "one.png", *SMALL[:-2], *source, "--element", text, code=2)
+    assert len(said.splitlines()) == 1, said
+    for mark, plain in (("⟨z⟩", "z"), ("⟨source.position⟩", ""), ("⟨screen.z⟩", "")):
+        words = words.replace(mark, plain)
+    assert words.strip() in said, said
+    assert not Path("one.caustic").exists()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--mirror",),
+        ("--array", "2"),
+        ("--gradient", "selfoc", "--gradient-terms", "0.01"),
+        ("--waves", "on"),
+        ("--collimate",),
+    ],
+)
+def test_what_elements_cannot_be_had_with_is_refused(_here, capfd, options):
+    said = run(capfd, "design", "one.png", *SMALL[:-2], "--element", FIELD_LENS, *options, code=2)
+    assert "element" in said and len(said.splitlines()) == 1
+
+
+def test_a_screen_where_the_lens_is_imaged_is_refused():
+    relay = thick(155.0, 30.0, (98.5, -98.5), 6.0, 1.5)  # of focal length 100 mm, about
+    m = matrix((98.5, -98.5), 6.0, 1.5) @ straight(150.0)
+    imaged = 161.0 - m[0, 1] / m[1, 1]
+    with pytest.raises(InputError, match="image it"):
+        _ = Relayed(replace(SCENE, elements=(relay,), screen=replace(SCREEN, z=float(imaged))), 5.0).first_order
+
+
+def test_a_scene_without_elements_is_as_it_was():
+    scene = replace(SCENE, elements=())
+    assert scene.pupil.z == LENS.z_in and scene.axial and not scene.jointly and System.of(scene, FIELD).leg is None
+    rays = next(iter(rays_of(scene, "lines", 4_000).chunks()))
+    assert Tracer(System.of(scene, FIELD), rays).fused is not None
