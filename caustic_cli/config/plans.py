@@ -166,10 +166,10 @@ def refinement(
 #: knot spans.
 TWO_SIDED = {
     "draft": (8, 500_000, 2, 30),
-    "standard": (16, 1_000_000, 3, 80),
-    "fine": (32, 2_000_000, 4, 200),
+    "standard": (32, 2_000_000, 4, 60),
+    "fine": (64, 4_000_000, 4, 200),
 }
-TWO_SIDED_SPANS = 256
+TWO_SIDED_SPANS = 512
 
 
 def two_sided(control: tuple[int, int], rays: int | None, resolution: tuple[int, int], quality: str = "standard") -> list[Table]:

@@ -19,6 +19,7 @@ from torch import Tensor
 from caustic_cli.config.table import check_all
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse import ranks
+from caustic_cli.inverse.between_sides import origins
 from caustic_cli.inverse.conditions import Ranges
 from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
 from caustic_cli.inverse.extended import best_light, regular_rays, shift_of
@@ -29,7 +30,7 @@ from caustic_cli.inverse.limits import within_limits
 from caustic_cli.inverse.losses import parse
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.over_range import AdamOverRange, RangeObjective
-from caustic_cli.inverse.parametrisation import Architecture, FreeHeights, Heights, parametrise
+from caustic_cli.inverse.parametrisation import Architecture, FreeHeights, Heights, SidesTogether, parametrise
 from caustic_cli.inverse.robust import RobustObjective
 from caustic_cli.inverse.schedule import Stage
 from caustic_cli.inverse.steps import Adam, Newtonlike
@@ -217,7 +218,9 @@ class Designer:
         return self.within_limits(replace(state, heights=heights.reshape(state.heights.shape)))
 
     def _module(self, state: State) -> Heights:
-        module = self._parametrise(state.stage, state.heights if self.options.network == "none" else None)
+        module = self._parametrise(
+            state.stage, state.heights if self.options.network == "none" else None, loaded=bool(state.parameters)
+        )
         if state.parameters:
             own, held = ({k: tuple(v.shape) for k, v in part.items()} for part in (module.state_dict(), state.parameters))
             if own != held:
@@ -437,11 +440,15 @@ class Designer:
         tu, tv = (a.change_of_basis(b) for a, b in zip(self.field(k - 1).spaces, self.field(k).spaces, strict=True))
         return replace(state, stage=k, iteration=0, parameters={}, optimizer={}, heights=tu @ state.heights @ tv.T)
 
-    def _parametrise(self, k: int, start: Tensor | None) -> Heights:
+    def _parametrise(self, k: int, start: Tensor | None, loaded: bool = False) -> Heights:
+        """That of stage k; loaded: its own tensors are read afterwards."""
         o = self.options
         low, high = self._bounds(self.stages[k])
         if self.stages[k].waves:
             return FreeHeights(low, high, start, counted=True)
+        if self.scene.second is not None and start is not None:
+            light = None if loaded else origins(self.scene, self.field(k), start)
+            return SidesTogether(low, high, start, o.preconditioner == "laplacian", light)
         return parametrise(
             low,
             high,

@@ -22,21 +22,18 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.ndimage import gaussian_filter, map_coordinates
 from torch import Tensor
 
 from caustic_cli.errors import InputError
+from caustic_cli.inverse.between_sides import rays_within, spread
 from caustic_cli.inverse.incidence import on_entrance
 from caustic_cli.inverse.initial_surface import net_of
 from caustic_cli.inverse.surface_from_map import slopes_to, surface
 from caustic_cli.inverse.surface_from_slopes import fitted
 from caustic_cli.inverse.transport import corners, solve
 from caustic_cli.inverse.view import View
-from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import EXIT, sides_of
-from caustic_cli.optics.trace import tracers
 from caustic_cli.scene import Scene, Screen
 from caustic_cli.scene.screen import Sags
 
@@ -46,8 +43,8 @@ PARTS, MOST_PARTS, SMOOTH = 6, 32, 0.7
 #: How often both surfaces are solved for, each time with the exit of the time before; steps for where a ray leaves that; and how
 #: often the first exit is fitted.
 REPEATS, HEIGHTS, FIRST_FITS = 3, 6, 2
-#: Rays that the exit is fitted to, for each of its controls; and at a time.
-RAYS_A_CONTROL, CHUNK = 4, 1 << 19
+#: Rays that the exit is fitted to, for each of its controls.
+RAYS_A_CONTROL = 4
 #: Light to which a black picture is lifted where it is paired with another, in parts of its mean.
 DARKEST = 0.02
 #: Cells along each axis on which two pictures are paired, and into how many a pixel is cut at most.
@@ -141,7 +138,7 @@ def first_sides(
                 break
             at = grid.at(exit, ex, ey)
         on_exit = _on_exit(near.light, ex, ey, grid)
-        aim = _spread(np.stack([ex[lit], ey[lit]], -1), np.stack([px[lit], py[lit]], -1), *grid.corners)
+        aim = spread(np.stack([ex[lit], ey[lit]]), np.stack([px[lit], py[lit]]), *grid.corners)
         nets[0] = net_of(grid.x, grid.y, _entrance(scene, grid, on_exit, exit), field)
         for _ in range(1 if k else FIRST_FITS):
             nets[1] = _exit(scene, field, nets, grid, aim)
@@ -161,7 +158,7 @@ def slopes_behind(near: Picture, far: Picture) -> tuple[np.ndarray, np.ndarray]:
         at, lands = [found.x + small[0].centre[0], found.y + small[0].centre[1]], small[1].corners
         lit = small[1].lit
     x, y = near.corners
-    qx, qy = _spread(np.stack([c[lit] for c in at], -1), np.stack([c[lit] for c in lands], -1), x, y)
+    qx, qy = spread(np.stack([c[lit] for c in at]), np.stack([c[lit] for c in lands]), x, y)
     far_off = far.z - near.z
     return (qx - x) / far_off, (qy - y) / far_off
 
@@ -208,16 +205,13 @@ def _exit(scene: Scene, field: HeightField, nets: Tensor, grid: _Aperture, aim: 
     Args:
         nets: of both sides, (2, n, m) mm; aim: places for light of the exit's points at the corners of cells, (2, ...) mm.
     """
-    lit, net = sides_of(scene, field, nets)
-    rays = []
-    for traced in tracers(lit, field, rays_of(lit, "grid", RAYS_A_CONTROL * net.numel()), torch.float64, CHUNK):
-        last = traced.last({EXIT: net})
-        rays.append(torch.stack([*last.state.full(last.local), *last.state.full(last.incoming), last.arriving]))
-    found = torch.cat(rays, 1)
-    x, y, z, dx, dy, dz, power = found[:, found[6] > 0].numpy()
+    light = rays_within(scene, field, nets, RAYS_A_CONTROL * nets[1].numel())
+    x, y, z = light.exit
     px, py = (grid.at(a, x, y) for a in aim)
-    slopes = slopes_to(px - x, py - y, scene.screen.z - z, (dx, dy, dz), scene.lens.index)
-    return fitted(field, *((torch.from_numpy(a), torch.from_numpy(b)) for a, b in ((x, y), slopes)), torch.from_numpy(power), net)
+    slopes = slopes_to(px - x, py - y, scene.screen.z - z, light.direction, scene.lens.index)
+    return fitted(
+        field, *((torch.from_numpy(a), torch.from_numpy(b)) for a, b in ((x, y), slopes)), torch.from_numpy(light.power), nets[1]
+    )
 
 
 def _on_exit(light: np.ndarray, ex: np.ndarray, ey: np.ndarray, grid: _Aperture) -> np.ndarray:
@@ -246,16 +240,6 @@ def _on_exit(light: np.ndarray, ex: np.ndarray, ey: np.ndarray, grid: _Aperture)
             " mm from its axis: a larger ⟨lens.size⟩, a smaller picture, a screen nearer the lens, or pictures that are more alike"
         )
     return gaussian_filter(total, SMOOTH)
-
-
-def _spread(points: np.ndarray, values: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Values (N, k) at scattered points (N, 2), linear between them and the nearest beyond, at x, y: (k, *x.shape)."""
-    at = np.stack([x.ravel(), y.ravel()], -1)
-    found = LinearNDInterpolator(points, values)(at)
-    beyond = np.isnan(found).any(-1)
-    if beyond.any():
-        found[beyond] = NearestNDInterpolator(points, values)(at[beyond])
-    return found.T.reshape(values.shape[1], *x.shape)
 
 
 def _cells(picture: Picture) -> Picture:

@@ -144,6 +144,26 @@ class FreeHeights(Heights):
         return self.low + 0.5 * (1.0 + torch.tanh(self.start.double())) * self.span
 
 
+class SidesTogether(FreeHeights):
+    """Heights of two sides, (2, n, m), of which the exit follows the entrance.
+
+    What is added to the entrance is also added to the exit where its light leaves: the optical path of every ray stays, and so, to
+    first order, does the direction in which it leaves.  So one of the parameters moves light about on the exit, the other turns it.
+
+    Args:
+        origins: (n, m, 2) places on the entrance, see `between_sides.origins`; None where they are loaded.
+    """
+
+    def __init__(self, low: Tensor, high: Tensor, start: Tensor, laplacian: bool, origins: Tensor | None):
+        super().__init__(low, high, start, laplacian, counted=True)
+        self.register_buffer("origins", low.new_zeros(*low.shape[1:], 2) if origins is None else origins)
+
+    def raw(self, inputs: Tensor | None = None) -> Tensor:
+        entrance, exit = self.y if self.laplacian is None else self.laplacian(self.y)
+        seen = torch.nn.functional.grid_sample(entrance[None, None], self.origins[None], align_corners=True, padding_mode="border")
+        return self.start + torch.stack([entrance, exit + seen[0, 0]])
+
+
 class NetworkHeights(Heights):
     """A network with input 1 (5.1.1), and `inputs` more, float32 weights.
 

@@ -26,6 +26,8 @@ from caustic_cli.scene import Scene, Screen
 
 #: Angle, rad, that counts as an error of the picture of 1.
 SHARP = 1e-2
+#: Rays that are kept from their value to its gradient, 0.6 KiB each: more are traced twice.
+WHOLE = 1 << 22
 
 
 class TwoSidedObjective:
@@ -80,13 +82,13 @@ class TwoSidedObjective:
         return tracers(self.scene, self.field, self.sampler, self.dtype, CHUNK)
 
     def __call__(self, heights: Tensor) -> Evaluation:
-        """Value and gradients; rays are traced twice where there are more than a chunk, so that memory does not grow with them.
+        """Value and gradients; rays are traced twice where there are more than WHOLE, so that memory does not grow beyond those.
 
         Raises:
             NoLight: none reaches a screen.
         """
         parameters = {name: h.detach().clone().requires_grad_() for name, h in zip((ENTRANCE, EXIT), heights, strict=True)}
-        leaves, whole = list(parameters.values()), self.sampler.count <= CHUNK
+        leaves, whole = list(parameters.values()), self.sampler.count <= WHOLE
         kept, sums, entering = [], None, torch.zeros((), dtype=torch.float64)
         with torch.set_grad_enabled(whole):
             for traced in self._tracers():
