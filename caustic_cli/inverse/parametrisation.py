@@ -18,7 +18,9 @@ from __future__ import annotations
 import math
 
 import torch
+from scipy.fft import dctn, idctn
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from caustic_cli.config import checks
 from caustic_cli.errors import InputError
@@ -69,6 +71,19 @@ class Heights(torch.nn.Module):
         return torch.atanh(y)
 
 
+class _Inverse(torch.autograd.Function):
+    """C_u^T x C_v over the last two axes of x, whose adjoint is C_u x C_v^T: by fast transforms, in n m log(n m) steps."""
+
+    @staticmethod
+    def forward(ctx, x: Tensor) -> Tensor:
+        return torch.from_numpy(idctn(x.detach().numpy(), axes=(-2, -1), norm="ortho", workers=torch.get_num_threads()))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, by: Tensor) -> Tensor:
+        return torch.from_numpy(dctn(by.numpy(), axes=(-2, -1), norm="ortho", workers=torch.get_num_threads()))
+
+
 class FreeHeights(Heights):
     """No network; with `laplacian`, in coordinates where the caustic's response is well conditioned.
 
@@ -85,7 +100,8 @@ class FreeHeights(Heights):
         self.y = torch.nn.Parameter(torch.zeros_like(raw) if counted else raw.clone())
         if laplacian:
             n, m = low.shape[-2:]
-            self.cu, self.cv = cosine_transform(n).to(low), cosine_transform(m).to(low)
+            if low.device.type != "cpu":
+                self.cu, self.cv = cosine_transform(n).to(low), cosine_transform(m).to(low)
             lam = [4.0 * torch.sin(0.5 * math.pi * torch.arange(k).to(low) / k) ** 2 for k in (n, m)]
             total = lam[0][:, None] + lam[1][None, :]
             total[0, 0] = math.inf  # the mean height moves no light: leave it where the start put it
@@ -94,7 +110,8 @@ class FreeHeights(Heights):
     def raw(self) -> Tensor:
         if not self.laplacian:
             return self.y if self.start is None else self.start + self.y
-        return self.start + self.cu.T @ (self.scale * self.y) @ self.cv
+        scaled = self.scale * self.y
+        return self.start + (_Inverse.apply(scaled) if scaled.device.type == "cpu" else self.cu.T @ scaled @ self.cv)
 
     def begun(self) -> Tensor:
         if self.start is None:
