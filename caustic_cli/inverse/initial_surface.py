@@ -26,8 +26,9 @@ from caustic_cli.scene import Scene
 
 #: Source cells along the lens' longer side: a picture of 250 x 250 pixels is resolved, and they are cheap.
 CELLS = 256
-#: Most of them for which transport is solved: what needs more, which kinks do, is evaluated on cells so many times finer.
-SOLVED = 512
+#: Most of them for which transport is solved.  What needs more, which creases do, is solved on about so many, and then evaluated on
+#: cells so many times finer.
+SOLVED, COARSE = 1024, 512
 #: How much higher a net may be than the surface it was interpolated from.
 OVERSHOOT = 2.0
 #: Surfaces solved for in turn where the light depends on the surface it meets.
@@ -204,7 +205,7 @@ def first_surface(scene: Scene, target: np.ndarray, field: HeightField, cells: i
     Raises:
         InputError: the picture is out of reach of refraction.
     """
-    times = -(-cells // SOLVED) if scene.source.distant else 1
+    times = -(-cells // COARSE) if cells > SOLVED and scene.source.distant else 1
     grid, lens = _Grid.of(scene, target, cells // times), scene.lens
     z = grid.offset
     if scene.source.distant or lens.mirror:

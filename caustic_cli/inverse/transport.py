@@ -46,6 +46,9 @@ COARSE_TOLERANCE, LINEAR_TOLERANCE = 1e-2, 3e-2
 EVENER = (1.0, 0.7, 0.4, 0.2, 0.1, 0.03, 0.0)  # parts of uniform light, if a level fails on the source itself
 DARKEST = 1e-3  # the source is lifted to at least this part of its mean: a cell without light has no derivative
 MAX_CELLS = 4096
+SHARP = (
+    0.75  # width of the average over phi on finer cells, in these: those of Laguerre are wider, so that it keeps no kink but theirs
+)
 STRIP = 128  # columns of corners averaged together, which bounds the memory
 
 
@@ -72,10 +75,10 @@ class Transport:
     solved: _Solved
 
     def finer(self, times: int) -> Transport:
-        """The same map at the corners of cells so many times smaller along each axis, its kinks as much sharper."""
+        """The same map at the corners of cells so many times smaller along each axis, its kinks sharper by more than that."""
         began, s = time.perf_counter(), self.solved
         shape = tuple(times * n for n in s.shape)
-        potential, x, y = _smoothed(s.psi, s.sites, shape, s.half, s.smooth)
+        potential, x, y = _smoothed(s.psi, s.sites, shape, s.half, SHARP)
         seconds = self.seconds + time.perf_counter() - began
         return replace(self, potential=potential - potential.mean(), x=x, y=y, seconds=seconds)
 
@@ -97,13 +100,12 @@ class _Sites:
 
 @dataclass(frozen=True, eq=False)
 class _Solved:
-    """What a map follows from: prices psi (N,) of the sites, shape and half sizes of the source's cells, smooth as of `solve`."""
+    """What a map follows from: prices psi (N,) of the sites, shape and half sizes of the source's cells."""
 
     psi: np.ndarray
     sites: _Sites
     shape: tuple[int, int]
     half: tuple[float, float]
-    smooth: float
 
 
 def centres(n: int, half: float, pad: int = 0) -> np.ndarray:
@@ -174,7 +176,7 @@ def solve(
                 found, error = psi, left
         psi = found
     potential, x, y = _smoothed(psi, sites, (n, m), (a, b), smooth)
-    solved = _Solved(psi, sites, (n, m), (a, b), smooth)
+    solved = _Solved(psi, sites, (n, m), (a, b))
     return Transport(potential - potential.mean(), x, y, error, len(psi), steps, time.perf_counter() - began, solved)
 
 
