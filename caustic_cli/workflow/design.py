@@ -482,7 +482,7 @@ def _run(
             on_iteration=on_iteration,
             notice=say.say,
         )
-        if not asked and not chosen["iterations"] and state.reason in DONE:
+        if not asked and not chosen["iterations"] and chosen["network"] == "none" and state.reason in DONE:
             state = replace(state, parameters={}, optimizer={})
         records.keep(state)
         if not asked:
