@@ -155,6 +155,16 @@ def test_resume_finds_the_project_by_its_picture_and_goes_on(capfd):
     assert len(load("blob.caustic").state.history) == 4
 
 
+def test_a_finished_project_keeps_nothing_of_its_optimiser_and_goes_on_without(capfd):
+    first = design(capfd, "blob.png", *TINY, "--waves", "off", "--quality", "draft")
+    state = load("blob.caustic").state
+    assert state.reason in workflow.DONE and not state.parameters and not state.optimizer
+    more = design(capfd, "--resume", "blob.caustic", "--iterations", state.total + 5, "--quiet")
+    assert more["relative_rms"] == pytest.approx(first["relative_rms"], rel=0.05)  # the judge's few rays are noisy
+    held = load("blob.caustic").state
+    assert held.reason == "no progress" or held.total == state.total + 5
+
+
 def test_resume_takes_no_other_settings(capfd):
     design(capfd, "blob.png", *TINY, "--iterations", 1)
     before = (Path("blob.caustic") / "project.toml").read_bytes()

@@ -243,3 +243,15 @@ REFUSED = {
 def test_contradictions_are_refused(options, sentence):
     with pytest.raises(InputError, match=sentence):
         parametrise(*bounds(), **options)
+
+
+def test_the_fast_transforms_derivative():
+    """Raw heights are linear in the parameters: the adjoint of the fast transform is that of the matrices."""
+    low, high = bounds(9, 7)
+    module = parametrise(low, high, start=low + 0.3 * (high - low), preconditioner="laplacian")
+    generator = torch.Generator().manual_seed(3)
+    by, along = (torch.randn(9, 7, dtype=torch.float64, generator=generator) for _ in range(2))
+    (module.raw() * by).sum().backward()
+    pulled = float((module.y.grad * along).sum())
+    module.y.data = along
+    assert float(((module.raw() - module.start) * by).sum().detach()) == pytest.approx(pulled, rel=1e-12)

@@ -434,3 +434,17 @@ def test_read_only_directory_is_refused(tmp_path):
             files.refuse_foreign(tmp_path / "a.png")
     finally:
         tmp_path.chmod(0o700)
+
+
+def test_gaps_between_bright_parts():
+    """Bars across a picture: each row along x crosses the gaps between them, no column any; a disc and even light have none."""
+    bars = np.zeros((60, 200))
+    for k in range(4):
+        bars[10:50, 20 + 40 * k : 40 + 40 * k] = 1.0
+    assert Picture(bars, "linear").gaps == pytest.approx(3 * 40 / 60)
+    x, y = np.meshgrid(np.linspace(-1, 1, 100), np.linspace(-1, 1, 100))
+    assert Picture((x * x + y * y < 0.6).astype(float), "linear").gaps == 0
+    assert Picture(np.ones((20, 30)), "linear").gaps == 0
+    scratched = np.ones((300, 300))
+    scratched[:, 100] = 0.0
+    assert Picture(scratched, "linear").gaps == 0

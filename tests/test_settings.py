@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from caustic_cli.config import settings
 from caustic_cli.config.completion import Derivation, build_options, build_stages, complete
+from caustic_cli.config.plans import GAPS, transport_cells
 from caustic_cli.config.settings import ELEMENT, SCHEMA, STAGE, build_lens, build_scene, dump, parse
 from caustic_cli.errors import InputError
 
@@ -272,3 +273,21 @@ def test_design_options_out_of_range(key, value):
     with pytest.raises(InputError) as caught:
         build_options(complete({"design": {key: value}}, 1.0))
     assert key in str(caught.value)
+
+
+def test_a_picture_with_gaps_has_a_net_as_fine_as_its_creases_ask_for():
+    rays = {"design": {"waves": "off"}}
+    plain, creased = complete(rays, 1.0), complete(rays, 1.0, gaps=1.0)
+    assert plain["lens"]["control"] == [503, 503]
+    assert creased["lens"]["control"] == [2003, 2003] == creased["design"]["stages"][-1]["control"]
+    assert complete(rays, 1.0, gaps=0.9 * GAPS)["design"] == plain["design"]
+    own = {**rays, "lens": {"control": [203, 203]}}
+    assert complete(own, 1.0, gaps=1.0)["design"]["stages"] == complete(own, 1.0)["design"]["stages"]
+    for other in ({}, {**rays, "source": {"type": "disc", "position": [[0.0, 0.0, -1000.0]]}}):  # seen as a wave; through a blur
+        assert complete(other, 1.0, gaps=1.0)["lens"]["control"] == complete(other, 1.0)["lens"]["control"]
+
+
+def test_cells_of_the_start_follow_rays_or_a_fine_net():
+    assert transport_cells(4_000_000, False, 500) == 500
+    assert transport_cells(4_000_000, False, 2000) == 2000
+    assert transport_cells(1_000_000, True, 2000) == 500  # each cell of a near source's light is solved for

@@ -321,3 +321,29 @@ def test_cells_fill_the_rectangle():
         assert slope[net[2][e]] == pytest.approx(weight[e], abs=2e-3)
         e = net[1][e]
     assert slope[p] < 0
+
+
+def test_a_finer_map_is_the_same_with_sharper_kinks():
+    """Two bright halves with a gap between: the light that falls into it is that within the average's width of the kink."""
+    target = np.zeros((30, 10))
+    target[:10], target[20:] = 1.0, 1.0
+    found = solve(target)
+    sharp = found.finer(4)
+    assert sharp.x.shape == (4 * 64 + 1, 4 * 48 + 1)
+    x, y = corners(64, 48)
+    away = np.abs(x[:, 0]) > 3 * 2 * A / 64
+    inner = np.ix_(away & (np.abs(x[:, 0]) < A - 0.4), np.abs(y[0]) < B - 0.4)
+    for a, b in ((found.x, sharp.x), (found.y, sharp.y)):
+        assert np.abs(b[::4, ::4] - a)[inner].max() < C / 30  # the distance of two sites
+    dark = [(np.abs(fine(m.x, 2000)) < 0.9 * C / 3).mean() for m in (found, sharp)]
+    assert 0 < dark[1] < 0.3 * dark[0]
+    z = sharp.potential
+    assert min(np.diff(z, 2, axis).min() for axis in (0, 1)) > -1e-12 * np.ptp(z)
+
+
+def test_the_average_does_not_depend_on_strips(monkeypatch):
+    whole = solve(flame())
+    monkeypatch.setattr(transport, "STRIP", 7)
+    strips = solve(flame())
+    np.testing.assert_array_equal(strips.potential, whole.potential)
+    np.testing.assert_array_equal(strips.y, whole.y)

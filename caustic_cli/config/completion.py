@@ -13,6 +13,7 @@ from typing import Any
 import torch
 
 from caustic_cli.config.plans import (
+    GAPS,
     LEAST_SPANS,
     LEAST_WAVES,
     TWO_SIDED_SPANS,
@@ -96,7 +97,9 @@ class Derivation:
                 check(key, getattr(self, key))
 
 
-def complete(given: Settings, aspect: float, by: Derivation | None = None, lit: tuple[float, float] = (1.0, 1.0)) -> Settings:
+def complete(
+    given: Settings, aspect: float, by: Derivation | None = None, lit: tuple[float, float] = (1.0, 1.0), gaps: float = 0.0
+) -> Settings:
     """Every setting a project needs.
 
     Args:
@@ -104,6 +107,7 @@ def complete(given: Settings, aspect: float, by: Derivation | None = None, lit: 
         aspect: height over width of the picture.
         by: what else was said.
         lit: parts of the picture's width and height that light is to cover.
+        gaps: of the picture between its bright parts, see `Picture.gaps`.
 
     Raises:
         InputError: a value is out of range, or two contradict each other.
@@ -171,7 +175,7 @@ def complete(given: Settings, aspect: float, by: Derivation | None = None, lit: 
     build_screen(s)
     source = build_source(s)
     _complete_lens(lens, screen, target, source, sides=2 if "second" in s else 1)
-    _complete_design(s, source, by.quality, by.rays, lit)
+    _complete_design(s, source, by.quality, by.rays, lit, gaps)
     return s
 
 
@@ -373,7 +377,9 @@ def shape_words(s: Settings) -> str:
     )
 
 
-def _complete_design(s: Settings, source: Source, quality: str | None, rays: int | None, lit: tuple[float, float]) -> None:
+def _complete_design(
+    s: Settings, source: Source, quality: str | None, rays: int | None, lit: tuple[float, float], gaps: float
+) -> None:
     lens, screen, design, given = s["lens"], s["screen"], s["design"], quality
     degree = check("lens.degree", lens["degree"])
     if "stages" in design and (given or rays):
@@ -416,7 +422,8 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
     # Sharp light's transport is right at every scale at once, if the net can hold it, and so is that of a source that shifts the
     # image, for the light behind its blur; otherwise from coarse to fine.
     moved = plain and fine_net and design["start"] != "offset" and (source.sharp or spread or max(array) > 1)
-    if "control" not in lens:
+    own = "control" in lens
+    if not own:
         spans = refinement_spans(max(screen["resolution"]), quality) if moved else DEFAULT_SPANS
         of_network = [DEFAULT_SPANS + p for p in degree] if value_of(design, "design.over") else [NETWORK_CONTROL] * 2
         lens["control"] = [spans + p for p in degree] if design["network"] == "none" else of_network
@@ -437,11 +444,16 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
         return
     nx, ny = screen["resolution"]
     sampler, base = _sampler(source), min(4_000_000, max(40_000, int(RAYS_PER_PIXEL * nx * ny)))
+    waves = _wave_stages(s, source, quality, lit)
     if moved and elements_of(s):
         stages = two_sided(tuple(lens["control"]), rays, (nx, ny), quality)
     elif moved:
         centre = source.pointlike() if spread else source
-        stages = refinement(tuple(lens["control"]), rays, (nx, ny), quality, scattered=not centre.collimated, spread=spread)
+        # Diffraction rounds creases by more than a fine net would.
+        creased = gaps >= GAPS and not (own or waves or spread) and source.distant and max(array) == 1
+        if creased:
+            lens["control"] = [refinement_spans(max(nx, ny), quality, creased) + p for p in degree]
+        stages = refinement(tuple(lens["control"]), rays, (nx, ny), quality, not centre.collimated, spread, creased)
         if value_of(s["target"], "target.sheet"):
             stages = each_lenslet(stages, math.prod(array), (nx, ny))
     elif value_of(design, "design.over"):
@@ -460,7 +472,7 @@ def _complete_design(s: Settings, source: Source, quality: str | None, rays: int
                 tolerance=2e-3 if plain else 0.0,
             )
         ]
-    stages += _wave_stages(s, source, quality, lit)
+    stages += waves
     if design["loss"].strip() == "rms":  # eq. 5.2.1 knows the screen alone
         stages = [stage | {"apron": 0} for stage in stages]
     design["stages"] = stages

@@ -99,26 +99,39 @@ REFINEMENT = {
     "standard": (2.0, 768, 64, 4_000_000, 4, ((0.5, 8), (1.0, 24))),
     "fine": (2.0, 768, 256, 16_000_000, 4, ((0.125, 15), (0.25, 65), (1.0, 25))),
 }
+#: Gaps of a picture (`io.picture`) from which on creases decide its error, and what a quality means then: light that crosses a
+#: crease falls into the black, and a crease is as narrow as knot spans and the start's cells are.  On so fine a net iterations gain
+#: little.
+GAPS = 0.5
+CREASED = {
+    "draft": (4.0, 1024, 16, 1_000_000, 2, ((1.0, 6),)),
+    "standard": (8.0, 2048, 64, 4_000_000, 4, ((1.0, 8),)),
+    "fine": (12.0, 3072, 256, 16_000_000, 4, ((0.5, 10),)),
+}
 #: So many times the iterations where what is refined is seen through a source's blur only.
 LONGER = 3
 #: Source cells of the transport start along the lens: one to so many rays of the last stage, within bounds.
 RAYS_PER_CELL, LEAST_CELLS, MOST_CELLS = 4, 256, 1024
+#: Knot spans of a net from which on its start has a cell to each of them.
+FINE_SPANS = 1024
 LEAST_SPANS = 32
 LEAST_RAYS = 40_000
 
 
-def refinement_spans(pixels: int, quality: str) -> int:
+def refinement_spans(pixels: int, quality: str, creased: bool = False) -> int:
     """Knot spans along each axis of the lens for a screen of so many pixels: finer than the picture."""
     check("quality", quality)
-    density, most, *_ = REFINEMENT[quality]
+    density, most, *_ = (CREASED if creased else REFINEMENT)[quality]
     return min(most, max(LEAST_SPANS, round(density * pixels)))
 
 
-def transport_cells(rays: int, scattered: bool) -> int:
-    """Source cells along the lens of a transport start that so many rays refine.
+def transport_cells(rays: int, scattered: bool, spans: int = 0) -> int:
+    """Source cells along the lens of a transport start that so many rays refine on a net of so many knot spans.
 
     What a cell leaves bright or dark shows as stripes where the picture is dark, and takes many iterations to smooth.
     """
+    if spans >= FINE_SPANS and not scattered:
+        return spans
     return min(MOST_CELLS, max(LEAST_CELLS, round(math.sqrt(rays * (4 if scattered else 1)) / RAYS_PER_CELL)))
 
 
@@ -129,6 +142,7 @@ def refinement(
     quality: str = "standard",
     scattered: bool = False,
     spread: bool = False,
+    creased: bool = False,
 ) -> list[Table]:
     """The default stages after a transport start, whose surface has every scale right already: full detail at once.
 
@@ -139,9 +153,10 @@ def refinement(
         rays: of the last stage, None for what the quality says.
         scattered: the source's rays have to be intersected one by one: take a quarter of them.
         spread: as of a stage; the light that the source spreads beside the screen is no error there.
+        creased: the picture has gaps, and the net is as fine as `refinement_spans` has it then.
     """
     check("quality", quality)
-    _, _, each, most, finer, plan = REFINEMENT[quality]
+    _, _, each, most, finer, plan = (CREASED if creased else REFINEMENT)[quality]
     pixels = resolution[0] * resolution[1]
     rays = rays or max(LEAST_RAYS, min(most, each * pixels) // (4 if scattered else 1))
     finer = max(1, min(finer, math.isqrt(rays // pixels)))
@@ -166,7 +181,7 @@ def refinement(
 #: knot spans.
 TWO_SIDED = {
     "draft": (8, 500_000, 2, 30),
-    "standard": (32, 2_000_000, 4, 60),
+    "standard": (64, 4_000_000, 4, 40),
     "fine": (64, 4_000_000, 4, 200),
 }
 TWO_SIDED_SPANS = 512

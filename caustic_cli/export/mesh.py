@@ -28,7 +28,7 @@ from caustic_cli.export.bodies import bodies
 from caustic_cli.export.surface import (
     MAX_POINTS,
     MAX_SAMPLES,
-    STEPS_PER_SPAN,
+    default_samples,
     grid_within,
     sample_grid,
     second_derivative_bounds,
@@ -131,7 +131,7 @@ def patch(
 def _across(field: HeightField, heights: Tensor, samples: tuple[int, int] | None, tolerance: float | None) -> int:
     """Points along a diameter of a round lens."""
     if tolerance is None:
-        counts = samples or [STEPS_PER_SPAN * (len(s.breaks) - 1) + 1 for s in field.spaces]
+        counts = samples or [default_samples(s) for s in field.spaces]
         n, asked = max(checks.pair("⟨samples⟩", counts, lambda w, k: checks.whole(w, k, 2, MAX_SAMPLES))), "⟨samples⟩"
     else:
         checks.number("⟨tolerance⟩", tolerance, 0.0, open_low=True)

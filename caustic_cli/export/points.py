@@ -12,12 +12,14 @@ from pathlib import Path
 
 from torch import Tensor
 
-from caustic_cli.export.surface import sample_grid
+from caustic_cli.export.surface import default_samples, sample_grid
 from caustic_cli.export.text import CREATED, rows
 from caustic_cli.io.files import atomic_path
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 
+#: Most points along an axis of the default cloud, which keep it under 20 MB; ⟨samples⟩ asks for more.
+MOST = 577
 HEADER = "x_mm,y_mm,z_mm\n"
 
 
@@ -32,6 +34,9 @@ def write_xyz(path: str | Path, scene: Scene, field: HeightField, heights: Tenso
 
 
 def _write(path, field: HeightField, heights: Tensor, samples, head: str, form: str) -> None:
+    counts = tuple(default_samples(s) for s in field.spaces)
+    if samples is None and max(counts) > MOST:
+        samples = (min(MOST, counts[0]), min(MOST, counts[1]))
     grid = sample_grid(field, heights, samples)
     points = grid.points.reshape(*grid.z.shape, 3).swapaxes(0, 1).reshape(-1, 3)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:

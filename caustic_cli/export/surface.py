@@ -33,6 +33,8 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 #: Equal steps per knot span of the default grid.  With 2 a not-a-knot bicubic is exact already; with 4 a natural one,
 #: whose end conditions are wrong, is good to some micrometres on the screen too.
 STEPS_PER_SPAN = 4
+#: Most lines along an axis of the default grid, as long as one a knot span is no more: finer nets would make files of gigabytes.
+MOST_LINES = 3072
 #: Most samples along one axis, and most points: 5e7 points are 2.8 GB of points, normals and heights.
 MAX_SAMPLES = 20_000
 MAX_POINTS = 50_000_000
@@ -62,20 +64,30 @@ class SurfaceGrid:
         return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
+def steps_per_span(space: SplineSpace) -> int:
+    """Equal steps per knot span of the default grid: `STEPS_PER_SPAN`, or fewer on a fine net."""
+    return max(1, min(STEPS_PER_SPAN, MOST_LINES // (len(space.breaks) - 1)))
+
+
+def default_samples(space: SplineSpace) -> int:
+    """Points of the default grid along an axis."""
+    return steps_per_span(space) * (len(space.breaks) - 1) + 1
+
+
 def sample_grid(field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None) -> SurfaceGrid:
     """The surface and its slopes on a grid that spans the whole aperture, borders included.
 
     Args:
         heights: (n, m) control heights, mm.
-        samples: (nx, ny) points of an equispaced grid, or None for `STEPS_PER_SPAN` equal steps in every knot span:
-            STEPS_PER_SPAN (n - p) + 1 points along an axis with simple knots, every knot among them.
+        samples: (nx, ny) points of an equispaced grid, or None for `steps_per_span` equal steps in every knot span: of k,
+            k (n - p) + 1 points along an axis with simple knots, every knot among them.
 
     Raises:
         InputError: fewer than 2 or more than `MAX_SAMPLES` samples along an axis, more than `MAX_POINTS` points, or
             heights that are not the field's.
     """
     if samples is None:
-        return on_lines(field, heights, [_knot_lines(s, STEPS_PER_SPAN) for s in field.spaces])
+        return on_lines(field, heights, [_knot_lines(s, steps_per_span(s)) for s in field.spaces])
     counts = checks.pair("⟨samples⟩", samples, lambda where, n: checks.whole(where, n, 2, MAX_SAMPLES))
     return on_lines(field, heights, [torch.linspace(0.0, 1.0, n, dtype=torch.float64) for n in counts])
 

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.export.surface import STEPS_PER_SPAN, sample_grid
+from caustic_cli.export.surface import default_samples, sample_grid
 from caustic_cli.export.text import CREATED, real, rows
 from caustic_cli.io.files import atomic_path
 from caustic_cli.optics.bspline import SplineSpace
@@ -36,7 +36,7 @@ def write_zemax(
 
     Args:
         heights: (n, m) control heights, mm.
-        samples: (nx, ny) points, equispaced; None for `STEPS_PER_SPAN` a knot span.
+        samples: (nx, ny) points, equispaced; None for `default_samples`.
 
     Raises:
         InputError: fewer than `LEAST` or too many points, or the file cannot be written there.
@@ -65,4 +65,4 @@ def write_zemax(
 
 
 def _count(space: SplineSpace) -> int:
-    return max(LEAST, STEPS_PER_SPAN * (len(space.breaks) - 1) + 1)
+    return max(LEAST, default_samples(space))

@@ -18,7 +18,7 @@ from torch import Tensor
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.incidence import incident
 from caustic_cli.inverse.relayed import Relayed
-from caustic_cli.inverse.surface_from_map import OutOfReach, Seen, Start, thrown
+from caustic_cli.inverse.surface_from_map import OutOfReach, Seen, Start, finer, thrown
 from caustic_cli.inverse.surface_from_map import surface as refracting_surface
 from caustic_cli.inverse.transport import corners
 from caustic_cli.inverse.view import View
@@ -29,6 +29,9 @@ from caustic_cli.scene.elements import SIDES
 
 #: Source cells along the lens' longer side: a picture of 250 x 250 pixels is resolved, and they are cheap.
 CELLS = 256
+#: Most of them for which transport is solved.  What needs more, which creases do, is solved on about so many, and then evaluated on
+#: cells so many times finer.
+SOLVED, COARSE = 1024, 512
 #: How much higher a net may be than the surface it was interpolated from.
 OVERSHOOT = 2.0
 #: Surfaces solved for in turn where the light depends on the surface it meets.
@@ -112,6 +115,17 @@ class _Grid:
             **options,
         )
 
+    def sharper(self, found: Start, times: int) -> tuple[_Grid, np.ndarray]:
+        """Corners of cells so many times finer, and heights there of a surface solved on these, its creases as much sharper."""
+        scene, mean = self.scene, float(found.heights.mean())
+        fine = _Grid(scene, self.target, *(corners(times * (len(c) - 1), c[-1]) for c in (self.x, self.y)))
+        _, directions = incident(scene, fine.x, fine.y, self.scaled(found.heights, fine))
+        view = self.view(mean)
+        centre = scene.screen.shift if view is None else view.picture(self.target)[2]
+        index = scene.lens.effective_index
+        z = finer(found, times, scene.lens.half_size, index, scene.screen.z, directions, centre=centre, view=view)
+        return fine, z
+
     def view(self, mean: float) -> Seen | None:
         """The screen as a surface of this mean height sees it, None of an upright one, which lies in its plane."""
         screen = self.scene.screen
@@ -192,19 +206,22 @@ def first_surface(scene: Scene, target: np.ndarray, field: HeightField, cells: i
         scene: source, lens and screen.
         target: (n_x, n_y) irradiance on its screen.
         field: spline spaces of the heights.
-        cells: source cells along the lens' longer side.
+        cells: source cells along the lens' longer side; more than SOLVED make creases sharper, of light from afar.
         fixed: the thickness is the user's own, and none other is tried.
 
     Raises:
         InputError: the picture is out of reach of refraction.
     """
-    grid, lens = _Grid.of(scene, target, cells), scene.lens
+    times = -(-cells // COARSE) if cells > SOLVED and scene.source.distant else 1
+    grid, lens = _Grid.of(scene, target, cells // times), scene.lens
     z = grid.offset
     if scene.source.distant or lens.mirror or scene.elements:
         found = None
         for _ in range(1 if scene.source.distant and not scene.before else PASSES):
             found = grid.solved(*incident(scene, grid.x, grid.y, z), float(grid.offset.mean()), found)
             z = found.heights
+        if times > 1:
+            grid, z = grid.sharper(found, times)
         return InitialSurface(net_of(grid.x, grid.y, z, field))
     few = _Grid.of(scene, target, min(cells, FEW_CELLS))
     best = _best(few, lens.offset.thickness, fixed)

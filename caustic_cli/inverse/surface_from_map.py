@@ -61,6 +61,7 @@ class Start:
         heights: z at the corners of the source's cells, edges of the aperture included, (n + 1, m + 1) float64, mm.
         x, y: landing points of the rays that leave there, mm, traced with the gradient of the bicubic spline through z.
         miss: root mean square distance between them and where they were sent, weighted by the source, mm.
+        shift: e, by which the picture was moved in all, (2, n + 1, m + 1) mm.
         corrections: how often the picture was moved.
         transport: the last map.
         seconds: wall time.
@@ -70,6 +71,7 @@ class Start:
     x: np.ndarray
     y: np.ndarray
     miss: float
+    shift: np.ndarray
     corrections: int
     transport: Transport
     seconds: float
@@ -137,7 +139,34 @@ def surface(
         moved, reach = _moved(np.asarray(target, dtype=np.float64), pixel, map_.potential, shift, x, y)
         map_ = solve(source, moved, half, reach, start=map_.potential, **{k: v for k, v in options.items() if k != "start"})
         aim = map_.x + shift[0] + centre[0], map_.y + shift[1] + centre[1]
-    return Start(z, *landing, miss, again, map_, time.perf_counter() - began)
+    return Start(z, *landing, miss, shift, again, map_, time.perf_counter() - began)
+
+
+def finer(
+    start: Start,
+    times: int,
+    source_half,
+    index: float,
+    z_screen: float,
+    directions=None,
+    *,
+    centre=(0.0, 0.0),
+    view: Seen | None = None,
+) -> np.ndarray:
+    """Heights of the same surface at the corners of cells so many times smaller along each axis, its creases as much sharper.
+
+    Args:
+        directions: as of `surface`, at the finer corners; the others as they were there.
+
+    What light cannot be refracted goes on by the map's own slope.
+    """
+    map_ = start.transport.finer(times)
+    coarse, fine = ([corners(k * n, h) for n, h in zip(start.transport.solved.shape, source_half, strict=True)] for k in (1, times))
+    shift = [RectBivariateSpline(*coarse, e)(*fine) for e in start.shift]
+    x, y = fine[0][:, None], fine[1][None, :]
+    aim = tuple(t + e + c for t, e, c in zip((map_.x, map_.y), shift, centre, strict=True))
+    d, dark = _directions(directions, map_.potential.shape), np.zeros(map_.potential.shape, bool)
+    return heights(map_, aim, x, y, d, index, z_screen, float(start.heights.mean()), dark, view)
 
 
 def _moved(target, pixel, potential, shift, x, y) -> tuple[np.ndarray, tuple[float, float]]:

@@ -17,12 +17,16 @@ phi has a kink there and the map a jump.  Two departures make full Newton steps 
     long as that of a round cell of its mass.
 
 The last phi is averaged over a few source cells.  That keeps it convex, and the map stays exactly its gradient.
+
+Between islands of light phi has a kink, which that average rounds off: what light crosses it there falls into the black.  So kinks
+have to be known far more finely than masses: `Transport.finer` takes the average of the same phi over cells as much smaller.  No
+equation is solved for that; its time is linear in cells, and so is its memory, which holds a strip of the raster at a time.
 """
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
@@ -36,17 +40,21 @@ FINE = 4  # raster points a source cell, along each axis
 LEAST = 128  # raster points along an axis
 LEVELS = (64, 16, 4, 1)  # of how many times fewer sites
 ROUGH, WIDE = 0.5, 0.4  # a coarse phi is rounded on a raster so much coarser than the next level's, over such a part of a cell
-MAX_LATTICE = 1024  # the picture is halved until it has at most so many pixels along an axis
+MAX_LATTICE = 2048  # the picture is halved until it has at most so many pixels along an axis
 BOND = 4.0  # border of a missing cell
 COARSE_TOLERANCE, LINEAR_TOLERANCE = 1e-2, 3e-2
 EVENER = (1.0, 0.7, 0.4, 0.2, 0.1, 0.03, 0.0)  # parts of uniform light, if a level fails on the source itself
 DARKEST = 1e-3  # the source is lifted to at least this part of its mean: a cell without light has no derivative
 MAX_CELLS = 4096
+SHARP = (
+    0.75  # width of the average over phi on finer cells, in these: those of Laguerre are wider, so that it keeps no kink but theirs
+)
+STRIP = 128  # columns of corners averaged together, which bounds the memory
 
 
 @dataclass(frozen=True, eq=False)
 class Transport:
-    """A map and what it was made of.
+    """A map and what it was made of: `finer` evaluates it on smaller cells.
 
     Attributes:
         potential: phi at the corners of the source's cells, edges included, (n + 1, m + 1) float64, mm^2; its mean is 0.
@@ -54,6 +62,7 @@ class Transport:
         error: light in the wrong cell, part of the whole (before phi is smoothed).
         sites, steps: point masses of the finest level, and Newton steps of all levels.
         seconds: wall time.
+        solved: prices, sites, picture, and cells and half sizes they are of.
     """
 
     potential: np.ndarray
@@ -63,6 +72,15 @@ class Transport:
     sites: int
     steps: int
     seconds: float
+    solved: _Solved
+
+    def finer(self, times: int) -> Transport:
+        """The same map at the corners of cells so many times smaller along each axis, its kinks sharper by more than that."""
+        began, s = time.perf_counter(), self.solved
+        shape = tuple(times * n for n in s.shape)
+        potential, x, y = _smoothed(s.psi, s.sites, shape, s.half, SHARP)
+        seconds = self.seconds + time.perf_counter() - began
+        return replace(self, potential=potential - potential.mean(), x=x, y=y, seconds=seconds)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +96,16 @@ class _Sites:
     @property
     def lines(self) -> tuple:
         return self.rows, self.first, self.y2
+
+
+@dataclass(frozen=True, eq=False)
+class _Solved:
+    """What a map follows from: prices psi (N,) of the sites, shape and half sizes of the source's cells."""
+
+    psi: np.ndarray
+    sites: _Sites
+    shape: tuple[int, int]
+    half: tuple[float, float]
 
 
 def centres(n: int, half: float, pad: int = 0) -> np.ndarray:
@@ -148,7 +176,8 @@ def solve(
                 found, error = psi, left
         psi = found
     potential, x, y = _smoothed(psi, sites, (n, m), (a, b), smooth)
-    return Transport(potential - potential.mean(), x, y, error, len(psi), steps, time.perf_counter() - began)
+    solved = _Solved(psi, sites, (n, m), (a, b))
+    return Transport(potential - potential.mean(), x, y, error, len(psi), steps, time.perf_counter() - began, solved)
 
 
 def _light(f: np.ndarray, even: float, raster: list, a: float, b: float) -> tuple:
@@ -308,17 +337,19 @@ def _newton(psi, sites: _Sites, raster: list, light: tuple, tolerance: float, mo
     return psi, error, most
 
 
-def _smoothed(psi, sites: _Sites, shape, half, smooth: float) -> list[np.ndarray]:
-    """phi and its gradient, averaged with a triangle over 2 `smooth` source cells, at the cells' corners."""
+def _smoothed(psi, sites: _Sites, shape, half, smooth: float) -> np.ndarray:
+    """phi and its gradient, averaged with a triangle over 2 `smooth` source cells, at the cells' corners: (3, n + 1, m + 1)."""
     box = np.ones(max(round(FINE * smooth), 1))
     kernel = np.convolve(np.convolve(box, box), (1.0, 1.0))  # of even length: centred between two raster points, as corners are
     kernel /= kernel.sum()
     pad = FINE * int(np.ceil(len(kernel) / (2 * FINE)))
-    raster = [centres(FINE * s, h, pad) for s, h in zip(shape, half, strict=True)]
-    phi, site = laguerre.envelope(psi, *sites.lines, *raster)
-    low, out = pad - len(kernel) // 2, []
-    for v in (phi, sites.y1[site], sites.y2[site]):
-        for axis in (0, 1):
-            v = sum(w * v.take(range(low + k, low + k + FINE * shape[axis] + 1, FINE), axis) for k, w in enumerate(kernel))
-        out.append(v)
+    x1, x2 = (centres(FINE * s, h, pad) for s, h in zip(shape, half, strict=True))
+    (n, m), low, out = shape, pad - len(kernel) // 2, np.empty((3, shape[0] + 1, shape[1] + 1))
+    for j in range(0, m + 1, STRIP):
+        count = min(STRIP, m + 1 - j)
+        at = low + FINE * j
+        phi, site = laguerre.envelope(psi, *sites.lines, x1, x2[at : at + FINE * (count - 1) + len(kernel)])
+        for v, mean in zip((phi, sites.y1[site], sites.y2[site]), out, strict=True):
+            v = sum(w * v[low + k : low + k + FINE * n + 1 : FINE] for k, w in enumerate(kernel))
+            mean[:, j : j + count] = sum(w * v[:, k : k + FINE * (count - 1) + 1 : FINE] for k, w in enumerate(kernel))
     return out

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageOps, PngImagePlugin
+from scipy.ndimage import binary_closing
 
 from caustic_cli.errors import InputError
 from caustic_cli.io.arrays import open_npy
@@ -27,6 +28,8 @@ MAX_BYTES = 1 << 30
 ACCEPTED = "an image (PNG, JPEG, TIFF, ...) or a 2-D .npy array is needed"
 #: Luminance of linear sRGB primaries (IEC 61966-2-1, Rec. 709).
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+#: Part of the peak below which a picture is dark, and part of its width below which a dark gap is none.
+DARK, NARROW = 0.01, 0.01
 
 
 def to_linear(value: np.ndarray) -> np.ndarray:
@@ -86,6 +89,21 @@ class Picture:
             at = np.flatnonzero(bright.any(1 - k))
             found.append(float(at[-1] - at[0] + 1) / bright.shape[k] if at.size else 1.0)
         return found[0], found[1]
+
+    @property
+    def gaps(self) -> float:
+        """Dark gaps between its bright parts that a row crosses, and a column, both on the mean: 0 of a photograph or a disc.
+
+        Dark is below a hundredth of the peak, and a gap at least a hundredth of the picture wide.
+        """
+        light = self.irradiance()
+        light = light if light.ndim == 2 else light.sum(0)
+        bright, found = light > DARK * light.max(), 0.0
+        for lines in (bright, bright.T):
+            width = max(1, round(NARROW * lines.shape[1]))
+            joined = binary_closing(np.pad(lines, ((0, 0), (2 * width, 2 * width))), np.ones((1, width)))
+            found += float(np.maximum((joined[:, 1:] & ~joined[:, :-1]).sum(1) - 1, 0).mean())
+        return found
 
     def write(self, path: Path) -> None:
         """Write it losslessly; `path` ends in `suffix`."""

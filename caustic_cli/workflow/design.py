@@ -55,6 +55,9 @@ from caustic_cli.workflow.reporter import Reporter
 
 #: Part of a picture that is brighter than NEARLY of its maximum from which on it looks like a drawing on white.
 GROUND, NEARLY = 0.6, 0.98
+#: Reasons after which a design that says no iterations of its own keeps nothing of its optimiser, which is many times the lens on
+#: disk: to go on begins that anew.
+DONE = ("iterations", "no progress")
 #: Part of a time limit that is left to the iterations, however long the start took.
 LEAST_PART = 0.25
 #: Source cells along a lenslet, at least.
@@ -127,7 +130,7 @@ def begin(
         said.setdefault("source", {}).setdefault("weights", [c / sum(light) for c in light])
     profile = said.get("source", {}).get("profile")
     light = read_picture((config.parent if config else Path()) / profile, linear=True) if profile else None
-    full = complete(said, picture.aspect, by, picture.lit)
+    full = complete(said, picture.aspect, by, picture.lit, picture.gaps)
     settings.refuse_unused(full["source"], given, [stage.get("source") for stage in full["design"]["stages"]])
     farther = full.get("second", {}).get("file")
     second = None
@@ -375,7 +378,8 @@ def _solved(project: Project, fixed: bool) -> tuple[torch.Tensor | None, float |
         scene, goal = designer.scene, grey(target)
         if scene.second is not None:
             return first_sides(scene, goal, project.second_target(scene), designer.field(0)), None
-        cells = transport_cells(max(s.rays for s in designer.stages), not scene.source.collimated)
+        spans = min(n - p for n, p in zip(designer.stages[0].control, scene.lens.degree, strict=True))
+        cells = transport_cells(max(s.rays for s in designer.stages), not scene.source.collimated, spans)
         spread = shift_of(scene) if designer.stages[0].spread else None
         if spread is not None:
             light = best_light(scene, goal, spread, SMOOTH_STEPS)
@@ -484,6 +488,8 @@ def _run(
             on_iteration=on_iteration,
             notice=say.say,
         )
+        if not asked and not chosen["iterations"] and chosen["network"] == "none" and state.reason in DONE:
+            state = replace(state, parameters={}, optimizer={})
         records.keep(state)
         if not asked:
             state.heights = designer.within_limits(state)

@@ -21,11 +21,17 @@ class FusedSurface:
         self.linear = tuple(x for a in self.axes for x in (a.first, a.matrices))
         self.geometry = tuple(x for a in self.axes for x in a.geometry)
         self.grads: np.ndarray | None = None
+        self.last: tuple[Tensor, np.ndarray] | None = None
 
     def coefficients(self, heights: Tensor) -> np.ndarray:
-        """(n, m) mm -> the polynomial of every span product, (I, J, p + 1, q + 1) float64."""
-        out = np.empty(self._coefficients())
-        spline.coefficients(ALL, heights.detach().double().contiguous().numpy(), *self.linear, out)
+        """(n, m) mm -> the polynomial of every span product, (I, J, p + 1, q + 1) float64; those of the last call where the heights
+        are the same, as they are for all rays of an image."""
+        heights = heights.detach().double()
+        if self.last is not None and torch.equal(self.last[0], heights):
+            return self.last[1]
+        self.last, out = None, np.empty(self._coefficients())
+        spline.coefficients(ALL, heights.contiguous().numpy(), *self.linear, out)
+        self.last = heights.clone(), out
         return out
 
     def order(self, x: Tensor, y: Tensor) -> tuple[np.ndarray, int]:
