@@ -181,10 +181,10 @@ def refinement(
 #: knot spans.
 TWO_SIDED = {
     "draft": (8, 500_000, 2, 30),
-    "standard": (64, 4_000_000, 4, 40),
+    "standard": (48, 3_000_000, 4, 50),
     "fine": (64, 4_000_000, 4, 200),
 }
-TWO_SIDED_SPANS = 512
+TWO_SIDED_SPANS = 384
 
 
 def two_sided(control: tuple[int, int], rays: int | None, resolution: tuple[int, int], quality: str = "standard") -> list[Table]:

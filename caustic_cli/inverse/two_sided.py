@@ -25,7 +25,7 @@ from caustic_cli.optics.trace import Parameters, Tracer, tracers
 from caustic_cli.scene import Scene, Screen
 
 #: Angle, rad, that counts as an error of the picture of 1.
-SHARP = 1e-2
+SHARP = 2e-2
 #: Rays that are kept from their value to its gradient, 0.6 KiB each: more are traced twice.
 WHOLE = 1 << 22
 
