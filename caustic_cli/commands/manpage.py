@@ -76,6 +76,9 @@ signal\-to\-noise ratio; structural similarity.
 .B noise, error_estimate
 Standard error of relative_rms, and relative RMS noise of the image, that the retrace's own rays leave.
 .TP
+.B image_kept
+Of render: true where render.png is still an earlier one of the same, with less noise.
+.TP
 .B on_screen, on_target, lost
 Parts of the source's power on the screen, where the target is bright, and lost, by cause; on_screen and all of lost sum to 1.
 .TP

@@ -178,7 +178,7 @@ def _lens(done: workflow.Result) -> Lens:
     return Lens(done.scene, done.field, done.heights, done.target, done.figures, done.project, done.state)
 
 
-def render(lens: Lens | str | Path, rays: float = 1_000_000, **options: Any) -> Render:
+def render(lens: Lens | str | Path, rays: float | None = None, **options: Any) -> Render:
     """`Lens.render` of a lens, or of a project or an archive."""
     return (lens if isinstance(lens, Lens) else load(lens)).render(rays, **options)
 
