@@ -90,7 +90,7 @@ def run(
         raise InputError(f"{output}: is a file; a directory for CSV, JSON and PNG is needed")
     if project is not None:
         options.require_project(project)
-    device = options.start_torch(device, threads, say)
+    device = options.start_torch(device, threads)
 
     from caustic_cli.studies import report  # noqa: PLC0415
     from caustic_cli.workflow.convergence import PLOTS, UNITS, Request, measure  # noqa: PLC0415

@@ -100,7 +100,7 @@ def run(
             path_of(preset)
         picture = read_stdin(ACCEPTED, MAX_BYTES) if piped else target
         read_picture(picture, "target.encoding" in given, given.get("target.color", False), given.get("invert", False))
-    device = options.start_torch(device, threads, say)
+    device = options.start_torch(device, threads)
 
     from caustic_cli.inverse import ranks  # noqa: PLC0415
     from caustic_cli.workflow import library  # noqa: PLC0415

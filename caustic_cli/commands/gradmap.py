@@ -60,7 +60,7 @@ def run(
     size = options.both(options.counts("--filter-size", filter_size))
     points = [options.indices("--control", text) for text in control or []]
     options.require_project(project)
-    device = options.start_torch(device, threads, say)
+    device = options.start_torch(device, threads)
 
     from caustic_cli.config.completion import filter_from  # noqa: PLC0415
     from caustic_cli.io.files import refuse_foreign  # noqa: PLC0415
@@ -72,7 +72,6 @@ def run(
 
     opened = Project.open(project)
     scene = opened.scene()
-    compile_for(scene, device, say)
     scene, field, heights, _ = opened.lens(scene)
     points = points or [(field.shape[0] // 2, field.shape[1] // 2)]
     for i, j in points:
@@ -93,6 +92,7 @@ def run(
         raise InputError(f"--alpha belongs to --reconstruction gaussian, got {reconstruction}")
     filter = filter_from(reconstruction, size, scene.screen, alpha)
     sampler = sampler_for(scene, count, opened.settings["design"]["seed"] if seed is None else seed, device)
+    compile_for(scene, device, say)
     maps = []
     for point, (image, data) in zip(points, files, strict=True):
         gradient = gradmap.gradient_image(

@@ -12,7 +12,6 @@ from typing import Annotated, Any
 import typer
 
 from caustic_cli.commands import console
-from caustic_cli.commands.console import Reporter
 from caustic_cli.config import checks, table
 from caustic_cli.config.table import Setting
 from caustic_cli.errors import InputError, no_project
@@ -342,8 +341,8 @@ def require_project(path: Path, archives: bool = False) -> None:
     raise no_project(path)
 
 
-def start_torch(device: str, threads: int | None, say: Reporter):
-    """Load torch, set its threads, choose the device ("cpu" or "cuda"), and have the CPU's kernels compiled.
+def start_torch(device: str, threads: int | None):
+    """Load torch, set its threads and choose the device ("cpu" or "cuda").
 
     Raises:
         InputError: an unknown device, CUDA asked for but absent, or fewer than one thread.
@@ -358,12 +357,7 @@ def start_torch(device: str, threads: int | None, say: Reporter):
         torch.set_num_threads(threads)
     if device == "cuda" and not torch.cuda.is_available():
         raise InputError("--device cuda: no CUDA device is at hand here; use auto or cpu")
-    device = "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
-    from caustic_cli.workflow.compilation import compile_usual  # noqa: PLC0415
-
-    with say.notify_if_slow("compiling the kernels for this machine, once: about ten seconds"):
-        compile_usual(device)
-    return device
+    return "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
 
 
 def dtype_of(name: str):

@@ -161,7 +161,7 @@ def run(
     if screen_at is not None:
         console.speak(console.spoken() | {"screen.z": "--screen-at"})
     options.require_project(project, archives=True)
-    device = options.start_torch(device, threads, say)
+    device = options.start_torch(device, threads)
 
     from caustic_cli.workflow.render import Request, render  # noqa: PLC0415
 

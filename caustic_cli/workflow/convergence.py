@@ -12,7 +12,7 @@ from caustic_cli.studies import diffraction, effects, intersection, light, train
 from caustic_cli.studies.convergence import run_study
 from caustic_cli.studies.report import Study
 from caustic_cli.workflow import comparison, tradeoff
-from caustic_cli.workflow.compilation import compile_for
+from caustic_cli.workflow.compilation import compile_for, compile_usual
 from caustic_cli.workflow.design import sphere
 from caustic_cli.workflow.lens import Lens
 from caustic_cli.workflow.reporter import Reporter
@@ -56,6 +56,7 @@ def measure(
         InputError: a value out of range.
     """
     seed = asked.seed or 0
+    compile_usual(device, say)
     if name == "intersection":
         case = (
             intersection.of_lens(lens.scene, lens.field, lens.heights, asked.rays, seed)
