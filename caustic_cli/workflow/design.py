@@ -34,6 +34,7 @@ from caustic_cli.inverse.initial_sides import first_sides
 from caustic_cli.inverse.initial_surface import InitialSurface, first_surface
 from caustic_cli.inverse.lenslets import first_array
 from caustic_cli.inverse.reach import largest_magnification, refuse_unreachable
+from caustic_cli.inverse.sharpness import advice
 from caustic_cli.inverse.surface_from_map import OutOfReach
 from caustic_cli.inverse.target import grey
 from caustic_cli.io.files import Piped
@@ -506,6 +507,9 @@ def _run(
             raise Interrupted(f"interrupted when the design was done; {project.path} is whole", 128 + asked[0])
     field = designer.field(found.state.stage)
     scene, heights = sides_of(designer.scene, field, found.state.heights)
+    size = tuple(project.settings["target"]["size"])
+    if not hurry and scene.second is None and (words := advice(scene, grey(target), size, field, heights)):
+        say.say(words)
     return Result(project, scene, field, heights, target, found.state, figures)
 
 
