@@ -63,7 +63,7 @@ The caustic as light makes it, where diffraction is simulated.
 The second picture as used, and as last rendered, of a lens with two.
 .TP
 .I NAME.caustic/report.png
-Target, caustic, lens height, loss against time.
+Target, caustic, its error, lens height and relief, loss against time, where the light goes.
 .SH JSON
 With
 .BR \-\-json ,

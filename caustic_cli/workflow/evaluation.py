@@ -87,6 +87,7 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
         found.figures,
         encoding,
         None if found.waves is None else grey(found.waves),
+        [(stage.blur, bool(stage.waves)) for stage in designer.stages],
     )
     return found
 
