@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,8 +13,10 @@ from scipy.interpolate import BSpline, RectBivariateSpline
 
 from caustic_cli import __version__
 from caustic_cli.errors import InputError
+from caustic_cli.export import FORMATS, obj, ply, stl, surface
+from caustic_cli.export.accuracy import Deviation, of_bilinear, of_patches, of_spline, of_triangles
 from caustic_cli.export.lighttools import write_lighttools
-from caustic_cli.export.mesh import closed_mesh
+from caustic_cli.export.mesh import closed_mesh, patch
 from caustic_cli.export.stl import TRIANGLE, write_stl
 from caustic_cli.export.surface import STEPS_PER_SPAN, sample_grid
 from caustic_cli.optics.sampling import Sample
@@ -21,6 +24,7 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
+from caustic_cli.workflow import export
 
 UNEVEN = (0.0, 0.0, 0.0, 0.0, 0.11, 0.2, 0.2, 0.55, 0.83, 1.0, 1.0, 1.0, 1.0)  # cubic, one double knot
 
@@ -341,3 +345,75 @@ def test_stl_refuses_a_surface_below_its_entrance(tmp_path):
     scene, field, heights = make()
     with pytest.raises(InputError, match="above the entrance"):
         write_stl(tmp_path / "lens.stl", scene, field, heights - 6.0)
+
+
+# how far samples are off, and how large a file is when nothing is said about them
+
+
+def quadratic(c, control=(24, 24)):
+    """A lens whose surface is 5 - c x^2 / 2."""
+    scene, field, _ = make(control=control, degree=(2, 2))
+    one = field.spaces[0]
+    squares = (2.0 * field.half_size[0]) ** 2 * torch.stack(
+        [(one.knots[k + 1] - 0.5) * (one.knots[k + 2] - 0.5) for k in range(one.n)]
+    )  # the blossom of (x - 0)^2
+    return scene, field, 5.0 - 0.5 * c * squares[:, None].expand(field.shape).contiguous()
+
+
+def test_flat_triangles_are_as_far_off_as_a_parabola_says():
+    """Between points h apart a chord of c x^2 / 2 is c h^2 / 8 off in its middle, its slope c h / sqrt(12) in the mean."""
+    scene, field, heights = quadratic(0.01)
+    points = patch(scene.lens, field, heights, (51, 41))
+    found, h = of_triangles(points, field, heights), 10.0 / 50
+    assert found.samples == (51, 41)
+    assert 0.99 * 0.01 * h * h / 8 < found.height <= 0.01 * h * h / 8 * (1 + 1e-9)
+    assert found.slope == pytest.approx(0.01 * h / 12**0.5, rel=0.01)
+    shaded = of_triangles(points, field, heights, shaded=True)
+    assert shaded.height == found.height and shaded.slope < 1e-4 * found.slope  # normals of a parabola are nearly linear
+    grid = sample_grid(field, heights, (51, 41))
+    assert of_bilinear(grid, field, heights).slope == pytest.approx(0.01 * h / 12**0.5, rel=0.01)
+
+
+def test_splines_and_patches_are_off_where_knots_are_no_lines():
+    _, field, heights = make(control=(23, 19))
+    for lay, a_span in ((of_spline, 2), (of_patches, 1)):
+        on = lay(sample_grid(field, heights, (a_span * 20 + 1, a_span * 16 + 1)), field, heights)
+        between = lay(sample_grid(field, heights, (a_span * 20 - 2, a_span * 16 - 2)), field, heights)
+        assert on.height < 1e-12 and on.slope < 1e-11
+        assert between.height > 1e-6 and between.slope > 1e-5
+
+
+def test_shift_is_that_of_traced_light():
+    """What a slope's error moves light by, in pixels, beside a ray through both surfaces."""
+    scene, field, heights = make(relief=0.01)
+    tilt = 1e-5
+    x, _ = field.control_xy()
+    found = {}
+    for name, net in (("designed", heights), ("read", heights + tilt * x[:, None])):
+        u = torch.linspace(0.01, 0.99, 500, dtype=torch.float64)
+        sample = Sample(u, u.flip(0), False, torch.tensor(1 / 500, dtype=torch.float64))
+        (landing,) = Tracer(System.of(scene, field), sample, track=True).land({EXIT: net}, scene.screen)
+        found[name] = torch.stack([landing.origin[0], landing.origin[1]])
+    moved = float((found["read"] - found["designed"]).square().sum(0).mean().sqrt()) / min(scene.screen.pixel)
+    assert Deviation("", (2, 2), 0.0, tilt).figures(scene)["shift_pixels"] == pytest.approx(moved, rel=0.02)
+
+
+@pytest.mark.parametrize("format", ["lighttools", "zemax", "stl", "ply", "obj", "csv", "xyz", "heightmap", "mitsuba"])
+@pytest.mark.parametrize("round", [False, True])
+def test_default_files_keep_to_the_usual_size_and_say_how_far_they_are_off(tmp_path, monkeypatch, format, round):
+    monkeypatch.setattr(surface, "USUAL_BYTES", 400_000)
+    for mesh in (stl, ply, obj):
+        monkeypatch.setattr(mesh, "BESIDE", 50_000)
+    scene, field, heights = make(control=(60, 60))
+    if round:
+        scene = replace(scene, lens=replace(scene.lens, aperture="circle"))
+    file = tmp_path / f"lens{FORMATS[format][0]}"
+    said = export.write(file, scene, field, heights, format)
+    sizes = [f.stat().st_size for f in tmp_path.iterdir() if f.stem.split("-")[-1] not in ("sides", "holder")]
+    assert max(sizes) <= 400_000
+    assert max(sizes) > (20_000 if format == "heightmap" else 150_000)  # as many points as there is room for
+    found = said.get("heightmap", said)
+    assert 0 < found["height_error_mm"] < (1e-12 if format == "zemax" else 1e-2)  # whose patches end at the knots
+    if format not in ("heightmap", "zemax"):
+        finer = export.write(file, scene, field, heights, format, samples=tuple(2 * n for n in found["samples"]))
+        assert finer["height_error_mm"] < found["height_error_mm"] and finer["shift_pixels"] < found["shift_pixels"]

@@ -113,6 +113,15 @@ def test_parts_of_a_kernel_are_the_whole():
     np.testing.assert_allclose(mean, 0.0, atol=0.01)
 
 
+@pytest.mark.parametrize("half", [(0.26, 0.26), (0.46, 0.32)])
+def test_parts_of_a_kernel_look_at_as_many_pixels(half):
+    """A wave image takes as many cut pixels beside the screen for all of them; two halves of a disc reach beyond their points
+    differently."""
+    parts = Spread(half, ((0.0, 0.0, 1.0),), 0.0).parts_on((0.1536, 0.1536), even_disc(2))
+    assert len({part.beside for part in parts}) == len({part.kernel.shape for part in parts}) == 1
+    assert sum(float(part.kernel.sum()) for part in parts) == pytest.approx(len(parts))
+
+
 def test_convolution_has_its_adjoint():
     kernel, g = Convolution(torch.rand(5, 7, dtype=torch.float64), 1), torch.Generator().manual_seed(3)
     a, b = (torch.rand(20, 31, dtype=torch.float64, generator=g) for _ in range(2))

@@ -12,7 +12,7 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Lens, PlaneWave, Scene, Screen
-from caustic_cli.studies.gradmap import compare, difference_step, finite_difference, gradient_image, plot_gradient
+from caustic_cli.studies.gradmap import compare, difference_step, finite_difference, gradient_image, plot_gradient, shown_part
 
 COSINE = Filter("cosine", (3, 5))  # C1: central differences are sharp
 PROFILE = torch.tensor([[1.0, 0.2, 0.0], [0.5, 2.0, 1.0]], dtype=torch.float64)
@@ -157,6 +157,18 @@ def test_plot_shows_the_screen_from_behind_and_repeats_byte_for_byte(tmp_path):
     assert rows.min() > rgb.shape[0] / 2 and columns.min() > map_only.shape[1] / 2
     coloured = (map_only.max(-1) - map_only.min(-1) > 8).sum()  # zeros are white, so nothing else has a colour
     assert coloured < 1.1 * len(rows)
+
+
+def test_a_plot_shows_what_is_not_zero():
+    screen = Screen((40.0, 20.0), 300.0, (100, 50))  # pixels of 0.4 mm
+    gradient = np.zeros((100, 50))
+    assert shown_part(gradient, screen) == [(-20.0, 20.0), (-10.0, 10.0)]
+    gradient[60:72, 20:25] = 1.0
+    (x0, x1), (y0, y1) = shown_part(gradient, screen)
+    np.testing.assert_allclose((x0, x1), (57 * 0.4 - 20.0, 75 * 0.4 - 20.0))
+    assert y1 - y0 == pytest.approx(x1 - x0) and 0.5 * (y0 + y1) == pytest.approx(22.5 * 0.4 - 10.0)
+    gradient[0, 0] = 1.0
+    assert shown_part(gradient, screen)[0][0] == -20.0
 
 
 def test_plot_of_nothing_is_a_plot(tmp_path):

@@ -148,7 +148,7 @@ def test_the_table_and_the_report_say_it_too(capfd, monkeypatch):
     peak, mean = (figures[f"{k}_irradiance"] for k in ("peak", "mean"))
     assert f"peak {peak:.4g} W/mm^2, mean {mean:.4g} W/mm^2" in err
     label, low, high, most, full = bars[0]
-    assert label == f"irradiance (W/mm²): peak {peak:.3g}, mean {mean:.3g}"
+    assert label == f"irradiance (W/mm²)\npeak {peak:.3g}, mean {mean:.3g}"
     assert low == 0 < high and most == pytest.approx(peak) and full == pytest.approx(1.0)
     target = Project.open("blob.caustic").target(Project.open("blob.caustic").scene())
     assert high == pytest.approx(mean * target.max() / target.mean())  # white, as in render.png
@@ -159,6 +159,7 @@ def test_the_table_and_the_report_say_it_too(capfd, monkeypatch):
 def test_a_report_of_any_brightness(tmp_path, mean, encoding):
     target = np.random.default_rng(0).random((12, 9))
     figures = {"relative_rms": 0.1, "mean_irradiance": mean, "peak_irradiance": 2.0 * mean, "irradiance_unit": "lux"}
+    figures |= {"on_screen": 0.9, "on_target": 0.8, "lost": {"fresnel": 0.1}}
     history = np.array([[1, 0, 0.1, 0.9, 0.1], [2, 0, 0.05, 0.9, 0.2]])
     write_report(
         tmp_path / "r.png",

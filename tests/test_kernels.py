@@ -7,12 +7,15 @@ torch's rays are compared with theirs, to 1e-5.
 
 from __future__ import annotations
 
+import time
+
 import numba
 import numpy as np
 import pytest
 import torch
 from helpers import pairwise
 
+from caustic_cli.commands import console
 from caustic_cli.optics.backends import backend_for, plain
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.frames import IDENTITY
@@ -244,6 +247,25 @@ def test_the_first_run_compiles_what_designs_and_renders_use(dtype):
         image, *_ = next(exposures(scene("schlick"), heights().requires_grad_(), FILTERS[-1], kind, dtype, rays))
         image.sum().backward()
     assert [list(kernel.signatures) for kernel in kernels] == ahead
+
+
+def test_compilation_is_spoken_of_where_something_is_compiled(monkeypatch):
+    """Once a block; not for what is compiled already, nor for what is slow but compiles nothing."""
+    monkeypatch.setattr(compilation, "PATIENCE", 0.05)
+    said = []
+    say = console.Reporter(False)
+    monkeypatch.setattr(say, "say", said.append)
+    slow = numba.njit(lambda x: np.cos(np.sin(x)) + np.ones(3).sum())
+    with compilation.told_of(say, "compiling"):
+        time.sleep(0.1)
+        assert said == []
+        for x in (1.0, 1, 1j, np.float32(1.0)):  # four signatures
+            slow(x)
+    assert said == ["compiling"]
+    with compilation.told_of(say, "again"):
+        slow(2.0)
+        time.sleep(0.1)
+    assert said == ["compiling"]
 
 
 def test_parts_of_the_first_run_are_shared_out():

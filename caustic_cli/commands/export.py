@@ -39,7 +39,11 @@ def run(
     ] = None,
     samples: Annotated[
         str | None,
-        typer.Option(metavar="N[xM]", help="Points along x and y.  [default: 4 a knot span, so that every knot is a grid line]"),
+        typer.Option(
+            metavar="N[xM]",
+            help="Points along x and y.  [default: 4 a knot span, so that every knot is a grid line; fewer where the file would"
+            " be larger than 20 MB]",
+        ),
     ] = None,
     tolerance: Annotated[
         float | None,
@@ -98,7 +102,7 @@ def run(
     count = tuple(options.both(options.counts("--samples", samples))) if samples else None
     given_of = {"mould": mould or None, "block": block, "samples": count, "tolerance": tolerance, "milling": milling or None}
 
-    from caustic_cli.workflow.export import export  # noqa: PLC0415
+    from caustic_cli.workflow.export import accuracy_words, export  # noqa: PLC0415
 
     all_figures = []
     for name in formats:
@@ -109,7 +113,9 @@ def run(
         all_figures.append(figures)
         if reused:
             continue
-        for file in (figures["file"], *figures.get("beside", ())):
+        words = accuracy_words(figures)
+        say.say(f"{figures['file']}: {figures['bytes']:,} bytes{f', {words}' if words else ''}")
+        for file in figures.get("beside", ()):
             say.say(f"{file}: {Path(file).stat().st_size:,} bytes")
         if "milling" in figures:
             from caustic_cli.studies.scallops import rows  # noqa: PLC0415

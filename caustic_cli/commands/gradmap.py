@@ -73,7 +73,6 @@ def run(
 
     opened = Project.open(project).at(at)
     scene = opened.scene()
-    compile_for(scene, device, say)
     scene, field, heights, _ = opened.lens(scene)
     points = points or [(field.shape[0] // 2, field.shape[1] // 2)]
     for i, j in points:
@@ -94,6 +93,7 @@ def run(
         raise InputError(f"--alpha belongs to --reconstruction gaussian, got {reconstruction}")
     filter = filter_from(reconstruction, size, scene.screen, alpha)
     sampler = sampler_for(scene, count, opened.settings["design"]["seed"] if seed is None else seed, device)
+    compile_for(scene, device, say)
     maps = []
     for point, (image, data) in zip(points, files, strict=True):
         gradient = gradmap.gradient_image(

@@ -63,7 +63,7 @@ The caustic as light makes it, where diffraction is simulated.
 The second picture as used, and as last rendered, of a lens with two.
 .TP
 .I NAME.caustic/report.png
-Target, caustic, lens height, loss against time.
+Target, caustic, its error, lens height and relief, loss against time, where the light goes.
 .SH JSON
 With
 .BR \-\-json ,
@@ -75,6 +75,9 @@ signal\-to\-noise ratio; structural similarity.
 .TP
 .B noise, error_estimate
 Standard error of relative_rms, and relative RMS noise of the image, that the retrace's own rays leave.
+.TP
+.B image_kept
+Of render: true where render.png is still an earlier one of the same, with less noise.
 .TP
 .B on_screen, on_target, lost
 Parts of the source's power on the screen, where the target is bright, and lost, by cause; on_screen and all of lost sum to 1.

@@ -399,8 +399,7 @@ def require_project(path: Path, archives: bool = False) -> None:
 
 
 def start_torch(device: str, threads: int | None, say: Reporter):
-    """Load torch, set its threads, choose the device ("cpu" or "cuda"), and have the CPU's kernels compiled.  What traces on a CUDA
-    device, and why not, is said.
+    """Load torch, set its threads and choose the device ("cpu" or "cuda").  What traces on a CUDA device, and why not, is said.
 
     Raises:
         InputError: an unknown device, CUDA asked for but absent, or fewer than one thread.
@@ -415,12 +414,9 @@ def start_torch(device: str, threads: int | None, say: Reporter):
         torch.set_num_threads(threads)
     if device == "cuda" and not torch.cuda.is_available():
         raise InputError("--device cuda: no CUDA device is at hand here; use auto or cpu")
-    from caustic_cli.workflow.compilation import choose_device, compile_usual  # noqa: PLC0415
+    from caustic_cli.workflow.compilation import choose_device  # noqa: PLC0415
 
-    device = choose_device(device, say)
-    with say.notify_if_slow("compiling the kernels for this machine, once: about ten seconds"):
-        compile_usual(device)
-    return device
+    return choose_device(device, say)
 
 
 def dtype_of(name: str):

@@ -25,7 +25,14 @@ def run(
         typer.Argument(help="Project directory made by caustic design, or an .npz made by caustic export.", show_default=False),
     ],
     given: dict[str, Any],
-    rays: Annotated[str, typer.Option(metavar="N", help="Number of rays, independent of those of the design.")] = "1000000",
+    rays: Annotated[
+        str | None,
+        typer.Option(
+            metavar="N",
+            help="Number of rays, independent of those of the design.  [default: as at the end of a design: 4e6, of other light"
+            " than a plane wave's up to 1.6e7 until the noise is a tenth of the error; with --tolerance, 1e6]",
+        ),
+    ] = None,
     tolerance: Annotated[
         float | None,
         typer.Option(
@@ -57,7 +64,8 @@ def run(
             "-o",
             "--out",
             metavar="PNG",
-            help="Image to write.  [default: render.png in PROJECT; of an archive, its name + -render.png, here]",
+            help="Image to write, a pixel for each of the screen's.  [default: render.png in PROJECT, at least 800 pixels wide,"
+            " unless a less noisy one of the same is there; of an archive, its name + -render.png, here]",
         ),
     ] = None,
     npy: Annotated[
@@ -133,7 +141,7 @@ def run(
 ) -> None:
     """Trace the lens of PROJECT; write the irradiance image and its figures."""
     say = console.Reporter(quiet, progress)
-    count = options.rays("--rays", rays)
+    count = None if rays is None else options.rays("--rays", rays)
     if tolerance is not None and not 0 < tolerance < 100:
         raise InputError(f"--tolerance must be greater than 0 and less than 100, got {tolerance:g}")
     size = options.both(options.counts("--filter-size", filter_size))

@@ -5,21 +5,24 @@ seen from +z.  Height = z_of_zero + value * mm_per_count, the same for both; a J
 the part lies (`part`), and the net on which the surface is a spline, so that it can be read in again as that.
 
 Without samples there are so many points that a bilinear surface through them is within `TOLERANCE` of the spline, by bounds of its
-second derivatives, and at least two a knot span.  Heights are rounded to the nearest count: half a quantum.
+second derivatives, and at least two a knot span, as far as a file of the usual size holds them.  Heights are rounded to the nearest
+count: half a quantum.  How far a bilinear surface through what is written is off is measured.
 """
 
 from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from PIL import Image, PngImagePlugin, TiffImagePlugin
 
 from caustic_cli.errors import InputError
+from caustic_cli.export.accuracy import of_bilinear
 from caustic_cli.export.part import Part, surface_of
-from caustic_cli.export.surface import MAX_SAMPLES, SurfaceGrid, sample_grid, step_within
+from caustic_cli.export.surface import MAX_SAMPLES, SurfaceGrid, most_points, sample_grid, step_within
 from caustic_cli.export.text import CREATED
 from caustic_cli.io.files import SOFTWARE, atomic_path, write_bytes
 from caustic_cli.io.heightmaps import COUNTS, SUFFIXES, VERSION, beside
@@ -28,6 +31,8 @@ from caustic_cli.io.heightmaps import COUNTS, SUFFIXES, VERSION, beside
 TOLERANCE = 1e-4
 #: Points a knot span of the default, at least.
 A_SPAN = 2
+#: Bytes of a point.
+SUFFIX_BYTES = {".png": 2, ".tif": 4, ".tiff": 4}
 
 
 def write_heightmap(path: str | Path, part: Part, samples: tuple[int, int] | None = None, tolerance: float | None = None) -> dict:
@@ -48,7 +53,7 @@ def write_heightmap(path: str | Path, part: Part, samples: tuple[int, int] | Non
         raise InputError(f"{path}: a height map is written as {', '.join(SUFFIXES)}")
     if samples is not None and tolerance is not None:
         raise InputError("⟨samples⟩ and ⟨tolerance⟩ both say how fine the map is: give one of them")
-    grid = sample_grid(part.field, part.heights, samples or _counts(part, TOLERANCE if tolerance is None else tolerance))
+    grid = sample_grid(part.field, part.heights, samples or _counts(part, suffix, tolerance))
     low, high = float(grid.z.min()), float(grid.z.max())
     picture = np.ascontiguousarray(grid.z.T[::-1])  # rows from +y down
     if suffix == ".png":
@@ -65,17 +70,25 @@ def write_heightmap(path: str | Path, part: Part, samples: tuple[int, int] | Non
         more = {"format": "TIFF", "tiffinfo": tags}
     with atomic_path(path) as temporary:
         Image.fromarray(values).save(temporary, **more)
+    written = replace(grid, z=(low + scale * values.astype(np.float64))[::-1].T.copy())
     said = _said(part, grid, path.name, low, high, scale, quantum)
+    said["height_error_mm"] = of_bilinear(written, part.field, part.heights).height
     write_bytes(beside(path), (json.dumps(said, indent=1, allow_nan=False) + "\n").encode())
     return said
 
 
-def _counts(part: Part, tolerance: float) -> tuple[int, int]:
+def _counts(part: Part, suffix: str, asked: float | None) -> tuple[int, int]:
+    """Points along x and y: what was asked, or the usual tolerance, as far as a file of the usual size holds it."""
+    tolerance = TOLERANCE if asked is None else asked
     step = step_within(part.field, part.heights, tolerance)
     counts = [
         max(math.ceil(2.0 * r / step), A_SPAN * (len(s.breaks) - 1)) + 1
         for s, r in zip(part.field.spaces, part.field.half_size, strict=True)
     ]
+    most = most_points(SUFFIX_BYTES[suffix])
+    if asked is None and math.prod(counts) > most:
+        shrink = math.sqrt(most / math.prod(counts))
+        counts = [max(2, math.floor(shrink * n)) for n in counts]
     if max(counts) > MAX_SAMPLES:
         raise InputError(f"⟨tolerance⟩ {tolerance:g} must ask for at most {MAX_SAMPLES} points along an axis, got {max(counts)}")
     return counts[0], counts[1]

@@ -18,7 +18,8 @@ from torch import Tensor
 
 from caustic_cli import __version__
 from caustic_cli.errors import InputError
-from caustic_cli.export.surface import sample_grid
+from caustic_cli.export.accuracy import Deviation, of_spline
+from caustic_cli.export.surface import SurfaceGrid, most_points, sample_grid
 from caustic_cli.io.files import MARK, atomic_path
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import front_of
@@ -26,12 +27,14 @@ from caustic_cli.scene import Scene, Screen, Source
 from caustic_cli.scene.elements import SIDES
 
 FORMAT_VERSION = 1
+#: Bytes of a point in `points`, `normals` and `z`, and of all that is neither that nor a control net, about.
+A_POINT, BESIDE = 7 * 8, 100_000
 
 
 def write_lighttools(
     path: str | Path, scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None
-) -> None:
-    """Write the archive whole or not at all.
+) -> Deviation:
+    """Write the archive whole or not at all; how far a spline through its cloud is off, whose exact one stands beside it.
 
     Keys: points, normals (N, 3); shape (2,); x (nx,), y (ny,), z (nx, ny); lens_half_size (2,), z_in, refractive_index;
     screen_half_size (2,), z_screen, resolution (2,); those of `_screen` and `_source`; fresnel unless exact; aperture if a circle;
@@ -40,12 +43,12 @@ def write_lighttools(
 
     Args:
         heights: (n, m) control heights, mm.
-        samples: (nx, ny) of the cloud, or None for a grid on the knots (`sample_grid`).
+        samples: (nx, ny) of the cloud, or None for as many as `USUAL_BYTES` hold, at most a grid on the knots (`sample_grid`).
 
     Raises:
         InputError: the samples are too few or too many, or the file cannot be written there.
     """
-    grid = sample_grid(field, heights, samples)
+    grid = usual_cloud(scene, field, heights, samples)
     x, y = (c.numpy() for c in field.control_xy())
     x, y = np.broadcast_arrays(x[:, None], y[None, :])
     arrays = {
@@ -80,6 +83,13 @@ def write_lighttools(
         np.savez(file, **arrays)  # dates every entry 1980-01-01
         with zipfile.ZipFile(file, "a") as archive:
             archive.comment = MARK
+    return of_spline(grid, field, heights)
+
+
+def usual_cloud(scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None) -> SurfaceGrid:
+    """The grid of an archive's cloud, beside the nets that it holds too; arguments as of `write_lighttools`."""
+    nets = 24 * (heights.numel() + (0 if scene.lens.front is None else front_of(scene.lens).heights.numel()))
+    return sample_grid(field, heights, samples, most_points(A_POINT, nets + BESIDE))
 
 
 def _entrance(scene: Scene) -> dict[str, np.ndarray]:

@@ -16,7 +16,8 @@ import numpy as np
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.export.surface import SurfaceGrid, sample_grid
+from caustic_cli.export.lighttools import usual_cloud
+from caustic_cli.export.surface import SurfaceGrid
 from caustic_cli.export.text import CREATED, real
 from caustic_cli.io.files import atomic_path, write_bytes
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -172,7 +173,7 @@ def write_script(
     for word, value in words.items():
         text = text.replace(word, value)
     write_bytes(script, text.encode())
-    _write_block(block, scene, sample_grid(field, heights, samples))
+    _write_block(block, scene, usual_cloud(scene, field, heights, samples))
 
 
 def _write_block(path: Path, scene: Scene, grid: SurfaceGrid) -> None:

@@ -28,16 +28,20 @@ from caustic_cli.export.bodies import bodies
 from caustic_cli.export.surface import (
     MAX_POINTS,
     MAX_SAMPLES,
-    default_samples,
+    STEPS_PER_SPAN,
+    even_counts,
     grid_within,
     sample_grid,
     second_derivative_bounds,
+    usual_steps,
 )
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import front_of
 from caustic_cli.scene import Lens, Scene
 
 STRETCH = 1.28
+#: Bytes of walls and entrance in a file of a mesh, about, beside those of the points that it is made of.
+BESIDE = 1e6
 #: Height of the flange, as a part of the least height on the rim.
 FLANGE = 0.5
 
@@ -51,7 +55,12 @@ class Patch:
 
 
 def closed_mesh(
-    scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None, tolerance: float | None = None
+    scene: Scene,
+    field: HeightField,
+    heights: Tensor,
+    samples: tuple[int, int] | None = None,
+    tolerance: float | None = None,
+    most: int | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) float64 mm and faces (F, 3) int64 of the solid, and of those of other elements.
 
@@ -59,34 +68,59 @@ def closed_mesh(
         heights: (n, m) control heights, mm.
         samples: (nx, ny) points on the exit surface, or None for a grid on the knots (`sample_grid`); other elements have theirs.
         tolerance: mm, instead of samples: as many points as keep every triangle so close to the exit surface (chord error).
+        most: points of both sides, where neither is given.
 
     Raises:
         InputError: samples and tolerance both; too few or too many points; or the surface reaches the entrance.
     """
-    parts = [lens_mesh(scene.lens, field, heights, samples, tolerance)]
+    sides = patches(scene.lens, field, heights, samples, tolerance, most)
+    return solids(scene, sides, tolerance, most)
+
+
+def solids(
+    scene: Scene, sides: tuple[Patch, ...], tolerance: float | None = None, most: int | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of the solid around these sides of the lens, and of the scene's other elements, of at most so many points
+    each."""
+    parts = [solid_of(scene.lens, *sides)]
     for body in bodies(scene):
-        vertices, faces = lens_mesh(body.lens, body.field, body.heights, None, tolerance)
+        vertices, faces = solid_of(body.lens, *patches(body.lens, body.field, body.heights, None, tolerance, most))
         parts.append((body.placed(vertices), faces))
     counts = np.cumsum([0, *(len(v) for v, _ in parts)])
     return np.concatenate([v for v, _ in parts]), np.concatenate([f + k for (_, f), k in zip(parts, counts, strict=False)])
 
 
-def lens_mesh(
-    lens: Lens, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None, tolerance: float | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """That of one lens or mirror."""
-    if lens.front is not None:
-        return _between(*(side.points for side in both_patches(lens, field, heights, samples, tolerance)), lens)
-    return solid(patch(lens, field, heights, samples, tolerance).points, lens)
+def patches(
+    lens: Lens,
+    field: HeightField,
+    heights: Tensor,
+    samples: tuple[int, int] | None = None,
+    tolerance: float | None = None,
+    most: int | None = None,
+) -> tuple[Patch, ...]:
+    """The sides of a solid that are free-form, the exit last; arguments as of `closed_mesh`."""
+    if lens.front is None:
+        return (patch(lens, field, heights, samples, tolerance, most),)
+    return both_patches(lens, field, heights, samples, tolerance, None if most is None else most // 2)
+
+
+def solid_of(lens: Lens, *sides: Patch) -> tuple[np.ndarray, np.ndarray]:
+    """The closed mesh around such sides."""
+    return solid(sides[0].points, lens) if len(sides) == 1 else _between(*(side.points for side in sides), lens)
 
 
 def both_patches(
-    lens: Lens, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None, tolerance: float | None = None
+    lens: Lens,
+    field: HeightField,
+    heights: Tensor,
+    samples: tuple[int, int] | None = None,
+    tolerance: float | None = None,
+    most: int | None = None,
 ) -> tuple[Patch, Patch]:
-    """Free-form entrance and exit of a lens, on as many points, normals towards +z; arguments as of `closed_mesh`."""
+    """Free-form entrance and exit of a lens, on as many points, normals towards +z; arguments as of `patch`."""
     entrance = front_of(lens)
     surfaces = (entrance.field, entrance.heights + lens.z_in), (field, heights)
-    found = [patch(lens, *surface, samples, tolerance) for surface in surfaces]
+    found = [patch(lens, *surface, samples, tolerance, most) for surface in surfaces]
     shapes = [p.points.shape[:2] for p in found]
     if shapes[0] != shapes[1]:
         found = [patch(lens, *surface, (max(s[0] for s in shapes), max(s[1] for s in shapes))) for surface in surfaces]
@@ -113,9 +147,14 @@ def _between(low: np.ndarray, high: np.ndarray, lens: Lens) -> tuple[np.ndarray,
 
 
 def patch(
-    lens: Lens, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None, tolerance: float | None = None
+    lens: Lens,
+    field: HeightField,
+    heights: Tensor,
+    samples: tuple[int, int] | None = None,
+    tolerance: float | None = None,
+    most: int | None = None,
 ) -> Patch:
-    """The exit surface within the aperture, by samples or tolerance as of `closed_mesh`.
+    """The exit surface within the aperture, by samples or tolerance as of `closed_mesh`; most: points without either.
 
     Raises:
         InputError: both were given, they ask for too few or too many points, or a tolerance for a round lens with kinks.
@@ -123,15 +162,18 @@ def patch(
     if samples is not None and tolerance is not None:
         raise InputError("⟨samples⟩ and ⟨tolerance⟩ both say how fine the mesh is: give one of them")
     if lens.round:
-        return _round_patch(field, heights, _across(field, heights, samples, tolerance))
+        return _round_patch(field, heights, _across(field, heights, samples, tolerance, most))
+    if samples is None and most is not None and usual_steps(field.spaces, most) < STEPS_PER_SPAN:
+        samples = even_counts(field.spaces, most)  # what is flat between points has nothing of knots among them
     grid = sample_grid(field, heights, samples) if tolerance is None else grid_within(field, heights, tolerance)
     return Patch(*(a.reshape(*grid.z.shape, 3) for a in (grid.points, grid.normals)))
 
 
-def _across(field: HeightField, heights: Tensor, samples: tuple[int, int] | None, tolerance: float | None) -> int:
+def _across(field: HeightField, heights: Tensor, samples: tuple[int, int] | None, tolerance: float | None, most: int | None) -> int:
     """Points along a diameter of a round lens."""
     if tolerance is None:
-        counts = samples or [default_samples(s) for s in field.spaces]
+        counts = samples or [STEPS_PER_SPAN * (len(s.breaks) - 1) + 1 for s in field.spaces]
+        counts = counts if samples or most is None else [min(max(counts), math.isqrt(most))] * 2
         n, asked = max(checks.pair("⟨samples⟩", counts, lambda w, k: checks.whole(w, k, 2, MAX_SAMPLES))), "⟨samples⟩"
     else:
         checks.number("⟨tolerance⟩", tolerance, 0.0, open_low=True)

@@ -26,10 +26,11 @@ import numpy as np
 from torch import Tensor
 
 from caustic_cli.errors import InputError
+from caustic_cli.export.accuracy import Deviation, of_triangles
 from caustic_cli.export.bodies import bodies
-from caustic_cli.export.mesh import Patch, both_patches, patch, refuse_open, rim_of, triangles
-from caustic_cli.export.ply import write_mesh
-from caustic_cli.export.surface import STEPS_PER_SPAN
+from caustic_cli.export.mesh import Patch, both_patches, patches, refuse_open, rim_of, triangles
+from caustic_cli.export.ply import FACE, write_mesh
+from caustic_cli.export.surface import STEPS_PER_SPAN, most_points
 from caustic_cli.export.text import CREATED, real
 from caustic_cli.io.files import write_bytes
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -45,6 +46,8 @@ BEFORE, WIDE = 1.0, 50.0
 DEPTH = 4
 #: Corners of a round lens' holder.
 RING = 1024
+#: Bytes of a point with its normal, and of its two triangles.
+A_POINT = 6 * 8 + 2 * FACE.itemsize
 #: Points along an axis of a mesh that Mitsuba loads in seconds.
 QUICK = 2048
 #: Width of the black frame around other elements, in parts of their own.
@@ -76,21 +79,24 @@ def write_mitsuba(
     samples: tuple[int, int] | None = None,
     tolerance: float | None = None,
     dark: bool = False,
-) -> None:
-    """Write the meshes and then the scene.  Arguments as of `closed_mesh`; `dark`: without its light, whatever that is.
+) -> Deviation:
+    """Write the meshes and then the scene; how far the exit's triangles are off.
+
+    Arguments as of `closed_mesh`; `dark`: without its light, whatever that is.
 
     Raises:
         InputError: as `closed_mesh`; a light that Mitsuba has no emitter for; or the files cannot be written there.
     """
-    light, surface = [] if dark else _light(scene), patch(scene.lens, field, heights, samples, tolerance)
+    light = [] if dark else _light(scene)
+    *fronts, surface = patches(
+        scene.lens, field, heights, samples, tolerance, (1 if scene.lens.front is None else 2) * most_points(A_POINT, 1e3)
+    )
+    found, front = of_triangles(surface, field, heights, shaded=True), fronts[0] if fronts else None
     if scene.lens.mirror:
         _write_mirror(path, scene, surface, light)
-        return
-    front = None
-    if scene.lens.front is None:
+        return found
+    if front is None:
         refuse_open(float(surface.points[..., 2].min()), scene.lens.z_in)
-    else:
-        front, surface = both_patches(scene.lens, field, heights, samples, tolerance)
     exit_mesh, sides = companions(path, False)
     points, normals = (a.reshape(-1, 3) for a in (surface.points, surface.normals))
     write_mesh(exit_mesh, points, triangles(surface.points), normals, text=False)
@@ -124,6 +130,7 @@ def write_mitsuba(
         "",
     ]
     write_bytes(path, "\n".join(lines).encode())
+    return found
 
 
 def _others(path: str | Path, scene: Scene) -> list[str]:

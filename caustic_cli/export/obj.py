@@ -6,7 +6,10 @@ from pathlib import Path
 
 from torch import Tensor
 
-from caustic_cli.export.mesh import closed_mesh
+from caustic_cli.export.accuracy import Deviation, of_triangles
+from caustic_cli.export.mesh import BESIDE, patches, solids
+from caustic_cli.export.ply import A_POINT
+from caustic_cli.export.surface import most_points
 from caustic_cli.export.text import CREATED, rows
 from caustic_cli.io.files import atomic_path
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -20,10 +23,13 @@ def write_obj(
     heights: Tensor,
     samples: tuple[int, int] | None = None,
     tolerance: float | None = None,
-) -> None:
-    """Write the solid whole or not at all.  Arguments and errors as of `closed_mesh`; InputError also if it cannot be written."""
-    vertices, faces = closed_mesh(scene, field, heights, samples, tolerance)
+) -> Deviation:
+    """Write the solid whole or not at all; arguments, errors and what comes back as of `write_ply`."""
+    most = most_points(A_POINT, BESIDE)
+    sides = patches(scene.lens, field, heights, samples, tolerance, most)
+    vertices, faces = solids(scene, sides, tolerance, most)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write(f"# {CREATED}\n# millimetres\no lens\n".encode())
         file.writelines(rows(vertices, "v %.17g %.17g %.17g\n"))
         file.writelines(rows(faces + 1, "f %d %d %d\n"))
+    return of_triangles(sides[-1], field, heights)

@@ -12,12 +12,16 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from caustic_cli.export.mesh import closed_mesh
+from caustic_cli.export.accuracy import Deviation, of_triangles
+from caustic_cli.export.mesh import BESIDE, patches, solids
+from caustic_cli.export.surface import most_points
 from caustic_cli.export.text import CREATED, rows
 from caustic_cli.io.files import atomic_path
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 
+#: Bytes of a point's three numbers and two triangles, as text, at most.
+A_POINT = 3 * 21 + 2 * 23
 FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
 
 
@@ -28,9 +32,15 @@ def write_ply(
     heights: Tensor,
     samples: tuple[int, int] | None = None,
     tolerance: float | None = None,
-) -> None:
-    """Write the solid whole or not at all.  Arguments and errors as of `closed_mesh`; InputError also if it cannot be written."""
-    write_mesh(path, *closed_mesh(scene, field, heights, samples, tolerance))
+) -> Deviation:
+    """Write the solid whole or not at all; how far its triangles are off.
+
+    Arguments and errors as of `closed_mesh`; InputError also if it cannot be written.
+    """
+    most = most_points(A_POINT, BESIDE)
+    sides = patches(scene.lens, field, heights, samples, tolerance, most)
+    write_mesh(path, *solids(scene, sides, tolerance, most))
+    return of_triangles(sides[-1], field, heights)
 
 
 def write_mesh(

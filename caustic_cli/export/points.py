@@ -12,33 +12,39 @@ from pathlib import Path
 
 from torch import Tensor
 
-from caustic_cli.export.surface import default_samples, sample_grid
+from caustic_cli.export.accuracy import Deviation, of_spline
+from caustic_cli.export.surface import most_points, sample_grid
 from caustic_cli.export.text import CREATED, rows
 from caustic_cli.io.files import atomic_path
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 
-#: Most points along an axis of the default cloud, which keep it under 20 MB; ⟨samples⟩ asks for more.
-MOST = 577
+#: Bytes of a point's three numbers, as text, at most.
+A_POINT = 3 * 21
 HEADER = "x_mm,y_mm,z_mm\n"
 
 
-def write_csv(path: str | Path, scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None) -> None:
-    """Write the table whole or not at all.  Arguments and errors as of `sample_grid`; InputError also if it cannot be written."""
-    _write(path, field, heights, samples, HEADER, "%.17g,%.17g,%.17g\n")
+def write_csv(
+    path: str | Path, scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None
+) -> Deviation:
+    """Write the table whole or not at all; how far a spline through its points is off.
+
+    Arguments and errors as of `sample_grid`; InputError also if it cannot be written.
+    """
+    return _write(path, field, heights, samples, HEADER, "%.17g,%.17g,%.17g\n")
 
 
-def write_xyz(path: str | Path, scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None) -> None:
-    """Write the points whole or not at all, below a comment that begins with #; arguments and errors as of `write_csv`."""
-    _write(path, field, heights, samples, f"# {CREATED}, millimetres\n", "%.17g %.17g %.17g\n")
+def write_xyz(
+    path: str | Path, scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None
+) -> Deviation:
+    """Write the points whole or not at all, below a comment that begins with #; all else as of `write_csv`."""
+    return _write(path, field, heights, samples, f"# {CREATED}, millimetres\n", "%.17g %.17g %.17g\n")
 
 
-def _write(path, field: HeightField, heights: Tensor, samples, head: str, form: str) -> None:
-    counts = tuple(default_samples(s) for s in field.spaces)
-    if samples is None and max(counts) > MOST:
-        samples = (min(MOST, counts[0]), min(MOST, counts[1]))
-    grid = sample_grid(field, heights, samples)
+def _write(path, field: HeightField, heights: Tensor, samples, head: str, form: str) -> Deviation:
+    grid = sample_grid(field, heights, samples, most_points(A_POINT))
     points = grid.points.reshape(*grid.z.shape, 3).swapaxes(0, 1).reshape(-1, 3)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write(head.encode())
         file.writelines(rows(points, form))
+    return of_spline(grid, field, heights)

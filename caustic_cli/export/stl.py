@@ -18,7 +18,9 @@ from torch import Tensor
 
 from caustic_cli import __version__
 from caustic_cli.errors import InputError
-from caustic_cli.export.mesh import closed_mesh
+from caustic_cli.export.accuracy import Deviation, of_triangles
+from caustic_cli.export.mesh import BESIDE, patches, solids
+from caustic_cli.export.surface import most_points
 from caustic_cli.io.files import atomic_path
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
@@ -37,19 +39,22 @@ def write_stl(
     heights: Tensor,
     samples: tuple[int, int] | None = None,
     tolerance: float | None = None,
-) -> None:
-    """Write the solid whole or not at all.  Arguments as of `closed_mesh`.
+) -> Deviation:
+    """Write the solid whole or not at all.  Arguments as of `closed_mesh`; how far its triangles are off.
 
     Raises:
         InputError: as `closed_mesh`; points closer than float32 can tell apart; or the file cannot be written there.
     """
-    vertices, faces = closed_mesh(scene, field, heights, samples, tolerance)
+    most = most_points(2 * TRIANGLE.itemsize, BESIDE)
+    sides = patches(scene.lens, field, heights, samples, tolerance, most)
+    vertices, faces = solids(scene, sides, tolerance, most)
     vertices = vertices.astype("<f4")
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write(HEADER)
         file.write(np.array(len(faces), "<u4").tobytes())
         for start in range(0, len(faces), BLOCK):
             file.write(_records(vertices[faces[start : start + BLOCK]]).tobytes())
+    return of_triangles(sides[-1], field, heights)
 
 
 def _records(corners: np.ndarray) -> np.ndarray:

@@ -33,8 +33,8 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 #: Equal steps per knot span of the default grid.  With 2 a not-a-knot bicubic is exact already; with 4 a natural one,
 #: whose end conditions are wrong, is good to some micrometres on the screen too.
 STEPS_PER_SPAN = 4
-#: Most lines along an axis of the default grid, as long as one a knot span is no more: finer nets would make files of gigabytes.
-MOST_LINES = 3072
+#: Bytes of a file that whoever says nothing about its samples gets, at most.
+USUAL_BYTES = 20_000_000
 #: Most samples along one axis, and most points: 5e7 points are 2.8 GB of points, normals and heights.
 MAX_SAMPLES = 20_000
 MAX_POINTS = 50_000_000
@@ -64,30 +64,51 @@ class SurfaceGrid:
         return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
-def steps_per_span(space: SplineSpace) -> int:
-    """Equal steps per knot span of the default grid: `STEPS_PER_SPAN`, or fewer on a fine net."""
-    return max(1, min(STEPS_PER_SPAN, MOST_LINES // (len(space.breaks) - 1)))
+def most_points(a_point: float, beside: float = 0.0) -> int:
+    """Points that a file of `USUAL_BYTES` holds at so many bytes each, `beside` what else is in it."""
+    return max(4, int((USUAL_BYTES - beside) / a_point))
 
 
-def default_samples(space: SplineSpace) -> int:
-    """Points of the default grid along an axis."""
-    return steps_per_span(space) * (len(space.breaks) - 1) + 1
+def usual_steps(spaces: Sequence[SplineSpace], most: int) -> int:
+    """Equal steps a knot span that are usual, `STEPS_PER_SPAN` or fewer for at most so many points; 0: not even one."""
+    spans = [len(s.breaks) - 1 for s in spaces]
+    return next((k for k in range(STEPS_PER_SPAN, 0, -1) if math.prod(k * n + 1 for n in spans) <= most), 0)
 
 
-def sample_grid(field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None) -> SurfaceGrid:
+def usual_counts(spaces: Sequence[SplineSpace], most: int, least: int = 2) -> tuple[int, int]:
+    """Points along x and y: `usual_steps` a knot span, or where those are too many, `most` of them in the spans' proportion;
+    `least` along each."""
+    steps, (nx, ny) = usual_steps(spaces, most), (len(s.breaks) - 1 for s in spaces)
+    return (max(least, steps * nx + 1), max(least, steps * ny + 1)) if steps else even_counts(spaces, most, least)
+
+
+def even_counts(spaces: Sequence[SplineSpace], most: int, least: int = 2) -> tuple[int, int]:
+    """About `most` points along x and y, in the proportion of their spans."""
+    nx, ny = (len(s.breaks) - 1 for s in spaces)
+    across = math.sqrt(most * nx / ny)
+    return max(least, math.floor(across)), max(least, math.floor(across * ny / nx))
+
+
+def sample_grid(
+    field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None, most: int | None = None
+) -> SurfaceGrid:
     """The surface and its slopes on a grid that spans the whole aperture, borders included.
 
     Args:
         heights: (n, m) control heights, mm.
-        samples: (nx, ny) points of an equispaced grid, or None for `steps_per_span` equal steps in every knot span: of k,
-            k (n - p) + 1 points along an axis with simple knots, every knot among them.
+        samples: (nx, ny) points of an equispaced grid, or None for `STEPS_PER_SPAN` equal steps in every knot span:
+            STEPS_PER_SPAN (n - p) + 1 points along an axis with simple knots, every knot among them.
+        most: points, where there are no samples: then fewer steps, and if need be an equispaced grid (`usual_counts`).
 
     Raises:
         InputError: fewer than 2 or more than `MAX_SAMPLES` samples along an axis, more than `MAX_POINTS` points, or
             heights that are not the field's.
     """
-    if samples is None:
-        return on_lines(field, heights, [_knot_lines(s, steps_per_span(s)) for s in field.spaces])
+    steps = STEPS_PER_SPAN if most is None else usual_steps(field.spaces, most)
+    if samples is None and steps:
+        return on_lines(field, heights, [_knot_lines(s, steps) for s in field.spaces])
+    if samples is None and most is not None:
+        samples = usual_counts(field.spaces, most)
     counts = checks.pair("⟨samples⟩", samples, lambda where, n: checks.whole(where, n, 2, MAX_SAMPLES))
     return on_lines(field, heights, [torch.linspace(0.0, 1.0, n, dtype=torch.float64) for n in counts])
 

@@ -18,30 +18,33 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.export.surface import default_samples, sample_grid
+from caustic_cli.export.accuracy import Deviation, of_patches
+from caustic_cli.export.surface import most_points, sample_grid, usual_counts
 from caustic_cli.export.text import CREATED, real, rows
 from caustic_cli.io.files import atomic_path
-from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 
 #: Fewest points along an axis that OpticStudio takes.
 LEAST = 5
+#: Digits of heights and derivatives, which leave 1e-11 of a slope and so nothing of a pixel, and bytes of a row of them at most.
+DIGITS = 11
+A_ROW = 4 * (DIGITS + 7) + 3
 
 
 def write_zemax(
     path: str | Path, scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None
-) -> None:
-    """Write the grid whole or not at all.
+) -> Deviation:
+    """Write the grid whole or not at all; how far its patches are off.
 
     Args:
         heights: (n, m) control heights, mm.
-        samples: (nx, ny) points, equispaced; None for `default_samples`.
+        samples: (nx, ny) points, equispaced; None for `usual_counts`.
 
     Raises:
         InputError: fewer than `LEAST` or too many points, or the file cannot be written there.
     """
-    grid = sample_grid(field, heights, samples or tuple(_count(s) for s in field.spaces))
+    grid = sample_grid(field, heights, samples or usual_counts(field.spaces, most_points(A_ROW), LEAST))
     nx, ny = grid.z.shape
     if min(nx, ny) < LEAST:
         raise InputError(f"⟨samples⟩ of a zemax grid must be at least {LEAST} along each axis, got {nx} x {ny}")
@@ -61,8 +64,5 @@ def write_zemax(
     ]
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write("\r\n".join(head).encode())
-        file.writelines(rows(table, "%.17g %.17g %.17g %.17g 0\r\n"))
-
-
-def _count(space: SplineSpace) -> int:
-    return max(LEAST, default_samples(space))
+        file.writelines(rows(table, f"{f'%.{DIGITS}g ' * 4}0\r\n"))
+    return of_patches(grid, field, heights)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +25,8 @@ from caustic_cli.io.files import NPY_HEADER, NPY_MAGIC, SOFTWARE, Piped, atomic_
 MAX_PIXELS = 8192 * 8192
 #: Largest image file read: its decoders may take in all of it at once.
 MAX_BYTES = 1 << 30
+#: Columns of a picture for people to look at, at least.
+WIDE = 800
 ACCEPTED = "an image (PNG, JPEG, TIFF, ...) or a 2-D .npy array is needed"
 #: Luminance of linear sRGB primaries (IEC 61966-2-1, Rec. 709).
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
@@ -258,9 +260,30 @@ def _luminance(image: Image.Image, linear: bool, transparent: bool, white: bool)
     return out
 
 
-def write_image(path: str | Path, irradiance: np.ndarray, white: float, encoding: str) -> None:
-    """Write irradiance (n_x, n_y), [i, j], as an 8-bit grey PNG with `white` (and everything above) at 255; (3, n_x, n_y), RGB."""
-    _write_png(Path(path), Image.fromarray(codes_of(irradiance, white, encoding)))
+def write_image(
+    path: str | Path,
+    irradiance: np.ndarray,
+    white: float,
+    encoding: str,
+    wide: int = 1,
+    said: Mapping[str, str] | None = None,
+) -> None:
+    """Write irradiance (n_x, n_y), [i, j], as an 8-bit grey PNG with `white` (and everything above) at 255; (3, n_x, n_y), RGB.
+
+    wide: columns that it has at least, each pixel a square of as many as that takes; said: texts about it, see `said_of`.
+    """
+    codes = codes_of(irradiance, white, encoding)
+    times = -(-wide // codes.shape[1])
+    _write_png(Path(path), Image.fromarray(codes.repeat(times, 0).repeat(times, 1)), said)
+
+
+def said_of(path: str | Path) -> dict[str, str]:
+    """The texts of a PNG that this program wrote; none of what is no such picture."""
+    try:
+        with Image.open(path) as image:
+            return {key: value for key, value in image.info.items() if isinstance(value, str)}
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):  # whatever is there says nothing about itself
+        return {}
 
 
 def codes_of(irradiance: np.ndarray, white: float, encoding: str) -> np.ndarray:
@@ -280,8 +303,10 @@ def write_npy(path: str | Path, array: np.ndarray) -> None:
         f.write(array.tobytes())
 
 
-def _write_png(path: Path, image: Image.Image) -> None:
+def _write_png(path: Path, image: Image.Image, said: Mapping[str, str] | None = None) -> None:
     info = PngImagePlugin.PngInfo()
     info.add_text("Software", SOFTWARE)
+    for key, text in (said or {}).items():
+        info.add_text(key, text)
     with atomic_path(path) as temporary:
         image.save(temporary, format="PNG", pnginfo=info)

@@ -68,11 +68,14 @@ class Spread:
     def parts_on(self, pixel: tuple[float, float], places: list[tuple[float, float]], most: int = MOST_CUT) -> list[Convolution]:
         """The same of parts of every position: of all that is nearest to each of these points of its frame, [-1, 1]^2, about it.
 
-        Their kernels' sums are their parts of the whole times the number of parts.
+        Their kernels are of one shape; their sums are their parts of the whole times the number of parts.
         """
         cut = _cut(min(h for h in self.half if h > 0) / math.sqrt(len(places)), pixel, most)
         cell = (pixel[0] / cut, pixel[1] / cut)
-        return [Convolution(torch.from_numpy(self.kernel(cell, (places, k))), cut) for k in range(len(places))]
+        kernels = [self.kernel(cell, (places, k)) for k in range(len(places))]
+        a, b = (max(kernel.shape[axis] for kernel in kernels) for axis in (0, 1))  # odd, as each is
+        alike = [np.pad(k, [((n - m) // 2,) * 2 for n, m in zip((a, b), k.shape, strict=True)]) for k in kernels]
+        return [Convolution(torch.from_numpy(kernel), cut) for kernel in alike]
 
     def kernel(self, cell: tuple[float, float], part: tuple[list[tuple[float, float]], int] | None = None) -> np.ndarray:
         """Part of the light of a cell that each cell about it gets: (2 a + 1, 2 b + 1), of sum 1, not negative.

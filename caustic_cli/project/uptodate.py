@@ -10,10 +10,11 @@ import contextlib
 import hashlib
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
+from torch import Tensor
 
 from caustic_cli import __version__
 from caustic_cli.config import settings
@@ -76,6 +77,15 @@ def finished(project: Project, checkpoint: Checkpoint) -> dict | None:
         return None
     _touch(files)
     return checkpoint.results | {"image": str(project.path / RENDER), "project": str(project.path)}
+
+
+def depicted(project: Project, heights: Tensor, figures: dict, asked: Mapping[str, object] | None = None) -> dict[str, str]:
+    """What an image of a lens says about itself: `of`, a hash of settings, control heights (n, m) and how else it was asked to be
+    made, and the estimated `noise` of its rays."""
+    how = {name: str(value) for name, value in sorted((asked or {}).items())}
+    found = hashlib.sha256(f"{inputs(project)['settings']}\n{json.dumps(how)}\n".encode())
+    found.update(np.ascontiguousarray(heights.detach().double().cpu().numpy()).tobytes())
+    return {"of": found.hexdigest(), "noise": f"{figures.get('error_estimate') or 0.0:.3g}"}
 
 
 class Outputs:

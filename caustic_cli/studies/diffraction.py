@@ -184,14 +184,13 @@ def draw_diffraction(study: Study, figure: Figure) -> None:
         rows = [r for r in study.rows if r["series"] == series]
         x = [r["value"] for r in rows]
         axes.plot(x, [r["error"] for r in rows], MARKERS[0] + "-", color=COLOURS[0], label="ray image against wave image")
-        axes.plot(x, [r["noise"] for r in rows], ":", color=COLOURS[7], label="noise of the rays")
-        axes.axhline(ENOUGH, color=COLOURS[1], linewidth=0.8)
+        axes.fill_between(x, [r["noise"] for r in rows], color=COLOURS[7], alpha=0.2, lw=0, label="within the noise of the rays")
+        axes.axhline(ENOUGH, color=COLOURS[1], linewidth=0.8, label="rays are enough below")
         axes.set(yscale="log", xlabel=label, ylabel="relative RMS" if k == 0 else None)
         if series == "lens size":
             axes.set_xscale("log")
         axes.grid(which="major", linewidth=0.4)
-        if k == 0:
-            axes.legend(fontsize="x-small")
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize="small")
 
 
 #: Endings of the pictures' names, and what draws them.

@@ -322,6 +322,12 @@ def draw_effects(study: Study, figure: Figure) -> None:
         title="effects: cost and error",
     )
     axes.set_xscale("symlog", linthresh=1.0)
+    axes.margins(x=0.1)
+    for row in study.rows:
+        if _matters(row) > floor:
+            axes.annotate(
+                row["series"], (1e3 * row["seconds"], _matters(row)), xytext=(5, 4), textcoords="offset points", fontsize="x-small"
+            )
     axes.grid(which="major", linewidth=0.4)
     figure.legend(loc="outside right upper", fontsize="x-small")
 

@@ -33,8 +33,10 @@ from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer, expose
-from caustic_cli.scene import Scene
+from caustic_cli.scene import Scene, Screen
 
+#: Pixels beside what is not zero that a picture shows, at least.
+LEAST_BESIDE = 3.0
 #: Pixels by which a central difference may move a landing point.  With d pixels the relative error is of order d^2 (the
 #: truncation of a C1 filter) plus 1e-12 / d (slopes rounded to 1e-16, thrown over a few hundred mm onto pixels of some
 #: 0.05 mm): measured least, 2e-8, between 1e-4 and 1e-3.  The lower end, because the part d of the rays that crosses a
@@ -181,8 +183,8 @@ def compare(
 def plot_gradient(path: str | Path, gradient: Tensor, scene: Scene, title: str) -> None:
     """Draw dJ/dP_ij (n_x, n_y) as a PNG of the screen seen from +z: x to the right, y up, mm.
 
-    Colours diverge symmetrically about 0 and exact zeros are white, which shows how far the control point reaches.  The
-    same numbers give the same bytes.
+    It shows the part of the screen where they are not zero (`shown_part`).  Colours diverge symmetrically about 0 and exact zeros
+    are white, which shows how far the control point reaches.  The same numbers give the same bytes.
 
     Raises:
         InputError: the file cannot be written.
@@ -200,10 +202,35 @@ def plot_gradient(path: str | Path, gradient: Tensor, scene: Scene, title: str) 
         vmax=limit,
         interpolation="nearest",
     )  # the colour of 0 is grey: white stands out
-    axes.set(xlabel="x (mm)", ylabel="y (mm)", title=title, facecolor="white")
+    (low_x, high_x), (low_y, high_y) = shown_part(g, scene.screen)
+    axes.set(
+        xlabel="x (mm)",
+        ylabel="y (mm)",
+        title=f"{title}\n({high_x - low_x:.3g} x {high_y - low_y:.3g} mm of the screen's {2 * rx:.3g} x {2 * ry:.3g})",
+        facecolor="white",
+        xlim=(low_x, high_x),
+        ylim=(low_y, high_y),
+    )
     figure.colorbar(shown, label="change of a pixel, parts of the source's power per mm of height")
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", metadata={"Software": SOFTWARE})
+
+
+def shown_part(gradient: np.ndarray, screen: Screen) -> list[tuple[float, float]]:
+    """From where to where along x and y, mm, a picture of this gradient (n_x, n_y) goes: around all that is not zero, with a
+    quarter of that and at least `LEAST_BESIDE` pixels beside it, as wide as high, within the screen."""
+    spans, centres = [], []
+    for axis in (0, 1):
+        lit = np.flatnonzero((gradient != 0).any(1 - axis))
+        low, high = (lit[0], lit[-1] + 1) if len(lit) else (0, gradient.shape[axis])
+        beside = max(LEAST_BESIDE, 0.25 * (high - low))
+        spans.append((high - low + 2.0 * beside) * screen.pixel[axis])
+        centres.append(0.5 * (low + high) * screen.pixel[axis] - screen.half_size[axis])
+    wide = max(spans)
+    return [
+        (max(-half, centre - 0.5 * wide), min(half, centre + 0.5 * wide))
+        for centre, half in zip(centres, screen.half_size, strict=True)
+    ]
 
 
 def _direction(field: HeightField, control: tuple[int, int]) -> Tensor:

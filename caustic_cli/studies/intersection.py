@@ -19,12 +19,14 @@ from __future__ import annotations
 import math
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 import torch
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -42,7 +44,7 @@ from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Points, Scene
 from caustic_cli.studies.fit import Order, order
 from caustic_cli.studies.measurement import haste
-from caustic_cli.studies.report import Study, draw_front, plain_ticks, spread, styles
+from caustic_cli.studies.report import Study, draw_front, legend_beside, plain_ticks, spread, styles
 
 #: Table D.3, its lengths in mm: half width of the lens, radius of the sphere, depth of the source, half-angle of its cone (rad).
 HALF, RADIUS, DEPTH, CONE, NET, DEGREE, RAYS = 5.0, 9.0, 6.0, 0.8, 15, 3, 25_000
@@ -338,12 +340,12 @@ def draw_convergence(study: Study, figure: Figure) -> None:
                 marker="o" if line == "-" else "^",
                 markersize=5,
                 markerfacecolor=None if line == "-" else "none",
-                label=f"mesh, {word}{_fit_label(found)}",
+                label=f"mesh, {word} {kind}{_fit_label(found)}",
             )
         for name, line in (("mesh+newton", "-"), ("newton", ":")):
             points = [row for row in table[name] if row[columns[0]] > 0]
             if points and name == "newton":
-                axes.axhline(points[0][columns[0]], color=style[name]["color"], linestyle=line, label=f"{name}, mean")
+                axes.axhline(points[0][columns[0]], color=style[name]["color"], linestyle=line, label=name)
             elif points:
                 axes.plot(
                     [row["n_u"] for row in points],
@@ -352,7 +354,7 @@ def draw_convergence(study: Study, figure: Figure) -> None:
                     linewidth=1,
                     marker=style[name]["marker"],
                     markersize=5,
-                    label=f"{name}, mean",
+                    label=name,
                 )
         axes.set(xscale="log", yscale="log", ylabel=f"{kind} (mm)", title=f"{kind}, with the fitted orders")
     for name, rows in table.items():
@@ -382,7 +384,13 @@ def draw_convergence(study: Study, figure: Figure) -> None:
         axes.set_xticks(n, [f"{k:g}" for k in n])
         axes.set_xlabel("n$_u$ = n$_v$")
         axes.grid(which="major", linewidth=0.4)
-        axes.legend(fontsize="small")
+    figure.legend(*_every_label(panels.flat), loc="outside lower center", ncols=4, fontsize="small")
+
+
+def _every_label(panels: Iterable[Axes]) -> tuple[list[Artist], list[str]]:
+    """Curves of all panels and their labels, each label once."""
+    found = {label: curve for axes in panels for curve, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    return list(found.values()), list(found)
 
 
 def draw_pareto(study: Study, figure: Figure) -> None:
@@ -392,7 +400,7 @@ def draw_pareto(study: Study, figure: Figure) -> None:
     for error in (ROUGH, EQUAL, FINE):
         axes.axhline(error, color="grey", linewidth=0.6, linestyle="--")
     axes.set(xlabel="time (s): median, least and most", ylabel="mean t-error (mm)", title="intersection: error and time")
-    axes.legend(fontsize="small")
+    legend_beside(figure)
 
 
 #: Endings of the pictures' names, and what draws them.

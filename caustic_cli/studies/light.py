@@ -21,9 +21,11 @@ from caustic_cli.errors import CausticError
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 from caustic_cli.studies.fit import pareto
-from caustic_cli.studies.report import Study, styles
+from caustic_cli.studies.report import Study, legend_beside, styles
 from caustic_cli.studies.retrace import FINAL_RAYS, retrace
 
+#: Least percentage points of light that a picture of it spans.
+LEAST_SPAN = 0.1
 #: Seconds of iterations for each lens, unless said.
 SECONDS = 10.0
 #: Rays of a retrace per pixel.
@@ -153,8 +155,12 @@ def draw_light(study: Study, figure: Figure) -> None:
         title="light: picture against light",
     )
     axes.set_ylim(bottom=0.0)
+    low, high = axes.get_xlim()
+    short = max(0.0, LEAST_SPAN - (high - low))
+    axes.set_xlim(low - 0.5 * short, high + 0.5 * short)  # rounding is no difference
+    axes.ticklabel_format(useOffset=False)
     axes.grid(which="major", linewidth=0.4)
-    axes.legend(fontsize="small")
+    legend_beside(figure)
 
 
 #: Endings of the pictures' names, and what draws them.

@@ -1,17 +1,28 @@
-"""report.png: target, caustic, error, lens height, and loss and light against time, side by side."""
+"""report.png: target, caustic, error, lens height and its relief, loss against time and where the light goes, side by side."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
+from mpl_toolkits.mplot3d import Axes3D
 
 from caustic_cli.io.files import atomic_path
 from caustic_cli.io.picture import SOFTWARE, to_linear, to_srgb
 from caustic_cli.scene import Lens, Screen
+from caustic_cli.studies.report import COLOURS, plain_ticks
 
 #: A scale of irradiance that ends below this has no room for ticks between numbers; a black image has such a one.
 DARK = 1e-250
+#: Part of the pixels whose errors the scale of the error holds.
+NEARLY = 0.995
+#: Points along an axis of the relief, at most; light, as a part of all, of which nothing is said.
+RELIEF, LITTLE = 130, 5e-5
+#: How a bar of colours stands beside its picture.
+BAR = {"fraction": 0.046, "pad": 0.03}
 
 
 def write_report(
@@ -25,6 +36,7 @@ def write_report(
     figures: dict,
     encoding: str,
     waves: np.ndarray | None = None,
+    stages: Sequence[tuple[float, bool]] = (),
 ) -> None:
     """Write the panels.
 
@@ -35,6 +47,7 @@ def write_report(
             because it hides the relief; of a lens whose index is a volume, that is drawn instead.
         history: (k, 5) rows iteration, stage, loss, on_screen, seconds.
         waves: (n_x, n_y), the wave image, where there is one: light follows it, and errors are its errors.
+        stages: how the loss of each sees the picture: through which blur, pixels, and whether as waves.
     """
     import matplotlib  # noqa: PLC0415
 
@@ -42,8 +55,8 @@ def write_report(
     from matplotlib import pyplot as plt  # noqa: PLC0415
     from matplotlib.colors import FuncNorm, Normalize  # noqa: PLC0415
 
-    across = 3 if waves is None else 4
-    figure, axes = plt.subplots(2, across, figsize=(4.8 * across, 8.8), constrained_layout=True)
+    figure = plt.figure(figsize=(20.0, 9.2), layout="constrained")
+    axes = figure.subplots(2, 4)
     extent = [-screen.half_size[0], screen.half_size[0], -screen.half_size[1], screen.half_size[1]]
     scale = target.sum() / target.max()
 
@@ -76,42 +89,118 @@ def write_report(
         )
         drawn = axis.imshow((part * scale * white).T, origin="lower", extent=extent, cmap="gray", norm=norm)
         if picture is not target:
-            figure.colorbar(drawn, ax=axis, label=_irradiance_words(figures, "wave_" if picture is waves else ""))
+            figure.colorbar(drawn, ax=axis, label=_irradiance_words(figures, "wave_" if picture is waves else ""), **BAR)
         axis.set(title=title, xlabel="x on the screen (mm)", ylabel="y (mm)")
-    error = image / max(image.sum(), 1e-300) - target / target.sum()
-    drawn = axes[0, -1].imshow(error.T * target.size, origin="lower", extent=extent, cmap="coolwarm", vmin=-1.0, vmax=1.0)
-    figure.colorbar(drawn, ax=axes[0, -1], label="of the mean irradiance")
-    axes[0, -1].set(title="error: too dark (blue), too bright (red)", xlabel="x on the screen (mm)", ylabel="y (mm)")
+    error = (image / max(image.sum(), 1e-300) - target / target.sum()) * target.size
+    most = _scale_of(error, (image > 0) | (target > 0))
+    axis = axes[0, len(shown)]
+    drawn = axis.imshow(error.T, origin="lower", extent=extent, cmap="coolwarm", vmin=-most, vmax=most)
+    figure.colorbar(drawn, ax=axis, label="of the mean irradiance", extend="both", **BAR)
+    axis.set(title="error: too dark (blue), too bright (red)", xlabel="x on the screen (mm)", ylabel="y (mm)")
+    if waves is None:
+        _draw_section(axes[0, 3], target, image, screen)
     rx, ry = lens.half_size
     volume = None if lens.gradient is None else lens.gradient.volume
-    shown, unit, name = (
+    relief, unit, name = (
         (_without_sphere(heights, rx, ry) * 1e3, "µm", "lens height, best paraboloid removed")
         if volume is None
         else (volume.mean(-1), "index", "index, mean along z")
     )
-    drawn = axes[1, 0].imshow(shown.T, origin="lower", extent=[-rx, rx, -ry, ry], cmap="viridis")
-    figure.colorbar(drawn, ax=axes[1, 0], label=unit)
+    drawn = axes[1, 0].imshow(relief.T, origin="lower", extent=[-rx, rx, -ry, ry], cmap="viridis")
+    figure.colorbar(drawn, ax=axes[1, 0], label=unit, **BAR)
     axes[1, 0].set(title=name, xlabel="x on the lens (mm)", ylabel="y (mm)")
-    for stage in np.unique(history[:, 1]):
-        rows = history[history[:, 1] == stage]
-        axes[1, 1].semilogy(rows[:, 4], rows[:, 2] * target.size, lw=1.5)
-        axes[1, 2].plot(rows[:, 4], rows[:, 3], lw=1.5)
-    axes[1, 1].set(title="loss of each stage against time", xlabel="s", ylabel="relative RMS")
-    axes[1, 2].set(title="light on the screen against time", xlabel="s", ylabel="part of the source's power", ylim=(0.0, 1.0))
-    for last in axes[1, 3:]:
-        last.set_axis_off()
-    for last in axes[1, 1:3]:
-        last.grid(alpha=0.3, which="both")
+    place = axes[1, 1].get_subplotspec()
+    axes[1, 1].remove()
+    _draw_relief(figure.add_subplot(place, projection="3d"), relief, (rx, ry), unit)
+    _draw_losses(axes[1, 2], history, target.size, figures, stages)
+    _draw_account(axes[1, 3], figures)
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", dpi=100, metadata={"Software": SOFTWARE})
     plt.close(figure)
+
+
+def _scale_of(error: np.ndarray, seen: np.ndarray) -> float:
+    """Where the scale of an error ends: what nearly all pixels that are `seen`, dark in neither image, keep within."""
+    sizes = np.abs(error[seen]) if seen.any() else np.abs(error)
+    return float(np.quantile(sizes, NEARLY)) or 1.0
+
+
+def _draw_section(axis: Axes, target: np.ndarray, image: np.ndarray, screen: Screen) -> None:
+    """Both along x where the target is brightest, over the target's mean."""
+    row = int(target.sum(0).argmax())
+    n, half = target.shape[0], screen.half_size
+    x = ((np.arange(n) + 0.5) * (2.0 / n) - 1.0) * half[0]
+    y = ((row + 0.5) * (2.0 / target.shape[1]) - 1.0) * half[1]
+    axis.step(x, image[:, row] / max(image.mean(), 1e-300), where="mid", color=COLOURS[1], lw=1.0, label="caustic")
+    axis.step(x, target[:, row] / target.mean(), where="mid", color="black", lw=1.2, label="target")
+    axis.set(title=f"along y = {y:.3g} mm", xlabel="x on the screen (mm)", ylabel="of the mean irradiance")
+    axis.set_ylim(0.0, 1.25 * axis.get_ylim()[1])  # room for the legend above all data
+    axis.legend(loc="upper right", ncols=2, frameon=False)
+
+
+def _draw_relief(axis: Axes3D, relief: np.ndarray, half: tuple[float, float], unit: str) -> None:
+    """The relief in three dimensions, lit from the side."""
+    every = max(1, max(relief.shape) // RELIEF)
+    z = relief[::every, ::every]
+    x, y = (np.linspace(-h, h, n) for h, n in zip(half, z.shape, strict=True))
+    axis.plot_surface(*np.meshgrid(x, y, indexing="ij"), z, cmap="viridis", rcount=len(x), ccount=len(y), lw=0, antialiased=False)
+    axis.set_box_aspect((half[0] / max(half), half[1] / max(half), 0.35), zoom=1.15)
+    axis.set(xlabel="x (mm)", ylabel="y (mm)", zlabel=unit, title="the same in relief")
+    axis.zaxis.set_major_locator(MaxNLocator(3))
+    axis.view_init(elev=38, azim=-65)
+
+
+def _draw_losses(axis: Axes, history: np.ndarray, pixels: int, figures: dict, stages: Sequence[tuple[float, bool]]) -> None:
+    """The loss of each stage as it sees the picture, and what the lenses it began and ended with are worth by rays of their own.
+
+    What is seen through a blur is drawn faint: it rises as the blur falls, and says nothing of the picture.
+    """
+    for k, stage in enumerate(np.unique(history[:, 1]).astype(int)):
+        rows = history[history[:, 1] == stage]
+        blur, waves = stages[stage] if stage < len(stages) else (0.0, False)
+        colour = COLOURS[k % len(COLOURS)]
+        style = {"lw": 0.9, "ls": "--", "alpha": 0.6} if blur > 0 else {"lw": 1.6}
+        axis.semilogy(rows[:, 4], rows[:, 2] * pixels, color=colour, marker="." if len(rows) == 1 else None, **style)
+        words = f"{blur:.2g} px" if blur > 0 else f"stage {stage + 1}{', waves' if waves else ''}"
+        axis.annotate(
+            words, (rows[0, 4], rows[0, 2] * pixels), xytext=(3, 4), textcoords="offset points", color=colour, fontsize="small"
+        )
+    last = history[-1, 4] if len(history) else 0.0
+    likeness = "wave_relative_rms" if figures.get("wave_relative_rms") is not None else "relative_rms"
+    for key, at, words in ((f"start_{likeness}", 0.0, "start"), (likeness, last, "finished")):
+        if figures.get(key):
+            axis.semilogy([at], [figures[key]], "o", color="black", ms=5, mfc="none" if at == 0.0 else "black")
+            side = {"xytext": (6, 0), "ha": "left"} if at == 0.0 else {"xytext": (-6, -10), "ha": "right"}
+            axis.annotate(
+                f"{words} {figures[key]:.3f}", (at, figures[key]), textcoords="offset points", va="center", fontsize="small", **side
+            )
+    if any(blur > 0 for blur, _ in stages):
+        axis.set_xlabel("s (dashed: seen through a blur of so many pixels)")
+    else:
+        axis.set_xlabel("s")
+    axis.margins(x=0.08, y=0.12)
+    axis.set(title="error: of the design (lines),\nretraced with other rays (points)", ylabel="relative RMS")
+    axis.grid(alpha=0.3, which="both")
+    plain_ticks(axis.yaxis)
+
+
+def _draw_account(axis: Axes, figures: dict) -> None:
+    """Where the light of the source goes."""
+    parts = [("on the picture", figures["on_target"] or 0.0, COLOURS[2])]
+    parts += [("beside it, on the screen", figures["on_screen"] - (figures["on_target"] or 0.0), COLOURS[0])]
+    parts += [(name.replace("_", " "), value, COLOURS[1]) for name, value in figures["lost"].items() if value > LITTLE]
+    axis.barh(range(len(parts)), [100.0 * value for _, value, _ in parts], 0.35, color=[colour for _, _, colour in parts])
+    for k, (name, value, _) in enumerate(parts):
+        axis.annotate(f"{name} {value:.2%}", (1.0, k - 0.22), va="bottom")
+    axis.set(title="where the light goes", xlabel="% of the source's light", xlim=(0.0, 100.0), yticks=[])
+    axis.set_ylim(len(parts) - 0.5, -0.6)
 
 
 def _irradiance_words(figures: dict, prefix: str) -> str:
     """What a bar of irradiance shows, its unit, and the peak and the mean of the image."""
     unit = figures["irradiance_unit"].replace("^2", "²")
     peak, mean = (figures[f"{prefix}{k}_irradiance"] for k in ("peak", "mean"))
-    return f"{'illuminance' if unit == 'lux' else 'irradiance'} ({unit}): peak {peak:.3g}, mean {mean:.3g}"
+    return f"{'illuminance' if unit == 'lux' else 'irradiance'} ({unit})\npeak {peak:.3g}, mean {mean:.3g}"
 
 
 def _without_sphere(heights: np.ndarray, rx: float, ry: float) -> np.ndarray:

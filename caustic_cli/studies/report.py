@@ -22,9 +22,24 @@ from caustic_cli.io.files import SOFTWARE, atomic_path, refuse_foreign, write_by
 from caustic_cli.studies.fit import Order, pareto
 
 #: Colours of Okabe and Ito, told apart by every kind of colour vision, and a marker of its own for each curve.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C564B", "#4D4D4D")
-MARKERS = "osD^vP<>"
+COLOURS = (
+    "#0072B2",
+    "#D55E00",
+    "#009E73",
+    "#CC79A7",
+    "#E69F00",
+    "#56B4E9",
+    "#8C564B",
+    "#4D4D4D",
+    "#6A3D9A",
+    "#B3B300",
+    "#E31A76",
+    "#00CED1",
+)
+MARKERS = "osD^vP<>Xph*"
 
+#: How much wider a picture is that has its legend beside it.
+BESIDE = 1.3
 
 #: Part by which a slower setting has to lower the error to be on the front.
 GAIN = 0.02
@@ -136,7 +151,13 @@ def draw_error_and_time(study: Study, figure: Figure) -> None:
         ylabel="error: relative RMS against the reference",
         title=f"{study.name}: error and time",
     )
-    axes.legend(fontsize="small")
+    legend_beside(figure)
+
+
+def legend_beside(figure: Figure) -> None:
+    """What the curves are, to the right of them, where it covers no data."""
+    figure.set_size_inches(BESIDE * figure.get_figwidth(), figure.get_figheight())
+    figure.legend(loc="outside right upper", fontsize="small")
 
 
 def draw_front(axes: Axes, study: Study) -> None:

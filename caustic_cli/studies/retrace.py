@@ -25,6 +25,8 @@ from caustic_cli.studies.noise import image_noise, lift, standard_error, varianc
 
 #: Rays of the retrace that ends a design.
 FINAL_RAYS = 4_000_000
+#: Part of relative_rms that its noise may be, where nothing is said about rays.
+QUIET = 0.1
 #: Independent images whose scatter tells their mean's noise: over thousands of pixels four are plenty.
 BATCHES = 4
 #: So many times the rays asked for may be traced to bring the noise of a figure down.

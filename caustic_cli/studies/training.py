@@ -22,7 +22,7 @@ from caustic_cli import __version__
 from caustic_cli.config import checks
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
-from caustic_cli.studies.report import Study, draw_front, plain_ticks
+from caustic_cli.studies.report import Study, draw_front, legend_beside, plain_ticks
 from caustic_cli.studies.retrace import FINAL_RAYS, retrace
 
 #: Slices that the time of every contender is cut into; a power of 2.
@@ -187,7 +187,7 @@ def draw_design(study: Study, figure: Figure) -> None:
         xlabel="time in iterations (s)", ylabel="relative RMS between retraced image and target", title="design: error and time"
     )
     plain_ticks(axes.yaxis)
-    axes.legend(fontsize="small")
+    legend_beside(figure)
 
 
 #: Endings of the pictures' names, and what draws them.

@@ -11,10 +11,14 @@ import itertools
 import os
 import subprocess
 import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
 import torch
+from numba.core import event
 
 from caustic_cli.errors import is_out_of_memory
 from caustic_cli.optics.backends import backend_for, cuda_kernels
@@ -24,6 +28,8 @@ from caustic_cli.optics.trace import warm_up
 from caustic_cli.scene import Lens, PlaneWave, Points, Scene, Screen
 from caustic_cli.workflow.reporter import Reporter
 
+#: s that are compiled before it is spoken of.
+PATIENCE = 2.0
 #: What is compiled by itself, and about how long that takes, s.
 PARTS = {"adjoint": 5.0, "transport": 5.5, "splat": 4.0, "surface": 2.8}
 #: Parts that call the same functions, and how much sooner they are compiled one after the other in one process, s.
@@ -113,23 +119,54 @@ def compile_side_by_side() -> None:
             process.wait()
 
 
-def compile_usual(device: str) -> None:
+class _Compiled(event.Listener):
+    """Says a text, once, when numba has compiled for `PATIENCE` seconds: what is read from its cache is no compilation."""
+
+    def __init__(self, say: Reporter, text: str):
+        self.say, self.text = say, text
+        self.depth, self.spent, self.since, self.waiting = 0, 0.0, 0.0, ExitStack()
+
+    def on_start(self, event: event.Event) -> None:
+        """A function is compiled, by itself or within another."""
+        self.depth += 1
+        if self.depth == 1 and self.spent < PATIENCE:
+            self.since = time.monotonic()
+            self.waiting.enter_context(self.say.notify_if_slow(self.text, PATIENCE - self.spent))
+
+    def on_end(self, event: event.Event) -> None:
+        """It is done."""
+        self.depth -= 1
+        if self.depth == 0 and self.spent < PATIENCE:
+            self.waiting.close()
+            self.spent += time.monotonic() - self.since
+
+
+@contextmanager
+def told_of(say: Reporter, text: str) -> Iterator[None]:
+    """Say `text` while the block compiles kernels, if that takes long."""
+    with event.install_listener("numba:compile", _Compiled(say, text)):
+        yield
+
+
+def compile_usual(device: str, say: Reporter) -> None:
     """Compile the kernels that every design and render takes, where the device's are compiled."""
     if not backend_for(device).compiled:
         return
-    if not kept():
-        compile_side_by_side()
-    backend_for(device).compile_plane()
+    with told_of(say, "compiling the kernels for this machine, once: about ten seconds"):
+        if not kept():
+            compile_side_by_side()
+        backend_for(device).compile_plane()
 
 
 def compile_for(scene: Scene | None, device: str, say: Reporter, requests: Requests | None = None, gradient: bool = False) -> None:
-    """Have the CPU's kernels compiled that the light of a scene needs beyond the usual ones.
+    """Have the CPU's kernels compiled that the light of a scene needs, beyond the usual ones too.
 
     Args:
         scene: None for whatever any scene may need.
         requests: of a plan, or None.
         gradient: derivatives are needed too.
     """
+    compile_usual(device, say)
     if not backend_for(device).compiled:
         return
     wanted = [(scene, requests or NO_REQUESTS)]
@@ -139,7 +176,7 @@ def compile_for(scene: Scene | None, device: str, say: Reporter, requests: Reque
             (Scene(Points(((0.0, 0.0, -50.0),)), lens, screen), NO_REQUESTS),
             (Scene(PlaneWave(), lens, screen), Requests(stages=True)),
         ]
-    with say.notify_if_slow("compiling the kernels that this scene needs, once: about half a minute"):
+    with told_of(say, "compiling the kernels that this scene needs, once: about half a minute"):
         try:
             for one, asked in wanted:
                 warm_up(one, asked, gradient)

@@ -14,7 +14,7 @@ from caustic_cli.studies.convergence import run_study
 from caustic_cli.studies.report import Study
 from caustic_cli.workflow import architectures as networks
 from caustic_cli.workflow import comparison, tradeoff
-from caustic_cli.workflow.compilation import compile_for
+from caustic_cli.workflow.compilation import compile_for, compile_usual
 from caustic_cli.workflow.design import sphere
 from caustic_cli.workflow.lens import Lens
 from caustic_cli.workflow.reporter import Reporter
@@ -73,6 +73,7 @@ def measure(
             f" {', '.join(OF_ANY_SCENE)}"
         )
     seed = asked.seed or 0
+    compile_usual(device, say)
     if name == "intersection":
         case = (
             intersection.of_lens(lens.scene, lens.field, lens.heights, asked.rays, seed)

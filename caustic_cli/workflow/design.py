@@ -34,6 +34,7 @@ from caustic_cli.inverse.initial_sides import first_sides
 from caustic_cli.inverse.initial_surface import InitialSurface, first_surface
 from caustic_cli.inverse.lenslets import first_array
 from caustic_cli.inverse.reach import largest_magnification, refuse_unreachable
+from caustic_cli.inverse.sharpness import advice
 from caustic_cli.inverse.surface_from_map import OutOfReach
 from caustic_cli.inverse.target import grey
 from caustic_cli.io.files import Piped
@@ -48,6 +49,7 @@ from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.project import CHECKPOINT, RENDER, Project, is_project
 from caustic_cli.scene import Scene
 from caustic_cli.studies.manufacture import preview
+from caustic_cli.workflow.compilation import compile_usual, told_of
 from caustic_cli.workflow.evaluation import expected_seconds, judge
 from caustic_cli.workflow.gradient import design_index, index_figures, is_free, limit_of
 from caustic_cli.workflow.movie import Movie
@@ -73,6 +75,7 @@ def begin(
     out: Path | None = None,
     force: bool = False,
     say: Reporter,
+    device: str = "cpu",
 ) -> tuple[Project, torch.Tensor | None]:
     """Check everything, then make the project directory, if there is to be one; also returns the first heights, None for the
     offset surface.
@@ -84,7 +87,7 @@ def begin(
         preset: a name of `config.presets`, whose settings those of config replace.
         config: a TOML file of further settings, which those `given` replace.
         out: the directory; None for a design in memory.
-        force: replace a project there.
+        force: replace a project there; device: of the design, whose kernels are compiled once all is checked.
 
     Raises:
         InputError: something is wrong; nothing was written.
@@ -161,9 +164,10 @@ def begin(
             refuse_unreachable(scene, grey(goal))
     if words := shape_words(full):
         say.say(words)
-    with say.notify_if_slow(
-        "solving the transport of the light to the picture; the first time, its kernels are compiled,"
-        " which takes about half a minute"
+    compile_usual(device, say)
+    with (
+        told_of(say, "compiling the kernels of the transport, once: about half a minute"),
+        say.notify_if_slow("solving the transport of the light to the picture"),
     ):
         try:
             project, first = first_heights(project, said)
@@ -515,6 +519,9 @@ def _run(
             raise Interrupted(f"interrupted when the design was done; {project.path} is whole", 128 + asked[0])
     field = designer.field(found.state.stage)
     scene, heights = sides_of(designer.scene, field, found.state.heights)
+    size = tuple(project.settings["target"]["size"])
+    if not hurry and scene.second is None and (words := advice(scene, grey(target), size, field, heights)):
+        say.say(words)
     return Result(project, scene, field, heights, target, found.state, figures)
 
 

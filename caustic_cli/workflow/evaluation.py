@@ -16,16 +16,17 @@ from caustic_cli.inverse.extended import limits
 from caustic_cli.inverse.losses import parse
 from caustic_cli.inverse.target import grey
 from caustic_cli.io.files import discard
-from caustic_cli.io.picture import write_image
+from caustic_cli.io.picture import WIDE, write_image
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import sides_of, traced_of
 from caustic_cli.optics.waves import WaveImage
+from caustic_cli.project import uptodate
 from caustic_cli.project.project import FARTHER, RENDER, REPORT, WAVE, Project
 from caustic_cli.studies.irradiance import irradiance
 from caustic_cli.studies.panels import write_report
-from caustic_cli.studies.retrace import FINAL_RAYS, retrace, white_level
+from caustic_cli.studies.retrace import FINAL_RAYS, QUIET, retrace, white_level
 from caustic_cli.studies.second import second_figures
 from caustic_cli.studies.waves import unseen_figures, wave_figures
 from caustic_cli.workflow import over_range
@@ -40,8 +41,6 @@ PROBE, RETRACES, WAVE_IMAGES, REPORT_SECONDS = 16, 2.5, 4, 2.5
 STARTS = 4
 #: Fewer rays, by this factor, judge each of the lenses that a network gives.
 OVER = 4
-#: Part of relative_rms that the noise of its rays may be.
-QUIET = 0.1
 #: From so many times the light on the screen, a lens is kept although the surface it began from is more like the target.
 BRIGHTER = 1.01
 
@@ -70,13 +69,14 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
         return found
     encoding = project.settings["target"]["encoding"]
     seen, aim = (irradiance(a, designer.scene.screen) for a in (found.image, target))
-    write_image(project.path / RENDER, seen, white_level(seen, aim), encoding)
+    made = uptodate.depicted(project, found.state.heights, found.figures)
+    write_image(project.path / RENDER, seen, white_level(seen, aim), encoding, WIDE, made)
     discard(project.path / WAVE)  # of another lens
     if found.waves is not None:
-        write_image(project.path / WAVE, found.waves, white_level(found.waves, target), encoding)
+        write_image(project.path / WAVE, found.waves, white_level(found.waves, target), encoding, WIDE)
     discard(project.path / FARTHER)
     if found.second is not None and designer.second is not None:
-        write_image(project.path / FARTHER, found.second, white_level(found.second, designer.second.numpy()), encoding)
+        write_image(project.path / FARTHER, found.second, white_level(found.second, designer.second.numpy()), encoding, WIDE)
     history = np.array(state.history, dtype=float).reshape(-1, 5)
     surface = _surface(
         designer.field(found.state.stage), found.state.heights[-1] if designer.scene.jointly else found.state.heights
@@ -92,6 +92,7 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
         found.figures,
         encoding,
         None if found.waves is None else grey(found.waves),
+        [(stage.blur, bool(stage.waves)) for stage in designer.stages],
     )
     return found
 

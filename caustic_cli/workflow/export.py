@@ -11,6 +11,7 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.export import FORMATS, TWO_SIDED
+from caustic_cli.export.accuracy import Deviation
 from caustic_cli.export.milling import Milling
 from caustic_cli.export.part import part_of
 from caustic_cli.io.heightmaps import beside
@@ -77,7 +78,8 @@ def write(
     milling: dict | None = None,
     **given,
 ) -> dict:
-    """Write a lens' files, see `files`; given: samples or tolerance; what of it goes into the figures."""
+    """Write a lens' files, see `files`; given: samples or tolerance; what of it goes into the figures: samples and how far the
+    surface that is read from them is off (`export.accuracy`), or what is said of milling and height maps."""
     if scene.lens.front is not None and (script or mould or format not in TWO_SIDED):
         raise InputError(
             f"⟨format⟩ {format} holds one free-form side; of this lens, which has two, {', '.join(TWO_SIDED)} hold both, without"
@@ -99,10 +101,33 @@ def write(
         raise InputError("⟨script⟩ builds lenses, not mirrors")
     if script and scene.screen.curved:
         raise InputError("⟨script⟩ builds plane receivers, not curved screens, which the archive alone holds")
-    writer(path, part.scene, part.field, part.heights, **given)
+    off: Deviation | None = writer(path, part.scene, part.field, part.heights, **given)
     if script:
         import_module("caustic_cli.export.lighttools_script").write_script(path, scene, field, heights, **given)
-    return {}
+    return {} if off is None else off.figures(scene)
+
+
+def accuracy_words(figures: dict) -> str:
+    """How a file's surface differs from the designed one: a clause."""
+    if "heightmap" in figures:
+        said = figures["heightmap"]
+        return f"{said['columns']} x {said['rows']} points; between them heights are at most {_length(said['height_error_mm'])} off"
+    if "read_as" not in figures:
+        return "the spline itself" if figures["format"] == "step" else ""
+    nx, ny = figures["samples"]
+    return (
+        f"{nx} x {ny} points; read as {figures['read_as']}, heights are at most {_length(figures['height_error_mm'])} off and"
+        f" light {_shift(figures['shift_pixels'])} (RMS)"
+    )
+
+
+def _length(length: float) -> str:
+    """A length in mm, as whoever makes a surface reads it."""
+    return f"{1e3 * length:.2g} µm" if length >= 1e-6 else "a nanometre"
+
+
+def _shift(pixels: float) -> str:
+    return f"{pixels:.2g} pixels" if pixels >= 0.001 else "a thousandth of a pixel"
 
 
 def _scallops(scene: Scene, field: HeightField, found: dict) -> dict:

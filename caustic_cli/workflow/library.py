@@ -35,7 +35,7 @@ from caustic_cli.optics.trace import tracers
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Scene
 from caustic_cli.workflow import design as workflow
-from caustic_cli.workflow.compilation import compile_for, compile_usual
+from caustic_cli.workflow.compilation import compile_for
 from caustic_cli.workflow.lens import Lens, Render, count, load
 from caustic_cli.workflow.movie import Movie
 from caustic_cli.workflow.reporter import Listener, Reporter
@@ -144,9 +144,15 @@ def design_of(
         InputError, CausticError: as of `design`.
     """
     began, recorder = time.monotonic(), None if movie is None else Movie(movie, force)
-    compile_usual(device)
     project, first = workflow.begin(
-        Path(target) if isinstance(target, str) else target, given, preset=preset, config=config, out=out, force=force, say=say
+        Path(target) if isinstance(target, str) else target,
+        given,
+        preset=preset,
+        config=config,
+        out=out,
+        force=force,
+        say=say,
+        device=device,
     )
     compile_for(project.scene(), device, say, gradient=True)
     return _lens(workflow.design(project, first, device, say, began, recorder))
@@ -181,7 +187,7 @@ def _lens(done: workflow.Result) -> Lens:
     return Lens(done.scene, done.field, done.heights, done.target, done.figures, done.project, done.state)
 
 
-def render(lens: Lens | str | Path, rays: float = 1_000_000, **options: Any) -> Render:
+def render(lens: Lens | str | Path, rays: float | None = None, **options: Any) -> Render:
     """`Lens.render` of a lens, or of a project or an archive."""
     return (lens if isinstance(lens, Lens) else load(lens)).render(rays, **options)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, cast
@@ -17,17 +17,17 @@ from caustic_cli.errors import InputError
 from caustic_cli.export.mitsuba import quick_samples, write_mitsuba
 from caustic_cli.export.page import refuse_untraceable
 from caustic_cli.io.files import discard, refuse_foreign
-from caustic_cli.io.picture import write_image, write_npy
+from caustic_cli.io.picture import WIDE, said_of, write_image, write_npy
 from caustic_cli.optics.emission.measured import coarse_words
 from caustic_cli.optics.plan import Plan, parse_effects
 from caustic_cli.optics.surfaces.cut import CutSurface
 from caustic_cli.project.project import FARTHER, RENDER, WAVE, Project, beside
-from caustic_cli.project.uptodate import Outputs
+from caustic_cli.project.uptodate import Outputs, depicted
 from caustic_cli.scene import Scene
 from caustic_cli.studies import effects as effects_study
 from caustic_cli.studies import manufacture
 from caustic_cli.studies.irradiance import irradiance
-from caustic_cli.studies.retrace import white_level
+from caustic_cli.studies.retrace import FINAL_RAYS, white_level
 from caustic_cli.studies.second import second_figures
 from caustic_cli.studies.verify import require_mitsuba, verify, write_panels
 from caustic_cli.workflow import page
@@ -39,6 +39,11 @@ from caustic_cli.workflow.tolerances import read as read_tolerances
 from caustic_cli.workflow.tolerances import tolerances
 from caustic_cli.workflow.wanted import illumination, wanted
 
+#: Rays where a tolerance begins, and of what is looked at beside the image, unless said.
+BESIDE_RAYS = 1_000_000
+#: An image stays where its noise is less than this part of what a new one of the same would have.
+QUIETER = 0.9
+
 
 @dataclass(frozen=True)
 class Request:
@@ -46,7 +51,7 @@ class Request:
 
     Args:
         lens: project directory, or an .npz archive as exported.
-        rays: traced; with `tolerance`, where the number begins.
+        rays: traced; with `tolerance`, where the number begins; None for those that judge a finished design.
         tolerance: relative RMS noise of the image that rays are added for, None for none.
         reconstruction, filter_size, alpha: of the image; alpha in 1/mm^2, None for 1 per pixel^2.
         given: path in `config.table` -> value, settings that replace the project's own.
@@ -64,7 +69,7 @@ class Request:
     """
 
     lens: Path
-    rays: int = 1_000_000
+    rays: int | None = None
     tolerance: float | None = None
     reconstruction: str = "bincount"
     filter_size: tuple[int, int] = (3, 3)
@@ -86,6 +91,18 @@ class Request:
     tolerances: Path | None = None
     want: Path | None = None
     at: str | None = None
+
+    @property
+    def count(self) -> int:
+        """Rays of what is looked at beside the image."""
+        return BESIDE_RAYS if self.rays is None else self.rays
+
+    @property
+    def shows(self) -> dict[str, object]:
+        """What decides what is seen in the image, beside its noise, by name, where it is not as usual."""
+        usual = {f.name: f.default for f in fields(self)}
+        names = ("reconstruction", "filter_size", "alpha", "screen_at", "effects", "cut")
+        return {name: getattr(self, name) for name in names if getattr(self, name) != usual[name]} | dict(self.given)
 
     @property
     def asks(self) -> dict[str, object]:
@@ -174,8 +191,9 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
         say.say(coarse)
     if asked.explain:
         compile_for(None, device, say)
+    rays = BESIDE_RAYS if asked.rays is None and asked.tolerance is not None else asked.rays
     image, figures = lens.render(
-        asked.rays,
+        rays,
         seed=seed,
         tolerance=asked.tolerance,
         filter=filter,
@@ -186,12 +204,22 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
         cut=cut,
     )
     if cut is not None:
-        nominal = lens.render(asked.rays, seed=seed, effects=plan, dtype=asked.dtype, device=device, say=say).figures
+        nominal = lens.render(rays, seed=seed, effects=plan, dtype=asked.dtype, device=device, say=say).figures
         beside_it = {f"nominal_{name}": nominal[name] for name in ("relative_rms", "noise")}
         figures["cut"] = {"program": str(asked.cut)} | beside_it | deviation
     shown = irradiance(image, scene.screen)
     aim = None if lens.target is None else irradiance(lens.target, scene.screen)
-    write_image(image_path, shown, white_level(shown, aim), lens.encoding)
+    wide = WIDE if asked.image is None else 1
+    own = depicted(project, lens.state.heights, figures, asked.shows) if project and lens.state else {}
+    there = said_of(image_path) if in_project and own and not asked.force else {}
+    if there.get("of") == own.get("of") and float(there.get("noise", "inf")) < QUIETER * float(own.get("noise", "inf")):
+        say.say(
+            f"{image_path}: its noise is {there['noise']}, less than the {own['noise']} that these rays leave, so it stays; ⟨force⟩"
+            " replaces it, ⟨out⟩ writes another beside it"
+        )
+        figures["image_kept"] = True
+    else:
+        write_image(image_path, shown, white_level(shown, aim), lens.encoding, wide, own)
     if scene.second is not None:
         farther_target = None if lens.project is None else lens.project.second_target(scene)
         with say.notify_if_slow("following the light behind the picture"):
@@ -200,14 +228,14 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
                 lens.field,
                 lens.heights,
                 farther_target,
-                rays=asked.rays,
+                rays=FINAL_RAYS if rays is None else rays,
                 seed=seed,
                 device=device,
                 requests=plan.requests,
             )
         figures |= more
         if light is not None:
-            write_image(farther, light, white_level(light, farther_target), lens.encoding)
+            write_image(farther, light, white_level(light, farther_target), lens.encoding, wide)
             figures["second_image"] = str(farther)
     if wave_path == asked.lens / WAVE:
         discard(wave_path)  # of what render.png was before
@@ -216,7 +244,7 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     waves = None
     if plan["diffraction"].on:
         with say.notify_if_slow("taking the wave image"):
-            waves, more = _wave_image(plan, lens, device, asked.effects != "auto", wave_path, wave_npy, cut)
+            waves, more = _wave_image(plan, lens, device, asked.effects != "auto", wave_path, wave_npy, cut, wide)
         figures |= more
     if asked.html is not None:
         page.write(asked.html, lens, plan, figures, waves, asked.lens.resolve().stem)
@@ -228,7 +256,13 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     }
     if asked.explain:
         figures["effects"] = effects_study.explain(
-            plan, scene, lens.field, lens.heights.to(device), rays=min(asked.rays, effects_study.RAYS), seed=seed, dtype=asked.dtype
+            plan,
+            scene,
+            lens.field,
+            lens.heights.to(device),
+            rays=min(asked.count, effects_study.RAYS),
+            seed=seed,
+            dtype=asked.dtype,
         )
     if sheet is not None:
         figures["report"] = manufacture.manufacture(scene, lens.field, lens.heights, asked.tool_radius, seed)
@@ -237,9 +271,9 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     if off is not None and draws[0] is not None and draws[1] is not None:
         figures["tolerances"] = tolerances(lens, plan, off, *draws, say)
     if goal is not None and lit is not None:
-        figures["want"] = wanted(lens, plan, goal, lit, asked.rays, seed, device, say)
+        figures["want"] = wanted(lens, plan, goal, lit, asked.count, seed, device, say)
     if panels is not None:
-        figures["verify"] = _verified(scene, lens, asked.rays, seed, panels)
+        figures["verify"] = _verified(scene, lens, asked.count, seed, panels)
     if made:
         made.keep(figures)
     return figures
@@ -259,13 +293,13 @@ def _refuse_unknown(asked: Request, scene: Scene) -> None:
 
 
 def _wave_image(
-    plan: Plan, lens: Lens, device: str, required: bool, path: Path, npy: Path | None, cut: CutSurface | None
+    plan: Plan, lens: Lens, device: str, required: bool, path: Path, npy: Path | None, cut: CutSurface | None, wide: int
 ) -> tuple[np.ndarray | None, dict]:
-    """Write the wave image; it, None where there is none, and its figures."""
+    """Write the wave image, `wide` columns at least; it, None where there is none, and its figures."""
     image, figures = lens.render_waves(effects=plan, required=required, device=device, cut=cut)
     if not image.size:
         return None, figures
-    write_image(path, image, white_level(image, lens.target), lens.encoding)
+    write_image(path, image, white_level(image, lens.target), lens.encoding, wide)
     if npy is not None:
         write_npy(npy, image)
     return image, figures | {"wave_image": str(path)}

@@ -12,6 +12,8 @@ from matplotlib import pyplot as plt
 from matplotlib.ticker import NullFormatter
 from PIL import Image
 
+from caustic_cli.studies.report import COLOURS, plain_ticks
+
 
 def picture(path: Path) -> np.ndarray:
     """A picture's grey values, [i, j] with i along +x and j along +y."""
@@ -23,7 +25,7 @@ def show(axis, image: np.ndarray, title: str, cmap: str = "gray", limit: float |
     low = None if limit is None else low
     drawn = axis.imshow(image.T, origin="lower", cmap=cmap, vmin=low, vmax=limit, interpolation="nearest")
     axis.set(xticks=[], yticks=[])
-    axis.set_title(title, fontsize=7)
+    axis.set_title(title, fontsize=8)
     return drawn
 
 
@@ -39,16 +41,16 @@ def figures_of(row: dict) -> str:
 
 def losses(axis, book, names: dict[str, str], title: str, pixels: float) -> None:
     """Relative RMS of every iteration: the optimiser's own render, eq. 5.2.1 times the pixels."""
-    for name, label in names.items():
+    for k, (name, label) in enumerate(names.items()):
         history = book.arrays(name)["history"]
-        own = name.startswith("own-")
-        axis.semilogy(history[:, 0], history[:, 2] * pixels, lw=1.0, ls="--" if own else "-", label=label)
+        own, colour = name.startswith("own-"), COLOURS[k % len(COLOURS)]
+        axis.semilogy(history[:, 0], history[:, 2] * pixels, lw=1.2, ls="--" if own else "-", color=colour, label=label)
     axis.set_title(title, fontsize=8)
     axis.set_xlabel("iteration", fontsize=7)
     axis.yaxis.set_minor_formatter(NullFormatter())
     axis.tick_params(labelsize=6)
     axis.grid(alpha=0.3, which="both")
-    axis.legend(fontsize=5.5)
+    axis.legend(fontsize=6.5, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, frameon=False)
 
 
 def draw(path: Path, book, rows: list[dict], pairs, mags, marks, pictures: Path) -> None:
@@ -73,15 +75,21 @@ def draw(path: Path, book, rows: list[dict], pairs, mags, marks, pictures: Path)
     _intersection(parts[3], book)
     _point(parts[4], book, pictures)
     _table(parts[5], rows)
-    figure.savefig(path, dpi=110, metadata={"Software": "caustic"})
+    figure.savefig(path, dpi=130, metadata={"Software": "caustic"})
     plt.close(figure)
+
+
+def lit_part(gradient: np.ndarray) -> np.ndarray:
+    """What is not zero of it, with some pixels beside: the thesis' figures show no more."""
+    i, j = (np.flatnonzero((gradient != 0).any(1 - axis)) for axis in (0, 1))
+    return gradient[max(0, i[0] - 2) : i[-1] + 3, max(0, j[0] - 2) : j[-1] + 3]
 
 
 def _gradients(part, book) -> None:
     axes = part.subplots(1, 3)
     about = {"a": "degrees (3, 3), filter (3, 3)", "b": "degrees (3, 3), filter (11, 11)", "c": "degrees (5, 3), filter (3, 3)"}
     for axis, (case, text) in zip(axes, about.items(), strict=True):
-        g = book.arrays(f"gradient-{case}")["gradient"]
+        g = lit_part(book.arrays(f"gradient-{case}")["gradient"])
         limit, total = np.abs(g).max(), book.rows[f"gradient-{case}"]["sum"]
         drawn = show(axis, np.ma.masked_equal(g, 0.0), f"({case}) {text}: sum {total:.1e}", "coolwarm", limit, -limit)
         part.colorbar(drawn, ax=axis).ax.tick_params(labelsize=6)
@@ -99,12 +107,12 @@ def _tophat(part, book, pairs, marks, pictures) -> None:
         found, about = book.arrays(f"tophat-{pair}"), book.rows[f"tophat-{pair}"]
         for axis, mark in zip(row, marks, strict=False):
             title = names[f"tophat-{pair}"].replace("sparse network", "sparse").replace("dense network", "dense")
-            show(axis, found[f"heights_{mark}"], f"{title}: heights, n = {mark}", "viridis")
+            show(axis, found[f"heights_{mark}"], f"{title}\nheights, n = {mark}", "viridis")
         _image_and_error(row[-2:], found["image"], target, about)
     found, row = book.arrays("own-tophat"), grid[-1]
     for axis in row[: len(marks) - 1]:
         axis.axis("off")
-    show(row[len(marks) - 1], found["heights"], "our defaults: heights", "viridis")
+    show(row[len(marks) - 1], found["heights"], "our defaults\nheights", "viridis")
     _image_and_error(row[-2:], found["image"], target, book.rows["own-tophat"])
 
 
@@ -153,12 +161,13 @@ def _intersection(part, book) -> None:
     mesh = [r for r in rows if r["series"] == "mesh"]
     newton = [r for r in rows if r["series"].startswith("newton")]
     n = [r["n_u"] for r in mesh]
-    for key, label in (("z_mean", "mean z-error"), ("error", "mean t-error")):
-        axes[0].loglog(n, [r[key] for r in mesh], "o-", ms=3, label=label)
+    for key, label, line, colour in (("z_mean", "mean z-error", "o-", COLOURS[0]), ("error", "mean t-error", "s--", COLOURS[1])):
+        axes[0].loglog(n, [r[key] for r in mesh], line, ms=4, label=label, color=colour)
     axes[1].loglog(n, [r["seconds"] for r in mesh], "o-", ms=3, label="mesh")
     for r in newton[:1]:
         axes[0].axhline(max(r["error"], 1e-17), color="grey", ls="--", label="Newton's method, t-error")
         axes[1].axhline(r["seconds"], color="grey", ls="--", label="Newton's method")
+    plain_ticks(axes[1].yaxis)
     for axis, text in zip(axes, ("error (mm)", "time (s)"), strict=True):
         axis.set_xlabel("knot span subdivisions $n_u = n_v$", fontsize=7)
         axis.set_ylabel(text, fontsize=7)

@@ -1,0 +1,142 @@
+"""What would make a picture sharp that a source's extent blurs, and how extended a source leaves a picture sharp.
+
+Notation
+    sigma   contrast of the picture: standard deviation of its irradiance over its mean, on the screen
+    e       relative RMS error that the blur leaves
+    f       by how much smaller the source's image, against the picture, makes e <= SHARP sigma
+
+The image of a source is as wide as the throw times the angle under which the lens sees it, whatever the magnification and the
+lens; the picture is as wide as both make it.  So all of these come to the same: f times the magnification, or the width of the
+lens, a throw or a source 1 / f as large, or details f times as coarse.  e is that of the best light behind the blur
+(`deconvolution`) for a lens that is designed for the source, and that of the plainly blurred picture for one that is designed for
+parallel light.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from caustic_cli.inverse.deconvolution import deconvolved
+from caustic_cli.inverse.extended import shift_of
+from caustic_cli.inverse.reach import largest_magnification
+from caustic_cli.optics.spread import Convolution, Spread
+from caustic_cli.optics.surfaces import HeightField
+from caustic_cli.scene import PlaneWave, Scene
+
+#: Part of its contrast by which a sharp picture is off, root mean square: 20 dB below it.
+SHARP = 0.1
+#: Halvings of the interval, of ratio 2^1 to begin with, in which a blur is sought: to 5 %; and doublings before that is found.
+HALVINGS, DOUBLINGS = 4, 7
+#: Iterations of the best light behind a blur, which is within some percent of the least error then.
+STEPS = 80
+#: Pixels along an axis on which that is sought, about: a blur that matters is wider than these.
+MOST_PIXELS = 256
+#: Angle of the sun, degrees.
+SUN = 0.533
+
+
+def advice(scene: Scene, target: np.ndarray, picture: tuple[float, float], field: HeightField, heights: torch.Tensor) -> str:
+    """What to say of a finished lens about the extent of its source: a sentence, or nothing.
+
+    Args:
+        target: (n, m) on the scene's screen; picture: its width and height, mm; heights: (n, m) mm.
+    """
+    sigma = float(target.std() / target.mean()) if target.mean() > 0 else 0.0
+    if sigma == 0 or scene.source.apart or scene.screen.curved or any(scene.screen.tilt):
+        return ""
+    if scene.source.extended:
+        spread = shift_of(scene, field, heights)
+        return "" if spread is None else _of_blur(scene, target, picture, spread, SHARP * sigma)
+    if not scene.source.collimated:
+        return ""
+    throw, pixel = abs(scene.screen.z - scene.lens.offset.thickness), scene.screen.pixel
+    width = _widest(lambda w: _blurred(target, disc(w).on(pixel)) <= SHARP * sigma, 0.5 * min(pixel), 0.5 * min(picture))
+    if width is None:
+        return ""
+    angle = math.degrees(width / throw)
+    return (
+        f"this picture stays sharp (a tenth of its contrast off) in light of up to {angle:.2g} degrees across; the sun's is {SUN:g}"
+    )
+
+
+def disc(width: float) -> Spread:
+    """The image of an even disc that is so many mm wide on the screen."""
+    return Spread((0.5 * width, 0.5 * width), ((0.0, 0.0, 1.0),), 0.0)
+
+
+def needed(target: np.ndarray, pixel: tuple[float, float], spread: Spread, error: float) -> float | None:
+    """By how much smaller a spread leaves the best light behind it within `error` relative RMS; None: no sensible number does."""
+    parts = _widest(lambda part: deconvolved(target, smaller(spread, part).on(pixel, 1), STEPS).error <= error, 0.5**DOUBLINGS, 1.0)
+    return None if parts is None else 1.0 / parts
+
+
+def smaller(spread: Spread, part: float) -> Spread:
+    """A spread that is only so much as wide."""
+    return replace(
+        spread,
+        half=tuple(part * h for h in spread.half),
+        shifts=tuple((part * x, part * y, power) for x, y, power in spread.shifts),
+        frame=tuple(part * f for f in spread.frame),
+    )
+
+
+def _of_blur(scene: Scene, target: np.ndarray, picture: tuple[float, float], spread: Spread, error: float) -> str:
+    """What would make a blurred picture sharp."""
+    times = [max(1, n // MOST_PIXELS) for n in target.shape]
+    n, m = (n - n % k for n, k in zip(target.shape, times, strict=True))
+    coarse = target[:n, :m].reshape(n // times[0], times[0], m // times[1], times[1]).mean((1, 3))
+    f = needed(coarse, (scene.screen.pixel[0] * times[0], scene.screen.pixel[1] * times[1]), spread, error)
+    if f is None or f <= 1.0:
+        return ""
+    lens, throw = scene.lens, abs(scene.screen.z)
+    mag, ways = picture[0] * lens.array[0] / lens.size[0], []
+
+    def reached(wanted: float, distance: float) -> bool:
+        """Whether a lens could magnify so far at another distance."""
+        z = math.copysign(distance, scene.screen.z)
+        other = replace(scene, source=PlaneWave(), screen=replace(scene.screen, z=z))
+        most = largest_magnification(other, [wanted / mag * p for p in picture])
+        return most is None or most >= wanted
+
+    if reached(f * mag, throw):
+        ways.append(f"⟨+mag⟩ {f * mag:.2g} instead of {mag:.2g}")
+    if throw / f > 2.0 * (lens.offset.thickness - lens.z_in) and reached(mag, throw / f):
+        ways.append(f"⟨+throw⟩ {throw / f:.3g} instead of {throw:.3g} mm")
+    ways.append(f"a lens of {f * lens.size[0]:.3g} mm")
+    if not scene.source.distant:
+        ways.append(f"a source {f:.2g} times smaller or farther away")
+    ways.append(f"a picture whose details are {f:.2g} times as coarse")
+    return (
+        f"the source blurs this picture; it would be sharp (a tenth of its contrast off) with {', '.join(ways[:-1])}, or {ways[-1]}"
+    )
+
+
+def _blurred(target: np.ndarray, spread: Convolution) -> float:
+    """Relative RMS error of a picture that is plainly spread."""
+    around = torch.from_numpy(target / target.mean()).repeat_interleave(spread.cut, 0).repeat_interleave(spread.cut, 1)
+    a, b = spread.beside
+    seen = spread(torch.nn.functional.pad(around, (b, b, a, a))).numpy() / spread.cut**2
+    return float(np.sqrt(np.mean((seen / seen.mean() - target / target.mean()) ** 2)))
+
+
+def _widest(holds: Callable[[float], bool], least: float, most: float) -> float | None:
+    """The largest number up to `most` for which something holds that ceases to once: doubled from `least`, then by halves; None
+    where it does not hold of the least."""
+    if not holds(least):
+        return None
+    low, high = least, 2.0 * least
+    while high < most and holds(high):
+        low, high = high, 2.0 * high
+    if high >= most:
+        if holds(most):
+            return most
+        high = most
+    for _ in range(HALVINGS):
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if holds(middle) else (low, middle)
+    return low

@@ -1,0 +1,95 @@
+"""What would make a blurred picture sharp, against the light of the lens that is advised."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from caustic_cli.inverse.deconvolution import deconvolved
+from caustic_cli.inverse.extended import shift_of
+from caustic_cli.inverse.sharpness import SHARP, STEPS, advice, disc, needed, smaller
+from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Scene, Screen
+from caustic_cli.studies.retrace import retrace
+
+PIXELS = 48
+
+
+def picture():
+    """A square and a ring on black, relative irradiance."""
+    x, y = np.meshgrid(*[(np.arange(PIXELS) + 0.5) / PIXELS - 0.5] * 2, indexing="ij")
+    r = np.hypot(x, y)
+    return ((r > 0.2) & (r < 0.3) | (np.maximum(abs(x), abs(y)) < 0.1)).astype(float)
+
+
+def scene(source, throw=300.0, mag=3.0):
+    """A lens of 10 mm with a picture on all of the screen, its field and the heights of the sphere that magnifies so."""
+    lens = Lens(control=(12, 12))
+    lens = replace(lens, offset=Offset.for_magnification((mag, mag), lens.index, throw, lens.offset.thickness))
+    field = HeightField.of(lens)
+    x, y = (c.numpy() for c in field.control_xy())
+    heights = torch.from_numpy(lens.offset.thickness + lens.offset.sag(x[:, None], y[None, :]))
+    return Scene(source, lens, Screen((10.0 * mag, 10.0 * mag), throw, (PIXELS, PIXELS))), field, heights
+
+
+def numbers(text):
+    """Numbers of the advice by what they are of."""
+    found = {name: float(value) for name, value in re.findall(r"⟨\+(mag|throw)⟩ ([\d.e+]+)", text)}
+    return found | {"lens": float(re.search(r"a lens of ([\d.e+]+)", text)[1])}
+
+
+def test_the_advised_lens_is_sharp():
+    """The least error behind the sun, of the scene as advised, is what sharp means; at half as much it is not."""
+    target, light = picture(), Disc(angle=0.533)
+    before = scene(light)
+    found = numbers(advice(before[0], target, (30.0, 30.0), *before[1:]))
+    error = SHARP * target.std() / target.mean()
+
+    def least(throw, mag):
+        after = scene(light, throw, mag)
+        return deconvolved(target, shift_of(*after).on(after[0].screen.pixel, 1), STEPS).error
+
+    assert found["mag"] > 3.6 and found["throw"] < 250
+    assert found["mag"] / 3.0 == pytest.approx(300.0 / found["throw"], rel=0.05)
+    assert found["lens"] == pytest.approx(10.0 * found["mag"] / 3.0, rel=0.05)
+    for throw, mag in ((300.0, found["mag"]), (found["throw"], 3.0)):
+        assert least(throw, mag) <= 1.1 * error < least(throw * 1.3, mag)
+    assert least(300.0, 3.0) > 1.1 * error
+
+
+def test_the_factor_is_the_least():
+    target = picture()
+    spread, pixel = disc(6.0), (30.0 / PIXELS,) * 2
+    for error in (0.1, 0.3):
+        f = needed(target, pixel, spread, error)
+        assert deconvolved(target, smaller(spread, 1.0 / f).on(pixel, 1), STEPS).error <= error
+        assert deconvolved(target, smaller(spread, 1.1 / f).on(pixel, 1), STEPS).error > error
+    assert needed(target, pixel, disc(1e-3), 0.3) == 1.0
+
+
+def test_nothing_is_said_of_what_is_sharp_or_has_no_extent():
+    small = scene(Disc(angle=0.01))
+    assert advice(small[0], picture(), (30.0, 30.0), *small[1:]) == ""
+    flat = scene(Disc(angle=0.533))
+    assert advice(flat[0], np.ones((PIXELS, PIXELS)), (30.0, 30.0), *flat[1:]) == ""
+
+
+def test_parallel_light_may_spread_as_far_as_is_said():
+    """The image of a lens in light of that angle, against its image in parallel light: a tenth of the contrast, by rays."""
+    wave, field, heights = scene(PlaneWave())
+    wave = replace(wave, screen=Screen((45.0, 45.0), 300.0, (90, 90))), field, heights  # dark around it
+    image, _ = retrace(*wave, None, rays=400_000)
+    sharp = image.image.numpy()  # what this lens throws is its picture
+    text = advice(wave[0], sharp, (30.0, 30.0), *wave[1:])
+    angle = float(re.search(r"up to ([\d.]+) degrees", text)[1])
+    after = replace(wave[0], source=Disc(angle=angle))
+    found, figures = retrace(after, *wave[1:], None, rays=1_000_000)
+    blurred = found.image.numpy()
+    error = np.sqrt(np.mean((blurred / blurred.mean() - sharp / sharp.mean()) ** 2) - figures["error_estimate"] ** 2)
+    assert error == pytest.approx(SHARP * sharp.std() / sharp.mean(), rel=0.15)
+    assert 0.0 < angle < math.degrees(30.0 / 300.0)
