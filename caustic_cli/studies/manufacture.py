@@ -111,7 +111,7 @@ def preview(scene: Scene, field: HeightField, heights: Tensor) -> str:
 
 
 def _megabytes(size: float) -> str:
-    return f"{size / 1e6:.{0 if size >= 1e7 else 1}f} MB"
+    return f"{size / 1e6:.{0 if size >= 1e7 else 1}f} MB" if size >= 5e4 else f"{size / 1e3:.0f} kB"
 
 
 def _points(space: SplineSpace) -> int:
