@@ -23,7 +23,7 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies import manufacture as manufacture_module
-from caustic_cli.studies.manufacture import manufacture
+from caustic_cli.studies.manufacture import manufacture, wall_and_stock
 
 ORDERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 
@@ -235,3 +235,16 @@ def test_the_command_writes_what_it_prints(tmp_path, monkeypatch, capfd):
     assert cli.run(shlex.split("render lens.npz --rays 1000 --report")) == 0
     assert "concave radius" in capfd.readouterr().err
     assert cli.run(shlex.split("render lens.npz --rays 1000 --tool-radius 3")) == 2
+
+
+@pytest.mark.parametrize("aperture", ["rectangle", "circle"])
+def test_wall_and_stock_are_those_of_the_glass(aperture):
+    """Of a bowl the rim is highest, of a circle's the lower one; the report says the same."""
+    scene, field, heights = surface(bowl(40.0), size=(10.0, 10.0))
+    scene = replace(scene, lens=replace(scene.lens, aperture=aperture))
+    said, f = wall_and_stock(scene, field, heights), manufacture(scene, field, heights)
+    assert said == {key: f[key] for key in ("minimum_wall_mm", "stock_height_mm")}
+    rim = 5.0 * (math.sqrt(2.0) if aperture == "rectangle" else 1.0)
+    assert said["minimum_wall_mm"] == pytest.approx(3.0 - scene.lens.z_in, abs=1e-4)
+    assert said["stock_height_mm"] == pytest.approx(43.0 - math.sqrt(40.0**2 - rim**2) - scene.lens.z_in, abs=2e-3)
+    assert wall_and_stock(replace(scene, lens=replace(scene.lens, mirror=True)), field, heights) == {}

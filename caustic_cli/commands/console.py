@@ -243,6 +243,11 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
         ("light on the picture", number("on_target", ".2%")),
         *behind,
         ("lost", lost or "nothing"),
+        *(
+            [("glass", f"wall {figures['minimum_wall_mm']:.2f} mm, stock {figures['stock_height_mm']:.2f} mm")]
+            if "stock_height_mm" in figures
+            else []
+        ),
         *_absolute(figures, ""),
         *waves,
         ("rays", number("rays", ",d")),

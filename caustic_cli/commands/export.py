@@ -23,7 +23,9 @@ EXAMPLES = """Examples:
 
 @options.from_fields(Milling, "milling")
 def run(
-    project: options.Project,
+    project: Annotated[
+        Path | None, typer.Argument(metavar="PROJECT", help="Project directory made by caustic design.", show_default=False)
+    ] = None,
     format: Annotated[
         str | None,
         typer.Option(
@@ -79,6 +81,9 @@ def run(
 ) -> None:
     """Write the lens of PROJECT in the formats of other programs."""
     say = console.Reporter(quiet)
+    if project is None:
+        listed = ", ".join(f"{name} ({suffix})" for name, (suffix, _, _) in FORMATS.items())
+        raise InputError(f"a project is needed, and a --format or an --out with its suffix, of {listed}")
     formats = [format_of(output)] if format is None and output else [name.strip() for name in (format or "lighttools").split(",")]
     if output and len(formats) > 1:
         raise InputError("--out names one file; several formats are written beside each other under the project's own name")

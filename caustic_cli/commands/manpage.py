@@ -76,6 +76,9 @@ signal\-to\-noise ratio; structural similarity.
 .B noise, error_estimate
 Standard error of relative_rms, and relative RMS noise of the image, that the retrace's own rays leave.
 .TP
+.B minimum_wall_mm, stock_height_mm
+Of design: least and largest height of the exit above the flat entrance.
+.TP
 .B image_kept
 Of render: true where render.png is still an earlier one of the same, with less noise.
 .TP

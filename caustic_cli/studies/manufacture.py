@@ -95,6 +95,17 @@ def manufacture(scene: Scene, field: HeightField, heights: Tensor, tool_radius: 
     }
 
 
+def wall_and_stock(scene: Scene, field: HeightField, heights: Tensor) -> dict[str, float]:
+    """Least and largest height above the flat entrance, mm, as of `manufacture`; nothing of a mirror or a free-form entrance."""
+    if scene.lens.mirror or scene.two_sided:
+        return {}
+    z = sampled(field, heights, [_points(s) for s in field.spaces])[0]
+    if scene.lens.round:
+        u, v = (torch.linspace(-1.0, 1.0, n, dtype=torch.float64) for n in z.shape)
+        z = z[u[:, None] ** 2 + v[None, :] ** 2 <= 1.0]
+    return {"minimum_wall_mm": float(z.min()) - scene.lens.z_in, "stock_height_mm": float(z.max()) - scene.lens.z_in}
+
+
 def preview(scene: Scene, field: HeightField, heights: Tensor) -> str:
     """What a design's first surface asks for, in one line; the finished one will be much like it."""
     lens, (z, *derivatives) = scene.lens, sampled(field, heights, [_points(s) for s in field.spaces])
@@ -111,7 +122,7 @@ def preview(scene: Scene, field: HeightField, heights: Tensor) -> str:
 
 
 def _megabytes(size: float) -> str:
-    return f"{size / 1e6:.{0 if size >= 1e7 else 1}f} MB"
+    return f"{size / 1e6:.{0 if size >= 1e7 else 1}f} MB" if size >= 5e4 else f"{size / 1e3:.0f} kB"
 
 
 def _points(space: SplineSpace) -> int:

@@ -48,7 +48,7 @@ from caustic_cli.project import attachments, directory, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.project import CHECKPOINT, RENDER, Project, is_project
 from caustic_cli.scene import Scene
-from caustic_cli.studies.manufacture import preview
+from caustic_cli.studies.manufacture import preview, wall_and_stock
 from caustic_cli.workflow.compilation import compile_usual, told_of
 from caustic_cli.workflow.evaluation import expected_seconds, judge
 from caustic_cli.workflow.gradient import design_index, index_figures, is_free, limit_of
@@ -506,7 +506,10 @@ def _run(
                 128 + asked[0],
             )
         found = judge(project, designer, target, state, device, hurry)
-        figures = found.figures | {"iterations": state.total, "seconds": time.monotonic() - began, "reason": found.state.reason}
+        made = wall_and_stock(designer.scene, designer.field(found.state.stage), found.state.heights)
+        figures = (
+            found.figures | made | {"iterations": state.total, "seconds": time.monotonic() - began, "reason": found.state.reason}
+        )
         if project.path is not None:
             figures |= {"image": str(project.path / RENDER), "project": str(project.path)}
         records.keep(found.state, figures)
