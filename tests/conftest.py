@@ -1,7 +1,10 @@
 """Settings for every test: one torch thread, fixed seeds, and hypothesis without randomness or clocks."""
 
+import os
 import warnings
 from pathlib import Path
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # threads of tests side by side must not wait for each other at full speed
 
 import pytest
 import torch
