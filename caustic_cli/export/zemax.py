@@ -27,9 +27,10 @@ from caustic_cli.scene import Scene
 
 #: Fewest points along an axis that OpticStudio takes.
 LEAST = 5
-#: Digits of heights and derivatives, which leave 1e-11 of a slope and so nothing of a pixel, and bytes of a row of them at most.
-DIGITS = 11
-A_ROW = 4 * (DIGITS + 7) + 3
+#: Digits of heights and derivatives, which leave 1e-12 of a slope and so nothing of a pixel, and bytes of a row of them: a sign or
+#: an exponent takes two more, which few have all.
+DIGITS = 12
+A_ROW = 4 * (DIGITS + 6) + 3
 
 
 def write_zemax(
