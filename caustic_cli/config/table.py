@@ -331,7 +331,7 @@ _ROWS = (
             "s", 0.0, above=True, default=math.inf,
             option=Option("--time-limit", "SECONDS")),
     Setting("design.checkpoint_every", "number", "between checkpoints", "s", 0.0, above=True, default=10.0,
-            why="what a kill may cost"),
+            why="what a kill may cost; those of large nets take seconds themselves, and are written more rarely"),
     Setting("design.seed", "whole", "of every random number: the same seed gives the same bytes", low=0, high=2**31 - 1, default=0,
             option=Option("--seed", common=True)),
     Setting("design.dtype", "text", "precision of the rays: float32 or float64", choices=("float32", "float64"), default="float32",

@@ -58,10 +58,10 @@ class LBFGS:
         return False
 
     def state(self) -> dict[str, Tensor]:
-        """Everything needed to go on: tensors only."""
+        """Everything needed to go on: tensors only, and none of them copied, since a large net's pairs are most of its memory."""
         out = {"x": self.x, "g": self.g, "f": torch.tensor([] if self.f is None else [self.f], dtype=torch.float64)}
-        if self.pairs:
-            out["s"], out["y"] = (torch.stack([p[k] for p in self.pairs]) for k in (0, 1))
+        for k, pair in enumerate(self.pairs):
+            out |= {f"{name}{k}": value for name, value in zip("sy", pair, strict=True)}
         return out
 
     def load(self, state: dict[str, Tensor]) -> None:
@@ -70,16 +70,19 @@ class LBFGS:
         Raises:
             InputError: it is that of another method, or of another number of unknowns.
         """
+        if "s" in state and "y" in state:  # as version 0.1.0 wrote them, all in one
+            rows = {f"{name}{k}": row for name in "sy" for k, row in enumerate(state[name])}
+            state = {name: value for name, value in state.items() if name not in ("s", "y")} | rows
         n, shapes = self.x.numel(), {name: tuple(value.shape) for name, value in state.items()}
+        count = (len(state) - 3) // 2
         own: dict[str, tuple[int, ...]] = {"x": (n,), "g": (n,), "f": (0,) if shapes.get("f") == (0,) else (1,)}
-        if "s" in shapes:
-            own |= dict.fromkeys(("s", "y"), (*shapes["s"][:1], n))
+        own |= {f"{name}{k}": (n,) for name in "sy" for k in range(count)}
         if shapes != own:
             raise InputError(UNFIT)
         self.x, self.g = state["x"].clone(), state["g"].clone()
         self.f = float(state["f"][0]) if len(state["f"]) else None
-        # Rows are copied: sums over a vector depend, in the last bit, on how its memory is aligned.
-        self.pairs = [(s.clone(), y.clone()) for s, y in zip(state["s"], state["y"], strict=True)] if "s" in state else []
+        # Copied: sums over a vector depend, in the last bit, on how its memory is aligned.
+        self.pairs = [(state[f"s{k}"].clone(), state[f"y{k}"].clone()) for k in range(count)]
 
     def _evaluate(self, x: Tensor) -> tuple[float, Tensor]:
         self.evaluations += 1

@@ -62,6 +62,8 @@ GROUND, NEARLY = 0.6, 0.98
 DONE = ("iterations", "no progress")
 #: Part of a time limit that is left to the iterations, however long the start took.
 LEAST_PART = 0.25
+#: A checkpoint that takes longer than so many seconds is followed by so many times the seconds more without one.
+QUICK, RARELY = 0.5, 10.0
 #: Source cells along a lenslet, at least.
 LEAST_CELLS = 128
 
@@ -478,7 +480,7 @@ def _run(
             )
             if movie is not None:
                 movie.record(now, target, project.settings["target"]["encoding"], bool(designer.stages[stage].waves))
-            if time.monotonic() - saved >= chosen["checkpoint_every"]:
+            if time.monotonic() - saved >= max(chosen["checkpoint_every"], RARELY * (records.seconds - QUICK)):
                 saved = time.monotonic()  # before the writing, which takes its time too
                 records.keep(now)
 
@@ -554,6 +556,7 @@ class _Records:
         self._goes_on = f"caustic design ⟨resume⟩ {project.path} goes on from it"
         before = project.path is not None and (project.path / CHECKPOINT).exists()
         self._safe = f"the one before is whole, {self._goes_on}" if before else "nothing of it is on disk"
+        self.seconds = 0.0  # that the last checkpoint took
 
     def keep(self, now: State, figures: dict[str, Any] | None = None) -> None:
         """Write a checkpoint, with the figures of a finished design.
@@ -563,11 +566,13 @@ class _Records:
         """
         if self.project.path is None:
             return
+        began = time.monotonic()
         try:
             self.project.save(Checkpoint(now, self.designer.field(now.stage).spaces, self.provenance, figures or {}, self.inputs))
         except CausticError as error:
             raise CausticError(f"{error} after iteration {now.total}; {self._safe}") from error
         self._safe = f"the one of iteration {now.total} is whole, {self._goes_on}"
+        self.seconds = time.monotonic() - began
 
 
 def provenance(project: Project, device: str) -> dict[str, Any]:
