@@ -11,7 +11,7 @@ from parametric import Surface
 from scipy.interpolate import BSpline
 
 from caustic_cli.errors import InputError
-from caustic_cli.optics.bspline import MAX_DEGREE, SplineSpace
+from caustic_cli.optics.bspline import MAX_DEGREE, SplineSpace, over_grid
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Lens
@@ -161,15 +161,34 @@ def test_slope_bound_holds_and_is_attained_by_a_plane():
 
 
 @pytest.mark.parametrize("degree", DEGREES)
-def test_derivative_matrix_gives_the_derivatives_control_points(degree):
+def test_differences_are_the_derivatives_control_points(degree):
     """Inner knots stay below multiplicity p, so that the derivative has no tears (degree 1 has them always: SciPy allows it)."""
     inner = [0.2, 0.5, 0.51]
     space = SplineSpace(degree, knots_with(degree, inner, [1, max(1, degree - 1), 1]))
     control = torch.randn(space.n, dtype=torch.float64)
     x = torch.rand(100, dtype=torch.float64)
     expected = (space.matrix(x, 1) @ control).numpy()
-    ours = BSpline(space.knots.numpy()[1:-1], (space.derivative_matrix() @ control).numpy(), degree - 1)(x.numpy())
+    ours = BSpline(space.knots.numpy()[1:-1], space.differences(control).numpy(), degree - 1)(x.numpy())
     np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("degree", DEGREES)
+def test_banded_products_and_interpolation_are_those_of_the_dense_matrix(degree):
+    space = SplineSpace(degree, knots_with(degree, [0.2, 0.5, 0.51], [1, max(1, degree - 1), 1]))
+    other, x = SplineSpace.uniform(degree + 5, degree), torch.rand(40, dtype=torch.float64)
+    net = torch.randn(space.n, other.n, dtype=torch.float64, requires_grad=True)
+    by = torch.randn(40, other.n, dtype=torch.float64)
+    for derivative in range(3):
+        u, v = (s.matrix(t, derivative) for s, t in ((space, x), (other, other.greville)))
+        dense = u @ net @ v.T
+        banded = over_grid(space.banded(x, derivative), net, other.banded(other.greville, derivative))
+        scale = 1e-13 * float(u.abs().max() * v.abs().max() * net.detach().abs().max())
+        torch.testing.assert_close(banded, dense, rtol=0, atol=scale)
+        pulled = [torch.autograd.grad(z, net, by)[0] for z in (banded, dense)]
+        torch.testing.assert_close(*pulled, rtol=1e-12, atol=scale)
+    values = torch.randn(space.n, other.n, dtype=torch.float64)
+    at, inverse = space.matrix(space.greville), space.interpolated(values)
+    torch.testing.assert_close(at @ inverse, values, rtol=0, atol=1e-14 * float(torch.linalg.cond(at)) * float(inverse.abs().max()))
 
 
 @st.composite

@@ -19,6 +19,7 @@ from caustic_cli.config.plans import (
     TWO_SIDED_SPANS,
     Table,
     coarse_to_fine,
+    creased_control,
     each_lenslet,
     on_rays,
     on_waves,
@@ -452,7 +453,7 @@ def _complete_design(
         # Diffraction rounds creases by more than a fine net would.
         creased = gaps >= GAPS and not (own or waves or spread) and source.distant and max(array) == 1
         if creased:
-            lens["control"] = [refinement_spans(max(nx, ny), quality, creased) + p for p in degree]
+            lens["control"] = [creased_control(max(nx, ny), p, quality) for p in degree]
         stages = refinement(tuple(lens["control"]), rays, (nx, ny), quality, not centre.collimated, spread, creased)
         if value_of(s["target"], "target.sheet"):
             stages = each_lenslet(stages, math.prod(array), (nx, ny))

@@ -200,8 +200,7 @@ class Designer:
 
     def begun(self, state: State) -> Tensor:
         """The surface that the design began from, on the net of the stage it stands in (n, m), mm."""
-        tu, tv = (a.change_of_basis(b) for a, b in zip(self.field(0).spaces, self.field(state.stage).spaces, strict=True))
-        return tu @ state.start @ tv.T
+        return self._carried(state.start, 0, state.stage)
 
     def showing(self, state: State, heights: Tensor) -> State:
         """A state whose lens is `heights`, although the optimiser stands elsewhere; `restored` undoes it."""
@@ -437,8 +436,14 @@ class Designer:
             return replace(state, stage=k, iteration=0, optimizer={})
         if self.options.network != "none":
             raise InputError("⟨design.stages.control⟩ cannot change between stages of a network")
-        tu, tv = (a.change_of_basis(b) for a, b in zip(self.field(k - 1).spaces, self.field(k).spaces, strict=True))
-        return replace(state, stage=k, iteration=0, parameters={}, optimizer={}, heights=tu @ state.heights @ tv.T)
+        return replace(state, stage=k, iteration=0, parameters={}, optimizer={}, heights=self._carried(state.heights, k - 1, k))
+
+    def _carried(self, heights: Tensor, before: int, after: int) -> Tensor:
+        """The same surface on the net of another stage."""
+        if self.stages[before].control == self.stages[after].control:
+            return heights
+        tu, tv = (a.change_of_basis(b) for a, b in zip(self.field(before).spaces, self.field(after).spaces, strict=True))
+        return tu @ heights @ tv.T
 
     def _parametrise(self, k: int, start: Tensor | None, loaded: bool = False) -> Heights:
         """That of stage k; loaded: its own tensors are read afterwards."""

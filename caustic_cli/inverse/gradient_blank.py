@@ -211,5 +211,4 @@ def _start(scene: Scene, target: np.ndarray, net: HeightField, cells: int) -> Te
     step = float(x[1] - x[0]), float(y[1] - y[0])
     values = integrate(sines[0] / t, sines[1] / t, step)
     spline = RectBivariateSpline(x, y, values)
-    at = [torch.linalg.inv(s.matrix(s.greville)) for s in net.spaces]
-    return at[0] @ torch.from_numpy(spline(*(c.numpy() for c in net.control_xy()))) @ at[1].T
+    return net.interpolated(torch.from_numpy(spline(*(c.numpy() for c in net.control_xy()))))

@@ -260,9 +260,8 @@ def _best(grid: _Grid, middle: float, fixed: bool) -> _Cut:
 def net_of(x: np.ndarray, y: np.ndarray, z: np.ndarray, field: HeightField) -> Tensor:
     """Control heights (n, m) of the surface with these heights at corners x (k,), y (l,): z (k, l), mm."""
     spline = RectBivariateSpline(x, y, z)
-    at = [torch.linalg.inv(s.matrix(s.greville)) for s in field.spaces]
     values = torch.from_numpy(spline(*(c.numpy() for c in field.control_xy())))
-    net = at[0] @ values @ at[1].T
+    net = field.interpolated(values)
     # Through points, a spline of high degree over knots that repeat overshoots; one that has them as its net never does.
     return net if float(net.max() - net.min()) <= OVERSHOOT * float(values.max() - values.min()) else values
 

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics import curvature
+from caustic_cli.optics.bspline import over_grid
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 
@@ -50,8 +51,8 @@ class Penalty:
         if terms and min(s.degree for s in field.spaces) < 2:
             raise InputError("⟨design.loss⟩: laplacian and curvature need splines of degree 2 or more")
         (su, sv), (rx, ry) = field.spaces, field.half_size
-        self.u = [(su.matrix(su.greville, k) / (2.0 * rx) ** k).to(device) for k in range(3)]
-        self.v = [(sv.matrix(sv.greville, k) / (2.0 * ry) ** k).T.to(device) for k in range(3)]
+        self.u = [(su.banded(su.greville, k) / (2.0 * rx) ** k).to(device) for k in range(3)]
+        self.v = [(sv.banded(sv.greville, k) / (2.0 * ry) ** k).to(device) for k in range(3)]
         x, y = (c.numpy() for c in field.control_xy())
         offset = scene.lens.offset
         self.base = torch.from_numpy(offset.thickness + offset.sag(x[:, None], y[None, :])).to(device)
@@ -63,15 +64,16 @@ class Penalty:
     def __call__(self, heights: Tensor) -> Tensor:
         """Heights (n, m) mm -> sum of weighted squares, scalar."""
         d, total = self.gain * (heights - self.base), heights.new_zeros(())
-        xx, xy, yy = self.u[2] @ d @ self.v[0], self.u[1] @ d @ self.v[1], self.u[0] @ d @ self.v[2]
+        if self.terms:
+            xx, xy, yy = (over_grid(self.u[a], d, self.v[b]) for a, b in ((2, 0), (1, 1), (0, 2)))
         for weight, name in self.terms:
             square = (xx + yy) ** 2 if name == "laplacian" else xx * xx + 2.0 * xy * xy + yy * yy
             total = total + weight * square.mean()
         if self.limit > 0:
-            slope2 = (self.u[1] @ heights @ self.v[0]) ** 2 + (self.u[0] @ heights @ self.v[1]) ** 2
+            slope2 = over_grid(self.u[1], heights, self.v[0]) ** 2 + over_grid(self.u[0], heights, self.v[1]) ** 2
             excess = (slope2.clamp_min(1e-300).sqrt() / self.limit - 1.0).clamp_min(0.0)
             total = total + (STIFFNESS * excess).square().mean()
         if self.radius > 0:
-            bent = curvature.largest(*(self.u[a] @ heights @ self.v[b] for a, b in curvature.ORDERS))
+            bent = curvature.largest(*(over_grid(self.u[a], heights, self.v[b]) for a, b in curvature.ORDERS))
             total = total + (STIFFNESS * (bent * self.radius - 1.0).clamp_min(0.0)).square().mean()
         return total

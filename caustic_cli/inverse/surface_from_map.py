@@ -267,9 +267,10 @@ def integrate(sx: np.ndarray, sy: np.ndarray, step: tuple[float, float]) -> np.n
         - (2.0 * np.sin(0.5 * np.pi * np.arange(m) / m) / hy) ** 2
     )
     wave[0, 0] = 1.0
-    spectrum = dctn(right, norm="ortho") / wave
+    workers = torch.get_num_threads()
+    spectrum = dctn(right, norm="ortho", workers=workers) / wave
     spectrum[0, 0] = 0.0
-    return idctn(spectrum, norm="ortho")
+    return idctn(spectrum, norm="ortho", workers=workers)
 
 
 def land(z: np.ndarray, x, y, d, index: float, z_screen: float, view: Seen | None = None) -> tuple[np.ndarray, np.ndarray]:

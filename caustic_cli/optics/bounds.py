@@ -212,7 +212,7 @@ def ghost_error(scene: Scene, field: HeightField, heights: Tensor, part: float, 
 def _slopes(field: HeightField, heights: Tensor) -> tuple[Tensor, Tensor]:
     """Bound of |grad Z| on every knot span, and the span's part of the aperture: (spans along x, along y) each."""
     (su, sv), (rx, ry) = field.spaces, field.half_size
-    gx, gy = (su.derivative_matrix() @ heights).abs() / (2 * rx), (heights @ sv.derivative_matrix().T).abs() / (2 * ry)
+    gx, gy = su.differences(heights).abs() / (2 * rx), sv.differences(heights, 1).abs() / (2 * ry)
     p, q = su.degree, sv.degree
     along = [torch.nn.functional.max_pool2d(g[None, None], window, 1)[0, 0] for g, window in ((gx, (p, q + 1)), (gy, (p + 1, q)))]
     widths = [torch.diff(s.knots[s.degree : s.n + 1]).double() for s in (su, sv)]

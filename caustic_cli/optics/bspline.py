@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
+from scipy.linalg import solve_banded
 from torch import Tensor
 
 from caustic_cli.errors import InputError
@@ -155,15 +156,32 @@ class SplineSpace:
         columns = first[:, None] + torch.arange(self.degree + 1, device=x.device)
         return values.new_zeros(len(x), self.n).scatter(1, columns, values)
 
-    def derivative_matrix(self) -> Tensor:
-        """Differences D with D @ P the control points of the derivative, a spline of degree p - 1: (n - 1, n)."""
+    def banded(self, x: Tensor, derivative: int = 0) -> Tensor:
+        """`matrix` as a sparse tensor: its product with a net takes p + 1 operations a point, not n."""
+        first, values = self.basis(x, derivative)
+        columns = first[:, None] + torch.arange(self.degree + 1, device=x.device)
+        rows = torch.arange(len(x), device=x.device)[:, None].expand_as(columns)
+        at = torch.stack([rows.reshape(-1), columns.reshape(-1)])
+        return torch.sparse_coo_tensor(at, values.reshape(-1), (len(x), self.n), check_invariants=False).coalesce()
+
+    def interpolated(self, values: Tensor) -> Tensor:
+        """Control points of the spline that has the values (n, ...) at the Greville abscissae: (n, ...) float64."""
+        p, n = self.degree, self.n
+        first, basis = self.basis(self.greville)
+        rows = torch.arange(n)[:, None].expand_as(basis)
+        columns = first[:, None] + torch.arange(p + 1)
+        bands = torch.zeros(2 * p + 1, n, dtype=torch.float64)
+        bands[p + rows - columns, columns] = basis
+        return torch.from_numpy(solve_banded((p, p), bands.numpy(), values.double().numpy()))
+
+    def differences(self, points: Tensor, axis: int = 0) -> Tensor:
+        """Control points of the derivative, a spline of degree p - 1, of those with `points` along an axis: n - 1 there."""
         p, t, n = self.degree, self.knots, self.n
         step = t[p + 1 : p + n] - t[1:n]
         scale = torch.where(step > 0, p / step.clamp_min(KNOT_RESOLUTION), 0.0)
-        rows = torch.arange(n - 1)
-        out = torch.zeros(n - 1, n, dtype=torch.float64)
-        out[rows, rows], out[rows, rows + 1] = -scale, scale
-        return out
+        shape = [1] * points.ndim
+        shape[axis] = -1
+        return points.diff(dim=axis) * scale.to(points).view(shape)
 
     def insert(self, new_knots) -> tuple[SplineSpace, Tensor]:
         """Boehm's knot insertion: the finer space and the matrix T (n', n) with T @ P the same spline in it."""
@@ -202,3 +220,8 @@ class SplineSpace:
             if it == len(self.knots):
                 return self.insert(missing)[1]
         return torch.linalg.solve(finer.matrix(finer.greville), self.matrix(finer.greville))
+
+
+def over_grid(u: Tensor, net: Tensor, v: Tensor) -> Tensor:
+    """u net v^T, (a, b), of `banded` u (a, n) and v (b, m), and a net (n, m)."""
+    return (v @ (u @ net).T.contiguous()).T

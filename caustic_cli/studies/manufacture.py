@@ -17,7 +17,7 @@ from torch import Tensor
 from caustic_cli.errors import InputError
 from caustic_cli.io.files import SOFTWARE, write_bytes
 from caustic_cli.optics import curvature
-from caustic_cli.optics.bspline import SplineSpace
+from caustic_cli.optics.bspline import SplineSpace, over_grid
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import stream
@@ -99,7 +99,7 @@ def wall_and_stock(scene: Scene, field: HeightField, heights: Tensor) -> dict[st
     """Least and largest height above the flat entrance, mm, as of `manufacture`; nothing of a mirror or a free-form entrance."""
     if scene.lens.mirror or scene.two_sided:
         return {}
-    z = sampled(field, heights, [_points(s) for s in field.spaces])[0]
+    (z,) = sampled(field, heights, [_points(s) for s in field.spaces], ((0, 0),))
     if scene.lens.round:
         u, v = (torch.linspace(-1.0, 1.0, n, dtype=torch.float64) for n in z.shape)
         z = z[u[:, None] ** 2 + v[None, :] ** 2 <= 1.0]
@@ -131,13 +131,12 @@ def _points(space: SplineSpace) -> int:
     return max(1, min(A_SPAN, MOST // spans)) * spans + 1
 
 
-def sampled(field: HeightField, heights: Tensor, shape) -> list[Tensor]:
-    """Heights and the derivatives of `curvature.ORDERS` on an even grid over the aperture, borders included: (n_x, n_y) each."""
+def sampled(field: HeightField, heights: Tensor, shape, orders=((0, 0), *curvature.ORDERS)) -> list[Tensor]:
+    """Derivatives of these orders by x and y on an even grid over the aperture, borders included: (n_x, n_y) each."""
     (su, sv), (rx, ry), net = field.spaces, field.half_size, heights.detach().double().cpu()
     u, v = (torch.linspace(0.0, 1.0, n, dtype=torch.float64) for n in shape)
-    rows = [su.matrix(u, k) @ net / (2.0 * rx) ** k for k in range(3)]
-    columns = [sv.matrix(v, k).T / (2.0 * ry) ** k for k in range(3)]
-    return [rows[a] @ columns[b] for a, b in ((0, 0), *curvature.ORDERS)]
+    rows, columns = ([s.banded(w, k) / (2.0 * r) ** k for k in range(3)] for s, w, r in ((su, u, rx), (sv, v, ry)))
+    return [over_grid(rows[a], net, columns[b]) for a, b in orders]
 
 
 def _steepest_incidence(scene: Scene, field: HeightField, heights: Tensor, seed: int) -> float:

@@ -233,8 +233,7 @@ class SplineIndex(IndexField):
         c, slopes = self.coefficients.detach().cpu(), []
         for axis, (space, (_, half)) in enumerate(zip(self.spaces, self.frame, strict=True)):
             if space is not None:
-                along = torch.tensordot(space.derivative_matrix(), c, dims=([1], [axis]))
-                slopes.append(float(along.abs().max()) / (2.0 * half))
+                slopes.append(float(space.differences(c, axis).abs().max()) / (2.0 * half))
         return Extremes(float(c.min()), float(c.max()), math.hypot(*slopes))
 
 

@@ -177,6 +177,45 @@ def evaluate(block, u, v, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y, z, zx, zy
         z[k], zx[k], zy[k] = value, along * wu[i] * scale_x, across * wv[j] * scale_y
 
 
+@njit(inline="always", **FAST)
+def _basis(matrix, x, out):
+    """Basis functions that do not vanish on a piece and their slopes at x into out (2, p + 1); matrix: as of `Axis`."""
+    count = len(matrix)
+    for k in range(count):
+        value, slope = matrix[count - 1, k], 0.0
+        for a in range(count - 2, -1, -1):
+            slope = slope * x + value
+            value = value * x + matrix[a, k]
+        out[0, k], out[1, k] = value, slope
+
+
+@njit(entry=True, **FAST)
+def evaluate_net(block, u, v, net, fu, tu, fv, tv, bu, mu, wu, bv, mv, wv, scale_x, scale_y, z, zx, zy, blocks):
+    """`evaluate` from the control heights (n, m) themselves, whose coefficients take longer where pieces are more than points.
+
+    fu, tu, fv, tv: `first` and `matrices` of both axes.
+    """
+    if block == ALL:
+        on_threads(blocks, (u, v, net, fu, tu, fv, tv, bu, mu, wu, bv, mv, wv, scale_x, scale_y, z, zx, zy, blocks))
+        return
+    count, along_u, along_v = len(u), np.empty((2, tu.shape[1])), np.empty((2, tv.shape[1]))
+    for k in range(block * count // blocks, (block + 1) * count // blocks):
+        i, j = piece(u[k], bu), piece(v[k], bv)
+        _basis(tu[i], (u[k] - mu[i]) * wu[i], along_u)
+        _basis(tv[j], (v[k] - mv[j]) * wv[j], along_v)
+        value, by_x, by_y = 0.0, 0.0, 0.0
+        for a in range(len(tu[i])):
+            row, slope = 0.0, 0.0
+            for b in range(len(tv[j])):
+                height = net[fu[i] + a, fv[j] + b]
+                row += height * along_v[0, b]
+                slope += height * along_v[1, b]
+            value += row * along_u[0, a]
+            by_x += row * along_u[1, a]
+            by_y += slope * along_u[0, a]
+        z[k], zx[k], zy[k] = value, by_x * wu[i] * scale_x, by_y * wv[j] * scale_y
+
+
 @njit(entry=True, **FAST)
 def pull_back(block, u, v, gz, gx, gy, bu, mu, wu, bv, mv, wv, scale_x, scale_y, grads):
     """Adjoint of `evaluate`: derivatives by the coefficients into grads (blocks, I, J, p + 1, q + 1), overwritten."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -9,6 +11,9 @@ from torch import Tensor
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels import batches, blocks, intersect, spline
 from caustic_cli.optics.kernels.threads import ALL
+
+#: Points to a piece of the surface below which they are evaluated from the control heights, and not from the coefficients of all.
+FEW = 1.0
 
 
 class FusedSurface:
@@ -34,6 +39,16 @@ class FusedSurface:
         self.last = heights.clone(), out
         return out
 
+    def evaluate(self, heights: Tensor, u: np.ndarray, v: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
+        """z mm, dz/dx and dz/dy at points in [0, 1]^2, all (N,) float64."""
+        found = [torch.empty(len(u), dtype=torch.float64) for _ in range(3)]
+        ends = (*self.geometry, *self.scale, *(t.numpy() for t in found), blocks())
+        if len(u) < FEW * math.prod(self._coefficients()[:2]):
+            spline.evaluate_net(ALL, u, v, heights.detach().double().contiguous().numpy(), *self.linear, *ends)
+        else:
+            spline.evaluate(ALL, u, v, self.coefficients(heights), *ends)
+        return found[0], found[1], found[2]
+
     def order(self, x: Tensor, y: Tensor) -> tuple[np.ndarray, int]:
         """Points (N,), mm, in order of their span products, and how many of these there are."""
         u, v = ((c.double() * s + 0.5).contiguous().numpy() for c, s in zip((x, y), self.scale, strict=True))
@@ -41,9 +56,7 @@ class FusedSurface:
 
     def slope_bounds(self, heights: Tensor) -> tuple[float, float]:
         """Bounds of |Z_u| and |Z_v| over [0, 1]^2, mm, from the control nets of the derivatives."""
-        by_u, by_v = (
-            float((a.space.derivative_matrix() @ h).abs().max()) for a, h in zip(self.axes, (heights, heights.T), strict=True)
-        )
+        by_u, by_v = (float(a.space.differences(heights, axis).abs().max()) for axis, a in enumerate(self.axes))
         return by_u, by_v
 
     def workspace(self) -> np.ndarray:
@@ -72,11 +85,7 @@ def scattered_surface(surface: FusedSurface, heights: Tensor, u: np.ndarray, v: 
 class _ScatteredSurface(torch.autograd.Function):
     @staticmethod
     def forward(heights: Tensor, surface: FusedSurface, u: np.ndarray, v: np.ndarray):
-        out = [torch.empty(len(u), dtype=torch.float64) for _ in range(3)]
-        spline.evaluate(
-            ALL, u, v, surface.coefficients(heights), *surface.geometry, *surface.scale, *(t.numpy() for t in out), blocks()
-        )
-        return tuple(out)
+        return surface.evaluate(heights, u, v)
 
     @staticmethod
     def setup_context(ctx, inputs, output):

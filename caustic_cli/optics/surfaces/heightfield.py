@@ -21,7 +21,7 @@ from scipy.interpolate import RectBivariateSpline
 from torch import Tensor
 
 from caustic_cli.optics.backends import backend_for
-from caustic_cli.optics.bspline import SplineSpace
+from caustic_cli.optics.bspline import SplineSpace, over_grid
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces.base import FIRST, Surface, SurfaceIntersection
 from caustic_cli.scene import Lens
@@ -62,6 +62,11 @@ class HeightField(Surface[Tensor]):
         x, y = ((2.0 * s.greville - 1.0) * r for s, r in zip(self.spaces, self.half_size, strict=True))
         return x, y
 
+    def interpolated(self, values: Tensor) -> Tensor:
+        """Control heights (n, m) of the surface that has the values (n, m) float64 over its control points."""
+        su, sv = self.spaces
+        return sv.interpolated(su.interpolated(values).T).T.contiguous()
+
     def prepare(self, sample: Sample, dtype: torch.dtype) -> Evaluator:
         """Everything about the surface at these rays that does not depend on the heights; values in `dtype`."""
         (su, sv), (rx, ry) = self.spaces, self.half_size
@@ -101,8 +106,8 @@ class HeightField(Surface[Tensor]):
         (su, sv), (rx, ry) = self.spaces, self.half_size
         h = heights.detach().double().cpu()
         return (
-            float((su.derivative_matrix() @ h).abs().max() / (2 * rx)),
-            float((h @ sv.derivative_matrix().T).abs().max() / (2 * ry)),
+            float(su.differences(h).abs().max() / (2 * rx)),
+            float(sv.differences(h, 1).abs().max() / (2 * ry)),
         )
 
     def hull(self, heights: Tensor) -> tuple[float, float]:
@@ -114,8 +119,8 @@ class HeightField(Surface[Tensor]):
         """The least height over the aperture, a rectangle or the circle within, mm: of `per_span` points a knot span, at most
         `most` along an axis; never more than that of the corners and the centre."""
         points = [torch.linspace(0.0, 1.0, min(most, per_span * (len(s.breaks) - 1) + 1), dtype=torch.float64) for s in self.spaces]
-        u, v = (s.matrix(p) for s, p in zip(self.spaces, points, strict=True))
-        z = u @ heights.detach().double().cpu() @ v.T
+        u, v = (s.banded(p) for s, p in zip(self.spaces, points, strict=True))
+        z = over_grid(u, heights.detach().double().cpu(), v)
         if round:
             inside = (2.0 * points[0][:, None] - 1.0).square() + (2.0 * points[1][None, :] - 1.0).square() <= 1.0
             z = z[inside]

@@ -78,7 +78,7 @@ class DeviceSurface:
         self.scale = (0.5 / half_size[0], 0.5 / half_size[1])
         self.u, self.v = (Axis.of(s, place) for s in spaces)
         self.geometry = (*self.u[2:], *self.v[2:])
-        self.differences = tuple(s.derivative_matrix().to(place) for s in spaces)
+        self.spaces = spaces
         #: d xi / dx and d eta / dy in the narrowest piece, per mm.
         self.steepest = tuple(float(a.inverse.max()) * s for a, s in zip((self.u, self.v), self.scale, strict=True))
 
@@ -293,10 +293,10 @@ def _sag(heights: Tensor) -> tuple[Tensor, Tensor]:
 def _bounds(surface: DeviceSurface, h: Tensor) -> Tensor:
     """Least and largest height, bounds of |Z_u| and |Z_v|, and the floor where rays enter, as `ray_intersections` has them."""
     low, high = torch.aminmax(h)
-    by_u, by_v = surface.differences
+    by_u, by_v = (s.differences(h, axis) for axis, s in enumerate(surface.spaces))
     under, narrow = ray_intersections.BELOW
     floor = low - torch.clamp(under * (high - low), min=narrow / min(surface.scale))
-    return torch.stack([low, high + 1e-6 * (high - low), (by_u @ h).abs().max(), (by_v @ h.T).abs().max(), floor])
+    return torch.stack([low, high + 1e-6 * (high - low), by_u.abs().max(), by_v.abs().max(), floor])
 
 
 class _Hits(torch.autograd.Function):
