@@ -189,10 +189,10 @@ def _sweep(path: Path) -> None:
                 left.unlink()
 
 
-def write_bytes(path: str | Path, data: bytes) -> None:
-    """Write `data` to `path` atomically."""
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(data)
+def write_bytes(path: str | Path, *parts: bytes | memoryview) -> None:
+    """Write `parts`, one after the other, to `path` atomically."""
+    with atomic_path(path) as temporary, open(temporary, "wb") as f:
+        f.writelines(parts)
 
 
 def is_ours(path: str | Path) -> bool:

@@ -18,6 +18,7 @@ Read are at most MAX_BYTES; the checksum is taken in pieces, and datasets only a
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import math
 import subprocess
@@ -76,7 +77,8 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
         CausticError: it could not be written; the one before is whole.
     """
     state, spaces = checkpoint.state, checkpoint.spaces
-    with h5py.File("checkpoint", "w", driver="core", backing_store=False) as f:  # in memory: a full disk is no HDF5 matter
+    image = io.BytesIO()  # a full disk is no HDF5 matter
+    with h5py.File(image, "w") as f:
         f.attrs["format_version"] = FORMAT_VERSION
         f.attrs["created_by"] = f"caustic {__version__}"
         f.attrs["provenance"] = json.dumps(checkpoint.provenance, sort_keys=True)
@@ -96,12 +98,10 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
                 part[key] = value.detach().cpu().numpy()
         f["history"] = np.array(state.history, dtype=np.float64).reshape(-1, len(HISTORY))
         f["history"].attrs["columns"] = ",".join(HISTORY)
-        f.flush()
-        image = f.id.get_file_image()
-    write_bytes(path, seal(image) + image)
+    write_bytes(path, seal(image.getbuffer()), image.getbuffer())
 
 
-def seal(image: bytes) -> bytes:
+def seal(image: bytes | memoryview) -> bytes:
     """The block that stands before an HDF5 image."""
     return _block(hashlib.sha256(image).hexdigest())
 
