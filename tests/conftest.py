@@ -58,6 +58,7 @@ SLOW = (
     "test_machine.py",
     "test_noise.py",
     "test_roundtrip.py",
+    "test_scale.py",
     "test_stages.py",
     "test_system.py",
     "test_tolerances.py",

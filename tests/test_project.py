@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -343,3 +344,20 @@ def test_a_bad_profile_is_refused_before_anything_is_made(tmp_path, monkeypatch,
     (tmp_path / "c.toml").write_text(f"[source]\nprofile = '{profile}'\n" + CONFIG)
     assert profile in refusal(["design", "even.png", "--config", "c.toml"], capfd)
     assert not (tmp_path / "even.caustic").exists()
+
+
+def test_a_checkpoint_is_held_once_while_it_is_written(tmp_path):
+    """Of an optimiser's pairs, many times the lens, memory gets one copy."""
+    pairs = {name: torch.ones(20, 200_000, dtype=torch.float64) for name in "sy"}  # 64 MB
+    net = torch.ones(4, 4, dtype=torch.float64)
+    state = State(net, parameters={"raw": net}, optimizer=pairs)
+    tracemalloc.start()
+    try:
+        checkpoint.save(tmp_path / "c.h5", Checkpoint(state, (SplineSpace.uniform(4, 3),) * 2, {}, {}))
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    size = (tmp_path / "c.h5").stat().st_size
+    assert size > 60e6
+    assert peak < 1.5 * size
+    assert torch.equal(checkpoint.load(tmp_path / "c.h5").state.optimizer["y"], pairs["y"])

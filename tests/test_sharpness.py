@@ -12,7 +12,8 @@ import torch
 
 from caustic_cli.inverse.deconvolution import deconvolved
 from caustic_cli.inverse.extended import shift_of
-from caustic_cli.inverse.sharpness import SHARP, STEPS, advice, disc, needed, smaller
+from caustic_cli.inverse.sharpness import SHARP, STEPS, _blurred, advice, disc, needed, smaller
+from caustic_cli.optics.spread import Convolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Scene, Screen
 from caustic_cli.studies.retrace import retrace
@@ -93,3 +94,24 @@ def test_parallel_light_may_spread_as_far_as_is_said():
     error = np.sqrt(np.mean((blurred / blurred.mean() - sharp / sharp.mean()) ** 2) - figures["error_estimate"] ** 2)
     assert error == pytest.approx(SHARP * sharp.std() / sharp.mean(), rel=0.15)
     assert 0.0 < angle < math.degrees(30.0 / 300.0)
+
+
+def test_a_large_screen_is_not_cut_finer(monkeypatch):
+    """What is convolved grows no faster than the picture, and its angle is that of pixels cut into 4 all the same."""
+    pixels, shapes, whole = 600, [], Convolution.whole
+
+    def seen(self, image, adjoint=False):
+        shapes.append(max(image.shape))
+        return whole(self, image, adjoint)
+
+    monkeypatch.setattr(Convolution, "whole", seen)
+    at = (np.arange(pixels) + 0.5) / pixels
+    target = 1.5 + np.cos(9.0 * np.pi * at)[:, None] * np.cos(7.0 * np.pi * at)
+    wave, field, heights = scene(PlaneWave())
+    wave = replace(wave, screen=Screen((30.0, 30.0), 300.0, (pixels, pixels)))
+    text = advice(wave, target, (30.0, 30.0), field, heights)
+    assert pixels < max(shapes) <= 2 * pixels
+    throw = 300.0 - wave.lens.offset.thickness
+    width = throw * math.radians(float(re.search(r"up to ([\d.]+) degrees", text)[1]))
+    exact = _blurred(target, disc(width).on(wave.screen.pixel))
+    assert exact == pytest.approx(SHARP * target.std() / target.mean(), rel=0.1)

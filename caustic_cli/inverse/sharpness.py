@@ -24,7 +24,7 @@ import torch
 from caustic_cli.inverse.deconvolution import deconvolved
 from caustic_cli.inverse.extended import shift_of
 from caustic_cli.inverse.reach import largest_magnification
-from caustic_cli.optics.spread import Convolution, Spread
+from caustic_cli.optics.spread import MOST_CUT, Convolution, Spread
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.scene import PlaneWave, Scene
 
@@ -55,7 +55,9 @@ def advice(scene: Scene, target: np.ndarray, picture: tuple[float, float], field
     if not scene.source.collimated:
         return ""
     throw, pixel = abs(scene.screen.z - scene.lens.offset.thickness), scene.screen.pixel
-    width = _widest(lambda w: _blurred(target, disc(w).on(pixel)) <= SHARP * sigma, 0.5 * min(pixel), 0.5 * min(picture))
+    cut = max(1, min(MOST_CUT, MOST_CUT * MOST_PIXELS // max(target.shape)))  # work in proportion to the pixels of a large screen
+    least = 2.0 * min(pixel) / cut  # a narrower disc is no wider than its cells
+    width = _widest(lambda w: _blurred(target, disc(w).on(pixel, cut)) <= SHARP * sigma, least, 0.5 * min(picture))
     if width is None:
         return ""
     angle = math.degrees(width / throw)

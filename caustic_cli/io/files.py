@@ -190,9 +190,9 @@ def _sweep(path: Path) -> None:
 
 
 def write_bytes(path: str | Path, *parts: bytes | memoryview) -> None:
-    """Write the parts of a file, one after the other, to `path` atomically."""
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        file.writelines(parts)
+    """Write `parts`, one after the other, to `path` atomically."""
+    with atomic_path(path) as temporary, open(temporary, "wb") as f:
+        f.writelines(parts)
 
 
 def is_ours(path: str | Path) -> bool:

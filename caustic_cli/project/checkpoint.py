@@ -98,8 +98,7 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
                 part[key] = value.detach().cpu().numpy()
         f["history"] = np.array(state.history, dtype=np.float64).reshape(-1, len(HISTORY))
         f["history"].attrs["columns"] = ",".join(HISTORY)
-    whole = image.getbuffer()
-    write_bytes(path, seal(whole), whole)
+    write_bytes(path, seal(image.getbuffer()), image.getbuffer())
 
 
 def seal(image: bytes | memoryview) -> bytes:
