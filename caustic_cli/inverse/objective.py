@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from caustic_cli.inverse import ranks
 from caustic_cli.inverse.losses import PENALTIES, ColorLoss, Loss, parse
@@ -136,7 +137,9 @@ class Objective:
     def _pool(self, image: Tensor, cut: int = 1) -> Tensor:
         """Pixels of the screen, cut into so many along each axis, from those of the render."""
         k, (*colors, n, m) = self.oversample // cut, image.shape
-        return image if k == 1 else image.view(*colors, n // k, k, m // k, k).sum((-3, -1))
+        if k == 1:
+            return image
+        return avg_pool2d(image.view(-1, n, m), k, divisor_override=1).view(*colors, n // k, m // k)  # sums; faster than .sum
 
     def _spread_out(self, images: Tensor) -> Tensor:
         """The source's image on screen and apron, from those of the rays of each of its points."""
