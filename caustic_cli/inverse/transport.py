@@ -118,6 +118,13 @@ def corners(n: int, half: float) -> np.ndarray:
     return np.linspace(-half, half, n + 1)
 
 
+def cell_lines(half: tuple[float, float], cells: int) -> tuple[np.ndarray, np.ndarray]:
+    """Edges x (n + 1,), y (m + 1,) of nearly square cells over a rectangle, so many along its longer side; 3 at least, since four
+    corners carry a cubic."""
+    x, y = (corners(max(3, round(cells * r / max(half))), r) for r in half)
+    return x, y
+
+
 def solve(
     source, target, source_half, target_half, *, start=None, smooth=1.5, tolerance=5e-3, most=10, darkest=DARKEST
 ) -> Transport:
