@@ -13,7 +13,7 @@ from scipy.interpolate import BSpline, RectBivariateSpline
 
 from caustic_cli import __version__
 from caustic_cli.errors import InputError
-from caustic_cli.export import FORMATS, obj, ply, stl, surface
+from caustic_cli.export import FORMATS, mesh, surface
 from caustic_cli.export.accuracy import Deviation, of_bilinear, of_patches, of_spline, of_triangles
 from caustic_cli.export.lighttools import write_lighttools
 from caustic_cli.export.mesh import closed_mesh, patch
@@ -23,7 +23,7 @@ from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer
-from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
+from caustic_cli.scene import Component, Lens, Offset, PlaneWave, Scene, Screen
 from caustic_cli.workflow import export
 
 UNEVEN = (0.0, 0.0, 0.0, 0.0, 0.11, 0.2, 0.2, 0.55, 0.83, 1.0, 1.0, 1.0, 1.0)  # cubic, one double knot
@@ -319,10 +319,10 @@ def test_stl_reads_as_a_volume_in_trimesh(tmp_path, case):
     trimesh = pytest.importorskip("trimesh")
     scene, field, heights = case
     write_stl(tmp_path / "lens.stl", scene, field, heights, (20, 33))
-    mesh = trimesh.load_mesh(tmp_path / "lens.stl")
-    assert mesh.is_watertight and mesh.is_winding_consistent and mesh.is_volume and mesh.body_count == 1
+    read = trimesh.load_mesh(tmp_path / "lens.stl")
+    assert read.is_watertight and read.is_winding_consistent and read.is_volume and read.body_count == 1
     write_lighttools(tmp_path / "lens.npz", scene, field, heights)
-    assert mesh.volume == pytest.approx(exact_volume(load(tmp_path / "lens.npz")), rel=1e-2)
+    assert read.volume == pytest.approx(exact_volume(load(tmp_path / "lens.npz")), rel=1e-2)
 
 
 def test_stl_repeats_to_the_byte(tmp_path):
@@ -402,8 +402,7 @@ def test_shift_is_that_of_traced_light():
 @pytest.mark.parametrize("round", [False, True])
 def test_default_files_keep_to_the_usual_size_and_say_how_far_they_are_off(tmp_path, monkeypatch, format, round):
     monkeypatch.setattr(surface, "USUAL_BYTES", 400_000)
-    for mesh in (stl, ply, obj):
-        monkeypatch.setattr(mesh, "BESIDE", 50_000)
+    monkeypatch.setattr(mesh, "BESIDE", 50_000)
     scene, field, heights = make(control=(60, 60))
     if round:
         scene = replace(scene, lens=replace(scene.lens, aperture="circle"))
@@ -417,3 +416,17 @@ def test_default_files_keep_to_the_usual_size_and_say_how_far_they_are_off(tmp_p
     if format not in ("heightmap", "zemax"):
         finer = export.write(file, scene, field, heights, format, samples=tuple(2 * n for n in found["samples"]))
         assert finer["height_error_mm"] < found["height_error_mm"] and finer["shift_pixels"] < found["shift_pixels"]
+
+
+@pytest.mark.parametrize("format", ["stl", "ply", "obj"])
+def test_default_files_of_several_solids_keep_to_the_usual_size(tmp_path, monkeypatch, format):
+    """All solids together, which would not fit if each had as many points as one alone."""
+    monkeypatch.setattr(surface, "USUAL_BYTES", 400_000)
+    monkeypatch.setattr(mesh, "BESIDE", 50_000)
+    scene, field, heights = make(control=(60, 60))
+    lenses = tuple(Component("lens", z, (12.0, 12.0), 4.0, (60.0, -90.0), 1.6) for z in (-40.0, -30.0, 60.0))
+    file = tmp_path / f"lens.{format}"
+    export.write(file, scene, field, heights, format)
+    alone = file.stat().st_size
+    export.write(file, replace(scene, elements=lenses), field, heights, format)
+    assert alone > 250_000 and 200_000 < file.stat().st_size <= 400_000

@@ -305,7 +305,7 @@ REFUSED = {
     "twice": ("throw=250:350,throw=1:2", [], "every key once"),
     "too far": ("throw=250:1e13", [], "-1e+12 to 1e+12"),
     "within the lens": ("throw=2:350", [], "must lie behind the lens"),
-    "no source place": ("source.z=-80:-40", [], "--source point, of one place, or grid, got plane"),
+    "no source place": ("source.z=-80:-40", [], "--source point, of one place, or grid, got the plane"),
     "behind the lens": ("source.z=-80:40", ["--source", "point"], "must lie before the lens"),
     "two places": (
         "source.z=-80:-40",

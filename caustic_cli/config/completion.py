@@ -1,6 +1,7 @@
 """The settings that follow from others: a complete project from a picture and what the user said.
 
-Screen, picture and offset surface follow from the magnification; the stages from control net, rays and pixels.
+Screen, picture and offset surface follow from the magnification; the stages from control net, rays and pixels.  What few scenes
+have is completed in `optional`.
 """
 
 from __future__ import annotations
@@ -12,20 +13,34 @@ from typing import Any
 
 import torch
 
+from caustic_cli.config.optional import (
+    complete_blank,
+    complete_elements,
+    complete_farther,
+    complete_index_design,
+    complete_over,
+    complete_second,
+    complete_two_sided,
+    first_magnification,
+    put_in_the_middle,
+)
 from caustic_cli.config.plans import (
     GAPS,
     LEAST_SPANS,
     LEAST_WAVES,
-    TWO_SIDED_SPANS,
+    RAYS_PER_PIXEL,
     Table,
     coarse_to_fine,
+    completed_stage,
     creased_control,
     each_lenslet,
     on_rays,
     on_waves,
     refinement,
     refinement_spans,
+    stage_base,
     two_sided,
+    usual_sampler,
     wave_refinement,
 )
 from caustic_cli.config.settings import (
@@ -51,7 +66,6 @@ from caustic_cli.inverse.schedule import Stage
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.resolution import BAND, Resolution, white
 from caustic_cli.scene import Offset, Scene, Screen, Source, sources
-from caustic_cli.scene.elements import refuse_beside
 from caustic_cli.scene.lens import array_control
 from caustic_cli.scene.light import RGB
 from caustic_cli.scene.sources.section import content
@@ -60,18 +74,12 @@ from caustic_cli.scene.tolerances import Tolerances
 DEFAULT_RESOLUTION = 250
 DEFAULT_SPANS = 128  # knot spans of the finished net; 128 halve evenly through the stages
 NETWORK_CONTROL = 50  # table D.2
-OVER_WIDTH, OVER_ITERATIONS = 128, 200  # of a network over a range: caustic convergence, study design, networks
-RAYS_PER_PIXEL = 9.0  # 750 x 750 rays on 250 x 250 pixels, tables D.1 and D.2
+OVER_ITERATIONS = 200  # of a network over a range: caustic convergence, study design, networks
 DRAFT_SECONDS, FINE_SECONDS = 8.0, 60.0  # time limits below and from which another quality is the better use of the time
 STEEPEST = 1.25  # least radius of a derived sphere, in half diagonals of the lens: slopes up to 1.3
-WAVE_KEYS = ("control", "blur", "apron", "iterations", "tolerance")  # of a stage on rays that one on the wave image has too
 PLATE, WALL = 20.0, 3.0  # width beyond which a lens is a plate, as thin as its relief and this wall allow, mm
 THICK, SAG = 2.0, 0.45  # thickness over width of a lens with two free-form sides, and what of it each of them may take
-BEAM = 1.2  # width of another lens or a mirror over that of a beam from the lens' edges to the picture's
 OBLONG = 2.5  # ratio of the magnifications along the axes from which on another shape of lens is advised
-#: Of a free gradient: range to either side of the index; degree of its splines, knot spans a pixel and the most of them; and rays a
-#: pixel at most, since they cost more.
-HALF_RANGE, INDEX_DEGREE, INDEX_SPANS, MOST_SPANS, RAYS_BENT = 0.05, 3, 2, 768, 16
 COLOR_GLASS = "N-BK7"  # of a coloured picture, unless glass or index is said: dispersion has to be known
 
 
@@ -139,7 +147,7 @@ def complete(
             lens.setdefault("glass", COLOR_GLASS)
     over = Ranges.parse(value_of(s["design"], "design.over"))
     if over and "throw" in over.keys:
-        _put_in_the_middle(over, s, given, by)
+        put_in_the_middle(over, s, given, by.throw)
     mag, margin = by.mag, default("margin") if by.margin is None else by.margin
     check("lens.size", lens["size"])
     check("screen.z", screen["z"])
@@ -150,29 +158,28 @@ def complete(
     check("target.flip", target["flip"])
     check("target.encoding", target["encoding"])
     _complete_source(s["source"], lens, [stage.get("source", "") for stage in s["design"].get("stages", [])])
-    if over:
-        _complete_over(over, s, given)
-    counted = s["design"]["network"] != "none" and s["design"].get("preconditioner") == "laplacian"
-    if (over or counted) and "initial" not in given.get("design", {}):
-        s["design"]["initial"] = "zero-last"
     if "also" in s["source"]:
         s["source"]["also"] = [{**DEFAULTS["source"], **table} for table in s["source"]["also"]]
         for table in s["source"]["also"]:
             _complete_source(table, lens, [], "⟨source.also.type⟩")
-    _complete_second(s)
+    if over:
+        complete_over(over, s, given)
+    if (over or _counted(s["design"])) and "initial" not in given.get("design", {}):
+        s["design"]["initial"] = "zero-last"
+    complete_second(s)
     if "size" not in target or mag is not None:
         if mag is None and "size" in screen:
             fit = min(screen["size"][0], screen["size"][1] / aspect) / (1.0 + margin)
         else:
-            fit = (mag or _first_magnification(s)) * lens["size"][0]
+            fit = (mag or first_magnification(s)) * lens["size"][0]
         target["size"] = [fit, fit * aspect]
     if "size" not in screen:
         screen["size"] = [(1.0 + margin) * x for x in target["size"]]
     if "resolution" not in screen:
         nx = by.resolution[0] if by.resolution else DEFAULT_RESOLUTION
         screen["resolution"] = [nx, max(2, round(nx * screen["size"][1] / screen["size"][0]))]
-    _complete_farther(s)
-    _complete_elements(s)
+    complete_farther(s)
+    complete_elements(s)
     build_screen(s)
     source = build_source(s)
     _complete_lens(lens, screen, target, source, sides=2 if "second" in s else 1)
@@ -194,39 +201,6 @@ def _complete_source(source: dict[str, Any], lens: dict[str, Any], stages: list[
         source.pop(key)
 
 
-def _put_in_the_middle(over: Ranges, s: Settings, given: Settings, by: Derivation) -> None:
-    """The screen of a network that is trained over throws: at their middle, and nowhere else."""
-    screen, z = s["screen"], over.middle[over.keys.index("throw")]
-    z = -z if value_of(s["lens"], "lens.mirror") else z
-    said = by.throw is not None or "z" in given.get("screen", {})
-    if said and not math.isclose(screen["z"], z, rel_tol=1e-9):
-        raise InputError(f"⟨screen.z⟩ must be the middle of ⟨design.over⟩ throw, {z:g} mm, or not be said, got {screen['z']:g} mm")
-    screen["z"] = z
-
-
-def _complete_over(over: Ranges, s: Settings, given: Settings) -> None:
-    """What a network that is trained over ranges has beside them: its source at their middle, its outputs and its width."""
-    source, design = s["source"], s["design"]
-    middle = {key.removeprefix("source."): v for key, v in zip(over.keys, over.middle, strict=True) if key != "throw"}
-    if middle:
-        if source["type"] not in ("point", "grid") or len(source["position"]) != 1 or source.get("also"):
-            key = next(iter(middle))
-            raise InputError(f"⟨design.over⟩ source.{key} needs ⟨+source.type⟩ point, of one place, or grid, got {source['type']}")
-        place = [middle.get(axis, c) for axis, c in zip("xyz", source["position"][0], strict=True)]
-        if "position" in given.get("source", {}) and not all(
-            math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-9) for a, b in zip(place, source["position"][0], strict=True)
-        ):
-            raise InputError(
-                "⟨source.position⟩ must have the middle of ⟨design.over⟩ where that names it,"
-                f" {','.join(f'{c:g}' for c in place)}, got {','.join(f'{c:g}' for c in source['position'][0])}"
-            )
-        source["position"] = [place]
-    if design["network"] != "none":
-        design.setdefault("preconditioner", "laplacian")
-    if design["network"] == "dense":
-        design.setdefault("network_width", OVER_WIDTH)
-
-
 def first_thickness(size: Sequence[float]) -> float:
     """Thickness that a lens is first solved with, mm, where none was said."""
     width = max(size)
@@ -237,7 +211,7 @@ def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[st
     index, scale = index_of(lens), max(lens["size"]) / 10.0
     check("lens.index", index)
     if lens.get("gradient") == "free":
-        _complete_blank(lens, screen, index)
+        complete_blank(lens, screen, index)
     if "glass" not in lens:
         lens["index"] = index
     else:
@@ -270,102 +244,6 @@ def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[st
         lens["radius"] = [math.copysign(max(abs(r), least), r) for r in radius]
 
 
-def _first_magnification(s: Settings) -> float:
-    """Of the picture, where nobody said it; where light goes on parallel or to a focus, a beam's as wide as the lens."""
-    second = s.get("second", {})
-    if "focus" in second:
-        return abs(1.0 - s["screen"]["z"] / second["focus"][2])
-    return 1.0 if second.get("collimate") else default("mag")
-
-
-def _complete_second(s: Settings) -> None:
-    """What makes the lens' entrance free-form; nothing at all where nobody said anything of it."""
-    second = s.get("second", {})
-    said = [key for key in ("file", "collimate", "focus") if second.get(key)]
-    if not said:
-        for key in ("z", "size"):
-            if key in second:
-                raise InputError(f"⟨second.{key}⟩ belongs to ⟨+second.file⟩, which is not given")
-        s.pop("second", None)
-        return
-    if len(said) > 1:
-        raise InputError(f"⟨second.{said[0]}⟩ and ⟨second.{said[1]}⟩ both say what light does behind the picture: give one of them")
-    if "focus" in second:
-        places = second["focus"]
-        second["focus"] = list(check("second.focus", places[0] if len(places) == 1 else places))
-    if "file" in second and "z" not in second:
-        raise InputError("⟨second.file⟩ needs ⟨+second.z⟩, the distance of its screen")
-    design, source = s["design"], s["source"]
-    wrong = {
-        "lens.mirror": value_of(s["lens"], "lens.mirror"),
-        "target.color": value_of(s["target"], "target.color"),
-        "lens.gradient": "gradient" in s["lens"],
-        "lens.array": max(value_of(s["lens"], "lens.array")) > 1,
-        "design.robust": design.get("robust", ""),
-        "design.network": design["network"] != "none",
-        "design.optimizer": design["optimizer"] != "lbfgs",
-    }
-    for path, given in wrong.items():
-        if given:
-            raise InputError(f"⟨{path}⟩ cannot be had with ⟨second.{said[0]}⟩, which needs two free-form sides of heights by lbfgs")
-    if source.get("also") or source["type"] == "rays":
-        raise InputError(f"⟨second.{said[0]}⟩ needs one source that is no ray file")
-
-
-def _complete_farther(s: Settings) -> None:
-    """Size of a second picture: that of a beam from the lens' edge through the first one's, farther on."""
-    second = s.get("second", {})
-    if "file" not in second:
-        return
-    check("second.z", second["z"])
-    grown, size, lens = second["z"] / s["screen"]["z"], s["target"]["size"], s["lens"]["size"]
-    second.setdefault("size", [max(0.1 * t, w + (t - w) * grown) for t, w in zip(size, lens, strict=True)])
-    check("second.size", second["size"])
-
-
-def _complete_elements(s: Settings) -> None:
-    """Sizes of other lenses and mirrors, and what cannot be had with them."""
-    tables, design = [dict(table) for table in elements_of(s)], s["design"]
-    if not tables:
-        s.pop("element", None)
-        return
-    s["element"] = {"list": tables}
-    free = any(table.get("free", "none") != "none" for table in tables)
-    refuse_beside(
-        {
-            "second.file": "second" in s,
-            "design.robust": bool(design.get("robust")),
-            "design.waves": design["waves"] == "on",
-            "design.network": free and design["network"] != "none",
-            "design.optimizer": free and design["optimizer"] != "lbfgs",
-            "target.color": free and value_of(s["target"], "target.color"),
-        },
-    )
-    lens, picture, throw = s["lens"]["size"], s["target"]["size"], abs(s["screen"]["z"])
-    for table in tables:
-        if "z" in table:
-            along = min(1.0, max(0.0, check("element.z", table["z"]) / throw))
-            size = [BEAM * (a + (b - a) * along) if along else a for a, b in zip(lens, picture, strict=True)]
-            lean = [math.cos(math.radians(t)) for t in check("element.tilt", table.get("tilt", (0.0, 0.0)))]
-            size = [w / c for w, c in zip(size, lean[::-1], strict=True)]
-            table.setdefault("size", [max(size)] * 2 if table.get("aperture") == "circle" else size)
-
-
-def _complete_blank(lens: Table, screen: Table, index: float) -> None:
-    """What a flat blank has whose index is designed; its sides are the least net."""
-    if value_of(lens, "lens.mirror"):
-        raise InputError("⟨lens.gradient⟩ free needs a lens: light never enters a mirror")
-    if any(map(math.isfinite, lens.setdefault("radius", [math.inf, math.inf]))):
-        raise InputError(f"⟨lens.radius⟩ of a free gradient must be [inf, inf], two flat sides, got {lens['radius']}")
-    lens.setdefault("control", [p + 1 for p in check("lens.degree", lens["degree"])])
-    lens.setdefault("index_range", [max(1.0, index - HALF_RANGE), index + HALF_RANGE])
-    lens.setdefault("index_control", [min(MOST_SPANS, INDEX_SPANS * n) + INDEX_DEGREE for n in screen["resolution"]])
-    for key in ("index_range", "index_control", "index_layers"):
-        check(f"lens.{key}", value_of(lens, f"lens.{key}"))
-    if not lens["index_range"][0] < lens["index_range"][1]:
-        raise InputError(f"⟨lens.index_range⟩ must ascend, got {lens['index_range']}")
-
-
 def shape_words(s: Settings) -> str:
     """Which lens would follow the shape of a long picture, where this one does not."""
     (w, h), (a, b) = s["target"]["size"], s["lens"]["size"]
@@ -389,7 +267,7 @@ def _complete_design(
             " of its own: change them there"
         )
     if lens.get("gradient") == "free":
-        _complete_index_design(s, source, quality or _quality(design["time_limit"]), rays)
+        complete_index_design(s, source, quality or _quality(design["time_limit"]), rays)
         return
     plain = design["network"] == "none" and design["optimizer"] == "lbfgs"
     asked = check("design.waves", design["waves"])
@@ -397,9 +275,9 @@ def _complete_design(
     fine_net = "control" not in lens or min(n - p for n, p in zip(lens["control"], degree, strict=True)) >= LEAST_SPANS
     fine_net = fine_net or max(array) > 1  # whose lenslets have to be solved for
     spread = plain and fine_net and not source.sharp and not elements_of(s) and _shifts(s, source)
-    counted = plain or (design["network"] != "none" and design.get("preconditioner") == "laplacian")  # from any first surface
-    design.setdefault("start", "transport" if "second" in s or (counted and fine_net and not source.apart) else "offset")
-    if design["start"] != "offset" and design["network"] != "none" and design.get("preconditioner") != "laplacian":
+    shaped = (plain or _counted(design)) and fine_net and not source.apart
+    design.setdefault("start", "transport" if "second" in s or shaped else "offset")
+    if design["start"] != "offset" and design["network"] != "none" and not _counted(design):
         raise InputError(
             f"⟨design.start⟩ {design['start']} gives a surface, which a network can begin from only with"
             " ⟨+design.preconditioner⟩ laplacian; use that, start offset, or network none"
@@ -413,7 +291,7 @@ def _complete_design(
         raise InputError(FROM_AFAR)
     quality = quality or _quality(design["time_limit"])
     if "second" in s:
-        _complete_two_sided(s, source, quality, rays)
+        complete_two_sided(s, source, quality, rays)
         return
     if any(table.get("free", "none") != "none" for table in elements_of(s)) and design["start"] != "transport":
         raise InputError(
@@ -436,7 +314,7 @@ def _complete_design(
         )
     design.setdefault("preconditioner", "laplacian" if plain else "none")
     if "stages" in design:
-        design["stages"] = [_complete_stage(stage, s, _sampler(source)) for stage in design["stages"]]
+        design["stages"] = [completed_stage(stage, s, usual_sampler(source)) for stage in design["stages"]]
         if asked != "auto" and any(stage.get("waves") for stage in design["stages"]) != (asked == "on"):
             raise InputError(
                 f"⟨design.waves⟩ {asked} and the given [[design.stages]] contradict each other: "
@@ -444,7 +322,7 @@ def _complete_design(
             )
         return
     nx, ny = screen["resolution"]
-    sampler, base = _sampler(source), min(4_000_000, max(40_000, int(RAYS_PER_PIXEL * nx * ny)))
+    sampler, base = usual_sampler(source), min(4_000_000, max(40_000, int(RAYS_PER_PIXEL * nx * ny)))
     waves = _wave_stages(s, source, quality, lit)
     if moved and elements_of(s):
         stages = two_sided(tuple(lens["control"]), rays, (nx, ny), quality)
@@ -479,48 +357,14 @@ def _complete_design(
     design["stages"] = stages
 
 
-def _complete_two_sided(s: Settings, source: Source, quality: str, rays: int | None) -> None:
-    """How a lens with two free-form sides is designed."""
-    lens, screen, design = s["lens"], s["screen"], s["design"]
-    if design["start"] != "transport":
-        raise InputError(f"⟨design.start⟩ of two free-form sides must be transport, got {design['start']}")
-    if design["waves"] == "on":
-        raise InputError("⟨design.waves⟩ on: two free-form sides are refined by rays alone")
-    if "control" not in lens:
-        lens["control"] = [min(TWO_SIDED_SPANS, refinement_spans(max(screen["resolution"]), quality)) + p for p in lens["degree"]]
-    design.setdefault("preconditioner", "laplacian")
-    if "stages" not in design:
-        design["stages"] = two_sided(tuple(lens["control"]), rays, tuple(screen["resolution"]), quality)
-        return
-    design["stages"] = [_complete_stage(stage, s, _sampler(source)) for stage in design["stages"]]
-    if any(stage.get(key) for stage in design["stages"] for key in ("waves", "spread")):
-        raise InputError("[[design.stages]] of two free-form sides are on the rays of the whole source, without waves or spread")
+def _counted(design: dict[str, Any]) -> bool:
+    """Whether it is by a network whose outputs are counted from a first surface, whichever that is."""
+    return design["network"] != "none" and design.get("preconditioner") == "laplacian"
 
 
 def _of_array(control: Sequence[int], degree: Sequence[int], array: Sequence[int]) -> list[int]:
     """The least control points, so many or more, that an array of lenslets can have; of one lens, these."""
     return [array_control(n, p, k) if k > 1 else n for n, p, k in zip(control, degree, array, strict=True)]
-
-
-def _complete_index_design(s: Settings, source: Source, quality: str, rays: int | None) -> None:
-    """How a free gradient is found: L-BFGS from transport, on rays."""
-    lens, screen, design = s["lens"], s["screen"], s["design"]
-    if not source.collimated:
-        raise InputError(f"⟨lens.gradient⟩ free is designed for light of ⟨source.type⟩ plane, got {s['source']['type']}")
-    if max(value_of(lens, "lens.array")) > 1:
-        raise InputError("⟨lens.array⟩ cannot be had with a free gradient, whose sides are flat")
-    if value_of(s["target"], "target.color"):
-        raise InputError("⟨target.color⟩ is not for a free gradient, whose index is designed at one wavelength")
-    for key, only in (("network", "none"), ("optimizer", "lbfgs"), ("loss", default("design.loss"))):
-        if design[key] != only:
-            raise InputError(f"⟨design.{key}⟩ of a free gradient must be {only}, got {design[key]}")
-    if check("design.waves", design["waves"]) == "on":
-        raise InputError("⟨design.waves⟩ on needs a lens of one index, of which the wave image is taken")
-    design["start"] = "offset"
-    design.setdefault("preconditioner", "laplacian")
-    if "stages" not in design:
-        last = refinement(tuple(lens["control"]), rays, tuple(screen["resolution"]), quality)[-1]
-        design["stages"] = [last | {"rays": rays or min(last["rays"], RAYS_BENT * math.prod(screen["resolution"]))}]
 
 
 def without_waves(s: Settings, given: bool) -> str:
@@ -605,32 +449,10 @@ def _quality(time_limit: float) -> str:
     return "draft" if time_limit < DRAFT_SECONDS else "fine" if FINE_SECONDS <= time_limit < math.inf else "standard"
 
 
-def _sampler(source: Source) -> str:
-    """A tensor product of rays makes a plane wave cheap; others are intersected one by one."""
-    return "lines" if source.collimated else "stratified"
-
-
 def _shifts(s: Settings, source: Source) -> bool:
     """Whether all that a source's extent does is to shift the image."""
     lens = build_lens({**s, "lens": {"control": [LEAST_SPANS] * 2, **s["lens"]}})
     return shift_of(Scene(source, lens, build_screen(s), build_light(s))) is not None
-
-
-def _complete_stage(table: dict[str, Any], s: Settings, sampler: str) -> dict[str, Any]:
-    base = _stage_base(s, sampler)
-    return {**({k: base[k] for k in WAVE_KEYS} if table.get("waves") else base), **table}
-
-
-def _stage_base(s: Settings, sampler: str) -> Table:
-    """What a stage of the user's own says where it says nothing."""
-    nx, ny = s["screen"]["resolution"]
-    return on_rays(
-        s["lens"]["control"],
-        int(RAYS_PER_PIXEL * nx * ny),
-        sampler,
-        iterations=default("design.stages.iterations"),
-        tolerance=default("design.stages.tolerance"),
-    )
 
 
 def filter_from(kind: str, size, screen: Screen, per_mm2: float | None = None, per_pixel2: float | None = None) -> Filter:
@@ -667,7 +489,7 @@ def build_stages(settings: Settings) -> list[Stage]:
 
 def stage_of(table: Table, settings: Settings) -> Stage:
     """The stage that a table of complete settings describes."""
-    t = _stage_base(settings, "grid") | table
+    t = stage_base(settings, "grid") | table
     filter = filter_from(
         t["reconstruction"], t["filter_size"], build_screen(settings), t.get("alpha_per_mm2"), t.get("alpha_per_pixel2")
     )

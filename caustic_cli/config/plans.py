@@ -12,9 +12,13 @@ from typing import Any
 
 from scipy.fft import next_fast_len
 
+from caustic_cli.config.settings import Settings
 from caustic_cli.config.table import check, default
+from caustic_cli.scene import Source
 
 Table = dict[str, Any]
+RAYS_PER_PIXEL = 9.0  # 750 x 750 rays on 250 x 250 pixels, tables D.1 and D.2
+WAVE_KEYS = ("control", "blur", "apron", "iterations", "tolerance")  # of a stage on rays that one on the wave image has too
 #: Of a default stage on rays or on the wave image: the part by which ten iterations have to lower the loss.
 TOLERANCE, WAVE_TOLERANCE = 2e-3, 1e-3
 
@@ -55,6 +59,29 @@ def on_waves(control: Sequence[int], waves: Sequence[float], apron: int, iterati
         "iterations": iterations,
         "tolerance": WAVE_TOLERANCE,
     }
+
+
+def usual_sampler(source: Source) -> str:
+    """A tensor product of rays makes a plane wave cheap; others are intersected one by one."""
+    return "lines" if source.collimated else "stratified"
+
+
+def completed_stage(table: Table, s: Settings, sampler: str) -> Table:
+    """A stage of the user's own with all that it does not say."""
+    base = stage_base(s, sampler)
+    return {**({k: base[k] for k in WAVE_KEYS} if table.get("waves") else base), **table}
+
+
+def stage_base(s: Settings, sampler: str) -> Table:
+    """What a stage of the user's own says where it says nothing."""
+    nx, ny = s["screen"]["resolution"]
+    return on_rays(
+        s["lens"]["control"],
+        int(RAYS_PER_PIXEL * nx * ny),
+        sampler,
+        iterations=default("design.stages.iterations"),
+        tolerance=default("design.stages.tolerance"),
+    )
 
 
 def coarse_to_fine(
@@ -189,8 +216,8 @@ def refinement(
     return stages
 
 
-#: The same of two free-form sides, whose rays are traced stage by stage: rays for each pixel, most, finer, iterations; and the most
-#: knot spans.
+#: The same of what is traced surface by surface, two free-form sides or a lens among other elements: rays for each pixel, most,
+#: finer, iterations; and the most knot spans of two sides.
 TWO_SIDED = {
     "draft": (8, 500_000, 2, 30),
     "standard": (48, 3_000_000, 4, 50),
@@ -200,7 +227,7 @@ TWO_SIDED_SPANS = 384
 
 
 def two_sided(control: tuple[int, int], rays: int | None, resolution: tuple[int, int], quality: str = "standard") -> list[Table]:
-    """The stage of two free-form sides after their start; arguments as of `refinement`."""
+    """The stage of two free-form sides, or of a lens among other elements, after their start; arguments as of `refinement`."""
     check("quality", quality)
     each, most, finer, iterations = TWO_SIDED[quality]
     pixels = resolution[0] * resolution[1]

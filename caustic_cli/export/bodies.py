@@ -20,7 +20,7 @@ from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.frames import Leg, Pose, out_of, turned_back
 from caustic_cli.optics.surfaces import Sphere
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import front_from
+from caustic_cli.optics.system import fixed_of, front_from
 from caustic_cli.scene import Component, Front, Lens, Scene
 from caustic_cli.scene.elements import PLATE, SIDES
 
@@ -66,23 +66,19 @@ def bodies(scene: Scene) -> Iterator[Body]:
         else:
             exit = _side(component, "back")
             exit = Front(exit.heights + component.thickness, exit.degree, exit.knots)
-        spaces = [
-            SplineSpace.uniform(n, p) if exit.knots is None else SplineSpace(p, torch.as_tensor(exit.knots[k], dtype=torch.float64))
-            for k, (n, p) in enumerate(zip(exit.heights.shape, exit.degree, strict=True))
-        ]
-        field = HeightField((spaces[0], spaces[1]), component.half_size)
+        surface = fixed_of(exit, component.half_size)
         lens = Lens(
             component.size,
             0.0,
             max(component.index, 1.0 + 1e-9),
-            field.shape,
+            surface.field.shape,
             exit.degree,
             exit.knots,
             aperture=component.aperture,
             front=entrance,
         )
         pose = leg.pose(component.z, component.tilt)
-        yield Body(component, number, lens, field, torch.from_numpy(exit.heights), pose)
+        yield Body(component, number, lens, surface.field, surface.heights, pose)
         leg = leg.folded(component.z, component.tilt) if component.mirror else leg
 
 

@@ -31,6 +31,7 @@ from caustic_cli.export.surface import (
     STEPS_PER_SPAN,
     even_counts,
     grid_within,
+    most_points,
     sample_grid,
     second_derivative_bounds,
     usual_steps,
@@ -40,7 +41,7 @@ from caustic_cli.optics.system import front_of
 from caustic_cli.scene import Lens, Scene
 
 STRETCH = 1.28
-#: Bytes of walls and entrance in a file of a mesh, about, beside those of the points that it is made of.
+#: Bytes of walls and entrances in a file of a mesh, about, beside those of the points that it is made of.
 BESIDE = 1e6
 #: Height of the flange, as a part of the least height on the rim.
 FLANGE = 0.5
@@ -60,7 +61,6 @@ def closed_mesh(
     heights: Tensor,
     samples: tuple[int, int] | None = None,
     tolerance: float | None = None,
-    most: int | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) float64 mm and faces (F, 3) int64 of the solid, and of those of other elements.
 
@@ -68,26 +68,36 @@ def closed_mesh(
         heights: (n, m) control heights, mm.
         samples: (nx, ny) points on the exit surface, or None for a grid on the knots (`sample_grid`); other elements have theirs.
         tolerance: mm, instead of samples: as many points as keep every triangle so close to the exit surface (chord error).
-        most: points of both sides, where neither is given.
 
     Raises:
         InputError: samples and tolerance both; too few or too many points; or the surface reaches the entrance.
     """
+    _, vertices, faces = exit_and_solids(scene, field, heights, samples, tolerance)
+    return vertices, faces
+
+
+def exit_and_solids(
+    scene: Scene,
+    field: HeightField,
+    heights: Tensor,
+    samples: tuple[int, int] | None = None,
+    tolerance: float | None = None,
+    a_point: float | None = None,
+) -> tuple[Patch, np.ndarray, np.ndarray]:
+    """The points of the exit, and vertices and faces of all solids; arguments as of `closed_mesh`.
+
+    a_point: bytes of a point and its triangles in a file, of whose `USUAL_BYTES` every solid then has as much where neither samples
+    nor tolerance say how fine it is; None for no such limit.
+    """
+    most = None if a_point is None else most_points(a_point, BESIDE) // (1 + len(scene.elements))
     sides = patches(scene.lens, field, heights, samples, tolerance, most)
-    return solids(scene, sides, tolerance, most)
-
-
-def solids(
-    scene: Scene, sides: tuple[Patch, ...], tolerance: float | None = None, most: int | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces of the solid around these sides of the lens, and of the scene's other elements, of at most so many points
-    each."""
     parts = [solid_of(scene.lens, *sides)]
     for body in bodies(scene):
         vertices, faces = solid_of(body.lens, *patches(body.lens, body.field, body.heights, None, tolerance, most))
         parts.append((body.placed(vertices), faces))
     counts = np.cumsum([0, *(len(v) for v, _ in parts)])
-    return np.concatenate([v for v, _ in parts]), np.concatenate([f + k for (_, f), k in zip(parts, counts, strict=False)])
+    vertices = np.concatenate([v for v, _ in parts])
+    return sides[-1], vertices, np.concatenate([f + k for (_, f), k in zip(parts, counts, strict=False)])
 
 
 def patches(
@@ -98,7 +108,8 @@ def patches(
     tolerance: float | None = None,
     most: int | None = None,
 ) -> tuple[Patch, ...]:
-    """The sides of a solid that are free-form, the exit last; arguments as of `closed_mesh`."""
+    """The sides of a solid that are free-form, the exit last; arguments as of `closed_mesh`; most: points of all of them, where
+    neither samples nor tolerance is given."""
     if lens.front is None:
         return (patch(lens, field, heights, samples, tolerance, most),)
     return both_patches(lens, field, heights, samples, tolerance, None if most is None else most // 2)

@@ -7,9 +7,8 @@ from pathlib import Path
 from torch import Tensor
 
 from caustic_cli.export.accuracy import Deviation, of_triangles
-from caustic_cli.export.mesh import BESIDE, patches, solids
+from caustic_cli.export.mesh import exit_and_solids
 from caustic_cli.export.ply import A_POINT
-from caustic_cli.export.surface import most_points
 from caustic_cli.export.text import CREATED, rows
 from caustic_cli.io.files import atomic_path
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -25,11 +24,9 @@ def write_obj(
     tolerance: float | None = None,
 ) -> Deviation:
     """Write the solid whole or not at all; arguments, errors and what comes back as of `write_ply`."""
-    most = most_points(A_POINT, BESIDE)
-    sides = patches(scene.lens, field, heights, samples, tolerance, most)
-    vertices, faces = solids(scene, sides, tolerance, most)
+    exit, vertices, faces = exit_and_solids(scene, field, heights, samples, tolerance, A_POINT)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write(f"# {CREATED}\n# millimetres\no lens\n".encode())
         file.writelines(rows(vertices, "v %.17g %.17g %.17g\n"))
         file.writelines(rows(faces + 1, "f %d %d %d\n"))
-    return of_triangles(sides[-1], field, heights)
+    return of_triangles(exit, field, heights)

@@ -13,8 +13,7 @@ import numpy as np
 from torch import Tensor
 
 from caustic_cli.export.accuracy import Deviation, of_triangles
-from caustic_cli.export.mesh import BESIDE, patches, solids
-from caustic_cli.export.surface import most_points
+from caustic_cli.export.mesh import exit_and_solids
 from caustic_cli.export.text import CREATED, rows
 from caustic_cli.io.files import atomic_path
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -37,10 +36,9 @@ def write_ply(
 
     Arguments and errors as of `closed_mesh`; InputError also if it cannot be written.
     """
-    most = most_points(A_POINT, BESIDE)
-    sides = patches(scene.lens, field, heights, samples, tolerance, most)
-    write_mesh(path, *solids(scene, sides, tolerance, most))
-    return of_triangles(sides[-1], field, heights)
+    exit, vertices, faces = exit_and_solids(scene, field, heights, samples, tolerance, A_POINT)
+    write_mesh(path, vertices, faces)
+    return of_triangles(exit, field, heights)
 
 
 def write_mesh(

@@ -19,8 +19,7 @@ from torch import Tensor
 from caustic_cli import __version__
 from caustic_cli.errors import InputError
 from caustic_cli.export.accuracy import Deviation, of_triangles
-from caustic_cli.export.mesh import BESIDE, patches, solids
-from caustic_cli.export.surface import most_points
+from caustic_cli.export.mesh import exit_and_solids
 from caustic_cli.io.files import atomic_path
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
@@ -45,16 +44,14 @@ def write_stl(
     Raises:
         InputError: as `closed_mesh`; points closer than float32 can tell apart; or the file cannot be written there.
     """
-    most = most_points(2 * TRIANGLE.itemsize, BESIDE)
-    sides = patches(scene.lens, field, heights, samples, tolerance, most)
-    vertices, faces = solids(scene, sides, tolerance, most)
+    exit, vertices, faces = exit_and_solids(scene, field, heights, samples, tolerance, 2 * TRIANGLE.itemsize)
     vertices = vertices.astype("<f4")
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write(HEADER)
         file.write(np.array(len(faces), "<u4").tobytes())
         for start in range(0, len(faces), BLOCK):
             file.write(_records(vertices[faces[start : start + BLOCK]]).tobytes())
-    return of_triangles(sides[-1], field, heights)
+    return of_triangles(exit, field, heights)
 
 
 def _records(corners: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ from torch import Tensor
 from caustic_cli.config.table import check
 from caustic_cli.errors import InputError
 from caustic_cli.optics.sampling import stream
-from caustic_cli.scene import Scene
+from caustic_cli.scene import Scene, Source
 
 #: What may vary, and the setting whose range holds for it.
 KEYS = {"throw": "screen.z", "source.x": "source.position", "source.y": "source.position", "source.z": "source.position"}
@@ -143,9 +143,7 @@ class Ranges:
             scene = replace(scene, screen=replace(scene.screen, z=z))
         if any(key.startswith("source.") for key in at):
             source = scene.source
-            if source.distant or source.apart or source.rays is not None or max(source.extent) > 0:
-                key = next(key for key in at if key.startswith("source."))
-                raise InputError(f"⟨design.over⟩ {key} needs ⟨+source.type⟩ point, of one place, or grid, got {source.label}")
+            self.refuse(source)
             shift = [at.get(f"source.{axis}", c) - c for axis, c in zip("xyz", source.centre, strict=True)]
 
             def place(p: Sequence[float]) -> tuple[float, float, float]:
@@ -153,6 +151,16 @@ class Ranges:
 
             scene = replace(scene, source=source.misplaced(place, 1.0))
         return scene
+
+    def refuse(self, source: Source) -> None:
+        """Refuse a source that has no one place, where its place varies.
+
+        Raises:
+            InputError: there is a range of its place.
+        """
+        key = next((key for key in self.keys if key.startswith("source.")), "")
+        if key and (source.distant or source.apart or source.rays is not None or max(source.extent) > 0):
+            raise InputError(f"⟨design.over⟩ {key} needs ⟨+source.type⟩ point, of one place, or grid, got {source.label}")
 
     def ends(self, scene: Scene) -> list[Scene]:
         """The scene at all combinations of ends of ranges.

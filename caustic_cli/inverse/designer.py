@@ -370,7 +370,7 @@ class Designer:
             )
         if scene.second is not None:
             targets = (self.target,) if self.second is None else (self.target, self.second)
-            rays = rays_of(scene, stage.sampler, stage.rays, stream(o.seed, f"stage {k}"), self.device)
+            rays = rays_of(scene, stage.sampler, stage.rays, self._seed(k), self.device)
             return TwoSidedObjective(scene, self.field(k), rays, stage.filter, targets, o.loss, **self._how(k))
         if stage.lenslets:
             own = self.own * (math.prod(scene.lens.array) if len(self.own) == 1 else 1)
@@ -379,17 +379,14 @@ class Designer:
             return ArrayObjective(parts, lambda n, lenslet: self._on_rays(lenslet.scene, k, lenslet.field, own[n], rays))
         if stage.spread and (spread := shift_of(scene, self.field(k), begun)) is not None:
             expected = best_light(scene, grey(self.target.cpu().numpy()), spread, SMOOTH_STEPS).kept
-            scene, rays, spread = regular_rays(scene, spread, stage, stream(o.seed, f"stage {k}"), self.device)
-        else:
-            found: AnyObjective = self._on_rays(scene, k, self.field(k), self.target, stage.rays)
-            return (
-                found
-                if o.over is None
-                else RangeObjective(
-                    found, o.over, lambda s, seed: rays_of(s, stage.sampler, stage.rays, seed, self.device), self._seed(k)
-                )
-            )
-        return self._traced(scene, k, self.field(k), self.target, rays, spread, expected)
+            scene, rays, spread = regular_rays(scene, spread, stage, self._seed(k), self.device)
+            return self._traced(scene, k, self.field(k), self.target, rays, spread, expected)
+        found = self._on_rays(scene, k, self.field(k), self.target, stage.rays)
+        if o.over is None:
+            return found
+        return RangeObjective(
+            found, o.over, lambda s, seed: rays_of(s, stage.sampler, stage.rays, seed, self.device), self._seed(k)
+        )
 
     def _on_rays(self, scene: Scene, k: int, field: HeightField, target: Tensor, count: int) -> Objective:
         """That of stage k by so many rays of a scene's whole source."""

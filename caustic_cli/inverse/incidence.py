@@ -36,6 +36,8 @@ STEPS = 40
 #: Distance of points of the pupil over which a trace is differentiated, mm; cells of it along each axis; how wide the light of its
 #: middle is at the exit at least, in parts of what it was.
 _STEP, CELLS, LEAST_GROWTH = 1e-5, 128, 1e-3
+#: Points along each axis of a cell that a circle's edge cuts.
+PARTS = 8
 #: Largest sine of what goes on beside the light.
 STEEPEST = 0.6
 #: Most of Newton's steps for (a, b), and how near to its corner a ray has to come, in parts of the lens' half width.
@@ -148,11 +150,11 @@ def _on_pupil(scene: Scene, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return RegularGridInterpolator(middles, light)(points)
 
 
-def _part_within(x: np.ndarray, y: np.ndarray, radius: float, parts: int = 8) -> np.ndarray:
-    """Part of each cell between corners x, y that lies within a circle, from parts x parts points of it."""
-    fine = [np.linspace(c[0], c[-1], 2 * parts * (len(c) - 1) + 1)[1::2] for c in (x, y)]
+def _part_within(x: np.ndarray, y: np.ndarray, radius: float) -> np.ndarray:
+    """Part of each cell between corners x, y that lies within a circle, from PARTS x PARTS points of it."""
+    fine = [np.linspace(c[0], c[-1], 2 * PARTS * (len(c) - 1) + 1)[1::2] for c in (x, y)]
     inside = (fine[0][:, None] ** 2 + fine[1][None, :] ** 2 <= radius**2).astype(float)
-    return inside.reshape(len(x) - 1, parts, len(y) - 1, parts).mean((1, 3))
+    return inside.reshape(len(x) - 1, PARTS, len(y) - 1, PARTS).mean((1, 3))
 
 
 def _square(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, tuple | None]:

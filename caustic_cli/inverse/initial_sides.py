@@ -31,7 +31,7 @@ from caustic_cli.inverse.incidence import on_entrance
 from caustic_cli.inverse.initial_surface import net_of
 from caustic_cli.inverse.surface_from_map import slopes_to, surface
 from caustic_cli.inverse.surface_from_slopes import fitted
-from caustic_cli.inverse.transport import corners, solve
+from caustic_cli.inverse.transport import cell_lines, corners, solve
 from caustic_cli.inverse.view import View
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene, Screen
@@ -87,8 +87,7 @@ class _Aperture:
     @classmethod
     def of(cls, half: tuple[float, float], cells: int) -> _Aperture:
         """So many cells along the longer side."""
-        x, y = (corners(max(3, round(cells * r / max(half))), r) for r in half)
-        return cls(x, y)
+        return cls(*cell_lines(half, cells))
 
     @property
     def corners(self) -> list[np.ndarray]:
@@ -129,17 +128,16 @@ def first_sides(
         slopes = slopes_towards(near, behind.focus)
     (px, py), lit = near.corners, near.lit
     nets = torch.stack([torch.zeros(field.shape, dtype=torch.float64), torch.full(field.shape, thickness, dtype=torch.float64)])
-    exit = None
+    light, directions = on_entrance(scene, grid.x, grid.y)
+    exit = np.full((len(grid.x), len(grid.y)), thickness)
     for k in range(REPEATS):
         at = np.full(px.shape, thickness)
-        for _ in range(HEIGHTS):
+        for _ in range(HEIGHTS if k else 1):  # a flat exit is met where the first step says
             ex, ey = px - slopes[0] * (near.z - at), py - slopes[1] * (near.z - at)
-            if exit is None:
-                break
             at = grid.at(exit, ex, ey)
         on_exit = _on_exit(near.light, ex, ey, grid)
         aim = spread(np.stack([ex[lit], ey[lit]]), np.stack([px[lit], py[lit]]), *grid.corners)
-        nets[0] = net_of(grid.x, grid.y, _entrance(scene, grid, on_exit, exit), field)
+        nets[0] = net_of(grid.x, grid.y, _entrance(scene, light, directions, on_exit, exit if k else None), field)
         for _ in range(1 if k else FIRST_FITS):
             nets[1] = _exit(scene, field, nets, grid, aim)
         exit = grid.heights(field, nets[1])
@@ -171,14 +169,16 @@ def slopes_towards(near: Picture, focus: tuple[float, float, float] | None) -> t
     return (focus[0] - x) / (focus[2] - near.z), (focus[1] - y) / (focus[2] - near.z)
 
 
-def _entrance(scene: Scene, grid: _Aperture, on_exit: np.ndarray, exit: np.ndarray | None) -> np.ndarray:
+def _entrance(
+    scene: Scene, light: np.ndarray, directions: tuple | None, on_exit: np.ndarray, exit: np.ndarray | None
+) -> np.ndarray:
     """Heights of the entrance at the corners of the aperture's cells, from its plane, which send light to the exit's.
 
     Args:
+        light, directions: on its plane, see `on_entrance`.
         on_exit: light on the cells there, any unit; exit: the exit's heights at their corners, None for a plane.
     """
     lens = scene.lens
-    light, directions = on_entrance(scene, grid.x, grid.y)
     z, half, centre, view = lens.offset.thickness, lens.half_size, (0.0, 0.0), None
     if exit is not None:
         view = View(Screen(lens.size, z, on_exit.shape, sags=Sags(exit - z, lens.size)), lens.z_in)
@@ -209,9 +209,8 @@ def _exit(scene: Scene, field: HeightField, nets: Tensor, grid: _Aperture, aim: 
     x, y, z = light.exit
     px, py = (grid.at(a, x, y) for a in aim)
     slopes = slopes_to(px - x, py - y, scene.screen.z - z, light.direction, scene.lens.index)
-    return fitted(
-        field, *((torch.from_numpy(a), torch.from_numpy(b)) for a, b in ((x, y), slopes)), torch.from_numpy(light.power), nets[1]
-    )
+    at, asked = ((torch.from_numpy(a), torch.from_numpy(b)) for a, b in ((x, y), slopes))
+    return fitted(field, at, asked, torch.from_numpy(light.power), nets[1])
 
 
 def _on_exit(light: np.ndarray, ex: np.ndarray, ey: np.ndarray, grid: _Aperture) -> np.ndarray:

@@ -20,7 +20,7 @@ from caustic_cli.inverse.incidence import incident
 from caustic_cli.inverse.relayed import Relayed
 from caustic_cli.inverse.surface_from_map import OutOfReach, Seen, Start, finer, thrown
 from caustic_cli.inverse.surface_from_map import surface as refracting_surface
-from caustic_cli.inverse.transport import corners
+from caustic_cli.inverse.transport import cell_lines, corners
 from caustic_cli.inverse.view import View
 from caustic_cli.optics.surfaces import Sphere
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -72,9 +72,7 @@ class _Grid:
 
     @classmethod
     def of(cls, scene: Scene, target: np.ndarray, cells: int) -> _Grid:
-        half = scene.lens.half_size
-        shape = tuple(max(3, round(cells * r / max(half))) for r in half)  # four corners carry a cubic
-        return cls(scene, target, corners(shape[0], half[0]), corners(shape[1], half[1]))
+        return cls(scene, target, *cell_lines(scene.lens.half_size, cells))
 
     @property
     def offset(self) -> np.ndarray:

@@ -60,7 +60,6 @@ class RobustObjective:
         field: HeightField,
         begun: Tensor,
         tolerances: Tolerances,
-        pairs: int = PAIRS,
     ):
         parameters = tuple(p for p in tolerances.parameters if p.error != "roughness" and not idle(scene, p.error))
         fits = tolerances.surface and _holds(field, tolerances.shortest)
@@ -69,7 +68,7 @@ class RobustObjective:
         surfaces = FormErrors(field, tolerances.form, tolerances.waviness) if fits else None
         rng = np.random.default_rng([tolerances.seed, PURPOSE, 1])
         self.parts: list[tuple[Plain, Tensor | float]] = [(objective(scene, begun), 0.0)]
-        for row in hypercube(parameters, pairs, tolerances.seed, PURPOSE):
+        for row in hypercube(parameters, PAIRS, tolerances.seed, PURPOSE):
             surface = surfaces.heights(rng, tolerances.surface) if surfaces else 0.0
             for sign in (-1.0, 1.0):
                 values = {(p.error, p.axis): sign * float(v) for p, v in zip(parameters, row, strict=True)}

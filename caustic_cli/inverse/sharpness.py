@@ -27,6 +27,7 @@ from caustic_cli.inverse.reach import largest_magnification
 from caustic_cli.optics.spread import MOST_CUT, Convolution, Spread
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.scene import PlaneWave, Scene
+from caustic_cli.scene.sources.disc import SUN
 
 #: Part of its contrast by which a sharp picture is off, root mean square: 20 dB below it.
 SHARP = 0.1
@@ -36,8 +37,6 @@ HALVINGS, DOUBLINGS = 4, 7
 STEPS = 80
 #: Pixels along an axis on which that is sought, about: a blur that matters is wider than these.
 MOST_PIXELS = 256
-#: Angle of the sun, degrees.
-SUN = 0.533
 
 
 def advice(scene: Scene, target: np.ndarray, picture: tuple[float, float], field: HeightField, heights: torch.Tensor) -> str:

@@ -46,9 +46,8 @@ COARSE_TOLERANCE, LINEAR_TOLERANCE = 1e-2, 3e-2
 EVENER = (1.0, 0.7, 0.4, 0.2, 0.1, 0.03, 0.0)  # parts of uniform light, if a level fails on the source itself
 DARKEST = 1e-3  # the source is lifted to at least this part of its mean: a cell without light has no derivative
 MAX_CELLS = 4096
-SHARP = (
-    0.75  # width of the average over phi on finer cells, in these: those of Laguerre are wider, so that it keeps no kink but theirs
-)
+#: Width of the average over phi on finer cells, in these: those of Laguerre are wider, so that it keeps no kink but theirs.
+SHARP = 0.75
 STRIP = 128  # columns of corners averaged together, which bounds the memory
 
 
@@ -62,7 +61,7 @@ class Transport:
         error: light in the wrong cell, part of the whole (before phi is smoothed).
         sites, steps: point masses of the finest level, and Newton steps of all levels.
         seconds: wall time.
-        solved: prices, sites, picture, and cells and half sizes they are of.
+        solved: prices and sites that it follows from, and the source's cells.
     """
 
     potential: np.ndarray
@@ -116,6 +115,13 @@ def centres(n: int, half: float, pad: int = 0) -> np.ndarray:
 def corners(n: int, half: float) -> np.ndarray:
     """Edges of n cells on [-half, half], (n + 1,)."""
     return np.linspace(-half, half, n + 1)
+
+
+def cell_lines(half: tuple[float, float], cells: int) -> tuple[np.ndarray, np.ndarray]:
+    """Edges x (n + 1,), y (m + 1,) of nearly square cells over a rectangle, so many along its longer side; 3 at least, since four
+    corners carry a cubic."""
+    x, y = (corners(max(3, round(cells * r / max(half))), r) for r in half)
+    return x, y
 
 
 def solve(

@@ -48,14 +48,16 @@ class View:
         ahead = np.stack([u, v, np.full(shape, self.screen.z - self.eye)]).reshape(3, -1)
         ahead = torch.from_numpy(ahead / np.sqrt((ahead * ahead).sum(0)))
         x, y, there = self.land((0.0, 0.0, self.eye), tuple(ahead))
-        return tuple(torch.where(there, c, torch.nan).reshape(shape).numpy() for c in (x, y))  # type: ignore[return-value]
+        u, v = (torch.where(there, c, torch.nan).reshape(shape).numpy() for c in (x, y))
+        return u, v
 
     def points(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Points of the screen behind (u, v) in space, mm; where there is none, of the plane."""
         x, y = self.own(u, v)
         there = np.isfinite(x)
         found = space(self.screen, np.where(there, x, 0.0), np.where(there, y, 0.0))
-        return tuple(np.where(there, a, b) for a, b in zip(found, (u, v, self.screen.z), strict=True))  # type: ignore[return-value]
+        px, py, pz = (np.where(there, a, b) for a, b in zip(found, (u, v, self.screen.z), strict=True))
+        return px, py, pz
 
     sign, straight = 1.0, (1.0, 1.0)  # see `relayed`: nothing stands between the lens and the screen
 
@@ -93,11 +95,11 @@ class View:
                 "[screen] part of the picture turns away from the lens, which cannot light it; less tilt or curvature is needed"
             )
         low, high = (u.min(), v.min()), (u.max(), v.max())
-        half = tuple(0.5 * float(b - a) for a, b in zip(low, high, strict=True))
-        middle = tuple(0.5 * float(b + a) for a, b in zip(low, high, strict=True))
+        half = 0.5 * float(high[0] - low[0]), 0.5 * float(high[1] - low[1])
+        middle = 0.5 * float(high[0] + low[0]), 0.5 * float(high[1] + low[1])
         edges = [np.linspace(a, b, FINER * (len(c) - 1) + 1) for a, b, c in zip(low, high, (x, y), strict=True)]
         own = self.own(*np.broadcast_arrays(edges[0][:, None], edges[1][None, :]))
-        return _integrals(target, s, *own), half, middle  # type: ignore[return-value]
+        return _integrals(target, s, *own), half, middle
 
 
 def _tensor(value):

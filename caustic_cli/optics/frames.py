@@ -33,10 +33,8 @@ class Pose:
             return self.frame
         (sa, ca), (sb, cb) = ((math.sin(t), math.cos(t)) for t in map(math.radians, self.tilt))
         own = (cb, 0.0, -sb), (sb * sa, ca, cb * sa), (sb * ca, -sa, cb * ca)
-        if self.frame == IDENTITY:
-            return own
-        x, y, z = (tuple(sum(a * f[k] for a, f in zip(axis, self.frame, strict=True)) for k in range(3)) for axis in own)
-        return x, y, z  # type: ignore[return-value]
+        x, y, z = (turned_back(Pose(frame=self.frame), axis) for axis in own)
+        return x, y, z
 
     @property
     def upright(self) -> bool:
@@ -67,8 +65,8 @@ class Leg:
 
         A mirror turned by t turns the axis by 2 t - 180 degrees, for t > 0, about the same line; the frame goes with it.
         """
-        turn = tuple(2.0 * t - math.copysign(180.0, t) if t else 0.0 for t in tilt)
-        frame, vertex = Pose(tilt=turn, frame=self.frame).axes, self.at(0.0, 0.0, z)  # type: ignore[arg-type]
+        about_x, about_y = (2.0 * t - math.copysign(180.0, t) if t else 0.0 for t in tilt)
+        frame, vertex = Pose(tilt=(about_x, about_y), frame=self.frame).axes, self.at(0.0, 0.0, z)
         x, y, w = (v - z * c for v, c in zip(vertex, frame[2], strict=True))
         return Leg((x, y, w), frame)
 

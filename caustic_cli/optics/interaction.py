@@ -35,7 +35,6 @@ class Walker(Protocol):
         heights: Tensor | None,
         *,
         forward: bool = True,
-        reflects: bool | None = None,
         straight: bool = True,
         parameters: Parameters = ...,
     ) -> Interaction:
@@ -48,7 +47,7 @@ class Interaction:
 
     tracer, index, element: whose and which; forward: whether light runs in the system's own direction; side: from which the
     surface is met; n_in, n_out: refractive indices before and behind, in the light's direction, (N,) where
-    the medium's varies; reflects; state: the rays, at the
+    the medium's varies; state: the rays, at the
     surface (origins in the system's frame, directions before it until `depart`, behind it from then on); local: their points in
     the element's frame; incoming: directions before it, in that frame; slopes: of the surface there; length: of the way to it, mm;
     lift: how far above the met point the rays go on, mm, where an effect says so; arriving, departing: power before and
@@ -63,7 +62,6 @@ class Interaction:
     side: float
     n_in: float | Tensor
     n_out: float | Tensor
-    reflects: bool
     straight: bool
     state: RayState
     local: tuple = ()
@@ -74,6 +72,11 @@ class Interaction:
     arriving: Tensor | None = None
     departing: Tensor | None = None
     passes: Tensor | None = None
+
+    @property
+    def reflects(self) -> bool:
+        """Whether the element is a mirror."""
+        return self.element.reflects
 
     @property
     def absorption(self) -> float:

@@ -98,10 +98,10 @@ class Element:
 def front_of(lens: Lens) -> Fixed:
     """The free-form entrance of a lens that has one."""
     assert lens.front is not None
-    return _fixed(lens.front, lens.half_size)
+    return fixed_of(lens.front, lens.half_size)
 
 
-def _fixed(front: Front, half_size: tuple[float, float]) -> Fixed:
+def fixed_of(front: Front, half_size: tuple[float, float]) -> Fixed:
     """The surface with these heights over an aperture."""
     if front.knots is None:
         u, v = (SplineSpace.uniform(n, p) for n, p in zip(front.heights.shape, front.degree, strict=True))
@@ -145,7 +145,7 @@ def _elements_of(
         front, radius = component.fronts[SIDES.index(side)], component.radius[SIDES.index(side)]
         surface: Surface
         if front is not None:
-            surface = _fixed(front, component.half_size)
+            surface = fixed_of(front, component.half_size)
         elif side in component.shaped:
             surface = HeightField(spaces, component.half_size)
         else:

@@ -203,7 +203,6 @@ class Tracer:
         heights: Tensor | None,
         *,
         forward: bool = True,
-        reflects: bool | None = None,
         straight: bool = True,
         parameters: Parameters = NOTHING,
     ) -> Interaction:
@@ -213,7 +212,6 @@ class Tracer:
             heights: of its surface, None where it has none.
             parameters: those of the media, see `index_name`; a medium's own where they are not there.
             forward: in the system's own direction, or back.
-            reflects: None for what the element does.
             straight: whether this is the walk itself, or a stray_light.
         """
         element = self.system.elements[k]
@@ -228,7 +226,6 @@ class Tracer:
             side,
             n_in,
             n_out,
-            element.reflects if reflects is None else reflects,
             straight,
             state,
         )

@@ -159,7 +159,7 @@ class Bench:
             self.progress(self.done, self.total)
 
 
-def haste(rows: Sequence[dict], name: str = "seconds") -> str:
-    """A warning where the machine was too busy for its times, with their spread in `<name>_min` and `_max`, to mean much."""
-    spread = statistics.median(row[f"{name}_max"] / row[f"{name}_min"] for row in rows)
+def haste(rows: Sequence[dict]) -> str:
+    """A warning where the machine was too busy for its times, with their spread in `seconds_min` and `_max`, to mean much."""
+    spread = statistics.median(row["seconds_max"] / row["seconds_min"] for row in rows)
     return f" (half of the times varied more than {spread:.1f}-fold: the machine was busy)" if spread > BUSY else ""

@@ -424,9 +424,9 @@ def study(trials: Trials, told: Callable[[str, int, int], None] = lambda what, d
     return Study(trials.parameters, drawn, tuple(judged), nominal, tuple(alone), unused, trials.waves is not None, t.seed, checked)
 
 
-def percentile_error(values: np.ndarray, part: float, seed: int = 0) -> float:
+def percentile_error(values: np.ndarray, part: float) -> float:
     """Standard error of a percentile, by resampling; of independent draws, so that a Latin hypercube's is rather smaller."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     return float(np.quantile(rng.choice(values, (RESAMPLED, len(values))), part, axis=1).std())
 
 

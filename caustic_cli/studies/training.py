@@ -89,7 +89,6 @@ def run_training(
     seed: int = 0,
     rays: int | None = None,
     device: str = "cpu",
-    about: dict | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Study:
     """Let all contenders run for the same time.  Neither errors nor times repeat: a faster machine gets further.
@@ -99,7 +98,6 @@ def run_training(
         seconds: for each, None for SECONDS.
         seed: of the retrace's rays.
         rays: of every retrace, None for RAYS_PER_PIXEL a pixel.
-        about: more to be told of how it was made.
         progress: told (slices done, in all) after each.
 
     Raises:
@@ -138,7 +136,7 @@ def run_training(
         "resolution": list(scene.screen.resolution),
         "reference_error": 0.0,
     }
-    return Study("design", COLUMNS, rows, {}, _advice(tables), made | (about or {}), "seconds", PLOTS)
+    return Study("design", COLUMNS, rows, {}, _advice(tables), made, "seconds", PLOTS)
 
 
 def _row(c: Contender, error: float) -> dict:

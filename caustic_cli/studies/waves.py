@@ -6,7 +6,6 @@ import math
 from itertools import pairwise
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from caustic_cli.optics.image import Image
@@ -32,7 +31,6 @@ def wave_figures(
     seen: Resolution,
     *,
     finer: float = FINER,
-    dtype: torch.dtype = torch.float32,
     required: bool = True,
     departure: Departure | None = None,
 ) -> tuple[WaveImage | None, dict]:
@@ -47,7 +45,7 @@ def wave_figures(
     """
     most = math.inf if required else UNASKED
     try:
-        found = wave_image(scene, field, heights.detach(), finer=finer, dtype=dtype, departure=departure, most=most)
+        found = wave_image(scene, field, heights.detach(), finer=finer, departure=departure, most=most)
     except NoWaveImage as error:
         if required:
             raise
@@ -67,15 +65,7 @@ def wave_figures(
     } | absolute
 
 
-def unseen_figures(
-    scene: Scene,
-    field: HeightField,
-    heights: Tensor,
-    target: np.ndarray,
-    *,
-    finer: float = FINER,
-    dtype: torch.dtype = torch.float32,
-) -> dict:
+def unseen_figures(scene: Scene, field: HeightField, heights: Tensor, target: np.ndarray) -> dict:
     """The same at other wavelengths than those that a scene says: between them, or beside a single one; of white light nothing.
 
     Returns:
@@ -85,7 +75,7 @@ def unseen_figures(
     if not own or scene.colored:
         return {}
     others = tuple(0.5 * (a + b) for a, b in pairwise(own)) or tuple(a * own[0] for a in ASIDE)
-    found = wave_image(scene, field, heights.detach(), wavelengths=others, finer=finer, dtype=dtype)
+    found = wave_image(scene, field, heights.detach(), wavelengths=others, finer=FINER)
     return {"wave_unseen_relative_rms": _judged(found, target)["relative_rms"], "wave_unseen_wavelengths": list(others)}
 
 

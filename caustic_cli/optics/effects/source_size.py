@@ -8,9 +8,10 @@ from torch import Tensor
 
 from caustic_cli.optics.effects.base import Amount, Decision, Effect
 from caustic_cli.scene import Disc, Scene
+from caustic_cli.scene.sources.disc import SUN
 
-#: Amounts that are measured where there is none: the sun's angle, degrees; a disc's size, mm.
-SUN, SIZE = 0.533, 1.0
+#: Size of a disc, mm, that is measured where there is none nearby; of a far one it is the sun's angle.
+SIZE = 1.0
 
 
 class SourceSize(Effect):

@@ -13,7 +13,7 @@ from importlib import import_module
 from caustic_cli.config import checks
 from caustic_cli.errors import InputError
 from caustic_cli.scene.sources.base import Source
-from caustic_cli.scene.sources.disc import Disc
+from caustic_cli.scene.sources.disc import SUN, Disc
 from caustic_cli.scene.sources.plane import PlaneWave
 from caustic_cli.scene.sources.points import Points
 from caustic_cli.scene.sources.section import COMMON, SourceType, Table
@@ -54,7 +54,7 @@ def names() -> tuple[str, ...]:
 
 #: What people call sources, and how each is said.
 CALLED = {
-    "sun": "sunlight is ⟨source⟩ disc with ⟨+source.angle⟩ 0.533",
+    "sun": f"sunlight is ⟨source⟩ disc with ⟨+source.angle⟩ {SUN:g}",
     "led": "an LED is ⟨source⟩ disc with ⟨+source.size⟩ 1x1, ⟨+source.position⟩ 0,0,-50 and ⟨+source.intensity⟩ lambertian",
     "lambertian": "that is an ⟨+source.intensity⟩, of ⟨source⟩ point, grid or disc",
     "laser": "a laser's parallel beam is ⟨source⟩ plane",

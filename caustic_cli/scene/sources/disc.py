@@ -17,6 +17,9 @@ from caustic_cli.scene.sources.plane import PlaneWave
 from caustic_cli.scene.sources.points import Points
 from caustic_cli.scene.sources.section import SourceType, Table, check_shining, content, middle, shining, standing
 
+#: Full angle under which the sun is seen, degrees.
+SUN = 0.533
+
 
 @dataclass(frozen=True)
 class Disc(Source):

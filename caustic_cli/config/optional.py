@@ -1,0 +1,197 @@
+"""What few scenes have, and what follows from it: networks over ranges, two free-form sides, other elements, a designed index.
+
+Each function completes its own part of the settings, where there is one, for `completion`.
+"""
+
+from __future__ import annotations
+
+import math
+
+from caustic_cli.config.plans import (
+    TWO_SIDED_SPANS,
+    Table,
+    completed_stage,
+    refinement,
+    refinement_spans,
+    two_sided,
+    usual_sampler,
+)
+from caustic_cli.config.settings import Settings, build_source, elements_of, value_of
+from caustic_cli.config.table import check, default
+from caustic_cli.errors import InputError
+from caustic_cli.inverse.conditions import Ranges
+from caustic_cli.scene import Source
+from caustic_cli.scene.elements import refuse_beside
+
+OVER_WIDTH = 128  # of a dense network over a range: caustic convergence, study design, networks
+BEAM = 1.2  # width of another lens or a mirror over that of a beam from the lens' edges to the picture's
+#: Of a free gradient: range to either side of the index; degree of its splines, knot spans a pixel and the most of them; and rays a
+#: pixel at most, since they cost more.
+HALF_RANGE, INDEX_DEGREE, INDEX_SPANS, MOST_SPANS, RAYS_BENT = 0.05, 3, 2, 768, 16
+
+
+def put_in_the_middle(over: Ranges, s: Settings, given: Settings, throw: float | None) -> None:
+    """The screen of a network that is trained over throws: at their middle, and nowhere else."""
+    screen, z = s["screen"], over.middle[over.keys.index("throw")]
+    z = -z if value_of(s["lens"], "lens.mirror") else z
+    said = throw is not None or "z" in given.get("screen", {})
+    if said and not math.isclose(screen["z"], z, rel_tol=1e-9):
+        raise InputError(f"⟨screen.z⟩ must be the middle of ⟨design.over⟩ throw, {z:g} mm, or not be said, got {screen['z']:g} mm")
+    screen["z"] = z
+
+
+def complete_over(over: Ranges, s: Settings, given: Settings) -> None:
+    """What a network that is trained over ranges has beside them: its source at their middle, its outputs and its width."""
+    source, design = s["source"], s["design"]
+    middle = {key.removeprefix("source."): v for key, v in zip(over.keys, over.middle, strict=True) if key != "throw"}
+    if middle:
+        over.refuse(build_source(s))
+    if middle and "position" in source:  # which a type of one's own may do without
+        place = [middle.get(axis, c) for axis, c in zip("xyz", source["position"][0], strict=True)]
+        if "position" in given.get("source", {}) and not all(
+            math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-9) for a, b in zip(place, source["position"][0], strict=True)
+        ):
+            raise InputError(
+                "⟨source.position⟩ must have the middle of ⟨design.over⟩ where that names it,"
+                f" {','.join(f'{c:g}' for c in place)}, got {','.join(f'{c:g}' for c in source['position'][0])}"
+            )
+        source["position"] = [place]
+    if design["network"] != "none":
+        design.setdefault("preconditioner", "laplacian")
+    if design["network"] == "dense":
+        design.setdefault("network_width", OVER_WIDTH)
+
+
+def first_magnification(s: Settings) -> float:
+    """Of the picture, where nobody said it; where light goes on parallel or to a focus, a beam's as wide as the lens."""
+    second = s.get("second", {})
+    if "focus" in second:
+        return abs(1.0 - s["screen"]["z"] / second["focus"][2])
+    return 1.0 if second.get("collimate") else default("mag")
+
+
+def complete_second(s: Settings) -> None:
+    """What makes the lens' entrance free-form; nothing at all where nobody said anything of it."""
+    second = s.get("second", {})
+    said = [key for key in ("file", "collimate", "focus") if second.get(key)]
+    if not said:
+        for key in ("z", "size"):
+            if key in second:
+                raise InputError(f"⟨second.{key}⟩ belongs to ⟨+second.file⟩, which is not given")
+        s.pop("second", None)
+        return
+    if len(said) > 1:
+        raise InputError(f"⟨second.{said[0]}⟩ and ⟨second.{said[1]}⟩ both say what light does behind the picture: give one of them")
+    if "focus" in second:
+        places = second["focus"]
+        second["focus"] = list(check("second.focus", places[0] if len(places) == 1 else places))
+    if "file" in second and "z" not in second:
+        raise InputError("⟨second.file⟩ needs ⟨+second.z⟩, the distance of its screen")
+    design, source = s["design"], s["source"]
+    wrong = {
+        "lens.mirror": value_of(s["lens"], "lens.mirror"),
+        "target.color": value_of(s["target"], "target.color"),
+        "lens.gradient": "gradient" in s["lens"],
+        "lens.array": max(value_of(s["lens"], "lens.array")) > 1,
+        "design.robust": design.get("robust", ""),
+        "design.network": design["network"] != "none",
+        "design.optimizer": design["optimizer"] != "lbfgs",
+    }
+    for path, given in wrong.items():
+        if given:
+            raise InputError(f"⟨{path}⟩ cannot be had with ⟨second.{said[0]}⟩, which needs two free-form sides of heights by lbfgs")
+    if source.get("also") or source["type"] == "rays":
+        raise InputError(f"⟨second.{said[0]}⟩ needs one source that is no ray file")
+
+
+def complete_farther(s: Settings) -> None:
+    """Size of a second picture: that of a beam from the lens' edge through the first one's, farther on."""
+    second = s.get("second", {})
+    if "file" not in second:
+        return
+    check("second.z", second["z"])
+    grown, size, lens = second["z"] / s["screen"]["z"], s["target"]["size"], s["lens"]["size"]
+    second.setdefault("size", [max(0.1 * t, w + (t - w) * grown) for t, w in zip(size, lens, strict=True)])
+    check("second.size", second["size"])
+
+
+def complete_two_sided(s: Settings, source: Source, quality: str, rays: int | None) -> None:
+    """How a lens with two free-form sides is designed."""
+    lens, screen, design = s["lens"], s["screen"], s["design"]
+    if design["start"] != "transport":
+        raise InputError(f"⟨design.start⟩ of two free-form sides must be transport, got {design['start']}")
+    if design["waves"] == "on":
+        raise InputError("⟨design.waves⟩ on: two free-form sides are refined by rays alone")
+    if "control" not in lens:
+        lens["control"] = [min(TWO_SIDED_SPANS, refinement_spans(max(screen["resolution"]), quality)) + p for p in lens["degree"]]
+    design.setdefault("preconditioner", "laplacian")
+    if "stages" not in design:
+        design["stages"] = two_sided(tuple(lens["control"]), rays, tuple(screen["resolution"]), quality)
+        return
+    design["stages"] = [completed_stage(stage, s, usual_sampler(source)) for stage in design["stages"]]
+    if any(stage.get(key) for stage in design["stages"] for key in ("waves", "spread")):
+        raise InputError("[[design.stages]] of two free-form sides are on the rays of the whole source, without waves or spread")
+
+
+def complete_elements(s: Settings) -> None:
+    """Sizes of other lenses and mirrors, and what cannot be had with them."""
+    tables, design = [dict(table) for table in elements_of(s)], s["design"]
+    if not tables:
+        s.pop("element", None)
+        return
+    s["element"] = {"list": tables}
+    free = any(table.get("free", "none") != "none" for table in tables)
+    refuse_beside(
+        {
+            "second.file": "second" in s,
+            "design.robust": bool(design.get("robust")),
+            "design.waves": design["waves"] == "on",
+            "design.network": free and design["network"] != "none",
+            "design.optimizer": free and design["optimizer"] != "lbfgs",
+            "target.color": free and value_of(s["target"], "target.color"),
+        },
+    )
+    lens, picture, throw = s["lens"]["size"], s["target"]["size"], abs(s["screen"]["z"])
+    for table in tables:
+        if "z" in table:
+            along = min(1.0, max(0.0, check("element.z", table["z"]) / throw))
+            size = [BEAM * (a + (b - a) * along) if along else a for a, b in zip(lens, picture, strict=True)]
+            lean = [math.cos(math.radians(t)) for t in check("element.tilt", table.get("tilt", (0.0, 0.0)))]
+            size = [w / c for w, c in zip(size, lean[::-1], strict=True)]
+            table.setdefault("size", [max(size)] * 2 if table.get("aperture") == "circle" else size)
+
+
+def complete_blank(lens: Table, screen: Table, index: float) -> None:
+    """What a flat blank has whose index is designed; its sides are the least net."""
+    if value_of(lens, "lens.mirror"):
+        raise InputError("⟨lens.gradient⟩ free needs a lens: light never enters a mirror")
+    if any(map(math.isfinite, lens.setdefault("radius", [math.inf, math.inf]))):
+        raise InputError(f"⟨lens.radius⟩ of a free gradient must be [inf, inf], two flat sides, got {lens['radius']}")
+    lens.setdefault("control", [p + 1 for p in check("lens.degree", lens["degree"])])
+    lens.setdefault("index_range", [max(1.0, index - HALF_RANGE), index + HALF_RANGE])
+    lens.setdefault("index_control", [min(MOST_SPANS, INDEX_SPANS * n) + INDEX_DEGREE for n in screen["resolution"]])
+    for key in ("index_range", "index_control", "index_layers"):
+        check(f"lens.{key}", value_of(lens, f"lens.{key}"))
+    if not lens["index_range"][0] < lens["index_range"][1]:
+        raise InputError(f"⟨lens.index_range⟩ must ascend, got {lens['index_range']}")
+
+
+def complete_index_design(s: Settings, source: Source, quality: str, rays: int | None) -> None:
+    """How a free gradient is found: L-BFGS from transport, on rays."""
+    lens, screen, design = s["lens"], s["screen"], s["design"]
+    if not source.collimated:
+        raise InputError(f"⟨lens.gradient⟩ free is designed for light of ⟨source.type⟩ plane, got {s['source']['type']}")
+    if max(value_of(lens, "lens.array")) > 1:
+        raise InputError("⟨lens.array⟩ cannot be had with a free gradient, whose sides are flat")
+    if value_of(s["target"], "target.color"):
+        raise InputError("⟨target.color⟩ is not for a free gradient, whose index is designed at one wavelength")
+    for key, only in (("network", "none"), ("optimizer", "lbfgs"), ("loss", default("design.loss"))):
+        if design[key] != only:
+            raise InputError(f"⟨design.{key}⟩ of a free gradient must be {only}, got {design[key]}")
+    if check("design.waves", design["waves"]) == "on":
+        raise InputError("⟨design.waves⟩ on needs a lens of one index, of which the wave image is taken")
+    design["start"] = "offset"
+    design.setdefault("preconditioner", "laplacian")
+    if "stages" not in design:
+        last = refinement(tuple(lens["control"]), rays, tuple(screen["resolution"]), quality)[-1]
+        design["stages"] = [last | {"rays": rays or min(last["rays"], RAYS_BENT * math.prod(screen["resolution"]))}]
