@@ -17,7 +17,7 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies import metrics, noise
-from caustic_cli.studies.retrace import MOST_TIMES, retrace
+from caustic_cli.studies.retrace import MOST_TIMES, judging_rays, retrace
 
 PIXELS = (40, 36)
 SOURCES = {"disc": Disc((0.0, 0.0, -100.0), (6.0, 6.0)), "point": Points(((0.0, 0.0, -100.0),)), "sun": Disc(angle=2.0)}
@@ -123,6 +123,20 @@ def test_figures_of_a_plane_wave_are_of_its_image_as_it_is():
     assert 0.5 < np.sqrt(np.mean(np.square(z))) < 1.5
     assert retrace(scene, field, heights, target, rays=30_000, seed=4, noise=False)[1]["noise"] is None
     assert retrace(scene, field, heights, None, rays=30_000)[1]["noise"] is None
+
+
+@pytest.mark.parametrize(
+    ("source", "pixels", "rays"),
+    [
+        (PlaneWave(), (250, 250), 4_000_000),
+        (PlaneWave(), (1000, 500), 32_000_000),
+        (PlaneWave(), (4000, 2000), 64_000_000),
+        (Disc((0.0, 0.0, -100.0), (6.0, 6.0)), (1000, 500), 4_000_000),
+    ],
+)
+def test_as_many_rays_a_pixel_judge_a_large_picture_of_a_plane_wave(source, pixels, rays):
+    """Its figures hold their noise; those of other light do not, and more rays are taken there by the noise itself."""
+    assert judging_rays(Scene(source, Lens(), Screen((30.0, 30.0), 100.0, pixels))) == rays
 
 
 def test_rays_are_added_until_the_figure_is_quiet():

@@ -29,8 +29,9 @@ def run(
         str | None,
         typer.Option(
             metavar="N",
-            help="Number of rays, independent of those of the design.  [default: as at the end of a design: 4e6, of other light"
-            " than a plane wave's up to 1.6e7 until the noise is a tenth of the error; with --tolerance, 1e6]",
+            help="Number of rays, independent of those of the design.  [default: as at the end of a design: 4e6, of a plane"
+            " wave 64 a pixel where those are more (at most 6.4e7), of other light up to 1.6e7 until the noise is a tenth of the"
+            " error; with --tolerance, 1e6]",
         ),
     ] = None,
     tolerance: Annotated[

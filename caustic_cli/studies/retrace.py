@@ -25,6 +25,8 @@ from caustic_cli.studies.noise import image_noise, lift, standard_error, varianc
 
 #: Rays of the retrace that ends a design.
 FINAL_RAYS = 4_000_000
+#: Pixels that these are enough for where nothing but their number lowers the noise, and the most times more of them.
+FINAL_PIXELS, MOST_FINAL = 250 * 250, 16
 #: Part of relative_rms that its noise may be, where nothing is said about rays.
 QUIET = 0.1
 #: Independent images whose scatter tells their mean's noise: over thousands of pixels four are plenty.
@@ -220,6 +222,12 @@ def retrace(
         return counted, figures
     sampler = sampler_for(scene, counted.rays, seed, device)
     return within_source(expose(scene, field, heights, sampler, filter, dtype, screen, requests=requests)), figures
+
+
+def judging_rays(scene: Scene, usual: int = FINAL_RAYS) -> int:
+    """Rays that judge a finished design: of a plane wave, whose figures hold their noise, as many a pixel for any number of pixels."""
+    times = math.prod(scene.screen.resolution) / FINAL_PIXELS if scene.source.collimated else 1.0
+    return round(usual * min(max(1.0, times), MOST_FINAL))
 
 
 def require_account(figures: dict, dtype: torch.dtype) -> None:

@@ -26,7 +26,7 @@ from caustic_cli.project import uptodate
 from caustic_cli.project.project import FARTHER, RENDER, REPORT, WAVE, Project
 from caustic_cli.studies.irradiance import irradiance
 from caustic_cli.studies.panels import write_report
-from caustic_cli.studies.retrace import FINAL_RAYS, QUIET, retrace, white_level
+from caustic_cli.studies.retrace import FINAL_RAYS, QUIET, judging_rays, retrace, white_level
 from caustic_cli.studies.second import second_figures
 from caustic_cli.studies.waves import unseen_figures, wave_figures
 from caustic_cli.workflow import over_range
@@ -100,7 +100,9 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
 def expected_seconds(designer: Designer, target: np.ndarray, state: State, device: str) -> float:
     """About how long `judge` will take in a hurry, s: by a retrace of few rays, and a wave image where one was refined."""
     scene, field, began = designer.scene, designer.field(state.stage), time.monotonic()
-    retrace(*traced_of(scene, field, state.heights), target, rays=FINAL_RAYS // PROBE, device=device, noise=False)
+    retrace(
+        *traced_of(scene, field, state.heights), target, rays=judging_rays(scene, FINAL_RAYS) // PROBE, device=device, noise=False
+    )
     over = designer.options.over
     retraces = RETRACES + (0.0 if over is None else 2.0 * len(over.judged()) / OVER)
     seconds = retraces * PROBE * (time.monotonic() - began) + REPORT_SECONDS
@@ -136,7 +138,7 @@ def evaluate(
         return retrace(
             *traced_of(scene, field, heights),
             target,
-            rays=FINAL_RAYS,
+            rays=judging_rays(scene, FINAL_RAYS),
             device=device,
             seed=seed,
             noise=noise,

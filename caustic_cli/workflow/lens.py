@@ -26,7 +26,7 @@ from caustic_cli.project import directory, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Scene
-from caustic_cli.studies.retrace import FINAL_RAYS, QUIET, retrace
+from caustic_cli.studies.retrace import FINAL_RAYS, QUIET, judging_rays, retrace
 from caustic_cli.studies.waves import wave_figures
 from caustic_cli.workflow import design as workflow
 from caustic_cli.workflow.compilation import compile_for
@@ -130,7 +130,7 @@ class Lens:
         """Retrace the lens with rays of its own, under the effects that the scene calls for.
 
         Args:
-            rays: how many; with `tolerance`, where the number begins.  None for those that judge a finished design, `FINAL_RAYS`,
+            rays: how many; with `tolerance`, where the number begins.  None for those that judge a finished design, `judging_rays`,
                 of other light than a plane wave's more until the noise is `QUIET`.
             seed: of the rays, the design's own unless given.
             tolerance: relative RMS noise of the image that rays are added for.
@@ -146,7 +146,7 @@ class Lens:
             self.field if cut is None else cut,
             self.heights,
             self.target,
-            rays=FINAL_RAYS if rays is None else count(rays),
+            rays=judging_rays(plan.scene, FINAL_RAYS) if rays is None else count(rays),
             quiet=QUIET if rays is None else None,
             seed=self.seed if seed is None else seed,
             filter=filter,
