@@ -225,7 +225,7 @@ def retrace(
 
 
 def judging_rays(scene: Scene, usual: int = FINAL_RAYS) -> int:
-    """Rays that judge a finished design: of a plane wave, whose figures hold their noise, as many a pixel for any number of pixels."""
+    """Rays that judge a finished design: of a plane wave, whose figures hold their noise, as many a pixel whatever their number."""
     times = math.prod(scene.screen.resolution) / FINAL_PIXELS if scene.source.collimated else 1.0
     return round(usual * min(max(1.0, times), MOST_FINAL))
 
