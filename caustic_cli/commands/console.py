@@ -194,11 +194,17 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
     if figures.get("error_estimate") is not None:
         in_all = f"; {figures['rays_traced']:,} rays in all" if "rays_traced" in figures else ""
         noise = [("noise of the image", f"{figures['error_estimate']:.2g}, estimated{in_all}")]
+    black = []
+    if figures.get("in_black") is not None:
+        known = figures.get("in_black_noise")
+        black = [("light in black", number("in_black", ".2%") + ("" if known is None else f", noise {known:.1g}"))]
     waves = []
     if "no_wave_image" in figures:
         waves = [("of light as a wave", f"no image: {figures['no_wave_image']}")]
     elif "wave_relative_rms" in figures:
         seen = f"relative RMS error {number('wave_relative_rms', '.4f')}, on the picture {number('wave_on_target', '.2%')}"
+        if figures.get("wave_in_black") is not None:
+            seen += f", in black {number('wave_in_black', '.2%')}"
         if figures["wave_relative_rms"] is None:  # an archive has no picture to be like
             seen = f"on the screen {number('wave_on_screen', '.2%')}"
         waves = [
@@ -241,6 +247,7 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
         ("SSIM", number("ssim", ".4f")),
         ("light on the screen", number("on_screen", ".2%")),
         ("light on the picture", number("on_target", ".2%")),
+        *black,
         *behind,
         ("lost", lost or "nothing"),
         *(
