@@ -197,7 +197,15 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
     black = []
     if figures.get("in_black") is not None:
         known = figures.get("in_black_noise")
-        black = [("light in black", number("in_black", ".2%") + ("" if known is None else f", noise {known:.1g}"))]
+        black = [("light in black", number("in_black", ".2%") + ("" if known is None else f", noise {known:.2%}"))]
+    radius = figures.get("min_radius")
+    if radius is not None and radius["in_black_per_mm"] is not None:
+        with_it, without = radius["start_in_black"], radius["start_in_black_without"]
+        known = "" if radius["noise"] is None else f", noise {radius['noise']:.2%}"
+        each = f"{radius['in_black_per_mm']:.2%} a mm{known}"
+        black += [
+            (f"a radius of {radius['radius_mm']:g} mm", f"first surface {with_it:.2%} in black, {without:.2%} without: {each}")
+        ]
     waves = []
     if "no_wave_image" in figures:
         waves = [("of light as a wave", f"no image: {figures['no_wave_image']}")]

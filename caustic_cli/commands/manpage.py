@@ -77,6 +77,10 @@ signal\-to\-noise ratio; structural similarity.
 Of the light on the screen, the part that lands where the target is below a hundredth of its peak, a dark margin included; null of
 a target that is so nowhere.
 .TP
+.B min_radius
+Of design with a least radius of concave places: radius_mm; of the surface that the design began from, retraced by the same rays,
+start_in_black with the radius, start_in_black_without, in_black_per_mm, the difference over the radius, and its noise.
+.TP
 .B noise, in_black_noise, error_estimate
 Standard errors of relative_rms and of in_black, and relative RMS noise of the image, that the retrace's own rays leave.
 .TP
