@@ -28,6 +28,7 @@ SHARED_KEYS = {
     "relative_rms",
     "psnr_db",
     "ssim",
+    "in_black",
     "on_screen",
     "on_target",
     "lost",

@@ -16,6 +16,7 @@ from test_export import make
 
 from caustic_cli import cli
 from caustic_cli.errors import CausticError, InputError
+from caustic_cli.inverse import limits
 from caustic_cli.inverse.limits import within_limits
 from caustic_cli.inverse.penalties import Penalty
 from caustic_cli.optics import curvature
@@ -97,6 +98,20 @@ def test_limits_are_obeyed_and_little_is_moved(rough):
     assert 1e-4 < (found - heights).abs().max() < 0.02  # mm: the relief
 
 
+@pytest.mark.parametrize("block", [1, 700, 10**9])
+def test_the_slope_of_what_exceeds(rough, block, monkeypatch):
+    """By differences, however many points are looked at together."""
+    field, heights, _ = rough
+    _, steep, bent = samples(field, heights, 100_000)
+    monkeypatch.setattr(limits, "BLOCK", block)
+    asked = limits._Limits(field, (heights - 0.01, heights), 0.8 * steep, 1.5 / bent, 4)
+    g = asked.violation(heights)[1]
+    d = torch.randn(heights.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    step = 1e-8
+    rise = (asked.violation(heights + step * d)[0] - asked.violation(heights - step * d)[0]) / (2 * step)
+    assert rise != 0 and float((g * d).sum()) == pytest.approx(rise, rel=1e-5)
+
+
 def test_a_lens_within_its_limits_is_left_alone(rough):
     field, heights, bounds = rough
     _, steep, bent = samples(field, heights, 100_000)
@@ -145,8 +160,8 @@ def test_a_designed_lens_obeys_its_limits(tmp_path, monkeypatch, capfd):
     Image.fromarray(np.where((x - 9) ** 2 + (y - 13) ** 2 < 34, 255, 60).astype(np.uint8)).save("dot.png")
     base = "design dot.png --resolution 24 --quality draft --control 35 --rays 20000 --iterations 3 --quiet "
     assert cli.run(shlex.split(base + "-o free")) == 0
-    limits = "--min-thickness 5 --min-radius 12 --max-slope 0.05"
-    assert cli.run(shlex.split(f"{base} -o bound {limits}")) == 0, capfd.readouterr().err
+    within = "--min-thickness 5 --min-radius 12 --max-slope 0.05"
+    assert cli.run(shlex.split(f"{base} -o bound {within}")) == 0, capfd.readouterr().err
     found = {}
     for name in ("free", "bound"):
         project = Project.open(Path(name))

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from caustic_cli.errors import InputError
+from caustic_cli.optics.image import Image
 from caustic_cli.optics.rays import LOSSES
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -115,6 +116,23 @@ def test_on_target_counts_light_where_the_target_is_not_black():
     assert metrics.on_target(image, np.array([[0.0, 5.0], [1e-9, 0.0]])) == pytest.approx(0.5, rel=1e-15)
 
 
+def test_light_in_black_is_counted_below_a_hundredth_of_the_peak():
+    image, target = np.array([[0.1, 0.2], [0.3, 0.2]]), np.array([[0.0, 5.0], [0.049, 0.05]])
+    assert metrics.in_black(image, target) == pytest.approx(0.4 / 0.8, rel=1e-15)
+    assert metrics.in_black(1e-9 * image, 1e200 * target) == pytest.approx(0.5, rel=1e-12)
+    assert metrics.in_black(image * (target >= 0.05), target) == 0.0
+    assert metrics.in_black(image, target + 0.1) is None  # no black
+    assert metrics.in_black(image, 0.0 * target) is None  # no peak
+    assert metrics.in_black(0.0 * image, target) is None  # no light
+
+
+def test_coloured_light_is_in_the_black_of_its_own_colour():
+    red, green = np.array([[0.0, 1.0]]), np.array([[4.0, 0.0]])
+    image, target = np.stack([[[0.1, 0.4]], [[0.3, 0.2]]]), np.stack([red, green])
+    assert metrics.in_black(image, target) == pytest.approx(0.3, rel=1e-15)
+    assert metrics.judge(Image(image, 1.0, {}), target)["in_black"] == pytest.approx(0.3, rel=1e-15)
+
+
 @pytest.mark.parametrize("black", [False, True])
 def test_judge_accounts_for_all_light_and_is_strict_json(black):
     lens = Lens(control=(5, 4))
@@ -125,7 +143,7 @@ def test_judge_accounts_for_all_light_and_is_strict_json(black):
     target = np.zeros((12, 12))
     target[3:, :] = 1.0
     found = metrics.judge(exposure, torch.from_numpy(target))
-    assert list(found) == ["loss", "relative_rms", "psnr_db", "ssim", "on_screen", "on_target", "lost", "rays"]
+    assert list(found) == ["loss", "relative_rms", "psnr_db", "ssim", "in_black", "on_screen", "on_target", "lost", "rays"]
     assert set(found["lost"]) == set(LOSSES)
     assert found["on_screen"] + sum(found["lost"].values()) == pytest.approx(1.0, abs=1e-12)
     assert found["rays"] == 1600

@@ -32,7 +32,7 @@ def lens(source):
     scene = Scene(source, made, Screen((44.0, 44.0), 100.0, PIXELS))
     u, v = (np.linspace(-1.0, 1.0, n) for n in PIXELS)
     target = 1.2 + np.cos(3.0 * u[:, None]) * np.cos(2.0 * v)
-    target[:4] = 0.0
+    target[:4] = target[16:20] = 0.0
     return scene, field, torch.from_numpy(heights), target
 
 
@@ -91,6 +91,9 @@ def test_a_retrace_with_few_rays_says_the_figure_of_many(name):
     z = (rms - truth["relative_rms"]) / np.hypot(said, truth["noise"])
     assert np.abs(z).max() < 4.0
     assert 0.4 < np.sqrt(np.mean(z**2)) < 1.7
+    dark, dark_said = np.array([(f["in_black"], f["in_black_noise"]) for f in figures]).T
+    z = (dark - truth["in_black"]) / np.hypot(dark_said, truth["in_black_noise"])
+    assert truth["in_black"] > 0.05 and np.abs(z).max() < 4.0 and 0.4 < np.sqrt(np.mean(z**2)) < 1.7
     assert metrics.relative_rms(found[0][0].image, target) > truth["relative_rms"] + 3.0 * said[0]
     exact = retrace(scene, field, heights, target, rays=2_000_000, seed=98)[0].image.numpy()
     apart = [metrics.relative_rms(e.image, exact) for e, _ in found]
@@ -121,8 +124,14 @@ def test_figures_of_a_plane_wave_are_of_its_image_as_it_is():
     found = [retrace(scene, field, heights, target, rays=30_000, seed=s)[1] for s in range(10)]
     z = [(f["relative_rms"] - more["relative_rms"]) / f["noise"] for f in found]
     assert 0.5 < np.sqrt(np.mean(np.square(z))) < 1.5
-    assert retrace(scene, field, heights, target, rays=30_000, seed=4, noise=False)[1]["noise"] is None
-    assert retrace(scene, field, heights, None, rays=30_000)[1]["noise"] is None
+    z = [(f["in_black"] - more["in_black"]) / f["in_black_noise"] for f in found]
+    assert 0.2 < np.sqrt(np.mean(np.square(z))) < 1.5
+    silent = retrace(scene, field, heights, target, rays=30_000, seed=4, noise=False)[1]
+    assert silent["noise"] is None and silent["in_black_noise"] is None and silent["in_black"] == figures["in_black"]
+    none = retrace(scene, field, heights, None, rays=30_000)[1]
+    assert none["noise"] is None and none["in_black"] is None and none["in_black_noise"] is None
+    grey = retrace(scene, field, heights, target + 1.0, rays=30_000)[1]
+    assert grey["noise"] > 0 and grey["in_black"] is None and grey["in_black_noise"] is None
 
 
 @pytest.mark.parametrize(

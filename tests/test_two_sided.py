@@ -136,6 +136,15 @@ def run(capfd, *arguments, code=0):
     return json.loads(out) if code == 0 else err.strip()
 
 
+def test_a_radius_of_both_sides_says_its_cost_and_again_when_resumed(_here, capfd):
+    made = run(capfd, "design", "one.png", *SMALL, "--collimate", "--iterations", "1", "-o", "p", "--min-radius", "8")
+    cost = made["min_radius"]
+    assert cost["in_black_per_mm"] == pytest.approx((cost["start_in_black"] - cost["start_in_black_without"]) / 8.0)
+    assert cost["noise"] is None  # of fewer rays, which say none
+    longer = run(capfd, "design", "--resume", "p", "--iterations", "2", "--quiet", "--json")
+    assert longer["iterations"] == 2 and longer["min_radius"] == cost
+
+
 def test_design_render_resume_and_files(_here, capfd):
     made = run(capfd, "design", "one.png", *SMALL, "--collimate", "--iterations", "4", "-o", "p")
     assert made["relative_rms"] < made["start_relative_rms"] < 0.5 and made["angle_rms_mrad"] < 5

@@ -194,11 +194,25 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
     if figures.get("error_estimate") is not None:
         in_all = f"; {figures['rays_traced']:,} rays in all" if "rays_traced" in figures else ""
         noise = [("noise of the image", f"{figures['error_estimate']:.2g}, estimated{in_all}")]
+    black = []
+    if figures.get("in_black") is not None:
+        known = figures.get("in_black_noise")
+        black = [("light in black", number("in_black", ".2%") + ("" if known is None else f", noise {known:.2%}"))]
+    radius = figures.get("min_radius")
+    if radius is not None and radius["in_black_per_mm"] is not None:
+        with_it, without = radius["start_in_black"], radius["start_in_black_without"]
+        known = "" if radius["noise"] is None else f", noise {radius['noise']:.2%}"
+        each = f"{radius['in_black_per_mm']:.2%} a mm{known}"
+        black += [
+            (f"a radius of {radius['radius_mm']:g} mm", f"first surface {with_it:.2%} in black, {without:.2%} without: {each}")
+        ]
     waves = []
     if "no_wave_image" in figures:
         waves = [("of light as a wave", f"no image: {figures['no_wave_image']}")]
     elif "wave_relative_rms" in figures:
         seen = f"relative RMS error {number('wave_relative_rms', '.4f')}, on the picture {number('wave_on_target', '.2%')}"
+        if figures.get("wave_in_black") is not None:
+            seen += f", in black {number('wave_in_black', '.2%')}"
         if figures["wave_relative_rms"] is None:  # an archive has no picture to be like
             seen = f"on the screen {number('wave_on_screen', '.2%')}"
         waves = [
@@ -241,6 +255,7 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
         ("SSIM", number("ssim", ".4f")),
         ("light on the screen", number("on_screen", ".2%")),
         ("light on the picture", number("on_target", ".2%")),
+        *black,
         *behind,
         ("lost", lost or "nothing"),
         *(

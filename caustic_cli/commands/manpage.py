@@ -73,8 +73,16 @@ design and render print one object with these keys, among others.  A figure that
 Image against target, counted in pixels: eq. 5.2.1 of the thesis; that times the pixels, the RMS error over the mean; peak
 signal\-to\-noise ratio; structural similarity.
 .TP
-.B noise, error_estimate
-Standard error of relative_rms, and relative RMS noise of the image, that the retrace's own rays leave.
+.B in_black
+Of the light on the screen, the part that lands where the target is below a hundredth of its peak, a dark margin included; null of
+a target that is so nowhere.
+.TP
+.B min_radius
+Of design with a least radius of concave places: radius_mm; of the surface that the design began from, retraced by the same rays,
+start_in_black with the radius, start_in_black_without, in_black_per_mm, the difference over the radius, and its noise.
+.TP
+.B noise, in_black_noise, error_estimate
+Standard errors of relative_rms and of in_black, and relative RMS noise of the image, that the retrace's own rays leave.
 .TP
 .B minimum_wall_mm, stock_height_mm
 Of design: least and largest height of the exit above the flat entrance.
@@ -85,7 +93,7 @@ Of render: true where render.png is still an earlier one of the same, with less 
 .B on_screen, on_target, lost
 Parts of the source's power on the screen, where the target is bright, and lost, by cause; on_screen and all of lost sum to 1.
 .TP
-.B wave_relative_rms, wave_on_target, resolvable
+.B wave_relative_rms, wave_on_target, wave_in_black, resolvable
 The same of the wave image, where diffraction is simulated; details that light carries across the picture.
 .TP
 .B least_relative_rms, etendue_limit

@@ -10,7 +10,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -42,6 +42,7 @@ from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.screen_shape import reach
 from caustic_cli.optics.spread import Convolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import EXIT
 from caustic_cli.optics.waves import NoWaveImage
 from caustic_cli.scene import Scene
 from caustic_cli.scene.tolerances import Tolerances
@@ -112,7 +113,8 @@ class State:
     stage, iteration: index of the stage and iterations done in it; total: iterations done in all; heights (n, m) mm
     float64, the lens so far; parameters, optimizer: tensors by name, empty when a stage has yet to begin; history:
     rows (iteration, stage, loss, on_screen, seconds); seconds: spent so far; reason: why it ended, "" if it has not; start
-    (n_0, m_0), the heights it began from, on the first stage's net; image, that the last iteration saw, of this run alone.
+    (n_0, m_0), the heights it began from, on the first stage's net; unrounded, of that shape, what these were before a least radius
+    was asked of them; image, that the last iteration saw, of this run alone.
     """
 
     heights: Tensor
@@ -125,7 +127,16 @@ class State:
     seconds: float = 0.0
     reason: str = ""
     start: Tensor | None = None
+    unrounded: Tensor | None = None
     image: Tensor | None = None
+
+
+class First(NamedTuple):
+    """What a design begins from, (n, m) mm on the first stage's net: heights, within all limits; unrounded, within all but that of
+    the radius, None where there is no such limit."""
+
+    heights: Tensor
+    unrounded: Tensor | None
 
 
 class Designer:
@@ -192,15 +203,26 @@ class Designer:
         others = [sphere_net(e, side, self.field(0)) for e in self.scene.elements for side in e.shaped]
         return torch.stack([*others, heights])
 
-    def begin(self, heights: Tensor | None = None) -> State:
-        """A fresh state: the parametrisation's own beginning, or `heights` (n, m) mm on the first stage's net."""
+    def first(self, heights: Tensor | None) -> First | None:
+        """What a design begins from heights of the exit (n, m) on the first stage's net, or of all surfaces; None from None.
+
+        Raises:
+            CausticError: as of `within_limits`.
+        """
+        if (whole := self.whole(heights)) is None:
+            return None
+        state = State(whole)
+        return First(self.within_limits(state), self.within_limits(state, rounded=False) if self.options.min_radius > 0 else None)
+
+    def begin(self, heights: Tensor | None = None, unrounded: Tensor | None = None) -> State:
+        """A fresh state: the parametrisation's own beginning, or what `first` has found."""
         module = self._parametrise(0, heights)
         first = module().detach()
-        return State(first, parameters=module.state_dict(), start=first)
+        return State(first, parameters=module.state_dict(), start=first, unrounded=unrounded)
 
-    def begun(self, state: State) -> Tensor:
-        """The surface that the design began from, on the net of the stage it stands in (n, m), mm."""
-        return self._carried(state.start, 0, state.stage)
+    def begun(self, state: State, rounded: bool = True) -> Tensor:
+        """The surface that the design began from, on the net of the stage it stands in (n, m), mm; or its `unrounded` one."""
+        return self._carried(state.start if rounded else state.unrounded, 0, state.stage)
 
     def showing(self, state: State, heights: Tensor) -> State:
         """A state whose lens is `heights`, although the optimiser stands elsewhere; `restored` undoes it."""
@@ -265,25 +287,24 @@ class Designer:
             state = self._next(state, k + 1)
         return state
 
-    def within_limits(self, state: State) -> Tensor:
-        """The state's heights, moved as little as the limits of slope and radius ask.
+    def within_limits(self, state: State, rounded: bool = True) -> Tensor:
+        """The state's heights, moved as little as the limits of slope and radius ask; rounded: False leaves the radius out.
 
         Raises:
             CausticError: no surface near them obeys these.
         """
         field, bounds, o = self.field(state.stage), self._bounds(self.stages[state.stage]), self.options
+        radius = o.min_radius if rounded else 0.0
         if not self.scene.jointly:
-            return within_limits(field, state.heights, bounds, o.max_slope, o.min_radius)
+            return _as_cut(field, state.heights, bounds, o.max_slope, radius, self.scene.lens.cut_from)
         found = []
         halves = [e.half_size for e in self.scene.elements for _ in e.shaped] or [field.half_size]
         for name, half, heights, low, high in zip(
             self.scene.shaped, [*halves, field.half_size], state.heights, *bounds, strict=True
         ):
             field = replace(field, half_size=half)
-            if name.endswith(("entrance", "front")):  # what is concave of these, seen from outside, is convex from within
-                found.append(-within_limits(field, -heights, (-high, -low), o.max_slope, o.min_radius))
-            else:
-                found.append(within_limits(field, heights, (low, high), o.max_slope, o.min_radius))
+            side = self.scene.lens.cut_from if name == EXIT else -1 if name.endswith(("entrance", "front")) else 1
+            found.append(_as_cut(field, heights, (low, high), o.max_slope, radius, side))
         return torch.stack(found)
 
     def _stage(self, state: State, k: int, limit: int, deadline: float, stop, on_iteration, notice, origin: float) -> bool:
@@ -502,3 +523,13 @@ class Designer:
             return False
         losses = [row[2] for row in state.history[-FLAT_SPAN - 1 :]]
         return losses[-1] > (1.0 - tolerance) * losses[0]
+
+
+def _as_cut(
+    field: HeightField, heights: Tensor, bounds: tuple[Tensor, Tensor], max_slope: float, min_radius: float, side: int
+) -> Tensor:
+    """`within_limits` of a surface that a tool cuts from +z, or -z (side -1), from where what is concave is convex from +z."""
+    if side > 0:
+        return within_limits(field, heights, bounds, max_slope, min_radius)
+    low, high = bounds
+    return -within_limits(field, -heights, (-high, -low), max_slope, min_radius)

@@ -29,8 +29,8 @@ ROOM, TRIES = 2e-3, 6
 #: The part of a limit by which it may be exceeded where it is kept, and by which the checked points must stay below it.
 LEFT, SPARE = 1e-3, 1e-3
 STEPS = 400
-#: Points looked at together when checking, which bounds the memory.
-BLOCK = 4_000_000
+#: Points looked at together.
+BLOCK = 400_000
 
 
 def within_limits(
@@ -64,10 +64,8 @@ def within_limits(
 
 def _descend(limits: _Limits, heights: Tensor) -> Tensor:
     def evaluate(flat: Tensor) -> tuple[float, Tensor]:
-        z = flat.view(heights.shape).requires_grad_()
-        value = limits.violation(z)
-        (g,) = torch.autograd.grad(value, z)
-        return float(value.detach()), g.reshape(-1)
+        value, gradient = limits.violation(flat.view(heights.shape))
+        return value, gradient.reshape(-1)
 
     method = LBFGS(evaluate, heights.detach().double().reshape(-1).clone())
     for _ in range(STEPS):
@@ -95,38 +93,51 @@ class _Limits:
         self.slope, self.radius, self.scale = slope, radius, 1e-3 * max(field.half_size)
         grids = [_grid(s, a_span) for s in field.spaces]
         self.u, self.v = (
-            [s.matrix(g, k) / (2.0 * r) ** k for k in range(3)]
+            [s.banded(g, k) / (2.0 * r) ** k for k in range(3)]
             for s, g, r in zip(field.spaces, grids, field.half_size, strict=True)
         )
 
-    def _shape(self, heights: Tensor, rows: slice = slice(None)) -> Iterator[Tensor]:
+    def _along(self, heights: Tensor) -> list[Tensor]:
+        """The surface's derivatives by x of order 0, 1 and 2 at the points a, as control heights along y: (points, m) each."""
+        return [torch.sparse.mm(u, heights) for u in self.u]
+
+    def _blocks(self) -> Iterator[slice]:
+        """Points a, a block at a time, which bounds the memory and what of it is written anew."""
+        count, step = self.u[0].shape[0], max(1, BLOCK // self.v[0].shape[0])
+        return (slice(start, start + step) for start in range(0, count, step))
+
+    def _shape(self, along: list[Tensor]) -> Iterator[Tensor]:
         """Slopes and radii beyond their limits, as parts of these."""
         need = curvature.ORDERS if self.radius > 0 else curvature.ORDERS[:2]
-        zx, zy, *second = (self.u[a][rows] @ heights @ self.v[b].T for a, b in need)
+        zx, zy, *second = (torch.sparse.mm(self.v[b], along[a].T).T for a, b in need)
         if self.slope > 0:
             yield (zx * zx + zy * zy).clamp_min(1e-300).sqrt() / self.slope - 1.0
         if self.radius > 0:
             yield curvature.largest(zx, zy, *second) * self.radius - 1.0
 
-    def violation(self, heights: Tensor) -> Tensor:
-        """Sum of squares of what exceeds; heights are asked to keep off their bounds, too, by more than is left in the end."""
+    def violation(self, heights: Tensor) -> tuple[float, Tensor]:
+        """Sum of squares of what exceeds, and its gradient (n, m); heights are asked to keep off their bounds, too, by more than is
+        left in the end."""
         room = 2.0 * LEFT * self.scale
-        beyond = (self.low + room - heights) / self.scale, (heights - self.high + room) / self.scale
-        return sum(term.clamp_min(0.0).square().sum() for term in (*self._shape(heights), *beyond))
+        short, tall = (t.clamp_min(0.0) / self.scale for t in (self.low + room - heights, heights - self.high + room))
+        value, gradient = float(short.square().sum() + tall.square().sum()), 2.0 * (tall - short) / self.scale
+        along = self._along(heights)
+        pulls = [torch.zeros_like(t) for t in along]
+        for rows in self._blocks():
+            part = [t[rows].requires_grad_() for t in along]
+            beyond = torch.stack([term.clamp_min(0.0).square().sum() for term in self._shape(part)]).sum()
+            for pull, found in zip(pulls, torch.autograd.grad(beyond, part, allow_unused=True), strict=True):
+                if found is not None:
+                    pull[rows] = found
+            value += float(beyond.detach())
+        return value, gradient + sum(torch.sparse.mm(u.T, pull) for u, pull in zip(self.u, pulls, strict=True))
 
     @torch.no_grad()
     def excess(self, heights: Tensor) -> float:
         """The largest excess, 0 or less where all is obeyed."""
-        step = max(1, BLOCK // len(self.v[0]))
+        along = self._along(heights)
         beyond = max(float((self.low - heights).max()), float((heights - self.high).max())) / self.scale
-        return max(
-            beyond,
-            *(
-                float(term.max())
-                for start in range(0, len(self.u[0]), step)
-                for term in self._shape(heights, slice(start, start + step))
-            ),
-        )
+        return max(beyond, *(float(t.max()) for rows in self._blocks() for t in self._shape([a[rows] for a in along])))
 
 
 def _grid(space: SplineSpace, a_span: int) -> Tensor:

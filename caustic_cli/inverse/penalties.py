@@ -7,7 +7,8 @@ Notation
     laplacian   root mean square of G (d_xx + d_yy): how much the lens magnifies unevenly
     curvature   root mean square of G sqrt(d_xx^2 + 2 d_xy^2 + d_yy^2): the bending energy of a thin plate
     slope       root mean square of 100 max(0, |grad z| / limit - 1)
-    radius      root mean square of 100 max(0, k r - 1), k the largest principal curvature, r the least concave radius
+    radius      root mean square of 100 max(0, k r - 1), k the largest principal curvature as the tool sees it (from -z of a
+                mirror), r the least concave radius
 
 Means are over the Greville abscissae of the control net.
 """
@@ -45,7 +46,7 @@ class Penalty:
         device: str | torch.device = "cpu",
         min_radius: float = 0.0,
     ):
-        self.terms, self.limit, self.radius = terms, max_slope, min_radius
+        self.terms, self.limit, self.radius, self.side = terms, max_slope, min_radius, scene.lens.cut_from
         if min_radius > 0 and min(s.degree for s in field.spaces) < 2:
             raise InputError("⟨design.min_radius⟩ needs splines of degree 2 or more, which have a curvature")
         if terms and min(s.degree for s in field.spaces) < 2:
@@ -74,6 +75,6 @@ class Penalty:
             excess = (slope2.clamp_min(1e-300).sqrt() / self.limit - 1.0).clamp_min(0.0)
             total = total + (STIFFNESS * excess).square().mean()
         if self.radius > 0:
-            bent = curvature.largest(*(over_grid(self.u[a], heights, self.v[b]) for a, b in curvature.ORDERS))
+            bent = curvature.largest(*(self.side * over_grid(self.u[a], heights, self.v[b]) for a, b in curvature.ORDERS))
             total = total + (STIFFNESS * (bent * self.radius - 1.0).clamp_min(0.0)).square().mean()
         return total

@@ -3,6 +3,7 @@
     /lens/heights             (n, m) float64, mm, or (2, n, m) of entrance and exit; attributes degree (2,)
     /lens/knots_u, knots_v    knot vectors on [0, 1]
     /start                    (n_0, m_0) float64, mm: the heights it began from, on the first stage's net
+    /unrounded                of the same shape, mm: what these were before a least radius was asked of them, where one was
     /state                    attributes stage, iteration, total, seconds, reason
     /state/parameters/*, /state/optimizer/*   tensors by name
     /history                  (iterations, 5): iteration, stage, loss (eq. 5.2.1), on_screen, seconds
@@ -38,6 +39,8 @@ from caustic_cli.io.files import open_regular, write_bytes
 from caustic_cli.optics.bspline import SplineSpace
 
 FORMAT_VERSION = 1
+#: Nets that a state may have beside its heights.
+STARTS = ("start", "unrounded")
 HISTORY = ("iteration", "stage", "loss", "on_screen", "seconds")
 #: Length of the block before the data, the least that HDF5 allows; and what an HDF5 file without one begins with.
 SEAL, SIGNATURE = 512, b"\x89HDF\r\n\x1a\n"
@@ -87,8 +90,9 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
         f["lens/heights"] = state.heights.cpu().numpy()
         f["lens"].attrs["degree"] = [s.degree for s in spaces]
         f["lens/knots_u"], f["lens/knots_v"] = (s.knots.numpy() for s in spaces)
-        if state.start is not None:
-            f["start"] = state.start.cpu().numpy()
+        for name in STARTS:
+            if (net := getattr(state, name)) is not None:
+                f[name] = net.cpu().numpy()
         group = f.create_group("state")
         for name in ("stage", "iteration", "total", "seconds", "reason"):
             group.attrs[name] = getattr(state, name)
@@ -207,7 +211,7 @@ def _load(path: Path, file: BinaryIO) -> Checkpoint:
                 history=[(int(r[0]), int(r[1]), *map(float, r[2:])) for r in rows],
                 seconds=float(group.attrs["seconds"]),
                 reason=str(group.attrs["reason"]),
-                start=contents.tensor("start").double() if "start" in f else None,
+                **{name: contents.tensor(name).double() for name in STARTS if name in f},
             )
             if min(state.stage, state.iteration, state.total) < 0 or not 0 <= state.seconds < math.inf:
                 raise ValueError("state")
@@ -226,7 +230,9 @@ def _load(path: Path, file: BinaryIO) -> Checkpoint:
         raise InputError(
             f"{path}: is damaged or not a caustic checkpoint ({type(error).__name__}); a whole checkpoints.h5 is needed"
         ) from error
-    nets = [state.heights] if state.start is None else [state.heights, state.start]
-    if tuple(state.heights.shape[-2:]) != (spaces[0].n, spaces[1].n) or not all(bool(torch.isfinite(z).all()) for z in nets):
+    nets = [z for z in (state.heights, state.start, state.unrounded) if z is not None]
+    fits = tuple(state.heights.shape[-2:]) == (spaces[0].n, spaces[1].n)
+    fits &= state.unrounded is None or (state.start is not None and state.start.shape == state.unrounded.shape)
+    if not fits or not all(bool(torch.isfinite(z).all()) for z in nets):
         raise InputError(f"{path}: is damaged (its heights do not fit its knots); a whole checkpoints.h5 is needed")
     return checkpoint

@@ -173,6 +173,11 @@ class Lens:
             raise InputError("⟨lens.array⟩ has knots of its own: give no knots_u and knots_v")
 
     @property
+    def cut_from(self) -> int:
+        """The side from which a tool cuts the shaped surface: 1 from +z, or -1 from -z, from where light reaches a mirror."""
+        return -1 if self.mirror else 1
+
+    @property
     def arrayed(self) -> bool:
         """Whether it is an array of lenslets."""
         return max(self.array) > 1

@@ -31,8 +31,8 @@ from caustic_cli.scene.materials import material
 MOST, A_SPAN = 2001, 4
 #: Rays of the sensitivities and of the angles inside the lens.
 RAYS = 100_000
-#: Bytes of a finished project (the lens and what it began from) and of a STEP file for each control height.
-PROJECT, STEP_FILE = 16, 92
+#: Bytes of a net in a project and of a STEP file, for each control height.
+NET, STEP_FILE = 8, 92
 #: Errors by which the sensitivities are found: of the throw, relative; of the index.
 STEP = 1e-4
 
@@ -58,7 +58,7 @@ def manufacture(scene: Scene, field: HeightField, heights: Tensor, tool_radius: 
         (u, v) = (torch.linspace(-1.0, 1.0, n, dtype=torch.float64) for n in z.shape)
         inside, at = u[:, None] ** 2 + v[None, :] ** 2 <= 1.0, tuple(n // 2 for n in z.shape)
         z, *derivatives = (torch.where(inside, t, t[at]) for t in (z, *derivatives))
-    bends = curvature.largest(*derivatives)
+    bends = curvature.largest(*(lens.cut_from * d for d in derivatives))
     bent, at = float(bends.max()), divmod(int(bends.argmax()), bends.shape[1])
     where = [(2.0 * k / (n - 1) - 1.0) * r for k, n, r in zip(at, z.shape, field.half_size, strict=True)]
     radius = 1.0 / bent if bent > 0 else None
@@ -106,10 +106,13 @@ def wall_and_stock(scene: Scene, field: HeightField, heights: Tensor) -> dict[st
     return {"minimum_wall_mm": float(z.min()) - scene.lens.z_in, "stock_height_mm": float(z.max()) - scene.lens.z_in}
 
 
-def preview(scene: Scene, field: HeightField, heights: Tensor) -> str:
-    """What a design's first surface asks for, in one line; the finished one will be much like it."""
+def preview(scene: Scene, field: HeightField, heights: Tensor, nets: int = 2) -> str:
+    """What a design's first surface asks for, in one line; the finished one will be much like it.
+
+    nets: that the finished project keeps: the lens' and what it began from."""
     lens, (z, *derivatives) = scene.lens, sampled(field, heights, [_points(s) for s in field.spaces])
-    slope, bent = float(torch.hypot(*derivatives[:2]).max()), float(curvature.largest(*derivatives).max())
+    slope = float(torch.hypot(*derivatives[:2]).max())
+    bent = float(curvature.largest(*(lens.cut_from * d for d in derivatives)).max())
     reflected = (
         "" if lens.mirror else f" (light along the axis is totally reflected from {1.0 / math.sqrt(lens.index**2 - 1.0):.2f})"
     )
@@ -117,7 +120,7 @@ def preview(scene: Scene, field: HeightField, heights: Tensor) -> str:
     return (
         f"first surface: wall {float(z.min()) - lens.z_in:.2f} mm, stock {float(z.max()) - lens.z_in:.2f} mm, slopes up to"
         f" {slope:.2g}{reflected}, {f'concave radius down to {1.0 / bent:.2g} mm' if bent > 0 else 'nowhere concave'};"
-        f" files: project about {_megabytes(PROJECT * size)}, STEP {_megabytes(STEP_FILE * size)}"
+        f" files: project about {_megabytes(nets * NET * size)}, STEP {_megabytes(STEP_FILE * size)}"
     )
 
 

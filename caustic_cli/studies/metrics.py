@@ -11,13 +11,15 @@ Notation
     psnr_db         10 log10(L^2 / mean((K - T)^2))
     ssim            mean of (2 m_K m_T + c_1)(2 s_KT + c_2) / ((m_K^2 + m_T^2 + c_1)(s_K^2 + s_T^2 + c_2)), local
                     means m, variances s^2 and covariance s_KT under an 11 x 11 Gaussian window; c_i = (k_i L)^2
+    in_black        sum of J where T < DARK L, over S J: of the light on the screen, what lands in the black, margins included
 
 The noise of an image's own rays adds to every squared error.  Where V is known, the variance of each pixel's noise on the scale
 of J, the figures are without it, as of endless rays: mean(V / (S J)^2) is taken off loss^2, and the window's mean of V off s_K^2,
 which stays at least s_KT^2 / s_T^2.  Both are without bias in the squares; the ratio that SSIM is keeps some.
 
 A black image is compared as it is, all zero: its relative_rms against an even target is 1.  What has no value (the
-logarithm of no error, anything relative to a black target) is None, because JSON has neither infinity nor NaN.
+logarithm of no error, anything relative to a black target, light in the black of a target without any) is None, because JSON has
+neither infinity nor NaN.
 
 Sources: thesis 5.2; Wang, Bovik, Sheikh, Simoncelli, IEEE Trans. Image Processing 13, 600 (2004) for SSIM.
 """
@@ -38,6 +40,8 @@ if TYPE_CHECKING:
 
 #: Window of Wang et al.: standard deviation and half width in pixels, and their two stabilising constants.
 SSIM_SIGMA, SSIM_RADIUS, SSIM_K1, SSIM_K2 = 1.5, 5, 0.01, 0.03
+#: Part of its peak below which a target is black.
+DARK = 0.01
 _FIGURES = ("loss", "relative_rms", "psnr_db", "ssim")
 
 
@@ -105,6 +109,22 @@ def on_target(image, target) -> float:
     return float(image[target > 0].sum())
 
 
+def black(target) -> np.ndarray:
+    """Where a target (n_x, n_y) is below DARK of its peak; (3, n_x, n_y) of a coloured one, each colour by its own."""
+    target = _array(target)
+    return target < DARK * target.max((-2, -1), keepdims=True)
+
+
+def in_black(image, target) -> float | None:
+    """Part of the light on the screen that lands where the target is `black`; (n_x, n_y), or (3, n_x, n_y) in colour.
+
+    None where the target has no black, or the image no light.
+    """
+    image, dark = _array(image), black(target)
+    total = image.sum()
+    return float(image[dark].sum() / total) if dark.any() and total > 0 else None
+
+
 def judge(exposure: Image, target, variance=None) -> dict:
     """The figures that `render json` and `design json` share, ready for `json.dumps(..., allow_nan=False)`.
 
@@ -114,10 +134,11 @@ def judge(exposure: Image, target, variance=None) -> dict:
         variance: of the noise of the image's pixels, of its shape, for figures without it; None leaves it in.
 
     Returns:
-        loss, relative_rms, psnr_db, ssim (None where undefined), on_screen, on_target, lost (name -> part of the
+        loss, relative_rms, psnr_db, ssim, in_black (None where undefined), on_screen, on_target, lost (name -> part of the
         source's power; with on_screen they sum to 1) and rays.
 
-    Of a coloured image, (3, n_x, n_y) like its target, the first four are means over the colours that the target has.
+    Of a coloured image, (3, n_x, n_y) like its target, the first four are means over the colours that the target has; light is in
+    the black of its own colour.
     """
     image = exposure.image
     if image.ndim == 3 and target is not None:
@@ -125,10 +146,11 @@ def judge(exposure: Image, target, variance=None) -> dict:
         parts = [judge(replace(exposure, image=i), t, v) for i, t, v in zip(image, target, noise, strict=True) if t.sum() > 0]
         means = {k: None if None in (v := [p[k] for p in parts]) else math.fsum(v) / len(v) for k in _FIGURES}
         sums = {k: math.fsum(p[k] for p in parts) for k in ("on_screen", "on_target")}
-        return means | sums | {k: parts[0][k] for k in ("lost", "rays")}
+        return means | {"in_black": in_black(image, target)} | sums | {k: parts[0][k] for k in ("lost", "rays")}
     against = (loss, relative_rms, psnr_db, ssim)
     return {
         **{figure.__name__: None if target is None else figure(image, target, variance) for figure in against},
+        "in_black": None if target is None else in_black(image, target),
         "on_screen": float(_array(image).sum()),
         "on_target": None if target is None else on_target(image, target),
         "lost": {name: float(value) for name, value in exposure.lost.items()},

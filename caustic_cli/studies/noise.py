@@ -11,6 +11,9 @@ The standard error of F^2 follows from how far the halves differ.  E_A and E_B a
 the number of all pixels: var(F^2) = sum over blocks of (E_A - E_B)^2 / 4.  Indeed (E_A - E_B) / 2 is the block's part of
 mean((m - t) (a - b)), which varies as F^2 does: by noise where the image is wrong, and by the product of both halves' noise.
 Neighbours, which share a ray that lands near their border one way or the other, are mostly in one block.
+
+That of G, the light in black (`metrics.in_black`), likewise: R_A is the block's sum of A (1 - G) in the black and of -A G
+elsewhere, over the sum of M, and var(G) = sum over blocks of (R_A - R_B)^2 / 4.
 """
 
 from __future__ import annotations
@@ -18,6 +21,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
+
+from caustic_cli.studies.metrics import black
 
 #: Pixels along the sides of a block.
 BLOCK = 8
@@ -47,6 +52,14 @@ def standard_error(one: np.ndarray, other: np.ndarray, target: np.ndarray, relat
     colours = [(one, other, target)] if target.ndim == 2 else [c for c in zip(one, other, target, strict=True) if c[2].sum() > 0]
     square = math.fsum(_of_square(*c) for c in colours) / max(1, len(colours))
     return math.sqrt(relative_rms**2 + square) - relative_rms
+
+
+def black_error(one: np.ndarray, other: np.ndarray, target: np.ndarray, in_black: float | None) -> float | None:
+    """Standard error of G, `in_black`, of the mean of two images, (n_x, n_y) or (3, n_x, n_y); None where there is no G."""
+    if in_black is None:
+        return None
+    apart = (black(target) - in_black) * (one - other) / (0.5 * (one.sum() + other.sum()))
+    return 0.5 * float(np.sqrt(sum((_blocks(a) ** 2).sum() for a in (apart if apart.ndim == 3 else apart[None]))))
 
 
 def _of_square(one: np.ndarray, other: np.ndarray, target: np.ndarray) -> float:

@@ -192,8 +192,18 @@ def _draw_account(axis: Axes, figures: dict) -> None:
     axis.barh(range(len(parts)), [100.0 * value for _, value, _ in parts], 0.35, color=[colour for _, _, colour in parts])
     for k, (name, value, _) in enumerate(parts):
         axis.annotate(f"{name} {value:.2%}", (1.0, k - 0.22), va="bottom")
-    axis.set(title="where the light goes", xlabel="% of the source's light", xlim=(0.0, 100.0), yticks=[])
+    axis.set(title=_account_words(figures), xlabel="% of the source's light", xlim=(0.0, 100.0), yticks=[])
     axis.set_ylim(len(parts) - 0.5, -0.6)
+
+
+def _account_words(figures: dict) -> str:
+    """The title of the account: how much light is in the picture's black, and what a least radius adds to that."""
+    words, radius = "where the light goes", figures.get("min_radius")
+    if figures.get("in_black") is not None:
+        words += f"\nof that on the screen, in black {figures['in_black']:.2%}"
+    if radius is not None and radius["in_black_per_mm"] is not None:
+        words += f"\na radius of {radius['radius_mm']:g} mm: {radius['in_black_per_mm']:.2%} more a mm, on the first surface"
+    return words
 
 
 def _irradiance_words(figures: dict, prefix: str) -> str:

@@ -21,7 +21,7 @@ from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Scene, Screen
 from caustic_cli.studies.irradiance import irradiance_figures, unit_figures
 from caustic_cli.studies.metrics import judge
-from caustic_cli.studies.noise import image_noise, lift, standard_error, variance_of
+from caustic_cli.studies.noise import black_error, image_noise, lift, standard_error, variance_of
 
 #: Rays of the retrace that ends a design.
 FINAL_RAYS = 4_000_000
@@ -185,8 +185,9 @@ def retrace(
 
     Returns:
         the exposure, reconstructed by `filter` (bincount unless given), and the figures of the JSON table, always by bincount,
-        with the rays that were traced; noise, of relative_rms, None without a target; error_estimate, the relative RMS noise of the
-        image, None of a black one; those of `studies.irradiance`; with `tolerance` also rays_traced.
+        with the rays that were traced; noise, of relative_rms, None without a target; in_black_noise, of in_black, None without
+        that; error_estimate, the relative RMS noise of the image, None of a black one; those of `studies.irradiance`; with
+        `tolerance` also rays_traced.
     """
 
     def trace(name: str, count: int, light: Scene = scene) -> Image:
@@ -250,7 +251,12 @@ def _judged_halves(counted: Image, target: np.ndarray | None, halves: tuple[Imag
     variance = variance_of(*pair)
     figures = judge(counted, target, variance)
     noise = None if target is None else standard_error(*pair, target, figures["relative_rms"])
-    return figures | {"noise": noise, "error_estimate": image_noise(variance, counted.image.cpu().numpy())}
+    dark = None if target is None else black_error(*pair, target, figures["in_black"])
+    return figures | {
+        "noise": noise,
+        "in_black_noise": dark,
+        "error_estimate": image_noise(variance, counted.image.cpu().numpy()),
+    }
 
 
 def _judged_even(counted: Image, target: np.ndarray | None, fewer: tuple[Image, Image] | None) -> dict:
@@ -258,7 +264,7 @@ def _judged_even(counted: Image, target: np.ndarray | None, fewer: tuple[Image, 
 
     fewer: two others, from whose noise its own follows, or None: stratified rays on two dimensions converge with order 3/4.
     """
-    figures = judge(counted, target) | {"noise": None, "error_estimate": None}
+    figures = judge(counted, target) | {"noise": None, "in_black_noise": None, "error_estimate": None}
     if fewer is None:
         return figures
     pair = [f.image.cpu().numpy() for f in fewer]
@@ -267,6 +273,8 @@ def _judged_even(counted: Image, target: np.ndarray | None, fewer: tuple[Image, 
     if target is not None and error is not None:
         own = standard_error(*pair, target, figures["relative_rms"]) * math.sqrt(2.0) * falls  # of one image, not of both's mean
         figures["noise"] = math.hypot(lift(figures["relative_rms"], error), own)
+        dark = black_error(*pair, target, figures["in_black"])
+        figures["in_black_noise"] = None if dark is None else dark * math.sqrt(2.0) * falls
     return figures | {"error_estimate": error}
 
 

@@ -38,10 +38,10 @@ def wave_figures(
     exit from the heights, as of `optics.waves.wave_image`; required: take it however long that takes, or raise NoWaveImage.
 
     Returns:
-        the image, None where there is none and `required` is false; and wave_relative_rms, wave_on_target (None without a target),
-        wave_on_screen, wave_wavelengths (nm), resolvable, the number of details across that light carries, wave_source_points, the
-        points that the source was taken as, wave_source_error, by how much an extended source's light is misplaced so, mm, and
-        wave_peak_irradiance and wave_mean_irradiance, as of a ray image.
+        the image, None where there is none and `required` is false; and wave_relative_rms, wave_on_target, wave_in_black (None
+        without a target), wave_on_screen, wave_wavelengths (nm), resolvable, the number of details across that light carries,
+        wave_source_points, the points that the source was taken as, wave_source_error, by how much an extended source's light is
+        misplaced so, mm, and wave_peak_irradiance and wave_mean_irradiance, as of a ray image.
     """
     most = math.inf if required else UNASKED
     try:
@@ -50,13 +50,21 @@ def wave_figures(
         if required:
             raise
         return None, dict.fromkeys(
-            ("wave_relative_rms", "wave_on_target", "wave_on_screen", "wave_peak_irradiance", "wave_mean_irradiance")
+            (
+                "wave_relative_rms",
+                "wave_on_target",
+                "wave_in_black",
+                "wave_on_screen",
+                "wave_peak_irradiance",
+                "wave_mean_irradiance",
+            )
         ) | {"wave_wavelengths": [], "resolvable": seen.resolvable, "no_wave_image": str(error)}
     of = _judged(found, target)
     absolute = {f"wave_{name}": value for name, value in irradiance_figures(scene, found.image).items()}
     return found, {
         "wave_relative_rms": of["relative_rms"],
         "wave_on_target": of["on_target"],
+        "wave_in_black": of["in_black"],
         "wave_on_screen": of["on_screen"],
         "wave_wavelengths": list(found.wavelengths),
         "resolvable": seen.resolvable,

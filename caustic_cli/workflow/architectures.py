@@ -50,7 +50,7 @@ class Candidate:
         self, about: dict[str, Any], designers: list[Designer], first: Tensor | None, target: np.ndarray, rays: int, seed: int
     ):
         self.designers, self.target, self.rays, self.seed = designers, target, rays, seed
-        self.states = [one.begin(first) for one in designers]
+        self.states = [one.begin(*first or ()) for one in designers]
         count = sum(v.numel() for state in self.states for name, v in state.parameters.items() if name != "start")
         self.about = about | {"parameters": count}
 

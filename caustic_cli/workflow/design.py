@@ -28,7 +28,7 @@ from caustic_cli.config.settings import Settings
 from caustic_cli.errors import CausticError, InputError, Interrupted
 from caustic_cli.inverse import ranks
 from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
-from caustic_cli.inverse.designer import Designer, State
+from caustic_cli.inverse.designer import Designer, First, State
 from caustic_cli.inverse.extended import best_light, centre_of, limits, shift_of
 from caustic_cli.inverse.initial_sides import first_sides
 from caustic_cli.inverse.initial_surface import InitialSurface, first_surface
@@ -78,7 +78,7 @@ def begin(
     force: bool = False,
     say: Reporter,
     device: str = "cpu",
-) -> tuple[Project, torch.Tensor | None]:
+) -> tuple[Project, First | None]:
     """Check everything, then make the project directory, if there is to be one; also returns the first heights, None for the
     offset surface.
 
@@ -182,7 +182,7 @@ def begin(
     return project, first
 
 
-def first_heights(project: Project, said: Settings) -> tuple[Project, torch.Tensor | None]:
+def first_heights(project: Project, said: Settings) -> tuple[Project, First | None]:
     """The heights that a design begins from, None for the offset surface; and the project whose thickness and height range are
     what they need, but for what was `said`.
 
@@ -193,7 +193,7 @@ def first_heights(project: Project, said: Settings) -> tuple[Project, torch.Tens
     lens = project.settings["lens"]
     first, middle = _solved(project, fixed)
     if "second" in project.settings:
-        return project, _designer(project, "cpu")[0].within_limits(State(first))
+        return project, _designer(project, "cpu")[0].first(first)
     if middle is not None:
         lens["thickness"] = middle
     if first is not None and not fixed and (spare := _spare(lens, first)) > 0:
@@ -202,9 +202,7 @@ def first_heights(project: Project, said: Settings) -> tuple[Project, torch.Tens
     if first is not None and _make_room(project.settings, said, first) and middle is None:
         _designer(project, "cpu")
         first, _ = _solved(project, fixed)
-    designer = _designer(project, "cpu")[0]
-    whole = designer.whole(first)
-    return project, None if whole is None else designer.within_limits(State(whole))
+    return project, _designer(project, "cpu")[0].first(first)
 
 
 @dataclass(frozen=True)
@@ -223,9 +221,7 @@ class Result:
     figures: dict[str, Any]
 
 
-def design(
-    project: Project, first: torch.Tensor | None, device: str, say: Reporter, began: float, movie: Movie | None = None
-) -> Result:
+def design(project: Project, first: First | None, device: str, say: Reporter, began: float, movie: Movie | None = None) -> Result:
     """Run a new design from its first heights to its end; movie: records it.
 
     One that `begin` found needs no work, or goes on.
@@ -257,10 +253,10 @@ def design(
             return _run_index(project, say, began, device)
         designer, target = _designer(project, device)
         _say_limits(project, designer, target, first, say)
-        return _run(project, designer, target, designer.begin(first), say, began, None, device, movie)
+        return _run(project, designer, target, designer.begin(*first or ()), say, began, None, device, movie)
 
 
-def _say_limits(project: Project, designer: Designer, target: np.ndarray, first: torch.Tensor | None, say: Reporter) -> None:
+def _say_limits(project: Project, designer: Designer, target: np.ndarray, first: First | None, say: Reporter) -> None:
     """What no lens can do about diffraction and an extended source, and what this one will be like, before time is spent on it."""
     light = grey(project.picture.irradiance())
     if (ground := float((light >= NEARLY * light.max()).mean())) > GROUND and light.min() < 0.5 * light.max():
@@ -278,7 +274,9 @@ def _say_limits(project: Project, designer: Designer, target: np.ndarray, first:
     if seen.matters and project.settings["design"]["waves"] == "auto" and project.without_waves:
         say.say(f"the wave image is not refined: {project.without_waves}")
     field = designer.field(0)
-    say.say(preview(designer.scene, field, designer.begin(None).heights if first is None else first))
+    heights = designer.begin().heights if first is None else first.heights
+    nets = 3 if first is not None and first.unrounded is not None else 2
+    say.say(preview(designer.scene, field, heights, nets))
 
 
 def _listed(wavelengths: tuple[float, ...]) -> str:
@@ -303,7 +301,7 @@ def resume(
         designer, target = _designer(project, device)
         begun = (project.path / CHECKPOINT).exists()  # if not, it was killed before its first checkpoint
         before = project.load() if begun else None
-        state = before.state if begun else designer.begin(designer.whole(_solved(project, fixed=True)[0]))
+        state = before.state if begun else designer.begin(*designer.first(_solved(project, fixed=True)[0]) or ())
         if state.stage >= len(designer.stages):
             raise project.error(f"has {len(designer.stages)} stages, but the checkpoint stands in stage {state.stage + 1}")
         if tuple(state.heights.shape[-2:]) != designer.stages[state.stage].control:
@@ -336,11 +334,12 @@ def follow(device: str) -> None:
 
 def _on_cpu(state: State) -> State:
     """A state that can be sent."""
-    start = None if state.start is None else state.start.cpu()
+    start, unrounded = (None if z is None else z.cpu() for z in (state.start, state.unrounded))
     return replace(
         state,
         heights=state.heights.cpu(),
         start=start,
+        unrounded=unrounded,
         image=None,
         parameters={k: v.cpu() for k, v in state.parameters.items()},
         optimizer={k: v.cpu() for k, v in state.optimizer.items()},

@@ -5,6 +5,7 @@ What the optimiser saw is no judge of what it did: it learns its own rays and it
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, replace
 
@@ -35,8 +36,9 @@ from caustic_cli.workflow import over_range
 REPORT_SAMPLES = 401
 #: Losses whose aim is the likeness itself; another may rightly pay for what it wants with likeness.
 LIKENESS = {"rms", "rms-light", "throughput"}
-#: For `expected_seconds`: part of FINAL_RAYS that are traced, retraces and wave images of an evaluation, and time of its report.
-PROBE, RETRACES, WAVE_IMAGES, REPORT_SECONDS = 16, 2.5, 4, 2.5
+#: For `expected_seconds`: part of FINAL_RAYS that are traced, retraces and wave images of an evaluation, more retraces with a least
+#: radius, and time of its report.
+PROBE, RETRACES, WAVE_IMAGES, RADIUS, REPORT_SECONDS = 16, 2.5, 4, 1.5, 2.5
 #: Fewer rays, by this factor, judge the first surfaces of a lens with two free-form sides.
 STARTS = 4
 #: Fewer rays, by this factor, judge each of the lenses that a network gives.
@@ -104,7 +106,7 @@ def expected_seconds(designer: Designer, target: np.ndarray, state: State, devic
         *traced_of(scene, field, state.heights), target, rays=judging_rays(scene, FINAL_RAYS) // PROBE, device=device, noise=False
     )
     over = designer.options.over
-    retraces = RETRACES + (0.0 if over is None else 2.0 * len(over.judged()) / OVER)
+    retraces = RETRACES + (0.0 if state.unrounded is None else RADIUS) + (0.0 if over is None else 2.0 * len(over.judged()) / OVER)
     seconds = retraces * PROBE * (time.monotonic() - began) + REPORT_SECONDS
     if any(s.waves for s in designer.stages):
         began = time.monotonic()
@@ -155,11 +157,12 @@ def evaluate(
     if refined:
         light, more = as_waves(state.heights)
         figures |= more
+    began = None
     by_likeness = {name for _, name in parse(designer.options.loss)} <= LIKENESS
     for_one = designer.options.robust is None and designer.options.over is None  # others pay for what they want with likeness
     if state.start is not None and by_likeness and for_one:
         start = designer.within_limits(replace(state, heights=designer.begun(state)))
-        _, began = trace(start, noise=not scene.source.collimated)  # of other light, what the retrace has anyway
+        _, began = trace(start, noise=not scene.source.collimated or state.unrounded is not None)  # other light has it anyway
         of_start = None
         if refined:
             of_start, more = as_waves(start)
@@ -179,6 +182,10 @@ def evaluate(
             figures |= {"start_noise": began["noise"]}
         if refined:
             figures |= {"start_wave_relative_rms": began["wave_relative_rms"]}
+    if state.unrounded is not None:
+        rounded = began or trace(designer.within_limits(replace(state, heights=designer.begun(state))))[1]
+        unrounded = trace(designer.begun(state, rounded=False))[1]
+        figures |= {"min_radius": radius_figures(designer.options.min_radius, rounded, unrounded)}
     bounds = limits(scene, grey(target), field, state.heights)
     if bounds.light is not None:
         figures |= {"least_relative_rms": bounds.light.error}
@@ -205,7 +212,31 @@ def _both_sides(designer: Designer, target: np.ndarray, state: State, device: st
     if state.start is not None:
         began = trace(designer.begun(state), FINAL_RAYS // STARTS)[2]
         figures |= {f"start_{key}": began[key] for key in ("relative_rms", "second_relative_rms", "angle_rms_mrad") if key in began}
+        if state.unrounded is not None:
+            unrounded = trace(designer.begun(state, rounded=False), FINAL_RAYS // STARTS)[2]
+            figures |= {"min_radius": radius_figures(designer.options.min_radius, began, unrounded)}
     return Evaluation(state, figures, image, None, second)
+
+
+def radius_figures(radius: float, rounded: dict, unrounded: dict) -> dict[str, float | None]:
+    """What a least radius of concave places costs: light in black of the surface that a design began from, with it and without.
+
+    Args:
+        radius: mm; rounded, unrounded: figures of that surface, of the same rays, within all limits and within all but the radius.
+
+    Returns:
+        radius_mm; start_in_black and start_in_black_without, parts of the light on the screen; in_black_per_mm, their difference
+        over the radius, and its noise; None where the picture has no black.
+    """
+    one, other = rounded["in_black"], unrounded["in_black"]
+    noises = rounded["in_black_noise"], unrounded["in_black_noise"]
+    return {
+        "radius_mm": radius,
+        "start_in_black": one,
+        "start_in_black_without": other,
+        "in_black_per_mm": None if one is None or other is None else (one - other) / radius,
+        "noise": None if None in noises else math.hypot(*noises) / radius,
+    }
 
 
 def _keys(figures: dict, than: dict) -> tuple[str, str]:

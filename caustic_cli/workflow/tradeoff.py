@@ -68,7 +68,7 @@ def _designed(project: Project | None, full: dict, weights, parts, seconds: floa
             options = replace(build_options(own), loss=loss, waves=False)
             try:
                 designer = Designer(scene, torch.from_numpy(goal), build_stages(own), options, device)
-                state = designer.run(designer.begin(first), time_limit=seconds)
+                state = designer.run(designer.begin(*first or ()), time_limit=seconds)
             except CausticError:
                 continue
             yield Lens(

@@ -85,6 +85,7 @@ def row(picture: Path, quality: str, folder: Path, more: list[str]) -> list[str]
         f"{sharp['relative_rms']:.3f}",
         f"{light:.4f}",
         f"{sharp['on_target'] / sharp['on_screen']:.3f}",
+        "-" if sharp["in_black"] is None else f"{sharp['in_black']:.2%}",
         f"{seconds:.0f}",
     ]
 
@@ -102,7 +103,7 @@ def main() -> None:
         caustic("design", known["flame"], "--quality", "draft", "--time-limit", 1, *more, "-o", folder / "warm.caustic")
         print(
             "| picture | quality | as a wave | of its light on the picture | by rays | with 3.2e7 rays | light | of it on the"
-            " picture | seconds |\n| --- | --- | --- | --- | --- | --- | --- | --- | --- |"
+            " picture | in black | seconds |\n| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |"
         )
         for name in options.pictures.split(","):
             for quality in options.qualities.split(","):
