@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
+from caustic_cli.export.surface import USUAL_BYTES
 from caustic_cli.io.files import SOFTWARE, write_bytes
 from caustic_cli.optics import curvature
 from caustic_cli.optics.bspline import SplineSpace
@@ -32,7 +33,7 @@ MOST, A_SPAN = 2001, 4
 #: Rays of the sensitivities and of the angles inside the lens.
 RAYS = 100_000
 #: Bytes of a finished project (the lens and what it began from) and of a STEP file for each control height.
-PROJECT, STEP_FILE = 16, 92
+PROJECT, STEP_FILE = 16, 72
 #: Errors by which the sensitivities are found: of the throw, relative; of the index.
 STEP = 1e-4
 
@@ -117,7 +118,7 @@ def preview(scene: Scene, field: HeightField, heights: Tensor) -> str:
     return (
         f"first surface: wall {float(z.min()) - lens.z_in:.2f} mm, stock {float(z.max()) - lens.z_in:.2f} mm, slopes up to"
         f" {slope:.2g}{reflected}, {f'concave radius down to {1.0 / bent:.2g} mm' if bent > 0 else 'nowhere concave'};"
-        f" files: project about {_megabytes(PROJECT * size)}, STEP {_megabytes(STEP_FILE * size)}"
+        f" files: project about {_megabytes(PROJECT * size)}, STEP {_megabytes(min(STEP_FILE * size, USUAL_BYTES))}"
     )
 
 
