@@ -34,6 +34,8 @@ MOST, A_SPAN = 2001, 4
 RAYS = 100_000
 #: Bytes of a finished project (the lens and what it began from) and of a STEP file for each control height.
 PROJECT, STEP_FILE = 16, 72
+#: Thickness of a plate that is cut from a common sheet, in parts of its width.
+SHEET = 0.08
 #: Errors by which the sensitivities are found: of the throw, relative; of the index.
 STEP = 1e-4
 
@@ -119,7 +121,18 @@ def preview(scene: Scene, field: HeightField, heights: Tensor) -> str:
         f"first surface: wall {float(z.min()) - lens.z_in:.2f} mm, stock {float(z.max()) - lens.z_in:.2f} mm, slopes up to"
         f" {slope:.2g}{reflected}, {f'concave radius down to {1.0 / bent:.2g} mm' if bent > 0 else 'nowhere concave'};"
         f" files: project about {_megabytes(PROJECT * size)}, STEP {_megabytes(min(STEP_FILE * size, USUAL_BYTES))}"
+        f"{_thinner(scene, float(z.min()), float(z.max()))}"
     )
+
+
+def _thinner(scene: Scene, low: float, high: float) -> str:
+    """What would make a plate whose surface is between two heights, mm, as thin as a sheet: its relief goes as 1 / throw."""
+    sheet = SHEET * max(scene.lens.size)
+    room = sheet - (low - scene.lens.z_in)  # none in a lens that is no plate
+    if scene.lens.mirror or scene.elements or not 0.0 < room < high - low:
+        return ""
+    throw = float(f"{abs(scene.screen.z) * (high - low) / room:.2g}")
+    return f"; a ⟨+throw⟩ of about {throw:g} mm or a smaller ⟨+mag⟩ would make it {sheet:.2g} mm thick"
 
 
 def _megabytes(size: float) -> str:

@@ -115,10 +115,10 @@ def accuracy_words(figures: dict) -> str:
     if "read_as" not in figures:
         return "the spline itself" if figures["format"] == "step" else ""
     nx, ny = figures["samples"]
-    exact = "; ⟨+tolerance⟩ 0 writes the exact one" if figures["format"] == "step" else ""
+    exact = {"step": "; ⟨tolerance⟩ 0 writes the exact one", "lighttools": "; the exact spline stands beside them"}
     return (
         f"{nx} x {ny} points; read as {figures['read_as']}, heights are at most {_length(figures['height_error_mm'])} off and"
-        f" light {_shift(figures['shift_pixels'])} (RMS){exact}"
+        f" light {_shift(figures['shift_pixels'])} (RMS){exact.get(figures['format'], '')}"
     )
 
 
