@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.export.surface import USUAL_BYTES
 from caustic_cli.io.files import SOFTWARE, write_bytes
 from caustic_cli.optics import curvature
 from caustic_cli.optics.bspline import SplineSpace
@@ -32,8 +31,8 @@ from caustic_cli.scene.materials import material
 MOST, A_SPAN = 2001, 4
 #: Rays of the sensitivities and of the angles inside the lens.
 RAYS = 100_000
-#: Bytes of a finished project (the lens and what it began from) and of a STEP file for each control height.
-PROJECT, STEP_FILE = 16, 72
+#: Bytes of a finished project (the lens and what it began from) for each control height.
+PROJECT = 16
 #: Thickness of a plate that is cut from a common sheet, in parts of its width.
 SHEET = 0.08
 #: Errors by which the sensitivities are found: of the throw, relative; of the index.
@@ -120,7 +119,7 @@ def preview(scene: Scene, field: HeightField, heights: Tensor) -> str:
     return (
         f"first surface: wall {float(z.min()) - lens.z_in:.2f} mm, stock {float(z.max()) - lens.z_in:.2f} mm, slopes up to"
         f" {slope:.2g}{reflected}, {f'concave radius down to {1.0 / bent:.2g} mm' if bent > 0 else 'nowhere concave'};"
-        f" files: project about {_megabytes(PROJECT * size)}, STEP {_megabytes(min(STEP_FILE * size, USUAL_BYTES))}"
+        f" project about {_megabytes(PROJECT * size)}"
         f"{_thinner(scene, float(z.min()), float(z.max()))}"
     )
 
