@@ -542,7 +542,10 @@ def test_several_formats_at_once_and_the_format_of_a_suffix(here, capfd):
     assert [e["format"] for e in json.loads(out)["exports"]] == ["step", "stl", "heightmap"]
     assert run("export blob.caustic -o named.stl --tolerance 0.01 --quiet", capfd)[0] == 0
     assert Path("named.stl").read_bytes() == Path("blob.stl").read_bytes()
-    assert run("export blob.caustic -o named.stp --quiet", capfd)[0] == 0
+    code, _, err = run("export blob.caustic -o named.stp", capfd)
+    assert code == 0 and "heights are at most a nanometre off" in err and "; --tolerance 0 writes the exact one" in err
+    code, _, err = run("export blob.caustic --format step --tolerance 0 -o exact.step", capfd)
+    assert code == 0 and "bytes, the spline itself" in err and Path("exact.step").stat().st_size > Path("named.stp").stat().st_size
     assert Path("named.stp").read_text().startswith("ISO-10303-21;")
 
 

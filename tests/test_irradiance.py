@@ -173,3 +173,38 @@ def test_a_report_of_any_brightness(tmp_path, mean, encoding):
         encoding,
     )
     assert (tmp_path / "r.png").stat().st_size > 10_000
+
+
+def test_blurred_stages_have_a_panel_of_their_own(tmp_path, monkeypatch):
+    """Their loss, which grows as the blur falls, is not drawn on the axis of the error; nor is it lost."""
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    drawn = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
+    target = np.random.default_rng(0).random((12, 9))
+    figures = {"relative_rms": 0.3, "start_relative_rms": 1.2, "mean_irradiance": 1.0, "peak_irradiance": 2.0}
+    figures |= {"irradiance_unit": "lux", "on_screen": 0.9, "on_target": 0.8, "lost": {"fresnel": 0.1}}
+    losses = {0: [0.2, 0.02], 1: [0.3, 0.1], 2: [0.4, 0.35]}
+    history = np.array([[1, k, loss / target.size, 0.9, k + 0.1 * i] for k, row in losses.items() for i, loss in enumerate(row)])
+    for blurs in ((4.0, 1.0, 0.0), (0.0, 0.0, 0.0)):
+        write_report(
+            tmp_path / "r.png",
+            target,
+            target,
+            np.zeros((9, 9)),
+            history,
+            Lens(),
+            Screen((12.0, 9.0), 300.0, (12, 9)),
+            figures,
+            "linear",
+            stages=[(blur, False) for blur in blurs],
+        )
+        panels = {axis.get_title(): axis for axis in drawn.pop().axes if axis.get_ylabel() == "relative RMS"}
+        found = {
+            title: [line.get_ydata().tolist() for line in axis.get_lines() if len(line.get_ydata()) > 1]
+            for title, axis in panels.items()
+        }
+        own = [found[title] for title in found if title.startswith("error")]
+        wanted = [pytest.approx(row) for row in losses.values()]
+        assert own == [[row for row, blur in zip(wanted, blurs, strict=True) if blur == 0]]
+        assert [row for rows in found.values() for row in rows] == (wanted[2:] + wanted[:2] if blurs[0] else wanted)

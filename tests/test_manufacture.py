@@ -24,7 +24,7 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies import manufacture as manufacture_module
-from caustic_cli.studies.manufacture import manufacture, wall_and_stock
+from caustic_cli.studies.manufacture import manufacture, preview, wall_and_stock
 
 ORDERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 
@@ -196,6 +196,17 @@ def test_report_of_a_bowl():
     assert f["steepest_incidence_deg"] == pytest.approx(math.degrees(math.atan(steep)), abs=0.3)
     assert f["sharpness_limit_mm"] == 0
     json.dumps(f, allow_nan=False)
+
+
+@pytest.mark.parametrize("wall", [3.0, 50.0])
+def test_a_thick_plate_says_what_would_make_it_thin(wall):
+    """The relief goes as 1 / throw: with 10 mm of it and 5 mm of room beside the wall, twice the throw."""
+    scene, field, heights = surface(lambda x, y: wall + 10.0 * (x / 50.0) ** 2 + 0.0 * y, size=(100.0, 80.0))
+    words = preview(scene, field, heights)
+    if wall == 3.0:
+        assert "; a ⟨+throw⟩ of about 600 mm or a smaller ⟨+mag⟩ would make it 8 mm thick" in words
+        words = preview(scene, field, 3.0 + 0.45 * (heights - 3.0))
+    assert "throw" not in words and "stock" in words  # a thin plate, and a lens that is none
 
 
 def test_report_of_a_dome_has_no_concave_place():

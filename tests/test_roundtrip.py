@@ -8,6 +8,7 @@ f and g being its height and slopes; they must land where the program's own trac
 from __future__ import annotations
 
 import ast
+import math
 import re
 import sys
 import types
@@ -21,6 +22,7 @@ from scipy.interpolate import BSpline, CubicHermiteSpline, RectBivariateSpline
 from test_export import CASES, make, signed_volume
 
 from caustic_cli.errors import InputError
+from caustic_cli.export.approximation import caps, on_fewer_knots
 from caustic_cli.export.lighttools import write_lighttools
 from caustic_cli.export.lighttools_script import companions, write_script
 from caustic_cli.export.mesh import closed_mesh
@@ -34,7 +36,9 @@ from caustic_cli.export.surface import STEPS_PER_SPAN, sample_grid, second_deriv
 from caustic_cli.export.zemax import write_zemax
 from caustic_cli.io.files import is_ours
 from caustic_cli.io.surfaces import onto, read_surface
+from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.sampling import Sample
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Disc, PlaneWave, Points, Scene
@@ -267,7 +271,7 @@ def step_surface(entities):
 
 def test_step(tmp_path, lens, rays, capsys):
     scene, field, heights = lens
-    write_step(tmp_path / "lens.step", *lens)
+    assert write_step(tmp_path / "lens.step", *lens, tolerance=0.0) is None
     (p, q), poles, (tu, tv) = step_surface(read_step(tmp_path / "lens.step"))
     assert (poles[..., 2] == heights.numpy()).all() and (tu == field.spaces[0].knots.numpy()).all()
     assert (tv == field.spaces[1].knots.numpy()).all()
@@ -283,6 +287,90 @@ def test_step(tmp_path, lens, rays, capsys):
     error = off(scene, rays, f, gx, gy)
     say(capsys, "step", error)
     assert error < 1e-9
+
+
+def step_field(path, half):
+    """The surface of a file as a height field, its poles at the Greville abscissae, and its control heights; and the poles."""
+    (p, q), poles, (tu, tv) = step_surface(read_step(path))
+    field = HeightField((SplineSpace(p, torch.as_tensor(tu)), SplineSpace(q, torch.as_tensor(tv))), half)
+    return field, torch.from_numpy(poles[..., 2].copy()), poles
+
+
+@pytest.mark.parametrize("half", [(5.0, 4.0), (0.05, 0.04), (500.0, 400.0)])
+def test_step_rounds_to_nothing(tmp_path, half):
+    """By default poles are rounded: by less than 0.1 nm, and by less than turns the surface by 2e-6."""
+    random = np.random.default_rng(3)
+    space = SplineSpace.uniform(40, 3)
+    field, heights = HeightField((space, space), half), half[0] * (0.5 + 0.01 * torch.from_numpy(random.uniform(size=(40, 40))))
+    scene, _, _ = make(**CASES["square"])
+    scene = replace(scene, lens=replace(scene.lens, size=(2 * half[0], 2 * half[1])))
+    off = write_step(tmp_path / "a.step", scene, field, heights)
+    assert off.samples == (40, 40) and 0 < off.height < 1e-7 and 0 < off.slope < 2e-6
+    _, found, poles = step_field(tmp_path / "a.step", half)
+    assert 0 < (found - heights).abs().max() <= 0.5e-7
+    x, y = (c.numpy() for c in field.control_xy())
+    assert max(np.abs(poles[..., 0] - x[:, None]).max(), np.abs(poles[..., 1] - y).max()) <= 0.5e-7
+    exact = tmp_path / "b.step"
+    write_step(exact, scene, field, heights, tolerance=0.0)
+    assert (tmp_path / "a.step").stat().st_size < 0.8 * exact.stat().st_size
+
+
+@pytest.mark.parametrize("limit", [0.3e6, 0.1e6])
+def test_step_is_laid_on_fewer_knots(tmp_path, monkeypatch, limit):
+    """A file that would be larger than usual holds fewer poles, and says how far they are off: as found by reading it."""
+    monkeypatch.setattr("caustic_cli.export.surface.USUAL_BYTES", limit)
+    u, v = SplineSpace.uniform(90, 3), SplineSpace.uniform(80, 4)
+    scene, field, _ = make(**CASES["square"])
+    field = HeightField((u, v), field.half_size)
+    x, y = field.control_xy()
+    heights = 5 + 0.05 * torch.sin(2.0 * x)[:, None] * torch.cos(1.5 * y) + 1e-6 * torch.cos(40.0 * x)[:, None]
+    off = write_step(tmp_path / "a.step", scene, field, heights)
+    read, found, _ = step_field(tmp_path / "a.step", field.half_size)
+    assert off.samples == read.shape and 0.8 * limit < (tmp_path / "a.step").stat().st_size <= limit
+    assert math.prod(read.shape) < 0.7 * math.prod(field.shape)
+    random = np.random.default_rng(5)
+    px, py = (torch.from_numpy(random.uniform(-r, r, 400_000)) for r in field.half_size)
+    (z, zx, zy), (own, own_x, own_y) = read.at(found, px, py), field.at(heights, px, py)
+    assert off.height == pytest.approx(float((z - own).abs().max()), rel=0.3)
+    assert off.slope == pytest.approx(float(torch.sqrt(((zx - own_x) ** 2 + (zy - own_y) ** 2).mean())), rel=0.03)
+
+
+def test_step_within_a_tolerance(tmp_path):
+    """The smaller the tolerance the more knots, up to the surface's own; and what cannot be is refused."""
+    u, (scene, field, _) = SplineSpace.uniform(80, 3), make(**CASES["square"])
+    field = HeightField((u, u), field.half_size)
+    x, y = field.control_xy()
+    heights, counts = 5 + 0.05 * torch.sin(2.0 * x)[:, None] * torch.cos(1.5 * y), []
+    for tolerance in (1e-3, 1e-5, 1e-12):
+        off = write_step(tmp_path / f"{tolerance}.step", scene, field, heights, tolerance=tolerance)
+        assert off.height <= tolerance or off.samples == field.shape
+        counts.append(off.samples[0])
+    assert 4 <= counts[0] < counts[1] < counts[2] == 80
+    for wrong in (-1e-3, math.nan, math.inf):
+        with pytest.raises(InputError, match="tolerance"):
+            write_step(tmp_path / "no.step", scene, field, heights, tolerance=wrong)
+
+
+def test_fewer_knots_keep_folds():
+    """A fold stays where it is, and what the fewer knots can hold comes back."""
+    u, v = SplineSpace.uniform(61, 3, 2), SplineSpace.uniform(40, 3)
+    field = HeightField((u, v), (2.0, 1.0))
+    x, y = field.control_xy()
+    folded = x.abs()[:, None] + (0.1 * y**3)[None, :]
+    fewer, net = on_fewer_knots(field, folded, 800)
+    assert math.prod(fewer.shape) <= 800 and (fewer.spaces[0].knots == 0.5).sum() == 3
+    places = [torch.linspace(-r, r, 101, dtype=torch.float64) for r in field.half_size]
+    px, py = (t.reshape(-1) for t in torch.meshgrid(*places, indexing="ij"))
+    for a, b in zip(fewer.at(net, px, py), field.at(folded, px, py), strict=True):
+        assert (a - b).abs().max() < 5e-3  # of slopes up to 1; a fold that is lost leaves all of them
+    same = on_fewer_knots(field, folded, math.prod(field.shape))
+    assert same[0] is field and same[1] is folded
+
+
+def test_small_surfaces_keep_their_points():
+    assert caps([16, 300, 300], 10_000) == [16, 300, 300]
+    assert caps([300, 16, 200], 216) == [100, 16, 100]
+    assert sum(caps([10**6, 5, 10**6], 101)) <= 101
 
 
 def shaped(made, aperture: str, border: float):
@@ -341,7 +429,7 @@ def test_step_in_opencascade(tmp_path, lens, rays, capsys):
     for k, made in enumerate([*cases, *(make(**case) for case in CASES.values()), lens]):
         scene, field, heights = made
         path = tmp_path / f"{k}.step"
-        write_step(path, *made)
+        write_step(path, *made, tolerance=0.0)
         reader = control.STEPControl_Reader()
         reader.ReadFile(str(path))
         reader.TransferRoots()

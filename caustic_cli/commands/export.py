@@ -52,7 +52,8 @@ def run(
         typer.Option(
             metavar="MM",
             help="stl, ply, obj, mitsuba: as many points as keep every triangle so close to the surface, instead of --samples;"
-            " heightmap: a bilinear surface (1e-4); gcode: straight moves (a hundredth of the scallops).",
+            " heightmap: a bilinear surface (1e-4); gcode: straight moves (a hundredth of the scallops); step: a spline on as few"
+            " knots as that takes, by measure, and with 0 the exact one.  [default of step: at most 20 MB]",
         ),
     ] = None,
     mould: Annotated[

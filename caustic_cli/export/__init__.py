@@ -10,7 +10,7 @@ from caustic_cli.errors import InputError
 FORMATS = {
     "lighttools": (".npz", "lighttools", "point cloud with normals and the exact spline"),
     "zemax": (".dat", "zemax", "Grid Sag with exact derivatives"),
-    "step": (".step", "step", "the exact spline as a solid"),
+    "step": (".step", "step", "the spline as a solid"),
     "stl": (".stl", "stl", "closed mesh"),
     "ply": (".ply", "ply", "closed mesh"),
     "obj": (".obj", "obj", "closed mesh"),
@@ -29,7 +29,7 @@ MOULDS = (*SOLIDS, *AS_CUT)
 #: Formats that hold both sides where both are free-form.
 TWO_SIDED = ("lighttools", *SOLIDS, "mitsuba")
 #: Formats whose tolerance says how finely they are sampled, and those that have no samples.
-WITHIN, UNSAMPLED = (*MESHES, "heightmap", "gcode"), ("step", "gcode")
+WITHIN, UNSAMPLED = (*MESHES, "step", "heightmap", "gcode"), ("step", "gcode")
 #: Further suffixes that a format goes by.
 ALSO = {
     "step": (".stp",),

@@ -11,6 +11,7 @@ root mean square.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +20,7 @@ from scipy.interpolate import RectBivariateSpline
 from torch import Tensor
 
 from caustic_cli.export.mesh import Patch, triangles
-from caustic_cli.export.surface import SurfaceGrid
+from caustic_cli.export.surface import SurfaceGrid, along
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 
@@ -105,6 +106,29 @@ def of_triangles(patch: Patch, field: HeightField, heights: Tensor, shaded: bool
     slope = tuple(-normal[:, k] / normal[:, 2] - own for k, own in ((0, zx), (1, zy)))
     read_as = "triangles with interpolated normals" if shaded else "flat triangles"
     return _deviation(read_as, patch.points.shape[:2], at[:, 2] - z, slope)
+
+
+def of_poles(poles: np.ndarray, written: HeightField, field: HeightField, heights: Tensor) -> Deviation:
+    """Of a B-spline with poles (n, m, 3) mm over the knots of `written`, which need not stand exactly at their abscissae: then
+    x and y are not quite linear along it."""
+    random, (n, m) = np.random.default_rng(SEED), written.shape
+    u, v = (torch.from_numpy(random.uniform(0.0, 1.0, POINTS)) for _ in range(2))
+    (x, xu), (y, yv) = (
+        [along(space, at, torch.from_numpy(ends.copy())[:, None], order)[:, 0] for order in (0, 1)]
+        for space, at, ends in zip(written.spaces, (u, v), (poles[:, 0, 0], poles[0, :, 1]), strict=True)
+    )
+    unit = HeightField(written.spaces, (0.5, 0.5))
+    z, zu, zv = unit.at(torch.from_numpy(poles[..., 2].copy()), u - 0.5, v - 0.5)
+    own = field.at(heights, x, y)
+    slope = (zu / xu - own[1]).numpy(), (zv / yv - own[2]).numpy()
+    return _deviation("the B-spline of these poles", (n, m), (z - own[0]).numpy(), slope)
+
+
+def together(deviations: Sequence[Deviation]) -> Deviation:
+    """Of several surfaces, the first's samples: the largest height, and the root of the sum of squares of the slopes."""
+    first = deviations[0]
+    slope = float(np.sqrt(sum(d.slope**2 for d in deviations)))
+    return Deviation(first.read_as, first.samples, max(d.height for d in deviations), slope)
 
 
 def _deviation(read_as: str, samples: tuple[int, ...], height: np.ndarray, slope: tuple[np.ndarray, ...]) -> Deviation:

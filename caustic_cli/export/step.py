@@ -1,11 +1,14 @@
-"""The lens as an exact solid in a STEP file (ISO 10303-21, application protocol 214): entrance plane or B-spline, exit B-spline,
-four sides; or a mirror, whose material lies above its surface and up to z_in.
+"""The lens as a solid in a STEP file (ISO 10303-21, application protocol 214): entrance plane or B-spline, exit B-spline, four
+sides; or a mirror, whose material lies above its surface and up to z_in.
 
 Other lenses and mirrors are solids of their own beside it, see `bodies`.
 
-The exit surface's poles stand at the Greville abscissae with the control heights as they are, to the last bit; its borders are
-B-spline curves with the border's poles.  Each border lies in a plane x = const or y = const, which is a side.  Of a round lens
-the same surface is cut by a cylinder, along a curve through many points.  A border for the mount is a flange, as in `mesh`.  mm.
+The exit surface's poles stand at the Greville abscissae with the control heights; its borders are B-spline curves with the
+border's poles.  Each border lies in a plane x = const or y = const, which is a side.  Of a round lens the same surface is cut by a
+cylinder, along a curve through many points.  A border for the mount is a flange, as in `mesh`.  mm.
+
+Unless all is asked for to the last bit, lengths are rounded to `DIGIT` of the poles' distance, and surfaces whose poles would make
+a larger file than is usual are laid on fewer knots (`approximation`).
 
 A shell is described from the corners up: vertices, edge curves from vertex to vertex, loops of edges counter-clockwise around
 each face's outward normal, faces, shell, solid; then the product that readers look for.
@@ -13,6 +16,7 @@ each face's outward normal, faces, shell, solid; then the product that readers l
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,15 +27,18 @@ from scipy.interpolate import make_interp_spline
 from torch import Tensor
 
 from caustic_cli import __version__
+from caustic_cli.config import checks
+from caustic_cli.export.accuracy import Deviation, of_poles, together
+from caustic_cli.export.approximation import caps, on_fewer_knots
 from caustic_cli.export.bodies import bodies
 from caustic_cli.export.mesh import FLANGE, closed_mesh, refuse_open
-from caustic_cli.export.surface import sample_grid
+from caustic_cli.export.surface import STEPS_PER_SPAN, knot_lines, most_points, on_lines
 from caustic_cli.export.text import CREATED
 from caustic_cli.io.files import atomic_path
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.frames import Pose, out_of, turned_back
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import front_of
+from caustic_cli.optics.system import front_from, front_of
 from caustic_cli.scene import Lens, Scene
 
 HEAD = f"""ISO-10303-21;
@@ -45,7 +52,12 @@ DATA;
 TAIL = "ENDSEC;\nEND-ISO-10303-21;\n"
 #: mm within which vertices, edges and faces of this solid meet: all are exact.
 UNCERTAINTY = 1e-7
-#: The same where a round lens' rim is an interpolated curve, and the most points on half of it.
+#: Where lengths are rounded: the unit of their last digit in parts of the poles' distance, which turns the surface by less than
+#: 1e-6; and at most, mm, which moves it by half of that, 0.05 nm.
+DIGIT, COARSEST = 1e-6, 1e-7
+#: Parts of a surface's poles that are tried for a tolerance, the last if none keeps it.
+PARTS = [2.0 ** (-k / 2) for k in range(12, -1, -1)]
+#: The same as UNCERTAINTY where a round lens' rim is an interpolated curve, and the most points on half of it.
 ROUND_UNCERTAINTY, MOST_ON_RIM = 1e-6, 1 << 15
 
 
@@ -53,11 +65,13 @@ class Entities:
     """Numbered entities: `add` returns the reference "#7" of a new one.
 
     mirrored: with z the other way, for solids described from below.  Directions outward stay so; loops run the other way.
+    decimals: of points; None for all digits.
     """
 
-    def __init__(self, mirrored: bool = False):
+    def __init__(self, mirrored: bool = False, decimals: int | None = None):
         self.lines: list[str] = []
         self.up = -1.0 if mirrored else 1.0
+        self.decimals = decimals
         self.pose = Pose()  # of the solid that is being described
 
     def add(self, text: str) -> str:
@@ -65,7 +79,8 @@ class Entities:
         return f"#{len(self.lines)}"
 
     def point(self, p) -> str:
-        return self.add(f"CARTESIAN_POINT('',{reals(out_of(self.pose, (p[0], p[1], self.up * p[2] + 0.0), 0.0))})")
+        at = out_of(self.pose, (p[0], p[1], self.up * p[2] + 0.0), 0.0)
+        return self.add(f"CARTESIAN_POINT('',{reals(at, self.decimals)})")
 
     def direction(self, d) -> str:
         return self.add(f"DIRECTION('',{reals(turned_back(self.pose, (d[0], d[1], self.up * d[2] + 0.0)))})")
@@ -114,32 +129,105 @@ class Loop:
     edges: list[tuple[str, bool]]
 
 
-def write_step(path: str | Path, scene: Scene, field: HeightField, heights: Tensor) -> None:
-    """Write the solid whole or not at all.  heights: (n, m) mm.
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """What lies between a lens' entrance and an exit, field and heights (n, m) mm, at `pose`."""
+
+    lens: Lens
+    field: HeightField
+    heights: Tensor
+    pose: Pose
+
+    @property
+    def sides(self) -> list[tuple[HeightField, Tensor]]:
+        """The surfaces that are B-splines, the exit first."""
+        if self.lens.front is None:
+            return [(self.field, self.heights)]
+        front = front_of(self.lens)
+        return [(self.field, self.heights), (front.field, front.heights)]
+
+    def with_sides(self, exit: tuple[HeightField, Tensor], *entrance: tuple[HeightField, Tensor]) -> Solid:
+        """The same between other surfaces."""
+        fronts = [front_from(*side) for side in entrance]
+        return replace(self, lens=replace(self.lens, front=fronts[0]) if fronts else self.lens, field=exit[0], heights=exit[1])
+
+
+def write_step(
+    path: str | Path, scene: Scene, field: HeightField, heights: Tensor, tolerance: float | None = None
+) -> Deviation | None:
+    """Write the solid whole or not at all; how far its free-form sides are off, None where they are the splines themselves.
+
+    Args:
+        heights: (n, m) mm.
+        tolerance: how far a surface may be off, mm, by measure, on as few knots as that takes: 0 for poles to the last bit; None
+            for a file of at most `USUAL_BYTES`.
 
     Raises:
         InputError: the surface reaches the entrance, or the file cannot be written there.
     """
-    net, mirror = heights.detach().double().cpu().numpy(), scene.lens.mirror
+    if tolerance is not None:
+        checks.number("⟨tolerance⟩", tolerance, 0.0)
+    mirror, heights = scene.lens.mirror, heights.detach().double().cpu()
     if mirror:  # the solid of the mirrored surface, mirrored back
-        net, heights = -net, -heights
+        heights = -heights
         scene = replace(scene, lens=replace(scene.lens, z_in=-scene.lens.z_in))
     if scene.lens.front is None:
-        refuse_open(float(net.min()), scene.lens.z_in)
+        refuse_open(float(heights.min()), scene.lens.z_in)
     if scene.lens.front is not None or scene.elements:
         closed_mesh(scene, field, heights)  # which refuses what is no solid
-    out = Entities(mirror)
-    solids = [lens_solid(out, scene.lens, field, heights, poles_of(field, net))]
-    for body in bodies(scene):
-        out.pose = body.pose
-        solids.append(lens_solid(out, body.lens, body.field, body.heights, poles_of(body.field, body.heights.numpy())))
+    solids = [Solid(scene.lens, field, heights, Pose()), *(Solid(b.lens, b.field, b.heights, b.pose) for b in bodies(scene))]
+    decimals = None if tolerance == 0 else _decimals(solids, tolerance)
+    solids, off = (solids, None) if decimals is None else approximated(solids, decimals, tolerance)
+    out, found = Entities(mirror, decimals), []
+    for solid in solids:
+        out.pose = solid.pose
+        found.append(lens_solid(out, solid.lens, solid.field, solid.heights, poles_of(solid.field, solid.heights.numpy())))
     out.pose = Pose()
     rounded = scene.lens.round or any(e.round for e in scene.elements)
-    _product(out, solids, ROUND_UNCERTAINTY if rounded else UNCERTAINTY)
+    digit = 0.0 if decimals is None else 10.0 ** (1 - decimals)
+    _product(out, found, max(ROUND_UNCERTAINTY if rounded else UNCERTAINTY, digit))
     with atomic_path(path) as temporary, open(temporary, "w", encoding="ascii", newline="\n") as file:
         file.write(HEAD)
         file.writelines(out.lines)
         file.write(TAIL)
+    return off
+
+
+def approximated(solids: list[Solid], decimals: int, tolerance: float | None) -> tuple[list[Solid], Deviation]:
+    """The solids with sides on so few knots that they stay within the tolerance, mm, or make a file of the usual size, and how far
+    those sides, their poles rounded, are off."""
+    sides = [side for solid in solids for side in solid.sides]
+
+    def measured(side: tuple[HeightField, Tensor], most: int) -> tuple[tuple[HeightField, Tensor], Deviation]:
+        """A side on so many poles."""
+        written = on_fewer_knots(*side, most)
+        return written, of_poles(poles_of(written[0], written[1].numpy()).round(decimals), written[0], *side)
+
+    if tolerance is None:
+        most = caps([math.prod(f.shape) for f, _ in sides], most_points(max(_bytes(f, h, decimals) for f, h in sides)))
+        found = [measured(side, n) for side, n in zip(sides, most, strict=True)]
+    else:
+        found = []
+        for side in sides:
+            for part in PARTS:
+                fewer = measured(side, math.ceil(part * math.prod(side[0].shape)))
+                if fewer[1].height <= tolerance:
+                    break
+            found.append(fewer)
+    written = iter(side for side, _ in found)
+    return [solid.with_sides(*(next(written) for _ in solid.sides)) for solid in solids], together([off for _, off in found])
+
+
+def _decimals(solids: list[Solid], tolerance: float | None) -> int:
+    """Of lengths in mm, so that rounding does nothing to the light, nor to a tenth of a tolerance."""
+    apart = min(2.0 * r / n for solid in solids for f, _ in solid.sides for r, n in zip(f.half_size, f.shape, strict=True))
+    return max(0, -math.floor(math.log10(min(DIGIT * apart, COARSEST, 0.1 * (tolerance or math.inf)))))
+
+
+def _bytes(field: HeightField, heights: Tensor, decimals: int) -> int:
+    """Of a pole and of the reference to it, at most."""
+    widest = (field.half_size[0], field.half_size[1], float(heights.abs().max()))
+    return len("#123456=CARTESIAN_POINT('',(,,));\n#123456,") + sum(len(f"{-w:.{decimals}f}") for w in widest)
 
 
 def poles_of(field: HeightField, net: np.ndarray) -> np.ndarray:
@@ -166,9 +254,7 @@ def lens_solid(out: Entities, lens: Lens, field: HeightField, heights: Tensor, p
     if lens.round:
         rim, lowest = _round_rim(out, field, heights)
     else:
-        grid = sample_grid(field, heights)
-        rim = _rim(out, poles, points, field.spaces)
-        lowest = min(float(edge.min()) for edge in (grid.z[0], grid.z[-1], grid.z[:, 0], grid.z[:, -1]))
+        rim, lowest = _rim(out, poles, points, field.spaces), _lowest_on_rim(field, heights)
     faces, upper, z_in = [out.face(exit_surface, out.bound(rim.edges), along=not lens.mirror)], rim, lens.z_in
     if lens.front is not None:
         front = front_of(lens)
@@ -205,6 +291,12 @@ def _rim(out: Entities, poles: np.ndarray, points: list[list[str]], spaces: tupl
         curve = out.curve(space.degree, border, space.knots.numpy())
         edges.append((out.edge(vertices[start], vertices[end], curve), k < 2))
     return Loop(corners, vertices, edges)
+
+
+def _lowest_on_rim(field: HeightField, heights: Tensor) -> float:
+    """The least height on the border of the whole surface, mm, of the points of its default grid there."""
+    (u, v), ends = (knot_lines(space, STEPS_PER_SPAN) for space in field.spaces), torch.tensor([0.0, 1.0], dtype=torch.float64)
+    return min(float(on_lines(field, heights, lines).z.min()) for lines in ((u, ends), (ends, v)))
 
 
 def _round_rim(out: Entities, field: HeightField, heights: Tensor) -> tuple[Loop, float]:
@@ -299,12 +391,17 @@ def _knots(*vectors: np.ndarray) -> Iterator[str]:
     yield from (reals(values) for values, _ in found)
 
 
-def reals(values) -> str:
-    """A list of reals: "(0.5,300.,1.E-05)"."""
-    return f"({','.join(map(real, values))})"
+def reals(values, decimals: int | None = None) -> str:
+    """A list of reals: "(0.5,300.,1.E-05)", or rounded."""
+    return f"({','.join(map(real, values) if decimals is None else (rounded(v, decimals) for v in values))})"
 
 
 def real(value: float) -> str:
     """A STEP real with 17 digits: it must hold a decimal point."""
     mantissa, e, exponent = format(float(value), ".17g").partition("e")
     return mantissa + ("" if "." in mantissa else ".") + (f"E{exponent}" if e else "")
+
+
+def rounded(value: float, decimals: int) -> str:
+    """A STEP real with so many decimals, no more than needed: "0.5", "300."."""
+    return f"{round(float(value), decimals) + 0.0:#.{decimals}f}".rstrip("0")

@@ -106,7 +106,7 @@ def sample_grid(
     """
     steps = STEPS_PER_SPAN if most is None else usual_steps(field.spaces, most)
     if samples is None and steps:
-        return on_lines(field, heights, [_knot_lines(s, steps) for s in field.spaces])
+        return on_lines(field, heights, [knot_lines(s, steps) for s in field.spaces])
     if samples is None and most is not None:
         samples = usual_counts(field.spaces, most)
     counts = checks.pair("⟨samples⟩", samples, lambda where, n: checks.whole(where, n, 2, MAX_SAMPLES))
@@ -121,7 +121,7 @@ def grid_within(field: HeightField, heights: Tensor, tolerance: float) -> Surfac
     """
     h = step_within(field, heights, tolerance)
     lines = [
-        _knot_lines(s, (s.breaks.diff() * 2.0 * r / h).ceil().clamp(1, MAX_SAMPLES).long())
+        knot_lines(s, (s.breaks.diff() * 2.0 * r / h).ceil().clamp(1, MAX_SAMPLES).long())
         for s, r in zip(field.spaces, field.half_size, strict=True)
     ]
     return on_lines(field, heights, lines, f"⟨tolerance⟩ {tolerance:g}")
@@ -171,14 +171,14 @@ def on_lines(field: HeightField, heights: Tensor, lines: Sequence[Tensor], asked
             f"{asked} must ask for at most {MAX_SAMPLES} points along an axis and {MAX_POINTS:.0e} in all, got {len(u)} x {len(v)}"
         )
     net = heights.detach().to("cpu", torch.float64)
-    rows, slopes = _along(su, u, net), _along(su, u, net, 1) / (2.0 * rx)  # (nx, m)
-    z, zy = _along(sv, v, rows.T).T, _along(sv, v, rows.T, 1).T / (2.0 * ry)
-    zx, zxy = _along(sv, v, slopes.T).T, _along(sv, v, slopes.T, 1).T / (2.0 * ry)
+    rows, slopes = along(su, u, net), along(su, u, net, 1) / (2.0 * rx)  # (nx, m)
+    z, zy = along(sv, v, rows.T).T, along(sv, v, rows.T, 1).T / (2.0 * ry)
+    zx, zxy = along(sv, v, slopes.T).T, along(sv, v, slopes.T, 1).T / (2.0 * ry)
     x, y = (2.0 * u - 1.0) * rx, (2.0 * v - 1.0) * ry
     return SurfaceGrid(*(t.contiguous().numpy() for t in (x, y, z, zx, zy, zxy)))
 
 
-def _knot_lines(space: SplineSpace, steps: int | Tensor) -> Tensor:
+def knot_lines(space: SplineSpace, steps: int | Tensor) -> Tensor:
     """Every distinct knot and `steps` equal steps between them, the same number or one a span, ascending on [0, 1]."""
     breaks = space.breaks.tolist()
     counts = [steps] * (len(breaks) - 1) if isinstance(steps, int) else steps.tolist()
@@ -186,7 +186,7 @@ def _knot_lines(space: SplineSpace, steps: int | Tensor) -> Tensor:
     return torch.cat([*inner, space.breaks[-1:]])
 
 
-def _along(space: SplineSpace, at: Tensor, net: Tensor, derivative: int = 0) -> Tensor:
+def along(space: SplineSpace, at: Tensor, net: Tensor, derivative: int = 0) -> Tensor:
     """Splines with control values net (n, k) at the points `at` (m,), or their derivative: (m, k).
 
     Sums over the p + 1 basis functions that do not vanish: no dense (m, n) matrix for a fine grid on a fine net.

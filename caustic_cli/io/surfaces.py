@@ -27,8 +27,8 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 MAX_CONTROL = int(TABLE["lens.control"].high)
 #: Kinds of file, by suffix.
 SUFFIXES = (".npz", ".step", ".stp", ".npy", *heightmaps.SUFFIXES)
-#: Relative difference up to which two lengths, or poles and Greville abscissae, are the same.
-SAME = 1e-9
+#: Relative difference up to which two lengths, or poles and Greville abscissae, are the same: files may hold them rounded.
+SAME = 1e-6
 
 #: Largest STEP file read: a net of 1600 x 1600 control points as exported.
 MAX_STEP_BYTES = 1 << 28

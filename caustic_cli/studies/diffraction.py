@@ -29,7 +29,7 @@ from caustic_cli.optics.waves import NoWaveImage, wave_image
 from caustic_cli.scene import Disc, Lens, Light, Offset, PlaneWave, Scene
 from caustic_cli.studies.measurement import Reference
 from caustic_cli.studies.metrics import relative_rms
-from caustic_cli.studies.report import COLOURS, MARKERS, Study
+from caustic_cli.studies.report import COLOURS, MARKERS, Study, plain_ticks
 from caustic_cli.studies.retrace import sampler_for
 
 #: Lens widths, mm; wavelengths, nm; full angles of a distant source, degrees.
@@ -172,24 +172,28 @@ def _from(rows: list[dict]) -> float | None:
 
 
 def draw_diffraction(study: Study, figure: Figure) -> None:
-    """Error against what is varied, with the predicted blur in pixels."""
+    """Error against what is varied, on one scale; an error of which the noise leaves nothing has no place on it."""
     figure.set_size_inches(10.8, 3.8)
     titles = {
         "lens size": "lens size (mm), all angles alike",
         "wavelength": "wavelength (nm)",
         "source size": "the source's full angle (degrees)",
     }
-    for k, (series, label) in enumerate(titles.items()):
-        axes = figure.add_subplot(1, 3, k + 1)
+    for axes, (series, label) in zip(figure.subplots(1, 3, sharey=True), titles.items(), strict=True):
         rows = [r for r in study.rows if r["series"] == series]
         x = [r["value"] for r in rows]
-        axes.plot(x, [r["error"] for r in rows], MARKERS[0] + "-", color=COLOURS[0], label="ray image against wave image")
+        seen = [r["error"] or math.nan for r in rows]
+        axes.plot(x, seen, MARKERS[0] + "-", color=COLOURS[0], label="ray image against wave image")
         axes.fill_between(x, [r["noise"] for r in rows], color=COLOURS[7], alpha=0.2, lw=0, label="within the noise of the rays")
         axes.axhline(ENOUGH, color=COLOURS[1], linewidth=0.8, label="rays are enough below")
-        axes.set(yscale="log", xlabel=label, ylabel="relative RMS" if k == 0 else None)
+        axes.set(yscale="log", xlabel=label)
         if series == "lens size":
             axes.set_xscale("log")
+            axes.set_xticks(x, [f"{value:g}" for value in x])
+            axes.minorticks_off()
         axes.grid(which="major", linewidth=0.4)
+    figure.axes[0].set_ylabel("relative RMS")
+    plain_ticks(figure.axes[0].yaxis)
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize="small")
 
 

@@ -17,6 +17,7 @@ from dataclasses import replace
 
 import torch
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from torch import Tensor
 
 from caustic_cli import __version__
@@ -32,7 +33,7 @@ from caustic_cli.optics.waves import NoWaveImage, wave_image
 from caustic_cli.optics.waves.image import UNASKED
 from caustic_cli.scene import Scene
 from caustic_cli.studies.metrics import relative_rms
-from caustic_cli.studies.report import COLOURS, MARKERS, Study
+from caustic_cli.studies.report import COLOURS, Study
 
 #: Rays of every image, and rounds, unless said: a few seconds for each effect on two cores.  A wave image alone takes seconds.
 RAYS, REPEATS, WAVE_REPEATS = 1 << 16, 5, 2
@@ -41,6 +42,8 @@ BY_NAME = {effect.name: effect for effect in EFFECTS}
 FREE = {effect.name: effect.free for effect in EFFECTS}
 #: Whether it is seen in the wave image alone.
 WAVES = {effect.name: effect.waves for effect in EFFECTS}
+#: Of an effect that the scene has or would have as it is; changes below this are rounding.
+OWN, ROUNDING = "the scene's own", 1e-12
 #: Least rays to a pixel of the ray image that a wave image is compared with.
 RAYS_A_PIXEL = 30
 
@@ -236,7 +239,7 @@ def run_effects(
         if told
         else "this scene calls for no effect"
     )
-    unfounded = max((_matters(r) for r in rows if not r["on"] and r["amount"] == "the scene's own"), default=0.0)
+    unfounded = max((_matters(r) for r in rows if not r["on"] and r["amount"] == OWN), default=0.0)
     advice += f"; what auto leaves out of it changes image or power by at most {unfounded:.2g}"
     about = {
         "version": __version__,
@@ -268,7 +271,7 @@ def _row(
     seed: int,
     dtype: torch.dtype,
 ) -> dict | None:
-    name, amount, bare = effect.name, "the scene's own", None
+    name, amount, bare = effect.name, OWN, None
     if not effect.present:
         made = BY_NAME[name].sample(scene, heights)
         if made is None:
@@ -297,39 +300,44 @@ def _row(
 
 
 def draw_effects(study: Study, figure: Figure) -> None:
-    """Cost of every effect, and the error of leaving it out; filled where auto simulates it."""
-    figure.set_size_inches(8.4, 5.6)
-    axes = figure.add_subplot()
-    floor = 0.5 * min((_matters(r) for r in study.rows if _matters(r) > 1e-12), default=1.0)
-    for k, row in enumerate(study.rows):
-        colour, error = COLOURS[k % len(COLOURS)], max(_matters(row), floor)
-        low, high = (1e3 * max(0.0, d) for d in (row["seconds"] - row["seconds_min"], row["seconds_max"] - row["seconds"]))
-        axes.errorbar(
-            [1e3 * row["seconds"]],
-            [error],
-            xerr=[[low], [high]],
-            linestyle="",
-            color=colour,
-            elinewidth=0.6,
-            marker=MARKERS[(k + k // len(COLOURS)) % len(MARKERS)],
-            markerfacecolor=colour if row["on"] else "none",
-            label=f"{row['series']}, {'on' if row['on'] else 'off'}, {row['amount']}",
-        )
-    axes.set(
-        yscale="log",
-        xlabel=f"cost (ms of processor time for {study.about['rays']:,} rays), and the rounds' range",
-        ylabel=f"left out: relative RMS or change of power, the larger (least drawn: {floor:.1g})",
-        title="effects: cost and error",
-    )
-    axes.set_xscale("symlog", linthresh=1.0)
-    axes.margins(x=0.1)
-    for row in study.rows:
-        if _matters(row) > floor:
-            axes.annotate(
-                row["series"], (1e3 * row["seconds"], _matters(row)), xytext=(5, 4), textcoords="offset points", fontsize="x-small"
-            )
-    axes.grid(which="major", linewidth=0.4)
-    figure.legend(loc="outside right upper", fontsize="x-small")
+    """A line for each effect, those that matter most above: the error of leaving it out, and its cost with the rounds' range."""
+    rows = sorted(study.rows, key=_matters)
+    figure.set_size_inches(10.4, 1.6 + 0.27 * len(rows))
+    errors, costs = figure.subplots(1, 2, sharey=True)
+    floor = 0.3 * min((_matters(r) for r in rows if _matters(r) > ROUNDING), default=1.0)
+    words = {"va": "center", "fontsize": "small", "bbox": {"facecolor": "white", "edgecolor": "none", "pad": 1.0}}
+    for k, row in enumerate(rows):
+        colour = COLOURS[row["amount"] != OWN]
+        style = {"color": colour, "marker": "o", "markersize": 6, "markerfacecolor": colour if row["on"] else "white"}
+        if _matters(row) > ROUNDING:
+            errors.plot([_matters(row)], [k], linestyle="", **style)
+        else:
+            errors.annotate("nothing", (floor, k), color=colour, **words)
+        cost, *ends = (1e3 * row[key] for key in ("seconds", "seconds_min", "seconds_max"))
+        if any((cost, *ends)):
+            costs.plot(ends, [k, k], color=colour, linewidth=1)  # noise: a cost whose range holds 0 was not told from it
+            costs.plot([cost], [k], linestyle="", **style)
+        else:
+            costs.annotate("none that could be saved", (0.0, k), color=colour, **words)
+    names = [row["series"] if row["amount"] == OWN else f"{row['series']}: {row['amount']}" for row in rows]
+    errors.set_yticks(range(len(rows)), names, fontsize="small")
+    errors.set(xscale="log", title="error of leaving it out", xlabel="relative RMS or change of power, the larger")
+    errors.set_xlim(left=0.8 * floor)
+    errors.set_ylim(-0.7, len(rows) - 0.3)
+    costs.set_xscale("symlog", linthresh=1.0)
+    costs.margins(x=0.08)
+    costs.set(title="cost, and range of the rounds", xlabel=f"ms of processor time for {study.about['rays']:,} rays")
+    for axes in (errors, costs):
+        axes.grid(linewidth=0.4)
+        axes.set_axisbelow(True)
+    kinds = {
+        "as this scene has it": {"color": COLOURS[0]},
+        "put in for this study": {"color": COLOURS[1]},
+        "simulated by auto": {"color": "black"},
+        "not simulated": {"color": "black", "markerfacecolor": "white"},
+    }
+    marks = [Line2D([], [], linestyle="", marker="o", markersize=6, label=name, **style) for name, style in kinds.items()]
+    figure.legend(handles=marks, loc="outside lower center", ncols=4, fontsize="small")
 
 
 #: Endings of the pictures' names, and what draws them.

@@ -315,8 +315,9 @@ def _named(row: dict) -> str:
     return row["series"] if row["n_u"] is None else f"{row['series']} with n_u = {row['n_u']}"
 
 
-def _fit_label(found: Order | None) -> str:
-    return "" if found is None else f": n$_u^{{{-found.exponent:.2f}}}$"
+def _fit_words(orders: dict[str, Order | None]) -> str:
+    """The fitted orders of the mesh's curves, in a title."""
+    return ", ".join(f"{word} n$_u^{{{-found.exponent:.2f}}}$" for word, found in orders.items() if found is not None)
 
 
 def draw_convergence(study: Study, figure: Figure) -> None:
@@ -327,8 +328,8 @@ def draw_convergence(study: Study, figure: Figure) -> None:
     mesh, (newton,) = table["mesh"], table["newton"]
     n = np.array([row["n_u"] for row in mesh], float)
     for axes, kind, columns in ((panels[0, 0], "z-error", ("z_mean", "z_max")), (panels[0, 1], "t-error", ("error", "t_max"))):
-        for word, column, line in zip(("mean", "maximum"), columns, ("-", "--"), strict=True):
-            found = study.orders[f"mesh, {word} {kind}"]
+        orders = {word: study.orders[f"mesh, {word} {kind}"] for word in ("mean", "maximum")}
+        for word, column, line in zip(orders, columns, ("-", "--"), strict=True):
             y = np.array([row[column] for row in mesh])
             use = y > 0
             axes.plot(
@@ -340,7 +341,7 @@ def draw_convergence(study: Study, figure: Figure) -> None:
                 marker="o" if line == "-" else "^",
                 markersize=5,
                 markerfacecolor=None if line == "-" else "none",
-                label=f"mesh, {word} {kind}{_fit_label(found)}",
+                label="mesh" if word == "mean" else "mesh, maximum",
             )
         for name, line in (("mesh+newton", "-"), ("newton", ":")):
             points = [row for row in table[name] if row[columns[0]] > 0]
@@ -356,7 +357,7 @@ def draw_convergence(study: Study, figure: Figure) -> None:
                     markersize=5,
                     label=name,
                 )
-        axes.set(xscale="log", yscale="log", ylabel=f"{kind} (mm)", title=f"{kind}, with the fitted orders")
+        axes.set(xscale="log", yscale="log", ylabel=f"{kind} (mm), mean unless said", title=f"{kind}; mesh: {_fit_words(orders)}")
     for name, rows in table.items():
         if name != "newton" and rows:
             panels[1, 0].errorbar(
@@ -384,7 +385,7 @@ def draw_convergence(study: Study, figure: Figure) -> None:
         axes.set_xticks(n, [f"{k:g}" for k in n])
         axes.set_xlabel("n$_u$ = n$_v$")
         axes.grid(which="major", linewidth=0.4)
-    figure.legend(*_every_label(panels.flat), loc="outside lower center", ncols=4, fontsize="small")
+    figure.legend(*_every_label(panels.flat), loc="outside lower center", ncols=5, fontsize="small")
 
 
 def _every_label(panels: Iterable[Axes]) -> tuple[list[Artist], list[str]]:
@@ -398,7 +399,8 @@ def draw_pareto(study: Study, figure: Figure) -> None:
     axes = figure.add_subplot()
     draw_front(axes, study)
     for error in (ROUGH, EQUAL, FINE):
-        axes.axhline(error, color="grey", linewidth=0.6, linestyle="--")
+        said = "errors that the advice is about" if error == ROUGH else None
+        axes.axhline(error, color="grey", linewidth=0.8, linestyle="--", label=said)
     axes.set(xlabel="time (s): median, least and most", ylabel="mean t-error (mm)", title="intersection: error and time")
     legend_beside(figure)
 

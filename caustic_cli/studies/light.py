@@ -152,9 +152,11 @@ def draw_light(study: Study, figure: Figure) -> None:
     axes.set(
         xlabel="light on the screen (% of the source's)",
         ylabel="relative RMS error of the picture",
-        title="light: picture against light",
+        title="light: error against light, which weighs {:g} to {:g} in the loss".format(
+            *(pick(r["weight"] for r in study.rows) for pick in (min, max))
+        ),
     )
-    axes.set_ylim(bottom=0.0)
+    axes.set_ylim(0.0, 1.15 * max(r["error"] for r in study.rows))
     low, high = axes.get_xlim()
     short = max(0.0, LEAST_SPAN - (high - low))
     axes.set_xlim(low - 0.5 * short, high + 0.5 * short)  # rounding is no difference

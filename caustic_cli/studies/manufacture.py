@@ -31,8 +31,10 @@ from caustic_cli.scene.materials import material
 MOST, A_SPAN = 2001, 4
 #: Rays of the sensitivities and of the angles inside the lens.
 RAYS = 100_000
-#: Bytes of a net in a project and of a STEP file, for each control height.
-NET, STEP_FILE = 8, 92
+#: Bytes of a net in a project, for each control height.
+NET = 8
+#: Thickness of a plate that is cut from a common sheet, in parts of its width.
+SHEET = 0.08
 #: Errors by which the sensitivities are found: of the throw, relative; of the index.
 STEP = 1e-4
 
@@ -120,8 +122,19 @@ def preview(scene: Scene, field: HeightField, heights: Tensor, nets: int = 2) ->
     return (
         f"first surface: wall {float(z.min()) - lens.z_in:.2f} mm, stock {float(z.max()) - lens.z_in:.2f} mm, slopes up to"
         f" {slope:.2g}{reflected}, {f'concave radius down to {1.0 / bent:.2g} mm' if bent > 0 else 'nowhere concave'};"
-        f" files: project about {_megabytes(nets * NET * size)}, STEP {_megabytes(STEP_FILE * size)}"
+        f" project about {_megabytes(nets * NET * size)}"
+        f"{_thinner(scene, float(z.min()), float(z.max()))}"
     )
+
+
+def _thinner(scene: Scene, low: float, high: float) -> str:
+    """What would make a plate whose surface is between two heights, mm, as thin as a sheet: its relief goes as 1 / throw."""
+    sheet = SHEET * max(scene.lens.size)
+    room = sheet - (low - scene.lens.z_in)  # none in a lens that is no plate
+    if scene.lens.mirror or scene.elements or not 0.0 < room < high - low:
+        return ""
+    throw = float(f"{abs(scene.screen.z) * (high - low) / room:.2g}")
+    return f"; a ⟨+throw⟩ of about {throw:g} mm or a smaller ⟨+mag⟩ would make it {sheet:.2g} mm thick"
 
 
 def _megabytes(size: float) -> str:

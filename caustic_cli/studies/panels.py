@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.image import AxesImage
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 
@@ -21,8 +22,10 @@ DARK = 1e-250
 NEARLY = 0.995
 #: Points along an axis of the relief, at most; light, as a part of all, of which nothing is said.
 RELIEF, LITTLE = 130, 5e-5
-#: How a bar of colours stands beside its picture.
-BAR = {"fraction": 0.046, "pad": 0.03}
+#: Where a bar of colours stands beside its picture, in parts of that: left, bottom, width, height.
+BAR = (1.03, 0.0, 0.046, 1.0)
+#: What is seen through a blur in a panel of its own, in parts of that of the error.
+BLURRED = 0.6
 
 
 def write_report(
@@ -89,13 +92,13 @@ def write_report(
         )
         drawn = axis.imshow((part * scale * white).T, origin="lower", extent=extent, cmap="gray", norm=norm)
         if picture is not target:
-            figure.colorbar(drawn, ax=axis, label=_irradiance_words(figures, "wave_" if picture is waves else ""), **BAR)
+            _bar(drawn, axis, _irradiance_words(figures, "wave_" if picture is waves else ""))
         axis.set(title=title, xlabel="x on the screen (mm)", ylabel="y (mm)")
     error = (image / max(image.sum(), 1e-300) - target / target.sum()) * target.size
     most = _scale_of(error, (image > 0) | (target > 0))
     axis = axes[0, len(shown)]
     drawn = axis.imshow(error.T, origin="lower", extent=extent, cmap="coolwarm", vmin=-most, vmax=most)
-    figure.colorbar(drawn, ax=axis, label="of the mean irradiance", extend="both", **BAR)
+    _bar(drawn, axis, "of the mean irradiance", extend="both")
     axis.set(title="error: too dark (blue), too bright (red)", xlabel="x on the screen (mm)", ylabel="y (mm)")
     if waves is None:
         _draw_section(axes[0, 3], target, image, screen)
@@ -107,7 +110,7 @@ def write_report(
         else (volume.mean(-1), "index", "index, mean along z")
     )
     drawn = axes[1, 0].imshow(relief.T, origin="lower", extent=[-rx, rx, -ry, ry], cmap="viridis")
-    figure.colorbar(drawn, ax=axes[1, 0], label=unit, **BAR)
+    _bar(drawn, axes[1, 0], unit)
     axes[1, 0].set(title=name, xlabel="x on the lens (mm)", ylabel="y (mm)")
     place = axes[1, 1].get_subplotspec()
     axes[1, 1].remove()
@@ -117,6 +120,11 @@ def write_report(
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", dpi=100, metadata={"Software": SOFTWARE})
     plt.close(figure)
+
+
+def _bar(drawn: AxesImage, axis: Axes, label: str, extend: str = "neither") -> None:
+    """A bar of colours, as high as the picture."""
+    axis.get_figure().colorbar(drawn, cax=axis.inset_axes(BAR), label=label, extend=extend)
 
 
 def _scale_of(error: np.ndarray, seen: np.ndarray) -> float:
@@ -153,35 +161,58 @@ def _draw_relief(axis: Axes3D, relief: np.ndarray, half: tuple[float, float], un
 def _draw_losses(axis: Axes, history: np.ndarray, pixels: int, figures: dict, stages: Sequence[tuple[float, bool]]) -> None:
     """The loss of each stage as it sees the picture, and what the lenses it began and ended with are worth by rays of their own.
 
-    What is seen through a blur is drawn faint: it rises as the blur falls, and says nothing of the picture.
+    Stages that see the picture through a blur have a panel below: the wider the blur the smaller their loss, which is of the lens
+    only within a stage.
     """
-    for k, stage in enumerate(np.unique(history[:, 1]).astype(int)):
-        rows = history[history[:, 1] == stage]
-        blur, waves = stages[stage] if stage < len(stages) else (0.0, False)
-        colour = COLOURS[k % len(COLOURS)]
-        style = {"lw": 0.9, "ls": "--", "alpha": 0.6} if blur > 0 else {"lw": 1.6}
-        axis.semilogy(rows[:, 4], rows[:, 2] * pixels, color=colour, marker="." if len(rows) == 1 else None, **style)
-        words = f"{blur:.2g} px" if blur > 0 else f"stage {stage + 1}{', waves' if waves else ''}"
-        axis.annotate(
-            words, (rows[0, 4], rows[0, 2] * pixels), xytext=(3, 4), textcoords="offset points", color=colour, fontsize="small"
+    found = [int(k) for k in np.unique(history[:, 1])]
+    how = {k: stages[k] if k < len(stages) else (0.0, False) for k in found}
+    mixed = len({waves for _, waves in how.values()}) > 1  # two measures, of which one may rise where the other falls
+    last, least = (history[-1, 4], history[-1, 2] * pixels) if len(history) else (0.0, 0.0)
+    below = None
+    if any(blur > 0 for blur, _ in how.values()):
+        grid = axis.get_subplotspec().subgridspec(2, 1, height_ratios=(1.0, BLURRED))
+        axis.set_subplotspec(grid[0])
+        below = axis.get_figure().add_subplot(grid[1], sharex=axis)
+        below.set_title("each stage as it sees both images, blurred", fontsize="medium")
+    for k, (blur, waves) in how.items():
+        rows, colour = history[history[:, 1] == k], COLOURS[k % len(COLOURS)]
+        own = axis if blur == 0 or below is None else below
+        own.semilogy(rows[:, 4], rows[:, 2] * pixels, color=colour, marker="." if len(rows) == 1 else None, lw=1.6)
+        kind = ", waves" if waves else ", rays" if mixed else ""
+        late = rows[0, 4] > 0.6 * last
+        own.annotate(
+            f"{blur:.2g} px" if blur > 0 else f"stage {k + 1}{kind}",
+            (rows[0, 4], rows[0, 2] * pixels),
+            xytext=(-3 if late else 3, 4),
+            textcoords="offset points",
+            ha="right" if late else "left",
+            color=colour,
+            fontsize="small",
         )
-    last = history[-1, 4] if len(history) else 0.0
     likeness = "wave_relative_rms" if figures.get("wave_relative_rms") is not None else "relative_rms"
     for key, at, words in ((f"start_{likeness}", 0.0, "start"), (likeness, last, "finished")):
         if figures.get(key):
             axis.semilogy([at], [figures[key]], "o", color="black", ms=5, mfc="none" if at == 0.0 else "black")
-            side = {"xytext": (6, 0), "ha": "left"} if at == 0.0 else {"xytext": (-6, -10), "ha": "right"}
+            away = 10 if least < figures[key] else -10
+            side = {"xytext": (6, 0), "ha": "left"} if at == 0.0 else {"xytext": (0, away), "ha": "right"}
             axis.annotate(
-                f"{words} {figures[key]:.3f}", (at, figures[key]), textcoords="offset points", va="center", fontsize="small", **side
+                f"{words} {figures[key]:.3f}",
+                (at, figures[key]),
+                textcoords="offset points",
+                va="center",
+                fontsize="small",
+                bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0, "alpha": 0.8},
+                **side,
             )
-    if any(blur > 0 for blur, _ in stages):
-        axis.set_xlabel("s (dashed: seen through a blur of so many pixels)")
-    else:
-        axis.set_xlabel("s")
-    axis.margins(x=0.08, y=0.12)
-    axis.set(title="error: of the design (lines),\nretraced with other rays (points)", ylabel="relative RMS")
-    axis.grid(alpha=0.3, which="both")
-    plain_ticks(axis.yaxis)
+    axis.set(title="error: of the design (lines),\nretraced with other rays (points)")
+    for own in (axis,) if below is None else (axis, below):
+        own.margins(x=0.08, y=0.12 if own is axis else 0.25)
+        own.set_ylabel("relative RMS")
+        own.grid(alpha=0.3, which="both")
+        plain_ticks(own.yaxis)
+    (below or axis).set_xlabel("s")
+    if below is not None:
+        axis.tick_params(labelbottom=False)
 
 
 def _draw_account(axis: Axes, figures: dict) -> None:

@@ -546,34 +546,38 @@ def write_plot(path: Path, found: Study) -> None:
 
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt  # noqa: PLC0415
+    from matplotlib.ticker import MaxNLocator  # noqa: PLC0415
 
-    figure, (error, light, bars) = plt.subplots(1, 3, figsize=(15.0, 4.8), constrained_layout=True)
+    from caustic_cli.studies.report import COLOURS  # noqa: PLC0415
+
+    figure, (error, light, bars) = plt.subplots(1, 3, figsize=(15.0, 5.6), constrained_layout=True)
     f = figures(found)
-    for axis, name, label in (
-        (error, "relative_rms", "as placed"),
-        (error, "shifted", "after the best shift"),
-        (light, "on_target", ""),
-    ):
-        axis.hist(found.of(name), bins=min(40, max(8, len(found.judged) // 8)), alpha=0.55, label=label or None)
+    placing = {"as placed": found.of("relative_rms"), "after the best shift": found.of("shifted")}
+    bins, both = min(40, max(8, len(found.judged) // 8)), np.concatenate(list(placing.values()))
+    for (label, values), colour, filled in zip(placing.items(), COLOURS[:2], (True, False), strict=True):
+        style = {"histtype": "stepfilled", "alpha": 0.4} if filled else {"histtype": "step", "lw": 1.6}
+        error.hist(values, np.histogram_bin_edges(both, bins), color=colour, label=label, **style)
+    light.hist(found.of("on_target"), bins, color=COLOURS[0], alpha=0.4, histtype="stepfilled")
     placed = f["relative_rms"]
     for value, color, style, label in (
         (f["nominal"]["relative_rms"], "k", "-", "without errors"),
-        (placed["p50"], "C0", "--", "half, as placed"),
-        (placed["p95"], "C0", "-", "95 %, as placed"),
+        (placed["p50"], COLOURS[0], "--", "half, as placed"),
+        (placed["p95"], COLOURS[0], "-", "95 %, as placed"),
     ):
         error.axvline(value, color=color, ls=style, label=f"{label}: {value:.3f}")
     error.set(title=f"{len(found.judged)} draws, judged by {f['judged_by']}", xlabel="relative RMS error", ylabel="draws")
-    error.legend(fontsize=8)
     light.axvline(f["nominal"]["on_target"], color="k", label=f"without errors: {f['nominal']['on_target']:.4f}")
-    light.axvline(f["on_target"]["p5"], color="C1", ls="--", label=f"95 % have at least {f['on_target']['p5']:.4f}")
+    light.axvline(f["on_target"]["p5"], color=COLOURS[0], ls="--", label=f"95 % have at least {f['on_target']['p5']:.4f}")
     light.set(title="light on the picture", xlabel="part of the source's power", ylabel="draws")
-    light.legend(fontsize=8)
     shown = found.sensitivities[:16][::-1]
-    bars.barh([f"{s.name}\n{s.sigma:.3g} {s.unit}".strip() for s in shown], [s.adds for s in shown], color="C2")
+    bars.barh([f"{s.name}\n{s.sigma:.3g} {s.unit}".strip() for s in shown], [s.adds for s in shown], color=COLOURS[2])
     bars.axvline(f["nominal"]["relative_rms"], color="k", ls=":", label="error without errors")
     bars.set(title="what each error of one sigma adds, in squares", xlabel="relative RMS error")
     bars.tick_params(axis="y", labelsize=8)
-    bars.legend(fontsize=8)
+    for axis in (error, light, bars):
+        axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=2, fontsize=8, frameon=False)  # below all data
+    for axis in (error, light):
+        axis.yaxis.set_major_locator(MaxNLocator(integer=True))
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", dpi=100, metadata={"Software": SOFTWARE})
     plt.close(figure)

@@ -322,7 +322,7 @@ def write_panels(path: str | Path, decision: Decision, scene: Scene) -> None:
         axis.set(title=title, xlabel="x on the screen (mm)", ylabel="y (mm)")
     z = decision.z[: decision.render.shape[0], : decision.render.shape[1]]
     drawn = axes[2].imshow(z.T, cmap="coolwarm", vmin=-4, vmax=4, **shown)
-    figure.colorbar(drawn, ax=axes[2], label="standard deviations")
+    figure.colorbar(drawn, cax=axes[2].inset_axes((1.03, 0.0, 0.046, 1.0)), label="standard deviations")
     f = decision.figures
     axes[2].set(
         title=f"Mitsuba - caustic: mean Z² {f['z_mean_square']:.3f}, {'agree' if f['agree'] else 'DISAGREE'}",

@@ -78,7 +78,7 @@ def write(
     milling: dict | None = None,
     **given,
 ) -> dict:
-    """Write a lens' files, see `files`; given: samples or tolerance; what of it goes into the figures: samples and how far the
+    """Write a lens' files, see `files`; given: samples or tolerance, mm; what of it goes into the figures: samples and how far the
     surface that is read from them is off (`export.accuracy`), or what is said of milling and height maps."""
     if scene.lens.front is not None and (script or mould or format not in TWO_SIDED):
         raise InputError(
@@ -115,9 +115,10 @@ def accuracy_words(figures: dict) -> str:
     if "read_as" not in figures:
         return "the spline itself" if figures["format"] == "step" else ""
     nx, ny = figures["samples"]
+    exact = {"step": "; ⟨tolerance⟩ 0 writes the exact one", "lighttools": "; the exact spline stands beside them"}
     return (
         f"{nx} x {ny} points; read as {figures['read_as']}, heights are at most {_length(figures['height_error_mm'])} off and"
-        f" light {_shift(figures['shift_pixels'])} (RMS)"
+        f" light {_shift(figures['shift_pixels'])} (RMS){exact.get(figures['format'], '')}"
     )
 
 

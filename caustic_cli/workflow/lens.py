@@ -200,7 +200,7 @@ class Lens:
         """Write the lens for another program; the format follows from the suffix (.step, .stl, .npz, ...) unless it is named.
 
         Args:
-            samples: points along x and y of sampled formats; tolerance: of meshes instead, mm.
+            samples: points along x and y of sampled formats; tolerance: of meshes instead, mm; of step, 0 for the exact spline.
             script: of lighttools: also a script that rebuilds the scene.
             mould: the negative; block: least material behind a mirror or a mould, mm; milling: of gcode, see `export.milling`.
         """
