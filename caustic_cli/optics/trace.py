@@ -19,6 +19,7 @@ Powers are parts of what the sources emit.  Nothing vanishes: image + every entr
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
@@ -219,7 +220,7 @@ class Tracer:
         n_in, n_out = n if forward else n[::-1]
         side = self.sides[k] if forward else -self.sides[k]
         m = Interaction(
-            self,
+            weakref.proxy(self),  # which holds the last of them: a cycle would keep its arrays until the collector comes by
             k,
             element,
             forward,
