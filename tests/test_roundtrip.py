@@ -13,6 +13,7 @@ import re
 import sys
 import types
 from dataclasses import replace
+from functools import partial
 from xml.etree import ElementTree
 
 import numpy as np
@@ -585,7 +586,7 @@ def test_bytes_repeat(tmp_path, write, name):
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-@pytest.mark.parametrize(("write", "name"), [(write_lighttools, "lens.npz"), (write_step, "lens.step")])
+@pytest.mark.parametrize(("write", "name"), [(write_lighttools, "lens.npz"), (partial(write_step, tolerance=0.0), "lens.step")])
 def test_the_spline_comes_back_to_the_last_bit(tmp_path, case, write, name):
     scene, field, heights = make(**case)
     write(tmp_path / name, scene, field, heights)

@@ -42,7 +42,7 @@ from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.screen_shape import reach
 from caustic_cli.optics.spread import Convolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import EXIT
+from caustic_cli.optics.system import EXIT, sides_of
 from caustic_cli.optics.waves import NoWaveImage
 from caustic_cli.scene import Scene
 from caustic_cli.scene.tolerances import Tolerances
@@ -194,6 +194,10 @@ class Designer:
     def field(self, stage: int) -> HeightField:
         """The spline spaces of a stage."""
         return HeightField.of(replace(self.scene.lens, control=self.stages[stage].control))
+
+    def exit(self, state: State) -> Tensor:
+        """Heights of the exit alone (n, m), on the net of the state's stage."""
+        return sides_of(self.scene, self.field(state.stage), state.heights)[1]
 
     def whole(self, heights: Tensor | None) -> Tensor | None:
         """Heights of the exit (n, m) on the first stage's net with those of the spheres that surfaces of other elements begin as,

@@ -507,7 +507,7 @@ def _run(
                 128 + asked[0],
             )
         found = judge(project, designer, target, state, device, hurry)
-        made = wall_and_stock(designer.scene, designer.field(found.state.stage), found.state.heights)
+        made = wall_and_stock(designer.scene, designer.field(found.state.stage), designer.exit(found.state))
         figures = (
             found.figures | made | {"iterations": state.total, "seconds": time.monotonic() - began, "reason": found.state.reason}
         )

@@ -80,9 +80,7 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
     if found.second is not None and designer.second is not None:
         write_image(project.path / FARTHER, found.second, white_level(found.second, designer.second.numpy()), encoding, WIDE)
     history = np.array(state.history, dtype=float).reshape(-1, 5)
-    surface = _surface(
-        designer.field(found.state.stage), found.state.heights[-1] if designer.scene.jointly else found.state.heights
-    )
+    surface = _surface(designer.field(found.state.stage), designer.exit(found.state))
     write_report(
         project.path / REPORT,
         grey(aim),

@@ -507,7 +507,7 @@ UNFIT = {
     "parameters without a name of ours": lambda f: f["state/parameters"].__setitem__("more", np.zeros(3)),
     "another number of unknowns": _shape("state/optimizer/x"),
     "another optimiser": lambda f: f["state/optimizer"].__setitem__("0.exp_avg", np.zeros(3)),
-    "pairs of another length": _shape("state/optimizer/s"),
+    "pairs of another length": _shape("state/optimizer/s0"),
     "a start on another net": _shape("start"),
 }
 
