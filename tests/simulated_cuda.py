@@ -302,10 +302,10 @@ def traced(scene: Scene, field, kind: str, rays: int):
     return by
 
 
-def check_trace(scene, field, heights, kind, filters, launched, monkeypatch, rays=300) -> dict:
+def check_trace(scene, field, heights, kind, filters, launched, monkeypatch) -> dict:
     """Image, power, losses and derivatives of a trace by one kernel; gives the losses with the last filter."""
     monkeypatch.setenv("CAUSTIC_KERNELS", "cuda")
-    by = traced(scene, field, kind, rays)
+    by = traced(scene, field, kind, 300)
     kernel, reference = by(nullcontext), by(plain)
     for filter in filters:
         kernel.filter = reference.filter = filter
@@ -354,9 +354,3 @@ def test_ray_image(round_, launched, monkeypatch):
     scene = Scene(Points(((1.0, -2.0, -12.0),)), replace(scene.lens, aperture="circle" if round_ else "rectangle"), scene.screen)
     lost = check_trace(scene, field, heights, "stratified", FILTERS[:2], launched, monkeypatch)
     assert lost["missed_surface"] > 0.1
-
-
-@pytest.mark.slow
-def test_plane_image_of_thousands_of_rays(launched, monkeypatch):
-    scene, field, heights = lens(control=(12, 11))
-    check_trace(scene, field, heights, "lines", FILTERS[1:2], lambda f: [f(), f()], monkeypatch, rays=4000)

@@ -202,10 +202,10 @@ def test_report_of_a_bowl():
 def test_a_thick_plate_says_what_would_make_it_thin(wall):
     """The relief goes as 1 / throw: with 10 mm of it and 5 mm of room beside the wall, twice the throw."""
     scene, field, heights = surface(lambda x, y: wall + 10.0 * (x / 50.0) ** 2 + 0.0 * y, size=(100.0, 80.0))
-    words = preview(scene, field, heights)
+    words = preview(scene, field, heights, 2e4)
     if wall == 3.0:
         assert "; a ⟨+throw⟩ of about 600 mm or a smaller ⟨+mag⟩ would make it 8 mm thick" in words
-        words = preview(scene, field, 3.0 + 0.45 * (heights - 3.0))
+        words = preview(scene, field, 3.0 + 0.45 * (heights - 3.0), 2e4)
     assert "throw" not in words and "stock" in words  # a thin plate, and a lens that is none
 
 

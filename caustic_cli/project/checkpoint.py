@@ -4,10 +4,12 @@
     /lens/knots_u, knots_v    knot vectors on [0, 1]
     /start                    (n_0, m_0) float64, mm: the heights it began from, on the first stage's net
     /unrounded                of the same shape, mm: what these were before a least radius was asked of them, where one was
+                              a net of more than a million heights is bytes (`packing`) with attribute shape once it is finished;
+                              the second and third as their difference to the first where their shapes are the same
     /state                    attributes stage, iteration, total, seconds, reason
     /state/parameters/*, /state/optimizer/*   tensors by name
     /history                  (iterations, 5): iteration, stage, loss (eq. 5.2.1), on_screen, seconds
-    attributes                format_version, created_by, provenance, results, inputs (JSON)
+    attributes                format_version (2 with packed nets, else 1), created_by, provenance, results, inputs (JSON)
 
 A file whose writer was killed cannot be read, so a checkpoint is never updated in place: it is written beside the old
 one and renamed.  Before the HDF5 data stands a block of SEAL bytes (HDF5 calls it the user block) with the sha256 of all
@@ -37,8 +39,10 @@ from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import State
 from caustic_cli.io.files import open_regular, write_bytes
 from caustic_cli.optics.bspline import SplineSpace
+from caustic_cli.project.packing import pack, unpack
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+HEIGHTS = "lens/heights"
 #: Nets that a state may have beside its heights.
 STARTS = ("start", "unrounded")
 HISTORY = ("iteration", "stage", "loss", "on_screen", "seconds")
@@ -47,6 +51,8 @@ SEAL, SIGNATURE = 512, b"\x89HDF\r\n\x1a\n"
 SEALED = f"caustic checkpoint, HDF5 from byte {SEAL}, sha256 "
 #: Largest checkpoint read: a net of 4096 x 4096 with its 20 pairs of L-BFGS, or the largest network with Adam's moments, is 6.5 GB.
 MAX_BYTES = 1 << 33
+#: Most heights of a packed net that is read, which may be a thousand times as large as its bytes: three of 4096 x 4096.
+MOST_PACKED = 3 << 24
 #: Most iterations of a history that is read.
 MOST_ITERATIONS = 10_000_000
 NEEDED = "a project with a designed lens is needed (caustic design makes one)"
@@ -82,17 +88,18 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
     state, spaces = checkpoint.state, checkpoint.spaces
     image = io.BytesIO()  # a full disk is no HDF5 matter
     with h5py.File(image, "w") as f:
-        f.attrs["format_version"] = FORMAT_VERSION
+        f.attrs["format_version"] = FORMAT_VERSION - 1
         f.attrs["created_by"] = f"caustic {__version__}"
         f.attrs["provenance"] = json.dumps(checkpoint.provenance, sort_keys=True)
         f.attrs["results"] = json.dumps(checkpoint.results)
         f.attrs["inputs"] = json.dumps(checkpoint.inputs, sort_keys=True)
-        f["lens/heights"] = state.heights.cpu().numpy()
+        heights = state.heights.cpu().numpy()
+        _write_net(f, HEIGHTS, heights)
         f["lens"].attrs["degree"] = [s.degree for s in spaces]
         f["lens/knots_u"], f["lens/knots_v"] = (s.knots.numpy() for s in spaces)
         for name in STARTS:
             if (net := getattr(state, name)) is not None:
-                f[name] = net.cpu().numpy()
+                _write_net(f, name, net.cpu().numpy(), heights)
         group = f.create_group("state")
         for name in ("stage", "iteration", "total", "seconds", "reason"):
             group.attrs[name] = getattr(state, name)
@@ -103,6 +110,16 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
         f["history"] = np.array(state.history, dtype=np.float64).reshape(-1, len(HISTORY))
         f["history"].attrs["columns"] = ",".join(HISTORY)
     write_bytes(path, seal(image.getbuffer()), image.getbuffer())
+
+
+def _write_net(f: h5py.File, name: str, net: np.ndarray, beside: np.ndarray | None = None) -> None:
+    like = beside if beside is not None and beside.shape == net.shape else None
+    if (packed := pack(net, like)) is None:
+        f[name] = net
+        return
+    f[name] = np.frombuffer(packed, np.uint8)
+    f[name].attrs["shape"] = net.shape
+    f.attrs["format_version"] = FORMAT_VERSION
 
 
 def seal(image: bytes | memoryview) -> bytes:
@@ -170,6 +187,17 @@ class _Contents:
     def tensor(self, name: str) -> torch.Tensor:
         return torch.from_numpy(self.read(name))
 
+    def net(self, name: str, beside: torch.Tensor | None = None) -> torch.Tensor:
+        """As written by `save`, beside the heights that it may be stored as a difference to."""
+        values, shape = self.read(name), self.file[name].attrs.get("shape")
+        if shape is None:
+            return torch.from_numpy(values).double()
+        shape = tuple(int(n) for n in shape)
+        if values.dtype != np.uint8 or min(shape) < 1 or math.prod(shape) > MOST_PACKED:
+            raise ValueError(f"shape of {name}")
+        like = None if beside is None or beside.shape != shape else beside.numpy()
+        return torch.from_numpy(unpack(values.tobytes(), shape, like))
+
 
 def load(path: Path) -> Checkpoint:
     """Read a checkpoint.
@@ -204,14 +232,15 @@ def _load(path: Path, file: BinaryIO) -> Checkpoint:
             if rows.ndim != 2 or rows.shape[1] != len(HISTORY) or len(rows) > MOST_ITERATIONS:
                 raise ValueError("history")
             group = f["state"]
+            heights = contents.net(HEIGHTS)
             state = State(
-                contents.tensor("lens/heights").double(),
+                heights,
                 **{k: int(group.attrs[k]) for k in ("stage", "iteration", "total")},
                 **{name: {k: contents.tensor(f"state/{name}/{k}") for k in group[name]} for name in ("parameters", "optimizer")},
                 history=[(int(r[0]), int(r[1]), *map(float, r[2:])) for r in rows],
                 seconds=float(group.attrs["seconds"]),
                 reason=str(group.attrs["reason"]),
-                **{name: contents.tensor(name).double() for name in STARTS if name in f},
+                **{name: contents.net(name, heights) for name in STARTS if name in f},
             )
             if min(state.stage, state.iteration, state.total) < 0 or not 0 <= state.seconds < math.inf:
                 raise ValueError("state")

@@ -31,8 +31,6 @@ from caustic_cli.scene.materials import material
 MOST, A_SPAN = 2001, 4
 #: Rays of the sensitivities and of the angles inside the lens.
 RAYS = 100_000
-#: Bytes of a net in a project, for each control height.
-NET = 8
 #: Thickness of a plate that is cut from a common sheet, in parts of its width.
 SHEET = 0.08
 #: Errors by which the sensitivities are found: of the throw, relative; of the index.
@@ -108,21 +106,20 @@ def wall_and_stock(scene: Scene, field: HeightField, heights: Tensor) -> dict[st
     return {"minimum_wall_mm": float(z.min()) - scene.lens.z_in, "stock_height_mm": float(z.max()) - scene.lens.z_in}
 
 
-def preview(scene: Scene, field: HeightField, heights: Tensor, nets: int = 2) -> str:
+def preview(scene: Scene, field: HeightField, heights: Tensor, project: float) -> str:
     """What a design's first surface asks for, in one line; the finished one will be much like it.
 
-    nets: that the finished project keeps: the lens' and what it began from."""
+    project: bytes that the finished project takes."""
     lens, (z, *derivatives) = scene.lens, sampled(field, heights, [_points(s) for s in field.spaces])
     slope = float(torch.hypot(*derivatives[:2]).max())
     bent = float(curvature.largest(*(lens.cut_from * d for d in derivatives)).max())
     reflected = (
         "" if lens.mirror else f" (light along the axis is totally reflected from {1.0 / math.sqrt(lens.index**2 - 1.0):.2f})"
     )
-    size = heights.numel()
     return (
         f"first surface: wall {float(z.min()) - lens.z_in:.2f} mm, stock {float(z.max()) - lens.z_in:.2f} mm, slopes up to"
         f" {slope:.2g}{reflected}, {f'concave radius down to {1.0 / bent:.2g} mm' if bent > 0 else 'nowhere concave'};"
-        f" project about {_megabytes(nets * NET * size)}"
+        f" project about {_megabytes(project)}"
         f"{_thinner(scene, float(z.min()), float(z.max()))}"
     )
 

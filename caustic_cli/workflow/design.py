@@ -46,6 +46,7 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import sides_of
 from caustic_cli.project import attachments, directory, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
+from caustic_cli.project.packing import expected_bytes, rounded
 from caustic_cli.project.project import CHECKPOINT, RENDER, Project, is_project
 from caustic_cli.scene import Scene
 from caustic_cli.studies.manufacture import preview, wall_and_stock
@@ -276,7 +277,7 @@ def _say_limits(project: Project, designer: Designer, target: np.ndarray, first:
     field = designer.field(0)
     heights = designer.begin().heights if first is None else first.heights
     nets = 3 if first is not None and first.unrounded is not None else 2
-    say.say(preview(designer.scene, field, heights, nets))
+    say.say(preview(designer.scene, field, heights, nets * expected_bytes(heights.numel())))
 
 
 def _listed(wavelengths: tuple[float, ...]) -> str:
@@ -494,10 +495,11 @@ def _run(
             notice=say.say,
         )
         if not asked and not chosen["iterations"] and chosen["network"] == "none" and state.reason in DONE:
-            state = replace(state, parameters={}, optimizer={})
+            start, sharp = (None if z is None else rounded(z) for z in (state.start, state.unrounded))
+            state = replace(state, start=start, unrounded=sharp, parameters={}, optimizer={})
         records.keep(state)
         if not asked:
-            state.heights = designer.within_limits(state)
+            state.heights = rounded(designer.within_limits(state))
         if asked:
             if movie is not None:
                 movie.write()
