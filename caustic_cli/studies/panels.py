@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
@@ -114,12 +115,21 @@ def write_report(
     axes[1, 0].set(title=name, xlabel="x on the lens (mm)", ylabel="y (mm)")
     place = axes[1, 1].get_subplotspec()
     axes[1, 1].remove()
-    _draw_relief(figure.add_subplot(place, projection="3d"), relief, (rx, ry), unit)
+    solid = figure.add_subplot(place, projection="3d")
     _draw_losses(axes[1, 2], history, target.size, figures, stages)
     _draw_account(axes[1, 3], figures)
+    _lay_out(figure)
+    _draw_relief(solid, relief, (rx, ry), unit)
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", dpi=100, metadata={"Software": SOFTWARE})
     plt.close(figure)
+
+
+def _lay_out(figure: Figure) -> None:
+    """Places for all that is drawn so far, which then stay: saving would draw everything twice to find them."""
+    if (engine := figure.get_layout_engine()) is not None:
+        engine.execute(figure)
+        figure.set_layout_engine(None)
 
 
 def _bar(drawn: AxesImage, axis: Axes, label: str, extend: str = "neither") -> None:
