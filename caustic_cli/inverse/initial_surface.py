@@ -37,7 +37,7 @@ SOLVED, COARSE = 1024, 512
 #: the finer ones.
 SITES, NEARLY = 2, 0.95
 #: Light in the wrong cell, and Newton steps a level, where finer cells show that: 5e-3 left text with errors of 0.088 to 0.123.
-EXACT, STEPS = 1e-3, 30
+EXACT, STEPS = 5e-4, 30
 #: How much higher a net may be than the surface it was interpolated from.
 OVERSHOOT = 2.0
 #: Surfaces solved for in turn where the light depends on the surface it meets.
