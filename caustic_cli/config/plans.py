@@ -145,6 +145,9 @@ LARGEST_FACTOR = 50
 #: Knot spans of a net from which on its start has a cell to each of them.
 FINE_SPANS = 1024
 LEAST_SPANS = 32
+#: Of pictures with more pixels along an axis than a quality has spans: spans, of which the start has cells too; rays a pixel, and
+#: their most; and iterations, all of them with these: fewer rays a pixel teach the lens their noise.
+LARGE_SPANS, LARGE_RAYS, MOST_RAYS, LARGE_PLAN = 1024, 8, 16_000_000, ((1.0, 16),)
 LEAST_RAYS = 40_000
 
 
@@ -181,7 +184,7 @@ def _largest_factor(n: int) -> int:
 def _spans(plan: dict[str, tuple], pixels: int, quality: str) -> int:
     check("quality", quality)
     density, most, *_ = plan[quality]
-    return min(most, max(LEAST_SPANS, round(density * pixels)))
+    return LARGE_SPANS if LARGE_SPANS > most < pixels else min(most, max(LEAST_SPANS, round(density * pixels)))
 
 
 def transport_cells(rays: int, scattered: bool, spans: int = 0) -> int:
@@ -215,8 +218,10 @@ def refinement(
         creased: the picture has gaps, and the net is that of `creased_control`.
     """
     check("quality", quality)
-    _, _, each, most, finer, plan = (CREASED if creased else REFINEMENT)[quality]
+    _, spans, each, most, finer, plan = (CREASED if creased else REFINEMENT)[quality]
     pixels = resolution[0] * resolution[1]
+    if LARGE_SPANS > spans < max(resolution) and quality == "standard":
+        most, plan = max(most, min(LARGE_RAYS * pixels, MOST_RAYS)), LARGE_PLAN
     rays = rays or max(LEAST_RAYS, min(most, each * pixels) // (4 if scattered else 1))
     finer = max(1, min(finer, math.isqrt(rays // pixels)))
     apron = 0 if spread else math.ceil(0.04 * max(resolution))
