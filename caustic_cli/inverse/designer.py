@@ -183,6 +183,7 @@ class Designer:
             raise InputError("⟨design.stages.waves⟩ needs network none: the wave image refines the heights themselves")
         if options.over and any(s.spread or s.source for s in stages):
             raise InputError("⟨design.over⟩ needs stages on the rays of the scene's own source, without spread")
+        self._room: tuple[tuple[int, int], tuple[Tensor, Tensor]] | None = None
         for stage in stages:
             self._bounds(stage)  # refuse an impossible lens before any work
 
@@ -221,8 +222,8 @@ class Designer:
     def begin(self, heights: Tensor | None = None, unrounded: Tensor | None = None) -> State:
         """A fresh state: the parametrisation's own beginning, or what `first` has found."""
         module = self._parametrise(0, heights)
-        first = module().detach()
-        return State(first, parameters=module.state_dict(), start=first, unrounded=unrounded)
+        first, free = module().detach(), self.options.network == "none"  # free heights are parameters enough
+        return State(first, parameters={} if free else module.state_dict(), start=first, unrounded=unrounded)
 
     def begun(self, state: State, rounded: bool = True) -> Tensor:
         """The surface that the design began from, on the net of the stage it stands in (n, m), mm; or its `unrounded` one."""
@@ -490,6 +491,12 @@ class Designer:
         )
 
     def _bounds(self, stage: Stage) -> tuple[Tensor, Tensor]:
+        """Least and largest heights of a stage's net; those of the last that was asked for are kept."""
+        if self._room is None or self._room[0] != stage.control:
+            self._room = stage.control, self._bounds_of(stage)
+        return self._room[1]
+
+    def _bounds_of(self, stage: Stage) -> tuple[Tensor, Tensor]:
         lens = replace(self.scene.lens, control=stage.control)
         x, y = HeightField.of(lens).control_xy()
         low, high = lens.height_bounds(x.numpy(), y.numpy())

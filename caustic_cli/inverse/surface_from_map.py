@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,7 +43,9 @@ from caustic_cli.optics.kernels.laguerre import prices
 Seen = View | Relayed  # how the lens sees a screen that is not simply the plane z_screen
 EVEN = 2.0  # cells over which e is smoothed: at a kink of phi the rays miss by the spline's own width, which is no error of T
 ENOUGH = 0.05  # pixels of e, root mean square, that are left alone
-REPEATS = 4  # of the heights; each takes another factor of about angle^2 / throw off the error
+REPEATS = 4  # of the heights, at most; each takes another factor of about angle^2 / throw off the error
+EXACT = 1e-10  # mm that the next repeat would move a height by
+ROWS = 64  # of corners whose slopes are found together: what is on the way stays in the processor's cache
 
 
 class OutOfReach(InputError):
@@ -162,7 +165,7 @@ def finer(
     """
     map_ = start.transport.finer(times)
     coarse, fine = ([corners(k * n, h) for n, h in zip(start.transport.solved.shape, source_half, strict=True)] for k in (1, times))
-    shift = [RectBivariateSpline(*coarse, e)(*fine) for e in start.shift]
+    shift = [RectBivariateSpline(*coarse, e)(*fine) for e in start.shift] if start.shift.any() else (0.0, 0.0)
     x, y = fine[0][:, None], fine[1][None, :]
     aim = tuple(t + e + c for t, e, c in zip((map_.x, map_.y), shift, centre, strict=True))
     d, dark = _directions(directions, map_.potential.shape), np.zeros(map_.potential.shape, bool)
@@ -227,15 +230,30 @@ def heights(
         slope = scale * (view.sign * map_.x - cx * x), scale * (view.sign * map_.y - cy * y)
     z = main - main.mean() + mean
     towards = None if view is None else view.towards(*aim)
+    within, rest, moved = np.empty(z.shape, bool), np.empty((2, *z.shape)), 0.0
     for _ in range(REPEATS):
-        tx, ty, tz = (aim[0] - x, aim[1] - y, z_screen - z) if towards is None else towards(x, y, z)
-        within = refracted(tx, ty, tz, d, index)
+        for rows in _strips(len(z), len(z) if view else ROWS):
+            if towards is None:
+                to = aim[0][rows] - x[rows], aim[1][rows] - y, z_screen - z[rows]
+            else:
+                to = towards(x, y, z)
+            light = tuple(v[rows] if isinstance(v, np.ndarray) else v for v in d)
+            within[rows] = turned = refracted(*to, light, index)
+            for w, s, out in zip(slopes_to(*to, light, index), slope, rest, strict=True):
+                out[rows] = np.where(turned, w - s[rows], 0.0)
         if not within[lit].all():
             raise OutOfReach(lit & ~within)
-        rest = [np.where(within, w - s, 0.0) for w, s in zip(slopes_to(tx, ty, tz, d, index), slope, strict=True)]
-        z = main + integrate(*rest, step)
+        before, z = z, main + integrate(*rest, step)
         z += mean - z.mean()
+        before, moved = moved, float(np.abs(z - before).max())
+        if moved * moved <= EXACT * before or moved == 0.0:  # changes fall by the same factor
+            break
     return z
+
+
+def _strips(n: int, rows: int) -> Iterator[slice]:
+    """All n rows, so many at a time."""
+    return (slice(k, k + rows) for k in range(0, n, rows))
 
 
 def refracted(tx, ty, tz, d, index: float) -> np.ndarray:
@@ -258,19 +276,27 @@ def slopes_to(tx, ty, tz, d, index: float) -> tuple[np.ndarray, np.ndarray]:
 
 def integrate(sx: np.ndarray, sy: np.ndarray, step: tuple[float, float]) -> np.ndarray:
     """The surface (n, m) of mean 0 whose differences are nearest to the slopes at its points, in the least-squares sense."""
-    n, m = sx.shape
-    hx, hy = step
-    ax, ay = 0.5 * (sx[1:] + sx[:-1]) / hx, 0.5 * (sy[:, 1:] + sy[:, :-1]) / hy
-    right = np.diff(ax, axis=0, prepend=0.0, append=0.0) + np.diff(ay, axis=1, prepend=0.0, append=0.0)
-    wave = (
-        -((2.0 * np.sin(0.5 * np.pi * np.arange(n) / n) / hx)[:, None] ** 2)
-        - (2.0 * np.sin(0.5 * np.pi * np.arange(m) / m) / hy) ** 2
-    )
-    wave[0, 0] = 1.0
+    right = _divergence(sx, step[0])
+    right += _divergence(sy.T, step[1]).T
+    wave = [(2.0 / h * np.sin(0.5 * np.pi * np.arange(n) / (n - 1))) ** 2 for n, h in zip(sx.shape, step, strict=True)]
     workers = torch.get_num_threads()
-    spectrum = dctn(right, norm="ortho", workers=workers) / wave
-    spectrum[0, 0] = 0.0
-    return idctn(spectrum, norm="ortho", workers=workers)
+    spectrum = dctn(right, type=1, workers=workers, overwrite_x=True)
+    total = wave[0][:, None] + wave[1]
+    total[0, 0] = math.inf
+    spectrum /= -total
+    z = idctn(spectrum, type=1, workers=workers, overwrite_x=True)
+    z -= z.mean()
+    return z
+
+
+def _divergence(slopes: np.ndarray, step: float) -> np.ndarray:
+    """Differences along the first axis of slopes (n, m) between points; there is nothing beyond the borders, whose points have half
+    a cell."""
+    out = np.empty_like(slopes)
+    mean = (0.5 / step) * (slopes[1:] + slopes[:-1])
+    np.subtract(mean[1:], mean[:-1], out=out[1:-1])
+    out[0], out[-1] = 2.0 * mean[0], -2.0 * mean[-1]
+    return out
 
 
 def land(z: np.ndarray, x, y, d, index: float, z_screen: float, view: Seen | None = None) -> tuple[np.ndarray, np.ndarray]:

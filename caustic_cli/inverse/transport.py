@@ -381,12 +381,10 @@ def _smoothed(psi, sites: _Sites, shape, half, smooth: float) -> np.ndarray:
     kernel /= kernel.sum()
     pad = FINE * int(np.ceil(len(kernel) / (2 * FINE)))
     x1, x2 = (centres(FINE * s, h, pad) for s, h in zip(shape, half, strict=True))
-    (n, m), low, out = shape, pad - len(kernel) // 2, np.empty((3, shape[0] + 1, shape[1] + 1))
+    m, low, out = shape[1], pad - len(kernel) // 2, np.empty((3, shape[0] + 1, shape[1] + 1))
     for j in range(0, m + 1, STRIP):
         count = min(STRIP, m + 1 - j)
         at = low + FINE * j
         phi, site = laguerre.envelope(psi, *sites.lines, x1, x2[at : at + FINE * (count - 1) + len(kernel)])
-        for v, mean in zip((phi, sites.y1[site], sites.y2[site]), out, strict=True):
-            v = sum(w * v[low + k : low + k + FINE * n + 1 : FINE] for k, w in enumerate(kernel))
-            mean[:, j : j + count] = sum(w * v[:, k : k + FINE * (count - 1) + 1 : FINE] for k, w in enumerate(kernel))
+        laguerre.averages(phi, site, sites.y1, sites.y2, kernel, FINE, low, out[:, :, j : j + count])
     return out

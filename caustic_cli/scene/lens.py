@@ -61,10 +61,10 @@ class Offset:
         Raises:
             InputError: the sphere ends inside the aperture.
         """
-        x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
+        xx, yy = (np.square(np.asarray(c, float)) for c in (x, y))
         rx, ry = self.radius
-        terms = [(x * x + y * y, rx)] if rx == ry else [(x * x, rx), (y * y, ry)]
-        total = np.zeros(x.shape)
+        terms = [(xx + yy, rx)] if rx == ry else [(xx, rx), (yy, ry)]
+        total = np.zeros(np.broadcast_shapes(xx.shape, yy.shape))
         for square, rho in terms:
             if math.isinf(rho):
                 continue
@@ -74,7 +74,10 @@ class Offset:
                     " (a smaller ⟨mag⟩ or a longer ⟨throw⟩ gives a larger radius)"
                 )
             # rho - sign sqrt(rho^2 - s) without its cancellation
-            total = total + square / (rho + math.copysign(1.0, rho) * np.sqrt(rho * rho - square))
+            root = np.sqrt(rho * rho - square)
+            root *= math.copysign(1.0, rho)
+            root += rho
+            total += square / root
         return total
 
 

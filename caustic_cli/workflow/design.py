@@ -465,7 +465,7 @@ def _run(
         stage, saved = -1, time.monotonic()
 
         def on_iteration(now: State) -> None:
-            nonlocal stage, saved
+            nonlocal stage
             if now.stage != stage:
                 stage = now.stage
                 s = designer.stages[stage]
@@ -480,6 +480,10 @@ def _run(
             )
             if movie is not None:
                 movie.record(now, target, project.settings["target"]["encoding"], bool(designer.stages[stage].waves))
+            keep_if_due(now)
+
+        def keep_if_due(now: State) -> None:
+            nonlocal saved
             if time.monotonic() - saved >= max(chosen["checkpoint_every"], RARELY * (records.seconds - QUICK)):
                 saved = time.monotonic()  # before the writing, which takes its time too
                 records.keep(now)
@@ -497,8 +501,10 @@ def _run(
         if not asked and not chosen["iterations"] and chosen["network"] == "none" and state.reason in DONE:
             start, sharp = (None if z is None else rounded(z) for z in (state.start, state.unrounded))
             state = replace(state, start=start, unrounded=sharp, parameters={}, optimizer={})
-        records.keep(state)
-        if not asked:
+        if asked:
+            records.keep(state)
+        else:
+            keep_if_due(state)
             state.heights = rounded(designer.within_limits(state))
         if asked:
             if movie is not None:

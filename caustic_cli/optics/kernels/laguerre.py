@@ -126,6 +126,41 @@ def _prices(i, across, phi, rows, first, y2, x1, x2, part, which, psi, at):
         part[j, i], which[j, i] = -value[j], place[j]
 
 
+def averages(phi, site, y1, y2, weights, step, low, out) -> None:
+    """Weighted averages of phi and its gradient over squares of a raster, at every `step`-th of its points.
+
+    Args:
+        phi, site: of `envelope`; y1, y2: (N,) coordinates of the sites.
+        weights: (k,) along either axis; low: of the first square, along the first axis; it begins with the second.
+        out: (3, n, m) to be filled.
+    """
+    _averages(ALL, phi, site, y1, y2, weights, step, low, out)
+
+
+@njit(entry=True, nogil=True)
+def _averages(i, phi, site, y1, y2, weights, step, low, out):
+    """Row i of `averages`."""
+    n, m = out.shape[1:]
+    if i == ALL:
+        on_threads(n, (phi, site, y1, y2, weights, step, low, out))
+        return
+    count = len(weights)
+    sums = np.zeros((3, step * (m - 1) + count))
+    for k in range(count):
+        w, r = weights[k], low + step * i + k
+        for q in range(sums.shape[1]):
+            p = site[r, q]
+            sums[0, q] += w * phi[r, q]
+            sums[1, q] += w * y1[p]
+            sums[2, q] += w * y2[p]
+    for c in range(3):
+        for j in range(m):
+            mean = 0.0
+            for k in range(count):
+                mean += weights[k] * sums[c, step * j + k]
+            out[c, i, j] = mean
+
+
 @njit(nogil=True)
 def _join(p, q, head, link, end, degree, count):
     """Note the border of p and q, unless it is known; half-borders 2 e and 2 e + 1 belong to the two sides."""
