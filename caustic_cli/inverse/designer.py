@@ -230,8 +230,8 @@ class Designer:
         return self._carried(state.start if rounded else state.unrounded, 0, state.stage)
 
     def showing(self, state: State, heights: Tensor) -> State:
-        """A state whose lens is `heights`, although the optimiser stands elsewhere; `restored` undoes it."""
-        return replace(state, heights=heights, parameters=state.parameters or self._module(state).state_dict())
+        """A state whose lens is `heights`, although the optimiser stands elsewhere; `restored` undoes it, unless that was let go."""
+        return replace(state, heights=heights)
 
     def restored(self, state: State) -> State:
         """A saved state as the loop left it, see `showing`."""
