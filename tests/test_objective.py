@@ -31,6 +31,12 @@ def heights(bumps: float = 0.1, seed: int = 0) -> torch.Tensor:
     return 3.0 + bumps * torch.randn(7, 6, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
+def cut_into(monkeypatch, rays: int) -> None:
+    """Chunks of so many rays."""
+    for name in ("CHUNK", "CHUNK_OF_ROWS"):
+        monkeypatch.setattr(module, name, rays)
+
+
 def disc() -> torch.Tensor:
     """A bright disc off the centre of the screen."""
     i, j = torch.arange(12.0, dtype=torch.float64)[:, None], torch.arange(9.0, dtype=torch.float64)
@@ -160,8 +166,9 @@ def test_chunks_do_not_change_value_or_gradient(name, fresnel, kept, monkeypatch
     """Many chunks are traced twice, one chunk once: the same sums in another order."""
     scene = replace(SCENE, lens=replace(LENS, fresnel=fresnel))
     whole = objective(name, scene=scene, apron=2)(heights())
-    monkeypatch.setattr(module, "CHUNK", 300)
-    monkeypatch.setattr(module, "KEPT_RAYS", 10**6 if kept else 0)
+    cut_into(monkeypatch, 300)
+    for limit in ("KEPT_RAYS", "KEPT_OF_ROWS"):
+        monkeypatch.setattr(module, limit, 10**6 if kept else 0)
     cut = objective(name, scene=scene, apron=2)(heights())
     assert cut.loss == pytest.approx(whole.loss, rel=1e-12)
     assert cut.on_screen == pytest.approx(whole.on_screen, rel=1e-12)
@@ -171,7 +178,7 @@ def test_chunks_do_not_change_value_or_gradient(name, fresnel, kept, monkeypatch
 @pytest.mark.parametrize("chunk", [300, 10**6])
 def test_bins_without_fresnel_have_a_slope_of_zero(chunk, monkeypatch):
     """Moving a ray within its pixel changes nothing then: that is a gradient of 0, not an error."""
-    monkeypatch.setattr(module, "CHUNK", chunk)
+    cut_into(monkeypatch, chunk)
     scene = replace(SCENE, lens=replace(LENS, fresnel="none"))
     evaluation = objective(scene=scene, f=Filter())(heights())
     assert evaluation.loss > 1e-3
@@ -244,7 +251,7 @@ def test_penalties_have_the_slope_of_differences(loss, max_slope, chunks, monkey
     along = torch.randn(8, 7, generator=g, dtype=torch.float64)
     sampler = Sampler("grid", (90, 90))
     if chunks > 1:
-        monkeypatch.setattr("caustic_cli.inverse.objective.CHUNK", 3000)
+        cut_into(monkeypatch, 3000)
     target = torch.rand(18, 15, generator=g, dtype=torch.float64)
     function = Objective(
         scene, field, sampler, Filter("cosine", (5, 5)), target, loss, apron=3, max_slope=max_slope, dtype=torch.float64
@@ -278,7 +285,7 @@ def test_oversampling_adds_up_smaller_pixels(chunks, monkeypatch):
     heights = 5.0 + (x[:, None] ** 2 + y**2) / 160 + 0.01 * torch.randn(8, 7, generator=g, dtype=torch.float64)
     along, target = torch.randn(8, 7, generator=g, dtype=torch.float64), torch.rand(18, 15, generator=g, dtype=torch.float64)
     if chunks > 1:
-        monkeypatch.setattr("caustic_cli.inverse.objective.CHUNK", 3000)
+        cut_into(monkeypatch, 3000)
     sampler = Sampler("grid", (90, 90))
     function = Objective(
         scene,

@@ -279,7 +279,7 @@ def test_a_picture_with_gaps_has_a_net_as_fine_as_its_creases_ask_for():
     rays = {"design": {"waves": "off"}}
     plain, creased = complete(rays, 1.0), complete(rays, 1.0, gaps=1.0)
     assert plain["lens"]["control"] == [503, 503]
-    assert creased["lens"]["control"] == [2015, 2015] == creased["design"]["stages"][-1]["control"]
+    assert creased["lens"]["control"] == [3003, 3003] == creased["design"]["stages"][-1]["control"]
     assert complete(rays, 1.0, gaps=0.9 * GAPS)["design"] == plain["design"]
     own = {**rays, "lens": {"control": [203, 203]}}
     assert complete(own, 1.0, gaps=1.0)["design"]["stages"] == complete(own, 1.0)["design"]["stages"]

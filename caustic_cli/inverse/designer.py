@@ -230,7 +230,7 @@ class Designer:
         return self._carried(state.start if rounded else state.unrounded, 0, state.stage)
 
     def showing(self, state: State, heights: Tensor) -> State:
-        """A state whose lens is `heights`, although the optimiser stands elsewhere; `restored` undoes it, unless that was let go."""
+        """A state whose lens is `heights`, although the optimiser stands elsewhere; `restored` undoes it, if that is kept."""
         return replace(state, heights=heights)
 
     def restored(self, state: State) -> State:

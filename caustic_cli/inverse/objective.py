@@ -22,14 +22,17 @@ from caustic_cli.inverse.penalties import Penalty
 from caustic_cli.optics.emission import Rays
 from caustic_cli.optics.memory import smaller
 from caustic_cli.optics.reconstruction import Filter
+from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.spread import Convolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT
 from caustic_cli.optics.trace import Parameters, Tracer, tracers
 from caustic_cli.scene import Scene
 
-#: Rays traced at a time, and the number up to which the prepared chunks are kept from one evaluation to the next.
+#: Rays traced at a time, and the number up to which the prepared chunks are kept from one evaluation to the next; and the same of
+#: rows and columns of rays along the axis, which keep little for each: 8e6 on 2000 x 2000 pixels take 0.6 s, by 2^20 at a time 3 s.
 CHUNK, KEPT_RAYS = 1 << 20, 1 << 22
+CHUNK_OF_ROWS, KEPT_OF_ROWS = 1 << 24, 1 << 25
 
 
 @dataclass(frozen=True)
@@ -114,8 +117,10 @@ class Objective:
         self.loss = (ColorLoss if scene.colored else Loss)(loss, smooth, blur, apron, wide > 0)
         self.penalty = penalty_of(scene, field, loss, max_slope, min_radius, self.device)
         self.scene, self.field, self.dtype = scene, field, dtype
-        self.expected, self.chunk, self.kept = expected, CHUNK, None
-        if sum(s.count for s in self.samplers) <= KEPT_RAYS:
+        self.expected, self.chunk, self.kept, kept = expected, CHUNK, None, KEPT_RAYS
+        if self._rows():
+            self.chunk, kept = CHUNK_OF_ROWS, KEPT_OF_ROWS
+        if sum(s.count for s in self.samplers) <= kept:
             try:
                 self.kept = list(self._tracers())
             except (MemoryError, RuntimeError) as error:
@@ -133,6 +138,13 @@ class Objective:
         """Whether chunks keep their graphs: a fused kernel's holds the net or the surface at its rays, a trace by stages every
         ray after each of them."""
         return self.kept is not None and (sum(t.fused is None for _, t in self.kept) <= 1)
+
+    def _rows(self) -> bool:
+        """Whether the rays are rows and columns of a plane wave along the axis, for which there is a fused kernel."""
+        if not (self.screen.upright and all(isinstance(s, Sampler) and s.tensor for s in self.samplers)):
+            return False
+        _, first = next(self._tracers(), (0, None))
+        return first is not None and first.fused is not None and first.start.along_axis
 
     def _pool(self, image: Tensor, cut: int = 1) -> Tensor:
         """Pixels of the screen, cut into so many along each axis, from those of the render."""

@@ -64,6 +64,11 @@ class RayState:
         """Number of rays."""
         return self.power.numel() if self.sample is None else math.prod(self.sample.shape)
 
+    @property
+    def along_axis(self) -> bool:
+        """Whether they are those of a plane wave along the axis, known by their sample of the aperture."""
+        return self.sample is not None and self.direction == (0.0, 0.0, 1.0)
+
     def total(self, power: Tensor) -> Tensor:
         """Power of all rays together: of a number that all of them carry, so many times that."""
         return power.sum(dtype=torch.float64) if power.ndim else power.double() * self.count

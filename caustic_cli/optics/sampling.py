@@ -173,6 +173,11 @@ class Sampler:
         """Number of rays."""
         return self.shape[0] * self.shape[1]
 
+    @property
+    def tensor(self) -> bool:
+        """Whether its samples are rows and columns."""
+        return self.kind in ("grid", "lines")
+
     def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[Sample]:
         """The rays in order, at most about `size` at a time; fluxes over all chunks sum to 1.
 
@@ -191,7 +196,7 @@ class Sampler:
     def _points(self, size: int, first: int = 0, step: int = 1) -> Iterator[Sample]:
         nu, nv = self.shape
         one = torch.ones((), dtype=torch.float64)
-        if self.kind in ("grid", "lines"):
+        if self.tensor:
             i, j = (torch.arange(k, device=self.device) for k in (nu, nv))
             du = dv = torch.tensor(0.5, dtype=torch.float64, device=self.device)
             if self.kind == "lines":

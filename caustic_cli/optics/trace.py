@@ -448,7 +448,7 @@ class Tracer:
             return None
         eta = m[-2].index_at(start.wavelength) / m[-1].index_at(start.wavelength)
         before = None if like is None else like.fused
-        if start.sample is not None and start.direction == (0.0, 0.0, 1.0):
+        if start.along_axis:
             return self.backend.plane_image(surface, start, eta, element.fresnel, before)
         return self.backend.ray_image(surface, start, eta, element.fresnel, element.aperture.radius, before)
 
