@@ -147,9 +147,9 @@ LARGEST_FACTOR = 50
 #: Knot spans of a net from which on its start has a cell to each of them.
 FINE_SPANS = 1024
 LEAST_SPANS = 32
-#: Of pictures with more pixels along an axis than a quality has spans: spans, of which the start has cells too; rays a pixel, and
-#: their most; and iterations, all of them with these: fewer rays a pixel teach the lens their noise.
-LARGE_SPANS, LARGE_RAYS, MOST_RAYS, LARGE_PLAN = 1024, 8, 16_000_000, ((1.0, 16),)
+#: Of pictures with more pixels along an axis than a quality has spans: spans, whose 1280 control points are a quick length; rays a
+#: pixel, and their most; and iterations, all of them with these: fewer rays a pixel teach the lens their noise.
+LARGE_SPANS, LARGE_RAYS, MOST_RAYS, LARGE_PLAN = 1277, 8, 16_000_000, ((1.0, 24),)
 LEAST_RAYS = 40_000
 
 
