@@ -118,13 +118,13 @@ class Objective:
         self.penalty = penalty_of(scene, field, loss, max_slope, min_radius, self.device)
         self.scene, self.field, self.dtype = scene, field, dtype
         self.expected, self.chunk, self.kept, kept = expected, CHUNK, None, KEPT_RAYS
-        if self._rows():
-            self.chunk, kept = CHUNK_OF_ROWS, KEPT_OF_ROWS
-        if sum(s.count for s in self.samplers) <= kept:
-            try:
+        try:
+            if self._rows():
+                self.chunk, kept = CHUNK_OF_ROWS, KEPT_OF_ROWS
+            if sum(s.count for s in self.samplers) <= kept:
                 self.kept = list(self._tracers())
-            except (MemoryError, RuntimeError) as error:
-                self.chunk = smaller(self.chunk, error)
+        except (MemoryError, RuntimeError) as error:
+            self.chunk = smaller(self.chunk, error)
 
     def moved(self, scene: Scene, rays: Rays) -> Objective:
         """The same in a scene whose screen or source stands elsewhere, by other rays; the target is not filtered anew."""

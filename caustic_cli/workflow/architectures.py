@@ -51,7 +51,8 @@ class Candidate:
     ):
         self.designers, self.target, self.rays, self.seed = designers, target, rays, seed
         self.states = [one.begin(*first or ()) for one in designers]
-        count = sum(v.numel() for state in self.states for name, v in state.parameters.items() if name != "start")
+        held = [state.parameters or {"heights": state.heights} for state in self.states]  # free heights are held once
+        count = sum(v.numel() for parameters in held for name, v in parameters.items() if name != "start")
         self.about = about | {"parameters": count}
 
     @property
