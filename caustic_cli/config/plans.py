@@ -124,7 +124,7 @@ def coarse_to_fine(
 #: and its iterations.
 REFINEMENT = {
     "draft": (1.0, 256, 16, 1_000_000, 2, ((1.0, 14),)),
-    "standard": (2.0, 768, 64, 4_000_000, 4, ((0.5, 8), (1.0, 24))),
+    "standard": (2.0, 957, 64, 8_000_000, 4, ((0.5, 8), (1.0, 24))),
     "fine": (2.0, 768, 256, 16_000_000, 4, ((0.125, 15), (0.25, 65), (1.0, 25))),
 }
 #: Gaps of a picture (`io.picture`) from which on creases decide its error, and what a quality means then: light that crosses a
@@ -147,9 +147,9 @@ LARGEST_FACTOR = 50
 #: Knot spans of a net from which on its start has a cell to each of them.
 FINE_SPANS = 1024
 LEAST_SPANS = 32
-#: Of pictures with more pixels along an axis than a quality has spans: spans, whose 1280 control points are a quick length; rays a
-#: pixel, and their most; and iterations, all of them with these: fewer rays a pixel teach the lens their noise.
-LARGE_SPANS, LARGE_RAYS, MOST_RAYS, LARGE_PLAN = 1277, 8, 16_000_000, ((1.0, 24),)
+#: Of pictures with more than LARGE_PIXELS along an axis, or more than a quality has spans: spans, whose 1280 control points are a
+#: quick length; rays a pixel, and their most; and iterations, all with these: fewer rays a pixel teach the lens their noise.
+LARGE_PIXELS, LARGE_SPANS, LARGE_RAYS, MOST_RAYS, LARGE_PLAN = 700, 1277, 8, 16_000_000, ((1.0, 24),)
 LEAST_RAYS = 40_000
 
 
@@ -187,7 +187,8 @@ def _largest_factor(n: int) -> int:
 def _spans(plan: dict[str, tuple], pixels: int, quality: str) -> int:
     check("quality", quality)
     density, most, *_ = plan[quality]
-    return LARGE_SPANS if LARGE_SPANS > most < pixels else min(most, max(LEAST_SPANS, round(density * pixels)))
+    large = most < LARGE_SPANS and pixels > min(most, LARGE_PIXELS)
+    return LARGE_SPANS if large else min(most, max(LEAST_SPANS, round(density * pixels)))
 
 
 def transport_cells(rays: int, scattered: bool, spans: int = 0) -> int:
@@ -223,7 +224,7 @@ def refinement(
     check("quality", quality)
     _, spans, each, most, finer, plan = (CREASED if creased else REFINEMENT)[quality]
     pixels = resolution[0] * resolution[1]
-    if LARGE_SPANS > spans < max(resolution) and quality == "standard":
+    if spans < LARGE_SPANS and max(resolution) > LARGE_PIXELS and quality == "standard":
         most, plan = max(most, min(LARGE_RAYS * pixels, MOST_RAYS)), LARGE_PLAN
     rays = rays or max(LEAST_RAYS, min(most, each * pixels) // (4 if scattered else 1))
     finer = max(1, min(finer, math.isqrt(rays // pixels)))
