@@ -125,7 +125,7 @@ def coarse_to_fine(
 REFINEMENT = {
     "draft": (1.0, 256, 16, 1_000_000, 2, ((1.0, 14),)),
     "standard": (2.0, 957, 64, 8_000_000, 4, ((0.5, 8), (1.0, 24))),
-    "fine": (2.0, 768, 256, 16_000_000, 4, ((0.125, 15), (0.25, 65), (1.0, 25))),
+    "fine": (2.0, 957, 256, 16_000_000, 4, ((0.125, 15), (0.25, 65), (1.0, 25))),
 }
 #: Gaps of a picture (`io.picture`) from which on creases decide its error, and what a quality means then: light that crosses a
 #: crease falls into the black, and a crease is as narrow as knot spans and the start's cells are.  On so fine a net iterations gain

@@ -44,7 +44,7 @@ Seen = View | Relayed  # how the lens sees a screen that is not simply the plane
 EVEN = 2.0  # cells over which e is smoothed: at a kink of phi the rays miss by the spline's own width, which is no error of T
 ENOUGH = 0.05  # pixels of e, root mean square, that are left alone
 REPEATS = 4  # of the heights, at most; each takes another factor of about angle^2 / throw off the error
-EXACT = 1e-10  # mm that the next repeat would move a height by
+CONVERGED = 1e-10  # mm that the next repeat would move a height by
 ROWS = 64  # of corners whose slopes are found together: what is on the way stays in the processor's cache
 
 
@@ -243,7 +243,7 @@ def heights(
         before, z = z, main + integrate(*rest, step)
         z += mean - z.mean()
         before, moved = moved, float(np.abs(z - before).max())
-        if moved * moved <= EXACT * before or moved == 0.0:  # changes fall by the same factor
+        if moved * moved <= CONVERGED * before or moved == 0.0:  # changes fall by the same factor
             break
     return z
 

@@ -24,7 +24,9 @@ from torch import Tensor
 from caustic_cli.errors import InputError
 from caustic_cli.optics.backends import backend_for
 
-SAMPLERS = ("grid", "lines", "stratified", "uniform", "sobol")
+#: Kinds whose points are rows and columns, and all kinds.
+TENSOR = ("grid", "lines")
+SAMPLERS = (*TENSOR, "stratified", "uniform", "sobol")
 #: Length of torch's Sobol sequence.
 SOBOL_RAYS = 1 << 30
 #: Largest of `normal_numbers`, whose uniform ones are at least 2^-33.
@@ -84,7 +86,7 @@ def numbers(
         points = _forwarded(engine, start).draw(stop - start, dtype=torch.float64)
         return [x.contiguous().to(device) for x in points.T]
     k, (nu, nv) = torch.arange(start, stop, device=device), shape
-    if kind in ("grid", "lines"):
+    if kind in TENSOR:
         cell, turn = k % (nu * nv), k // (nu * nv)
         i, j = cell // nv, cell % nv
         du = dv = torch.tensor(0.5, dtype=torch.float64, device=device)
@@ -176,7 +178,7 @@ class Sampler:
     @property
     def tensor(self) -> bool:
         """Whether its samples are rows and columns."""
-        return self.kind in ("grid", "lines")
+        return self.kind in TENSOR
 
     def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[Sample]:
         """The rays in order, at most about `size` at a time; fluxes over all chunks sum to 1.

@@ -503,10 +503,6 @@ def _run(
             state = replace(state, start=start, unrounded=sharp, parameters={}, optimizer={})
         if asked:
             records.keep(state)
-        else:
-            keep_if_due(state)
-            state.heights = rounded(designer.within_limits(state))
-        if asked:
             if movie is not None:
                 movie.write()
             raise Interrupted(
@@ -514,6 +510,8 @@ def _run(
                 f" caustic design ⟨resume⟩ {project.path} goes on",
                 128 + asked[0],
             )
+        keep_if_due(state)
+        state.heights = rounded(designer.within_limits(state))
         found = judge(project, designer, target, state, device, hurry)
         made = wall_and_stock(designer.scene, designer.field(found.state.stage), designer.exit(found.state))
         figures = (
