@@ -20,7 +20,7 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics import curvature
-from caustic_cli.optics.bspline import over_grid
+from caustic_cli.optics.bspline import derivatives_over_grid
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 
@@ -54,27 +54,30 @@ class Penalty:
         (su, sv), (rx, ry) = field.spaces, field.half_size
         self.u = [(su.banded(su.greville, k) / (2.0 * rx) ** k).to(device) for k in range(3)]
         self.v = [(sv.banded(sv.greville, k) / (2.0 * ry) ** k).to(device) for k in range(3)]
-        x, y = (c.numpy() for c in field.control_xy())
-        offset = scene.lens.offset
-        self.base = torch.from_numpy(offset.thickness + offset.sag(x[:, None], y[None, :])).to(device)
-        self.gain = (scene.lens.effective_index - 1.0) * (scene.screen.z - offset.thickness)
+        if terms:
+            x, y = (c.numpy() for c in field.control_xy())
+            offset = scene.lens.offset
+            self.base = torch.from_numpy(offset.thickness + offset.sag(x[:, None], y[None, :])).to(device)
+            self.gain = (scene.lens.effective_index - 1.0) * (scene.screen.z - offset.thickness)
 
     def __bool__(self) -> bool:
         return bool(self.terms) or self.limit > 0 or self.radius > 0
 
     def __call__(self, heights: Tensor) -> Tensor:
         """Heights (n, m) mm -> sum of weighted squares, scalar."""
-        d, total = self.gain * (heights - self.base), heights.new_zeros(())
+        total = heights.new_zeros(())
         if self.terms:
-            xx, xy, yy = (over_grid(self.u[a], d, self.v[b]) for a, b in ((2, 0), (1, 1), (0, 2)))
+            d = self.gain * (heights - self.base)
+            xx, xy, yy = derivatives_over_grid(self.u, d, self.v, ((2, 0), (1, 1), (0, 2)))
         for weight, name in self.terms:
             square = (xx + yy) ** 2 if name == "laplacian" else xx * xx + 2.0 * xy * xy + yy * yy
             total = total + weight * square.mean()
         if self.limit > 0:
-            slope2 = over_grid(self.u[1], heights, self.v[0]) ** 2 + over_grid(self.u[0], heights, self.v[1]) ** 2
+            zx, zy = derivatives_over_grid(self.u, heights, self.v, ((1, 0), (0, 1)))
+            slope2 = zx * zx + zy * zy
             excess = (slope2.clamp_min(1e-300).sqrt() / self.limit - 1.0).clamp_min(0.0)
             total = total + (STIFFNESS * excess).square().mean()
         if self.radius > 0:
-            bent = curvature.largest(*(self.side * over_grid(self.u[a], heights, self.v[b]) for a, b in curvature.ORDERS))
+            bent = curvature.largest(*(self.side * d for d in derivatives_over_grid(self.u, heights, self.v, curvature.ORDERS)))
             total = total + (STIFFNESS * (bent * self.radius - 1.0).clamp_min(0.0)).square().mean()
         return total

@@ -15,11 +15,12 @@ in x - t_i out of single precision.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
 import torch
-from scipy.linalg import solve_banded
 from torch import Tensor
 
 from caustic_cli.errors import InputError
@@ -165,14 +166,27 @@ class SplineSpace:
         return torch.sparse_coo_tensor(at, values.reshape(-1), (len(x), self.n), check_invariants=False).coalesce()
 
     def interpolated(self, values: Tensor) -> Tensor:
-        """Control points of the spline that has the values (n, ...) at the Greville abscissae: (n, ...) float64."""
+        """Control points of the spline that has the values (n, ...) at the Greville abscissae: (n, ...) float64.
+
+        The matrix is banded and totally positive: elimination needs no pivoting (de Boor, Pinkus, SIAM J. Numer. Anal. 14, 1977).
+        It goes by whole rows of the values, which is many times as fast as LAPACK's, column by column, where there are many.
+        """
         p, n = self.degree, self.n
         first, basis = self.basis(self.greville)
-        rows = torch.arange(n)[:, None].expand_as(basis)
-        columns = first[:, None] + torch.arange(p + 1)
-        bands = torch.zeros(2 * p + 1, n, dtype=torch.float64)
-        bands[p + rows - columns, columns] = basis
-        return torch.from_numpy(solve_banded((p, p), bands.numpy(), values.double().numpy()))
+        rows, columns = torch.arange(n)[:, None].expand_as(basis), first[:, None] + torch.arange(p + 1)
+        bands = np.zeros((n, 2 * p + 1))  # row i has its columns i - p to i + p
+        bands[rows, p + columns - rows] = basis
+        out = np.array(values.double().numpy(), order="C")
+        for i in range(n):
+            for k in range(1, min(p, n - 1 - i) + 1):
+                if factor := bands[i + k, p - k] / bands[i, p]:
+                    bands[i + k, p - k + 1 : 2 * p + 1 - k] -= factor * bands[i, p + 1 :]
+                    out[i + k] -= factor * out[i]
+        for i in reversed(range(n)):
+            for k in range(1, min(p, n - 1 - i) + 1):
+                out[i] -= bands[i, p + k] * out[i + k]
+            out[i] /= bands[i, p]
+        return torch.from_numpy(out)
 
     def differences(self, points: Tensor, axis: int = 0) -> Tensor:
         """Control points of the derivative, a spline of degree p - 1, of those with `points` along an axis: n - 1 there."""
@@ -224,4 +238,11 @@ class SplineSpace:
 
 def over_grid(u: Tensor, net: Tensor, v: Tensor) -> Tensor:
     """u net v^T, (a, b), of `banded` u (a, n) and v (b, m), and a net (n, m)."""
-    return (v @ (u @ net).T.contiguous()).T
+    return derivatives_over_grid([u], net, [v], [(0, 0)])[0]
+
+
+def derivatives_over_grid(u: Sequence[Tensor], net: Tensor, v: Sequence[Tensor], orders: Iterable[tuple[int, int]]) -> list[Tensor]:
+    """`over_grid` of u[j] and v[k], derivatives by order, for every (j, k) in `orders`."""
+    orders = list(orders)
+    along = {j: (u[j] @ net).T.contiguous() for j in {j for j, _ in orders}}
+    return [(v[k] @ along[j]).T for j, k in orders]

@@ -74,10 +74,11 @@ class Offset:
                     " (a smaller ⟨mag⟩ or a longer ⟨throw⟩ gives a larger radius)"
                 )
             # rho - sign sqrt(rho^2 - s) without its cancellation
-            root = np.sqrt(rho * rho - square)
+            root = rho * rho - square
+            np.sqrt(root, out=root)
             root *= math.copysign(1.0, rho)
             root += rho
-            total += square / root
+            total += np.divide(square, root, out=root)
         return total
 
 

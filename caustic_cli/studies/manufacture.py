@@ -17,7 +17,7 @@ from torch import Tensor
 from caustic_cli.errors import InputError
 from caustic_cli.io.files import SOFTWARE, write_bytes
 from caustic_cli.optics import curvature
-from caustic_cli.optics.bspline import SplineSpace, over_grid
+from caustic_cli.optics.bspline import SplineSpace, derivatives_over_grid
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import stream
@@ -149,7 +149,7 @@ def sampled(field: HeightField, heights: Tensor, shape, orders=((0, 0), *curvatu
     (su, sv), (rx, ry), net = field.spaces, field.half_size, heights.detach().double().cpu()
     u, v = (torch.linspace(0.0, 1.0, n, dtype=torch.float64) for n in shape)
     rows, columns = ([s.banded(w, k) / (2.0 * r) ** k for k in range(3)] for s, w, r in ((su, u, rx), (sv, v, ry)))
-    return [over_grid(rows[a], net, columns[b]) for a, b in orders]
+    return derivatives_over_grid(rows, net, columns, orders)
 
 
 def _steepest_incidence(scene: Scene, field: HeightField, heights: Tensor, seed: int) -> float:
