@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import dataclasses
 import inspect
 import math
+import os
 import re
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,6 +19,8 @@ from caustic_cli.config import checks, table
 from caustic_cli.config.table import Setting
 from caustic_cli.errors import InputError, near, no_project
 
+#: Parameters of mallopt(3), from glibc's malloc.h.
+TRIM_THRESHOLD, MMAP_MAX = -1, -4
 Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", envvar="CAUSTIC_QUIET", help="Say nothing on stderr but errors.")]
 Debug = Annotated[bool, typer.Option("--debug", envvar="CAUSTIC_DEBUG", help="Show the traceback of an error.")]
@@ -408,6 +412,7 @@ def start_torch(device: str, threads: int | None, say: Reporter):
         raise InputError(f"--device must be auto, cpu or cuda, got {device!r}")
     if threads is not None and not 1 <= threads <= 1024:
         raise InputError(f"--threads must be a whole number 1 to 1024, got {threads}")
+    _keep_freed_memory()
     import torch  # noqa: PLC0415
 
     if threads:
@@ -417,6 +422,21 @@ def start_torch(device: str, threads: int | None, say: Reporter):
     from caustic_cli.workflow.compilation import choose_device  # noqa: PLC0415
 
     return choose_device(device, say)
+
+
+def _keep_freed_memory() -> None:
+    """Large arrays come from what this process has freed before, and in large pages: a third of the time of a design on a net of
+    3003 x 3003 points went into pages that the system cleared (tests/benchmarks/README.md).
+
+    For glibc, whose malloc otherwise maps every large array anew (mallopt(3)); others do as they do.  Before torch is loaded.
+    """
+    os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")  # torch's own
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (AttributeError, OSError, TypeError):  # no glibc; no C library by that name
+        return
+    mallopt(TRIM_THRESHOLD, -1)
+    mallopt(MMAP_MAX, 0)
 
 
 def dtype_of(name: str):

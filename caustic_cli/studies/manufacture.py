@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,6 +30,8 @@ from caustic_cli.scene.materials import material
 
 #: Points looked at along each axis and a knot span, at most.
 MOST, A_SPAN = 2001, 4
+#: Rows of them that are looked at together.
+ROWS = 64
 #: Rays of the sensitivities and of the angles inside the lens.
 RAYS = 100_000
 #: Thickness of a plate that is cut from a common sheet, in parts of its width.
@@ -110,17 +113,19 @@ def preview(scene: Scene, field: HeightField, heights: Tensor, project: float) -
     """What a design's first surface asks for, in one line; the finished one will be much like it.
 
     project: bytes that the finished project takes."""
-    lens, (z, *derivatives) = scene.lens, sampled(field, heights, [_points(s) for s in field.spaces])
-    slope = float(torch.hypot(*derivatives[:2]).max())
-    bent = float(curvature.largest(*(lens.cut_from * d for d in derivatives)).max())
+    lens, found = scene.lens, []
+    for z, *derivatives in _strips(field, heights, [_points(s) for s in field.spaces]):
+        bends = curvature.largest(*(lens.cut_from * d for d in derivatives))
+        found.append(torch.stack([-z.min(), z.max(), torch.hypot(*derivatives[:2]).max(), bends.max()]))
+    low, high, slope, bent = (float(m) for m in torch.stack(found).amax(0) * torch.tensor([-1.0, 1.0, 1.0, 1.0]))
     reflected = (
         "" if lens.mirror else f" (light along the axis is totally reflected from {1.0 / math.sqrt(lens.index**2 - 1.0):.2f})"
     )
     return (
-        f"first surface: wall {float(z.min()) - lens.z_in:.2f} mm, stock {float(z.max()) - lens.z_in:.2f} mm, slopes up to"
+        f"first surface: wall {low - lens.z_in:.2f} mm, stock {high - lens.z_in:.2f} mm, slopes up to"
         f" {slope:.2g}{reflected}, {f'concave radius down to {1.0 / bent:.2g} mm' if bent > 0 else 'nowhere concave'};"
         f" project about {_megabytes(project)}"
-        f"{_thinner(scene, float(z.min()), float(z.max()))}"
+        f"{_thinner(scene, low, high)}"
     )
 
 
@@ -146,10 +151,17 @@ def _points(space: SplineSpace) -> int:
 
 def sampled(field: HeightField, heights: Tensor, shape, orders=((0, 0), *curvature.ORDERS)) -> list[Tensor]:
     """Derivatives of these orders by x and y on an even grid over the aperture, borders included: (n_x, n_y) each."""
+    return [torch.cat(parts) for parts in zip(*_strips(field, heights, shape, orders), strict=True)]
+
+
+def _strips(field: HeightField, heights: Tensor, shape, orders=((0, 0), *curvature.ORDERS)) -> Iterator[list[Tensor]]:
+    """`sampled`, some rows at a time: what is made of them stays in the processor's cache."""
     (su, sv), (rx, ry), net = field.spaces, field.half_size, heights.detach().double().cpu()
     u, v = (torch.linspace(0.0, 1.0, n, dtype=torch.float64) for n in shape)
-    rows, columns = ([s.banded(w, k) / (2.0 * r) ** k for k in range(3)] for s, w, r in ((su, u, rx), (sv, v, ry)))
-    return derivatives_over_grid(rows, net, columns, orders)
+    columns = [sv.banded(v, k) / (2.0 * ry) ** k for k in range(3)]
+    for w in u.split(ROWS):
+        rows = [su.banded(w, k) / (2.0 * rx) ** k for k in range(3)]
+        yield derivatives_over_grid(rows, net, columns, orders)
 
 
 def _steepest_incidence(scene: Scene, field: HeightField, heights: Tensor, seed: int) -> float:
