@@ -267,6 +267,27 @@ def test_a_start_that_a_fixed_thickness_would_cut_is_lifted(capfd):
     assert 0 < float(load("thin").state.heights.min()) < 0.1
 
 
+@pytest.mark.parametrize(("said", "wall"), [((), 3.0), (("--min-thickness", 2), 2.0), (("--min-thickness", 4), 4.0)])
+def test_the_wall_of_a_plate_is_what_was_said(capfd, said, wall):
+    options = (
+        "--lens-size",
+        60,
+        "--throw",
+        600,
+        "--resolution",
+        24,
+        "--rays",
+        40_000,
+        "--quiet",
+        "--threads",
+        1,
+        "--iterations",
+        1,
+    )
+    found = design(capfd, "blob.png", *options, *said, "--waves", "off")
+    assert wall <= found["minimum_wall_mm"] < wall + 0.1
+
+
 @pytest.mark.parametrize("limit, control, rays", [(5, 32, 40_000), (20, 48, 40_000), (90, 48, 256 * 24 * 24)])
 def test_the_time_limit_chooses_the_quality(capfd, limit, control, rays, monkeypatch):
     monkeypatch.setattr(workflow, "_run", begun)

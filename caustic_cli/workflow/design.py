@@ -197,7 +197,7 @@ def first_heights(project: Project, said: Settings) -> tuple[Project, First | No
         return project, _designer(project, "cpu")[0].first(first)
     if middle is not None:
         lens["thickness"] = middle
-    if first is not None and not fixed and (spare := _spare(lens, first)) > 0:
+    if first is not None and not fixed and (spare := _spare(lens, said, first)) > 0:
         lens["thickness"] -= spare
         first, middle = _solved(project, fixed=True)[0], lens["thickness"]
     if first is not None and _make_room(project.settings, said, first) and middle is None:
@@ -416,11 +416,12 @@ def _solved(project: Project, fixed: bool) -> tuple[torch.Tensor | None, float |
     return onto(field, heights, net), None
 
 
-def _spare(lens: dict[str, Any], first: torch.Tensor) -> float:
-    """Glass that a plate has below its first surface beyond its wall, mm; 0 of a lens that is none."""
+def _spare(lens: dict[str, Any], said: Settings, first: torch.Tensor) -> float:
+    """Glass that a plate has below its first surface beyond its wall, which may have been said, mm; 0 of another lens."""
     if max(lens["size"]) <= PLATE:
         return 0.0
-    return max(0.0, float(first.min()) - lens["z_in"] - max(WALL, lens["min_thickness"]))
+    wall = lens["min_thickness"] if "min_thickness" in said.get("lens", {}) else WALL
+    return max(0.0, float(first.min()) - lens["z_in"] - wall)
 
 
 def _make_room(full: Settings, said: Settings, first: torch.Tensor) -> bool:
