@@ -54,7 +54,7 @@ class Penalty:
         (su, sv), (rx, ry) = field.spaces, field.half_size
         self.u = [(su.banded(su.greville, k) / (2.0 * rx) ** k).to(device) for k in range(3)]
         self.v = [(sv.banded(sv.greville, k) / (2.0 * ry) ** k).to(device) for k in range(3)]
-        if terms:
+        if self:  # two sides take the base for their radius, too
             x, y = (c.numpy() for c in field.control_xy())
             offset = scene.lens.offset
             self.base = torch.from_numpy(offset.thickness + offset.sag(x[:, None], y[None, :])).to(device)
