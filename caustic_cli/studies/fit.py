@@ -44,16 +44,18 @@ def order(n: Sequence[float], error: Sequence[float], least: float = 0.0) -> Ord
     return Order(-slope, deviation, len(x), float(n[use].min()), float(n[use].max()))
 
 
-def pareto(cost: Sequence[float], error: Sequence[float], gain: float = 0.0) -> list[bool]:
+def pareto(cost: Sequence[float], error: Sequence[float], gain: float = 0.0, alike: float = 0.0) -> list[bool]:
     """For every setting, whether no other one is at least as good in both and better in one; of two that are the same, the first.
 
     gain: part by which an error has to be less than that of every cheaper setting on the front, such as the errors' own noise.
+    alike: part by which costs differ that are as good as the same; of such settings the one with the least error is on the front.
     """
-    front, least = set(), float("inf")
+    front: list[int] = []
     for k in sorted(range(len(cost)), key=lambda k: (cost[k], error[k])):
-        if error[k] < (1.0 - gain) * least:
-            front.add(k)
-            least = error[k]
+        if not front or error[k] < (1.0 - gain) * error[front[-1]]:
+            while front and cost[k] < (1.0 + alike) * cost[front[-1]]:
+                front.pop()
+            front.append(k)
     return [k in front for k in range(len(cost))]
 
 

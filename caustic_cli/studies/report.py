@@ -41,8 +41,8 @@ MARKERS = "osD^vP<>Xph*"
 #: How much wider a picture is that has its legend beside it.
 BESIDE = 1.3
 
-#: Part by which a slower setting has to lower the error to be on the front.
-GAIN = 0.02
+#: Part by which a slower setting has to lower the error to be on the front, and by which it has to be slower to count as such.
+GAIN, ALIKE = 0.02, 0.1
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ def draw_front(axes: Axes, study: Study) -> None:
         if order is not None:
             label += f", {study.about['orders_of']} of order {order.exponent:.2f}"
         axes.errorbar([row["seconds"] for row in mine], [row["error"] for row in mine], xerr=spread(mine), label=label, **style)
-    best = pareto([row["seconds"] for row in rows], [row["error"] for row in rows], GAIN)
+    best = pareto([row["seconds"] for row in rows], [row["error"] for row in rows], GAIN, ALIKE)
     front = sorted((row["seconds"], row["error"]) for row, on in zip(rows, best, strict=True) if on)
     axes.plot(
         [seconds for seconds, _ in front],
