@@ -24,6 +24,10 @@ SIGNALS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 _sent: list[int] = []
 #: Seconds after which an interruption that was lost is tried again.
 AGAIN = 0.05
+#: For the libraries' threads, where the environment does not say otherwise.  Threads that wait for one another sleep: beside other
+#: programs on the same cores they would otherwise keep these from working.  And OpenBLAS, which only solves small systems here, has
+#: one: it hands systems of two equations to a second.
+THREADS = {"OMP_WAIT_POLICY": "passive", "OPENBLAS_NUM_THREADS": "1"}
 
 
 def run(arguments: list[str]) -> int:
@@ -115,6 +119,7 @@ def main() -> None:
     try:
         _answer_signals()
         _open_streams()
+        os.environ |= THREADS | os.environ  # before a library reads them
         if not sys.warnoptions:
             warnings.simplefilter("ignore")  # libraries' own, which are for developers
         status = run(sys.argv[1:])

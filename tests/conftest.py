@@ -4,7 +4,9 @@ import os
 import warnings
 from pathlib import Path
 
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # threads of tests side by side must not wait for each other at full speed
+from caustic_cli.cli import THREADS
+
+os.environ |= THREADS | os.environ  # as the command does, before a library reads them
 
 import pytest
 import torch

@@ -34,6 +34,7 @@ def small_designs(patch, rays: int, report: bool = False) -> None:
 
     patch: pytest's monkeypatch."""
     patch.setattr(plans, "LEAST_CELLS", 64)
+    patch.setattr(plans, "LEAST_CREASED", 64)
     patch.setattr(workflow, "LEAST_CELLS", 32)
     patch.setattr(initial_surface, "FEW_CELLS", 32)
     patch.setattr(evaluation, "FINAL_RAYS", rays)

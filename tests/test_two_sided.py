@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers import small_designs
 from PIL import Image
 
 from caustic_cli import cli, load
@@ -109,6 +110,7 @@ def test_a_designed_entrance_traces_as_the_free_one():
 @pytest.fixture
 def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    small_designs(monkeypatch, 100_000, report=True)
     for name, light in (("one", ONE), ("two", TWO)):
         Image.fromarray((255 * light / light.max()).astype(np.uint8).T[::-1]).save(f"{name}.png")
 
