@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers import small_designs
 from PIL import Image
 
 from caustic_cli import cli, load
@@ -308,6 +309,7 @@ def test_solids_are_closed_and_their_spheres_are_spheres(aperture):
 @pytest.fixture
 def _here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    small_designs(monkeypatch, 200_000, report=True)
     light = picture()
     Image.fromarray((255 * light / light.max()).astype(np.uint8).T[::-1]).save("one.png")
 

@@ -65,6 +65,15 @@ def test_an_edit_of_another_file_is_noticed(package, tmp_path):
     assert len(list(Path(kept).glob(f"{cache.PREFIX}*"))) == 2
 
 
+def test_installations_of_the_same_sources_share_what_is_kept(package, tmp_path):
+    """Wherever and whenever they were installed."""
+    kept, other = str(tmp_path / "kept"), tmp_path / "other" / "caustic_cli"
+    assert run(RUN, package, NUMBA_CACHE_DIR=kept) == ["1.0", "0", "1"]
+    shutil.copytree(package, other)
+    os.utime(other / "optics" / "kernels" / "probe.py", (1e9, 1e9))
+    assert run(RUN, other, NUMBA_CACHE_DIR=kept) == ["1.0", "1", "0"]
+
+
 @pytest.mark.parametrize("temporary", [True, False], ids=["temporary files only", "nowhere"])
 def test_kernels_run_where_nothing_can_be_written(package, tmp_path, temporary):
     """No home and no cache: below the directory of temporary files; and if not there either, without keeping anything."""

@@ -1,8 +1,8 @@
 """Where the compiled kernels are kept: a directory of their own for each state of their sources.
 
-Numba keys what it keeps by the time stamp of the one file that a function stands in, so that an edit of a function or a constant
-of another file, which is compiled into it, would go unnoticed.  Here every state of all the kernels' files, together with the
-versions of numba and Python, has its own directory `caustic-<hash>` below the first of
+Numba keys what it keeps by the path and time stamp of the one file that a function stands in, so that an edit of a function or a
+constant of another file, which is compiled into it, would go unnoticed, and every installation compiles anew.  Here every state
+of all the kernels' files, together with the versions of numba and Python, has its own directory `caustic-<hash>` below the first of
 
     NUMBA_CACHE_DIR, where the user wants numba's files;
     XDG_CACHE_HOME/caustic, by default ~/.cache/caustic: one for each user, which leaves an installation as it was packed and

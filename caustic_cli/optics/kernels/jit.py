@@ -13,7 +13,7 @@ from typing import Any
 
 import numba
 from numba import prange
-from numba.core.caching import FunctionCache
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, UserProvidedCacheLocator
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.kernels import cache
@@ -41,8 +41,35 @@ if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]  # kernels call one a
 numba.config.SLP_VECTORIZE = 1  # type: ignore[attr-defined]  # numba makes its settings as it is loaded
 
 
+class _Place(UserProvidedCacheLocator):
+    """Below `cache.DIRECTORY`, which is of one state of the sources, wherever these are installed and whenever they were."""
+
+    def __init__(self, function, file: str):
+        assert cache.DIRECTORY is not None
+        self._lineno = function.__code__.co_firstlineno
+        self._cache_path = str(cache.DIRECTORY / Path(file).resolve().relative_to(cache.PACKAGE).parent)
+
+    @classmethod
+    def from_function(cls, function, file: str):
+        """The place of a function of a file; None if it cannot be written to, or is no file of this package's."""
+        with contextlib.suppress(OSError, ValueError):
+            place = cls(function, file)
+            place.ensure_cache_path()
+            return place
+
+    def get_source_stamp(self) -> str:
+        """Nothing: the directory is the stamp."""
+        return ""
+
+
+class _Placed(CompileResultCacheImpl):
+    _locator_classes = [_Place]  # noqa: RUF012  # as numba has it
+
+
 class _Kept(FunctionCache):
     """What numba keeps of a function; a file that cannot be read or written, on a full disk for instance, is as none."""
+
+    _impl_class = _Placed
 
     def load_overload(self, sig, target_context):
         """The compiled code of a signature, None if none is kept."""
@@ -72,16 +99,10 @@ def njit(*, entry: bool = False, parallel: bool = False, **options):
     }
 
     def decorate(function):
-        compiled, before = numba.njit(**options)(function), numba.config.CACHE_DIR
+        compiled = numba.njit(**options)(function)
         if cache.DIRECTORY is not None:
-            try:  # numba looks at it here and now: what others compile in this process is kept where they want it
-                numba.config.CACHE_DIR = str(cache.DIRECTORY)
-                with contextlib.suppress(RuntimeError):  # it cannot be written to after all: compiled anew in every process
-                    kept = _Kept(function)
-                    if cache.DIRECTORY in Path(kept.cache_path).parents:  # nor kept where numba would otherwise
-                        compiled._cache = kept  # as its option `cache` does
-            finally:
-                numba.config.CACHE_DIR = before
+            with contextlib.suppress(RuntimeError):  # it cannot be written to after all: compiled anew in every process
+                compiled._cache = _Kept(function)  # as its option `cache` does
         return compiled
 
     return decorate
