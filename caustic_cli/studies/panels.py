@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
@@ -25,6 +24,8 @@ NEARLY = 0.995
 RELIEF, LITTLE = 130, 5e-5
 #: Where a bar of colours stands beside its picture, in parts of that: left, bottom, width, height.
 BAR = (1.03, 0.0, 0.046, 1.0)
+#: Of the panels.  Finding places that just fit took as long as drawing.
+PLACES = {"left": 0.035, "right": 0.95, "bottom": 0.065, "top": 0.925, "wspace": 0.57, "hspace": 0.3}
 #: What is seen through a blur in a panel of its own, in parts of that of the error.
 BLURRED = 0.6
 
@@ -59,8 +60,8 @@ def write_report(
     from matplotlib import pyplot as plt  # noqa: PLC0415
     from matplotlib.colors import FuncNorm, Normalize  # noqa: PLC0415
 
-    figure = plt.figure(figsize=(20.0, 9.2), layout="constrained")
-    axes = figure.subplots(2, 4)
+    figure = plt.figure(figsize=(21.0, 9.2))
+    axes = figure.subplots(2, 4, gridspec_kw=PLACES)
     extent = [-screen.half_size[0], screen.half_size[0], -screen.half_size[1], screen.half_size[1]]
     scale = target.sum() / target.max()
 
@@ -118,18 +119,10 @@ def write_report(
     solid = figure.add_subplot(place, projection="3d")
     _draw_losses(axes[1, 2], history, target.size, figures, stages)
     _draw_account(axes[1, 3], figures)
-    _lay_out(figure)
     _draw_relief(solid, relief, (rx, ry), unit)
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", dpi=100, metadata={"Software": SOFTWARE})
     plt.close(figure)
-
-
-def _lay_out(figure: Figure) -> None:
-    """Places for all that is drawn so far, which then stay: saving would draw everything twice to find them."""
-    if (engine := figure.get_layout_engine()) is not None:
-        engine.execute(figure)
-        figure.set_layout_engine(None)
 
 
 def _bar(drawn: AxesImage, axis: Axes, label: str, extend: str = "neither") -> None:
@@ -189,11 +182,12 @@ def _draw_losses(axis: Axes, history: np.ndarray, pixels: int, figures: dict, st
         own = axis if blur == 0 or below is None else below
         own.semilogy(rows[:, 4], rows[:, 2] * pixels, color=colour, marker="." if len(rows) == 1 else None, lw=1.6)
         kind = ", waves" if waves else ", rays" if mixed else ""
-        late = rows[0, 4] > 0.6 * last
+        at, up = (rows[0], 4) if own is axis or k % 2 == 0 else (rows[-1], -11)  # above one line and below the next: many are short
+        late = at[4] > 0.6 * last
         own.annotate(
             f"{blur:.2g} px" if blur > 0 else f"stage {k + 1}{kind}",
-            (rows[0, 4], rows[0, 2] * pixels),
-            xytext=(-3 if late else 3, 4),
+            (at[4], at[2] * pixels),
+            xytext=(-3 if late else 3, up),
             textcoords="offset points",
             ha="right" if late else "left",
             color=colour,
