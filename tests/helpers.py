@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image
 
 from caustic_cli.config import plans
-from caustic_cli.inverse import initial_surface
+from caustic_cli.inverse import deconvolution, initial_surface
 from caustic_cli.workflow import design as workflow
 from caustic_cli.workflow import evaluation
 
@@ -30,13 +30,15 @@ def begun(project, *_) -> SimpleNamespace:
 
 def small_designs(patch, rays: int, report: bool = False) -> None:
     """For tests of what is done with a design: a first surface from 64 source cells across the lens in place of 256, and from 32
-    across a lenslet, `rays` for the decision, and no report, whose drawing takes longer than all the rest, unless asked for.
+    across a lenslet, fewer iterations for the least error, `rays` for the decision, and no report, whose drawing takes longer than
+    all the rest, unless asked for.
 
     patch: pytest's monkeypatch."""
     patch.setattr(plans, "LEAST_CELLS", 64)
     patch.setattr(plans, "LEAST_CREASED", 64)
     patch.setattr(workflow, "LEAST_CELLS", 32)
     patch.setattr(initial_surface, "FEW_CELLS", 32)
+    patch.setattr(deconvolution, "MOST_STEPS", 400)
     patch.setattr(evaluation, "FINAL_RAYS", rays)
     if not report:
         patch.setattr(evaluation, "write_report", lambda *args: None)

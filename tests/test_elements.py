@@ -13,6 +13,7 @@ from helpers import small_designs
 from PIL import Image
 
 from caustic_cli import cli, load
+from caustic_cli.config import plans
 from caustic_cli.errors import InputError
 from caustic_cli.export.bodies import CLOSE, bodies
 from caustic_cli.export.mesh import closed_mesh
@@ -354,7 +355,8 @@ def test_design_render_resume_and_files(_here, capfd):
     assert "lens by itself" in run(capfd, "export", "p", "--format", "zemax", code=2)
 
 
-def test_surfaces_of_two_lenses_are_shaped_together(_here, capfd):
+def test_surfaces_of_two_lenses_are_shaped_together(_here, capfd, monkeypatch):
+    monkeypatch.setattr(plans, "LEAST_CELLS", 256)
     beside = ("--element", "lens z=60 thickness=6 radius=150,-150 index=1.5 size=26 free=both")
     fixed = ("--element", beside[1].removesuffix(" free=both"))
     one = run(capfd, "design", "one.png", *SMALL, *fixed, "--iterations", "8", "-o", "one")

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 import torch
@@ -91,6 +91,7 @@ class SplineSpace:
                 raise InputError(f"distinct knots must be at least {KNOT_RESOLUTION:g} apart")
 
     @classmethod
+    @lru_cache(maxsize=16)  # so that what follows from a space is found once for all surfaces of it
     def uniform(cls, n: int, degree: int, parts: int = 1) -> SplineSpace:
         """Open and equispaced knots for `n` control points (the thesis' lenses); parts: as of `open_knots`."""
         if not 1 <= degree <= MAX_DEGREE:

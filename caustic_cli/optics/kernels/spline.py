@@ -13,6 +13,7 @@ in a global one it is not (degree 7 loses everything in single precision).
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -36,6 +37,12 @@ class Axis:
         rows = [space.basis(middle, a)[1] * (width**a / math.factorial(a))[:, None] for a in range(space.degree + 1)]
         self.matrices = torch.stack(rows, 1).contiguous().numpy()
         self.geometry = (breaks.numpy(), middle.numpy(), (1.0 / width).numpy())
+
+
+@lru_cache(maxsize=16)
+def axis(space: SplineSpace) -> Axis:
+    """The pieces of a space, which many surfaces in turn are of."""
+    return Axis(space)
 
 
 @njit(entry=True, **FAST)

@@ -20,7 +20,7 @@ class FusedSurface:
     """What the kernels know of a height field of half widths (r_x, r_y) mm, made once for all heights."""
 
     def __init__(self, spaces: tuple[SplineSpace, SplineSpace], half_size: tuple[float, float]):
-        self.axes = tuple(spline.Axis(s) for s in spaces)
+        self.axes = tuple(spline.axis(s) for s in spaces)
         self.shape = tuple(s.n for s in spaces)
         self.scale = (0.5 / half_size[0], 0.5 / half_size[1])
         self.linear = tuple(x for a in self.axes for x in (a.first, a.matrices))

@@ -20,7 +20,7 @@ from torch.autograd.function import once_differentiable
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels import blocks
 from caustic_cli.optics.kernels.jit import FAST, njit
-from caustic_cli.optics.kernels.spline import Axis, piece
+from caustic_cli.optics.kernels.spline import axis, piece
 from caustic_cli.optics.kernels.stage import component
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 
@@ -36,8 +36,8 @@ class VolumeAxis:
             self.breaks, self.middles, self.over = np.array([0.0, 1.0]), np.array([0.5]), np.array([1.0])
             self.first, self.matrices = np.zeros(1, np.int64), np.ones((1, 1, 1))
         else:
-            axis = Axis(space)
-            (self.breaks, self.middles, self.over), self.first, self.matrices = axis.geometry, axis.first, axis.matrices
+            own = axis(space)
+            (self.breaks, self.middles, self.over), self.first, self.matrices = own.geometry, own.first, own.matrices
         self.place = np.array([middle - half, 1.0 / (2.0 * half)])
 
     @property

@@ -90,16 +90,17 @@ class HeightField(Surface[Tensor]):
     def at(self, heights: Tensor, x: Tensor, y: Tensor, orders: Sequence[tuple[int, int]] = FIRST) -> list[Tensor]:
         """Derivatives of these orders by x and y at points (N,) mm, each (N,) float64, mm^(1 - a - b); linear in the heights."""
         (su, sv), (rx, ry), flat = self.spaces, self.half_size, heights.double().reshape(-1)
-        u, v, out = 0.5 * (x / rx + 1.0), 0.5 * (y / ry + 1.0), []
-        for a, b in orders:
-            (i, bu), (j, bv) = su.basis(u, a), sv.basis(v, b)
-            corner, columns = i * sv.n + j, torch.arange(sv.degree + 1, device=flat.device)
-            total: Tensor | float = 0.0
-            for k in range(su.degree + 1):  # one row of the local net at a time bounds the memory
-                at = (corner + k * sv.n)[:, None] + columns
-                total = total + bu[:, k] * (flat.index_select(0, at.reshape(-1)).view(at.shape) * bv).sum(1)
-            out.append(cast(Tensor, total) / ((2.0 * rx) ** a * (2.0 * ry) ** b))
-        return out
+        u, v = 0.5 * (x / rx + 1.0), 0.5 * (y / ry + 1.0)
+        bu, bv = ({k: s.basis(c, k) for k in {order[d] for order in orders}} for d, s, c in ((0, su, u), (1, sv, v)))
+        corner = bu[orders[0][0]][0] * sv.n + bv[orders[0][1]][0]
+        columns = torch.arange(sv.degree + 1, device=flat.device)
+        totals: list[Tensor | float] = [0.0] * len(orders)
+        for k in range(su.degree + 1):  # one row of the local net at a time bounds the memory
+            at = (corner + k * sv.n)[:, None] + columns
+            row = flat.index_select(0, at.reshape(-1)).view(at.shape)
+            along = {b: (row * basis).sum(1) for b, (_, basis) in bv.items()}
+            totals = [total + bu[a][1][:, k] * along[b] for total, (a, b) in zip(totals, orders, strict=True)]
+        return [cast(Tensor, t) / ((2.0 * rx) ** a * (2.0 * ry) ** b) for t, (a, b) in zip(totals, orders, strict=True)]
 
     def slope_bounds(self, heights: Tensor) -> tuple[float, float]:
         """Upper bounds of |dz/dx| and |dz/dy|: the derivative's control net holds the derivative in its convex hull."""

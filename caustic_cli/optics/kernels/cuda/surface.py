@@ -48,7 +48,7 @@ class Axis(NamedTuple):
     @classmethod
     def of(cls, space: SplineSpace, place: torch.device) -> Axis:
         """On a device."""
-        axis = spline.Axis(space)
+        axis = spline.axis(space)
         control = torch.from_numpy(axis.first)[:, None] + torch.arange(space.degree + 1)
         return cls(*(t.to(place) for t in (control, *(torch.from_numpy(a) for a in (axis.matrices, *axis.geometry)))))
 
