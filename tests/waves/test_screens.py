@@ -261,6 +261,14 @@ def test_partly_total_reflection():
     assert found.leaving == pytest.approx(rays.leaving, abs=0.01)
 
 
+def test_a_surface_without_order_has_no_wave_image():
+    """Of what is thrown wherever it likes no light comes from where a wavefront would have it: refused, and not NaN."""
+    scene = scene_of(10.0, Screen((30.0, 30.0), 300.0, (20, 20)), control=(25, 25))
+    heights = 6.0 * torch.rand(25, 25, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    with pytest.raises(CausticError, match="crosses itself"):
+        wave_image(scene, HeightField.of(scene.lens), heights)
+
+
 def test_focus_before_the_screen():
     """Light that has crossed on its way lands where rays land."""
     screen = Screen((3.0, 3.0), 82.0, (12, 12))

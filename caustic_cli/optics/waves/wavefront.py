@@ -41,6 +41,10 @@ SURVEY, FEW = 65, 0.01
 LEFT = 1e-3
 #: The same where it has to be exact: derivatives see the misses of feet to first order.
 LEFT_EXACT = 1e-9
+CROSSES = (
+    "light crosses itself within the lens' own depth, so that no wavefront behind it stands for it; a flatter surface or a screen"
+    " farther away has one"
+)
 #: At the edges of what is dark rays may miss the grid by this part of a cell.
 AT_EDGE = 0.05
 #: Rays traced at a time.
@@ -288,6 +292,8 @@ def wavefront(
     ex, ey = x - f.x, y - f.y
     path = f.path + optics.index * (f.qx * ex + f.qy * ey)
     dark = (f.power <= 0) | (behind & ((ex.abs() > AT_EDGE * step[0]) | (ey.abs() > AT_EDGE * step[1]))).detach()
+    if bool(dark.all()):
+        raise NoWaveImage(CROSSES)
     known = ~dark | (behind & (f.power > 0))  # beside the dark, rays from the edge of the light stand for its path
     path = torch.where(known, path - path[~dark].detach().mean(), torch.zeros_like(path))
     dark = dark.view(shape)
@@ -304,10 +310,7 @@ def wavefront(
     power = f.power.view(shape)
     crossed = torch.where((squeeze.detach() <= 0) & ~dark, power.detach(), torch.zeros_like(power))
     if float(crossed.sum()) > CROSSED * float(power.detach().sum()):
-        raise NoWaveImage(
-            "light crosses itself within the lens' own depth, so that no wavefront behind it stands for it;"
-            " a flatter surface or a screen farther away has one"
-        )
+        raise NoWaveImage(CROSSES)
     if bool((~dark).any()):
         power = torch.where(dark, filled(power.detach(), dark), power)
     by_x, by_y = torch.gradient(power.detach(), spacing=step, dim=(0, 1), edge_order=2)
