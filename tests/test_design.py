@@ -297,6 +297,14 @@ def test_the_time_limit_chooses_the_quality(capfd, limit, control, rays, monkeyp
     assert stages[-1]["rays"] == rays and len(stages) == {5: 1, 20: 2, 90: 3}[limit]
 
 
+@pytest.mark.parametrize("limit, stages", [(20, 1), (90, 2)])
+def test_a_source_with_an_extent_takes_longer(capfd, limit, stages, monkeypatch):
+    monkeypatch.setattr(workflow, "_run", begun)
+    sun = ("--source-angle", "0.533", "--resolution", "24", "--waves", "off", "--quiet", "--threads", "1")
+    design(capfd, "blob.png", *sun, "--time-limit", limit, "-o", "p")
+    assert len(workflow.Project.open("p").settings["design"]["stages"]) == stages
+
+
 def test_lbfgs_never_goes_uphill_within_a_stage(capfd):
     design(capfd, "blob.png", "--config", staged(), "--iterations", 30, "--quiet", "-o", "p")
     rows, checked = load("p").state.history, 0

@@ -76,6 +76,7 @@ DEFAULT_SPANS = 128  # knot spans of the finished net; 128 halve evenly through 
 NETWORK_CONTROL = 50  # table D.2
 OVER_ITERATIONS = 200  # of a network over a range: caustic convergence, study design, networks
 DRAFT_SECONDS, FINE_SECONDS = 8.0, 60.0  # time limits below and from which another quality is the better use of the time
+EXTENDED = 5.0  # so many times these of a source with an extent, whose start is solved for behind its blur
 STEEPEST = 1.25  # least radius of a derived sphere, in half diagonals of the lens: slopes up to 1.3
 PLATE, WALL = 20.0, 3.0  # width beyond which a lens is a plate, as thin as its relief and this wall allow, mm
 THICK, SAG = 2.0, 0.45  # thickness over width of a lens with two free-form sides, and what of it each of them may take
@@ -267,7 +268,7 @@ def _complete_design(
             " of its own: change them there"
         )
     if lens.get("gradient") == "free":
-        complete_index_design(s, source, quality or _quality(design["time_limit"]), rays)
+        complete_index_design(s, source, quality or _quality(design["time_limit"], source), rays)
         return
     plain = design["network"] == "none" and design["optimizer"] == "lbfgs"
     asked = check("design.waves", design["waves"])
@@ -289,7 +290,7 @@ def _complete_design(
         )
     if max(array) > 1 and design["start"] == "transport" and not source.distant:
         raise InputError(FROM_AFAR)
-    quality = quality or _quality(design["time_limit"])
+    quality = quality or _quality(design["time_limit"], source)
     if "second" in s:
         complete_two_sided(s, source, quality, rays)
         return
@@ -444,9 +445,10 @@ def _wave_samples(s: Settings, seen: Resolution, lit: tuple[float, float]) -> fl
     )
 
 
-def _quality(time_limit: float) -> str:
+def _quality(time_limit: float, source: Source) -> str:
     """What a time limit leaves room for at 250 x 250 pixels on two cores."""
-    return "draft" if time_limit < DRAFT_SECONDS else "fine" if FINE_SECONDS <= time_limit < math.inf else "standard"
+    seconds = time_limit / (EXTENDED if source.extended else 1.0)
+    return "draft" if seconds < DRAFT_SECONDS else "fine" if FINE_SECONDS <= seconds < math.inf else "standard"
 
 
 def _shifts(s: Settings, source: Source) -> bool:

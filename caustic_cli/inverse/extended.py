@@ -55,13 +55,22 @@ class Limits:
         return "; ".join(found)
 
 
-def limits(scene: Scene, target: np.ndarray, field: HeightField | None = None, heights: torch.Tensor | None = None) -> Limits:
-    """What the source of a scene lets any lens do, by the spread of this lens, or of the offset surface; target: (n, m)."""
+def limits(
+    scene: Scene,
+    target: np.ndarray,
+    field: HeightField | None = None,
+    heights: torch.Tensor | None = None,
+    steps: int | None = None,
+) -> Limits:
+    """What the source of a scene lets any lens do, by the spread of this lens, or of the offset surface.
+
+    target: (n, m); steps: as of `best_light`.
+    """
     if not scene.source.extended or scene.source.apart or scene.elements:
         return Limits(None, None)
     spread = shift_of(scene, field, heights)
     seen = spread is not None and max(spread.reach()) > LEAST_REACH * max(scene.screen.pixel)
-    light = best_light(scene, target, spread) if seen else None
+    light = best_light(scene, target, spread, steps) if seen else None
     return Limits(light, etendue_limit(scene))
 
 

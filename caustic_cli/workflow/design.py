@@ -267,7 +267,8 @@ def _say_limits(project: Project, designer: Designer, target: np.ndarray, first:
     seen = Resolution.before(designer.scene, tuple(project.settings["target"]["size"]))
     if not designer.scene.elements:
         say.say(seen.sentence())
-    words = limits(designer.scene, grey(target)).sentence()
+    hurry = math.isfinite(project.settings["design"]["time_limit"])
+    words = limits(designer.scene, grey(target), steps=SMOOTH_STEPS if hurry else None).sentence()
     if words:
         say.say(words)
     if designer.scene.jointly:

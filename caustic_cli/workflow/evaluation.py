@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.extended import limits
 from caustic_cli.inverse.losses import parse
@@ -128,7 +129,8 @@ def evaluate(
     image where that was refined, whose figures are then there too.
 
     Args:
-        seed: of the rays; size: width and height of the picture, mm; hurry: leave the noise at what FINAL_RAYS make of it.
+        seed: of the rays; size: width and height of the picture, mm; hurry: leave the noise at what FINAL_RAYS make of it, and the
+            least error at what a few iterations find.
     """
     scene, field = designer.scene, designer.field(state.stage)
     if scene.second is not None:
@@ -184,7 +186,7 @@ def evaluate(
         rounded = began or trace(designer.within_limits(replace(state, heights=designer.begun(state))))[1]
         unrounded = trace(designer.begun(state, rounded=False))[1]
         figures |= {"min_radius": radius_figures(designer.options.min_radius, rounded, unrounded)}
-    bounds = limits(scene, grey(target), field, state.heights)
+    bounds = limits(scene, grey(target), field, state.heights, SMOOTH_STEPS if hurry else None)
     if bounds.light is not None:
         figures |= {"least_relative_rms": bounds.light.error}
     if bounds.etendue is not None:
