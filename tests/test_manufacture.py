@@ -253,12 +253,12 @@ def test_the_command_writes_what_it_prints(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     write_lighttools("lens.npz", *surface(bowl(20.0)))
     for _ in range(2):  # and replaces its own
-        assert cli.run(shlex.split("render lens.npz --rays 1000 --report --tool-radius 3 --json --quiet")) == 0
+        assert cli.run(shlex.split("render lens.npz --rays 1000 --effects fresnel --report --tool-radius 3 --json --quiet")) == 0
         out, err = capfd.readouterr()
         assert err == ""
         told = json.loads(Path("report.json").read_text())
         assert told.pop("created_by") == "caustic" and told == json.loads(out)["report"]
-    assert cli.run(shlex.split("render lens.npz --rays 1000 --report")) == 0
+    assert cli.run(shlex.split("render lens.npz --rays 1000 --effects fresnel --report")) == 0
     assert "concave radius" in capfd.readouterr().err
     assert cli.run(shlex.split("render lens.npz --rays 1000 --tool-radius 3")) == 2
 
