@@ -183,7 +183,7 @@ def _draw_losses(axis: Axes, history: np.ndarray, pixels: int, figures: dict, st
         own.semilogy(rows[:, 4], rows[:, 2] * pixels, color=colour, marker="." if len(rows) == 1 else None, lw=1.6)
         kind = ", waves" if waves else ", rays" if mixed else ""
         at, up = (rows[0], 4) if own is axis or k % 2 == 0 else (rows[-1], -11)  # above one line and below the next: many are short
-        late = at[4] > 0.6 * last
+        late = at[4] > 0.7 * last
         own.annotate(
             f"{blur:.2g} px" if blur > 0 else f"stage {k + 1}{kind}",
             (at[4], at[2] * pixels),
