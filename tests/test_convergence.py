@@ -80,6 +80,7 @@ def test_pareto_front():
     assert pareto(cost, error) == [True, True, False, True, False, True]  # of two that are the same, one
     assert pareto([1.0, 2.0, 3.0], [1.0, 0.99, 0.5], gain=0.02) == [True, False, True]  # what is gained is noise
     assert pareto([1.0, 1.02, 3.0], [1.0, 0.5, 0.4], alike=0.05) == [False, True, True]  # what is cheaper is noise
+    assert pareto([1.0, 1.08, 1.16], [3.0, 2.0, 1.0], alike=0.1) == [False, True, True]  # not from one to the next on and on
 
 
 @pytest.mark.parametrize(

@@ -16,8 +16,8 @@ from caustic_cli.optics.trace import tracers
 from caustic_cli.scene import Scene
 
 CHUNK = 1 << 19
-#: Rays that `origins` are found from: so many a control, and their most.
-RAYS_A_CONTROL, RAYS = 8, 300_000
+#: Rays that `origins` are found from: so many for each of them, and their most.
+AN_ORIGIN, MOST_RAYS = 8, 300_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ def spread(points: np.ndarray, values: np.ndarray, x: np.ndarray, y: np.ndarray)
 
 def origins(scene: Scene, field: HeightField, nets: Tensor) -> Tensor:
     """Where light of each of the exit's controls enters, in parts of the half size along y and x: (n, m, 2) float64."""
-    light = rays_within(scene, field, nets, min(RAYS, RAYS_A_CONTROL * nets[1].numel()))
+    light = rays_within(scene, field, nets, min(MOST_RAYS, AN_ORIGIN * nets[1].numel()))
     x, y = np.meshgrid(*(c.numpy() for c in field.control_xy()), indexing="ij")
     u, v = (c / r for c, r in zip(spread(light.exit[:2], light.entrance, x, y), field.half_size, strict=True))
     return torch.from_numpy(np.stack([v, u], -1))

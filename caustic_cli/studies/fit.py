@@ -51,11 +51,15 @@ def pareto(cost: Sequence[float], error: Sequence[float], gain: float = 0.0, ali
     alike: part by which costs differ that are as good as the same; of such settings the one with the least error is on the front.
     """
     front: list[int] = []
+    cheapest = 0.0  # of the settings that cost the same as the last on the front
     for k in sorted(range(len(cost)), key=lambda k: (cost[k], error[k])):
-        if not front or error[k] < (1.0 - gain) * error[front[-1]]:
-            while front and cost[k] < (1.0 + alike) * cost[front[-1]]:
-                front.pop()
+        if front and not error[k] < (1.0 - gain) * error[front[-1]]:
+            continue
+        if front and cost[k] < (1.0 + alike) * cheapest:
+            front[-1] = k
+        else:
             front.append(k)
+            cheapest = cost[k]
     return [k in front for k in range(len(cost))]
 
 

@@ -25,7 +25,7 @@ RELIEF, LITTLE = 130, 5e-5
 #: Where a bar of colours stands beside its picture, in parts of that: left, bottom, width, height.
 BAR = (1.03, 0.0, 0.046, 1.0)
 #: Of the panels.  Finding places that just fit took as long as drawing.
-PLACES = {"left": 0.035, "right": 0.95, "bottom": 0.065, "top": 0.925, "wspace": 0.57, "hspace": 0.3}
+PLACES = {"left": 0.035, "right": 0.95, "bottom": 0.065, "top": 0.925, "wspace": 0.62, "hspace": 0.42}
 #: What is seen through a blur in a panel of its own, in parts of that of the error.
 BLURRED = 0.6
 
@@ -60,7 +60,7 @@ def write_report(
     from matplotlib import pyplot as plt  # noqa: PLC0415
     from matplotlib.colors import FuncNorm, Normalize  # noqa: PLC0415
 
-    figure = plt.figure(figsize=(21.0, 9.2))
+    figure = plt.figure(figsize=(22.0, 9.8))
     axes = figure.subplots(2, 4, gridspec_kw=PLACES)
     extent = [-screen.half_size[0], screen.half_size[0], -screen.half_size[1], screen.half_size[1]]
     scale = target.sum() / target.max()

@@ -311,8 +311,7 @@ def wavefront(
     crossed = torch.where((squeeze.detach() <= 0) & ~dark, power.detach(), torch.zeros_like(power))
     if float(crossed.sum()) > CROSSED * float(power.detach().sum()):
         raise NoWaveImage(CROSSES)
-    if bool((~dark).any()):
-        power = torch.where(dark, filled(power.detach(), dark), power)
+    power = torch.where(dark, filled(power.detach(), dark), power)
     by_x, by_y = torch.gradient(power.detach(), spacing=step, dim=(0, 1), edge_order=2)
     density = (power + torch.where(dark, torch.zeros_like(ex), by_x * ex + by_y * ey)).clamp_min(0.0) * squeeze.clamp_min(0.0)
     rx, ry = (abs(s) / 2.0 for s in seen.scale)
