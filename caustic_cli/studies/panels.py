@@ -208,7 +208,7 @@ def _draw_losses(axis: Axes, history: np.ndarray, pixels: int, figures: dict, st
                 bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0, "alpha": 0.8},
                 **side,
             )
-    axis.set(title="error: of the design (lines),\nretraced with other rays (points)")
+    axis.set(title="error: as the design sees it (lines),\nretraced with other rays (points)")
     for own in (axis,) if below is None else (axis, below):
         own.margins(x=0.08, y=0.12 if own is axis else 0.25)
         own.set_ylabel("relative RMS")
