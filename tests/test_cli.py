@@ -448,6 +448,16 @@ def test_an_archive_renders_like_its_project(here, capfd):
     assert figures["image"] == "lens-render.png" and figures["relative_rms"] is None and figures["on_target"] is None
     assert (np.load("a.npy") == np.load("b.npy")).all() and Path("lens-render.png").is_file()
     assert run("render lens.npz --source point", capfd)[0] == 2
+    Path("e.toml").write_text("[z]\n")
+    before = sorted(Path().iterdir())
+    assert run("render lens.npz --rays 9000 -o t.png --tolerances e.toml", capfd)[0] == 2
+    assert sorted(Path().iterdir()) == before
+
+
+def test_a_script_of_a_scene_that_it_does_not_build_leaves_nothing_behind(here, capfd):
+    assert run("design blob.png --screen-tilt 5,0 --iterations 1 --waves off -o tilted.caustic --quiet", capfd)[0] == 0
+    code, out, err = run("export tilted.caustic --script -o lens.npz --quiet", capfd)
+    assert (code, out) == (2, "") and "a tilted screen" in err and not [*Path().glob("lens*")]
 
 
 # help and the process

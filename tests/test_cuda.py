@@ -81,9 +81,7 @@ def test_cuda_repeats_bitwise(sampler):
 @pytest.mark.slow
 @pytest.mark.parametrize("part", ["sums or splat or stages or surface", "image"])
 def test_kernels_in_the_simulator(part):
-    done = process(
-        *("-m", "pytest", "-q", "-p", "no:cacheprovider", "simulated_cuda.py", "-k", part), NUMBA_ENABLE_CUDASIM="1"
-    )
+    done = process(*("-m", "pytest", "-q", "-p", "no:cacheprovider", "simulated_cuda.py", "-k", part), NUMBA_ENABLE_CUDASIM="1")
     assert done.returncode == 0, done.stdout + done.stderr
     assert " passed" in done.stdout
 

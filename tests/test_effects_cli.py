@@ -14,12 +14,15 @@ from caustic_cli.config.completion import complete
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.losses import Loss
 from caustic_cli.inverse.objective import Objective
+from caustic_cli.io.archive import open_archive
 from caustic_cli.io.picture import read_picture
 from caustic_cli.optics.effects import EFFECTS
+from caustic_cli.optics.effects.mirror import Mirror
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Lens, Light, Offset, PlaneWave, Scene, Screen
+from caustic_cli.scene.gradient import Gradient
 from caustic_cli.scene.light import RGB
 from caustic_cli.studies import effects as study
 from caustic_cli.workflow import design as workflow
@@ -133,6 +136,22 @@ def test_a_mirror_is_designed_and_exported_as_one(capfd):
         begun = run(capfd, "design", "blob.png", "--mirror", *TINY, "--start", name, "--iterations", "1", "-o", f"{name}.caustic")
         assert said["turned"] and begun["start_relative_rms"] < 1.05 * figures["relative_rms"]
     assert "must lie before the mirror" in run(capfd, "render", "blob.caustic", "--screen-at", "20", code=2)
+    check = run(capfd, "gradmap", "blob.caustic", "--control", "5,5", "--rays", "4000", "--check")["maps"][0]["check"]
+    assert 0 < check["relative_error"] < 1e-4
+    report = run(capfd, "render", "blob.caustic", "--rays", "4000", "--effects", "none", "--report", "--force")["report"]
+    assert report["throw_error_of_a_pixel_mm"] > 0 and report["minimum_wall_mm"] is report["critical_angle_deg"] is None
+
+
+def test_an_archive_keeps_glass_and_light(capfd):
+    """What of them the scene has beyond clear glass and light of one wavelength: the image is the project's own, bit for bit."""
+    glass = ("--glass", "N-BK7", "--absorption", "0.02", "--roughness", "0.01")
+    run(capfd, "design", "blob.png", *TINY, *glass, "--wavelengths", "450:2,650", "--polarisation", "30")
+    run(capfd, "export", "blob.caustic", "-o", "lens.npz")
+    for source, image in (("blob.caustic", "a.npy"), ("lens.npz", "b.npy")):
+        run(capfd, "render", source, "--rays", "4000", "--npy", image)
+    assert (np.load("a.npy") == np.load("b.npy")).all()
+    scene, light = open_archive("lens.npz")[0], workflow.Project.open("blob.caustic").scene().light
+    assert scene.light.parts == light.parts and scene.light.wavelengths == light.wavelengths
 
 
 def test_dispersion_of_a_glass_and_its_range(capfd):
@@ -218,6 +237,12 @@ def test_the_study_of_effects(capfd, tmp_path):
         assert rows[name]["amount"] != "the scene's own" and rows[name]["error"] + abs(rows[name]["power"]) > 1e-7, name
     assert rows["entrance"]["error"] < 1e-12
     assert {p.suffix for p in (tmp_path / "out").iterdir()} == {".csv", ".json", ".png"}
+
+
+def test_a_lens_of_many_indices_makes_no_mirror():
+    """The study leaves out what the scene cannot have."""
+    lens = Lens(control=(6, 6), gradient=Gradient("selfoc", (0.1,)))
+    assert Mirror().sample(Scene(PlaneWave(), lens, Screen((20.0, 20.0))), torch.ones(6, 6)) is None
 
 
 def test_rounds_of_a_wave_image(monkeypatch):

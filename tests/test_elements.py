@@ -404,7 +404,7 @@ def test_mitsuba_traces_them(_here, capfd, text):
         ("lens zz=3", "zz is not a key; did you mean z?"),
         ("lens z=3 z=4", "says z twice"),
         ("lens z=three", "must be a number"),
-        ("lens z=-30 radius=50", "two numbers parted by a comma"),
+        ("lens z=-30 radius=50", "two numbers separated by a comma"),
         ("lens z=-30 radius=5,inf", "must be at least"),
         ("lens z=-30 radius=50,-0", "non-zero"),
         ("lens z=-30 thickness=0.1 radius=30,-30", "glass at the rim"),

@@ -81,7 +81,22 @@ def test_light_lost_beside_the_screen_is_accounted_for():
     assert deconvolved(np.ones((40, 40)), spread(0.5), 200).kept < 0.97
 
 
+def test_a_picture_of_dots_has_its_light_however_soon_the_bound_is_tight():
+    target = np.zeros((48, 48))
+    target[8::16, 8::16] = 1.0
+    found = deconvolved(target, spread(1.5))
+    assert found.light.shape == tuple(48 + 2 * n for n in found.beside) and found.bound > 0.9 * found.error
+
+
 # The source's kernel
+
+
+@pytest.mark.parametrize("most", range(1, 9))
+def test_a_pixel_is_cut_into_cells_that_its_render_has(most):
+    """A render whose pixels are cut into `most` can be added up to the kernel's cells, as fine as is asked for or all of them."""
+    for half, wanted in ((4.0, 1), (1.0, 2), (0.55, 3), (0.1, 4)):
+        cut = Spread((half, half), ((0.0, 0.0, 1.0),), 0.0).on((0.1, 0.1), most).cut
+        assert most % cut == 0 and (cut >= wanted or cut == most)
 
 
 @pytest.mark.parametrize("half", [(0.35, 0.2), (0.9, 0.9), (2.0, 0.31)])
@@ -163,6 +178,21 @@ def test_regular_rays_carry_the_light_of_the_source(kind, round_):
     found = sum(float(state.power.sum()) for grid in grids for state in grid.chunks(5000))
     drawn = sum(float(state.power.sum()) for state in rays_of(scene, "stratified", 120_000).chunks())
     assert found == pytest.approx(drawn, rel=5e-3)
+
+
+def test_a_blurred_render_is_added_up_to_pixels_whatever_it_is_cut_into():
+    """Three cells a pixel, of a kernel that asks for two."""
+    scene = scene_of(Disc((0.0, 0.0, -40.0), (2.2, 2.2)))
+    field, heights = HeightField.of(scene.lens), heights_of(scene)
+    traced, rays, kernels = regular_rays(
+        scene, shift_of(scene, field, heights), Stage((19, 19), 40_000, "grid", spread=True, oversample=3), 0, "cpu"
+    )
+    cosine, target = Filter("cosine", (3, 3)), torch.from_numpy(disc_on(32))
+    made = Objective(
+        traced, field, rays, cosine, target, "rms", spread=kernels, filter_target=False, oversample=3, dtype=torch.float64
+    )
+    image = expose(scene, field, heights, rays_of(scene, "sobol", 1 << 18)).image
+    assert kernels[0].cut == 3 and made(heights).loss * 32**2 == pytest.approx(relative_rms(image, target), rel=0.05)
 
 
 @pytest.mark.parametrize("kind", SOURCES)

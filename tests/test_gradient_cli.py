@@ -93,7 +93,7 @@ def test_a_file_of_indices_is_kept(capfd):
         (("--gradient", "free", "--mirror"), "mirror"),
         (("--gradient", "lens"), "must be one of"),
         (("--gradient", "selfoc"), "gradient_terms"),
-        (("--gradient", "selfoc", "--gradient-terms", "0.1,x"), "parted by commas"),
+        (("--gradient", "selfoc", "--gradient-terms", "0.1,x"), "separated by commas"),
         (("--gradient-terms", "0.1"), "--gradient"),
         (("--gradient", "volume"), "index_file"),
         (("--gradient", "volume", "--index-file", "blob.png"), "npy"),

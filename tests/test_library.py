@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -82,6 +83,9 @@ def test_a_saved_lens_is_a_project(lens, capfd):
     assert cli.run(["render", "saved.caustic", "--rays", "1e4", "--quiet", "--json"]) == 0
     assert json.loads(capfd.readouterr().out)["rays"] > 9000
     assert cli.run(["design", "--resume", "saved.caustic", "--quiet"]) == 0
+    replace(load("saved.caustic"), provenance={"device": "cuda"}).save("copy.caustic")
+    load("copy.caustic").save("another.caustic")
+    assert load("another.caustic").provenance == {"device": "cuda"}
 
 
 def test_a_render_is_of_its_own_rays(lens):

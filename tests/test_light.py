@@ -19,7 +19,7 @@ from caustic_cli.inverse.incidence import incident
 from caustic_cli.inverse.initial_surface import InitialSurface, first_surface
 from caustic_cli.inverse.losses import Loss
 from caustic_cli.inverse.objective import Objective
-from caustic_cli.inverse.reach import refuse_unreachable
+from caustic_cli.inverse.reach import largest_magnification, refuse_unreachable
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces import HeightField
@@ -149,6 +149,13 @@ def test_the_largest_turn_is_that_of_refraction():
                 refuse_unreachable(scene, blob())
         else:
             refuse_unreachable(scene, blob())
+
+
+def test_the_largest_magnification_is_not_known_of_a_picture_across_its_lens():
+    """No width of a tall picture is within a long lens' reach right before it."""
+    scene = Scene(PlaneWave(), Lens((100.0, 10.0)), Screen((120.0, 120.0), 30.0, (12, 12)))
+    assert largest_magnification(scene, (10.0, 100.0)) is None
+    assert largest_magnification(scene, (100.0, 10.0)) > 1.0
 
 
 def test_nothing_is_solved_for_a_picture_out_of_reach(tmp_path, monkeypatch, capfd):

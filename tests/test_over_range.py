@@ -330,6 +330,11 @@ def test_what_cannot_be_trained_over_is_refused_in_a_line(capfd, case):
     assert sentence in err and len(err.splitlines()) == 1 and not Path("blob.caustic").exists()
 
 
+def test_a_value_said_twice_is_refused():
+    with pytest.raises(InputError, match="every key once, got throw twice"):
+        Ranges.parse("throw=250:350").values("throw=300,throw=310")
+
+
 def test_contradictions_of_networks_are_refused():
     with pytest.raises(InputError, match="leaves the inputs of a network without any effect"):
         designer(initial="zero")

@@ -147,7 +147,7 @@ def test_a_design_changes_its_source_and_resumes_inside_any_stage(capfd):
     "arguments, message",
     [
         (["--source", "moon"], "--source must be one of plane, point, grid, disc, rays, got 'moon'"),
-        (["--source", "point", "--source-position", "1,2"], "--source-position must be 3 numbers parted by commas"),
+        (["--source", "point", "--source-position", "1,2"], "--source-position must be 3 numbers separated by commas"),
         (
             ["--wavelengths", "abc"],
             "--wavelengths must be wavelengths in nm, each with a weight or without, like 450:2,550, got 'abc'",

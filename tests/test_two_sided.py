@@ -205,6 +205,12 @@ def test_two_pictures_by_the_command_line(_here, capfd):
         and Path("p/second.png").exists()
     )
     assert run(capfd, "design", "one.png", *SMALL, *options, "--iterations", "3", "-o", "p") == made  # nothing was done
+    render = ("render", "p", "--rays", "5000", "--effects", "fresnel", "--json", "--quiet")
+    seen = run(capfd, *render)
+    image = Image.open("p/second.png")
+    image.rotate(90).save("p/second.png")
+    again = run(capfd, *render)
+    assert again["second_relative_rms"] != seen["second_relative_rms"] and again["relative_rms"] == seen["relative_rms"]
 
 
 @pytest.mark.parametrize(

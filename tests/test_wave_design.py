@@ -140,6 +140,15 @@ def test_local_magnification_is_that_of_the_map():
     assert local_magnification(scene, HeightField.of(scene.lens), heights) == pytest.approx(1 + 58.5 * 0.5443 / 16.0, rel=0.02)
 
 
+def test_local_magnification_is_that_wherever_the_lens_stands():
+    """Lens, source and screen moved along the axis together."""
+    at = Points(((0.0, 0.0, -8.0),))
+    here, there = scene_of(at), scene_of(replace(at, positions=((0.0, 0.0, -5.0),)), z_in=3.0, offset=Offset(4.5, (16.0, 16.0)))
+    there = replace(there, screen=replace(there.screen, z=here.screen.z + 3.0))
+    one, two = (local_magnification(s, HeightField.of(s.lens), heights_of(s, 0.0)) for s in (here, there))
+    assert two == pytest.approx(one, rel=1e-9)
+
+
 @pytest.mark.parametrize(
     ("extra", "stages"),
     [
@@ -291,6 +300,12 @@ def test_one_wavelength_is_judged_beside_it_too(_here, capfd):
     figures = design(capfd, "blob.png", *SMALL, "--wavelengths", "550", "-o", "laser")
     assert figures["wave_wavelengths"] == [550.0] and figures["wave_unseen_wavelengths"] == pytest.approx([544.5, 555.5])
     assert figures["wave_relative_rms"] < figures["wave_unseen_relative_rms"]
+
+
+def test_wavelengths_beside_one_are_those_that_the_glass_is_known_at(_here, capfd):
+    """PMMA's formula begins at 437 nm."""
+    figures = design(capfd, "blob.png", *SMALL, "--glass", "PMMA", "--wavelengths", "438")
+    assert figures["wave_unseen_wavelengths"] == pytest.approx([442.38])
 
 
 def test_limits_are_kept(_here, capfd):

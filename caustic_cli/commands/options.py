@@ -235,8 +235,8 @@ def _radius(option: str, text: str) -> dict[str, Any]:
 
 
 def _terms(option: str, text: str) -> dict[str, Any]:
-    """Numbers parted by commas, one or more."""
-    return {"lens.gradient_terms": list(numbers(option, text, (text.count(",") + 1,), ",", "numbers parted by commas"))}
+    """Numbers separated by commas, one or more."""
+    return {"lens.gradient_terms": list(numbers(option, text, (text.count(",") + 1,), ",", "numbers separated by commas"))}
 
 
 def _elements(option: str, texts: list[str]) -> dict[str, Any]:
@@ -275,7 +275,7 @@ def _element_value(where: str, row: Setting, text: str, kind: str) -> Any:
     if row.key == "size":
         return both(size(where, text))
     alone = (1, 2) if row.key == "radius" and kind == "mirror" else (2,)
-    form = "two numbers parted by a comma, like " + ("50,inf" if row.key == "radius" else "45,0")
+    form = "two numbers separated by a comma, like " + ("50,inf" if row.key == "radius" else "45,0")
     return both(numbers(where, text, alone, ",", form, unit=row.unit, endless=row.key == "radius"))
 
 
@@ -316,7 +316,7 @@ def numbers(
     unit: str = "",
     endless: bool = False,
 ) -> tuple[float, ...]:
-    """Numbers parted by x ("10x8") or by what `separator` matches; `form` says what would be accepted.
+    """Numbers separated by x ("10x8") or by what `separator` matches; `form` says what would be accepted.
 
     unit: mm for lengths, which may say another unit, the last one for all that say none: "10x8cm"; endless: inf is a number too.
 
@@ -334,7 +334,7 @@ def numbers(
     except ValueError:
         values = ()
     if len(values) not in count or not all(math.isfinite(v) or (endless and math.isinf(v)) for v in values):
-        usual = "a number or two like 10x8" if separator.startswith("[x") else f"{max(count)} numbers parted by commas"
+        usual = "a number or two like 10x8" if separator.startswith("[x") else f"{max(count)} numbers separated by commas"
         raise InputError(f"{option} must be {form or usual}, got {text!r}")
     return values if unit != "mm" else tuple(v * scale for v, scale in zip(values, scales, strict=True))
 

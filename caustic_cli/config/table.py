@@ -305,7 +305,7 @@ _ROWS = (
     Setting("design.activation", "text", "of a dense network: tanh, relu, silu or sine", choices=("tanh", "relu", "silu", "sine"),
             default="tanh", written=False, why="as in the thesis", option=Option("--activation", "tanh|relu|silu|sine")),
     Setting("design.over", "text", "ranges over which a network is trained, which takes their values as inputs and so gives a lens"
-            " for each: throw, source.x, source.y, source.z = LOW:HIGH, parted by commas", "mm", default="", written=False,
+            " for each: throw, source.x, source.y, source.z = LOW:HIGH, separated by commas", "mm", default="", written=False,
             option=Option("--over", "KEY=LOW:HIGH[,...]")),
     Setting("design.initial", "text", "parameters at first: zero, uniform (+-1e-4), random, or zero-last (random but for the last"
             " layer of a network, which is zero: it begins at its first surface)",

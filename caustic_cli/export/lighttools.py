@@ -23,7 +23,7 @@ from caustic_cli.export.surface import SurfaceGrid, most_points, sample_grid
 from caustic_cli.io.files import MARK, atomic_path
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import front_of
-from caustic_cli.scene import Scene, Screen, Source
+from caustic_cli.scene import Lens, Light, Scene, Screen, Source
 from caustic_cli.scene.elements import SIDES
 
 FORMAT_VERSION = 1
@@ -38,8 +38,8 @@ def write_lighttools(
 
     Keys: points, normals (N, 3); shape (2,); x (nx,), y (ny,), z (nx, ny); lens_half_size (2,), z_in, refractive_index;
     screen_half_size (2,), z_screen, resolution (2,); those of `_screen` and `_source`; fresnel unless exact; aperture if a circle;
-    mirror, 1, of one; those of `_elements` beside it; those of `_entrance` where it is free-form; control_points (n, m, 3) with
-    x, y at the Greville abscissae, degrees (2,), knots_u, knots_v on [0, 1]; unit, format_version, created_by.
+    mirror, 1, of one; those of `_glass`, `_light` and `_elements`; those of `_entrance` where it is free-form; control_points
+    (n, m, 3) with x, y at the Greville abscissae, degrees (2,), knots_u, knots_v on [0, 1]; unit, format_version, created_by.
 
     Args:
         heights: (n, m) control heights, mm.
@@ -69,6 +69,8 @@ def write_lighttools(
         **({"aperture": np.array("circle")} if scene.lens.round else {}),
         **({"mirror": np.array(1, np.int64)} if scene.lens.mirror else {}),
         **({} if scene.lens.fresnel == "exact" else {"fresnel": np.array(scene.lens.fresnel)}),
+        **_glass(scene.lens),
+        **_light(scene.light),
         "control_points": np.stack([x, y, heights.detach().double().cpu().numpy()], -1),
         "degrees": np.array([s.degree for s in field.spaces], np.int64),
         "knots_u": field.spaces[0].knots.numpy(),
@@ -90,6 +92,23 @@ def usual_cloud(scene: Scene, field: HeightField, heights: Tensor, samples: tupl
     """The grid of an archive's cloud, beside the nets that it holds too; arguments as of `write_lighttools`."""
     nets = 24 * (heights.numel() + (0 if scene.lens.front is None else front_of(scene.lens).heights.numel()))
     return sample_grid(field, heights, samples, most_points(A_POINT, nets + BESIDE))
+
+
+def _glass(lens: Lens) -> dict[str, np.ndarray]:
+    """What a lens is beyond clear and of one index: absorption, 1/mm; roughness, of slopes; glass, the name of its material."""
+    found = {key: _reals(getattr(lens, key)) for key in ("absorption", "roughness") if getattr(lens, key)}
+    return found if lens.glass is None else found | {"glass": np.array(lens.glass)}
+
+
+def _light(light: Light) -> dict[str, np.ndarray]:
+    """What light is beyond unpolarised and of one wavelength, in watts: source_power_unit; source_wavelengths (k,), nm, with
+    source_weights (k,); source_color, 1, where they are those of a coloured picture; source_polarisation, degrees from +x."""
+    found = {} if light.unit == "W" else {"source_power_unit": np.array(light.unit)}
+    if light.wavelengths:
+        found |= {"source_wavelengths": _reals(light.wavelengths), "source_weights": _reals(light.parts)}
+    if light.color:
+        found["source_color"] = np.array(1, np.int64)
+    return found if light.polarisation is None else found | {"source_polarisation": _reals(light.polarisation)}
 
 
 def _entrance(scene: Scene) -> dict[str, np.ndarray]:
@@ -153,7 +172,7 @@ def _source(scene: Scene) -> dict[str, np.ndarray]:
     (a, b), the relative irradiance over the aperture [i, j], is there only when a wave is not uniform; `source_size` (2,) mm
     or `source_angle` (full, degrees) only for a disc; `source_intensity` where there is a cone, with
     `source_intensity_table` (k, 2), degrees and relative intensity, if that is a table; `source_brightness` (a, b), the relative
-    radiance over a disc's rectangle [i, j], only where a picture says it; `source_power_unit` unless W.
+    radiance over a disc's rectangle [i, j], only where a picture says it.
 
     Raises:
         InputError: the archive knows no source of this type.
@@ -165,7 +184,6 @@ def _source(scene: Scene) -> dict[str, np.ndarray]:
         "source_type": np.array(source.kind),
         "source_positions": source.points()[0],
         "source_power": _reals(source.powers),
-        **({} if scene.light.unit == "W" else {"source_power_unit": np.array(scene.light.unit)}),
         **_KEYS[source.kind](scene),
     }
 

@@ -22,6 +22,7 @@ from caustic_cli.export.text import CREATED, real
 from caustic_cli.io.files import atomic_path, write_bytes
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
+from caustic_cli.scene.plain import beyond_plain
 
 #: Rows of the flat entrance along each axis: a plane needs no more.
 FLAT = 5
@@ -148,15 +149,19 @@ def companions(path: str | Path) -> tuple[Path, Path]:
     return path.with_suffix(".py"), path.with_suffix(".lts.txt")
 
 
-def write_script(
-    path: str | Path, scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None
-) -> None:
-    """Write script and block for the archive `path`, which `write_lighttools` wrote with the same arguments.
+def refuse(scene: Scene) -> None:
+    """Refuse a scene that is not what the script builds.
 
     Raises:
-        InputError: a plane wave with a profile, which the script's source has not; or the files cannot be written.
+        InputError: naming what it has and the script has not.
     """
-    path, source = Path(path), scene.source
+    source, beyond = scene.source, beyond_plain(scene)
+    if beyond:
+        raise InputError(
+            f"⟨script⟩ builds clear lenses and straight screens, not {', '.join(beyond)}, which the archive alone holds"
+        )
+    if scene.light.unit != "W":
+        raise InputError(f"⟨script⟩: its power is in watts, so one in {scene.light.unit} cannot be written")
     if source.profile is not None:
         raise InputError("⟨script⟩: its source is uniform, so one with a profile cannot be written")
     if source.brightness is not None or source.rays is not None or not isinstance(source.intensity, str):
@@ -167,6 +172,18 @@ def write_script(
         raise InputError("⟨script⟩: its disc is round, so an elliptical one cannot be written")
     if scene.lens.round:
         raise InputError("⟨script⟩: its freeform solid is a rectangle, so a circular aperture cannot be written")
+
+
+def write_script(
+    path: str | Path, scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None
+) -> None:
+    """Write script and block for the archive `path`, which `write_lighttools` wrote with the same arguments, of a scene that is not
+    to `refuse`.
+
+    Raises:
+        InputError: the files cannot be written.
+    """
+    path = Path(path)
     script, block = companions(path)
     words = {"@CREATED@": CREATED, "@NPZ@": path.name, "@NAME@": script.name, "@STEM@": path.stem, "@FLAT@": str(FLAT)}
     text = SCRIPT

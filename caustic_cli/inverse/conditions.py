@@ -27,7 +27,7 @@ from caustic_cli.scene import Scene, Source
 
 #: What may vary, and the setting whose range holds for it.
 KEYS = {"throw": "screen.z", "source.x": "source.position", "source.y": "source.position", "source.z": "source.position"}
-FORM = f"KEY=LOW:HIGH parted by commas, KEY one of {', '.join(KEYS)}, like throw=250:350"
+FORM = f"KEY=LOW:HIGH separated by commas, KEY one of {', '.join(KEYS)}, like throw=250:350"
 #: Parts of a range at which its lenses are judged: its ends, its middle, and between.
 JUDGED = (0.0, 0.25, 0.5, 0.75, 1.0)
 
@@ -101,7 +101,7 @@ class Ranges:
         Raises:
             InputError: naming what is unknown, no number, or outside its range.
         """
-        form = f"KEY=VALUE parted by commas, of {self.words()}"
+        form = f"KEY=VALUE separated by commas, of {self.words()}"
         said = dict(_assignments("⟨at⟩", text, form, self.keys))
         for one in self.each:
             if one.key in said:
@@ -173,7 +173,7 @@ class Ranges:
 
 
 def _assignments(where: str, text: str, form: str, known: Sequence[str] = tuple(KEYS)) -> list[tuple[str, str]]:
-    """KEY=TEXT parted by commas."""
+    """KEY=TEXT separated by commas."""
     found = []
     for part in text.split(","):
         key, equals, value = (word.strip() for word in part.partition("="))
@@ -181,6 +181,8 @@ def _assignments(where: str, text: str, form: str, known: Sequence[str] = tuple(
             raise InputError(f"{where} must be {form}; got {part.strip()!r}")
         if key not in known:
             raise InputError(f"{where}: {key!r} is not a key; known are {', '.join(known)}")
+        if key in dict(found):
+            raise InputError(f"{where} may name every key once, got {key} twice")
         found.append((key, value))
     return found
 

@@ -94,6 +94,6 @@ def deconvolved(target: np.ndarray, spread: Convolution, steps: int | None = Non
             dual = float((nu * b).sum() - 0.5 * nu.square().sum() - b.numel() * (back(nu)[near] / reach[near]).max())
             least = min(least, float((y - b).square().mean().sqrt()))
             bound = max(bound, math.sqrt(max(0.0, 2.0 * dual / b.numel())))
-            if bound > (1.0 - TIGHT) * least:
+            if light is not None and bound > (1.0 - TIGHT) * least:
                 break
     return Deconvolved(light, pixels, least, bound, kept)

@@ -28,6 +28,7 @@ from torch import Tensor
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.incidence import incident
 from caustic_cli.inverse.lbfgs import LBFGS
+from caustic_cli.inverse.losses import NoLight
 from caustic_cli.inverse.objective import Evaluation, Objective
 from caustic_cli.inverse.parametrisation import FreeHeights
 from caustic_cli.inverse.surface_from_map import integrate
@@ -126,7 +127,7 @@ def design_blank(
     spread, room = float(layer.max() - layer.min()), high - low
     if spread > (1.0 - 2.0 * INSIDE) * room:
         raise InputError(
-            f"⟨lens.index_range⟩ spans {room:.3g}, and this picture asks for an index that varies by {spread:.3g};"
+            f"⟨lens.index_range⟩ spans {room:.3g}, and this picture requires an index that varies by {spread:.3g};"
             f" a thickness of {(lens.offset.thickness - lens.z_in) * 1.1 * spread / room:.3g} mm, or a smaller ⟨mag⟩, needs no more"
         )
 
@@ -137,29 +138,37 @@ def design_blank(
     objective = _BlankObjective(scene, target, begun, rays or RAYS_A_PIXEL * math.prod(screen.resolution), seed)
     low_net, high_net = (torch.full(control, v, dtype=torch.float64) for v in (low, high))
     nets = [FreeHeights(low_net, high_net, layer, laplacian=True) for _ in range(layers)]
-    seen: Evaluation | None = None
+    seen: dict[float, Evaluation] = {}
+
+    def controls(x: Tensor) -> Tensor:
+        for one, y in zip(nets, x.view(layers, *control), strict=True):
+            one.y.data = y.clone()
+        return torch.stack([one() for one in nets], -1)
 
     def evaluate(x: Tensor) -> tuple[float, Tensor]:
-        nonlocal seen
-        parts = x.view(layers, *control)
-        for one, y in zip(nets, parts, strict=True):
-            one.y.data = y.clone()
-        values = torch.stack([one() for one in nets], -1)
-        seen = found = objective.evaluate({objective.name: values.detach()})
+        values = controls(x)
+        try:
+            found = objective.evaluate({objective.name: values.detach()})
+        except NoLight:
+            if search.f is None:
+                raise
+            return math.inf, torch.zeros_like(x)  # a step too far: the line search turns back
+        seen[found.loss] = found
         by = torch.autograd.grad(values, [one.y for one in nets], found.gradients[objective.name])
         return found.loss, torch.stack(by).reshape(-1)
 
     search = LBFGS(evaluate, torch.zeros(layers * math.prod(control), dtype=torch.float64))
     history: list[tuple[float, float]] = []
     for k in range(iterations):
+        seen.clear()
         if stop() or not search.step():
             break
-        assert search.f is not None and seen is not None
-        history.append((search.f, seen.on_screen))
-        on_iteration(k + 1, search.f, seen.on_screen, seen.image)
-    evaluate(search.x)
+        assert search.f is not None
+        found = seen[search.f]
+        history.append((search.f, found.on_screen))
+        on_iteration(k + 1, search.f, found.on_screen, found.image)
     with torch.no_grad():
-        return Blank(volume(torch.stack([one() for one in nets], -1)), begun, tuple(history))
+        return Blank(volume(controls(search.x)), begun, tuple(history))
 
 
 class _BlankObjective(Objective):

@@ -66,7 +66,8 @@ def largest_magnification(scene: Scene, picture: Sequence[float]) -> float | Non
     reach = throw * math.tan(math.acos(1.0 / lens.inside))
     corner, goal = np.array(lens.half_size), 0.5 * np.array(picture)
     along, square = goal @ corner, goal @ goal  # |f goal - corner| = reach
-    return float((along + math.sqrt(along**2 - square * (corner @ corner - reach**2))) / square * goal[0] / corner[0])
+    root = along**2 - square * (corner @ corner - reach**2)
+    return None if root < 0 else float((along + math.sqrt(root)) / square * goal[0] / corner[0])
 
 
 def _in_glass(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -109,7 +109,7 @@ def surface(
         options: of `transport.solve`.
 
     Raises:
-        InputError: as `transport.solve`; an index not above 1, a screen not above the lens, directions that are no unit
+        InputError: as `transport.solve`; an index that is none such, a screen not above the lens, directions that are no unit
             vectors towards it.
         OutOfReach: light that cannot be refracted to the picture.
     """

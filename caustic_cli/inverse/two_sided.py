@@ -87,7 +87,9 @@ class TwoSidedObjective:
         Raises:
             NoLight: none reaches a screen.
         """
-        parameters = {name: h.detach().clone().requires_grad_() for name, h in zip((ENTRANCE, EXIT), heights, strict=True)}
+        parameters = {
+            name: h.detach().to(self.device).clone().requires_grad_() for name, h in zip((ENTRANCE, EXIT), heights, strict=True)
+        }
         leaves, whole = list(parameters.values()), self.sampler.count <= WHOLE
         kept, sums, entering = [], None, torch.zeros((), dtype=torch.float64)
         with torch.set_grad_enabled(whole):

@@ -18,6 +18,8 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import front_from
 from caustic_cli.scene import Component, Disc, Front, Lens, Light, PlaneWave, Points, Scene, Screen, Source
 from caustic_cli.scene.elements import SIDES
+from caustic_cli.scene.light import MAX_WAVELENGTHS
+from caustic_cli.scene.materials import material
 from caustic_cli.scene.screen import MAX_SAGS, Sags
 from caustic_cli.scene.sources.distribution import MOST_ANGLES, Distribution
 from caustic_cli.scene.sources.points import MAX_POINTS
@@ -44,15 +46,29 @@ def open_archive(path: str | Path) -> tuple[Scene, HeightField, Tensor]:
             fresnel=data.text("fresnel", "exact"),
             aperture=data.text("aperture", "rectangle"),
             mirror="mirror" in data,
+            absorption=data.real("absorption") if "absorption" in data else 0.0,
+            roughness=data.real("roughness") if "roughness" in data else 0.0,
+            glass=data.text("glass") if "glass" in data else None,
         )
+        if lens.glass is not None:
+            material(lens.glass)
         if "entrance_control_points" in data:
             entrance, low = surface_of(data, "entrance_")
             lens = replace(lens, front=front_from(entrance, low - lens.z_in))
         screen = _screen(data)
-        light = Light(unit=data.text("source_power_unit", "W"))
-        scene = Scene(_source(data), lens, screen, light, elements=_elements(data))
+        scene = Scene(_source(data), lens, screen, _light(data), elements=_elements(data))
         refuse_without_glass(scene, field, heights)
         return scene, field, heights
+
+
+def _light(data: Archive) -> Light:
+    """Of what wavelengths and polarisation; see `export/lighttools.py`."""
+    wavelengths, weights = (
+        tuple(data.reals(f"source_{key}", None, most=MAX_WAVELENGTHS).tolist()) if f"source_{key}" in data else ()
+        for key in ("wavelengths", "weights")
+    )
+    polarisation = data.real("source_polarisation") if "source_polarisation" in data else None
+    return Light(polarisation, wavelengths, weights, color="source_color" in data, unit=data.text("source_power_unit", "W"))
 
 
 def _elements(data: Archive) -> tuple[Component, ...]:

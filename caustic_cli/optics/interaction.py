@@ -52,7 +52,7 @@ class Interaction:
     the element's frame; incoming: directions before it, in that frame; slopes: of the surface there; length: of the way to it, mm;
     lift: how far above the met point the rays go on, mm, where an effect says so; arriving, departing: power before and
     after the interaction; passes: of the interaction; straight: whether this is the walk
-    itself, not a stray_light.
+    itself, not stray light.
     """
 
     tracer: Walker

@@ -7,7 +7,7 @@ Notation, a ray of N
     path    optical path length, the sum of n t over the media behind it, mm
     E       unit vector of the field of linearly polarised light, normal to d; None where that is not asked for
 
-Components of o, d and E are (N,) tensors, or plain floats where all rays flux them: the products with 0 and 1 of a plane wave
+Components of o, d and E are (N,) tensors, or plain floats where all rays share them: the products with 0 and 1 of a plane wave
 are then never computed.  Sources emit such rays, every element hands them on, screens collect them.
 """
 

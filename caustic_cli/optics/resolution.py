@@ -14,7 +14,7 @@ from torch import Tensor
 
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.surfaces.base import FIRST, SECOND
-from caustic_cli.scene import Scene
+from caustic_cli.scene import Lens, Scene
 
 #: nm: the wavelength at which light without one is judged, and the band of white light.
 GREEN, BAND = 550.0, (450.0, 650.0)
@@ -57,11 +57,9 @@ class Resolution:
         said = scene.light.wavelengths
         wavelength = sum(w * p for w, p in zip(said, scene.light.parts, strict=True)) if said else GREEN
         distance = abs(screen.z - lens.offset.thickness)
-        # A point of the exit sees the source through the glass, which brings it nearer by what the index makes of the thickness.
-        seen_from = lens.z_in + (lens.offset.thickness - lens.z_in) / lens.inside
         return cls(
             diffraction_blur(wavelength, distance, magnification),
-            scene.source.blur(seen_from, distance),
+            scene.source.blur(_seen_from(lens), distance),
             max(screen.pixel),
             picture,
             lens.size[0],
@@ -145,11 +143,16 @@ class Paraxial:
     straight: float
 
 
+def _seen_from(lens: Lens) -> float:
+    """z, mm, from which a source is as far away as a point of the exit sees it: through glass, which is index times thinner."""
+    return lens.z_in + (lens.offset.thickness - lens.z_in) / lens.inside
+
+
 def paraxial(scene: Scene, field: HeightField, heights: Tensor) -> Paraxial:
     """The lens of a scene with these heights (n, m) mm at POINTS^2 points, in light of its source's centre."""
     lens = scene.lens
     distance = abs(scene.screen.z - lens.offset.thickness)
-    vergence = 0.0 if scene.source.distant else 1.0 / (lens.z_in - scene.source.centre[2] + lens.offset.thickness / lens.inside)
+    vergence = 0.0 if scene.source.distant else 1.0 / (_seen_from(lens) - scene.source.centre[2])
     line = (torch.arange(POINTS, dtype=torch.float64, device=heights.device) + 0.5) * (2.0 / POINTS) - 1.0
     x, y = (c.reshape(-1) * r for c, r in zip(torch.meshgrid(line, line, indexing="ij"), field.half_size, strict=True))
     gx, gy, xx, xy, yy = field.at(heights.detach(), x, y, (*FIRST[1:], *SECOND))

@@ -61,7 +61,7 @@ class Spread:
         return x, y
 
     def on(self, pixel: tuple[float, float], most: int = MOST_CUT) -> Convolution:
-        """The same on an image of such pixels, mm, that are cut into 1, 2 or 4 along each axis, at most, if they are too wide."""
+        """The same on an image of such pixels, mm, that are cut into a divisor of `most` along each axis if they are too wide."""
         cut = _cut(min((h for h in self.half if h > 0), default=max(self.reach()) / 2.0), pixel, most)
         return Convolution(torch.from_numpy(self.kernel((pixel[0] / cut, pixel[1] / cut))), cut)
 
@@ -124,9 +124,9 @@ def _bright(picture: np.ndarray, half: tuple[float, float], cell: tuple[float, f
 
 
 def _cut(fine: float, pixel: tuple[float, float], most: int) -> int:
-    """Into how many cells a pixel is cut along each axis for what is so fine, mm."""
-    wanted = CELLS * max(pixel) / fine if fine > 0 else 1.0
-    return min(most, 1 if wanted <= 1.0 else 2 if wanted <= 2.0 else MOST_CUT)
+    """Into how many cells a pixel is cut along each axis for what is so fine, mm: a divisor of `most`, whose cells make up each."""
+    wanted = min(MOST_CUT, CELLS * max(pixel) / fine) if fine > 0 else 1.0
+    return next((k for k in range(1, most) if most % k == 0 and k >= wanted), most)
 
 
 def _even_disc(half: tuple[float, float], cell: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:

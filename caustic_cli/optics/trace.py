@@ -213,7 +213,7 @@ class Tracer:
             heights: of its surface, None where it has none.
             parameters: those of the media, see `index_name`; a medium's own where they are not there.
             forward: in the system's own direction, or back.
-            straight: whether this is the walk itself, or a stray_light.
+            straight: whether this is the walk itself, or stray light.
         """
         element = self.system.elements[k]
         n = [medium.index_at(state.wavelength) for medium in self.media[k : k + 2]]

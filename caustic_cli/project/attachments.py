@@ -28,6 +28,8 @@ SHAPE = "screen"
 INDEX, MOST_INDEX = "index.npy", 8 * MOST_VALUES + (1 << 12)
 #: Keys of [source] that may name a file, and what it is called in a project.
 STEMS = {"file": "source", "intensity": "intensity"}
+#: What the names of all of them begin with.
+ALL = (*STEMS.values(), SHAPE, Path(INDEX).stem, Path(ERRORS).stem)
 
 
 def attached(source: Mapping[str, Any], folder: Path | None = None) -> dict[str, Any]:

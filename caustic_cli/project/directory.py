@@ -16,12 +16,16 @@ from pathlib import Path
 
 from caustic_cli.errors import InputError
 from caustic_cli.io.files import LEFT_BEHIND, PARTS, is_ours, refuse_special
-from caustic_cli.project.project import MADE, Project, is_project
+from caustic_cli.project import attachments
+from caustic_cli.project.project import MADE, TOML, Project, is_project
 
 try:
     import fcntl
 except ImportError:  # Windows has other locks; there, two designs in one directory are the user's care
     fcntl = None
+
+#: What the names of a project's pictures begin with.
+PICTURES = ("target", "profile", "second")
 
 
 def check(path: Path, force: bool) -> None:
@@ -50,9 +54,9 @@ def check(path: Path, force: bool) -> None:
 def _of_a_new_project(path: Path) -> bool:
     """Whether a file is what a project begins with: one may have been killed before its project.toml was written."""
     return path.is_file() and (
-        path.name.startswith((".target.", ".profile.", ".source", ".intensity", ".project.toml."))
-        or (path.stem in ("target", "profile") and is_ours(path))
-        or (path.stem.split("-")[0] in ("source", "intensity") and any(map(is_ours, path.parent.glob("target.*"))))
+        path.name.startswith(tuple(f".{stem}" for stem in (*PICTURES, *attachments.ALL, TOML)))
+        or (path.stem in PICTURES and is_ours(path))
+        or (path.stem.split("-")[0] in attachments.ALL and any(map(is_ours, path.parent.glob("target.*"))))
     )
 
 

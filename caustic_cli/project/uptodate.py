@@ -99,7 +99,7 @@ class Outputs:
     def __init__(self, project: Project, command: str, options: dict, paths: Iterable[Path | None]):
         self.record, self.paths = project.path / RECORD, [p for p in paths if p is not None]
         given = {k: str(v) for k, v in sorted(options.items())}
-        inputs = [digest(project.settings, project.picture, project.profile), _hash(project.path / CHECKPOINT)]
+        inputs = [digest(project.settings, project.picture, project.profile, project.second), _hash(project.path / CHECKPOINT)]
         files = ("source.file", "source.intensity", "screen.shape_file")
         inputs += [_hash(Path(options[name])) for name in files if options.get(name)]
         self.asked = hashlib.sha256(json.dumps([command, given, inputs]).encode()).hexdigest()

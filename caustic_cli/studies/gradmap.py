@@ -110,7 +110,7 @@ def _step(scene: Scene, field: HeightField, heights: Tensor, control: tuple[int,
     An index close to 1 bends next to nothing, and a far screen magnifies what thick glass cannot hold.
     """
     least = LEAST_STEP * float(heights.abs().max())
-    return min(max(difference_step(scene, field, control), least), 0.5 * (scene.screen.z - float(heights.max())))
+    return min(max(difference_step(scene, field, control), least), 0.5 * float((scene.screen.z - heights).abs().min()))
 
 
 def finite_difference(

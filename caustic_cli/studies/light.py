@@ -36,7 +36,7 @@ COLUMNS = {
     "thickness": "the same, mm",
     "weight": "of light beside the picture",
     "loss": "what the lens was designed with",
-    "error": "relative RMS between the retraced image and the target, each over its own mean, the rays' noise taken off",
+    "error": "relative RMS between the retraced image and the target, each over its own mean",
     "noise": "standard error of that",
     "on_screen": "part of the source's power on the screen",
     "front": "whether no other lens is both brighter and closer to the picture",

@@ -38,10 +38,16 @@ RAYS = 100_000
 SHEET = 0.08
 #: Errors by which the sensitivities are found: of the throw, relative; of the index.
 STEP = 1e-4
+#: What a mirror, which is no block of glass, has none of.
+OF_GLASS = (
+    *("minimum_wall_mm", "minimum_wall_bound_mm", "stock_height_mm", "volume_cm3", "mass_g"),
+    *("critical_angle_deg", "steepest_incidence_deg", "internal_reflection_margin_deg"),
+    *("landing_mm_per_thousandth_index", "index_error_of_a_pixel"),
+)
 
 
 def manufacture(scene: Scene, field: HeightField, heights: Tensor, tool_radius: float | None = None, seed: int = 0) -> dict:
-    """Figures for JSON; None where there is none (no concave place, a point source's blur is 0).
+    """Figures for JSON; None where there is none (no concave place, a mirror's glass).  A point source's blur is 0.
 
     Keys: minimum_wall_mm and _bound_mm, from the flat entrance; stock_height_mm, what a blank must have; volume_cm3 and, of a known
     material, mass_g; maximum_slope and _bound; smallest_concave_radius_mm and where, (x, y) mm; tool_radius_mm and tool_fits if one
@@ -80,12 +86,12 @@ def manufacture(scene: Scene, field: HeightField, heights: Tensor, tool_radius: 
     if tool_radius is not None:
         found |= {"tool_radius_mm": tool_radius, "tool_fits": radius is None or radius >= tool_radius}
     critical, incidence = math.degrees(math.asin(1.0 / lens.index)), _steepest_incidence(scene, field, heights, seed)
-    blur = scene.source.blur(lens.z_in, scene.screen.z - lens.z_in)
-    throw = STEP * scene.screen.z
+    blur = scene.source.blur(lens.z_in, abs(scene.screen.z - lens.z_in))
+    throw = STEP * abs(scene.screen.z)
     by_throw = _moved(scene, scene, field, heights, seed, throw) / throw
     other = replace(scene, lens=replace(lens, index=lens.index + STEP))
     by_index = _moved(scene, other, field, heights, seed, 0.0) / STEP
-    return found | {
+    found |= {
         "critical_angle_deg": critical,
         "steepest_incidence_deg": incidence,
         "internal_reflection_margin_deg": critical - incidence,
@@ -96,6 +102,7 @@ def manufacture(scene: Scene, field: HeightField, heights: Tensor, tool_radius: 
         "throw_error_of_a_pixel_mm": pixel / by_throw if by_throw > 0 else None,
         "index_error_of_a_pixel": pixel / by_index if by_index > 0 else None,
     }
+    return found | dict.fromkeys(OF_GLASS) if lens.mirror else found
 
 
 def wall_and_stock(scene: Scene, field: HeightField, heights: Tensor) -> dict[str, float]:
@@ -202,7 +209,7 @@ def write_json(path: str | Path, figures: dict) -> None:
 
 
 def rows(f: dict) -> list[tuple[str, str]]:
-    """The figures as a person reads them."""
+    """The figures that there are, as a person reads them."""
     radius, at = f["smallest_concave_radius_mm"], f["smallest_concave_radius_at_mm"]
     concave = "nowhere concave" if radius is None else f"{radius:.4g} mm at ({at[0]:.3g}, {at[1]:.3g})"
     if "tool_radius_mm" in f:
@@ -211,21 +218,26 @@ def rows(f: dict) -> list[tuple[str, str]]:
     def of_a_pixel(key: str, unit: str) -> str:
         return "" if f[key] is None else f"; one pixel at {f[key]:.3g}{unit}"
 
+    found = [
+        ("maximum slope", f"{f['maximum_slope']:.4f} (surely below {f['maximum_slope_bound']:.4f})"),
+        ("smallest concave radius", concave),
+        ("sharpness limit", f"{f['sharpness_limit_mm']:.3g} mm, {f['sharpness_limit_pixels']:.3g} pixels"),
+        (
+            "throw wrong by 1 mm",
+            f"light moves {f['landing_mm_per_mm_throw']:.3g} mm{of_a_pixel('throw_error_of_a_pixel_mm', ' mm')}",
+        ),
+    ]
+    if f["minimum_wall_mm"] is None:
+        return found
     margin = f["internal_reflection_margin_deg"]
     return [
         ("minimum wall", f"{f['minimum_wall_mm']:.4f} mm (surely above {f['minimum_wall_bound_mm']:.4f})"),
         ("stock height", f"{f['stock_height_mm']:.4f} mm"),
         ("volume", f"{f['volume_cm3']:.4g} cm^3" + ("" if f["mass_g"] is None else f", {f['mass_g']:.4g} g")),
-        ("maximum slope", f"{f['maximum_slope']:.4f} (surely below {f['maximum_slope_bound']:.4f})"),
-        ("smallest concave radius", concave),
+        *found,
         (
             "margin to internal reflection",
             f"{margin:.2f} degrees of {f['critical_angle_deg']:.2f}" + ", LIGHT IS LOST" * (margin < 0),
-        ),
-        ("sharpness limit", f"{f['sharpness_limit_mm']:.3g} mm, {f['sharpness_limit_pixels']:.3g} pixels"),
-        (
-            "throw wrong by 1 mm",
-            f"light moves {f['landing_mm_per_mm_throw']:.3g} mm{of_a_pixel('throw_error_of_a_pixel_mm', ' mm')}",
         ),
         (
             "index wrong by 0.001",

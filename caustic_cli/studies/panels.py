@@ -48,8 +48,8 @@ def write_report(
     Args:
         target, image: (n_x, n_y) irradiance; drawn at the same exposure and in the picture's encoding, images beside a bar of
             what they are on the screen.
-        heights: (a, b) surface heights on an even grid over the aperture, mm; the sphere that fits best is taken out,
-            because it hides the relief; of a lens whose index is a volume, that is drawn instead.
+        heights: (a, b) surface heights on an even grid over the aperture, mm; the paraboloid that fits best is
+            taken out, because it hides the relief; of a lens whose index is a volume, that is drawn instead.
         history: (k, 5) rows iteration, stage, loss, on_screen, seconds.
         waves: (n_x, n_y), the wave image, where there is one: light follows it, and errors are its errors.
         stages: how the loss of each sees the picture: through which blur, pixels, and whether as waves.

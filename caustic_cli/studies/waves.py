@@ -14,6 +14,7 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.waves import NoWaveImage, WaveImage, wave_image
 from caustic_cli.optics.waves.image import UNASKED, Departure
 from caustic_cli.scene import Scene
+from caustic_cli.scene.materials import material
 from caustic_cli.studies.irradiance import irradiance_figures
 from caustic_cli.studies.metrics import judge
 
@@ -77,12 +78,17 @@ def unseen_figures(scene: Scene, field: HeightField, heights: Tensor, target: np
     """The same at other wavelengths than those that a scene says: between them, or beside a single one; of white light nothing.
 
     Returns:
-        wave_unseen_relative_rms and wave_unseen_wavelengths, nm.
+        wave_unseen_relative_rms and wave_unseen_wavelengths, nm, those that the glass is known at.
     """
     own = sorted(scene.light.wavelengths)
     if not own or scene.colored:
         return {}
     others = tuple(0.5 * (a + b) for a, b in pairwise(own)) or tuple(a * own[0] for a in ASIDE)
+    if scene.lens.glass is not None:
+        low, high = material(scene.lens.glass).range_nm
+        others = tuple(w for w in others if low <= w <= high)
+    if not others:
+        return {}
     found = wave_image(scene, field, heights.detach(), wavelengths=others, finer=FINER)
     return {"wave_unseen_relative_rms": _judged(found, target)["relative_rms"], "wave_unseen_wavelengths": list(others)}
 

@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from caustic_cli.config.completion import build_options, build_stages, complete
 from caustic_cli.config.settings import build_scene
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.conditions import Range, Ranges
-from caustic_cli.inverse.designer import Designer, Options
+from caustic_cli.inverse.designer import Designer, First, Options
 from caustic_cli.inverse.parametrisation import Architecture
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Scene
@@ -41,13 +40,13 @@ class Candidate:
     Args:
         about: columns that do not change.
         designers: whose lenses are judged, each over its own ranges or in its own scene.
-        first: heights (n, m) mm that all begin from, None for the offset surface.
+        first: what all begin from, None for the offset surface.
         target: (n_x, n_y).
         rays, seed: of the retrace.
     """
 
     def __init__(
-        self, about: dict[str, Any], designers: list[Designer], first: Tensor | None, target: np.ndarray, rays: int, seed: int
+        self, about: dict[str, Any], designers: list[Designer], first: First | None, target: np.ndarray, rays: int, seed: int
     ):
         self.designers, self.target, self.rays, self.seed = designers, target, rays, seed
         self.states = [one.begin(*first or ()) for one in designers]
@@ -101,7 +100,7 @@ def candidates(
     Raises:
         InputError: no stage is on rays, or there are two free-form sides.
     """
-    first: Tensor | None = None
+    first: First | None = None
     if project is None:
         full = complete({"screen": {"resolution": [PIXELS] * 2}, "lens": {"control": [CONTROL] * 2}}, 1.0)
         scene = build_scene(full)

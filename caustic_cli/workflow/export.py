@@ -97,13 +97,12 @@ def write(
     if format == "heightmap":
         found = writer(path, part, **given)
         return {"heightmap": {key: value for key, value in found.items() if key != "spline"}}
-    if script and scene.lens.mirror:
-        raise InputError("⟨script⟩ builds lenses, not mirrors")
-    if script and scene.screen.curved:
-        raise InputError("⟨script⟩ builds plane receivers, not curved screens, which the archive alone holds")
+    scripts = import_module("caustic_cli.export.lighttools_script") if script else None
+    if scripts is not None:
+        scripts.refuse(scene)
     off: Deviation | None = writer(path, part.scene, part.field, part.heights, **given)
-    if script:
-        import_module("caustic_cli.export.lighttools_script").write_script(path, scene, field, heights, **given)
+    if scripts is not None:
+        scripts.write_script(path, scene, field, heights, **given)
     return {} if off is None else off.figures(scene)
 
 

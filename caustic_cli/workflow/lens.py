@@ -28,7 +28,6 @@ from caustic_cli.project.project import Project
 from caustic_cli.scene import Scene
 from caustic_cli.studies.retrace import FINAL_RAYS, QUIET, judging_rays, retrace
 from caustic_cli.studies.waves import wave_figures
-from caustic_cli.workflow import design as workflow
 from caustic_cli.workflow.compilation import compile_for
 from caustic_cli.workflow.cut import FINER, departure
 from caustic_cli.workflow.export import write
@@ -53,7 +52,7 @@ class Lens:
         target: (n_x, n_y) or (3, n_x, n_y) on the screen's pixels, None of an archive.
         figures: of the design's own evaluation, by rays it was not designed with; empty of what was loaded unfinished.
         project: settings and picture, None of an archive.
-        state: where its design stands.
+        state: where its design stands; provenance: of that, see `workflow.design.provenance`.
     """
 
     scene: Scene
@@ -63,6 +62,7 @@ class Lens:
     figures: dict[str, Any]
     project: Project | None = None
     state: State | None = None
+    provenance: dict[str, Any] | None = None
 
     def surface(self, x: Any, y: Any, side: str = "exit") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Height z, mm, and slopes dz/dx, dz/dy of the exit surface at points of the aperture, float64, of their common shape.
@@ -92,7 +92,7 @@ class Lens:
         scene = project.scene(dict(given or {}))
         target = project.target(scene)
         scene, field, heights, checkpoint = project.lens(scene)
-        return cls(scene, field, heights, target, dict(checkpoint.results), project, checkpoint.state)
+        return cls(scene, field, heights, target, dict(checkpoint.results), project, checkpoint.state, checkpoint.provenance)
 
     @classmethod
     def of_archive(cls, path: str | Path) -> Lens:
@@ -212,18 +212,14 @@ class Lens:
 
     def save(self, path: str | Path, force: bool = False) -> Path:
         """Write the lens as a project directory, which `load` and the command line open; force: replace a project there."""
-        if self.project is None or self.state is None:
+        if self.project is None or self.state is None or self.provenance is None:
             raise InputError("an archive's lens has no picture and no design, so it cannot be saved as a project")
         place = Path(path)
         project = replace(self.project, path=place)
         directory.check(place, force)
         directory.settle(project, force)
         with project.hold:
-            project.save(
-                Checkpoint(
-                    self.state, self.field.spaces, workflow.provenance(project, "cpu"), self.figures, uptodate.inputs(project)
-                )
-            )
+            project.save(Checkpoint(self.state, self.field.spaces, self.provenance, self.figures, uptodate.inputs(project)))
         return place
 
 

@@ -155,7 +155,7 @@ def design_of(
         device=device,
     )
     compile_for(project.scene(), device, say, gradient=True)
-    return _lens(workflow.design(project, first, device, say, began, recorder))
+    return _lens(workflow.design(project, first, device, say, began, recorder), device)
 
 
 def resume(
@@ -180,11 +180,12 @@ def resume(
     began, say, recorder = time.monotonic(), say or Listener(), None if movie is None else Movie(movie, force)
     project = Project.open(path)
     compile_for(project.scene(), device, say, gradient=True)
-    return _lens(workflow.resume(project, iterations, time_limit, device, say, began, recorder))
+    return _lens(workflow.resume(project, iterations, time_limit, device, say, began, recorder), device)
 
 
-def _lens(done: workflow.Result) -> Lens:
-    return Lens(done.scene, done.field, done.heights, done.target, done.figures, done.project, done.state)
+def _lens(done: workflow.Result, device: str) -> Lens:
+    made = workflow.provenance(done.project, device)
+    return Lens(done.scene, done.field, done.heights, done.target, done.figures, done.project, done.state, made)
 
 
 def render(lens: Lens | str | Path, rays: float | None = None, **options: Any) -> Render:

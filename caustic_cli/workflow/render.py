@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from caustic_cli.config.completion import filter_from
+from caustic_cli.config.tolerances import read as read_tolerances
 from caustic_cli.errors import InputError
 from caustic_cli.export.mitsuba import quick_samples, write_mitsuba
 from caustic_cli.export.page import refuse_untraceable
@@ -35,7 +36,6 @@ from caustic_cli.workflow.compilation import compile_for
 from caustic_cli.workflow.cut import compared, cut_surface, mark
 from caustic_cli.workflow.lens import Lens, is_archive, refuse_at
 from caustic_cli.workflow.reporter import Reporter
-from caustic_cli.workflow.tolerances import read as read_tolerances
 from caustic_cli.workflow.tolerances import tolerances
 from caustic_cli.workflow.wanted import illumination, wanted
 
@@ -143,6 +143,8 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     if asked.image is not None and asked.image.suffix.lower() not in ("", ".png"):
         raise InputError(f"{asked.image}: ⟨out⟩ is a PNG, and its name must end in .png")
     archived = Lens.of_archive(asked.lens) if is_archive(asked.lens) else None
+    if archived is not None and asked.tolerances is not None:
+        raise InputError("⟨tolerances⟩ compares with the picture, which an archive does not hold; render its project")
     if archived:
         refuse_at(asked.at)
     project = None if archived else Project.open(asked.lens).at(asked.at)

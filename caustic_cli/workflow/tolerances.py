@@ -7,8 +7,6 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from caustic_cli.config import tolerances as schema
-from caustic_cli.errors import InputError
 from caustic_cli.optics.plan import Plan
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -20,11 +18,6 @@ from caustic_cli.workflow.lens import Lens
 from caustic_cli.workflow.reporter import Reporter
 
 
-def read(path: Path) -> Tolerances:
-    """Tolerances from a TOML file; see `config.tolerances`."""
-    return schema.read(path)
-
-
 def tolerances(lens: Lens, plan: Plan, asked: Tolerances, sheet: Path, plot: Path, say: Reporter) -> dict:
     """Study a lens under errors; write all draws to `sheet`, CSV, and `plot`, PNG.
 
@@ -34,10 +27,9 @@ def tolerances(lens: Lens, plan: Plan, asked: Tolerances, sheet: Path, plot: Pat
         the figures for JSON, with the paths of both files.
 
     Raises:
-        InputError: the lens has no picture to be like, or an error makes its scene impossible.
+        InputError: an error makes its scene impossible.
     """
-    if lens.target is None:
-        raise InputError("⟨tolerances⟩ compares with the picture, which an archive does not hold; render its project")
+    assert lens.target is not None
     refined = lens.figures.get("wave_relative_rms") is not None and plan["diffraction"].on
     seen = Resolution.at(plan.scene, lens.field, lens.heights)
     with study.one_thread(), say.progress(None) as show:

@@ -12,7 +12,7 @@ import torch
 from caustic_cli.config import settings
 from caustic_cli.config.completion import build_options, build_stages, complete
 from caustic_cli.errors import CausticError
-from caustic_cli.inverse.designer import Designer
+from caustic_cli.inverse.designer import Designer, First
 from caustic_cli.io.picture import Picture
 from caustic_cli.project.project import Project
 from caustic_cli.studies.light import Lens
@@ -76,7 +76,7 @@ def _designed(project: Project | None, full: dict, weights, parts, seconds: floa
             )
 
 
-def _first(project: Project | None, own: dict) -> tuple[torch.Tensor | None, dict, np.ndarray]:
+def _first(project: Project | None, own: dict) -> tuple[First | None, dict, np.ndarray]:
     """First heights for settings, the settings as they need them, and the target (n_x, n_y)."""
     project = Project(None, own, Picture(picture_of_disc(), "linear")) if project is None else replace(project, settings=own)
     project, first = first_heights(project, {"lens": {"thickness": own["lens"]["thickness"]}})

@@ -5,7 +5,7 @@
 
 Writes DIR/thesis.png (one page, in the order of the thesis' figures), thesis.csv and thesis.json (loss, light, time), and every
 project.  --quick is a few dozen iterations of each, about ten minutes on two cores; without it the iterations are the thesis',
-half an hour.  What is done already is not done again.  Only the command line and the files it documents are used.
+half an hour.  What is done already is not done again.  Only the command line and what its library documents are used.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 from page import draw
+
+from caustic_cli import load
 
 HERE = Path(__file__).resolve().parent
 PICTURES = HERE.parent
@@ -58,9 +60,9 @@ class Book:
 
 
 def state(project: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Control heights (n, m), mm, and history (k, 5) of a project, as `checkpoints.h5` documents them."""
+    """Control heights (n, m), mm, and history (k, 5) of a project."""
     with h5py.File(project / "checkpoints.h5") as f:
-        return f["lens/heights"][()], f["history"][()]
+        return load(project).heights.numpy(), f["history"][()]
 
 
 def finish(book: Book, name: str, project: Path, figures: dict, seconds: float, **more: np.ndarray) -> None:

@@ -105,7 +105,7 @@ def row(name: str, picture: Path, quality: str, folder: Path, out: Path) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", default=",".join(LENSES), help="names of lenses, parted by commas")
+    parser.add_argument("--only", default=",".join(LENSES), help="names of lenses, separated by commas")
     parser.add_argument("--quality", default="standard", choices=("draft", "standard", "fine"))
     parser.add_argument("-o", "--out", type=Path, default=EXAMPLES / "gallery", metavar="DIR")
     given = parser.parse_args()

@@ -161,7 +161,7 @@ def plot(designs: list[dict], by_rays: list[dict], path: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False)
-    parser.add_argument("--pixels", default="125,250,500,1000,2000", help="along a side, parted by commas")
+    parser.add_argument("--pixels", default="125,250,500,1000,2000", help="along a side, separated by commas")
     parser.add_argument("--picture", type=Path, help="instead of the portrait; it is made square")
     parser.add_argument("--most-rays", type=float, default=5.12e8, help="of a retrace")
     parser.add_argument("--large", action=argparse.BooleanOptionalAction, default=True, help="design the lens of 300 mm too")

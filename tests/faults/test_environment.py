@@ -77,7 +77,7 @@ def test_a_bad_value_in_the_environment_is_one_line(variables, monkeypatch, capf
     in_one_line(variables, cli.run(["design", "blob.png", "--quiet"]), *capfd.readouterr())
 
 
-@pytest.mark.parametrize("variables", [BAD[0], {"NUMBA_DISABLE_JIT": "1"}, {"NUMBA_NUM_THREADS": "0"}], ids=lambda v: min(v))
+@pytest.mark.parametrize("variables", [BAD[0], {"NUMBA_DISABLE_JIT": "1"}, {"NUMBA_NUM_THREADS": "0"}], ids=min)
 def test_a_bad_value_ends_a_process_with_one_line(variables):
     done = run(["design", "blob.png", "--quiet"], **variables)
     in_one_line(variables, done.returncode, done.stdout, done.stderr)

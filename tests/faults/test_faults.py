@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -195,6 +196,12 @@ def test_a_place_half_born_is_free(capfd):
     run([*DESIGN, "-o", "empty"], capfd, 0)
     for name in ("project.toml", "checkpoints.h5", "render.png"):
         (Path("empty") / name).unlink()
+    run([*DESIGN, "-o", "empty"], capfd, 0)
+    for name in ("project.toml", "checkpoints.h5", "render.png"):
+        (Path("empty") / name).unlink()
+    shutil.copy("empty/target.png", "empty/second.png")  # and whatever else is written before project.toml
+    for name in ("screen.npy", "index.npy", "tolerances.toml", "source.csv", ".second.png.1"):
+        (Path("empty") / name).touch()
     run([*DESIGN, "-o", "empty"], capfd, 0)
     (Path("empty") / "project.toml").unlink()  # a lens is there
     assert "not a caustic project" in run([*DESIGN, "-o", "empty"], capfd, 2)

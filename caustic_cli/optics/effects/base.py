@@ -73,7 +73,7 @@ class Amount:
 
 
 class Action:
-    """What an effect does to rays in one trace; a `Interaction`'s fields are read and changed in place."""
+    """What an effect does to rays in one trace; an `Interaction`'s fields are read and changed in place."""
 
     #: Whether `stray_light` adds light that goes another way.
     stray = False

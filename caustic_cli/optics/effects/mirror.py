@@ -21,8 +21,10 @@ class Mirror(Effect):
             return Decision(self.name, True, "the surface is a mirror", fixed=True)
         return Decision(self.name, False, "the surface is glass", fixed=True, present=False)
 
-    def sample(self, scene: Scene, heights: Tensor) -> Amount:
-        """The same surface as a mirror, with the screen as far before it."""
+    def sample(self, scene: Scene, heights: Tensor) -> Amount | None:
+        """The same surface as a mirror, with the screen as far before it; a lens whose index is a volume has none such."""
+        if scene.lens.gradient is not None:
+            return None
         z = 2.0 * float(heights.mean()) - scene.screen.z
         lens, screen = replace(scene.lens, mirror=True), replace(scene.screen, z=z)
         return Amount(Scene(scene.source, lens, screen, scene.light), scene, f"the screen at {z:.4g} mm")

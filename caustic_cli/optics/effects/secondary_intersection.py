@@ -32,7 +32,7 @@ class SecondaryIntersection(Effect):
                 self.name, False, "it is looked for at a last surface alone, and light goes on to others", present=False
             )
         if b.slope_ratio < 1.0:
-            why = f"slopes up to {b.slope:.3g} are {b.slope_ratio:.3g} of what rays leaving slope_ratio at"
+            why = f"slopes up to {b.slope:.3g} are {b.slope_ratio:.3g} of those at which a ray that left could meet it again"
             return Decision(self.name, False, why, b.slope_ratio, 1.0)
         return Decision(
             self.name,
