@@ -9,7 +9,6 @@ import matplotlib
 matplotlib.use("Agg")
 import numpy as np
 from matplotlib import pyplot as plt
-from matplotlib.ticker import NullFormatter
 from PIL import Image
 
 from caustic_cli.studies.report import COLOURS, plain_ticks
@@ -47,7 +46,7 @@ def losses(axis, book, names: dict[str, str], title: str, pixels: float) -> None
         axis.semilogy(history[:, 0], history[:, 2] * pixels, lw=1.2, ls="--" if own else "-", color=colour, label=label)
     axis.set_title(title, fontsize=8)
     axis.set_xlabel("iteration", fontsize=7)
-    axis.yaxis.set_minor_formatter(NullFormatter())
+    plain_ticks(axis.yaxis)
     axis.tick_params(labelsize=6)
     axis.grid(alpha=0.3, which="both")
     axis.legend(fontsize=6.5, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, frameon=False)
