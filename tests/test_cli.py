@@ -455,7 +455,9 @@ def test_an_archive_renders_like_its_project(here, capfd):
 
 
 def test_a_script_of_a_scene_that_it_does_not_build_leaves_nothing_behind(here, capfd):
-    assert run("design blob.png --screen-tilt 5,0 --iterations 1 --waves off -o tilted.caustic --quiet", capfd)[0] == 0
+    shutil.copytree("blob.caustic", "tilted.caustic")
+    toml = Path("tilted.caustic/project.toml")
+    toml.write_text(toml.read_text().replace("[screen]\n", "[screen]\ntilt = [5.0, 0.0]\n"))
     code, out, err = run("export tilted.caustic --script -o lens.npz --quiet", capfd)
     assert (code, out) == (2, "") and "a tilted screen" in err and not [*Path().glob("lens*")]
 
