@@ -15,7 +15,7 @@ from scipy.interpolate import BSpline
 
 import caustic_cli as caustic
 from caustic_cli import cli
-from caustic_cli.errors import InputError
+from caustic_cli.errors import CausticError, InputError
 from caustic_cli.export.mesh import closed_mesh
 from caustic_cli.export.step import write_step
 from caustic_cli.inverse.lenslets import ArrayObjective, first_array, joined, lenslets
@@ -193,6 +193,12 @@ def test_brightness_of_lenslets_that_throw_the_same():
     found = brightness(np.stack([one, other, one, 0 * one, 1e-9 * rng.uniform(0, 1, 300)], -1), 2 * one + 3 * other)
     assert found.residual < 1e-10 and found.error < 1e-10 and found.brightness[3] == 0.0
     assert found.brightness[0] + found.brightness[2] == pytest.approx(2.0) and found.brightness[1] == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize("basis", [np.zeros((6, 2)), np.eye(6)[:, :2]], ids=["no light", "light elsewhere"])
+def test_brightness_that_nothing_comes_closer_with_is_refused(basis):
+    with pytest.raises(CausticError, match="no image has light where it is wanted"):
+        brightness(basis, np.eye(6)[5])
 
 
 # The program

@@ -14,7 +14,9 @@ from caustic_cli.io.files import is_ours
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import SAMPLERS
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.system import front_from
 from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
+from caustic_cli.studies import diffraction, intersection
 from caustic_cli.studies.convergence import FILTERS, run_study, single_precision
 from caustic_cli.studies.fit import knee, order, pareto
 from caustic_cli.studies.measurement import REFERENCE_FACTOR, Bench, Setting
@@ -268,3 +270,26 @@ def test_a_file_in_place_of_the_directory_is_refused(rays, tmp_path):
     (tmp_path / "taken").write_text("")
     with pytest.raises(InputError, match="cannot be made"):
         write(rays, tmp_path / "taken")
+
+
+def front(lens: Lens) -> Lens:
+    """The same with a free-form entrance."""
+    field = HeightField.of(lens)
+    bumps = 0.05 * torch.rand(field.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    return replace(lens, front=front_from(field, bumps))
+
+
+def test_intersections_behind_a_free_form_entrance():
+    """Of rays that begin at places of their own."""
+    lens = front(Lens(control=(12, 12), offset=Offset(5.0)))
+    scene = Scene(PlaneWave(), lens, Screen((30.0, 30.0), 300.0, (8, 8)))
+    case = intersection.of_lens(scene, HeightField.of(lens), torch.full((12, 12), 5.0, dtype=torch.float64), 500)
+    x, y, z = case.rays.origin
+    assert x.shape == y.shape == z.shape == case.rays.power.shape and float(z.std()) > 0
+
+
+def test_the_study_of_diffraction_refuses_what_it_does_not_scale():
+    lens = front(Lens(control=(12, 12), offset=Offset(5.0)))
+    scene = Scene(PlaneWave(), lens, Screen((30.0, 30.0), 300.0, (8, 8)))
+    with pytest.raises(InputError, match="one index with a flat entrance"):
+        diffraction.run_diffraction(scene, HeightField.of(lens), torch.full((12, 12), 5.0, dtype=torch.float64))

@@ -29,6 +29,7 @@ from caustic_cli.optics.spread import Convolution, Spread
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
+from caustic_cli.scene.sources.distribution import Distribution
 from caustic_cli.studies.metrics import relative_rms
 
 SMALL = ["--lens-size", "2", "--throw", "60", "--mag", "2", "--resolution", "32", "--quiet", "--threads", "1"]
@@ -251,6 +252,19 @@ def test_etendue_of_small_areas():
     area = math.pi * 3.0 * 2.0 / 4.0
     expected = (25.0 / 58.5**2) / (area / 80.0**2)
     assert etendue_limit(near) == pytest.approx(min(1.0, expected), rel=0.01)
+
+
+@pytest.mark.parametrize(
+    "light", [{"cone": 1.0}, {"intensity": Distribution((0.0, 1.0, 1.2, 90.0), (1.0, 1.0, 0.0, 0.0))}], ids=["cone", "table"]
+)
+def test_etendue_of_light_that_does_not_fill_the_lens(light):
+    """A flat plate sends much of a narrow beam through a screen that sees little of the lens: the limit is no less."""
+    lens = Lens((20.0, 20.0), control=(8, 8), offset=Offset(5.0))
+    scene = Scene(Disc((0.0, 0.0, -50.0), (4.0, 4.0), **light), lens, Screen((10.0, 10.0), 300.0, (10, 10)))
+    plate = torch.full((8, 8), 5.0, dtype=torch.float64)
+    image = expose(scene, HeightField.of(lens), plate, rays_of(scene, "sobol", 1 << 14))
+    on_screen, entered = float(image.image.sum()), 1.0 - image.lost.get("missed_lens", 0.0)
+    assert on_screen > 0.3 and on_screen / entered < etendue_limit(scene) <= 1.0
 
 
 def test_limits_in_words():

@@ -418,3 +418,17 @@ def test_a_candidate_that_fails_is_left_out_by_name(few):
     made[1].reach = fail
     study = architectures.run_architectures(made, seconds=100.0)
     assert list(study.about["failed"].values()) == ["out of light"] and len(study.rows) == 2 * 4
+
+
+def test_a_grid_whose_networks_all_fail_is_an_error(few):
+    """Though free heights beside them do not."""
+    made = grid.candidates(None, "cpu")
+
+    def fail(_):
+        raise CausticError("out of light")
+
+    for one in made:
+        if one.about["network"] == "dense":
+            one.reach = fail
+    with pytest.raises(CausticError, match="none of the networks could be trained: out of light"):
+        architectures.run_architectures(made, seconds=100.0)

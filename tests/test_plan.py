@@ -16,7 +16,8 @@ from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.reintersection import again
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import is_lowered
-from caustic_cli.scene import Disc, Light, Points, Screen
+from caustic_cli.scene import Disc, Lens, Light, Offset, PlaneWave, Points, Scene, Screen
+from caustic_cli.scene.gradient import Gradient
 
 SMOOTH = Filter("cosine", (3, 3))
 NARROW = Points(((0.4, -0.2, -40.0),), cone=4.0)
@@ -209,3 +210,11 @@ def test_names():
     assert len(set(names)) == len(names) == 18
     assert {effect.name for effect in EFFECTS if effect.free} == {"missed-surface", "total-reflection", "screen-shift"}
     assert replace(NO_REQUESTS, stages=True) == STAGES != NO_REQUESTS
+
+
+def test_the_bound_of_bending_knows_the_height_of_the_glass():
+    """A ray bends over all of it, wherever the offset is."""
+    lens = Lens(control=(8, 8), offset=Offset(5.0), height_range=(-1.0, 6.0), gradient=Gradient("radial", (-2e-3,)))
+    scene, field = Scene(PlaneWave(), lens, Screen((30.0, 30.0), 300.0, (8, 8))), HeightField.of(lens)
+    low, high = (bounds_of(scene, field, torch.full((8, 8), z, dtype=torch.float64)).inside for z in (5.0, 10.0))
+    assert high == pytest.approx(2.0 * low, rel=1e-9)

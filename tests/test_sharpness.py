@@ -63,6 +63,15 @@ def test_the_advised_lens_is_sharp():
     assert least(300.0, 3.0) > 1.1 * error
 
 
+def test_advice_is_of_the_way_from_the_lens_wherever_it_stands():
+    one, field, heights = scene(Disc(angle=0.533))
+    lens, screen = one.lens, one.screen
+    offset = replace(lens.offset, thickness=lens.offset.thickness + 150.0)
+    moved = replace(one, lens=replace(lens, z_in=150.0, offset=offset), screen=replace(screen, z=screen.z + 150.0))
+    here, there = (numbers(advice(s, picture(), (30.0, 30.0), field, h)) for s, h in ((one, heights), (moved, heights + 150.0)))
+    assert there["mag"] == here["mag"] and there["throw"] == pytest.approx(here["throw"] + 150.0, abs=0.6)
+
+
 def test_the_factor_is_the_least():
     target = picture()
     spread, pixel = disc(6.0), (30.0 / PIXELS,) * 2

@@ -182,6 +182,21 @@ def test_an_upright_scene_is_close():
     assert apart[0] < 0.2 and apart[1] > 1.5
 
 
+@pytest.mark.parametrize(
+    "error", [Misalignment(source_tilt=(0.4, -0.3)), Misalignment(lens_tilt=(0.5, 0.2))], ids=["source", "lens"]
+)
+def test_an_upright_mirror_is_close(error):
+    """Its light goes back, and a mirror that is turned turns it twice as far."""
+    lens = Lens(control=(8, 8), offset=Offset(5.0), mirror=True)
+    scene, field = Scene(PlaneWave(), lens, Screen((30.0, 30.0), -100.0, (32, 32))), HeightField.of(lens)
+    heights = torch.full((8, 8), 5.0, dtype=torch.float64)
+    rays = rays_of(scene, "stratified", 400, 4)
+    (exact,), (still,) = (landed(scene, field, heights, rays, e) for e in (error, Misalignment()))
+    (close,) = landed(error.upright(scene), field, heights, rays, Misalignment())
+    apart = [float(torch.hypot(exact.x - o.x, exact.y - o.y).mean()) for o in (close, still)]
+    assert apart[0] < 0.15 * apart[1] and apart[1] > 0.8
+
+
 def test_the_best_shift_is_found():
     x = np.arange(48.0)
     spot = np.exp(-((x[:, None] - 22.3) ** 2 + (x[None, :] - 25.6) ** 2) / 30.0)

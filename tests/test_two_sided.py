@@ -64,6 +64,16 @@ def test_first_sides_of_two_pictures():
     assert found["relative_rms"] < 0.35 and found["second_relative_rms"] < 0.7
 
 
+@pytest.mark.parametrize("loss", ["rms", "uniformity"])
+def test_losses_of_the_images_alone_have_gradients_of_both_sides(loss):
+    """They do not depend on what leaves the lens."""
+    scene = Scene(PlaneWave(), LENS, NEAR, second=Second(FAR))
+    field, targets = HeightField.of(LENS), (torch.from_numpy(ONE), torch.from_numpy(TWO))
+    objective = TwoSidedObjective(scene, field, rays_of(scene, "grid", 10_000), Filter("cosine", (5, 5)), targets, loss, apron=6)
+    nets = torch.stack([torch.zeros(field.shape, dtype=torch.float64), torch.full(field.shape, 15.0, dtype=torch.float64)])
+    assert bool(torch.isfinite(objective(nets).gradient).all())
+
+
 @pytest.mark.parametrize("second", [Second(), Second(FAR), Second(focus=(1.0, 2.0, 200.0))])
 def test_the_loss_has_the_gradients_of_both_sides(second):
     """Against central differences along random directions, each side's own and both."""

@@ -454,7 +454,8 @@ class Designer:
 
     def _next(self, state: State, k: int) -> State:
         """The state at the beginning of stage k: the same surface on its net."""
-        keep = self.options.network != "none" or (self.options.optimizer == "adam" and not self.stages[k].waves)
+        by_rays = not (self.stages[k].waves or self.stages[k - 1].waves)
+        keep = self.options.network != "none" or (self.options.optimizer == "adam" and by_rays)
         if self.stages[k].control == self.stages[k - 1].control and keep:
             return replace(state, stage=k, iteration=0, optimizer={})
         if self.options.network != "none":

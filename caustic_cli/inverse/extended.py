@@ -21,6 +21,7 @@ from caustic_cli.optics.screen_shape import normals, space
 from caustic_cli.optics.spread import Convolution, Spread, spread_at
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.scene import Scene, Source
+from caustic_cli.scene.sources.distribution import relative
 
 #: A source shifts the image where it misplaces light by no more than this part of what it spreads it over.
 SHIFTS = 0.35
@@ -131,7 +132,10 @@ def etendue_limit(scene: Scene) -> float | None:
     elif min(source.extent) > 0 and len(source.points()[0]) == 1:
         a, b, part = _area(source.extent, True)
         x0, y0, z0 = source.points()[0][0]
-        given = cell * part * _seen(x, y, (a + x0, b + y0, z0 - lens.z_in)).sum()
+        seen = _seen(x, y, (a + x0, b + y0, z0 - lens.z_in))
+        slope = np.hypot(a + x0 - x[:, None], b + y0 - y[:, None]) / (lens.z_in - z0)
+        cone = source.cone_over(lens.half_size, lens.z_in, lens.round)
+        given = cell * part * seen[(np.arctan(slope) <= cone) & (relative(source.intensity, slope) > 0)].sum()
     else:
         return None
     a, b, part = _area(screen.half_size, False)

@@ -123,7 +123,7 @@ def first_sides(
     grid = _Aperture.of(lens.half_size, cells or min(most, max(least, A_PIXEL * max(target.shape))))
     near = Picture(target, scene.screen.half_size, scene.screen.z, scene.screen.shift)
     if second is not None and behind.screen is not None:
-        slopes = slopes_behind(near, Picture(second, behind.screen.half_size, behind.screen.z))
+        slopes = slopes_behind(near, Picture(second, behind.screen.half_size, behind.screen.z, behind.screen.shift))
     else:
         slopes = slopes_towards(near, behind.focus)
     (px, py), lit = near.corners, near.lit

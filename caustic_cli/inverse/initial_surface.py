@@ -188,7 +188,7 @@ class _Grid:
                 except OutOfReach as error:
                     if not left:
                         raise
-                    reached = reached * _mean(~error.where)
+                    reached = reached * _mean((~error.where).astype(float))
             z = again.heights
         z = z + middle - _middle(z)
         return _Cut(np.maximum(z, self.floor), middle, max(0.0, self.floor - float(z.min())))

@@ -94,20 +94,20 @@ def _of_blur(scene: Scene, target: np.ndarray, picture: tuple[float, float], spr
     f = needed(coarse, (scene.screen.pixel[0] * times[0], scene.screen.pixel[1] * times[1]), spread, error)
     if f is None or f <= 1.0:
         return ""
-    lens, throw = scene.lens, abs(scene.screen.z)
+    lens = scene.lens
+    middle, throw = lens.offset.thickness, scene.screen.z - lens.offset.thickness  # the blur goes as the way from the exit
     mag, ways = picture[0] * lens.array[0] / lens.size[0], []
 
-    def reached(wanted: float, distance: float) -> bool:
-        """Whether a lens could magnify so far at another distance."""
-        z = math.copysign(distance, scene.screen.z)
+    def reached(wanted: float, z: float) -> bool:
+        """Whether a lens could magnify so far onto a screen elsewhere."""
         other = replace(scene, source=PlaneWave(), screen=replace(scene.screen, z=z))
         most = largest_magnification(other, [wanted / mag * p for p in picture])
         return most is None or most >= wanted
 
-    if reached(f * mag, throw):
+    if reached(f * mag, scene.screen.z):
         ways.append(f"⟨+mag⟩ {f * mag:.2g} instead of {mag:.2g}")
-    if throw / f > 2.0 * (lens.offset.thickness - lens.z_in) and reached(mag, throw / f):
-        ways.append(f"⟨+throw⟩ {throw / f:.3g} instead of {throw:.3g} mm")
+    if abs(throw) / f > 2.0 * (middle - lens.z_in) and reached(mag, middle + throw / f):
+        ways.append(f"⟨+throw⟩ {abs(middle + throw / f):.3g} instead of {abs(scene.screen.z):.3g} mm")
     ways.append(f"a lens of {f * lens.size[0]:.3g} mm")
     if not scene.source.distant:
         ways.append(f"a source {f:.2g} times smaller or farther away")

@@ -105,7 +105,8 @@ class TwoSidedObjective:
         *by, entrance, exit = torch.autograd.grad(loss, [*sums, *leaves], allow_unused=True)
         gradients = [torch.zeros_like(h) if g is None else g.clone() for h, g in zip(leaves, (entrance, exit), strict=True)]
         for part in kept or (self._see(traced, parameters) for traced in self._tracers()):
-            live = [(value, pull.to(value.dtype)) for value, pull in zip(part, by, strict=True) if value.requires_grad]
+            pulled = [(value, pull) for value, pull in zip(part, by, strict=True) if pull is not None]
+            live = [(value, pull.to(value.dtype)) for value, pull in pulled if value.requires_grad]
             values, pulls = zip(*live, strict=True)
             for gradient, more in zip(gradients, torch.autograd.grad(values, leaves, pulls, allow_unused=True), strict=True):
                 if more is not None:

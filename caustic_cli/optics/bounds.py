@@ -39,9 +39,9 @@ class Bounds:
     microfacets' normals; index: the largest of all wavelengths; critical: n sin i, total reflection is impossible below 1;
     slope_ratio: of the slope bound to the exit ray's slope, a secondary intersection is impossible below 1; reach: how far rays get
     to the aperture's edge, in parts of its half width, at the greatest height; ghost: part of the power that is reflected twice
-    inside; polarised: of unpolarised light, how much the exit's reflectance changes by what the entrance makes of s and p;
-    ghost_error: about what relative RMS that light adds to the image, see `ghost_error`; resolution: what diffraction, source and
-    pixels let it show.
+    inside; depth: of the glass, mm; polarised: of unpolarised light, how much the exit's reflectance changes by what the entrance
+    makes of s and p; ghost_error: about what relative RMS that light adds to the image, see `ghost_error`; resolution: what
+    diffraction, source and pixels let it show.
     """
 
     incidence: float
@@ -53,6 +53,7 @@ class Bounds:
     slope_ratio: float
     reach: float
     ghost: float
+    depth: float
     ghost_error: float
     polarised: float
     resolution: Resolution
@@ -81,11 +82,11 @@ def bounds_of(scene: Scene, field: HeightField, heights: Tensor, steeper: float 
     least, most = min(indices), max(indices)
     pupil = scene.pupil
     incidence = _through(scene, scene.source.incidence(pupil.half_size, pupil.z, pupil.round))
-    bent = 0.0
+    bent, depth = 0.0, float(heights.max()) - lens.z_in
     if field_of_index := field_of(lens):
-        low, high, steepest = field_of_index.extremes(lens.half_size, lens.offset.thickness - lens.z_in)
+        low, high, steepest = field_of_index.extremes(lens.half_size, depth)
         least, most = least * low / lens.index, most * high / lens.index
-        bent = steepest * (lens.offset.thickness - lens.z_in) / low
+        bent = steepest * depth / low
     front = 0.0 if lens.front is None else math.atan(math.hypot(*front_of(lens).slope_bounds(None)))
     inside = min(front + math.asin(max(-1.0, min(1.0, math.sin(incidence - front) / least))) + bent, 0.5 * math.pi)
     slope = field.slope_bound(heights) + steeper
@@ -101,7 +102,7 @@ def bounds_of(scene: Scene, field: HeightField, heights: Tensor, steeper: float 
     ghost, polarised = _ghost(scene, field, heights, inside + front, most), _polarised(incidence + front, critical, most)
     focused = 0.0 if scene.two_sided or scene.elements else ghost_error(scene, field, heights, ghost, most)
     seen = Resolution.at(scene, field, heights)
-    return Bounds(incidence, inside, slope, lean, most, critical, slope_ratio, reach, ghost, focused, polarised, seen)
+    return Bounds(incidence, inside, slope, lean, most, critical, slope_ratio, reach, ghost, depth, focused, polarised, seen)
 
 
 def _through(scene: Scene, lean: float) -> float:

@@ -120,7 +120,7 @@ class Misalignment:
         changed, ((x, y, z), _) = self.scene(scene), self.screen(scene)
         if scene.source.distant:
             ahead = turned(self.lens_pose(scene), turned_back(Pose(tilt=self.source_tilt), (0.0, 0.0, 1.0)))
-            reach = z - scene.lens.offset.thickness
+            reach = abs(z - scene.lens.offset.thickness)  # a mirror's light goes back, but aside as before
             x, y = x - reach * ahead[0] / ahead[2], y - reach * ahead[1] / ahead[2]
         return replace(changed, screen=replace(scene.screen, z=z, shift=(x, y)))
 

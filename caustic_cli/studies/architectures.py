@@ -8,7 +8,7 @@ limit ends the study after a round that all have been through.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 import torch
@@ -99,7 +99,7 @@ def run_architectures(
                 progress(k * len(candidates) + i + 1, len(ROUNDS) * len(candidates))
         if not left or time.monotonic() - began > seconds * len(candidates):
             break
-    if not left:
+    if not any(_in_grid(c.about) for c in left):
         raise CausticError(f"none of the networks could be trained: {next(iter(failed.values()))}")
     rows.sort(key=lambda row: [c.about["series"] for c in candidates].index(row["series"]))
     made = {
@@ -114,6 +114,11 @@ def run_architectures(
     return Study("networks", COLUMNS, rows, {}, advice, made | (about or {}), "seconds", PLOTS)
 
 
+def _in_grid(about: Mapping[str, Any]) -> bool:
+    """Whether columns are those of one of the networks that are compared."""
+    return about["network"] == "dense" and about["inputs"] in ("", "range")
+
+
 def last_round(rows: Sequence[dict]) -> list[dict]:
     """The rows of the most iterations."""
     most = max(row["iterations"] for row in rows)
@@ -123,7 +128,7 @@ def last_round(rows: Sequence[dict]) -> list[dict]:
 def _advice(rows: Sequence[dict]) -> str:
     """The best, what every choice is worth beside it, and what conditioning is, in one sentence."""
     rows = last_round(rows)
-    grid = [row for row in rows if row["network"] == "dense" and row["inputs"] in ("", "range")]
+    grid = [row for row in rows if _in_grid(row)]
     best = min(grid, key=lambda row: row["error"])
     parts = [f"after {best['iterations']} iterations {best['series']} has the least error of the networks, {best['error']:.3g}"]
     for key in ("preconditioner", "lr", "activation", "layers", "width"):
@@ -144,7 +149,7 @@ def _advice(rows: Sequence[dict]) -> str:
 def draw_architectures(study: Study, figure: Figure) -> None:
     """Error of the last round against width; panels by preconditioner and learning rate, curves by layers and activation."""
     rows = last_round(study.rows)
-    grid = [row for row in rows if row["network"] == "dense" and row["inputs"] in ("", "range")]
+    grid = [row for row in rows if _in_grid(row)]
     down, across = (sorted({row[key] for row in grid}) for key in ("preconditioner", "lr"))
     figure.set_size_inches(2.2 + 3.4 * len(across), 1.4 + 2.8 * len(down))
     panels = figure.subplots(len(down), len(across), sharex=True, sharey=True, squeeze=False)

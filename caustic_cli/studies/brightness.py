@@ -21,6 +21,8 @@ import numpy as np
 from scipy.linalg import lstsq
 from scipy.optimize import nnls
 
+from caustic_cli.errors import CausticError
+
 
 @dataclass(frozen=True, eq=False)
 class Solution:
@@ -36,9 +38,14 @@ def brightness(basis: np.ndarray, wanted: np.ndarray) -> Solution:
     """Non-negative least squares: basis (pixels, n) of images, wanted (pixels,), any unit.
 
     Columns without light get brightness 0.
+
+    Raises:
+        CausticError: no image has light where it is wanted.
     """
     length = np.linalg.norm(basis, axis=0)
     lit = length > 0
+    if not (wanted @ basis > 0).any():
+        raise CausticError("no image has light where it is wanted, so no brightness comes closer than none")
     columns, goal = basis[:, lit] / length[lit], wanted / np.linalg.norm(wanted)
     found = nnls(columns, goal)[0]
     positive = found > 0

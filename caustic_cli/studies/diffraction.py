@@ -22,6 +22,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from caustic_cli import __version__
+from caustic_cli.errors import InputError
 from caustic_cli.optics.resolution import GREEN, Resolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
@@ -83,7 +84,13 @@ def run_diffraction(
     dtype: torch.dtype | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Study:
-    """Ray image against wave image of a lens in plane light, at several sizes, wavelengths and source sizes."""
+    """Ray image against wave image of a lens in plane light, at several sizes, wavelengths and source sizes.
+
+    Raises:
+        InputError: the index varies, or the entrance is free-form.
+    """
+    if scene.lens.gradient is not None or scene.two_sided:
+        raise InputError("⟨study⟩ diffraction is of lenses of one index with a flat entrance")
     plane = replace(scene, source=PlaneWave(scene.source.power), light=Light())
     own = plane.lens.size[0]
     cases = [("lens size", size, GREEN, 0.0, size / own) for size in SIZES]

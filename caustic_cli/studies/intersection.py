@@ -119,12 +119,14 @@ def of_lens(scene: Scene, field: HeightField, heights: Tensor, rays: int | None 
         scene = replace(scene, source=Points(((0.0, 0.0, scene.lens.z_in - away),)))
         source = f"a point on the axis, {away:g} mm before the lens, as rays along z need no search"
     sampler = rays_of(scene, "uniform", rays or RAYS, seed)
-    entered = Tracer(System.of(scene, field), next(iter(sampler.chunks(sampler.count)))).start
+    entered = Tracer(System.of(scene, field), next(iter(sampler.chunks(sampler.count)))).start.counted_from(0.0)
     inside = entered.power > 0
     if not bool(inside.any()):
         raise CausticError("no ray enters the lens, so there is nothing to intersect; check source position and cone")
-    (x, y, z), direction = entered.origin, tuple(c[inside].contiguous() for c in entered.direction)
-    rays = RayState((x[inside].contiguous(), y[inside].contiguous(), z), direction, entered.power[inside].contiguous())
+    origin, direction = (
+        tuple(c[inside].contiguous() if isinstance(c, Tensor) else c for c in v) for v in (entered.origin, entered.direction)
+    )
+    rays = RayState(origin, direction, entered.power[inside].contiguous())
     return Case(field, heights.detach().double().cpu(), rays, source)
 
 

@@ -142,7 +142,8 @@ def _thinner(scene: Scene, low: float, high: float) -> str:
     room = sheet - (low - scene.lens.z_in)  # none in a lens that is no plate
     if scene.lens.mirror or scene.elements or not 0.0 < room < high - low:
         return ""
-    throw = float(f"{abs(scene.screen.z) * (high - low) / room:.2g}")
+    middle = scene.lens.offset.thickness
+    throw = float(f"{middle + (scene.screen.z - middle) * (high - low) / room:.2g}")
     return f"; a ⟨+throw⟩ of about {throw:g} mm or a smaller ⟨+mag⟩ would make it {sheet:.2g} mm thick"
 
 

@@ -31,13 +31,10 @@ class GradientIndex(Effect):
         lens, field = scene.lens, field_of(scene.lens)
         if field is None:
             return Decision(self.name, False, "the lens has one index", 0.0, UNSEEN, present=False)
-        depth = lens.offset.thickness - lens.z_in
-        least, most, steepest = field.extremes(lens.half_size, depth)
-        turn = min(steepest * depth * most / least, 0.5 * math.pi)
-        moved = turn * (depth / (2.0 * least) + scene.screen.z - lens.offset.thickness) / min(scene.screen.pixel)
-        step = (max(most - lens.index, lens.index - least) / lens.index) * max(
-            abs(lens.half_size[0] / lens.offset.radius[0]), abs(lens.half_size[1] / lens.offset.radius[1])
-        )
+        least, most, steepest = field.extremes(lens.half_size, bounds.depth)
+        turn = min(steepest * bounds.depth * most / least, 0.5 * math.pi)
+        moved = turn * (bounds.depth / (2.0 * least) + scene.screen.z - lens.offset.thickness) / min(scene.screen.pixel)
+        step = (max(most - lens.index, lens.index - least) / lens.index) * bounds.slope
         moved += step * (scene.screen.z - lens.offset.thickness) / min(scene.screen.pixel)
         why = (
             f"the index goes from {least:.5g} to {most:.5g}, by up to {steepest:.3g} per mm, which moves light by up to"
