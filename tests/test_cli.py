@@ -168,6 +168,7 @@ BAD = {
     "export samples of a step": ("export blob.caustic --format step --samples 9", "--samples"),
     "export tolerance": ("export blob.caustic --format stl --tolerance 0", "--tolerance"),
     "export tolerance of a table": ("export blob.caustic --format zemax --tolerance 1", "--tolerance"),
+    "export tolerance gcode": ("export blob.caustic --format gcode --tolerance 0", "--tolerance"),
     "export script of a mesh": ("export blob.caustic --format ply --script", "--script"),
     "export mesh over a foreign file": ("export blob.caustic --format mitsuba -o mine.xml", "--force"),
     "start file": (DESIGN + "--start none.npz", "none.npz"),

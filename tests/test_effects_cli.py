@@ -15,6 +15,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.inverse.losses import Loss
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.io.archive import open_archive
+from caustic_cli.io.files import MARK, refuse_foreign
 from caustic_cli.io.picture import read_picture
 from caustic_cli.optics.effects import EFFECTS
 from caustic_cli.optics.effects.mirror import Mirror
@@ -26,6 +27,7 @@ from caustic_cli.scene.gradient import Gradient
 from caustic_cli.scene.light import RGB
 from caustic_cli.studies import effects as study
 from caustic_cli.workflow import design as workflow
+from caustic_cli.workflow.render import Request
 
 NAMES = tuple(effect.name for effect in EFFECTS)
 # A lens of 3 mm: a wave image takes a tenth of the time of one of 10 mm.
@@ -280,3 +282,64 @@ def test_bad_values_are_named(changes, message):
     with pytest.raises(InputError) as error:
         settings.build_scene(full)
     assert message in str(error.value)
+
+
+def test_files_of_one_index_have_that_of_the_one_wavelength(capfd):
+    """N-BK7 at 450 nm, not at the d line."""
+    run(capfd, "design", "blob.png", *TINY, "--glass", "N-BK7", "--wavelengths", "450")
+    for name in ("lens.npz", "lens.dat", "lens.xml"):
+        run(capfd, "export", "blob.caustic", "-o", name)
+    assert float(np.load("lens.npz")["refractive_index"]) == pytest.approx(1.52532, abs=1e-5)
+    for name in ("lens.dat", "lens.xml"):
+        text = workflow.Path(name).read_text()
+        assert "1.5253" in text and "1.5168" not in text
+
+
+def test_wavelengths_leave_a_coloured_picture_its_balance(capfd):
+    run(capfd, "design", "rgb.png", "--color", "--wavelengths", "620,540,460", *TINY, "-o", "own.caustic")
+    run(capfd, "design", "rgb.png", "--color", "--wavelengths", "620:1,540:1,460:1", *TINY, "-o", "even.caustic")
+    own, even = (workflow.Project.open(f"{name}.caustic").scene().light for name in ("own", "even"))
+    red, green, blue = own.parts
+    assert red == pytest.approx(blue, rel=0.2) and green < 0.7 * red and even.parts == (1 / 3,) * 3
+
+
+def test_a_configuration_says_how_the_picture_is_read(capfd):
+    np.save("rgb.npy", np.random.default_rng(0).random((3, 24, 24)))
+    workflow.Path("c.toml").write_text("[target]\ncolor = true\n")
+    assert len(run(capfd, "design", "rgb.npy", "--config", "c.toml", *TINY)["lost"]) > 0
+
+
+MIRROR = "mirror z=50 tilt=45,0"
+
+
+@pytest.mark.parametrize(
+    "options",
+    [("--focus", "0,0,0"), ("--second", "rgb.png", "--second-at", "500", "--throw", "0"), ("--element", MIRROR, "--throw", "0")],
+    ids=["focus", "second", "element"],
+)
+def test_no_distance_at_all_is_one_line(options, capfd):
+    err = run(capfd, "design", "blob.png", *TINY, *options, code=2)
+    assert "must lie behind" in err and "internal" not in err
+
+
+def test_an_image_for_another_value_is_another(tmp_path):
+    request = Request(tmp_path, at="throw=350")
+    assert request.shows == {"at": "throw=350"} and Request(tmp_path).shows == {}
+
+
+def test_what_a_project_is_made_of_is_no_output():
+    workflow.Path("project.toml").touch()
+    for name in ("second.png", "screen.npy", "index.npy", "tolerances.toml"):
+        workflow.Path(name).write_bytes(MARK)
+        with pytest.raises(InputError):
+            refuse_foreign(workflow.Path(name))
+
+
+def test_a_first_surface_that_changes_is_another_design(capfd):
+    run(capfd, "design", "blob.png", *TINY, "-o", "first.caustic")
+    heights = workflow.Project.open("first.caustic").load().state.heights.numpy()
+    np.save("start.npy", heights)
+    own = ("design", "blob.png", *TINY, "--start", "start.npy", "-o", "own.caustic")
+    assert run(capfd, *own)["relative_rms"] == run(capfd, *own)["relative_rms"]  # the same design is welcome
+    np.save("start.npy", heights + 1e-4)
+    assert "holds a design already" in run(capfd, *own, code=2)

@@ -63,6 +63,8 @@ def test_a_blank_is_designed_kept_and_rendered(capfd):
     anew = run(capfd, "design", "blob.png", "--gradient", "free", *TINY, "-o", "free.caustic")
     assert anew["index_least"] == figures["index_least"]
     assert "in one go" in run(capfd, "design", "--resume", "free.caustic", code=2)
+    movie = ("design", "blob.png", "--gradient", "free", *TINY, "-o", "moving.caustic", "--movie", "m.gif")
+    assert "--movie is of a surface's design" in run(capfd, *movie, code=2)
     assert run(capfd, "export", "free.caustic", "--format", "stl", "-o", "blank.stl")["bytes"] > 1000
     assert "varies" in run(capfd, "export", "free.caustic", "--format", "lighttools", code=2)
     assert "varies" in run(capfd, "gradmap", "free.caustic", "--threads", "1", code=2)

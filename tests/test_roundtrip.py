@@ -24,25 +24,29 @@ from test_export import CASES, make, signed_volume
 
 from caustic_cli.errors import InputError
 from caustic_cli.export.approximation import caps, on_fewer_knots
+from caustic_cli.export.heightmap import write_heightmap
 from caustic_cli.export.lighttools import write_lighttools
 from caustic_cli.export.lighttools_script import companions, write_script
 from caustic_cli.export.mesh import closed_mesh
 from caustic_cli.export.mitsuba import write_mitsuba
 from caustic_cli.export.obj import write_obj
+from caustic_cli.export.part import part_of
 from caustic_cli.export.ply import write_ply
 from caustic_cli.export.points import write_csv, write_xyz
 from caustic_cli.export.step import write_step
 from caustic_cli.export.stl import write_stl
 from caustic_cli.export.surface import STEPS_PER_SPAN, sample_grid, second_derivative_bounds
 from caustic_cli.export.zemax import write_zemax
+from caustic_cli.io.archive import open_archive
 from caustic_cli.io.files import is_ours
+from caustic_cli.io.heightmaps import read_heightmap
 from caustic_cli.io.surfaces import onto, read_surface
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer
-from caustic_cli.scene import Disc, PlaneWave, Points, Scene
+from caustic_cli.scene import Component, Disc, Offset, PlaneWave, Points, Scene
 
 LIMIT = 1e-3  # mm on a screen 300 mm away
 CASE = {"control": (22, 16), "size": (10.0, 8.0), "relief": 0.03}
@@ -641,3 +645,29 @@ def test_readers_refuse(tmp_path, lens):
     for name in ("lens.step", "lens.npz"):
         with pytest.raises(InputError, match="lens_size"):
             read_surface(tmp_path / name, (5.0, 5.0))
+
+
+def test_a_height_map_of_many_points_is_read_back(tmp_path):
+    """Rounding that falls together is no edit."""
+    scene, field, heights = make(control=(259, 259), relief=0.02)
+    write_heightmap(tmp_path / "z.png", part_of("heightmap", scene, field, heights))
+    found, again = read_heightmap(tmp_path / "z.png", field.half_size)
+    assert found.shape == field.shape
+    x, y = (9.9 * torch.rand(500, generator=torch.Generator().manual_seed(k), dtype=torch.float64) - 4.95 for k in (0, 1))
+    assert float((found.at(again, x, y)[0] - field.at(heights, x, y)[0]).abs().max()) < 2e-6
+
+
+@pytest.mark.parametrize("name", ["tom&jerry.xml", 'a "b" <c>.xml'])
+def test_mitsuba_files_of_any_name_are_xml(tmp_path, name):
+    scene, field, heights = make()
+    write_mitsuba(tmp_path / name, scene, field, heights)
+    named = [e.get("value") for e in ElementTree.parse(tmp_path / name).iter("string") if e.get("name") == "filename"]
+    assert named and all((tmp_path / n).is_file() for n in named)
+
+
+def test_an_archive_stands_where_its_lens_did(tmp_path):
+    """Another lens right behind a thin one is behind it."""
+    scene, field, heights = make()
+    thin = replace(scene, lens=replace(scene.lens, offset=Offset(1.0)), elements=(Component("lens", 3.0, (10.0, 10.0), 1.0),))
+    write_lighttools(tmp_path / "lens.npz", thin, field, heights - heights.mean() + 1.0)
+    assert open_archive(tmp_path / "lens.npz")[0].lens.offset.thickness == pytest.approx(1.0, abs=0.3)

@@ -99,7 +99,8 @@ def run(
         if preset is not None:
             path_of(preset)
         picture = read_stdin(ACCEPTED, MAX_BYTES) if piped else target
-        read_picture(picture, "target.encoding" in given, given.get("target.color", False), given.get("invert", False))
+        if config is None:  # which may say how it is read
+            read_picture(picture, "target.encoding" in given, given.get("target.color", False), given.get("invert", False))
     device = options.start_torch(device, threads, say)
 
     from caustic_cli.inverse import ranks  # noqa: PLC0415

@@ -213,10 +213,9 @@ def _spectrum(option: str, text: str) -> dict[str, Any]:
     """Wavelengths and their weights: "450:2,550"."""
     form = "wavelengths in nm, each with a weight or without, like 450:2,550"
     lines = [numbers(option, part, (1, 2), ":", form) for part in text.split(",")]
-    return {
-        "source.wavelengths": [line[0] for line in lines],
-        "source.weights": [line[1] if len(line) == 2 else 1.0 for line in lines],
-    }
+    weighed = any(len(line) == 2 for line in lines)
+    weights = [line[1] if len(line) == 2 else 1.0 for line in lines] if weighed else []
+    return {"source.wavelengths": [line[0] for line in lines], "source.weights": weights}
 
 
 def _power(option: str, text: str) -> dict[str, Any]:

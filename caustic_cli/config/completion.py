@@ -151,7 +151,8 @@ def complete(
         put_in_the_middle(over, s, given, by.throw)
     mag, margin = by.mag, default("margin") if by.margin is None else by.margin
     check("lens.size", lens["size"])
-    check("screen.z", screen["z"])
+    if check("screen.z", screen["z"]) == 0:
+        raise InputError("⟨screen.z⟩ must lie behind the lens, or before a mirror, got 0 mm")
     if "size" in screen:
         check("screen.size", screen["size"])
     if "size" in target:

@@ -65,7 +65,7 @@ def complete_over(over: Ranges, s: Settings, given: Settings) -> None:
 def first_magnification(s: Settings) -> float:
     """Of the picture, where nobody said it; where light goes on parallel or to a focus, a beam's as wide as the lens."""
     second = s.get("second", {})
-    if "focus" in second:
+    if "focus" in second and second["focus"][2] != 0:
         return abs(1.0 - s["screen"]["z"] / second["focus"][2])
     return 1.0 if second.get("collimate") else default("mag")
 

@@ -188,7 +188,7 @@ def write_script(
     words = {"@CREATED@": CREATED, "@NPZ@": path.name, "@NAME@": script.name, "@STEM@": path.stem, "@FLAT@": str(FLAT)}
     text = SCRIPT
     for word, value in words.items():
-        text = text.replace(word, value)
+        text = text.replace(word, value.replace("\\", "\\\\").replace('"', '\\"'))
     write_bytes(script, text.encode())
     _write_block(block, scene, usual_cloud(scene, field, heights, samples))
 

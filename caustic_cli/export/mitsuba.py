@@ -21,6 +21,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from torch import Tensor
@@ -115,12 +116,12 @@ def write_mitsuba(
     if front is not None:
         mesh = companions(path, lens.round, two_sided=True)[-1]
         write_mesh(mesh, front.points.reshape(-1, 3), triangles(front.points)[:, ::-1], -front.normals.reshape(-1, 3), text=False)
-        entrance = [f'<shape type="ply" id="entrance"><string name="filename" value="{mesh.name}"/>{glass}</shape>']
+        entrance = [f'<shape type="ply" id="entrance"><string name="filename" value={quoteattr(mesh.name)}/>{glass}</shape>']
     lines = [
         *_camera(screen, away, f'<scale x="-1"/><translate z="{real(screen.z - away)}"/>{onto}', surfaces + 2),
         *entrance,
-        f'<shape type="ply" id="exit"><string name="filename" value="{exit_mesh.name}"/>{glass}</shape>',
-        f'<shape type="ply" id="sides"><string name="filename" value="{sides.name}"/>'
+        f'<shape type="ply" id="exit"><string name="filename" value={quoteattr(exit_mesh.name)}/>{glass}</shape>',
+        f'<shape type="ply" id="sides"><string name="filename" value={quoteattr(sides.name)}/>'
         f'<boolean name="face_normals" value="true"/>{BLACK}</shape>',
         *holder,
         *_others(path, scene),
@@ -154,9 +155,9 @@ def _others(path: str | Path, scene: Scene) -> list[str]:
             if side == "front":  # out of the glass, or towards the light
                 faces, normals = faces[:, ::-1], -normals
             write_mesh(mesh, body.placed(seen.points.reshape(-1, 3)), faces, body.turned(normals), text=False)
-            lines.append(f'<shape type="ply" id="{name}"><string name="filename" value="{mesh.name}"/>{coating}</shape>')
+            lines.append(f'<shape type="ply" id="{name}"><string name="filename" value={quoteattr(mesh.name)}/>{coating}</shape>')
         lines.append(
-            f'<shape type="ply"><string name="filename" value="{black.name}"/>'
+            f'<shape type="ply"><string name="filename" value={quoteattr(black.name)}/>'
             f'<boolean name="face_normals" value="true"/><bsdf type="twosided">{BLACK}</bsdf></shape>'
         )
     return lines
@@ -182,7 +183,7 @@ def _write_mirror(path: str | Path, scene: Scene, surface: Patch, light: list[st
     coated = f'<bsdf type="twosided"><bsdf type="conductor"><string name="material" value="none"/></bsdf>{BLACK}</bsdf>'
     lines = [
         *_camera(screen, away, f'<rotate y="1" angle="180"/><translate z="{real(screen.z + away)}"/>'),
-        f'<shape type="ply" id="mirror"><string name="filename" value="{mesh.name}"/>{coated}</shape>',
+        f'<shape type="ply" id="mirror"><string name="filename" value={quoteattr(mesh.name)}/>{coated}</shape>',
         *_screen(screen, ""),
         *(line.replace("</shape>", '<bsdf type="null"/></shape>') for line in light),
         "</scene>",
@@ -275,7 +276,7 @@ def _round_holder(path: str | Path, radius: float, z: float, black: str) -> list
     faces = np.concatenate([f + k * 2 * RING for k, (_, f) in enumerate(parts)])
     file = companions(path, True)[2]
     write_mesh(file, np.concatenate([v for v, _ in parts]), faces, text=False)
-    return [f'<shape type="ply" id="holder"><string name="filename" value="{file.name}"/>{black}</shape>']
+    return [f'<shape type="ply" id="holder"><string name="filename" value={quoteattr(file.name)}/>{black}</shape>']
 
 
 def _light(scene: Scene) -> list[str]:
@@ -318,6 +319,8 @@ def _area(scene: Scene) -> list[str]:
         )
     if source.brightness is not None:
         raise InputError("⟨format⟩ mitsuba: its disc is evenly bright, so one with a picture of its brightness cannot be written")
+    if not min(source.size) > 0:
+        raise InputError("⟨format⟩ mitsuba: its disc shines by its area, so one without any cannot be written")
     (wx, wy), (x, y, z), cone = source.size, source.position, source.cone_over(pupil.half_size, pupil.z, pupil.round)
     radiance = source.power / (math.pi * math.pi * wx * wy / 4.0 * math.sin(cone) ** 2)  # its cone just covers the lens
     return [

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
@@ -16,7 +17,7 @@ from caustic_cli.optics.bounds import refuse_without_glass
 from caustic_cli.optics.bspline import MAX_DEGREE
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import front_from
-from caustic_cli.scene import Component, Disc, Front, Lens, Light, PlaneWave, Points, Scene, Screen, Source
+from caustic_cli.scene import Component, Disc, Front, Lens, Light, Offset, PlaneWave, Points, Scene, Screen, Source
 from caustic_cli.scene.elements import SIDES
 from caustic_cli.scene.light import MAX_WAVELENGTHS
 from caustic_cli.scene.materials import material
@@ -49,6 +50,7 @@ def open_archive(path: str | Path) -> tuple[Scene, HeightField, Tensor]:
             absorption=data.real("absorption") if "absorption" in data else 0.0,
             roughness=data.real("roughness") if "roughness" in data else 0.0,
             glass=data.text("glass") if "glass" in data else None,
+            offset=Offset(float(field.at(heights, *torch.zeros(2, 1, dtype=torch.float64), ((0, 0),))[0])),
         )
         if lens.glass is not None:
             material(lens.glass)

@@ -38,7 +38,7 @@ MOST_CONTENTS = 1 << 20
 #: Bytes of a file: the points and normals of 50 million samples fit.
 MOST_OF_FILE = 1 << 33
 #: Axes of an array, digits of its size along one, and characters of a text.
-MOST_AXES, MOST_DIGITS, MOST_TEXT = 8, 18, 100
+MOST_AXES, MOST_DIGITS, MOST_TEXT = 8, 18, 10_000
 #: Bytes decompressed at a time.
 PIECE = 1 << 20
 MAGIC = b"\x93NUMPY"

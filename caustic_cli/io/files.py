@@ -26,7 +26,7 @@ MARK = SOFTWARE.encode()
 CREATED_BY = f"created by {SOFTWARE}"  # in a comment at the beginning of a text file
 #: How files begin that a project is made of.
 PARTS = ("project.toml", "checkpoints.h5", "target.", "profile.", "source.", "source-", "intensity.", "intensity-", ".outputs.json")
-PARTS += ("tolerances.toml",)
+PARTS += ("tolerances.toml", "second.", "screen.", "index.")
 NPY_MAGIC = b"\x93NUMPY"
 NPY_HEADER = 256  # bytes; NumPy itself pads to 64 or 128
 #: A temporary file nobody has written to for so many seconds was left by a killed process.

@@ -21,6 +21,7 @@ from caustic_cli.config import settings
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.io.files import open_regular, read_bytes, refuse_foreign, write_bytes
+from caustic_cli.io.heightmaps import beside
 from caustic_cli.io.picture import Picture
 from caustic_cli.project import attachments
 from caustic_cli.project.checkpoint import MAX_BYTES, Checkpoint
@@ -29,10 +30,12 @@ from caustic_cli.project.project import CHECKPOINT, FARTHER, MADE, RENDER, WAVE,
 RECORD = ".outputs.json"
 #: Largest record read, in bytes; what is beyond has been written by somebody else, and is no record.
 MOST_RECORDED = 1 << 24
+#: Settings that name files, where they are given for one run.
+FILES = ("source.file", "source.intensity", "screen.shape_file")
 
 
 def digest(full: Settings, *pictures: Picture | None) -> str:
-    """Hash of complete settings and the pictures and files they speak of; of another project to start from, its lens too."""
+    """Hash of complete settings and the pictures and files they speak of; of a lens to start from, that too."""
     found = hashlib.sha256(f"{__version__}\n{settings.dump(full)}".encode())
     for picture in filter(None, pictures):
         found.update(f"{picture.values.shape}{picture.values.dtype}{picture.encoding}".encode())
@@ -42,6 +45,8 @@ def digest(full: Settings, *pictures: Picture | None) -> str:
     start = Path(full["design"]["start"])
     if is_project(start):
         found.update(_hash(start / CHECKPOINT).encode())
+    elif start.is_file():
+        found.update(f"{_hash(start)}{_hash(beside(start))}".encode())  # of a height map, its JSON too
     return found.hexdigest()
 
 
@@ -100,8 +105,7 @@ class Outputs:
         self.record, self.paths = project.path / RECORD, [p for p in paths if p is not None]
         given = {k: str(v) for k, v in sorted(options.items())}
         inputs = [digest(project.settings, project.picture, project.profile, project.second), _hash(project.path / CHECKPOINT)]
-        files = ("source.file", "source.intensity", "screen.shape_file")
-        inputs += [_hash(Path(options[name])) for name in files if options.get(name)]
+        inputs += [_hash(Path(options[name])) for name in FILES if options.get(name)]
         self.asked = hashlib.sha256(json.dumps([command, given, inputs]).encode()).hexdigest()
         self.key = " ".join(str(p.resolve()) for p in self.paths)
 

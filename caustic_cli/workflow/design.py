@@ -131,6 +131,8 @@ def begin(
         if isinstance(target, Picture)
         else read_picture(target, goal.get("encoding") == "linear", goal.get("color", False), invert)
     )
+    if not said.get("source", {}).get("weights", True):  # of wavelengths without any, which may be the picture's
+        del said["source"]["weights"]
     if goal.get("color", False):
         light = [float(c) for c in picture.irradiance().sum((1, 2))]
         said.setdefault("source", {}).setdefault("weights", [c / sum(light) for c in light])
@@ -251,6 +253,8 @@ def design(project: Project, first: First | None, device: str, say: Reporter, be
         return Result(project, scene, field, heights, target, checkpoint.state, figures)
     with project.hold:
         if is_free(project):
+            if movie is not None:
+                raise InputError("⟨movie⟩ is of a surface's design; ⟨lens.gradient⟩ free designs the index")
             return _run_index(project, say, began, device)
         designer, target = _designer(project, device)
         _say_limits(project, designer, target, first, say)

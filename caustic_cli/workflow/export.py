@@ -79,7 +79,10 @@ def write(
     **given,
 ) -> dict:
     """Write a lens' files, see `files`; given: samples or tolerance, mm; what of it goes into the figures: samples and how far the
-    surface that is read from them is off (`export.accuracy`), or what is said of milling and height maps."""
+    surface that is read from them is off (`export.accuracy`), or what is said of milling and height maps.  Of light of one
+    wavelength, a file of one index has that for it."""
+    if len(scene.light.wavelengths) == 1:
+        scene = scene.at(scene.light.wavelengths[0])
     if scene.lens.front is not None and (script or mould or format not in TWO_SIDED):
         raise InputError(
             f"⟨format⟩ {format} holds one free-form side; of this lens, which has two, {', '.join(TWO_SIDED)} hold both, without"

@@ -23,7 +23,7 @@ from caustic_cli.optics.emission.measured import coarse_words
 from caustic_cli.optics.plan import Plan, parse_effects
 from caustic_cli.optics.surfaces.cut import CutSurface
 from caustic_cli.project.project import FARTHER, RENDER, WAVE, Project, beside
-from caustic_cli.project.uptodate import Outputs, depicted
+from caustic_cli.project.uptodate import FILES, Outputs, depicted
 from caustic_cli.scene import Scene
 from caustic_cli.studies import effects as effects_study
 from caustic_cli.studies import manufacture
@@ -101,8 +101,10 @@ class Request:
     def shows(self) -> dict[str, object]:
         """What decides what is seen in the image, beside its noise, by name, where it is not as usual."""
         usual = {f.name: f.default for f in fields(self)}
-        names = ("reconstruction", "filter_size", "alpha", "screen_at", "effects", "cut")
-        return {name: getattr(self, name) for name in names if getattr(self, name) != usual[name]} | dict(self.given)
+        names = ("reconstruction", "filter_size", "alpha", "screen_at", "effects", "at")
+        cut = {"cut": mark(self.cut)} if self.cut else {}
+        given = {key: mark(Path(value)) if key in FILES else value for key, value in dict(self.given).items()}
+        return {name: getattr(self, name) for name in names if getattr(self, name) != usual[name]} | cut | given
 
     @property
     def asks(self) -> dict[str, object]:
@@ -308,7 +310,9 @@ def _wave_image(
 
 
 def _verified(scene: Scene, lens: Lens, rays: int, seed: int, panels: Path) -> dict:
-    """The figures of the comparison with Mitsuba; its picture is written to `panels`."""
+    """The figures of the comparison with Mitsuba, of glass that has one index; its picture is written to `panels`."""
+    if len(scene.light.wavelengths) == 1:
+        scene = scene.at(scene.light.wavelengths[0])
     with TemporaryDirectory() as folder:
         path = Path(folder) / "lens.xml"
         write_mitsuba(path, scene, lens.field, lens.heights, quick_samples(lens.field), dark=True)

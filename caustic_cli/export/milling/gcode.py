@@ -24,6 +24,8 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
+from caustic_cli.config import checks
+from caustic_cli.config.checks import LENGTH
 from caustic_cli.errors import InputError
 from caustic_cli.export.milling import Milling
 from caustic_cli.export.milling.offset import BallOffset, FlatOffset, shape_of
@@ -117,6 +119,8 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
     Raises:
         InputError: stock below the surface, a tool that would cut into the table, or a file that cannot be written there.
     """
+    if tolerance is not None:
+        checks.number("⟨tolerance⟩", tolerance, 0.0, LENGTH, open_low=True)
     m, lens, base = milling or Milling(), part.lens, part.lens.z_in
     field, heights = part.field, part.heights - base  # from here on Z0 is the flat face
     low, high, slope, concave = shape_of(field, heights)
