@@ -288,6 +288,15 @@ def test_refusals(line, said, arrays, monkeypatch, capfd):
     assert code == 2 and said in err and len(err.strip().splitlines()) == 1, err
 
 
+def test_an_image_by_light_that_no_array_is_designed_for(arrays, monkeypatch, capfd):
+    """Light of a point is refused by a design alone; from far away it is a plane wave's."""
+    monkeypatch.chdir(arrays)
+    line = "render blob.caustic --rays 40000 --quiet --json --threads 1"
+    plane, far = (run(f"{line} -o {n}.png {o}", capfd) for n, o in (("a", ""), ("b", "--source point --source-position 0,0,-1e6")))
+    assert plane[0] == far[0] == 0, far[2]
+    assert json.loads(far[1])["relative_rms"] == pytest.approx(json.loads(plane[1])["relative_rms"], rel=0.05)
+
+
 def test_tiles_are_in_the_order_of_lenslets():
     light = np.arange(4 * 6, dtype=float).reshape(4, 6) + 1.0
     found = tiles(light, (2, 3))

@@ -68,6 +68,9 @@ def test_a_blank_is_designed_kept_and_rendered(capfd):
     assert run(capfd, "export", "free.caustic", "--format", "stl", "-o", "blank.stl")["bytes"] > 1000
     assert "varies" in run(capfd, "export", "free.caustic", "--format", "lighttools", code=2)
     assert "varies" in run(capfd, "gradmap", "free.caustic", "--threads", "1", code=2)
+    far = ("--source", "point", "--source-position", "0,0,-1e6")  # a design needs a plane wave, an image any light
+    seen = run(capfd, "render", "free.caustic", "--rays", "40000", "--quiet", "--threads", "1", "-o", "far.png", *far)
+    assert seen["relative_rms"] == pytest.approx(again["relative_rms"], abs=0.02)
     lens = load("free.caustic")
     assert field_of(lens.scene.lens).shape == (51, 51, 1) and float(np.ptp(lens.surface(np.linspace(-4, 4, 9), 0.0)[0])) < 1e-12
 

@@ -159,11 +159,7 @@ def complete(
         check("target.size", target["size"])
     check("target.flip", target["flip"])
     check("target.encoding", target["encoding"])
-    _complete_source(s["source"], lens, [stage.get("source", "") for stage in s["design"].get("stages", [])])
-    if "also" in s["source"]:
-        s["source"]["also"] = [{**DEFAULTS["source"], **table} for table in s["source"]["also"]]
-        for table in s["source"]["also"]:
-            _complete_source(table, lens, [], "⟨source.also.type⟩")
+    complete_source(s["source"], lens, [stage.get("source", "") for stage in s["design"].get("stages", [])])
     if over:
         complete_over(over, s, given)
     if (over or _counted(s["design"])) and "initial" not in given.get("design", {}):
@@ -189,18 +185,22 @@ def complete(
     return s
 
 
-def _complete_source(source: dict[str, Any], lens: dict[str, Any], stages: list[str], where: str = "⟨source.type⟩") -> None:
+def complete_source(source: dict[str, Any], lens: dict[str, Any], stages: Sequence[str] = (), where: str = "⟨source.type⟩") -> None:
     """What the types of source in use need and nobody said, without what none of them has: a plane wave has no intensity.
 
     `stages`: the types that stages name, "" for the source's own; they need their keys too.
     """
+    if "also" in source:
+        source["also"] = [{**DEFAULTS["source"], **table} for table in source["also"]]
+        for table in source["also"]:
+            complete_source(table, lens, where="⟨source.also.type⟩")
     types = [sources.type_of(source["type"], where)]
     types += [sources.type_of(type, "⟨design.stages.source⟩") for type in stages if type]
     for type in types:
         for key, value in type.defaults(lens).items():
             source.setdefault(key, value)
     for key in set(DEFAULTS["source"]).difference(sources.COMMON, *(type.keys for type in types)):
-        source.pop(key)
+        source.pop(key, None)
 
 
 def first_thickness(size: Sequence[float]) -> float:

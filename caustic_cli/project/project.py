@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.config import settings
-from caustic_cli.config.completion import build_options, build_stages, complete
+from caustic_cli.config.completion import build_options, build_stages, complete, complete_source
 from caustic_cli.config.settings import Settings, value_of
 from caustic_cli.errors import InputError, no_project, plain
 from caustic_cli.inverse.conditions import Ranges
@@ -165,7 +165,9 @@ class Project:
         settings.refuse_unused(changed["source"], given)
         if changed["source"]["type"] not in sources.used_by("profile"):
             changed["source"].pop("profile", None)
-        return settings.build_scene(complete(changed, self.picture.aspect), profile)
+        changed = settings.with_defaults(changed)
+        complete_source(changed["source"], changed["lens"])  # what else a design asks of its light, an image does not
+        return settings.build_scene(changed, profile)
 
     def target(self, scene: Scene) -> np.ndarray:
         """The picture on the scene's screen, (n_x, n_y), or (3, n_x, n_y) of a coloured one."""
