@@ -91,7 +91,7 @@ def test_irradiance_is_power_over_area():
     in_watts = Scene(Disc(power=3.0), Lens(), scene.screen)
     assert irradiance_figures(in_watts, image)["peak_irradiance"] == pytest.approx(3.0 / 2.0)
     assert unit_figures(in_watts)["irradiance_unit"] == "W/mm^2"
-    assert per_part(in_watts, Screen((8.0, 4.0), 50.0, (8, 4))) == pytest.approx(3.0)
+    assert per_part(in_watts.onto(Screen((8.0, 4.0), 50.0, (8, 4)))) == pytest.approx(3.0)
     colours = np.stack([image, 0.0 * image, image])
     assert irradiance_figures(in_watts, colours)["mean_irradiance"] == pytest.approx(3.0 * 2.0 / 8.0)
 

@@ -231,7 +231,7 @@ def test_time_bounds_the_stages():
     assert wave_refinement(1e6, 0) == [(5, n) for n in WAVES["standard"][1]]
     fewer = wave_refinement(1e7, 0)
     assert 0 < sum(n for _, n in fewer) < sum(WAVES["standard"][1]) and all(n >= LEAST_WAVES for _, n in fewer)
-    assert wave_refinement(1e9, 0) == [] and len(wave_refinement(1e9, 0, hurry=False)) == 2
+    assert wave_refinement(1e9, 0) == [] and len(wave_refinement(1e9, 0, timed=False)) == 2
     with pytest.raises(InputError, match="waves"):
         completion.complete({"design": {"waves": "perhaps"}}, 1.0)
     with pytest.raises(InputError, match="network none"):

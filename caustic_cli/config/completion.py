@@ -427,7 +427,7 @@ def _wave_stages(s: Settings, source: Source, quality: str, lit: tuple[float, fl
     if asked == "auto" and (seen.source > seen.pixel or not seen.matters):
         return []
     own = s["source"].get("wavelengths", [])
-    plan = wave_refinement(_wave_samples(s, seen, lit), len(own), quality, hurry=asked == "auto")
+    plan = wave_refinement(_wave_samples(s, seen, lit), len(own), quality, timed=asked == "auto")
     apron = math.ceil(0.04 * max(screen["resolution"]))
     return [on_waves(lens["control"], list(map(float, own)) or white(count), apron, n) for count, n in plan]
 

@@ -293,17 +293,17 @@ SECONDS_A_SAMPLE, SECONDS_A_POINT = 2.2e-8, 6e-8
 LEAST_WAVES = 5
 
 
-def wave_refinement(samples: float, wavelengths: int, quality: str = "standard", hurry: bool = True) -> list[tuple[int, int]]:
+def wave_refinement(samples: float, wavelengths: int, quality: str = "standard", timed: bool = True) -> list[tuple[int, int]]:
     """Stages on the wave image after those on rays: (wavelengths of white light, iterations) each.
 
     Args:
         samples: of the field at one wavelength.
         wavelengths: of the source; 0 for white light.
-        hurry: keep within the quality's time, with fewer iterations or none at all.
+        timed: keep within the quality's time, with fewer iterations or none at all.
     """
     check("quality", quality)
     count, plan, seconds = WAVES[quality]
     each = samples * (SECONDS_A_SAMPLE * (wavelengths or count) + SECONDS_A_POINT)
-    part = min(1.0, seconds / (each * sum(plan))) if hurry else 1.0
+    part = min(1.0, seconds / (each * sum(plan))) if timed else 1.0
     stages = [(count, int(part * n)) for n in plan]
     return [s for s in stages if s[1] >= LEAST_WAVES]

@@ -151,10 +151,8 @@ def _between(low: np.ndarray, high: np.ndarray, lens: Lens) -> tuple[np.ndarray,
         raise InputError(f"a solid needs its exit above its entrance everywhere, got a least thickness of {least:.6g} mm")
     nx, ny = high.shape[:2]
     top, below = rim_of(nx, ny), nx * ny + rim_of(nx, ny)
-    after, after_below = np.roll(top, -1), np.roll(below, -1)
-    walls = [np.stack([below, after_below, after], -1), np.stack([below, after, top], -1)]
     entrance = nx * ny + triangles(low)[:, ::-1]
-    return np.concatenate([high.reshape(-1, 3), low.reshape(-1, 3)]), np.concatenate([triangles(high), *walls, entrance])
+    return np.concatenate([high.reshape(-1, 3), low.reshape(-1, 3)]), np.concatenate([triangles(high), walls(top, below), entrance])
 
 
 def patch(
@@ -243,6 +241,12 @@ def rim_of(nx: int, ny: int) -> np.ndarray:
     return np.concatenate([number[:-1, 0], number[-1, :-1], number[:0:-1, -1], number[0, :0:-1]])
 
 
+def walls(top: np.ndarray, below: np.ndarray) -> np.ndarray:
+    """Triangles, seen from outside, between two loops of points (k,), counter-clockwise from +z, by their numbers: (2 k, 3)."""
+    after, after_below = np.roll(top, -1), np.roll(below, -1)
+    return np.concatenate([np.stack([below, after_below, after], -1), np.stack([below, after, top], -1)])
+
+
 def solid(points: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     """Closed triangle mesh of the lens under points (nx, ny, 3): vertices (V, 3) float64 mm, faces (F, 3) int64.
 
@@ -266,8 +270,7 @@ def solid(points: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
         loops = [_at(rim, lens, 0.0, high), _at(rim, lens, lens.border, high), _at(rim, lens, lens.border, lens.z_in)]
     for loop in loops:
         below = count + np.arange(len(rim))
-        after, after_below = np.roll(numbers, -1), np.roll(below, -1)
-        faces += [np.stack([below, after_below, after], -1), np.stack([below, after, numbers], -1)]
+        faces.append(walls(numbers, below))
         vertices.append(loop)
         numbers, count = below, count + len(rim)
     faces.append(np.stack([np.full_like(numbers, count), np.roll(numbers, -1), numbers], -1))

@@ -29,7 +29,7 @@ from torch import Tensor
 from caustic_cli.errors import InputError
 from caustic_cli.export.accuracy import Deviation, of_triangles
 from caustic_cli.export.bodies import bodies
-from caustic_cli.export.mesh import Patch, both_patches, patches, refuse_open, rim_of, triangles
+from caustic_cli.export.mesh import Patch, both_patches, patches, refuse_open, rim_of, triangles, walls
 from caustic_cli.export.ply import FACE, write_mesh
 from caustic_cli.export.surface import STEPS_PER_SPAN, most_points
 from caustic_cli.export.text import CREATED, real
@@ -143,8 +143,8 @@ def _others(path: str | Path, scene: Scene) -> list[str]:
         rims = [p.points.reshape(-1, 3)[rim_of(*p.points.shape[:2])] for p in patches]
         outer = rims[0] * [FRAME, FRAME, 1.0]
         frame, around = _strip(outer, rims[0])
-        sides, walls = _strip(rims[1], rims[0])
-        write_mesh(black, body.placed(np.concatenate([frame, sides])), np.concatenate([around, walls + len(frame)]), text=False)
+        sides, across = _strip(rims[1], rims[0])
+        write_mesh(black, body.placed(np.concatenate([frame, sides])), np.concatenate([around, across + len(frame)]), text=False)
         coating = _glass(body.component.index)
         if body.component.mirror:
             coating = f'<bsdf type="twosided"><bsdf type="conductor"><string name="material" value="none"/></bsdf>{BLACK}</bsdf>'
@@ -241,11 +241,7 @@ def quick_samples(field: HeightField) -> tuple[int, int]:
 
 def _strip(top: np.ndarray, low: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Between two loops (k, 3), counter-clockwise from +z: vertices, and triangles seen from outside."""
-    high, below = np.arange(len(top)), len(top) + np.arange(len(low))
-    after, after_below = np.roll(high, -1), np.roll(below, -1)
-    return np.concatenate([top, low]), np.concatenate(
-        [np.stack([below, after_below, after], -1), np.stack([below, after, high], -1)]
-    )
+    return np.concatenate([top, low]), walls(np.arange(len(top)), len(top) + np.arange(len(low)))
 
 
 def _holder(lens: Lens, black: str) -> list[str]:

@@ -138,23 +138,9 @@ def step_within(field: HeightField, heights: Tensor, tolerance: float) -> float:
 def second_derivative_bounds(field: HeightField, heights: Tensor) -> tuple[float, float, float]:
     """Upper bounds of |z_xx|, |z_xy|, |z_yy| between knots, 1/mm, from the derivatives' control nets."""
     (su, sv), (rx, ry), net = field.spaces, field.half_size, heights.detach().double().cpu()
-    u, v = _difference(net, su.knots, su.degree), _difference(net.T, sv.knots, sv.degree)
-    twist = _difference(u.T, sv.knots, sv.degree)
-    xx, yy = (_difference(d, s.knots[1:-1], s.degree - 1) for d, s in ((u, su), (v, sv)))
-    bounds = (xx, 4 * rx * rx), (twist, 4 * rx * ry), (yy, 4 * ry * ry)
-    return tuple(float(d.abs().max() / scale) if d.numel() else 0.0 for d, scale in bounds)
-
-
-def _difference(net: Tensor, knots: Tensor, p: int) -> Tensor:
-    """Control net (n - 1, k) of the derivative of a spline of degree p with control values (n, k), by its knots alone.
-
-    Where p knots coincide the derivative may jump; the jump itself is left out.
-    """
-    if p < 1:
-        return net[:0]
-    n = len(net)
-    step = (knots[p + 1 : p + n] - knots[1:n])[:, None]
-    return torch.where(step > 0, p * net.diff(dim=0) / step.clamp_min(1e-300), 0.0)
+    xx, yy = (float(s.differences(net, k, 2).abs().max()) if s.degree > 1 else 0.0 for k, s in enumerate(field.spaces))
+    xy = float(sv.differences(su.differences(net), 1).abs().max())
+    return xx / (4.0 * rx * rx), xy / (4.0 * rx * ry), yy / (4.0 * ry * ry)
 
 
 def on_lines(field: HeightField, heights: Tensor, lines: Sequence[Tensor], asked: str = "⟨samples⟩") -> SurfaceGrid:

@@ -12,10 +12,9 @@ from torch import Tensor
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT, sides_of
-from caustic_cli.optics.trace import tracers
+from caustic_cli.optics.trace import CHUNK, tracers
 from caustic_cli.scene import Scene
 
-CHUNK = 1 << 19
 #: Rays that `origins` are found from: so many for each of them, and their most.
 AN_ORIGIN, MOST_RAYS = 8, 300_000
 

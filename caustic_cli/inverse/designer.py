@@ -33,7 +33,7 @@ from caustic_cli.inverse.over_range import AdamOverRange, RangeObjective
 from caustic_cli.inverse.parametrisation import Architecture, FreeHeights, Heights, SidesTogether, parametrise
 from caustic_cli.inverse.robust import RobustObjective
 from caustic_cli.inverse.schedule import Stage
-from caustic_cli.inverse.steps import Adam, Newtonlike
+from caustic_cli.inverse.steps import Adam, QuasiNewton
 from caustic_cli.inverse.target import grey
 from caustic_cli.inverse.two_sided import TwoSidedObjective
 from caustic_cli.inverse.waves import WaveObjective
@@ -342,7 +342,7 @@ class Designer:
                     state.reason = "no wave image"
                     return True
                 adam = self.options.optimizer == "adam" and not stage.waves
-                kind = AdamOverRange if self.options.over else Adam if adam else Newtonlike
+                kind = AdamOverRange if self.options.over else Adam if adam else QuasiNewton
                 method = kind(objective, heights, self.options.lr)
                 if state.optimizer:
                     method.load(state.optimizer)

@@ -24,7 +24,7 @@ from scipy.interpolate import RegularGridInterpolator
 
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.relayed import bare, opened, passed
-from caustic_cli.inverse.target import overlap
+from caustic_cli.optics.averages import shared_out
 from caustic_cli.optics.emission.measured import irradiance
 from caustic_cli.optics.interface import reflectance
 from caustic_cli.optics.system import ENTRANCE, System
@@ -162,12 +162,7 @@ def _square(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[
     source, lens, shape = scene.source, scene.lens, (len(x) - 1, len(y) - 1)
     if source.distant:
         profile = source.profile
-        if profile is None:
-            return np.ones(shape), None
-        for axis in (0, 1):  # the profile's cells, averaged over these
-            covers = overlap(np.linspace(0.0, 1.0, profile.shape[axis] + 1), np.linspace(0.0, 1.0, shape[axis] + 1))
-            profile = covers @ profile if axis == 0 else (covers @ profile.T).T
-        return profile, None
+        return (np.ones(shape) if profile is None else shared_out(profile, shape)), None
     x0, y0, z0 = source.centre
     h, t, n = lens.z_in - z0, z - lens.z_in, lens.inside
     if h <= 0:

@@ -162,7 +162,7 @@ class Objective:
             for spread, image in zip(self.spread, images, strict=True)
         )
 
-    def _due(self, seen: Tensor, leaving: Tensor) -> Tensor:
+    def _expected_power(self, seen: Tensor, leaving: Tensor) -> Tensor:
         """Power that the loss holds against an image: all that leaves the lens; behind a source's blur what it sees, unless that
         is less than what can be expected there."""
         return torch.maximum(seen.sum((-2, -1)), self.expected * leaving) if self.spread else leaving
@@ -219,7 +219,7 @@ class Objective:
         ranks.all_reduce(image, leaving, entering)
         image, leaving = image.requires_grad_(), leaving.requires_grad_()
         seen = self._spread_out(image)
-        loss = self.loss(seen, self._due(seen, leaving), penalty, entering)
+        loss = self.loss(seen, self._expected_power(seen, leaving), penalty, entering)
         wanted = [image, leaving, *leaves] if penalty.requires_grad else [image, leaving]
         by_image, by_leaving, *direct = torch.autograd.grad(loss, wanted, allow_unused=True)
         gradients = [torch.zeros_like(heights) for heights in leaves]

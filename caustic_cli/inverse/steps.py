@@ -106,7 +106,7 @@ class Adam:
         self.adam.load_state_dict(whole)
 
 
-class Newtonlike:
+class QuasiNewton:
     """L-BFGS on half the squared relative RMS, whose curvature near the minimum is that of a least-squares problem."""
 
     def __init__(self, objective: Objective, heights: Heights, lr: float):

@@ -3,22 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import sparse
 
 from caustic_cli.errors import InputError
+from caustic_cli.optics.averages import averaged
 from caustic_cli.optics.screen_shape import areas
 from caustic_cli.scene import Screen
-
-
-def overlap(cells: np.ndarray, pixels: np.ndarray) -> sparse.csr_array:
-    """Part of each pixel's width covered by each cell: (len(pixels) - 1, len(cells) - 1), from ascending edges in mm."""
-    edges = np.unique(np.concatenate([cells, pixels]))
-    middle = 0.5 * (edges[:-1] + edges[1:])
-    row, column = np.searchsorted(pixels, middle) - 1, np.searchsorted(cells, middle) - 1
-    rows, columns = len(pixels) - 1, len(cells) - 1
-    inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-    value = np.diff(edges)[inside] / np.diff(pixels)[row[inside]]
-    return sparse.coo_array((value, (row[inside], column[inside])), shape=(rows, columns)).tocsr()
 
 
 def target_on_screen(irradiance: np.ndarray, size: tuple[float, float], screen: Screen, flip: str = "") -> np.ndarray:
@@ -44,18 +33,16 @@ def target_on_screen(irradiance: np.ndarray, size: tuple[float, float], screen: 
         irradiance = irradiance[::-1]
     if "y" in flip:
         irradiance = irradiance[:, ::-1]
-    mean = irradiance
-    for axis in (0, 1):
-        cells = np.linspace(-0.5, 0.5, irradiance.shape[axis] + 1) * size[axis]
-        pixels = np.linspace(-0.5, 0.5, screen.resolution[axis] + 1) * screen.size[axis]
-        if abs(cells[0] - pixels[0]) < 1e-9 * screen.size[axis]:  # a picture as wide as the screen shares its edges exactly
-            cells[[0, -1]] = pixels[[0, -1]]
-        covers = overlap(cells, pixels)
-        mean = covers @ mean if axis == 0 else (covers @ mean.T).T
+    cells = [np.linspace(-0.5, 0.5, n + 1) * w for n, w in zip(irradiance.shape, size, strict=True)]
+    pixels = [np.linspace(-0.5, 0.5, n + 1) * w for n, w in zip(screen.resolution, screen.size, strict=True)]
+    for own, whole in zip(cells, pixels, strict=True):
+        if abs(own[0] - whole[0]) < 2e-9 * whole[-1]:  # a picture as wide as the screen shares its edges exactly
+            own[[0, -1]] = whole[[0, -1]]
+    mean = averaged(irradiance, cells, pixels)
     if not mean.sum() > 0:
         raise InputError("target is black all over: a picture with some light in it is needed")
     true = areas(screen)
-    return np.ascontiguousarray(mean if true is None else mean * true)
+    return mean if true is None else mean * true
 
 
 def tiles(light: np.ndarray, array: tuple[int, int]) -> list[np.ndarray]:

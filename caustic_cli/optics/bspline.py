@@ -189,14 +189,19 @@ class SplineSpace:
             out[i] /= bands[i, p]
         return torch.from_numpy(out)
 
-    def differences(self, points: Tensor, axis: int = 0) -> Tensor:
-        """Control points of the derivative, a spline of degree p - 1, of those with `points` along an axis: n - 1 there."""
-        p, t, n = self.degree, self.knots, self.n
-        step = t[p + 1 : p + n] - t[1:n]
-        scale = torch.where(step > 0, p / step.clamp_min(KNOT_RESOLUTION), 0.0)
-        shape = [1] * points.ndim
-        shape[axis] = -1
-        return points.diff(dim=axis) * scale.to(points).view(shape)
+    def differences(self, points: Tensor, axis: int = 0, order: int = 1) -> Tensor:
+        """Control points of a derivative, a spline of degree p - order, of those with `points` along an axis: n - order there.
+
+        Where knots coincide p - order + 1 times, or oftener, it may jump; the jump itself is left out.  order: at most p.
+        """
+        for k in range(order):
+            p, t, n = self.degree - k, self.knots[k : len(self.knots) - k], self.n - k
+            step = t[p + 1 : p + n] - t[1:n]
+            scale = torch.where(step > 0, p / step.clamp_min(KNOT_RESOLUTION), 0.0)
+            shape = [1] * points.ndim
+            shape[axis] = -1
+            points = points.diff(dim=axis) * scale.to(points).view(shape)
+        return points
 
     def insert(self, new_knots) -> tuple[SplineSpace, Tensor]:
         """Boehm's knot insertion: the finer space and the matrix T (n', n) with T @ P the same spline in it."""

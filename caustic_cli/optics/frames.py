@@ -12,6 +12,8 @@ from functools import cached_property
 
 from torch import Tensor
 
+from caustic_cli.scene.screen import tilted
+
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 Axes = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
@@ -31,9 +33,7 @@ class Pose:
         """Unit vectors along its x, y and z."""
         if not any(self.tilt):
             return self.frame
-        (sa, ca), (sb, cb) = ((math.sin(t), math.cos(t)) for t in map(math.radians, self.tilt))
-        own = (cb, 0.0, -sb), (sb * sa, ca, cb * sa), (sb * ca, -sa, cb * ca)
-        x, y, z = (turned_back(Pose(frame=self.frame), axis) for axis in own)
+        x, y, z = (turned_back(Pose(frame=self.frame), axis) for axis in tilted(self.tilt))
         return x, y, z
 
     @property

@@ -28,7 +28,7 @@ from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.screen_shape import shape_of
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, System
-from caustic_cli.optics.trace import Tracer
+from caustic_cli.optics.trace import CHUNK, Tracer
 from caustic_cli.scene import Scene, Source
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.several import Several
@@ -164,7 +164,6 @@ def landed(
     rays: Rays,
     errors: Misalignment,
     requests: Requests = NO_REQUESTS,
-    chunk: int = 1 << 19,
 ) -> Iterator[Landed]:
     """Rays of a scene with these errors on its screen, chunk by chunk.
 
@@ -183,7 +182,7 @@ def landed(
                 lens = replace(band.scene.lens, index=plain.scene.lens.index + errors.index)
                 band = replace(band, scene=replace(band.scene, lens=lens))
             system = System.of(band.scene, field)
-            for state in of_member(rays, band.member).chunks(chunk):
+            for state in of_member(rays, band.member).chunks(CHUNK):
                 if not isinstance(state, RayState):
                     state = RayState.on_axis(state, system.pupil.half_size, system.pupil.z).spread()
                 state = errors.directed(scene, band.scene.source, state)

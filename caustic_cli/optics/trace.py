@@ -48,6 +48,8 @@ from caustic_cli.optics.surfaces import HeightField, SurfaceIntersection
 from caustic_cli.optics.system import EXIT, Element, Placed, System
 from caustic_cli.scene import Light, PlaneWave, Points, Scene, Screen
 
+#: Rays traced at a time, which bounds the memory.
+CHUNK = 1 << 19
 #: No parameters at all.
 NOTHING: Parameters = MappingProxyType({})
 
@@ -545,7 +547,7 @@ def expose(
     filter: Filter | None = None,
     dtype: torch.dtype = torch.float64,
     screen: Screen | None = None,
-    chunk: int = 1 << 19,
+    chunk: int = CHUNK,
     requests: Requests = NO_REQUESTS,
 ) -> Image[float]:
     """Trace all rays of a sampler and collect them: the value of the one function every command asks about.
@@ -579,7 +581,7 @@ def render(
     seed: int = 0,
     device: str | torch.device = "cpu",
     dtype: torch.dtype = torch.float64,
-    chunk: int = 1 << 19,
+    chunk: int = CHUNK,
     requests: Requests = NO_REQUESTS,
 ) -> list[Image[float]]:
     """The image on every screen of a system, from about `rays` rays of every source at every wavelength.

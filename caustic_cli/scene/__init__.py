@@ -142,6 +142,11 @@ class Scene:
         """Whether all light within the lens runs along the axis."""
         return self.source.collimated and not self.two_sided and self.lens.gradient is None and not self.before
 
+    def part(self, k: int, of: int) -> Scene:
+        """The same in the k-th of so many lights that are alike and independent: a ray file's rays are shared out among them,
+        other light's are drawn anew."""
+        return replace(self, source=self.source.part(k, of))
+
     def onto(self, screen: Screen) -> Scene:
         """The same light on another screen, with nothing said of what it does behind that."""
         return replace(self, screen=screen, second=None)

@@ -153,5 +153,10 @@ class Screen:
     @property
     def axes(self) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]:
         """Unit vectors along its x and y, and its normal."""
-        (sa, ca), (sb, cb) = ((math.sin(t), math.cos(t)) for t in map(math.radians, self.tilt))
-        return (cb, 0.0, -sb), (sb * sa, ca, cb * sa), (sb * ca, -sa, cb * ca)
+        return tilted(self.tilt)
+
+
+def tilted(tilt: tuple[float, float]) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]:
+    """Axes x, y, z turned right-handedly about x first, then about y, degrees: unit vectors."""
+    (sa, ca), (sb, cb) = ((math.sin(t), math.cos(t)) for t in map(math.radians, tilt))
+    return (cb, 0.0, -sb), (sb * sa, ca, cb * sa), (sb * ca, -sa, cb * ca)

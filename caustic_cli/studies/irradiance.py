@@ -25,16 +25,16 @@ def irradiance(image: np.ndarray, screen: Screen) -> np.ndarray:
     return image if true is None else image / true
 
 
-def per_part(scene: Scene, screen: Screen | None = None) -> float:
+def per_part(scene: Scene) -> float:
     """E of a plane screen's pixel that gets all of the source's power."""
-    wide, tall = (screen or scene.screen).pixel
+    wide, tall = scene.screen.pixel
     return scene.source.power * UNITS[scene.light.unit][1] / (wide * tall)
 
 
-def irradiance_figures(scene: Scene, image, screen: Screen | None = None) -> dict[str, float]:
+def irradiance_figures(scene: Scene, image) -> dict[str, float]:
     """peak_irradiance, of the brightest pixel of an image J as it is, and mean_irradiance, over the screen."""
     total = image.sum(0) if image.ndim == 3 else image
-    scale, true = per_part(scene, screen), areas(screen or scene.screen)
+    scale, true = per_part(scene), areas(scene.screen)
     if true is None:
         return {"peak_irradiance": float(total.max()) * scale, "mean_irradiance": float(total.mean()) * scale}
     total = np.asarray(total.cpu() if isinstance(total, Tensor) else total)

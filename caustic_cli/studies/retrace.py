@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from caustic_cli.optics.sampling import SOBOL_RAYS, stream
 from caustic_cli.optics.surfaces.cut import CutSurface
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
-from caustic_cli.scene import Scene, Screen
+from caustic_cli.scene import Scene
 from caustic_cli.studies.irradiance import irradiance_figures, unit_figures
 from caustic_cli.studies.metrics import judge
 from caustic_cli.studies.noise import black_error, image_noise, lift, standard_error, variance_of
@@ -59,11 +59,6 @@ def _available(scene: Scene) -> int:
     return min((one.rays.count for one in scene.source.members if one.rays is not None), default=BATCHES * MOST_RAYS)
 
 
-def _part(scene: Scene, k: int, of: int) -> Scene:
-    """The scene in the k-th of so many lights that are alike and independent: rays of a file are shared out among them."""
-    return replace(scene, source=scene.source.part(k, of))
-
-
 @dataclass(frozen=True)
 class Converged:
     """An image traced until its noise was low enough.
@@ -86,7 +81,6 @@ def converge(
     *,
     rays: int,
     seed: int = 0,
-    screen: Screen | None = None,
     device: str = "cpu",
     dtype: torch.dtype = torch.float64,
     requests: Requests = NO_REQUESTS,
@@ -100,7 +94,7 @@ def converge(
         CausticError: MOST_RAYS or those of a file are not enough, or no light reaches the screen.
     """
     each, traced, order = max(1, rays // BATCHES), 0, ORDER if scene.source.collimated else SOBOL_ORDER
-    available, lights = _available(scene), [_part(scene, k, BATCHES) for k in range(BATCHES)]
+    available, lights = _available(scene), [scene.part(k, BATCHES) for k in range(BATCHES)]
     while True:
         if each * BATCHES > available:
             raise CausticError(f"⟨tolerance⟩ {tolerance:g} asks for more rays than the file holds, {available:,}")
@@ -113,7 +107,6 @@ def converge(
                     _rays(light, each, stream(seed, f"batch {k}"), device),
                     None,
                     dtype,
-                    screen,
                     requests=requests,
                 )
             )
@@ -165,7 +158,6 @@ def retrace(
     rays: int,
     seed: int = 0,
     filter: Filter | None = None,
-    screen: Screen | None = None,
     device: str = "cpu",
     dtype: torch.dtype = torch.float64,
     tolerance: float | None = None,
@@ -192,13 +184,11 @@ def retrace(
 
     def trace(name: str, count: int, light: Scene = scene) -> Image:
         sampler = _rays(light, max(1, count), stream(seed, name), device)
-        return within_source(expose(light, field, heights, sampler, None, dtype, screen, requests=requests))
+        return within_source(expose(light, field, heights, sampler, None, dtype, requests=requests))
 
     even = scene.source.collimated
     if tolerance is not None:
-        found = converge(
-            scene, field, heights, tolerance, rays=rays, seed=seed, screen=screen, device=device, dtype=dtype, requests=requests
-        )
+        found = converge(scene, field, heights, tolerance, rays=rays, seed=seed, device=device, dtype=dtype, requests=requests)
         counted = found.exposure
         figures = _judged_halves(counted, target, found.halves) | {"error_estimate": found.error, "rays_traced": found.traced}
     elif even:
@@ -206,7 +196,7 @@ def retrace(
         figures = _judged_even(counted, target, tuple(trace(f"noise {k}", rays // PROBE) for k in (0, 1)) if noise else None)
     else:
         parts: tuple[list[Image], list[Image]] = [], []
-        lights = [_part(scene, k, 2) for k in (0, 1)]
+        lights = [scene.part(k, 2) for k in (0, 1)]
         while True:
             for k in range(len(parts[0]), max(1, 2 * len(parts[0]))):
                 for part, name, light in zip(parts, ("render", "render, other half"), lights, strict=True):
@@ -218,11 +208,11 @@ def retrace(
             if enough or 2 * len(parts[0]) > MOST_TIMES or rays * len(parts[0]) >= _available(scene):
                 break
     require_account(figures, dtype)
-    figures |= irradiance_figures(scene, counted.image, screen) | unit_figures(scene)
+    figures |= irradiance_figures(scene, counted.image) | unit_figures(scene)
     if filter is None or filter.reach == (0, 0):
         return counted, figures
     sampler = sampler_for(scene, counted.rays, seed, device)
-    return within_source(expose(scene, field, heights, sampler, filter, dtype, screen, requests=requests)), figures
+    return within_source(expose(scene, field, heights, sampler, filter, dtype, requests=requests)), figures
 
 
 def judging_rays(scene: Scene, usual: int = FINAL_RAYS) -> int:

@@ -217,7 +217,7 @@ class Trials:
     def _rays(self, errors: Misalignment, heights: Tensor, half: int) -> list[Landed]:
         changed, even = errors.scene(self.scene), self.scene.source.collimated or self.rays > SOBOL_RAYS // 4
         kind, seed = "stratified" if even else "sobol", stream(self.tolerances.seed, f"tolerances {half}")
-        rays = rays_of(_part(changed, half % 2), kind, self.rays, seed)
+        rays = rays_of(changed.part(half % 2, 2), kind, self.rays, seed)
         return list(landed(self.scene, self.field, heights, rays, errors, self.requests))
 
     def _image(self, parts: Iterable[Landed]) -> np.ndarray:
@@ -287,11 +287,6 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-def _part(scene: Scene, half: int) -> Scene:
-    """One half of the light of ray files; all of other light, whose rays are drawn anew."""
-    return replace(scene, source=scene.source.part(half, 2))
 
 
 def best_shift(image: np.ndarray, target: np.ndarray) -> tuple[float, tuple[float, float]]:

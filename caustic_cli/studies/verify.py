@@ -37,6 +37,7 @@ from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Scene
 from caustic_cli.scene.plain import beyond_plain
 from caustic_cli.studies.drawn import KINDS, emitted
+from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.retrace import BATCHES
 
 VARIANTS = ("llvm_ad_mono", "llvm_ad_rgb", "scalar_rgb")  # the scalar one works everywhere and takes minutes
@@ -231,7 +232,7 @@ def compare(
     chi2, beyond, largest = float(np.mean(some**2)), float(np.mean(abs(some) > 3)), float(abs(some).max())
     turned = _turned(render)
     own, other = _correlation(image, render), max(_correlation(image, t) for t in turned)
-    total, of_noise = _rms(image, render), _noise(image, squares, renders)
+    total, of_noise = relative_rms(image, render), _noise(image, squares, renders)
     figures = {
         **(about or {}),
         "rays": rays,
@@ -299,13 +300,8 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.corrcoef(a.ravel(), b.ravel())[0, 1]) if np.ptp(a) > 0 < np.ptp(b) else 0.0
 
 
-def _rms(a: np.ndarray, b: np.ndarray) -> float:
-    """Difference of two images, each over its own mean."""
-    return float(np.sqrt(np.mean((a / a.mean() - b / b.mean()) ** 2)))
-
-
 def _noise(image: np.ndarray, squares: np.ndarray, renders: np.ndarray) -> float:
-    """What noise alone makes of `_rms`."""
+    """What noise alone makes of `relative_rms`."""
     return float(np.sqrt(squares.mean() + renders.var(0, ddof=1).mean() / len(renders)) / image.mean())
 
 

@@ -271,8 +271,8 @@ def _say_limits(project: Project, designer: Designer, target: np.ndarray, first:
     seen = Resolution.before(designer.scene, tuple(project.settings["target"]["size"]))
     if not designer.scene.elements:
         say.say(seen.sentence())
-    hurry = math.isfinite(project.settings["design"]["time_limit"])
-    words = limits(designer.scene, grey(target), steps=SMOOTH_STEPS if hurry else None).sentence()
+    timed = math.isfinite(project.settings["design"]["time_limit"])
+    words = limits(designer.scene, grey(target), steps=SMOOTH_STEPS if timed else None).sentence()
     if words:
         say.say(words)
     if designer.scene.jointly:
@@ -459,8 +459,8 @@ def _run(
 ) -> Result:
     chosen = project.settings["design"]
     limit = chosen["time_limit"] if time_limit is None else time_limit
-    hurry = math.isfinite(limit)
-    if hurry:  # the limit is the command's: what the start took counts, and what the evaluation will take
+    timed = math.isfinite(limit)
+    if timed:  # the limit is the command's: what the start took counts, and what the evaluation will take
         after = expected_seconds(designer, target, state, device)
         limit = max(LEAST_PART * limit, limit - (time.monotonic() - began) - after)
     records = _Records(project, designer, device)
@@ -518,7 +518,7 @@ def _run(
             )
         keep_if_due(state)
         state.heights = rounded(designer.within_limits(state))
-        found = judge(project, designer, target, state, device, hurry)
+        found = judge(project, designer, target, state, device, timed)
         made = wall_and_stock(designer.scene, designer.field(found.state.stage), designer.exit(found.state))
         figures = (
             found.figures | made | {"iterations": state.total, "seconds": time.monotonic() - began, "reason": found.state.reason}
@@ -536,7 +536,7 @@ def _run(
     field = designer.field(found.state.stage)
     scene, heights = sides_of(designer.scene, field, found.state.heights)
     size = tuple(project.settings["target"]["size"])
-    if not hurry and scene.second is None and (words := advice(scene, grey(target), size, field, heights)):
+    if not timed and scene.second is None and (words := advice(scene, grey(target), size, field, heights)):
         say.say(words)
     return Result(project, scene, field, heights, target, found.state, figures)
 

@@ -64,10 +64,10 @@ class Evaluation:
     second: np.ndarray | None = None
 
 
-def judge(project: Project, designer: Designer, target: np.ndarray, state: State, device: str, hurry: bool = False) -> Evaluation:
+def judge(project: Project, designer: Designer, target: np.ndarray, state: State, device: str, timed: bool = False) -> Evaluation:
     """Evaluate the finished lens; write render.png, wave.png and report.png into the project, if it has a directory."""
     chosen = project.settings["design"]
-    found = evaluate(designer, target, state, device, chosen["seed"], tuple(project.settings["target"]["size"]), hurry)
+    found = evaluate(designer, target, state, device, chosen["seed"], tuple(project.settings["target"]["size"]), timed)
     if project.path is None:
         return found
     encoding = project.settings["target"]["encoding"]
@@ -99,7 +99,7 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
 
 
 def expected_seconds(designer: Designer, target: np.ndarray, state: State, device: str) -> float:
-    """About how long `judge` will take in a hurry, s: by a retrace of few rays, and a wave image where one was refined."""
+    """About how long `judge` will take under a time limit, s: by a retrace of few rays, and a wave image where one was refined."""
     scene, field, began = designer.scene, designer.field(state.stage), time.monotonic()
     retrace(
         *traced_of(scene, field, state.heights), target, rays=judging_rays(scene, FINAL_RAYS) // PROBE, device=device, noise=False
@@ -121,7 +121,7 @@ def evaluate(
     device: str,
     seed: int,
     size: tuple[float, float],
-    hurry: bool = False,
+    timed: bool = False,
 ) -> Evaluation:
     """Retrace the finished lens with rays that it was not designed with, and where diffraction was refined, as a wave.
 
@@ -129,8 +129,8 @@ def evaluate(
     image where that was refined, whose figures are then there too.
 
     Args:
-        seed: of the rays; size: width and height of the picture, mm; hurry: leave the noise at what FINAL_RAYS make of it, and the
-            least error at what a few iterations find.
+        seed: of the rays; size: width and height of the picture, mm; timed: under a time limit, leave the noise at what FINAL_RAYS
+            make of it, and the least error at what a few iterations find.
     """
     scene, field = designer.scene, designer.field(state.stage)
     if scene.second is not None:
@@ -144,7 +144,7 @@ def evaluate(
             device=device,
             seed=seed,
             noise=noise,
-            quiet=None if hurry else QUIET,
+            quiet=None if timed else QUIET,
         )
 
     refined = any(s.waves for s in designer.stages[: state.stage + 1])
@@ -186,7 +186,7 @@ def evaluate(
         rounded = began or trace(designer.within_limits(replace(state, heights=designer.begun(state))))[1]
         unrounded = trace(designer.begun(state, rounded=False))[1]
         figures |= {"min_radius": radius_figures(designer.options.min_radius, rounded, unrounded)}
-    bounds = limits(scene, grey(target), field, state.heights, SMOOTH_STEPS if hurry else None)
+    bounds = limits(scene, grey(target), field, state.heights, SMOOTH_STEPS if timed else None)
     if bounds.light is not None:
         figures |= {"least_relative_rms": bounds.light.error}
     if bounds.etendue is not None:

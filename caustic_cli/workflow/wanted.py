@@ -13,6 +13,7 @@ from caustic_cli.inverse.target import target_on_screen
 from caustic_cli.io.picture import read_picture, write_image
 from caustic_cli.optics.plan import Plan, compile_plan
 from caustic_cli.studies.brightness import brightness
+from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.retrace import retrace, white_level
 from caustic_cli.workflow.lens import Lens
 from caustic_cli.workflow.reporter import Reporter
@@ -73,10 +74,9 @@ def wanted(
     level = solved.brightness / solved.brightness.max()
     seen = (basis @ level).reshape(asked.shape)
     write_image(image, seen, white_level(seen, asked), lens.encoding)
-    error = np.sqrt(np.mean((seen / seen.mean() - asked / asked.mean()) ** 2))
     return {
         "brightness": level.reshape(scene.lens.array).tolist(),
-        "error": float(error),
+        "error": relative_rms(seen, asked),
         "kkt_residual": solved.residual,
         "power": float(np.dot(level, [one.share for one in parts])),
         "image": str(image),

@@ -29,6 +29,7 @@ from caustic_cli import __version__
 from caustic_cli.errors import InputError
 from caustic_cli.export.surface import sample_grid
 from caustic_cli.io.files import CREATED_BY, write_bytes
+from caustic_cli.optics.averages import shared_out
 from caustic_cli.optics.emission.brightness import bright_points
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene, Screen, Source
@@ -200,17 +201,7 @@ def _coarser(screen: Screen) -> Screen:
 def _onto(image: np.ndarray, screen: Screen) -> np.ndarray:
     """An image's light, of all colours, on the pixels of a screen of the same size."""
     grey = image.sum(0) if image.ndim == 3 else image
-    (a, b), (n, m) = grey.shape, screen.resolution
-    return _shares(a, n) @ grey @ _shares(b, m).T
-
-
-def _shares(fine: int, coarse: int) -> np.ndarray:
-    """Part of each of `fine` equal cells that lies in each of `coarse` ones over the same length: (coarse, fine)."""
-    if fine == coarse:
-        return np.eye(fine)
-    edges, own = np.arange(fine + 1) / fine, np.arange(coarse + 1) / coarse
-    ends = np.minimum(edges[None, 1:], own[1:, None]) - np.maximum(edges[None, :-1], own[:-1, None])
-    return np.clip(ends, 0.0, None) * fine
+    return shared_out(grey, screen.resolution) * (grey.size / math.prod(screen.resolution))
 
 
 def _coded(values: np.ndarray) -> dict:

@@ -61,9 +61,9 @@ class IndexField(ABC):
     def at(self, point: Point, coefficients: Tensor | None = None) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
         """n^2 and F at points, three (N,) mm; differentiable by the points and the coefficients, None for the field's own."""
 
-    def index(self, point: Point, coefficients: Tensor | None = None) -> Tensor:
+    def index(self, point: Point) -> Tensor:
         """n at points (N,)."""
-        return self.at(point, coefficients)[0].clamp_min(LEAST_SQUARE).sqrt()
+        return self.at(point)[0].clamp_min(LEAST_SQUARE).sqrt()
 
     def extremes(self, half_size: tuple[float, float], depth: float) -> Extremes:
         """Bounds over [-r_x, r_x] x [-r_y, r_y] x [0, depth], mm: from a survey, widened by what may lie between its points."""

@@ -116,10 +116,10 @@ class HeightField(Surface[Tensor]):
         low, high = torch.aminmax(heights.detach())
         return float(low), float(high)
 
-    def least(self, heights: Tensor, round: bool = False, per_span: int = 8, most: int = 4001) -> float:
-        """The least height over the aperture, a rectangle or the circle within, mm: of `per_span` points a knot span, at most
-        `most` along an axis; never more than that of the corners and the centre."""
-        points = [torch.linspace(0.0, 1.0, min(most, per_span * (len(s.breaks) - 1) + 1), dtype=torch.float64) for s in self.spaces]
+    def least(self, heights: Tensor, round: bool = False) -> float:
+        """The least height over the aperture, a rectangle or the circle within, mm: of 8 points a knot span, at most
+        4001 along an axis; never more than that of the corners and the centre."""
+        points = [torch.linspace(0.0, 1.0, min(4001, 8 * (len(s.breaks) - 1) + 1), dtype=torch.float64) for s in self.spaces]
         u, v = (s.banded(p) for s, p in zip(self.spaces, points, strict=True))
         z = over_grid(u, heights.detach().double().cpu(), v)
         if round:
