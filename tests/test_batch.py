@@ -221,7 +221,7 @@ def test_completion_is_installed_and_completes(tmp_path):
     home = tmp_path / "home"
     home.mkdir()
     done = subprocess.run(
-        [sys.executable, "-m", "caustic_cli", "--install-completion", "bash"],
+        ["bash", "-c", f"{sys.executable} -m caustic_cli --install-completion; exit $?"],  # the shell is that which calls it
         check=True,
         text=True,
         capture_output=True,

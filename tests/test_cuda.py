@@ -17,6 +17,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from caustic_cli.errors import InputError
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.optics import backends
 from caustic_cli.optics.reconstruction import Filter
@@ -125,6 +126,9 @@ def test_the_backend_of_a_device(kernels, name, monkeypatch):
     assert (backends.backend_for("cpu"), backends.backend_for("cuda:0")) == ("numba", name)
     monkeypatch.setenv("CAUSTIC_KERNELS", "torch")
     assert backends.backend_for("cuda:0") == "torch"
+    monkeypatch.setenv("CAUSTIC_KERNELS", "numpy")
+    with pytest.raises(InputError, match="torch or cuda"):
+        backends.backend_for("cpu")
 
 
 def test_cuda_is_not_loaded_for_a_cpu():

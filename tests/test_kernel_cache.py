@@ -74,6 +74,17 @@ def test_installations_of_the_same_sources_share_what_is_kept(package, tmp_path)
     assert run(RUN, other, NUMBA_CACHE_DIR=kept) == ["1.0", "1", "0"]
 
 
+def test_damaged_files_are_made_anew(package, tmp_path):
+    """An index or a function's code that was cut off, as by a loss of power, costs one compilation and no more."""
+    kept = tmp_path / "kept"
+    assert run(RUN, package, NUMBA_CACHE_DIR=str(kept)) == ["1.0", "0", "1"]
+    for ending in ("nbi", "nbc"):
+        (damaged,) = kept.rglob(f"probe.probe-*.{ending}")
+        damaged.write_bytes(b"")
+        assert run(RUN, package, NUMBA_CACHE_DIR=str(kept)) == ["1.0", "0", "1"]
+        assert run(RUN, package, NUMBA_CACHE_DIR=str(kept)) == ["1.0", "1", "0"]
+
+
 @pytest.mark.parametrize("temporary", [True, False], ids=["temporary files only", "nowhere"])
 def test_kernels_run_where_nothing_can_be_written(package, tmp_path, temporary):
     """No home and no cache: below the directory of temporary files; and if not there either, without keeping anything."""

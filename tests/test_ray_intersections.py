@@ -207,7 +207,7 @@ def test_a_long_way_off():
 
 
 def test_where_the_aperture_ends():
-    """A flat surface at height 2, of a circle of 3 mm: a square around it stops light, or lets it pass."""
+    """A flat surface at height 2."""
     _, fused, heights = surface()
     heights = torch.full_like(heights, 2.0)
     one, none = torch.ones(1, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
@@ -220,29 +220,12 @@ def test_where_the_aperture_ends():
 
     assert meets(0.0, 0.0, 0.0, 1.0) == 2.0
     assert meets(3.5, 0.0, 0.0, 1.0) == 2.0
-    assert meets(3.5, 0.0, 0.0, 1.0, radius=3.0) is None
-    assert meets(3.5, 0.0, 0.0, 1.0, radius=3.0, rectangle=False) is None
     assert meets(-6.0, 0.0, 2.0, 1.0) == 2.0
-    assert meets(-6.0, 0.0, 2.0, 1.0, radius=3.0, rectangle=False) == 2.0
     assert meets(-7.0, 0.0, 0.5, 1.0) is None  # enters above it
     for z in (2.0, 3.0):
         assert meets(0.0, z, 0.0, 1.0) is None
     assert meets(0.0, 3.0, 0.0, -1.0) is None
     assert meets(0.0, 3.0, 0.0, -1.0, side=-1.0) == 1.0
-    with pytest.raises(ValueError, match="needs a radius"):
-        meets(0.0, 0.0, 0.0, 1.0, rectangle=False)
-
-
-def test_beyond_a_circle_there_is_nothing_to_meet():
-    """Light that runs above the surface outside the circle is lost only where the surface is said to go on there."""
-    _, fused, heights = surface(30, 29, (2, 2))
-    heights = torch.full_like(heights, 2.0)
-    heights[:3] = 0.0
-    one, length = torch.ones(1, dtype=torch.float64), math.hypot(4.0, 1.0)
-    ray = [(-6.0 * one, 0 * one, 0.5 * one), (4.0 / length * one, 0 * one, 1.0 / length * one)]
-    assert not bool(hits_of_rays(fused, heights, *ray, radius=3.5)[3])
-    t, _, _, found = hits_of_rays(fused, heights, *ray, radius=3.5, rectangle=False)
-    assert bool(found) and float(t) == pytest.approx(1.5 * length, rel=1e-14)
 
 
 def test_from_above_is_the_mirror_image():

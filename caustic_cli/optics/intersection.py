@@ -10,9 +10,9 @@ Notation, in the frame of the surface
 A ray with L < |d_z| meets the surface once.  Newton's iteration then runs inside a bracket, from the hull and the aperture, that
 bisection takes over where a step leaves it.  For any other ray the first root is isolated before that.
 
-`reference` is plain torch, for any surface and device; `kernels.hit` is its fused form for B-splines.  The thesis' triangle mesh is
-in `mesh`.  At the hit f(t; P, o, d) = 0 gives every derivative of t (`attach`), whatever found it: no iteration is ever
-differentiated.
+`reference` is plain torch, for any surface and device; `kernels.batches`, by `kernels.intersect`, is its fused form for B-splines.
+The thesis' triangle mesh is in `mesh`.  At the hit f(t; P, o, d) = 0 gives every derivative of t (`attach`), whatever found it: no
+iteration is ever differentiated.
 """
 
 from __future__ import annotations

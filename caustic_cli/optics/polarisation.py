@@ -16,8 +16,7 @@ import math
 import torch
 from torch import Tensor
 
-#: |d x N|^2 below which a ray counts as normal to the surface: R_s and R_p then differ by less than any rounding.
-NORMAL = 1e-30
+from caustic_cli.optics.tolerances import NORMAL
 
 
 def field_of(angle: float, d):

@@ -130,8 +130,11 @@ class RayState:
 
     def spread(self) -> RayState:
         """The same with x, y and power (N,): of a sample they are rows, columns and a number until rays go their own ways."""
-        if self.sample is None:
+        s = self.sample
+        if s is None or (not s.tensor and self.power.ndim):
             return self
-        shape = self.sample.shape
-        x, y, power = (torch.broadcast_to(c, shape).reshape(-1) for c in (*self.origin[:2], self.power))
-        return replace(self, origin=(x, y, self.origin[2]), power=power, lost=dict(self.lost))
+        x, y, power = (torch.broadcast_to(c, s.shape).reshape(-1) for c in (*self.origin[:2], self.power))
+        if s.tensor:
+            u, v = (torch.broadcast_to(c, s.shape).reshape(-1) for c in (s.u[:, None], s.v[None, :]))
+            s = replace(s, u=u, v=v, tensor=False)
+        return replace(self, origin=(x, y, self.origin[2]), power=power, sample=s, lost=dict(self.lost))

@@ -12,3 +12,5 @@ FEW_ULP, MOST_STEPS = 4.0 * 2.220446049250313e-16, 100
 #: Part of the way through the surface's box below which two roots are not told apart: the surface then rises above the ray by
 #: no more than some 1e-12 of that way, and the ray may as well pass.  And most probes for the first root.
 FINEST, MOST_PROBES = 1e-6, 20_000
+#: |d x N|^2 below which a ray counts as normal to the surface: R_s and R_p then differ by less than any rounding.
+NORMAL = 1e-30

@@ -88,8 +88,8 @@ class Tracer:
     ):
         self.system, self.requests, self.weight, self.channel, self.track = system, requests, weight, channel, track
         self.media, self.sides = system.media(), system.sides()
-        #: Steps through each medium of varying index, from the first rays that came through it.
-        self.steps: dict[int, int] = {} if like is None else dict(like.steps)
+        #: Steps through media of varying index to elements, forward or not, and the parameters that they were chosen for.
+        self.steps: dict[tuple[int, int, bool], tuple[int, list]] = {} if like is None else dict(like.steps)
         pupil = system.pupil
         state = rays if isinstance(rays, RayState) else RayState.on_axis(rays, pupil.half_size, pupil.z)
         state = replace(state, lost=dict(state.lost), wavelength=wavelength)
@@ -271,8 +271,10 @@ class Tracer:
             state, hit = state.to(self.dtype), SurfaceIntersection(t, gx, gy, hit.found)
             o, d = (tuple(_cast(c, self.dtype) for c in v) for v in (o, d))
         m.local, m.incoming, m.slopes, m.length = advanced(o, d, hit.t), d, (hit.gx, hit.gy), hit.t
-        if prepared is None or state.sample is None:  # a sample stands on the surface
-            found, aperture = hit.found, element.aperture
+        aperture, pupil = element.aperture, self.system.pupil
+        within = (aperture.half_size, aperture.round) == (pupil.half_size, pupil.round)
+        if prepared is None or state.sample is None or not within:  # a sample of the same aperture stands on the surface
+            found = hit.found
             if aperture.round or aperture.half_size != element.surface.half_size:
                 found = found & aperture.holds(*m.local[:2])
             kept = torch.where(found, state.power, torch.zeros_like(state.power))
@@ -297,6 +299,10 @@ class Tracer:
             o, d = out_of(pose, points, state.datum), turned_back(pose, vectors)
             return into(element.pose, o, d, state.datum)
 
+        way, given = (medium, m.index, m.forward), [None if c is None else c.detach() for c in (parameters.get(name), heights)]
+        steps, before = self.steps.get(way, (None, given))
+        if not all(a is b or (a is not None and b is not None and torch.equal(a, b)) for a, b in zip(given, before, strict=True)):
+            steps = None  # as many as other parameters asked for may be too few
         found = cross(
             self.backend.flow,
             field,
@@ -307,9 +313,10 @@ class Tracer:
             heights,
             seen,
             m.side,
-            self.steps.get(medium),
+            steps,
         )
-        self.steps[medium] = found.steps
+        if steps is None:
+            self.steps[way] = found.steps, [None if c is None else c.clone() for c in given]
         m.local, m.incoming = seen(found.point, found.direction)
         m.slopes, m.length, m.n_in = found.slopes, found.length, scale * found.n
         met = found.found & element.aperture.holds(*m.local[:2])
@@ -449,6 +456,10 @@ class Tracer:
         if not plain:
             return None
         eta = m[-2].index_at(start.wavelength) / m[-1].index_at(start.wavelength)
+        if element.fresnel == "schlick" and eta < 1.0:  # the fused kernels take its cosine behind the surface
+            return None
+        if start.along_axis and element.aperture.round != self.system.pupil.round:
+            return None
         before = None if like is None else like.fused
         if start.along_axis:
             return self.backend.plane_image(surface, start, eta, element.fresnel, before)
@@ -456,6 +467,7 @@ class Tracer:
 
     def onto(self, state: RayState, screen: Screen | Placed) -> RayState:
         """Rays straight on to a screen; x and y of their origins are the screen's own coordinates, mm."""
+        state = state.spread()
         if isinstance(screen, Screen) and self.system.leg is not None:
             screen = self.system.placed(screen)
         frame = screen if isinstance(screen, Screen) else screen.screen

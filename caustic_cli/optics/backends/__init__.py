@@ -1,8 +1,11 @@
 """What does the arithmetic: an object that offers the stages of a trace, chosen once for a device.
 
 Stages, each with its adjoint and tangent
+    scatter                   points of the aperture, at random
     spline_on, spline_at      a B-spline's height and slopes at the points of a sample, or at points
     meet, meet_spline, meet_fixed   where rays meet any surface, a B-spline, or a B-spline if they are known beforehand
+    find, finder, next_meetings   where they meet it, without derivatives, once or again
+    flow                      through a medium of varying index
     interact                  Snell, Fresnel, or a mirror
     land                      to a plane
     splat                     onto pixels
@@ -22,13 +25,19 @@ from importlib import import_module
 
 import torch
 
+from caustic_cli.errors import InputError
+
 #: Name -> module and class, looked up when they are needed: they know surfaces, which know this, and numba is slow to load.
 BACKENDS = {"torch": ("reference", "Torch"), "numba": ("cpu", "Numba"), "cuda": ("cuda", "Cuda")}
+#: What CAUSTIC_KERNELS may be.
+KERNELS = ("", "torch", "cuda")
 
 
 def backend_for(device: torch.device | str):
     """The backend for tensors on `device`."""
     kernels = os.environ.get("CAUSTIC_KERNELS", "")
+    if kernels not in KERNELS:
+        raise InputError(f"the environment's CAUSTIC_KERNELS must be torch or cuda, or not be set, got {kernels!r}")
     if kernels == "torch":
         return _made("torch")
     if torch.device(device).type == "cpu":

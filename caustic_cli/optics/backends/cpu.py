@@ -77,7 +77,9 @@ class Numba(Torch):
         return SurfaceIntersection(*hits_of_rays(surface, heights, (ox, oy, oz), (dx, dy, dz), side=side))
 
     def meet_fixed(self, field, origin, direction):
-        """As the reference; what does not depend on the heights is prepared."""
+        """As the reference; what does not depend on the heights is prepared, for rays that all begin within the aperture."""
+        if any(bool((c.abs() > half).any()) for c, half in zip(origin[:2], field.half_size, strict=True)):
+            return lambda heights: self.meet_spline(field, heights, origin, direction, 1.0)
         hits = RayIntersections(FusedSurface(field.spaces, field.half_size), origin, direction, None)
 
         def meet(heights: Tensor) -> SurfaceIntersection:

@@ -69,7 +69,7 @@ class Torch:
         if found is not None:
             return found
         if start is not None:
-            raise InputError("mesh+newton intersection runs on the CPU; use newton")
+            raise InputError("mesh+newton intersection needs the kernels of a CPU: unset CAUSTIC_KERNELS, or use newton")
         return intersection.reference(field, heights, origin, direction, 1.0, radius)
 
     def finder(self, field, origin, direction):

@@ -60,7 +60,8 @@ class Facets(Action):
             return
         if m.index not in self.noise:
             last = len(m.tracer.system.elements) - 1
-            numbers = normal_numbers(FACETS + last - m.index, index_of(m.tracer.start))
+            rays = getattr(m.tracer, "start", m.state)  # before the first free surface a tracer has not begun: as they come there
+            numbers = normal_numbers(FACETS + last - m.index, index_of(rays))
             self.noise[m.index] = tuple(m.element.roughness * n.to(m.state.power.dtype) for n in numbers)
         m.slopes = tuple(g + n for g, n in zip(m.slopes, self.noise[m.index], strict=True))
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels import blocks
@@ -42,6 +43,7 @@ class _Contraction(torch.autograd.Function):
         ctx.along = inputs[1]
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, by_value, by_slope):
         out = torch.zeros(len(by_value), ctx.along.size, dtype=torch.float64)
         _spread(ALL, by_value.contiguous().numpy(), by_slope.contiguous().numpy(), *ctx.along.arrays, out.numpy())

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels import axial_refraction, blocks, filter_weights, pixels, plane, points
@@ -189,7 +190,7 @@ def _layout(count: int) -> tuple[int, int]:
 
 
 def _strided(array: np.ndarray) -> np.ndarray:
-    """The same values read-only and not contiguous: tensor and scattered rays then flux one compiled kernel."""
+    """The same values read-only and not contiguous: tensor and scattered rays then share one compiled kernel."""
     if array.flags.c_contiguous:
         wide = np.empty((array.shape[0], array.shape[1] + 1), array.dtype)
         wide[:, :-1] = array
@@ -261,6 +262,7 @@ class _Image(torch.autograd.Function):
         ctx.mark_non_differentiable(output[2])
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, by_image, by_leaving, _):
         sums = _adjoint(by_image, float(by_leaving), ctx.saved_tensors, ctx.rows, ctx.apart, ctx.arguments, ctx.workspace)
         nets = (torch.from_numpy(s[0] if ctx.apart else pixels.total(s)) for s in sums)

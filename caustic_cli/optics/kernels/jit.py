@@ -77,9 +77,13 @@ class _Kept(FunctionCache):
             return super().load_overload(sig, target_context)
 
     def save_overload(self, sig, data):
-        """Keep the compiled code of a signature, if it can be."""
+        """Keep the compiled code of a signature, if it can be; an index that cannot be read, which is before that, begins anew."""
         with contextlib.suppress(OSError, EOFError, pickle.PickleError):
-            super().save_overload(sig, data)
+            try:
+                super().save_overload(sig, data)
+            except (EOFError, pickle.PickleError):
+                self.flush()
+                super().save_overload(sig, data)
 
 
 def njit(*, entry: bool = False, parallel: bool = False, **options):

@@ -1,6 +1,6 @@
 """Fused CPU kernel: refraction at the exit surface -> landing point -> splat, with its adjoint and its tangent.
 
-The function of `tracing.trace_plane` followed by `reconstruction.splat`, a row of rays at a time without storing anything
+The stages of `optics.trace` by the plain-torch backend, a row of rays at a time without storing anything
 between rows; both are the reference it is tested against.  All of it in float64: float32 was no faster.
 
 Each of a fixed number of blocks of rows has an image of its own and they are added in order, so the result does not depend
@@ -256,8 +256,8 @@ def forward(
     of dz/dy with bu and net_y.  first (a,) int64; bu, du (a, p + 1); nets (n, b); x, y mm and flux, parts of the
     source's power, (a, b).
 
-    images (blocks, n_x + 4 r_x, n_y + 4 r_y), ledgers and scratch (blocks, `scratch_rows`, b) are overwritten; they set the number
-    of blocks.
+    images (blocks, n_x + 4 r_x, n_y + 4 r_y, and -v_y % 4 more), ledgers and scratch (blocks, `scratch_rows`, b) are overwritten;
+    they set the number of blocks.
 
     exit_, frame, splat: an `Exit`, a `Frame` and a `Splat`.  Of oblique rays `along_x` and `along_y` (a, b) are their
     directions' components, and instead of the sag comes the distance along them to the surface; each has a net's number to
@@ -332,7 +332,7 @@ def backward(
 
     nets (3, 1 if apart else blocks, n, b) are overwritten: the `pixels.total` of each is the derivative by a net (n, b).
 
-    apart: no two rows flux a row of the nets, so that one sum serves all blocks.  Otherwise net_x is taken to be net
+    apart: no two rows share a row of the nets, so that one sum serves all blocks.  Otherwise net_x is taken to be net
     itself, and the sum of both derivatives comes as the first.  scratch: overwritten, as in `forward`.
     """
     if block == ALL:

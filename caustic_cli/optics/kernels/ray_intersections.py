@@ -11,11 +11,10 @@ and t is counted from o nevertheless.  The search and the derivatives are those 
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.kernels import batches, blocks
 from caustic_cli.optics.kernels.jit import FAST, njit
@@ -33,8 +32,6 @@ def hits_of_rays(
     direction: tuple[Tensor, Tensor, Tensor],
     *,
     side: float = 1.0,
-    radius: float | None = None,
-    rectangle: bool = True,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """First hits of rays, in the surface's own frame.
 
@@ -42,21 +39,15 @@ def hits_of_rays(
         heights: (n, m) mm.
         origin, direction: (N,) float64 each, mm, and unit vectors; side * d_z > 0, any other ray misses.
         side: 1 for rays from below, -1 for rays from above.
-        radius: hits farther than this from the axis (mm) do not count; None for no such limit.
-        rectangle: the surface goes on beyond `radius`, to the edges of its net, and stops the light there.  If not, it ends at
-            `radius`, and rays pass through where there is none; which needs a radius.
 
     Returns:
         t, mm, 0 where there is no hit; dz/dx, dz/dy there; found, bool.  (N,) each; t and slopes are differentiable once, in either
         mode, by heights, origin and direction.  A ray that starts on the surface or beyond it misses.
     """
-    if not rectangle and radius is None:
-        raise ValueError("a surface that is not a rectangle needs a radius")
-    limit = np.inf if radius is None else float(radius)
     if side > 0:
-        return _HitsOfRays.apply(heights, *origin, *direction, surface, limit, rectangle)[:4]
+        return _HitsOfRays.apply(heights, *origin, *direction, surface)[:4]
     (ox, oy, oz), (dx, dy, dz) = origin, direction
-    t, gx, gy, found, *_ = _HitsOfRays.apply(-heights, ox, oy, -oz, dx, dy, -dz, surface, limit, rectangle)
+    t, gx, gy, found, *_ = _HitsOfRays.apply(-heights, ox, oy, -oz, dx, dy, -dz, surface)
     return t, -gx, -gy, found
 
 
@@ -71,21 +62,11 @@ def _stretch(o, d, first, last):
 
 
 @njit(inline="always", **FAST)
-def enter_alone(ray, floor, circle, scale_x, scale_y):
+def enter_alone(ray, floor):
     """o_u, o_v, o_z and the way of one ray, as of `enter`."""
     ou, ov, oz, du, dv, dz = ray
     first, last = _stretch(ou, du, 0.0, np.inf)
     first, last = _stretch(ov, dv, first, last)
-    if circle < np.inf:
-        x, y, dx, dy = (ou - 0.5) / scale_x, (ov - 0.5) / scale_y, du / scale_x, dv / scale_y
-        a, b, beyond = dx * dx + dy * dy, x * dx + y * dy, x * x + y * y - circle * circle
-        root = b * b - a * beyond
-        if root >= 0.0 and a > 0.0:  # the roots by sums without cancellation
-            far = -b - math.sqrt(root) if b > 0.0 else -b + math.sqrt(root)
-            one, two = far / a, beyond / far if far != 0.0 else 0.0
-            first, last = max(first, min(one, two)), min(last, max(one, two))
-        elif beyond > 0.0:
-            last = -np.inf
     if not (first <= last and dz > 0.0):
         return -1.0, ov, oz, 0.0
     t = max(first, min((floor - oz) / dz, last))
@@ -95,18 +76,18 @@ def enter_alone(ray, floor, circle, scale_x, scale_y):
 
 
 @njit(entry=True, **FAST)
-def enter(block, ou, ov, oz, du, dv, dz, floor, circle, scale_x, scale_y, way, blocks):
+def enter(block, ou, ov, oz, du, dv, dz, floor, way, blocks):
     """Take rays (N,) to where they enter the box, ou, ov, oz overwritten; way (N,): how far that is.
 
-    floor: of the box, mm; circle: radius of the aperture, mm, or infinite.  A ray that never enters is put beside the aperture.
+    floor: of the box, mm.  A ray that never enters is put beside the aperture.
     """
     if block == ALL:
-        on_threads(blocks, (ou, ov, oz, du, dv, dz, floor, circle, scale_x, scale_y, way, blocks))
+        on_threads(blocks, (ou, ov, oz, du, dv, dz, floor, way, blocks))
         return
     count = len(ou)
     for k in range(block * count // blocks, (block + 1) * count // blocks):
         ray = (ou[k], ov[k], oz[k], du[k], dv[k], dz[k])
-        ou[k], ov[k], oz[k], way[k] = enter_alone(ray, floor, circle, scale_x, scale_y)
+        ou[k], ov[k], oz[k], way[k] = enter_alone(ray, floor)
 
 
 def _rays(surface: FusedSurface, o, d) -> tuple[np.ndarray, ...]:
@@ -126,14 +107,12 @@ class _HitsOfRays(torch.autograd.Function):
         dy: Tensor,
         dz: Tensor,
         surface: FusedSurface,
-        radius: float,
-        rectangle: bool,
     ):
         h, middle = _sag(heights)
         low, high = float(h.min()), float(h.max())
         rays, way, n = _rays(surface, (ox, oy, oz - middle), (dx, dy, dz)), np.empty(len(ox)), blocks()
         floor = low - max(BELOW[0] * (high - low), BELOW[1] / min(surface.scale))
-        enter(ALL, *rays, floor, np.inf if rectangle else radius, *surface.scale, way, n)
+        enter(ALL, *rays, floor, way, n)
         order, used = batches.order(*rays[:2], surface.geometry[0], surface.geometry[3])
         status, *out = batches.found(len(way))
         top = high + 1e-6 * (high - low)  # above what touches the hull's top, by whatever rounding
@@ -144,7 +123,7 @@ class _HitsOfRays(torch.autograd.Function):
             *rays,
             (low, top),
             surface.slope_bounds(h),
-            radius,
+            np.inf,
             surface.coefficients(h),
             *surface.geometry,
             *surface.scale,
@@ -161,12 +140,13 @@ class _HitsOfRays(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx, inputs, output):
-        *tensors, ctx.surface, _, _ = inputs
+        *tensors, ctx.surface = inputs
         ctx.save_for_backward(*tensors, *output)
         ctx.save_for_forward(*tensors, *output)
         ctx.mark_non_differentiable(*output[3:])
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, *by):
         heights, ox, oy, oz, dx, dy, dz, t, gx, gy, _, met, where = ctx.saved_tensors
         surface, wanted = ctx.surface, ctx.needs_input_grad
@@ -192,7 +172,7 @@ class _HitsOfRays(torch.autograd.Function):
         out = [surface.pull(grads).to(heights.dtype) if wanted[0] else None]
         out += [a if w else None for a, w in zip(starts, wanted[1:4], strict=True)]
         out += [t * a if w else None for a, w in zip(starts, wanted[4:7], strict=True)]
-        return *out, None, None, None
+        return *out, None
 
     @staticmethod
     def jvp(ctx, *tangents):

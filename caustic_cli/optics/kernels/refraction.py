@@ -29,8 +29,7 @@ from caustic_cli.optics.kernels.axial_refraction import EXACT, SCHLICK
 from caustic_cli.optics.kernels.jit import FAST, njit
 from caustic_cli.optics.kernels.stage import BATCH, load, store
 from caustic_cli.optics.kernels.threads import ALL, on_threads
-from caustic_cli.optics.polarisation import NORMAL
-from caustic_cli.optics.tolerances import CRITICAL
+from caustic_cli.optics.tolerances import CRITICAL, NORMAL
 
 # Rows of a batch's scratch: the ray, what its refraction is made of, R and its derivatives, the derivatives that come and go.
 DX, DY, DZ, GX, GY, P, EX, EY, EZ = range(9)

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels import batches, blocks, intersect, spline
@@ -93,6 +94,7 @@ class _ScatteredSurface(torch.autograd.Function):
         ctx.heights_dtype = heights.dtype
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, *by):
         surface, u, v = ctx.rest
         grads = surface.workspace()
@@ -226,6 +228,7 @@ class _Hits(torch.autograd.Function):
         ctx.mark_non_differentiable(*output[3:])
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, *by):
         heights, *found, met, where, c = ctx.saved_tensors
         surface, (ou, ov, _, *directions) = ctx.rays.surface, ctx.rays.rays

@@ -10,7 +10,6 @@ the surface, at most |xi| = x > 1/2 from the middle of a piece, powers reach max
 
 from __future__ import annotations
 
-import math
 from functools import cache, lru_cache
 from typing import NamedTuple
 
@@ -196,7 +195,7 @@ def _meet(rays, bounds, radius, geometry, scale, c, out, where):
     for k in range(cuda.grid(1), len(t), cuda.gridsize(1)):
         du, dv = dx[k] * scale_x, dy[k] * scale_y
         ray = (ox[k] * scale_x + 0.5, oy[k] * scale_y + 0.5, oz[k], du, dv, dz[k])
-        ou, ov, up, way = enter_alone(ray, floor, math.inf, scale_x, scale_y)
+        ou, ov, up, way = enter_alone(ray, floor)
         status, here, reach, zx, zy = meet_alone(
             (ou, ov, up, du, dv, dz[k]), (low, high), (slope_u, slope_v), c, bu, mu, wu, bv, mv, wv, scale_x, scale_y
         )
