@@ -161,7 +161,7 @@ def test_mag_counts_lens_widths():
 
 @pytest.mark.parametrize(("at", "thickness"), [(-10.0, 11.607), (-60.0, 6.0)])
 def test_a_lens_close_to_its_source_is_thick_enough_for_its_corners(at, thickness):
-    """Lambertian source 10 mm before a lens of 30 mm: the offset gathers 56 degrees, and its corners lie 10.6 mm below its middle."""
+    """A source 10 mm before a lens of 30 mm: the offset gathers 56 degrees, and its corners lie 10.6 mm below its middle."""
     said = {"source": {"type": "point", "position": [[0.0, 0.0, at]]}, "lens": {"size": [30.0, 30.0]}}
     s = complete(said, 1.0, Derivation(mag=3.0))
     low, _ = build_lens(s).height_bounds(np.array([-15.0, 0.0, 15.0]), np.array([-15.0, 0.0, 15.0]))
