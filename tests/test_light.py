@@ -97,6 +97,14 @@ def test_a_surface_that_would_reach_below_the_lens_is_cut_at_its_least_thickness
     assert z.min() == pytest.approx(-1.6, abs=1e-12) and (z == z.min()).mean() > 0.1 and z[40, 40] > 2.5
 
 
+def test_a_cut_surface_is_refined_on_more_cells_as_far_as_time_allows():
+    """Where a surface is cut off it gets no light, on any number of cells; a cut that rings between cells let some in, for 0.53."""
+    scene, target = close_by(min_thickness=0.4, control=(160, 160)), blob()
+    field = HeightField.of(scene.lens)
+    whole, hurried = (first_surface(scene, target, field, 128, True, seconds) for seconds in (math.inf, 0.0))
+    assert traced(scene, whole, target)[0] < 0.43 < traced(scene, hurried, target)[0] < 0.5  # on 128 cells, and on 91
+
+
 def test_light_that_comes_through_the_sides_does_not_count():
     """The exit's corner under a source beside the axis sees it only through the lens' side."""
     scene = beside((20.0, 0.0, -20.0))

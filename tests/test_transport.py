@@ -184,6 +184,16 @@ def test_a_start_saves_steps():
     assert np.abs(warm.x - cold.x).max() < 0.5
 
 
+def test_a_start_that_another_light_led_to_is_given_up():
+    """Newton's method is lost where the source has become dark: it begins anew, on coarse sites."""
+    left = np.repeat(np.arange(64) < 20, 48).reshape(64, 48).astype(float)
+    other = solve(flame(), source=left, darkest=0.02)
+    cold = solve(flame(), source=left[::-1], darkest=0.02)
+    found = solve(flame(), source=left[::-1], darkest=0.02, start=other.potential)
+    assert np.array_equal(found.potential, cold.potential) and found.error < 5e-3
+    assert cold.steps < found.steps <= cold.steps + 10  # those of the finest level that led nowhere
+
+
 def bad(value):
     out = np.ones((8, 8))
     out[3, 4] = value

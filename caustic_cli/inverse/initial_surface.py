@@ -9,6 +9,7 @@ taken that keeps most.
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -95,8 +96,8 @@ class _Grid:
         """What these corners have, at those of another grid."""
         return RectBivariateSpline(self.x, self.y, values)(onto.x, onto.y)
 
-    def solved(self, light: np.ndarray, directions, mean: float, again: Start | None = None, **options) -> Start:
-        """The surface of this mean height that sends the light to the picture."""
+    def solved(self, light: np.ndarray, directions, mean: float, potential: np.ndarray | None = None, **options) -> Start:
+        """The surface of this mean height that sends the light to the picture; potential: of a similar one at these corners."""
         scene = self.scene
         if not light.all() and (scene.before or not scene.source.distant):
             options["darkest"] = DARKEST
@@ -115,7 +116,7 @@ class _Grid:
             directions,
             centre=centre,
             view=view,
-            start=None if again is None else again.transport.potential,
+            start=potential,
             **options,
         )
 
@@ -165,16 +166,16 @@ class _Grid:
         on = (np.abs(u) <= screen.half_size[0]) & (np.abs(v) <= screen.half_size[1])
         return float((light * self.above(z) * _mean(np.where(on, part, 0.0))).sum() / on_lens) if on_lens > 0 else 0.0
 
-    def cut(self, z: np.ndarray, middle: float, passes: int) -> _Cut:
+    def cut(self, z: np.ndarray, middle: float, passes: int, potential: np.ndarray | None = None) -> _Cut:
         """The surface of this height in its middle that sends what light it can to the picture, cut off at the least thickness.
 
         Args:
-            z: heights to begin from.
+            z, potential: heights to begin from, and the potential of their map where that is known.
 
         Raises:
             InputError: no light can be refracted to the picture.
         """
-        reached, again = 1.0, None
+        reached = 1.0
         for _ in range(passes):
             z = np.maximum(z + middle - _middle(z), self.floor)
             light, directions = incident(self.scene, self.x, self.y, z)
@@ -183,27 +184,30 @@ class _Grid:
                 if not lit.max() > 0:
                     raise InputError(UNREACHED)
                 try:
-                    again = self.solved(lit, directions, float(z.mean()), again)
+                    found = self.solved(lit, directions, float(z.mean()), potential)
                     break
                 except OutOfReach as error:
                     if not left:
                         raise
                     reached = reached * _mean((~error.where).astype(float))
-            z = again.heights
+            z, potential = found.heights, found.transport.potential
         z = z + middle - _middle(z)
-        return _Cut(np.maximum(z, self.floor), middle, max(0.0, self.floor - float(z.min())))
+        return _Cut(z, middle, max(0.0, self.floor - float(z.min())), potential)
 
 
 @dataclass(frozen=True, eq=False)
 class _Cut:
-    """Heights of a cut surface, that of its middle, and how far it would reach below the cut, mm."""
+    """A surface before it is cut: heights, that of its middle, how far it reaches below the cut, mm; potential of its map, mm^2."""
 
     z: np.ndarray
     middle: float
     short: float
+    potential: np.ndarray
 
 
-def first_surface(scene: Scene, target: np.ndarray, field: HeightField, cells: int = CELLS, fixed: bool = False) -> InitialSurface:
+def first_surface(
+    scene: Scene, target: np.ndarray, field: HeightField, cells: int = CELLS, fixed: bool = False, seconds: float = math.inf
+) -> InitialSurface:
     """A lens that throws the picture, from the light of the source's centre.
 
     Args:
@@ -212,10 +216,12 @@ def first_surface(scene: Scene, target: np.ndarray, field: HeightField, cells: i
         field: spline spaces of the heights.
         cells: source cells along the lens' longer side; more than SOLVED make creases sharper, of light from afar.
         fixed: the thickness is the user's own, and none other is tried.
+        seconds: about how long it may take for a near source, whose cells are as many as that allows.
 
     Raises:
         InputError: the picture is out of reach of refraction.
     """
+    began = time.monotonic()
     times, options = _times(cells, target) if scene.source.distant else 1, {}
     cells = min(cells, SOLVED * times)
     if times > 1:
@@ -225,16 +231,26 @@ def first_surface(scene: Scene, target: np.ndarray, field: HeightField, cells: i
     if scene.source.distant or lens.mirror or scene.elements:
         found = None
         for _ in range(1 if scene.source.distant and not scene.before else PASSES):
-            found = grid.solved(*incident(scene, grid.x, grid.y, z), float(grid.offset.mean()), found, **options)
+            known = None if found is None else found.transport.potential
+            found = grid.solved(*incident(scene, grid.x, grid.y, z), float(grid.offset.mean()), known, **options)
             z = found.heights
         if times > 1:
             grid, z = grid.sharper(found, times)
         return InitialSurface(net_of(grid.x, grid.y, z, field))
-    few = _Grid.of(scene, target, min(cells, FEW_CELLS))
-    best = _best(few, lens.offset.thickness, fixed)
-    found = grid.cut(few.scaled(best.z, grid), best.middle, PASSES - 1)
-    net = net_of(grid.x, grid.y, found.z, field)
-    return InitialSurface(net.clamp_min(grid.floor), best.middle)  # a spline through a kink undershoots
+    coarse = _Grid.of(scene, target, min(cells, FEW_CELLS))
+    found = _best(coarse, lens.offset.thickness, fixed)
+    within = cells
+    for most, passes in ((round(math.sqrt(FEW_CELLS * cells)), PASSES - 1), (cells, 1)):
+        n, started = min(most, within), time.monotonic()
+        if n < max(len(coarse.x), len(coarse.y)):
+            continue
+        fine = _Grid.of(scene, target, n)
+        found = fine.cut(coarse.scaled(found.z, fine), found.middle, passes, coarse.scaled(found.potential, fine))
+        coarse, now = fine, time.monotonic()
+        left = max(0.0, seconds - (now - began))  # a pass on so many times the cells takes so many times as long
+        within = int(min(cells, n * math.sqrt(left * passes / (now - started))))
+    net = net_of(coarse.x, coarse.y, np.maximum(found.z, coarse.floor), field)
+    return InitialSurface(net.clamp_min(coarse.floor), found.middle)  # a spline through a kink undershoots
 
 
 def _times(cells: int, target: np.ndarray) -> int:

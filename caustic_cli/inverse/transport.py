@@ -179,7 +179,12 @@ def solve(
         enough = max(tolerance, MERGED) if fewer == 1 else COARSE_TOLERANCE
         found, error, taken = _newton(psi, sites, raster, _light(f, 0.0, raster, a, b), enough, most)
         steps += taken
-        if error > 10.0 * enough and f.size > 1:  # lost in the dark parts of the source
+        lost = error > 10.0 * enough and f.size > 1  # in the dark parts of the source
+        if lost and start is not None:  # which are others than where the start comes from
+            options = {"smooth": smooth, "tolerance": tolerance, "most": most, "darkest": darkest}
+            again = solve(source, target, source_half, target_half, **options)
+            return replace(again, steps=steps + again.steps, seconds=time.perf_counter() - began)
+        if lost:
             psi = 0.5 * ((a / c) * sites.y1**2 + (b / d) * sites.y2**2)
             for even in EVENER:
                 light = _light(f, even, raster, a, b)
@@ -189,7 +194,7 @@ def solve(
                 found, error = psi, left
         psi = found
     for _ in range(ROUNDS):
-        if error < tolerance:
+        if error < tolerance or taken == 0:
             break
         psi, sites = _merged(psi, sites, raster)
         psi, error, taken = _newton(psi, sites, raster, _light(f, 0.0, raster, a, b), tolerance, most)

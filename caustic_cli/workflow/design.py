@@ -61,8 +61,8 @@ GROUND, NEARLY = 0.6, 0.98
 #: Reasons after which a design that says no iterations of its own keeps nothing of its optimiser, which is many times the lens on
 #: disk: to go on begins that anew.
 DONE = ("iterations", "no progress")
-#: Part of a time limit that is left to the iterations, however long the start took.
-LEAST_PART = 0.25
+#: Part of a time limit that is left to the iterations, however long the start took; and that a first surface may take.
+LEAST_PART, START_PART = 0.25, 0.3
 #: A checkpoint that takes longer than so many seconds is followed by so many times the seconds more without one.
 QUICK, RARELY = 0.5, 10.0
 #: Source cells along a lenslet, at least.
@@ -400,7 +400,8 @@ def _solved(project: Project, fixed: bool) -> tuple[torch.Tensor | None, float |
             cells = max(LEAST_CELLS, cells // max(scene.lens.array))
             found = InitialSurface(first_array(scene, goals, designer.stages[0].control, cells).heights)
         else:
-            found = first_surface(scene, goal, designer.field(0), cells, fixed)
+            seconds = START_PART * project.settings["design"]["time_limit"]
+            found = first_surface(scene, goal, designer.field(0), cells, fixed, seconds)
         lens = designer.scene.lens
         short = lens.z_in + lens.min_thickness - float(found.heights.min())
         return found.heights + 1.01 * short if fixed and short > 0 else found.heights, found.middle
