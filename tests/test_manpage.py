@@ -70,7 +70,7 @@ def test_sections_in_the_usual_order():
         "FILES",
         "JSON",
         "ORIENTATION",
-        "THE SAME AGAIN",
+        "REPEATED COMMANDS",
         "COMPLETION",
         "EXIT STATUS",
         "ENVIRONMENT",

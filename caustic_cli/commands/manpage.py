@@ -1,7 +1,7 @@
-"""The manual pages: of the commands, from the parser itself, and of project.toml, from the table of settings.
+"""The manual pages: those of the commands, generated from the parser, and that of project.toml, from the table of settings.
 
-`python -m caustic_cli.commands.manpage man` writes caustic.1, one for each command, and caustic-project.5, the reference of all
-settings.  The sections around them are below.
+`python -m caustic_cli.commands.manpage man` writes caustic.1, a page for each command, and caustic-project.5, the reference of
+all settings.  The hand-written sections are below.
 """
 
 from __future__ import annotations
@@ -22,17 +22,18 @@ from caustic_cli.scene import materials
 
 HEAD = r""".TH CAUSTIC 1 "" "caustic {version}" "User Commands"
 .SH NAME
-caustic \- design free-form lenses that throw a picture as a caustic
+caustic \- design free-form lenses that project a picture as a caustic
 .SH SYNOPSIS
 .B caustic
 .I COMMAND
 .RI [ OPTIONS ]
 .SH DESCRIPTION
-Give it a picture, and it finds the free-form lens that throws this picture as a caustic: a B-spline surface is shaped by
-differentiable ray tracing until the light lands where the picture is bright.
+Designs free-form lenses that project a given picture as a caustic.  The free-form surface is a tensor\-product B\-spline,
+optimised by differentiable ray tracing until the irradiance on the screen matches the picture, and refined with diffraction
+taken into account where it matters.
 .PP
-Lengths are millimetres, angles degrees, wavelengths nanometres, powers watts.  Results go to standard output, everything
-meant for a person to standard error.
+Lengths are in millimetres, angles in degrees, wavelengths in nanometres and powers in watts.  Results are written to standard
+output, messages to standard error.
 .SH COMMANDS
 """
 
@@ -40,131 +41,135 @@ TAIL = r""".SH FILES
 A project is a directory:
 .TP
 .I NAME.caustic/project.toml
-Everything that defines the scene and the design, with units:
+All settings that define the scene and the design, with units; see
 .BR caustic-project (5).
-Editing it and rendering again is a normal way to work.
+It may be edited by hand before the project is rendered again.
 .TP
 .I NAME.caustic/checkpoints.h5
-Control heights, optimiser state, loss history, provenance (HDF5); replaced as a whole, never half-written.
+Control heights, optimiser state, loss history and provenance (HDF5); always replaced as a whole.
 .TP
 .IR NAME.caustic/target.png " or " target.npy
-The target as used.
+The target as used by the design.
 .TP
 .IR NAME.caustic/source.* ", " intensity.csv
-Copies of the files that [source] names: rays, a picture of its brightness, a table of angles; source-2.*, ... of further sources.
+Copies of the files named in [source]: a ray file, a picture of the radiance, a table of the angular distribution; source\-2.*
+and so on for further sources.
 .TP
 .I NAME.caustic/render.png
-The caustic by rays, as last rendered.
+The caustic by ray tracing, as last rendered.
 .TP
 .I NAME.caustic/wave.png
-The caustic as light makes it, where diffraction is simulated.
+The caustic by wave optics, where diffraction is simulated.
 .TP
 .IR NAME.caustic/second.png ", " render\-second.png
-The second picture as used, and as last rendered, of a lens with two.
+For a lens with two pictures, the second picture as used by the design and as last rendered.
 .TP
 .I NAME.caustic/report.png
-Target, caustic, its error, lens height and relief, loss against time, where the light goes.
+Target, caustic and its error, height and relief of the lens, error during each stage, and energy budget.
 .SH JSON
 With
 .BR \-\-json ,
-design and render print one object with these keys, among others.  A figure that is undefined is null.
+design and render print one object with the following keys, among others.  Undefined values are null.
 .TP
 .B loss, relative_rms, psnr_db, ssim
-Image against target, counted in pixels: eq. 5.2.1 of the thesis; that times the pixels, the RMS error over the mean; peak
-signal\-to\-noise ratio; structural similarity.
+Comparison of image and target, with rays counted in pixels: the loss of eq. 5.2.1 of the thesis; that loss times the number of
+pixels, which is the RMS error divided by the mean; peak signal\-to\-noise ratio; structural similarity.
 .TP
 .B in_black
-Of the light on the screen, the part that lands where the target is below a hundredth of its peak, a dark margin included; null of
-a target that is so nowhere.
+Fraction of the light on the screen that lands where the target is below a hundredth of its peak, a dark margin included; null
+for a target without such pixels.
 .TP
 .B min_radius
-Of design with a least radius of concave places: radius_mm; of the surface that the design began from, retraced by the same rays,
-start_in_black with the radius, start_in_black_without, in_black_per_mm, the difference over the radius, and its noise.
+For a design with a minimum radius of concave places: radius_mm, and for the initial surface, retraced with the same rays,
+start_in_black with the radius, start_in_black_without, in_black_per_mm (their difference divided by the radius) and its noise.
 .TP
 .B noise, in_black_noise, error_estimate
-Standard errors of relative_rms and of in_black, and relative RMS noise of the image, that the retrace's own rays leave.
+Standard errors of relative_rms and of in_black, and the relative RMS noise of the image, due to the rays of the retrace.
 .TP
 .B minimum_wall_mm, stock_height_mm
-Of design: least and largest height of the exit above the flat entrance.
+For a design: least and largest height of the exit above the flat entrance.
 .TP
 .B image_kept
-Of render: true where render.png is still an earlier one of the same, with less noise.
+For a render: true if render.png is an earlier image of the same scene, with less noise.
 .TP
 .B on_screen, on_target, lost
-Parts of the source's power on the screen, where the target is bright, and lost, by cause; on_screen and all of lost sum to 1.
+Fractions of the source's power that land on the screen, that land where the target is bright, and that are lost, by cause;
+on_screen and all entries of lost sum to 1.
 .TP
 .B wave_relative_rms, wave_on_target, wave_in_black, resolvable
-The same of the wave image, where diffraction is simulated; details that light carries across the picture.
+The same quantities for the wave image, where diffraction is simulated; number of details across the picture that the light can
+resolve.
 .TP
 .B least_relative_rms, etendue_limit
-Behind an extended source's blur: the error of the best light found, and the most light that \['e]tendue lets through.
+For an extended source: the least error found behind its blur, and the largest fraction of the light that \['e]tendue permits.
 .TP
 .B second_relative_rms, second_noise, second_on_target, second_on_screen, second_image
-The same of a second picture behind the first; of light that shall leave that parallel or towards a focus,
+The same quantities for a second picture behind the first; if the light is to continue parallel or towards a focus instead,
 .BR angle_rms_mrad ,
-the root mean square of its angle to that way.
+the root mean square of its angular deviation.
 .TP
 .B start_relative_rms, start_noise
-Of the surface that a design began from, by the same rays.
+The same quantities for the initial surface of a design, by the same rays.
 .TP
 .B tolerances
-Of a study of errors: draws, percentiles p5, p50 and p95 of relative_rms (as placed), shifted_relative_rms (after the best shift of
-the screen) and on_target, sensitivities, offenders, wave_check, csv, plot.
+For a tolerance study: draws, percentiles p5, p50 and p95 of relative_rms (as placed), shifted_relative_rms (after the best
+shift of the screen) and on_target, sensitivities, offenders, wave_check, csv, plot.
 .TP
 .B want
-Of an array and a wanted illumination: brightness of each lenslet's source in parts of the largest, N lists of M; error, relative
-RMS of the image that they give; kkt_residual; power, part of what all sources would take; image.
+For an array with a prescribed illumination: brightness of each lenslet's source relative to the largest, N lists of M; error, the
+relative RMS error of the resulting image; kkt_residual; power, as a fraction of what all sources would require; image.
 .TP
 .B rays, iterations, seconds, image, project
-Rays traced, iterations done, wall time, files.
+Number of rays traced, number of iterations, wall time, paths of files.
 .SH ORIENTATION
-Arrays are indexed [i, j], i along +x and j along +y.  Image files are the screen seen from +z: column 0 is the \-x edge,
-row 0 the +y edge.  Seen from the lens' side the picture is mirrored;
+Arrays are indexed [i, j], with i along +x and j along +y.  Image files show the screen as seen from +z: column 0 is the \-x edge,
+row 0 the +y edge.  Seen from the side of the lens the picture is mirrored;
 .B \-\-flip x
 designs for that viewer.
-.SH THE SAME AGAIN
-A design, render or export of the same inputs with the same options as before is no work: the command says so, prints the same
-JSON, touches what it made, so that
+.SH REPEATED COMMANDS
+A design, render or export that repeats an earlier command on the same inputs with the same options performs no work: it says
+so, prints the same JSON, updates the time stamps of its outputs, so that
 .BR make (1)
-finds it newer than its sources, and exits 0.
+considers them newer than their sources, and exits with status 0.
 .B \-\-force
-does it anew.
+repeats the work.
 .SH COMPLETION
 .B caustic \-\-install\-completion
-adds completion of commands and options to the shell;
+adds completion of commands and options to the configuration of the shell;
 .B caustic \-\-show\-completion
-prints what it would add.
+prints the lines that it would add.
 .SH EXIT STATUS
 .TP
 .B 0
 Done.
 .TP
 .B 1
-Could not finish; the message says why and what is safe on disk.
+The command could not finish; the message states the reason and what has been saved.
 .TP
 .B 2
-Bad usage or bad input: one line says what, where, and what would be accepted.
+Incorrect usage or input; a one-line message states what is wrong, where, and what would be accepted.
 .TP
 .B 130, 143
-Interrupted by SIGINT or SIGTERM, after the last state was saved.
+Interrupted by SIGINT or SIGTERM, after the state was saved.
 .SH ENVIRONMENT
 .TP
 .BI CAUSTIC_ COMMAND _ OPTION
-The default of an option, hyphens written as underscores: CAUSTIC_DESIGN_MAG=2, CAUSTIC_RENDER_RAYS=4e6, CAUSTIC_DESIGN_LINEAR=1.
-What the command line says wins.
+Default of an option, with hyphens written as underscores: CAUSTIC_DESIGN_MAG=2, CAUSTIC_RENDER_RAYS=4e6, CAUSTIC_DESIGN_LINEAR=1.
+The command line takes precedence.
 .TP
 .B CAUSTIC_QUIET, CAUSTIC_PROGRESS, CAUSTIC_SEED, CAUSTIC_DEVICE, CAUSTIC_DTYPE, CAUSTIC_THREADS, CAUSTIC_DEBUG
-The same for the options that most commands share.
+Defaults of the options that most commands share.
 .TP
 .B CAUSTIC_KERNELS
-"torch" runs the plain-torch reference instead of the compiled kernels, on a CUDA device too, where --dtype float32 counts then.
+"torch" selects the plain\-torch reference instead of the compiled kernels, also on a CUDA device, where \-\-dtype float32 then
+takes effect.
 .TP
 .B NUMBA_CACHE_DIR
-Directory to keep the compiled kernels in; default: caustic in XDG_CACHE_HOME or in ~/.cache. Where nothing can be written there, it
-is a directory of the user's own among the temporary files. What has not been used for 30 days is removed.
+Directory of the compiled kernels; by default caustic in XDG_CACHE_HOME or in ~/.cache.  If it cannot be written, a private
+directory of the user among the temporary files is used.  Kernels that have not been used for 30 days are removed.
 .TP
 .B NO_COLOR
-Set to anything: no colour.
+If set to any value, output is not coloured.
 .SH EXAMPLES
 .nf
 caustic design flame.png --source plane --mag 3
@@ -191,29 +196,29 @@ caustic\-project \- the settings of a caustic project, project.toml
 .SH DESCRIPTION
 A project's directory holds
 .IR project.toml ,
-which says everything that defines the scene and the design.
+which contains all settings that define the scene and the design.
 .B caustic design
-writes it, with each key's unit or meaning beside it; it may be edited by hand, and given to a new design with
+writes it, with the unit or meaning of each key beside it.  It may be edited by hand, and passed to a new design by
 .BR \-\-config .
-The same names, as
-.IR section.key ,
-are the library's.  What a default's reason is stands after it.
+The Python library uses the same names, as
+.IR section.key .
+The reason for a default is given in parentheses after it.
 .PP
 Several tables
 .B [[source]]
-are several sources; several tables
+describe several sources; several tables
 .B [[design.stages]]
-are the stages of a design, one after another.
+describe the successive stages of a design.
 """
 MATERIALS = """.SH MATERIALS
-What [lens] glass may say, whatever the case, blanks and hyphens: refractive index at 587.6 nm, Abbe number, density, and the slope
-of a surface from which on light along the axis is totally reflected.  Where an index has a spread, batches differ: measure yours
-and say it as index.
+Values of [lens] glass; case, blanks and hyphens are ignored.  Listed are the refractive index at 587.6 nm, the Abbe number, the
+density, and the slope of a surface above which light along the axis is totally reflected.  Where the index is given with a
+spread, it varies between batches: measure that of your batch and set it as index.
 """
 PRESETS = """.SH PRESETS
-What \\fB\\-\\-preset\\fR may say: files with some of these settings.
+Values of \\fB\\-\\-preset\\fR, each of which is a file with some of these settings.
 """
-#: How a kind of setting is written.
+#: Notation of each kind of setting.
 KINDS = {
     "number": "number",
     "whole": "whole number",
@@ -233,7 +238,7 @@ def reference() -> str:
     headings = {row.section: plain_name(f"{row.section}.").strip() for row in TABLE.values() if row.section}
     for section, heading in headings.items():
         parts.append(f".SH {_plain(heading)}\n" + "".join(_setting(row) for row in TABLE.values() if row.section == section))
-    parts.append(".SH FROM THE COMMAND LINE ALONE\nSettings are derived from these, and no project holds them.\n")
+    parts.append(".SH COMMAND\\-LINE ONLY\nOther settings are derived from these, which are not stored in a project.\n")
     parts.append("".join(_setting(row) for row in TABLE.values() if not row.section))
     parts.append(MATERIALS + "".join(f".TP\n\\fB{_plain(name)}\\fR\n{_plain(text)}\n" for name, text in _materials()))
     parts.append(PRESETS + "".join(f".TP\n\\fB{_plain(name)}\\fR\n{_plain(text)}\n" for name, text in presets.rows()))
@@ -241,7 +246,7 @@ def reference() -> str:
 
 
 def _materials() -> list[tuple[str, str]]:
-    """Each material, and what is known of it."""
+    """Each material with its properties."""
     found = []
     for name, index, abbe, density, slope, also in materials.rows():
         facts = [f"n_d {index}", f"V_d {abbe}", "" if density == "-" else f"{density} g/cm^3", f"steepest slope {slope}"]
@@ -271,7 +276,7 @@ def _setting(row: Setting) -> str:
 
 
 def pages() -> dict[str, str]:
-    """All pages by file name: the whole program, each command alone, and the settings."""
+    """All pages by file name: the program, each command, and the settings."""
     commands = {f"caustic-{name}.1": _page(name, command) for name, command in parser().commands.items()}
     return {"caustic.1": build(), **commands, "caustic-project.5": reference()}
 
@@ -288,7 +293,7 @@ def _page(name: str, command) -> str:
         f'.TH CAUSTIC-{name.upper()} 1 "" "caustic {__version__}" "User Commands"\n.SH NAME\ncaustic\\-{name} \\- {summary}\n'
         f".SH SYNOPSIS\n.B caustic {name}\n{_plain(_usage(command))} [OPTIONS]\n.SH DESCRIPTION\n{_plain(command.help or '')}\n"
         f".SH OPTIONS\n{options}.SH EXAMPLES\n.nf\n{examples}\n.fi\n.SH SEE ALSO\n.BR caustic (1)\n"
-        "tells of files, orientation, exit status and environment.\n"
+        "describes files, orientation, exit status and environment.\n"
     )
 
 
@@ -308,7 +313,7 @@ def _command(name: str, command) -> str:
 
 
 def _plain(text: str) -> str:
-    """Text as roff shows it: backslashes, hyphens and leading dots made safe."""
+    """Text escaped for roff: backslashes, hyphens and leading dots."""
     text = re.sub(r"\s+", " ", text).strip().replace("\\", "\\e").replace("-", "\\-")
     return "\\&" + text if text[:1] in (".", "'") else text
 

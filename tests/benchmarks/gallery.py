@@ -2,7 +2,7 @@
 
     python tests/benchmarks/gallery.py [--only NAME,...] [--quality draft|standard|fine] [-o DIR]
 
-writes examples/gallery: README.md, and for each lens a strip of target, image by rays, image of light as a wave where that is
+writes examples/gallery: README.md, and for each lens a strip of target, image by rays, wave image where diffraction is
 simulated, and relief.  About ten minutes on two cores.
 """
 
@@ -23,22 +23,22 @@ from caustic_cli import load
 
 #: What each lens is for, its picture, and the options that make it.
 LENSES = {
-    "flame": ("The first command of the README: a plane wave, refined on what light does as a wave", "flame", ""),
-    "portrait": ("A photograph, by rays alone", "portrait", "--waves off"),
-    "logo": ("A black drawing on nothing, inverted", "logo", "--invert"),
+    "flame": ("The first command of the README: a plane wave, refined on the wave image", "flame", ""),
+    "portrait": ("A photograph, refined by ray tracing only", "portrait", "--waves off"),
+    "logo": ("A black drawing on a transparent background, inverted", "logo", "--invert"),
     "point": ("A point source 50 mm before the lens", "ball", "--source point"),
     "disc": ("A disc of 5 mm at 1 m", "ball", "--source disc --source-size 5 --source-position 0,0,-1000"),
     "plate": ("A 100 mm acrylic plate in sunlight, wall at 0.55 m", "portrait", "--preset plate-100"),
     "mirror": ("A 100 mm mirror in sunlight, wall at 1 m", "flame", "--preset mirror-100"),
-    "led": ("A luminaire's lens 60 mm before an LED, wall at 2 m", "tophat", "--preset led-30"),
-    "laser": ("A round lens in a laser's beam, screen at 1 m", "flame", "--preset laser-25"),
-    "print": ("A lens of printing resin, a small LED 500 mm before it, wall at 300 mm", "portrait", "--preset print-50"),
+    "led": ("A luminaire lens, 60 mm from an LED, wall at 2 m", "tophat", "--preset led-30"),
+    "laser": ("A round lens in a laser beam, screen at 1 m", "flame", "--preset laser-25"),
+    "print": ("A lens of printing resin, 500 mm from a small LED, wall at 300 mm", "portrait", "--preset print-50"),
 }
 HEAD = """# Gallery
 
-Lenses by `python tests/benchmarks/gallery.py`, on two cores: target, image by rays, image of light as a wave where that is
-simulated, and the lens' relief about the quadric that fits it best (each by a scale of its own). Figures are by rays that no design
-saw; the times were taken beside other work.
+The lenses below were designed by `python tests/benchmarks/gallery.py` on two cores. Each strip shows the target, the image by ray
+tracing, the wave image where diffraction is simulated, and the relief of the lens relative to its best-fitting quadric (each on its
+own scale). Errors are measured with rays that no design used; other work on the machine affected the times.
 
 """
 #: Pixels along a panel's side.
@@ -94,8 +94,8 @@ def row(name: str, picture: Path, quality: str, folder: Path, out: Path) -> str:
     strip(project, out / f"{name}.png")
     figures = [
         f"relative RMS error by rays {sharp['relative_rms']:.3f} ± {sharp['noise']:.4f}",
-        f"of light as a wave {sharp['wave_relative_rms']:.3f}" if sharp.get("wave_relative_rms") is not None else "",
-        f"least possible behind the source's blur {said['least_relative_rms']:.3f}" if said.get("least_relative_rms") else "",
+        f"of the wave image {sharp['wave_relative_rms']:.3f}" if sharp.get("wave_relative_rms") is not None else "",
+        f"least possible error behind the source's blur {said['least_relative_rms']:.3f}" if said.get("least_relative_rms") else "",
         f"light on the picture {sharp['on_target']:.1%}",
         f"designed in {seconds:.0f} s",
     ]
