@@ -19,10 +19,10 @@ from caustic_cli.export.lighttools import write_lighttools
 from caustic_cli.export.mitsuba import write_mitsuba
 from caustic_cli.export.page import refuse_untraceable
 from caustic_cli.export.zemax import write_zemax
-from caustic_cli.inverse.extended import etendue_limit
 from caustic_cli.inverse.initial_surface import _Grid, first_surface
+from caustic_cli.inverse.projection import View
+from caustic_cli.inverse.source_limits import etendue_limit
 from caustic_cli.inverse.target import target_on_screen
-from caustic_cli.inverse.view import View
 from caustic_cli.io.archive import open_archive
 from caustic_cli.io.sags import read_sags
 from caustic_cli.optics.effects.screen_shape import displacement

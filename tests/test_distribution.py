@@ -30,7 +30,7 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Disc, Lens, Points, Scene, Screen
 from caustic_cli.scene.sources.distribution import Distribution
-from caustic_cli.studies.drawn import emitted
+from caustic_cli.studies.independent_rays import emitted
 from caustic_cli.workflow import design as workflow
 
 AT = (0.5, -0.5, -12.0)

@@ -20,7 +20,7 @@ from caustic_cli.export.mesh import closed_mesh
 from caustic_cli.inverse.incidence import incident
 from caustic_cli.inverse.initial_surface import first_surface, sphere_net
 from caustic_cli.inverse.objective import Objective
-from caustic_cli.inverse.relayed import Relayed
+from caustic_cli.inverse.relay import Relayed
 from caustic_cli.io.archive import open_archive
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.frames import Leg

@@ -13,7 +13,7 @@ from caustic_cli import cli
 from caustic_cli.config import settings
 from caustic_cli.config.completion import complete
 from caustic_cli.errors import CausticError, InputError
-from caustic_cli.inverse.extended import centre_of
+from caustic_cli.inverse.source_limits import centre_of
 from caustic_cli.optics.bounds import bounds_of, refuse_without_glass
 from caustic_cli.optics.effects import EFFECTS
 from caustic_cli.optics.emission import rays_of

@@ -16,11 +16,11 @@ from PIL import Image
 from caustic_cli import cli
 from caustic_cli.commands.console import figures_rows
 from caustic_cli.config import settings
-from caustic_cli.inverse import extended
+from caustic_cli.inverse import source_limits
 from caustic_cli.inverse.deconvolution import deconvolved
-from caustic_cli.inverse.extended import centre_of, etendue_limit, limits, regular_rays, shift_of
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.schedule import Stage
+from caustic_cli.inverse.source_limits import centre_of, etendue_limit, limits, regular_rays, shift_of
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.emission.coherent import even_disc, modes
 from caustic_cli.optics.emission.regular import RegularGrid
@@ -200,7 +200,7 @@ def test_a_blurred_render_is_added_up_to_pixels_whatever_it_is_cut_into():
 @pytest.mark.parametrize("exact", [10.0, 1e-5], ids=["middle", "points"])
 def test_objective_sees_the_image_of_the_source(kind, exact, monkeypatch):
     """On its own regular rays, spread, the loss is that of very many rays drawn from all of the source; its gradient is right."""
-    monkeypatch.setattr(extended, "EXACT", exact)
+    monkeypatch.setattr(source_limits, "EXACT", exact)
     scene = scene_of(SOURCES[kind])
     field, heights = HeightField.of(scene.lens), heights_of(scene)
     stage = Stage((19, 19), 200_000, "grid", oversample=4, spread=True)

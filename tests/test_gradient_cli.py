@@ -12,7 +12,7 @@ import torch
 from helpers import small_designs, write_blob
 
 from caustic_cli import cli, load
-from caustic_cli.inverse.gradient_blank import blank_system, design_blank
+from caustic_cli.inverse.gradient_index import blank_system, design_blank
 from caustic_cli.optics.effects import EFFECTS
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.gradient import field_of

@@ -19,7 +19,7 @@ from caustic_cli.inverse.incidence import incident
 from caustic_cli.inverse.initial_surface import InitialSurface, first_surface
 from caustic_cli.inverse.losses import Loss
 from caustic_cli.inverse.objective import Objective
-from caustic_cli.inverse.reach import largest_magnification, refuse_unreachable
+from caustic_cli.inverse.reachability import largest_magnification, refuse_unreachable
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces import HeightField

@@ -31,7 +31,7 @@ from caustic_cli.optics.envelope import Envelope
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
 from caustic_cli.studies.scallops import PARABOLA, scallops
-from caustic_cli.workflow.cut import compared, cut_surface
+from caustic_cli.workflow.machining import compared, cut_surface
 
 EDGES = (-4.9, 4.9)
 

@@ -15,10 +15,10 @@ from caustic_cli import cli
 from caustic_cli.config.completion import build_options, build_stages, complete
 from caustic_cli.config.settings import build_scene
 from caustic_cli.errors import CausticError, InputError
-from caustic_cli.inverse.conditions import JUDGED, Range, Ranges
 from caustic_cli.inverse.designer import Designer
-from caustic_cli.inverse.over_range import BATCH, AdamOverRange, RangeObjective
 from caustic_cli.inverse.parametrisation import Architecture, parametrise
+from caustic_cli.inverse.range_training import BATCH, AdamOverRange, RangeObjective
+from caustic_cli.inverse.scene_parameters import JUDGED, Range, Ranges
 from caustic_cli.io.files import is_ours
 from caustic_cli.project import checkpoint
 from caustic_cli.studies import architectures

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from caustic_cli.inverse.deconvolution import deconvolved
-from caustic_cli.inverse.extended import shift_of
 from caustic_cli.inverse.sharpness import SHARP, STEPS, _blurred, advice, disc, needed, smaller
+from caustic_cli.inverse.source_limits import shift_of
 from caustic_cli.optics.spread import Convolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Scene, Screen

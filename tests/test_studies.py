@@ -17,7 +17,7 @@ from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.intersection import find
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Lens, Offset, PlaneWave, Points, Scene, Screen
-from caustic_cli.studies import intersection, training
+from caustic_cli.studies import intersection, optimiser_comparison
 from caustic_cli.studies.report import as_json, paths_of, refuse_foreign_files, write
 from caustic_cli.studies.retrace import retrace
 from caustic_cli.workflow import comparison
@@ -205,7 +205,9 @@ def test_contenders_get_equal_time_and_an_independent_verdict():
     bad = good + 0.02 * torch.sin(torch.arange(9.0))[:, None]
     fast, slow = (Rival(name, field, bad, good, share) for name, share in (("fast", 0.3), ("slow", 0.95)))
     told = []
-    study = training.run_training(scene, image, [slow, fast], seconds=1.6, rays=20_000, progress=lambda *s: told.append(s))
+    study = optimiser_comparison.run_training(
+        scene, image, [slow, fast], seconds=1.6, rays=20_000, progress=lambda *s: told.append(s)
+    )
     assert fast.turns == pytest.approx([0.1] * 12) and slow.turns == pytest.approx([0.1] * 12)
     assert told[-1] == (32, 32)
     for series in ("fast", "slow"):
@@ -243,7 +245,7 @@ def test_the_contenders_of_a_project(small):
     assert tuple(entry.heights.shape) == (11, 11)
     assert (entry.iterations, entry.seconds, entry.steps, entry.loss) == (0, 0.0, [], None)  # what was tried out is forgotten
     with pytest.raises(InputError, match="seconds"):
-        training.run_training(scene, target, [entry], seconds=0.0)
+        optimiser_comparison.run_training(scene, target, [entry], seconds=0.0)
 
 
 def test_transport_contends_where_a_design_would_begin_there():
@@ -297,7 +299,7 @@ def test_coarse_to_fine_goes_through_its_nets(small):
 def test_the_study_of_designs_lowers_the_error(small, tmp_path):
     scene, target, _ = small
     entries = [contender(small, k) for k in (1, 4)]
-    study = training.run_training(scene, target, entries, seconds=0.5, rays=40_000)
+    study = optimiser_comparison.run_training(scene, target, entries, seconds=0.5, rays=40_000)
     for e in entries:
         mine = [r for r in study.rows if r["series"] == e.series]
         assert mine[0]["iterations"] == 0 and mine[-1]["error"] < mine[0]["error"]

@@ -12,7 +12,7 @@ from PIL import Image
 
 from caustic_cli import cli, load
 from caustic_cli.export.mesh import closed_mesh
-from caustic_cli.inverse.initial_sides import first_sides
+from caustic_cli.inverse.initial_two_sided import first_sides
 from caustic_cli.inverse.two_sided import TwoSidedObjective
 from caustic_cli.io.archive import open_archive
 from caustic_cli.optics.emission import rays_of
@@ -22,7 +22,7 @@ from caustic_cli.optics.system import ENTRANCE, EXIT, System, sides_of
 from caustic_cli.optics.trace import expose, render
 from caustic_cli.scene import Lens, Offset, PlaneWave, Points, Scene, Screen, Second
 from caustic_cli.studies.retrace import retrace
-from caustic_cli.studies.second import second_figures
+from caustic_cli.studies.second_target import second_figures
 
 HALF, PIXELS = 6.0, 40
 NEAR = Screen((2 * HALF, 2 * HALF), 50.0, (PIXELS, PIXELS))

@@ -57,12 +57,12 @@ from caustic_cli.config.settings import (
 )
 from caustic_cli.config.table import check, default
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.conditions import Ranges
 from caustic_cli.inverse.designer import Options
-from caustic_cli.inverse.extended import shift_of
 from caustic_cli.inverse.lenslets import FROM_AFAR
 from caustic_cli.inverse.parametrisation import Architecture
+from caustic_cli.inverse.scene_parameters import Ranges
 from caustic_cli.inverse.schedule import Stage
+from caustic_cli.inverse.source_limits import shift_of
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.resolution import BAND, Resolution, white
 from caustic_cli.scene import Offset, Scene, Screen, Source, sources

@@ -19,21 +19,21 @@ from torch import Tensor
 from caustic_cli.config.table import check_all
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse import ranks
-from caustic_cli.inverse.between_sides import origins
-from caustic_cli.inverse.conditions import Ranges
+from caustic_cli.inverse.constraints import within_limits
 from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
-from caustic_cli.inverse.extended import best_light, regular_rays, shift_of
 from caustic_cli.inverse.initial_surface import room_of, sphere_net
+from caustic_cli.inverse.internal_rays import origins
 from caustic_cli.inverse.lbfgs import UNFIT
 from caustic_cli.inverse.lenslets import ArrayObjective, lenslets
-from caustic_cli.inverse.limits import within_limits
 from caustic_cli.inverse.losses import parse
 from caustic_cli.inverse.objective import Objective
-from caustic_cli.inverse.over_range import AdamOverRange, RangeObjective
+from caustic_cli.inverse.optimisers import Adam, QuasiNewton
 from caustic_cli.inverse.parametrisation import Architecture, FreeHeights, Heights, SidesTogether, parametrise
+from caustic_cli.inverse.range_training import AdamOverRange, RangeObjective
 from caustic_cli.inverse.robust import RobustObjective
+from caustic_cli.inverse.scene_parameters import Ranges
 from caustic_cli.inverse.schedule import Stage
-from caustic_cli.inverse.steps import Adam, QuasiNewton
+from caustic_cli.inverse.source_limits import best_light, regular_rays, shift_of
 from caustic_cli.inverse.target import grey
 from caustic_cli.inverse.two_sided import TwoSidedObjective
 from caustic_cli.inverse.waves import WaveObjective

@@ -23,7 +23,7 @@ import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.relayed import bare, opened, passed
+from caustic_cli.inverse.relay import bare, opened, passed
 from caustic_cli.optics.averages import shared_out
 from caustic_cli.optics.emission.measured import irradiance
 from caustic_cli.optics.interface import reflectance

@@ -18,11 +18,11 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.incidence import incident
-from caustic_cli.inverse.relayed import Relayed
+from caustic_cli.inverse.projection import View
+from caustic_cli.inverse.relay import Relayed
 from caustic_cli.inverse.surface_from_map import OutOfReach, Seen, Start, finer, thrown
 from caustic_cli.inverse.surface_from_map import surface as refracting_surface
 from caustic_cli.inverse.transport import cell_lines, corners
-from caustic_cli.inverse.view import View
 from caustic_cli.optics.surfaces import Sphere
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Component, Lens, Scene

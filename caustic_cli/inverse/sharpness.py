@@ -22,8 +22,8 @@ import numpy as np
 import torch
 
 from caustic_cli.inverse.deconvolution import deconvolved
-from caustic_cli.inverse.extended import shift_of
-from caustic_cli.inverse.reach import largest_magnification
+from caustic_cli.inverse.reachability import largest_magnification
+from caustic_cli.inverse.source_limits import shift_of
 from caustic_cli.optics.spread import MOST_CUT, Convolution, Spread
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.scene import PlaneWave, Scene

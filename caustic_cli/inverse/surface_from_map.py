@@ -33,9 +33,9 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import gaussian_filter
 
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.relayed import Relayed
+from caustic_cli.inverse.projection import View
+from caustic_cli.inverse.relay import Relayed
 from caustic_cli.inverse.transport import Transport, corners, solve
-from caustic_cli.inverse.view import View
 from caustic_cli.optics.backends.reference import Torch
 from caustic_cli.optics.frames import IDENTITY
 from caustic_cli.optics.kernels.laguerre import prices

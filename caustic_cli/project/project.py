@@ -20,8 +20,8 @@ from caustic_cli.config import settings
 from caustic_cli.config.completion import build_options, build_stages, complete, complete_source
 from caustic_cli.config.settings import Settings, value_of
 from caustic_cli.errors import InputError, no_project, plain
-from caustic_cli.inverse.conditions import Ranges
 from caustic_cli.inverse.designer import Designer, State
+from caustic_cli.inverse.scene_parameters import Ranges
 from caustic_cli.inverse.target import target_on_screen, tiles
 from caustic_cli.io.files import write_bytes
 from caustic_cli.io.picture import Picture, read_picture

@@ -36,7 +36,7 @@ from caustic_cli.optics.system import System
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Scene
 from caustic_cli.scene.plain import beyond_plain
-from caustic_cli.studies.drawn import KINDS, emitted
+from caustic_cli.studies.independent_rays import KINDS, emitted
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.retrace import BATCHES
 

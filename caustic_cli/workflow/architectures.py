@@ -13,13 +13,13 @@ import torch
 from caustic_cli.config.completion import build_options, build_stages, complete
 from caustic_cli.config.settings import build_scene
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.conditions import Range, Ranges
 from caustic_cli.inverse.designer import Designer, First, Options
 from caustic_cli.inverse.parametrisation import Architecture
+from caustic_cli.inverse.scene_parameters import Range, Ranges
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Scene
 from caustic_cli.studies.retrace import retrace
-from caustic_cli.workflow import over_range
+from caustic_cli.workflow import range_evaluation
 from caustic_cli.workflow.comparison import disc
 from caustic_cli.workflow.design import first_heights
 
@@ -74,7 +74,7 @@ class Candidate:
         found = []
         for designer, state in zip(self.designers, self.states, strict=True):
             if designer.options.over is not None:
-                found += over_range.errors(
+                found += range_evaluation.errors(
                     designer, state, self.target, rays=self.rays, seed=self.seed, device=designer.device, middle=False
                 )
                 continue

@@ -48,7 +48,7 @@ class Turns(Designer):
 
 
 class Entry:
-    """A design that takes turns; a `studies.training.Contender`.
+    """A design that takes turns; a `studies.optimiser_comparison.Contender`.
 
     Raises:
         InputError: the lens leaves the heights no room.

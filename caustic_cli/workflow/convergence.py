@@ -9,7 +9,7 @@ import torch
 
 from caustic_cli.config import checks
 from caustic_cli.errors import InputError
-from caustic_cli.studies import architectures, diffraction, effects, intersection, light, training
+from caustic_cli.studies import architectures, diffraction, effects, efficiency, intersection, optimiser_comparison
 from caustic_cli.studies.convergence import run_study
 from caustic_cli.studies.report import Study
 from caustic_cli.workflow import architectures as networks
@@ -22,11 +22,11 @@ from caustic_cli.workflow.reporter import Reporter
 #: Plots of the studies that bring their own.
 PLOTS = {
     "intersection": intersection.PLOTS,
-    "design": training.PLOTS,
+    "design": optimiser_comparison.PLOTS,
     "networks": architectures.PLOTS,
     "effects": effects.PLOTS,
     "diffraction": diffraction.PLOTS,
-    "light": light.PLOTS,
+    "light": efficiency.PLOTS,
 }
 #: Studies that trace whatever a scene has.
 OF_ANY_SCENE = ("rays", "reconstruction", "precision")
@@ -84,7 +84,7 @@ def measure(
     project = lens.project if lens else None
     if name == "design":
         scene, target, entries = comparison.entries_of(project, device, asked.dtype, asked.seed)
-        return training.run_training(
+        return optimiser_comparison.run_training(
             scene, target, entries, seconds=asked.seconds, seed=seed, rays=asked.rays, device=device, progress=progress
         )
     if name == "networks":
@@ -93,9 +93,9 @@ def measure(
             compared, seconds=asked.seconds, about={"seed": seed, "device": device}, progress=progress
         )
     if name == "light":
-        each = checks.number("⟨seconds⟩", light.SECONDS if asked.seconds is None else asked.seconds, 0.0, 1e6, open_low=True)
+        each = checks.number("⟨seconds⟩", efficiency.SECONDS if asked.seconds is None else asked.seconds, 0.0, 1e6, open_low=True)
         count, lenses = tradeoff.lenses(project, each, device)
-        return light.run_light(lenses, count, rays=asked.rays, seed=seed, device=device, progress=progress)
+        return efficiency.run_light(lenses, count, rays=asked.rays, seed=seed, device=device, progress=progress)
     other = comparison.lens_of_disc if name == "diffraction" else sphere
     scene, field, heights = (lens.scene, lens.field, lens.heights) if lens else other()
     heights = heights.to(device)

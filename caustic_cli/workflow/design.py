@@ -29,12 +29,12 @@ from caustic_cli.errors import CausticError, InputError, Interrupted
 from caustic_cli.inverse import ranks
 from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
 from caustic_cli.inverse.designer import Designer, First, State
-from caustic_cli.inverse.extended import best_light, centre_of, limits, shift_of
-from caustic_cli.inverse.initial_sides import first_sides
 from caustic_cli.inverse.initial_surface import InitialSurface, first_surface
+from caustic_cli.inverse.initial_two_sided import first_sides
 from caustic_cli.inverse.lenslets import first_array
-from caustic_cli.inverse.reach import largest_magnification, refuse_unreachable
+from caustic_cli.inverse.reachability import largest_magnification, refuse_unreachable
 from caustic_cli.inverse.sharpness import advice
+from caustic_cli.inverse.source_limits import best_light, centre_of, limits, shift_of
 from caustic_cli.inverse.surface_from_map import OutOfReach
 from caustic_cli.inverse.target import grey
 from caustic_cli.io.files import Piped
@@ -52,7 +52,7 @@ from caustic_cli.scene import Scene
 from caustic_cli.studies.manufacture import preview, wall_and_stock
 from caustic_cli.workflow.compilation import compile_usual, told_of
 from caustic_cli.workflow.evaluation import expected_seconds, judge
-from caustic_cli.workflow.gradient import design_index, index_figures, is_free, limit_of
+from caustic_cli.workflow.gradient_index import design_index, index_figures, is_free, limit_of
 from caustic_cli.workflow.movie import Movie
 from caustic_cli.workflow.reporter import Reporter
 

@@ -14,8 +14,8 @@ import torch
 
 from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
 from caustic_cli.inverse.designer import Designer, State
-from caustic_cli.inverse.extended import limits
 from caustic_cli.inverse.losses import parse
+from caustic_cli.inverse.source_limits import limits
 from caustic_cli.inverse.target import grey
 from caustic_cli.io.files import discard
 from caustic_cli.io.picture import WIDE, write_image
@@ -26,12 +26,12 @@ from caustic_cli.optics.system import sides_of, traced_of
 from caustic_cli.optics.waves import WaveImage
 from caustic_cli.project import uptodate
 from caustic_cli.project.project import FARTHER, RENDER, REPORT, WAVE, Project
+from caustic_cli.studies.design_report import write_report
 from caustic_cli.studies.irradiance import irradiance
-from caustic_cli.studies.panels import write_report
 from caustic_cli.studies.retrace import FINAL_RAYS, QUIET, judging_rays, retrace, white_level
-from caustic_cli.studies.second import second_figures
+from caustic_cli.studies.second_target import second_figures
 from caustic_cli.studies.waves import unseen_figures, wave_figures
-from caustic_cli.workflow import over_range
+from caustic_cli.workflow import range_evaluation
 
 #: Points along each side of the aperture at which the report draws the surface.
 REPORT_SAMPLES = 401
@@ -194,7 +194,7 @@ def evaluate(
     if light is not None:
         figures |= unseen_figures(scene, field, state.heights.to(device), target)
     if designer.options.over is not None:
-        figures |= {"over": over_range.errors(designer, state, target, rays=FINAL_RAYS // OVER, seed=seed, device=device)}
+        figures |= {"over": range_evaluation.errors(designer, state, target, rays=FINAL_RAYS // OVER, seed=seed, device=device)}
     return Evaluation(state, figures, exposure.image.cpu().numpy(), None if light is None else light.image.cpu().numpy())
 
 

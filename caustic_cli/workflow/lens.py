@@ -29,8 +29,8 @@ from caustic_cli.scene import Scene
 from caustic_cli.studies.retrace import FINAL_RAYS, QUIET, judging_rays, retrace
 from caustic_cli.studies.waves import wave_figures
 from caustic_cli.workflow.compilation import compile_for
-from caustic_cli.workflow.cut import FINER, departure
 from caustic_cli.workflow.export import write
+from caustic_cli.workflow.machining import FINER, departure
 from caustic_cli.workflow.reporter import Listener, Reporter
 
 
@@ -137,7 +137,7 @@ class Lens:
             filter: reconstruction filter; None counts rays in pixels.
             effects: as of `plan`, or a plan.
             dtype: of the ray arithmetic.
-            cut: the surface that a tool left, instead of the lens' own (`workflow.cut`).
+            cut: the surface that a tool left, instead of the lens' own (`workflow.machining`).
         """
         plan = effects if isinstance(effects, Plan) else self.plan(effects)
         compile_for(plan.scene, device, say or Listener(), plan.requests)

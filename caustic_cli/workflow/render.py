@@ -29,15 +29,15 @@ from caustic_cli.studies import effects as effects_study
 from caustic_cli.studies import manufacture
 from caustic_cli.studies.irradiance import irradiance
 from caustic_cli.studies.retrace import FINAL_RAYS, white_level
-from caustic_cli.studies.second import second_figures
+from caustic_cli.studies.second_target import second_figures
 from caustic_cli.studies.verify import require_mitsuba, verify, write_panels
 from caustic_cli.workflow import page
 from caustic_cli.workflow.compilation import compile_for
-from caustic_cli.workflow.cut import compared, cut_surface, mark
+from caustic_cli.workflow.illumination import illumination, wanted
 from caustic_cli.workflow.lens import Lens, is_archive, refuse_at
+from caustic_cli.workflow.machining import compared, cut_surface, mark
 from caustic_cli.workflow.reporter import Reporter
 from caustic_cli.workflow.tolerances import tolerances
-from caustic_cli.workflow.wanted import illumination, wanted
 
 #: Rays where a tolerance begins, and of what is looked at beside the image, unless said.
 BESIDE_RAYS = 1_000_000

@@ -15,7 +15,7 @@ from caustic_cli.errors import CausticError
 from caustic_cli.inverse.designer import Designer, First
 from caustic_cli.io.picture import Picture
 from caustic_cli.project.project import Project
-from caustic_cli.studies.light import Lens
+from caustic_cli.studies.efficiency import Lens
 from caustic_cli.workflow.comparison import picture_of_disc
 from caustic_cli.workflow.design import first_heights
 

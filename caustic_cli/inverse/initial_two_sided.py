@@ -26,13 +26,13 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.between_sides import rays_within, spread
 from caustic_cli.inverse.incidence import on_entrance
 from caustic_cli.inverse.initial_surface import net_of
+from caustic_cli.inverse.internal_rays import rays_within, spread
+from caustic_cli.inverse.projection import View
 from caustic_cli.inverse.surface_from_map import slopes_to, surface
 from caustic_cli.inverse.surface_from_slopes import fitted
 from caustic_cli.inverse.transport import cell_lines, corners, solve
-from caustic_cli.inverse.view import View
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene, Screen
 from caustic_cli.scene.screen import Sags

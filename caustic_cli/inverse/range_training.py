@@ -16,10 +16,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caustic_cli.inverse.conditions import Ranges
 from caustic_cli.inverse.objective import Evaluation, Objective
+from caustic_cli.inverse.optimisers import Adam
 from caustic_cli.inverse.parametrisation import Heights
-from caustic_cli.inverse.steps import Adam
+from caustic_cli.inverse.scene_parameters import Ranges
 from caustic_cli.optics.emission import Rays
 from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.system import EXIT

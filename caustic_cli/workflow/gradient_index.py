@@ -1,4 +1,4 @@
-"""The design of a free gradient from beginning to end: a flat blank's index by `inverse.gradient_blank`, judged as any lens is.
+"""The design of a free gradient from beginning to end: a flat blank's index by `inverse.gradient_index`, judged as any lens is.
 
 The project keeps the control values beside project.toml, in the file that [lens] index_file names; its checkpoint holds the flat
 side.
@@ -19,7 +19,7 @@ from caustic_cli.config.completion import build_stages
 from caustic_cli.config.plans import transport_cells
 from caustic_cli.config.settings import value_of
 from caustic_cli.inverse.designer import State
-from caustic_cli.inverse.gradient_blank import design_blank
+from caustic_cli.inverse.gradient_index import design_blank
 from caustic_cli.project import attachments
 from caustic_cli.project.project import Project
 from caustic_cli.workflow.reporter import Reporter
