@@ -30,7 +30,7 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Disc, Lens, Points, Scene, Screen
 from caustic_cli.scene.sources.distribution import Distribution
-from caustic_cli.studies.independent_rays import emitted
+from caustic_cli.studies.independent_rays import sample_rays
 from caustic_cli.workflow import design as workflow
 
 AT = (0.5, -0.5, -12.0)
@@ -217,7 +217,7 @@ def test_rays_against_independent_ones(source):
     lean = 0.04 if source.distant else 0.5
     rng, rays = np.random.default_rng(0), 200_000
     places = []
-    for o, d, _ in emitted(here, rays, rng):
+    for o, d, _ in sample_rays(here, rays, rng):
         way = -o[2] / d[2]
         places.append(np.concatenate([o[:2] + way * d[:2], d]))
     x, y, *d = np.concatenate(places, 1)

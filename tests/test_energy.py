@@ -13,7 +13,7 @@ from caustic_cli import cli
 from caustic_cli.config import settings
 from caustic_cli.config.completion import complete
 from caustic_cli.errors import CausticError, InputError
-from caustic_cli.inverse.source_limits import centre_of
+from caustic_cli.inverse.source_limits import point_source
 from caustic_cli.optics.bounds import bounds_of, refuse_without_glass
 from caustic_cli.optics.effects import EFFECTS
 from caustic_cli.optics.emission import rays_of
@@ -23,7 +23,7 @@ from caustic_cli.optics.spread import Convolution, spread_at
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Disc, Lens, Light, Offset, PlaneWave, Points, Scene, Screen
-from caustic_cli.studies.retrace import require_account, retrace
+from caustic_cli.studies.retrace import require_energy_balance, retrace
 from caustic_cli.workflow import evaluation
 
 
@@ -91,8 +91,8 @@ def test_projects_and_archives_without_glass_are_not_opened(tmp_path, monkeypatc
 )
 def test_an_impossible_account_stops_a_render(parts):
     with pytest.raises(CausticError, match="does not close"):
-        require_account(parts, torch.float64)
-    require_account({"on_screen": 0.6, "lost": {"absorbed": 0.4}}, torch.float64)
+        require_energy_balance(parts, torch.float64)
+    require_energy_balance({"on_screen": 0.6, "lost": {"absorbed": 0.4}}, torch.float64)
 
 
 def test_weights_that_overflow_are_refused():
@@ -144,7 +144,7 @@ def test_an_image_spread_is_the_image_of_the_source():
     disc = Scene(Disc((0.0, 0.0, -500.0), (5.0, 5.0), intensity="uniform"), scene.lens, Screen((30.0, 30.0), 300.0, (60, 60)))
     spread = spread_at(disc, field, heights).on(disc.screen.pixel)
     assert spread.cut == 4
-    fine = replace(disc, screen=replace(disc.screen, resolution=(240, 240)), source=centre_of(disc))
+    fine = replace(disc, screen=replace(disc.screen, resolution=(240, 240)), source=point_source(disc))
 
     def image(scene: Scene, rays: int, seed: int) -> torch.Tensor:
         found = expose(scene, field, heights, rays_of(scene, "sobol", rays, seed), None, torch.float64).image

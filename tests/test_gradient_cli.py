@@ -12,7 +12,7 @@ import torch
 from helpers import small_designs, write_blob
 
 from caustic_cli import cli, load
-from caustic_cli.inverse.gradient_index import blank_system, design_blank
+from caustic_cli.inverse.gradient_index import design_gradient_index, plate_system
 from caustic_cli.optics.effects import EFFECTS
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.gradient import field_of
@@ -62,9 +62,9 @@ def test_a_blank_is_designed_kept_and_rendered(capfd):
     assert again["relative_rms"] == pytest.approx(figures["relative_rms"], abs=0.02)
     anew = run(capfd, "design", "blob.png", "--gradient", "free", *TINY, "-o", "free.caustic")
     assert anew["index_least"] == figures["index_least"]
-    assert "in one go" in run(capfd, "design", "--resume", "free.caustic", code=2)
+    assert "cannot be resumed" in run(capfd, "design", "--resume", "free.caustic", code=2)
     movie = ("design", "blob.png", "--gradient", "free", *TINY, "-o", "moving.caustic", "--movie", "m.gif")
-    assert "--movie is of a surface's design" in run(capfd, *movie, code=2)
+    assert "--movie records the design of a surface" in run(capfd, *movie, code=2)
     assert run(capfd, "export", "free.caustic", "--format", "stl", "-o", "blank.stl")["bytes"] > 1000
     assert "varies" in run(capfd, "export", "free.caustic", "--format", "lighttools", code=2)
     assert "varies" in run(capfd, "gradmap", "free.caustic", "--threads", "1", code=2)
@@ -116,16 +116,16 @@ def test_a_design_comes_nearer_to_the_picture():
     target = np.where((np.abs(x) < 0.6) & (np.abs(y) < 0.5), 1.0 + 0.6 * np.sin(5.0 * x) * np.cos(4.0 * y), 0.0)
 
     def error(index) -> float:
-        (image,) = render(blank_system(scene, index), {}, 200_000, seed=9)
+        (image,) = render(plate_system(scene, index), {}, 200_000, seed=9)
         j = image.image.numpy()
         return float(np.sqrt(np.mean((j / j.mean() - target / target.mean()) ** 2)))
 
-    found = design_blank(scene, target, (28, 28), 2, cells=20, iterations=10)
+    found = design_gradient_index(scene, target, (28, 28), 2, cells=20, iterations=10)
     assert error(found.index) < 0.9 * error(found.start) < 0.35 and found.index.shape == (28, 28, 2)
     losses = [loss for loss, _ in found.history]
     assert losses == sorted(losses, reverse=True)
     held = scene_of(Gradient("volume", (), found.index.coefficients.numpy()))
-    (image,) = render(blank_system(scene, found.index), {}, 4000)
+    (image,) = render(plate_system(scene, found.index), {}, 4000)
     by_net = expose(held, HeightField.of(held.lens), flat(held), rays_of(held, "stratified", 4000))
     assert torch.allclose(by_net.image, image.image, atol=1e-9)
 

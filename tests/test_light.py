@@ -128,14 +128,14 @@ def test_light_that_comes_through_the_sides_does_not_count():
     ],
 )
 def test_a_picture_out_of_reach_is_refused(scene):
-    with pytest.raises(InputError, match="no light can leave the lens for the picture: it would have to turn by at least"):
+    with pytest.raises(InputError, match="no light can be refracted to the picture: it would have to be deflected by at least"):
         refuse_unreachable(scene, blob())
     refuse_unreachable(replace(scene, screen=replace(scene.screen, shift=(0.0, 0.0))), blob())
 
 
 def test_light_that_misses_the_lens_is_refused():
     scene = Scene(Points(((30.0, 0.0, -20.0),), cone=20.0), Lens(), Screen((30.0, 30.0), 300.0, (48, 48)))
-    with pytest.raises(InputError, match="none of its light meets the lens"):
+    with pytest.raises(InputError, match="none of its light falls on the lens"):
         refuse_unreachable(scene, blob())
 
 

@@ -104,7 +104,7 @@ def test_the_slope_of_what_exceeds(rough, block, monkeypatch):
     field, heights, _ = rough
     _, steep, bent = samples(field, heights, 100_000)
     monkeypatch.setattr(constraints, "BLOCK", block)
-    asked = constraints._Limits(field, (heights - 0.01, heights), 0.8 * steep, 1.5 / bent, 4)
+    asked = constraints._Constraints(field, (heights - 0.01, heights), 0.8 * steep, 1.5 / bent, 4)
     g = asked.violation(heights)[1]
     d = torch.randn(heights.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
     step = 1e-8

@@ -302,7 +302,7 @@ def test_a_new_design_leaves_nothing_of_the_one_before(copy):
     for name in MADE:
         (copy / name).write_bytes(b"of before")
     (copy / "notes.txt").write_text("mine")
-    directory.settle(Project.open(copy), True)
+    directory.create(Project.open(copy), True)
     assert sorted(p.name for p in copy.iterdir()) == ["notes.txt", "project.toml", "target.npy"]
 
 

@@ -50,7 +50,7 @@ def small():
 
 def contender(small, k):
     scene, target, full = small
-    return comparison.Entry(*comparison.plans(scene, full)[k], scene, torch.from_numpy(target))
+    return comparison.TimedDesign(*comparison.variants(scene, full)[k], scene, torch.from_numpy(target))
 
 
 def test_both_errors_of_the_mesh_are_of_order_two(interaction):
@@ -205,7 +205,7 @@ def test_contenders_get_equal_time_and_an_independent_verdict():
     bad = good + 0.02 * torch.sin(torch.arange(9.0))[:, None]
     fast, slow = (Rival(name, field, bad, good, share) for name, share in (("fast", 0.3), ("slow", 0.95)))
     told = []
-    study = optimiser_comparison.run_training(
+    study = optimiser_comparison.run_comparison(
         scene, image, [slow, fast], seconds=1.6, rays=20_000, progress=lambda *s: told.append(s)
     )
     assert fast.turns == pytest.approx([0.1] * 12) and slow.turns == pytest.approx([0.1] * 12)
@@ -224,7 +224,7 @@ def test_contenders_get_equal_time_and_an_independent_verdict():
 
 def test_the_contenders_of_a_project(small):
     scene, target, full = small
-    plans = comparison.plans(scene, full)
+    plans = comparison.variants(scene, full)
     assert [series for series, *_ in plans] == [
         "lbfgs, 19x19",
         "lbfgs, 11x11",
@@ -245,7 +245,7 @@ def test_the_contenders_of_a_project(small):
     assert tuple(entry.heights.shape) == (11, 11)
     assert (entry.iterations, entry.seconds, entry.steps, entry.loss) == (0, 0.0, [], None)  # what was tried out is forgotten
     with pytest.raises(InputError, match="seconds"):
-        optimiser_comparison.run_training(scene, target, [entry], seconds=0.0)
+        optimiser_comparison.run_comparison(scene, target, [entry], seconds=0.0)
 
 
 def test_transport_contends_where_a_design_would_begin_there():
@@ -253,8 +253,8 @@ def test_transport_contends_where_a_design_would_begin_there():
     scene = build_scene(full)
     target = torch.from_numpy(comparison.disc(scene, tuple(full["target"]["size"])))
     entries = {
-        plan[0]: comparison.Entry(*plan, scene, target)
-        for plan in comparison.plans(scene, full)
+        plan[0]: comparison.TimedDesign(*plan, scene, target)
+        for plan in comparison.variants(scene, full)
         if plan[0] in ("lbfgs, 35x35", comparison.TRANSPORT)
     }
     assert len(entries) == 2
@@ -269,7 +269,7 @@ def test_a_lens_with_knots_of_its_own_keeps_its_net(small):
     scene, _, full = small
     knots = SplineSpace.uniform(19, 3).knots.tolist()
     own = replace(scene, lens=replace(scene.lens, knots=(knots, knots)))
-    plans = comparison.plans(own, full)
+    plans = comparison.variants(own, full)
     assert [series for series, *_ in plans][:2] == ["lbfgs, 19x19", "adam, 19x19"] and len(plans) == 4
     assert {s.control for _, stages, _ in plans for s in stages} == {(19, 19)}
 
@@ -299,7 +299,7 @@ def test_coarse_to_fine_goes_through_its_nets(small):
 def test_the_study_of_designs_lowers_the_error(small, tmp_path):
     scene, target, _ = small
     entries = [contender(small, k) for k in (1, 4)]
-    study = optimiser_comparison.run_training(scene, target, entries, seconds=0.5, rays=40_000)
+    study = optimiser_comparison.run_comparison(scene, target, entries, seconds=0.5, rays=40_000)
     for e in entries:
         mine = [r for r in study.rows if r["series"] == e.series]
         assert mine[0]["iterations"] == 0 and mine[-1]["error"] < mine[0]["error"]

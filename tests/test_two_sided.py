@@ -235,7 +235,7 @@ def test_two_pictures_by_the_command_line(_here, capfd):
         (("--collimate", "--source", "point", "--start", "offset"), "must be transport"),
         (("--second", "missing.png", "--second-at", "400"), "missing.png"),
         (("--collimate", "--config", "waves.toml"), "without waves or spread"),
-        (("--collimate", "--mag", "6"), "would have to come from beside the lens"),
+        (("--collimate", "--mag", "6"), "would have to come from outside the lens"),
     ],
 )
 def test_bad_input_is_refused(_here, capfd, options, words):

@@ -124,7 +124,7 @@ def of_poles(poles: np.ndarray, written: HeightField, field: HeightField, height
     return _deviation("the B-spline of these poles", (n, m), (z - own[0]).numpy(), slope)
 
 
-def together(deviations: Sequence[Deviation]) -> Deviation:
+def combined(deviations: Sequence[Deviation]) -> Deviation:
     """Of several surfaces, the first's samples: the largest height, and the root of the sum of squares of the slopes."""
     first = deviations[0]
     slope = float(np.sqrt(sum(d.slope**2 for d in deviations)))

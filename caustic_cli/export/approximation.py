@@ -5,7 +5,7 @@ Notation
     t           the points of the fit: `degree` + 1 equal steps in every span of the surface, its knots among them
 
 Both axes are fitted one after the other, each by its own least squares, which commute.  Folds stay: a knot that is repeated is
-kept as often, and the simple ones between two of them are thinned evenly.
+kept as often, and the simple ones between two of them are coarsened evenly.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ def on_fewer_knots(field: HeightField, heights: Tensor, most: int) -> tuple[Heig
     than its own.  heights: (n, m) mm."""
     if most >= math.prod(field.shape):
         return field, heights
-    u, v = (thinned(space, math.sqrt(most / math.prod(field.shape))) for space in field.spaces)
+    u, v = (coarsened(space, math.sqrt(most / math.prod(field.shape))) for space in field.spaces)
     net = _fitted(heights.detach().double().cpu(), field.spaces[0], u)
     return HeightField((u, v), field.half_size), _fitted(net.T, field.spaces[1], v).T.contiguous()
 
 
-def thinned(space: SplineSpace, part: float) -> SplineSpace:
+def coarsened(space: SplineSpace, part: float) -> SplineSpace:
     """The same degree on at most `part` of the control points, as far as the ends and the repeated knots leave that open."""
     knots, times = np.unique(space.knots.numpy(), return_counts=True)
     kept = np.flatnonzero(times > 1)
@@ -48,7 +48,7 @@ def thinned(space: SplineSpace, part: float) -> SplineSpace:
     return SplineSpace(space.degree, torch.from_numpy(np.concatenate(found)))
 
 
-def caps(sizes: Sequence[int], most: int) -> list[int]:
+def allocate_points(sizes: Sequence[int], most: int) -> list[int]:
     """How many points each of some surfaces may have for at most so many in all: the small ones keep theirs."""
     left, found = most, dict[int, int]()
     for rank, k in enumerate(sorted(range(len(sizes)), key=lambda k: sizes[k])):

@@ -28,8 +28,8 @@ from torch import Tensor
 
 from caustic_cli import __version__
 from caustic_cli.config import checks
-from caustic_cli.export.accuracy import Deviation, of_poles, together
-from caustic_cli.export.approximation import caps, on_fewer_knots
+from caustic_cli.export.accuracy import Deviation, combined, of_poles
+from caustic_cli.export.approximation import allocate_points, on_fewer_knots
 from caustic_cli.export.bodies import bodies
 from caustic_cli.export.mesh import FLANGE, closed_mesh, refuse_open
 from caustic_cli.export.surface import STEPS_PER_SPAN, knot_lines, most_points, on_lines
@@ -204,7 +204,7 @@ def approximated(solids: list[Solid], decimals: int, tolerance: float | None) ->
         return written, of_poles(poles_of(written[0], written[1].numpy()).round(decimals), written[0], *side)
 
     if tolerance is None:
-        most = caps([math.prod(f.shape) for f, _ in sides], most_points(max(_bytes(f, h, decimals) for f, h in sides)))
+        most = allocate_points([math.prod(f.shape) for f, _ in sides], most_points(max(_bytes(f, h, decimals) for f, h in sides)))
         found = [measured(side, n) for side, n in zip(sides, most, strict=True)]
     else:
         found = []
@@ -215,7 +215,7 @@ def approximated(solids: list[Solid], decimals: int, tolerance: float | None) ->
                     break
             found.append(fewer)
     written = iter(side for side, _ in found)
-    return [solid.with_sides(*(next(written) for _ in solid.sides)) for solid in solids], together([off for _, off in found])
+    return [solid.with_sides(*(next(written) for _ in solid.sides)) for solid in solids], combined([off for _, off in found])
 
 
 def _decimals(solids: list[Solid], tolerance: float | None) -> int:

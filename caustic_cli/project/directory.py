@@ -60,7 +60,7 @@ def _of_a_new_project(path: Path) -> bool:
     )
 
 
-def settle(project: Project, force: bool) -> None:
+def create(project: Project, force: bool) -> None:
     """Write a new project to its place and hold it (`Project.hold`).
 
     Where nothing stands it is made beside it and renamed, so that it is there as a whole or not at all.

@@ -84,7 +84,7 @@ def finished(project: Project, checkpoint: Checkpoint) -> dict | None:
     return checkpoint.results | {"image": str(project.path / RENDER), "project": str(project.path)}
 
 
-def depicted(project: Project, heights: Tensor, figures: dict, asked: Mapping[str, object] | None = None) -> dict[str, str]:
+def image_provenance(project: Project, heights: Tensor, figures: dict, asked: Mapping[str, object] | None = None) -> dict[str, str]:
     """What an image of a lens says about itself: `of`, a hash of settings, control heights (n, m) and how else it was asked to be
     made, and the estimated `noise` of its rays."""
     how = {name: str(value) for name, value in sorted((asked or {}).items())}

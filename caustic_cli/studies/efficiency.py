@@ -1,8 +1,8 @@
-"""What light a picture costs: lenses of one scene whose losses weigh the light that is kept against the picture, and their front.
+"""Trade-off between optical efficiency and picture error: the Pareto front over thickness and weight of the light in the loss.
 
-A lens close to its source keeps the more light the thinner it is, up to a point, and shows the source the larger.  So lenses of
-several thicknesses are designed, each with the loss `rms + w light` for several weights w, and all are judged by rays that no
-design has seen.  A lens is on the Pareto front if none other is both brighter and closer to the picture.
+For a near source a thinner lens collects more light, up to a point, and has a larger blur.  So lenses of several thicknesses are
+designed, each with the loss `rms + w light` for several weights w, and all are evaluated with independent rays.  A lens is on the
+Pareto front if no other has both a higher efficiency and a smaller error.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from caustic_cli.studies.fit import pareto
 from caustic_cli.studies.report import Study, legend_beside, styles
 from caustic_cli.studies.retrace import FINAL_RAYS, retrace
 
-#: Least percentage points of light that a picture of it spans.
+#: Least range of the efficiency axis, percentage points.
 LEAST_SPAN = 0.1
-#: Seconds of iterations for each lens, unless said.
+#: Default seconds of iterations for each lens.
 SECONDS = 10.0
 #: Rays of a retrace per pixel.
 RAYS_PER_PIXEL = 64
@@ -45,7 +45,7 @@ COLUMNS = {
 
 
 @dataclass(frozen=True, eq=False)
-class Lens:
+class DesignedLens:
     """A designed lens: its thickness, mm, the weight of the light, the loss, the scene, the spline spaces and heights (n, m) mm,
     the target (n_x, n_y), and the seconds its iterations took."""
 
@@ -59,8 +59,8 @@ class Lens:
     seconds: float
 
 
-def run_light(
-    lenses: Iterable[Lens],
+def run_efficiency(
+    lenses: Iterable[DesignedLens],
     count: int,
     *,
     rays: int | None = None,
@@ -68,15 +68,15 @@ def run_light(
     device: str = "cpu",
     progress: Callable[[int, int], None] | None = None,
 ) -> Study:
-    """Judge lenses one by one.
+    """Evaluate lenses one by one.
 
     Args:
-        count: how many there may be.
-        rays: of every retrace, None for RAYS_PER_PIXEL a pixel.
-        progress: told (lenses done, in all) after each.
+        count: largest number of lenses, for the progress.
+        rays: of every retrace, None for RAYS_PER_PIXEL per pixel.
+        progress: called with (lenses done, in total) after each.
 
     Raises:
-        CausticError: there is none.
+        CausticError: there are no lenses.
     """
     rows: list[dict] = []
     for k, lens in enumerate(lenses):
@@ -114,7 +114,7 @@ def run_light(
 
 
 def _advice(rows: list[dict]) -> str:
-    """The ends of the front in one sentence."""
+    """The ends of the Pareto front in one sentence."""
     front = sorted((r for r in rows if r["front"]), key=lambda r: r["error"])
     sharp, bright = front[0], front[-1]
     if sharp is bright:
@@ -127,8 +127,8 @@ def _words(row: dict) -> str:
     return f"error {row['error']:.3g} with {row['on_screen']:.1%} of the light ({made})"
 
 
-def draw_light(study: Study, figure: Figure) -> None:
-    """Error against light, a curve for each thickness, the Pareto front ringed and joined."""
+def draw_efficiency(study: Study, figure: Figure) -> None:
+    """Error against efficiency, a curve for each thickness, and the Pareto front."""
     axes = figure.add_subplot()
     for series, style in styles(row["series"] for row in study.rows).items():
         mine = [row for row in study.rows if row["series"] == series]
@@ -159,11 +159,11 @@ def draw_light(study: Study, figure: Figure) -> None:
     axes.set_ylim(0.0, 1.15 * max(r["error"] for r in study.rows))
     low, high = axes.get_xlim()
     short = max(0.0, LEAST_SPAN - (high - low))
-    axes.set_xlim(low - 0.5 * short, high + 0.5 * short)  # rounding is no difference
+    axes.set_xlim(low - 0.5 * short, high + 0.5 * short)  # a range within rounding is widened
     axes.ticklabel_format(useOffset=False)
     axes.grid(which="major", linewidth=0.4)
     legend_beside(figure)
 
 
 #: Endings of the pictures' names, and what draws them.
-PLOTS = {"": draw_light}
+PLOTS = {"": draw_efficiency}
