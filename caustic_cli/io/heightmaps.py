@@ -1,4 +1,4 @@
-"""Height maps in: a picture of heights and the JSON beside it, as `export format heightmap` writes them."""
+"""Reader of height maps: a picture of heights and its JSON, as written by `export format heightmap`."""
 
 from __future__ import annotations
 
@@ -20,31 +20,31 @@ from caustic_cli.io.files import naming, open_regular, read_bytes
 from caustic_cli.optics.bspline import MAX_DEGREE, SplineSpace
 from caustic_cli.optics.surfaces.heightfield import HeightField
 
-#: Suffixes of the pictures; counts of a PNG; number of the JSON's form.
+#: Suffixes of the pictures; largest value of a PNG; format version of the JSON.
 SUFFIXES = (".png", ".tif", ".tiff")
 COUNTS = 65535
 VERSION = 1
 #: Bytes of the JSON and of the picture; points of a map; control points of a net.
 MOST_JSON, MOST_BYTES, MOST_POINTS = 1 << 20, 1 << 30, 50_000_000
 MAX_CONTROL = int(TABLE["lens.control"].high)
-#: How far, in quanta, a map may be off the spline that its JSON says it is of: rounding is half of one, and of a thousand by a
-#: thousand points the nearest spline is off by 0.87 where rounding falls together; an edit is off by many.
+#: Largest deviation, in quanta, of a map from the spline of its JSON: rounding is half a quantum, and for 1000 x 1000 points the
+#: least-squares spline deviates by up to 0.87; an edited map deviates by many.
 OFF = 1.5
 ACCEPTED = "a height map of caustic export is needed: a 16-bit grey PNG or a TIFF of 32-bit floats, with its JSON beside it"
 
 
 def beside(path: str | Path) -> Path:
-    """The JSON of a picture: NAME.png.json would hide what NAME.json is of, so the picture's suffix stays."""
+    """Path of the JSON of a picture, NAME.png.json."""
     path = Path(path)
     return path.with_name(path.name + ".json")
 
 
 def read_heightmap(path: Path, half_size: tuple[float, float]) -> tuple[HeightField, Tensor]:
-    """The surface of a height map, in the scene's coordinates: control heights (n, m) mm on the net that its JSON says, the nearest
-    spline to the heights; else a cubic spline through them.
+    """The surface of a height map, in the coordinates of the scene: control heights (n, m) mm of the least-squares spline on the
+    net of its JSON, or else of an interpolating cubic spline.
 
     Raises:
-        InputError: no such files, or they hold none; heights that are off the net they say by more than their rounding.
+        InputError: the files are missing or invalid, or the heights deviate from a spline on that net by more than rounding.
     """
     said = _said(beside(path))
     with naming(path):
@@ -59,17 +59,18 @@ def read_heightmap(path: Path, half_size: tuple[float, float]) -> tuple[HeightFi
 
 
 def interpolated(z: np.ndarray, half_size: tuple[float, float]) -> tuple[HeightField, Tensor]:
-    """The spline through heights (a, b) mm on an even grid over the aperture, borders included: cubic, or less through fewer."""
+    """Interpolating spline of heights (a, b) mm on a regular grid over the aperture, borders included: cubic, or of lower
+    degree."""
     if not 2 <= min(z.shape) <= max(z.shape) <= MAX_CONTROL:
         raise InputError(f"must have 2 to {MAX_CONTROL} heights along each axis, got {z.shape[0]} x {z.shape[1]}")
     return HeightField.through(z, half_size)
 
 
 def fitted(z: np.ndarray, half_size: tuple[float, float], net: dict, off: float) -> tuple[HeightField, Tensor]:
-    """The spline on a net next to heights (a, b) mm on an even grid, by least squares along either axis.
+    """Least-squares spline on a net for heights (a, b) mm on a regular grid.
 
     Raises:
-        InputError: no such net, too few heights for it, or some that are off by more than `off` mm.
+        InputError: an invalid net, too few heights for it, or a deviation of more than `off` mm.
     """
     degrees, knots = net["degrees"], (net["knots_u"], net["knots_v"])
     spaces = tuple(SplineSpace(p, torch.tensor(t, dtype=torch.float64)) for p, t in zip(degrees, knots, strict=True))
@@ -92,7 +93,7 @@ def fitted(z: np.ndarray, half_size: tuple[float, float], net: dict, off: float)
 
 
 def _said(path: Path) -> dict[str, Any]:
-    """The JSON's numbers, checked."""
+    """The contents of the JSON, validated."""
     data = read_bytes(path, MOST_JSON, ACCEPTED)
     with naming(path):
         try:
@@ -127,7 +128,7 @@ def _check_net(net: object) -> None:
 
 
 def _picture(path: Path, said: dict) -> np.ndarray:
-    """Its values (rows, columns)."""
+    """Values of the picture (rows, columns)."""
     with open_regular(path, ACCEPTED, MOST_BYTES) as file:
         try:
             with Image.open(file, formats=("PNG", "TIFF")) as image:

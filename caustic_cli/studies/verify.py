@@ -64,7 +64,7 @@ def require_mitsuba(scene: Scene) -> None:
     if beyond_plain(scene):
         raise InputError(f"⟨verify⟩ mitsuba traces clear lenses and straight screens, not {', '.join(beyond_plain(scene))}")
     if scene.source.kind not in KINDS:
-        raise InputError(f"⟨verify⟩ mitsuba knows no source of type {scene.source.kind}")
+        raise InputError(f"⟨verify⟩ mitsuba does not support sources of type {scene.source.kind}")
     if scene.lens.fresnel != "exact":
         raise InputError(f"⟨verify⟩ mitsuba knows exact Fresnel reflection only; ⟨lens.fresnel⟩ is {scene.lens.fresnel}")
 

@@ -174,7 +174,7 @@ def test_one_design_at_a_time_holds_a_project(capfd, monkeypatch):
     before, inner = content("blob.caustic"), []
     with directory.locked(Path("blob.caustic")):
         for arguments in (["design", "--resume", "blob.caustic", "--iterations", "5", "--quiet"], [*DESIGN, "--force"]):
-            assert "another caustic design is at work there" in run(arguments, capfd, 2)
+            assert "another caustic design is running there" in run(arguments, capfd, 2)
         assert content("blob.caustic") == before
         run(["export", "blob.caustic", "--quiet"], capfd, 0)  # to look is allowed
     judged = workflow.evaluate_and_write

@@ -1,4 +1,5 @@
-"""LightTools ray files as text, `.ray` and `.txt`: comments after #, lines `lt_name: value`, then a ray a line.
+"""Reader of LightTools ray files in text format, `.ray` and `.txt`: comments after #, lines `lt_name: value`, then one ray per
+line.
 
     lt_rdf_version: 2.0
     lt_datatype: radiant_power            or luminous_flux
@@ -11,7 +12,7 @@
     x y z  L M N  flux [wavelength, nm] [more columns, such as Stokes parameters]
     lt_endofdata
 
-Names are read in any case.
+Names are case-insensitive.
 """
 
 from __future__ import annotations
@@ -53,16 +54,16 @@ MOST_COLUMNS = 24
 
 
 def begins(data: bytes) -> bool:
-    """Whether a file is one of these."""
+    """Whether the data are of this format."""
     head = data[:HEADER].lower()
     return b"\0" not in head and re.search(rb"^[ \t]*lt_", head, re.MULTILINE) is not None
 
 
 def parse(data: bytes) -> RaySet:
-    """The rays in a file's bytes.
+    """Parse the contents of a file.
 
     Raises:
-        InputError: it breaks the format.
+        InputError: it is invalid.
     """
     start = data[:HEADER].lower().find(BEGIN)
     if start < 0:
@@ -88,7 +89,7 @@ def parse(data: bytes) -> RaySet:
     least = 8 if colored == "wavelength" else 7
     table = _rows(data, first, stop, least) if first else np.zeros((0, least))
     unit_of_flux, key = FLUXES[kind]
-    totals = _numbers(said.get(f"{key}", "0"), f"lt_{key}")
+    totals = _numbers(said.get(key, "0"), f"lt_{key}")
     return RaySet(
         MILLIMETRES[unit] * table[:, 0:3],
         table[:, 3:6],
@@ -100,7 +101,7 @@ def parse(data: bytes) -> RaySet:
 
 
 def _header(data: bytes) -> dict[str, str]:
-    """What its lines say, by their names without lt_."""
+    """Values of the header by their names without lt_."""
     said = {}
     for line in data.decode("ascii", "replace").splitlines():
         name, colon, value = line.partition("#")[0].strip().partition(":")

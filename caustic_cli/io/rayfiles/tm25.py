@@ -1,6 +1,6 @@
-"""IES TM-25 ray files (ANSI/IES TM-25-13 and -20), `.tm25ray`: little-endian, floats of 32 bits, mm, nm.
+"""Reader of IES TM-25 ray files (ANSI/IES TM-25-13 and -20), `.tm25ray`: little-endian, floats of 32 bits, mm, nm.
 
-    offset  0   "TM25", int32 version (2013 or 2020), int32 how it was made
+    offset  0   "TM25", int32 version (2013 or 2020), int32 method of creation
            12   float32 luminous flux, lm; float32 radiant flux, W; uint64 number of rays
            28   28 bytes date, int32 where rays start
            60   int32 spectrum: 0 none, 1 one wavelength, 2 each ray its own, 3 one table, 4 each ray a table's number
@@ -14,7 +14,7 @@
                 rays, one after another, all float32: x y z, unit k, W, nm, lm, 3 Stokes and 3 ellipse, 2 tristimulus, table
                 number, each if its flag is set, and the additional columns
 
-Quantities that are not known are 0 or NaN.
+Unknown quantities are 0 or NaN.
 """
 
 from __future__ import annotations
@@ -31,21 +31,21 @@ VERSIONS = (2013, 2020)
 #: Bytes before the tables, their unit of padding, and of a column's name.
 HEADER, BLOCK, NAME = 36_288, 32, 512
 MOST_TABLES = 10_000
-#: Columns by the flag that brings them along.
+#: Number of columns for each flag.
 COLUMNS = (3, 3, 1, 1, 1, 6, 2, 1)
 FLAGS = ("position", "direction", "radiant flux", "wavelength", "luminous flux", "Stokes", "tristimulus", "table number")
 
 
 def begins(data: bytes) -> bool:
-    """Whether a file is one of these."""
+    """Whether the data are of this format."""
     return data.startswith(MAGIC)
 
 
 def parse(data: bytes) -> RaySet:
-    """The rays in a file's bytes.
+    """Parse the contents of a file.
 
     Raises:
-        InputError: it breaks the format.
+        InputError: it is invalid.
     """
     if len(data) < HEADER:
         raise InputError(f"is cut off: the header of TM-25 is {HEADER:,} bytes, the file {len(data):,}")
