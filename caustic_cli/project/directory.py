@@ -72,13 +72,17 @@ def create(project: Project, force: bool) -> None:
     check(path, force)
     try:
         if path.exists():
-            project.hold.enter_context(locked(path))
-            for present in path.iterdir():
-                if present.name.startswith((*PARTS, *MADE)):
-                    refuse_special(present)  # before anything is removed
-            for name in MADE:
-                (path / name).unlink(missing_ok=True)
-            project.write(path)
+            try:
+                project.hold.enter_context(locked(path))
+                for present in path.iterdir():
+                    if present.name.startswith((*PARTS, *MADE)):
+                        refuse_special(present)  # before anything is removed
+                for name in MADE:
+                    (path / name).unlink(missing_ok=True)
+                project.write(path)
+            except BaseException:
+                project.hold.close()
+                raise
             return
         path.parent.mkdir(parents=True, exist_ok=True)
         for left in path.parent.glob(".*.caustic-new"):
