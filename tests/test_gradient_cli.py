@@ -21,8 +21,10 @@ from caustic_cli.optics.plan import compile_plan
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import System
 from caustic_cli.optics.trace import Tracer, expose, render
+from caustic_cli.project import directory
 from caustic_cli.scene import Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.scene.gradient import Gradient
+from caustic_cli.workflow import design as workflow
 
 TINY = ("--resolution", "24", "--iterations", "3", "--threads", "1", "--quiet")
 
@@ -64,7 +66,7 @@ def test_a_blank_is_designed_kept_and_rendered(capfd):
     assert anew["index_least"] == figures["index_least"]
     assert "cannot be resumed" in run(capfd, "design", "--resume", "free.caustic", code=2)
     movie = ("design", "blob.png", "--gradient", "free", *TINY, "-o", "moving.caustic", "--movie", "m.gif")
-    assert "--movie records the design of a surface" in run(capfd, *movie, code=2)
+    assert "--movie records the design of a surface" in run(capfd, *movie, code=2) and not Path("moving.caustic").exists()
     assert run(capfd, "export", "free.caustic", "--format", "stl", "-o", "blank.stl")["bytes"] > 1000
     assert "varies" in run(capfd, "export", "free.caustic", "--format", "lighttools", code=2)
     assert "varies" in run(capfd, "gradmap", "free.caustic", "--threads", "1", code=2)
@@ -73,6 +75,19 @@ def test_a_blank_is_designed_kept_and_rendered(capfd):
     assert seen["relative_rms"] == pytest.approx(again["relative_rms"], abs=0.02)
     lens = load("free.caustic")
     assert field_of(lens.scene.lens).shape == (51, 51, 1) and float(np.ptp(lens.surface(np.linspace(-4, 4, 9), 0.0)[0])) < 1e-12
+
+
+def test_a_design_of_an_index_that_is_run_again_locks_its_project(capfd, monkeypatch):
+    again = ("design", "blob.png", "--gradient", "free", *TINY, "-o", "again.caustic")
+    run(capfd, *again)
+    Path("again.caustic/render.png").unlink()
+
+    def run_index(project, *_):
+        with directory.locked(project.path):
+            raise AssertionError("another design could run there")
+
+    monkeypatch.setattr(workflow, "_run_index", run_index)
+    assert "another caustic design is running there" in run(capfd, *again, code=2)
 
 
 def test_a_file_of_indices_is_kept(capfd):

@@ -77,6 +77,7 @@ def begin(
     config: Path | None = None,
     out: Path | None = None,
     force: bool = False,
+    recorded: bool = False,
     say: Reporter,
     device: str = "cpu",
 ) -> tuple[Project, InitialHeights | None]:
@@ -89,7 +90,8 @@ def begin(
         preset: a name of `config.presets`, whose settings are overridden by those of config.
         config: a TOML file of further settings, which are overridden by those `given`.
         out: the directory; None for a design in memory.
-        force: replace a project there; device: of the design, whose kernels are compiled after the validation.
+        force: replace a project there; recorded: whether a movie of the design is to be made.
+        device: of the design, whose kernels are compiled after the validation.
 
     Raises:
         InputError: invalid input; nothing was written.
@@ -158,6 +160,8 @@ def begin(
         uptodate.digest(full, picture, light, second),
         without_waves=without_waves(full, "stages" in said.get("design", {})),
     )
+    if recorded and is_free(project):
+        raise InputError("⟨movie⟩ records the design of a surface; ⟨lens.gradient⟩ free designs the index")
     if out is not None and not force and (same := uptodate.same_design(out, project.asked)):
         return replace(same[0], found=same[1]), None
     designer, goal = _designer(project, "cpu")  # builds and thereby validates scene, target, stages, options
@@ -243,6 +247,7 @@ def design(
             )
         )
         if not figures and is_free(project):
+            project.hold.enter_context(directory.locked(project.path))
             return design(replace(project, asked=uptodate.asked_of(project, project.found), found=None), None, device, say, began)
         if not figures:
             return resume(project, None, None, device, say, began, movie)
@@ -254,8 +259,6 @@ def design(
         return Result(project, scene, field, heights, target, checkpoint.state, figures)
     with project.hold:
         if is_free(project):
-            if movie is not None:
-                raise InputError("⟨movie⟩ records the design of a surface; ⟨lens.gradient⟩ free designs the index")
             return _run_index(project, say, began, device)
         designer, target = _designer(project, device)
         _say_limits(project, designer, target, first, say)

@@ -151,6 +151,7 @@ def design_of(
         config=config,
         out=out,
         force=force,
+        recorded=recorder is not None,
         say=say,
         device=device,
     )
