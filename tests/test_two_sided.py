@@ -64,6 +64,19 @@ def test_first_sides_of_two_pictures():
     assert found["relative_rms"] < 0.35 and found["second_relative_rms"] < 0.7
 
 
+def test_a_loss_of_zero_has_no_gradient():
+    """Parallel light through a plate is its own picture, and goes on parallel: nothing of it is not a number."""
+    scene, field = Scene(PlaneWave(), LENS, NEAR, second=Second()), HeightField.of(LENS)
+    plate = torch.stack([torch.zeros(field.shape, dtype=torch.float64), torch.full(field.shape, LENS.offset.thickness).double()])
+
+    def evaluation(target: torch.Tensor):
+        rays = rays_of(scene, "grid", 10_000)
+        return TwoSidedObjective(scene, field, rays, Filter("cosine", (3, 3)), (target,), "rms", filter_target=False)(plate)
+
+    found = evaluation(evaluation(torch.from_numpy(ONE)).image)
+    assert found.loss == 0.0 and bool((found.gradient == 0.0).all())
+
+
 @pytest.mark.parametrize("loss", ["rms", "uniformity"])
 def test_losses_of_the_images_alone_have_gradients_of_both_sides(loss):
     """They do not depend on what leaves the lens."""

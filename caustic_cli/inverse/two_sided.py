@@ -133,4 +133,7 @@ class TwoSidedObjective:
         leaving = sums[count]
         terms = [one(sums[k], leaving, entering=entering) * one.target.numel() for k, one in enumerate(self.losses)]
         squares = terms[0].square() + (terms[1].square() if count > 1 else sums[-1] / (leaving * SHARP**2))
-        return (0.5 * squares + penalty).sqrt() / self.loss.target.numel()
+        square, pixels = 0.5 * squares + penalty, self.loss.target.numel()
+        if not float(square.detach()) > 0:
+            return square / pixels  # zero loss: the square root has no derivative there, its square has
+        return square.sqrt() / pixels
