@@ -24,6 +24,7 @@ from scipy.interpolate import RegularGridInterpolator
 
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.relay import trace_through, without_apertures, without_freeforms
+from caustic_cli.inverse.transport import cell_means
 from caustic_cli.optics.averages import shared_out
 from caustic_cli.optics.emission.measured import irradiance
 from caustic_cli.optics.interface import reflectance
@@ -109,8 +110,9 @@ def _traced(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[
         far = np.hypot(*where) / half[0] if round_ else np.maximum(*(np.abs(c) / h for c, h in zip(where, half, strict=True)))
         power = np.where(known & (far <= 1 + 1e-9), power, 0.0)
     power = power * _pupil_irradiance(scene, *at)
-    light = 0.25 * (power[1:, 1:] + power[:-1, 1:] + power[1:, :-1] + power[:-1, :-1])
-    return light, _extrapolated(d, known & (power > 0), goal.reshape(2, *shape) / np.array(lens.half_size)[:, None, None])
+    return cell_means(power), _extrapolated(
+        d, known & (power > 0), goal.reshape(2, *shape) / np.array(lens.half_size)[:, None, None]
+    )
 
 
 def _extrapolated(d: np.ndarray, lit: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -193,5 +195,5 @@ def _direct(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[
     power = np.where((q <= math.tan(cone) * (1 + 1e-9)) & through[0] & through[1], power, 0.0)
     light = irradiance(scene, x, y, float(z.mean()))
     if light is None:
-        light = 0.25 * (power[1:, 1:] + power[:-1, 1:] + power[1:, :-1] + power[:-1, :-1])
+        light = cell_means(power)
     return light, (sx * cosine / n, sy * cosine / n, inside)

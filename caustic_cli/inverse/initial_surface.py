@@ -22,7 +22,7 @@ from caustic_cli.inverse.projection import ScreenProjection
 from caustic_cli.inverse.relay import RelayedScreen
 from caustic_cli.inverse.surface_from_map import MappedSurface, OutOfReach, Projection, finer, refract_to_screen
 from caustic_cli.inverse.surface_from_map import surface as refracting_surface
-from caustic_cli.inverse.transport import cell_lines, corners
+from caustic_cli.inverse.transport import cell_lines, cell_means, corners
 from caustic_cli.optics.surfaces import Sphere
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Component, Lens, Scene
@@ -140,7 +140,7 @@ class _Grid:
 
     def above(self, z: np.ndarray) -> np.ndarray:
         """Fraction of the corners of each cell where the surface is not truncated."""
-        return _mean((z > self.floor).astype(float))
+        return cell_means((z > self.floor).astype(float))
 
     def efficiency(self, z: np.ndarray) -> float:
         """Fraction of the light on the lens that a surface, truncated at the least thickness, sends to the screen."""
@@ -164,7 +164,7 @@ class _Grid:
         )
         u, v = (u - screen.shift[0], v - screen.shift[1]) if projection is None else projection.screen_coordinates(u, v)
         on = (np.abs(u) <= screen.half_size[0]) & (np.abs(v) <= screen.half_size[1])
-        return float((light * self.above(z) * _mean(np.where(on, part, 0.0))).sum() / on_lens) if on_lens > 0 else 0.0
+        return float((light * self.above(z) * cell_means(np.where(on, part, 0.0))).sum() / on_lens) if on_lens > 0 else 0.0
 
     def truncated(self, z: np.ndarray, middle: float, passes: int) -> _TruncatedSurface:
         """The surface of this vertex height that maps all light in reach to the picture, truncated at the least thickness.
@@ -189,7 +189,7 @@ class _Grid:
                 except OutOfReach as error:
                     if not left:
                         raise
-                    reached = reached * _mean((~error.where).astype(float))
+                    reached = reached * cell_means((~error.where).astype(float))
             z = again.heights
         z = z + middle - _middle(z)
         return _TruncatedSurface(np.maximum(z, self.floor), middle, max(0.0, self.floor - float(z.min())))
@@ -301,11 +301,6 @@ def departure_bound(element: Component, lens: Lens) -> float:
     thickness."""
     thinnest = element.thickness + min(0.0, element.sag("back") - element.sag("front")) if not element.mirror else np.inf
     return min(lens.height_range[1], THICKNESS_PART * thinnest)
-
-
-def _mean(v: np.ndarray) -> np.ndarray:
-    """Mean of the four corners of each cell: (n + 1, m + 1) -> (n, m)."""
-    return 0.25 * (v[1:, 1:] + v[:-1, 1:] + v[1:, :-1] + v[:-1, :-1])
 
 
 def _middle(z: np.ndarray) -> float:

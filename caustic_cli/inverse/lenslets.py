@@ -171,7 +171,7 @@ class ArrayObjective:
         """Value, gradient, fraction of the light on the screen and image at heights (n, m) mm float64 of the array."""
         found = [loss(one.of(heights)) for loss, one in zip(self.each, self.parts, strict=True)]
         total = float(np.sqrt(np.mean([e.loss**2 for e in found])))
-        gradient = torch.zeros_like(found[0].gradient, device=found[0].gradient.device).new_zeros(heights.shape)
+        gradient = found[0].gradient.new_zeros(heights.shape)
         for e, one in zip(found, self.parts, strict=True):
             gradient[one.rows, one.columns] += (e.loss / (total * len(found)) if total > 0 else 0.0) * e.gradient
         shares = [one.share for one in self.parts]

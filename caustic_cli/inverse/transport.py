@@ -124,6 +124,11 @@ def corners(n: int, half: float) -> np.ndarray:
     return np.linspace(-half, half, n + 1)
 
 
+def cell_means(values: np.ndarray) -> np.ndarray:
+    """Mean over the four corners of each cell: (n + 1, m + 1) -> (n, m)."""
+    return 0.25 * (values[1:, 1:] + values[:-1, 1:] + values[1:, :-1] + values[:-1, :-1])
+
+
 def cell_lines(half: tuple[float, float], cells: int) -> tuple[np.ndarray, np.ndarray]:
     """Edges x (n + 1,), y (m + 1,) of nearly square cells over a rectangle, `cells` along its longer side and at least 3, as a
     cubic spline requires."""

@@ -68,7 +68,7 @@ def read_program(path: str | Path) -> Program:
         moves: list[list[tuple]] = [[]]
         motion, place = None, [math.nan] * 3
         for number, raw in enumerate(file, 1):
-            line = raw.decode("latin-1").strip().upper() if b"(" not in raw else raw.decode("latin-1").strip()
+            line = raw.decode("latin-1")
             if "(" in line:
                 for pattern in (_STOCK, _ZERO, _TURNED):
                     if found := pattern.search(line):
