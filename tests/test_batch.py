@@ -105,7 +105,7 @@ def test_another_design_is_refused_as_before(capfd, change):
 
 
 def test_an_unfinished_design_goes_on_when_it_is_asked_for_again(capfd, monkeypatch):
-    with monkeypatch.context() as patch:  # killed after its last iteration, before the decision
+    with monkeypatch.context() as patch:  # killed after its last iteration, before the evaluation
         patch.setattr(workflow, "evaluate_and_write", interrupt)
         assert run([*DESIGN, "--quiet"], capfd, 130).err == "caustic: interrupted\n"
     assert not checkpoint.load(Path("blob.caustic/checkpoints.h5")).results

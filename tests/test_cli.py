@@ -161,7 +161,7 @@ BAD = {
     "gradmap bincount": ("gradmap blob.caustic --reconstruction bincount", "bincount"),
     "export format": ("export blob.caustic --format moon", "--format"),
     "export samples": ("export blob.caustic --samples 0", "--samples"),
-    "export suffix": ("export blob.caustic -o lens.iges", "its suffix names no format"),
+    "export suffix": ("export blob.caustic -o lens.iges", "its suffix is not that of a format"),
     "export against the suffix": ("export blob.caustic --format step -o x.stl", "step is written to .step or .stp, not to .stl"),
     "export several to one": ("export blob.caustic --format step,stl -o x.step", "--out names one file"),
     "render a jpeg": ("render blob.caustic -o x.jpg", ".png"),

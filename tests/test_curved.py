@@ -1,4 +1,4 @@
-"""Curved screens: landing points and areas against closed forms, derivatives, the account of the light, and designs for them."""
+"""Curved screens: landing points and areas against closed forms, derivatives, the energy balance, and designs for them."""
 
 import json
 import math
@@ -153,7 +153,7 @@ def test_a_placed_screen_is_the_same_screen():
 
 
 @pytest.mark.parametrize("screen", [screen_of(SPHERE), screen_of(TUNNEL), screen_of(sags=sags()), screen_of((11.0, 11.0), (0, 60))])
-def test_no_light_is_lost_from_the_account(screen):
+def test_the_energy_balance_closes(screen):
     """Image and losses sum to 1, although rays miss a small sphere that is turned away."""
     scene = Scene(POINT, scene_of(screen).lens, replace(screen, size=(12.0, 7.0)))
     heights = bumpy(scene, 0.1)
@@ -301,8 +301,8 @@ def test_etendue_of_a_screen_around_the_lens():
 
 
 @pytest.mark.parametrize("screen", [*SHAPES, screen_of(tilt=(0.0, 30.0))])
-def test_a_view(screen):
-    """There and back: points of the screen, places of the plane; and the picture's power stays."""
+def test_a_projection_is_inverted_and_conserves_power(screen):
+    """Points of the screen and of the plane are mapped to each other, and the power of the picture is conserved."""
     view = ScreenProjection(screen, 3.0)
     x, y = np.random.default_rng(1).uniform(-6.5, 6.5, (2, 100))
     u, v = view.project(x, y)
@@ -321,7 +321,7 @@ def test_a_view(screen):
     np.testing.assert_allclose(place, seen, atol=0.1 * min(screen.pixel))
 
 
-def test_a_screen_that_turns_away_is_refused():
+def test_a_screen_that_faces_away_is_refused():
     """Of a globe close by the lens sees less than the picture needs."""
     with pytest.raises(InputError, match="faces away from the lens"):
         ScreenProjection(Screen((16.0, 14.0), 12.0, (16, 14), radius=(10.9, 10.9)), 3.0).projected_target(np.ones((16, 14)))

@@ -88,7 +88,7 @@ def test_a_table_of_a_known_distribution_is_it(table, word, aimed):
     ],
 )
 @pytest.mark.parametrize("kind", ["stratified", "sobol", "uniform"])
-def test_the_account_closes(source, kind):
+def test_the_energy_balance_closes(source, kind):
     here = scene(source)
     sampler = rays_of(here, kind, 8_000, 3)
     for chunk in (1 << 20, 777):

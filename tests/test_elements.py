@@ -148,7 +148,7 @@ def test_a_folded_axis_is_that_of_the_reflected_ray():
     assert np.linalg.det(np.array(leg.frame)) == pytest.approx(1.0)
 
 
-def test_a_hollow_mirror_focuses_at_half_its_radius():
+def test_a_concave_mirror_focuses_at_half_its_radius():
     """Of rays close to the axis, square to the plane of incidence: the sagittal focus, f / cos."""
     hollow = mirror(50.0, (30.0, 0.0), radius=-200.0)
     at = 100.0 / math.cos(math.radians(30.0))
@@ -352,7 +352,7 @@ def test_design_render_resume_and_files(_here, capfd):
         Path("t.toml").write_text("[index]\nsigma = 0.001\n")
         said = run(capfd, "render", "p", study, *files, "--quiet", "--force", code=2)
         assert "element" in said, study
-    assert "lens by itself" in run(capfd, "export", "p", "--format", "zemax", code=2)
+    assert "single lens" in run(capfd, "export", "p", "--format", "zemax", code=2)
 
 
 def test_surfaces_of_two_lenses_are_shaped_together(_here, capfd, monkeypatch):

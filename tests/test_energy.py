@@ -1,4 +1,4 @@
-"""Power is never made out of nothing, and none that matters is left out: surfaces without glass, ghosts that focus, accounts."""
+"""Conservation of energy: surfaces without glass, ghosts that focus, energy balances of random scenes."""
 
 import math
 import sys
@@ -89,7 +89,7 @@ def test_projects_and_archives_without_glass_are_not_opened(tmp_path, monkeypatc
         {"on_screen": math.nan, "lost": {}},
     ],
 )
-def test_an_impossible_account_stops_a_render(parts):
+def test_an_invalid_energy_balance_stops_a_render(parts):
     with pytest.raises(CausticError, match="does not close"):
         require_energy_balance(parts, torch.float64)
     require_energy_balance({"on_screen": 0.6, "lost": {"absorbed": 0.4}}, torch.float64)
@@ -231,7 +231,7 @@ def random_scene(rng: np.random.Generator) -> tuple[Scene, HeightField, torch.Te
     return Scene(source, lens, screen, light), HeightField.of(lens), heights
 
 
-def account_of(seed: int) -> dict[str, float] | None:
+def balance_of(seed: int) -> dict[str, float] | None:
     """Where the light of a random scene goes, None of a scene that is refused."""
     rng = np.random.default_rng(seed)
     try:
@@ -245,15 +245,15 @@ def account_of(seed: int) -> dict[str, float] | None:
     return {"on_screen": figures["on_screen"], **figures["lost"]}
 
 
-def test_accounts_of_random_scenes():
+def test_energy_balances_of_random_scenes():
     """Every part in [0, 1], all together 1 to 1e-12.  `python tests/test_energy.py 1000` goes through so many."""
-    check_accounts(range(60))
+    check_balances(range(60))
 
 
-def check_accounts(seeds: range) -> int:
+def check_balances(seeds: range) -> int:
     counted = 0
     for seed in seeds:
-        account = account_of(seed)
+        account = balance_of(seed)
         if account is None:
             continue
         counted += 1
@@ -264,4 +264,4 @@ def check_accounts(seeds: range) -> int:
 
 
 if __name__ == "__main__":
-    print(f"{check_accounts(range(int(sys.argv[1])))} accounts of {sys.argv[1]} scenes close")
+    print(f"{check_balances(range(int(sys.argv[1])))} accounts of {sys.argv[1]} scenes close")

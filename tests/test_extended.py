@@ -1,4 +1,4 @@
-"""Designs for extended sources: the best light behind a blur, the source's kernel, rays of few points, the designs."""
+"""Designs for extended sources: deconvolution bounds, the convolution kernel, rays of few points, the designs."""
 
 from __future__ import annotations
 

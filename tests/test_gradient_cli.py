@@ -1,4 +1,4 @@
-"""Lenses whose index varies, on the command line: given by a formula or a file, or designed in place of the surface."""
+"""Gradient-index lenses on the command line: given by a formula or a file, or designed in place of the surface."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def flat(scene: Scene) -> torch.Tensor:
     return torch.full(scene.lens.control, scene.lens.offset.thickness, dtype=torch.float64)
 
 
-def test_a_blank_is_designed_kept_and_rendered(capfd):
+def test_a_gradient_index_plate_is_designed_saved_and_rendered(capfd):
     """By transport nearly at once; the project opens again with the same image; the same design again is the same index."""
     figures = run(capfd, "design", "blob.png", "--gradient", "free", *TINY, "-o", "free.caustic")
     assert figures["relative_rms"] < 0.3 and figures["on_screen"] > 0.85 and figures["iterations"] == 3

@@ -1,4 +1,4 @@
-"""Light that is kept: first surfaces of sources close by and beside the axis, pictures out of reach, the loss, the front."""
+"""Optical efficiency: initial surfaces for near and off-axis sources, reachability, the loss, the Pareto front."""
 
 from __future__ import annotations
 
@@ -248,7 +248,7 @@ def test_study_of_light(tmp_path, monkeypatch, capfd):
         assert row["front"] == (not better)
         assert 0 < row["on_screen"] < 1 and row["noise"] < 0.2 * row["error"]
     front = sorted((r["on_screen"], r["error"]) for r in rows if r["front"])
-    assert len(front) >= 2 and found["advice"].startswith(f"{len(front)} lenses are on the front")
+    assert len(front) >= 2 and found["advice"].startswith(f"{len(front)} lenses are on the Pareto front")
 
 
 def test_study_of_light_from_infinity_varies_the_weight_alone(tmp_path, monkeypatch, capfd):

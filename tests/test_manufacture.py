@@ -1,4 +1,4 @@
-"""Limits that a finished design obeys, and the report of what making a lens asks for, against closed forms."""
+"""Constraints that a finished design satisfies, and the manufacturing report, against closed forms."""
 
 import json
 import math
@@ -87,7 +87,7 @@ def rough():
     return field, heights, (heights - 0.5, heights + 0.5)
 
 
-def test_limits_are_obeyed_and_little_is_moved(rough):
+def test_limits_are_satisfied_and_little_is_moved(rough):
     field, heights, bounds = rough
     _, steep, bent = samples(field, heights, 100_000)
     slope, radius = 0.8 * steep, 1.5 / bent
@@ -99,7 +99,7 @@ def test_limits_are_obeyed_and_little_is_moved(rough):
 
 
 @pytest.mark.parametrize("block", [1, 700, 10**9])
-def test_the_slope_of_what_exceeds(rough, block, monkeypatch):
+def test_the_gradient_of_the_violation(rough, block, monkeypatch):
     """By differences, however many points are looked at together."""
     field, heights, _ = rough
     _, steep, bent = samples(field, heights, 100_000)

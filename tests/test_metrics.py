@@ -134,7 +134,7 @@ def test_coloured_light_is_in_the_black_of_its_own_colour():
 
 
 @pytest.mark.parametrize("black", [False, True])
-def test_judge_accounts_for_all_light_and_is_strict_json(black):
+def test_figures_of_merit_account_for_all_light_and_are_strict_json(black):
     lens = Lens(control=(5, 4))
     scene = Scene(PlaneWave(), lens, Screen((9.0, 9.0), 100.0, (12, 12)))
     x = torch.linspace(-5.0, 5.0, 5, dtype=torch.float64)[:, None]

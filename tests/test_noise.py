@@ -1,4 +1,4 @@
-"""Figures without the noise of the rays that they are from, and what noise is left in them."""
+"""Figures corrected for Monte-Carlo noise, and their standard errors."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def test_as_many_rays_a_pixel_judge_a_large_picture_of_a_plane_wave(source, pixe
     assert evaluation_rays(Scene(source, Lens(), Screen((30.0, 30.0), 100.0, pixels))) == rays
 
 
-def test_rays_are_added_until_the_figure_is_quiet():
+def test_rays_are_added_until_the_noise_is_low():
     scene, field, heights, target = lens(SOURCES["disc"])
     _, first = retrace(scene, field, heights, target, rays=2000, seed=1)
     _, same = retrace(scene, field, heights, target, rays=2000, seed=1, quiet=2.0 * first["noise"] / first["relative_rms"])

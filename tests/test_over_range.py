@@ -1,4 +1,4 @@
-"""Networks over ranges of the scene's values: gradients, draws, resuming, a lens for each value, what is refused, the studies."""
+"""Networks over ranges of scene parameters: gradients, sampling, resuming, a lens for each value, refusals, the studies."""
 
 import csv
 import json

@@ -1,4 +1,4 @@
-"""What would make a blurred picture sharp, against the light of the lens that is advised."""
+"""Advice on the blur of a source, against the deconvolution for the advised geometry."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Errors of making and placing: their file, their draws, the surface's, the trace with them, the study, and designs for them."""
+"""Manufacturing and alignment errors: their file, draws, surface errors, tracing, tolerance analysis, and robust designs."""
 
 import csv
 import json

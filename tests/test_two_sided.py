@@ -1,4 +1,4 @@
-"""Lenses with two free-form sides: first surfaces, loss, design, what light does behind the picture, files."""
+"""Lenses with two free-form sides: initial surfaces, loss, design, a second picture or ray directions, files."""
 
 import json
 import tomllib
@@ -65,7 +65,7 @@ def test_first_sides_of_two_pictures():
 
 
 def test_a_loss_of_zero_has_no_gradient():
-    """Parallel light through a plate is its own picture, and goes on parallel: nothing of it is not a number."""
+    """Collimated light through a plate has its own image as picture, and stays collimated: the gradient is zero, not NaN."""
     scene, field = Scene(PlaneWave(), LENS, NEAR, second=Second()), HeightField.of(LENS)
     plate = torch.stack([torch.zeros(field.shape, dtype=torch.float64), torch.full(field.shape, LENS.offset.thickness).double()])
 

@@ -1,4 +1,4 @@
-"""The decision of --verify: noise alone agrees, every honest fault does not; and Mitsuba itself, where it is installed."""
+"""The comparison of --verify: noise alone agrees, every real fault does not; and Mitsuba itself, where it is installed."""
 
 import importlib.util
 import json

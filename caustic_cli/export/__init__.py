@@ -57,7 +57,7 @@ def format_of(path: Path, named: str | None = None) -> str:
         if suffix not in BY_SUFFIX:
             known = ", ".join(BY_SUFFIX)
             raise InputError(
-                f"{path}: its suffix names no format; one of {known} is needed, or ⟨format⟩ beside a name without a suffix"
+                f"{path}: its suffix is not that of a format; one of {known} is needed, or ⟨format⟩ beside a name without a suffix"
             )
         return BY_SUFFIX[suffix]
     own = (FORMATS[named][0], *ALSO.get(named, ()))

@@ -90,7 +90,7 @@ def _counts(part: Part, suffix: str, asked: float | None) -> tuple[int, int]:
         shrink = math.sqrt(most / math.prod(counts))
         counts = [max(2, math.floor(shrink * n)) for n in counts]
     if max(counts) > MAX_SAMPLES:
-        raise InputError(f"⟨tolerance⟩ {tolerance:g} must ask for at most {MAX_SAMPLES} points along an axis, got {max(counts)}")
+        raise InputError(f"⟨tolerance⟩ {tolerance:g} must give at most {MAX_SAMPLES} points along an axis, got {max(counts)}")
     return counts[0], counts[1]
 
 

@@ -197,7 +197,7 @@ def _across(field: HeightField, heights: Tensor, samples: tuple[int, int] | None
         n = math.ceil(2.0 * max(field.half_size) * math.sqrt(curvature / tolerance)) + 1 if curvature > 0 else 2
         n = max(n, 9)
     if n > min(MAX_SAMPLES, math.isqrt(MAX_POINTS)):
-        raise InputError(f"{asked} must ask for at most {math.isqrt(MAX_POINTS)} points across a round lens, got {n}")
+        raise InputError(f"{asked} must give at most {math.isqrt(MAX_POINTS)} points across a round lens, got {n}")
     return n
 
 

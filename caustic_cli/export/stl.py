@@ -2,7 +2,7 @@
 
     80 bytes of header, uint32 count, then per triangle: float32 normal (3), float32 corners (3, 3), uint16 zero
 
-all little-endian; lengths are mm in the scene's coordinates, since STL itself knows no unit.  The solid is that of
+all little-endian; lengths are mm in the scene's coordinates, since STL has no unit.  The solid is that of
 `mesh`; corners run counter-clockwise seen from outside.
 
 STL corners are float32, which resolve the sag to about 5e-7 mm at some mm of thickness: sufficient for printing, not for

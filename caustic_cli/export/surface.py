@@ -154,7 +154,7 @@ def on_lines(field: HeightField, heights: Tensor, lines: Sequence[Tensor], asked
     (su, sv), (rx, ry), (u, v) = field.spaces, field.half_size, lines
     if max(len(u), len(v)) > MAX_SAMPLES or len(u) * len(v) > MAX_POINTS:
         raise InputError(
-            f"{asked} must ask for at most {MAX_SAMPLES} points along an axis and {MAX_POINTS:.0e} in all, got {len(u)} x {len(v)}"
+            f"{asked} must give at most {MAX_SAMPLES} points along an axis and {MAX_POINTS:.0e} in all, got {len(u)} x {len(v)}"
         )
     net = heights.detach().to("cpu", torch.float64)
     rows, slopes = along(su, u, net), along(su, u, net, 1) / (2.0 * rx)  # (nx, m)

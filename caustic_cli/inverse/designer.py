@@ -103,7 +103,7 @@ class Options:
                 "⟨design.initial⟩ zero leaves the inputs of a network without any effect, for good: zero-last, uniform or random"
             )
         if self.robust is not None:
-            raise InputError("⟨design.robust⟩ cannot be had with ⟨design.over⟩, which is a mean over scenes already")
+            raise InputError("⟨design.robust⟩ cannot be combined with ⟨design.over⟩, which is a mean over scenes already")
 
 
 @dataclass

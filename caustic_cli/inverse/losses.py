@@ -2,7 +2,7 @@
 
 Every term is a dimensionless root mean square t; r is the relative residual N (J / P - T / sum T) on N pixels.
 
-    rms         r with P = sum J, eq. 5.2.1.  Light thrown off the screen costs nothing (erratum E13).
+    rms         r with P = sum J, eq. 5.2.1.  Light beside the screen has no influence (erratum E13).
     rms-light   r with P = P_out, the power that leaves the lens: light beside the screen counts as missing.
     throughput  t^2 is the fraction of the light beside the screen, weighted by its distance from it (1 at the apron's rim), which
                 has a gradient where that of rms-light, which does not depend on the distance, vanishes
@@ -121,8 +121,7 @@ class Loss:
             inside = image[self.region]
             if not float(inside.detach().sum()) > 0:  # a black region would count as uniform
                 raise NoLight(
-                    "no light reaches the bright part of the picture, so there is nothing to make even; check throw,"
-                    " mag and screen size"
+                    "no light reaches the bright part of the picture, so uniformity is undefined; check throw, mag and screen size"
                 )
             return (inside / inside.mean()).var(correction=0)
         residual = image / (total if name == "rms" else leaving) - self.target

@@ -48,11 +48,11 @@ class SourceLimits:
         found = []
         if self.light is not None:
             found.append(
-                f"behind the source's blur the best light there can be is {self.light.bound:.3g} (proven) to"
-                f" {self.light.error:.3g} (found) relative RMS from the picture"
+                f"with the blur of the source the least possible relative RMS error is between {self.light.bound:.3g} (lower bound)"
+                f" and {self.light.error:.3g} (reached)"
             )
         if self.etendue is not None:
-            found.append(f"etendue lets {self.etendue:.0%} of the light on the lens reach the screen")
+            found.append(f"by etendue, at most {self.etendue:.0%} of the light on the lens can reach the screen")
         return "; ".join(found)
 
 

@@ -302,7 +302,7 @@ def land(
     z: np.ndarray, x, y, d, index: float, z_screen: float, projection: Projection | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Landing points (n, m), mm, of the rays d through the bicubic spline of z, NaN where totally reflected: on the plane z_screen,
-    as `projection` sees them."""
+    or projected by `projection`."""
     spline = RectBivariateSpline(x[:, 0], y[0], z, kx=min(3, len(z) - 1), ky=min(3, z.shape[1] - 1))
     return refract_to_screen(
         x, y, z, spline(x[:, 0], y[0], dx=1), spline(x[:, 0], y[0], dy=1), d, index, z_screen, projection=projection

@@ -2,7 +2,7 @@
 
 Notation
     f, g         source density on [-a, a] x [-b, b], constant or bilinear between cell centres; picture g, constant per pixel
-    y_p, m_p     sites: point masses that stand for g, one or a few pixels each; black pixels have none
+    y_p, m_p     sites: point masses that discretise g, one or a few pixels each; black pixels have none
     psi_p        their prices (Kantorovich dual variables);  phi(x) = max_p (x . y_p - psi_p)
     A_p          light in the Laguerre cell of p, where p attains that maximum;  dA_p / dpsi_q = w_pq, weights of the cell borders
     e            transport error, sum |A_p - m_p| / 2, as a fraction of the total: light in a wrong cell

@@ -56,7 +56,7 @@ class WaveObjective:
     """The loss as a function of the heights; see above.
 
     Args:
-        scene: its screen is the one the picture is judged on.
+        scene: with the screen of the picture.
         field: spline spaces of the heights.
         heights: h_0 (n, m) mm.
         target, loss, blur, apron, max_slope, min_radius: as of an `Objective`.

@@ -72,7 +72,7 @@ class Stored:
         """
         size = math.prod(self.shape) * self.dtype.itemsize
         if size > self.unread[0]:
-            raise InputError(f"asks for {size:,} bytes; at most {self.unread[0]:,} more are read")
+            raise InputError(f"has {size:,} bytes; at most {self.unread[0]:,} more are read")
         self.unread[0] -= size
         data = bytearray(size)
         view, at = memoryview(data), 0

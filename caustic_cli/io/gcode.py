@@ -63,7 +63,7 @@ def read_program(path: str | Path) -> Program:
         InputError: it is invalid or not supported, with the line.
     """
     with naming(path), open_regular(path, ACCEPTED, MOST_BYTES) as file:
-        said: dict[re.Pattern, str] = {}
+        comments: dict[re.Pattern, str] = {}
         tools: list[tuple[str, float | None]] = [("", None)]
         moves: list[list[tuple]] = [[]]
         motion, place = None, [math.nan] * 3
@@ -72,7 +72,7 @@ def read_program(path: str | Path) -> Program:
             if "(" in line:
                 for pattern in (_STOCK, _ZERO, _TURNED):
                     if found := pattern.search(line):
-                        said[pattern] = found[1]
+                        comments[pattern] = found[1]
                 if found := _TOOL.search(line):
                     tools.append((found[1], _real(found[2], number)))
                     moves.append([])
@@ -108,8 +108,8 @@ def read_program(path: str | Path) -> Program:
             cuts.append(Cut(kind, radius, table[known, :3], table[known, 3] > 0))
     if not cuts:
         raise InputError(f"{path}: moves no tool; {ACCEPTED}")
-    real = {key: _real(said[key], 0) if key in said else None for key in (_STOCK, _ZERO)}
-    return Program(tuple(cuts), real[_STOCK], real[_ZERO], said[_TURNED] == "yes" if _TURNED in said else None)
+    real = {key: _real(comments[key], 0) if key in comments else None for key in (_STOCK, _ZERO)}
+    return Program(tuple(cuts), real[_STOCK], real[_ZERO], comments[_TURNED] == "yes" if _TURNED in comments else None)
 
 
 def _real(text: str, number: int) -> float:

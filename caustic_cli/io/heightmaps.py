@@ -46,16 +46,16 @@ def read_heightmap(path: Path, half_size: tuple[float, float]) -> tuple[HeightFi
     Raises:
         InputError: the files are missing or invalid, or the heights deviate from a spline on that net by more than rounding.
     """
-    said = _said(beside(path))
+    header = _said(beside(path))
     with naming(path):
-        values = _picture(path, said)
+        values = _picture(path, header)
     with naming(beside(path)):
-        z = said["z_of_zero"] + said["mm_per_count"] * values.astype(np.float64)[::-1].T  # [i, j], j along +y
-        z = -z[:, ::-1] if said["turned"] else z
+        z = header["z_of_zero"] + header["mm_per_count"] * values.astype(np.float64)[::-1].T  # [i, j], j along +y
+        z = -z[:, ::-1] if header["turned"] else z
         if not (np.abs(z) <= LENGTH).all():
             raise InputError(f"must hold heights within +-{LENGTH:g} mm")
-        half = -said["x_of_column_0"], said["y_of_row_0"]
-        return fitted(z, half, said["spline"], OFF * said["quantum_mm"]) if "spline" in said else interpolated(z, half)
+        half = -header["x_of_column_0"], header["y_of_row_0"]
+        return fitted(z, half, header["spline"], OFF * header["quantum_mm"]) if "spline" in header else interpolated(z, half)
 
 
 def interpolated(z: np.ndarray, half_size: tuple[float, float]) -> tuple[HeightField, Tensor]:
@@ -97,22 +97,22 @@ def _said(path: Path) -> dict[str, Any]:
     data = read_bytes(path, MOST_JSON, ACCEPTED)
     with naming(path):
         try:
-            said = json.loads(data)
+            header = json.loads(data)
         except (ValueError, RecursionError) as error:
             raise InputError(f"is no JSON ({str(error)[:100]}); {ACCEPTED}") from error
-        if not isinstance(said, dict) or said.get("height_map") != VERSION or said.get("unit") != "mm":
-            raise InputError(f"says no height_map {VERSION} in mm; {ACCEPTED}")
+        if not isinstance(header, dict) or header.get("height_map") != VERSION or header.get("unit") != "mm":
+            raise InputError(f"does not describe a height_map {VERSION} in mm; {ACCEPTED}")
         for key in ("z_of_zero", "mm_per_count", "quantum_mm", "x_of_column_0", "y_of_row_0"):
-            value = said.get(key)
+            value = header.get(key)
             if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or abs(value) > LENGTH:
                 raise InputError(f"{key} must be a number within +-{LENGTH:g}, got {str(value)[:40]!r}")
-        if not (said["x_of_column_0"] < 0 < said["y_of_row_0"] and said["quantum_mm"] > 0):
+        if not (header["x_of_column_0"] < 0 < header["y_of_row_0"] and header["quantum_mm"] > 0):
             raise InputError("x_of_column_0 must be below 0, y_of_row_0 and quantum_mm above")
-        if not isinstance(said.get("turned"), bool):
+        if not isinstance(header.get("turned"), bool):
             raise InputError("turned must be true or false")
-        if "spline" in said:
-            _check_net(said["spline"])
-        return said
+        if "spline" in header:
+            _check_net(header["spline"])
+        return header
 
 
 def _check_net(net: object) -> None:
@@ -127,14 +127,14 @@ def _check_net(net: object) -> None:
         raise InputError("spline must have degrees of two whole numbers, and knots_u and knots_v of numbers 0 to 1")
 
 
-def _picture(path: Path, said: dict) -> np.ndarray:
+def _picture(path: Path, header: dict) -> np.ndarray:
     """Values of the picture (rows, columns)."""
     with open_regular(path, ACCEPTED, MOST_BYTES) as file:
         try:
             with Image.open(file, formats=("PNG", "TIFF")) as image:
                 size, mode = image.size, image.mode
-                if list(size) != [said.get("columns"), said.get("rows")] or math.prod(size) > MOST_POINTS:
-                    raise InputError(f"has {size[0]} x {size[1]} pixels, not what its JSON says, or too many; {ACCEPTED}")
+                if list(size) != [header.get("columns"), header.get("rows")] or math.prod(size) > MOST_POINTS:
+                    raise InputError(f"has {size[0]} x {size[1]} pixels, not those of its JSON, or too many; {ACCEPTED}")
                 if mode not in ("I;16", "I;16B", "I", "F"):
                     raise InputError(f"has pixels of kind {mode}; {ACCEPTED}")
                 return np.asarray(image)

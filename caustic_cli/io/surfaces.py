@@ -201,7 +201,7 @@ def _surface(poles: np.ndarray, degrees, knots, half=None) -> tuple[HeightField,
         or not np.abs(poles[..., 1] - y[None, :]).max() <= SAME * half[1]
     ):
         raise InputError(
-            "is no height field over an aperture centred on the axis: its control points must stand at the"
+            "is not a height field over an aperture centred on the axis: its control points must be at the"
             " Greville abscissae, rows along +x"
         )
     return field, torch.from_numpy(np.ascontiguousarray(poles[..., 2]))

@@ -224,9 +224,7 @@ class Project:
             )
         has, says = state.state.heights.shape[0] if state.state.heights.ndim == 3 else 1, len(scene.shaped)
         if has != says:
-            raise self.error(
-                f"[second] and [[element]] say {says} free-form surface(s), and what was designed has {has}; design again"
-            )
+            raise self.error(f"[second] and [[element]] give {says} free-form surface(s), and the design has {has}; design again")
         scene, heights = sides_of(scene, field, state.state.heights if self.values is None else self._trained(state.state))
         try:
             refuse_without_glass(scene, field, heights)

@@ -25,22 +25,22 @@ ROUNDS = (25, 50, 100, 200)
 SECONDS = 4.0
 
 COLUMNS = {
-    "series": "what is trained",
+    "series": "name of the candidate",
     "network": "dense, or none for the heights themselves",
-    "inputs": "range: a network trained over a range, which sees where in it it is; none: over a range, but one lens for all of it;"
-    " alone: one network for each value that is judged; empty where there is no range",
+    "inputs": "range: a network trained over a range, with the parameters as inputs; none: over a range, without inputs, one lens"
+    " for all of it; alone: one network for each value evaluated; empty without a range",
     "layers": "hidden layers",
     "width": "neurons in each",
     "activation": "of the hidden layers",
-    "preconditioner": "laplacian: outputs are the coordinates in which the caustic's response is well conditioned; none: heights",
+    "preconditioner": "laplacian: outputs are coordinates in which the response of the caustic is well conditioned; none: heights",
     "lr": "learning rate of Adam",
     "parameters": "weights and biases, or heights",
     "iterations": "of Adam",
     "seconds": "spent in iterations, s",
     "loss": "the last iteration's own loss times the pixels",
-    "error": "relative RMS between the retraced image and the target; over a range, the root mean square over the values judged",
+    "error": "relative RMS between the retraced image and the target; over a range, the root mean square over the values evaluated",
     "worst": "over a range, the largest of these",
-    "noise": "standard error of `error` that the retrace's own rays leave",
+    "noise": "standard error of `error`, by the rays of the retrace",
 }
 
 

@@ -42,16 +42,16 @@ FASTER = 1.1
 STALLED = 0.1
 
 _COMMON = {
-    "series": "the curve this setting belongs to",
-    "sampler": "kind of rays",
+    "series": "name of the curve",
+    "sampler": "sampling of the rays",
     "rays": "rays traced",
-    "error": "relative RMS against the reference, each image over its own mean, less the reference's own error in"
-    " quadrature; root mean square over the repeats",
+    "error": "relative RMS against the reference, each image over its own mean, corrected for the reference's own"
+    " error in quadrature; root mean square over the repeats",
 }
 _TIMES = {
     "seconds": "wall time of sampling, tracing and reconstruction, s; median of the repeats",
-    "seconds_min": "least of them, s",
-    "seconds_max": "most of them, s",
+    "seconds_min": "shortest of them, s",
+    "seconds_max": "longest of them, s",
 }
 
 
@@ -139,8 +139,8 @@ def study_reconstruction(bench: Benchmark, dtype: torch.dtype) -> Study:
         | {
             "filter": "reconstruction filter",
             "size": "its size, pixels along either axis",
-            "noise": "relative RMS against the filter's own reference: what more rays remove",
-            "bias": "relative RMS between the filter's own reference and the reference: what they do not",
+            "noise": "relative RMS against the filter's own reference, which decreases with the number of rays",
+            "bias": "relative RMS between the filter's own reference and the reference, which does not",
             "kernel": "relative RMS between the reference smoothed by Filter.smooth and the filter's own reference",
             "reference_error": "estimated relative RMS of the filter's own reference",
         }

@@ -76,8 +76,8 @@ def write_report(
     else:
         shown = [
             (target, "target"),
-            (image, titled("by rays", figures["relative_rms"])),
-            (waves, titled("what light will do (waves)", figures["wave_relative_rms"])),
+            (image, titled("ray image", figures["relative_rms"])),
+            (waves, titled("wave image", figures["wave_relative_rms"])),
         ]
         image = waves
     for axis, (picture, title) in zip(axes[0], shown, strict=False):
@@ -176,7 +176,7 @@ def _draw_losses(axis: Axes, history: np.ndarray, pixels: int, figures: dict, st
         grid = axis.get_subplotspec().subgridspec(2, 1, height_ratios=(1.0, BLURRED))
         axis.set_subplotspec(grid[0])
         below = axis.get_figure().add_subplot(grid[1], sharex=axis)
-        below.set_title("each stage as it sees both images, blurred", fontsize="medium")
+        below.set_title("loss of each stage, with blur", fontsize="medium")
     for k, (blur, waves) in how.items():
         rows, colour = history[history[:, 1] == k], COLOURS[k % len(COLOURS)]
         own = axis if blur == 0 or below is None else below
@@ -208,7 +208,7 @@ def _draw_losses(axis: Axes, history: np.ndarray, pixels: int, figures: dict, st
                 bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0, "alpha": 0.8},
                 **side,
             )
-    axis.set(title="error: as the design sees it (lines),\nretraced with other rays (points)")
+    axis.set(title="error: loss of the design (lines),\nretraced with independent rays (points)")
     for own in (axis,) if below is None else (axis, below):
         own.margins(x=0.08, y=0.12 if own is axis else 0.25)
         own.set_ylabel("relative RMS")

@@ -43,14 +43,14 @@ A_PIXEL = 64
 ENOUGH = 0.1
 
 COLUMNS = {
-    "series": "what is varied",
+    "series": "parameter varied",
     "value": "lens size (mm), wavelength (nm) or the source's full angle (degrees)",
-    "error": "relative RMS between ray image and wave image, each over its own mean, the rays' noise taken off",
-    "noise": "of the ray image, relative RMS",
+    "error": "relative RMS between ray image and wave image, each over its own mean, corrected for the noise of the rays",
+    "noise": "relative RMS noise of the ray image",
     "blur": "predicted blur by diffraction and the source, pixels",
     "seconds": "time of the wave image, s",
     "rays_seconds": "time of the ray image, s",
-    "samples": "of the largest transform, along an axis",
+    "samples": "samples of the largest transform along an axis",
 }
 
 

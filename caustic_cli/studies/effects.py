@@ -50,16 +50,16 @@ RAYS_A_PIXEL = 30
 COLUMNS = {
     "series": "effect",
     "on": "whether auto simulates it in this scene",
-    "why": "why, in this scene",
-    "bound": "the number that decides",
-    "limit": "what it is compared with",
-    "amount": "of the effect as measured here: the scene's own, or what was put in",
-    "error": "relative RMS between the image without and with it, each over its own mean",
-    "power": "light on the screen without it less with it, part of the source's power",
-    "seconds": "cost: least time with it less least time without, s",
-    "seconds_min": "least of the rounds' differences, s",
-    "seconds_max": "most of them, s",
-    "whole": "least time with it, s",
+    "why": "reason, in this scene",
+    "bound": "the number on which the decision is based",
+    "limit": "the value with which it is compared",
+    "amount": "of the effect in this measurement: that of the scene, or of the example added for the study",
+    "error": "relative RMS between the images without and with the effect, each over its own mean",
+    "power": "light on the screen without the effect minus with it, as a fraction of the source's power",
+    "seconds": "cost: shortest time with it minus shortest time without, s",
+    "seconds_min": "least difference over the rounds, s",
+    "seconds_max": "largest of them, s",
+    "whole": "shortest time with it, s",
 }
 
 
@@ -239,7 +239,7 @@ def run_effects(
         else "this scene calls for no effect"
     )
     unfounded = max((_influence(r) for r in rows if not r["on"] and r["amount"] == OWN), default=0.0)
-    advice += f"; what auto leaves out of it changes image or power by at most {unfounded:.2g}"
+    advice += f"; effects of it that auto leaves out change image or power by at most {unfounded:.2g}"
     about = {
         "version": __version__,
         "seed": seed,
@@ -318,7 +318,7 @@ def draw_effects(study: Study, figure: Figure) -> None:
             costs.plot(ends, [k, k], color=colour, linewidth=1)  # a range that contains 0 is noise
             costs.plot([cost], [k], linestyle="", **style)
         else:
-            costs.annotate("none that could be saved", (0.0, k), color=colour, **words)
+            costs.annotate("none", (0.0, k), color=colour, **words)
     names = [row["series"] if row["amount"] == OWN else f"{row['series']}: {row['amount']}" for row in rows]
     errors.set_yticks(range(len(rows)), names, fontsize="small")
     errors.set(xscale="log", title="error of leaving it out", xlabel="relative RMS or change of power, the larger")

@@ -34,12 +34,12 @@ RAYS_PER_PIXEL = 64
 COLUMNS = {
     "series": "thickness of the design, mm",
     "thickness": "the same, mm",
-    "weight": "of light beside the picture",
-    "loss": "what the lens was designed with",
+    "weight": "of the term `light` of the loss, relative to `rms`",
+    "loss": "loss of the design",
     "error": "relative RMS between the retraced image and the target, each over its own mean",
-    "noise": "standard error of that",
-    "on_screen": "part of the source's power on the screen",
-    "front": "whether no other lens is both brighter and closer to the picture",
+    "noise": "standard error of `error`",
+    "on_screen": "fraction of the source's power on the screen",
+    "front": "whether the lens is on the Pareto front: none other is both brighter and has a smaller error",
     "seconds": "of the design's iterations",
 }
 
@@ -118,8 +118,8 @@ def _advice(rows: list[dict]) -> str:
     front = sorted((r for r in rows if r["front"]), key=lambda r: r["error"])
     sharp, bright = front[0], front[-1]
     if sharp is bright:
-        return f"one lens is both the sharpest and the brightest: {_words(sharp)}"
-    return f"{len(front)} lenses are on the front, from {_words(sharp)} to {_words(bright)}"
+        return f"one lens has both the least error and the highest efficiency: {_words(sharp)}"
+    return f"{len(front)} lenses are on the Pareto front, from {_words(sharp)} to {_words(bright)}"
 
 
 def _words(row: dict) -> str:
@@ -152,7 +152,7 @@ def draw_efficiency(study: Study, figure: Figure) -> None:
     axes.set(
         xlabel="light on the screen (% of the source's)",
         ylabel="relative RMS error of the picture",
-        title="light: error against light, which weighs {:g} to {:g} in the loss".format(
+        title="light: error against efficiency, weights {:g} to {:g} of the light in the loss".format(
             *(pick(r["weight"] for r in study.rows) for pick in (min, max))
         ),
     )

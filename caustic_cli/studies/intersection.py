@@ -62,19 +62,19 @@ AWAY = 5.0
 ROUGH, FINE, EQUAL = 1e-4, 1e-9, 1e-6
 
 COLUMNS = {
-    "series": "method: mesh, looked for four rectangles of knot span products at a time; mesh, flat boxes, through all of them"
-    " one by one; newton; mesh+newton, which begins at the mesh's hit",
-    "n_u": "parts that the mesh cuts every knot span into along either axis",
+    "series": "method: mesh, with a bounding-box hierarchy of knot-span rectangles; mesh, flat boxes, with a linear search over"
+    " them; newton; mesh+newton, which starts from the intersection with the mesh",
+    "n_u": "cells of the mesh per knot span along each axis",
     "rays": "rays in all",
-    "hits": "rays found to meet the surface",
-    "strayed": "rays that only this method or only the reference finds to meet it; the errors are over the others",
+    "hits": "rays found to intersect the surface",
+    "strayed": "rays that only this method or only the reference finds to intersect it; errors are over the others",
     "error": "mean t-error, mm",
     "t_max": "maximum t-error, mm",
     "z_mean": "mean z-error, mm",
     "z_max": "maximum z-error, mm",
     "seconds": "wall time of one evaluation with new heights, s; median of the repeats",
-    "seconds_min": "least of them, s",
-    "seconds_max": "most of them, s",
+    "seconds_min": "shortest of them, s",
+    "seconds_max": "longest of them, s",
 }
 #: Curves whose order is fitted: what they are called, and their column.
 FITTED = {"mean z-error": "z_mean", "mean t-error": "error", "maximum z-error": "z_max", "maximum t-error": "t_max"}
@@ -367,7 +367,7 @@ def draw_convergence(study: Study, figure: Figure) -> None:
                     markersize=5,
                     label=name,
                 )
-        axes.set(xscale="log", yscale="log", ylabel=f"{kind} (mm), mean unless said", title=f"{kind}; mesh: {_fit_words(orders)}")
+        axes.set(xscale="log", yscale="log", ylabel=f"{kind} (mm), mean unless stated", title=f"{kind}; mesh: {_fit_words(orders)}")
     for name, rows in table.items():
         if name != "newton" and rows:
             panels[1, 0].errorbar(
@@ -409,7 +409,7 @@ def draw_pareto(study: Study, figure: Figure) -> None:
     axes = figure.add_subplot()
     draw_front(axes, study)
     for error in (ROUGH, EQUAL, FINE):
-        said = "errors that the advice is about" if error == ROUGH else None
+        said = "errors compared in the advice" if error == ROUGH else None
         axes.axhline(error, color="grey", linewidth=0.8, linestyle="--", label=said)
     axes.set(xlabel="time (s): median, least and most", ylabel="mean t-error (mm)", title="intersection: error and time")
     legend_beside(figure)

@@ -129,7 +129,7 @@ def figures_of_merit(exposure: Image, target, variance=None) -> dict:
     """The figures of merit that `render json` and `design json` share, for `json.dumps(..., allow_nan=False)`.
 
     Args:
-        exposure: a traced image; eq. 5.2.1 asks for bincount reconstruction.
+        exposure: a traced image; eq. 5.2.1 is defined for bincount reconstruction.
         target: (n_x, n_y), any scale, or None: figures relative to it are None then.
         variance: of the noise of the pixels, of the shape of the image, for figures corrected for it; None for uncorrected ones.
 

@@ -37,13 +37,13 @@ ALIKE = 0.02
 COLUMNS = {
     "series": "optimiser or network, and its control net or nets",
     "optimizer": "lbfgs or adam",
-    "network": "what the heights come from: none, sparse or dense",
+    "network": "parametrisation of the heights: none, sparse or dense",
     "control": "control points along x and y, now",
     "iterations": "done so far",
     "seconds": "spent in iterations so far, s",
     "iteration": "wall time of one iteration so far, s; median",
-    "iteration_min": "least of them, s",
-    "iteration_max": "most of them, s",
+    "iteration_min": "shortest of them, s",
+    "iteration_max": "longest of them, s",
     "loss": "the last iteration's own loss times the pixels, for rms a relative RMS (filtered, blurred in early stages); empty"
     " before the first iteration",
     "error": "relative RMS between the retraced image and the target, each over its own mean",

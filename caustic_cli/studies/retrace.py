@@ -97,7 +97,7 @@ def converge(
     available, lights = _available(scene), [scene.part(k, BATCHES) for k in range(BATCHES)]
     while True:
         if each * BATCHES > available:
-            raise CausticError(f"⟨tolerance⟩ {tolerance:g} asks for more rays than the file holds, {available:,}")
+            raise CausticError(f"⟨tolerance⟩ {tolerance:g} requires more rays than the file holds, {available:,}")
         parts = [
             limited_to_source(
                 expose(
@@ -126,7 +126,7 @@ def converge(
         each = int(each * min(32.0, more))
         if max(each, foreseen) * BATCHES > MOST_RAYS:
             raise CausticError(
-                f"⟨tolerance⟩ {tolerance:g} asks for more than {MOST_RAYS:.0e} rays: {traced:,} left an estimated"
+                f"⟨tolerance⟩ {tolerance:g} requires more than {MOST_RAYS:.0e} rays: {traced:,} left an estimated"
                 f" error of {error:.2g}; fewer pixels or a larger tolerance need fewer"
             )
 

@@ -489,7 +489,7 @@ def rows(f: dict) -> list[tuple[str, str]]:
     error, placed, light = f["relative_rms"], f["shifted_relative_rms"], f["on_target"]
     noise = f", noise {f['noise']:.2g}" if f["noise"] else ""
     table = [
-        ("judged", f"by {f['judged_by']}, {f['draws']} draws"),
+        ("evaluated", f"by {f['judged_by']}, {f['draws']} draws"),
         (
             "without errors",
             f"relative RMS error {f['nominal']['relative_rms']:.4f}, light on the picture {f['nominal']['on_target']:.2%}",
@@ -561,7 +561,7 @@ def write_plot(path: Path, found: Study) -> None:
         (placed["p95"], COLOURS[0], "-", "95 %, as placed"),
     ):
         error.axvline(value, color=color, ls=style, label=f"{label}: {value:.3f}")
-    error.set(title=f"{len(found.judged)} draws, judged by {f['judged_by']}", xlabel="relative RMS error", ylabel="draws")
+    error.set(title=f"{len(found.judged)} draws, evaluated by {f['judged_by']}", xlabel="relative RMS error", ylabel="draws")
     light.axvline(f["nominal"]["on_target"], color="k", label=f"without errors: {f['nominal']['on_target']:.4f}")
     light.axvline(f["on_target"]["p5"], color=COLOURS[0], ls="--", label=f"95 % have at least {f['on_target']['p5']:.4f}")
     light.set(title="light on the picture", xlabel="part of the source's power", ylabel="draws")

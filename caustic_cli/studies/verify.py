@@ -66,7 +66,7 @@ def require_mitsuba(scene: Scene) -> None:
     if scene.source.kind not in KINDS:
         raise InputError(f"⟨verify⟩ mitsuba does not support sources of type {scene.source.kind}")
     if scene.lens.fresnel != "exact":
-        raise InputError(f"⟨verify⟩ mitsuba knows exact Fresnel reflection only; ⟨lens.fresnel⟩ is {scene.lens.fresnel}")
+        raise InputError(f"⟨verify⟩ mitsuba supports exact Fresnel reflection only; ⟨lens.fresnel⟩ is {scene.lens.fresnel}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,7 +227,7 @@ def compare(
     z, spread = _z_scores(*(_rebinned(a, side) for a in (renders, image, squares)), rays, per_ray, shift / side)
     some = z[np.isfinite(z)]
     if not len(some):
-        raise CausticError(f"{rays:,} rays are too few to judge a single pixel by; ⟨rays⟩ must be larger")
+        raise CausticError(f"{rays:,} rays are too few to test a single pixel; ⟨rays⟩ must be larger")
     sums = renders.sum((1, 2))
     noise = squares.sum() - image.sum() ** 2 / rays + sums.var(ddof=1) / len(sums) + (LEAK * render.sum()) ** 2
     light = float((image.sum() - render.sum()) / noise**0.5)

@@ -118,7 +118,9 @@ def candidates(
         target = project.target(scene)
     stages = [s for s in build_stages(full) if not s.waves]
     if not stages or scene.second is not None or scene.lens.arrayed:
-        raise InputError("⟨networks⟩ are compared on the rays of a lens with one free-form side, and this project has none such")
+        raise InputError(
+            "⟨networks⟩ are compared on ray images of a lens with one free-form side, which this project does not have"
+        )
     stage = replace(stages[-1], blur=0.0, iterations=10**9, tolerance=0.0, source=None, spread=False, control=scene.lens.control)
     own, goal = build_options(full), torch.from_numpy(target)
     base = replace(own, dtype=dtype or own.dtype, seed=own.seed if seed is None else seed, optimizer="adam", robust=None)

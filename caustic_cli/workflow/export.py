@@ -49,7 +49,7 @@ def export(
     values = {"at": at} if at is not None else {}
     made = Outputs(opened, "export", {"format": format, "script": script, **values, **given}, written)
     if not force and (found := made.found()):
-        say.say(f"{path}: is what the same options made of the same project, so there is nothing to do; ⟨force⟩ does it again")
+        say.say(f"{path}: is up to date: the same options and the same project, so there is nothing to do; ⟨force⟩ repeats it")
         return found, True
     made.refuse_foreign(force)
     scene, field, heights, _ = opened.lens(scene)
@@ -92,7 +92,7 @@ def write(
         )
     if scene.elements and (script or format == "zemax"):
         raise InputError(
-            f"⟨format⟩ {format} holds a lens by itself; with other elements {', '.join(TWO_SIDED)} hold the scene, without ⟨script⟩"
+            f"⟨format⟩ {format} holds a single lens; with other elements {', '.join(TWO_SIDED)} hold the scene, without ⟨script⟩"
         )
     part = part_of(format, scene, field, heights, mould, block)
     writer = getattr(_home(format), f"write_{format}")
@@ -119,7 +119,7 @@ def accuracy_words(figures: dict) -> str:
     if "read_as" not in figures:
         return "the spline itself" if figures["format"] == "step" else ""
     nx, ny = figures["samples"]
-    exact = {"step": "; ⟨tolerance⟩ 0 writes the exact one", "lighttools": "; the exact spline stands beside them"}
+    exact = {"step": "; ⟨tolerance⟩ 0 writes the exact one", "lighttools": "; the exact spline is stored beside them"}
     return (
         f"{nx} x {ny} points; read as {figures['read_as']}, heights are at most {_length(figures['height_error_mm'])} off and"
         f" light {_shift(figures['shift_pixels'])} (RMS){exact.get(figures['format'], '')}"

@@ -130,7 +130,7 @@ class Lens:
         """Retrace the lens with independent rays, with the effects that the scene calls for.
 
         Args:
-            rays: their number; with `tolerance`, the initial one.  None for those that judge a finished design,
+            rays: their number; with `tolerance`, the initial one.  None for those of the evaluation of a design,
                 `evaluation_rays`, of other light than a plane wave's more until the noise is `RELATIVE_NOISE`.
             seed: of the rays, that of the design unless given.
             tolerance: relative RMS noise of the image, for which the number of rays is increased.

@@ -41,12 +41,12 @@ def cut_surface(path: Path, scene: Scene, field: HeightField, tool_radius: float
         if cut.kind == "flat end":  # roughing, above the finished surface
             continue
         if radius is None:
-            raise InputError(f"{path}: does not say the radius of its ball-nose tool; ⟨tool_radius⟩ does")
+            raise InputError(f"{path}: does not give the radius of its ball-nose tool; ⟨tool_radius⟩ is needed")
         centres = cut.tips + np.array([0.0, 0.0, radius])
         top = math.inf if program.top is None else program.top
         envelopes.append(Envelope(radius, *_near(centres, top + radius), top=top))
     if not envelopes:
-        raise InputError(f"{path}: has no ball-nose tool, whose cut is known")
+        raise InputError(f"{path}: has no ball-nose tool, the only kind that is simulated")
     mirror = scene.lens.mirror
     turned = mirror if program.turned is None else program.turned
     zero = scene.lens.z_in if program.zero is None else program.zero

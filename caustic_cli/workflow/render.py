@@ -173,7 +173,7 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     made = Outputs(project, "render", asked.asks | {"device": device}, paths) if project and not asked.verify else None
     if made and not asked.force and (figures := made.found()):
         say.say(
-            f"{image_path}: is what the same options made of the same project, so there is nothing to do; ⟨force⟩ does it again"
+            f"{image_path}: is up to date: the same options and the same project, so there is nothing to do; ⟨force⟩ repeats it"
         )
         return figures | {"reused": True}
     lens = archived or Lens.of(cast(Project, project), asked.given)

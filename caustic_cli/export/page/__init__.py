@@ -79,7 +79,7 @@ def refuse_untraceable(scene: Scene) -> None:
     if scene.lens.gradient is not None:
         raise InputError("⟨html⟩: the page traces lenses of one index, and this one's varies")
     if scene.elements:
-        raise InputError("⟨html⟩: the page traces a lens by itself, and this scene has [[element]] tables")
+        raise InputError("⟨html⟩: the page traces a single lens, and this scene has [[element]] tables")
     if scene.two_sided:
         raise InputError("⟨html⟩: the page traces lenses with a flat entrance, and this one's is free-form")
     if any(one.rays is not None for one in scene.source.members):

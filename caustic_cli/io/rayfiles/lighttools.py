@@ -68,18 +68,18 @@ def parse(data: bytes) -> RaySet:
     start = data[:HEADER].lower().find(BEGIN)
     if start < 0:
         raise InputError(f"has no line {BEGIN.decode()} within its first {HEADER:,} bytes")
-    said = _header(data[:start])
-    unit = said.get("length_units", "millimeters").lower()
+    header = _header(data[:start])
+    unit = header.get("length_units", "millimeters").lower()
     if unit not in MILLIMETRES:
         raise InputError(f"has lt_length_units {unit!r}; one of {', '.join(MILLIMETRES)} is needed")
-    kind = said.get("datatype", "radiant_power").lower()
+    kind = header.get("datatype", "radiant_power").lower()
     if kind not in FLUXES:
         raise InputError(f"has lt_datatype {kind!r}; radiant_power or luminous_flux is needed")
-    if said.get("far_field_data", "no").lower() not in ("no", "0", "false"):
+    if header.get("far_field_data", "no").lower() not in ("no", "0", "false"):
         raise InputError("has far-field data, whose rays start nowhere; lt_far_field_data must be NO")
-    if any(float(v) != 0 for v in _numbers(said.get("data_origin", "0 0 0"), "lt_data_origin")):
+    if any(float(v) != 0 for v in _numbers(header.get("data_origin", "0 0 0"), "lt_data_origin")):
         raise InputError("has an lt_data_origin that is not 0 0 0; ⟨source_position⟩ moves a source")
-    colored = said.get("color_info", "none").lower()
+    colored = header.get("color_info", "none").lower()
     if colored not in ("none", "wavelength"):
         raise InputError(f"has lt_color_info {colored!r}; none or wavelength is needed")
     first = data.find(b"\n", start) + 1
@@ -89,7 +89,7 @@ def parse(data: bytes) -> RaySet:
     least = 8 if colored == "wavelength" else 7
     table = _rows(data, first, stop, least) if first else np.zeros((0, least))
     unit_of_flux, key = FLUXES[kind]
-    totals = _numbers(said.get(key, "0"), f"lt_{key}")
+    totals = _numbers(header.get(key, "0"), f"lt_{key}")
     return RaySet(
         MILLIMETRES[unit] * table[:, 0:3],
         table[:, 3:6],
@@ -102,12 +102,12 @@ def parse(data: bytes) -> RaySet:
 
 def _header(data: bytes) -> dict[str, str]:
     """Values of the header by their names without lt_."""
-    said = {}
+    header = {}
     for line in data.decode("ascii", "replace").splitlines():
         name, colon, value = line.partition("#")[0].strip().partition(":")
         if colon and name.lower().startswith("lt_"):
-            said[name.lower()[3:].strip()] = value.strip()
-    return said
+            header[name.lower()[3:].strip()] = value.strip()
+    return header
 
 
 def _numbers(text: str, name: str) -> list[float]:

@@ -61,7 +61,7 @@ def parse(data: bytes) -> RaySet:
     tables, more, text = struct.unpack_from("<iii", data, 76)
     flags = struct.unpack_from("<8i", data, 256)
     if not 0 <= spectrum <= 4:
-        raise InputError(f"has a spectral data identifier of {spectrum}; TM-25 knows 0 to 4")
+        raise InputError(f"has a spectral data identifier of {spectrum}; TM-25 defines 0 to 4")
     if min(tables, more, text) < 0 or tables > MOST_TABLES:
         raise InputError(
             f"counts {tables} spectral tables, {more} additional columns and {text} bytes of text; none may be"
@@ -71,11 +71,11 @@ def parse(data: bytes) -> RaySet:
         if flag not in (0, 1):
             raise InputError(f"has a {name} flag of {flag}; 0 or 1 is needed")
     if not (flags[0] and flags[1]):
-        raise InputError("says that its rays have no position or no direction; both are needed")
+        raise InputError("declares rays without position or direction; both are needed")
     if not (flags[2] or flags[4]):
-        raise InputError("says that its rays have neither radiant nor luminous flux; one is needed")
+        raise InputError("declares rays with neither radiant nor luminous flux; one is needed")
     if spectrum == 2 and not flags[3]:
-        raise InputError("says that each ray has a wavelength, but has no column for it")
+        raise InputError("declares a wavelength for each ray, but has no column for it")
     start = _after_tables(data, tables) + NAME * more + text
     each = sum(n for n, flag in zip(COLUMNS, flags, strict=True) if flag) + more
     if rays == 0:
@@ -90,7 +90,7 @@ def parse(data: bytes) -> RaySet:
     wavelengths = table[:, at["wavelength"]] if flags[3] else None
     if spectrum == 1:
         if not single > 0:
-            raise InputError(f"says that it has one wavelength, but that is {single:g} nm")
+            raise InputError(f"declares a single wavelength of {single:g} nm")
         wavelengths = np.full(rays, single)
     total = watts if radiant else lumens
     return RaySet(table[:, 0:3], table[:, 3:6], flux, total if np.isfinite(total) else 0.0, "W" if radiant else "lm", wavelengths)
