@@ -58,7 +58,7 @@ def foreseen(scene: Scene, first: InitialSurface, target: np.ndarray) -> float:
     grid = initial_surface._Grid.of(scene, target, 96)
     x, y = (torch.from_numpy(c.ravel().copy()) for c in np.meshgrid(grid.x, grid.y, indexing="ij"))
     z = HeightField.of(scene.lens).at(first.heights, x, y)[0].view(len(grid.x), len(grid.y)).numpy()
-    return grid.kept(np.where(z < grid.floor + 1e-3, grid.floor, z))  # where it is cut off, to rounding
+    return grid.efficiency(np.where(z < grid.floor + 1e-3, grid.floor, z))  # where it is cut off, to rounding
 
 
 # First surfaces
@@ -163,7 +163,7 @@ def test_nothing_is_solved_for_a_picture_out_of_reach(tmp_path, monkeypatch, cap
     Image.fromarray((255 * blob()).astype(np.uint8)).save("blob.png")
     monkeypatch.setattr(workflow, "first_surface", lambda *args: pytest.fail("solved for nothing"))
     assert cli.run(["design", "blob.png", "--screen-shift", "2000,0", "--resolution", "32"]) == 2
-    assert "no light can leave the lens" in capfd.readouterr().err
+    assert "no light can be refracted to the picture" in capfd.readouterr().err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["blob.png"]
 
 
