@@ -62,7 +62,7 @@ def test_a_cone_that_covers_a_circle():
 
 
 @pytest.mark.parametrize("source", SOURCES, ids=NAMES)
-def test_no_light_beyond_the_circle_and_the_account_closes(source, kernels):
+def test_no_light_beyond_the_circle_and_the_energy_balance_closes(source, kernels):
     scene, field, heights = round_with(source)
     fluxes = 0.0
     for rays in rays_of(scene, "stratified", 20_000).chunks(7000):

@@ -18,7 +18,7 @@ from caustic_cli import cli
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.export.mesh import closed_mesh
 from caustic_cli.export.step import write_step
-from caustic_cli.inverse.lenslets import ArrayObjective, first_array, joined, lenslets
+from caustic_cli.inverse.lenslets import ArrayObjective, assemble, initial_array, lenslets
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.target import tiles
 from caustic_cli.optics.bspline import SplineSpace, open_knots
@@ -107,12 +107,12 @@ def test_lenslets_whose_borders_can_meet_do():
     scene = array_scene()
     net, rng = bumps(scene), np.random.default_rng(3)
     parts = [one.of(net) + float(rng.normal()) for one in lenslets(scene)]
-    made = joined(parts, scene.lens.array)
+    made = assemble(parts, scene.lens.array)
     assert made.gap < 1e-14
     difference = made.heights - net
     assert float(difference.max() - difference.min()) < 1e-13
     parts[0] = parts[0] + torch.linspace(0.0, 1e-3, parts[0].shape[1], dtype=torch.float64)
-    assert 1e-4 < joined(parts, scene.lens.array).gap < 1e-3
+    assert 1e-4 < assemble(parts, scene.lens.array).gap < 1e-3
 
 
 def test_gradient_of_the_loss_of_an_array():
@@ -155,8 +155,8 @@ def test_an_uneven_and_wandering_beam_changes_little():
     lens = Lens((6.0, 6.0), control=(52, 52), array=(3, 3), fresnel="none")
     scene = Scene(PlaneWave(), lens, Screen((18.0, 18.0), 300.0, (40, 40)))
     single = replace(scene, lens=replace(lens, array=(1, 1)))
-    heights = first_array(scene, [hat()], lens.control, 96).heights
-    alone = first_array(single, [hat()], lens.control, 96).heights
+    heights = initial_array(scene, [hat()], lens.control, 96).heights
+    alone = initial_array(single, [hat()], lens.control, 96).heights
     change = []
     for made, net in ((scene, heights), (single, alone)):
         seen = []

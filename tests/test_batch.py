@@ -105,14 +105,14 @@ def test_another_design_is_refused_as_before(capfd, change):
 
 
 def test_an_unfinished_design_goes_on_when_it_is_asked_for_again(capfd, monkeypatch):
-    with monkeypatch.context() as patch:  # killed after its last iteration, before the decision
-        patch.setattr(workflow, "judge", interrupt)
+    with monkeypatch.context() as patch:  # killed after its last iteration, before the evaluation
+        patch.setattr(workflow, "evaluate_and_write", interrupt)
         assert run([*DESIGN, "--quiet"], capfd, 130).err == "caustic: interrupted\n"
     assert not checkpoint.load(Path("blob.caustic/checkpoints.h5")).results
     out, err = run([*DESIGN, "--json"], capfd)
-    assert "goes on from its checkpoint" in err and json.loads(out)["iterations"] == 3
+    assert "continues from its checkpoint" in err and json.loads(out)["iterations"] == 3
     Path("blob.caustic/render.png").unlink()  # and what is missing is made again
-    assert "goes on" in run(DESIGN, capfd).err and Path("blob.caustic/render.png").exists()
+    assert "continues" in run(DESIGN, capfd).err and Path("blob.caustic/render.png").exists()
     assert "nothing to do" in run(DESIGN, capfd).err
 
 

@@ -161,7 +161,7 @@ BAD = {
     "gradmap bincount": ("gradmap blob.caustic --reconstruction bincount", "bincount"),
     "export format": ("export blob.caustic --format moon", "--format"),
     "export samples": ("export blob.caustic --samples 0", "--samples"),
-    "export suffix": ("export blob.caustic -o lens.iges", "its suffix names no format"),
+    "export suffix": ("export blob.caustic -o lens.iges", "its suffix is not that of a format"),
     "export against the suffix": ("export blob.caustic --format step -o x.stl", "step is written to .step or .stp, not to .stl"),
     "export several to one": ("export blob.caustic --format step,stl -o x.step", "--out names one file"),
     "render a jpeg": ("render blob.caustic -o x.jpg", ".png"),
@@ -343,13 +343,13 @@ def test_render_traces_the_rays_of_the_verdict_and_keeps_the_better_picture(here
         assert image.size[0] >= 800 and image.info["noise"]
     better = picture.read_bytes()
     code, out, err = run("render blob.caustic --rays 2000 --json", capfd)
-    assert code == 0 and "so it stays" in err and "--force" in err
+    assert code == 0 and "so it is kept" in err and "--force" in err
     assert picture.read_bytes() == better and json.loads(out)["image_kept"]
     _, out, _ = run("render blob.caustic --json --quiet", capfd)
     assert 190_000 < json.loads(out)["rays"] < 210_000 and picture.read_bytes() == better  # the same again, to the byte
     for asked in ("--rays 2000 --force", "--screen-at 149 --rays 2000"):  # asked for, and of something else
         _, out, err = run(f"render blob.caustic {asked} --json", capfd)
-        assert picture.read_bytes() != better and "image_kept" not in json.loads(out) and "stays" not in err
+        assert picture.read_bytes() != better and "image_kept" not in json.loads(out) and "is kept" not in err
         assert run("render blob.caustic --quiet --force", capfd)[0] == 0 and picture.read_bytes() == better
     assert run("render blob.caustic --rays 2000 --quiet -o small.png", capfd)[0] == 0
     with Image.open("small.png") as image:

@@ -19,7 +19,7 @@ from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
 from caustic_cli.studies import diffraction, intersection
 from caustic_cli.studies.convergence import FILTERS, run_study, single_precision
 from caustic_cli.studies.fit import knee, order, pareto
-from caustic_cli.studies.measurement import REFERENCE_FACTOR, Bench, Setting
+from caustic_cli.studies.measurement import REFERENCE_FACTOR, Benchmark, Setting
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.report import as_json, plot, write
 
@@ -114,7 +114,7 @@ def test_orders_of_the_samplers(rays):
 def test_uniform_rays_have_the_error_of_a_poisson_process(rays):
     """n independent rays on N pixels: relative RMS^2 = N^2 mean(p (1 - p)) / n, about N sum(p) / n for shares p."""
     scene, field, heights = smooth()
-    bench = Bench(scene, field, heights, 7, 1, 1 << 15)
+    bench = Benchmark(scene, field, heights, 7, 1, 1 << 15)
     p = bench.image(Setting("", "lines", 1 << 18, Filter(), torch.float64), 0).numpy()
     p = p / p.sum()
     checked = 0
@@ -132,7 +132,7 @@ def test_the_reference_is_better_than_what_it_judges_and_knows_its_own_error(ray
     assert REFERENCE_FACTOR >= 16
     assert 0 < rays.about["reference_error"] < 0.4 * min(row["error"] for row in rays.rows)
     scene, field, heights = smooth()
-    one, other = (Bench(scene, field, heights, seed, 1, 1 << 12).reference(Filter()) for seed in (0, 50))
+    one, other = (Benchmark(scene, field, heights, seed, 1, 1 << 12).reference(Filter()) for seed in (0, 50))
     apart = relative_rms(one.image, other.image)  # of two equally wrong images: sqrt(2) times the error of either
     assert 0.8 < apart / np.hypot(one.error, other.error) < 1.25
     assert one.error_of(one.image) == 0.0
@@ -143,8 +143,8 @@ def test_errors_do_not_depend_on_the_reference():
     """The same image against a poor reference and a far better one."""
     scene, field, heights = smooth()
     setting = Setting("", "uniform", 1 << 13, Filter(), torch.float64)
-    poor, good = (Bench(scene, field, heights, 0, 1, n).reference(Filter()) for n in (1 << 8, 1 << 14))
-    image = Bench(scene, field, heights, 0, 1, 1).image(setting, 0)
+    poor, good = (Benchmark(scene, field, heights, 0, 1, n).reference(Filter()) for n in (1 << 8, 1 << 14))
+    image = Benchmark(scene, field, heights, 0, 1, 1).image(setting, 0)
     assert poor.error > 5 * good.error
     # 575 pixels: relative scatter 1 / sqrt(1150) = 0.03
     assert poor.error_of(image) == pytest.approx(good.error_of(image), rel=0.1)
@@ -199,7 +199,7 @@ def test_progress_ends_where_it_said():
 def test_the_profile_of_the_source_is_seen():
     scene, field, heights = smooth()
     half = replace(scene, source=PlaneWave(profile=np.array([[0.0], [1.0]])))
-    image = Bench(half, field, heights, 0, 1, 256).reference(Filter()).image
+    image = Benchmark(half, field, heights, 0, 1, 256).reference(Filter()).image
     assert float(image[:9].sum()) == 0.0
     assert float(image[14:].sum()) > 0.8 * float(image.sum()) > 0
 

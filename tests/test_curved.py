@@ -1,4 +1,4 @@
-"""Curved screens: landing points and areas against closed forms, derivatives, the account of the light, and designs for them."""
+"""Curved screens: landing points and areas against closed forms, derivatives, the energy balance, and designs for them."""
 
 import json
 import math
@@ -19,10 +19,10 @@ from caustic_cli.export.lighttools import write_lighttools
 from caustic_cli.export.mitsuba import write_mitsuba
 from caustic_cli.export.page import refuse_untraceable
 from caustic_cli.export.zemax import write_zemax
-from caustic_cli.inverse.extended import etendue_limit
 from caustic_cli.inverse.initial_surface import _Grid, first_surface
+from caustic_cli.inverse.projection import ScreenProjection
+from caustic_cli.inverse.source_limits import etendue_limit
 from caustic_cli.inverse.target import target_on_screen
-from caustic_cli.inverse.view import View
 from caustic_cli.io.archive import open_archive
 from caustic_cli.io.sags import read_sags
 from caustic_cli.optics.effects.screen_shape import displacement
@@ -153,7 +153,7 @@ def test_a_placed_screen_is_the_same_screen():
 
 
 @pytest.mark.parametrize("screen", [screen_of(SPHERE), screen_of(TUNNEL), screen_of(sags=sags()), screen_of((11.0, 11.0), (0, 60))])
-def test_no_light_is_lost_from_the_account(screen):
+def test_the_energy_balance_closes(screen):
     """Image and losses sum to 1, although rays miss a small sphere that is turned away."""
     scene = Scene(POINT, scene_of(screen).lens, replace(screen, size=(12.0, 7.0)))
     heights = bumpy(scene, 0.1)
@@ -301,30 +301,30 @@ def test_etendue_of_a_screen_around_the_lens():
 
 
 @pytest.mark.parametrize("screen", [*SHAPES, screen_of(tilt=(0.0, 30.0))])
-def test_a_view(screen):
-    """There and back: points of the screen, places of the plane; and the picture's power stays."""
-    view = View(screen, 3.0)
+def test_a_projection_is_inverted_and_conserves_power(screen):
+    """Points of the screen and of the plane are mapped to each other, and the power of the picture is conserved."""
+    view = ScreenProjection(screen, 3.0)
     x, y = np.random.default_rng(1).uniform(-6.5, 6.5, (2, 100))
-    u, v = view.onto(x, y)
-    np.testing.assert_allclose(view.own(u, v), [x, y], atol=1e-9)
+    u, v = view.project(x, y)
+    np.testing.assert_allclose(view.screen_coordinates(u, v), [x, y], atol=1e-9)
     px, py, pz = view.points(u, v)
     np.testing.assert_allclose([px, py, pz], space(screen, x, y), atol=1e-9)
     np.testing.assert_allclose(np.cross(np.stack([px, py, pz - 3.0]).T, np.stack([u, v, 57.0 + 0.0 * u]).T), 0.0, atol=1e-7)
     spot = np.zeros(screen.resolution)
     spot[20, 9] = 1.0  # a pixel: its power, and its middle as seen
-    picture, half, middle = view.picture(spot)
+    picture, half, middle = view.projected_target(spot)
     cell = [2.0 * h / n for h, n in zip(half, picture.shape, strict=True)]
     assert picture.sum() == pytest.approx(1.0, rel=0.02)
     at = [(np.arange(n) + 0.5) * w - h + c for n, w, h, c in zip(picture.shape, cell, half, middle, strict=True)]
     place = [float((picture.sum(1 - k) * at[k]).sum() / picture.sum()) for k in (0, 1)]
-    seen = view.onto(*((np.array((k + 0.5) * w - h)) for k, w, h in zip((20, 9), screen.pixel, screen.half_size, strict=True)))
+    seen = view.project(*((np.array((k + 0.5) * w - h)) for k, w, h in zip((20, 9), screen.pixel, screen.half_size, strict=True)))
     np.testing.assert_allclose(place, seen, atol=0.1 * min(screen.pixel))
 
 
-def test_a_screen_that_turns_away_is_refused():
+def test_a_screen_that_faces_away_is_refused():
     """Of a globe close by the lens sees less than the picture needs."""
-    with pytest.raises(InputError, match="turns away from the lens"):
-        View(Screen((16.0, 14.0), 12.0, (16, 14), radius=(10.9, 10.9)), 3.0).picture(np.ones((16, 14)))
+    with pytest.raises(InputError, match="faces away from the lens"):
+        ScreenProjection(Screen((16.0, 14.0), 12.0, (16, 14), radius=(10.9, 10.9)), 3.0).projected_target(np.ones((16, 14)))
 
 
 def picture() -> np.ndarray:
@@ -356,7 +356,7 @@ def test_the_first_surface_knows_tilt_and_shape(name, plane_error, monkeypatch):
     """Its error is nearly that on a plane screen, and less than by the transport to a plane in its place."""
     error = start_error(name)
     assert 0.01 < plane_error < error + 0.005 < 1.2 * plane_error + 0.005
-    monkeypatch.setattr(_Grid, "view", lambda self, mean: None)
+    monkeypatch.setattr(_Grid, "projection", lambda self, mean: None)
     assert start_error(name) > {"tilt": 3.5, "dome": 2.5, "shape": 1.6, "cylinder": 1.2, "sphere": 1.1}[name] * error
 
 

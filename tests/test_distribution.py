@@ -30,7 +30,7 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Disc, Lens, Points, Scene, Screen
 from caustic_cli.scene.sources.distribution import Distribution
-from caustic_cli.studies.drawn import emitted
+from caustic_cli.studies.independent_rays import sample_rays
 from caustic_cli.workflow import design as workflow
 
 AT = (0.5, -0.5, -12.0)
@@ -88,7 +88,7 @@ def test_a_table_of_a_known_distribution_is_it(table, word, aimed):
     ],
 )
 @pytest.mark.parametrize("kind", ["stratified", "sobol", "uniform"])
-def test_the_account_closes(source, kind):
+def test_the_energy_balance_closes(source, kind):
     here = scene(source)
     sampler = rays_of(here, kind, 8_000, 3)
     for chunk in (1 << 20, 777):
@@ -217,7 +217,7 @@ def test_rays_against_independent_ones(source):
     lean = 0.04 if source.distant else 0.5
     rng, rays = np.random.default_rng(0), 200_000
     places = []
-    for o, d, _ in emitted(here, rays, rng):
+    for o, d, _ in sample_rays(here, rays, rng):
         way = -o[2] / d[2]
         places.append(np.concatenate([o[:2] + way * d[:2], d]))
     x, y, *d = np.concatenate(places, 1)

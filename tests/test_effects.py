@@ -1,4 +1,4 @@
-"""Every effect against its closed form, the account of all of them together, and derivatives."""
+"""Every effect against its closed form, the energy balance of all of them together, and derivatives."""
 
 import math
 from dataclasses import replace
@@ -409,7 +409,7 @@ SOURCES = [None, POINT, Disc((0.0, 0.0, -30.0), (2.0, 1.0))]
 
 @pytest.mark.parametrize("source", SOURCES)
 @pytest.mark.parametrize("bumps", [0.1, 1.5])
-def test_the_account_closes_and_all_is_finite(source, bumps):
+def test_the_energy_balance_closes_and_all_is_finite(source, bumps):
     """Image + losses = 1 to 1e-12 with every effect at once, with and without total reflection."""
     light = Light(30.0, (450.0, 600.0), (1.0, 2.0))
     scene = scene_of(

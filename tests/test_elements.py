@@ -20,7 +20,7 @@ from caustic_cli.export.mesh import closed_mesh
 from caustic_cli.inverse.incidence import incident
 from caustic_cli.inverse.initial_surface import first_surface, sphere_net
 from caustic_cli.inverse.objective import Objective
-from caustic_cli.inverse.relayed import Relayed
+from caustic_cli.inverse.relay import RelayedScreen
 from caustic_cli.io.archive import open_archive
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.frames import Leg
@@ -96,13 +96,13 @@ def test_two_lenses_in_line_are_their_system_matrix():
 
 def test_the_screen_seen_through_what_follows_is_that_of_the_matrix():
     two = thick(60.0, 25.0, (-70.0, 200.0), 6.0, 1.5)
-    seen = Relayed(replace(SCENE, elements=(two,)), 5.0)
+    seen = RelayedScreen(replace(SCENE, elements=(two,)), 5.0)
     a, b = (straight(300.0 - 66.0) @ matrix((-70.0, 200.0), 6.0, 1.5) @ straight(55.0))[0]
     assert seen.first_order[0] == pytest.approx([a, a], rel=1e-6) and seen.first_order[1] == pytest.approx([b, b], rel=1e-6)
     u, v = np.array([[3.0, -4.0]]), np.array([[1.0, 2.0]])
     x, y, z = np.array([[2.0, -3.0]]), np.array([[0.5, 4.0]]), np.full((1, 2), 5.1)
-    t = np.stack(seen.towards(u, v)(x, y, z))
-    found = seen.seen(tuple(c.ravel() for c in (x, y, z)), tuple(c.ravel() for c in t / np.linalg.norm(t, axis=0)))
+    t = np.stack(seen.directions_to(u, v)(x, y, z))
+    found = seen.intersections(tuple(c.ravel() for c in (x, y, z)), tuple(c.ravel() for c in t / np.linalg.norm(t, axis=0)))
     assert np.allclose(np.stack(found), [u.ravel(), v.ravel()], atol=1e-5)
 
 
@@ -148,14 +148,14 @@ def test_a_folded_axis_is_that_of_the_reflected_ray():
     assert np.linalg.det(np.array(leg.frame)) == pytest.approx(1.0)
 
 
-def test_a_hollow_mirror_focuses_at_half_its_radius():
+def test_a_concave_mirror_focuses_at_half_its_radius():
     """Of rays close to the axis, square to the plane of incidence: the sagittal focus, f / cos."""
     hollow = mirror(50.0, (30.0, 0.0), radius=-200.0)
     at = 100.0 / math.cos(math.radians(30.0))
-    seen = Relayed(replace(SCENE, elements=(hollow,), screen=replace(SCREEN, z=50.0 + at)), 5.0)
+    seen = RelayedScreen(replace(SCENE, elements=(hollow,), screen=replace(SCREEN, z=50.0 + at)), 5.0)
     a, _ = seen.first_order
     assert abs(a[0]) < 1e-6  # parallel rays of any x meet there
-    tangential = Relayed(
+    tangential = RelayedScreen(
         replace(SCENE, elements=(hollow,), screen=replace(SCREEN, z=50.0 + 100.0 * math.cos(math.radians(30)))), 5.0
     )
     assert abs(tangential.first_order[0][1]) < 1e-4  # and of any y
@@ -352,7 +352,7 @@ def test_design_render_resume_and_files(_here, capfd):
         Path("t.toml").write_text("[index]\nsigma = 0.001\n")
         said = run(capfd, "render", "p", study, *files, "--quiet", "--force", code=2)
         assert "element" in said, study
-    assert "lens by itself" in run(capfd, "export", "p", "--format", "zemax", code=2)
+    assert "single lens" in run(capfd, "export", "p", "--format", "zemax", code=2)
 
 
 def test_surfaces_of_two_lenses_are_shaped_together(_here, capfd, monkeypatch):
@@ -453,8 +453,8 @@ def test_a_screen_where_the_lens_is_imaged_is_refused():
     relay = thick(155.0, 30.0, (98.5, -98.5), 6.0, 1.5)  # of focal length 100 mm, about
     m = matrix((98.5, -98.5), 6.0, 1.5) @ straight(150.0)
     imaged = 161.0 - m[0, 1] / m[1, 1]
-    with pytest.raises(InputError, match="image it"):
-        _ = Relayed(replace(SCENE, elements=(relay,), screen=replace(SCREEN, z=float(imaged))), 5.0).first_order
+    with pytest.raises(InputError, match="conjugate to the lens"):
+        _ = RelayedScreen(replace(SCENE, elements=(relay,), screen=replace(SCREEN, z=float(imaged))), 5.0).first_order
 
 
 def test_a_scene_without_elements_is_as_it_was():

@@ -1,4 +1,4 @@
-"""Power is never made out of nothing, and none that matters is left out: surfaces without glass, ghosts that focus, accounts."""
+"""Conservation of energy: surfaces without glass, ghosts that focus, energy balances of random scenes."""
 
 import math
 import sys
@@ -13,7 +13,7 @@ from caustic_cli import cli
 from caustic_cli.config import settings
 from caustic_cli.config.completion import complete
 from caustic_cli.errors import CausticError, InputError
-from caustic_cli.inverse.extended import centre_of
+from caustic_cli.inverse.source_limits import point_source
 from caustic_cli.optics.bounds import bounds_of, refuse_without_glass
 from caustic_cli.optics.effects import EFFECTS
 from caustic_cli.optics.emission import rays_of
@@ -23,7 +23,7 @@ from caustic_cli.optics.spread import Convolution, spread_at
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Disc, Lens, Light, Offset, PlaneWave, Points, Scene, Screen
-from caustic_cli.studies.retrace import require_account, retrace
+from caustic_cli.studies.retrace import require_energy_balance, retrace
 from caustic_cli.workflow import evaluation
 
 
@@ -89,10 +89,10 @@ def test_projects_and_archives_without_glass_are_not_opened(tmp_path, monkeypatc
         {"on_screen": math.nan, "lost": {}},
     ],
 )
-def test_an_impossible_account_stops_a_render(parts):
+def test_an_invalid_energy_balance_stops_a_render(parts):
     with pytest.raises(CausticError, match="does not close"):
-        require_account(parts, torch.float64)
-    require_account({"on_screen": 0.6, "lost": {"absorbed": 0.4}}, torch.float64)
+        require_energy_balance(parts, torch.float64)
+    require_energy_balance({"on_screen": 0.6, "lost": {"absorbed": 0.4}}, torch.float64)
 
 
 def test_weights_that_overflow_are_refused():
@@ -144,7 +144,7 @@ def test_an_image_spread_is_the_image_of_the_source():
     disc = Scene(Disc((0.0, 0.0, -500.0), (5.0, 5.0), intensity="uniform"), scene.lens, Screen((30.0, 30.0), 300.0, (60, 60)))
     spread = spread_at(disc, field, heights).on(disc.screen.pixel)
     assert spread.cut == 4
-    fine = replace(disc, screen=replace(disc.screen, resolution=(240, 240)), source=centre_of(disc))
+    fine = replace(disc, screen=replace(disc.screen, resolution=(240, 240)), source=point_source(disc))
 
     def image(scene: Scene, rays: int, seed: int) -> torch.Tensor:
         found = expose(scene, field, heights, rays_of(scene, "sobol", rays, seed), None, torch.float64).image
@@ -231,7 +231,7 @@ def random_scene(rng: np.random.Generator) -> tuple[Scene, HeightField, torch.Te
     return Scene(source, lens, screen, light), HeightField.of(lens), heights
 
 
-def account_of(seed: int) -> dict[str, float] | None:
+def balance_of(seed: int) -> dict[str, float] | None:
     """Where the light of a random scene goes, None of a scene that is refused."""
     rng = np.random.default_rng(seed)
     try:
@@ -245,15 +245,15 @@ def account_of(seed: int) -> dict[str, float] | None:
     return {"on_screen": figures["on_screen"], **figures["lost"]}
 
 
-def test_accounts_of_random_scenes():
+def test_energy_balances_of_random_scenes():
     """Every part in [0, 1], all together 1 to 1e-12.  `python tests/test_energy.py 1000` goes through so many."""
-    check_accounts(range(60))
+    check_balances(range(60))
 
 
-def check_accounts(seeds: range) -> int:
+def check_balances(seeds: range) -> int:
     counted = 0
     for seed in seeds:
-        account = account_of(seed)
+        account = balance_of(seed)
         if account is None:
             continue
         counted += 1
@@ -264,4 +264,4 @@ def check_accounts(seeds: range) -> int:
 
 
 if __name__ == "__main__":
-    print(f"{check_accounts(range(int(sys.argv[1])))} accounts of {sys.argv[1]} scenes close")
+    print(f"{check_balances(range(int(sys.argv[1])))} accounts of {sys.argv[1]} scenes close")

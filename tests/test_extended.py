@@ -1,4 +1,4 @@
-"""Designs for extended sources: the best light behind a blur, the source's kernel, rays of few points, the designs."""
+"""Designs for extended sources: deconvolution bounds, the convolution kernel, rays of few points, the designs."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from PIL import Image
 from caustic_cli import cli
 from caustic_cli.commands.console import figures_rows
 from caustic_cli.config import settings
-from caustic_cli.inverse import extended
+from caustic_cli.inverse import source_limits
 from caustic_cli.inverse.deconvolution import deconvolved
-from caustic_cli.inverse.extended import centre_of, etendue_limit, limits, regular_rays, shift_of
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.schedule import Stage
+from caustic_cli.inverse.source_limits import etendue_limit, performance_limits, point_source, regular_rays, source_spread
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.emission.coherent import even_disc, modes
 from caustic_cli.optics.emission.regular import RegularGrid
@@ -186,7 +186,7 @@ def test_a_blurred_render_is_added_up_to_pixels_whatever_it_is_cut_into():
     scene = scene_of(Disc((0.0, 0.0, -40.0), (2.2, 2.2)))
     field, heights = HeightField.of(scene.lens), heights_of(scene)
     traced, rays, kernels = regular_rays(
-        scene, shift_of(scene, field, heights), Stage((19, 19), 40_000, "grid", spread=True, oversample=3), 0, "cpu"
+        scene, source_spread(scene, field, heights), Stage((19, 19), 40_000, "grid", spread=True, oversample=3), 0, "cpu"
     )
     cosine, target = Filter("cosine", (3, 3)), torch.from_numpy(disc_on(32))
     made = Objective(
@@ -200,11 +200,11 @@ def test_a_blurred_render_is_added_up_to_pixels_whatever_it_is_cut_into():
 @pytest.mark.parametrize("exact", [10.0, 1e-5], ids=["middle", "points"])
 def test_objective_sees_the_image_of_the_source(kind, exact, monkeypatch):
     """On its own regular rays, spread, the loss is that of very many rays drawn from all of the source; its gradient is right."""
-    monkeypatch.setattr(extended, "EXACT", exact)
+    monkeypatch.setattr(source_limits, "EXACT", exact)
     scene = scene_of(SOURCES[kind])
     field, heights = HeightField.of(scene.lens), heights_of(scene)
     stage = Stage((19, 19), 200_000, "grid", oversample=4, spread=True)
-    shifts = shift_of(scene, field, heights)
+    shifts = source_spread(scene, field, heights)
     traced, rays, kernels = regular_rays(scene, shifts, stage, 0, "cpu")
     assert (len(kernels) > 1) == (exact < 1.0)
     target = torch.from_numpy(disc_on(32))
@@ -231,10 +231,10 @@ def test_objective_sees_the_image_of_the_source(kind, exact, monkeypatch):
 
 def test_sources_that_do_more_than_shift():
     """Right before the lens, in depth, or apart: no kernel stands for them; a plane wave has none."""
-    assert shift_of(scene_of(Disc((0.0, 0.0, -0.3), (2.0, 2.0)))) is None
-    assert shift_of(scene_of(PlaneWave())) is None
-    assert shift_of(scene_of(Points(((0.0, 0.0, -50.0), (0.3, 0.0, -60.0))))) is None
-    assert shift_of(scene_of(SOURCES["sun"])) is not None
+    assert source_spread(scene_of(Disc((0.0, 0.0, -0.3), (2.0, 2.0)))) is None
+    assert source_spread(scene_of(PlaneWave())) is None
+    assert source_spread(scene_of(Points(((0.0, 0.0, -50.0), (0.3, 0.0, -60.0))))) is None
+    assert source_spread(scene_of(SOURCES["sun"])) is not None
 
 
 # What cannot be
@@ -269,18 +269,18 @@ def test_etendue_of_light_that_does_not_fill_the_lens(light):
 
 def test_limits_in_words():
     scene = scene_of(SOURCES["sun"])
-    words = limits(scene, disc_on(32)).sentence()
+    words = performance_limits(scene, disc_on(32)).sentence()
     assert "relative RMS" in words and "etendue" in words and len(words.splitlines()) == 1
-    assert limits(scene_of(PlaneWave()), disc_on(32)).sentence() == ""
+    assert performance_limits(scene_of(PlaneWave()), disc_on(32)).sentence() == ""
 
 
 def test_the_middle_shines_into_the_cone_of_the_whole():
     """So that as much of its light meets the lens."""
     scene = scene_of(SOURCES["disc"])
-    middle = centre_of(scene)
+    middle = point_source(scene)
     half, z = scene.lens.half_size, scene.lens.z_in
     assert middle.cone_over(half, z) == pytest.approx(scene.source.cone_over(half, z))
-    assert centre_of(scene_of(SOURCES["sun"])).collimated
+    assert point_source(scene_of(SOURCES["sun"])).collimated
 
 
 # Designs

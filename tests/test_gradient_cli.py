@@ -1,4 +1,4 @@
-"""Lenses whose index varies, on the command line: given by a formula or a file, or designed in place of the surface."""
+"""Gradient-index lenses on the command line: given by a formula or a file, or designed in place of the surface."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 from helpers import small_designs, write_blob
 
 from caustic_cli import cli, load
-from caustic_cli.inverse.gradient_blank import blank_system, design_blank
+from caustic_cli.inverse.gradient_index import design_gradient_index, plate_system
 from caustic_cli.optics.effects import EFFECTS
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.gradient import field_of
@@ -21,8 +21,10 @@ from caustic_cli.optics.plan import compile_plan
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import System
 from caustic_cli.optics.trace import Tracer, expose, render
+from caustic_cli.project import directory
 from caustic_cli.scene import Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.scene.gradient import Gradient
+from caustic_cli.workflow import design as workflow
 
 TINY = ("--resolution", "24", "--iterations", "3", "--threads", "1", "--quiet")
 
@@ -51,7 +53,7 @@ def flat(scene: Scene) -> torch.Tensor:
     return torch.full(scene.lens.control, scene.lens.offset.thickness, dtype=torch.float64)
 
 
-def test_a_blank_is_designed_kept_and_rendered(capfd):
+def test_a_gradient_index_plate_is_designed_saved_and_rendered(capfd):
     """By transport nearly at once; the project opens again with the same image; the same design again is the same index."""
     figures = run(capfd, "design", "blob.png", "--gradient", "free", *TINY, "-o", "free.caustic")
     assert figures["relative_rms"] < 0.3 and figures["on_screen"] > 0.85 and figures["iterations"] == 3
@@ -62,9 +64,9 @@ def test_a_blank_is_designed_kept_and_rendered(capfd):
     assert again["relative_rms"] == pytest.approx(figures["relative_rms"], abs=0.02)
     anew = run(capfd, "design", "blob.png", "--gradient", "free", *TINY, "-o", "free.caustic")
     assert anew["index_least"] == figures["index_least"]
-    assert "in one go" in run(capfd, "design", "--resume", "free.caustic", code=2)
+    assert "cannot be resumed" in run(capfd, "design", "--resume", "free.caustic", code=2)
     movie = ("design", "blob.png", "--gradient", "free", *TINY, "-o", "moving.caustic", "--movie", "m.gif")
-    assert "--movie is of a surface's design" in run(capfd, *movie, code=2)
+    assert "--movie records the design of a surface" in run(capfd, *movie, code=2) and not Path("moving.caustic").exists()
     assert run(capfd, "export", "free.caustic", "--format", "stl", "-o", "blank.stl")["bytes"] > 1000
     assert "varies" in run(capfd, "export", "free.caustic", "--format", "lighttools", code=2)
     assert "varies" in run(capfd, "gradmap", "free.caustic", "--threads", "1", code=2)
@@ -73,6 +75,19 @@ def test_a_blank_is_designed_kept_and_rendered(capfd):
     assert seen["relative_rms"] == pytest.approx(again["relative_rms"], abs=0.02)
     lens = load("free.caustic")
     assert field_of(lens.scene.lens).shape == (51, 51, 1) and float(np.ptp(lens.surface(np.linspace(-4, 4, 9), 0.0)[0])) < 1e-12
+
+
+def test_a_design_of_an_index_that_is_run_again_locks_its_project(capfd, monkeypatch):
+    again = ("design", "blob.png", "--gradient", "free", *TINY, "-o", "again.caustic")
+    run(capfd, *again)
+    Path("again.caustic/render.png").unlink()
+
+    def run_index(project, *_):
+        with directory.locked(project.path):
+            raise AssertionError("another design could run there")
+
+    monkeypatch.setattr(workflow, "_run_index", run_index)
+    assert "another caustic design is running there" in run(capfd, *again, code=2)
 
 
 def test_a_file_of_indices_is_kept(capfd):
@@ -116,16 +131,16 @@ def test_a_design_comes_nearer_to_the_picture():
     target = np.where((np.abs(x) < 0.6) & (np.abs(y) < 0.5), 1.0 + 0.6 * np.sin(5.0 * x) * np.cos(4.0 * y), 0.0)
 
     def error(index) -> float:
-        (image,) = render(blank_system(scene, index), {}, 200_000, seed=9)
+        (image,) = render(plate_system(scene, index), {}, 200_000, seed=9)
         j = image.image.numpy()
         return float(np.sqrt(np.mean((j / j.mean() - target / target.mean()) ** 2)))
 
-    found = design_blank(scene, target, (28, 28), 2, cells=20, iterations=10)
+    found = design_gradient_index(scene, target, (28, 28), 2, cells=20, iterations=10)
     assert error(found.index) < 0.9 * error(found.start) < 0.35 and found.index.shape == (28, 28, 2)
     losses = [loss for loss, _ in found.history]
     assert losses == sorted(losses, reverse=True)
     held = scene_of(Gradient("volume", (), found.index.coefficients.numpy()))
-    (image,) = render(blank_system(scene, found.index), {}, 4000)
+    (image,) = render(plate_system(scene, found.index), {}, 4000)
     by_net = expose(held, HeightField.of(held.lens), flat(held), rays_of(held, "stratified", 4000))
     assert torch.allclose(by_net.image, image.image, atol=1e-9)
 

@@ -16,8 +16,8 @@ from caustic_cli.errors import InputError
 from caustic_cli.io.archive import open_archive
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Disc, Lens, Light, PlaneWave, Scene, Screen
+from caustic_cli.studies.design_report import write_report
 from caustic_cli.studies.irradiance import irradiance_figures, per_part, unit_figures
-from caustic_cli.studies.panels import write_report
 from caustic_cli.workflow import evaluation
 
 TINY = ["--resolution", "24", "--control", "12", "--rays", "4000", "--waves", "off", "--quiet", "--threads", "1", "--json"]

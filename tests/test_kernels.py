@@ -256,13 +256,13 @@ def test_compilation_is_spoken_of_where_something_is_compiled(monkeypatch):
     say = console.Reporter(False)
     monkeypatch.setattr(say, "say", said.append)
     slow = numba.njit(lambda x: np.cos(np.sin(x)) + np.ones(3).sum())
-    with compilation.told_of(say, "compiling"):
+    with compilation.announce_compilation(say, "compiling"):
         time.sleep(0.1)
         assert said == []
         for x in (1.0, 1, 1j, np.float32(1.0)):  # four signatures
             slow(x)
     assert said == ["compiling"]
-    with compilation.told_of(say, "again"):
+    with compilation.announce_compilation(say, "again"):
         slow(2.0)
         time.sleep(0.1)
     assert said == ["compiling"]
@@ -270,7 +270,7 @@ def test_compilation_is_spoken_of_where_something_is_compiled(monkeypatch):
 
 def test_parts_of_the_first_run_are_shared_out():
     for processes in range(1, 5):
-        shares = compilation.shares(processes)
+        shares = compilation.partition(processes)
         assert sorted(part for share in shares for part in share) == sorted(compilation.PARTS)
         assert len(shares) == processes
         assert all(shares)

@@ -103,7 +103,7 @@ def test_exports_by_suffix(lens):
     assert torch.allclose(archive.heights, lens.heights, atol=1e-12) and archive.target is None
     with pytest.raises(InputError, match="cannot be saved as a project"):
         archive.save("no.caustic")
-    with pytest.raises(InputError, match=r"lens\.jpg: its suffix names no format"):
+    with pytest.raises(InputError, match=r"lens\.jpg: its suffix is not that of a format"):
         lens.export("lens.jpg")
 
 

@@ -1,4 +1,4 @@
-"""Light that is kept: first surfaces of sources close by and beside the axis, pictures out of reach, the loss, the front."""
+"""Optical efficiency: initial surfaces for near and off-axis sources, reachability, the loss, the Pareto front."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from caustic_cli.inverse.incidence import incident
 from caustic_cli.inverse.initial_surface import InitialSurface, first_surface
 from caustic_cli.inverse.losses import Loss
 from caustic_cli.inverse.objective import Objective
-from caustic_cli.inverse.reach import largest_magnification, refuse_unreachable
+from caustic_cli.inverse.reachability import largest_magnification, refuse_unreachable
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces import HeightField
@@ -58,7 +58,7 @@ def foreseen(scene: Scene, first: InitialSurface, target: np.ndarray) -> float:
     grid = initial_surface._Grid.of(scene, target, 96)
     x, y = (torch.from_numpy(c.ravel().copy()) for c in np.meshgrid(grid.x, grid.y, indexing="ij"))
     z = HeightField.of(scene.lens).at(first.heights, x, y)[0].view(len(grid.x), len(grid.y)).numpy()
-    return grid.kept(np.where(z < grid.floor + 1e-3, grid.floor, z))  # where it is cut off, to rounding
+    return grid.efficiency(np.where(z < grid.floor + 1e-3, grid.floor, z))  # where it is cut off, to rounding
 
 
 # First surfaces
@@ -136,14 +136,14 @@ def test_light_that_comes_through_the_sides_does_not_count():
     ],
 )
 def test_a_picture_out_of_reach_is_refused(scene):
-    with pytest.raises(InputError, match="no light can leave the lens for the picture: it would have to turn by at least"):
+    with pytest.raises(InputError, match="no light can be refracted to the picture: it would have to be deflected by at least"):
         refuse_unreachable(scene, blob())
     refuse_unreachable(replace(scene, screen=replace(scene.screen, shift=(0.0, 0.0))), blob())
 
 
 def test_light_that_misses_the_lens_is_refused():
     scene = Scene(Points(((30.0, 0.0, -20.0),), cone=20.0), Lens(), Screen((30.0, 30.0), 300.0, (48, 48)))
-    with pytest.raises(InputError, match="none of its light meets the lens"):
+    with pytest.raises(InputError, match="none of its light falls on the lens"):
         refuse_unreachable(scene, blob())
 
 
@@ -171,7 +171,7 @@ def test_nothing_is_solved_for_a_picture_out_of_reach(tmp_path, monkeypatch, cap
     Image.fromarray((255 * blob()).astype(np.uint8)).save("blob.png")
     monkeypatch.setattr(workflow, "first_surface", lambda *args: pytest.fail("solved for nothing"))
     assert cli.run(["design", "blob.png", "--screen-shift", "2000,0", "--resolution", "32"]) == 2
-    assert "no light can leave the lens" in capfd.readouterr().err
+    assert "no light can be refracted to the picture" in capfd.readouterr().err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["blob.png"]
 
 
@@ -256,7 +256,7 @@ def test_study_of_light(tmp_path, monkeypatch, capfd):
         assert row["front"] == (not better)
         assert 0 < row["on_screen"] < 1 and row["noise"] < 0.2 * row["error"]
     front = sorted((r["on_screen"], r["error"]) for r in rows if r["front"])
-    assert len(front) >= 2 and found["advice"].startswith(f"{len(front)} lenses are on the front")
+    assert len(front) >= 2 and found["advice"].startswith(f"{len(front)} lenses are on the Pareto front")
 
 
 def test_study_of_light_from_infinity_varies_the_weight_alone(tmp_path, monkeypatch, capfd):

@@ -1,4 +1,4 @@
-"""Limits that a finished design obeys, and the report of what making a lens asks for, against closed forms."""
+"""Constraints that a finished design satisfies, and the manufacturing report, against closed forms."""
 
 import json
 import math
@@ -16,8 +16,8 @@ from test_export import make
 
 from caustic_cli import cli
 from caustic_cli.errors import CausticError, InputError
-from caustic_cli.inverse import limits
-from caustic_cli.inverse.limits import within_limits
+from caustic_cli.inverse import constraints
+from caustic_cli.inverse.constraints import within_limits
 from caustic_cli.inverse.penalties import Penalty
 from caustic_cli.optics import curvature
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -87,7 +87,7 @@ def rough():
     return field, heights, (heights - 0.5, heights + 0.5)
 
 
-def test_limits_are_obeyed_and_little_is_moved(rough):
+def test_limits_are_satisfied_and_little_is_moved(rough):
     field, heights, bounds = rough
     _, steep, bent = samples(field, heights, 100_000)
     slope, radius = 0.8 * steep, 1.5 / bent
@@ -99,12 +99,12 @@ def test_limits_are_obeyed_and_little_is_moved(rough):
 
 
 @pytest.mark.parametrize("block", [1, 700, 10**9])
-def test_the_slope_of_what_exceeds(rough, block, monkeypatch):
+def test_the_gradient_of_the_violation(rough, block, monkeypatch):
     """By differences, however many points are looked at together."""
     field, heights, _ = rough
     _, steep, bent = samples(field, heights, 100_000)
-    monkeypatch.setattr(limits, "BLOCK", block)
-    asked = limits._Limits(field, (heights - 0.01, heights), 0.8 * steep, 1.5 / bent, 4)
+    monkeypatch.setattr(constraints, "BLOCK", block)
+    asked = constraints._Constraints(field, (heights - 0.01, heights), 0.8 * steep, 1.5 / bent, 4)
     g = asked.violation(heights)[1]
     d = torch.randn(heights.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
     step = 1e-8
@@ -129,7 +129,7 @@ def test_bounds_are_kept_meanwhile(rough):
 
 
 def test_limits_that_contradict_say_so(rough, monkeypatch):
-    monkeypatch.setattr("caustic_cli.inverse.limits.STEPS", 20)
+    monkeypatch.setattr("caustic_cli.inverse.constraints.STEPS", 20)
     field, heights, _ = rough
     with pytest.raises(CausticError, match="max_slope"):
         within_limits(field, heights, (heights - 1e-6, heights + 1e-6), 1e-3)

@@ -78,7 +78,7 @@ def test_the_image_is_that_of_the_source_it_was_drawn_from(name, part):
 
 
 @pytest.mark.parametrize("rays", [10**9, 100_000, 7])
-def test_the_account_closes(rays):
+def test_the_energy_balance_closes(rays):
     positions, directions, flux = cone_of(200_001, 50.0, (2.0, 2.0), 3)
     flux = flux * np.random.default_rng(0).exponential(size=len(flux))
     directions[::7] *= -1.0
@@ -153,7 +153,7 @@ def test_a_tolerance_beyond_the_file_is_refused():
     here = scene(measured(KNOWN["point"][0]))
     field, z = HeightField.of(LENS), heights(LENS)
     assert converge(here, field, z, 0.2, rays=4000).error <= 0.2
-    with pytest.raises(CausticError, match=r"tolerance 0.001 asks for more rays than the file holds, 400,000"):
+    with pytest.raises(CausticError, match=r"tolerance 0.001 requires more rays than the file holds, 400,000"):
         converge(here, field, z, 1e-3, rays=4000)
 
 

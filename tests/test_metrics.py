@@ -130,11 +130,11 @@ def test_coloured_light_is_in_the_black_of_its_own_colour():
     red, green = np.array([[0.0, 1.0]]), np.array([[4.0, 0.0]])
     image, target = np.stack([[[0.1, 0.4]], [[0.3, 0.2]]]), np.stack([red, green])
     assert metrics.in_black(image, target) == pytest.approx(0.3, rel=1e-15)
-    assert metrics.judge(Image(image, 1.0, {}), target)["in_black"] == pytest.approx(0.3, rel=1e-15)
+    assert metrics.figures_of_merit(Image(image, 1.0, {}), target)["in_black"] == pytest.approx(0.3, rel=1e-15)
 
 
 @pytest.mark.parametrize("black", [False, True])
-def test_judge_accounts_for_all_light_and_is_strict_json(black):
+def test_figures_of_merit_account_for_all_light_and_are_strict_json(black):
     lens = Lens(control=(5, 4))
     scene = Scene(PlaneWave(), lens, Screen((9.0, 9.0), 100.0, (12, 12)))
     x = torch.linspace(-5.0, 5.0, 5, dtype=torch.float64)[:, None]
@@ -142,7 +142,7 @@ def test_judge_accounts_for_all_light_and_is_strict_json(black):
     exposure = expose(scene, HeightField.of(lens), heights, Sampler("grid", (40, 40)))
     target = np.zeros((12, 12))
     target[3:, :] = 1.0
-    found = metrics.judge(exposure, torch.from_numpy(target))
+    found = metrics.figures_of_merit(exposure, torch.from_numpy(target))
     assert list(found) == ["loss", "relative_rms", "psnr_db", "ssim", "in_black", "on_screen", "on_target", "lost", "rays"]
     assert set(found["lost"]) == set(LOSSES)
     assert found["on_screen"] + sum(found["lost"].values()) == pytest.approx(1.0, abs=1e-12)

@@ -1,4 +1,4 @@
-"""What a least radius of concave places costs: light in the picture's black, of the surface that a design begins from."""
+"""Cost of a least concave radius: light in black regions of the picture, for the initial surface of a design."""
 
 import json
 import shlex
@@ -148,7 +148,7 @@ def test_a_project_of_before_knows_no_such_figures(here, capfd):
     }
 
 
-def test_what_a_radius_costs():
+def test_the_cost_of_a_radius():
     one, other = {"in_black": 0.05, "in_black_noise": 0.003}, {"in_black": 0.01, "in_black_noise": 0.004}
     found = radius_figures(2.0, one, other)
     assert found["in_black_per_mm"] == pytest.approx(0.02) and found["noise"] == pytest.approx(0.0025)

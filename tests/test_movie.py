@@ -1,4 +1,4 @@
-"""`caustic design --movie`: its frames are the images that the design saw, and its file is there whole or not at all."""
+"""`caustic design --movie`: its frames are the images of the objective, and its file is written atomically."""
 
 import os
 import stat

@@ -1,4 +1,4 @@
-"""Figures without the noise of the rays that they are from, and what noise is left in them."""
+"""Figures corrected for Monte-Carlo noise, and their standard errors."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies import metrics, noise
-from caustic_cli.studies.retrace import MOST_TIMES, judging_rays, retrace
+from caustic_cli.studies.retrace import MOST_TIMES, evaluation_rays, retrace
 
 PIXELS = (40, 36)
 SOURCES = {"disc": Disc((0.0, 0.0, -100.0), (6.0, 6.0)), "point": Points(((0.0, 0.0, -100.0),)), "sun": Disc(angle=2.0)}
@@ -118,7 +118,7 @@ def test_figures_of_a_plane_wave_are_of_its_image_as_it_is():
     exposure, figures = retrace(scene, field, heights, target, rays=30_000, seed=4)
     image = expose(scene, field, heights, rays_of(scene, "stratified", 30_000, stream(4, "render"))).image
     assert torch.equal(exposure.image, image) and figures["rays"] == exposure.rays
-    assert {k: figures[k] for k in metrics.judge(exposure, target)} == metrics.judge(exposure, target)
+    assert {k: figures[k] for k in metrics.figures_of_merit(exposure, target)} == metrics.figures_of_merit(exposure, target)
     truth, more = retrace(scene, field, heights, target, rays=3_000_000, seed=5)
     assert figures["error_estimate"] == pytest.approx(metrics.relative_rms(image, truth.image.numpy()), rel=0.15)
     found = [retrace(scene, field, heights, target, rays=30_000, seed=s)[1] for s in range(10)]
@@ -145,10 +145,10 @@ def test_figures_of_a_plane_wave_are_of_its_image_as_it_is():
 )
 def test_as_many_rays_a_pixel_judge_a_large_picture_of_a_plane_wave(source, pixels, rays):
     """Its figures hold their noise; those of other light do not, and more rays are taken there by the noise itself."""
-    assert judging_rays(Scene(source, Lens(), Screen((30.0, 30.0), 100.0, pixels))) == rays
+    assert evaluation_rays(Scene(source, Lens(), Screen((30.0, 30.0), 100.0, pixels))) == rays
 
 
-def test_rays_are_added_until_the_figure_is_quiet():
+def test_rays_are_added_until_the_noise_is_low():
     scene, field, heights, target = lens(SOURCES["disc"])
     _, first = retrace(scene, field, heights, target, rays=2000, seed=1)
     _, same = retrace(scene, field, heights, target, rays=2000, seed=1, quiet=2.0 * first["noise"] / first["relative_rms"])

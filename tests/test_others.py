@@ -1,4 +1,4 @@
-"""The decision on other programs' lenses agrees with the program's own render of the same surface."""
+"""The evaluation of other programs' lenses agrees with the program's own render of the same surface."""
 
 import sys
 from dataclasses import replace

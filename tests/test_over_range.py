@@ -1,4 +1,4 @@
-"""Networks over ranges of the scene's values: gradients, draws, resuming, a lens for each value, what is refused, the studies."""
+"""Networks over ranges of scene parameters: gradients, sampling, resuming, a lens for each value, refusals, the studies."""
 
 import csv
 import json
@@ -15,10 +15,10 @@ from caustic_cli import cli
 from caustic_cli.config.completion import build_options, build_stages, complete
 from caustic_cli.config.settings import build_scene
 from caustic_cli.errors import CausticError, InputError
-from caustic_cli.inverse.conditions import JUDGED, Range, Ranges
 from caustic_cli.inverse.designer import Designer
-from caustic_cli.inverse.over_range import BATCH, AdamOverRange, RangeObjective
 from caustic_cli.inverse.parametrisation import Architecture, parametrise
+from caustic_cli.inverse.range_training import BATCH, RangeAdam, RangeObjective
+from caustic_cli.inverse.scene_parameters import EVALUATED, Range, Ranges
 from caustic_cli.io.files import is_ours
 from caustic_cli.project import checkpoint
 from caustic_cli.studies import architectures
@@ -120,7 +120,7 @@ def test_zero_last_begins_at_the_start_whatever_the_inputs():
 # the loss over a range
 
 
-def stepped(made: Designer) -> AdamOverRange:
+def stepped(made: Designer) -> RangeAdam:
     """Adam on the first stage, before its first step, with parameters that are nothing in particular."""
     module = made._parametrise(0, None)
     generator = torch.Generator().manual_seed(2)
@@ -129,7 +129,7 @@ def stepped(made: Designer) -> AdamOverRange:
         p.data += 0.05 * torch.randn(p.shape, generator=generator, dtype=torch.float64)
     objective = made._objective(0, module)
     assert isinstance(objective, RangeObjective)
-    return AdamOverRange(objective, module, 1e-3)
+    return RangeAdam(objective, module, 1e-3)
 
 
 SCENES = {
@@ -145,7 +145,7 @@ SCENES = {
 def test_gradients_of_the_mean_loss_pass_the_taylor_test(case):
     """|L(p + h q) - L(p - h q) - 2 h <q, dL/dp>| falls with h^3 along a random direction of all parameters."""
     adam = stepped(designer(*SCENES[case]))
-    z, judge = adam._judged()
+    z, judge = adam._objective_here()
     e = judge(z.detach())
     z.backward(e.gradient)
     parameters = list(adam.heights.parameters())
@@ -158,7 +158,7 @@ def test_gradients_of_the_mean_loss_pass_the_taylor_test(case):
     def loss(h: float) -> float:
         for p, at, way in zip(parameters, before, ways, strict=True):
             p.data = at + h * way
-        moved, same = adam._judged()
+        moved, same = adam._objective_here()
         return same(moved.detach()).loss
 
     for h in (4e-4, 2e-4, 1e-4):
@@ -173,7 +173,7 @@ def test_the_loss_is_the_mean_over_lenses_in_their_own_scenes():
     """Each, made from nothing, says what the moved objective says."""
     made = designer(*SCENES["source"])
     adam = stepped(made)
-    objective, z = adam.over, adam._judged()[0].detach()
+    objective, z = adam.over, adam._objective_here()[0].detach()
     e, found = objective(z, 0), []
     for k, (row, heights) in enumerate(zip(objective.values(0).tolist(), z, strict=True)):
         alone = replace(made.options, over=None)
@@ -190,16 +190,16 @@ def test_the_loss_is_the_mean_over_lenses_in_their_own_scenes():
 def test_draws_are_stratified_repeatable_and_new_every_iteration():
     both = Ranges((Range("throw", 250.0, 350.0), Range("source.z", -80.0, -40.0)))
     for iteration in range(20):
-        values = both.drawn(7, iteration, BATCH)
-        assert np.array_equal(values, both.drawn(7, iteration, BATCH))
-        assert not np.array_equal(values, both.drawn(7, iteration + 1, BATCH))
-        assert not np.array_equal(values, both.drawn(8, iteration, BATCH))
+        values = both.sampled(7, iteration, BATCH)
+        assert np.array_equal(values, both.sampled(7, iteration, BATCH))
+        assert not np.array_equal(values, both.sampled(7, iteration + 1, BATCH))
+        assert not np.array_equal(values, both.sampled(8, iteration, BATCH))
         for column, one in zip(values.T, both.each, strict=True):
             parts = np.floor((column - one.low) / (one.high - one.low) * BATCH)
             assert sorted(parts) == list(range(BATCH))
     scaled = both.scaled([[250.0, -40.0], both.middle])
     assert torch.equal(scaled, torch.tensor([[-1.0, 1.0], [0.0, 0.0]], dtype=torch.float64))
-    assert both.judged()[0] == (250.0, -60.0) and len(both.judged()) == 2 * len(JUDGED) - 1
+    assert both.evaluation_points()[0] == (250.0, -60.0) and len(both.evaluation_points()) == 2 * len(EVALUATED) - 1
     assert [s.screen.z for s in THROWS.ends(designer().scene)] == [250.0, 350.0]
 
 
@@ -404,7 +404,7 @@ def test_over_a_range_one_lens_for_all_and_networks_alone_stand_beside(few, capf
     last = [row for row in found["rows"] if row["iterations"] == 6]
     assert [row["inputs"] for row in last] == ["range"] * 5 + ["none", "alone"]
     assert all(row["worst"] >= row["error"] > 0 for row in last) and "one lens for the whole range" in found["advice"]
-    assert last[-1]["parameters"] == len(JUDGED) * last[-2]["parameters"]
+    assert last[-1]["parameters"] == len(EVALUATED) * last[-2]["parameters"]
     for more, sentence in ((["--study", "rays"], "--networks belongs to --study design"), (["--repeats", "2"], "--repeats has no")):
         assert sentence in run(capfd, "convergence", "--study", "design", "--networks", *more, "--quiet", code=2)
 

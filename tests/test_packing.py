@@ -1,4 +1,4 @@
-"""Nets of heights in few bytes: the same to the last bit, and refused where the bytes are no net."""
+"""Compression of large control nets: lossless, and refused where the data are invalid."""
 
 from __future__ import annotations
 

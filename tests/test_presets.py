@@ -111,7 +111,7 @@ def test_what_is_said_before_a_design_begins(monkeypatch):
         rays=4000,
         on_message=lines.append,
     )
-    assert any(line.startswith(white) and line.endswith("of a drawing on white, invert makes the lines bright") for line in lines)
+    assert any(line.startswith(white) and line.endswith("for a drawing on white, invert makes the lines bright") for line in lines)
     (first,) = [line for line in lines if line.startswith("first surface: wall 2.")]
     assert "totally reflected from 0.90" in first and "project about 21 kB" in first
     assert any("source 4.6 mm or" in line and "pixels" in line for line in lines)

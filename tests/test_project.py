@@ -302,8 +302,17 @@ def test_a_new_design_leaves_nothing_of_the_one_before(copy):
     for name in MADE:
         (copy / name).write_bytes(b"of before")
     (copy / "notes.txt").write_text("mine")
-    directory.settle(Project.open(copy), True)
+    directory.create(Project.open(copy), True)
     assert sorted(p.name for p in copy.iterdir()) == ["notes.txt", "project.toml", "target.npy"]
+
+
+def test_a_directory_that_cannot_be_replaced_is_unlocked_again(copy):
+    (copy / "render.png").unlink(missing_ok=True)
+    (copy / "render.png").mkdir()
+    with pytest.raises(InputError, match="is a directory") as refused:  # which keeps everything of the attempt alive
+        directory.create(Project.open(copy), True)
+    with directory.locked(copy):
+        assert refused.value is not None
 
 
 @pytest.mark.parametrize("results", [{"loss": 1.0}, {"loss": 1.0, "wave_relative_rms": None}, {"wave_relative_rms": 0.1}])

@@ -23,7 +23,7 @@ from scipy.interpolate import BSpline, CubicHermiteSpline, RectBivariateSpline
 from test_export import CASES, make, signed_volume
 
 from caustic_cli.errors import InputError
-from caustic_cli.export.approximation import caps, on_fewer_knots
+from caustic_cli.export.approximation import allocate_points, on_fewer_knots
 from caustic_cli.export.heightmap import write_heightmap
 from caustic_cli.export.lighttools import write_lighttools
 from caustic_cli.export.lighttools_script import companions, write_script
@@ -373,9 +373,9 @@ def test_fewer_knots_keep_folds():
 
 
 def test_small_surfaces_keep_their_points():
-    assert caps([16, 300, 300], 10_000) == [16, 300, 300]
-    assert caps([300, 16, 200], 216) == [100, 16, 100]
-    assert sum(caps([10**6, 5, 10**6], 101)) <= 101
+    assert allocate_points([16, 300, 300], 10_000) == [16, 300, 300]
+    assert allocate_points([300, 16, 200], 216) == [100, 16, 100]
+    assert sum(allocate_points([10**6, 5, 10**6], 101)) <= 101
 
 
 def shaped(made, aperture: str, border: float):

@@ -1,4 +1,4 @@
-"""What would make a blurred picture sharp, against the light of the lens that is advised."""
+"""Advice on the blur of a source, against the deconvolution for the advised geometry."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from caustic_cli.inverse.deconvolution import deconvolved
-from caustic_cli.inverse.extended import shift_of
-from caustic_cli.inverse.sharpness import SHARP, STEPS, _blurred, advice, disc, needed, smaller
+from caustic_cli.inverse.sharpness import SHARP, STEPS, _blurred, advice, disc, required_reduction, scaled_spread
+from caustic_cli.inverse.source_limits import source_spread
 from caustic_cli.optics.spread import Convolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Scene, Screen
@@ -53,7 +53,7 @@ def test_the_advised_lens_is_sharp():
 
     def least(throw, mag):
         after = scene(light, throw, mag)
-        return deconvolved(target, shift_of(*after).on(after[0].screen.pixel, 1), STEPS).error
+        return deconvolved(target, source_spread(*after).on(after[0].screen.pixel, 1), STEPS).error
 
     assert found["mag"] > 3.6 and found["throw"] < 250
     assert found["mag"] / 3.0 == pytest.approx(300.0 / found["throw"], rel=0.05)
@@ -76,10 +76,10 @@ def test_the_factor_is_the_least():
     target = picture()
     spread, pixel = disc(6.0), (30.0 / PIXELS,) * 2
     for error in (0.1, 0.3):
-        f = needed(target, pixel, spread, error)
-        assert deconvolved(target, smaller(spread, 1.0 / f).on(pixel, 1), STEPS).error <= error
-        assert deconvolved(target, smaller(spread, 1.1 / f).on(pixel, 1), STEPS).error > error
-    assert needed(target, pixel, disc(1e-3), 0.3) == 1.0
+        f = required_reduction(target, pixel, spread, error)
+        assert deconvolved(target, scaled_spread(spread, 1.0 / f).on(pixel, 1), STEPS).error <= error
+        assert deconvolved(target, scaled_spread(spread, 1.1 / f).on(pixel, 1), STEPS).error > error
+    assert required_reduction(target, pixel, disc(1e-3), 0.3) == 1.0
 
 
 def test_nothing_is_said_of_what_is_sharp_or_has_no_extent():

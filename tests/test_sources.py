@@ -257,7 +257,7 @@ def test_a_source_from_outside(ring, kernels, tmp_path):
     steepest = math.atan((1.5 + math.hypot(5.0, 4.0)) / 20.0)  # never more
     assert 0.9 * steepest < bounds_of(scene, field, heights).incidence <= steepest
     for write, name in ((write_mitsuba, "lens.xml"), (write_lighttools, "lens.npz")):
-        with pytest.raises(InputError, match="knows no source of type ring"):
+        with pytest.raises(InputError, match="does not support sources of type ring"):
             write(tmp_path / name, scene, field, heights)
     assert not list(tmp_path.iterdir())
 
@@ -265,7 +265,7 @@ def test_a_source_from_outside(ring, kernels, tmp_path):
 def test_a_kind_that_others_do_not_know_is_refused_in_a_sentence(ring, monkeypatch):
     scene = Scene(Ring((0.0, 0.0, -20.0), 3.0), make()[0].lens, Screen((10.0, 10.0)))
     monkeypatch.setattr(verify, "find_spec", lambda name: True)
-    with pytest.raises(InputError, match="verify mitsuba knows no source of type ring"):
+    with pytest.raises(InputError, match="verify mitsuba does not support sources of type ring"):
         verify.require_mitsuba(scene)
     monkeypatch.delitem(emission._MAKERS, "ring")
     with pytest.raises(InputError, match="type ring has no rays"):

@@ -271,7 +271,7 @@ def test_a_bad_power_is_named_as_the_key_it_is(type, power):
 def test_a_tolerance_out_of_reach_is_refused_as_soon_as_it_is_foreseen(capfd):
     run(capfd, "design", "blob.png", *TINY, "--iterations", "1")
     began = time.monotonic()
-    assert "asks for more than 1e+11 rays" in run(
+    assert "requires more than 1e+11 rays" in run(
         capfd, "render", "blob.caustic", "--rays", "4000", "--tolerance", "1e-9", "--quiet", "--threads", "1", code=1
     )
     assert time.monotonic() - began < 20  # and not after the 1e11 rays, hours

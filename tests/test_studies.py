@@ -1,4 +1,4 @@
-"""The studies of intersection and of design: orders, an exact reference, fair turns, and what they write."""
+"""The studies of intersection and of optimisers: orders, an exact reference, equal time slices, and what they write."""
 
 import csv
 import json
@@ -17,7 +17,7 @@ from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.intersection import find
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Lens, Offset, PlaneWave, Points, Scene, Screen
-from caustic_cli.studies import intersection, training
+from caustic_cli.studies import intersection, optimiser_comparison
 from caustic_cli.studies.report import as_json, paths_of, refuse_foreign_files, write
 from caustic_cli.studies.retrace import retrace
 from caustic_cli.workflow import comparison
@@ -48,9 +48,9 @@ def small():
     return scene, target, full
 
 
-def contender(small, k):
+def run_of(small, k):
     scene, target, full = small
-    return comparison.Entry(*comparison.plans(scene, full)[k], scene, torch.from_numpy(target))
+    return comparison.TimedDesign(*comparison.variants(scene, full)[k], scene, torch.from_numpy(target))
 
 
 def test_both_errors_of_the_mesh_are_of_order_two(interaction):
@@ -179,8 +179,8 @@ def test_errors_of_zero_are_in_the_table_but_not_in_the_picture(interaction, tmp
     assert "newton,,5000,5000,0,0.0," in paths[0].read_text()
 
 
-class Rival:
-    """A contender that comes closer to its goal with every iteration, of a tenth of a second on a clock of its own."""
+class Run:
+    """A design run that comes closer to its goal with every iteration, of a tenth of a second on a clock of its own."""
 
     optimizer, network = "adam", "none"
 
@@ -199,13 +199,15 @@ class Rival:
             self.heights = self.end + (self.start - self.end) * self.share**self.iterations
 
 
-def test_contenders_get_equal_time_and_an_independent_verdict():
+def test_runs_get_equal_time_and_an_independent_evaluation():
     scene, field, good = lens()
     image = retrace(scene, field, good, np.ones((16, 16)), rays=20_000, seed=5)[0].image.numpy()
     bad = good + 0.02 * torch.sin(torch.arange(9.0))[:, None]
-    fast, slow = (Rival(name, field, bad, good, share) for name, share in (("fast", 0.3), ("slow", 0.95)))
+    fast, slow = (Run(name, field, bad, good, share) for name, share in (("fast", 0.3), ("slow", 0.95)))
     told = []
-    study = training.run_training(scene, image, [slow, fast], seconds=1.6, rays=20_000, progress=lambda *s: told.append(s))
+    study = optimiser_comparison.run_comparison(
+        scene, image, [slow, fast], seconds=1.6, rays=20_000, progress=lambda *s: told.append(s)
+    )
     assert fast.turns == pytest.approx([0.1] * 12) and slow.turns == pytest.approx([0.1] * 12)
     assert told[-1] == (32, 32)
     for series in ("fast", "slow"):
@@ -220,9 +222,9 @@ def test_contenders_get_equal_time_and_an_independent_verdict():
     assert last["error"] == retrace(scene, field, slow.heights, image, rays=20_000)[1]["relative_rms"]
 
 
-def test_the_contenders_of_a_project(small):
+def test_the_runs_of_a_project(small):
     scene, target, full = small
-    plans = comparison.plans(scene, full)
+    plans = comparison.variants(scene, full)
     assert [series for series, *_ in plans] == [
         "lbfgs, 19x19",
         "lbfgs, 11x11",
@@ -239,20 +241,20 @@ def test_the_contenders_of_a_project(small):
         ("adam", "dense"),
     ]
     assert all(stages[-1].rays == 5000 and stages[-1].tolerance == 0 for _, stages, _ in plans)
-    entry = contender(small, 1)
+    entry = run_of(small, 1)
     assert tuple(entry.heights.shape) == (11, 11)
     assert (entry.iterations, entry.seconds, entry.steps, entry.loss) == (0, 0.0, [], None)  # what was tried out is forgotten
     with pytest.raises(InputError, match="seconds"):
-        training.run_training(scene, target, [entry], seconds=0.0)
+        optimiser_comparison.run_comparison(scene, target, [entry], seconds=0.0)
 
 
-def test_transport_contends_where_a_design_would_begin_there():
+def test_a_run_begins_by_transport_where_a_design_would():
     full = complete({"screen": {"resolution": [24, 24]}, "lens": {"control": [35, 35]}}, 1.0, Derivation(rays=5000))
     scene = build_scene(full)
     target = torch.from_numpy(comparison.disc(scene, tuple(full["target"]["size"])))
     entries = {
-        plan[0]: comparison.Entry(*plan, scene, target)
-        for plan in comparison.plans(scene, full)
+        plan[0]: comparison.TimedDesign(*plan, scene, target)
+        for plan in comparison.variants(scene, full)
         if plan[0] in ("lbfgs, 35x35", comparison.TRANSPORT)
     }
     assert len(entries) == 2
@@ -267,14 +269,14 @@ def test_a_lens_with_knots_of_its_own_keeps_its_net(small):
     scene, _, full = small
     knots = SplineSpace.uniform(19, 3).knots.tolist()
     own = replace(scene, lens=replace(scene.lens, knots=(knots, knots)))
-    plans = comparison.plans(own, full)
+    plans = comparison.variants(own, full)
     assert [series for series, *_ in plans][:2] == ["lbfgs, 19x19", "adam, 19x19"] and len(plans) == 4
     assert {s.control for _, stages, _ in plans for s in stages} == {(19, 19)}
 
 
-def test_a_design_in_turns_is_the_design_in_one_go(small):
+def test_a_design_in_time_slices_is_the_uninterrupted_design(small):
     for k in (0, 4):
-        entry = contender(small, k)
+        entry = run_of(small, k)
         while entry.iterations < 6:
             entry.advance(0.0)  # one iteration a turn
         whole = entry.designer.run(entry.designer.begin(), iterations=6)
@@ -284,7 +286,7 @@ def test_a_design_in_turns_is_the_design_in_one_go(small):
 
 
 def test_coarse_to_fine_goes_through_its_nets(small):
-    entry = contender(small, 3)
+    entry = run_of(small, 3)
     seen = []
     while entry.field.shape != (19, 19):
         entry.advance(0.05)
@@ -296,8 +298,8 @@ def test_coarse_to_fine_goes_through_its_nets(small):
 
 def test_the_study_of_designs_lowers_the_error(small, tmp_path):
     scene, target, _ = small
-    entries = [contender(small, k) for k in (1, 4)]
-    study = training.run_training(scene, target, entries, seconds=0.5, rays=40_000)
+    entries = [run_of(small, k) for k in (1, 4)]
+    study = optimiser_comparison.run_comparison(scene, target, entries, seconds=0.5, rays=40_000)
     for e in entries:
         mine = [r for r in study.rows if r["series"] == e.series]
         assert mine[0]["iterations"] == 0 and mine[-1]["error"] < mine[0]["error"]

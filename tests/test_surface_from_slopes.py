@@ -1,4 +1,4 @@
-"""Splines through slopes at scattered points: against the spline they were taken from, and against dense least squares."""
+"""B-spline surfaces from scattered slopes: against the spline they were taken from, and against dense least squares."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Errors of making and placing: their file, their draws, the surface's, the trace with them, the study, and designs for them."""
+"""Manufacturing and alignment errors: their file, draws, surface errors, tracing, tolerance analysis, and robust designs."""
 
 import csv
 import json
@@ -249,7 +249,7 @@ def test_roughness_blurs_as_facets_scatter():
 def test_what_means_nothing_is_said():
     found = study.study(trials("draws = 10\n[throw]\nsigma = 3\n[source_shift]\nsigma = 1", rays=2000))
     assert list(found.unused) == ["source_shift"] and [p.name for p in found.parameters] == ["throw"]
-    with pytest.raises(InputError, match="means anything here"):
+    with pytest.raises(InputError, match="applies to this scene"):
         study.study(trials("[source_shift]\nsigma = 1", rays=2000))
 
 

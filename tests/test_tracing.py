@@ -1,4 +1,4 @@
-"""The whole path: closed forms, the energy account, symmetries, precision, and derivatives of the image."""
+"""The whole path: closed forms, the energy balance, symmetries, precision, and derivatives of the image."""
 
 import gc
 import math

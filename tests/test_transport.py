@@ -239,7 +239,7 @@ def traced(found, n, index, z_screen, samples=800):
     at = transport.corners(n, A)
     spline, x = RectBivariateSpline(at, at, found.heights), transport.centres(samples, A)
     slopes = spline(x, x, dx=1), spline(x, x, dy=1)
-    return surface_from_map.thrown(x[:, None], x[None, :], spline(x, x), *slopes, (0.0, 0.0, 1.0), index, z_screen)[:2]
+    return surface_from_map.refract_to_screen(x[:, None], x[None, :], spline(x, x), *slopes, (0.0, 0.0, 1.0), index, z_screen)[:2]
 
 
 @pytest.mark.parametrize("z_screen", [300.0, 30.0])
@@ -266,7 +266,7 @@ def test_parallel_light_to_a_uniform_screen():
 def test_refraction_keeps_snells_law():
     """Against the angles: n sin(a) = sin(b)."""
     slope, index = 0.2, 1.5
-    x, y, _ = surface_from_map.thrown(*np.zeros((3, 1)), np.full(1, slope), np.zeros(1), (0.0, 0.0, 1.0), index, 10.0)
+    x, y, _ = surface_from_map.refract_to_screen(*np.zeros((3, 1)), np.full(1, slope), np.zeros(1), (0.0, 0.0, 1.0), index, 10.0)
     inside = np.arctan(slope)
     assert x[0] == pytest.approx(10.0 * np.tan(np.arcsin(index * np.sin(inside)) - inside), rel=1e-12)
     assert y[0] == 0.0

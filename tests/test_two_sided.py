@@ -1,4 +1,4 @@
-"""Lenses with two free-form sides: first surfaces, loss, design, what light does behind the picture, files."""
+"""Lenses with two free-form sides: initial surfaces, loss, design, a second picture or ray directions, files."""
 
 import json
 import tomllib
@@ -12,7 +12,7 @@ from PIL import Image
 
 from caustic_cli import cli, load
 from caustic_cli.export.mesh import closed_mesh
-from caustic_cli.inverse.initial_sides import first_sides
+from caustic_cli.inverse.initial_two_sided import first_sides
 from caustic_cli.inverse.two_sided import TwoSidedObjective
 from caustic_cli.io.archive import open_archive
 from caustic_cli.optics.emission import rays_of
@@ -22,7 +22,7 @@ from caustic_cli.optics.system import ENTRANCE, EXIT, System, sides_of
 from caustic_cli.optics.trace import expose, render
 from caustic_cli.scene import Lens, Offset, PlaneWave, Points, Scene, Screen, Second
 from caustic_cli.studies.retrace import retrace
-from caustic_cli.studies.second import second_figures
+from caustic_cli.studies.second_target import second_figures
 
 HALF, PIXELS = 6.0, 40
 NEAR = Screen((2 * HALF, 2 * HALF), 50.0, (PIXELS, PIXELS))
@@ -62,6 +62,19 @@ def test_first_sides_of_two_pictures():
     field = HeightField.of(LENS)
     found = judged(scene, field, first_sides(scene, ONE, TWO, field, 128), TWO)
     assert found["relative_rms"] < 0.35 and found["second_relative_rms"] < 0.7
+
+
+def test_a_loss_of_zero_has_no_gradient():
+    """Collimated light through a plate has its own image as picture, and stays collimated: the gradient is zero, not NaN."""
+    scene, field = Scene(PlaneWave(), LENS, NEAR, second=Second()), HeightField.of(LENS)
+    plate = torch.stack([torch.zeros(field.shape, dtype=torch.float64), torch.full(field.shape, LENS.offset.thickness).double()])
+
+    def evaluation(target: torch.Tensor):
+        rays = rays_of(scene, "grid", 10_000)
+        return TwoSidedObjective(scene, field, rays, Filter("cosine", (3, 3)), (target,), "rms", filter_target=False)(plate)
+
+    found = evaluation(evaluation(torch.from_numpy(ONE)).image)
+    assert found.loss == 0.0 and bool((found.gradient == 0.0).all())
 
 
 @pytest.mark.parametrize("loss", ["rms", "uniformity"])
@@ -235,7 +248,7 @@ def test_two_pictures_by_the_command_line(_here, capfd):
         (("--collimate", "--source", "point", "--start", "offset"), "must be transport"),
         (("--second", "missing.png", "--second-at", "400"), "missing.png"),
         (("--collimate", "--config", "waves.toml"), "without waves or spread"),
-        (("--collimate", "--mag", "6"), "would have to come from beside the lens"),
+        (("--collimate", "--mag", "6"), "would have to come from outside the lens"),
     ],
 )
 def test_bad_input_is_refused(_here, capfd, options, words):

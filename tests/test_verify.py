@@ -1,4 +1,4 @@
-"""The decision of --verify: noise alone agrees, every honest fault does not; and Mitsuba itself, where it is installed."""
+"""The comparison of --verify: noise alone agrees, every real fault does not; and Mitsuba itself, where it is installed."""
 
 import importlib.util
 import json
@@ -93,7 +93,7 @@ def test_its_own_rays_carry_the_power_that_ours_do(source):
     """Another sampling of the same source: as much of it enters the lens."""
     scene, field, heights = scene_with(source)
     carried = 0.0
-    for start, direction, share in verify.emitted(scene, RAYS, np.random.default_rng(0)):
+    for start, direction, share in verify.sample_rays(scene, RAYS, np.random.default_rng(0)):
         assert np.allclose(np.linalg.norm(direction, axis=0), 1)
         x, y = start[:2] + direction[:2] * (scene.lens.z_in - start[2]) / direction[2]
         inside = (abs(x) <= scene.lens.half_size[0]) & (abs(y) <= scene.lens.half_size[1])

@@ -224,7 +224,7 @@ def test_wavelengths_that_are_none(text, _here, capfd):
 def test_a_design_on_waves_alone_has_no_rays_to_compare_others_on():
     full = completion.complete({"lens": {"control": [9, 9]}, "design": {"stages": [{"waves": [550.0]}]}}, 1.0)
     with pytest.raises(InputError, match="one stage on rays is needed"):
-        comparison.plans(None, full)
+        comparison.variants(None, full)
 
 
 def test_time_bounds_the_stages():

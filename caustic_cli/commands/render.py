@@ -205,7 +205,7 @@ def _show(title: str, figures: dict, say: console.Reporter) -> None:
     """The figures, and what was asked for beside them, as a person reads them."""
     say.table(title, console.figures_rows(figures))
     if "cut" in figures:
-        from caustic_cli.workflow.cut import rows as of_cut  # noqa: PLC0415
+        from caustic_cli.workflow.machining import rows as of_cut  # noqa: PLC0415
 
         say.table(f"as {figures['cut']['program']} cuts it", of_cut(figures))
     if "effects" in figures:
@@ -221,7 +221,7 @@ def _show(title: str, figures: dict, say: console.Reporter) -> None:
 
         say.table("tolerances", of_tolerances(figures["tolerances"]))
     if "want" in figures:
-        from caustic_cli.workflow.wanted import rows as of_wanted  # noqa: PLC0415
+        from caustic_cli.workflow.illumination import rows as of_wanted  # noqa: PLC0415
 
         say.table("brightness of the lenslets' sources", of_wanted(figures["want"]))
     if "verify" in figures:

@@ -58,12 +58,12 @@ from caustic_cli.config.settings import (
 )
 from caustic_cli.config.table import check, default
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.conditions import Ranges
 from caustic_cli.inverse.designer import Options
-from caustic_cli.inverse.extended import shift_of
-from caustic_cli.inverse.lenslets import FROM_AFAR
+from caustic_cli.inverse.lenslets import NEEDS_DISTANT_SOURCE
 from caustic_cli.inverse.parametrisation import Architecture
+from caustic_cli.inverse.scene_parameters import Ranges
 from caustic_cli.inverse.schedule import Stage
+from caustic_cli.inverse.source_limits import source_spread
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.resolution import BAND, Resolution, white
 from caustic_cli.scene import Offset, Scene, Screen, Source, sources
@@ -305,7 +305,7 @@ def _complete_design(
             " optimizer lbfgs"
         )
     if max(array) > 1 and design["start"] == "transport" and not source.distant:
-        raise InputError(FROM_AFAR)
+        raise InputError(NEEDS_DISTANT_SOURCE)
     quality = quality or _quality(design["time_limit"], source)
     if "second" in s:
         complete_two_sided(s, source, quality, rays)
@@ -470,7 +470,7 @@ def _quality(time_limit: float, source: Source) -> str:
 def _shifts(s: Settings, source: Source) -> bool:
     """Whether all that a source's extent does is to shift the image."""
     lens = build_lens({**s, "lens": {"control": [LEAST_SPANS] * 2, **s["lens"]}})
-    return shift_of(Scene(source, lens, build_screen(s), build_light(s))) is not None
+    return source_spread(Scene(source, lens, build_screen(s), build_light(s))) is not None
 
 
 def filter_from(kind: str, size, screen: Screen, per_mm2: float | None = None, per_pixel2: float | None = None) -> Filter:

@@ -19,7 +19,7 @@ from caustic_cli.config.plans import (
 from caustic_cli.config.settings import Settings, build_source, elements_of, value_of
 from caustic_cli.config.table import check, default
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.conditions import Ranges
+from caustic_cli.inverse.scene_parameters import Ranges
 from caustic_cli.scene import Source
 from caustic_cli.scene.elements import refuse_beside
 

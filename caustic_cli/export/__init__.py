@@ -1,4 +1,4 @@
-"""The lens for other programs: sampled surfaces, solids and archives.  Writes files, traces no light."""
+"""Export of lenses for other programs: sampled surfaces, solids, archives and scenes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 from caustic_cli.errors import InputError
 
-#: Format -> suffix of its default file, where its `write_<format>` is, what the file is.
+#: Format -> default suffix, module of `write_<format>`, description.
 FORMATS = {
     "lighttools": (".npz", "lighttools", "point cloud with normals and the exact spline"),
     "zemax": (".dat", "zemax", "Grid Sag with exact derivatives"),
@@ -20,17 +20,17 @@ FORMATS = {
     "gcode": (".nc", "milling.gcode", "program for a three-axis mill"),
     "mitsuba": (".xml", "mitsuba", "the whole scene for Mitsuba 3, ready to run, with two meshes beside it"),
 }
-#: Formats that say the lens' index.
+#: Formats that hold a single refractive index.
 ONE_INDEX = ("lighttools", "zemax", "mitsuba")
 MESHES = ("stl", "ply", "obj", "mitsuba")
-#: Formats of solids, whose back a mirror needs; those that lie as the part is cut; and those that can be its mould.
+#: Formats of solids, in which a mirror gets a back; formats in the orientation of machining; and formats that support moulds.
 SOLIDS, AS_CUT = ("step", "stl", "ply", "obj"), ("heightmap", "gcode")
 MOULDS = (*SOLIDS, *AS_CUT)
-#: Formats that hold both sides where both are free-form.
+#: Formats that support two free-form sides.
 TWO_SIDED = ("lighttools", *SOLIDS, "mitsuba")
-#: Formats whose tolerance says how finely they are sampled, and those that have no samples.
+#: Formats with a tolerance, and formats without samples.
 WITHIN, UNSAMPLED = (*MESHES, "step", "heightmap", "gcode"), ("step", "gcode")
-#: Further suffixes that a format goes by.
+#: Further suffixes of formats.
 ALSO = {
     "step": (".stp",),
     "heightmap": (".tiff", ".png"),
@@ -38,17 +38,17 @@ ALSO = {
     "csv": (".txt",),
     "xyz": (".txt",),
 }
-#: The format that a file's suffix stands for.
+#: Format by suffix.
 BY_SUFFIX = {suffix: name for name, (suffix, _, _) in FORMATS.items()} | {
     suffix: name for name, suffixes in ALSO.items() for suffix in suffixes if suffix != ".txt"
 }
 
 
 def format_of(path: Path, named: str | None = None) -> str:
-    """The format of a file by its suffix, or the one that is named.
+    """The format of a file, by its suffix unless it is named.
 
     Raises:
-        InputError: it is unknown, or the two contradict each other.
+        InputError: the format is unknown, or contradicts the suffix.
     """
     if named is not None and named not in FORMATS:
         raise InputError(f"⟨format⟩ must be one of {', '.join(FORMATS)}, got {named!r}")
@@ -57,7 +57,7 @@ def format_of(path: Path, named: str | None = None) -> str:
         if suffix not in BY_SUFFIX:
             known = ", ".join(BY_SUFFIX)
             raise InputError(
-                f"{path}: its suffix names no format; one of {known} is needed, or ⟨format⟩ beside a name without a suffix"
+                f"{path}: its suffix is not that of a format; one of {known} is needed, or ⟨format⟩ beside a name without a suffix"
             )
         return BY_SUFFIX[suffix]
     own = (FORMATS[named][0], *ALSO.get(named, ()))

@@ -1,12 +1,11 @@
-"""How far a sampled surface is from the spline between its samples, as programs lay it there: measured, not bounded.
+"""Deviation of an exported surface, as interpolated by other programs, from the designed spline: measured by random sampling.
 
 Notation
-    dZ       the surface that is read, less the spline's Z at the same x and y, mm
-    dg       the same of the slope that light is refracted by: of a facet, or of its interpolated normals
-    shift    L (n - 1) |dg| over a pixel's width, 2 L |dg| of a mirror: how far off light lands, to first order
+    dZ       height of the interpolated surface minus Z of the spline at the same x and y, mm
+    dg       likewise the slope at which light is refracted: of a facet, or of interpolated normals
+    shift    L (n - 1) |dg| over the width of a pixel, 2 L |dg| for a mirror: displacement of the light, to first order
 
-Both are looked at in `POINTS` places spread evenly, at random, over the aperture; the height is the largest there, the slope the
-root mean square.
+Evaluated at `POINTS` uniformly distributed random points of the aperture: the largest height deviation and the RMS slope deviation.
 """
 
 from __future__ import annotations
@@ -24,14 +23,14 @@ from caustic_cli.export.surface import SurfaceGrid, along
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 
-#: Places in which the surfaces are compared: the root mean square is good to 1 %.
+#: Number of points: the statistical error of the RMS is below 1 %.
 POINTS = 100_000
 SEED = 0
 
 
 @dataclass(frozen=True)
 class Deviation:
-    """read_as: what is laid through the samples; samples: (nx, ny); height: largest |dZ|, mm; slope: RMS |dg|."""
+    """read_as: interpolation of the samples; samples: (nx, ny); height: largest |dZ|, mm; slope: RMS |dg|."""
 
     read_as: str
     samples: tuple[int, int]
@@ -39,7 +38,7 @@ class Deviation:
     slope: float
 
     def figures(self, scene: Scene) -> dict:
-        """Of the JSON: read_as, samples, height_error_mm, shift_pixels by the scene that the lens is for."""
+        """Figures for JSON: read_as, samples, height_error_mm, and shift_pixels in the scene of the lens."""
         lens, screen = scene.lens, scene.screen
         gain = abs(screen.z - lens.offset.thickness) * (2.0 if lens.mirror else lens.index - 1.0) / min(screen.pixel)
         return {
@@ -51,19 +50,20 @@ class Deviation:
 
 
 def of_spline(grid: SurfaceGrid, field: HeightField, heights: Tensor) -> Deviation:
-    """Of a bicubic not-a-knot spline through the heights, of lower degree where there are fewer than four along an axis."""
+    """Deviation of a bicubic not-a-knot spline through the heights, of lower degree for fewer than four along an axis;
+    of the bilinear interpolation for fewer than three."""
     nx, ny = grid.z.shape
     if min(nx, ny) < 3:
         return of_bilinear(grid, field, heights)
     read = RectBivariateSpline(grid.x, grid.y, grid.z, kx=min(3, nx - 1), ky=min(3, ny - 1), s=0)
-    x, y, (z, zx, zy) = _places(field, heights)
+    x, y, (z, zx, zy) = _random_points(field, heights)
     slope = read.ev(x, y, dx=1) - zx, read.ev(x, y, dy=1) - zy
     return _deviation("a bicubic spline", (nx, ny), read.ev(x, y) - z, slope)
 
 
 def of_bilinear(grid: SurfaceGrid, field: HeightField, heights: Tensor) -> Deviation:
-    """Of heights that are interpolated linearly along x and y."""
-    x, y, (z, zx, zy) = _places(field, heights)
+    """Deviation of the bilinear interpolation of the heights."""
+    x, y, (z, zx, zy) = _random_points(field, heights)
     (i, wx), (j, wy) = _cells(grid.x, x), _cells(grid.y, y)
     t, s = (x - grid.x[i]) / wx, (y - grid.y[j]) / wy
     low, high = ((1.0 - t) * grid.z[i, b] + t * grid.z[i + 1, b] for b in (j, j + 1))  # on the cell's two lines of y
@@ -73,8 +73,8 @@ def of_bilinear(grid: SurfaceGrid, field: HeightField, heights: Tensor) -> Devia
 
 
 def of_patches(grid: SurfaceGrid, field: HeightField, heights: Tensor) -> Deviation:
-    """Of bicubic patches through heights, slopes and twists (Hermite)."""
-    x, y, (z, zx, zy) = _places(field, heights)
+    """Deviation of bicubic Hermite patches through heights, slopes and twists."""
+    x, y, (z, zx, zy) = _random_points(field, heights)
     (i, wx), (j, wy) = _cells(grid.x, x), _cells(grid.y, y)
     (hx, dx), (hy, dy) = _hermite((x - grid.x[i]) / wx), _hermite((y - grid.y[j]) / wy)
 
@@ -93,10 +93,10 @@ def of_patches(grid: SurfaceGrid, field: HeightField, heights: Tensor) -> Deviat
 
 
 def of_triangles(patch: Patch, field: HeightField, heights: Tensor, shaded: bool = False) -> Deviation:
-    """Of flat triangles between points; shaded: light is refracted by normals interpolated between the points' own."""
+    """Deviation of flat triangles between points; shaded: with interpolated vertex normals."""
     corners, random = triangles(patch.points), np.random.default_rng(SEED)
     chosen = corners[random.integers(len(corners), size=POINTS)]  # (N, 3)
-    weights = random.dirichlet((1.0, 1.0, 1.0), POINTS)  # even over a triangle
+    weights = random.dirichlet((1.0, 1.0, 1.0), POINTS)  # uniform over a triangle
     points, normals = (a.reshape(-1, 3)[chosen] for a in (patch.points, patch.normals))  # (N, 3 corners, 3)
     at = np.einsum("nc,nck->nk", weights, points)
     normal = (
@@ -109,8 +109,8 @@ def of_triangles(patch: Patch, field: HeightField, heights: Tensor, shaded: bool
 
 
 def of_poles(poles: np.ndarray, written: HeightField, field: HeightField, heights: Tensor) -> Deviation:
-    """Of a B-spline with poles (n, m, 3) mm over the knots of `written`, which need not stand exactly at their abscissae: then
-    x and y are not quite linear along it."""
+    """Deviation of a B-spline with poles (n, m, 3) mm on the knots of `written`; x and y of rounded poles are not exactly at the
+    Greville abscissae."""
     random, (n, m) = np.random.default_rng(SEED), written.shape
     u, v = (torch.from_numpy(random.uniform(0.0, 1.0, POINTS)) for _ in range(2))
     (x, xu), (y, yv) = (
@@ -124,8 +124,8 @@ def of_poles(poles: np.ndarray, written: HeightField, field: HeightField, height
     return _deviation("the B-spline of these poles", (n, m), (z - own[0]).numpy(), slope)
 
 
-def together(deviations: Sequence[Deviation]) -> Deviation:
-    """Of several surfaces, the first's samples: the largest height, and the root of the sum of squares of the slopes."""
+def combined(deviations: Sequence[Deviation]) -> Deviation:
+    """Deviation of several surfaces: samples of the first, largest height, and root sum of squares of the slopes."""
     first = deviations[0]
     slope = float(np.sqrt(sum(d.slope**2 for d in deviations)))
     return Deviation(first.read_as, first.samples, max(d.height for d in deviations), slope)
@@ -135,21 +135,22 @@ def _deviation(read_as: str, samples: tuple[int, ...], height: np.ndarray, slope
     return Deviation(read_as, samples[:2], float(np.abs(height).max()), float(np.sqrt(np.mean(slope[0] ** 2 + slope[1] ** 2))))
 
 
-def _places(field: HeightField, heights: Tensor) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-    """x, y (N,) mm over the rectangle, and the spline's Z, Z_x, Z_y there."""
+def _random_points(field: HeightField, heights: Tensor) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Random points x, y (N,) mm of the rectangle, and Z, Z_x, Z_y of the spline there."""
     random = np.random.default_rng(SEED)
     x, y = (random.uniform(-r, r, POINTS) for r in field.half_size)
     return x, y, [a.numpy() for a in field.at(heights, torch.from_numpy(x), torch.from_numpy(y))]
 
 
 def _cells(lines: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Between which of the lines places (N,) are: the lower one's number, and how far the next is."""
+    """Index of the grid cell of positions (N,), and its width."""
     cell = np.clip(np.searchsorted(lines, at, "right") - 1, 0, len(lines) - 2)
     return cell, lines[cell + 1] - lines[cell]
 
 
 def _hermite(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weights (2, 2, N) of values and slopes at a unit cell's lower and upper line at places (N,) in it, and their derivatives."""
+    """Cubic Hermite basis (2, 2, N), of values and slopes at the lower and upper end of a unit cell, at t (N,), and its
+    derivatives."""
     h = np.array([[(1 + 2 * t) * (1 - t) ** 2, t * t * (3 - 2 * t)], [t * (1 - t) ** 2, t * t * (t - 1)]])
     d = np.array([[6 * t * (t - 1), 6 * t * (1 - t)], [(1 - t) * (1 - 3 * t), t * (3 * t - 2)]])
     return h, d

@@ -1,11 +1,11 @@
-"""A B-spline surface on fewer knots, by least squares: what a file holds where the whole control net would be too much.
+"""Knot reduction: least-squares approximation of a B-spline surface on fewer knots, for smaller files.
 
 Notation
     S           knot spans along an axis, before and after
-    t           the points of the fit: `degree` + 1 equal steps in every span of the surface, its knots among them
+    t           nodes of the fit: `degree` + 1 equal steps per span of the surface, knots included
 
-Both axes are fitted one after the other, each by its own least squares, which commute.  Folds stay: a knot that is repeated is
-kept as often, and the simple ones between two of them are thinned evenly.
+The two axes are fitted one after the other, which is the tensor-product least-squares fit.  Creases are preserved: repeated knots
+keep their multiplicity, and the simple knots between two of them are thinned out evenly.
 """
 
 from __future__ import annotations
@@ -25,17 +25,18 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 
 
 def on_fewer_knots(field: HeightField, heights: Tensor, most: int) -> tuple[HeightField, Tensor]:
-    """The least-squares surface of the same degrees with at most about so many control points: as it is where those are not fewer
-    than its own.  heights: (n, m) mm."""
+    """Least-squares surface of the same degrees with at most about `most` control points; unchanged if it has no more than these.
+    heights: (n, m) mm."""
     if most >= math.prod(field.shape):
         return field, heights
-    u, v = (thinned(space, math.sqrt(most / math.prod(field.shape))) for space in field.spaces)
+    u, v = (coarsened(space, math.sqrt(most / math.prod(field.shape))) for space in field.spaces)
     net = _fitted(heights.detach().double().cpu(), field.spaces[0], u)
     return HeightField((u, v), field.half_size), _fitted(net.T, field.spaces[1], v).T.contiguous()
 
 
-def thinned(space: SplineSpace, part: float) -> SplineSpace:
-    """The same degree on at most `part` of the control points, as far as the ends and the repeated knots leave that open."""
+def coarsened(space: SplineSpace, part: float) -> SplineSpace:
+    """Spline space of the same degree with about the fraction `part` of the control points; end knots and repeated knots are
+    kept."""
     knots, times = np.unique(space.knots.numpy(), return_counts=True)
     kept = np.flatnonzero(times > 1)
     simple = len(knots) - len(kept)
@@ -48,8 +49,8 @@ def thinned(space: SplineSpace, part: float) -> SplineSpace:
     return SplineSpace(space.degree, torch.from_numpy(np.concatenate(found)))
 
 
-def caps(sizes: Sequence[int], most: int) -> list[int]:
-    """How many points each of some surfaces may have for at most so many in all: the small ones keep theirs."""
+def allocate_points(sizes: Sequence[int], most: int) -> list[int]:
+    """Distribute at most `most` points over surfaces of these sizes: small ones keep all of theirs."""
     left, found = most, dict[int, int]()
     for rank, k in enumerate(sorted(range(len(sizes)), key=lambda k: sizes[k])):
         found[k] = min(sizes[k], left // (len(sizes) - rank))
@@ -58,6 +59,6 @@ def caps(sizes: Sequence[int], most: int) -> list[int]:
 
 
 def _fitted(net: Tensor, old: SplineSpace, new: SplineSpace) -> Tensor:
-    """Control values (n', k) of the splines nearest to those with control values (n, k)."""
+    """Control values (n', k) of the least-squares approximations to splines with control values (n, k)."""
     t = knot_lines(old, old.degree + 1)
     return torch.from_numpy(make_lsq_spline(t.numpy(), along(old, t, net).numpy(), new.knots.numpy(), new.degree).c)

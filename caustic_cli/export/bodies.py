@@ -1,8 +1,8 @@
-"""Other lenses and mirrors of a scene as solids, each in a frame of its own: a lens between two surfaces, a mirror as a plate
-behind one.
+"""Solids of the other lenses and mirrors of a scene, each in its own frame: a lens between two surfaces, a mirror as a plate behind
+its surface.
 
-All surfaces are written as B-splines.  That of a sphere is interpolated at degree DEGREE on twice as many knots until it departs
-from the sphere, within the aperture, by less than CLOSE mm.
+All surfaces are B-splines.  A sphere is interpolated with degree DEGREE, doubling the number of knots until the deviation within
+the aperture is at most CLOSE mm.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from caustic_cli.optics.system import fixed_of, front_from
 from caustic_cli.scene import Component, Front, Lens, Scene
 from caustic_cli.scene.elements import PLATE, SIDES
 
-#: Of a sphere's spline: degree, control points along an axis at first and at most, and largest departure, mm.
+#: Spline of a sphere: degree, first and largest number of control points along an axis, and largest deviation, mm.
 DEGREE, FIRST, MOST, CLOSE = 5, 16, 256, 1e-8
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A solid between a lens' free-form entrance and an exit, field and heights (n, m) mm, that stands at `pose`.
+    """A solid between the free-form entrance of a lens and an exit, field and heights (n, m) mm, placed at `pose`.
 
-    component: what it is of; number: of the element, counted from 0.
+    component: the element; number: its index, from 0.
     """
 
     component: Component
@@ -43,11 +43,11 @@ class Body:
     pose: Pose
 
     def placed(self, points: np.ndarray) -> np.ndarray:
-        """Points (..., 3) of its own frame in the scene, mm."""
+        """Points (..., 3) of its own frame in that of the scene, mm."""
         return np.stack(out_of(self.pose, tuple(np.moveaxis(points, -1, 0)), 0.0), -1)
 
     def turned(self, vectors: np.ndarray) -> np.ndarray:
-        """Vectors (..., 3) likewise."""
+        """Vectors (..., 3) of its own frame in that of the scene."""
         return np.stack(turned_back(self.pose, tuple(np.moveaxis(vectors, -1, 0))), -1)
 
 
@@ -55,7 +55,7 @@ def bodies(scene: Scene) -> Iterator[Body]:
     """The solids beside the free-form lens, in the order in which light meets them.
 
     Raises:
-        InputError: a sphere too steep to be written as a spline.
+        InputError: a sphere is too steep to be approximated by a spline.
     """
     leg = Leg()
     for number, component in enumerate(scene.elements):
@@ -83,7 +83,7 @@ def bodies(scene: Scene) -> Iterator[Body]:
 
 
 def _side(component: Component, side: str) -> Front:
-    """A surface of a lens or mirror, from its vertex' plane."""
+    """A surface of a lens or mirror, with heights from its vertex plane, mm."""
     front, radius = component.fronts[SIDES.index(side)], component.radius[SIDES.index(side)]
     if front is not None:
         return front
@@ -104,15 +104,15 @@ def _side(component: Component, side: str) -> Front:
         if float(off.max()) <= CLOSE:
             return front_from(field, net)
         count *= 2
-    raise InputError(f"⟨element.radius⟩ of {radius:g} mm is too steep within its aperture to be written as a spline")
+    raise InputError(f"⟨element.radius⟩ of {radius:g} mm is too steep within its aperture to be approximated by a spline")
 
 
 def _sag(sphere: Sphere, x: Tensor, y: Tensor) -> Tensor:
-    """Over a grid, (n, m) mm."""
+    """Sag of a sphere on a grid, (n, m) mm."""
     a, b = torch.broadcast_tensors(x[:, None], y[None, :])
     return sphere.at(None, a.reshape(-1), b.reshape(-1), ((0, 0),))[0].reshape(a.shape)
 
 
 def _constant(z: float) -> Front:
-    """A plane."""
+    """A plane at z, mm."""
     return Front(np.full((2, 2), z), (1, 1))

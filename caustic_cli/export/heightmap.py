@@ -1,12 +1,12 @@
-"""The surface as a picture of heights, as programs for milling read it: 16-bit grey PNG, or TIFF of 32-bit floats, by the suffix.
+"""Height maps for milling programs: 16-bit grey PNG, or TIFF of 32-bit floats, by the suffix.
 
-Pixels stand at points, borders included: column 0 is the edge at -x, the last one that at +x, row 0 the edge at +y, as the part is
-seen from +z.  Height = z_of_zero + value * mm_per_count, the same for both; a JSON file beside the picture says these numbers, how
-the part lies (`part`), and the net on which the surface is a spline, so that it can be read in again as that.
+Pixels are points, borders included: column 0 is the edge at -x, the last one that at +x, row 0 the edge at +y, as seen from +z.
+Height = z_of_zero + value * mm_per_count in both formats; a JSON file beside the picture holds these numbers, the orientation of
+the part (`part`), and the control net of the spline, so that the surface can be read back as such.
 
-Without samples there are so many points that a bilinear surface through them is within `TOLERANCE` of the spline, by bounds of its
-second derivatives, and at least two a knot span, as far as a file of the usual size holds them.  Heights are rounded to the nearest
-count: half a quantum.  How far a bilinear surface through what is written is off is measured.
+By default the bilinear interpolation of the points is within `TOLERANCE` of the spline, by bounds of its second derivatives, with
+at least two points per knot span, as far as the default file size allows.  Heights are rounded to the nearest count.  The deviation
+of the bilinear interpolation of the written values is measured.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ from caustic_cli.export.text import CREATED
 from caustic_cli.io.files import SOFTWARE, atomic_path, write_bytes
 from caustic_cli.io.heightmaps import COUNTS, SUFFIXES, VERSION, beside
 
-#: mm by which a bilinear surface through the default points is off, at most.
+#: Largest deviation of the bilinear interpolation of the default points, mm.
 TOLERANCE = 1e-4
-#: Points a knot span of the default, at least.
+#: Least default number of points per knot span.
 A_SPAN = 2
-#: Bytes of a point.
+#: Bytes per point.
 SUFFIX_BYTES = {".png": 2, ".tif": 4, ".tiff": 4}
 
 
 def write_heightmap(path: str | Path, part: Part, samples: tuple[int, int] | None = None, tolerance: float | None = None) -> dict:
-    """Write the picture and then its JSON, each whole or not at all.
+    """Write the picture and its JSON, each atomically.
 
     Args:
-        samples: (nx, ny) points; tolerance: mm of a bilinear surface through the points, instead.
+        samples: (nx, ny) points; tolerance: of the bilinear interpolation, mm, instead.
 
     Returns:
-        what the JSON says.
+        the contents of the JSON.
 
     Raises:
         InputError: another suffix, both samples and tolerance, too many points, or a file that cannot be written there.
@@ -78,7 +78,7 @@ def write_heightmap(path: str | Path, part: Part, samples: tuple[int, int] | Non
 
 
 def _counts(part: Part, suffix: str, asked: float | None) -> tuple[int, int]:
-    """Points along x and y: what was asked, or the usual tolerance, as far as a file of the usual size holds it."""
+    """Points along x and y for the tolerance asked, mm, or for the default one within the default file size."""
     tolerance = TOLERANCE if asked is None else asked
     step = step_within(part.field, part.heights, tolerance)
     counts = [
@@ -90,12 +90,12 @@ def _counts(part: Part, suffix: str, asked: float | None) -> tuple[int, int]:
         shrink = math.sqrt(most / math.prod(counts))
         counts = [max(2, math.floor(shrink * n)) for n in counts]
     if max(counts) > MAX_SAMPLES:
-        raise InputError(f"⟨tolerance⟩ {tolerance:g} must ask for at most {MAX_SAMPLES} points along an axis, got {max(counts)}")
+        raise InputError(f"⟨tolerance⟩ {tolerance:g} must give at most {MAX_SAMPLES} points along an axis, got {max(counts)}")
     return counts[0], counts[1]
 
 
 def _said(part: Part, grid: SurfaceGrid, name: str, low: float, high: float, scale: float, quantum: float) -> dict:
-    """The JSON."""
+    """Contents of the JSON."""
     (nx, ny), (rx, ry) = grid.z.shape, part.field.half_size
     field, _ = surface_of(part)
     enough = all(n >= A_SPAN * (len(s.breaks) - 1) + 1 for n, s in zip((nx, ny), field.spaces, strict=True))

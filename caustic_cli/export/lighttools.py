@@ -27,14 +27,14 @@ from caustic_cli.scene import Lens, Light, Scene, Screen, Source
 from caustic_cli.scene.elements import SIDES
 
 FORMAT_VERSION = 1
-#: Bytes of a point in `points`, `normals` and `z`, and of all that is neither that nor a control net, about.
+#: Bytes of a point in `points`, `normals` and `z`, and approximate bytes of all but these and control nets.
 A_POINT, BESIDE = 7 * 8, 100_000
 
 
 def write_lighttools(
     path: str | Path, scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None
 ) -> Deviation:
-    """Write the archive whole or not at all; how far a spline through its cloud is off, whose exact one stands beside it.
+    """Write the archive atomically; the deviation of a spline through its point cloud, beside which the exact spline is stored.
 
     Keys: points, normals (N, 3); shape (2,); x (nx,), y (ny,), z (nx, ny); lens_half_size (2,), z_in, refractive_index;
     screen_half_size (2,), z_screen, resolution (2,); those of `_screen` and `_source`; fresnel unless exact; aperture if a circle;
@@ -43,7 +43,7 @@ def write_lighttools(
 
     Args:
         heights: (n, m) control heights, mm.
-        samples: (nx, ny) of the cloud, or None for as many as `USUAL_BYTES` hold, at most a grid on the knots (`sample_grid`).
+        samples: (nx, ny) of the point cloud; None for as many as `USUAL_BYTES` allow, at most a grid on the knots (`sample_grid`).
 
     Raises:
         InputError: the samples are too few or too many, or the file cannot be written there.
@@ -89,20 +89,20 @@ def write_lighttools(
 
 
 def usual_cloud(scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None) -> SurfaceGrid:
-    """The grid of an archive's cloud, beside the nets that it holds too; arguments as of `write_lighttools`."""
+    """Grid of the point cloud of an archive; arguments as in `write_lighttools`."""
     nets = 24 * (heights.numel() + (0 if scene.lens.front is None else front_of(scene.lens).heights.numel()))
     return sample_grid(field, heights, samples, most_points(A_POINT, nets + BESIDE))
 
 
 def _glass(lens: Lens) -> dict[str, np.ndarray]:
-    """What a lens is beyond clear and of one index: absorption, 1/mm; roughness, of slopes; glass, the name of its material."""
+    """Optional keys of the glass: absorption, 1/mm; roughness, RMS slope; glass, name of the material."""
     found = {key: _reals(getattr(lens, key)) for key in ("absorption", "roughness") if getattr(lens, key)}
     return found if lens.glass is None else found | {"glass": np.array(lens.glass)}
 
 
 def _light(light: Light) -> dict[str, np.ndarray]:
-    """What light is beyond unpolarised and of one wavelength, in watts: source_power_unit; source_wavelengths (k,), nm, with
-    source_weights (k,); source_color, 1, where they are those of a coloured picture; source_polarisation, degrees from +x."""
+    """Optional keys of the light: source_power_unit, unless W; source_wavelengths (k,), nm, with source_weights (k,); source_color,
+    1, if these are those of a coloured picture; source_polarisation, degrees from +x."""
     found = {} if light.unit == "W" else {"source_power_unit": np.array(light.unit)}
     if light.wavelengths:
         found |= {"source_wavelengths": _reals(light.wavelengths), "source_weights": _reals(light.parts)}
@@ -112,7 +112,7 @@ def _light(light: Light) -> dict[str, np.ndarray]:
 
 
 def _entrance(scene: Scene) -> dict[str, np.ndarray]:
-    """Of a free-form entrance: entrance_control_points (n, m, 3), entrance_degrees, entrance_knots_u, entrance_knots_v."""
+    """Keys of a free-form entrance: entrance_control_points (n, m, 3), entrance_degrees, entrance_knots_u, entrance_knots_v."""
     if scene.lens.front is None:
         return {}
     front = front_of(scene.lens)
@@ -128,10 +128,10 @@ def _entrance(scene: Scene) -> dict[str, np.ndarray]:
 
 
 def _elements(scene: Scene) -> dict[str, np.ndarray]:
-    """Of k other lenses and mirrors, in the order in which light meets them: element_type, element_aperture, k words with commas
-    between them; element_z, element_thickness, element_index, element_absorption (k,); element_curvature (k, 2), 1/mm, of front
-    and back; element_size, element_tilt (k, 2), degrees; of designed surfaces element_1_front_heights (n, m) from their vertex'
-    plane, mm, with their degrees, knots_u and knots_v.  Behind a mirror z counts along the folded axis."""
+    """Keys of k other lenses and mirrors, in the order of the light: element_type, element_aperture, k words separated by commas;
+    element_z, element_thickness, element_index, element_absorption (k,); element_curvature (k, 2), 1/mm, of front and back;
+    element_size, element_tilt (k, 2), degrees; of designed surfaces element_1_front_heights (n, m) from their vertex' plane, mm,
+    with their degrees, knots_u and knots_v.  Behind a mirror z counts along the folded axis."""
     found, elements = {}, scene.elements
     if not elements:
         return {}
@@ -154,9 +154,9 @@ def _elements(scene: Scene) -> dict[str, np.ndarray]:
 
 
 def _screen(screen: Screen) -> dict[str, np.ndarray]:
-    """What a screen has beyond its size and distance: `screen_tilt` (2,), degrees, `screen_shift` (2,), mm, and of a curved one
-    `screen_curvature` (2,), 1/mm along x and y, 0 along a cylinder, or `screen_sag` (a, b), mm along its normal, [i, j] on an
-    even grid over `screen_sag_half_size` (2,), mm about its middle."""
+    """Optional keys of the screen: `screen_tilt` (2,), degrees, `screen_shift` (2,), mm, and of a curved one
+    `screen_curvature` (2,), 1/mm along x and y, 0 along a cylinder, or `screen_sag` (a, b), mm along its normal, [i, j] on a
+    regular grid over `screen_sag_half_size` (2,), mm about its centre."""
     found = {f"screen_{key}": _reals(getattr(screen, key)) for key in ("tilt", "shift") if any(getattr(screen, key))}
     if screen.rounded:
         found["screen_curvature"] = 1.0 / _reals(screen.radius)
@@ -166,20 +166,20 @@ def _screen(screen: Screen) -> dict[str, np.ndarray]:
 
 
 def _source(scene: Scene) -> dict[str, np.ndarray]:
-    """The source's keys.  A plane wave stands nowhere and does not spread: no positions, one power, cone 0.
+    """Keys of the source.  A plane wave has no positions, one power, and cone 0.
 
     `source_power` (k,), of each position; (1,), through the aperture, for a plane wave or a disc at infinity.  `source_profile`
-    (a, b), the relative irradiance over the aperture [i, j], is there only when a wave is not uniform; `source_size` (2,) mm
+    (a, b), the relative irradiance over the aperture [i, j], only for a non-uniform wave; `source_size` (2,) mm
     or `source_angle` (full, degrees) only for a disc; `source_intensity` where there is a cone, with
     `source_intensity_table` (k, 2), degrees and relative intensity, if that is a table; `source_brightness` (a, b), the relative
-    radiance over a disc's rectangle [i, j], only where a picture says it.
+    radiance over a disc's rectangle [i, j], if that is given by a picture.
 
     Raises:
-        InputError: the archive knows no source of this type.
+        InputError: the format does not support this type of source.
     """
     source = scene.source
     if source.kind not in _KEYS:
-        raise InputError(f"⟨format⟩ lighttools knows no source of type {source.kind}")
+        raise InputError(f"⟨format⟩ lighttools does not support sources of type {source.kind}")
     return {
         "source_type": np.array(source.kind),
         "source_positions": source.points()[0],
@@ -199,7 +199,7 @@ def _of_points(scene: Scene) -> dict[str, np.ndarray]:
 
 
 def _intensity(source: Source) -> dict[str, np.ndarray]:
-    """A word, and the angles and intensities of a table."""
+    """Keys of the intensity: a word, or "table" with angles and intensities."""
     given = source.intensity
     if isinstance(given, str):
         return {"source_intensity": np.array(given)}
@@ -215,12 +215,12 @@ def _of_disc(scene: Scene) -> dict[str, np.ndarray]:
 
 
 def _of_rays(scene: Scene) -> dict[str, np.ndarray]:
-    """Of a ray file, which stays a file of its own, where its rays approach each other most."""
+    """Keys of a ray file, which is not included: the cone about the point where its rays are closest to each other."""
     source, lens = scene.source, scene.lens
     return {"cone_half_angle": _reals(np.degrees(source.cone_over(lens.half_size, lens.z_in, lens.round)))}
 
 
-#: What else the archive says of a source, by its kind.
+#: Further keys of a source, by its kind.
 _KEYS = {"plane": _of_plane, "point": _of_points, "grid": _of_points, "disc": _of_disc, "rays": _of_rays}
 
 

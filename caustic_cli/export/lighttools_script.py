@@ -1,11 +1,11 @@
-"""What rebuilds the exported scene inside LightTools, beside the `.npz`: a Python script and a point block.
+"""Import into LightTools: a Python script that rebuilds the scene from the `.npz`, and a block of points.
 
     NAME.py        attaches to a running LightTools by COM (pywin32), builds lens, source, receiver and simulation from NAME.npz,
                    runs it, and writes the illuminance as NAME-lighttools.npy, [i, j]
     NAME.lts.txt   the two `restorePoints` blocks of a FreeformSolid in an `.lts` model, front and rear, x varying fastest,
                    to be pasted into a model in place of its own: for those without COM
 
-Calls and block are those of working scripts and models of LightTools 8.5; neither has been run inside LightTools here.
+Calls and block follow working scripts and models of LightTools 8.5; neither has been tested in LightTools itself.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 from caustic_cli.scene.plain import beyond_plain
 
-#: Rows of the flat entrance along each axis: a plane needs no more.
+#: Points of the flat entrance along each axis.
 FLAT = 5
-#: Points in a line of the block.
+#: Points per line of the block.
 WRAP = 4
 
 SCRIPT = '''"""@CREATED@ for the model @NPZ@: run it on Windows while LightTools (8.5 or later) is open.
@@ -150,10 +150,10 @@ def companions(path: str | Path) -> tuple[Path, Path]:
 
 
 def refuse(scene: Scene) -> None:
-    """Refuse a scene that is not what the script builds.
+    """Refuse a scene that the script does not support.
 
     Raises:
-        InputError: naming what it has and the script has not.
+        InputError: naming what is not supported.
     """
     source, beyond = scene.source, beyond_plain(scene)
     if beyond:
@@ -177,8 +177,7 @@ def refuse(scene: Scene) -> None:
 def write_script(
     path: str | Path, scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None
 ) -> None:
-    """Write script and block for the archive `path`, which `write_lighttools` wrote with the same arguments, of a scene that is not
-    to `refuse`.
+    """Write script and block for an archive written by `write_lighttools` with the same arguments, of a scene that passes `refuse`.
 
     Raises:
         InputError: the files cannot be written.

@@ -1,16 +1,17 @@
-"""The lens as a closed, oriented triangle mesh: exit surface, walls along its border, flat or free-form entrance; or a mirror,
-whose material lies above its surface and up to z_in.
+"""Closed, oriented triangle mesh of a lens: exit surface, side walls, flat or free-form entrance; or of a mirror, with material
+above its surface up to z_in.
 
-Corners run counter-clockwise seen from outside.  What the mesh formats (STL, PLY, OBJ) are made of.
+Vertices are counter-clockwise seen from outside.  Used by the mesh formats (STL, PLY, OBJ).
 
-The exit surface is a patch of nx x ny points.  Over a circle the square's lattice (a, b) is laid on the disc by P. Shirley and
-K. Chiu's concentric map (J. Graphics Tools 2(3), 1997): squares around the middle become circles,
+The exit surface is a patch of nx x ny points.  For a circular aperture the square lattice (a, b) is mapped to the disc by the
+concentric map of P. Shirley and K. Chiu (J. Graphics Tools 2(3), 1997): concentric squares become circles,
 
     where |a| >= |b|:  (x, y) = r a (cos t, sin t), t = pi b / (4 a);   elsewhere with x and a exchanged for y and b.
 
-Its edges and shorter diagonals are at most STRETCH steps long.  A triangle with edges up to L is off by at most L^2 |D2z| / 6.
+Its edges and shorter diagonals are at most STRETCH steps long.  The error of a triangle with edges up to L is at most L^2 |D2z| /
+6.
 
-A border, for the mount, is a flange around the aperture, half as high as the surface's lowest point on it.
+A border, for the mount, is a flange around the aperture, half as high as the lowest point of the rim.
 """
 
 from __future__ import annotations
@@ -41,9 +42,9 @@ from caustic_cli.optics.system import front_of
 from caustic_cli.scene import Lens, Scene
 
 STRETCH = 1.28
-#: Bytes of walls and entrances in a file of a mesh, about, beside those of the points that it is made of.
+#: Approximate bytes of walls and entrances in a mesh file.
 BESIDE = 1e6
-#: Height of the flange, as a part of the least height on the rim.
+#: Height of the flange over the least height of the rim.
 FLANGE = 0.5
 
 
@@ -62,15 +63,15 @@ def closed_mesh(
     samples: tuple[int, int] | None = None,
     tolerance: float | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) float64 mm and faces (F, 3) int64 of the solid, and of those of other elements.
+    """Vertices (V, 3) float64 mm and faces (F, 3) int64 of the solid of the lens and of other elements.
 
     Args:
         heights: (n, m) control heights, mm.
-        samples: (nx, ny) points on the exit surface, or None for a grid on the knots (`sample_grid`); other elements have theirs.
-        tolerance: mm, instead of samples: as many points as keep every triangle so close to the exit surface (chord error).
+        samples: (nx, ny) points on the exit surface; None for a grid on the knots (`sample_grid`), as for other elements.
+        tolerance: largest chord error of the triangles, mm, instead of samples.
 
     Raises:
-        InputError: samples and tolerance both; too few or too many points; or the surface reaches the entrance.
+        InputError: both samples and tolerance; too few or too many points; or the surface reaches the entrance.
     """
     _, vertices, faces = exit_and_solids(scene, field, heights, samples, tolerance)
     return vertices, faces
@@ -84,10 +85,10 @@ def exit_and_solids(
     tolerance: float | None = None,
     a_point: float | None = None,
 ) -> tuple[Patch, np.ndarray, np.ndarray]:
-    """The points of the exit, and vertices and faces of all solids; arguments as of `closed_mesh`.
+    """Patch of the exit, and vertices and faces of all solids; arguments as in `closed_mesh`.
 
-    a_point: bytes of a point and its triangles in a file, of whose `USUAL_BYTES` every solid then has as much where neither samples
-    nor tolerance say how fine it is; None for no such limit.
+    a_point: bytes per point with its triangles in a file, for the default number of points within `USUAL_BYTES`, divided equally
+    between the solids; None for no such limit.
     """
     most = None if a_point is None else most_points(a_point, BESIDE) // (1 + len(scene.elements))
     sides = patches(scene.lens, field, heights, samples, tolerance, most)
@@ -108,15 +109,15 @@ def patches(
     tolerance: float | None = None,
     most: int | None = None,
 ) -> tuple[Patch, ...]:
-    """The sides of a solid that are free-form, the exit last; arguments as of `closed_mesh`; most: points of all of them, where
-    neither samples nor tolerance is given."""
+    """Patches of the free-form sides of a solid, the exit last; arguments as in `closed_mesh`; most: default number of points of
+    all of them."""
     if lens.front is None:
         return (patch(lens, field, heights, samples, tolerance, most),)
     return both_patches(lens, field, heights, samples, tolerance, None if most is None else most // 2)
 
 
 def solid_of(lens: Lens, *sides: Patch) -> tuple[np.ndarray, np.ndarray]:
-    """The closed mesh around such sides."""
+    """Closed mesh of a solid with these free-form sides: vertices and faces."""
     return solid(sides[0].points, lens) if len(sides) == 1 else _between(*(side.points for side in sides), lens)
 
 
@@ -128,7 +129,7 @@ def both_patches(
     tolerance: float | None = None,
     most: int | None = None,
 ) -> tuple[Patch, Patch]:
-    """Free-form entrance and exit of a lens, on as many points, normals towards +z; arguments as of `patch`."""
+    """Patches of the free-form entrance and the exit of a lens, with equal numbers of points; arguments as in `patch`."""
     entrance = front_of(lens)
     surfaces = (entrance.field, entrance.heights + lens.z_in), (field, heights)
     found = [patch(lens, *surface, samples, tolerance, most) for surface in surfaces]
@@ -139,13 +140,13 @@ def both_patches(
 
 
 def _between(low: np.ndarray, high: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
-    """The closed mesh between two patches (nx, ny, 3) over the same points of the aperture.
+    """Closed mesh between two patches (nx, ny, 3) over the same points of the aperture.
 
     Raises:
-        InputError: they touch, or there is a border, for which such a lens has no flat place.
+        InputError: they intersect, or the lens has a border, which requires a flat entrance.
     """
     if lens.border > 0:
-        raise InputError("⟨lens.border⟩ cannot be had where both sides are free-form: there is no flat entrance for its rim")
+        raise InputError("⟨lens.border⟩ requires a flat entrance, and both sides of this lens are free-form")
     least = float((high[..., 2] - low[..., 2]).min())
     if not least > 0:
         raise InputError(f"a solid needs its exit above its entrance everywhere, got a least thickness of {least:.6g} mm")
@@ -163,23 +164,23 @@ def patch(
     tolerance: float | None = None,
     most: int | None = None,
 ) -> Patch:
-    """The exit surface within the aperture, by samples or tolerance as of `closed_mesh`; most: points without either.
+    """Patch of the exit surface within the aperture; samples or tolerance as in `closed_mesh`; most: default number of points.
 
     Raises:
-        InputError: both were given, they ask for too few or too many points, or a tolerance for a round lens with kinks.
+        InputError: both are given, there are too few or too many points, or a tolerance for a round lens with creases.
     """
     if samples is not None and tolerance is not None:
         raise InputError("⟨samples⟩ and ⟨tolerance⟩ both say how fine the mesh is: give one of them")
     if lens.round:
         return _round_patch(field, heights, _across(field, heights, samples, tolerance, most))
     if samples is None and most is not None and usual_steps(field.spaces, most) < STEPS_PER_SPAN:
-        samples = even_counts(field.spaces, most)  # what is flat between points has nothing of knots among them
+        samples = even_counts(field.spaces, most)  # knots on grid lines do not improve piecewise linear interpolation
     grid = sample_grid(field, heights, samples) if tolerance is None else grid_within(field, heights, tolerance)
     return Patch(*(a.reshape(*grid.z.shape, 3) for a in (grid.points, grid.normals)))
 
 
 def _across(field: HeightField, heights: Tensor, samples: tuple[int, int] | None, tolerance: float | None, most: int | None) -> int:
-    """Points along a diameter of a round lens."""
+    """Number of points along a diameter of a round lens."""
     if tolerance is None:
         counts = samples or [STEPS_PER_SPAN * (len(s.breaks) - 1) + 1 for s in field.spaces]
         counts = counts if samples or most is None else [min(max(counts), math.isqrt(most))] * 2
@@ -196,7 +197,7 @@ def _across(field: HeightField, heights: Tensor, samples: tuple[int, int] | None
         n = math.ceil(2.0 * max(field.half_size) * math.sqrt(curvature / tolerance)) + 1 if curvature > 0 else 2
         n = max(n, 9)
     if n > min(MAX_SAMPLES, math.isqrt(MAX_POINTS)):
-        raise InputError(f"{asked} must ask for at most {math.isqrt(MAX_POINTS)} points across a round lens, got {n}")
+        raise InputError(f"{asked} must give at most {math.isqrt(MAX_POINTS)} points across a round lens, got {n}")
     return n
 
 
@@ -210,7 +211,7 @@ def _round_patch(field: HeightField, heights: Tensor, n: int) -> Patch:
     near, far = r * torch.cos(angle), r * torch.sin(angle)
     x, y = (torch.where(wide, p, q) * field.half_size[0] for p, q in ((near, far), (far, near)))
     points, normals = [], []
-    for i in range(0, n, 64):  # some rows at a time bound the memory
+    for i in range(0, n, 64):  # in strips, which bounds the memory
         at = x[i : i + 64].reshape(-1), y[i : i + 64].reshape(-1)
         z, zx, zy = field.at(heights, *at)
         points.append(torch.stack([*at, z], -1))
@@ -219,9 +220,10 @@ def _round_patch(field: HeightField, heights: Tensor, n: int) -> Patch:
 
 
 def triangles(points: np.ndarray) -> np.ndarray:
-    """Two triangles for every cell of points (nx, ny, 3), numbered row-major, along the shorter diagonal: (2 (nx-1) (ny-1), 3).
+    """Two triangles for every cell of points (nx, ny, 3), in row-major numbering, split along the shorter diagonal: (2 (nx-1)
+    (ny-1), 3).
 
-    Over a rectangle both are as long, and it is the one from low to high x and y.
+    For equal diagonals, as over a rectangle, along that from low to high x and y.
     """
     nx, ny = points.shape[:2]
     number, flat = np.arange(nx * ny).reshape(nx, ny), points[..., :2]
@@ -236,13 +238,13 @@ def triangles(points: np.ndarray) -> np.ndarray:
 
 
 def rim_of(nx: int, ny: int) -> np.ndarray:
-    """Numbers of the border points of such a patch, once around, counter-clockwise from +z: (2 (nx + ny) - 4,)."""
+    """Indices of the border points of a patch, counter-clockwise from +z: (2 (nx + ny) - 4,)."""
     number = np.arange(nx * ny).reshape(nx, ny)
     return np.concatenate([number[:-1, 0], number[-1, :-1], number[:0:-1, -1], number[0, :0:-1]])
 
 
 def walls(top: np.ndarray, below: np.ndarray) -> np.ndarray:
-    """Triangles, seen from outside, between two loops of points (k,), counter-clockwise from +z, by their numbers: (2 k, 3)."""
+    """Triangles between two loops of point indices (k,), each counter-clockwise from +z, oriented outwards: (2 k, 3)."""
     after, after_below = np.roll(top, -1), np.roll(below, -1)
     return np.concatenate([np.stack([below, after_below, after], -1), np.stack([below, after, top], -1)])
 
@@ -250,13 +252,13 @@ def walls(top: np.ndarray, below: np.ndarray) -> np.ndarray:
 def solid(points: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     """Closed triangle mesh of the lens under points (nx, ny, 3): vertices (V, 3) float64 mm, faces (F, 3) int64.
 
-    Loops of as many points as the rim has follow it outwards and down, joined by strips; a fan from its middle closes the
-    entrance.  So every edge belongs to exactly two triangles.
+    Loops with as many points as the rim follow it outwards and down, connected by strips; a triangle fan closes the entrance.  So
+    every edge belongs to exactly two triangles.
 
     Raises:
-        InputError: the surface reaches the entrance, so that there is no solid.
+        InputError: the surface reaches the entrance.
     """
-    if lens.mirror:  # the solid of the mirrored surface, mirrored back: outward stays outward when the corners' order turns
+    if lens.mirror:  # built upside down and reflected in z; the order of vertices is reversed to keep the orientation
         upside = replace(lens, mirror=False, z_in=-lens.z_in)
         vertices, faces = solid(points * [1.0, 1.0, -1.0], upside)
         return vertices * [1.0, 1.0, -1.0] + 0.0, faces[:, ::-1].copy()
@@ -279,21 +281,21 @@ def solid(points: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
 
 
 def flange_height(rim: np.ndarray, z_in: float) -> float:
-    """z of a border's upper face, mm, under rim points (k, 3): below all light that leaves."""
+    """z of the upper face of a border, mm, for rim points (k, 3): below all rays that leave the exit."""
     return z_in + FLANGE * (float(rim[:, 2].min()) - z_in)
 
 
 def _at(rim: np.ndarray, lens: Lens, wider: float, z: float) -> np.ndarray:
-    """The rim moved out by `wider` mm and to z."""
+    """The rim (k, 3), moved outwards by `wider` mm and to height z."""
     scale = [(r + wider) / r for r in lens.half_size]
     return np.stack([rim[:, 0] * scale[0], rim[:, 1] * scale[1], np.full(len(rim), z)], -1)
 
 
 def refuse_open(least: float, z_in: float) -> None:
-    """Refuse a lens whose `least` height, mm, is not above the entrance.
+    """Refuse a lens whose least height, mm, is not above the entrance.
 
     Raises:
-        InputError: there is no solid.
+        InputError: it is not a solid.
     """
     if not least > z_in:
         raise InputError(

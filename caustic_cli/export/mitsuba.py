@@ -1,15 +1,15 @@
-"""The whole scene for Mitsuba 3: `NAME.xml`, to be run as `mitsuba NAME.xml`, and beside it its meshes, `NAME-exit.ply`,
-`NAME-sides.ply` and a round lens' `NAME-holder.ply` (binary, float64).
+"""Scene description for Mitsuba 3: `NAME.xml`, to be run as `mitsuba NAME.xml`, with its meshes `NAME-exit.ply`, `NAME-sides.ply`
+and `NAME-holder.ply` of a round lens (binary, float64).
 
     entrance, exit   the lens, smooth `dielectric`; the exit surface is a mesh with its normals at the vertices
     element-1-front  surfaces of other lenses, and mirrors, with black sides and a black frame; behind a mirror the screen and the
                      camera stand on the folded axis
-    sides, holder    black: what leaves by the sides or goes past the lens is lost, as in a render
-    screen           white and diffuse; a camera between lens and screen sees it mirrored back, as from behind
+    sides, holder    black: light that leaves through the sides or misses the lens is lost, as in a render
+    screen           white and diffuse; a camera between lens and screen, whose image is flipped to the view from +z
     light            a plane wave as a collimated area, points as spots, a disc as a Lambertian area
 
-A mirror is its surface alone, a perfect `conductor` that is black behind; the camera stands between it and the screen, which light
-from the mirror lights on its +z side, and sees it as from +z.
+A mirror is its surface alone, a perfect `conductor` with a black back; the camera is between it and the screen, and views its +z
+side, which the mirror illuminates.
 
 The integrator traces light (`ptracer`), four surfaces deep: entrance, exit, screen, camera.  With radiance L in the image,
 pi L times a pixel's area is its power.  Lengths are mm, so radiance is W / (mm^2 sr).
@@ -40,29 +40,30 @@ from caustic_cli.scene import Component, Lens, Scene, Screen
 from caustic_cli.scene.elements import surface_name
 from caustic_cli.scene.plain import beyond_plain
 
-#: Rays a pixel of the scene's own sampler, Mitsuba's `spp`.
+#: Samples per pixel of the scene, Mitsuba's `spp`.
 SAMPLES = 256
-#: The collimated light starts so far before the entrance, mm, and the holder is so many lens widths wide.
+#: Distance of the collimated emitter before the entrance, mm; width of the holder over that of the lens.
 BEFORE, WIDE = 1.0, 50.0
 DEPTH = 4
-#: Corners of a round lens' holder.
+#: Vertices around the holder of a round lens.
 RING = 1024
-#: Bytes of a point with its normal, and of its two triangles.
+#: Bytes per point with its normal and two triangles.
 A_POINT = 6 * 8 + 2 * FACE.itemsize
 #: Points along an axis of a mesh that Mitsuba loads in seconds.
 QUICK = 2048
-#: Width of the black frame around other elements, in parts of their own.
+#: Width of the black frame around other elements, over their own.
 FRAME = 1.5
-#: Half a turn, after which rectangles look to -z; what takes all light.
+#: Rotation that turns rectangles towards -z; a perfect absorber.
 SPIN = '<rotate x="1" angle="180"/>'
 BLACK = '<bsdf type="diffuse"><rgb name="reflectance" value="0"/></bsdf>'
+MIRRORED = f'<bsdf type="twosided"><bsdf type="conductor"><string name="material" value="none"/></bsdf>{BLACK}</bsdf>'
 
 
 def companions(
     path: str | Path, round: bool = True, mirror: bool = False, two_sided: bool = False, elements: Sequence[Component] = ()
 ) -> list[Path]:
-    """The meshes beside a scene file: of the exit surface, of the sides, of a round lens' holder, of a free-form entrance; of a
-    mirror; and of other elements, with what is black about them."""
+    """Mesh files of a scene: exit surface, sides, holder of a round lens, free-form entrance; or mirror; and surfaces of other
+    elements with their black parts."""
     path = Path(path)
     if mirror:
         return [path.with_name(f"{path.stem}-mirror.ply")]
@@ -81,12 +82,12 @@ def write_mitsuba(
     tolerance: float | None = None,
     dark: bool = False,
 ) -> Deviation:
-    """Write the meshes and then the scene; how far the exit's triangles are off.
+    """Write the meshes and then the scene; returns the deviation of the triangles of the exit.
 
-    Arguments as of `closed_mesh`; `dark`: without its light, whatever that is.
+    Arguments as in `closed_mesh`; `dark`: without an emitter.
 
     Raises:
-        InputError: as `closed_mesh`; a light that Mitsuba has no emitter for; or the files cannot be written there.
+        InputError: as `closed_mesh`; a source without an equivalent emitter; or the files cannot be written.
     """
     light = [] if dark else _light(scene)
     *fronts, surface = patches(
@@ -135,7 +136,8 @@ def write_mitsuba(
 
 
 def _others(path: str | Path, scene: Scene) -> list[str]:
-    """Other lenses and mirrors: their surfaces, and black sides and a black frame around each, which stop light beside it."""
+    """Shapes of other lenses and mirrors: their surfaces, black sides, and a black frame around each, which stops light beside
+    it."""
     lines = []
     for body in bodies(scene):
         patches = both_patches(body.lens, body.field, body.heights)
@@ -147,12 +149,12 @@ def _others(path: str | Path, scene: Scene) -> list[str]:
         write_mesh(black, body.placed(np.concatenate([frame, sides])), np.concatenate([around, across + len(frame)]), text=False)
         coating = _glass(body.component.index)
         if body.component.mirror:
-            coating = f'<bsdf type="twosided"><bsdf type="conductor"><string name="material" value="none"/></bsdf>{BLACK}</bsdf>'
+            coating = MIRRORED
         for side, seen in zip(body.component.sides, patches, strict=False):
             name = surface_name(body.number, side)
             mesh = Path(path).with_name(f"{Path(path).stem}-{name}.ply")
             faces, normals = triangles(seen.points), seen.normals.reshape(-1, 3)
-            if side == "front":  # out of the glass, or towards the light
+            if side == "front":  # normals out of the glass, or towards the light
                 faces, normals = faces[:, ::-1], -normals
             write_mesh(mesh, body.placed(seen.points.reshape(-1, 3)), faces, body.turned(normals), text=False)
             lines.append(f'<shape type="ply" id="{name}"><string name="filename" value={quoteattr(mesh.name)}/>{coating}</shape>')
@@ -168,22 +170,21 @@ def _glass(index: float) -> str:
 
 
 def _write_mirror(path: str | Path, scene: Scene, surface: Patch, light: list[str]) -> None:
-    """The scene of a mirror.
+    """Write the scene of a mirror.
 
     Raises:
-        InputError: light that comes through the screen.
+        InputError: the screen would obstruct the source.
     """
     screen, lens = scene.screen, scene.lens
     if not scene.source.collimated and scene.source.nearest <= screen.z:
-        raise InputError("⟨format⟩ mitsuba: the screen would stand in the light of this mirror's source")
+        raise InputError("⟨format⟩ mitsuba: the screen would obstruct the light of this mirror's source")
     (mesh,) = companions(path, False, True)
     points, normals = (a.reshape(-1, 3) for a in (surface.points, surface.normals))
     write_mesh(mesh, points, triangles(surface.points)[:, ::-1], -normals, text=False)  # towards the light
     away = 0.9 * (min(float(points[:, 2].min()), lens.z_in) - BEFORE - screen.z)
-    coated = f'<bsdf type="twosided"><bsdf type="conductor"><string name="material" value="none"/></bsdf>{BLACK}</bsdf>'
     lines = [
         *_camera(screen, away, f'<rotate y="1" angle="180"/><translate z="{real(screen.z + away)}"/>'),
-        f'<shape type="ply" id="mirror"><string name="filename" value={quoteattr(mesh.name)}/>{coated}</shape>',
+        f'<shape type="ply" id="mirror"><string name="filename" value={quoteattr(mesh.name)}/>{MIRRORED}</shape>',
         *_screen(screen, ""),
         *(line.replace("</shape>", '<bsdf type="null"/></shape>') for line in light),
         "</scene>",
@@ -193,7 +194,7 @@ def _write_mirror(path: str | Path, scene: Scene, surface: Patch, light: list[st
 
 
 def _onto(scene: Scene) -> str:
-    """The transformation onto the part of a folded axis that the screen stands on; nothing for a straight one."""
+    """Transformation to the leg of a folded axis with the screen; empty for a straight axis."""
     leg = System.of(scene).leg
     if leg is None:
         return ""
@@ -202,7 +203,7 @@ def _onto(scene: Scene) -> str:
 
 
 def _camera(screen: Screen, away: float, place: str, depth: int = DEPTH) -> list[str]:
-    """The scene's first lines: how light is traced, and a camera `away` mm from the screen, which fills its picture."""
+    """First lines of the scene: integrator, and a camera `away` mm from the screen, which fills its image."""
     sx, sy = screen.half_size
     width, height = screen.resolution[0], max(1, round(screen.resolution[0] * sy / sx))
     return [
@@ -222,7 +223,7 @@ def _camera(screen: Screen, away: float, place: str, depth: int = DEPTH) -> list
 
 
 def _screen(screen: Screen, spin: str, onto: str = "") -> list[str]:
-    """A white rectangle that looks to +z, or, spun, to -z; onto: a folded axis."""
+    """White rectangle facing +z, or -z with `spin`; onto: transformation to a folded axis."""
     sx, sy = screen.half_size
     return [
         '<shape type="rectangle" id="screen">',
@@ -234,13 +235,13 @@ def _screen(screen: Screen, spin: str, onto: str = "") -> list[str]:
 
 
 def quick_samples(field: HeightField) -> tuple[int, int]:
-    """Samples along x and y for a mesh that loads quickly: four steps a knot span, or as many as `QUICK` allows."""
+    """Samples along x and y for a mesh that loads quickly: STEPS_PER_SPAN steps per knot span, or as many as `QUICK` allows."""
     spans = [len(s.breaks) - 1 for s in field.spaces]
     return tuple(min(STEPS_PER_SPAN, max(1, QUICK // k)) * k + 1 for k in spans)
 
 
 def _strip(top: np.ndarray, low: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Between two loops (k, 3), counter-clockwise from +z: vertices, and triangles seen from outside."""
+    """Strip between two loops (k, 3), counter-clockwise from +z: vertices, and triangles oriented outwards."""
     return np.concatenate([top, low]), walls(np.arange(len(top)), len(top) + np.arange(len(low)))
 
 
@@ -263,10 +264,10 @@ def _holder(lens: Lens, black: str) -> list[str]:
 
 
 def _round_holder(path: str | Path, radius: float, z: float, black: str) -> list[str]:
-    """A black ring around the entrance, in a mesh of its own: rings that widen, since single precision misses thin triangles."""
+    """A black annulus around the entrance, as a mesh of rings of growing width, since single precision misses thin triangles."""
     angle = np.linspace(0.0, 2.0 * np.pi, RING, endpoint=False)
     inner = np.stack([np.cos(angle), np.sin(angle), np.full_like(angle, z)], -1) * [radius, radius, 1.0]
-    inner[:, :2] /= math.cos(math.pi / RING)  # around the circle, not within
+    inner[:, :2] /= math.cos(math.pi / RING)  # polygon circumscribed about the circle
     widths = [1.0, 1.05, 1.25, 2.0, 6.0, WIDE]
     parts = [_strip(inner * [a, a, 1.0], inner * [b, b, 1.0]) for a, b in itertools.pairwise(widths)]
     faces = np.concatenate([f + k * 2 * RING for k, (_, f) in enumerate(parts)])
@@ -276,21 +277,21 @@ def _round_holder(path: str | Path, radius: float, z: float, black: str) -> list
 
 
 def _light(scene: Scene) -> list[str]:
-    """The emitters.
+    """The emitters of the source.
 
     Raises:
-        InputError: Mitsuba has none like this.
+        InputError: Mitsuba has no equivalent emitter.
     """
     beyond = [name for name in beyond_plain(scene) if name != "a mirror"]
     if beyond:
         raise InputError(f"⟨format⟩ mitsuba is written for clear lenses and straight screens, not {', '.join(beyond)}")
     if scene.source.kind not in _EMITTERS:
-        raise InputError(f"⟨format⟩ mitsuba knows no source of type {scene.source.kind}")
+        raise InputError(f"⟨format⟩ mitsuba does not support sources of type {scene.source.kind}")
     return _EMITTERS[scene.source.kind](scene)
 
 
 def _collimated(scene: Scene) -> list[str]:
-    """A plane wave: an area as wide as the lens."""
+    """Collimated emitter of a plane wave, as wide as the lens."""
     source, pupil = scene.source, scene.pupil
     if source.profile is not None:
         raise InputError("⟨format⟩ mitsuba: its collimated emitter is uniform, so a source with a profile cannot be written")
@@ -306,7 +307,7 @@ def _collimated(scene: Scene) -> list[str]:
 
 
 def _area(scene: Scene) -> list[str]:
-    """A disc that shines on everything."""
+    """Lambertian area emitter of a disc."""
     source, pupil = scene.source, scene.pupil
     if source.distant or source.intensity != "lambertian" or source.cone is not None:
         raise InputError(
@@ -318,7 +319,9 @@ def _area(scene: Scene) -> list[str]:
     if not min(source.size) > 0:
         raise InputError("⟨format⟩ mitsuba: its disc shines by its area, so one without any cannot be written")
     (wx, wy), (x, y, z), cone = source.size, source.position, source.cone_over(pupil.half_size, pupil.z, pupil.round)
-    radiance = source.power / (math.pi * math.pi * wx * wy / 4.0 * math.sin(cone) ** 2)  # its cone just covers the lens
+    radiance = source.power / (
+        math.pi * math.pi * wx * wy / 4.0 * math.sin(cone) ** 2
+    )  # the power is that within the cone that covers the lens
     return [
         '<shape type="disk" id="light">',
         f'  <transform name="to_world"><scale x="{real(wx / 2)}" y="{real(wy / 2)}"/>'
@@ -329,7 +332,7 @@ def _area(scene: Scene) -> list[str]:
 
 
 def _spots(scene: Scene) -> list[str]:
-    """A spot a point.  Mitsuba's fall off towards their rim, so they are even a little beyond the cone."""
+    """A spot emitter per point; its falloff begins beyond the cone."""
     source, pupil = scene.source, scene.pupil
     if source.intensity != "uniform":
         raise InputError("⟨format⟩ mitsuba: its spots shine evenly, so points of another intensity cannot be written")
@@ -346,5 +349,5 @@ def _spots(scene: Scene) -> list[str]:
     return lines
 
 
-#: The emitters of a source, by its kind.
+#: Emitters of a source, by its kind.
 _EMITTERS = {"plane": _collimated, "point": _spots, "grid": _spots, "disc": _area}

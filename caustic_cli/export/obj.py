@@ -1,4 +1,4 @@
-"""The lens as a closed solid in a Wavefront OBJ file: `v x y z` in mm with 17 digits, `f a b c` counted from 1."""
+"""Writer of Wavefront OBJ files of the closed solid: `v x y z` in mm with 17 digits, `f a b c` counted from 1."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def write_obj(
     samples: tuple[int, int] | None = None,
     tolerance: float | None = None,
 ) -> Deviation:
-    """Write the solid whole or not at all; arguments, errors and what comes back as of `write_ply`."""
+    """Write the solid atomically; arguments, errors and result as in `write_ply`."""
     exit, vertices, faces = exit_and_solids(scene, field, heights, samples, tolerance, A_POINT)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write(f"# {CREATED}\n# millimetres\no lens\n".encode())

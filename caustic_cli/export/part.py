@@ -1,17 +1,16 @@
-"""Which solid is made, and how it lies in a file: a lens, a mirror, or the mould of either.
+"""The part to be manufactured and its orientation in a file: a lens, a mirror, or the mould of either.
 
 Notation
     Z           the optical surface, in the scene's coordinates
-    below       the material of a lens fills z_in <= z <= Z: the tool comes from +z, as the file has it
-    above       that of a mirror fills Z <= z: light comes from below, and its back is flat
+    below       a lens: material in z_in <= z <= Z, machined from +z
+    above       a mirror: material in Z <= z, with a flat back; light comes from -z
 
-A mould is the complement: above the surface of a lens, below that of a mirror.  What lies above is turned about the x axis by half
-a turn for the machine, (x, y, z) -> (x, -y, -z), so that it lies below: a rotation, which makes no mirror image.  The turned
-surface is -Z(x, -y), a spline of the negative control heights in the opposite order along y.  A mould turned back and pressed onto
-the lens meets it everywhere, since both are the same surface.
+A mould is the complement: above the surface of a lens, below that of a mirror.  Material above the surface is rotated for machining
+by 180 degrees about the x axis, (x, y, z) -> (x, -y, -z), which does not change the handedness.  The rotated surface is -Z(x, -y),
+a spline with the negative control heights in reverse order along y.  Rotated back, a mould has exactly the surface of the lens.
 
-Solids of mirrors stay in the scene's coordinates, which a design can begin from again; moulds, height maps and programs for mills
-are as they are cut.
+Solids of mirrors remain in the coordinates of the scene, so that a design can start from them; moulds, height maps and G-code
+programs are in the orientation of machining.
 """
 
 from __future__ import annotations
@@ -27,16 +26,16 @@ from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Lens, PlaneWave, Scene, Screen
 
-#: Least material behind the surface of a mirror or a mould, in parts of its larger side, unless said.
+#: Default least material behind the surface of a mirror or a mould, over its larger side.
 BLOCK = 0.2
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """What a file holds.
+    """Part in a file.
 
-    scene: with the lens' z_in at the flat face; field, heights: the surface, (n, m) mm; kind: lens, mirror or mould; turned:
-    whether the scene's (x, y, z) is (x, -y, -z) here.
+    scene: with z_in of the lens at the flat face; field, heights: the surface, (n, m) mm; kind: lens, mirror or mould; turned:
+    whether it is rotated, the (x, y, z) of the scene being (x, -y, -z) here.
     """
 
     scene: Scene
@@ -47,20 +46,20 @@ class Part:
 
     @property
     def lens(self) -> Lens:
-        """Of the scene."""
+        """The lens of the scene."""
         return self.scene.lens
 
 
 def part_of(
     format: str, scene: Scene, field: HeightField, heights: Tensor, mould: bool = False, block: float | None = None
 ) -> Part:
-    """The part that a format is to hold.
+    """The part for a format.
 
     Args:
         mould: the negative; block: least material behind the surface of a mirror or a mould, mm.
 
     Raises:
-        InputError: a format that holds no moulds, or a block for what has its own flat face.
+        InputError: the format does not support moulds, or a block is given for a lens.
     """
     lens, heights = scene.lens, heights.detach().double().cpu()
     kind = "mould" if mould else "mirror" if lens.mirror else "lens"
@@ -85,17 +84,17 @@ def part_of(
 
 
 def turned(field: HeightField, heights: Tensor) -> tuple[HeightField, Tensor]:
-    """The surface turned about the x axis by half a turn: -Z(x, -y).  The heights are exactly the negative ones."""
+    """The surface rotated by 180 degrees about the x axis: -Z(x, -y), without rounding."""
     u, v = field.spaces
     return HeightField((u, SplineSpace(v.degree, 1.0 - v.knots.flip(0))), field.half_size), -heights.flip(1)
 
 
 def _alone(scene: Scene, base: float) -> Scene:
-    """A scene with a solid down to `base`, mm, and no border; nothing else in it means anything."""
+    """A scene for a solid down to `base`, mm, without a border; its source and screen are placeholders."""
     lens = replace(scene.lens, z_in=base, mirror=False, border=0.0, min_thickness=0.0)
     return Scene(PlaneWave(), lens, Screen(scene.screen.size, base + 1e6, (2, 2)))
 
 
 def surface_of(part: Part) -> tuple[HeightField, Tensor]:
-    """The part's surface in the scene's coordinates again."""
+    """The surface of the part in the coordinates of the scene."""
     return turned(part.field, part.heights) if part.turned else (part.field, torch.as_tensor(part.heights))

@@ -1,8 +1,8 @@
-"""The lens as a closed solid in a PLY file (G. Turk, The PLY Polygon File Format, 1994), as text.
+"""Writer of PLY files of the closed solid (G. Turk, The PLY Polygon File Format, 1994), as text.
 
-    ply, format, comments, properties; then per vertex x y z, float64 mm, 17 digits; then per triangle 3 and its corners
+    ply, format, comments, properties; then per vertex x y z, float64 mm, 17 digits; then per triangle 3 and its vertices
 
-`write_mesh` also writes normals, for programs that shade, and little-endian binary, for programs that are slow at text.
+`write_mesh` can also write normals, and little-endian binary.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ def write_ply(
     samples: tuple[int, int] | None = None,
     tolerance: float | None = None,
 ) -> Deviation:
-    """Write the solid whole or not at all; how far its triangles are off.
+    """Write the solid atomically; returns the deviation of its triangles.
 
-    Arguments and errors as of `closed_mesh`; InputError also if it cannot be written.
+    Arguments and errors as in `closed_mesh`; InputError also if it cannot be written.
     """
     exit, vertices, faces = exit_and_solids(scene, field, heights, samples, tolerance, A_POINT)
     write_mesh(path, vertices, faces)

@@ -1,4 +1,4 @@
-"""The exit surface as a list of points, x varying fastest, both ascending: `.csv` with a header, or plain `.xyz`.
+"""Writer of the points of the exit surface, x varying fastest, both ascending: `.csv` with a header, or plain `.xyz`.
 
     x_mm,y_mm,z_mm          # created by caustic ...
     -5,-5,5.1               -5 -5 5.1
@@ -27,9 +27,9 @@ HEADER = "x_mm,y_mm,z_mm\n"
 def write_csv(
     path: str | Path, scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None
 ) -> Deviation:
-    """Write the table whole or not at all; how far a spline through its points is off.
+    """Write the table atomically; returns the deviation of a spline through its points.
 
-    Arguments and errors as of `sample_grid`; InputError also if it cannot be written.
+    Arguments and errors as in `sample_grid`; InputError also if it cannot be written.
     """
     return _write(path, field, heights, samples, HEADER, "%.17g,%.17g,%.17g\n")
 
@@ -37,7 +37,7 @@ def write_csv(
 def write_xyz(
     path: str | Path, scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None
 ) -> Deviation:
-    """Write the points whole or not at all, below a comment that begins with #; all else as of `write_csv`."""
+    """Write the points atomically, after a comment line that begins with #; otherwise as `write_csv`."""
     return _write(path, field, heights, samples, f"# {CREATED}, millimetres\n", "%.17g %.17g %.17g\n")
 
 

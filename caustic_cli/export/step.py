@@ -1,17 +1,17 @@
-"""The lens as a solid in a STEP file (ISO 10303-21, application protocol 214): entrance plane or B-spline, exit B-spline, four
-sides; or a mirror, whose material lies above its surface and up to z_in.
+"""Writer of STEP files (ISO 10303-21, application protocol 214) of the solid: plane or B-spline entrance, B-spline exit, four
+sides; or of a mirror, with material above its surface up to z_in.
 
-Other lenses and mirrors are solids of their own beside it, see `bodies`.
+Other lenses and mirrors are separate solids, see `bodies`.
 
-The exit surface's poles stand at the Greville abscissae with the control heights; its borders are B-spline curves with the
-border's poles.  Each border lies in a plane x = const or y = const, which is a side.  Of a round lens the same surface is cut by a
-cylinder, along a curve through many points.  A border for the mount is a flange, as in `mesh`.  mm.
+The poles of the exit surface are the control heights at the Greville abscissae; its edges are B-spline curves with the border
+poles, in the planes x = const or y = const of the sides.  For a round lens the same surface is trimmed by a cylinder, along an
+interpolated curve.  A border for the mount is a flange, as in `mesh`.  Lengths are mm.
 
-Unless all is asked for to the last bit, lengths are rounded to `DIGIT` of the poles' distance, and surfaces whose poles would make
-a larger file than is usual are laid on fewer knots (`approximation`).
+Unless the exact spline is requested, lengths are rounded to `DIGIT` of the distance of the poles, and surfaces with too many poles
+for the default file size are approximated on fewer knots (`approximation`).
 
-A shell is described from the corners up: vertices, edge curves from vertex to vertex, loops of edges counter-clockwise around
-each face's outward normal, faces, shell, solid; then the product that readers look for.
+The boundary representation is written bottom-up: vertices, edge curves, edge loops counter-clockwise about the outward normal of
+each face, faces, shell, solid; then the product.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from torch import Tensor
 
 from caustic_cli import __version__
 from caustic_cli.config import checks
-from caustic_cli.export.accuracy import Deviation, of_poles, together
-from caustic_cli.export.approximation import caps, on_fewer_knots
+from caustic_cli.export.accuracy import Deviation, combined, of_poles
+from caustic_cli.export.approximation import allocate_points, on_fewer_knots
 from caustic_cli.export.bodies import bodies
 from caustic_cli.export.mesh import FLANGE, closed_mesh, refuse_open
 from caustic_cli.export.surface import STEPS_PER_SPAN, knot_lines, most_points, on_lines
@@ -50,21 +50,21 @@ ENDSEC;
 DATA;
 """
 TAIL = "ENDSEC;\nEND-ISO-10303-21;\n"
-#: mm within which vertices, edges and faces of this solid meet: all are exact.
+#: Tolerance within which vertices, edges and faces of the solid coincide, mm.
 UNCERTAINTY = 1e-7
-#: Where lengths are rounded: the unit of their last digit in parts of the poles' distance, which turns the surface by less than
-#: 1e-6; and at most, mm, which moves it by half of that, 0.05 nm.
+#: Rounding of lengths: unit of the last digit over the distance of the poles, which changes slopes by less than 1e-6; and at most,
+#: mm, which changes heights by half of that, 0.05 nm.
 DIGIT, COARSEST = 1e-6, 1e-7
-#: Parts of a surface's poles that are tried for a tolerance, the last if none keeps it.
+#: Fractions of the poles of a surface that are tried for a tolerance, in this order.
 PARTS = [2.0 ** (-k / 2) for k in range(12, -1, -1)]
-#: The same as UNCERTAINTY where a round lens' rim is an interpolated curve, and the most points on half of it.
+#: UNCERTAINTY for the interpolated rim of a round lens, and most points on half of it.
 ROUND_UNCERTAINTY, MOST_ON_RIM = 1e-6, 1 << 15
 
 
 class Entities:
-    """Numbered entities: `add` returns the reference "#7" of a new one.
+    """Numbered STEP entities: `add` returns the reference "#7" of a new one.
 
-    mirrored: with z the other way, for solids described from below.  Directions outward stay so; loops run the other way.
+    mirrored: reflect z; outward normals remain outward, and loops are reversed.
     decimals: of points; None for all digits.
     """
 
@@ -115,14 +115,14 @@ class Entities:
         return self.add(f"FACE_{'OUTER_' if outer else ''}BOUND('',{closed},.T.)")
 
     def face(self, surface: str, *bounds: str, along: bool = True) -> str:
-        """A face whose outward normal is the surface's, or, not `along`, the opposite, inside the first bound and outside the
-        others."""
+        """A face inside the first bound and outside the others, whose outward normal is that of the surface, or opposite unless
+        `along`."""
         return self.add(f"ADVANCED_FACE('',({','.join(bounds)}),{surface},{'.T.' if along else '.F.'})")
 
 
 @dataclass(frozen=True)
 class Loop:
-    """Corners (mm) and their vertices, counter-clockwise from +z, and the edge from each to the next, as it is or reversed."""
+    """Corners (mm) and their vertices, counter-clockwise from +z, and the edges between them with their orientation."""
 
     corners: list[np.ndarray]
     vertices: list[str]
@@ -131,7 +131,7 @@ class Loop:
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """What lies between a lens' entrance and an exit, field and heights (n, m) mm, at `pose`."""
+    """Solid between the entrance of a lens and an exit, field and heights (n, m) mm, at `pose`."""
 
     lens: Lens
     field: HeightField
@@ -140,14 +140,14 @@ class Solid:
 
     @property
     def sides(self) -> list[tuple[HeightField, Tensor]]:
-        """The surfaces that are B-splines, the exit first."""
+        """The B-spline surfaces, the exit first."""
         if self.lens.front is None:
             return [(self.field, self.heights)]
         front = front_of(self.lens)
         return [(self.field, self.heights), (front.field, front.heights)]
 
     def with_sides(self, exit: tuple[HeightField, Tensor], *entrance: tuple[HeightField, Tensor]) -> Solid:
-        """The same between other surfaces."""
+        """The solid with other surfaces."""
         fronts = [front_from(*side) for side in entrance]
         return replace(self, lens=replace(self.lens, front=fronts[0]) if fronts else self.lens, field=exit[0], heights=exit[1])
 
@@ -155,11 +155,11 @@ class Solid:
 def write_step(
     path: str | Path, scene: Scene, field: HeightField, heights: Tensor, tolerance: float | None = None
 ) -> Deviation | None:
-    """Write the solid whole or not at all; how far its free-form sides are off, None where they are the splines themselves.
+    """Write the solid atomically; returns the deviation of its free-form sides, None if they are exact.
 
     Args:
         heights: (n, m) mm.
-        tolerance: how far a surface may be off, mm, by measure, on as few knots as that takes: 0 for poles to the last bit; None
+        tolerance: largest measured deviation of a surface, mm, reached with as few knots as possible; 0 for the exact spline; None
             for a file of at most `USUAL_BYTES`.
 
     Raises:
@@ -168,13 +168,13 @@ def write_step(
     if tolerance is not None:
         checks.number("⟨tolerance⟩", tolerance, 0.0)
     mirror, heights = scene.lens.mirror, heights.detach().double().cpu()
-    if mirror:  # the solid of the mirrored surface, mirrored back
+    if mirror:  # built upside down and reflected in z
         heights = -heights
         scene = replace(scene, lens=replace(scene.lens, z_in=-scene.lens.z_in))
     if scene.lens.front is None:
         refuse_open(float(heights.min()), scene.lens.z_in)
     if scene.lens.front is not None or scene.elements:
-        closed_mesh(scene, field, heights)  # which refuses what is no solid
+        closed_mesh(scene, field, heights)  # raises an error if it is not a solid
     solids = [Solid(scene.lens, field, heights, Pose()), *(Solid(b.lens, b.field, b.heights, b.pose) for b in bodies(scene))]
     decimals = None if tolerance == 0 else _decimals(solids, tolerance)
     solids, off = (solids, None) if decimals is None else approximated(solids, decimals, tolerance)
@@ -194,17 +194,17 @@ def write_step(
 
 
 def approximated(solids: list[Solid], decimals: int, tolerance: float | None) -> tuple[list[Solid], Deviation]:
-    """The solids with sides on so few knots that they stay within the tolerance, mm, or make a file of the usual size, and how far
-    those sides, their poles rounded, are off."""
+    """The solids with sides approximated within the tolerance, mm, or to the default file size, and the deviation with rounded
+    poles."""
     sides = [side for solid in solids for side in solid.sides]
 
     def measured(side: tuple[HeightField, Tensor], most: int) -> tuple[tuple[HeightField, Tensor], Deviation]:
-        """A side on so many poles."""
+        """A side with at most this number of poles, and its deviation."""
         written = on_fewer_knots(*side, most)
         return written, of_poles(poles_of(written[0], written[1].numpy()).round(decimals), written[0], *side)
 
     if tolerance is None:
-        most = caps([math.prod(f.shape) for f, _ in sides], most_points(max(_bytes(f, h, decimals) for f, h in sides)))
+        most = allocate_points([math.prod(f.shape) for f, _ in sides], most_points(max(_bytes(f, h, decimals) for f, h in sides)))
         found = [measured(side, n) for side, n in zip(sides, most, strict=True)]
     else:
         found = []
@@ -215,23 +215,23 @@ def approximated(solids: list[Solid], decimals: int, tolerance: float | None) ->
                     break
             found.append(fewer)
     written = iter(side for side, _ in found)
-    return [solid.with_sides(*(next(written) for _ in solid.sides)) for solid in solids], together([off for _, off in found])
+    return [solid.with_sides(*(next(written) for _ in solid.sides)) for solid in solids], combined([off for _, off in found])
 
 
 def _decimals(solids: list[Solid], tolerance: float | None) -> int:
-    """Of lengths in mm, so that rounding does nothing to the light, nor to a tenth of a tolerance."""
+    """Decimals of lengths in mm, for which rounding is negligible for the light and below a tenth of the tolerance."""
     apart = min(2.0 * r / n for solid in solids for f, _ in solid.sides for r, n in zip(f.half_size, f.shape, strict=True))
     return max(0, -math.floor(math.log10(min(DIGIT * apart, COARSEST, 0.1 * (tolerance or math.inf)))))
 
 
 def _bytes(field: HeightField, heights: Tensor, decimals: int) -> int:
-    """Of a pole and of the reference to it, at most."""
+    """Upper bound of the bytes of a pole and its reference."""
     widest = (field.half_size[0], field.half_size[1], float(heights.abs().max()))
     return len("#123456=CARTESIAN_POINT('',(,,));\n#123456,") + sum(len(f"{-w:.{decimals}f}") for w in widest)
 
 
 def poles_of(field: HeightField, net: np.ndarray) -> np.ndarray:
-    """(n, m, 3) mm: control heights (n, m) at the Greville abscissae."""
+    """Poles (n, m, 3) mm: control heights (n, m) at the Greville abscissae."""
     x, y = (c.numpy() for c in field.control_xy())
     return np.stack([*np.broadcast_arrays(x[:, None], y[None, :]), net], -1)
 
@@ -280,7 +280,7 @@ def lens_solid(out: Entities, lens: Lens, field: HeightField, heights: Tensor, p
 
 
 def _rim(out: Entities, poles: np.ndarray, points: list[list[str]], spaces: tuple[SplineSpace, SplineSpace]) -> Loop:
-    """The border of the whole surface: its border poles' curves."""
+    """Border of a rectangular surface: curves of its border poles."""
     su, sv = spaces
     corners = [poles[0, 0], poles[-1, 0], poles[-1, -1], poles[0, -1]]
     vertices = [out.add(f"VERTEX_POINT('',{out.point(p)})") for p in corners]
@@ -294,14 +294,14 @@ def _rim(out: Entities, poles: np.ndarray, points: list[list[str]], spaces: tupl
 
 
 def _lowest_on_rim(field: HeightField, heights: Tensor) -> float:
-    """The least height on the border of the whole surface, mm, of the points of its default grid there."""
+    """Least height on the border of a rectangular surface, mm, at the points of its default grid."""
     (u, v), ends = (knot_lines(space, STEPS_PER_SPAN) for space in field.spaces), torch.tensor([0.0, 1.0], dtype=torch.float64)
     return min(float(on_lines(field, heights, lines).z.min()) for lines in ((u, ends), (ends, v)))
 
 
 def _round_rim(out: Entities, field: HeightField, heights: Tensor) -> tuple[Loop, float]:
-    """The surface over the circle: two cubic curves through so many of its points that they stay within ROUND_UNCERTAINTY / 10;
-    and its least height, mm."""
+    """Border of the surface over a circle: two interpolating cubic curves within ROUND_UNCERTAINTY / 10; and its least height,
+    mm."""
     radius, count, off = field.half_size[0], 8 * max(field.shape), np.inf
 
     def on(t: np.ndarray) -> np.ndarray:
@@ -324,21 +324,21 @@ def _round_rim(out: Entities, field: HeightField, heights: Tensor) -> tuple[Loop
 
 
 def _flat(out: Entities, lens: Lens, wider: float, z: float) -> Loop:
-    """The aperture's outline, `wider` mm around it, at z."""
+    """Outline of the aperture, enlarged by `wider` mm, at z."""
     rx, ry = (r + wider for r in lens.half_size)
     flat = [(rx, 0.0), (-rx, 0.0)] if lens.round else [(-rx, -ry), (rx, -ry), (rx, ry), (-rx, ry)]
     corners = [np.array([*p, z]) for p in flat]
     vertices = [out.add(f"VERTEX_POINT('',{out.point(p)})") for p in corners]
     around = corners[1:] + corners[:1]
     if lens.round:
-        circle = out.add(f"CIRCLE('',{out.placement((0, 0, z), (0, 0, out.up), (1, 0, 0))},{real(rx)})")  # the edges' own way
+        circle = out.add(f"CIRCLE('',{out.placement((0, 0, z), (0, 0, out.up), (1, 0, 0))},{real(rx)})")  # orientation of the edges
     curves = [circle if lens.round else out.line(a, b) for a, b in zip(corners, around, strict=True)]
     edges = [(out.edge(a, b, c), True) for a, b, c in zip(vertices, vertices[1:] + vertices[:1], curves, strict=True)]
     return Loop(corners, vertices, edges)
 
 
 def _walls(out: Entities, lens: Lens, upper: Loop, lower: Loop, wider: float) -> list[str]:
-    """Upright faces between two loops: planes, or halves of a cylinder."""
+    """Vertical faces between two loops: planes, or halves of a cylinder."""
     posts = [
         (out.edge(a, b, out.line(p, q)), True)
         for a, b, p, q in zip(lower.vertices, upper.vertices, lower.corners, upper.corners, strict=True)
@@ -360,7 +360,7 @@ def _reversed(edges: list[tuple[str, bool]]) -> list[tuple[str, bool]]:
 
 
 def _product(out: Entities, solids: list[str], uncertainty: float) -> None:
-    """Units, and the product whose shape the solids are."""
+    """Write units, and the product with the shape of the solids."""
     millimetre = out.add("(LENGTH_UNIT()NAMED_UNIT(*)SI_UNIT(.MILLI.,.METRE.))")
     radian = out.add("(NAMED_UNIT(*)PLANE_ANGLE_UNIT()SI_UNIT($,.RADIAN.))")
     steradian = out.add("(NAMED_UNIT(*)SI_UNIT($,.STERADIAN.)SOLID_ANGLE_UNIT())")
@@ -371,7 +371,7 @@ def _product(out: Entities, solids: list[str], uncertainty: float) -> None:
         f"GLOBAL_UNIT_ASSIGNED_CONTEXT(({millimetre},{radian},{steradian}))"
         "REPRESENTATION_CONTEXT('',''))"
     )
-    origin = out.placement((0, 0, 0), (0, 0, out.up), (1, 0, 0))  # the file's own axes
+    origin = out.placement((0, 0, 0), (0, 0, out.up), (1, 0, 0))  # axes of the file
     shape = out.add(f"ADVANCED_BREP_SHAPE_REPRESENTATION('lens',({origin},{','.join(solids)}),{context})")
     application = out.add("APPLICATION_CONTEXT('automotive design')")
     out.add(f"APPLICATION_PROTOCOL_DEFINITION('international standard','automotive_design',2000,{application})")
@@ -403,5 +403,5 @@ def real(value: float) -> str:
 
 
 def rounded(value: float, decimals: int) -> str:
-    """A STEP real with so many decimals, no more than needed: "0.5", "300."."""
+    """A STEP real with at most this number of decimals: "0.5", "300."."""
     return f"{round(float(value), decimals) + 0.0:#.{decimals}f}".rstrip("0")

@@ -1,12 +1,12 @@
-"""The lens as a closed solid in a binary STL file (3D Systems, StereoLithography Interface Specification, 1989).
+"""Writer of binary STL files of the closed solid (3D Systems, StereoLithography Interface Specification, 1989).
 
     80 bytes of header, uint32 count, then per triangle: float32 normal (3), float32 corners (3, 3), uint16 zero
 
-all little-endian; lengths are mm in the scene's coordinates, since STL itself knows no unit.  The solid is that of
+all little-endian; lengths are mm in the scene's coordinates, since STL has no unit.  The solid is that of
 `mesh`; corners run counter-clockwise seen from outside.
 
-STL corners are float32: beside some mm of thickness they resolve the sag to about 5e-7 mm.  That is fine for a printer
-or a picture, not for tracing the caustic on a dense grid; the LightTools archive keeps float64.
+STL corners are float32, which resolve the sag to about 5e-7 mm at some mm of thickness: sufficient for printing, not for
+tracing the caustic on a dense grid; the LightTools archive has float64.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from caustic_cli.io.files import atomic_path
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 
-#: Readers take a file that begins with "solid" for the text variant.
+#: Must not begin with "solid", by which readers recognise the text variant.
 HEADER = f"binary STL of a lens, millimetres, caustic {__version__}".encode().ljust(80)
 TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])  # 50 bytes
 #: Triangles written at a time, which bounds the memory.
@@ -39,10 +39,10 @@ def write_stl(
     samples: tuple[int, int] | None = None,
     tolerance: float | None = None,
 ) -> Deviation:
-    """Write the solid whole or not at all.  Arguments as of `closed_mesh`; how far its triangles are off.
+    """Write the solid atomically.  Arguments as in `closed_mesh`; returns the deviation of its triangles.
 
     Raises:
-        InputError: as `closed_mesh`; points closer than float32 can tell apart; or the file cannot be written there.
+        InputError: as `closed_mesh`; points that coincide in float32; or the file cannot be written.
     """
     exit, vertices, faces = exit_and_solids(scene, field, heights, samples, tolerance, 2 * TRIANGLE.itemsize)
     vertices = vertices.astype("<f4")
@@ -58,7 +58,7 @@ def _records(corners: np.ndarray) -> np.ndarray:
     """STL records of triangles with `corners` (F, 3, 3) float32: (F,) of TRIANGLE.
 
     Raises:
-        InputError: a triangle lost its area to float32.
+        InputError: a triangle has no area in float32.
     """
     exact = corners.astype(np.float64)
     normal = np.cross(exact[:, 1] - exact[:, 0], exact[:, 2] - exact[:, 0])

@@ -1,4 +1,4 @@
-"""The exit surface on a rectangular grid of points, exact from the B-spline: what the exported files are made of.
+"""Sampling of the exit surface on a rectangular grid: exact values and derivatives of the B-spline, for the exported files.
 
 Notation
     u_a, v_b     grid lines on [0, 1], both ends included;  x_a = (2 u_a - 1) r_x,  y_b = (2 v_b - 1) r_y, mm
@@ -10,9 +10,9 @@ A triangle with legs h along x and y leaves its surface by at most h^2 (M_xx + 2
 at p is half the mean of (v - p)^T D2z (v - p) over the corners v, weighted by p's barycentric coordinates, and that mean of
 (v_x - p_x)^2 is at most h^2 / 4.
 
-Whoever reads such a grid lays a spline of their own through it.  That returns the designed surface only if every knot
-is a grid line: a not-a-knot bicubic through 4 steps a span gives a cubic lens back to rounding (1e-10 mm on a screen
-300 mm away); through an arbitrary grid as dense it is off by 1e-4 mm for a smooth relief and 0.1 mm for a rough one.
+Other programs interpolate such a grid by a spline, which reproduces the designed surface only if every knot is a grid line: a
+not-a-knot bicubic with 4 steps per span reproduces a cubic lens to rounding (1e-10 mm on a screen 300 mm away); on an arbitrary
+grid of the same density the error is 1e-4 mm for a smooth relief and 0.1 mm for a rough one.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from caustic_cli.errors import InputError
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.surfaces.heightfield import HeightField
 
-#: Equal steps per knot span of the default grid.  With 2 a not-a-knot bicubic is exact already; with 4 a natural one,
-#: whose end conditions are wrong, is good to some micrometres on the screen too.
+#: Equal steps per knot span of the default grid.  A not-a-knot bicubic is exact with 2; with 4 a natural spline, whose end
+#: conditions are wrong, has an error of some micrometres on the screen.
 STEPS_PER_SPAN = 4
-#: Bytes of a file that whoever says nothing about its samples gets, at most.
+#: Default limit of the file size, bytes.
 USUAL_BYTES = 20_000_000
 #: Most samples along one axis, and most points: 5e7 points are 2.8 GB of points, normals and heights.
 MAX_SAMPLES = 20_000
@@ -65,19 +65,19 @@ class SurfaceGrid:
 
 
 def most_points(a_point: float, beside: float = 0.0) -> int:
-    """Points that a file of `USUAL_BYTES` holds at so many bytes each, `beside` what else is in it."""
+    """Number of points in a file of `USUAL_BYTES` at `a_point` bytes each, with `beside` bytes of other contents."""
     return max(4, int((USUAL_BYTES - beside) / a_point))
 
 
 def usual_steps(spaces: Sequence[SplineSpace], most: int) -> int:
-    """Equal steps a knot span that are usual, `STEPS_PER_SPAN` or fewer for at most so many points; 0: not even one."""
+    """Default steps per knot span: `STEPS_PER_SPAN`, or fewer for at most `most` points; 0 if one is too many."""
     spans = [len(s.breaks) - 1 for s in spaces]
     return next((k for k in range(STEPS_PER_SPAN, 0, -1) if math.prod(k * n + 1 for n in spans) <= most), 0)
 
 
 def usual_counts(spaces: Sequence[SplineSpace], most: int, least: int = 2) -> tuple[int, int]:
-    """Points along x and y: `usual_steps` a knot span, or where those are too many, `most` of them in the spans' proportion;
-    `least` along each."""
+    """Points along x and y: `usual_steps` per knot span, or about `most` points in the proportion of the spans; at least
+    `least`."""
     steps, (nx, ny) = usual_steps(spaces, most), (len(s.breaks) - 1 for s in spaces)
     return (max(least, steps * nx + 1), max(least, steps * ny + 1)) if steps else even_counts(spaces, most, least)
 
@@ -92,17 +92,17 @@ def even_counts(spaces: Sequence[SplineSpace], most: int, least: int = 2) -> tup
 def sample_grid(
     field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None, most: int | None = None
 ) -> SurfaceGrid:
-    """The surface and its slopes on a grid that spans the whole aperture, borders included.
+    """The surface and its slopes on a grid over the whole aperture, borders included.
 
     Args:
         heights: (n, m) control heights, mm.
         samples: (nx, ny) points of an equispaced grid, or None for `STEPS_PER_SPAN` equal steps in every knot span:
             STEPS_PER_SPAN (n - p) + 1 points along an axis with simple knots, every knot among them.
-        most: points, where there are no samples: then fewer steps, and if need be an equispaced grid (`usual_counts`).
+        most: default number of points: fewer steps per span, or an equispaced grid, if necessary (`usual_counts`).
 
     Raises:
         InputError: fewer than 2 or more than `MAX_SAMPLES` samples along an axis, more than `MAX_POINTS` points, or
-            heights that are not the field's.
+            heights of another shape than the field.
     """
     steps = STEPS_PER_SPAN if most is None else usual_steps(field.spaces, most)
     if samples is None and steps:
@@ -114,10 +114,10 @@ def sample_grid(
 
 
 def grid_within(field: HeightField, heights: Tensor, tolerance: float) -> SurfaceGrid:
-    """The same on equal steps in every knot span, so small that a triangulation is nowhere off by more than `tolerance` mm.
+    """The surface on equal steps per knot span, for a triangulation within `tolerance` mm everywhere.
 
     Raises:
-        InputError: that takes too many points.
+        InputError: too many points.
     """
     h = step_within(field, heights, tolerance)
     lines = [
@@ -128,7 +128,7 @@ def grid_within(field: HeightField, heights: Tensor, tolerance: float) -> Surfac
 
 
 def step_within(field: HeightField, heights: Tensor, tolerance: float) -> float:
-    """Largest step h, mm, of a triangulated grid with the knots among its lines that is off by at most `tolerance` mm."""
+    """Largest step h, mm, of a triangulated grid with knots on grid lines whose error is at most `tolerance` mm."""
     checks.number("⟨tolerance⟩", tolerance, 0.0, open_low=True)
     xx, xy, yy = second_derivative_bounds(field, heights)
     curvature = xx + 2.0 * xy + yy
@@ -144,17 +144,17 @@ def second_derivative_bounds(field: HeightField, heights: Tensor) -> tuple[float
 
 
 def on_lines(field: HeightField, heights: Tensor, lines: Sequence[Tensor], asked: str = "⟨samples⟩") -> SurfaceGrid:
-    """The surface on grid lines u (nx,), v (ny,) on [0, 1]; `asked`: what a refusal names.
+    """The surface on grid lines u (nx,), v (ny,) on [0, 1]; `asked`: setting named in an error.
 
     Raises:
-        InputError: too many points, or heights that are not the field's.
+        InputError: too many points, or heights of another shape than the field.
     """
     if tuple(heights.shape) != field.shape:
         raise InputError(f"control heights must have shape {field.shape}, got {tuple(heights.shape)}")
     (su, sv), (rx, ry), (u, v) = field.spaces, field.half_size, lines
     if max(len(u), len(v)) > MAX_SAMPLES or len(u) * len(v) > MAX_POINTS:
         raise InputError(
-            f"{asked} must ask for at most {MAX_SAMPLES} points along an axis and {MAX_POINTS:.0e} in all, got {len(u)} x {len(v)}"
+            f"{asked} must give at most {MAX_SAMPLES} points along an axis and {MAX_POINTS:.0e} in all, got {len(u)} x {len(v)}"
         )
     net = heights.detach().to("cpu", torch.float64)
     rows, slopes = along(su, u, net), along(su, u, net, 1) / (2.0 * rx)  # (nx, m)
@@ -165,7 +165,7 @@ def on_lines(field: HeightField, heights: Tensor, lines: Sequence[Tensor], asked
 
 
 def knot_lines(space: SplineSpace, steps: int | Tensor) -> Tensor:
-    """Every distinct knot and `steps` equal steps between them, the same number or one a span, ascending on [0, 1]."""
+    """Distinct knots and `steps` equal steps between them, a common number or one per span, ascending on [0, 1]."""
     breaks = space.breaks.tolist()
     counts = [steps] * (len(breaks) - 1) if isinstance(steps, int) else steps.tolist()
     inner = [torch.arange(k, dtype=torch.float64) / k * (b - a) + a for a, b, k in zip(breaks, breaks[1:], counts, strict=False)]
@@ -175,7 +175,7 @@ def knot_lines(space: SplineSpace, steps: int | Tensor) -> Tensor:
 def along(space: SplineSpace, at: Tensor, net: Tensor, derivative: int = 0) -> Tensor:
     """Splines with control values net (n, k) at the points `at` (m,), or their derivative: (m, k).
 
-    Sums over the p + 1 basis functions that do not vanish: no dense (m, n) matrix for a fine grid on a fine net.
+    Sums over the p + 1 non-zero basis functions, without a dense (m, n) matrix.
     """
     first, values = space.basis(at, derivative)
     return sum(values[:, a, None] * net[first + a] for a in range(space.degree + 1))

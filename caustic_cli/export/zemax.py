@@ -1,12 +1,12 @@
-"""The exit surface as a Grid Sag file of Zemax OpticStudio (`.DAT`), with exact derivatives.
+"""Writer of Zemax OpticStudio Grid Sag files (`.DAT`) of the exit surface, with exact derivatives.
 
     ! comments
     nx ny delx dely unitflag xdec ydec      unitflag 0 is mm; the grid is centred
     z dz/dx dz/dy d2z/dxdy nodata           nx ny lines: the first is at (-x, +y), x varies fastest, y descends
 
-z is the sag, measured from the surface's vertex (0, 0).  Base radius infinity, conic 0, interpolation bicubic: its Hermite
-patches with exact derivatives return a bicubic lens to rounding where every knot is a grid line, as it is by default when
-knots are equispaced.  Zero derivatives would make OpticStudio take differences, which costs 0.05 mm on the screen and more.
+z is the sag from the vertex (0, 0) of the surface.  Base radius infinity, conic 0, bicubic interpolation: Hermite patches with
+exact derivatives reproduce a bicubic lens to rounding if every knot is a grid line, as by default for equispaced knots.  With
+zero derivatives OpticStudio uses finite differences, with an error of 0.05 mm and more on the screen.
 """
 
 from __future__ import annotations
@@ -25,10 +25,9 @@ from caustic_cli.io.files import atomic_path
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 
-#: Fewest points along an axis that OpticStudio takes.
+#: Least number of points along an axis in OpticStudio.
 LEAST = 5
-#: Digits of heights and derivatives, which leave 1e-12 of a slope and so nothing of a pixel, and bytes of a row of them: a sign or
-#: an exponent takes two more, which few have all.
+#: Significant digits of heights and derivatives, for a relative error of 1e-12, and typical bytes of a row.
 DIGITS = 12
 A_ROW = 4 * (DIGITS + 6) + 3
 
@@ -36,7 +35,7 @@ A_ROW = 4 * (DIGITS + 6) + 3
 def write_zemax(
     path: str | Path, scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None
 ) -> Deviation:
-    """Write the grid whole or not at all; how far its patches are off.
+    """Write the grid atomically; returns the deviation of its patches.
 
     Args:
         heights: (n, m) control heights, mm.
@@ -58,7 +57,7 @@ def write_zemax(
         "! Grid Sag, mm; base radius infinity, conic 0; interpolation bicubic",
         f"! vertex {real(vertex - lens.z_in)} mm behind the flat entrance, index {real(lens.index)},"
         f" screen {real(scene.screen.z - vertex)} mm behind the vertex",
-        *([f"! the screen is {scene.screen.shape_words()}, which this file leaves to you"] if scene.screen.curved else []),
+        *([f"! the screen is {scene.screen.shape_words()}, which this file does not contain"] if scene.screen.curved else []),
         *([f"! circular aperture of radius {real(lens.half_size[0])} mm"] if lens.round else []),
         f"{nx} {ny} {real((grid.x[-1] - grid.x[0]) / (nx - 1))} {real((grid.y[-1] - grid.y[0]) / (ny - 1))} 0 0 0",
         "",

@@ -1,1 +1,1 @@
-"""Which lens: parametrisations, losses, optimisers and the design loop.  Knows no files and no command line."""
+"""The inverse problem: parametrisations, losses, optimisers and the design loop.  Independent of files and of the command line."""

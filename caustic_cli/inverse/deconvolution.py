@@ -1,16 +1,17 @@
-"""The light that, spread by an extended source's image, comes closest to a picture, and how close any light can come.
+"""Non-negative deconvolution of a picture by the image of an extended source, with a duality bound on the least possible error.
 
     minimise  |y - b|^2 / 2,    y = S K x,    x >= 0,    mean(y) = mean(b) = 1
 
-K convolves with the source's image, S looks at the screen alone: b is the picture on it, x light on the screen and around it, from
-where it still reaches the screen.  Accelerated projected gradients with restarts (Beck and Teboulle, SIAM J. Imaging Sci. 2, 2009;
-O'Donoghue and Candes, Found. Comput. Math. 15, 2015); the constraint's multiplier c is added to b and follows mean(y).
+K is the convolution with the source's image and S the restriction to the screen: b is the picture on the screen, x the irradiance
+on the screen and on the margin from which light is still spread onto it.  Accelerated projected gradients with restarts (Beck and
+Teboulle, SIAM J. Imaging Sci. 2, 2009; O'Donoghue and Candes, Found. Comput. Math. 15, 2015); the multiplier c of the mean
+constraint is added to b and updated by mean(y).
 
-Every x and every nu give a bound: with w = K^T S^T 1 and N pixels,
+Weak duality gives a lower bound for every nu: with w = K^T S^T 1 and N pixels,
 
     |y - b|^2 / 2 >= nu . b - |nu|^2 / 2 - N max_i (K^T S^T nu)_i / w_i
 
-whatever the light, which nu = b + c - y makes tight where x is optimal.
+for any x, which is tight for nu = b + c - y at the optimum.
 """
 
 from __future__ import annotations
@@ -24,23 +25,27 @@ from torch import Tensor
 
 from caustic_cli.optics.spread import Convolution
 
-#: Iterations until the light is returned, which is still smooth then, and for the least error; how often that is looked at.
+#: Iterations after which x is returned (early stopping keeps it smooth) and of the search for the least error; interval of its
+#: checks.
 SMOOTH_STEPS, MOST_STEPS, LOOK = 60, 3000, 50
-#: Iterations times cells that are worth their time, about a second, and least iterations.
+#: Budget of iterations times cells, about a second, and least number of iterations.
 WORK, LEAST_STEPS = 3e7, 300
-#: Cells of a pixel, along each axis, that light may be told apart by; finer ones take long.
+#: Most cells per pixel along each axis.
 FINEST = 2
-#: Part of the least error to which its bound comes before the iterations end.
+#: Relative gap between error and bound at which the iterations end.
 TIGHT = 0.02
-#: Light of which no more than this part, rounding, reaches the screen does not count.
+#: Cells of which no more than this fraction, rounding, reaches the screen are left out.
 REACHES = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Deconvolved:
-    """light: (n + 2 a, m + 2 b), relative irradiance of pixels on the screen and around it; beside: (a, b); error: relative RMS
-    between the picture and the best light found, spread, each over its own mean on the screen; bound: no light comes closer; kept:
-    the part of that light which is spread onto the screen."""
+    """Result of a deconvolution.
+
+    light: (n + 2 a, m + 2 b), relative irradiance on the pixels of the screen and of a margin around it; beside: that margin (a,
+    b), pixels; error: relative RMS between the picture and the best solution found, blurred, each over its own mean on the screen;
+    bound: lower bound of that error for any light; kept: fraction of `light` that the blur leaves on the screen.
+    """
 
     light: np.ndarray
     beside: tuple[int, int]
@@ -50,12 +55,12 @@ class Deconvolved:
 
 
 def deconvolved(target: np.ndarray, spread: Convolution, steps: int | None = None) -> Deconvolved:
-    """The best light behind a source's spread.
+    """The irradiance that, blurred by an extended source, is closest to a picture.
 
     Args:
         target: (n, m), not negative, not all zero, any scale.
-        spread: of the source on the target's pixels.
-        steps: iterations; None for as many as a second is enough for.
+        spread: convolution with the source's image on the target's pixels.
+        steps: iterations; None for about a second of them.
     """
     cut, b = spread.cut, torch.from_numpy(target / target.mean())
     pixels = tuple(n // cut for n in spread.beside)

@@ -19,21 +19,21 @@ from torch import Tensor
 from caustic_cli.config.table import check_all
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse import ranks
-from caustic_cli.inverse.between_sides import origins
-from caustic_cli.inverse.conditions import Ranges
+from caustic_cli.inverse.constraints import within_limits
 from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
-from caustic_cli.inverse.extended import best_light, regular_rays, shift_of
-from caustic_cli.inverse.initial_surface import room_of, sphere_net
+from caustic_cli.inverse.initial_surface import departure_bound, sphere_net
+from caustic_cli.inverse.internal_rays import entrance_points
 from caustic_cli.inverse.lbfgs import UNFIT
 from caustic_cli.inverse.lenslets import ArrayObjective, lenslets
-from caustic_cli.inverse.limits import within_limits
 from caustic_cli.inverse.losses import parse
 from caustic_cli.inverse.objective import Objective
-from caustic_cli.inverse.over_range import AdamOverRange, RangeObjective
+from caustic_cli.inverse.optimisers import Adam, QuasiNewton
 from caustic_cli.inverse.parametrisation import Architecture, FreeHeights, Heights, SidesTogether, parametrise
+from caustic_cli.inverse.range_training import RangeAdam, RangeObjective
 from caustic_cli.inverse.robust import RobustObjective
+from caustic_cli.inverse.scene_parameters import Ranges
 from caustic_cli.inverse.schedule import Stage
-from caustic_cli.inverse.steps import Adam, QuasiNewton
+from caustic_cli.inverse.source_limits import best_irradiance, regular_rays, source_spread
 from caustic_cli.inverse.target import grey
 from caustic_cli.inverse.two_sided import TwoSidedObjective
 from caustic_cli.inverse.waves import WaveObjective
@@ -48,21 +48,21 @@ from caustic_cli.scene import Scene
 from caustic_cli.scene.tolerances import Tolerances
 
 AnyObjective = Objective | WaveObjective | ArrayObjective | TwoSidedObjective | RangeObjective
-#: A stage's flatness is judged over so many iterations.
+#: Iterations over which the decrease of the loss is compared with the tolerance of a stage.
 FLAT_SPAN = 10
 
 
 @dataclass(frozen=True)
 class Options:
-    """How to look for the heights; the stages say with what.
+    """Options of the optimisation; the stages set its resolution.
 
     loss: weighted terms, see `losses`; max_slope: limit of the lens' slope, 0 for none;
-    min_radius: least radius of concave places, mm, 0 for any;
+    min_radius: least radius of concave regions, mm, 0 for any;
     optimizer, lr: lbfgs, or adam with its learning rate; network, initial, preconditioner:
     see `parametrisation`; filter_target: filter the target as the render is filtered; seed: of rays and networks;
     dtype: precision of the rays; waves: stages on the wave image have to be, see `NoWaveImage`;
-    robust: errors for which the last stage is, see `robust`; architecture: of a dense network; over: ranges over which a network
-    is trained, and inputs: whether it sees where in them it is, or is one lens for all.
+    robust: errors that the last stage takes into account, see `robust`; architecture: of a dense network; over: ranges of scene
+    parameters over which a network is trained; inputs: whether it takes them as inputs, or is a single lens for all.
     """
 
     loss: str = "rms-light"
@@ -103,18 +103,18 @@ class Options:
                 "⟨design.initial⟩ zero leaves the inputs of a network without any effect, for good: zero-last, uniform or random"
             )
         if self.robust is not None:
-            raise InputError("⟨design.robust⟩ cannot be had with ⟨design.over⟩, which is a mean over scenes already")
+            raise InputError("⟨design.robust⟩ cannot be combined with ⟨design.over⟩, which is a mean over scenes already")
 
 
 @dataclass
 class State:
-    """Where a design stands.
+    """State of a design.
 
-    stage, iteration: index of the stage and iterations done in it; total: iterations done in all; heights (n, m) mm
-    float64, the lens so far; parameters, optimizer: tensors by name, empty when a stage has yet to begin; history:
-    rows (iteration, stage, loss, on_screen, seconds); seconds: spent so far; reason: why it ended, "" if it has not; start
-    (n_0, m_0), the heights it began from, on the first stage's net; unrounded, of that shape, what these were before a least radius
-    was asked of them; image, that the last iteration saw, of this run alone.
+    stage, iteration: index of the stage and iterations done in it; total: iterations in total; heights (n, m) mm float64, the
+    current lens; parameters, optimizer: tensors by name, empty before a stage begins; history: rows (iteration, stage, loss,
+    on_screen, seconds); seconds: elapsed; reason: of its end, "" while running; start (n_0, m_0), the initial heights on the
+    control net of the first stage; unrounded, of that shape, the same without the limit of the radius; image, of the last iteration
+    of this run, which is not saved.
     """
 
     heights: Tensor
@@ -131,26 +131,26 @@ class State:
     image: Tensor | None = None
 
 
-class First(NamedTuple):
-    """What a design begins from, (n, m) mm on the first stage's net: heights, within all limits; unrounded, within all but that of
-    the radius, None where there is no such limit."""
+class InitialHeights(NamedTuple):
+    """Initial heights, (n, m) mm on the control net of the first stage: heights, within all limits; unrounded, within all but that
+    of the radius, None where there is no such limit."""
 
     heights: Tensor
     unrounded: Tensor | None
 
 
 class Designer:
-    """Designs one lens.
+    """Runs the stages of the design of a lens.
 
     Args:
         scene: its lens holds the final control net; stages replace `control`.
         target: (n_x, n_y) irradiance on the scene's screen, not all zero.
-        stages, options: how.
+        stages, options: of the optimisation.
         device: where rays are traced.
-        own: (n_x, n_y) of each lenslet of an array; or one for all, the target unless given.
+        own: (n_x, n_y) targets of the lenslets of an array; or one for all, `target` unless given.
         second: (k_x, k_y) irradiance on the scene's second screen, where it has one.
 
-    Where several surfaces are shaped together, heights are those of all, (k, n, m): see `Scene.shaped`.
+    Where several surfaces are designed jointly, heights are those of all, (k, n, m): see `Scene.shaped`.
     """
 
     def __init__(
@@ -189,7 +189,7 @@ class Designer:
 
     @property
     def scenes(self) -> list[Scene]:
-        """The scene; of a network over ranges, that at all their ends."""
+        """The scene; for a network over ranges, the scenes at all combinations of their ends."""
         return [self.scene] if self.options.over is None else self.options.over.ends(self.scene)
 
     def field(self, stage: int) -> HeightField:
@@ -197,19 +197,20 @@ class Designer:
         return HeightField.of(replace(self.scene.lens, control=self.stages[stage].control))
 
     def exit(self, state: State) -> Tensor:
-        """Heights of the exit alone (n, m), on the net of the state's stage."""
+        """Heights of the exit alone (n, m) mm, on the control net of the stage of the state."""
         return sides_of(self.scene, self.field(state.stage), state.heights)[1]
 
     def whole(self, heights: Tensor | None) -> Tensor | None:
-        """Heights of the exit (n, m) on the first stage's net with those of the spheres that surfaces of other elements begin as,
-        (k, n, m); others as they are."""
+        """Heights of the exit (n, m) on the control net of the first stage, with the initial spheres of other designed surfaces,
+        (k, n, m); heights of all surfaces are returned unchanged."""
         if heights is None or heights.ndim == 3 or not self.scene.jointly:
             return heights
         others = [sphere_net(e, side, self.field(0)) for e in self.scene.elements for side in e.shaped]
         return torch.stack([*others, heights])
 
-    def first(self, heights: Tensor | None) -> First | None:
-        """What a design begins from heights of the exit (n, m) on the first stage's net, or of all surfaces; None from None.
+    def initial_heights(self, heights: Tensor | None) -> InitialHeights | None:
+        """Initial heights within the limits, from those of the exit (n, m) or of all surfaces on the control net of the first
+        stage; None from None.
 
         Raises:
             CausticError: as of `within_limits`.
@@ -217,28 +218,30 @@ class Designer:
         if (whole := self.whole(heights)) is None:
             return None
         state = State(whole)
-        return First(self.within_limits(state), self.within_limits(state, rounded=False) if self.options.min_radius > 0 else None)
+        return InitialHeights(
+            self.within_limits(state), self.within_limits(state, rounded=False) if self.options.min_radius > 0 else None
+        )
 
     def begin(self, heights: Tensor | None = None, unrounded: Tensor | None = None) -> State:
-        """A fresh state: the parametrisation's own beginning, or what `first` has found."""
+        """The initial state: that of the parametrisation, or from `initial_heights`."""
         module = self._parametrise(0, heights)
-        first, free = module().detach(), self.options.network == "none"  # free heights are parameters enough
+        first, free = module().detach(), self.options.network == "none"  # free heights are the parameters themselves
         return State(first, parameters={} if free else module.state_dict(), start=first, unrounded=unrounded)
 
     def begun(self, state: State, rounded: bool = True) -> Tensor:
-        """The surface that the design began from, on the net of the stage it stands in (n, m), mm; or its `unrounded` one."""
+        """The initial surface on the control net of the current stage (n, m), mm; or the `unrounded` one."""
         return self._carried(state.start if rounded else state.unrounded, 0, state.stage)
 
     def showing(self, state: State, heights: Tensor) -> State:
-        """A state whose lens is `heights`, although the optimiser stands elsewhere; `restored` undoes it, if that is kept."""
+        """A state whose lens is `heights`, while the parameters of the optimiser are unchanged; `restored` undoes it."""
         return replace(state, heights=heights)
 
     def restored(self, state: State) -> State:
-        """A saved state as the loop left it, see `showing`."""
+        """A state whose heights are those of the parameters of the optimiser again, see `showing`."""
         return replace(state, heights=self._module(state)().detach()) if state.parameters else state
 
     def heights_at(self, state: State, values: Sequence[float]) -> Tensor:
-        """The lens (n, m), mm, that a network gives for values of its ranges, in their order."""
+        """The lens (n, m), mm, that a network returns for values of the scene parameters, in the order of the ranges."""
         assert self.options.over is not None
         heights = self._module(state)(self.options.over.scaled([values])).detach()
         return self.within_limits(replace(state, heights=heights.reshape(state.heights.shape)))
@@ -264,17 +267,17 @@ class Designer:
         on_iteration: Callable[[State], None] = lambda s: None,
         notice: Callable[[str], None] = lambda text: None,
     ) -> State:
-        """Go on from `state` until the stages are done.
+        """Continue from `state` until the stages are done.
 
         Args:
-            iterations: in all, counted from the very beginning; 0 for what the stages say.
-            time_limit: seconds for this run; each stage gets its part.
-            stop: asked after every iteration; True ends the run with the state whole.
-            on_iteration: told after every iteration.
-            notice: told what a person should know, such as that a step had to be taken back.
+            iterations: in total, counted from the beginning of the design; 0 for those of the stages.
+            time_limit: seconds for this run, shared by the stages in proportion to their cost.
+            stop: called after every iteration; True ends the run with a complete state.
+            on_iteration: called after every iteration.
+            notice: called with messages for the user, such as of a rejected step.
 
         Raises:
-            CausticError: no light reaches the screen where a stage begins, or nothing there is finite.
+            CausticError: no light reaches the screen at the beginning of a stage, or the loss there is not finite.
         """
         began, before = time.monotonic(), state.seconds
         limit = iterations or sum(s.iterations for s in self.stages)
@@ -293,15 +296,15 @@ class Designer:
         return state
 
     def within_limits(self, state: State, rounded: bool = True) -> Tensor:
-        """The state's heights, moved as little as the limits of slope and radius ask; rounded: False leaves the radius out.
+        """The heights of the state, made feasible for the limits of slope and radius; rounded: False leaves the radius out.
 
         Raises:
-            CausticError: no surface near them obeys these.
+            CausticError: no feasible surface was found near them.
         """
         field, bounds, o = self.field(state.stage), self._bounds(self.stages[state.stage]), self.options
         radius = o.min_radius if rounded else 0.0
         if not self.scene.jointly:
-            return _as_cut(field, state.heights, bounds, o.max_slope, radius, self.scene.lens.cut_from)
+            return _within_limits_from(field, state.heights, bounds, o.max_slope, radius, self.scene.lens.cut_from)
         found = []
         halves = [e.half_size for e in self.scene.elements for _ in e.shaped] or [field.half_size]
         for name, half, heights, low, high in zip(
@@ -309,7 +312,7 @@ class Designer:
         ):
             field = replace(field, half_size=half)
             side = self.scene.lens.cut_from if name == EXIT else -1 if name.endswith(("entrance", "front")) else 1
-            found.append(_as_cut(field, heights, (low, high), o.max_slope, radius, side))
+            found.append(_within_limits_from(field, heights, (low, high), o.max_slope, radius, side))
         return torch.stack(found)
 
     def _stage(self, state: State, k: int, limit: int, deadline: float, stop, on_iteration, notice, origin: float) -> bool:
@@ -318,7 +321,7 @@ class Designer:
         cap = math.inf if final else stage.iterations
         method = heights = None
         while True:
-            # Only what a checkpoint holds decides whether to go on, so that a resumed run decides alike.
+            # Decided from the contents of a checkpoint alone, so that a resumed run decides alike.
             if state.iteration >= cap:
                 return True
             if self._flat(state, stage.tolerance):
@@ -342,16 +345,16 @@ class Designer:
                     state.reason = "no wave image"
                     return True
                 adam = self.options.optimizer == "adam" and not stage.waves
-                kind = AdamOverRange if self.options.over else Adam if adam else QuasiNewton
+                kind = RangeAdam if self.options.over else Adam if adam else QuasiNewton
                 method = kind(objective, heights, self.options.lr)
                 if state.optimizer:
                     method.load(state.optimizer)
-            told = method.taken_back > 0
+            told = method.rejected > 0
             moved = method.step()
-            if method.taken_back and not told:
+            if method.rejected and not told:
                 notice(
-                    f"stage {k + 1}, iteration {state.total + 1}: a step led to where no light reaches the screen or the loss is"
-                    " not finite; it was taken back and a shorter one tried, as any such step will be"
+                    f"stage {k + 1}, iteration {state.total + 1}: a step to an image without light or a loss that is not finite"
+                    " was rejected and shortened, as any such step will be"
                 )
             if not moved:
                 state.reason = "no progress"
@@ -375,7 +378,7 @@ class Designer:
         return RobustObjective(objective, self.scene, self.field(k), heights.begun(), o.robust)
 
     def _objective_in(self, scene: Scene, k: int, begun: Tensor) -> AnyObjective:
-        """That of stage k in a scene, for heights near `begun`."""
+        """The objective of stage k in a scene, for heights near `begun`."""
         stage, o = self.stages[k], self.options
         if stage.source is not None:
             scene = replace(scene, source=stage.source)
@@ -403,8 +406,8 @@ class Designer:
             parts = lenslets(scene, stage.control)
             rays = max(1, stage.rays // len(parts))
             return ArrayObjective(parts, lambda n, lenslet: self._on_rays(lenslet.scene, k, lenslet.field, own[n], rays))
-        if stage.spread and (spread := shift_of(scene, self.field(k), begun)) is not None:
-            expected = best_light(scene, grey(self.target.cpu().numpy()), spread, SMOOTH_STEPS).kept
+        if stage.spread and (spread := source_spread(scene, self.field(k), begun)) is not None:
+            expected = best_irradiance(scene, grey(self.target.cpu().numpy()), spread, SMOOTH_STEPS).kept
             scene, rays, spread = regular_rays(scene, spread, stage, self._seed(k), self.device)
             return self._traced(scene, k, self.field(k), self.target, rays, spread, expected)
         found = self._on_rays(scene, k, self.field(k), self.target, stage.rays)
@@ -415,12 +418,12 @@ class Designer:
         )
 
     def _on_rays(self, scene: Scene, k: int, field: HeightField, target: Tensor, count: int) -> Objective:
-        """That of stage k by so many rays of a scene's whole source."""
+        """The objective of stage k with `count` rays of the whole source of a scene."""
         rays = rays_of(scene, self.stages[k].sampler, count, self._seed(k), self.device)
         return self._traced(scene, k, field, target, rays, (), 1.0)
 
     def _seed(self, k: int) -> int:
-        """Of all random numbers of stage k."""
+        """Seed of all random numbers of stage k."""
         return stream(self.options.seed, f"stage {k}")
 
     def _traced(
@@ -433,14 +436,14 @@ class Designer:
         spread: Sequence[Convolution],
         expected: float,
     ) -> Objective:
-        """That of stage k on the ray image, by these rays."""
+        """The objective of stage k on the ray image, with these rays."""
         how = self._how(k)
         return Objective(
             scene, field, rays, self.stages[k].filter, target, self.options.loss, spread=spread, expected=expected, **how
         )
 
     def _how(self, k: int) -> dict[str, Any]:
-        """What stage k and the options say of any objective on rays."""
+        """Keyword arguments of any objective on rays, from stage k and the options."""
         stage, o = self.stages[k], self.options
         return {
             "blur": stage.blur,
@@ -453,7 +456,7 @@ class Designer:
         }
 
     def _next(self, state: State, k: int) -> State:
-        """The state at the beginning of stage k: the same surface on its net."""
+        """The state at the beginning of stage k: the same surface on its control net."""
         by_rays = not (self.stages[k].waves or self.stages[k - 1].waves)
         keep = self.options.network != "none" or (self.options.optimizer == "adam" and by_rays)
         if self.stages[k].control == self.stages[k - 1].control and keep:
@@ -463,20 +466,20 @@ class Designer:
         return replace(state, stage=k, iteration=0, parameters={}, optimizer={}, heights=self._carried(state.heights, k - 1, k))
 
     def _carried(self, heights: Tensor, before: int, after: int) -> Tensor:
-        """The same surface on the net of another stage."""
+        """The same surface on the control net of another stage."""
         if self.stages[before].control == self.stages[after].control:
             return heights
         tu, tv = (a.change_of_basis(b) for a, b in zip(self.field(before).spaces, self.field(after).spaces, strict=True))
         return tu @ heights @ tv.T
 
     def _parametrise(self, k: int, start: Tensor | None, loaded: bool = False) -> Heights:
-        """That of stage k; loaded: its own tensors are read afterwards."""
+        """The parametrisation of stage k; loaded: its tensors are loaded afterwards."""
         o = self.options
         low, high = self._bounds(self.stages[k])
         if self.stages[k].waves:
             return FreeHeights(low, high, start, counted=True)
         if self.scene.second is not None and start is not None:
-            light = None if loaded else origins(self.scene, self.field(k), start)
+            light = None if loaded else entrance_points(self.scene, self.field(k), start)
             return SidesTogether(low, high, start, o.preconditioner == "laplacian", light)
         return parametrise(
             low,
@@ -492,7 +495,7 @@ class Designer:
         )
 
     def _bounds(self, stage: Stage) -> tuple[Tensor, Tensor]:
-        """Least and largest heights of a stage's net; those of the last that was asked for are kept."""
+        """Least and largest heights of the control net of a stage, mm; cached for one stage."""
         if self._room is None or self._room[0] != stage.control:
             self._room = stage.control, self._bounds_of(stage)
         return self._room[1]
@@ -523,24 +526,26 @@ class Designer:
             low, high = np.stack([-most, low]), np.stack([most, high])
         elif self.scene.jointly:
             field = HeightField.of(lens)
-            others = [(sphere_net(e, side, field).numpy(), room_of(e, lens)) for e in self.scene.elements for side in e.shaped]
+            others = [
+                (sphere_net(e, side, field).numpy(), departure_bound(e, lens)) for e in self.scene.elements for side in e.shaped
+            ]
             low = np.stack([*(net - room for net, room in others), low])
             high = np.stack([*(net + room for net, room in others), high])
         return torch.from_numpy(low), torch.from_numpy(high)
 
     @staticmethod
     def _flat(state: State, tolerance: float) -> bool:
-        """Whether the last FLAT_SPAN iterations of this stage hardly lowered the loss."""
+        """Whether the last FLAT_SPAN iterations of this stage lowered the loss by less than the tolerance."""
         if tolerance == 0 or state.iteration <= FLAT_SPAN:
             return False
         losses = [row[2] for row in state.history[-FLAT_SPAN - 1 :]]
         return losses[-1] > (1.0 - tolerance) * losses[0]
 
 
-def _as_cut(
+def _within_limits_from(
     field: HeightField, heights: Tensor, bounds: tuple[Tensor, Tensor], max_slope: float, min_radius: float, side: int
 ) -> Tensor:
-    """`within_limits` of a surface that a tool cuts from +z, or -z (side -1), from where what is concave is convex from +z."""
+    """`within_limits` for a surface that is machined from +z, or from -z (side -1), where concave and convex are exchanged."""
     if side > 0:
         return within_limits(field, heights, bounds, max_slope, min_radius)
     low, high = bounds

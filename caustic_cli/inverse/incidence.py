@@ -1,17 +1,17 @@
-"""The light that meets a lens' exit surface: of a source's middle, through the flat entrance and the glass.
+"""Irradiance and ray directions at the exit surface: light of the centre of the source, refracted by the flat entrance.
 
 Notation
     p = (x, y, z)   a point of the exit surface; o = (x_0, y_0, z_0) the source, h its distance before the entrance
     s               tangents of the ray's direction from the source, (d_x, d_y) / d_z; q = |s|
-    f               power on the exit surface, seen along z, per area
+    f               power on the exit surface per area projected along z
 
 A ray of tangent q crosses the entrance at h q from the axis through the source and the glass under it by t q', with
 q' = q / sqrt(n^2 (1 + q^2) - q^2) by Snell; t is the height of p above the entrance.  So the point p is reached by the q with
-h q + t q' = |(x - x_0, y - y_0)|, unless that has to come in by the lens' sides, and
+h q + t q' = |(x - x_0, y - y_0)|, unless it would enter through the sides of the lens, and
 f = I(q) (1 - R(q)) (1 + q^2)^(-3/2) |d(s_x, s_y) / d(x, y)|.
 
-Where other lenses stand before the lens, rays are traced through them: from (a, b) of the pupil, which the source lights with
-irradiance g(a, b), to p, which is solved for (a, b) by Newton's method; then f = T g |d(a, b) / d(x, y)|, T what passes.
+With other lenses before the lens, rays are traced through them from points (a, b) of the pupil, which has the irradiance g(a, b);
+the ray to p is found by Newton's method for (a, b), and f = T g |d(a, b) / d(x, y)| with the transmittance T.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.relayed import bare, opened, passed
+from caustic_cli.inverse.relay import trace_through, without_apertures, without_freeforms
+from caustic_cli.inverse.transport import cell_means
 from caustic_cli.optics.averages import shared_out
 from caustic_cli.optics.emission.measured import irradiance
 from caustic_cli.optics.interface import reflectance
@@ -31,51 +32,50 @@ from caustic_cli.optics.system import ENTRANCE, System
 from caustic_cli.scene import Scene
 from caustic_cli.scene.sources.distribution import relative
 
-#: Newton steps for q; its function is concave, so from the greater of two lower bounds each step stays below the root.
+#: Newton iterations for q; the function is concave, so that they increase monotonically from the greater of two lower bounds.
 STEPS = 40
-#: Distance of points of the pupil over which a trace is differentiated, mm; cells of it along each axis; how wide the light of its
-#: middle is at the exit at least, in parts of what it was.
+#: Finite-difference step on the pupil, mm; cells of the pupil along each axis; least magnification from the pupil to the exit.
 _STEP, CELLS, LEAST_GROWTH = 1e-5, 128, 1e-3
-#: Points along each axis of a cell that a circle's edge cuts.
+#: Subsamples along each axis of a cell cut by a circular aperture.
 PARTS = 8
-#: Largest sine of what goes on beside the light.
+#: Largest sine of an extrapolated direction.
 STEEPEST = 0.6
-#: Most of Newton's steps for (a, b), and how near to its corner a ray has to come, in parts of the lens' half width.
+#: Most Newton iterations for (a, b), and their tolerance in parts of the half width of the lens.
 TRACED_STEPS, FOUND = 12, 1e-7
 
 
 def incident(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, tuple | None]:
-    """Power per area, seen along z, in the cells between corners x (n + 1,), y (m + 1,), (n, m), and the unit directions inside
-    the glass at the corners, three (n + 1, m + 1) arrays (None for along z); z: heights of the surface there, mm.
+    """Power per area projected along z in the cells with corners x (n + 1,), y (m + 1,): (n, m); and unit directions inside the
+    glass at the corners, three (n + 1, m + 1) arrays, or None for light along z.  z: heights of the surface there, mm.
 
-    Near light is in parts of the source's intensity times its solid angle, any other in a unit of its own.
+    The unit is that of intensity over its axial value times solid angle for a source nearby, and arbitrary for others.
 
     Raises:
-        InputError: the source stands behind the entrance.
+        InputError: the source lies behind the entrance.
     """
-    light, directions = (_through if scene.before else _square)(scene, x, y, z)
-    return (light * _part_within(x, y, scene.lens.half_size[0]) if scene.lens.round else light), directions
+    light, directions = (_traced if scene.before else _direct)(scene, x, y, z)
+    return (light * _fraction_within(x, y, scene.lens.half_size[0]) if scene.lens.round else light), directions
 
 
 def on_entrance(scene: Scene, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, tuple | None]:
-    """The same in air, on the plane of the entrance: as if the lens there had the index 1 and no thickness."""
+    """The same in air on the plane of the entrance."""
     air = replace(scene, lens=replace(scene.lens, index=1.0 + 1e-9, glass=None, fresnel="none", front=None), second=None)
     return incident(air, x, y, np.full((len(x), len(y)), scene.lens.z_in))
 
 
-def _through(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, tuple]:
-    """The same over the whole rectangle, through the lenses before the lens."""
-    pupil, lens, whole = scene.pupil, scene.lens, System.of(bare(scene))
+def _traced(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, tuple]:
+    """`incident` over the whole rectangle, traced through the lenses before the lens."""
+    pupil, lens, whole = scene.pupil, scene.lens, System.of(without_freeforms(scene))
     names = [e.name for e in whole.elements]
-    system = opened(whole, 0, names.index(ENTRANCE) + 1)
+    system = without_apertures(whole, 0, names.index(ENTRANCE) + 1)
     first = scene.before[0].extent[0]
 
     def arrive(at: np.ndarray, z: np.ndarray):
-        """Where rays of the pupil's points (2, N) meet heights z, their directions in the glass, where they entered it, and what
-        passes."""
+        """Intersections with the heights z of rays from points (2, N) of the pupil, their directions in the glass, their points on
+        the entrance, and their transmittance."""
         d = _from_source(scene, *at)
         back = (pupil.z - first) / d[2] + 1e-6  # the first surface may reach through the pupil
-        state = passed(system, (at[0] - back * d[0], at[1] - back * d[1], pupil.z - back * d[2]), d)
+        state = trace_through(system, (at[0] - back * d[0], at[1] - back * d[1], pupil.z - back * d[2]), d)
         inside = np.stack([c.numpy().reshape(z.shape) for c in state.full(state.direction)])
         entered = np.stack([c.numpy().reshape(z.shape) for c in state.origin[:2]])
         return entered + (z - lens.z_in) / inside[2] * inside[:2], inside, entered, state.power.numpy().reshape(z.shape)
@@ -85,12 +85,12 @@ def _through(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple
     grown = np.array([start[0, 1] - start[0, 0], start[1, 2] - start[1, 0]]) / small
     if not (np.abs(grown) > LEAST_GROWTH).all():
         raise InputError(
-            "⟨element.radius⟩: the lenses before the lens focus their light into it; a first surface needs it spread out"
+            "⟨element.radius⟩: the lenses before the lens focus their light inside it; transport needs an extended beam on its exit"
         )
     shape, flat = z.shape, z.ravel()
     goal = np.stack([c.ravel() for c in np.broadcast_arrays(x[:, None], y[None, :])])
     at, left = goal / grown[:, None], np.arange(z.size)
-    for _ in range(TRACED_STEPS):  # of the corners that are left; those that no ray gets to stay
+    for _ in range(TRACED_STEPS):  # of the corners not converged; those that no ray reaches remain
         here, by_a, by_b = np.moveaxis(arrive(at[:, None, left] + _STEP * middle[:, :, None], np.stack([flat[left]] * 3))[0], 1, 0)
         ja, jb, off = (by_a - here) / _STEP, (by_b - here) / _STEP, goal[:, left] - here
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -109,14 +109,15 @@ def _through(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple
     for where, half, round_ in ((at, pupil.half_size, pupil.round), (entered, lens.half_size, lens.round)):
         far = np.hypot(*where) / half[0] if round_ else np.maximum(*(np.abs(c) / h for c, h in zip(where, half, strict=True)))
         power = np.where(known & (far <= 1 + 1e-9), power, 0.0)
-    power = power * _on_pupil(scene, *at)
-    light = 0.25 * (power[1:, 1:] + power[:-1, 1:] + power[1:, :-1] + power[:-1, :-1])
-    return light, _goes_on(d, known & (power > 0), goal.reshape(2, *shape) / np.array(lens.half_size)[:, None, None])
+    power = power * _pupil_irradiance(scene, *at)
+    return cell_means(power), _extrapolated(
+        d, known & (power > 0), goal.reshape(2, *shape) / np.array(lens.half_size)[:, None, None]
+    )
 
 
-def _goes_on(d: np.ndarray, lit: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Unit directions (3, n, m) where corners are lit, and elsewhere those of a cubic fitted to them: a jump would be one of the
-    surface's slopes; at: places in parts of the aperture."""
+def _extrapolated(d: np.ndarray, lit: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Unit directions (3, n, m) at lit corners, extrapolated to the others by a least-squares cubic, since a discontinuity would be
+    one of the slopes of the surface; at: positions over the half size of the aperture."""
     terms = np.stack([at[0] ** i * at[1] ** j for i in range(4) for j in range(4 - i)], -1)
     found = d[:2].copy()
     if lit.any():
@@ -129,7 +130,7 @@ def _goes_on(d: np.ndarray, lit: np.ndarray, at: np.ndarray) -> tuple[np.ndarray
 
 
 def _from_source(scene: Scene, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Unit directions of the light of the source's middle at points of the pupil."""
+    """Unit directions of the light of the source's centre at points (a, b) of the pupil, mm."""
     if scene.source.distant:
         return np.zeros_like(a), np.zeros_like(a), np.ones_like(a)
     x0, y0, z0 = scene.source.centre
@@ -138,8 +139,8 @@ def _from_source(scene: Scene, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray
     return dx / length, dy / length, h / length
 
 
-def _on_pupil(scene: Scene, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Irradiance there, between the middles of CELLS x CELLS cells."""
+def _pupil_irradiance(scene: Scene, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Irradiance of the pupil at (a, b), interpolated between the centres of CELLS x CELLS cells."""
     pupil = scene.pupil
     size = (2.0 * pupil.half_size[0], 2.0 * pupil.half_size[1])
     lens = replace(scene.lens, size=size, z_in=pupil.z, aperture="circle" if pupil.round else "rectangle", border=0.0)
@@ -150,15 +151,15 @@ def _on_pupil(scene: Scene, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return RegularGridInterpolator(middles, light)(points)
 
 
-def _part_within(x: np.ndarray, y: np.ndarray, radius: float) -> np.ndarray:
-    """Part of each cell between corners x, y that lies within a circle, from PARTS x PARTS points of it."""
+def _fraction_within(x: np.ndarray, y: np.ndarray, radius: float) -> np.ndarray:
+    """Fraction of each cell with corners x, y within a circle, by PARTS x PARTS subsamples."""
     fine = [np.linspace(c[0], c[-1], 2 * PARTS * (len(c) - 1) + 1)[1::2] for c in (x, y)]
     inside = (fine[0][:, None] ** 2 + fine[1][None, :] ** 2 <= radius**2).astype(float)
     return inside.reshape(len(x) - 1, PARTS, len(y) - 1, PARTS).mean((1, 3))
 
 
-def _square(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, tuple | None]:
-    """The same over the whole rectangle."""
+def _direct(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, tuple | None]:
+    """`incident` over the whole rectangle, by the closed form above."""
     source, lens, shape = scene.source, scene.lens, (len(x) - 1, len(y) - 1)
     if source.distant:
         profile = source.profile
@@ -167,8 +168,8 @@ def _square(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[
     h, t, n = lens.z_in - z0, z - lens.z_in, lens.inside
     if h <= 0:
         raise InputError(
-            f"⟨source.file⟩: its rays meet at z = {z0:.4g} mm, not before the lens, where a first surface by transport"
-            " needs a source; ⟨start⟩ offset needs none"
+            f"⟨source.file⟩: its rays meet at z = {z0:.4g} mm, not before the lens, as an initial surface by transport"
+            " requires; ⟨start⟩ offset does not"
         )
     dx, dy = x[:, None] - x0, y[None, :] - y0
     rho = np.hypot(dx, dy)
@@ -194,5 +195,5 @@ def _square(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[
     power = np.where((q <= math.tan(cone) * (1 + 1e-9)) & through[0] & through[1], power, 0.0)
     light = irradiance(scene, x, y, float(z.mean()))
     if light is None:
-        light = 0.25 * (power[1:, 1:] + power[:-1, 1:] + power[1:, :-1] + power[:-1, :-1])
+        light = cell_means(power)
     return light, (sx * cosine / n, sy * cosine / n, inside)

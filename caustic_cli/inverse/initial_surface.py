@@ -1,9 +1,9 @@
-"""The first surface of a design by transport: the heights that send what lights the exit surface onto the picture.
+"""Initial surface of a design by optimal transport of the irradiance on the exit to the picture.
 
-Light of a source close by can be lost: it leaves by the sides of a thick lens, and what reaches a thin one asks for more depth than
-that has.  So where much is lost, surfaces of several heights are solved for, each cut off at the least thickness, and only from
-the light that they do send to the picture: what falls on the cut, or cannot be refracted so far, counts for nothing.  The one is
-taken that keeps most.
+Light of a near source can be lost: through the sides of a thick lens, or because a thin one is not deep enough for the relief.
+Where much is lost, surfaces with several heights of their vertex are computed, each truncated at the least thickness, with
+transport of only that light which can reach the picture: light on the truncated part, or beyond the limit of refraction, is left
+out.  The surface of highest efficiency is taken.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.incidence import incident
-from caustic_cli.inverse.relayed import Relayed
-from caustic_cli.inverse.surface_from_map import OutOfReach, Seen, Start, finer, thrown
+from caustic_cli.inverse.projection import ScreenProjection
+from caustic_cli.inverse.relay import RelayedScreen
+from caustic_cli.inverse.surface_from_map import MappedSurface, OutOfReach, Projection, finer, refract_to_screen
 from caustic_cli.inverse.surface_from_map import surface as refracting_surface
-from caustic_cli.inverse.transport import cell_lines, corners
-from caustic_cli.inverse.view import View
+from caustic_cli.inverse.transport import cell_lines, cell_means, corners
 from caustic_cli.optics.surfaces import Sphere
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Component, Lens, Scene
@@ -31,38 +31,37 @@ from caustic_cli.scene.elements import SIDES
 
 #: Source cells along the lens' longer side: a picture of 250 x 250 pixels is resolved, and they are cheap.
 CELLS = 256
-#: Most of them for which transport is solved.  What needs more, which creases do, is solved on about so many, and then evaluated on
-#: cells so many times finer.
+#: Most cells for which transport is solved.  Where more are needed, as for creases, it is solved on about COARSE, and the map is
+#: evaluated on finer cells.
 SOLVED, COARSE = 1024, 512
-#: Sites of the solution for a bright pixel where finer cells are; part of the cells then needed that are enough where these divide
-#: the finer ones.
+#: Sites per bright pixel where the map is evaluated on finer cells; fraction of the cells then needed that is accepted if it
+#: divides the finer ones.
 SITES, NEARLY = 2, 0.95
-#: Light in the wrong cell, and Newton steps a level, where finer cells show that: 5e-3 left text with errors of 0.088 to 0.123.
+#: Transport error and Newton steps per level for finer cells, which resolve it: 5e-3 left text with errors of 0.088 to 0.123.
 EXACT, STEPS = 5e-4, 30
-#: How much higher a net may be than the surface it was interpolated from.
+#: Largest peak-to-valley ratio of an interpolated control net to the surface.
 OVERSHOOT = 2.0
-#: Surfaces solved for in turn where the light depends on the surface it meets.
+#: Fixed-point iterations where the irradiance on the surface depends on its heights.
 PASSES = 3
-#: Light where a near source has none to give, in parts of the mean: it costs as much of the picture, and saves many steps.
+#: Lower bound of the irradiance of a near source over its mean: a trade-off between the picture and the number of Newton steps.
 DARKEST = 0.02
-#: Cells on which the height of a near source's lens is chosen; one that sends this part of the light on it to the screen will do.
-FEW_CELLS, WELL = 64, 0.7
-#: Heights of the surface's middle that are tried where one sends less, in parts of the lens' thickness.
+#: Cells on which the vertex height is chosen for a near source; efficiency that is accepted at once.
+FEW_CELLS, ENOUGH_LIGHT = 64, 0.7
+#: Vertex heights that are tried otherwise, in parts of the thickness of the lens.
 TRIED = (0.3, 0.45, 0.65, 1.5, 2.2, 3.3)
-#: Cells along which light has nowhere to go that are left out at most before the picture counts as out of reach.
+#: Most repetitions without the cells whose light cannot be refracted to the picture, before it counts as out of reach.
 RETRIES = 4
-#: Part of another lens' least thickness that each of its surfaces may take.
-GLASS = 0.45
+#: Fraction of the least thickness of another lens by which each of its surfaces may depart from its sphere.
+THICKNESS_PART = 0.45
 UNREACHED = (
-    "no light of the source that meets the lens can be refracted to the picture by a surface over this aperture; a picture"
-    " nearer the light's way, or a source farther away, is needed"
+    "no light of the source that falls on the lens can be refracted to the picture by a surface over this aperture; a picture"
+    " closer to the undeflected light, or a source farther away, is needed"
 )
 
 
 @dataclass(frozen=True, eq=False)
 class InitialSurface:
-    """A first surface: its control heights (n, m) mm float64, and the height of its middle, mm, where that was chosen, for a near
-    source."""
+    """An initial surface: control heights (n, m) mm float64, and its vertex height, mm, where that was chosen (near sources)."""
 
     heights: Tensor
     middle: float | None = None
@@ -70,7 +69,7 @@ class InitialSurface:
 
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """Corners x (n + 1,), y (m + 1,) of source cells over the lens of a scene, and its target."""
+    """Grid of source cells over the lens of a scene, with corners x (n + 1,), y (m + 1,) mm, and the target."""
 
     scene: Scene
     target: np.ndarray
@@ -83,27 +82,29 @@ class _Grid:
 
     @property
     def offset(self) -> np.ndarray:
-        """Heights of the offset surface."""
+        """Heights of the offset surface at the corners, mm."""
         offset = self.scene.lens.offset
         return offset.thickness + offset.sag(self.x[:, None], self.y[None, :])
 
     @property
     def floor(self) -> float:
-        """The least height that the lens may have."""
+        """Least height of the exit by the least thickness, mm."""
         return self.scene.lens.z_in + self.scene.lens.min_thickness
 
     def scaled(self, values: np.ndarray, onto: _Grid) -> np.ndarray:
-        """What these corners have, at those of another grid."""
+        """Values at the corners, interpolated at those of another grid."""
         return RectBivariateSpline(self.x, self.y, values)(onto.x, onto.y)
 
-    def solved(self, light: np.ndarray, directions, mean: float, potential: np.ndarray | None = None, **options) -> Start:
-        """The surface of this mean height that sends the light to the picture; potential: of a similar one at these corners."""
+    def solved(self, light: np.ndarray, directions, mean: float, potential: np.ndarray | None = None, **options) -> MappedSurface:
+        """The surface of this mean height that maps the light to the picture; potential: initial one at these corners, mm^2."""
         scene = self.scene
         if not light.all() and (scene.before or not scene.source.distant):
             options["darkest"] = DARKEST
-        view = self.view(mean)
+        projection = self.projection(mean)
         target, half, centre = (
-            (self.target, scene.screen.half_size, scene.screen.shift) if view is None else view.picture(self.target)
+            (self.target, scene.screen.half_size, scene.screen.shift)
+            if projection is None
+            else projection.projected_target(self.target)
         )
         return refracting_surface(
             light,
@@ -115,43 +116,43 @@ class _Grid:
             mean,
             directions,
             centre=centre,
-            view=view,
+            projection=projection,
             start=potential,
             **options,
         )
 
-    def sharper(self, found: Start, times: int) -> tuple[_Grid, np.ndarray]:
-        """Corners of cells so many times finer, and heights there of a surface solved on these, its creases as much sharper."""
+    def sharper(self, found: MappedSurface, times: int) -> tuple[_Grid, np.ndarray]:
+        """A grid of cells `times` finer, and the heights there of a surface solved on this grid, with sharper creases."""
         scene, mean = self.scene, float(found.heights.mean())
         fine = _Grid(scene, self.target, *(corners(times * (len(c) - 1), c[-1]) for c in (self.x, self.y)))
         _, directions = incident(scene, fine.x, fine.y, self.scaled(found.heights, fine))
-        view = self.view(mean)
-        centre = scene.screen.shift if view is None else view.picture(self.target)[2]
+        projection = self.projection(mean)
+        centre = scene.screen.shift if projection is None else projection.projected_target(self.target)[2]
         index = scene.lens.effective_index
-        z = finer(found, times, scene.lens.half_size, index, scene.screen.z, directions, centre=centre, view=view)
+        z = finer(found, times, scene.lens.half_size, index, scene.screen.z, directions, centre=centre, projection=projection)
         return fine, z
 
-    def view(self, mean: float) -> Seen | None:
-        """The screen as a surface of this mean height sees it, None of an upright one, which lies in its plane."""
+    def projection(self, mean: float) -> Projection | None:
+        """Projection of the screen for a surface of this mean height; None for an upright plane screen."""
         screen = self.scene.screen
         if self.scene.behind:
-            return Relayed(self.scene, mean)
-        return None if screen.upright else View(screen, mean, -1.0 if self.scene.lens.mirror else 1.0)
+            return RelayedScreen(self.scene, mean)
+        return None if screen.upright else ScreenProjection(screen, mean, -1.0 if self.scene.lens.mirror else 1.0)
 
     def above(self, z: np.ndarray) -> np.ndarray:
-        """Part of each cell's corners where the surface is not cut off."""
-        return _mean((z > self.floor).astype(float))
+        """Fraction of the corners of each cell where the surface is not truncated."""
+        return cell_means((z > self.floor).astype(float))
 
-    def kept(self, z: np.ndarray) -> float:
-        """Part of the light on the lens that a surface, cut off at the least thickness, sends to the screen."""
+    def efficiency(self, z: np.ndarray) -> float:
+        """Fraction of the light on the lens that a surface, truncated at the least thickness, sends to the screen."""
         scene, lens, screen = self.scene, self.scene.lens, self.scene.screen
         z = np.maximum(z, self.floor)
         on_lens = incident(scene, self.x, self.y, np.full_like(z, lens.z_in))[0].sum()
         light, directions = incident(scene, self.x, self.y, z)
         surface = RectBivariateSpline(self.x, self.y, z)
         at = np.broadcast_arrays(self.x[:, None], self.y[None, :])
-        view = self.view(float(z.mean()))
-        u, v, part = thrown(
+        projection = self.projection(float(z.mean()))
+        u, v, part = refract_to_screen(
             *at,
             z,
             surface(self.x, self.y, dx=1),
@@ -160,17 +161,17 @@ class _Grid:
             lens.effective_index,
             screen.z,
             "none" if lens.fresnel == "none" else "exact",
-            view,
+            projection,
         )
-        u, v = (u - screen.shift[0], v - screen.shift[1]) if view is None else view.own(u, v)
+        u, v = (u - screen.shift[0], v - screen.shift[1]) if projection is None else projection.screen_coordinates(u, v)
         on = (np.abs(u) <= screen.half_size[0]) & (np.abs(v) <= screen.half_size[1])
-        return float((light * self.above(z) * _mean(np.where(on, part, 0.0))).sum() / on_lens) if on_lens > 0 else 0.0
+        return float((light * self.above(z) * cell_means(np.where(on, part, 0.0))).sum() / on_lens) if on_lens > 0 else 0.0
 
-    def cut(self, z: np.ndarray, middle: float, passes: int, potential: np.ndarray | None = None) -> _Cut:
-        """The surface of this height in its middle that sends what light it can to the picture, cut off at the least thickness.
+    def truncated(self, z: np.ndarray, middle: float, passes: int, potential: np.ndarray | None = None) -> _TruncatedSurface:
+        """The surface of this vertex height that maps all light in reach to the picture, truncated at the least thickness.
 
         Args:
-            z, potential: heights to begin from, and the potential of their map where that is known.
+            z, potential: initial heights, and the initial potential of their map, mm^2, where one is known.
 
         Raises:
             InputError: no light can be refracted to the picture.
@@ -189,15 +190,15 @@ class _Grid:
                 except OutOfReach as error:
                     if not left:
                         raise
-                    reached = reached * _mean((~error.where).astype(float))
+                    reached = reached * cell_means((~error.where).astype(float))
             z, potential = found.heights, found.transport.potential
         z = z + middle - _middle(z)
-        return _Cut(z, middle, max(0.0, self.floor - float(z.min())), potential)
+        return _TruncatedSurface(z, middle, max(0.0, self.floor - float(z.min())), potential)
 
 
 @dataclass(frozen=True, eq=False)
-class _Cut:
-    """A surface before it is cut: heights, that of its middle, how far it reaches below the cut, mm; potential of its map, mm^2."""
+class _TruncatedSurface:
+    """A surface before truncation: heights, vertex height, how far it extends below the truncation, mm; its potential, mm^2."""
 
     z: np.ndarray
     middle: float
@@ -208,21 +209,21 @@ class _Cut:
 def first_surface(
     scene: Scene, target: np.ndarray, field: HeightField, cells: int = CELLS, fixed: bool = False, seconds: float = math.inf
 ) -> InitialSurface:
-    """A lens that throws the picture, from the light of the source's centre.
+    """Initial surface for a picture, from light of the centre of the source.
 
     Args:
         scene: source, lens and screen.
         target: (n_x, n_y) irradiance on its screen.
         field: spline spaces of the heights.
-        cells: source cells along the lens' longer side; more than SOLVED make creases sharper, of light from afar.
-        fixed: the thickness is the user's own, and none other is tried.
-        seconds: about how long it may take for a near source, whose cells are as many as that allows.
+        cells: source cells along the lens' longer side; more than SOLVED sharpen creases, for distant sources.
+        fixed: the thickness is given by the user, and no other is tried.
+        seconds: approximate time allowed for a near source, which limits its cells.
 
     Raises:
-        InputError: the picture is out of reach of refraction.
+        InputError: the picture cannot be reached by refraction.
     """
     began = time.monotonic()
-    times, options = _times(cells, target) if scene.source.distant else 1, {}
+    times, options = _refinement(cells, target) if scene.source.distant else 1, {}
     cells = min(cells, SOLVED * times)
     if times > 1:
         options = {"tolerance": EXACT, "most": STEPS}
@@ -245,7 +246,7 @@ def first_surface(
         if n < max(len(coarse.x), len(coarse.y)):
             continue
         fine = _Grid.of(scene, target, n)
-        found = fine.cut(coarse.scaled(found.z, fine), found.middle, passes, coarse.scaled(found.potential, fine))
+        found = fine.truncated(coarse.scaled(found.z, fine), found.middle, passes, coarse.scaled(found.potential, fine))
         coarse, now = fine, time.monotonic()
         left = max(0.0, seconds - (now - began))  # a pass on so many times the cells takes so many times as long
         within = int(min(cells, n * math.sqrt(left * passes / (now - started))))
@@ -253,10 +254,10 @@ def first_surface(
     return InitialSurface(net.clamp_min(coarse.floor), found.middle)  # a spline through a kink undershoots
 
 
-def _times(cells: int, target: np.ndarray) -> int:
-    """How many times finer than those that transport is solved on so many cells are, 1 where it is solved on these, or on SOLVED.
+def _refinement(cells: int, target: np.ndarray) -> int:
+    """Refinement factor from the cells on which transport is solved to `cells`; 1 where it is solved on these, or on SOLVED.
 
-    A map on finer cells sends the light of a site to a point, so that the sites have to be finer than the bright pixels.
+    A map on finer cells concentrates the light of a site in a point, so that sites have to be finer than bright pixels.
     """
     needed = max(COARSE, math.sqrt(SITES * np.count_nonzero(target)))
     if cells <= SOLVED or needed > SOLVED:
@@ -265,17 +266,17 @@ def _times(cells: int, target: np.ndarray) -> int:
     return whole if cells <= SOLVED * whole else -(-cells // COARSE)
 
 
-def _best(grid: _Grid, middle: float, fixed: bool) -> _Cut:
-    """The cut surface that keeps most light: of this height in its middle, or of others where it is not fixed."""
-    tried: list[tuple[float, _Cut]] = []
+def _best(grid: _Grid, middle: float, fixed: bool) -> _TruncatedSurface:
+    """The truncated surface of highest efficiency: with this vertex height, or others where it is not fixed."""
+    tried: list[tuple[float, _TruncatedSurface]] = []
 
-    def attempt(middle: float) -> _Cut | None:
+    def attempt(middle: float) -> _TruncatedSurface | None:
         try:
-            found = grid.cut(grid.offset, middle, PASSES)
+            found = grid.truncated(grid.offset, middle, PASSES)
         except InputError as error:
             problems.append(error)
             return None
-        tried.append((grid.kept(found.z), found))
+        tried.append((grid.efficiency(found.z), found))
         return found
 
     problems: list[InputError] = []
@@ -283,7 +284,7 @@ def _best(grid: _Grid, middle: float, fixed: bool) -> _Cut:
     if not fixed:
         if found is not None and found.short:
             attempt(middle + found.short)
-        if max((kept for kept, _ in tried), default=0.0) < WELL:
+        if max((kept for kept, _ in tried), default=0.0) < ENOUGH_LIGHT:
             low = grid.scene.lens.z_in
             for part in TRIED:
                 attempt(low + part * (middle - low))
@@ -297,13 +298,13 @@ def net_of(x: np.ndarray, y: np.ndarray, z: np.ndarray, field: HeightField) -> T
     spline = RectBivariateSpline(x, y, z)
     values = torch.from_numpy(spline(*(c.numpy() for c in field.control_xy())))
     net = field.interpolated(values)
-    # Through points, a spline of high degree over knots that repeat overshoots; one that has them as its net never does.
+    # An interpolating spline of high degree with repeated knots overshoots; the values as control net (Schoenberg) do not.
     return net if float(net.max() - net.min()) <= OVERSHOOT * float(values.max() - values.min()) else values
 
 
 def sphere_net(element: Component, side: str, field: HeightField) -> Tensor:
-    """Control heights (n, m) of the sphere that a side of another lens or mirror is, on the exit's spline spaces over its aperture,
-    from its vertex' plane, mm."""
+    """Control heights (n, m) of the spherical surface of another element, on the spline spaces of the exit over its own aperture,
+    from its vertex plane, mm."""
     x, y = (corners(2 * n, h) for n, h in zip(field.shape, element.half_size, strict=True))
     radius = element.radius[SIDES.index(side)]
     points = (torch.from_numpy(c) for c in np.broadcast_arrays(x[:, None], y[None, :]))
@@ -311,19 +312,14 @@ def sphere_net(element: Component, side: str, field: HeightField) -> Tensor:
     return net_of(x, y, z.numpy(), replace(field, half_size=element.half_size))
 
 
-def room_of(element: Component, lens: Lens) -> float:
-    """How far a design may take a surface of another lens or mirror from its sphere, mm: as far as the exit from its own, and never
-    through the glass."""
+def departure_bound(element: Component, lens: Lens) -> float:
+    """Largest departure of a designed surface of another element from its sphere, mm: that of the exit, limited by the
+    thickness."""
     thinnest = element.thickness + min(0.0, element.sag("back") - element.sag("front")) if not element.mirror else np.inf
-    return min(lens.height_range[1], GLASS * thinnest)
-
-
-def _mean(v: np.ndarray) -> np.ndarray:
-    """Of the four corners of each cell."""
-    return 0.25 * (v[1:, 1:] + v[:-1, 1:] + v[1:, :-1] + v[:-1, :-1])
+    return min(lens.height_range[1], THICKNESS_PART * thinnest)
 
 
 def _middle(z: np.ndarray) -> float:
-    """Height in the middle of the lens."""
+    """Height at the centre of the lens."""
     n, m = z.shape
     return float(z[(n - 1) // 2 : n // 2 + 1, (m - 1) // 2 : m // 2 + 1].mean())

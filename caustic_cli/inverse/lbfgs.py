@@ -1,7 +1,7 @@
 """L-BFGS with a strong Wolfe line search (Nocedal & Wright, Numerical Optimization, algorithms 7.4, 3.5, 3.6).
 
-Written for resuming: everything the next iteration needs is in `state()`, and evaluations are the expensive part, so
-none is repeated.  A step whose value is not finite is treated as far too long.
+Its whole state can be saved and restored (`state()`, `load()`), and no evaluation, the expensive part, is repeated.  A step to a
+value that is not finite is treated as too long.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 
-#: f may stay this much above Armijo's line: the sufficient decrease constant c1, and the curvature constant c2.
+#: Constants c1 (sufficient decrease, Armijo) and c2 (curvature) of the strong Wolfe conditions.
 ARMIJO, CURVATURE = 1e-4, 0.9
 UNFIT = (
     "the checkpoint's optimiser is another, or of another net, than ⟨design.optimizer⟩, ⟨design.network⟩ and ⟨lens.control⟩ say;"
     " design again to change them"
 )
-MAX_EVALUATIONS = 12  # a line search
-FIRST_STEP = 0.1  # of the first direction, in units of f / |g|^2
+MAX_EVALUATIONS = 12  # per line search
+FIRST_STEP = 0.1  # along the first direction, in units of f / |g|^2
 
 
 class LBFGS:
@@ -29,8 +29,8 @@ class LBFGS:
 
     Args:
         evaluate: x (n,) float64 -> (f, gradient (n,)).
-        x: where to start.
-        memory: pairs kept.
+        x: initial point (n,).
+        memory: number of correction pairs (s, y).
     """
 
     def __init__(self, evaluate: Callable[[Tensor], tuple[float, Tensor]], x: Tensor, memory: int = 20):
@@ -41,7 +41,7 @@ class LBFGS:
         self.evaluations = 0
 
     def step(self) -> bool:
-        """One iteration.  False: no lower point was found along the search direction nor along the gradient."""
+        """One iteration.  False if neither the quasi-Newton direction nor steepest descent leads to a lower value."""
         if self.f is None:
             self.f, self.g = self._evaluate(self.x)
         if not float(self.g.abs().max()) > 0:
@@ -54,23 +54,23 @@ class LBFGS:
                 return True
             if not self.pairs:
                 return False
-            self.pairs = []  # the curvature learnt misleads: forget it and go down the gradient
+            self.pairs = []  # restart: discard the curvature estimate, use steepest descent
         return False
 
     def state(self) -> dict[str, Tensor]:
-        """Everything needed to go on: tensors only, and none of them copied, since a large net's pairs are most of its memory."""
+        """Everything needed to continue, as tensors; none is copied, since the pairs of a large net dominate its memory."""
         out = {"x": self.x, "g": self.g, "f": torch.tensor([] if self.f is None else [self.f], dtype=torch.float64)}
         for k, pair in enumerate(self.pairs):
             out |= {f"{name}{k}": value for name, value in zip("sy", pair, strict=True)}
         return out
 
     def load(self, state: dict[str, Tensor]) -> None:
-        """Go on from `state()`.
+        """Continue from a `state()`.
 
         Raises:
-            InputError: it is that of another method, or of another number of unknowns.
+            InputError: the state is of another method or of another number of unknowns.
         """
-        if "s" in state and "y" in state:  # as version 0.1.0 wrote them, all in one
+        if "s" in state and "y" in state:  # the layout of version 0.1.0
             rows = {f"{name}{k}": row for name in "sy" for k, row in enumerate(state[name])}
             state = {name: value for name, value in state.items() if name not in ("s", "y")} | rows
         n, shapes = self.x.numel(), {name: tuple(value.shape) for name, value in state.items()}

@@ -1,17 +1,18 @@
-"""An array of lenslets: each is a lens of its own, designed in a frame of its own, and all of them are one surface.
+"""Lenslet arrays: each lenslet is designed in its own frame, and all of them are assembled into one B-spline surface.
 
 Notation
     (N, M)   lenslets along x and y; a lenslet is w = size / (N, M) wide
-    c_ij     middle of lenslet i, j: ((i + 1/2) / N - 1/2, (j + 1/2) / M - 1/2) times the size, mm
+    c_ij     centre of lenslet i, j: ((i + 1/2) / N - 1/2, (j + 1/2) / M - 1/2) times the size, mm
     s, p     knot spans of a lenslet and the degree, along each axis
     P_ij     control net of a lenslet, s + p points along each axis: those from i (s + p - 1) on of the whole net, so that
              neighbours share the ones on their border
-    h_ij     height that a lenslet is raised by, mm
+    h_ij     height offset (piston) of a lenslet, mm
 
-In the frame of lenslet i, j the screen is shifted by -c_ij, and nothing else is different.  Parallel light is thrown to the same
-places from any height, so the h_ij are free to make borders meet: they minimise the sum over all borders of the mean square of
-the two sides' control points.  What is left is shared by the two sides; how much that is, `Joined.gap` says.  Along a border the
-surface has a ridge: borders are knots of multiplicity p (`bspline.open_knots`), so that a lenslet's control points shape no other.
+In the frame of lenslet i, j the screen is shifted by -c_ij; all else is the same.  The landing points of collimated light do not
+depend on a height offset, so the h_ij are chosen to make borders meet: they minimise the sum over all borders of the mean square
+step between the control points on both sides.  The remaining steps, at most `AssembledArray.gap`, are averaged.  The surface may
+have a crease along a border: borders are knots of multiplicity p (`bspline.open_knots`), so that the control points of a lenslet
+affect no other.
 """
 
 from __future__ import annotations
@@ -27,13 +28,13 @@ from caustic_cli.errors import InputError
 from caustic_cli.inverse.initial_surface import CELLS, first_surface
 from caustic_cli.inverse.losses import ColorLoss, Loss
 from caustic_cli.inverse.objective import Evaluation
-from caustic_cli.inverse.robust import Plain
+from caustic_cli.inverse.robust import SceneObjective
 from caustic_cli.optics.averages import shared_out
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT
 from caustic_cli.scene import Scene
 
-FROM_AFAR = (
+NEEDS_DISTANT_SOURCE = (
     "⟨lens.array⟩ needs light from infinity, which reaches every lenslet alike: ⟨+source.type⟩ plane, or a disc with"
     " ⟨+source.angle⟩"
 )
@@ -43,8 +44,8 @@ FROM_AFAR = (
 class Lenslet:
     """One lenslet of an array.
 
-    scene, field: in its own frame, where it is a lens by itself, in its own part of the light; rows, columns: of its control points
-    in the whole net; share: its part of the light on the array.
+    scene, field: in its own frame, with its section of the beam; rows, columns: of its control points in the net of the array;
+    share: its fraction of the light on the array.
     """
 
     scene: Scene
@@ -54,7 +55,7 @@ class Lenslet:
     share: float
 
     def of(self, net: Tensor) -> Tensor:
-        """Its part of the array's control points."""
+        """Its section of a control net (n, m) of the array."""
         return net[self.rows, self.columns]
 
 
@@ -66,7 +67,7 @@ def lenslets(scene: Scene, control: tuple[int, int] | None = None) -> list[Lensl
     """
     lens, screen = scene.lens, scene.screen
     if not scene.source.distant:
-        raise InputError(FROM_AFAR)
+        raise InputError(NEEDS_DISTANT_SOURCE)
     steps = [(n - 1) // k for n, k in zip(control or lens.control, lens.array, strict=True)]
     size = (lens.size[0] / lens.array[0], lens.size[1] / lens.array[1])
     own = replace(lens, size=size, control=(steps[0] + 1, steps[1] + 1), array=(1, 1))
@@ -88,7 +89,7 @@ def lenslets(scene: Scene, control: tuple[int, int] | None = None) -> list[Lensl
 
 
 def _light(profile: np.ndarray | None, array: tuple[int, int]) -> list[list[np.ndarray]]:
-    """The beam's irradiance over each lenslet, in cells of its own, of one unit."""
+    """Irradiance profile over each lenslet, on a grid of its own, all in the same unit."""
     if profile is None:
         return [[np.ones((1, 1))] * array[1]] * array[0]
     cells = [max(1, -(-n // k)) for n, k in zip(profile.shape, array, strict=True)]
@@ -98,15 +99,15 @@ def _light(profile: np.ndarray | None, array: tuple[int, int]) -> list[list[np.n
 
 
 @dataclass(frozen=True, eq=False)
-class Joined:
-    """heights: (n, m) of the whole array, mm; gap: largest difference of two lenslets' control points on their border, mm."""
+class AssembledArray:
+    """heights: control net (n, m) of the array, mm; gap: largest step between control points of two lenslets on a border, mm."""
 
     heights: Tensor
     gap: float
 
 
-def joined(nets: Sequence[Tensor], array: tuple[int, int]) -> Joined:
-    """The surface that lenslets with these control nets, j fastest, make together; its mean height is that of the nets."""
+def assemble(nets: Sequence[Tensor], array: tuple[int, int]) -> AssembledArray:
+    """Assemble the control nets of all lenslets, j fastest, into that of the array; the mean height is unchanged."""
     n, m = array
     parts = torch.stack(list(nets)).double().view(n, m, *nets[0].shape)
     steps = [parts[:-1, :, -1] - parts[1:, :, 0], parts[:, :-1, :, -1] - parts[:, 1:, :, 0]]  # (n - 1, m, k), (n, m - 1, k)
@@ -116,7 +117,7 @@ def joined(nets: Sequence[Tensor], array: tuple[int, int]) -> Joined:
     wanted = torch.cat([s.mean(-1).reshape(-1) for s in steps])
     equations = torch.zeros(len(wanted) + 1, n * m, dtype=torch.float64)
     lines = torch.arange(len(wanted))
-    equations[lines, behind], equations[lines, before], equations[-1] = 1.0, -1.0, 1.0  # the last: no height on the whole
+    equations[lines, behind], equations[lines, before], equations[-1] = 1.0, -1.0, 1.0  # the last equation: zero mean offset
     raised = torch.linalg.lstsq(equations, torch.cat([wanted, wanted.new_zeros(1)])[:, None]).solution.view(n, m)
     parts = parts + raised[:, :, None, None]
     gaps = [parts[:-1, :, -1] - parts[1:, :, 0], parts[:, :-1, :, -1] - parts[:, 1:, :, 0]]
@@ -126,11 +127,11 @@ def joined(nets: Sequence[Tensor], array: tuple[int, int]) -> Joined:
         for j in range(m):
             net[i * a : (i + 1) * a + 1, j * b : (j + 1) * b + 1] += parts[i, j]
             count[i * a : (i + 1) * a + 1, j * b : (j + 1) * b + 1] += 1.0
-    return Joined(net / count, max((float(g.abs().max()) for g in gaps if g.numel()), default=0.0))
+    return AssembledArray(net / count, max((float(g.abs().max()) for g in gaps if g.numel()), default=0.0))
 
 
-def first_array(scene: Scene, targets: Sequence[np.ndarray], control: tuple[int, int], cells: int = CELLS) -> Joined:
-    """The array whose lenslets throw the pictures, each by its own transport.
+def initial_array(scene: Scene, targets: Sequence[np.ndarray], control: tuple[int, int], cells: int = CELLS) -> AssembledArray:
+    """Initial surface of an array by optimal transport, solved for each lenslet.
 
     Args:
         scene: source, lens and screen of the whole.
@@ -143,33 +144,34 @@ def first_array(scene: Scene, targets: Sequence[np.ndarray], control: tuple[int,
     """
     parts = lenslets(scene, control)
     each = targets if len(targets) == len(parts) else [targets[0]] * len(parts)
-    return joined(
+    return assemble(
         [first_surface(one.scene, goal, one.field, cells).heights for one, goal in zip(parts, each, strict=True)], scene.lens.array
     )
 
 
 class ArrayObjective:
-    """The loss of an array as a function of its heights, every lenslet judged by its own picture.
+    """The loss of an array as a function of its heights, each lenslet against its own target.
 
         L = sqrt(mean over lenslets of L_k^2),    L_k the loss of lenslet k as a lens by itself
 
-    so that no lenslet makes up for what another does wrong, and the image holds under any beam.  Borders belong to both sides.
+    so that lenslets do not compensate each other's errors, and the image does not depend on the beam profile.  Control points on a
+    border belong to both lenslets.
 
     Args:
-        parts: of the array.
-        objective: makes the loss of a lenslet, by its number.
+        parts: the lenslets of the array.
+        objective: returns the loss of a lenslet, given its number.
     """
 
-    def __init__(self, parts: Sequence[Lenslet], objective: Callable[[int, Lenslet], Plain]):
+    def __init__(self, parts: Sequence[Lenslet], objective: Callable[[int, Lenslet], SceneObjective]):
         self.parts = list(parts)
         self.each = [objective(k, one) for k, one in enumerate(self.parts)]
         self.loss: Loss | ColorLoss = self.each[0].loss
 
     def __call__(self, heights: Tensor) -> Evaluation:
-        """Value, gradient, light on the screen and image at heights (n, m) mm float64 of the array."""
+        """Value, gradient, fraction of the light on the screen and image at heights (n, m) mm float64 of the array."""
         found = [loss(one.of(heights)) for loss, one in zip(self.each, self.parts, strict=True)]
         total = float(np.sqrt(np.mean([e.loss**2 for e in found])))
-        gradient = torch.zeros_like(found[0].gradient, device=found[0].gradient.device).new_zeros(heights.shape)
+        gradient = found[0].gradient.new_zeros(heights.shape)
         for e, one in zip(found, self.parts, strict=True):
             gradient[one.rows, one.columns] += (e.loss / (total * len(found)) if total > 0 else 0.0) * e.gradient
         shares = [one.share for one in self.parts]

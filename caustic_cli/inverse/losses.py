@@ -1,18 +1,18 @@
-"""How far an image is from its target, and what is penalised besides (thesis 5.2, 6.4, 7.2).
+"""Loss functions: the distance between an image and its target (thesis 5.2, 6.4, 7.2).
 
 Every term is a dimensionless root mean square t; r is the relative residual N (J / P - T / sum T) on N pixels.
 
-    rms         r with P = sum J, eq. 5.2.1.  Light thrown off the screen costs nothing (erratum E13).
-    rms-light   r with P = P_out, the power that leaves the lens: every ray counts.
-    throughput  t^2 is the part of the light beside the screen, each ray weighted by its distance from it (1 at the apron's rim):
-                it pulls back where rms-light, which sees how much light is out there but not how far, has no slope
-    light       t^2 is the part of the light on the lens that does not reach the screen, whatever becomes of it; what lands beside
-                the screen counts by its distance, as of throughput, so that there is a slope
-    diffusion   the Laplacian of r, with P = P_out: errors that alternate from pixel to pixel count
-    uniformity  standard deviation of J over its mean where the target is not dark: no picture is asked for (5.2)
+    rms         r with P = sum J, eq. 5.2.1.  Light beside the screen has no influence (erratum E13).
+    rms-light   r with P = P_out, the power that leaves the lens: light beside the screen counts as missing.
+    throughput  t^2 is the fraction of the light beside the screen, weighted by its distance from it (1 at the apron's rim), which
+                has a gradient where that of rms-light, which does not depend on the distance, vanishes
+    light       t^2 is the fraction of the light on the lens that does not reach the screen; light beside the screen is weighted by
+                its distance, as in throughput, so that there is a gradient
+    diffusion   the Laplacian of r, with P = P_out: penalises errors of high spatial frequency
+    uniformity  standard deviation of J over its mean where the target is not dark (5.2)
     laplacian, curvature    of the lens, see `penalties`
 
-Both sides may be blurred by the same matrices, J -> G_x J G_y^T: the residual is then seen at a coarser scale.
+Image and target may both be blurred, J -> G_x J G_y^T, so that the residual is compared at a coarser scale.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ class NoLight(CausticError):
 
 
 def gaussian_matrix(n: int, sigma: float) -> Tensor:
-    """Blur along one axis by a Gaussian of `sigma` pixels, cut at 4 sigma: (n, n) float64; light leaving the frame is lost."""
+    """Gaussian blur along one axis with standard deviation `sigma` pixels, truncated at 4 sigma: (n, n) float64, dark beyond the
+    frame."""
     reach = max(1, math.ceil(4.0 * sigma))
     d = torch.arange(n, dtype=torch.float64)
     d = d[:, None] - d[None, :]
@@ -72,9 +73,9 @@ class Loss:
     Args:
         text: see `parse`.
         target: (n_x, n_y) irradiance to reach, any scale, not all zero, already filtered as the render will be.
-        blur: standard deviation in pixels of the Gaussian both sides are seen through; 0 for none.
+        blur: standard deviation, pixels, of the Gaussian that image and target are blurred by; 0 for none.
         apron: pixels on each side that do not belong to the screen.
-        region: (n_x, n_y) bool, where `uniformity` looks; None for where the target is not dark.
+        region: (n_x, n_y) bool, where `uniformity` is evaluated; None for where the target is not dark.
     """
 
     def __init__(self, text: str, target: Tensor, blur: float = 0.0, apron: int = 0, region: Tensor | None = None):
@@ -93,10 +94,10 @@ class Loss:
     def __call__(self, image: Tensor, leaving: Tensor, penalty: Tensor | float = 0.0, entering: Tensor | None = None) -> Tensor:
         """Loss of an image (n_x, n_y) made by rays that carried `leaving` out of the lens: scalar, in units of eq. 5.2.1.
 
-        penalty: sum of weighted squares of what does not concern the image; entering: light on the lens, None for `leaving`.
+        penalty: weighted sum of squared penalty terms of the surface; entering: power on the lens, None for `leaving`.
 
         Raises:
-            NoLight: no light to compare.
+            NoLight: the image is black.
         """
         total = image.sum()
         if not float(total.detach()) > 0:
@@ -108,7 +109,7 @@ class Loss:
         square = sum(weight * self._square(name, image, leaving, entering, total) for weight, name in self.terms) + penalty
         pixels = self.target.numel()
         if not float(square.detach()) > 0:
-            return square / pixels  # a perfect picture: the root's slope is infinite there, the square's is 0
+            return square / pixels  # zero loss: the square root has no derivative there, its square has
         return square.sqrt() / pixels
 
     def _square(self, name: str, image: Tensor, leaving: Tensor, entering: Tensor, total: Tensor) -> Tensor:
@@ -118,10 +119,9 @@ class Loss:
             return 1.0 - (image * (1.0 - self.distance / max(self.apron, 1))).sum() / entering
         if name == "uniformity":
             inside = image[self.region]
-            if not float(inside.detach().sum()) > 0:  # evenly dark is not what was asked for
+            if not float(inside.detach().sum()) > 0:  # a black region would count as uniform
                 raise NoLight(
-                    "no light reaches the bright part of the picture, so there is nothing to make even; check throw,"
-                    " mag and screen size"
+                    "no light reaches the bright part of the picture, so uniformity is undefined; check throw, mag and screen size"
                 )
             return (inside / inside.mean()).var(correction=0)
         residual = image / (total if name == "rms" else leaving) - self.target
@@ -134,7 +134,7 @@ class Loss:
 
 
 class ColorLoss:
-    """The root of the mean square over red, green and blue, each against its own target; a colour without light is left out.
+    """Root mean square of the losses of the red, green and blue channels; channels without light in the target are left out.
 
     Args:
         target, region: (3, n_x, n_y); all others as of `Loss`.

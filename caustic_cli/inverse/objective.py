@@ -1,4 +1,4 @@
-"""The loss of a set of control heights and its derivative, over one fixed set of rays.
+"""The objective function: the loss of control heights and its gradient, for a fixed set of rays.
 
     Scene + heights -> trace -> landing points, weights -> reconstruct -> image -> loss
 
@@ -29,16 +29,16 @@ from caustic_cli.optics.system import EXIT
 from caustic_cli.optics.trace import Parameters, Tracer, tracers
 from caustic_cli.scene import Scene
 
-#: Rays traced at a time, and the number up to which the prepared chunks are kept from one evaluation to the next; and the same of
-#: rows and columns of rays along the axis, which keep little for each: 8e6 on 2000 x 2000 pixels take 0.6 s, by 2^20 at a time 3 s.
+#: Rays traced at a time, and most rays whose prepared chunks are kept between evaluations; and the same for tensor grids of axial
+#: rays, which need little memory per ray: 8e6 on 2000 x 2000 pixels take 0.6 s, by 2^20 at a time 3 s.
 CHUNK, KEPT_RAYS = 1 << 20, 1 << 22
 CHUNK_OF_ROWS, KEPT_OF_ROWS = 1 << 24, 1 << 25
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Loss (units of eq. 5.2.1), its gradients over the heights of each surface (n, m) per mm, the part of the light on the
-    screen, and the image there that was judged, power per pixel, (n_x, n_y) or (3, n_x, n_y)."""
+    """Loss (units of eq. 5.2.1), its gradients with respect to the heights of each surface (n, m) per mm, the fraction of the light
+    on the screen, and the image there, power per pixel, (n_x, n_y) or (3, n_x, n_y)."""
 
     loss: float
     gradients: dict[str, Tensor]
@@ -47,14 +47,14 @@ class Evaluation:
 
     @property
     def gradient(self) -> Tensor:
-        """That of a lens' exit, or of all surfaces, (k, n, m)."""
+        """Gradient of the exit (n, m), or of all surfaces, (k, n, m)."""
         return torch.stack([*self.gradients.values()]) if len(self.gradients) > 1 else self.gradients[EXIT]
 
 
 def penalty_of(
     scene: Scene, field: HeightField, loss: str, max_slope: float, min_radius: float, device: str | torch.device
 ) -> Penalty:
-    """What a loss and the limits say of the surface itself."""
+    """The penalty terms of the surface, from a loss and the limits."""
     terms = [(weight, name) for weight, name in parse(loss) if name in PENALTIES and weight > 0]
     return Penalty(scene, field, terms, max_slope, device, min_radius)
 
@@ -63,23 +63,21 @@ class Objective:
     """The loss as a function of the heights.
 
     Args:
-        scene: its screen is the one the picture is judged on.
+        scene: with the screen of the picture.
         field: spline spaces of the heights.
-        sampler: the rays, the same at every evaluation; or those of each of several points of the source.
+        sampler: the rays, the same at every evaluation; or a list with those of several points of the source.
         filter: reconstruction filter.
         target: (n_x, n_y) irradiance on the scene's screen, or (3, n_x, n_y) of a coloured scene.
         loss: weighted terms, see `losses.parse`.
         blur: pixels, see `Loss`.
         filter_target: filter the target as the render is filtered.
-        apron: pixels by which the screen is widened on every side, dark in the target: light that has left the screen
-            is seen there and pulled back.
-        max_slope: limit of the lens' slope, 0 for none; min_radius: least radius of concave places, mm, 0 for any.
-        oversample: the filter works on pixels so many times smaller along each axis, which are then added up: a render that
-            is nearly a bincount, and yet smooth in the heights.
-        spread: what the image of the rays of each point is convolved with, the part of the source that it stands for; empty for
-            rays of all of it.  Rays are caught around the screen and the apron as far as their light reaches these.
-        expected: part of the light that the loss asks for on screen and apron; what a source spreads beside them is none of its
-            concern.
+        apron: pixels of a dark guard band around the target, in which light beside the screen contributes to the loss.
+        max_slope: limit of the lens' slope, 0 for none; min_radius: least radius of concave regions, mm, 0 for any.
+        oversample: the filter is applied on pixels smaller by this factor along each axis, which are then summed: a render
+            close to a bincount, and yet differentiable with respect to the heights.
+        spread: convolution for the image of each point, with the section of the source that it represents; empty for rays of the
+            whole source.  The image is then traced on a margin from which light is spread onto screen and apron.
+        expected: fraction of the light that can be on screen and apron behind the blur of the source.
         dtype: precision of the rays.
     """
 
@@ -127,7 +125,7 @@ class Objective:
             self.chunk = smaller(self.chunk, error)
 
     def moved(self, scene: Scene, rays: Rays) -> Objective:
-        """The same in a scene whose screen or source stands elsewhere, by other rays; the target is not filtered anew."""
+        """The same objective for another position of screen or source and other rays, sharing the filtered target."""
         other = copy.copy(self)
         other.scene, other.screen, other.samplers = scene, replace(self.screen, z=scene.screen.z), [rays]
         other.kept = None if self.kept is None else list(other._tracers())
@@ -135,26 +133,26 @@ class Objective:
 
     @property
     def whole(self) -> bool:
-        """Whether chunks keep their graphs: a fused kernel's holds the net or the surface at its rays, a trace by stages every
-        ray after each of them."""
+        """Whether the graphs of all chunks are kept: a fused kernel stores the net or the surface at its rays, a staged trace every
+        ray after each stage."""
         return self.kept is not None and (sum(t.fused is None for _, t in self.kept) <= 1)
 
     def _rows(self) -> bool:
-        """Whether the rays are rows and columns of a plane wave along the axis, for which there is a fused kernel."""
+        """Whether the rays are a tensor grid of an axial plane wave, for which there is a fused kernel."""
         if not (self.screen.upright and all(isinstance(s, Sampler) and s.tensor for s in self.samplers)):
             return False
         _, first = next(self._tracers(), (0, None))
         return first is not None and first.fused is not None and first.start.along_axis
 
     def _pool(self, image: Tensor, cut: int = 1) -> Tensor:
-        """Pixels of the screen, cut into so many along each axis, from those of the render."""
+        """Pixels of the screen, each subdivided by `cut` along each axis, from those of the render, by summation."""
         k, (*colors, n, m) = self.oversample // cut, image.shape
         if k == 1:
             return image
         return avg_pool2d(image.view(-1, n, m), k, divisor_override=1).view(*colors, n // k, m // k)  # sums; faster than .sum
 
     def _spread_out(self, images: Tensor) -> Tensor:
-        """The source's image on screen and apron, from those of the rays of each of its points."""
+        """The image on screen and apron of the whole source, from those of its points."""
         if not self.spread:
             return images[0]
         return sum(
@@ -163,12 +161,12 @@ class Objective:
         )
 
     def _expected_power(self, seen: Tensor, leaving: Tensor) -> Tensor:
-        """Power that the loss holds against an image: all that leaves the lens; behind a source's blur what it sees, unless that
-        is less than what can be expected there."""
+        """Power to which the loss normalises an image: all that leaves the lens; with a blur that in the image, but at least what
+        can be expected there."""
         return torch.maximum(seen.sum((-2, -1)), self.expected * leaving) if self.spread else leaving
 
     def _tracers(self) -> Iterator[tuple[int, Tracer]]:
-        """This rank's chunks, ready to be traced, each with the number of its point."""
+        """Tracers of the chunks of this rank, each with the index of its source point."""
         rank, count = ranks.rank_and_size()
         for k, sampler in enumerate(self.samplers):
             size = min(self.chunk, math.ceil(sampler.count / count)) if count > 1 else self.chunk
@@ -176,15 +174,16 @@ class Objective:
                 yield k, traced
 
     def __call__(self, heights: Tensor) -> Evaluation:
-        """`evaluate` at the heights (n, m) mm float64 of a lens' exit, or at those of all surfaces that are `shaped`, (k, n, m)."""
+        """`evaluate` at the heights (n, m) mm float64 of the exit, or of all surfaces that are `shaped`, (k, n, m)."""
         return self.evaluate({EXIT: heights} if heights.ndim == 2 else dict(zip(self.scene.shaped, heights, strict=True)))
 
     def evaluate(self, parameters: Parameters) -> Evaluation:
         """Value and gradients at heights {name of a surface: (n, m) mm float64}.
 
-        The loss sees rays through the image alone.  So the image is accumulated chunk by chunk, the loss gives its
-        derivative by the image, and each chunk is traced again to pull that back: memory does not grow with rays.
-        Where there is little to keep, the graph is kept instead of tracing again.  Where memory runs out, smaller chunks are tried.
+        The loss depends on the rays through the image alone.  So the image is accumulated chunk by chunk, the loss is
+        differentiated with respect to the image, and each chunk is traced again for the vector-Jacobian product: memory does not
+        grow with the number of rays.  Small graphs are kept instead of tracing again.  When memory runs out, smaller chunks are
+        tried.
 
         Raises:
             CausticError: out of memory, or no light reaches the screen.
@@ -193,9 +192,9 @@ class Objective:
             try:
                 return self._evaluate(parameters)
             except (MemoryError, RuntimeError) as error:
-                if ranks.rank_and_size()[1] > 1:  # the others wait for this chunk's image
+                if ranks.rank_and_size()[1] > 1:  # the other ranks wait for the image of this chunk
                     raise
-                problem = error.with_traceback(None)  # which would hold all that was allocated
+                problem = error.with_traceback(None)  # the traceback would keep all allocations alive
             self.chunk, self.kept = smaller(self.chunk, problem), None
 
     def _evaluate(self, given: Parameters) -> Evaluation:
@@ -224,7 +223,7 @@ class Objective:
         by_image, by_leaving, *direct = torch.autograd.grad(loss, wanted, allow_unused=True)
         gradients = [torch.zeros_like(heights) for heights in leaves]
         for k, part in parts or ((k, self._see(traced, parameters)) for k, traced in self.kept or self._tracers()):
-            # Whole pixels, and what leaves a lens without reflections, do not depend on the heights at all.
+            # Bincount images, and the power that leaves a lens without reflections, do not depend on the heights.
             pulls = [
                 (value, by.to(value.dtype))
                 for value, by in zip(part, (by_image[k], by_leaving), strict=True)
@@ -244,6 +243,6 @@ class Objective:
         return Evaluation(float(loss.detach()), dict(zip(parameters, gradients, strict=True)), float(inner.sum()), inner)
 
     def _see(self, traced: Tracer, parameters: Parameters) -> tuple[Tensor, Tensor]:
-        """What a chunk adds to the image, and to the power that leaves the lens."""
+        """Contribution of a chunk to the image, and to the power that leaves the lens."""
         part = traced.expose(parameters, self.screen, self.filter)
         return self._pool(part.image, self.cut), part.leaving

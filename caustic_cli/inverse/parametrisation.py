@@ -1,4 +1,4 @@
-"""From trainable parameters to control heights (thesis 5.1).
+"""Parametrisations of the control heights: free, preconditioned, or the output of a network (thesis 5.1).
 
     heights = low + (1 + tanh(raw)) / 2 (high - low)                          eqs. 5.1.1, 5.1.2; low, high per control point
 
@@ -10,11 +10,11 @@
     dense     1 -> hidden layers, fully connected -> a fully connected layer of control-net size; in the thesis two hidden layers
               of control-net size and tanh, which eq. 5.1.1 makes three
 
-A network may have further inputs c beside the 1, which its first layer sees through weights of their own: a lens for each c
-(`conditions`).  With the Laplacian preconditioner its outputs are the coordinates y above, not raw values.
+A network may have further inputs c beside the 1, with weights of their own in the first layer: a lens for each c
+(`scene_parameters`).  With the Laplacian preconditioner its outputs are the coordinates y above, not raw values.
 
-The caustic responds to the Laplacian of the surface: in the preconditioned coordinates every length scale of the
-picture pulls equally hard, and L-BFGS needs tens of iterations where a plain gradient needs thousands.
+The caustic depends on the Laplacian of the surface: in the preconditioned coordinates all length scales of the picture contribute
+equally to the gradient, and L-BFGS needs tens of iterations where gradient descent needs thousands.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from caustic_cli.config.table import check, default
 from caustic_cli.errors import InputError
 
 NETWORKS = ("none", "sparse", "dense")
-#: zero-last: random but for the last layer of a network, which is zero: it begins at its first surface, and learns from there.
+#: zero-last: random but for a zero last layer of the network, which then starts at the initial surface.
 INITIAL = ("zero", "uniform", "random", "zero-last")
 PRECONDITIONERS = ("none", "laplacian")
-#: tanh is inverted no closer than this to its limits: raw stays below 8.4 and a gradient remains.
+#: Least distance to the limits at which tanh is inverted: raw stays below 8.4, where the gradient does not vanish.
 SATURATION = 1e-7
 UNIFORM_SPREAD = 1e-4  # thesis 6.2.1
 ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
@@ -52,7 +52,7 @@ MAX_DENSE = 500_000_000
 
 @dataclass(frozen=True)
 class Architecture:
-    """Of a dense network: hidden layers, neurons in each (0 for as many as control points), and their activation.
+    """Architecture of a dense network: hidden layers, neurons in each (0 for as many as control points), and activation.
 
     Raises:
         InputError: out of range, see the table.
@@ -77,7 +77,7 @@ def cosine_transform(n: int) -> Tensor:
 
 
 class _Inverse(torch.autograd.Function):
-    """C_u^T x C_v over the last two axes of x, whose adjoint is C_u x C_v^T: by fast transforms, in n m log(n m) steps."""
+    """Inverse cosine transform C_u^T x C_v over the last two axes of x, with adjoint C_u x C_v^T, in O(n m log(n m))."""
 
     @staticmethod
     def forward(ctx, x: Tensor) -> Tensor:
@@ -98,7 +98,7 @@ class InverseLaplacian:
             self.cu, self.cv = cosine_transform(n).to(like), cosine_transform(m).to(like)
         lam = [4.0 * torch.sin(0.5 * math.pi * torch.arange(k).to(like) / k) ** 2 for k in (n, m)]
         total = lam[0][:, None] + lam[1][None, :]
-        total[0, 0] = math.inf  # the mean height moves no light: leave it where the start put it
+        total[0, 0] = math.inf  # the mean height does not affect the image: keep it
         self.scale = float(lam[0][1] + lam[1][1]) / total
 
     def __call__(self, y: Tensor) -> Tensor:
@@ -127,7 +127,7 @@ class Heights(torch.nn.Module):
         return self.low + 0.5 * (1.0 + torch.tanh(self.raw(inputs).double())) * self.span
 
     def begun(self) -> Tensor:
-        """The heights (n, m) that parameters are counted from, or where they are counted from none, those of now."""
+        """The heights (n, m), mm, at which parameters that are relative to an initial surface are zero; else the current ones."""
         return self().detach()
 
     def invert(self, heights: Tensor) -> Tensor:
@@ -137,11 +137,11 @@ class Heights(torch.nn.Module):
 
 
 class FreeHeights(Heights):
-    """No network; with `laplacian`, in coordinates where the caustic's response is well conditioned.
+    """Free control heights; with `laplacian`, in coordinates where the response of the caustic is well conditioned.
 
     Args:
-        start: (n, m) heights to start from, or None for the middle of the range.
-        counted: parameters are counted from the start, which `begun` tells.
+        start: (n, m) initial heights, mm, or None for the middle of the range.
+        counted: parameters are relative to the initial heights, which `begun` returns.
     """
 
     def __init__(self, low: Tensor, high: Tensor, start: Tensor | None = None, laplacian: bool = False, counted: bool = False):
@@ -162,13 +162,13 @@ class FreeHeights(Heights):
 
 
 class SidesTogether(FreeHeights):
-    """Heights of two sides, (2, n, m), of which the exit follows the entrance.
+    """Heights of two surfaces, (2, n, m), with coupled parameters that decouple positions and directions of the rays.
 
-    What is added to the entrance is also added to the exit where its light leaves: the optical path of every ray stays, and so, to
-    first order, does the direction in which it leaves.  So one of the parameters moves light about on the exit, the other turns it.
+    A change of the entrance is also added to the exit where its rays leave: the optical path length of every ray, and so, to first
+    order, the direction in which it leaves, is unchanged.  So the first parameter moves light on the exit, the second deflects it.
 
     Args:
-        origins: (n, m, 2) places on the entrance, see `between_sides.origins`; None where they are loaded.
+        origins: (n, m, 2) points of the entrance, see `internal_rays.entrance_points`; None where they are loaded.
     """
 
     def __init__(self, low: Tensor, high: Tensor, start: Tensor, laplacian: bool, origins: Tensor | None):
@@ -186,8 +186,8 @@ class NetworkHeights(Heights):
 
     Args:
         kind: sparse or dense; degree: of the spline, for the kernel of a sparse one.
-        start: (n, m) heights that a preconditioned network is counted from, or None for the middle of the range.
-        laplacian: its outputs are coordinates of the preconditioner.
+        start: (n, m) heights, mm, relative to which a preconditioned network is defined, or None for the middle of the range.
+        laplacian: outputs are coordinates of the preconditioner.
     """
 
     def __init__(
@@ -234,7 +234,9 @@ class NetworkHeights(Heights):
             of_layer = spread(fan_in, k == len(layers) - 1)
             self.weights.append(parameter(shape, of_layer))
             self.biases.append(parameter((width,), of_layer))
-        self.seen = parameter((layers[0][2], inputs), spread(1, False)) if inputs else None  # of the inputs, in the first layer
+        self.seen = (
+            parameter((layers[0][2], inputs), spread(1, False)) if inputs else None
+        )  # weights of the inputs in the first layer
         self.laplacian = InverseLaplacian(low) if laplacian else None
         self.register_buffer("start", (torch.zeros_like(low) if start is None else self.invert(start)) if laplacian else None)
 
@@ -268,10 +270,10 @@ def parametrise(
     architecture: Architecture | None = None,
     inputs: int = 0,
 ) -> Heights:
-    """The parametrisation a design asks for; inputs: how many a network has beside the 1.
+    """The parametrisation with these options; inputs: number of inputs of a network beside the 1.
 
     Raises:
-        InputError: an unknown name, a start given to a network that is not counted from one, or a network too large.
+        InputError: an unknown name, an initial surface for a network that does not take one, or a network that is too large.
     """
     checks.choice("⟨design.network⟩", network, NETWORKS)
     checks.choice("⟨design.initial⟩", initial, INITIAL)

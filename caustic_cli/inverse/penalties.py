@@ -1,14 +1,14 @@
-"""What a design minds about the lens itself (thesis 6.4): bumps, slopes beyond a limit, hollows too narrow for a tool.
+"""Regularisation and penalty terms of the lens surface (thesis 6.4): roughness, slope limit, least concave radius of curvature.
 
 Notation
     d       departure of the surface from the offset, mm
     G       (n - 1) T, mm, with T from lens to screen: a curvature d_xx moves light apart by the factor 1 + G d_xx
 
-    laplacian   root mean square of G (d_xx + d_yy): how much the lens magnifies unevenly
+    laplacian   root mean square of G (d_xx + d_yy): to first order, the variation of the local magnification
     curvature   root mean square of G sqrt(d_xx^2 + 2 d_xy^2 + d_yy^2): the bending energy of a thin plate
     slope       root mean square of 100 max(0, |grad z| / limit - 1)
-    radius      root mean square of 100 max(0, k r - 1), k the largest principal curvature as the tool sees it (from -z of a
-                mirror), r the least concave radius
+    radius      root mean square of 100 max(0, k r - 1), k the largest principal curvature, concave seen from the tool (from -z for
+                a mirror), r the least concave radius
 
 Means are over the Greville abscissae of the control net.
 """
@@ -24,17 +24,18 @@ from caustic_cli.optics.bspline import derivatives_over_grid
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 
+#: Weight of the relative excess over a limit.
 STIFFNESS = 100.0
 
 
 class Penalty:
-    """Weighted squares of what a surface is asked not to have.
+    """Weighted sum of squared penalty terms of a surface.
 
     Args:
         scene, field: the lens and the spline spaces of its heights.
         terms: (weight, name) of `losses.PENALTIES`.
         max_slope: limit of |grad z|, 0 for none.
-        min_radius: least radius of curvature of concave places, mm, 0 for any.
+        min_radius: least radius of curvature of concave regions, mm, 0 for any.
     """
 
     def __init__(
@@ -54,7 +55,7 @@ class Penalty:
         (su, sv), (rx, ry) = field.spaces, field.half_size
         self.u = [(su.banded(su.greville, k) / (2.0 * rx) ** k).to(device) for k in range(3)]
         self.v = [(sv.banded(sv.greville, k) / (2.0 * ry) ** k).to(device) for k in range(3)]
-        if self:  # two sides take the base for their radius, too
+        if self:  # the entrance of a two-sided lens is measured from the base, too
             x, y = (c.numpy() for c in field.control_xy())
             offset = scene.lens.offset
             self.base = torch.from_numpy(offset.thickness + offset.sag(x[:, None], y[None, :])).to(device)

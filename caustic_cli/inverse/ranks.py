@@ -1,8 +1,8 @@
-"""One design by several processes (`torchrun`): each rank traces its part of the rays, and images and gradients are summed.
+"""Data-parallel design by several processes (`torchrun`): each rank traces its share of the rays; images and gradients are summed.
 
-Rank 0 reads, decides, writes and speaks.  The others receive from it what is to be designed and walk through the same loop with
-the same numbers; only what they trace differs.  Whatever depends on a clock or a signal is rank 0's to say.  In a single
-process every function here does nothing.
+Rank 0 reads, decides, writes and reports.  The others receive the design from it and run the same loop with the same numbers; only
+the rays they trace differ.  Decisions that depend on a clock or a signal are broadcast by rank 0.  In a single process every
+function here does nothing.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from caustic_cli.errors import CausticError, InputError, Interrupted
 
 @contextmanager
 def process_group(device: str) -> Iterator[int]:
-    """Meet the other ranks if torchrun started this process, over gloo on CPUs and nccl on GPUs; gives the rank.
+    """Join the process group if torchrun started this process, over gloo on CPUs and nccl on GPUs; yields the rank.
 
-    Rank 0 lets the others go when its block ends; when it fails, they learn it from their next sum.
+    Rank 0 releases the others when its block ends; when it fails, their next collective operation fails.
 
     Raises:
-        InputError: the environment says no such rank, number of ranks or place to meet.
-        CausticError: they do not meet there.
+        InputError: the environment holds no valid rank, number of ranks or address.
+        CausticError: the group cannot be formed.
     """
     if checks.rank_and_size()[1] == 1:
         yield 0
@@ -57,7 +57,7 @@ def process_group(device: str) -> Iterator[int]:
 
 
 def _meet(device: str) -> None:
-    """Wait for the other ranks in a thread of its own: no signal is answered while C++ waits in the main one."""
+    """Initialise the process group in a separate thread: signals are not handled while C++ blocks the main one."""
     failed: list[Exception] = []
 
     def meet() -> None:
@@ -65,7 +65,7 @@ def _meet(device: str) -> None:
             if device == "cuda":
                 torch.cuda.set_device(current)
             dist.init_process_group("nccl" if device == "cuda" else "gloo")
-        except Exception as error:  # whatever it is, it is the main thread's
+        except Exception as error:  # re-raised in the main thread
             failed.append(error)
 
     current = torch.cuda.current_device() if device == "cuda" else None
@@ -83,27 +83,27 @@ def _say_goodbye(rank: int) -> None:
 
 
 def rank_and_size() -> tuple[int, int]:
-    """This process' rank, and how many there are."""
+    """Rank of this process, and number of ranks."""
     if dist.is_available() and dist.is_initialized():
         return dist.get_rank(), dist.get_world_size()
     return 0, 1
 
 
 def send(task) -> None:
-    """Rank 0: what the others are to do (`receive`), None for nothing more."""
+    """Rank 0: send a task to the others (`receive`), None to release them."""
     if rank_and_size()[1] > 1:
         _call(dist.broadcast_object_list, [task], 0)
 
 
 def receive():
-    """The other ranks: what rank 0 tells."""
+    """The other ranks: receive a task from rank 0."""
     task = [None]
     _call(dist.broadcast_object_list, task, 0)
     return task[0]
 
 
 def all_reduce(*tensors: Tensor) -> None:
-    """Replace each tensor by its sum over all ranks; every rank gets the same bits."""
+    """Replace each tensor by its sum over all ranks, bitwise the same on every rank."""
     if rank_and_size()[1] > 1:
         for tensor in tensors:
             _call(dist.all_reduce, tensor)
@@ -116,7 +116,7 @@ def broadcast(tensor: Tensor) -> None:
 
 
 def decide(answer: bool, device: str | torch.device = "cpu") -> bool:
-    """Rank 0's answer."""
+    """The answer of rank 0, on every rank."""
     if rank_and_size()[1] == 1:
         return answer
     said = torch.tensor(int(answer), device=device)
@@ -129,5 +129,5 @@ def _call(collective, *arguments) -> None:
         collective(*arguments)
     except RuntimeError as error:
         raise CausticError(
-            f"rank {dist.get_rank()}: another rank has stopped, and what it said tells why ({str(error).splitlines()[0][:200]})"
+            f"rank {dist.get_rank()}: another rank has stopped, see its message ({str(error).splitlines()[0][:200]})"
         ) from error

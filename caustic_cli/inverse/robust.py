@@ -1,10 +1,10 @@
-"""The loss of a lens under errors of making and placing: over a few draws of them, the same at every evaluation.
+"""Robust design: the loss averaged over a fixed sample of manufacturing and alignment errors.
 
     L = (sum over k of w_k L_k^POWER)^(1 / POWER),    L_k the loss in the scene of draw k,    k = 0 the scene without errors
 
-with w_0 = 1 - WEIGHT and the rest in equal parts.  Draws are a Latin hypercube of their own, which no study of tolerances takes;
-each comes with its opposite, so that no error has a mean.  A draw's scene is the upright one nearest to it
-(`Misalignment.upright`): what only turns the picture or the screen is left out, and so is roughness.
+with w_0 = 1 - WEIGHT and equal weights otherwise.  The draws are a Latin hypercube, independent of that of a tolerance study, in
+antithetic pairs, so that every error has zero mean.  The scene of a draw is the nearest one with an upright screen
+(`Misalignment.upright`): rotations of the picture or the screen, and roughness, are left out.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from caustic_cli.optics.system import EXIT
 from caustic_cli.scene import Scene
 from caustic_cli.scene.tolerances import Tolerances, hypercube
 
-#: Pairs of opposite draws, the power of the mean over them, and their weight in all.
+#: Antithetic pairs of draws, exponent of the power mean over them, and their total weight.
 PAIRS, POWER, WEIGHT = 2, 2.0, 0.1
-#: Purpose of these draws.
+#: Stream of random numbers of these draws.
 PURPOSE = 2
 
 
-class Plain(Protocol):
-    """The loss in one scene."""
+class SceneObjective(Protocol):
+    """The loss in a single scene."""
 
     loss: Loss | ColorLoss
 
@@ -45,29 +45,29 @@ class RobustObjective:
     """The loss as a function of the heights; see above.
 
     Args:
-        objective: makes the loss in a scene, near heights (n, m) mm.
-        scene, field, begun: without errors; begun, the heights at which the stage begins.
+        objective: returns the loss in a scene, near heights (n, m) mm.
+        scene, field: without errors; begun: heights at the beginning of the stage, (n, m) mm.
         tolerances: the errors.
 
     Raises:
-        InputError: none of the errors means anything here.
+        InputError: none of the errors applies to the scene.
     """
 
     def __init__(
         self,
-        objective: Callable[[Scene, Tensor], Plain],
+        objective: Callable[[Scene, Tensor], SceneObjective],
         scene: Scene,
         field: HeightField,
         begun: Tensor,
         tolerances: Tolerances,
     ):
         parameters = tuple(p for p in tolerances.parameters if p.error != "roughness" and not idle(scene, p.error))
-        fits = tolerances.surface and _holds(field, tolerances.shortest)
+        fits = tolerances.surface and _resolves(field, tolerances.shortest)
         if not (parameters or fits):
-            raise InputError("⟨design.robust⟩ names no error that a design can be for in this scene")
+            raise InputError("⟨design.robust⟩ names no error that a design can take into account in this scene")
         surfaces = FormErrors(field, tolerances.form, tolerances.waviness) if fits else None
         rng = np.random.default_rng([tolerances.seed, PURPOSE, 1])
-        self.parts: list[tuple[Plain, Tensor | float]] = [(objective(scene, begun), 0.0)]
+        self.parts: list[tuple[SceneObjective, Tensor | float]] = [(objective(scene, begun), 0.0)]
         for row in hypercube(parameters, PAIRS, tolerances.seed, PURPOSE):
             surface = surfaces.heights(rng, tolerances.surface) if surfaces else 0.0
             for sign in (-1.0, 1.0):
@@ -78,7 +78,7 @@ class RobustObjective:
         self.loss = self.parts[0][0].loss
 
     def __call__(self, heights: Tensor) -> Evaluation:
-        """Value, gradient and the mean light on the screen at heights (n, m) mm float64; the image without errors."""
+        """Value, gradient and mean fraction of the light on the screen at heights (n, m) mm float64; the image without errors."""
         found = [part(heights + added) for part, added in self.parts]
         losses = torch.tensor([e.loss for e in found], dtype=torch.float64)
         share = torch.full_like(losses, WEIGHT / max(1, len(found) - 1))
@@ -91,8 +91,8 @@ class RobustObjective:
         return Evaluation(loss, {EXIT: torch.as_tensor(gradient)}, on_screen, found[0].image)
 
 
-def _holds(field: HeightField, shortest: float) -> bool:
-    """Whether a net holds waves of that length at all."""
+def _resolves(field: HeightField, shortest: float) -> bool:
+    """Whether a control net resolves surface errors of this period, mm."""
     return all(
         3.0 * float(space.breaks.diff().max()) * 2.0 * half <= shortest
         for space, half in zip(field.spaces, field.half_size, strict=True)

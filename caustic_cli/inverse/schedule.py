@@ -1,7 +1,7 @@
-"""How a design proceeds: a list of stages, coarse to fine.
+"""Coarse-to-fine optimisation schedule: a list of stages.
 
-Early stages see the picture through a wide blur on a small control net with few rays, late ones at full detail.  The
-blur halves from stage to stage, so that light always knows which way to go.  Each stage traces rays of its own.
+Early stages compare blurred images on a small control net with few rays, late ones at full detail.  The blur halves from stage to
+stage, so that the loss has a gradient towards features not yet reached.  Each stage traces its own rays.
 """
 
 from __future__ import annotations
@@ -14,29 +14,29 @@ from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import SAMPLERS
 from caustic_cli.scene import Source
 
-#: Rays that take as long as the transform at one wavelength of a scene of usual size.
+#: Rays whose cost equals that of the Fourier transform at one wavelength of a typical scene.
 RAYS_A_WAVE = 600_000
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One stretch of a design.
+    """One stage of a design.
 
     Args:
-        control: control points along x and y; a finer net than the stage before takes over its surface.
+        control: control points along x and y; the surface of the stage before is represented on them.
         rays: number of rays; sampler: see `caustic_cli.optics.sampling`.
         filter: reconstruction filter of the render inside the loss.
-        blur: Gaussian seen by the loss on both render and target, pixels.
+        blur: standard deviation of the Gaussian blur of render and target in the loss, pixels.
         apron: pixels added around the screen, dark in the target, that catch stray light.
-        iterations: optimiser iterations; the last stage goes on to the design's total.
-        source: what shines during this stage, None for the scene's own (6.4: a point first, then the grid).
+        iterations: optimiser iterations; the last stage continues to the total of the design.
+        source: the source during this stage, None for that of the scene (6.4: a point first, then the grid).
         tolerance: ends the stage when ten iterations lowered the loss by less than this part; 0 never.
         oversample: see `Objective`.
-        waves: nm, the wavelengths at which the wave image is refined instead of the ray image, of light that says none; empty for
-            rays.
-        spread: the rays are those of the source's middle, and their image is spread by the source's, where that is what the source
-            does.
-        lenslets: every lenslet of an array is judged by its own picture, with its part of the rays, see `lenslets.ArrayObjective`.
+        waves: nm, wavelengths of the wave image, which is optimised instead of the ray image, unless the scene gives its own; empty
+            for the ray image.
+        spread: rays are traced from the centre of the source, and their image is convolved with that of the source, where this is
+            a good approximation.
+        lenslets: each lenslet of an array is compared with its own target, see `lenslets.ArrayObjective`.
     """
 
     control: tuple[int, int]
@@ -59,6 +59,6 @@ class Stage:
 
     @property
     def cost(self) -> float:
-        """Of all its iterations, in rays."""
+        """Estimated cost of all its iterations, in units of one traced ray."""
         each = RAYS_A_WAVE * len(self.waves) if self.waves else self.rays
         return self.iterations * (each + 20.0 * self.control[0] * self.control[1])

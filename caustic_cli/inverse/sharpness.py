@@ -1,15 +1,14 @@
-"""What would make a picture sharp that a source's extent blurs, and how extended a source leaves a picture sharp.
+"""Blur by an extended source: the largest source that leaves a picture sharp, and changes of the geometry that reduce the blur.
 
 Notation
     sigma   contrast of the picture: standard deviation of its irradiance over its mean, on the screen
-    e       relative RMS error that the blur leaves
-    f       by how much smaller the source's image, against the picture, makes e <= SHARP sigma
+    e       relative RMS error due to the blur
+    f       factor by which the image of the source must shrink relative to the picture for e <= SHARP sigma
 
-The image of a source is as wide as the throw times the angle under which the lens sees it, whatever the magnification and the
-lens; the picture is as wide as both make it.  So all of these come to the same: f times the magnification, or the width of the
-lens, a throw or a source 1 / f as large, or details f times as coarse.  e is that of the best light behind the blur
-(`deconvolution`) for a lens that is designed for the source, and that of the plainly blurred picture for one that is designed for
-parallel light.
+The width of the image of a source is the throw times the angle that the source subtends at the lens, whatever the magnification and
+the lens; that of the picture is proportional to both.  So the following are equivalent: f times the magnification or the width of
+the lens, 1 / f times the throw or the source, or details f times as coarse.  e is that of the optimum (`deconvolution`) for a lens
+designed for the source, and that of the blurred picture for one designed for collimated light.
 """
 
 from __future__ import annotations
@@ -22,25 +21,25 @@ import numpy as np
 import torch
 
 from caustic_cli.inverse.deconvolution import deconvolved
-from caustic_cli.inverse.extended import shift_of
-from caustic_cli.inverse.reach import largest_magnification
+from caustic_cli.inverse.reachability import largest_magnification
+from caustic_cli.inverse.source_limits import source_spread
 from caustic_cli.optics.spread import MOST_CUT, Convolution, Spread
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.scene import PlaneWave, Scene
 from caustic_cli.scene.sources.disc import SUN
 
-#: Part of its contrast by which a sharp picture is off, root mean square: 20 dB below it.
+#: RMS error of a picture that counts as sharp, in parts of its contrast: 20 dB below it.
 SHARP = 0.1
-#: Halvings of the interval, of ratio 2^1 to begin with, in which a blur is sought: to 5 %; and doublings before that is found.
+#: Bisections of the bracket, at first of ratio 2, to 5 %; and most doublings to find it.
 HALVINGS, DOUBLINGS = 4, 7
-#: Iterations of the best light behind a blur, which is within some percent of the least error then.
+#: Iterations of a deconvolution, whose error is then within a few per cent of the least.
 STEPS = 80
-#: Pixels along an axis on which that is sought, about: a blur that matters is wider than these.
+#: Approximate number of pixels along an axis for the search: a relevant blur is wider than these.
 MOST_PIXELS = 256
 
 
 def advice(scene: Scene, target: np.ndarray, picture: tuple[float, float], field: HeightField, heights: torch.Tensor) -> str:
-    """What to say of a finished lens about the extent of its source: a sentence, or nothing.
+    """Advice about the extent of the source of a finished lens: a sentence, or an empty string.
 
     Args:
         target: (n, m) on the scene's screen; picture: its width and height, mm; heights: (n, m) mm.
@@ -49,14 +48,14 @@ def advice(scene: Scene, target: np.ndarray, picture: tuple[float, float], field
     if sigma == 0 or scene.source.apart or scene.screen.curved or any(scene.screen.tilt):
         return ""
     if scene.source.extended:
-        spread = shift_of(scene, field, heights)
+        spread = source_spread(scene, field, heights)
         return "" if spread is None else _of_blur(scene, target, picture, spread, SHARP * sigma)
     if not scene.source.collimated:
         return ""
     throw, pixel = abs(scene.screen.z - scene.lens.offset.thickness), scene.screen.pixel
     cut = max(1, min(MOST_CUT, MOST_CUT * MOST_PIXELS // max(target.shape)))  # work in proportion to the pixels of a large screen
     least = 2.0 * min(pixel) / cut  # a narrower disc is no wider than its cells
-    width = _widest(lambda w: _blurred(target, disc(w).on(pixel, cut)) <= SHARP * sigma, least, 0.5 * min(picture))
+    width = _largest_satisfying(lambda w: _blurred(target, disc(w).on(pixel, cut)) <= SHARP * sigma, least, 0.5 * min(picture))
     if width is None:
         return ""
     angle = math.degrees(width / throw)
@@ -66,18 +65,21 @@ def advice(scene: Scene, target: np.ndarray, picture: tuple[float, float], field
 
 
 def disc(width: float) -> Spread:
-    """The image of an even disc that is so many mm wide on the screen."""
+    """The image of a uniform disc of this width on the screen, mm."""
     return Spread((0.5 * width, 0.5 * width), ((0.0, 0.0, 1.0),), 0.0)
 
 
-def needed(target: np.ndarray, pixel: tuple[float, float], spread: Spread, error: float) -> float | None:
-    """By how much smaller a spread leaves the best light behind it within `error` relative RMS; None: no sensible number does."""
-    parts = _widest(lambda part: deconvolved(target, smaller(spread, part).on(pixel, 1), STEPS).error <= error, 0.5**DOUBLINGS, 1.0)
+def required_reduction(target: np.ndarray, pixel: tuple[float, float], spread: Spread, error: float) -> float | None:
+    """Factor by which a spread must shrink for the deconvolution error to be at most `error` relative RMS; None beyond
+    2^DOUBLINGS."""
+    parts = _largest_satisfying(
+        lambda part: deconvolved(target, scaled_spread(spread, part).on(pixel, 1), STEPS).error <= error, 0.5**DOUBLINGS, 1.0
+    )
     return None if parts is None else 1.0 / parts
 
 
-def smaller(spread: Spread, part: float) -> Spread:
-    """A spread that is only so much as wide."""
+def scaled_spread(spread: Spread, part: float) -> Spread:
+    """A spread scaled by the factor `part`."""
     return replace(
         spread,
         half=tuple(part * h for h in spread.half),
@@ -87,19 +89,19 @@ def smaller(spread: Spread, part: float) -> Spread:
 
 
 def _of_blur(scene: Scene, target: np.ndarray, picture: tuple[float, float], spread: Spread, error: float) -> str:
-    """What would make a blurred picture sharp."""
+    """Advice on changes that make a blurred picture sharp."""
     times = [max(1, n // MOST_PIXELS) for n in target.shape]
     n, m = (n - n % k for n, k in zip(target.shape, times, strict=True))
     coarse = target[:n, :m].reshape(n // times[0], times[0], m // times[1], times[1]).mean((1, 3))
-    f = needed(coarse, (scene.screen.pixel[0] * times[0], scene.screen.pixel[1] * times[1]), spread, error)
+    f = required_reduction(coarse, (scene.screen.pixel[0] * times[0], scene.screen.pixel[1] * times[1]), spread, error)
     if f is None or f <= 1.0:
         return ""
     lens = scene.lens
-    middle, throw = lens.offset.thickness, scene.screen.z - lens.offset.thickness  # the blur goes as the way from the exit
+    middle, throw = lens.offset.thickness, scene.screen.z - lens.offset.thickness  # the blur is proportional to the latter
     mag, ways = picture[0] * lens.array[0] / lens.size[0], []
 
     def reached(wanted: float, z: float) -> bool:
-        """Whether a lens could magnify so far onto a screen elsewhere."""
+        """Whether a magnification can be reached onto a screen at z."""
         other = replace(scene, source=PlaneWave(), screen=replace(scene.screen, z=z))
         most = largest_magnification(other, [wanted / mag * p for p in picture])
         return most is None or most >= wanted
@@ -118,16 +120,16 @@ def _of_blur(scene: Scene, target: np.ndarray, picture: tuple[float, float], spr
 
 
 def _blurred(target: np.ndarray, spread: Convolution) -> float:
-    """Relative RMS error of a picture that is plainly spread."""
+    """Relative RMS error of a picture that is convolved with a spread."""
     around = torch.from_numpy(target / target.mean()).repeat_interleave(spread.cut, 0).repeat_interleave(spread.cut, 1)
     a, b = spread.beside
     seen = spread(torch.nn.functional.pad(around, (b, b, a, a))).numpy() / spread.cut**2
     return float(np.sqrt(np.mean((seen / seen.mean() - target / target.mean()) ** 2)))
 
 
-def _widest(holds: Callable[[float], bool], least: float, most: float) -> float | None:
-    """The largest number up to `most` for which something holds that ceases to once: doubled from `least`, then by halves; None
-    where it does not hold of the least."""
+def _largest_satisfying(holds: Callable[[float], bool], least: float, most: float) -> float | None:
+    """The largest number up to `most` that satisfies a monotone predicate, bracketed by doubling from `least` and refined by
+    bisection; None if `least` does not."""
     if not holds(least):
         return None
     low, high = least, 2.0 * least

@@ -1,22 +1,22 @@
-"""From an optimal transport map to a lens surface: the heights whose refracted rays land where the map says.
+"""From an optimal transport map to a refracting or reflecting surface: heights whose rays land at the images of the map.
 
 Notation
     p = (x, y, z)    a point of the exit surface;  d its ray inside the glass, a unit vector
-    T                where it shall land on the plane z_screen;  t = (T - p) / |T - p|, the direction it needs
-    N                normal (-z_x, -z_y, 1); Snell's law (thesis eq. 2.1.10) asks n d - t to be parallel to it, so
+    T                its target point on the plane z_screen;  t = (T - p) / |T - p|, the direction required behind the surface
+    N                normal (-z_x, -z_y, 1), parallel to n d - t by Snell's law in vector form (thesis eq. 2.1.10), so
 
                      z_x = (t_x - n d_x) / (n d_z - t_z),    z_y likewise
 
-T = grad phi, so to first order in all angles z = (phi - |(x, y)|^2 / 2) / ((n - 1) D), D = z_screen - z.  That part is exact;
-only the rest of the slopes is integrated, in the least-squares sense (a Poisson equation by the cosine transform, Strang,
-SIAM Review 41, 1999).  z enters t, so this is repeated, always at the same mean height.
+T = grad phi, so to first order in all angles z = (phi - |(x, y)|^2 / 2) / ((n - 1) D), D = z_screen - z.  That part is taken
+analytically; only the remaining slopes are integrated, in the least-squares sense (a Poisson equation by the cosine transform,
+Strang, SIAM Review 41, 1999).  Since t depends on z, this is a fixed-point iteration at constant mean height.
 
-The slopes needed are not quite a gradient.  What they miss moves the landing points by e(x, y), a smooth field that grows with
-the angles.  Each pixel of the picture is then moved by -e of the place that lights it, transported again, and the rays are
-sent to T + e, which a surface can do.
+The required slopes are not exactly integrable.  The residual displaces the landing points by e(x, y), a smooth field that grows
+with the angles.  It is corrected by an outer iteration: each pixel of the picture is moved by -e at the point that illuminates it,
+the transport is solved again, and rays are aimed at T + e.
 
-On a tilted or curved screen T and e are places of the plane z_screen as the lens' middle sees them (`view`); rays are aimed at the
-point of the screen behind T, whose depth t knows, and landing points are taken back to that plane.
+For a tilted or curved screen T and e are points of the plane z_screen in central projection (`projection`); rays are aimed at the
+point of the screen that projects to T, and landing points are projected back.
 """
 
 from __future__ import annotations
@@ -33,23 +33,23 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import gaussian_filter
 
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.relayed import Relayed
+from caustic_cli.inverse.projection import ScreenProjection
+from caustic_cli.inverse.relay import RelayedScreen
 from caustic_cli.inverse.transport import Transport, corners, solve
-from caustic_cli.inverse.view import View
 from caustic_cli.optics.backends.reference import Torch
 from caustic_cli.optics.frames import IDENTITY
 from caustic_cli.optics.kernels.laguerre import prices
 
-Seen = View | Relayed  # how the lens sees a screen that is not simply the plane z_screen
-EVEN = 2.0  # cells over which e is smoothed: at a kink of phi the rays miss by the spline's own width, which is no error of T
-ENOUGH = 0.05  # pixels of e, root mean square, that are left alone
-REPEATS = 4  # of the heights, at most; each takes another factor of about angle^2 / throw off the error
-CONVERGED = 1e-10  # mm that the next repeat would move a height by
-ROWS = 64  # of corners whose slopes are found together: what is on the way stays in the processor's cache
+Projection = ScreenProjection | RelayedScreen  # of a screen that is not the plane z_screen
+SMOOTHING = 2.0  # cells over which e is smoothed: at a kink of phi the spline smooths the slopes, which is no error of T
+NEGLIGIBLE = 0.05  # RMS of e, pixels, that is not corrected
+REPEATS = 4  # most fixed-point iterations; each reduces the error by a factor of about angle^2 / throw
+CONVERGED = 1e-10  # largest expected change of a height in the next iteration, mm
+ROWS = 64  # of corners processed at a time, so that intermediate arrays fit in the cache
 
 
 class OutOfReach(InputError):
-    """Light that no refraction turns to where the map sends it; where: the corners that it comes from, (n + 1, m + 1) bool."""
+    """The map requires a deflection beyond the limit of refraction; where: at which corners, (n + 1, m + 1) bool."""
 
     def __init__(self, where: np.ndarray):
         super().__init__("the picture cannot be reached by refraction: a smaller picture or a longer throw is needed")
@@ -57,15 +57,15 @@ class OutOfReach(InputError):
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
-    """A surface and where it sends the light.
+class MappedSurface:
+    """A surface that realises a transport map, and its landing points.
 
     Attributes:
-        heights: z at the corners of the source's cells, edges of the aperture included, (n + 1, m + 1) float64, mm.
-        x, y: landing points of the rays that leave there, mm, traced with the gradient of the bicubic spline through z.
-        miss: root mean square distance between them and where they were sent, weighted by the source, mm.
-        shift: e, by which the picture was moved in all, (2, n + 1, m + 1) mm.
-        corrections: how often the picture was moved.
+        heights: z at the corners of the source cells, (n + 1, m + 1) float64, mm.
+        x, y: landing points of the rays from there, mm, with the gradient of the bicubic spline through z.
+        miss: RMS distance between landing points and targets, weighted by the source, mm.
+        shift: e, the total displacement of the picture, (2, n + 1, m + 1) mm.
+        corrections: number of outer iterations.
         transport: the last map.
         seconds: wall time.
     """
@@ -92,26 +92,27 @@ def surface(
     *,
     corrections=2,
     centre=(0.0, 0.0),
-    view: Seen | None = None,
+    projection: Projection | None = None,
     **options,
-) -> Start:
-    """Surface of a lens that throws `target` on a plane behind it.
+) -> MappedSurface:
+    """Surface that maps the irradiance `source` onto the picture `target` on a plane.
 
     Args:
-        source: irradiance of the exit surface, seen along z, (n, m), any unit; where it is 0, the surface just goes on.
+        source: irradiance of the exit surface per area projected along z, (n, m), any unit; where it is 0 the surface is
+            extrapolated.
         target: the picture, (k, l), any unit; half sizes in mm as for `transport.solve`.
-        index: of the glass, with 1 outside; one over it for a surface that light enters the glass by; -1 for a mirror.
+        index: of the glass, with 1 outside; its inverse for a surface by which light enters the glass; -1 for a mirror.
         z_screen, thickness: the screen's plane and the surface's mean height, mm.
         directions: unit directions inside the glass at those corners, three (n + 1, m + 1) arrays, or None for (0, 0, 1).
-        corrections: how often, at most, the picture is moved by what the rays miss and transported again.
+        corrections: most outer iterations.
         centre: of the picture on the plane, mm.
-        view: of a screen that does not lie in that plane; target, centre and landing points are then as it sees them.
+        projection: of a screen that does not lie in that plane; target, centre and landing points are then projected.
         options: of `transport.solve`.
 
     Raises:
-        InputError: as `transport.solve`; an index that is none such, a screen not above the lens, directions that are no unit
+        InputError: as `transport.solve`; an index out of range, a screen not behind the surface, or directions that are not unit
             vectors towards it.
-        OutOfReach: light that cannot be refracted to the picture.
+        OutOfReach: light cannot be refracted to the picture.
     """
     began = time.perf_counter()
     shape = np.shape(source)
@@ -131,22 +132,22 @@ def surface(
     pixel = [2.0 * h / s for h, s in zip(target_half, np.shape(target), strict=True)]
     aim, shift = (map_.x + centre[0], map_.y + centre[1]), np.zeros((2, *light.shape))
     for again in range(corrections + 1):
-        z = heights(map_, aim, x, y, d, index, z_screen, thickness, light > 0, view)
-        landing = land(z, x, y, d, index, z_screen, view)
+        z = heights(map_, aim, x, y, d, index, z_screen, thickness, light > 0, projection)
+        landing = land(z, x, y, d, index, z_screen, projection)
         off = np.nan_to_num(np.stack([w - t for w, t in zip(landing, aim, strict=True)]))
         miss = float(np.sqrt((light * (off**2).sum(0)).sum()))
-        off = np.stack([gaussian_filter(w, EVEN) for w in off])
-        if again == corrections or not np.sqrt((light * (off**2).sum(0)).sum()) > ENOUGH * min(pixel):
+        off = np.stack([gaussian_filter(w, SMOOTHING) for w in off])
+        if again == corrections or not np.sqrt((light * (off**2).sum(0)).sum()) > NEGLIGIBLE * min(pixel):
             break
         shift += off
         moved, reach = _moved(np.asarray(target, dtype=np.float64), pixel, map_.potential, shift, x, y)
         map_ = solve(source, moved, half, reach, start=map_.potential, **{k: v for k, v in options.items() if k != "start"})
         aim = map_.x + shift[0] + centre[0], map_.y + shift[1] + centre[1]
-    return Start(z, *landing, miss, shift, again, map_, time.perf_counter() - began)
+    return MappedSurface(z, *landing, miss, shift, again, map_, time.perf_counter() - began)
 
 
 def finer(
-    start: Start,
+    start: MappedSurface,
     times: int,
     source_half,
     index: float,
@@ -154,14 +155,14 @@ def finer(
     directions=None,
     *,
     centre=(0.0, 0.0),
-    view: Seen | None = None,
+    projection: Projection | None = None,
 ) -> np.ndarray:
-    """Heights of the same surface at the corners of cells so many times smaller along each axis, its creases as much sharper.
+    """Heights of the same surface on cells `times` smaller along each axis, with creases sharper by the same factor.
 
     Args:
         directions: as of `surface`, at the finer corners; the others as they were there.
 
-    What light cannot be refracted goes on by the map's own slope.
+    Where light cannot be refracted, the paraxial slope of the map is used.
     """
     map_ = start.transport.finer(times)
     coarse, fine = ([corners(k * n, h) for n, h in zip(start.transport.solved.shape, source_half, strict=True)] for k in (1, times))
@@ -169,11 +170,11 @@ def finer(
     x, y = fine[0][:, None], fine[1][None, :]
     aim = tuple(t + e + c for t, e, c in zip((map_.x, map_.y), shift, centre, strict=True))
     d, dark = _directions(directions, map_.potential.shape), np.zeros(map_.potential.shape, bool)
-    return heights(map_, aim, x, y, d, index, z_screen, float(start.heights.mean()), dark, view)
+    return heights(map_, aim, x, y, d, index, z_screen, float(start.heights.mean()), dark, projection)
 
 
 def _moved(target, pixel, potential, shift, x, y) -> tuple[np.ndarray, tuple[float, float]]:
-    """The picture with each pixel moved by -shift of the place that lights it, in a frame wide enough, and its half sizes."""
+    """The picture with each pixel moved by -shift at the point that illuminates it, padded as necessary, and its half sizes, mm."""
     shape = target.shape
     at = [(np.arange(s) + 0.5 - 0.5 * s) * w for s, w in zip(shape, pixel, strict=True)]
     from_ = prices(potential, at[0], np.arange(shape[0] + 1) * shape[1], np.tile(at[1], shape[0]), x[:, 0], y[0])[1]
@@ -184,7 +185,7 @@ def _moved(target, pixel, potential, shift, x, y) -> tuple[np.ndarray, tuple[flo
     low = [np.floor(t).astype(np.int64) for t in to]
     wide = [s + 2 * f for s, f in zip(shape, frame, strict=True)]
     out = np.zeros(wide[0] * wide[1])
-    for i in (0, 1):  # a pixel is shared by the four that it then covers
+    for i in (0, 1):  # bilinear distribution over the four pixels covered
         for j in (0, 1):
             share = np.abs(1 - i - (to[0] - low[0])) * np.abs(1 - j - (to[1] - low[1]))
             out += np.bincount((low[0] + i) * wide[1] + low[1] + j, share * target.ravel()[bright], len(out))
@@ -204,35 +205,35 @@ def _directions(directions, shape) -> tuple:
 
 
 def heights(
-    map_: Transport, aim, x, y, d, index: float, z_screen: float, mean: float, lit: np.ndarray, view: Seen | None = None
+    map_: Transport, aim, x, y, d, index: float, z_screen: float, mean: float, lit: np.ndarray, projection: Projection | None = None
 ) -> np.ndarray:
-    """Heights at the corners x (n + 1, 1), y (1, m + 1), mm, whose rays land at `aim` as nearly as a surface can.
+    """Heights at the corners x (n + 1, 1), y (1, m + 1), mm, whose rays land at `aim`, in the least-squares sense.
 
     Args:
-        map_: a map close to `aim` (two arrays, mm): its potential is taken as it is, and only the rest integrated.
+        map_: a map close to `aim` (two arrays, mm): its potential is taken analytically, and only the remainder integrated.
         d, index, z_screen, mean: ray directions in the glass, its index, the screen's plane and the heights' mean, mm.
-        lit: (n + 1, m + 1) bool, corners whose light counts; others that are out of reach take the map's own slope.
-        view: as of `surface`.
+        lit: (n + 1, m + 1) bool, corners with light; others that are out of reach take the paraxial slope of the map.
+        projection: as of `surface`.
 
-    A mirror's normal is parallel to d - t, as if the index were 1, and t runs back.
+    The normal of a mirror is parallel to d - t, as for index 1, and t points backwards.
 
     Raises:
-        OutOfReach: no refraction sends light of a lit corner where it is aimed.
+        OutOfReach: light of a lit corner cannot be refracted to its target point.
     """
     step = float(x[1, 0] - x[0, 0]), float(y[0, 1] - y[0, 0])
     scale = 1.0 / ((index - 1.0) * (z_screen - mean))
-    if view is None:
+    if projection is None:
         main = scale * (map_.potential - 0.5 * (x * x + y * y))
         slope = scale * (map_.x - x), scale * (map_.y - y)
     else:
-        cx, cy = view.straight
-        main = scale * (view.sign * map_.potential - 0.5 * (cx * x * x + cy * y * y))
-        slope = scale * (view.sign * map_.x - cx * x), scale * (view.sign * map_.y - cy * y)
+        cx, cy = projection.axial_scale
+        main = scale * (projection.sign * map_.potential - 0.5 * (cx * x * x + cy * y * y))
+        slope = scale * (projection.sign * map_.x - cx * x), scale * (projection.sign * map_.y - cy * y)
     z = main - main.mean() + mean
-    towards = None if view is None else view.towards(*aim)
+    towards = None if projection is None else projection.directions_to(*aim)
     within, rest, moved = np.empty(z.shape, bool), np.empty((2, *z.shape)), 0.0
     for _ in range(REPEATS):
-        for rows in _strips(len(z), len(z) if view else ROWS):
+        for rows in _strips(len(z), len(z) if projection else ROWS):
             to = towards(x, y, z) if towards else (aim[0][rows] - x[rows], aim[1][rows] - y, z_screen - z[rows])
             light = tuple(v[rows] if isinstance(v, np.ndarray) else v for v in d)
             within[rows] = turned = refracted(*to, light, index)
@@ -243,18 +244,18 @@ def heights(
         before, z = z, main + integrate(*rest, step)
         z += mean - z.mean()
         before, moved = moved, float(np.abs(z - before).max())
-        if moved * moved <= CONVERGED * before or moved == 0.0:  # changes fall by the same factor
+        if moved * moved <= CONVERGED * before or moved == 0.0:  # linear convergence
             break
     return z
 
 
 def _strips(n: int, rows: int) -> Iterator[slice]:
-    """All n rows, so many at a time."""
+    """Slices of n rows, `rows` at a time."""
     return (slice(k, k + rows) for k in range(0, n, rows))
 
 
 def refracted(tx, ty, tz, d, index: float) -> np.ndarray:
-    """Where a surface can turn rays d towards (tx, ty, tz): from glass of that index into air, into glass of 1 / index, or by
+    """Where a surface can deflect rays d towards (tx, ty, tz): from glass of that index into air, into glass of 1 / index, or by
     reflection (-1)."""
     forward = math.copysign(1.0, index)
     turns = max(index, 1.0 / index) if index > 0 else index
@@ -263,7 +264,7 @@ def refracted(tx, ty, tz, d, index: float) -> np.ndarray:
 
 
 def slopes_to(tx, ty, tz, d, index: float) -> tuple[np.ndarray, np.ndarray]:
-    """Slopes of the surface that turns rays d towards (tx, ty, tz), see above; without meaning where none can (`refracted`)."""
+    """Slopes of the surface that deflects rays d towards (tx, ty, tz), see above; meaningless where none can (`refracted`)."""
     n = abs(index)
     length = np.sqrt(tx * tx + ty * ty + tz * tz)
     lean = n * d[2] - tz / length  # N_z, up to a factor
@@ -272,7 +273,8 @@ def slopes_to(tx, ty, tz, d, index: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def integrate(sx: np.ndarray, sy: np.ndarray, step: tuple[float, float]) -> np.ndarray:
-    """The surface (n, m) of mean 0 whose differences are nearest to the slopes at its points, in the least-squares sense."""
+    """Least-squares integration of slopes: the surface (n, m) of mean 0 whose differences are closest to the slopes at its
+    points."""
     right = _divergence(sx, step[0])
     right += _divergence(sy.T, step[1]).T
     wave = [(2.0 / h * np.sin(0.5 * np.pi * np.arange(n) / (n - 1))) ** 2 for n, h in zip(sx.shape, step, strict=True)]
@@ -287,8 +289,8 @@ def integrate(sx: np.ndarray, sy: np.ndarray, step: tuple[float, float]) -> np.n
 
 
 def _divergence(slopes: np.ndarray, step: float) -> np.ndarray:
-    """Differences along the first axis of slopes (n, m) between points; there is nothing beyond the borders, whose points have half
-    a cell."""
+    """Divergence along the first axis of slopes (n, m), with natural (Neumann) boundary conditions: border points have half a
+    cell."""
     out = np.empty_like(slopes)
     mean = (0.5 / step) * (slopes[1:] + slopes[:-1])
     np.subtract(mean[1:], mean[:-1], out=out[1:-1])
@@ -296,19 +298,23 @@ def _divergence(slopes: np.ndarray, step: float) -> np.ndarray:
     return out
 
 
-def land(z: np.ndarray, x, y, d, index: float, z_screen: float, view: Seen | None = None) -> tuple[np.ndarray, np.ndarray]:
+def land(
+    z: np.ndarray, x, y, d, index: float, z_screen: float, projection: Projection | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Landing points (n, m), mm, of the rays d through the bicubic spline of z, NaN where totally reflected: on the plane z_screen,
-    as `view` sees them."""
+    or projected by `projection`."""
     spline = RectBivariateSpline(x[:, 0], y[0], z, kx=min(3, len(z) - 1), ky=min(3, z.shape[1] - 1))
-    return thrown(x, y, z, spline(x[:, 0], y[0], dx=1), spline(x[:, 0], y[0], dy=1), d, index, z_screen, view=view)[:2]
+    return refract_to_screen(
+        x, y, z, spline(x[:, 0], y[0], dx=1), spline(x[:, 0], y[0], dy=1), d, index, z_screen, projection=projection
+    )[:2]
 
 
-def thrown(
-    x, y, z, zx, zy, d, index: float, z_screen: float, fresnel: str = "none", view: Seen | None = None
+def refract_to_screen(
+    x, y, z, zx, zy, d, index: float, z_screen: float, fresnel: str = "none", projection: Projection | None = None
 ) -> tuple[np.ndarray, ...]:
-    """Where rays d inside the glass land that leave it at (x, y, z) with slopes zx, zy, NaN where totally reflected, and the part
-    of each that passes.  view: as of `surface`; NaN where they miss its screen."""
-    shape, backend = z.shape, Torch()  # too few rays to wait for a compiler
+    """Landing points u, v of rays d inside the glass that leave it at (x, y, z) with slopes zx, zy, NaN where totally reflected,
+    and their transmittance.  projection: as of `surface`; NaN where they miss its screen."""
+    shape, backend = z.shape, Torch()  # too few rays to be worth compiling
 
     def flat(value):
         return value if isinstance(value, float) else torch.from_numpy(np.broadcast_to(value, shape).flatten())
@@ -322,11 +328,11 @@ def thrown(
         reflects=mirror,
         fresnel=fresnel,
     )
-    if view is None:
+    if projection is None:
         landing = backend.land(tuple(origin), out.direction, (0.0, 0.0, z_screen), IDENTITY, -1.0 if mirror else 1.0)[:2]
         passes = out.passes
     else:
-        landing = map(torch.from_numpy, view.seen(*(tuple(map(_array, v)) for v in (origin, out.direction))))
+        landing = map(torch.from_numpy, projection.intersections(*(tuple(map(_array, v)) for v in (origin, out.direction))))
         passes = out.passes
     return *(torch.where(passes, c, torch.nan).view(shape).numpy() for c in landing), out.power.view(shape).numpy()
 

@@ -1,13 +1,13 @@
-"""The B-spline whose slopes at scattered points are nearest to given ones: weighted least squares.
+"""B-spline surface from scattered slopes, by weighted and regularised least squares.
 
 Notation
     c           control heights (n, m), mm;  J c the slopes along x and y at N points, linear in c
-    s, w        slopes that are asked for, and the weight of each point, N on the whole
-    S c         differences, along both axes, of the slopes from one control to the next
+    s, w        given slopes, and the weight of each point, N in total
+    S c         second differences of the control net along both axes
 
-c minimises |J c - s|^2 weighted by w, plus SMOOTH N / (n m) |S c|^2, which decides where there are no points.  Conjugate gradients,
-whose preconditioner solves the same problem for points spread evenly, a Poisson equation, by the cosine transform; J and its
-transpose are the backend's.
+c minimises |J c - s|^2 weighted by w, plus the regularisation SMOOTH N / (n m) |S c|^2, which determines it where there are no
+points.  Conjugate gradients, preconditioned with the solution for uniformly distributed points, a Poisson equation, by the cosine
+transform.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from torch import Tensor
 from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.surfaces.heightfield import HeightField
 
-#: What second differences count, against the slopes of points of mean weight.
+#: Regularisation parameter: weight of second differences relative to slopes of points of mean weight.
 SMOOTH = 1e-3
-#: Steps of conjugate gradients at most, and the part of the residual at which they end.
+#: Most iterations of conjugate gradients, and their relative tolerance.
 STEPS, ENOUGH = 80, 1e-4
 
 
 def fitted(
     field: HeightField, points: tuple[Tensor, Tensor], slopes: tuple[Tensor, Tensor], weight: Tensor, first: Tensor
 ) -> Tensor:
-    """Control heights (n, m) mm float64, of the mean height of `first`, from which the search begins.
+    """Control heights (n, m) mm float64, with the mean of `first`, the initial guess.
 
     Args:
         points: x and y (N,) on the aperture, mm; slopes: along x and y there (N,); weight: of each point (N,), not negative.

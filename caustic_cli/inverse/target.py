@@ -1,4 +1,4 @@
-"""The picture on the screen's pixels: exact area averages of a picture of constant square cells."""
+"""Resampling of a picture onto the pixels of a screen by exact area averages."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from caustic_cli.scene import Screen
 def target_on_screen(irradiance: np.ndarray, size: tuple[float, float], screen: Screen, flip: str = "") -> np.ndarray:
     """Relative power on each pixel of a screen, dark around the picture: (n_x, n_y) float64.
 
-    That is the picture's mean irradiance there, and on a curved screen times the pixel's true area: see `optics.screen_shape`.
+    This is the mean irradiance of the picture there, on a curved screen times the true area of the pixel (`optics.screen_shape`).
 
     Args:
         irradiance: (a, b), [i, j] with i along +x and j along +y, finite and not negative, any scale.
@@ -36,7 +36,7 @@ def target_on_screen(irradiance: np.ndarray, size: tuple[float, float], screen: 
     cells = [np.linspace(-0.5, 0.5, n + 1) * w for n, w in zip(irradiance.shape, size, strict=True)]
     pixels = [np.linspace(-0.5, 0.5, n + 1) * w for n, w in zip(screen.resolution, screen.size, strict=True)]
     for own, whole in zip(cells, pixels, strict=True):
-        if abs(own[0] - whole[0]) < 2e-9 * whole[-1]:  # a picture as wide as the screen shares its edges exactly
+        if abs(own[0] - whole[0]) < 2e-9 * whole[-1]:  # a picture as wide as the screen has exactly its edges
             own[[0, -1]] = whole[[0, -1]]
     mean = averaged(irradiance, cells, pixels)
     if not mean.sum() > 0:
@@ -46,10 +46,10 @@ def target_on_screen(irradiance: np.ndarray, size: tuple[float, float], screen: 
 
 
 def tiles(light: np.ndarray, array: tuple[int, int]) -> list[np.ndarray]:
-    """The pictures on a sheet (a, b) of N x M of them, [i, j] with i along +x and j along +y, j fastest.
+    """Split a sheet (a, b) into N x M pictures, [i, j] with i along +x and j along +y, j fastest.
 
     Raises:
-        InputError: its pixels cannot be shared out, or one of them is black.
+        InputError: the sheet cannot be divided evenly, or one of the pictures is black.
     """
     a, b = (size // n for size, n in zip(light.shape, array, strict=True))
     if (a * array[0], b * array[1]) != light.shape or min(a, b) < 2:
@@ -65,5 +65,5 @@ def tiles(light: np.ndarray, array: tuple[int, int]) -> list[np.ndarray]:
 
 
 def grey(image: np.ndarray) -> np.ndarray:
-    """(n_x, n_y) of an image, the colours of a coloured one (3, n_x, n_y) added up."""
+    """Sum over the colour channels of an image (3, n_x, n_y): (n_x, n_y); a monochrome one is returned as it is."""
     return image if image.ndim == 2 else image.sum(0)

@@ -1,26 +1,26 @@
-"""Optimal transport of light from a rectangle onto a picture: the map T = grad phi, phi convex (Brenier 1991).
+"""Semi-discrete optimal transport of irradiance from a rectangle onto a picture: T = grad phi, phi convex (Brenier 1991).
 
 Notation
     f, g         source density on [-a, a] x [-b, b], constant or bilinear between cell centres; picture g, constant per pixel
-    y_p, m_p     sites: point masses that stand for g, one or a few pixels each; black pixels have none
-    psi_p        their prices (dual variables);  phi(x) = max_p (x . y_p - psi_p)
-    A_p          light in the Laguerre cell of p, where p attains that maximum;  dA_p / dpsi_q = w_pq, borders of cells
-    e            light in the wrong cell, sum |A_p - m_p| / 2, as a part of the whole
+    y_p, m_p     sites: point masses that discretise g, one or a few pixels each; black pixels have none
+    psi_p        their prices (Kantorovich dual variables);  phi(x) = max_p (x . y_p - psi_p)
+    A_p          light in the Laguerre cell of p, where p attains that maximum;  dA_p / dpsi_q = w_pq, weights of the cell borders
+    e            transport error, sum |A_p - m_p| / 2, as a fraction of the total: light in a wrong cell
 
-Semi-discrete transport by Newton's method (Kitagawa, Merigot & Thibert, J. Eur. Math. Soc. 21, 2019) from coarse sites to
-fine ones (Merigot, Comput. Graph. Forum 30, 2011).  Where g vanishes there is nothing to solve, so true zeros need no floor:
-phi has a kink there and the map a jump.  Two departures make full Newton steps safe from a rough start:
+Newton's method (Kitagawa, Merigot & Thibert, J. Eur. Math. Soc. 21, 2019), multilevel from coarse to fine sites (Merigot, Comput.
+Graph. Forum 30, 2011).  Black pixels have no sites, so zeros of g are exact: phi has a kink there and the map a discontinuity.  Two
+modifications make full Newton steps robust from a poor initial guess:
 
-    a cell lighter than its mass grows like the square of its price, so its borders count by the secant
+    the mass of a cell lighter than its site grows like the square of its price, so its borders are weighted by the secant
     (1 + sqrt(m / A)) / 2 instead of the tangent;
-    a site without a cell is given the price at which its plane touches phi, and a border with the site it touches as
+    a site with an empty cell gets the price at which its plane touches phi, and a border with the site it touches as
     long as that of a round cell of its mass.
 
-The last phi is averaged over a few source cells.  That keeps it convex, and the map stays exactly its gradient.
+The final phi is averaged over a few source cells, which keeps it convex and the map its exact gradient.
 
-Between islands of light phi has a kink, which that average rounds off: what light crosses it there falls into the black.  So kinks
-have to be known far more finely than masses: `Transport.finer` takes the average of the same phi over cells as much smaller.  No
-equation is solved for that; its time is linear in cells, and so is its memory, which holds a strip of the raster at a time.
+Between separate bright regions phi has a kink, which that average smooths: light that crosses it falls into the dark gap.  So kinks
+have to be resolved more finely than masses: `Transport.finer` averages the same phi over smaller cells.  This solves no equation;
+time and memory are linear in the number of cells, processed in strips.
 """
 
 from __future__ import annotations
@@ -37,38 +37,38 @@ from caustic_cli.errors import InputError
 from caustic_cli.optics.kernels import blocks, laguerre
 from caustic_cli.optics.kernels.multigrid import Multigrid, matrix
 
-FINE = 4  # raster points a source cell, along each axis, over which phi is averaged
-#: The same where Newton's method sees its cells: those of sites along a line are long and narrow, and a cell that falls between the
-#: points of the raster counts as missing.  With 4 a picture of lines kept 3 % of its light in wrong cells, however many steps;
-#: with 8 steps converge quadratically, and text, lines and photographs take a half to a fifth of the time.
-SEEN, MANY = 8, 4096  # FINE at least; beyond that, so many points along an axis at most
-#: Light in the wrong cell at which sites that the raster still misses are merged with others, so that steps converge; how often.
+FINE = 4  # raster points per source cell along each axis, over which phi is averaged
+#: The same for Newton's method: cells of sites along a line are long and narrow, and one between the points of the raster appears
+#: empty.  With 4 a picture of lines kept 3 % of its light in wrong cells after any number of steps; with 8 convergence is
+#: quadratic, and text, lines and photographs take a half to a fifth of the time.
+SEEN, MANY = 8, 4096  # FINE at least; beyond that, at most so many points along an axis
+#: Transport error at which sites whose cells the raster misses are merged with neighbours, for convergence; most repetitions.
 MERGED, ROUNDS = 5e-3, 4
 LEAST = 128  # raster points along an axis
-LEVELS = (64, 16, 4, 1)  # of how many times fewer sites
-ROUGH, WIDE = 0.5, 0.4  # a coarse phi is rounded on a raster so much coarser than the next level's, over such a part of a cell
-MAX_LATTICE = 2048  # the picture is halved until it has at most so many pixels along an axis
-BOND = 4.0  # border of a missing cell
+LEVELS = (64, 16, 4, 1)  # ratios of the number of sites on the finest level to that on each level
+ROUGH, WIDE = 0.5, 0.4  # resolution of the raster on which a coarse phi is smoothed, relative to the next level; width in cells
+MAX_LATTICE = 2048  # the picture is downsampled by 2 until it has at most so many pixels along an axis
+BOND = 4.0  # length of the border of an empty cell
 COARSE_TOLERANCE, LINEAR_TOLERANCE = 1e-2, 3e-2
-EVENER = (1.0, 0.7, 0.4, 0.2, 0.1, 0.03, 0.0)  # parts of uniform light, if a level fails on the source itself
-DARKEST = 1e-3  # the source is lifted to at least this part of its mean: a cell without light has no derivative
+EVENER = (1.0, 0.7, 0.4, 0.2, 0.1, 0.03, 0.0)  # continuation in the fraction of uniform light, if a level fails otherwise
+DARKEST = 1e-3  # lower bound of the source over its mean: a cell without light has no derivative
 MAX_CELLS = 4096
-#: Width of the average over phi on finer cells, in these: those of Laguerre are wider, so that it keeps no kink but theirs.
+#: Width of the average of phi in `finer`, in its cells, which are smaller than the Laguerre cells.
 SHARP = 0.75
 STRIP = 128  # columns of corners averaged together, which bounds the memory
 
 
 @dataclass(frozen=True, eq=False)
 class Transport:
-    """A map and what it was made of: `finer` evaluates it on smaller cells.
+    """A transport map and the solution it derives from: `finer` evaluates it on smaller cells.
 
     Attributes:
         potential: phi at the corners of the source's cells, edges included, (n + 1, m + 1) float64, mm^2; its mean is 0.
         x, y: the map there, mm; the exact gradient of phi.
-        error: light in the wrong cell, part of the whole (before phi is smoothed).
+        error: e, before phi is smoothed.
         sites, steps: point masses of the finest level, and Newton steps of all levels.
         seconds: wall time.
-        solved: prices and sites that it follows from, and the source's cells.
+        solved: prices and sites, and the source cells.
     """
 
     potential: np.ndarray
@@ -81,7 +81,7 @@ class Transport:
     solved: _Solved
 
     def finer(self, times: int) -> Transport:
-        """The same map at the corners of cells so many times smaller along each axis, its kinks sharper by more than that."""
+        """The same map at the corners of cells `times` smaller along each axis, with sharper kinks."""
         began, s = time.perf_counter(), self.solved
         shape = tuple(times * n for n in s.shape)
         potential, x, y = _smoothed(s.psi, s.sites, shape, s.half, SHARP)
@@ -106,7 +106,7 @@ class _Sites:
 
 @dataclass(frozen=True, eq=False)
 class _Solved:
-    """What a map follows from: prices psi (N,) of the sites, shape and half sizes of the source's cells."""
+    """Solution of the dual problem: prices psi (N,) of the sites; shape and half sizes of the grid of source cells."""
 
     psi: np.ndarray
     sites: _Sites
@@ -124,9 +124,14 @@ def corners(n: int, half: float) -> np.ndarray:
     return np.linspace(-half, half, n + 1)
 
 
+def cell_means(values: np.ndarray) -> np.ndarray:
+    """Mean over the four corners of each cell: (n + 1, m + 1) -> (n, m)."""
+    return 0.25 * (values[1:, 1:] + values[:-1, 1:] + values[1:, :-1] + values[:-1, :-1])
+
+
 def cell_lines(half: tuple[float, float], cells: int) -> tuple[np.ndarray, np.ndarray]:
-    """Edges x (n + 1,), y (m + 1,) of nearly square cells over a rectangle, so many along its longer side; 3 at least, since four
-    corners carry a cubic."""
+    """Edges x (n + 1,), y (m + 1,) of nearly square cells over a rectangle, `cells` along its longer side and at least 3, as a
+    cubic spline requires."""
     x, y = (corners(max(3, round(cells * r / max(half))), r) for r in half)
     return x, y
 
@@ -134,23 +139,23 @@ def cell_lines(half: tuple[float, float], cells: int) -> tuple[np.ndarray, np.nd
 def solve(
     source, target, source_half, target_half, *, start=None, smooth=1.5, tolerance=5e-3, most=10, darkest=DARKEST
 ) -> Transport:
-    """The map that carries `source` onto `target` at least quadratic cost.
+    """The optimal transport map from `source` to `target` for quadratic cost.
 
     Args:
         source: density on [-a, a] x [-b, b], (n, m) float64, not negative, [i, j] with i along +x; any unit.
         target: density on [-c, c] x [-d, d], (k, l) float64, not negative; zeros stay dark.
         source_half, target_half: (a, b) and (c, d), mm.
-        start: potential of a similar problem on the same source cells, (n + 1, m + 1), mm^2, or None.
-        smooth: width of the average over phi, source cells: a triangle of twice this width; at least 0.5.
-        tolerance: light in the wrong cell at which Newton's method stops, a part of the whole.
-        most: Newton steps a level.
-        darkest: part of its mean to which the source is lifted where it is darker; the more, the fewer steps.
+        start: potential of a similar problem on the same source cells, (n + 1, m + 1), mm^2, as initial guess, or None.
+        smooth: half width of the triangular average of phi, source cells, at least 0.5.
+        tolerance: error e at which Newton's method stops.
+        most: Newton steps per level.
+        darkest: lower bound of the source over its mean; larger values need fewer steps.
 
     Raises:
         InputError: a density that is not 2-D, not finite, negative or black, or a size that is not positive.
     """
     began = time.perf_counter()
-    blocks()  # torch's threads decide over numba's too
+    blocks()  # sets numba's number of threads to torch's
     f, g = _density("source", source), _density("target", target)
     (a, b), (c, d) = _halves("source", source_half), _halves("target", target_half)
     if not 0.5 <= smooth <= 16:
@@ -159,7 +164,9 @@ def solve(
     f = np.maximum(f / f.mean(), darkest)
     f = f[:1, :1] if np.ptp(f) == 0 else f
     f = f / (f.mean() * 4.0 * a * b)
-    most_sites = int(n * m * f.mean() ** 2 / (f * f).mean())  # so that where most light is, a cell is not below a source cell
+    most_sites = int(
+        n * m * f.mean() ** 2 / (f * f).mean()
+    )  # so that Laguerre cells are not smaller than source cells where most light is
     pyramid = _pyramid(g, (c, d), most_sites)
     psi = sites = None
     steps = 0
@@ -179,12 +186,12 @@ def solve(
         enough = max(tolerance, MERGED) if fewer == 1 else COARSE_TOLERANCE
         found, error, taken = _newton(psi, sites, raster, _light(f, 0.0, raster, a, b), enough, most)
         steps += taken
-        lost = error > 10.0 * enough and f.size > 1  # in the dark parts of the source
-        if lost and start is not None:  # which are others than where the start comes from
+        failed = error > 10.0 * enough and f.size > 1  # Newton's method, in dark regions of the source
+        if failed and start is not None:  # which were lit where the initial potential comes from
             options = {"smooth": smooth, "tolerance": tolerance, "most": most, "darkest": darkest}
             again = solve(source, target, source_half, target_half, **options)
             return replace(again, steps=steps + again.steps, seconds=time.perf_counter() - began)
-        if lost:
+        if failed:  # continuation from uniform light
             psi = 0.5 * ((a / c) * sites.y1**2 + (b / d) * sites.y2**2)
             for even in EVENER:
                 light = _light(f, even, raster, a, b)
@@ -205,12 +212,12 @@ def solve(
 
 
 def _points(cells: float) -> int:
-    """Raster points along an axis of so many source cells."""
+    """Raster points along an axis with this number of source cells."""
     return max(int(FINE * cells), min(int(SEEN * cells), MANY), LEAST)
 
 
 def _light(f: np.ndarray, even: float, raster: list, a: float, b: float) -> tuple:
-    """What `laguerre.cells` needs of the source, mixed with a part `even` of uniform light."""
+    """Arguments of `laguerre.cells` for the source mixed with a fraction `even` of uniform light."""
     lit = (1.0 - even) * f + even * f.mean()
     return lit, laguerre.sampled(lit, *raster, a, b), a, b
 
@@ -243,7 +250,8 @@ def _halve(v: np.ndarray) -> np.ndarray:
 
 
 def _pyramid(g: np.ndarray, half: tuple[float, float], goal: int) -> list:
-    """[(mass and its moments (3, k, l), low edge, pixel)], from fine to coarse; bright pixels are split to reach the goal."""
+    """[(mass and its first moments (3, k, l), low edge, pixel)], from fine to coarse; pixels are subdivided to reach `goal`
+    sites."""
     split = 1
     while max(g.shape) * split * 2 <= MAX_LATTICE and np.count_nonzero(g) * (2 * split) ** 2 <= 1.6 * goal:
         split *= 2
@@ -262,7 +270,7 @@ def _pyramid(g: np.ndarray, half: tuple[float, float], goal: int) -> list:
 def _sites(pyramid: list, least: float) -> _Sites:
     """Blocks of pixels, each of at least a mass `least`, as points at their centroids.
 
-    From fine to coarse: what is lighter than that joins a site of its own block of 2 x 2, or waits for the next level.
+    From fine to coarse: a lighter block joins a site of its parent block of 2 x 2, or is left to the next level.
     """
     level = 0
     while level + 1 < len(pyramid) and pyramid[level][0][0].size > 32 / least:
@@ -291,7 +299,7 @@ def _sites(pyramid: list, least: float) -> _Sites:
     order = np.lexsort((y2, row))
     row, y2, mass = row[order], y2[order], mass[order]
     same = np.append((np.diff(row) == 0) & (np.diff(y2) < 0.1 * pixel[1]), False)
-    if same.any():  # two in one place are one
+    if same.any():  # merge coincident sites
         last = np.flatnonzero(~same)
         mass, row, y2 = np.diff(np.cumsum(mass)[last], prepend=0.0), row[last], y2[last]
     rows, first = np.unique(row, return_index=True)
@@ -304,7 +312,7 @@ def _prices(phi: np.ndarray, sites: _Sites, raster: list) -> np.ndarray:
 
 
 def _resampled(potential, shape: tuple[int, int], half: tuple[float, float], raster: list) -> np.ndarray:
-    """A start potential on the raster, or InputError."""
+    """The initial potential, interpolated on the raster; InputError if it is invalid."""
     v = np.asarray(potential, dtype=np.float64)
     if v.shape != (shape[0] + 1, shape[1] + 1) or not np.isfinite(v).all():
         raise InputError(f"the start potential must be {shape[0] + 1} x {shape[1] + 1} finite values, one a corner of a cell")
@@ -313,7 +321,7 @@ def _resampled(potential, shape: tuple[int, int], half: tuple[float, float], ras
 
 
 def _rounded(psi: np.ndarray, sites: _Sites, raster: list, half: tuple[float, float]) -> np.ndarray:
-    """phi of a coarser level on a finer raster, its kinks rounded over about a cell: new sites then find room between old."""
+    """phi of a coarser level on a finer raster, smoothed over about a cell, so that new sites get cells between the old ones."""
     shape = tuple(len(x) for x in raster)
     width = [WIDE * s / len(psi) ** 0.5 for s in shape]
     pad = [int(np.ceil(3.0 * w)) for w in width]
@@ -324,7 +332,7 @@ def _rounded(psi: np.ndarray, sites: _Sites, raster: list, half: tuple[float, fl
 
 
 def _merged(psi: np.ndarray, sites: _Sites, raster: list) -> tuple[np.ndarray, _Sites]:
-    """Prices and sites without those that no point of the raster sees, whose mass the nearest ones take."""
+    """Prices and sites without those whose cells contain no raster point; their mass is added to the nearest ones."""
     _, site = laguerre.envelope(psi, *sites.lines, *raster)
     seen = np.zeros(len(psi), bool)
     seen[site.ravel()] = True
@@ -337,7 +345,7 @@ def _merged(psi: np.ndarray, sites: _Sites, raster: list) -> tuple[np.ndarray, _
 
 
 def _cells(psi: np.ndarray, sites: _Sites, raster: list, light: tuple) -> tuple:
-    """Prices (those of missing cells lowered until they touch), masses of the cells, and the derivative's graph."""
+    """Prices (those of empty cells lowered until they touch phi), masses of the cells, and the sparse Jacobian as a graph."""
     phi, site = laguerre.envelope(psi, *sites.lines, *raster)
     seen = np.zeros(len(psi), bool)
     seen[site.ravel()] = True
@@ -354,7 +362,7 @@ def _cells(psi: np.ndarray, sites: _Sites, raster: list, light: tuple) -> tuple:
 
 
 def _newton(psi, sites: _Sites, raster: list, light: tuple, tolerance: float, most: int) -> tuple[np.ndarray, float, int]:
-    """Prices whose cells hold the sites' masses, the light still in a wrong cell, and the steps taken."""
+    """Damped Newton iteration: prices, transport error, and the number of steps taken."""
     psi, mass, graph = _cells(psi, sites, raster, light)
     excess = mass - sites.mass
     error = 0.5 * float(np.abs(excess).sum())
@@ -380,7 +388,7 @@ def _newton(psi, sites: _Sites, raster: list, light: tuple, tolerance: float, mo
 
 
 def _smoothed(psi, sites: _Sites, shape, half, smooth: float) -> np.ndarray:
-    """phi and its gradient, averaged with a triangle over 2 `smooth` source cells, at the cells' corners: (3, n + 1, m + 1)."""
+    """phi and its gradient at the corners of cells, averaged with a triangle of half width `smooth` cells: (3, n + 1, m + 1)."""
     box = np.ones(max(round(FINE * smooth), 1))
     kernel = np.convolve(np.convolve(box, box), (1.0, 1.0))  # of even length: centred between two raster points, as corners are
     kernel /= kernel.sum()

@@ -1,9 +1,9 @@
-"""The loss of a lens with two free-form sides: of its picture, and of what its light does behind it.
+"""The loss of a lens with two free-form surfaces: of its picture, and of a second picture or the ray directions behind it.
 
     loss = sqrt((t_1^2 + t_2^2) / 2) / pixels
 
-t_1 is the error of the picture on the screen, as of any lens (`losses`).  t_2 is that of a second picture on a screen farther on;
-or the root mean square, over all light, of the angle between a ray's direction and the wanted one, in parts of SHARP.
+t_1 is the error of the picture on the screen (`losses`); t_2 that of a second picture on a screen farther away, or the RMS angle
+between the directions of the rays and the prescribed ones, weighted by power, over SHARP.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from caustic_cli.optics.system import ENTRANCE, EXIT
 from caustic_cli.optics.trace import Parameters, Tracer, tracers
 from caustic_cli.scene import Scene, Screen
 
-#: Angle, rad, that counts as an error of the picture of 1.
+#: Angle, rad, equivalent to a relative RMS error of 1.
 SHARP = 2e-2
-#: Rays that are kept from their value to its gradient, 0.6 KiB each: more are traced twice.
+#: Most rays whose graph is kept for the gradient, 0.6 KiB each; more are traced twice.
 WHOLE = 1 << 22
 
 
@@ -82,10 +82,10 @@ class TwoSidedObjective:
         return tracers(self.scene, self.field, self.sampler, self.dtype, CHUNK)
 
     def __call__(self, heights: Tensor) -> Evaluation:
-        """Value and gradients; rays are traced twice where there are more than WHOLE, so that memory does not grow beyond those.
+        """Value and gradients; more than WHOLE rays are traced twice, which bounds the memory.
 
         Raises:
-            NoLight: none reaches a screen.
+            NoLight: no light reaches a screen.
         """
         parameters = {
             name: h.detach().to(self.device).clone().requires_grad_() for name, h in zip((ENTRANCE, EXIT), heights, strict=True)
@@ -116,7 +116,7 @@ class TwoSidedObjective:
         return Evaluation(float(loss.detach()), dict(zip(parameters, gradients, strict=True)), float(inner.sum()), inner)
 
     def _see(self, traced: Tracer, parameters: Parameters) -> list[Tensor]:
-        """What a chunk adds to every image, to the power that leaves the lens, and to the squares of angles times power."""
+        """Contribution of a chunk to each image, to the power that leaves the lens, and to the sum of power times squared angle."""
         states = traced(parameters)
         images = [traced.collect(states, screen, self.filter) for screen in self.screens]
         found = [self._pool(image.image) for image in images] + [images[0].leaving]
@@ -125,7 +125,7 @@ class TwoSidedObjective:
         return found
 
     def _penalty(self, entrance: Tensor, exit: Tensor) -> Tensor | float:
-        """Of both sides, each seen from outside."""
+        """Penalties of both surfaces, each from outside the glass."""
         return self.penalty(exit) + self.penalty(self.penalty.base - entrance) if self.penalty else 0.0
 
     def _loss(self, sums: list[Tensor], entering: Tensor, penalty: Tensor | float) -> Tensor:
@@ -133,4 +133,7 @@ class TwoSidedObjective:
         leaving = sums[count]
         terms = [one(sums[k], leaving, entering=entering) * one.target.numel() for k, one in enumerate(self.losses)]
         squares = terms[0].square() + (terms[1].square() if count > 1 else sums[-1] / (leaving * SHARP**2))
-        return (0.5 * squares + penalty).sqrt() / self.loss.target.numel()
+        square, pixels = 0.5 * squares + penalty, self.loss.target.numel()
+        if not float(square.detach()) > 0:
+            return square / pixels  # zero loss: the square root has no derivative there, its square has
+        return square.sqrt() / pixels

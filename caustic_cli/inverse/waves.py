@@ -1,13 +1,14 @@
 """The loss of a lens' wave image and its derivative by the control heights.
 
-Around the lens at which a stage begins, with heights h_0 and optical path v_0(x) to a foot x of light on the plane behind it,
+Linearised about the lens at the beginning of a stage, with heights h_0 and optical path length v_0(x) to a point x of the plane
+behind it,
 
     v(x) = v_0(x) + c(x) (h - h_0)(s(x)),    c = n_in d_in - n_out d_out along the surface's normal axis
 
-is the path of a lens of heights h: by Fermat's principle exact to first order, s(x) the point of the surface where that light
-meets it.  A refinement moves a surface by tenths of a micrometre, where the second order is some thousandths of a wavelength; the
-next stage begins from an exact trace again.  Amplitudes stay those of the trace.  So an evaluation takes no rays: the spline at
-fixed points, one Fourier transform and its adjoint for each wavelength.
+is the path length of a lens of heights h, by Fermat's principle exact to first order, where s(x) is the intersection of that ray
+with the surface.  A refinement moves the surface by tenths of a micrometre, for which the second order is some thousandths of a
+wavelength; the next stage starts from an exact trace again.  Amplitudes are those of the trace.  So an evaluation needs no ray
+tracing: the spline at fixed points, one Fourier transform and its adjoint for each wavelength.
 """
 
 from __future__ import annotations
@@ -28,16 +29,16 @@ from caustic_cli.optics.waves.receiver import receiver_of
 from caustic_cli.optics.waves.wavefront import Wavefront
 from caustic_cli.scene import Scene
 
-#: Bytes of graphs that are kept from an image to its derivative; beyond, every transform is made again.
+#: Most bytes of graphs kept for the gradient; beyond, every transform is recomputed.
 KEPT = 1 << 30
 
 
 @dataclass(frozen=True)
 class Part:
-    """Light of one wavelength and one point of the source, by its number: phase (n, m) rad at h_0 in [0, 2 pi), its derivative by
-    the height (n, m) rad/mm, amplitude (n, m), which samples fall on which pixels, and the power of all of it.
+    """Light of one wavelength and one mode, a point of the source: phase (n, m) rad at h_0 in [0, 2 pi), its derivative with
+    respect to the height (n, m) rad/mm, amplitude (n, m), masks of samples on pixels, and total power.
 
-    front: shared by parts whose light goes the same ways.
+    front: shared by parts with the same rays.
     """
 
     line: Line
@@ -55,15 +56,15 @@ class WaveObjective:
     """The loss as a function of the heights; see above.
 
     Args:
-        scene: its screen is the one the picture is judged on.
+        scene: with the screen of the picture.
         field: spline spaces of the heights.
         heights: h_0 (n, m) mm.
         target, loss, blur, apron, max_slope, min_radius: as of an `Objective`.
-        wavelengths: nm, in equal parts, of a scene that says none; empty for white light's.
+        wavelengths: nm, of equal weight, for a scene that gives none; empty for those of white light.
         dtype: of fields; paths are float64.
 
     Raises:
-        NoWaveImage: no light, no single wavefront, or memory is short.
+        NoWaveImage: no light, no single wavefront, or not enough memory.
     """
 
     def __init__(
@@ -105,7 +106,7 @@ class WaveObjective:
         for line in lines:
             for k, mode in enumerate(imager.modes(line.system)):
                 key = id(line.system), line.label, k
-                if key not in made:  # wavelengths of one index go the same ways
+                if key not in made:  # wavelengths of the same index have the same rays
                     made[key] = imager.front(line, mode, parameters, sensitive=True)
                 front = made[key]
                 phase, amplitude = imager.field(line, front, self.dtype)
@@ -158,7 +159,7 @@ class WaveObjective:
         return Evaluation(float(loss.detach()), {EXIT: gradient}, float(inner.sum()), inner)
 
     def _moved(self, front: Wavefront, change: Tensor) -> Tensor:
-        """How far the surface moved where light of a wavefront meets it, (n, m) mm."""
+        """Displacement of the surface at the intersections of the rays of a wavefront, (n, m) mm."""
         return self.field.evaluate(change, front.at_x.reshape(-1), front.at_y.reshape(-1))[0].view(front.at_x.shape)
 
     def _image(self, part: Part, moved: Tensor) -> Tensor:

@@ -1,1 +1,1 @@
-"""Files of every kind: pictures, lens surfaces, archives, ray files and tables, read with bounds and written whole."""
+"""File formats: pictures, lens surfaces, archives, ray files and tables; reading is bounded, writing atomic."""

@@ -1,4 +1,4 @@
-"""The scene and the lens out of an exported `.npz`, so that it can be traced without its project."""
+"""Reader of exported `.npz` archives: scene and lens, for tracing without the project."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from caustic_cli.scene.screen import MAX_SAGS, Sags
 from caustic_cli.scene.sources.distribution import MOST_ANGLES, Distribution
 from caustic_cli.scene.sources.points import MAX_POINTS
 
-#: Cells along an axis of a source's picture.
+#: Most cells along an axis of a picture of a source.
 MOST_CELLS = 1 << 16
 
 
@@ -64,7 +64,7 @@ def open_archive(path: str | Path) -> tuple[Scene, HeightField, Tensor]:
 
 
 def _light(data: Archive) -> Light:
-    """Of what wavelengths and polarisation; see `export/lighttools.py`."""
+    """Wavelengths and polarisation; see `export/lighttools.py`."""
     wavelengths, weights = (
         tuple(data.reals(f"source_{key}", None, most=MAX_WAVELENGTHS).tolist()) if f"source_{key}" in data else ()
         for key in ("wavelengths", "weights")
@@ -103,7 +103,7 @@ def _elements(data: Archive) -> tuple[Component, ...]:
 
 
 def _front(data: Archive, name: str) -> Front | None:
-    """A designed surface of one of them."""
+    """A designed surface of another element, or None."""
     if f"{name}heights" not in data:
         return None
     heights, degree = data.reals(f"{name}heights", None, None, most=MAX_CONTROL), data.wholes(f"{name}degrees", 2)
@@ -158,7 +158,7 @@ def _disc(data: Archive) -> Disc:
     return Disc(_positions(data)[0], size, _power(data), brightness=brightness, **_shining(data))
 
 
-#: What makes a source of its keys in the archive, by its kind: see `export/lighttools.py`.
+#: Readers of a source by its kind: see `export/lighttools.py`.
 _READERS = {"plane": _plane, "point": _points, "grid": _points, "disc": _disc}
 
 
@@ -167,7 +167,7 @@ def _power(data: Archive) -> float:
 
 
 def _picture(data: Archive, name: str) -> np.ndarray | None:
-    """Relative irradiance or radiance, None where the archive has none."""
+    """Relative irradiance or radiance (a, b), None if absent."""
     return data.reals(name, None, None, most=MOST_CELLS) if name in data else None
 
 

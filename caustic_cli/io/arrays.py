@@ -1,11 +1,11 @@
-"""NumPy's arrays in files, `.npy` and `.npz`: the header first, and the data only where it says what is wanted.
+"""Safe reader of NumPy files, `.npy` and `.npz`: bounded in size, with the header validated before data are read.
 
 A .npy file is "\\x93NUMPY", two bytes of version, the length of the header, the header (a Python dictionary of descr, fortran_order
-and shape, as text) and the data.  A .npz archive is a ZIP file of them.  Neither is read by NumPy itself: its reader evaluates the
-header, allocates what that says, and decompresses what is there, whatever it is.
+and shape, as text) and the data.  A .npz archive is a ZIP file of them.  NumPy's own reader is not used: it evaluates the
+header as Python, and allocates and decompresses as much as the file declares.
 
-Here a header is read by a pattern, has at most MOST_HEADER bytes, and is of numbers or text; an array has at most MOST_BYTES, all
-that is read of an archive MOST_IN_ALL, and its table of contents MOST_CONTENTS.  Members that nobody asks for are not touched.
+Here a header is parsed by a regular expression, has at most MOST_HEADER bytes, and a numeric or text dtype; an array has at most
+MOST_BYTES, all arrays read from an archive MOST_IN_ALL, and its central directory MOST_CONTENTS.  Other members are not read.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ MOST_HEADER = 4096
 MOST_BYTES = 3 * 8 * 8192 * 8192
 #: Bytes of all arrays read of one archive: a net of 4096 x 4096 control points and a picture.
 MOST_IN_ALL = 1 << 30
-#: Bytes of an archive's table of contents: 20,000 members.
+#: Bytes of the central directory of an archive: 20,000 members.
 MOST_CONTENTS = 1 << 20
 #: Bytes of a file: the points and normals of 50 million samples fit.
 MOST_OF_FILE = 1 << 33
@@ -42,7 +42,7 @@ MOST_AXES, MOST_DIGITS, MOST_TEXT = 8, 18, 10_000
 #: Bytes decompressed at a time.
 PIECE = 1 << 20
 MAGIC = b"\x93NUMPY"
-#: What reading a damaged file may end in: of ZIP's table of contents and members, of their compression, and of the header.
+#: Exceptions of reading a damaged file: ZIP directory and members, compression, and header.
 DAMAGED = (OSError, EOFError, ValueError, TypeError, OverflowError, RuntimeError, zipfile.BadZipFile, zlib.error, struct.error)
 
 _FIELD = re.compile(r"""["'](descr|fortran_order|shape)["']\s*:\s*(?:["']([^"']*)["']|(True|False)|\(([\d\s,L]*)\))\s*,?\s*""")
@@ -51,10 +51,10 @@ _KIND = re.compile(r"[<>=|]?[biufcUS]\d{1,9}")
 
 @dataclass(frozen=True)
 class Stored:
-    """An array in a file, of which the header has been read.
+    """An array in a file, whose header has been read and validated.
 
-    shape, dtype: as the header says, the data being as long as that asks for; unread: bytes that may yet be read, in a list of one
-    number that arrays of an archive share; accepted: words for what is needed instead of a damaged file.
+    shape, dtype: from the header; unread: remaining byte budget, in a list of one number that arrays of an archive share; accepted:
+    description of a valid file for error messages.
     """
 
     shape: tuple[int, ...]
@@ -68,11 +68,11 @@ class Stored:
         """The array.
 
         Raises:
-            InputError: it is longer than may be read, cut off, or damaged.
+            InputError: it exceeds the byte budget, or is truncated or damaged.
         """
         size = math.prod(self.shape) * self.dtype.itemsize
         if size > self.unread[0]:
-            raise InputError(f"asks for {size:,} bytes; at most {self.unread[0]:,} more are read")
+            raise InputError(f"has {size:,} bytes; at most {self.unread[0]:,} more are read")
         self.unread[0] -= size
         data = bytearray(size)
         view, at = memoryview(data), 0
@@ -88,13 +88,13 @@ class Stored:
     def read_reals(self) -> np.ndarray:
         """An array of numbers as float64."""
         values = self.read()
-        with np.errstate(invalid="ignore", over="ignore"):  # a signalling NaN; what float64 cannot hold becomes infinite
+        with np.errstate(invalid="ignore", over="ignore"):  # signalling NaN; overflow to infinity
             return values.astype(np.float64)
 
 
 @contextlib.contextmanager
 def refusing(accepted: str) -> Iterator[None]:
-    """Within the block, what DAMAGED lists becomes an InputError; RuntimeError is ZIP's own, that a password is needed."""
+    """Convert DAMAGED exceptions of the block to InputError; zipfile raises RuntimeError for an encrypted member."""
     try:
         yield
     except DAMAGED as error:
@@ -104,10 +104,10 @@ def refusing(accepted: str) -> Iterator[None]:
 
 
 def _header(file: BinaryIO, size: int, unread: list[int], accepted: str, exact: bool) -> Stored:
-    """The header of an array at the beginning of a file of `size` bytes, which with `exact` ends where the array ends.
+    """Read the header of an array at the beginning of a file of `size` bytes; exact: the file must end with the array.
 
     Raises:
-        ValueError: it is none, of neither numbers nor text, or asks for more than there is.
+        ValueError: the header is invalid, of another dtype, or declares more data than there are.
     """
     start = file.read(8)
     if start[:6] != MAGIC or start[6:7] not in (b"\1", b"\2", b"\3"):
@@ -138,10 +138,10 @@ def _header(file: BinaryIO, size: int, unread: list[int], accepted: str, exact: 
 
 @contextlib.contextmanager
 def open_npy(path: Path | Piped, accepted: str) -> Iterator[Stored]:
-    """The array of a .npy file, its header read; what is refused within the block is said of the file.
+    """Open a .npy file and read its header; an InputError of the block is prefixed with the file name.
 
     Raises:
-        InputError: there is none, it is no regular file, or damaged; `accepted` says what is needed.
+        InputError: there is no such regular file, or it is damaged; `accepted` describes a valid one.
     """
     with open_regular(path, accepted, MOST_OF_FILE) as file, naming(path):
         with refusing(accepted):
@@ -152,7 +152,8 @@ def open_npy(path: Path | Piped, accepted: str) -> Iterator[Stored]:
 
 
 class _Bounded:
-    """A file whose every read is of at most MOST_CONTENTS bytes: ZIP's table of contents is read at once, by a length it says."""
+    """A file whose reads are limited to MOST_CONTENTS bytes: zipfile reads the central directory at once, by its declared
+    length."""
 
     def __init__(self, file: BinaryIO):
         self.seek, self.tell, self.seekable, self.close, self._read = file.seek, file.tell, file.seekable, file.close, file.read
@@ -165,7 +166,7 @@ class _Bounded:
 
 
 class Archive:
-    """The arrays of a .npz archive by name, each read when it is asked for."""
+    """The arrays of a .npz archive by name, each read on demand."""
 
     def __init__(self, archive: zipfile.ZipFile, accepted: str):
         self.accepted, self._zip, self._unread = accepted, archive, [MOST_IN_ALL]
@@ -176,10 +177,10 @@ class Archive:
 
     @contextlib.contextmanager
     def open(self, name: str) -> Iterator[Stored]:
-        """An array, its header read.
+        """Open an array and read its header.
 
         Raises:
-            InputError: there is none of that name, or it is damaged, encrypted, or compressed otherwise than by deflate.
+            InputError: there is no such array, or it is damaged, encrypted, or not compressed by deflate.
         """
         if name not in self:
             raise InputError(f"has no {name}; {self.accepted}")
@@ -199,7 +200,7 @@ class Archive:
             shape: its size along each axis, None for any; most: of these.
 
         Raises:
-            InputError: it is of another shape or kind, or damaged, or there is none.
+            InputError: there is no such array, or it has another shape or dtype, or is damaged.
         """
         with self.open(name) as stored:
             _check(name, stored, shape, "fiub", "finite numbers")
@@ -215,13 +216,13 @@ class Archive:
         return float(self.reals(name))
 
     def wholes(self, name: str, count: int) -> tuple[int, ...]:
-        """So many whole numbers."""
+        """An array of `count` whole numbers."""
         with self.open(name) as stored:
             _check(name, stored, (count,), "iu", "whole numbers")
             return tuple(int(v) for v in stored.read())
 
     def text(self, name: str, default: str | None = None) -> str:
-        """A text of at most MOST_TEXT characters; `default` where there is none of that name."""
+        """A text of at most MOST_TEXT characters; `default` if it is absent."""
         if default is not None and name not in self:
             return default
         with self.open(name) as stored:
@@ -244,10 +245,10 @@ def _check(name: str, stored: Stored, shape: tuple[int | None, ...], kinds: str,
 
 @contextlib.contextmanager
 def open_npz(path: Path, accepted: str) -> Iterator[Archive]:
-    """The arrays of a .npz archive; what is refused within the block is said of the file.
+    """Open a .npz archive; an InputError of the block is prefixed with the file name.
 
     Raises:
-        InputError: there is none, it is no regular file, or damaged; `accepted` says what is needed.
+        InputError: there is no such regular file, or it is damaged; `accepted` describes a valid one.
     """
     with open_regular(path, accepted, MOST_OF_FILE) as file, naming(path):
         with refusing(accepted):

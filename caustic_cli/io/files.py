@@ -1,7 +1,7 @@
-"""Files are written whole or not at all: temporary file beside the target, fsync, rename.
+"""Atomic writing (temporary file in the same directory, fsync, rename) and bounded reading of files.
 
-Only regular files, and links to them, are opened or replaced: a device, a pipe or a socket may have no end, keep its reader
-waiting, or be lost.  Each reader says how many bytes it reads at most, and a larger file is refused by its size alone.
+Only regular files, and links to them, are opened or replaced: a device, a pipe or a socket may be endless, block its reader, or be
+destroyed.  Each reader gives the largest number of bytes it reads, and a larger file is refused by its size.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from typing import BinaryIO
 
 from caustic_cli.errors import CausticError, InputError
 
-#: What marks a file as made by this program, so that it may be replaced.
+#: Mark of files made by this program, which it may replace.
 SOFTWARE = "caustic"
 MARK = SOFTWARE.encode()
 CREATED_BY = f"created by {SOFTWARE}"  # in a comment at the beginning of a text file
-#: How files begin that a project is made of.
+#: Beginnings of the names of the files of a project that outputs must not replace.
 PARTS = ("project.toml", "checkpoints.h5", "target.", "profile.", "source.", "source-", "intensity.", "intensity-", ".outputs.json")
 PARTS += ("tolerances.toml", "second.", "screen.", "index.")
 NPY_MAGIC = b"\x93NUMPY"
 NPY_HEADER = 256  # bytes; NumPy itself pads to 64 or 128
-#: A temporary file nobody has written to for so many seconds was left by a killed process.
+#: Age, s, after which a temporary file counts as left by a killed process.
 LEFT_BEHIND = 600.0
 
 
 @contextlib.contextmanager
 def naming(path: str | Path | Piped) -> Iterator[None]:
-    """Put the file's name before what is said of its content within the block."""
+    """Prefix an InputError of the block with the file name."""
     try:
         yield
     except InputError as error:
@@ -43,7 +43,7 @@ def naming(path: str | Path | Piped) -> Iterator[None]:
 
 
 class Piped(bytes):
-    """What came through standard input, in place of a file's path."""
+    """Data from standard input, in place of a path."""
 
     def __str__(self) -> str:
         return "standard input"
@@ -53,7 +53,7 @@ def read_stdin(accepted: str, most: int) -> Piped:
     """All of standard input.
 
     Raises:
-        InputError: it is closed, a terminal, empty, or more than `most` bytes; `accepted` says what is needed.
+        InputError: it is closed, a terminal, empty, or more than `most` bytes; `accepted` describes a valid file.
     """
     if sys.stdin is None or sys.stdin.closed:
         raise InputError(f"standard input is closed; {accepted}")
@@ -68,20 +68,20 @@ def read_stdin(accepted: str, most: int) -> Piped:
 
 
 def open_regular(path: str | Path | Piped, accepted: str, most: int) -> BinaryIO:
-    """A regular file of at most `most` bytes, opened for reading; whoever reads it closes it.  What was piped in is one in memory.
+    """Open a regular file of at most `most` bytes for reading, to be closed by the caller; piped data are a file in memory.
 
     Raises:
-        InputError: there is none, it is something else or larger, or cannot be read; `accepted` says what is needed.
+        InputError: there is no such regular file, it is larger, or cannot be read; `accepted` describes a valid file.
     """
 
     if isinstance(path, Piped):
         return io.BytesIO(path)
 
     def opened(name, flags: int) -> int:
-        return os.open(name, flags | getattr(os, "O_NONBLOCK", 0))  # a pipe that takes its place meanwhile keeps nobody waiting
+        return os.open(name, flags | getattr(os, "O_NONBLOCK", 0))  # does not block on a pipe that replaced the file meanwhile
 
     try:
-        _refuse_special(path, os.stat(path), accepted)  # before it is opened: that alone may set a device going
+        _refuse_special(path, os.stat(path), accepted)  # checked first, since opening may already act on a device
         file = open(path, "rb", opener=opened)  # noqa: SIM115 (it is the caller's)
         try:
             found = os.fstat(file.fileno())
@@ -93,7 +93,7 @@ def open_regular(path: str | Path | Piped, accepted: str, most: int) -> BinaryIO
             raise
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file; {accepted}") from error
-    except (OSError, ValueError) as error:  # a name too long, or with a zero byte
+    except (OSError, ValueError) as error:  # e.g. a name that is too long, or contains a zero byte
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error}); {accepted}") from error
@@ -104,12 +104,12 @@ def read_bytes(path: str | Path, most: int, accepted: str, least: int = 1) -> by
     """All of a regular file of `least` (0 or 1) to `most` bytes.
 
     Raises:
-        InputError: there is none, it is empty, too large or cannot be read; `accepted` says what is needed.
+        InputError: there is no such file, it is empty, too large or cannot be read; `accepted` describes a valid file.
     """
     with open_regular(path, accepted, most) as file:
         try:
             size = os.fstat(file.fileno()).st_size
-            data = file.read(size + 1)  # for which memory is taken at once
+            data = file.read(size + 1)  # allocates the whole size at once
         except OSError as error:
             raise InputError(f"{path}: cannot be read ({error.strerror}); {accepted}") from error
     if len(data) < least:
@@ -120,32 +120,32 @@ def read_bytes(path: str | Path, most: int, accepted: str, least: int = 1) -> by
 
 
 def _refuse_special(path: str | Path, found: os.stat_result, needed: str) -> None:
-    """Refuse what is neither a regular file nor a link to one."""
+    """Refuse anything but a regular file or a link to one."""
     if not stat.S_ISREG(found.st_mode):
         kind = "a directory" if stat.S_ISDIR(found.st_mode) else "not a regular file"
         raise InputError(f"{path}: is {kind}; {needed}")
 
 
 def refuse_special(path: str | Path) -> None:
-    """Refuse to write where something stands that is no regular file: renaming onto a device would remove it.
+    """Refuse to replace anything but a regular file: renaming onto a device would remove it.
 
     Raises:
-        InputError: there is a directory, a device, a pipe or a socket, or a link to one.
+        InputError: the path is a directory, a device, a pipe or a socket, or a link to one.
     """
     try:
         found = os.stat(path)
-    except (OSError, ValueError):  # nothing there; what makes writing impossible is said where it is tried
+    except (OSError, ValueError):  # nothing there; other problems are reported when writing
         return
     _refuse_special(path, found, "a file name is needed")
 
 
 @contextlib.contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """A temporary path in the same directory; renamed onto `path` when the block ends well, removed when it does not.
+    """A temporary path in the same directory, renamed to `path` when the block succeeds, removed otherwise.
 
     Raises:
-        InputError: the directory cannot be written to, or something else than a regular file stands there.
-        CausticError: the file could not be written, on a full disk for instance; what stood there before still does.
+        InputError: the directory cannot be written to, or the path is not a regular file.
+        CausticError: the file could not be written, on a full disk for instance; an existing file is unchanged.
     """
     path = Path(path)
     refuse_special(path)
@@ -161,7 +161,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         yield temporary
         umask = os.umask(0)
         os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)  # mkstemp makes it private; a plain open() would not have
+        os.chmod(temporary, 0o666 & ~umask)  # mkstemp creates it with mode 0600, unlike open()
         with open(temporary, "rb") as f:
             os.fsync(f.fileno())
         os.replace(temporary, path)
@@ -175,13 +175,13 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 
 def _around(path: Path) -> tuple[str, str]:
-    """Beginning and end of a temporary file's name, not longer than a name may be even if that of `path` is as long."""
+    """Prefix and suffix of the name of a temporary file, within the length limit of names for any `path`."""
     name, suffix = path.name.encode(errors="surrogateescape"), path.suffix.encode(errors="surrogateescape")
     return f".{name[:200].decode(errors='ignore')}.", path.suffix if len(suffix) <= 40 else ""
 
 
 def _sweep(path: Path) -> None:
-    """Remove what processes that were killed while they wrote `path` have left beside it."""
+    """Remove temporary files left by processes that were killed while writing `path`."""
     prefix, suffix = map(glob.escape, _around(path))
     for left in path.parent.glob(f"{prefix}????????{suffix}"):
         with contextlib.suppress(OSError):  # another process was faster
@@ -196,9 +196,9 @@ def write_bytes(path: str | Path, *parts: bytes | memoryview) -> None:
 
 
 def is_ours(path: str | Path) -> bool:
-    """Whether this program made the file: by our mark in a PNG, GIF, MP4, .npy, .npz, STL, JSON or text; nothing else is ours.
+    """Whether this program made the file, by its mark in a PNG, GIF, MP4, .npy, .npz, STL, JSON or text.
 
-    Read are its first and last 1024 bytes.  What cannot be read is not ours.
+    Reads the first and last 1024 bytes.  False for a file that cannot be read.
     """
     try:
         with open_regular(path, "", sys.maxsize) as f:
@@ -222,17 +222,17 @@ def is_ours(path: str | Path) -> bool:
 
 
 def discard(path: Path) -> None:
-    """Remove a file that is out of date, if this program made it."""
+    """Remove an outdated file, if this program made it."""
     if path.is_file() and is_ours(path):
         path.unlink()
 
 
 def refuse_foreign(path: str | Path, force: bool = False) -> None:
-    """Stop before work begins when `path` cannot be written, or holds something this program did not make.
+    """Refuse before work begins if `path` cannot be written, or holds a file not made by this program.
 
     Raises:
-        InputError: its directory is missing or read-only, it is no regular file, it is foreign and `force` is false, or it
-            is what a project is made of.
+        InputError: its directory is missing or read-only, it is not a regular file, it was not made by this program and `force`
+            is false, or it is part of a project.
     """
     path = Path(path)
     refuse_special(path)
@@ -247,10 +247,10 @@ def refuse_foreign(path: str | Path, force: bool = False) -> None:
 
 
 def _sync_directory(directory: Path) -> None:
-    """Make the rename itself durable, where the system lets a directory be synced."""
+    """Sync the directory, which makes the rename durable, where the system supports it."""
     try:
         handle = os.open(directory, os.O_RDONLY)
-    except OSError:  # not possible on every system; the file's own content is safe already
+    except OSError:  # not possible on every system; the content of the file is synced already
         return
     try:
         os.fsync(handle)

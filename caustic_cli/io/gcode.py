@@ -1,10 +1,10 @@
-"""Programs for mills in: the straight moves of a three-axis G-code program (RS-274), by tool.
+"""Reader of three-axis G-code programs (RS-274): linear moves, by tool.
 
-Read are G0 and G1 with X, Y, Z in absolute millimetres, one motion a block, blocks deleted by none; G17, G21, G90, G94, F, S, M and
-N words are taken note of or passed over; comments stand in parentheses or behind a semicolon.  Arcs, inches, relative moves,
-cycles, offsets and parameters are refused: a cut would not be what the file says.
+Supported are G0 and G1 with X, Y, Z in absolute millimetres, one motion per block, without block delete; G17, G21, G90, G94, F, S,
+M and N words are ignored; comments are in parentheses or after a semicolon.  Arcs, inches, relative moves, cycles, offsets and
+parameters are refused, since the simulated cut would be wrong.
 
-Comments that programs of our own carry say the tool, the stock, and how the part lies: see `export.milling.gcode`.
+Comments of exported programs give the tool, the stock, and the orientation of the part: see `export.milling.gcode`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from caustic_cli.io.files import naming, open_regular
 ACCEPTED = "a program of G0 and G1 moves in millimetres is needed"
 #: Largest program read, bytes: some 20 million moves.
 MOST_BYTES = 1 << 29
-#: Words that say nothing about where the tool goes, or only what is assumed anyway.
+#: G words without influence on the tool path, or with the assumed modes; ignored letters.
 PLAIN = {"G17", "G21", "G40", "G49", "G54", "G61", "G64", "G80", "G90", "G94"}
 PASSED_OVER = set("FSTMNH")
 
@@ -36,8 +36,8 @@ _TURNED = re.compile(r"\(turned: (yes|no)")
 
 @dataclass(frozen=True, eq=False)
 class Cut:
-    """What one tool does: kind (ball nose, flat end, "" where nobody says), radius, mm or None, and tips (k, 3) mm one after the
-    other; rapid (k,), whether the tool went there by G0."""
+    """Path of one tool: kind (ball nose, flat end, "" if unknown), radius, mm or None; successive positions of the tip (k, 3) mm;
+    rapid (k,), whether each was reached by G0."""
 
     kind: str
     radius: float | None
@@ -47,8 +47,8 @@ class Cut:
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """cuts, by tool; top: height of the stock, mm, or None; zero: z of Z0 in the part's coordinates, mm, or None; turned: whether
-    the scene's (x, y, z) is (x, -y, -z) of the part, or None."""
+    """cuts: paths by tool; top: height of the stock, mm, or None; zero: z of Z0 in the coordinates of the part, mm, or None;
+    turned: whether the (x, y, z) of the scene is (x, -y, -z) of the part, or None."""
 
     cuts: tuple[Cut, ...]
     top: float | None
@@ -57,26 +57,26 @@ class Program:
 
 
 def read_program(path: str | Path) -> Program:
-    """The moves of a program.
+    """Read a program.
 
     Raises:
-        InputError: it is none, or not of this kind, with the line.
+        InputError: it is invalid or not supported, with the line.
     """
     with naming(path), open_regular(path, ACCEPTED, MOST_BYTES) as file:
-        said: dict[re.Pattern, str] = {}
+        comments: dict[re.Pattern, str] = {}
         tools: list[tuple[str, float | None]] = [("", None)]
         moves: list[list[tuple]] = [[]]
         motion, place = None, [math.nan] * 3
         for number, raw in enumerate(file, 1):
-            line = raw.decode("latin-1").strip().upper() if b"(" not in raw else raw.decode("latin-1").strip()
+            line = raw.decode("latin-1")
             if "(" in line:
                 for pattern in (_STOCK, _ZERO, _TURNED):
                     if found := pattern.search(line):
-                        said[pattern] = found[1]
+                        comments[pattern] = found[1]
                 if found := _TOOL.search(line):
                     tools.append((found[1], _real(found[2], number)))
                     moves.append([])
-                    place = [math.nan] * 3  # another tool is another length: nothing says where it stands
+                    place = [math.nan] * 3  # the position is unknown after a tool change
             line = _COMMENT.sub("", line).upper().strip().strip("%")
             if not line:
                 continue
@@ -103,13 +103,13 @@ def read_program(path: str | Path) -> Program:
     cuts = []
     for (kind, radius), rows in zip(tools, moves, strict=True):
         table = np.array(rows, float).reshape(-1, 4)
-        known = np.isfinite(table[:, :3]).all(1)  # before that only some coordinates have been said
+        known = np.isfinite(table[:, :3]).all(1)  # positions with all coordinates known
         if known.any():
             cuts.append(Cut(kind, radius, table[known, :3], table[known, 3] > 0))
     if not cuts:
         raise InputError(f"{path}: moves no tool; {ACCEPTED}")
-    real = {key: _real(said[key], 0) if key in said else None for key in (_STOCK, _ZERO)}
-    return Program(tuple(cuts), real[_STOCK], real[_ZERO], said[_TURNED] == "yes" if _TURNED in said else None)
+    real = {key: _real(comments[key], 0) if key in comments else None for key in (_STOCK, _ZERO)}
+    return Program(tuple(cuts), real[_STOCK], real[_ZERO], comments[_TURNED] == "yes" if _TURNED in comments else None)
 
 
 def _real(text: str, number: int) -> float:

@@ -1,4 +1,4 @@
-"""Height maps in: a picture of heights and the JSON beside it, as `export format heightmap` writes them."""
+"""Reader of height maps: a picture of heights and its JSON, as written by `export format heightmap`."""
 
 from __future__ import annotations
 
@@ -20,56 +20,57 @@ from caustic_cli.io.files import naming, open_regular, read_bytes
 from caustic_cli.optics.bspline import MAX_DEGREE, SplineSpace
 from caustic_cli.optics.surfaces.heightfield import HeightField
 
-#: Suffixes of the pictures; counts of a PNG; number of the JSON's form.
+#: Suffixes of the pictures; largest value of a PNG; format version of the JSON.
 SUFFIXES = (".png", ".tif", ".tiff")
 COUNTS = 65535
 VERSION = 1
 #: Bytes of the JSON and of the picture; points of a map; control points of a net.
 MOST_JSON, MOST_BYTES, MOST_POINTS = 1 << 20, 1 << 30, 50_000_000
 MAX_CONTROL = int(TABLE["lens.control"].high)
-#: How far, in quanta, a map may be off the spline that its JSON says it is of: rounding is half of one, and of a thousand by a
-#: thousand points the nearest spline is off by 0.87 where rounding falls together; an edit is off by many.
+#: Largest deviation, in quanta, of a map from the spline of its JSON: rounding is half a quantum, and for 1000 x 1000 points the
+#: least-squares spline deviates by up to 0.87; an edited map deviates by many.
 OFF = 1.5
 ACCEPTED = "a height map of caustic export is needed: a 16-bit grey PNG or a TIFF of 32-bit floats, with its JSON beside it"
 
 
 def beside(path: str | Path) -> Path:
-    """The JSON of a picture: NAME.png.json would hide what NAME.json is of, so the picture's suffix stays."""
+    """Path of the JSON of a picture, NAME.png.json."""
     path = Path(path)
     return path.with_name(path.name + ".json")
 
 
 def read_heightmap(path: Path, half_size: tuple[float, float]) -> tuple[HeightField, Tensor]:
-    """The surface of a height map, in the scene's coordinates: control heights (n, m) mm on the net that its JSON says, the nearest
-    spline to the heights; else a cubic spline through them.
+    """The surface of a height map, in the coordinates of the scene: control heights (n, m) mm of the least-squares spline on the
+    net of its JSON, or else of an interpolating cubic spline.
 
     Raises:
-        InputError: no such files, or they hold none; heights that are off the net they say by more than their rounding.
+        InputError: the files are missing or invalid, or the heights deviate from a spline on that net by more than rounding.
     """
-    said = _said(beside(path))
+    header = _said(beside(path))
     with naming(path):
-        values = _picture(path, said)
+        values = _picture(path, header)
     with naming(beside(path)):
-        z = said["z_of_zero"] + said["mm_per_count"] * values.astype(np.float64)[::-1].T  # [i, j], j along +y
-        z = -z[:, ::-1] if said["turned"] else z
+        z = header["z_of_zero"] + header["mm_per_count"] * values.astype(np.float64)[::-1].T  # [i, j], j along +y
+        z = -z[:, ::-1] if header["turned"] else z
         if not (np.abs(z) <= LENGTH).all():
             raise InputError(f"must hold heights within +-{LENGTH:g} mm")
-        half = -said["x_of_column_0"], said["y_of_row_0"]
-        return fitted(z, half, said["spline"], OFF * said["quantum_mm"]) if "spline" in said else interpolated(z, half)
+        half = -header["x_of_column_0"], header["y_of_row_0"]
+        return fitted(z, half, header["spline"], OFF * header["quantum_mm"]) if "spline" in header else interpolated(z, half)
 
 
 def interpolated(z: np.ndarray, half_size: tuple[float, float]) -> tuple[HeightField, Tensor]:
-    """The spline through heights (a, b) mm on an even grid over the aperture, borders included: cubic, or less through fewer."""
+    """Interpolating spline of heights (a, b) mm on a regular grid over the aperture, borders included: cubic, or of lower
+    degree."""
     if not 2 <= min(z.shape) <= max(z.shape) <= MAX_CONTROL:
         raise InputError(f"must have 2 to {MAX_CONTROL} heights along each axis, got {z.shape[0]} x {z.shape[1]}")
     return HeightField.through(z, half_size)
 
 
 def fitted(z: np.ndarray, half_size: tuple[float, float], net: dict, off: float) -> tuple[HeightField, Tensor]:
-    """The spline on a net next to heights (a, b) mm on an even grid, by least squares along either axis.
+    """Least-squares spline on a net for heights (a, b) mm on a regular grid.
 
     Raises:
-        InputError: no such net, too few heights for it, or some that are off by more than `off` mm.
+        InputError: an invalid net, too few heights for it, or a deviation of more than `off` mm.
     """
     degrees, knots = net["degrees"], (net["knots_u"], net["knots_v"])
     spaces = tuple(SplineSpace(p, torch.tensor(t, dtype=torch.float64)) for p, t in zip(degrees, knots, strict=True))
@@ -92,26 +93,26 @@ def fitted(z: np.ndarray, half_size: tuple[float, float], net: dict, off: float)
 
 
 def _said(path: Path) -> dict[str, Any]:
-    """The JSON's numbers, checked."""
+    """The contents of the JSON, validated."""
     data = read_bytes(path, MOST_JSON, ACCEPTED)
     with naming(path):
         try:
-            said = json.loads(data)
+            header = json.loads(data)
         except (ValueError, RecursionError) as error:
             raise InputError(f"is no JSON ({str(error)[:100]}); {ACCEPTED}") from error
-        if not isinstance(said, dict) or said.get("height_map") != VERSION or said.get("unit") != "mm":
-            raise InputError(f"says no height_map {VERSION} in mm; {ACCEPTED}")
+        if not isinstance(header, dict) or header.get("height_map") != VERSION or header.get("unit") != "mm":
+            raise InputError(f"does not describe a height_map {VERSION} in mm; {ACCEPTED}")
         for key in ("z_of_zero", "mm_per_count", "quantum_mm", "x_of_column_0", "y_of_row_0"):
-            value = said.get(key)
+            value = header.get(key)
             if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or abs(value) > LENGTH:
                 raise InputError(f"{key} must be a number within +-{LENGTH:g}, got {str(value)[:40]!r}")
-        if not (said["x_of_column_0"] < 0 < said["y_of_row_0"] and said["quantum_mm"] > 0):
+        if not (header["x_of_column_0"] < 0 < header["y_of_row_0"] and header["quantum_mm"] > 0):
             raise InputError("x_of_column_0 must be below 0, y_of_row_0 and quantum_mm above")
-        if not isinstance(said.get("turned"), bool):
+        if not isinstance(header.get("turned"), bool):
             raise InputError("turned must be true or false")
-        if "spline" in said:
-            _check_net(said["spline"])
-        return said
+        if "spline" in header:
+            _check_net(header["spline"])
+        return header
 
 
 def _check_net(net: object) -> None:
@@ -126,14 +127,14 @@ def _check_net(net: object) -> None:
         raise InputError("spline must have degrees of two whole numbers, and knots_u and knots_v of numbers 0 to 1")
 
 
-def _picture(path: Path, said: dict) -> np.ndarray:
-    """Its values (rows, columns)."""
+def _picture(path: Path, header: dict) -> np.ndarray:
+    """Values of the picture (rows, columns)."""
     with open_regular(path, ACCEPTED, MOST_BYTES) as file:
         try:
             with Image.open(file, formats=("PNG", "TIFF")) as image:
                 size, mode = image.size, image.mode
-                if list(size) != [said.get("columns"), said.get("rows")] or math.prod(size) > MOST_POINTS:
-                    raise InputError(f"has {size[0]} x {size[1]} pixels, not what its JSON says, or too many; {ACCEPTED}")
+                if list(size) != [header.get("columns"), header.get("rows")] or math.prod(size) > MOST_POINTS:
+                    raise InputError(f"has {size[0]} x {size[1]} pixels, not those of its JSON, or too many; {ACCEPTED}")
                 if mode not in ("I;16", "I;16B", "I", "F"):
                     raise InputError(f"has pixels of kind {mode}; {ACCEPTED}")
                 return np.asarray(image)

@@ -1,4 +1,4 @@
-"""Tables of an angular distribution: text of two columns, degrees from the axis and relative intensity."""
+"""Reader of tabulated intensity distributions: text of two columns, degrees from the axis and relative intensity."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ TABLE = "a .csv of two columns is needed: degrees from +z, ascending from 0, and
 
 
 def parse_distribution(data: bytes, where: str) -> Distribution:
-    """The distribution in a file's bytes: a line of names may come first; columns part at commas, semicolons or blanks; # begins a
+    """Parse the contents of a file: a header line is optional; columns are separated by commas, semicolons or blanks; # begins a
     comment.
 
     Raises:

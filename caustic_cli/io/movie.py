@@ -1,4 +1,4 @@
-"""Pictures one after another in one file: GIF by Pillow, MP4 by ffmpeg where that is installed."""
+"""Writer of movies: GIF by Pillow, MP4 by ffmpeg if that is installed."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from caustic_cli.errors import CausticError, InputError
 from caustic_cli.io.files import CREATED_BY, atomic_path, refuse_foreign
 
 MADE = f"{CREATED_BY} {__version__}"
-#: Frames a second of an MP4, in which a picture that stays is there again and again.
+#: Frames per second of an MP4, in which longer frames are repeated.
 RATE = 25
 
 
 def refuse_unwritable(path: str | Path, force: bool = False) -> None:
-    """Stop before work begins where a movie could not be written to `path`.
+    """Refuse before work begins if a movie cannot be written to `path`.
 
     Raises:
-        InputError: its suffix is no movie's, what encodes it is not installed, or as of `files.refuse_foreign`.
+        InputError: another suffix, no encoder is installed, or as in `files.refuse_foreign`.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in (".gif", ".mp4"):
@@ -38,10 +38,10 @@ def refuse_unwritable(path: str | Path, force: bool = False) -> None:
 
 
 def write_movie(path: str | Path, frames: Sequence[Image.Image], milliseconds: Sequence[int]) -> None:
-    """Write pictures of one size, each shown for so long; a GIF begins again at its end.
+    """Write frames of one size with their durations; a GIF repeats.
 
     Raises:
-        InputError: as of `refuse_unwritable`; CausticError: it could not be encoded.
+        InputError: as in `refuse_unwritable`; CausticError: it could not be encoded.
     """
     path = Path(path)
     refuse_unwritable(path, force=True)
@@ -63,7 +63,7 @@ def write_movie(path: str | Path, frames: Sequence[Image.Image], milliseconds: S
 
 
 def _ffmpeg() -> str | None:
-    """The program, of the system or of the package imageio-ffmpeg."""
+    """Path of ffmpeg, of the system or of the package imageio-ffmpeg, or None."""
     found = shutil.which("ffmpeg")
     if found is None and importlib.util.find_spec("imageio_ffmpeg") is not None:
         found = import_module("imageio_ffmpeg").get_ffmpeg_exe()
@@ -71,7 +71,7 @@ def _ffmpeg() -> str | None:
 
 
 def _encode(path: Path, frames: Sequence[Image.Image], milliseconds: Sequence[int]) -> None:
-    width, height = (n + n % 2 for n in frames[0].size)  # colours are kept for every other pixel
+    width, height = (n + n % 2 for n in frames[0].size)  # even, since yuv420p subsamples the chroma
     command = [str(_ffmpeg()), "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
     command += ["-r", str(RATE), "-i", "-", "-c:v", "libx264", "-preset", "medium", "-crf", "18", "-pix_fmt", "yuv420p"]
     command += ["-metadata", f"comment={MADE}", "-f", "mp4", str(path)]
@@ -86,6 +86,6 @@ def _encode(path: Path, frames: Sequence[Image.Image], milliseconds: Sequence[in
 
 
 def _padded(frame: Image.Image, width: int, height: int) -> np.ndarray:
-    """Colours (height, width, 3), black beyond the frame."""
+    """RGB (height, width, 3), padded with black."""
     pixels = np.asarray(frame.convert("RGB"))
     return np.pad(pixels, ((0, height - pixels.shape[0]), (0, width - pixels.shape[1]), (0, 0)))

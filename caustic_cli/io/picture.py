@@ -1,4 +1,4 @@
-"""Pictures in and out: reading a target, writing images.
+"""Reading of target pictures and writing of images.
 
 A picture file is the screen seen from +z: column 0 is the -x edge, row 0 the +y edge.  Arrays are [i, j], i along +x and
 j along +y.  Pixel values are sRGB-encoded or linear; irradiance is always linear.
@@ -25,12 +25,12 @@ from caustic_cli.io.files import NPY_HEADER, NPY_MAGIC, SOFTWARE, Piped, atomic_
 MAX_PIXELS = 8192 * 8192
 #: Largest image file read: its decoders may take in all of it at once.
 MAX_BYTES = 1 << 30
-#: Columns of a picture for people to look at, at least.
+#: Least number of columns of an image for viewing.
 WIDE = 800
 ACCEPTED = "an image (PNG, JPEG, TIFF, ...) or a 2-D .npy array is needed"
 #: Luminance of linear sRGB primaries (IEC 61966-2-1, Rec. 709).
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-#: Part of the peak below which a picture is dark, and part of its width below which a dark gap is none.
+#: Fraction of the peak below which a picture counts as dark, and fraction of its width below which a dark gap is ignored.
 DARK, NARROW = 0.01, 0.01
 
 
@@ -46,10 +46,10 @@ def to_srgb(value: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A target as it is kept in a project.
+    """A target picture as stored in a project.
 
     values: uint8 or uint16 codes in image order (rows from the top), uint8 (rows, columns, 3) in colour, or float64 irradiance in
-    array order [i, j], (3, n_x, n_y) in colour; encoding: what the codes mean.
+    array order [i, j], (3, n_x, n_y) in colour; encoding: srgb or linear.
     """
 
     values: np.ndarray
@@ -83,7 +83,7 @@ class Picture:
 
     @property
     def lit(self) -> tuple[float, float]:
-        """Parts of its width and height that the least rectangle about all its light takes; all of a black picture."""
+        """Width and height of the bounding box of all non-zero pixels, over those of the picture; 1 for a black picture."""
         light = self.irradiance()
         bright = (light if light.ndim == 2 else light.sum(0)) > 0
         found = []
@@ -94,9 +94,9 @@ class Picture:
 
     @property
     def gaps(self) -> float:
-        """Dark gaps between its bright parts that a row crosses, and a column, both on the mean: 0 of a photograph or a disc.
+        """Mean number of dark gaps between bright regions along a row plus that along a column: 0 for a photograph or a disc.
 
-        Dark is below a hundredth of the peak, and a gap at least a hundredth of the picture wide.
+        Dark means below a hundredth of the peak, and a gap is at least a hundredth of the picture wide.
         """
         light = self.irradiance()
         light = light if light.ndim == 2 else light.sum(0)
@@ -108,7 +108,7 @@ class Picture:
         return found
 
     def write(self, path: Path) -> None:
-        """Write it losslessly; `path` ends in `suffix`."""
+        """Write the picture losslessly; `path` ends in `suffix`."""
         if self.suffix == ".npy":
             write_npy(path, self.values)
         else:
@@ -116,16 +116,16 @@ class Picture:
 
 
 def read_picture(path: str | Path | Piped, linear: bool = False, color: bool = False, invert: bool = False) -> Picture:
-    """The picture at `path`, reduced to one channel of luminance, or with `color` as red, green and blue of 8 bits each.
+    """Read a picture, reduced to luminance, or with `color` as 8-bit RGB.
 
-    8- and 16-bit grey codes are kept as they are.  Colour becomes luminance, alpha lies over black, a camera's
-    orientation tag is obeyed.  A .npy array, and a floating-point image, is linear irradiance.
+    8- and 16-bit grey codes are kept unchanged.  Colour is converted to luminance, alpha is composited over black, and an EXIF
+    orientation is applied.  A .npy array, and a floating-point image, is linear irradiance.
 
     Args:
-        invert: take what is dark as bright; alpha lies over white then.
+        invert: exchange dark and bright; alpha is then composited over white.
 
     Raises:
-        InputError: there is no such picture, or it is too large, too small, black, negative or not finite.
+        InputError: the picture cannot be read, or is too large, too small, black, negative or not finite.
     """
     if isinstance(path, Piped):
         array = path.startswith(NPY_MAGIC)
@@ -173,10 +173,10 @@ def _read_image(path: Path | Piped, linear: bool, color: bool, white: bool) -> P
     with open_regular(path, ACCEPTED, MAX_BYTES) as file, naming(path):
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of sizes, which are checked below, and of metadata, which nobody needs
+                warnings.simplefilter("ignore")  # about sizes, which are checked below, and metadata
                 with Image.open(file) as image:
                     _check_size(*image.size)
-                    if image.format == "EPS":  # which Pillow would have Ghostscript draw
+                    if image.format == "EPS":  # which Pillow would pass to Ghostscript
                         raise InputError(f"is a drawing, not pixels; {ACCEPTED}")
                     with _silent() if image.format == "TIFF" else nullcontext():
                         image = ImageOps.exif_transpose(image)
@@ -185,7 +185,7 @@ def _read_image(path: Path | Piped, linear: bool, color: bool, white: bool) -> P
             raise
         except Image.DecompressionBombError as error:
             raise InputError(f"is too large; at most {MAX_PIXELS} pixels (8192 x 8192) are read") from error
-        except Exception as error:  # what a broken file makes one of Pillow's many decoders stumble over may be anything
+        except Exception as error:  # a damaged file may cause any exception in a decoder
             raise InputError(f"is not an image that can be read ({type(error).__name__}); {ACCEPTED}") from error
     encoding = "linear" if linear else "srgb"
     if color and image.mode != "F" and not image.mode.startswith("I"):
@@ -209,7 +209,7 @@ def _read_image(path: Path | Piped, linear: bool, color: bool, white: bool) -> P
 
 
 def _lit(path: Path | Piped, image: Image.Image, picture: Picture) -> Picture:
-    """A picture of colour or transparency, unless it is a black drawing on nothing."""
+    """The picture; refused if it is black on a transparent ground."""
     if not picture.values.any() and len(set(image.convert("RGBA").getchannel("A").getextrema())) == 2:
         raise InputError(f"{path}: is black on nothing, so that none of it is bright; ⟨invert⟩ takes dark as bright")
     return picture
@@ -217,7 +217,7 @@ def _lit(path: Path | Piped, image: Image.Image, picture: Picture) -> Picture:
 
 @contextmanager
 def _silent() -> Iterator[None]:
-    """Nothing is said on stderr within the block: libtiff says there what it finds wrong with a file, past Pillow and Python."""
+    """Redirect stderr to the null device within the block: libtiff writes warnings to it directly."""
     try:
         before = os.dup(2)
     except OSError:  # closed
@@ -233,7 +233,7 @@ def _silent() -> Iterator[None]:
 
 
 def _over_ground(image: Image.Image, linear: bool, white: bool) -> np.ndarray:
-    """8-bit codes (rows, columns, 3) of a colour picture over black, or over white."""
+    """8-bit codes (rows, columns, 3) of a colour picture, composited over black or white."""
     codes = np.asarray(image.convert("RGBA"))
     if codes[..., 3].min() == 255:
         return codes[..., :3].copy()
@@ -244,12 +244,12 @@ def _over_ground(image: Image.Image, linear: bool, white: bool) -> np.ndarray:
 
 
 def _luminance(image: Image.Image, linear: bool, transparent: bool, white: bool) -> np.ndarray:
-    """16-bit codes of the luminance of a colour or transparent picture over black, or over white: (rows, columns) uint16."""
+    """16-bit codes of the luminance of a colour or transparent picture, composited over black or white: (rows, columns) uint16."""
     codes = np.asarray(image.convert("RGBA" if transparent else "RGB"))
     table = np.arange(256) / 255.0
     table = table if linear else to_linear(table)
     out = np.empty(codes.shape[:2], dtype=np.uint16)
-    for k in range(0, len(codes), 256):  # in strips, so that a large photograph is not held in float64 three times
+    for k in range(0, len(codes), 256):  # in strips, which bounds the memory
         strip = codes[k : k + 256]
         light = table[strip[..., :3]] @ LUMINANCE
         if transparent:
@@ -270,7 +270,7 @@ def write_image(
 ) -> None:
     """Write irradiance (n_x, n_y), [i, j], as an 8-bit grey PNG with `white` (and everything above) at 255; (3, n_x, n_y), RGB.
 
-    wide: columns that it has at least, each pixel a square of as many as that takes; said: texts about it, see `said_of`.
+    wide: least number of columns, reached by integer upscaling; said: text entries, see `said_of`.
     """
     codes = codes_of(irradiance, white, encoding)
     times = -(-wide // codes.shape[1])
@@ -278,23 +278,23 @@ def write_image(
 
 
 def said_of(path: str | Path) -> dict[str, str]:
-    """The texts of a PNG that this program wrote; none of what is no such picture."""
+    """Text entries of a PNG; empty if it cannot be read."""
     try:
         with Image.open(path) as image:
             return {key: value for key, value in image.info.items() if isinstance(value, str)}
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):  # whatever is there says nothing about itself
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):  # no readable picture
         return {}
 
 
 def codes_of(irradiance: np.ndarray, white: float, encoding: str) -> np.ndarray:
-    """Irradiance as 8-bit codes in image order, (rows, columns), or (rows, columns, 3) of colours, as `write_image` writes it."""
+    """Irradiance as 8-bit codes in image order, (rows, columns) or (rows, columns, 3), as written by `write_image`."""
     value = np.clip(irradiance / white if white > 0 else np.zeros_like(irradiance), 0.0, 1.0)
     value = to_srgb(value) if encoding == "srgb" else value
     return np.ascontiguousarray(np.moveaxis(np.rint(value * 255.0).astype(np.uint8), (-1, -2), (0, 1))[::-1])
 
 
 def write_npy(path: str | Path, array: np.ndarray) -> None:
-    """Write a .npy (format 1.0) whose header is padded to NPY_HEADER bytes: how this program knows its own."""
+    """Write a .npy (format 1.0) whose header is padded to NPY_HEADER bytes, by which the program recognises its own files."""
     array = np.ascontiguousarray(array)
     text = repr({"descr": np.lib.format.dtype_to_descr(array.dtype), "fortran_order": False, "shape": array.shape})
     header = text.ljust(NPY_HEADER - 11) + "\n"

@@ -1,4 +1,4 @@
-"""The shape of a curved screen in: heights on an even grid, a 2-D `.npy` or a TIFF of 32-bit floats."""
+"""Reader of the sag of a curved screen: heights on a regular grid, a 2-D `.npy` or a TIFF of 32-bit floats."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def read_sags(path: Path) -> tuple[bytes, np.ndarray]:
     """The bytes of a file and the heights in it, (a, b) float64 mm, [i, j] with i along +x and j along +y.
 
     Raises:
-        InputError: there is none, or it holds no such heights.
+        InputError: the file cannot be read, or holds no such heights.
     """
     data = read_bytes(path, MOST_BYTES, ACCEPTED)
     if path.suffix.lower() == ".npy":
@@ -46,7 +46,7 @@ def _floats(data: bytes) -> np.ndarray:
             return np.ascontiguousarray(np.asarray(image, dtype=np.float64)[::-1].T)
     except InputError:
         raise
-    except Exception as error:  # what a broken file makes Pillow's decoders stumble over may be anything
+    except Exception as error:  # a damaged file may cause any exception in a decoder
         raise InputError(f"is no TIFF that can be read ({type(error).__name__}); {ACCEPTED}") from error
 
 

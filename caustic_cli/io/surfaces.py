@@ -1,6 +1,6 @@
-"""Lens surfaces from files, to begin a design from or to render: `.npz`, `.step` and height maps as exported, `.npy` of heights.
+"""Readers of lens surfaces, as initial surface of a design: exported `.npz`, `.step` and height maps, and `.npy` of heights.
 
-Everything is mm in the scene's coordinates: heights above z = 0, aperture centred on the axis.
+Lengths are mm in the coordinates of the scene: heights above z = 0, aperture centred on the axis.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 
 #: Most control points along one axis of a surface.
 MAX_CONTROL = int(TABLE["lens.control"].high)
-#: Kinds of file, by suffix.
+#: Suffixes of supported files.
 SUFFIXES = (".npz", ".step", ".stp", ".npy", *heightmaps.SUFFIXES)
-#: Relative difference up to which two lengths, or poles and Greville abscissae, are the same: files may hold them rounded.
+#: Relative tolerance for lengths, and for poles at the Greville abscissae, which files may hold rounded.
 SAME = 1e-6
 
 #: Largest STEP file read: a net of 1600 x 1600 control points as exported.
@@ -35,8 +35,8 @@ MAX_STEP_BYTES = 1 << 28
 ACCEPTED = "an archive of caustic export ⟨format⟩ lighttools is needed"
 HEIGHTS = f"a 2-D .npy array of heights in mm, 2 to {MAX_CONTROL} along each axis, is needed"
 
-# Each pattern begins with characters of its own and never gives back what it has taken, so that reading a file takes time in
-# proportion to its length.  In a text without strings and comments:
+# Possessive quantifiers prevent backtracking, so that parsing time is linear in the length of a file.  For text without strings and
+# comments:
 _STRING = re.compile(r"(?:'[^']*+')++|/\*(?:[^*]|\*(?!/))*+\*/|(?:'|/\*)(?s:.*)")
 _POINT = re.compile(
     r"#(\d{1,18})\s*+=\s*+CARTESIAN_POINT\s*+\(\s*+''\s*+,\s*+\(([^(),]*+),([^(),]*+),([^(),]*+)\)\s*+\)\s*+;", re.A
@@ -52,11 +52,11 @@ def read_surface(path: str | Path, half_size: tuple[float, float]) -> tuple[Heig
     """The surface in a file and its control heights (n, m) mm float64.
 
     Args:
-        half_size: (r_x, r_y) mm of the aperture it must fill.  A `.npy` of heights (a, b) mm, [i, j] with i along +x, is laid
-            over it, borders included, and interpolated by a spline.
+        half_size: (r_x, r_y) mm of the aperture.  A `.npy` of heights (a, b) mm, [i, j] with i along +x, is placed on a regular
+            grid over it, borders included, and interpolated by a spline.
 
     Raises:
-        InputError: no such file, it holds no such surface, or one of another size.
+        InputError: the file cannot be read, holds no such surface, or one of another size.
     """
     path = Path(path)
     if path.suffix.lower() not in _READERS:
@@ -65,7 +65,7 @@ def read_surface(path: str | Path, half_size: tuple[float, float]) -> tuple[Heig
 
 
 def _of_this_size(found: tuple[HeightField, Tensor], half_size: tuple[float, float]) -> tuple[HeightField, Tensor]:
-    """A surface that is as large as the aperture it must fill."""
+    """The surface; refused if its size is not that of the aperture."""
     if any(abs(a - b) > SAME * b for a, b in zip(found[0].half_size, half_size, strict=True)):
         wide, high = (2.0 * r for r in found[0].half_size)
         raise InputError(
@@ -75,7 +75,7 @@ def _of_this_size(found: tuple[HeightField, Tensor], half_size: tuple[float, flo
 
 
 def onto(field: HeightField, heights: Tensor, net: HeightField) -> Tensor:
-    """Control heights of the same surface on another net: exact where that holds all its knots, else interpolated."""
+    """Control heights of the same surface on another net: exact if that contains all its knots, else interpolated."""
     tu, tv = (a.change_of_basis(b) for a, b in zip(field.spaces, net.spaces, strict=True))
     return tu @ heights @ tv.T
 
@@ -87,10 +87,10 @@ def read_npz(path: Path, half_size: tuple[float, float]) -> tuple[HeightField, T
 
 
 def surface_of(data: Archive, side: str = "") -> tuple[HeightField, Tensor]:
-    """The surface that an archive's arrays describe; side: what the names of its own begin with, such as "entrance_".
+    """The surface in the arrays of an archive; side: prefix of their names, such as "entrance_".
 
     Raises:
-        InputError: something is missing or not a surface.
+        InputError: an array is missing or invalid.
     """
     own = {key: side + key for key in ("control_points", "degrees", "knots_u", "knots_v")}
     missing = [key for key in (*own.values(), "lens_half_size") if key not in data]
@@ -102,12 +102,12 @@ def surface_of(data: Archive, side: str = "") -> tuple[HeightField, Tensor]:
 
 
 def read_step(path: Path, half_size: tuple[float, float]) -> tuple[HeightField, Tensor]:
-    """The one B-spline surface of a STEP file whose poles stand at the Greville abscissae, in millimetres, over this aperture.
+    """The single B-spline surface of a STEP file in millimetres, with poles at the Greville abscissae, over this aperture.
 
-    Read are files of at most MAX_STEP_BYTES, in time and memory proportional to their length: 20 s and 2.2 GB for the longest.
+    Files have at most MAX_STEP_BYTES; time and memory are linear in their length: 20 s and 2.2 GB for the longest.
 
     Raises:
-        InputError: there is none or more than one, it is no such height field, or the unit is another.
+        InputError: there is not exactly one surface, it is not such a height field, or the unit is another.
     """
     text = read_bytes(path, MAX_STEP_BYTES, "a STEP file is needed").decode("latin-1")
     with naming(path):
@@ -129,10 +129,10 @@ def read_step(path: Path, half_size: tuple[float, float]) -> tuple[HeightField, 
 
 
 def _step_surface(text: str, at: int) -> tuple[np.ndarray, list[int], list[np.ndarray]]:
-    """Poles (n, m, 3), degrees and knots of the surface whose arguments begin at `at`, taken one after another.
+    """Parse poles (n, m, 3), degrees and knots of the surface whose arguments begin at `at`.
 
     Raises:
-        ValueError: they are not there.
+        ValueError: a syntax error.
     """
     found, rows, more = _after(_DEGREES, text, at), [], ","
     degrees, at = [int(found[1]), int(found[2])], found.end()
@@ -163,7 +163,7 @@ def _step_surface(text: str, at: int) -> tuple[np.ndarray, list[int], list[np.nd
 
 
 def _after(pattern: re.Pattern, text: str, at: int) -> re.Match:
-    """What a pattern takes from `at` on."""
+    """Match of a pattern at position `at`."""
     found = pattern.match(text, at)
     if found is None:
         raise ValueError("an argument that is not there")
@@ -171,7 +171,7 @@ def _after(pattern: re.Pattern, text: str, at: int) -> re.Match:
 
 
 def _knots(counts: list[str], values: list[str]) -> np.ndarray:
-    """The knot vector on [0, 1] with these distinct knots, each so many times."""
+    """The knot vector on [0, 1] with these distinct knots and multiplicities."""
     if any(len(c.strip()) > 4 for c in counts):
         raise ValueError("a multiplicity of more than four digits")
     times, distinct = [int(c) for c in counts], [float(v) for v in values]
@@ -184,7 +184,7 @@ def _knots(counts: list[str], values: list[str]) -> np.ndarray:
 
 
 def _surface(poles: np.ndarray, degrees, knots, half=None) -> tuple[HeightField, Tensor]:
-    """The height field with these poles (n, m, 3); its half widths from the poles unless given."""
+    """The height field with these poles (n, m, 3); half sizes from the poles unless given."""
     if min(poles.shape) < 2 or not (np.abs(poles) <= LENGTH).all():
         raise InputError(f"control points must be n x m x 3 numbers within +-{LENGTH:g} mm, n and m at least 2, got {poles.shape}")
     spaces = tuple(SplineSpace(p, torch.as_tensor(t)) for p, t in zip(degrees, knots, strict=True))
@@ -201,14 +201,14 @@ def _surface(poles: np.ndarray, degrees, knots, half=None) -> tuple[HeightField,
         or not np.abs(poles[..., 1] - y[None, :]).max() <= SAME * half[1]
     ):
         raise InputError(
-            "is no height field over an aperture centred on the axis: its control points must stand at the"
+            "is not a height field over an aperture centred on the axis: its control points must be at the"
             " Greville abscissae, rows along +x"
         )
     return field, torch.from_numpy(np.ascontiguousarray(poles[..., 2]))
 
 
 def read_heights(path: Path, half_size: tuple[float, float]) -> tuple[HeightField, Tensor]:
-    """The spline through heights on an even grid over the aperture, borders included."""
+    """Interpolating spline of heights on a regular grid over the aperture, borders included."""
     with open_npy(path, HEIGHTS) as stored:
         shape = stored.shape
         if len(shape) != 2 or stored.dtype.kind not in "fiu" or not 2 <= min(shape) <= max(shape) <= MAX_CONTROL:
@@ -220,13 +220,13 @@ def read_heights(path: Path, half_size: tuple[float, float]) -> tuple[HeightFiel
 
 
 def read_heightmap(path: Path, half_size: tuple[float, float]) -> tuple[HeightField, Tensor]:
-    """The surface of a picture of heights and its JSON, over this aperture."""
+    """The surface of a height map and its JSON, over this aperture."""
     found = heightmaps.read_heightmap(path, half_size)
     with naming(path):
         return _of_this_size(found, half_size)
 
 
-#: What reads each kind of file.
+#: Reader of each suffix.
 _READERS = {".npz": read_npz, ".step": read_step, ".stp": read_step, ".npy": read_heights} | dict.fromkeys(
     heightmaps.SUFFIXES, read_heightmap
 )

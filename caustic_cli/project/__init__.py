@@ -1,1 +1,1 @@
-"""A project's directory: what it holds, its checkpoints, who works there, and whether it is up to date."""
+"""Project directories: contents, checkpoints, locking, and whether outputs are up to date."""

@@ -1,5 +1,5 @@
-"""The files that [source], [lens], [screen] and [design] speak of: read once, checked, and kept in the project under names of their
-own."""
+"""Files referenced by [source], [lens], [screen] and [design]: read once, validated, and copied into the project under fixed
+names."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ from caustic_cli.io.sags import read_sags
 from caustic_cli.scene.gradient import MOST_VALUES, checked_volume
 from caustic_cli.scene.sources.section import Attached
 
-#: What the file of [design] robust is called in a project.
+#: Name in a project of the file of [design] robust.
 ERRORS = "tolerances.toml"
-#: What the file of [screen] shape_file is called, but for its suffix.
+#: Name in a project, without suffix, of the file of [screen] shape_file.
 SHAPE = "screen"
-#: What the file of [lens] index_file is called in a project, and its largest size, bytes.
+#: Name in a project of the file of [lens] index_file, and its largest size, bytes.
 INDEX, MOST_INDEX = "index.npy", 8 * MOST_VALUES + (1 << 12)
-#: Keys of [source] that may name a file, and what it is called in a project.
+#: Keys of [source] that may name a file, and its name in a project without suffix.
 STEMS = {"file": "source", "intensity": "intensity"}
-#: What the names of all of them begin with.
+#: Beginnings of the names of all of them.
 ALL = (*STEMS.values(), SHAPE, Path(INDEX).stem, Path(ERRORS).stem)
 
 
 def attached(source: Mapping[str, Any], folder: Path | None = None) -> dict[str, Any]:
-    """A [source] section in which names of files carry what these hold (`Attached`).
+    """A [source] section in which file names carry the contents of the files (`Attached`).
 
     Args:
-        folder: where they are; None where names are paths as a user gives them.
+        folder: the directory of the files; None if names are paths given by the user.
 
     Raises:
-        InputError: a file is missing, too large, or not what its key asks for.
+        InputError: a file is missing, too large, or not of the kind of its key.
     """
     found = dict(source)
     for key in STEMS:
@@ -54,10 +54,10 @@ def attached(source: Mapping[str, Any], folder: Path | None = None) -> dict[str,
 
 
 def with_errors(design: Mapping[str, Any], folder: Path | None = None) -> dict[str, Any]:
-    """A [design] section whose `robust` carries what the file holds, if it names one; folder: as of `attached`.
+    """A [design] section whose `robust` carries the contents of its file, if it names one; folder: as in `attached`.
 
     Raises:
-        InputError: the file is missing, too large, or names no errors.
+        InputError: the file is missing, too large, or invalid.
     """
     name = design.get("robust")
     if not name or not isinstance(name, str) or isinstance(name, Attached):
@@ -68,7 +68,7 @@ def with_errors(design: Mapping[str, Any], folder: Path | None = None) -> dict[s
 
 
 def with_shape(screen: Mapping[str, Any], folder: Path | None = None) -> dict[str, Any]:
-    """A [screen] section whose `shape_file` carries the heights in it, if it names one; folder: as of `attached`.
+    """A [screen] section whose `shape_file` carries the heights of its file, if it names one; folder: as in `attached`.
 
     Raises:
         InputError: the file is missing or holds no heights.
@@ -81,7 +81,7 @@ def with_shape(screen: Mapping[str, Any], folder: Path | None = None) -> dict[st
 
 
 def with_index(lens: Mapping[str, Any], folder: Path | None = None) -> dict[str, Any]:
-    """A [lens] section whose `index_file` carries the control values in it, if it names one; folder: as of `attached`.
+    """A [lens] section whose `index_file` carries the control values of its file, if it names one; folder: as in `attached`.
 
     Raises:
         InputError: the file is missing, too large, or holds no volume of refractive indices.
@@ -97,7 +97,7 @@ def with_index(lens: Mapping[str, Any], folder: Path | None = None) -> dict[str,
 
 
 def index_attached(values: np.ndarray) -> Attached:
-    """Control values (n, m, k) as the file that a project keeps of them."""
+    """Control values (n, m, k) as the file that is stored in a project."""
     held = io.BytesIO()
     np.save(held, np.ascontiguousarray(values, dtype=np.float64))
     return Attached.of(INDEX, held.getvalue(), values)
@@ -109,7 +109,7 @@ def index_of(lens: Mapping[str, Any]) -> np.ndarray | None:
 
 
 def named_in_project(full: Mapping[str, dict[str, Any]]) -> None:
-    """Rename the files of complete settings as a project calls them, those of further sources by their number."""
+    """Rename the files of complete settings to their names in a project, those of further sources with a number."""
     source, lens, screen, design = (full[section] for section in ("source", "lens", "screen", "design"))
     if isinstance(shape := screen.get("shape_file"), Attached):
         screen["shape_file"] = shape.named(f"{SHAPE}{Path(shape).suffix.lower()}")
@@ -124,7 +124,7 @@ def named_in_project(full: Mapping[str, dict[str, Any]]) -> None:
 
 
 def of(full: Mapping[str, Mapping[str, Any]]) -> list[Attached]:
-    """All files of complete settings."""
+    """All files referenced by complete settings."""
     source = full["source"]
     others = full["design"].get("robust"), full["screen"].get("shape_file"), full["lens"].get("index_file")
     return [file for file in others if isinstance(file, Attached)] + [
@@ -133,7 +133,7 @@ def of(full: Mapping[str, Mapping[str, Any]]) -> list[Attached]:
 
 
 def _is_file(key: str, name: str) -> bool:
-    """Whether what a key says is a file: an intensity may be one of a few words, and no file of tables goes without a suffix."""
+    """Whether the value of a key is a file name: an intensity may also be a keyword, which has no suffix."""
     return bool(name) and (key != "intensity" or bool(Path(name).suffix))
 
 

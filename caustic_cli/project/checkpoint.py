@@ -1,21 +1,22 @@
-"""checkpoints.h5: the lens as designed so far and everything needed to go on (HDF5).
+"""checkpoints.h5: the current lens of a design and the state needed to resume it (HDF5).
 
     /lens/heights             (n, m) float64, mm, or (2, n, m) of entrance and exit; attributes degree (2,)
     /lens/knots_u, knots_v    knot vectors on [0, 1]
-    /start                    (n_0, m_0) float64, mm: the heights it began from, on the first stage's net
-    /unrounded                of the same shape, mm: what these were before a least radius was asked of them, where one was
-                              a net of more than a million heights is bytes (`packing`) with attribute shape once it is finished;
-                              the second and third as their difference to the first where their shapes are the same
+    /start                    (n_0, m_0) float64, mm: initial heights, on the control net of the first stage
+    /unrounded                of the same shape, mm: the same without the limit of the radius, if there is one;
+                              nets of more than a million heights are compressed (`packing`), with an attribute shape, when the
+                              design is finished; start and unrounded as differences to heights if the shapes are equal
     /state                    attributes stage, iteration, total, seconds, reason
     /state/parameters/*, /state/optimizer/*   tensors by name
     /history                  (iterations, 5): iteration, stage, loss (eq. 5.2.1), on_screen, seconds
     attributes                format_version (2 with packed nets, else 1), created_by, provenance, results, inputs (JSON)
 
-A file whose writer was killed cannot be read, so a checkpoint is never updated in place: it is written beside the old
-one and renamed.  Before the HDF5 data stands a block of SEAL bytes (HDF5 calls it the user block) with the sha256 of all
-that follows, so that nothing of a damaged file is believed.  Files of earlier versions have none.
+A file whose writer was killed cannot be read, so a checkpoint is never updated in place: it is written to a temporary file and
+renamed.  The HDF5 data follow a user block of SEAL bytes with the sha256 of the data, so that no part of a damaged file is used.
+Files of earlier versions have none.
 
-Read are at most MAX_BYTES; the checksum is taken in pieces, and datasets only as far as the file really holds them, none twice.
+At most MAX_BYTES are read; the checksum is computed in pieces, and datasets are read only if their data are in the file, none
+twice.
 """
 
 from __future__ import annotations
@@ -46,12 +47,12 @@ HEIGHTS = "lens/heights"
 #: Nets that a state may have beside its heights.
 STARTS = ("start", "unrounded")
 HISTORY = ("iteration", "stage", "loss", "on_screen", "seconds")
-#: Length of the block before the data, the least that HDF5 allows; and what an HDF5 file without one begins with.
+#: Length of the user block, the least that HDF5 allows; and the signature of an HDF5 file.
 SEAL, SIGNATURE = 512, b"\x89HDF\r\n\x1a\n"
 SEALED = f"caustic checkpoint, HDF5 from byte {SEAL}, sha256 "
 #: Largest checkpoint read: a net of 4096 x 4096 with its 20 pairs of L-BFGS, or the largest network with Adam's moments, is 6.5 GB.
 MAX_BYTES = 1 << 33
-#: Most heights of a packed net that is read, which may be a thousand times as large as its bytes: three of 4096 x 4096.
+#: Most heights of a compressed net that is read, a bound of its expansion: three of 4096 x 4096.
 MOST_PACKED = 3 << 24
 #: Most iterations of a history that is read.
 MOST_ITERATIONS = 10_000_000
@@ -67,9 +68,9 @@ with h5py.File(sys.argv[1], "r") as f:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A design's state, the spline spaces of its heights, where it came from and, once finished, its figures.
+    """State of a design, spline spaces of its heights, provenance, and figures once it is finished.
 
-    inputs: digests of what it was made from, see `uptodate`.
+    inputs: digests of its inputs, see `uptodate`.
     """
 
     state: State
@@ -83,10 +84,10 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
     """Write a checkpoint atomically.
 
     Raises:
-        CausticError: it could not be written; the one before is whole.
+        CausticError: it could not be written; the one before is intact.
     """
     state, spaces = checkpoint.state, checkpoint.spaces
-    image = io.BytesIO()  # a full disk is no HDF5 matter
+    image = io.BytesIO()  # in memory, so that a full disk is not an error inside HDF5
     with h5py.File(image, "w") as f:
         f.attrs["format_version"] = FORMAT_VERSION - 1
         f.attrs["created_by"] = f"caustic {__version__}"
@@ -123,7 +124,7 @@ def _write_net(f: h5py.File, name: str, net: np.ndarray, beside: np.ndarray | No
 
 
 def seal(image: bytes | memoryview) -> bytes:
-    """The block that stands before an HDF5 image."""
+    """The user block for an HDF5 image."""
     return _block(hashlib.sha256(image).hexdigest())
 
 
@@ -132,14 +133,14 @@ def _block(digest: str) -> bytes:
 
 
 def _sealed(file: BinaryIO) -> bool:
-    """Whether a file begins with the checksum of all that follows."""
+    """Whether a file begins with a user block whose checksum matches the data."""
     file.seek(0)
     head = file.read(SEAL)
     return head.startswith(SEALED.encode()) and head == _block(hashlib.file_digest(file, "sha256").hexdigest())
 
 
 def _begins(file: BinaryIO) -> tuple[bool, bool]:
-    """Whether HDF5 data begin at once, and whether they begin after a block."""
+    """Whether HDF5 data begin at offset 0, and whether they begin after a user block."""
     found = []
     for at in (0, SEAL):
         file.seek(at)
@@ -155,9 +156,9 @@ class _Newer(InputError):
 
 
 def _version(path: Path) -> int:
-    """Format version of a file that no checksum vouches for, 0 if it cannot be read; all its attributes are read in passing.
+    """Format version of a file without a valid checksum, 0 if it cannot be read; reads all its attributes.
 
-    In a process of its own: HDF5's library may crash over a damaged file.
+    In a subprocess, since the HDF5 library may crash on a damaged file.
     """
     try:
         done = subprocess.run(
@@ -169,7 +170,7 @@ def _version(path: Path) -> int:
 
 
 class _Contents:
-    """The datasets of a file that lie in it as they are: none elsewhere, none that grows when it is read, none read again."""
+    """Restricted access to the datasets of a file: none external, compressed or larger than the file, and none read twice."""
 
     def __init__(self, file: h5py.File):
         self.file, self.unread = file, file.id.get_filesize()
@@ -188,7 +189,7 @@ class _Contents:
         return torch.from_numpy(self.read(name))
 
     def net(self, name: str, beside: torch.Tensor | None = None) -> torch.Tensor:
-        """As written by `save`, beside the heights that it may be stored as a difference to."""
+        """A control net as written by `save`; beside: the heights to which it may be stored as a difference."""
         values, shape = self.read(name), self.file[name].attrs.get("shape")
         if shape is None:
             return torch.from_numpy(values).double()
@@ -217,7 +218,7 @@ def _load(path: Path, file: BinaryIO) -> Checkpoint:
             raise _Newer(path, version)
         if version == 0 or not at_once:
             raise InputError(
-                f"{path}: is damaged (its checksum is not that of its content) or not a caustic checkpoint; a whole"
+                f"{path}: is damaged (its checksum does not match its content) or not a caustic checkpoint; an intact"
                 " checkpoints.h5 is needed"
             )
     try:
@@ -255,13 +256,13 @@ def _load(path: Path, file: BinaryIO) -> Checkpoint:
             checkpoint = Checkpoint(state, spaces, *tables)
     except _Newer:
         raise
-    except Exception as error:  # what a broken file makes HDF5 stumble over may be anything
+    except Exception as error:  # a damaged file may cause any exception in h5py
         raise InputError(
-            f"{path}: is damaged or not a caustic checkpoint ({type(error).__name__}); a whole checkpoints.h5 is needed"
+            f"{path}: is damaged or not a caustic checkpoint ({type(error).__name__}); an intact checkpoints.h5 is needed"
         ) from error
     nets = [z for z in (state.heights, state.start, state.unrounded) if z is not None]
     fits = tuple(state.heights.shape[-2:]) == (spaces[0].n, spaces[1].n)
     fits &= state.unrounded is None or (state.start is not None and state.start.shape == state.unrounded.shape)
     if not fits or not all(bool(torch.isfinite(z).all()) for z in nets):
-        raise InputError(f"{path}: is damaged (its heights do not fit its knots); a whole checkpoints.h5 is needed")
+        raise InputError(f"{path}: is damaged (its heights do not match its knots); an intact checkpoints.h5 is needed")
     return checkpoint

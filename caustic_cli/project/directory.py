@@ -1,7 +1,7 @@
-"""The place of a project on disk: free or taken, made whole, and locked by one design at a time.
+"""Creation and locking of a project directory: atomic, never over foreign files, and with one design at a time.
 
-The lock is the operating system's on the directory itself, so it ends with the process that holds it, killed or not, and
-nothing of it is left behind.
+The lock is an advisory lock of the operating system on the directory itself, so it ends with the process that holds it, even if
+that is killed, and leaves no lock file.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from caustic_cli.project.project import MADE, TOML, Project, is_project
 
 try:
     import fcntl
-except ImportError:  # Windows has other locks; there, two designs in one directory are the user's care
+except ImportError:  # not on Windows, where concurrent designs in one directory are not detected
     fcntl = None
 
-#: What the names of a project's pictures begin with.
+#: Names, without suffix, of the pictures of a project.
 PICTURES = ("target", "profile", "second")
 
 
 def check(path: Path, force: bool) -> None:
-    """Refuse a path where something stands that a new project must not replace; changes nothing.
+    """Refuse a path with contents that a new project must not replace; changes nothing.
 
     Raises:
         InputError: it is no directory, not a project, a project without `force`, or cannot be written to.
@@ -46,13 +46,13 @@ def check(path: Path, force: bool) -> None:
         raise InputError(f"{path}: exists and is not a caustic project; -o DIR chooses another place")
     if is_project(path) and not force:
         raise InputError(
-            f"{path}: holds a design already, of another picture or other options; ⟨resume⟩ goes on with it,"
+            f"{path}: holds a design already, of another picture or other options; ⟨resume⟩ continues it,"
             " ⟨force⟩ begins anew, -o DIR chooses another place"
         )
 
 
 def _of_a_new_project(path: Path) -> bool:
-    """Whether a file is what a project begins with: one may have been killed before its project.toml was written."""
+    """Whether a file belongs to an incomplete project, whose design was killed before its project.toml was written."""
     return path.is_file() and (
         path.name.startswith(tuple(f".{stem}" for stem in (*PICTURES, *attachments.ALL, TOML)))
         or (path.stem in PICTURES and is_ours(path))
@@ -60,25 +60,29 @@ def _of_a_new_project(path: Path) -> bool:
     )
 
 
-def settle(project: Project, force: bool) -> None:
-    """Write a new project to its place and hold it (`Project.hold`).
+def create(project: Project, force: bool) -> None:
+    """Create a project directory and lock it (`Project.hold`).
 
-    Where nothing stands it is made beside it and renamed, so that it is there as a whole or not at all.
+    A new directory is written beside its path and renamed, so that it appears complete or not at all.
 
     Raises:
-        InputError: something stands there, another design works there, or it cannot be written to.
+        InputError: there are other contents, another design is running there, or it cannot be written to.
     """
     path = project.path
     check(path, force)
     try:
         if path.exists():
-            project.hold.enter_context(locked(path))
-            for present in path.iterdir():
-                if present.name.startswith((*PARTS, *MADE)):
-                    refuse_special(present)  # before anything is removed
-            for name in MADE:
-                (path / name).unlink(missing_ok=True)
-            project.write(path)
+            try:
+                project.hold.enter_context(locked(path))
+                for present in path.iterdir():
+                    if present.name.startswith((*PARTS, *MADE)):
+                        refuse_special(present)  # before anything is removed
+                for name in MADE:
+                    (path / name).unlink(missing_ok=True)
+                project.write(path)
+            except BaseException:
+                project.hold.close()
+                raise
             return
         path.parent.mkdir(parents=True, exist_ok=True)
         for left in path.parent.glob(".*.caustic-new"):
@@ -102,10 +106,10 @@ def settle(project: Project, force: bool) -> None:
 
 @contextlib.contextmanager
 def locked(directory: Path) -> Iterator[None]:
-    """Hold a directory alone, until the block or the process ends.
+    """Lock a directory exclusively, until the block or the process ends.
 
     Raises:
-        InputError: another process holds it.
+        InputError: another process has locked it.
     """
     handle = os.open(directory, os.O_RDONLY)
     try:
@@ -122,7 +126,7 @@ def _lock(handle: int, directory: Path) -> None:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
         raise InputError(
-            f"{directory}: another caustic design is at work there; wait until it is done, or -o DIR chooses another place"
+            f"{directory}: another caustic design is running there; wait until it has ended, or -o DIR chooses another place"
         ) from error
-    except OSError:  # a network file system without locks: as on Windows
+    except OSError:  # a network file system without locks
         return

@@ -1,10 +1,9 @@
-"""Large nets of heights in few bytes: whole multiples of STEP, as differences of neighbours.
+"""Compression of large control nets: fixed-point heights in units of STEP, delta coding along both axes, deflate.
 
-Over a knot span of 5 um a surface differs from what its neighbours continue by nanometres, but for creases: the mixed differences
-along both axes, counted in STEPs, are small integers, and zlib packs a net of 2000 x 2000 into 8 MB where float64 takes 32.
-Sums of integers give it back to the last bit.
+Over a knot span of 5 um the mixed second difference of a surface is a few nanometres, except at creases: in units of STEP these are
+small integers, and zlib compresses a net of 2000 x 2000 to 8 MB instead of 32 in float64.  Decoding by integer sums is exact.
 
-A height rounded to STEP is off by at most 2 pm: where spans are 5 um, a ray by 0.04 um at 300 mm.
+Rounding to STEP changes a height by at most 2 pm: with spans of 5 um, a ray by 0.04 um at 300 mm.
 """
 
 from __future__ import annotations
@@ -15,28 +14,29 @@ import zlib
 import numpy as np
 from torch import Tensor
 
-#: mm; a power of two, so that its multiples are float64.
+#: Quantum of heights, mm; a power of two, so that its multiples are exact in float64.
 STEP = 2.0**-28
-#: Values of a net from which on it is packed.
+#: Least number of values of a net that is compressed.
 LARGE = 1 << 20
-#: Bytes of a packed height, about: text and lines on nets of 2000 x 2000.
+#: Typical bytes per compressed height: text and lines on nets of 2000 x 2000.
 PACKED = 2.0
-#: Multiples of STEP beyond this are not packed: sums of four of them stay within int64, and each within float64.
+#: Largest multiple of STEP that is compressed: sums of four are within int64, and each is exact in float64.
 MOST = 2.0**50
 
 
 def rounded(net: Tensor) -> Tensor:
-    """A large net (..., n, m), mm, in whole STEPs; a smaller one as it is."""
+    """A large net (..., n, m), mm, rounded to multiples of STEP; a smaller one unchanged."""
     return net if net.numel() < LARGE else (net / STEP).round() * STEP
 
 
 def expected_bytes(count: int) -> float:
-    """What a net of so many heights takes in a project, about."""
+    """Approximate size in a project of a net with this number of heights, bytes."""
     return count * (8.0 if count < LARGE else PACKED)
 
 
 def pack(net: np.ndarray, like: np.ndarray | None = None) -> bytes | None:
-    """A large net (..., n, m) float64, mm, in whole STEPs, as its difference to one that it is `like`; None of any other."""
+    """Compress a large net (..., n, m) float64, mm, of multiples of STEP, as its difference to `like` if given; None for any other
+    net."""
     if net.size < LARGE or not all(_whole(z) for z in (net, like) if z is not None):
         return None
     values = (net / STEP).astype(np.int64)
@@ -44,7 +44,7 @@ def pack(net: np.ndarray, like: np.ndarray | None = None) -> bytes | None:
         values -= (like / STEP).astype(np.int64)
     for axis in (-1, -2):
         values = np.diff(values, axis=axis, prepend=0)
-    # Byte by byte, so that those which are alike stand side by side; to seek runs of them alone is six times as fast.
+    # In byte planes, so that similar bytes are adjacent; run-length matching alone is six times as fast as the default strategy.
     planes = np.ascontiguousarray(values.astype("<i8").reshape(-1, 1).view(np.uint8).T)
     packer = zlib.compressobj(strategy=zlib.Z_RLE)
     return packer.compress(planes) + packer.flush()
@@ -56,10 +56,10 @@ def _whole(net: np.ndarray) -> bool:
 
 
 def unpack(data: bytes, shape: tuple[int, ...], like: np.ndarray | None = None) -> np.ndarray:
-    """The net of this shape that was packed, beside the same other one.
+    """Decompress a net of this shape, with the same `like`.
 
     Raises:
-        ValueError: these bytes are no such net.
+        ValueError: the data are invalid.
     """
     count = 8 * math.prod(shape)
     reader = zlib.decompressobj()

@@ -1,7 +1,7 @@
-"""A project directory: the scene and the design in text, the lens in a checkpoint, pictures and the source's files beside them.
+"""A project directory: settings of scene and design in TOML, the lens in a checkpoint, pictures and files of the source.
 
 NAME.caustic/  project.toml  checkpoints.h5  target.png (or target.npy)  render.png  wave.png  report.png
-               source.tm25ray (or what else [source] file names)
+               source.tm25ray (or another type of [source] file)
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from caustic_cli.config import settings
 from caustic_cli.config.completion import build_options, build_stages, complete, complete_source
 from caustic_cli.config.settings import Settings, value_of
 from caustic_cli.errors import InputError, no_project, plain
-from caustic_cli.inverse.conditions import Ranges
 from caustic_cli.inverse.designer import Designer, State
+from caustic_cli.inverse.scene_parameters import Ranges
 from caustic_cli.inverse.target import target_on_screen, tiles
 from caustic_cli.io.files import write_bytes
 from caustic_cli.io.picture import Picture, read_picture
@@ -33,9 +33,9 @@ from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.scene import Scene, sources
 
 TOML, CHECKPOINT, RENDER, WAVE, REPORT = "project.toml", "checkpoints.h5", "render.png", "wave.png", "report.png"
-#: The image on the second screen, of a design that has one.
+#: Name of the image on the second screen, of a design with one.
 FARTHER = "render-second.png"
-#: What a design makes beside its inputs; WAVE only where diffraction is simulated, FARTHER only where there are two screens.
+#: Outputs of a design; WAVE only with diffraction, FARTHER only with two screens.
 MADE = (CHECKPOINT, RENDER, WAVE, REPORT, FARTHER)
 
 
@@ -45,7 +45,7 @@ def is_project(path: Path) -> bool:
 
 
 def beside(path: Path) -> Path:
-    """Where the wave image belongs beside a ray image or its numbers: render.png -> wave.png, NAME.png -> NAME-wave.png."""
+    """Path of the wave image for that of a ray image or its array: render.png -> wave.png, NAME.png -> NAME-wave.png."""
     return path.with_stem(Path(WAVE).stem if path.stem == Path(RENDER).stem else f"{path.stem}-wave")
 
 
@@ -62,10 +62,10 @@ class Designed(NamedTuple):
 class Project:
     """An opened project: its directory, complete settings, target picture and source profile.
 
-    path: None of one that is in memory alone; second: the picture on a screen farther on; on_disk: whether its settings were read
-    from there; asked: digest of what its user gave (`uptodate`); found: the checkpoint, where the same had been asked for before;
-    hold: what lets go of the directory when the design that works there is done; without_waves: see
-    `config.completion.without_waves`; values: those of a network's ranges that its scene and lens are for, None for their middle.
+    path: None for a project in memory; second: the picture on a screen farther away; on_disk: whether its settings were read from
+    there; asked: digest of the user's input (`uptodate`); found: the checkpoint of an earlier design with the same input; hold:
+    context that releases the lock of the directory; without_waves: see `config.completion.without_waves`; values: of the scene
+    parameters of a network, None for the middle of their ranges.
     """
 
     path: Path | None
@@ -114,25 +114,25 @@ class Project:
             full = complete(given, picture.aspect)
             other = full.get("second", {}).get("file")
             second = _picture(path, other, full["target"]["encoding"] == "linear") if other else None
-            build_stages(full), build_options(full)  # a project whose design is impossible is not opened for its lens either
+            build_stages(full), build_options(full)  # validates the design, too
             return cls(path, full, picture, _picture(path, profile, True) if profile else None, second, on_disk=True)
         except InputError as error:
             raise InputError(f"{path / TOML}: {error!s}") from error
 
     def error(self, words: str) -> InputError:
-        """An error about its settings, which names the file if they are in one."""
+        """An error about its settings, which names their file if there is one."""
         return InputError(f"{self.path / TOML}: {plain(words)}" if self.on_disk else words)
 
     @property
     def over(self) -> Ranges | None:
-        """Over which its network is trained, None where it is none such."""
+        """Ranges over which its network is trained, or None."""
         return Ranges.parse(value_of(self.settings["design"], "design.over"))
 
     def at(self, text: str | None) -> Project:
-        """The same with scene and lens for "throw=300" (`Ranges.values`) of a network that is trained over a range.
+        """The project at parameter values "throw=300" (`Ranges.values`) of a network trained over ranges; unchanged for None.
 
         Raises:
-            InputError: it is not, or the values are not within its ranges.
+            InputError: there is no such network, or the values are out of range.
         """
         if text is None:
             return self
@@ -143,7 +143,7 @@ class Project:
         return replace(self, values=self.over.values(text))
 
     def scene(self, given: Mapping[str, Any] | None = None) -> Scene:
-        """The scene it describes, at its values; `given`, path -> value, replaces some of its settings."""
+        """The scene, at the parameter values; `given`, path -> value, overrides some of its settings."""
         scene = self._scene(given)
         return scene if self.values is None or self.over is None else self.over.scene(scene, self.values)
 
@@ -155,7 +155,7 @@ class Project:
             except InputError as error:
                 raise self.error(f"{error}") from error
         changed = {section: dict(values) for section, values in self.settings.items()}
-        changed["design"].pop("over", None)  # it says nothing of another light
+        changed["design"].pop("over", None)  # does not apply to another light
         before = changed["source"]["type"]
         for path, value in given.items():
             section, _, key = path.rpartition(".")
@@ -166,11 +166,11 @@ class Project:
         if changed["source"]["type"] not in sources.used_by("profile"):
             changed["source"].pop("profile", None)
         changed = settings.with_defaults(changed)
-        complete_source(changed["source"], changed["lens"])  # what else a design asks of its light, an image does not
+        complete_source(changed["source"], changed["lens"])  # further conditions of a design on its source do not apply to an image
         return settings.build_scene(changed, profile)
 
     def target(self, scene: Scene) -> np.ndarray:
-        """The picture on the scene's screen, (n_x, n_y), or (3, n_x, n_y) of a coloured one."""
+        """The target on the screen of the scene, (n_x, n_y), or (3, n_x, n_y) in colour."""
         t, light = self.settings["target"], self.picture.irradiance()
         if value_of(t, "target.sheet"):
             return np.mean([own / own.sum() for own in self.targets(scene)], axis=0)
@@ -181,32 +181,32 @@ class Project:
         return target_on_screen(light, tuple(t["size"]), scene.screen, t["flip"])
 
     def second_target(self, scene: Scene) -> np.ndarray | None:
-        """The second picture on its screen, (n_x, n_y); None where there is none."""
+        """The second target on its screen, (n_x, n_y), or None."""
         if self.second is None or scene.second is None or scene.second.screen is None:
             return None
         size, flip = tuple(self.settings["second"]["size"]), self.settings["target"]["flip"]
         return target_on_screen(self.second.irradiance(), size, scene.second.screen, flip)
 
     def targets(self, scene: Scene) -> list[np.ndarray]:
-        """The picture of each lenslet on the scene's screen, (n_x, n_y), j fastest; of a single picture, that alone."""
+        """The target of each lenslet on the screen of the scene, (n_x, n_y), j fastest; a single one for a common picture."""
         t, light = self.settings["target"], self.picture.irradiance()
         if not value_of(t, "target.sheet"):
             return [self.target(scene)]
         return [target_on_screen(tile, tuple(t["size"]), scene.screen, t["flip"]) for tile in tiles(light, scene.lens.array)]
 
     def load(self) -> Checkpoint:
-        """The design so far."""
+        """Read the checkpoint."""
         return checkpoint.load(self.path / CHECKPOINT)
 
     def save(self, state: Checkpoint) -> None:
-        """Write the design so far."""
+        """Write a checkpoint."""
         checkpoint.save(self.path / CHECKPOINT, state)
 
     def lens(self, scene: Scene) -> Designed:
-        """The designed surface over the scene's aperture, and that scene with the designed entrance, if that is free-form.
+        """The designed surface, and the scene with the designed entrance, if that is free-form.
 
         Raises:
-            InputError: there is none, or project.toml was edited to another net than the lens was designed on.
+            InputError: there is none, or project.toml was edited to another control net.
         """
         state = self.load()
         field = HeightField(state.spaces, scene.lens.half_size)
@@ -224,9 +224,7 @@ class Project:
             )
         has, says = state.state.heights.shape[0] if state.state.heights.ndim == 3 else 1, len(scene.shaped)
         if has != says:
-            raise self.error(
-                f"[second] and [[element]] say {says} free-form surface(s), and what was designed has {has}; design again"
-            )
+            raise self.error(f"[second] and [[element]] give {says} free-form surface(s), and the design has {has}; design again")
         scene, heights = sides_of(scene, field, state.state.heights if self.values is None else self._trained(state.state))
         try:
             refuse_without_glass(scene, field, heights)
@@ -235,7 +233,7 @@ class Project:
         return Designed(scene, field, heights, state)
 
     def _trained(self, state: State) -> Tensor:
-        """The lens (n, m), mm, that its network gives for its values."""
+        """Heights (n, m), mm, from the network at the parameter values."""
         if not state.parameters:
             raise self.error("holds no network yet: design it first")
         middle = self._scene(None)
@@ -244,9 +242,9 @@ class Project:
         return designer.heights_at(state, self.values or ())
 
     def write(self, path: Path | None = None) -> None:
-        """Write project.toml and the pictures to `path`, the project's own unless given; the directory exists.
+        """Write project.toml and all files to an existing directory, that of the project by default.
 
-        project.toml comes last: where it is, the rest is.
+        project.toml is written last, so that its presence implies that of the others.
         """
         path = path or self.path
         self.picture.write(path / self.settings["target"]["file"])
@@ -264,8 +262,8 @@ class Project:
 
 
 def _change(source: Settings, before: str, given: set[str]) -> None:
-    """Read the files that new keys of [source] name, and forget that of another type."""
-    if given - {"polarisation"}:  # another light is another light for all of it
+    """Read the files named by new keys of [source], and remove that of another type."""
+    if given - {"polarisation"}:  # a changed source replaces all further ones
         source.pop("also", None)
     if source["type"] != before and "file" not in given:
         source.pop("file", None)

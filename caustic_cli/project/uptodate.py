@@ -1,7 +1,7 @@
-"""The same inputs and options again are no work: what was made stays, and only its time stamps say that it was asked for.
+"""Incremental work: outputs with unchanged inputs and options are kept, and only their time stamps are updated.
 
-A design's inputs are remembered in its checkpoint, those of other outputs in the project's RECORD, each by its hash.  Outputs
-are touched, checkpoint first, so that make finds them newer than the files they were made from.
+The hashes of the inputs of a design are stored in its checkpoint, those of other outputs in the RECORD of the project.  Outputs are
+touched, checkpoint first, so that make finds them newer than their prerequisites.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from caustic_cli.project.checkpoint import MAX_BYTES, Checkpoint
 from caustic_cli.project.project import CHECKPOINT, FARTHER, MADE, RENDER, WAVE, Project, is_project
 
 RECORD = ".outputs.json"
-#: Largest record read, in bytes; what is beyond has been written by somebody else, and is no record.
+#: Largest record read, bytes; a larger file is not a record of this program.
 MOST_RECORDED = 1 << 24
-#: Settings that name files, where they are given for one run.
+#: Settings of a single run that name files.
 FILES = ("source.file", "source.intensity", "screen.shape_file")
 
 
 def digest(full: Settings, *pictures: Picture | None) -> str:
-    """Hash of complete settings and the pictures and files they speak of; of a lens to start from, that too."""
+    """Hash of complete settings, the pictures and files they refer to, and the lens that the design starts from."""
     found = hashlib.sha256(f"{__version__}\n{settings.dump(full)}".encode())
     for picture in filter(None, pictures):
         found.update(f"{picture.values.shape}{picture.values.dtype}{picture.encoding}".encode())
@@ -46,35 +46,35 @@ def digest(full: Settings, *pictures: Picture | None) -> str:
     if is_project(start):
         found.update(_hash(start / CHECKPOINT).encode())
     elif start.is_file():
-        found.update(f"{_hash(start)}{_hash(beside(start))}".encode())  # of a height map, its JSON too
+        found.update(f"{_hash(start)}{_hash(beside(start))}".encode())  # and the JSON of a height map
     return found.hexdigest()
 
 
 def inputs(project: Project) -> dict[str, str]:
-    """What a checkpoint remembers: `asked`, the digest of what the user gave, and `settings`, of what became of it."""
+    """Digests stored in a checkpoint: `asked`, of the user's input, and `settings`, of the complete settings."""
     return {"asked": project.asked, "settings": digest(project.settings, project.picture, project.profile, project.second)}
 
 
 def asked_of(project: Project, checkpoint: Checkpoint) -> str:
-    """What a project's user gave, "" if it has been edited since."""
+    """Digest of the user's input of a project, "" if the project has been edited since."""
     before = checkpoint.inputs
     return before.get("asked", "") if inputs(project)["settings"] == before.get("settings") else ""
 
 
 def same_design(path: Path, asked: str) -> tuple[Project, Checkpoint] | None:
-    """The design at `path`, if it is one of what is `asked` again."""
+    """Project and checkpoint at `path`, if they have the same input digest `asked`; else None."""
     if not is_project(path) or not (path / CHECKPOINT).exists():
         return None
     try:
         project = Project.open(path)
         checkpoint = project.load()
-    except InputError:  # damaged: whoever wants the place will say so
+    except InputError:  # damaged: reported when the directory is to be used
         return None
     return (project, checkpoint) if asked == asked_of(project, checkpoint) else None
 
 
 def finished(project: Project, checkpoint: Checkpoint) -> dict | None:
-    """The figures of a finished design whose files are all there, which are touched; None if something is left to do."""
+    """Figures of a finished design with complete outputs, which are touched; None if it is unfinished or an output is missing."""
     waves = checkpoint.results.get("wave_relative_rms") is not None
     without = {name for name, there in ((WAVE, waves), (FARTHER, project.second is not None)) if not there}
     files = [project.path / name for name in MADE if name not in without]
@@ -84,9 +84,9 @@ def finished(project: Project, checkpoint: Checkpoint) -> dict | None:
     return checkpoint.results | {"image": str(project.path / RENDER), "project": str(project.path)}
 
 
-def depicted(project: Project, heights: Tensor, figures: dict, asked: Mapping[str, object] | None = None) -> dict[str, str]:
-    """What an image of a lens says about itself: `of`, a hash of settings, control heights (n, m) and how else it was asked to be
-    made, and the estimated `noise` of its rays."""
+def image_provenance(project: Project, heights: Tensor, figures: dict, asked: Mapping[str, object] | None = None) -> dict[str, str]:
+    """Text entries of the PNG of a lens: `of`, a hash of settings, control heights (n, m) and options, and its estimated
+    `noise`."""
     how = {name: str(value) for name, value in sorted((asked or {}).items())}
     found = hashlib.sha256(f"{inputs(project)['settings']}\n{json.dumps(how)}\n".encode())
     found.update(np.ascontiguousarray(heights.detach().double().cpu().numpy()).tobytes())
@@ -94,11 +94,11 @@ def depicted(project: Project, heights: Tensor, figures: dict, asked: Mapping[st
 
 
 class Outputs:
-    """What a command writes from a project.
+    """Outputs of a command for a project, and the record of their inputs.
 
     Args:
-        project: where from; command: the command's name; options: what decides the outcome, by name.
-        paths: the files it writes.
+        project: the project; command: name of the command; options: parameters that determine the result, by name.
+        paths: the files written.
     """
 
     def __init__(self, project: Project, command: str, options: dict, paths: Iterable[Path | None]):
@@ -110,7 +110,7 @@ class Outputs:
         self.key = " ".join(str(p.resolve()) for p in self.paths)
 
     def found(self) -> dict | None:
-        """The figures of the time when the same was asked for, if every file is still what it was then; they are touched."""
+        """Figures of an earlier run with the same inputs if all its files are unchanged; these are touched."""
         record = self._records().get(self.key)
         if not isinstance(record, dict) or record.get("asked") != self.asked or not isinstance(record.get("figures"), dict):
             return None
@@ -120,8 +120,8 @@ class Outputs:
         return record["figures"]
 
     def refuse_foreign(self, force: bool) -> None:
-        """Stop before work begins where a file cannot be written, or holds what neither its mark nor the record says is ours: a
-        CSV has no room for a mark.
+        """Refuse before work begins if a file cannot be written, or was made by another program according to its mark and the
+        record (a CSV has no mark).
 
         Raises:
             InputError: as of `io.files.refuse_foreign`.
@@ -132,9 +132,9 @@ class Outputs:
             refuse_foreign(path, force or _hash(path) in ours)
 
     def keep(self, figures: dict) -> None:
-        """Remember what was made."""
+        """Record the outputs and their figures."""
         entry = {"asked": self.asked, "files": [_hash(p) for p in self.paths], "figures": figures}
-        with contextlib.suppress(CausticError):  # a project that cannot be written to has no memory; the output is there
+        with contextlib.suppress(CausticError):  # a read-only project has no record; the outputs exist
             write_bytes(self.record, json.dumps(self._records() | {self.key: entry}, indent=1).encode())
 
     def _records(self) -> dict:
@@ -156,5 +156,5 @@ def _hash(path: Path) -> str:
 
 def _touch(paths: Iterable[Path]) -> None:
     for path in paths:
-        with contextlib.suppress(OSError):  # read-only: then make must run the command again, which costs little
+        with contextlib.suppress(OSError):  # read-only: make runs the command again
             os.utime(path)

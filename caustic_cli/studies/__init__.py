@@ -1,7 +1,7 @@
-"""Questions with tables and plots: figures of merit, gradient images, accuracy against time.
+"""Numerical studies with tables and plots: figures of merit, gradient images, accuracy against computation time.
 
-Matplotlib, which draws them, wants a directory for its list of fonts, and does not start where it can write none; here it goes
-without, and writes none.  What it has to say about that, and about a list it makes, is no result and no error.
+Matplotlib needs a writable directory for its font cache, and does not start without one; in that case it is loaded here without a
+cache.  Its log messages about the cache are suppressed.
 """
 
 import logging
@@ -10,15 +10,15 @@ import tempfile
 from pathlib import Path
 from unittest import mock
 
-#: Directories in which nobody creates a file, of Linux and of other Unix systems.
+#: Directories in which no file can be created, of Linux and of other Unix systems.
 UNWRITABLE = ("/proc/self", "/dev/fd")
 
 
 def _without_directory() -> None:
-    """Load matplotlib for a directory that it takes to be writable; that it can keep no list there is only a warning to it."""
+    """Load matplotlib with a cache directory that it takes to be writable; a failure to write there is only a warning."""
     os.environ["MPLCONFIGDIR"] = next((d for d in UNWRITABLE if Path(d).is_dir()), os.curdir)
     with mock.patch("os.access", return_value=True):
-        import matplotlib.font_manager  # noqa: F401, PLC0415 - the list of fonts is sought here and now
+        import matplotlib.font_manager  # noqa: F401, PLC0415 - builds the list of fonts
 
 
 logging.getLogger("matplotlib").setLevel(logging.ERROR)

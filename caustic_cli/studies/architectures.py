@@ -1,8 +1,8 @@
-"""Which network of heights learns best: a grid of architectures, each trained alike (the thesis' outlook, 7.2).
+"""Comparison of network architectures by a grid search (outlook of the thesis, 7.2).
 
-Candidates are trained for the same numbers of iterations, ROUNDS one after the other, on the same picture from the same first lens,
-and their lenses are retraced with the same rays, which none has seen.  So errors repeat from run to run, and times do not; a time
-limit ends the study after a round that all have been through.
+All candidates are trained for the same numbers of iterations, in ROUNDS, on the same picture from the same initial lens, and their
+lenses are retraced with the same independent rays.  So errors are reproducible, and times are not; a time limit ends the study
+after a complete round.
 """
 
 from __future__ import annotations
@@ -19,37 +19,35 @@ from caustic_cli.config import checks
 from caustic_cli.errors import CausticError
 from caustic_cli.studies.report import Study, plain_ticks, styles
 
-#: Iterations in all after each round.
+#: Total iterations after each round.
 ROUNDS = (25, 50, 100, 200)
 #: Seconds for each candidate, unless said.
 SECONDS = 4.0
-#: Errors this close, relatively, are called equal.
-ALIKE = 0.02
 
 COLUMNS = {
-    "series": "what is trained",
+    "series": "name of the candidate",
     "network": "dense, or none for the heights themselves",
-    "inputs": "range: a network trained over a range, which sees where in it it is; none: over a range, but one lens for all of it;"
-    " alone: one network for each value that is judged; empty where there is no range",
+    "inputs": "range: a network trained over a range, with the parameters as inputs; none: over a range, without inputs, one lens"
+    " for all of it; alone: one network for each value evaluated; empty without a range",
     "layers": "hidden layers",
     "width": "neurons in each",
     "activation": "of the hidden layers",
-    "preconditioner": "laplacian: outputs are the coordinates in which the caustic's response is well conditioned; none: heights",
+    "preconditioner": "laplacian: outputs are coordinates in which the response of the caustic is well conditioned; none: heights",
     "lr": "learning rate of Adam",
     "parameters": "weights and biases, or heights",
     "iterations": "of Adam",
     "seconds": "spent in iterations, s",
     "loss": "the last iteration's own loss times the pixels",
-    "error": "relative RMS between the retraced image and the target; over a range, the root mean square over the values judged",
+    "error": "relative RMS between the retraced image and the target; over a range, the root mean square over the values evaluated",
     "worst": "over a range, the largest of these",
-    "noise": "standard error of `error` that the retrace's own rays leave",
+    "noise": "standard error of `error`, by the rays of the retrace",
 }
 
 
 class Candidate(Protocol):
     """A network in training.
 
-    about: its columns, as far as they do not change; seconds: spent; loss: of the last iteration, times the pixels.
+    about: its constant columns; seconds: spent; loss: of the last iteration, times the pixels.
     """
 
     about: dict[str, Any]
@@ -57,14 +55,14 @@ class Candidate(Protocol):
     loss: float | None
 
     def reach(self, iterations: int) -> None:
-        """Go on to so many iterations in all.
+        """Continue to this total number of iterations.
 
         Raises:
-            CausticError: it cannot: its loss is not finite, or no light reaches the screen.
+            CausticError: the loss is not finite, or no light reaches the screen.
         """
 
     def judged(self) -> dict[str, float]:
-        """error, worst and noise."""
+        """Figures error, worst and noise, see COLUMNS."""
 
 
 def run_architectures(
@@ -77,9 +75,9 @@ def run_architectures(
     """Train all candidates.
 
     Args:
-        seconds: for each on average, None for SECONDS: no round is begun when all of them together have had that.
-        about: more to be told of how it was made.
-        progress: told (turns done, in all) after each.
+        seconds: per candidate on average, None for SECONDS: no further round begins when the total is spent.
+        about: further metadata of the study.
+        progress: called with (evaluations done, in total) after each.
 
     Raises:
         InputError: numbers out of range.
@@ -115,7 +113,7 @@ def run_architectures(
 
 
 def _in_grid(about: Mapping[str, Any]) -> bool:
-    """Whether columns are those of one of the networks that are compared."""
+    """Whether these columns are of a network of the grid."""
     return about["network"] == "dense" and about["inputs"] in ("", "range")
 
 
@@ -126,7 +124,7 @@ def last_round(rows: Sequence[dict]) -> list[dict]:
 
 
 def _advice(rows: Sequence[dict]) -> str:
-    """The best, what every choice is worth beside it, and what conditioning is, in one sentence."""
+    """The best network, and the least error for every choice of each hyperparameter, in one sentence."""
     rows = last_round(rows)
     grid = [row for row in rows if _in_grid(row)]
     best = min(grid, key=lambda row: row["error"])
@@ -185,7 +183,7 @@ def _layers(n: int) -> str:
 
 
 def _beside(rows: Sequence[dict], preconditioner: str) -> list[dict]:
-    """What networks are compared with: no network, at its best learning rate, and the other ways to be trained over a range."""
+    """Baselines: free heights at their best learning rate, and the other ways of training over a range."""
     free = [row for row in rows if row["network"] == "none" and row["preconditioner"] == preconditioner]
     best = [min(free, key=lambda row: row["error"])] if free else []
     return best + [row for row in rows if row["inputs"] in ("none", "alone")]

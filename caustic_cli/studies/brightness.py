@@ -1,16 +1,16 @@
-"""The brightness of each lenslet's source for a wanted illumination.
+"""Brightness of the sources of a lenslet array for a target illumination, by non-negative least squares.
 
 Notation
     A_k   image of lenslet k alone, lit as it is in the scene: power per pixel, (pixels,)
-    b     brightness of each lenslet's source, counted in what the scene gives it; not negative
-    w     the wanted image, of as much power as all lenslets throw on the screen at b = 1
+    b     brightness of each lenslet's source, relative to that of the scene; not negative
+    w     the target image, scaled to the power on the screen at b = 1
 
     min over b >= 0 of |A b - w|^2,    gradient g = A^T (A b - w)
 
-Karush, Kuhn and Tucker: b is the solution if and only if g_k = 0 where b_k > 0 and g_k >= 0 where b_k = 0.  The active set is that
-of Lawson & Hanson (Solving Least Squares Problems, 1974, ch. 23), by SciPy; on it the least squares are solved again by an
-orthogonal factorisation of columns of unit length, with a step of refinement.  Where lenslets throw the same picture the solution
-is not unique, and one of them is found.
+Optimality conditions (Karush, Kuhn, Tucker): g_k = 0 where b_k > 0 and g_k >= 0 where b_k = 0.  The active set is found by the
+method of Lawson & Hanson (Solving Least Squares Problems, 1974, ch. 23), by SciPy; on it the least-squares problem is solved again
+by an orthogonal factorisation of the normalised columns, with one step of iterative refinement.  Where lenslets have the same
+picture the solution is not unique.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from caustic_cli.errors import CausticError
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """brightness (n,); residual: largest violation of the conditions above over the largest |A_k . w|, columns of unit length;
-    error: |A b - w| over |w|."""
+    """brightness (n,); residual: largest violation of the optimality conditions over the largest |A_k . w|, for columns of unit
+    length; error: |A b - w| / |w|."""
 
     brightness: np.ndarray
     residual: float
@@ -52,7 +52,7 @@ def brightness(basis: np.ndarray, wanted: np.ndarray) -> Solution:
     refined = np.zeros_like(found)
     for _ in range(2):
         refined[positive] += lstsq(columns[:, positive], goal - columns @ refined, lapack_driver="gelsy")[0]
-    # A set with a member at nearly nothing may leave it below: then SciPy's own numbers stand.
+    # With a nearly degenerate active set a refined value may be negative: then the unrefined solution is kept.
     candidates = [found] + ([refined] if (refined >= 0).all() else [])
     best = min(candidates, key=lambda b: _violation(columns, goal, b))
     out = np.zeros(basis.shape[1])
@@ -61,7 +61,7 @@ def brightness(basis: np.ndarray, wanted: np.ndarray) -> Solution:
 
 
 def _violation(columns: np.ndarray, goal: np.ndarray, b: np.ndarray) -> float:
-    """How far b is from the conditions, over the largest gradient at b = 0."""
+    """Largest violation of the optimality conditions at b, over the largest gradient at b = 0."""
     gradient = columns.T @ (columns @ b - goal)
     wrong = np.where(b > 0, np.abs(gradient), np.maximum(0.0, -gradient))
     return float(wrong.max(initial=0.0) / np.abs(columns.T @ goal).max())

@@ -1,9 +1,9 @@
-"""What accuracy costs in time: the error of an image against one made with many more rays, setting by setting.
+"""Convergence studies: error against computation time of an image, relative to a reference with many more rays.
 
-    rays            samplers x numbers of rays, bincount: how fast does each kind of ray converge
-    reconstruction  filters x numbers of rays: what blur costs in bias and saves in noise
-    precision       float32 against float64 on the same rays: is single precision enough here; both in plain torch, since the
-                    CPU's kernels know float64 only
+    rays            samplers x numbers of rays, bincount: the order of convergence of each sampler
+    reconstruction  filters x numbers of rays: bias and noise of each filter
+    precision       float32 against float64 on the same rays; both in plain torch, since the CPU's kernels support float64
+                    only
 
 A bincount image has noise only.  For n independent rays its error is sqrt(N / n) on N evenly lit pixels, order 1/2;
 with one ray in each of n cells only the cells on a pixel's border contribute, which gives order 3/4 once there are
@@ -25,7 +25,7 @@ from caustic_cli.optics.sampling import SAMPLERS
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 from caustic_cli.studies.fit import Order, knee, order
-from caustic_cli.studies.measurement import REFERENCE_SEED, Bench, Reference, Setting, haste
+from caustic_cli.studies.measurement import REFERENCE_SEED, Benchmark, Reference, Setting, busy_warning
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.report import Study
 
@@ -36,22 +36,22 @@ FILTERS = (Filter(), *(Filter(kind, (v, v), (1.0, 1.0)) for kind in ("gaussian",
 #: Single precision is enough where it changes the image by less than this part of the error its rays leave anyway:
 #: it then adds half a percent to it in quadrature.
 NEGLIGIBLE = 0.1
-#: A speedup below this is the noise of the times.
+#: A speedup below this is within the scatter of the times.
 FASTER = 1.1
-#: An order below this is no convergence: halving the error would take a thousand times the rays.
+#: An order below this counts as no convergence: halving the error would take a thousand times the rays.
 STALLED = 0.1
 
 _COMMON = {
-    "series": "the curve this setting belongs to",
-    "sampler": "kind of rays",
+    "series": "name of the curve",
+    "sampler": "sampling of the rays",
     "rays": "rays traced",
-    "error": "relative RMS against the reference, each image over its own mean, less the reference's own error in"
-    " quadrature; root mean square over the repeats",
+    "error": "relative RMS against the reference, each image over its own mean, corrected for the reference's own"
+    " error in quadrature; root mean square over the repeats",
 }
 _TIMES = {
     "seconds": "wall time of sampling, tracing and reconstruction, s; median of the repeats",
-    "seconds_min": "least of them, s",
-    "seconds_max": "most of them, s",
+    "seconds_min": "shortest of them, s",
+    "seconds_max": "longest of them, s",
 }
 
 
@@ -72,11 +72,11 @@ def run_study(
     Args:
         name: rays, reconstruction or precision.
         heights: (n, m) control heights, mm; the study runs on their device.
-        seed: of the rays studied; the reference takes others.
+        seed: of the rays studied; the reference uses others.
         dtype: precision of the rays studied, None for float64 (`precision` always compares both).
-        max_rays: rays of the largest setting, None for MAX_RAYS; the reference takes many times more.
+        max_rays: rays of the largest setting, None for MAX_RAYS; the reference uses many times more.
         repeats: rounds, each with fresh rays.
-        progress: told (rays traced, rays in all) after every image.
+        progress: called with (rays traced, rays in total) after every image.
 
     Raises:
         InputError: unknown study, or numbers out of range.
@@ -85,11 +85,11 @@ def run_study(
     checks.choice("⟨study⟩", name, tuple(STUDIES))
     max_rays = checks.whole("⟨rays⟩", MAX_RAYS[name] if max_rays is None else max_rays, 256, 1 << 32)
     checks.whole("⟨repeats⟩", repeats, 1, 1000)
-    bench = Bench(scene, field, heights.detach().double(), seed, repeats, max_rays, progress)
+    bench = Benchmark(scene, field, heights.detach().double(), seed, repeats, max_rays, progress)
     return STUDIES[name](bench, dtype or torch.float64)
 
 
-def study_rays(bench: Bench, dtype: torch.dtype) -> Study:
+def study_rays(bench: Benchmark, dtype: torch.dtype) -> Study:
     """Error against the number of rays, for every sampler."""
     settings = [Setting(kind, kind, bench.max_rays >> k, Filter(), dtype) for k in range(6, -1, -1) for kind in SAMPLERS]
     bench.plan(settings)
@@ -101,16 +101,15 @@ def study_rays(bench: Bench, dtype: torch.dtype) -> Study:
     advice = f"a relative error of {best['error']:.2g} costs {best['seconds']:.2g} s with {best['rays']} {best['sampler']} rays"
     if least is not best:
         advice += f", the least, {least['error']:.2g}, {least['seconds']:.2g} s with {least['rays']} {least['sampler']}"
-    advice += f"; {_halving(orders[best['series']])}{haste(rows)}"
+    advice += f"; {_halving(orders[best['series']])}{busy_warning(rows)}"
     return Study("rays", _COMMON | _TIMES, rows, orders, advice, _about(bench, dtype, truth))
 
 
-def study_reconstruction(bench: Bench, dtype: torch.dtype) -> Study:
-    """Error of filters, split into the bias of their blur and the noise that it leaves.
+def study_reconstruction(bench: Benchmark, dtype: torch.dtype) -> Study:
+    """Error of filters, split into bias and noise.
 
-    A filter's own reference is what its images tend to.  The bincount reference smoothed by `Filter.smooth` is not
-    quite that, because light is not even within a pixel and some is blurred in from beyond the frame: how far off it is
-    stands beside it, as `kernel`.
+    The reference of a filter is the limit of its images for many rays.  The bincount reference smoothed by `Filter.smooth` differs
+    from it, because irradiance is not uniform within a pixel and light is blurred in from outside the frame: column `kernel`.
     """
     settings = [
         Setting(f.kind if f.size[0] == 1 else f"{f.kind} {f.size[0]}", "lines", bench.max_rays >> k, f, dtype)
@@ -140,8 +139,8 @@ def study_reconstruction(bench: Bench, dtype: torch.dtype) -> Study:
         | {
             "filter": "reconstruction filter",
             "size": "its size, pixels along either axis",
-            "noise": "relative RMS against the filter's own reference: what more rays remove",
-            "bias": "relative RMS between the filter's own reference and the reference: what they do not",
+            "noise": "relative RMS against the filter's own reference, which decreases with the number of rays",
+            "bias": "relative RMS between the filter's own reference and the reference, which does not",
             "kernel": "relative RMS between the reference smoothed by Filter.smooth and the filter's own reference",
             "reference_error": "estimated relative RMS of the filter's own reference",
         }
@@ -155,13 +154,13 @@ def study_reconstruction(bench: Bench, dtype: torch.dtype) -> Study:
             than += f" (bincount {plain['error']:.2g} in {plain['seconds']:.2g} s)"
         parts.append(f"with {best['rays']} rays {best['series']} has the least error, {best['error']:.2g}{than}")
     about = _about(bench, dtype, truth) | {"orders_of": "noise"}
-    return Study("reconstruction", columns, rows, _orders(bench, rows, "noise"), "; ".join(parts) + haste(rows), about)
+    return Study("reconstruction", columns, rows, _orders(bench, rows, "noise"), "; ".join(parts) + busy_warning(rows), about)
 
 
-def study_precision(bench: Bench, _dtype) -> Study:
-    """Both precisions on the same rays: how far apart their images are, beside how wrong either is.
+def study_precision(bench: Benchmark, _dtype) -> Study:
+    """Both precisions on the same rays: the difference of their images, beside the error of each.
 
-    Both rows of a pair go by plain torch, so that they differ in nothing else: the CPU's kernels know float64 only.
+    Both use plain torch, so that they differ in nothing else: the CPU's kernels support float64 only.
     """
     settings = [
         Setting(f"{kind} {_name(dtype)}", kind, bench.max_rays >> k, Filter(), dtype)
@@ -195,19 +194,19 @@ def study_precision(bench: Bench, _dtype) -> Study:
     advice = (
         f"float32 changes the image of {worst['rays']} {worst['sampler']} rays by {worst['difference']:.2g},"
         f" where the rays leave an error of {worst['error']:.2g}, and is {worst['speedup']:.2g} times as fast"
-        f" in plain torch: {single_precision(worst)}{haste(rows)}"
+        f" in plain torch: {single_precision(worst)}{busy_warning(rows)}"
     )
     return Study("precision", columns, rows, _orders(bench, rows), advice, _about(bench, None, truth))
 
 
 def single_precision(row: dict) -> str:
-    """Whether float32 will do, by a row of it that knows difference, error and speedup."""
+    """Whether float32 is sufficient, from a row with difference, error and speedup."""
     if row["speedup"] < FASTER:
         return "float32 gains nothing here"
     return "float32 is enough" if row["difference"] <= NEGLIGIBLE * row["error"] else "use float64"
 
 
-def _orders(bench: Bench, rows: list[dict], column: str = "error") -> dict[str, Order | None]:
+def _orders(bench: Benchmark, rows: list[dict], column: str = "error") -> dict[str, Order | None]:
     """Fitted order of every series over its settings with at least one ray a pixel."""
     table: dict[str, list[dict]] = {}
     for row in rows:
@@ -217,14 +216,14 @@ def _orders(bench: Bench, rows: list[dict], column: str = "error") -> dict[str, 
 
 
 def _halving(found: Order | None) -> str:
-    """What half the error costs: error ~ n^-k asks for 2^(1/k) times the rays, and as much more time."""
+    """Cost of halving the error: with error ~ n^-k, 2^(1/k) times the rays and the time."""
     if found is None or found.exponent < STALLED:
         return "more rays hardly lower it"
     return f"halving it costs {2.0 ** (1.0 / found.exponent):.2g} times as much"
 
 
-def _about(bench: Bench, dtype: torch.dtype | None, truth: Reference) -> dict:
-    """How a study was made; everything but the threads' speed follows from it."""
+def _about(bench: Benchmark, dtype: torch.dtype | None, truth: Reference) -> dict:
+    """Metadata of a study, from which all but the times can be reproduced."""
     seeds = [bench.seed + REFERENCE_SEED, bench.seed + REFERENCE_SEED + 1]
     return {
         "version": __version__,
@@ -247,8 +246,8 @@ def _name(dtype: torch.dtype) -> str:
     return str(dtype).removeprefix("torch.")
 
 
-#: Every study by name: of a bench, with rays of a dtype.
-STUDIES: dict[str, Callable[[Bench, torch.dtype], Study]] = {
+#: Every study by name, as a function of a benchmark and the dtype of the rays.
+STUDIES: dict[str, Callable[[Benchmark, torch.dtype], Study]] = {
     "rays": study_rays,
     "reconstruction": study_reconstruction,
     "precision": study_precision,

@@ -1,13 +1,13 @@
-"""Where rays are enough: how far the ray image is from the wave image over lens size, wavelength and size of the source.
+"""Validity of geometrical optics: ray image against wave image over lens size, wavelength and source size.
 
 Notation
-    size        width of the lens; throw, screen and relief grow with it, so that all angles stay as they are
+    size        width of the lens; throw, screen and relief scale with it, so that all angles are unchanged
     wave        the wave image at one wavelength, `error` the relative RMS between it and the ray image, each over its own mean
-    noise       of the ray image, from two halves of its rays; taken off the error in quadrature
-    blur        predicted: sqrt(lambda L M) and the source's own, mm
+    noise       of the ray image, from two halves of its rays; subtracted from the error in quadrature
+    blur        predicted, by diffraction, sqrt(lambda L M), and by the source, mm
 
-A larger lens at the same angles has larger pixels, too: the Fresnel scale grows only with the root of the size, so rays come
-closer.
+Pixels scale with the lens, and the Fresnel scale sqrt(lambda L M) only with the square root of its size, so that the agreement
+improves with size.
 """
 
 from __future__ import annotations
@@ -37,25 +37,25 @@ from caustic_cli.studies.retrace import sampler_for
 SIZES = (5.0, 10.0, 20.0, 40.0, 60.0, 100.0)
 WAVELENGTHS = (405.0, 550.0, 780.0, 1064.0, 1550.0)
 ANGLES = (0.0, 0.02, 0.05, 0.1)
-#: Rays of each ray image, to a pixel, unless said.
+#: Rays per pixel of each ray image by default.
 A_PIXEL = 64
-#: An error up to which rays are called enough.
+#: Largest error at which the ray image counts as sufficient.
 ENOUGH = 0.1
 
 COLUMNS = {
-    "series": "what is varied",
+    "series": "parameter varied",
     "value": "lens size (mm), wavelength (nm) or the source's full angle (degrees)",
-    "error": "relative RMS between ray image and wave image, each over its own mean, the rays' noise taken off",
-    "noise": "of the ray image, relative RMS",
+    "error": "relative RMS between ray image and wave image, each over its own mean, corrected for the noise of the rays",
+    "noise": "relative RMS noise of the ray image",
     "blur": "predicted blur by diffraction and the source, pixels",
     "seconds": "time of the wave image, s",
     "rays_seconds": "time of the ray image, s",
-    "samples": "of the largest transform, along an axis",
+    "samples": "samples of the largest transform along an axis",
 }
 
 
 def scaled(scene: Scene, field: HeightField, heights: Tensor, factor: float) -> tuple[Scene, HeightField, Tensor]:
-    """Everything of a scene in plane light so many times as large, angles as they are."""
+    """A scene with a plane wave, scaled by a factor at constant angles; field and heights (n, m) mm with it."""
     lens, screen = scene.lens, scene.screen
     radius = tuple(factor * r for r in lens.offset.radius)
     larger: Lens = replace(
@@ -144,7 +144,7 @@ def run_diffraction(
 
 
 def _rays(scene: Scene, field: HeightField, heights: Tensor, rays: int, seed: int) -> tuple[Reference, float]:
-    """The ray image by two halves, and its time."""
+    """The ray image from two halves of the rays, and its time, s."""
     began = time.perf_counter()
     samplers = [sampler_for(scene, rays // 2, seed + k, str(heights.device)) for k in (0, 1)]
     halves = [expose(scene, field, heights, sampler).image.cpu() for sampler in samplers]
@@ -152,7 +152,7 @@ def _rays(scene: Scene, field: HeightField, heights: Tensor, rays: int, seed: in
 
 
 def _advice(rows: list[dict]) -> str:
-    """One sentence: from which size on rays are enough."""
+    """From which size on the ray image is sufficient, in one sentence."""
     sizes = [r for r in rows if r["series"] == "lens size"]
     found = []
     if (size := _from(sizes)) is not None:
@@ -169,7 +169,7 @@ def _advice(rows: list[dict]) -> str:
 
 
 def _from(rows: list[dict]) -> float | None:
-    """The least value from which on every error is small enough; None where the last is not."""
+    """The least value from which on all errors are at most ENOUGH; None if the last is not."""
     found = None
     for row in sorted(rows, key=lambda r: -r["value"]):
         if row["error"] > ENOUGH:
@@ -179,7 +179,7 @@ def _from(rows: list[dict]) -> float | None:
 
 
 def draw_diffraction(study: Study, figure: Figure) -> None:
-    """Error against what is varied, on one scale; an error of which the noise leaves nothing has no place on it."""
+    """Error against each parameter, on a common scale; errors below the noise are omitted."""
     figure.set_size_inches(10.8, 3.8)
     titles = {
         "lens size": "lens size (mm), all angles alike",

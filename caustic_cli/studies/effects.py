@@ -1,12 +1,12 @@
-"""What every effect costs, and what leaving it out does to the image, measured in one run.
+"""Cost and influence of every simulated effect: computation time, and the change of the image without it.
 
 Notation
     with, without   images of the same rays by plans that differ in one effect
-    cost            least time of sampling, tracing and reconstruction with, less the least without: what else the machine does
-                    only ever adds to either.  Processor time of all threads, which that disturbs least; wall time on a GPU
+    cost            least time of sampling, tracing and reconstruction with, minus the least without, since interference only ever
+                    adds time.  Processor time of all threads, which is disturbed least; wall time on a GPU
     error           relative RMS between the two images, each over its own mean; power, light on the screen without less with
 
-Both plans take turns, round after round, so that a machine that slows down for a while slows both.
+Both plans are timed alternately, so that a temporary slowdown of the machine affects both.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from caustic_cli.scene import Scene
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.report import COLOURS, Study
 
-#: Rays of every image, and rounds, unless said: a few seconds for each effect on two cores.  A wave image alone takes seconds.
+#: Default number of rays and of rounds: a few seconds for each effect on two cores.  A wave image alone takes seconds.
 RAYS, REPEATS, WAVE_REPEATS = 1 << 16, 5, 2
 BY_NAME = {effect.name: effect for effect in EFFECTS}
-#: Whether an effect costs nothing that could be saved.
+#: Whether leaving out an effect saves no time.
 FREE = {effect.name: effect.free for effect in EFFECTS}
-#: Whether it is seen in the wave image alone.
+#: Whether an effect appears in the wave image alone.
 WAVES = {effect.name: effect.waves for effect in EFFECTS}
-#: Of an effect that the scene has or would have as it is; changes below this are rounding.
+#: Amount of an effect that the scene itself has; changes below this are rounding.
 OWN, ROUNDING = "the scene's own", 1e-12
 #: Least rays to a pixel of the ray image that a wave image is compared with.
 RAYS_A_PIXEL = 30
@@ -50,30 +50,29 @@ RAYS_A_PIXEL = 30
 COLUMNS = {
     "series": "effect",
     "on": "whether auto simulates it in this scene",
-    "why": "why, in this scene",
-    "bound": "the number that decides",
-    "limit": "what it is compared with",
-    "amount": "of the effect as measured here: the scene's own, or what was put in",
-    "error": "relative RMS between the image without and with it, each over its own mean",
-    "power": "light on the screen without it less with it, part of the source's power",
-    "seconds": "cost: least time with it less least time without, s",
-    "seconds_min": "least of the rounds' differences, s",
-    "seconds_max": "most of them, s",
-    "whole": "least time with it, s",
+    "why": "reason, in this scene",
+    "bound": "the number on which the decision is based",
+    "limit": "the value with which it is compared",
+    "amount": "of the effect in this measurement: that of the scene, or of the example added for the study",
+    "error": "relative RMS between the images without and with the effect, each over its own mean",
+    "power": "light on the screen without the effect minus with it, as a fraction of the source's power",
+    "seconds": "cost: shortest time with it minus shortest time without, s",
+    "seconds_min": "least difference over the rounds, s",
+    "seconds_max": "largest of them, s",
+    "whole": "shortest time with it, s",
 }
 
 
 def measure_waves(
     plan: Plan, field: HeightField, heights: Tensor, *, rays: int = RAYS, repeats: int = WAVE_REPEATS, seed: int = 0
 ) -> dict:
-    """The same of what is seen in the wave image alone: the rounds' times of it, for without it nothing is done, and how the ray
-    image differs from it."""
+    """`measure` for an effect of the wave image alone: its whole time is the cost, and the error is that of the ray image."""
     times, light, clock = [], None, _clock(heights)
     for _ in range(repeats):
         began = clock()
         try:
             light = wave_image(plan.scene, field, heights.detach(), most=UNASKED).image.cpu()
-        except NoWaveImage:  # nothing to compare with, or more than a comparison is worth
+        except NoWaveImage:  # no wave image, or one that is too expensive for a comparison
             return {"error": None, "power": None} | dict.fromkeys(("seconds", "seconds_min", "seconds_max", "whole"), 0.0)
         times.append(clock() - began)
     sampler = rays_of(plan.scene, "stratified", max(rays, RAYS_A_PIXEL * light.numel()), stream(seed, "effects"), heights.device)
@@ -107,7 +106,7 @@ def measure(
 ) -> dict:
     """Cost and error of the effect in which two plans differ: error, power, seconds, seconds_min, seconds_max, whole.
 
-    Where only the plan without it leaves the fused kernels, both are timed by stages: the cost is that of the effect alone.
+    Where only the plan with it uses the fused kernels, both are timed by stages: the cost is that of the effect alone.
     """
     if is_lowered(with_.scene, field, with_.requests) and not is_lowered(without.scene, field, without.requests):
         with_ = replace(with_, requests=with_.requests | Requests(stages=True))
@@ -148,8 +147,8 @@ def explain(
     """A row for each effect of a plan of `scene`: name, on, why, bound, limit, cost_ms, cost_ms_range, error, power.
 
     error and power are those of leaving it out.  cost_ms of an effect that is off is what it would cost; cost_ms_range are the
-    extremes of the rounds' differences.  What the scene has nothing of has neither cost nor error; what cannot be left out has no
-    error (None).
+    extremes of the differences over the rounds.  An effect absent from the scene has neither cost nor error; one that cannot be
+    left out has no error (None).
     """
     rows = []
     for effect in plan.effects:
@@ -178,7 +177,7 @@ def explain(
 
 
 def table(rows: list[dict]) -> list[str]:
-    """The rows of `explain` as lines of text under their titles; a cost is 0 where the rounds do not agree on its sign."""
+    """The rows of `explain` as lines of text with a header; a cost is 0 where the rounds disagree on its sign."""
 
     def number(value: float | None, form: str) -> str:
         return "-" if value is None else format(value, form)
@@ -218,7 +217,7 @@ def run_effects(
     dtype: torch.dtype | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Study:
-    """Cost against error of every effect at a lens; what its scene lacks is put in, one effect at a time.
+    """Cost and error of every effect for a lens; effects absent from its scene are added one at a time.
 
     Raises:
         InputError: numbers out of range.
@@ -233,14 +232,14 @@ def run_effects(
             rows.append(found)
         if progress is not None:
             progress(k + 1, len(EFFECTS))
-    told = sorted((r for r in rows if r["on"]), key=_matters, reverse=True)
+    told = sorted((r for r in rows if r["on"]), key=_influence, reverse=True)
     advice = (
-        f"of what this scene has, {told[0]['series']} matters most ({_matters(told[0]):.2g})"
+        f"of what this scene has, {told[0]['series']} matters most ({_influence(told[0]):.2g})"
         if told
         else "this scene calls for no effect"
     )
-    unfounded = max((_matters(r) for r in rows if not r["on"] and r["amount"] == OWN), default=0.0)
-    advice += f"; what auto leaves out of it changes image or power by at most {unfounded:.2g}"
+    unfounded = max((_influence(r) for r in rows if not r["on"] and r["amount"] == OWN), default=0.0)
+    advice += f"; effects of it that auto leaves out change image or power by at most {unfounded:.2g}"
     about = {
         "version": __version__,
         "seed": seed,
@@ -255,8 +254,8 @@ def run_effects(
     return Study("effects", COLUMNS, rows, {}, advice, about, "rays", PLOTS)
 
 
-def _matters(row: dict) -> float:
-    """What leaving an effect out changes: the larger of error and power."""
+def _influence(row: dict) -> float:
+    """Influence of an effect: the larger of error and change of power without it."""
     return max(row["error"] or 0.0, abs(row["power"] or 0.0))
 
 
@@ -300,25 +299,26 @@ def _row(
 
 
 def draw_effects(study: Study, figure: Figure) -> None:
-    """A line for each effect, those that matter most above: the error of leaving it out, and its cost with the rounds' range."""
-    rows = sorted(study.rows, key=_matters)
+    """A row for each effect, in the order of influence: the error of leaving it out, and its cost with the range over the
+    rounds."""
+    rows = sorted(study.rows, key=_influence)
     figure.set_size_inches(10.4, 1.6 + 0.27 * len(rows))
     errors, costs = figure.subplots(1, 2, sharey=True)
-    floor = 0.3 * min((_matters(r) for r in rows if _matters(r) > ROUNDING), default=1.0)
+    floor = 0.3 * min((_influence(r) for r in rows if _influence(r) > ROUNDING), default=1.0)
     words = {"va": "center", "fontsize": "small", "bbox": {"facecolor": "white", "edgecolor": "none", "pad": 1.0}}
     for k, row in enumerate(rows):
         colour = COLOURS[row["amount"] != OWN]
         style = {"color": colour, "marker": "o", "markersize": 6, "markerfacecolor": colour if row["on"] else "white"}
-        if _matters(row) > ROUNDING:
-            errors.plot([_matters(row)], [k], linestyle="", **style)
+        if _influence(row) > ROUNDING:
+            errors.plot([_influence(row)], [k], linestyle="", **style)
         else:
             errors.annotate("nothing", (floor, k), color=colour, **words)
         cost, *ends = (1e3 * row[key] for key in ("seconds", "seconds_min", "seconds_max"))
         if any((cost, *ends)):
-            costs.plot(ends, [k, k], color=colour, linewidth=1)  # noise: a cost whose range holds 0 was not told from it
+            costs.plot(ends, [k, k], color=colour, linewidth=1)  # a range that contains 0 is noise
             costs.plot([cost], [k], linestyle="", **style)
         else:
-            costs.annotate("none that could be saved", (0.0, k), color=colour, **words)
+            costs.annotate("none", (0.0, k), color=colour, **words)
     names = [row["series"] if row["amount"] == OWN else f"{row['series']}: {row['amount']}" for row in rows]
     errors.set_yticks(range(len(rows)), names, fontsize="small")
     errors.set(xscale="log", title="error of leaving it out", xlabel="relative RMS or change of power, the larger")

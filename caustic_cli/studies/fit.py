@@ -1,6 +1,6 @@
 """Convergence orders by regression, and the Pareto front of error against cost.
 
-An order k says error = C n^-k: minus the slope of the least-squares line through (log n, log error).
+Order k means error = C n^-k: minus the slope of the least-squares line through (log n, log error).
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-#: Least number of settings an order is read from: two always fit a line exactly and would hide that they do not.
+#: Least number of settings for a fit: two always lie on a line, and leave no residual.
 MIN_POINTS = 3
 
 
@@ -26,9 +26,9 @@ class Order:
 
 
 def order(n: Sequence[float], error: Sequence[float], least: float = 0.0) -> Order | None:
-    """Order k of error = C n^-k over the settings with n >= `least`, over all where fewer than MIN_POINTS have that.
+    """Order k of error = C n^-k over the settings with n >= `least`, or over all if those are fewer than MIN_POINTS.
 
-    Errors of exactly 0 carry no order and are left out.  None when fewer than MIN_POINTS remain, or all n are equal.
+    Errors of exactly 0 are left out.  None when fewer than MIN_POINTS remain, or all n are equal.
     """
     n, error = np.asarray(n, float), np.asarray(error, float)
     use = error > 0
@@ -45,10 +45,10 @@ def order(n: Sequence[float], error: Sequence[float], least: float = 0.0) -> Ord
 
 
 def pareto(cost: Sequence[float], error: Sequence[float], gain: float = 0.0, alike: float = 0.0) -> list[bool]:
-    """For every setting, whether no other one is at least as good in both and better in one; of two that are the same, the first.
+    """For every setting, whether it is Pareto optimal in cost and error; of identical settings, the first is.
 
-    gain: part by which an error has to be less than that of every cheaper setting on the front, such as the errors' own noise.
-    alike: part by which costs differ that are as good as the same; of such settings the one with the least error is on the front.
+    gain: relative reduction of the error that a more expensive setting must reach over the front, such as the noise of the errors.
+    alike: relative difference below which costs count as equal; of such settings the one with the least error is on the front.
     """
     front: list[int] = []
     cheapest = 0.0  # of the settings that cost the same as the last on the front
@@ -64,6 +64,6 @@ def pareto(cost: Sequence[float], error: Sequence[float], gain: float = 0.0, ali
 
 
 def knee(cost: Sequence[float], error: Sequence[float], near: float = 0.25) -> int:
-    """The cheapest setting whose error is within this part of the least."""
+    """Index of the cheapest setting whose error exceeds the least by at most this fraction."""
     enough = (1.0 + near) * min(error)
     return min((k for k in range(len(cost)) if error[k] <= enough), key=lambda k: cost[k])

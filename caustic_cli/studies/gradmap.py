@@ -1,4 +1,4 @@
-"""The derivative of the whole image with respect to one control height: one forward-mode pass (thesis 6.1, erratum E11).
+"""Derivative of the image with respect to one control height, by forward-mode differentiation (thesis 6.1, erratum E11).
 
 Notation
     J           image, (n_x, n_y), parts of the source's power per pixel
@@ -35,7 +35,7 @@ from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer, expose
 from caustic_cli.scene import Scene, Screen
 
-#: Pixels beside what is not zero that a picture shows, at least.
+#: Least margin, pixels, around the non-zero part that a plot shows.
 LEAST_BESIDE = 3.0
 #: Pixels by which a central difference may move a landing point.  With d pixels the relative error is of order d^2 (the
 #: truncation of a C1 filter) plus 1e-12 / d (slopes rounded to 1e-16, thrown over a few hundred mm onto pixels of some
@@ -66,8 +66,8 @@ def gradient_image(
         dtype: precision of the ray arithmetic; chunks are summed in float64.
 
     Raises:
-        InputError: no such control point, a filter without a derivative, or an index that varies, through which rays have a
-            derivative in reverse mode only.
+        InputError: no such control point, a filter without a derivative, or a gradient index, for which only the reverse mode is
+            implemented.
     """
     if scene.lens.gradient is not None:
         raise InputError("the image's derivative by one height is taken of lenses of one index, and this one's varies")
@@ -105,9 +105,9 @@ def difference_step(scene: Scene, field: HeightField, control: tuple[int, int], 
 
 
 def _step(scene: Scene, field: HeightField, heights: Tensor, control: tuple[int, int]) -> float:
-    """`difference_step` within what the heights can tell apart and half the way to the screen.
+    """`difference_step`, bounded by the rounding of the heights and half the distance to the screen.
 
-    An index close to 1 bends next to nothing, and a far screen magnifies what thick glass cannot hold.
+    The bounds matter for an index close to 1 and for a very distant screen.
     """
     least = LEAST_STEP * float(heights.abs().max())
     return min(max(difference_step(scene, field, control), least), 0.5 * float((scene.screen.z - heights).abs().min()))
@@ -125,7 +125,7 @@ def finite_difference(
 ) -> Tensor:
     """The same derivative by central differences of two float64 renders with the same rays: (n_x, n_y), per mm.
 
-    Every ray is traced by `expose`, so nothing but the physics is shared with `gradient_image`.  Float64 whatever the
+    Every ray is traced by `expose`, independently of the selection and differentiation in `gradient_image`.  Float64 whatever the
     render uses: in float32 the difference of two nearly equal images is rounding.
 
     Args:
@@ -217,8 +217,8 @@ def plot_gradient(path: str | Path, gradient: Tensor, scene: Scene, title: str) 
 
 
 def shown_part(gradient: np.ndarray, screen: Screen) -> list[tuple[float, float]]:
-    """From where to where along x and y, mm, a picture of this gradient (n_x, n_y) goes: around all that is not zero, with a
-    quarter of that and at least `LEAST_BESIDE` pixels beside it, as wide as high, within the screen."""
+    """Limits along x and y, mm, of a plot of this gradient (n_x, n_y): the non-zero part with a margin of a quarter of its size, at
+    least `LEAST_BESIDE` pixels, square, within the screen."""
     spans, centres = [], []
     for axis in (0, 1):
         lit = np.flatnonzero((gradient != 0).any(1 - axis))

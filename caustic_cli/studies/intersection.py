@@ -1,17 +1,17 @@
-"""What accuracy costs where rays meet the surface: the thesis' triangle mesh beside Newton's method (thesis 4.3.3, 6.3).
+"""Accuracy and cost of ray-surface intersection: triangle mesh and Newton's method (thesis 4.3.3, 6.3).
 
 Notation
     o, d        a ray's start and unit direction inside the lens, mm
     Z           the B-spline surface; T the mesh, every knot span cut in n_u = n_v parts
-    t, t*       distance to the hit that a method finds, and to the exact one
+    t, t*       distance to the intersection by a method, and to the exact one
     t-error     |t - t*|, mm
-    z-error     |o_z + t d_z - Z| below or above the hit, mm; for the mesh |T - Z|
+    z-error     |o_z + t d_z - Z| at the intersection, mm; for the mesh |T - Z|
 
 t* comes from float64 Newton hits by two more steps with f(t) = o_z + t d_z - Z in extended precision; where that leaves |f| is
 the reference's own error.  The thesis finds order 2 in n_u for both errors (eq. 4.3.21 and fig. 6.2.14).
 
-Times are those of one evaluation with new heights, as a design needs it in every iteration: for the mesh vertices, boxes and
-search, for Newton the polynomials of the spans and the iteration.  What the rays alone decide is made before.
+Times are of one evaluation with new heights, as in every iteration of a design: for the mesh vertices, bounding boxes and search,
+for Newton the polynomials of the spans and the iteration.  Work that depends on the rays alone is done before.
 """
 
 from __future__ import annotations
@@ -43,38 +43,38 @@ from caustic_cli.optics.system import System
 from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Points, Scene
 from caustic_cli.studies.fit import Order, order
-from caustic_cli.studies.measurement import haste
+from caustic_cli.studies.measurement import busy_warning
 from caustic_cli.studies.report import Study, draw_front, legend_beside, plain_ticks, spread, styles
 
 #: Table D.3, its lengths in mm: half width of the lens, radius of the sphere, depth of the source, half-angle of its cone (rad).
 HALF, RADIUS, DEPTH, CONE, NET, DEGREE, RAYS = 5.0, 9.0, 6.0, 0.8, 15, 3, 25_000
-#: Rounds of timings, unless said.
+#: Default number of timing rounds.
 REPEATS = 9
-#: Most cells of the mesh along an axis, and most knot span products that are gone through one by one.
+#: Most cells of the mesh along an axis, and most knot-span rectangles that are searched linearly.
 MOST_CELLS, MOST_FLAT = 1600, 4096
-#: Parts for a mesh that only tells Newton where to begin.
+#: n_u of meshes that give the initial guess for Newton's method.
 COARSE = (1, 2, 4, 8)
-#: What the name of a series ends in whose boxes are gone through one by one.
+#: Suffix of series whose boxes are searched linearly.
 FLAT = ", flat boxes"
-#: Of a lens in parallel light: how far before it the point source stands instead, in lens widths.
+#: Distance of the point source that replaces a plane wave, in lens widths.
 AWAY = 5.0
 #: t-errors, mm, that the advice compares, and the one at which Newton and the mesh are.
 ROUGH, FINE, EQUAL = 1e-4, 1e-9, 1e-6
 
 COLUMNS = {
-    "series": "method: mesh, looked for four rectangles of knot span products at a time; mesh, flat boxes, through all of them"
-    " one by one; newton; mesh+newton, which begins at the mesh's hit",
-    "n_u": "parts that the mesh cuts every knot span into along either axis",
+    "series": "method: mesh, with a bounding-box hierarchy of knot-span rectangles; mesh, flat boxes, with a linear search over"
+    " them; newton; mesh+newton, which starts from the intersection with the mesh",
+    "n_u": "cells of the mesh per knot span along each axis",
     "rays": "rays in all",
-    "hits": "rays found to meet the surface",
-    "strayed": "rays that only this method or only the reference finds to meet it; the errors are over the others",
+    "hits": "rays found to intersect the surface",
+    "strayed": "rays that only this method or only the reference finds to intersect it; errors are over the others",
     "error": "mean t-error, mm",
     "t_max": "maximum t-error, mm",
     "z_mean": "mean z-error, mm",
     "z_max": "maximum z-error, mm",
     "seconds": "wall time of one evaluation with new heights, s; median of the repeats",
-    "seconds_min": "least of them, s",
-    "seconds_max": "most of them, s",
+    "seconds_min": "shortest of them, s",
+    "seconds_max": "longest of them, s",
 }
 #: Curves whose order is fitted: what they are called, and their column.
 FITTED = {"mean z-error": "z_mean", "mean t-error": "error", "maximum z-error": "z_max", "maximum t-error": "t_max"}
@@ -82,7 +82,7 @@ FITTED = {"mean z-error": "z_mean", "mean t-error": "error", "maximum z-error": 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A surface and rays that meet it: heights (n, m) mm, and where the rays come from in words."""
+    """A surface with heights (n, m) mm, rays that intersect it, and a description of their source."""
 
     field: HeightField
     heights: Tensor
@@ -108,7 +108,8 @@ def table_d3(rays: int | None = None, seed: int = 0) -> Case:
 
 
 def of_lens(scene: Scene, field: HeightField, heights: Tensor, rays: int | None = None, seed: int = 0) -> Case:
-    """A lens and the rays of its own source that enter it; rays along z are exact at once, so a plane wave gives way to a point.
+    """A lens and the rays of its source that enter it; a plane wave, whose intersections are trivial, is replaced by a point
+    source.
 
     Raises:
         CausticError: no ray enters the lens.
@@ -156,7 +157,7 @@ def _exact_basis(space: SplineSpace, u: np.ndarray) -> tuple[np.ndarray, list[np
 
 
 def reference(case: Case) -> tuple[np.ndarray, np.ndarray, float]:
-    """t* (N,) longdouble mm, which rays hit (N,), and how far off the surface the hits still are, mm.
+    """t* (N,) longdouble mm, which rays intersect (N,), and the largest residual |f|, mm.
 
     Raises:
         CausticError: no ray meets the surface.
@@ -175,13 +176,13 @@ def reference(case: Case) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 def _above(case: Case, t: np.ndarray) -> np.ndarray:
-    """f(t) (N,), mm: how high above the surface the rays are at t (N,) longdouble."""
+    """f(t) (N,), mm: height of the rays above the surface at t (N,) longdouble."""
     x, y, dx, dy, dz = (c.numpy().astype(np.longdouble) for c in (*case.rays.origin[:2], *case.rays.direction))
     return case.rays.origin[2] + t * dz - exact_heights(case.field, case.heights, x + t * dx, y + t * dy)
 
 
 def settings_of(field: HeightField, most: int | None = None) -> list[tuple[str, int | None]]:
-    """(series, n_u) of all settings: n_u = 1, 2, 4, .. up to `most` or to what memory is reasonable for."""
+    """(series, n_u) of all settings: n_u = 1, 2, 4, .. up to `most`, or a limit by memory."""
     spans = [len(s.breaks) - 1 for s in field.spaces]
     most = most or max(COARSE[2], min(128, MOST_CELLS // max(spans)))
     parts = [2**k for k in range(int(math.log2(most)) + 1)]
@@ -202,13 +203,13 @@ def run_intersection(
     most: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Study:
-    """Measure all methods on the rays of a case, in turns.  The errors repeat from run to run, the times do not.
+    """Measure all methods on the rays of a case, alternately.  Errors are reproducible, times are not.
 
     Args:
-        seed: of the rays, only to be told.
+        seed: of the rays, for the metadata.
         repeats: timed rounds, None for REPEATS.
         most: largest n_u, a power of 2; None for 128, less for a lens with many knot spans.
-        progress: told (evaluations done, in all) after each.
+        progress: called with (evaluations done, in total) after each.
     """
     repeats = checks.whole("⟨repeats⟩", REPEATS if repeats is None else repeats, 1, 1000)
     settings = settings_of(case.field, most)
@@ -252,12 +253,19 @@ def run_intersection(
         "newton_times_as_fast": None if at_equal is None else at_equal / newton["seconds"],
     }
     return Study(
-        "intersection", COLUMNS, rows, orders, _advice(rows, about["newton_times_as_fast"]) + haste(rows), about, "n_u", PLOTS
+        "intersection",
+        COLUMNS,
+        rows,
+        orders,
+        _advice(rows, about["newton_times_as_fast"]) + busy_warning(rows),
+        about,
+        "n_u",
+        PLOTS,
     )
 
 
 def _evaluate(case: Case, prepared: Callable, series: str, n: int | None) -> tuple[Tensor, Tensor]:
-    """t (N,) and status (N,) as one setting finds them; Newton's method has its rays prepared, as in a design."""
+    """t (N,) and status (N,) of one setting; for Newton's method the rays are prepared, as in a design."""
     if n is None:
         return prepared(case.heights)
     method = Method(series.removesuffix(FLAT), (n, n), not series.endswith(FLAT))
@@ -265,7 +273,7 @@ def _evaluate(case: Case, prepared: Callable, series: str, n: int | None) -> tup
 
 
 def _errors(case: Case, t: Tensor, status: Tensor, truth: np.ndarray, hit: np.ndarray) -> dict:
-    """Hits and errors of one setting, over the rays that it and the reference find to meet the surface."""
+    """Intersections and errors of one setting, over the rays that it and the reference find to intersect the surface."""
     found = (status == Status.HIT).numpy()
     both = found & hit
     t = np.where(both, t.numpy(), truth).astype(np.longdouble)
@@ -293,7 +301,7 @@ def seconds_at(rows: list[dict], error: float) -> float | None:
 
 
 def _advice(rows: list[dict], faster: float | None) -> str:
-    """What accuracy costs here, in one sentence."""
+    """Cost of accuracy, in one sentence."""
     rough, fine = (
         min((row for row in rows if row["error"] <= error), key=lambda row: row["seconds"], default=None) for error in (ROUGH, FINE)
     )
@@ -359,7 +367,7 @@ def draw_convergence(study: Study, figure: Figure) -> None:
                     markersize=5,
                     label=name,
                 )
-        axes.set(xscale="log", yscale="log", ylabel=f"{kind} (mm), mean unless said", title=f"{kind}; mesh: {_fit_words(orders)}")
+        axes.set(xscale="log", yscale="log", ylabel=f"{kind} (mm), mean unless stated", title=f"{kind}; mesh: {_fit_words(orders)}")
     for name, rows in table.items():
         if name != "newton" and rows:
             panels[1, 0].errorbar(
@@ -401,7 +409,7 @@ def draw_pareto(study: Study, figure: Figure) -> None:
     axes = figure.add_subplot()
     draw_front(axes, study)
     for error in (ROUGH, EQUAL, FINE):
-        said = "errors that the advice is about" if error == ROUGH else None
+        said = "errors compared in the advice" if error == ROUGH else None
         axes.axhline(error, color="grey", linewidth=0.8, linestyle="--", label=said)
     axes.set(xlabel="time (s): median, least and most", ylabel="mean t-error (mm)", title="intersection: error and time")
     legend_beside(figure)

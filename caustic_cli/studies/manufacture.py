@@ -1,7 +1,7 @@
-"""What it takes to make a lens, and how well the optics must be kept: the figures of `render report`.
+"""Manufacturing figures and alignment sensitivities of a lens: `render report`.
 
-Lengths are mm, angles degrees.  The surface is looked at on a grid of some points a knot span, and bounded by its control net,
-which holds it: between the two lies the truth.
+Lengths are mm, angles degrees.  Extrema of the surface are sampled on a grid of a few points per knot span, and bounded by its
+control net (convex-hull property): the true values lie in between.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Scene
 from caustic_cli.scene.materials import material
 
-#: Points looked at along each axis and a knot span, at most.
+#: Most sample points along each axis and per knot span.
 MOST, A_SPAN = 2001, 4
-#: Rows of them that are looked at together.
+#: Rows of points evaluated at a time.
 ROWS = 64
 #: Rays of the sensitivities and of the angles inside the lens.
 RAYS = 100_000
-#: Thickness of a plate that is cut from a common sheet, in parts of its width.
+#: Thickness of common sheet material, in parts of the width of the plate.
 SHEET = 0.08
-#: Errors by which the sensitivities are found: of the throw, relative; of the index.
+#: Finite-difference steps of the sensitivities: of the throw, relative; of the index.
 STEP = 1e-4
-#: What a mirror, which is no block of glass, has none of.
+#: Figures that do not apply to a mirror.
 OF_GLASS = (
     *("minimum_wall_mm", "minimum_wall_bound_mm", "stock_height_mm", "volume_cm3", "mass_g"),
     *("critical_angle_deg", "steepest_incidence_deg", "internal_reflection_margin_deg"),
@@ -47,13 +47,14 @@ OF_GLASS = (
 
 
 def manufacture(scene: Scene, field: HeightField, heights: Tensor, tool_radius: float | None = None, seed: int = 0) -> dict:
-    """Figures for JSON; None where there is none (no concave place, a mirror's glass).  A point source's blur is 0.
+    """Figures for JSON; None where one does not apply (no concave region, a mirror).  The blur of a point source is 0.
 
-    Keys: minimum_wall_mm and _bound_mm, from the flat entrance; stock_height_mm, what a blank must have; volume_cm3 and, of a known
-    material, mass_g; maximum_slope and _bound; smallest_concave_radius_mm and where, (x, y) mm; tool_radius_mm and tool_fits if one
-    was given; critical_angle_deg, steepest_incidence_deg inside the lens and internal_reflection_margin_deg; sharpness_limit_mm and
-    _pixels, of the source's size; landing_mm_per_mm_throw and landing_mm_per_thousandth_index, root mean square over the light, and
-    the errors that move the light by one pixel, throw_error_of_a_pixel_mm and index_error_of_a_pixel.
+    Keys: minimum_wall_mm and _bound_mm, from the flat entrance; stock_height_mm, least height of a blank; volume_cm3 and, of a
+    known material, mass_g; maximum_slope and _bound; smallest_concave_radius_mm and its position (x, y) mm; tool_radius_mm and
+    tool_fits if one was given; critical_angle_deg, steepest_incidence_deg inside the lens and internal_reflection_margin_deg;
+    sharpness_limit_mm and _pixels, of the source's size; landing_mm_per_mm_throw and landing_mm_per_thousandth_index, root mean
+    square over the light, and the errors that displace the light by one pixel, throw_error_of_a_pixel_mm and
+    index_error_of_a_pixel.
 
     Raises:
         InputError: the tool's radius is not above 0.
@@ -63,7 +64,7 @@ def manufacture(scene: Scene, field: HeightField, heights: Tensor, tool_radius: 
     lens, pixel = scene.lens, max(scene.screen.pixel)
     z, *derivatives = sampled(field, heights, [_points(s) for s in field.spaces])
     inside = torch.ones_like(z, dtype=torch.bool)
-    if lens.round:  # what lies beyond the circle takes the middle's place
+    if lens.round:  # points outside the circle are replaced by the centre
         (u, v) = (torch.linspace(-1.0, 1.0, n, dtype=torch.float64) for n in z.shape)
         inside, at = u[:, None] ** 2 + v[None, :] ** 2 <= 1.0, tuple(n // 2 for n in z.shape)
         z, *derivatives = (torch.where(inside, t, t[at]) for t in (z, *derivatives))
@@ -117,9 +118,9 @@ def wall_and_stock(scene: Scene, field: HeightField, heights: Tensor) -> dict[st
 
 
 def preview(scene: Scene, field: HeightField, heights: Tensor, project: float) -> str:
-    """What a design's first surface asks for, in one line; the finished one will be much like it.
+    """Manufacturing figures of the initial surface in one line; those of the finished one will be similar.
 
-    project: bytes that the finished project takes."""
+    project: expected size of the finished project, bytes."""
     lens, found = scene.lens, []
     for z, *derivatives in _strips(field, heights, [_points(s) for s in field.spaces]):
         bends = curvature.largest(*(lens.cut_from * d for d in derivatives))
@@ -137,10 +138,10 @@ def preview(scene: Scene, field: HeightField, heights: Tensor, project: float) -
 
 
 def _thinner(scene: Scene, low: float, high: float) -> str:
-    """What would make a plate whose surface is between two heights, mm, as thin as a sheet: its relief goes as 1 / throw, if the
-    light comes from infinity; that of a lens near its source gathers the light, whatever the throw."""
+    """Advice on the throw at which a plate, whose surface lies between two heights, mm, is as thin as sheet material: relief ~ 1 /
+    throw for a distant source; near a source the relief collects its light, whatever the throw."""
     sheet = SHEET * max(scene.lens.size)
-    room = sheet - (low - scene.lens.z_in)  # none in a lens that is no plate
+    room = sheet - (low - scene.lens.z_in)  # not positive for a lens that is not a plate
     near = math.isfinite(scene.source.nearest)
     if near or scene.lens.mirror or scene.elements or not 0.0 < room < high - low:
         return ""
@@ -154,7 +155,7 @@ def _megabytes(size: float) -> str:
 
 
 def _points(space: SplineSpace) -> int:
-    """Points along an axis, as many a knot span as there may be: equispaced knots, where cubics bend most, are among them."""
+    """Sample points along an axis: equispaced knots, where the curvature of cubics has its extrema, are among them."""
     spans = len(space.breaks) - 1
     return max(1, min(A_SPAN, MOST // spans)) * spans + 1
 
@@ -165,7 +166,7 @@ def sampled(field: HeightField, heights: Tensor, shape, orders=((0, 0), *curvatu
 
 
 def _strips(field: HeightField, heights: Tensor, shape, orders=((0, 0), *curvature.ORDERS)) -> Iterator[list[Tensor]]:
-    """`sampled`, some rows at a time: what is made of them stays in the processor's cache."""
+    """`sampled`, ROWS at a time, so that intermediate arrays fit in the cache."""
     (su, sv), (rx, ry), net = field.spaces, field.half_size, heights.detach().double().cpu()
     u, v = (torch.linspace(0.0, 1.0, n, dtype=torch.float64) for n in shape)
     columns = [sv.banded(v, k) / (2.0 * ry) ** k for k in range(3)]
@@ -187,7 +188,8 @@ def _steepest_incidence(scene: Scene, field: HeightField, heights: Tensor, seed:
 
 
 def _moved(scene: Scene, other: Scene, field: HeightField, heights: Tensor, seed: int, further: float) -> float:
-    """Root mean square distance on the screen, mm, between the same rays through two scenes, the second `further` mm away."""
+    """RMS distance on the screen, mm, between the landing points of the same rays in two scenes, the second screen `further` mm
+    away."""
     total = power = 0.0
     for one, two in zip(_landings(scene, field, heights, seed, 0.0), _landings(other, field, heights, seed, further), strict=True):
         weight = torch.where(two.power > 0, one.power, 0.0)
@@ -207,12 +209,12 @@ def _rays(scene: Scene, seed: int):
 
 
 def write_json(path: str | Path, figures: dict) -> None:
-    """`report.json`: the figures, beginning with who made it."""
+    """Write `report.json`: the figures, with the program's mark first."""
     write_bytes(path, (json.dumps({"created_by": SOFTWARE} | figures, indent=2, allow_nan=False) + "\n").encode())
 
 
 def rows(f: dict) -> list[tuple[str, str]]:
-    """The figures that there are, as a person reads them."""
+    """The figures as rows of a table (name, text)."""
     radius, at = f["smallest_concave_radius_mm"], f["smallest_concave_radius_at_mm"]
     concave = "nowhere concave" if radius is None else f"{radius:.4g} mm at ({at[0]:.3g}, {at[1]:.3g})"
     if "tool_radius_mm" in f:

@@ -1,15 +1,15 @@
-"""Error and time of many settings, measured against one reference in one run.
+"""Benchmark of image settings: error against a common reference, and computation time.
 
 Notation
     setting     a way to make the image: rays, filter, precision
-    reference   the mean of two float64 images of their own rays, many times more than any setting's
+    reference   the mean of two independent float64 images with many times more rays than any setting
     error       relative RMS between two images, each over its own mean (metrics.relative_rms)
 
-The two halves A and B of a reference are independent, so (A + B) / 2 is wrong by about |A - B| / 2; and its rays are
-others than a setting's, so its error adds to the setting's in quadrature and is taken off again.  They are `stratified`:
+The two halves A and B of a reference are independent, so (A + B) / 2 has an error of about |A - B| / 2; its rays are independent
+of those of a setting, so its error adds to that of the setting in quadrature and is subtracted again.  They are `stratified`:
 unbiased, with an error of order 3/4.
 
-Settings take turns, round after round, so that a machine that slows down for a while slows all of them.
+Settings are measured alternately in rounds, so that a temporary slowdown of the machine affects all of them.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Scene
 from caustic_cli.studies.metrics import relative_rms
 
-#: Rays of a reference over those of the largest setting: an error of order 3/4 falls to an eighth, so what is taken off in
-#: quadrature is a few per cent.
+#: Rays of a reference over those of the largest setting: an error of order 3/4 falls to an eighth, so the correction in quadrature
+#: is about one per cent.
 REFERENCE_FACTOR = 16
-#: Distance from a study's seed to its reference's: no number of repeats reaches it.
+#: Offset of the seed of a reference to that of its study, beyond any number of repeats.
 REFERENCE_SEED = 1_000_003
-#: Repeats of one setting on an idle machine differ by a few tenths; by more than this, something else was running.
+#: Ratio of the longest to the shortest time of a setting beyond which the machine counts as busy; a few tenths above 1 are usual.
 BUSY = 2.0
 
 
 @dataclass(frozen=True)
 class Setting:
-    """A way to make the image; `series` names the curve it belongs to, `rays` is rounded to whole cells."""
+    """Settings of an image; `series` names the curve it belongs to, `rays` is rounded to whole cells."""
 
     series: str
     sampler: str
@@ -53,16 +53,16 @@ class Setting:
 
 @dataclass(frozen=True)
 class Reference:
-    """Image (n_x, n_y), how many rays made it, and the estimate of its own error (relative RMS)."""
+    """Image (n_x, n_y), its number of rays, and the estimate of its error (relative RMS)."""
 
     image: Tensor
     rays: int
     error: float
 
     def error_of(self, image: Tensor) -> float:
-        """Relative RMS of `image` (n_x, n_y) against the truth: against this image, less this image's own error.
+        """Relative RMS error of `image` (n_x, n_y), corrected for the error of the reference.
 
-        sqrt(d^2 - error^2); 0 for an image that is closer to the reference than the truth is.
+        sqrt(d^2 - error^2) with the distance d to the reference; 0 where d < error.
         """
         return math.sqrt(max(0.0, relative_rms(image, self.image) ** 2 - self.error**2))
 
@@ -72,15 +72,15 @@ Figures = Callable[[Setting, Tensor, Tensor | None], dict[str, float | None]]
 
 
 @dataclass
-class Bench:
-    """A lens to be measured.
+class Benchmark:
+    """Measurement of settings for one lens.
 
     Args:
         scene, heightfield, heights: the lens; (n, m) mm float64, on the device to work on.
         seed: of the rays of the first round; each round takes the next one.
         repeats: rounds.
         max_rays: rays of the largest setting.
-        progress: told (rays traced, rays in all) after every image, or None.
+        progress: called with (rays traced, rays in total) after every image, or None.
     """
 
     scene: Scene
@@ -94,21 +94,21 @@ class Bench:
     total: int = field(default=0, init=False)
 
     def plan(self, settings: Sequence[Setting], filtered: int = 0) -> None:
-        """Announce all the work: the settings, a bincount reference, and so many others."""
+        """Set the total for the progress: the settings, a bincount reference, and `filtered` other references."""
         references = (1 + filtered) * REFERENCE_FACTOR * self.max_rays
         self.total = references + self.repeats * sum(s.rays for s in settings)
 
     def sampler(self, setting: Setting, seed: int) -> Rays:
-        """The rays of a setting: about as many as it asks for."""
+        """About as many rays as a setting asks for."""
         return rays_of(self.scene, setting.sampler, setting.rays, seed, self.heights.device)
 
     def image(self, setting: Setting, seed: int) -> Tensor:
-        """The image that a setting makes with the rays of `seed`: (n_x, n_y) float64, colours added up."""
+        """The image of a setting with the rays of `seed`: (n_x, n_y) float64, summed over colours."""
         found = expose(self.scene, self.heightfield, self.heights, self.sampler(setting, seed), setting.filter, setting.dtype).image
         return found.sum(0) if self.scene.colored else found
 
     def reference(self, filter: Filter) -> Reference:
-        """The image to compare with, through `filter`.
+        """The reference image, reconstructed with `filter`.
 
         Raises:
             CausticError: no light reaches the screen.
@@ -126,10 +126,10 @@ class Bench:
         return Reference(sum(images) / 2.0, 2 * self.sampler(half, 0).count, relative_rms(*images) / 2.0)
 
     def measure(self, settings: Sequence[Setting], figures: Figures) -> list[dict]:
-        """Run every setting in turn, each round with the same fresh rays for all: one row a setting.
+        """Measure all settings in rounds, each with the same fresh rays for all: one row per setting.
 
         A row holds series, sampler, rays, the figures (root mean square over the rounds; None stays None), and seconds,
-        seconds_min, seconds_max (median and extremes).  One untimed run of the smallest setting warms the machine up.
+        seconds_min, seconds_max (median and extremes).  One untimed run of the smallest setting comes first (warm-up).
         """
         found: list[list[dict]] = [[] for _ in settings]
         times: list[list[float]] = [[] for _ in settings]
@@ -159,7 +159,7 @@ class Bench:
             self.progress(self.done, self.total)
 
 
-def haste(rows: Sequence[dict]) -> str:
-    """A warning where the machine was too busy for its times, with their spread in `seconds_min` and `_max`, to mean much."""
+def busy_warning(rows: Sequence[dict]) -> str:
+    """A warning, or "", where the spread of the times in `seconds_min` and `seconds_max` shows that the machine was busy."""
     spread = statistics.median(row["seconds_max"] / row["seconds_min"] for row in rows)
     return f" (half of the times varied more than {spread:.1f}-fold: the machine was busy)" if spread > BUSY else ""

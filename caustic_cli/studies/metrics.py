@@ -1,4 +1,4 @@
-"""Figures of merit: how good an image is as a picture of its target.  NumPy, float64.
+"""Figures of merit of an image against its target.  NumPy, float64.
 
 Notation
     J, T        image and target, (n_x, n_y), power or irradiance per pixel, each on any scale
@@ -11,15 +11,15 @@ Notation
     psnr_db         10 log10(L^2 / mean((K - T)^2))
     ssim            mean of (2 m_K m_T + c_1)(2 s_KT + c_2) / ((m_K^2 + m_T^2 + c_1)(s_K^2 + s_T^2 + c_2)), local
                     means m, variances s^2 and covariance s_KT under an 11 x 11 Gaussian window; c_i = (k_i L)^2
-    in_black        sum of J where T < DARK L, over S J: of the light on the screen, what lands in the black, margins included
+    in_black        sum of J where T < DARK L, over S J: fraction of the light on the screen in black regions, margins included
 
-The noise of an image's own rays adds to every squared error.  Where V is known, the variance of each pixel's noise on the scale
-of J, the figures are without it, as of endless rays: mean(V / (S J)^2) is taken off loss^2, and the window's mean of V off s_K^2,
-which stays at least s_KT^2 / s_T^2.  Both are without bias in the squares; the ratio that SSIM is keeps some.
+The Monte-Carlo noise of an image adds to every squared error.  If its variance V per pixel is known, on the scale of J, the figures
+are corrected for it to the limit of infinitely many rays: mean(V / (S J)^2) is subtracted from loss^2, and the window's mean of V
+from s_K^2, which is kept at least s_KT^2 / s_T^2.  The squares are then unbiased; the ratio in SSIM keeps a small bias.
 
-A black image is compared as it is, all zero: its relative_rms against an even target is 1.  What has no value (the
-logarithm of no error, anything relative to a black target, light in the black of a target without any) is None, because JSON has
-neither infinity nor NaN.
+A black image is compared as all zero: its relative_rms against a uniform target is 1.  Undefined values (the logarithm of zero
+error, anything relative to a black target, light in black regions of a target without any) are None, because JSON has neither
+infinity nor NaN.
 
 Sources: thesis 5.2; Wang, Bovik, Sheikh, Simoncelli, IEEE Trans. Image Processing 13, 600 (2004) for SSIM.
 """
@@ -40,15 +40,15 @@ if TYPE_CHECKING:
 
 #: Window of Wang et al.: standard deviation and half width in pixels, and their two stabilising constants.
 SSIM_SIGMA, SSIM_RADIUS, SSIM_K1, SSIM_K2 = 1.5, 5, 0.01, 0.03
-#: Part of its peak below which a target is black.
+#: Fraction of its peak below which a target counts as black.
 DARK = 0.01
 _FIGURES = ("loss", "relative_rms", "psnr_db", "ssim")
 
 
 def loss(image, target, variance=None) -> float:
-    """Eq. 5.2.1 between image and target, (n_x, n_y) each on any scale: a part of the whole light, per pixel.
+    """Eq. 5.2.1 between image and target, (n_x, n_y) each on any scale: RMS difference per pixel, as a fraction of the total light.
 
-    variance: (n_x, n_y) of the image's noise, or None to leave it in; an error below it is 0.
+    variance: (n_x, n_y) of the noise of the image, which is corrected for, or None; an error below it is 0.
 
     Raises:
         InputError: the two differ in shape, or hold something that is not a finite number.
@@ -104,46 +104,48 @@ def ssim(image, target, variance=None) -> float | None:
 
 
 def on_target(image, target) -> float:
-    """Part of the source's power that lands where the target is not zero; `image` in parts of the source's power."""
+    """Fraction of the source's power that lands where the target is not zero; `image` as a fraction of that power per pixel."""
     image, target = _pair(image, target)
     return float(image[target > 0].sum())
 
 
 def black(target) -> np.ndarray:
-    """Where a target (n_x, n_y) is below DARK of its peak; (3, n_x, n_y) of a coloured one, each colour by its own."""
+    """Mask of black regions of a target (n_x, n_y), below DARK of its peak; of (3, n_x, n_y), for each colour separately."""
     target = _array(target)
     return target < DARK * target.max((-2, -1), keepdims=True)
 
 
 def in_black(image, target) -> float | None:
-    """Part of the light on the screen that lands where the target is `black`; (n_x, n_y), or (3, n_x, n_y) in colour.
+    """Fraction of the light on the screen that lands where the target is `black`; (n_x, n_y), or (3, n_x, n_y) in colour.
 
-    None where the target has no black, or the image no light.
+    None if the target has no black region, or the image is black.
     """
     image, dark = _array(image), black(target)
     total = image.sum()
     return float(image[dark].sum() / total) if dark.any() and total > 0 else None
 
 
-def judge(exposure: Image, target, variance=None) -> dict:
-    """The figures that `render json` and `design json` share, ready for `json.dumps(..., allow_nan=False)`.
+def figures_of_merit(exposure: Image, target, variance=None) -> dict:
+    """The figures of merit that `render json` and `design json` share, for `json.dumps(..., allow_nan=False)`.
 
     Args:
-        exposure: a traced image; eq. 5.2.1 asks for bincount reconstruction.
-        target: (n_x, n_y), any scale, or None where there is none: what compares with it is None then.
-        variance: of the noise of the image's pixels, of its shape, for figures without it; None leaves it in.
+        exposure: a traced image; eq. 5.2.1 is defined for bincount reconstruction.
+        target: (n_x, n_y), any scale, or None: figures relative to it are None then.
+        variance: of the noise of the pixels, of the shape of the image, for figures corrected for it; None for uncorrected ones.
 
     Returns:
         loss, relative_rms, psnr_db, ssim, in_black (None where undefined), on_screen, on_target, lost (name -> part of the
         source's power; with on_screen they sum to 1) and rays.
 
-    Of a coloured image, (3, n_x, n_y) like its target, the first four are means over the colours that the target has; light is in
-    the black of its own colour.
+    For a coloured image, (3, n_x, n_y) like its target, the first four are means over the colours that the target has; in_black is
+    evaluated for each colour separately.
     """
     image = exposure.image
     if image.ndim == 3 and target is not None:
         noise = [None] * len(image) if variance is None else variance
-        parts = [judge(replace(exposure, image=i), t, v) for i, t, v in zip(image, target, noise, strict=True) if t.sum() > 0]
+        parts = [
+            figures_of_merit(replace(exposure, image=i), t, v) for i, t, v in zip(image, target, noise, strict=True) if t.sum() > 0
+        ]
         means = {k: None if None in (v := [p[k] for p in parts]) else math.fsum(v) / len(v) for k in _FIGURES}
         sums = {k: math.fsum(p[k] for p in parts) for k in ("on_screen", "on_target")}
         return means | {"in_black": in_black(image, target)} | sums | {k: parts[0][k] for k in ("lost", "rays")}
@@ -173,7 +175,7 @@ def _pair(image, target) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _of_normalised(variance, image: np.ndarray) -> np.ndarray:
-    """The variance of a normalised image's noise; zero where none is known or the image is black."""
+    """Variance of the noise of the normalised image; zero if unknown or if the image is black."""
     total = image.sum()
     return np.zeros_like(image) if variance is None or not total > 0 else _array(variance) / total**2
 

@@ -1,6 +1,6 @@
-"""A study's result as a table (CSV), as data (JSON) and as plots (PNG): `<study>.csv`, `.json`, `.png`.
+"""Output of a study as a table (CSV), as data (JSON) and as plots (PNG): `<study>.csv`, `.json`, `.png`.
 
-A study may bring plots of its own: each has an ending that follows the study's name, "" or "-pareto".
+A study may define its own plots; the file name of each is that of the study and a suffix, "" or "-pareto".
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.io.files import SOFTWARE, atomic_path, refuse_foreign, write_bytes
 from caustic_cli.studies.fit import Order, pareto
 
-#: Colours of Okabe and Ito, told apart by every kind of colour vision, and a marker of its own for each curve.
+#: Colours, the first of them of Okabe and Ito, distinguishable with all kinds of colour vision; and a marker for each curve.
 COLOURS = (
     "#0072B2",
     "#D55E00",
@@ -38,16 +38,16 @@ COLOURS = (
 )
 MARKERS = "osD^vP<>Xph*"
 
-#: How much wider a picture is that has its legend beside it.
+#: Factor by which a figure is widened for a legend beside it.
 BESIDE = 1.3
 
-#: Part by which a slower setting has to lower the error to be on the front, and by which it has to be slower to count as such.
+#: Relative reduction of the error for a slower setting to be on the Pareto front; relative difference of times that count as equal.
 GAIN, ALIKE = 0.02, 0.1
 
 
 @dataclass(frozen=True)
 class Study:
-    """What a study found.
+    """Result of a study.
 
     Args:
         name: of the study.
@@ -57,9 +57,9 @@ class Study:
         orders: fitted order in `against` of every curve, None where it could not be fitted;
             `about["orders_of"]` names the column where the curves are the series.
         advice: one sentence.
-        about: how it was made: seed, repeats, device, the reference and its own error, ...
-        against: what the orders are fitted in.
-        plots: the ending of every picture's name -> what draws it.
+        about: metadata: seed, repeats, device, the reference and its error, ...
+        against: column that the orders are fitted in.
+        plots: suffix of the file name -> function that draws the plot.
     """
 
     name: str
@@ -84,9 +84,9 @@ def paths_of(name: str, directory: str | Path, plots: dict[str, Drawing] | None 
 
 
 def refuse_foreign_files(paths: list[Path], force: bool = False) -> None:
-    """Stop before work begins where one of `paths_of` cannot be written or would replace what this program did not make.
+    """Refuse before work begins if one of `paths_of` cannot be written or would replace a file not made by this program.
 
-    A CSV has no room for our mark: it is ours if the JSON beside it is.
+    A CSV cannot carry the mark of the program: it counts as its own if the JSON beside it does.
 
     Raises:
         InputError: naming the file.
@@ -109,7 +109,7 @@ def write(study: Study, directory: str | Path) -> list[Path]:
     except OSError as error:
         raise InputError(f"{directory}: cannot be made ({error.strerror}); a directory you may write to is needed") from error
     paths = paths_of(study.name, directory, study.plots)
-    write_bytes(paths[1], as_json(study).encode())  # first: where the rest cannot be written, it says that the table is ours
+    write_bytes(paths[1], as_json(study).encode())  # first, since it identifies the table as made by this program
     write_bytes(paths[0], as_csv(study).encode())
     for path, draw in zip(paths[2:], study.plots.values(), strict=True):
         plot(study, path, draw)
@@ -126,14 +126,14 @@ def as_csv(study: Study) -> str:
 
 
 def as_json(study: Study) -> str:
-    """Everything, one object that begins with who made it; there is neither infinity nor NaN in it."""
+    """The whole study as one JSON object that begins with the program's mark, without infinity or NaN."""
     data = {f.name: getattr(study, f.name) for f in fields(study) if f.name != "plots"}
     data["orders"] = {name: None if found is None else vars(found) for name, found in study.orders.items()}
     return json.dumps({"created_by": SOFTWARE} | data, indent=2, allow_nan=False) + "\n"
 
 
 def plot(study: Study, path: str | Path, draw: Drawing | None = None) -> None:
-    """Write one picture of a study, by default error against time."""
+    """Write one plot of a study, by default error against time."""
     figure = Figure(figsize=(7.2, 5.2), dpi=150, layout="constrained")
     (draw or draw_error_and_time)(study, figure)
     with atomic_path(path) as temporary:
@@ -141,7 +141,7 @@ def plot(study: Study, path: str | Path, draw: Drawing | None = None) -> None:
 
 
 def draw_error_and_time(study: Study, figure: Figure) -> None:
-    """Error against time, one curve a series, the Pareto front ringed and joined."""
+    """Error against time, one curve per series, and the Pareto front."""
     axes = figure.add_subplot()
     draw_front(axes, study)
     if study.about["reference_error"] > 0:
@@ -155,7 +155,7 @@ def draw_error_and_time(study: Study, figure: Figure) -> None:
 
 
 def legend_beside(figure: Figure) -> None:
-    """What the curves are, to the right of them, where it covers no data."""
+    """Place the legend to the right of the axes."""
     figure.set_size_inches(BESIDE * figure.get_figwidth(), figure.get_figheight())
     figure.legend(loc="outside right upper", fontsize="small")
 
@@ -163,7 +163,7 @@ def legend_beside(figure: Figure) -> None:
 def draw_front(axes: Axes, study: Study) -> None:
     """The curves of error against time on logarithmic axes, with bars where a row knows its spread, and the Pareto front.
 
-    An error or a time of exactly 0 has no place on such axes and is left out.
+    Errors and times of exactly 0 are left out.
     """
     axes.set(xscale="log", yscale="log")
     rows = [row for row in study.rows if row["error"] > 0 and row["seconds"] > 0]
@@ -192,7 +192,7 @@ def draw_front(axes: Axes, study: Study) -> None:
 
 
 def plain_ticks(axis: Axis) -> None:
-    """Plain numbers at 1, 2 and 5 on a logarithmic axis that spans less than three decades, once everything is drawn on it."""
+    """Decimal tick labels at 1, 2 and 5 on a logarithmic axis of less than three decades; to be called after plotting."""
     low, high = axis.get_view_interval()
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 1000.0 * low else (1.0,)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
@@ -200,7 +200,7 @@ def plain_ticks(axis: Axis) -> None:
 
 
 def styles(series: Iterable[str]) -> dict[str, dict]:
-    """How the curve of each series looks, as options of `Axes.errorbar`."""
+    """Line style of each series, as options of `Axes.errorbar`."""
     return {
         name: {
             "linewidth": 1,
@@ -214,11 +214,11 @@ def styles(series: Iterable[str]) -> dict[str, dict]:
 
 
 def spread(rows: list[dict]) -> list[list[float]] | None:
-    """How far the least and the most time of every row lie from its median, s; None where rows have none."""
+    """Distances of the shortest and longest time of every row from the median, s, for error bars; None without such columns."""
     if not rows or "seconds_min" not in rows[0]:
         return None
     return [[row["seconds"] - row["seconds_min"] for row in rows], [row["seconds_max"] - row["seconds"] for row in rows]]
 
 
-#: The one picture of a study that brings none of its own.
+#: Plot of a study that defines none.
 PLOTS: dict[str, Drawing] = {"": draw_error_and_time}

@@ -1,4 +1,4 @@
-"""The decision on a lens: an independent retrace by bincount, with rays no optimiser has seen."""
+"""Validation of a lens: an independent bincount retrace with rays that were not used in the optimisation."""
 
 from __future__ import annotations
 
@@ -20,51 +20,51 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Scene
 from caustic_cli.studies.irradiance import irradiance_figures, unit_figures
-from caustic_cli.studies.metrics import judge
-from caustic_cli.studies.noise import black_error, image_noise, lift, standard_error, variance_of
+from caustic_cli.studies.metrics import figures_of_merit
+from caustic_cli.studies.noise import black_error, image_noise, noise_bias, standard_error, variance_of
 
-#: Rays of the retrace that ends a design.
+#: Rays of the final retrace of a design.
 FINAL_RAYS = 4_000_000
-#: Pixels that these are enough for where nothing but their number lowers the noise, and the most times more of them.
+#: Pixels for which these suffice where the noise is not corrected for, and the largest factor for more pixels.
 FINAL_PIXELS, MOST_FINAL = 250 * 250, 16
-#: Part of relative_rms that its noise may be, where nothing is said about rays.
-QUIET = 0.1
-#: Independent images whose scatter tells their mean's noise: over thousands of pixels four are plenty.
+#: Default largest noise of relative_rms, as a fraction of it.
+RELATIVE_NOISE = 0.1
+#: Independent images whose variance estimates the noise of their mean: four suffice over thousands of pixels.
 BATCHES = 4
-#: So many times the rays asked for may be traced to bring the noise of a figure down.
+#: Largest factor by which the number of rays is increased to reduce the noise of a figure.
 MOST_TIMES = 4
-#: Orders of the noise: of stratified rays on two dimensions; of Sobol's on the four of a disc, measured.
+#: Orders of convergence of the noise: of stratified rays in two dimensions; of a Sobol sequence in the four of a disc, measured.
 ORDER, SOBOL_ORDER = 0.75, 0.58
-#: A plane wave's noise is told by two images of one PROBE-th of its rays each.
+#: The noise of a plane wave is estimated from two images with 1 / PROBE of its rays each.
 PROBE = 8
-#: By how much the account of the light may miss, by the precision of the rays: the rounding of their sums.
-ACCOUNT = {torch.float64: 1e-9, torch.float32: 1e-3}
-#: Most rays that tolerance may ask for in one go.
+#: Tolerance of the energy balance by the precision of the rays: rounding of sums.
+BALANCE = {torch.float64: 1e-9, torch.float32: 1e-3}
+#: Most rays of one image for a tolerance.
 MOST_RAYS = 10**11
 
 
 def sampler_for(scene: Scene, rays: int, seed: int, device: str = "cpu") -> Rays:
-    """About `rays` rays of the scene's source, unrelated to those of any design."""
+    """About `rays` rays of the scene's source, independent of those of any design."""
     return _rays(scene, rays, stream(seed, "render"), device)
 
 
 def _rays(scene: Scene, rays: int, seed: int, device: str) -> Rays:
-    """Stratified rays of a plane wave, whose two dimensions strata fill evenly; of other light, up to four dimensions, Sobol's."""
+    """Stratified rays of a plane wave (two dimensions); a Sobol sequence for other sources (up to four dimensions)."""
     even = scene.source.collimated or rays > SOBOL_RAYS // 2
     return rays_of(scene, "stratified" if even else "sobol", rays, seed, device)
 
 
 def _available(scene: Scene) -> int:
-    """Rays that the smallest of the scene's ray files holds; more than can be asked for where there is none."""
+    """Number of rays in the smallest ray file of the scene; more than the largest request without one."""
     return min((one.rays.count for one in scene.source.members if one.rays is not None), default=BATCHES * MOST_RAYS)
 
 
 @dataclass(frozen=True)
 class Converged:
-    """An image traced until its noise was low enough.
+    """An image traced to a noise tolerance.
 
-    exposure: the mean of BATCHES independent ones, and halves, the means of one half of them and the other; error: estimated
-    relative RMS of that mean's noise, from their variance; traced: rays spent in all, those of the attempts before it included.
+    exposure: the mean of BATCHES independent images; halves: the means of the first and the second half of them; error: estimated
+    relative RMS noise of the mean, from their variance; traced: total number of rays, including earlier attempts.
     """
 
     exposure: Image
@@ -87,8 +87,8 @@ def converge(
 ) -> Converged:
     """Trace BATCHES independent sets of rays, about `rays` in all, then more until the noise is at most `tolerance`.
 
-    The relative RMS noise of the mean of B images J_k is sqrt(mean over pixels of var(J_k) / B) / mean(J).  Rays that converge with
-    order p are n (e / tolerance)^(1 / p) after n that leave an error e.
+    The relative RMS noise of the mean of B images J_k is sqrt(mean over pixels of var(J_k) / B) / mean(J).  With order of
+    convergence p and the error e of n rays, the number of rays required is n (e / tolerance)^(1 / p).
 
     Raises:
         CausticError: MOST_RAYS or those of a file are not enough, or no light reaches the screen.
@@ -97,9 +97,9 @@ def converge(
     available, lights = _available(scene), [scene.part(k, BATCHES) for k in range(BATCHES)]
     while True:
         if each * BATCHES > available:
-            raise CausticError(f"⟨tolerance⟩ {tolerance:g} asks for more rays than the file holds, {available:,}")
+            raise CausticError(f"⟨tolerance⟩ {tolerance:g} requires more rays than the file holds, {available:,}")
         parts = [
-            within_source(
+            limited_to_source(
                 expose(
                     light,
                     field,
@@ -122,18 +122,18 @@ def converge(
             halves = mean_of(parts[: BATCHES // 2]), mean_of(parts[BATCHES // 2 :])
             return Converged(mean_of(parts), halves, error, traced)
         more = max(1.3, 1.1 * (error / tolerance) ** (1.0 / order))
-        foreseen = each * more if each > mean.numel() else 0.0  # too few rays a pixel foretell nothing
+        foreseen = each * more if each > mean.numel() else 0.0  # no extrapolation from less than one ray per pixel
         each = int(each * min(32.0, more))
         if max(each, foreseen) * BATCHES > MOST_RAYS:
             raise CausticError(
-                f"⟨tolerance⟩ {tolerance:g} asks for more than {MOST_RAYS:.0e} rays: {traced:,} left an estimated"
+                f"⟨tolerance⟩ {tolerance:g} requires more than {MOST_RAYS:.0e} rays: {traced:,} left an estimated"
                 f" error of {error:.2g}; fewer pixels or a larger tolerance need fewer"
             )
 
 
-def within_source(image: Image) -> Image:
-    """An image of no more light than the source has: few rays aimed at the lens may estimate a little more than all of it, and then
-    what they carry is scaled to all of it."""
+def limited_to_source(image: Image) -> Image:
+    """The image, scaled to the power of the source if it exceeds that: a Monte-Carlo estimate from few rays aimed at the lens may
+    do so slightly."""
     missed = image.lost.get("missed_lens", 0.0)
     if missed >= 0.0:
         return image
@@ -143,7 +143,7 @@ def within_source(image: Image) -> Image:
 
 
 def mean_of(parts: list[Image]) -> Image:
-    """The image that several of as many rays each make together."""
+    """The mean of several images with the same number of rays each."""
     lost = {name: math.fsum(p.lost[name] for p in parts) / len(parts) for name in parts[0].lost}
     leaving = math.fsum(p.leaving for p in parts) / len(parts)
     return Image(torch.stack([p.image for p in parts]).mean(0), leaving, lost, sum(p.rays for p in parts))
@@ -165,15 +165,15 @@ def retrace(
     noise: bool = True,
     quiet: float | None = None,
 ) -> tuple[Image, dict]:
-    """Trace a lens with rays of its own; with `tolerance`, as many as that asks for (`converge`).  requests: of a plan.
+    """Trace a lens with independent rays; with `tolerance`, as many as it requires (`converge`).  requests: of a plan.
 
-    A plane wave's stratified rays leave little noise, which its figures hold.  All other light, and with `tolerance` that too, is
-    traced in independent halves, from which the figures are without noise (`studies.noise`).
+    Stratified rays of a plane wave have little noise, which is not corrected for.  Other light, and all light with `tolerance`, is
+    traced in two independent halves, from which the figures are corrected for noise (`studies.noise`).
 
     Args:
-        noise: say what the noise is; a plane wave needs a quarter more rays for that.
-        quiet: part of relative_rms that its noise may be: until then other light than a plane wave's gets more rays, up to
-            MOST_TIMES as many.
+        noise: estimate the noise; for a plane wave this takes a quarter more rays.
+        quiet: largest noise of relative_rms as a fraction of it: for light other than a plane wave, the number of rays is increased
+            until it is reached, by a factor of at most MOST_TIMES.
 
     Returns:
         the exposure, reconstructed by `filter` (bincount unless given), and the figures of the JSON table, always by bincount,
@@ -184,16 +184,18 @@ def retrace(
 
     def trace(name: str, count: int, light: Scene = scene) -> Image:
         sampler = _rays(light, max(1, count), stream(seed, name), device)
-        return within_source(expose(light, field, heights, sampler, None, dtype, requests=requests))
+        return limited_to_source(expose(light, field, heights, sampler, None, dtype, requests=requests))
 
     even = scene.source.collimated
     if tolerance is not None:
         found = converge(scene, field, heights, tolerance, rays=rays, seed=seed, device=device, dtype=dtype, requests=requests)
         counted = found.exposure
-        figures = _judged_halves(counted, target, found.halves) | {"error_estimate": found.error, "rays_traced": found.traced}
+        figures = _figures_of_halves(counted, target, found.halves) | {"error_estimate": found.error, "rays_traced": found.traced}
     elif even:
         counted = trace("render", rays)
-        figures = _judged_even(counted, target, tuple(trace(f"noise {k}", rays // PROBE) for k in (0, 1)) if noise else None)
+        figures = _figures_of_stratified(
+            counted, target, tuple(trace(f"noise {k}", rays // PROBE) for k in (0, 1)) if noise else None
+        )
     else:
         parts: tuple[list[Image], list[Image]] = [], []
         lights = [scene.part(k, 2) for k in (0, 1)]
@@ -203,43 +205,43 @@ def retrace(
                     part.append(trace(f"{name} {k}" if k else name, rays // 2, light))
             halves = mean_of(parts[0]), mean_of(parts[1])
             counted = mean_of(list(halves))
-            figures = _judged_halves(counted, target, halves)
+            figures = _figures_of_halves(counted, target, halves)
             enough = quiet is None or target is None or figures["noise"] <= quiet * figures["relative_rms"]
             if enough or 2 * len(parts[0]) > MOST_TIMES or rays * len(parts[0]) >= _available(scene):
                 break
-    require_account(figures, dtype)
+    require_energy_balance(figures, dtype)
     figures |= irradiance_figures(scene, counted.image) | unit_figures(scene)
     if filter is None or filter.reach == (0, 0):
         return counted, figures
     sampler = sampler_for(scene, counted.rays, seed, device)
-    return within_source(expose(scene, field, heights, sampler, filter, dtype, requests=requests)), figures
+    return limited_to_source(expose(scene, field, heights, sampler, filter, dtype, requests=requests)), figures
 
 
-def judging_rays(scene: Scene, usual: int = FINAL_RAYS) -> int:
-    """Rays that judge a finished design: of a plane wave, whose figures hold their noise, as many a pixel whatever their number."""
+def evaluation_rays(scene: Scene, usual: int = FINAL_RAYS) -> int:
+    """Rays of the evaluation of a design: for a plane wave, whose noise is not corrected for, in proportion to the pixels."""
     times = math.prod(scene.screen.resolution) / FINAL_PIXELS if scene.source.collimated else 1.0
     return round(usual * min(max(1.0, times), MOST_FINAL))
 
 
-def require_account(figures: dict, dtype: torch.dtype) -> None:
-    """Stop where the account of the light is impossible: a part outside [0, 1], or a sum that is not 1.
+def require_energy_balance(figures: dict, dtype: torch.dtype) -> None:
+    """Check the energy balance: all fractions are in [0, 1], and their sum is 1, within BALANCE.
 
     Raises:
-        CausticError: naming the parts.
+        CausticError: naming the fractions.
     """
     parts = {"on_screen": figures["on_screen"], **figures["lost"]}
-    room = ACCOUNT[dtype]
+    room = BALANCE[dtype]
     if abs(math.fsum(parts.values()) - 1.0) <= room and all(-room <= part <= 1.0 + room for part in parts.values()):
         return
     listed = ", ".join(f"{name} {part:.6g}" for name, part in parts.items())
-    raise CausticError(f"the account of the light does not close, so nothing is written: {listed}")
+    raise CausticError(f"the energy balance of the light does not close, so nothing is written: {listed}")
 
 
-def _judged_halves(counted: Image, target: np.ndarray | None, halves: tuple[Image, Image]) -> dict:
-    """Figures of the mean of two halves, without its noise."""
+def _figures_of_halves(counted: Image, target: np.ndarray | None, halves: tuple[Image, Image]) -> dict:
+    """Figures of the mean of two halves, corrected for noise."""
     pair = [h.image.cpu().numpy() for h in halves]
     variance = variance_of(*pair)
-    figures = judge(counted, target, variance)
+    figures = figures_of_merit(counted, target, variance)
     noise = None if target is None else standard_error(*pair, target, figures["relative_rms"])
     dark = None if target is None else black_error(*pair, target, figures["in_black"])
     return figures | {
@@ -249,27 +251,29 @@ def _judged_halves(counted: Image, target: np.ndarray | None, halves: tuple[Imag
     }
 
 
-def _judged_even(counted: Image, target: np.ndarray | None, fewer: tuple[Image, Image] | None) -> dict:
-    """Figures of an image as it is.
+def _figures_of_stratified(counted: Image, target: np.ndarray | None, fewer: tuple[Image, Image] | None) -> dict:
+    """Figures of an image of stratified rays, without correction for noise.
 
-    fewer: two others, from whose noise its own follows, or None: stratified rays on two dimensions converge with order 3/4.
+    fewer: two images with fewer rays, from which the noise is extrapolated with order 3/4 in two dimensions, or None.
     """
-    figures = judge(counted, target) | {"noise": None, "in_black_noise": None, "error_estimate": None}
+    figures = figures_of_merit(counted, target) | {"noise": None, "in_black_noise": None, "error_estimate": None}
     if fewer is None:
         return figures
     pair = [f.image.cpu().numpy() for f in fewer]
     image, falls = counted.image.cpu().numpy(), (sum(f.rays for f in fewer) / 2.0 / counted.rays) ** ORDER
     error = image_noise(2.0 * variance_of(*pair) * falls**2, image)
     if target is not None and error is not None:
-        own = standard_error(*pair, target, figures["relative_rms"]) * math.sqrt(2.0) * falls  # of one image, not of both's mean
-        figures["noise"] = math.hypot(lift(figures["relative_rms"], error), own)
+        own = (
+            standard_error(*pair, target, figures["relative_rms"]) * math.sqrt(2.0) * falls
+        )  # of one image, not of the mean of two
+        figures["noise"] = math.hypot(noise_bias(figures["relative_rms"], error), own)
         dark = black_error(*pair, target, figures["in_black"])
         figures["in_black_noise"] = None if dark is None else dark * math.sqrt(2.0) * falls
     return figures | {"error_estimate": error}
 
 
 def white_level(image: np.ndarray, target: np.ndarray | None) -> float:
-    """The irradiance drawn white: the target's maximum at the image's power, so both are exposed alike; without one the image's."""
+    """Irradiance displayed as white: the maximum of the target at the power of the image, for equal exposure; else of the image."""
     if target is None:
         return float(image.max()) or 1.0
     return float(target.max() / target.sum() * image.sum())

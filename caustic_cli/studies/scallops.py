@@ -1,18 +1,18 @@
-"""What the scallops of a ball-nose tool do to the light of a lens.
+"""Optical effect of the scallops left by a ball-nose tool: blur of rays, and scattering by diffraction.
 
 Notation
     R, s        radius of the tool and distance of its passes, mm
     h           s^2 / (8 R), height of a scallop on a flat surface
-    g           s / (2 R) = sqrt(2 h / R), slope at the cusps; between two of them slopes are even from -g to g
+    g           s / (2 R) = sqrt(2 h / R), slope at the cusps; slopes are uniformly distributed from -g to g
     n, T        refractive index (-1 for a mirror) and throw, mm
     lambda      wavelength, mm
 
-Each scallop is a small lens: rays spread over a width b = 2 |n - 1| g T = |n - 1| T s / R across the passes, however fine they are.
-Light as a wave sees a grating of period s and depth h instead: orders lambda T / s apart on the screen, within the same b, and the
-part of the light that leaves the undisturbed order is that of a phase whose standard deviation is 2 pi |n - 1| sigma / lambda,
-sigma = h / sqrt(11.25) of a parabola: 1 - exp(-phi^2) where the heights are Gaussian, and for small ones.  So rays ask for slopes
-below a pixel's, and waves, where the orders do not fall upon one another, for a depth far below a wavelength: the latter is reached
-first.
+In geometrical optics each scallop is a small cylindrical lens: rays spread over a width b = 2 |n - 1| g T = |n - 1| T s / R across
+the passes.  In wave optics the scallops are a phase grating of period s and depth h: orders lambda T / s apart on the screen,
+within the same b, and the fraction of the light scattered out of the zeroth order is 1 - exp(-phi^2) for Gaussian or small phases,
+with the standard deviation phi = 2 pi |n - 1| sigma / lambda and sigma = h / sqrt(11.25) of a parabola.  So rays require slopes
+that displace light by less than a pixel, and waves, where the orders are resolved, a depth far below a wavelength; with decreasing
+step-over the latter is reached first.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from caustic_cli.scene import Scene
 
 #: Standard deviation of a parabola's heights in parts of its depth: sqrt(4 / 45).
 PARABOLA = math.sqrt(4.0 / 45.0)
-#: The blur, in pixels, and the part of light scattered that a step-over is said for.
+#: Blur, pixels, and fraction of light scattered for which a step-over is given.
 PIXELS, SCATTERED = 0.5, 0.01
 
 
 def scallops(scene: Scene, step: float, radius: float) -> dict:
     """Figures for JSON, of a step-over s and a tool of radius R, mm.
 
-    Keys: blur_mm and blur_pixels, of rays; scattered, the part of light as a wave that leaves its way, at wavelength_nm;
+    Keys: blur_mm and blur_pixels, of rays; scattered, the fraction of light scattered by diffraction, at wavelength_nm;
     step_over_of_half_a_pixel_mm and scallop_of_half_a_pixel_mm, for which rays blur by half a pixel; step_over_of_waves_mm and
     scallop_of_waves_mm, for which a hundredth of the light is scattered.
     """
@@ -57,7 +57,7 @@ def scallops(scene: Scene, step: float, radius: float) -> dict:
 
 
 def rows(f: dict) -> list[tuple[str, str]]:
-    """A program's figures as a person reads them."""
+    """The figures of a machining program as rows of a table (name, text)."""
     return [
         ("program", f"{f['lines']:,} lines, {f['length_mm']:,.0f} mm of cut, about {_time(f['minutes'])}"),
         (

@@ -1,4 +1,4 @@
-"""What errors of making and placing do to a picture: the sensitivity to each, and a Monte-Carlo over all of them.
+"""Tolerance analysis: sensitivity to manufacturing and alignment errors, and Monte-Carlo simulation of all of them.
 
 Notation
     t           target over its own mean
@@ -6,24 +6,24 @@ Notation
     F           relative RMS error, F^2 = mean((m - t)^2); F_0 of the lens without errors
     s_k         standard deviation of parameter k
     g_k         derivative of m by it, from the images at +s_k and -s_k: (m_+ - m_-) / (2 s_k)
-    c_k         what it adds, in squares: c_k^2 = (F_+^2 + F_-^2) / 2 - F_0^2
+    c_k         its contribution, in quadrature: c_k^2 = (F_+^2 + F_-^2) / 2 - F_0^2
 
-To second order F^2 is F_0^2 + 2 d <m_0 - t, g> + d^2 (|g|^2 + <m_0 - t, m''>) at an error d, whose term of first order has no mean;
-so the mean of F^2 over all draws is about F_0^2 plus all c_k^2.  c_k holds both parts of the second order.
+To second order F^2 is F_0^2 + 2 d <m_0 - t, g> + d^2 (|g|^2 + <m_0 - t, m''>) at an error d, whose first-order
+term has zero mean; so the mean of F^2 over all draws is about F_0^2 plus the sum of c_k^2, which contain both second-order terms.
 
 Draws of the parameters are a Latin hypercube: of each parameter, one in every one of as many equal parts of probability; the mean
-of F^2, nearly a sum over parameters, is then told far more exactly than by independent draws.  Every draw traces the same points of
-the lens.
+of F^2, nearly a sum over parameters, then has a much smaller variance than with independent draws.  Every draw traces the same
+points of the lens (common random numbers).
 
 Images are those of two independent halves of the rays, A and B, whose noise drops out of F^2 = mean((a - t) (b - t))
-(`studies.noise`).  Of a lens that was refined on its wave image, the light that moves is that of the wave image: light at q goes
-to q + u(q), with u the mean displacement of the rays that land near q.  Errors of the surface change what interferes, so that each
-of a few realisations of them has its wave image, which the other errors then move.  Those bend the phase only a little over the
-width of a detail; by how much the image of the 95 % draw is then wrong is measured by its own wave image, as far as index,
-thickness, throw and source go, and said.
+(`studies.noise`).  For a lens refined on its wave image, the wave image is warped instead: light at q moves to q + u(q), with u the
+mean displacement of the rays that land near q.  Surface errors change the interference, so each of a few realisations of them has
+its own wave image, which is warped by the other errors.  These change the phase only slightly over the width of a detail; the error
+of this approximation is measured for the draw at the 95th percentile with its own wave image, as far as index, thickness, throw and
+source are concerned.
 
-A decentred or tilted lens moves the picture as a whole, which a screen may be moved after: F is told as placed, and also after the
-shift of the screen that suits each draw best.
+A decentred or tilted lens displaces the picture as a whole, which a shift of the screen can compensate: F is given as placed, and
+also after the best shift of the screen for each draw (compensator).
 """
 
 from __future__ import annotations
@@ -56,40 +56,40 @@ from caustic_cli.scene import Scene
 from caustic_cli.scene.tolerances import Parameter, Tolerances, hypercube
 from caustic_cli.studies.noise import standard_error
 
-#: Rays of a draw, both halves together.
+#: Rays of a draw, both halves included.
 RAYS = 200_000
-#: Realisations of a random surface by which its contribution is told.
+#: Realisations of a random surface error for its contribution.
 REALISATIONS = 4
-#: Number of the first of those realisations: beyond all draws.
+#: Number of the first of those realisations, beyond all draws.
 ALONE = 10**6
-#: Realisations of the surface's errors that have a wave image; draws take them in turn.
+#: Realisations of the surface errors with a wave image, which the draws use cyclically.
 REALISED = 8
-#: Errors that a wave image of its own can have.
+#: Errors that can be included in the computation of a wave image.
 WAVED = ("index", "thickness", "throw", "source_shift", "source_distance", "source_size")
-#: Part of the draws that count as the worst.
+#: Fraction of the draws that count as the worst.
 WORST = 0.05
-#: Resamplings for the standard error of a percentile.
+#: Bootstrap samples for the standard error of a percentile.
 RESAMPLED = 400
-#: Steps of the fixed point by which light is traced back to where the wave image has it.
+#: Fixed-point iterations of the inverse displacement.
 BACK = 4
-#: Pixels that its displacement is averaged over, at least.
+#: Least width, pixels, of the average of displacements.
 NEAR = 1.5
-#: Part of the rays that are enough for displacements, which are smooth.
+#: Factor by which fewer rays suffice for displacements, which are smooth.
 FEWER = 5
-#: Light, of its mean over all pixels, that is enough to tell its displacement.
+#: Least irradiance over its mean for which a displacement is estimated.
 LIT = 1e-3
-#: So many times the rays of a draw judge the lens without errors, whose error is the smallest.
+#: Factor by which more rays are used for the lens without errors.
 NOMINAL = 8
-#: Slope of the exit, uniform over the lens, by which the effect of its roughness is told.
+#: Uniform slope of the exit, a finite-difference step for the effect of roughness.
 LEAN = 1e-5
 
 Values = dict[tuple[str, int], float]
 
 
 @dataclass(frozen=True)
-class Judged:
-    """A draw's figures: relative_rms as placed; shifted, after the best shift (x, y) mm of the screen; on_target, on_screen, parts
-    of the source's power; noise, standard error of relative_rms, of its rays."""
+class TrialFigures:
+    """Figures of a draw: relative_rms as placed; shifted, after the best shift (x, y) mm of the screen; on_target, on_screen,
+    fractions of the source's power; noise, standard error of relative_rms."""
 
     relative_rms: float
     shifted: float
@@ -100,14 +100,14 @@ class Judged:
 
 
 class Trials:
-    """A lens whose picture is judged under given errors.
+    """Evaluation of a lens under given errors.
 
     Args:
-        scene, field, heights: the lens; of a plan, with `requests`.
+        scene, field, heights, requests: of a plan; heights (n, m) mm.
         target: (n_x, n_y) or, of a coloured scene, (3, n_x, n_y).
-        tolerances: what may be off.
-        waves: what gives the wave image of heights in a scene, of the target's shape; None to judge by rays.
-        near: pixels over which displacements are averaged there.
+        tolerances: distributions of the errors.
+        waves: function that returns the wave image of heights in a scene, of the target's shape; None for ray images.
+        near: pixels over which displacements are averaged for wave images.
     """
 
     def __init__(
@@ -136,14 +136,15 @@ class Trials:
             self.begin = self._rays(Misalignment(), self.heights, 0)
             self.power = sum(float(part.power.sum()) for part in self.begin)
 
-    def judge(self, values: Values, number: int | None = None, which: tuple[str, ...] | None = None) -> Judged:
-        """Figures under errors by (name, axis), and the surface's errors of that realisation, all of them or just `which`."""
-        return self.judged(*self.images(values, number, which))
+    def evaluate(self, values: Values, number: int | None = None, which: tuple[str, ...] | None = None) -> TrialFigures:
+        """Figures under errors by (name, axis), and a realisation of the surface errors, all of them or only `which`."""
+        return self.figures_of(*self.images(values, number, which))
 
     def images(
         self, values: Values, number: int | None = None, which: tuple[str, ...] | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The two halves' images, (colours, n_x, n_y) each, parts of the source's power on the pixels; twice the same of waves."""
+        """Images of the two halves of the rays, (colours, n_x, n_y) each, fractions of the source's power; twice the same for
+        waves."""
         errors, which = Misalignment.of(values), self.tolerances.surface if which is None else which
         which = which if number is not None else ()
         if self.waves is None:
@@ -158,17 +159,17 @@ class Trials:
             pair = [np.stack([gaussian_filter(c, width, mode="constant") for c in one]) for one in pair]
         return pair[0], pair[1]
 
-    def nominal(self) -> Judged:
-        """Figures without errors; by rays, of NOMINAL times as many."""
+    def nominal(self) -> TrialFigures:
+        """Figures without errors; with NOMINAL times as many rays for ray images."""
         if self.waves is not None:
-            return self.judge({})
+            return self.evaluate({})
         pairs = [[self._image(self._rays(Misalignment(), self.heights, 2 * k + half)) for k in range(NOMINAL)] for half in (0, 1)]
-        return self.judged(np.mean(pairs[0], 0), np.mean(pairs[1], 0))
+        return self.figures_of(np.mean(pairs[0], 0), np.mean(pairs[1], 0))
 
-    def by_waves(self, values: Values, number: int | None) -> tuple[Judged, Judged]:
-        """Figures under the errors of `values` that are of index, thickness, throw and source.
+    def by_waves(self, values: Values, number: int | None) -> tuple[TrialFigures, TrialFigures]:
+        """Figures under the errors of `values` that are of index, thickness, throw and source (WAVED).
 
-        By the light of the wave image moved as rays are, and by their own wave image.
+        By the warped nominal wave image, and by the wave image with these errors.
         """
         assert self.waves is not None
         kept = {key: v for key, v in values.items() if key[0] in WAVED}
@@ -177,13 +178,13 @@ class Trials:
         scene = replace(scene, screen=replace(scene.screen, z=scene.screen.z + errors.throw))
         surface = self.surface(number % REALISED, which) if which and number is not None else 0.0
         own = self._coloured(self.waves(scene, self.field, self.heights + errors.thickness + surface))
-        return self.judge(kept, number), self.judged(own, own)
+        return self.evaluate(kept, number), self.figures_of(own, own)
 
     def _coloured(self, image: np.ndarray) -> np.ndarray:
         return image if image.ndim == 3 else image[None]
 
     def _wave_image(self, number: int, which: tuple[str, ...]) -> list[np.ndarray]:
-        """Spline coefficients of the wave image, colour by colour, of a realisation of the surface's errors."""
+        """Cubic spline coefficients of the wave image of a realisation of the surface errors, per colour."""
         assert self.waves is not None
         if (number, which) not in self.smooth:
             heights = self.heights + self.surface(number, which) if which else self.heights
@@ -191,7 +192,7 @@ class Trials:
             self.smooth[number, which] = [spline_filter(c, order=3) for c in found]
         return self.smooth[number, which]
 
-    def judged(self, one: np.ndarray, other: np.ndarray) -> Judged:
+    def figures_of(self, one: np.ndarray, other: np.ndarray) -> TrialFigures:
         """Figures of an image, from two halves of it."""
         squares, best, lit = [], [], [k for k, t in enumerate(self.target) if t.sum() > 0]
         together = 0.5 * (one + other)
@@ -205,12 +206,12 @@ class Trials:
                 noise += standard_error(one[k], other[k], self.target[k], math.sqrt(max(0.0, squares[-1]))) / len(lit)
         shift = tuple(float(np.mean([s[axis] for _, s in best]) * self.scene.screen.pixel[axis]) for axis in (0, 1))
         error, shifted = (float(np.mean(np.sqrt(np.maximum(0.0, s)))) for s in (squares, [s for s, _ in best]))
-        return Judged(
+        return TrialFigures(
             error, min(error, shifted), (shift[0], shift[1]), float(together[self.target > 0].sum()), float(together.sum()), noise
         )
 
     def surface(self, number: int, which: tuple[str, ...]) -> Tensor:
-        """The realisation of those errors of the surface, control heights (n, m) mm."""
+        """A realisation of these surface errors as control heights (n, m) mm."""
         assert self.surfaces is not None
         return self.surfaces.heights(np.random.default_rng([self.tolerances.seed, 1, number]), which)
 
@@ -228,12 +229,12 @@ class Trials:
         return image
 
     def _placed(self, part: Landed) -> tuple[Tensor, Tensor]:
-        """Landing points as a splat counts them, from the foot of the axis."""
+        """Landing points relative to the axis, as a splat takes them, mm."""
         sx, sy = self.scene.screen.shift
         return part.x + sx, part.y + sy
 
     def _moved(self, now: list[Landed], smooth: list[np.ndarray]) -> np.ndarray:
-        """A wave image, by its splines, with its light moved as rays are."""
+        """A wave image, given by splines, warped by the displacement of the rays."""
         shape, (wx, wy), (rx, ry) = self.target.shape[1:], self.scene.screen.pixel, self.scene.screen.half_size
         out = np.zeros(self.target.shape)
         scale = sum(float(part.power.sum()) for part in now) / self.power
@@ -261,7 +262,7 @@ class Trials:
         return out
 
     def _gain(self) -> tuple[float, float]:
-        """How far, mm, light moves on the screen along x and y for a slope of 1 of the exit: root mean square over the light."""
+        """RMS displacement on the screen along x and y per unit slope of the exit, mm, weighted by power."""
         if self.gain is None:
             still = self._rays(Misalignment(), self.heights, 0)
             found = []
@@ -279,8 +280,8 @@ class Trials:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Within the block torch works in one thread: a draw's arrays are small, and several threads wait for each other on a machine
-    that has more to do."""
+    """Run torch single-threaded within the block: the arrays of a draw are small, and threads would wait for each other on a busy
+    machine."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -290,9 +291,10 @@ def one_thread() -> Iterator[None]:
 
 
 def best_shift(image: np.ndarray, target: np.ndarray) -> tuple[float, tuple[float, float]]:
-    """The largest mean product of a target and a shifted image, each over its own mean, and that shift of the screen in pixels.
+    """Image registration: the largest cross-correlation of target and shifted image, each over its own mean, and that shift in
+    pixels.
 
-    By a Fourier transform at whole pixels, and a parabola through the neighbours of the largest.
+    By Fourier transform at whole pixels, with parabolic interpolation of the peak.
     """
     shape = [2 * n for n in image.shape]
     product = np.fft.irfft2(np.fft.rfft2(image, shape) * np.conj(np.fft.rfft2(target, shape)), shape) / image.size
@@ -310,7 +312,7 @@ def best_shift(image: np.ndarray, target: np.ndarray) -> tuple[float, tuple[floa
 def displacement(sums: np.ndarray, near: float) -> tuple[np.ndarray, np.ndarray]:
     """Mean displacement on every pixel from the sums (3, n_x, n_y) over its rays of power, and of power times displacement.
 
-    It is averaged over `near` pixels; where there is too little light for that, it is that of the nearest pixel with enough.
+    Gaussian average over `near` pixels; where there is too little light, the value of the nearest pixel with enough.
     """
     weight, x, y = (gaussian_filter(s, near, mode="constant") for s in sums)
     enough = weight > LIT * sums[0].mean()
@@ -322,10 +324,11 @@ def displacement(sums: np.ndarray, near: float) -> tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """What one error does alone.
+    """Effect of a single error.
 
-    name, unit; sigma: its standard deviation; derivative: RMS of the image's derivative by it, of the image's mean, per unit, None
-    of a random surface; below, above: relative RMS errors at -sigma and +sigma, of a random surface both their mean; adds: c_k.
+    name, unit; sigma: its standard deviation; derivative: RMS of the derivative of the image with respect to it, over the mean of
+    the image, per unit, None for a random surface; below, above: relative RMS errors at -sigma and +sigma, for a random surface
+    both their mean; adds: c_k.
     """
 
     name: str
@@ -337,49 +340,49 @@ class Sensitivity:
     adds: float
 
 
-def sensitivities(trials: Trials, told: Callable[[int], None] = lambda done: None) -> list[Sensitivity]:
-    """Of every error alone, by what it adds, the worst first."""
-    found, square = [], trials.judge({}).relative_rms ** 2  # of the same rays: their noise drops out of differences
+def sensitivities(trials: Trials, progress: Callable[[int], None] = lambda done: None) -> list[Sensitivity]:
+    """Sensitivities to all errors, the largest contribution first."""
+    found, square = [], trials.evaluate({}).relative_rms ** 2  # with the same rays, so that the noise cancels in differences
     for p in trials.parameters:
         pairs = [trials.images({(p.error, p.axis): sign * p.sigma}) for sign in (-1.0, 1.0)]
-        below, above = (trials.judged(*pair) for pair in pairs)
+        below, above = (trials.figures_of(*pair) for pair in pairs)
         slopes = [_slope(pairs[0][half], pairs[1][half], p.sigma) for half in (0, 1)]
         derivative = math.sqrt(max(0.0, float(np.mean(slopes[0] * slopes[1]))))
         adds = 0.5 * (below.relative_rms**2 + above.relative_rms**2) - square
         found.append(
             Sensitivity(p.name, p.unit, p.sigma, derivative, below.relative_rms, above.relative_rms, math.sqrt(max(0.0, adds)))
         )
-        told(len(found))
-    first = ALONE if len(trials.tolerances.surface) > 1 else 0  # one error alone is that of the first draws
+        progress(len(found))
+    first = ALONE if len(trials.tolerances.surface) > 1 else 0  # a single error has the realisations of the first draws
     for name in trials.tolerances.surface:
-        errors = [trials.judge({}, first + k, (name,)).relative_rms for k in range(REALISATIONS)]
+        errors = [trials.evaluate({}, first + k, (name,)).relative_rms for k in range(REALISATIONS)]
         mean = math.sqrt(sum(e * e for e in errors) / len(errors))
         t = trials.tolerances
         sigma = t.form.rms if name == "form_error" and t.form else t.waviness.amplitude / math.sqrt(2.0) if t.waviness else 0.0
         found.append(Sensitivity(name, "mm", sigma, None, mean, mean, math.sqrt(max(0.0, mean**2 - square))))
-        told(len(found))
+        progress(len(found))
     return sorted(found, key=lambda s: -s.adds)
 
 
 def _slope(low: np.ndarray, high: np.ndarray, sigma: float) -> np.ndarray:
-    """Derivative of the image over its mean, of the colours that there are."""
+    """Derivative of the image over its mean, for the colours with light."""
     pairs = [(a, b) for a, b in zip(low, high, strict=True) if min(a.sum(), b.sum()) > 0]
     return np.stack([(b / b.mean() - a / a.mean()) / (2.0 * sigma) for a, b in pairs])
 
 
 @dataclass(frozen=True)
 class Study:
-    """All draws.
+    """Result of a tolerance analysis.
 
-    drawn, judged: of every draw its parameters (draws, k) and its figures; nominal: of the lens without errors; unused: errors that
-    mean nothing in the scene, and why; by_waves: judged by waves; checked: relative RMS of the draw at 95 %, with no more than the
-    errors of WAVED, by light moved as rays are and by its own wave image.
+    drawn, judged: parameters (draws, k) and figures of every draw; nominal: figures without errors; unused: errors that do not
+    apply to the scene, and why; by_waves: whether wave images were used; checked: relative RMS of the draw at 95 %, with only the
+    errors WAVED, by the warped and by its own wave image.
     """
 
     parameters: tuple[Parameter, ...]
     drawn: np.ndarray
-    judged: tuple[Judged, ...]
-    nominal: Judged
+    judged: tuple[TrialFigures, ...]
+    nominal: TrialFigures
     sensitivities: tuple[Sensitivity, ...]
     unused: dict[str, str]
     by_waves: bool
@@ -387,28 +390,28 @@ class Study:
     checked: tuple[float, float] | None = None
 
     def of(self, name: str) -> np.ndarray:
-        """A figure of every draw."""
+        """One figure of every draw, (draws,)."""
         return np.array([getattr(j, name) for j in self.judged])
 
 
-def study(trials: Trials, told: Callable[[str, int, int], None] = lambda what, done, whole: None) -> Study:
+def study(trials: Trials, progress: Callable[[str, int, int], None] = lambda what, done, whole: None) -> Study:
     """Sensitivities, then all draws.
 
     Raises:
-        InputError: no error of the tolerances means anything in the scene, or one makes it impossible.
+        InputError: no error of the tolerances applies to the scene, or one makes the scene invalid.
     """
     t = trials.tolerances
     unused = {e.name: why for e in t.errors if (why := idle(trials.scene, e.name))}
     if not (trials.parameters or t.surface):
-        raise InputError(f"no error of the tolerances means anything here: {'; '.join(f'{k}: {v}' for k, v in unused.items())}")
+        raise InputError(f"no error of the tolerances applies to this scene: {'; '.join(f'{k}: {v}' for k, v in unused.items())}")
     nominal = trials.nominal()
     kinds = len(trials.parameters) + len(t.surface)
-    alone = sensitivities(trials, lambda done: told("sensitivities", done, kinds))
+    alone = sensitivities(trials, lambda done: progress("sensitivities", done, kinds))
     drawn, judged = hypercube(trials.parameters, t.draws, t.seed), []
     for number, row in enumerate(drawn):
         values = {(p.error, p.axis): float(v) for p, v in zip(trials.parameters, row, strict=True)}
-        judged.append(trials.judge(values, number))
-        told("draws", number + 1, t.draws)
+        judged.append(trials.evaluate(values, number))
+        progress("draws", number + 1, t.draws)
     checked = None
     if trials.waves is not None:
         at = int(np.argsort([j.relative_rms for j in judged])[math.ceil(0.95 * len(judged)) - 1])
@@ -419,16 +422,15 @@ def study(trials: Trials, told: Callable[[str, int, int], None] = lambda what, d
 
 
 def percentile_error(values: np.ndarray, part: float) -> float:
-    """Standard error of a percentile, by resampling; of independent draws, so that a Latin hypercube's is rather smaller."""
+    """Bootstrap standard error of a percentile of independent draws; that of a Latin hypercube is smaller."""
     rng = np.random.default_rng(0)
     return float(np.quantile(rng.choice(values, (RESAMPLED, len(values))), part, axis=1).std())
 
 
 def offenders(found: Study) -> list[dict]:
-    """How the size of each parameter goes with the error, the strongest first.
+    """Rank correlation of the magnitude of each parameter with the error, the strongest first.
 
-    That is its rank correlation over all draws, and its mean size in the worst ones, in standard deviations (of no offender it is
-    about 0.8).
+    With the mean magnitude in the worst draws, in standard deviations (about 0.8 without correlation).
     """
     error = found.of("relative_rms")
     worst = np.argsort(error)[-max(1, math.ceil(WORST * len(error))) :]
@@ -446,7 +448,7 @@ def offenders(found: Study) -> list[dict]:
 
 
 def figures(found: Study) -> dict:
-    """For JSON, under `tolerances`."""
+    """Figures for JSON, under `tolerances`."""
 
     def spread(name: str) -> dict:
         values = found.of(name)
@@ -483,21 +485,21 @@ def figures(found: Study) -> dict:
 
 
 def rows(f: dict) -> list[tuple[str, str]]:
-    """The figures as a person reads them."""
+    """The figures as rows of a table (name, text)."""
     error, placed, light = f["relative_rms"], f["shifted_relative_rms"], f["on_target"]
     noise = f", noise {f['noise']:.2g}" if f["noise"] else ""
     table = [
-        ("judged", f"by {f['judged_by']}, {f['draws']} draws"),
+        ("evaluated", f"by {f['judged_by']}, {f['draws']} draws"),
         (
             "without errors",
             f"relative RMS error {f['nominal']['relative_rms']:.4f}, light on the picture {f['nominal']['on_target']:.2%}",
         ),
         (
             "relative RMS error",
-            f"{error['p50']:.4f} (half of all), {error['p95']:.4f} ± {error['p95_standard_error']:.4f} (95 %){noise}",
+            f"{error['p50']:.4f} (median), {error['p95']:.4f} ± {error['p95_standard_error']:.4f} (95 %){noise}",
         ),
-        ("after the best shift of the screen", f"{placed['p50']:.4f} (half of all), {placed['p95']:.4f} (95 %)"),
-        ("light on the picture", f"{light['p50']:.2%} (half of all), at least {light['p5']:.2%} (95 %)"),
+        ("after the best shift of the screen", f"{placed['p50']:.4f} (median), {placed['p95']:.4f} (95 %)"),
+        ("light on the picture", f"{light['p50']:.2%} (median), at least {light['p5']:.2%} (95 %)"),
         (
             "root mean square, and as predicted",
             f"{error['mean_square_root']:.4f}, {f['predicted_mean_square_root']:.4f} from the errors one by one",
@@ -521,7 +523,7 @@ def rows(f: dict) -> list[tuple[str, str]]:
 
 
 def write_csv(path: Path, found: Study) -> None:
-    """All draws: their parameters and their figures."""
+    """Write parameters and figures of all draws."""
     text = io.StringIO(f"# {CREATED_BY} {__version__}\n")
     text.seek(0, io.SEEK_END)
     out = csv.writer(text, lineterminator="\n")
@@ -535,7 +537,7 @@ def write_csv(path: Path, found: Study) -> None:
 
 
 def write_plot(path: Path, found: Study) -> None:
-    """Distributions of error and light over the draws, and what each error adds alone."""
+    """Plot the distributions of error and light over the draws, and the contribution of each error."""
     import matplotlib  # noqa: PLC0415
 
     matplotlib.use("Agg")
@@ -555,18 +557,18 @@ def write_plot(path: Path, found: Study) -> None:
     placed = f["relative_rms"]
     for value, color, style, label in (
         (f["nominal"]["relative_rms"], "k", "-", "without errors"),
-        (placed["p50"], COLOURS[0], "--", "half, as placed"),
+        (placed["p50"], COLOURS[0], "--", "median, as placed"),
         (placed["p95"], COLOURS[0], "-", "95 %, as placed"),
     ):
         error.axvline(value, color=color, ls=style, label=f"{label}: {value:.3f}")
-    error.set(title=f"{len(found.judged)} draws, judged by {f['judged_by']}", xlabel="relative RMS error", ylabel="draws")
+    error.set(title=f"{len(found.judged)} draws, evaluated by {f['judged_by']}", xlabel="relative RMS error", ylabel="draws")
     light.axvline(f["nominal"]["on_target"], color="k", label=f"without errors: {f['nominal']['on_target']:.4f}")
     light.axvline(f["on_target"]["p5"], color=COLOURS[0], ls="--", label=f"95 % have at least {f['on_target']['p5']:.4f}")
     light.set(title="light on the picture", xlabel="part of the source's power", ylabel="draws")
     shown = found.sensitivities[:16][::-1]
     bars.barh([f"{s.name}\n{s.sigma:.3g} {s.unit}".strip() for s in shown], [s.adds for s in shown], color=COLOURS[2])
     bars.axvline(f["nominal"]["relative_rms"], color="k", ls=":", label="error without errors")
-    bars.set(title="what each error of one sigma adds, in squares", xlabel="relative RMS error")
+    bars.set(title="contribution of each error of one sigma, in quadrature", xlabel="relative RMS error")
     bars.tick_params(axis="y", labelsize=8)
     for axis in (error, light, bars):
         axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=2, fontsize=8, frameon=False)  # below all data

@@ -1,18 +1,18 @@
-"""The same lens in Mitsuba 3, a light tracer that shares no line with this one: do the two images agree?
+"""Verification against Mitsuba 3, an independent light tracer: statistical comparison of the two images.
 
 Mitsuba loads the exported scene (`export format mitsuba`) and sends independent rays through entrance and exit with its own
 intersections and its own `dielectric`, transmission chosen at both, weighted by its Fresnel factor; what reaches the screen is
-binned.  What leaves by the sides or passes the lens is lost, as in a render.
+binned.  Light that leaves through the sides or misses the lens is lost, as in a render.
 
-Notation, of each pixel, or of `side` x `side` of them taken together so that enough rays are expected
-    M, R        power by Mitsuba and by the render, parts of the source's
-    s_M^2       variance of M: rays are independent, so the squares of their weights tell it
-    s_R^2       variance of R, from the scatter of BATCHES independent renders, pooled over 3 x 3
-    s_S         range of R over 3 x 3 times the part of a pixel by which TURN moves light on the screen: the mesh's own error
+Notation, for each pixel, or for bins of `side` x `side` pixels with a sufficient expected number of rays
+    M, R        power by Mitsuba and by the render, fractions of the source's
+    s_M^2       variance of M, from the sum of squares of the weights of independent rays
+    s_R^2       variance of R, from BATCHES independent renders, pooled over 3 x 3 pixels
+    s_S         range of R over 3 x 3 times the fraction of a pixel by which TURN displaces light on the screen: error of the mesh
     Z           (M - R) / sqrt(s_M^2 + s_R^2 + s_S^2)
 
-They agree if Z is noise: its mean square near 1, few beyond 3, none beyond LARGEST; if the power on the screen is the same; and if
-M is like R as it is and not flipped or turned.
+The images agree if Z is noise: mean square near 1, few values beyond 3, none beyond LARGEST; if the power on the screen is the
+same; and if M correlates best with R in its own orientation.
 """
 
 from __future__ import annotations
@@ -36,42 +36,45 @@ from caustic_cli.optics.system import System
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Scene
 from caustic_cli.scene.plain import beyond_plain
-from caustic_cli.studies.drawn import KINDS, emitted
+from caustic_cli.studies.independent_rays import KINDS, sample_rays
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.retrace import BATCHES
 
-VARIANTS = ("llvm_ad_mono", "llvm_ad_rgb", "scalar_rgb")  # the scalar one works everywhere and takes minutes
-#: Angle, rad, by which normals interpolated within triangles may turn the light.
+VARIANTS = ("llvm_ad_mono", "llvm_ad_rgb", "scalar_rgb")  # the scalar variant works everywhere but is slow
+#: Angle, rad, by which interpolated normals may deflect the light.
 TURN = 1e-5
-#: Least rays expected of a judged pixel, least part of the light on judged pixels, and most pixels along a side taken together.
+#: Least expected rays of a tested bin, least fraction of the light in tested bins, and most pixels along the side of a bin.
 LEAST_RAYS, JUDGED, MOST = 25, 0.8, 32
-#: Part of normal values beyond 3 sigma; what the mean square may exceed 1 by, beside its own 3 sigma; largest |Z|.
+#: Fraction of normal values beyond 3 sigma; tolerated excess of the mean square over 1, beside its own 3 sigma; largest |Z|.
 NORMAL, CHI2, LARGEST = 0.0027, 0.05, 7.0
-#: |Z| of the light on the screen, and the part of it that single precision may lose between triangles and at borders.
+#: Largest |Z| of the light on the screen, and fraction of it that single precision may lose between triangles and at borders.
 LIGHT, LEAK = 4.0, 5e-5
-#: A flipped image may correlate better than the image itself by this much: symmetric pictures differ by noise alone.
+#: Tolerance for a better correlation of a flipped image, which for symmetric pictures differs by noise alone.
 TIE = 1e-2
 
 
 def require_mitsuba(scene: Scene) -> None:
-    """Refuse before work begins what cannot be verified.
+    """Refuse a scene that cannot be verified, before work begins.
 
     Raises:
-        InputError: Mitsuba is not installed, or the scene has what is not written for it, or other reflections than exact ones.
+        InputError: Mitsuba is not installed, the scene cannot be exported to it, or Fresnel reflection is not exact.
     """
     if find_spec("mitsuba") is None:
         raise InputError("⟨verify⟩ mitsuba needs Mitsuba 3, which is not installed: pip install mitsuba")
     if beyond_plain(scene):
         raise InputError(f"⟨verify⟩ mitsuba traces clear lenses and straight screens, not {', '.join(beyond_plain(scene))}")
     if scene.source.kind not in KINDS:
-        raise InputError(f"⟨verify⟩ mitsuba knows no source of type {scene.source.kind}")
+        raise InputError(f"⟨verify⟩ mitsuba does not support sources of type {scene.source.kind}")
     if scene.lens.fresnel != "exact":
-        raise InputError(f"⟨verify⟩ mitsuba knows exact Fresnel reflection only; ⟨lens.fresnel⟩ is {scene.lens.fresnel}")
+        raise InputError(f"⟨verify⟩ mitsuba supports exact Fresnel reflection only; ⟨lens.fresnel⟩ is {scene.lens.fresnel}")
 
 
 @dataclass(frozen=True, eq=False)
-class Decision:
-    """render, mitsuba, z: (n_x, n_y), z on taken-together pixels and NaN where too few rays are expected; figures for JSON."""
+class Agreement:
+    """Result of the comparison.
+
+    render, mitsuba, z: (n_x, n_y), z per bin and NaN where too few rays are expected; figures: for JSON.
+    """
 
     render: np.ndarray
     mitsuba: np.ndarray
@@ -80,11 +83,11 @@ class Decision:
 
     @property
     def agree(self) -> bool:
-        """Whether nothing but noise tells the two apart."""
+        """Whether the images agree within noise."""
         return self.figures["agree"]
 
 
-def verify(path: Path, scene: Scene, field: HeightField, heights: Tensor, rays: int, seed: int = 0) -> Decision:
+def verify(path: Path, scene: Scene, field: HeightField, heights: Tensor, rays: int, seed: int = 0) -> Agreement:
     """Trace the lens here and the exported scene at `path` in Mitsuba, with about `rays` rays each, and compare.
 
     Raises:
@@ -94,7 +97,7 @@ def verify(path: Path, scene: Scene, field: HeightField, heights: Tensor, rays: 
     import mitsuba as mi  # noqa: PLC0415
 
     mi.set_log_level(mi.LogLevel.Error)
-    world = mi.load_file(str(path), optimize=False)  # which would make one mesh of entrance and exit, without a name
+    world = mi.load_file(str(path), optimize=False)  # optimising would merge entrance and exit into one unnamed mesh
     image, squares = _trace(mi, world, scene, rays, seed)
     renders = np.array(
         [
@@ -111,10 +114,10 @@ def verify(path: Path, scene: Scene, field: HeightField, heights: Tensor, rays: 
 
 
 def _choose_variant() -> str:
-    """Set the first variant that works here.
+    """Set the first variant that works on this machine.
 
-    Tried in a process of its own: an LLVM older than Dr.Jit asks for does not raise, it aborts.  (A newer one is found with the
-    environment variable DRJIT_LIBLLVM_PATH.)
+    Each is tried in a subprocess, since Dr.Jit aborts with an LLVM that is too old.  (The environment variable DRJIT_LIBLLVM_PATH
+    selects another one.)
     """
     probe = (
         "import sys, mitsuba as mi, drjit as dr; mi.set_variant(sys.argv[1]);"
@@ -129,18 +132,18 @@ def _choose_variant() -> str:
     raise CausticError(f"⟨verify⟩ mitsuba: none of its variants {', '.join(VARIANTS)} works on this machine")
 
 
-# the light
+# tracing
 
 
 def _trace(mi, world, scene: Scene, rays: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Power per pixel [i, j], as a part of the source's, and the sums of the squares of what each ray brings."""
+    """Power per pixel [i, j], as a fraction of the source's, and the sums of squares of the contributions of the rays."""
     rng = np.random.default_rng([seed, 1])
     shapes = {shape.id(): shape for shape in world.shapes()}
     follow = _follow if "scalar" not in mi.variant() else _follow_scalar
     image, squares = np.zeros((2, *scene.screen.resolution))
     system = System.of(scene)
     surfaces, leg = [(e.name, e.reflects) for e in system.elements], system.leg or Leg()
-    for start, direction, share in emitted(scene, rays, rng):
+    for start, direction, share in sample_rays(scene, rays, rng):
         *points, weight = follow(mi, world, shapes, [*surfaces, ("screen", False)], start, direction)
         x, y = (sum((p - o) * a for p, o, a in zip(points, leg.origin, axis, strict=True)) for axis in leg.frame[:2])
         image += _binned(x, y, weight * share, scene)
@@ -149,8 +152,7 @@ def _trace(mi, world, scene: Scene, rays: int, seed: int) -> tuple[np.ndarray, n
 
 
 def _follow(mi, world, shapes, surfaces: list[tuple[str, bool]], start: np.ndarray, direction: np.ndarray):
-    """Landing x, y, z (mm) and weight of the rays, all at once, which meet these shapes, or are reflected by them; weight 0 where
-    lost."""
+    """Landing points x, y, z (mm) and weights of all rays through this sequence of surfaces; weight 0 where lost."""
     ray = mi.Ray3f(mi.Point3f(*map(mi.Float, start)), mi.Vector3f(*map(mi.Float, direction)))
     weight, active = mi.Float(1.0), mi.Bool(True)
     for name, reflects in surfaces:
@@ -180,10 +182,10 @@ def _follow_scalar(mi, world, _shapes, surfaces: list[tuple[str, bool]], start: 
 
 
 def _onwards(mi, hit, active, reflects: bool):
-    """The transmitted ray and its share of the power, or the reflected one of a mirror, by Mitsuba's BSDF.
+    """The transmitted ray and its transmittance, or the ray reflected by a mirror, by Mitsuba's BSDF.
 
-    Component 1 of `dielectric` is transmission; chosen alone, its sample is the refracted direction and its weight the Fresnel
-    transmittance, 0 on total reflection.  Importance mode: power of light, not radiance scaled by the index.
+    Component 1 of `dielectric` is transmission; selected alone, its sample is the refracted direction and its weight the Fresnel
+    transmittance, 0 for total reflection.  Importance mode: power, not radiance scaled by the index.
     """
     context = mi.BSDFContext(mi.TransportMode.Importance)
     if not reflects:
@@ -201,36 +203,36 @@ def _binned(x: np.ndarray, y: np.ndarray, value: np.ndarray, scene: Scene) -> np
     return np.bincount(at, value[inside], nx * ny).reshape(nx, ny)
 
 
-# the decision
+# comparison
 
 
 def compare(
     renders: np.ndarray, image: np.ndarray, squares: np.ndarray, rays: int, shift: float = 0.0, about: dict | None = None
-) -> Decision:
-    """Z-scores of Mitsuba's image against several renders, and whether they are noise.
+) -> Agreement:
+    """Z-scores of Mitsuba's image against several renders, and whether they are consistent with noise.
 
     Args:
         renders: (k, n_x, n_y), independent.
-        image, squares: (n_x, n_y), power and the sums of squares of what each of the `rays` rays brings.
-        shift: part of a pixel by which the light may be moved.
-        about: figures to begin with.
+        image, squares: (n_x, n_y), power and the sums of squares of the contributions of the `rays` rays.
+        shift: fraction of a pixel by which the light may be displaced.
+        about: further figures.
     """
     render = renders.mean(0)
     per_ray, side = squares.sum() / image.sum(), 1
     while side < MOST:
-        expected = _taken(render, side)
+        expected = _rebinned(render, side)
         if expected[expected >= LEAST_RAYS * per_ray].sum() >= JUDGED * expected.sum():
             break
         side *= 2
-    z, spread = _z_scores(*(_taken(a, side) for a in (renders, image, squares)), rays, per_ray, shift / side)
+    z, spread = _z_scores(*(_rebinned(a, side) for a in (renders, image, squares)), rays, per_ray, shift / side)
     some = z[np.isfinite(z)]
     if not len(some):
-        raise CausticError(f"{rays:,} rays are too few to judge a single pixel by; ⟨rays⟩ must be larger")
+        raise CausticError(f"{rays:,} rays are too few to test a single pixel; ⟨rays⟩ must be larger")
     sums = renders.sum((1, 2))
     noise = squares.sum() - image.sum() ** 2 / rays + sums.var(ddof=1) / len(sums) + (LEAK * render.sum()) ** 2
     light = float((image.sum() - render.sum()) / noise**0.5)
     chi2, beyond, largest = float(np.mean(some**2)), float(np.mean(abs(some) > 3)), float(abs(some).max())
-    turned = _turned(render)
+    turned = _other_orientations(render)
     own, other = _correlation(image, render), max(_correlation(image, t) for t in turned)
     total, of_noise = relative_rms(image, render), _noise(image, squares, renders)
     figures = {
@@ -259,67 +261,67 @@ def compare(
         and abs(light) < LIGHT
         and own >= other - TIE
     )
-    return Decision(render, image, np.repeat(np.repeat(z, side, 0), side, 1), figures)
+    return Agreement(render, image, np.repeat(np.repeat(z, side, 0), side, 1), figures)
 
 
 def _z_scores(renders: np.ndarray, image: np.ndarray, squares: np.ndarray, rays: int, per_ray: float, shift: float):
-    """Z of each pixel, NaN where too few rays are expected, and the mean noise of the others, relative."""
+    """Z of each bin, NaN where too few rays are expected, and the mean relative noise of the others."""
     render, scatter = renders.mean(0), renders.var(0, ddof=1) / len(renders)
-    around = _around(render).sum(0)  # few renders tell a pixel's variance badly: as much a unit of light as its neighbours'
-    scatter = render * _around(scatter).sum(0) / np.where(around > 0, around, 1.0)
-    moved = shift * np.ptp(_around(render, "edge"), axis=0)
+    around = _neighbourhood(render).sum(0)  # pooled variance per unit of power, since few renders estimate that of a pixel poorly
+    scatter = render * _neighbourhood(scatter).sum(0) / np.where(around > 0, around, 1.0)
+    moved = shift * np.ptp(_neighbourhood(render, "edge"), axis=0)
     judged = render >= LEAST_RAYS * per_ray
-    each = np.where(image > 0, squares / np.where(image > 0, image, 1.0), per_ray)  # what a ray brings there
-    expected = (image + render) / 2  # the count itself would make a pixel that has too few look surer than it is
+    each = np.where(image > 0, squares / np.where(image > 0, image, 1.0), per_ray)  # mean contribution of a ray there
+    expected = (image + render) / 2  # with the observed count the variance of a bin with few rays would be underestimated
     variance = np.where(judged, each * expected - expected**2 / rays + scatter + moved**2, 1.0)
     z = np.where(judged, (image - render) / np.sqrt(variance), np.nan)
     return z, np.mean(np.sqrt(variance[judged]) / render[judged]) if judged.any() else 0.0
 
 
-def _taken(a: np.ndarray, side: int) -> np.ndarray:
-    """Sums over side x side pixels of the last two axes; the last ones may be fewer, and are filled up with darkness."""
+def _rebinned(a: np.ndarray, side: int) -> np.ndarray:
+    """Sums over bins of side x side pixels along the last two axes, zero-padded at the upper borders."""
     nx, ny = (-(-n // side) for n in a.shape[-2:])
     pad = [(0, 0)] * (a.ndim - 2) + [(0, nx * side - a.shape[-2]), (0, ny * side - a.shape[-1])]
     return np.pad(a, pad).reshape(*a.shape[:-2], nx, side, ny, side).sum((-3, -1))
 
 
-def _around(a: np.ndarray, mode: str = "constant") -> np.ndarray:
+def _neighbourhood(a: np.ndarray, mode: str = "constant") -> np.ndarray:
     """The 3 x 3 pixels around each: (9, n_x, n_y)."""
     padded = np.pad(a, 1, mode=mode)
     return np.array([padded[i : i + a.shape[0], j : j + a.shape[1]] for i in range(3) for j in range(3)])
 
 
-def _turned(a: np.ndarray) -> list[np.ndarray]:
-    """The image flipped and turned, in all ways that keep its shape."""
+def _other_orientations(a: np.ndarray) -> list[np.ndarray]:
+    """The image in all other orientations that keep its shape."""
     flipped = [a[::-1], a[:, ::-1], a[::-1, ::-1]]
     return flipped if a.shape[0] != a.shape[1] else flipped + [b.T for b in (a, *flipped)]
 
 
 def _correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Pearson's, over pixels."""
+    """Pearson correlation over pixels."""
     return float(np.corrcoef(a.ravel(), b.ravel())[0, 1]) if np.ptp(a) > 0 < np.ptp(b) else 0.0
 
 
 def _noise(image: np.ndarray, squares: np.ndarray, renders: np.ndarray) -> float:
-    """What noise alone makes of `relative_rms`."""
+    """Expected `relative_rms` from noise alone."""
     return float(np.sqrt(squares.mean() + renders.var(0, ddof=1).mean() / len(renders)) / image.mean())
 
 
-def write_panels(path: str | Path, decision: Decision, scene: Scene) -> None:
-    """A PNG: the render, Mitsuba's image, and their difference in standard deviations."""
+def write_panels(path: str | Path, found: Agreement, scene: Scene) -> None:
+    """Write a PNG with the render, Mitsuba's image, and their difference in standard deviations."""
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     figure = Figure(figsize=(14.4, 5.0), dpi=100, layout="constrained")
     axes, (sx, sy) = figure.subplots(1, 3), scene.screen.half_size
-    white = np.quantile(decision.render, 0.999) or 1.0
+    white = np.quantile(found.render, 0.999) or 1.0
     shown = {"extent": [-sx, sx, -sy, sy], "origin": "lower"}
-    for axis, image, title in zip(axes, (decision.render, decision.mitsuba), ("caustic", "Mitsuba 3"), strict=False):
+    for axis, image, title in zip(axes, (found.render, found.mitsuba), ("caustic", "Mitsuba 3"), strict=False):
         axis.imshow(np.sqrt(np.clip(image / white, 0.0, 1.0)).T, cmap="gray", vmin=0, vmax=1, **shown)
         axis.set(title=title, xlabel="x on the screen (mm)", ylabel="y (mm)")
-    z = decision.z[: decision.render.shape[0], : decision.render.shape[1]]
+    z = found.z[: found.render.shape[0], : found.render.shape[1]]
     drawn = axes[2].imshow(z.T, cmap="coolwarm", vmin=-4, vmax=4, **shown)
     figure.colorbar(drawn, cax=axes[2].inset_axes((1.03, 0.0, 0.046, 1.0)), label="standard deviations")
-    f = decision.figures
+    f = found.figures
     axes[2].set(
         title=f"Mitsuba - caustic: mean Z² {f['z_mean_square']:.3f}, {'agree' if f['agree'] else 'DISAGREE'}",
         xlabel="x on the screen (mm)",

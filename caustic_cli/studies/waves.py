@@ -1,4 +1,4 @@
-"""The decision on a lens as light sees it: its wave image, at wavelengths and on grids that no optimiser used."""
+"""Validation of a lens in wave optics: its wave image, at wavelengths and on grids not used in the optimisation."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from caustic_cli.optics.waves.image import UNASKED, Departure
 from caustic_cli.scene import Scene
 from caustic_cli.scene.materials import material
 from caustic_cli.studies.irradiance import irradiance_figures
-from caustic_cli.studies.metrics import judge
+from caustic_cli.studies.metrics import figures_of_merit
 
-#: So many times finer than needed are a decision's samples, on both planes.
+#: Oversampling of both planes for the validation.
 FINER = 1.25
-#: Wavelengths beside a single one, in parts of it, that say how a lens bears light of another colour.
+#: Wavelengths relative to a single one, for the sensitivity to the wavelength.
 ASIDE = (0.99, 1.01)
 
 
@@ -39,8 +39,8 @@ def wave_figures(
     exit from the heights, as of `optics.waves.wave_image`; required: take it however long that takes, or raise NoWaveImage.
 
     Returns:
-        the image, None where there is none and `required` is false; and wave_relative_rms, wave_on_target, wave_in_black (None
-        without a target), wave_on_screen, wave_wavelengths (nm), resolvable, the number of details across that light carries,
+        the image, None if it is not available and `required` is false; and wave_relative_rms, wave_on_target, wave_in_black (None
+        without a target), wave_on_screen, wave_wavelengths (nm), resolvable, the number of resolvable details across the picture,
         wave_source_points, the points that the source was taken as, wave_source_error, by how much an extended source's light is
         misplaced so, mm, and wave_peak_irradiance and wave_mean_irradiance, as of a ray image.
     """
@@ -75,7 +75,7 @@ def wave_figures(
 
 
 def unseen_figures(scene: Scene, field: HeightField, heights: Tensor, target: np.ndarray) -> dict:
-    """The same at other wavelengths than those that a scene says: between them, or beside a single one; of white light nothing.
+    """Figures at wavelengths between those of the scene, or next to a single one; empty for white light.
 
     Returns:
         wave_unseen_relative_rms and wave_unseen_wavelengths, nm, those that the glass is known at.
@@ -94,4 +94,4 @@ def unseen_figures(scene: Scene, field: HeightField, heights: Tensor, target: np
 
 
 def _judged(found: WaveImage, target: np.ndarray | None) -> dict:
-    return judge(Image(found.image, found.leaving, {}), target)
+    return figures_of_merit(Image(found.image, found.leaving, {}), target)

@@ -1,1 +1,1 @@
-"""What commands call: a design from beginning to end, a render, comparisons of designs."""
+"""Complete tasks for the command line and the library: design, render, export and studies."""

@@ -1,4 +1,4 @@
-"""The networks that `convergence study design networks` trains against each other."""
+"""Candidates for the comparison of network architectures (`studies.architectures`)."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ import torch
 from caustic_cli.config.completion import build_options, build_stages, complete
 from caustic_cli.config.settings import build_scene
 from caustic_cli.errors import InputError
-from caustic_cli.inverse.conditions import Range, Ranges
-from caustic_cli.inverse.designer import Designer, First, Options
+from caustic_cli.inverse.designer import Designer, InitialHeights, Options
 from caustic_cli.inverse.parametrisation import Architecture
+from caustic_cli.inverse.scene_parameters import Range, Ranges
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Scene
 from caustic_cli.studies.retrace import retrace
-from caustic_cli.workflow import over_range
+from caustic_cli.workflow import range_evaluation
 from caustic_cli.workflow.comparison import disc
 from caustic_cli.workflow.design import first_heights
 
-#: The grid: hidden layers, neurons in each, activations, learning rates, and what the outputs are.
+#: Grid of hyperparameters: hidden layers, neurons in each, activations, learning rates, and preconditioners of the output.
 LAYERS, WIDTHS, ACTIVATIONS, RATES = (1, 2, 3), (16, 64, 256), ("tanh", "silu"), (3e-4, 1e-3, 3e-3)
 OUTPUTS = ("none", "laplacian")
-#: Learning rates of the heights themselves, which a step moves by as much and no more.
+#: Learning rates of free heights, which bound the change of raw values per step.
 FREE_RATES = (1e-3, 1e-2, 1e-1)
 #: Without a project: pixels across the screen, and control points.
 PIXELS, CONTROL = 48, 35
@@ -35,46 +35,52 @@ RAYS_PER_PIXEL = 64
 
 
 class Candidate:
-    """A `studies.architectures.Candidate`: one design, or several for as many values, which share its columns.
+    """A `studies.architectures.Candidate`: one design, or several for different parameter values with common columns.
 
     Args:
-        about: columns that do not change.
-        designers: whose lenses are judged, each over its own ranges or in its own scene.
-        first: what all begin from, None for the offset surface.
+        about: constant columns.
+        designers: of the lenses evaluated, each over its own ranges or in its own scene.
+        first: initial heights of all, None for the offset surface.
         target: (n_x, n_y).
         rays, seed: of the retrace.
     """
 
     def __init__(
-        self, about: dict[str, Any], designers: list[Designer], first: First | None, target: np.ndarray, rays: int, seed: int
+        self,
+        about: dict[str, Any],
+        designers: list[Designer],
+        first: InitialHeights | None,
+        target: np.ndarray,
+        rays: int,
+        seed: int,
     ):
         self.designers, self.target, self.rays, self.seed = designers, target, rays, seed
         self.states = [one.begin(*first or ()) for one in designers]
-        held = [state.parameters or {"heights": state.heights} for state in self.states]  # free heights are held once
+        held = [state.parameters or {"heights": state.heights} for state in self.states]  # free heights are the parameters
         count = sum(v.numel() for parameters in held for name, v in parameters.items() if name != "start")
         self.about = about | {"parameters": count}
 
     @property
     def seconds(self) -> float:
-        """Spent so far, on all of them."""
+        """Seconds of iterations so far, of all designs."""
         return sum(state.seconds for state in self.states)
 
     @property
     def loss(self) -> float | None:
-        """Mean of the last iterations', times the pixels."""
+        """Mean loss of the last iterations, times the pixels."""
         losses = [state.history[-1][2] for state in self.states if state.history]
         return self.target.size * sum(losses) / len(losses) if losses else None
 
     def reach(self, iterations: int) -> None:
-        """Go on to so many iterations in all."""
+        """Continue to this total number of iterations."""
         self.states = [one.run(state, iterations=iterations) for one, state in zip(self.designers, self.states, strict=True)]
 
     def judged(self) -> dict[str, float]:
-        """error, worst and noise."""
+        """Figures error, worst and noise, see `studies.architectures.COLUMNS`."""
         found = []
         for designer, state in zip(self.designers, self.states, strict=True):
             if designer.options.over is not None:
-                found += over_range.errors(
+                found += range_evaluation.errors(
                     designer, state, self.target, rays=self.rays, seed=self.seed, device=designer.device, middle=False
                 )
                 continue
@@ -91,16 +97,16 @@ class Candidate:
 def candidates(
     project: Project | None, device: str, dtype: torch.dtype | None = None, seed: int | None = None, rays: int | None = None
 ) -> list[Candidate]:
-    """The grid for a project's picture and scene, or without one for a bright disc; and what it is compared with.
+    """The grid for the picture and scene of a project, or without one for a bright disc; and its baselines.
 
-    Of a project whose network is trained over a range, all are, from its own first surface with its activation and preconditioner;
-    beside them stand its own, the same without inputs, which is one lens for the whole range, and one for each value alone.  Of any
-    other, networks begin at the offset surface, and heights by Adam stand beside them.
+    For a project whose network is trained over a range, all candidates are, from its initial surface and with its activation and
+    preconditioner; the baselines are its own network, the same without inputs, a single lens for the whole range, and one network
+    for each value.  Otherwise networks start from the offset surface, and the baselines are free heights by Adam.
 
     Raises:
         InputError: no stage is on rays, or there are two free-form sides.
     """
-    first: First | None = None
+    first: InitialHeights | None = None
     if project is None:
         full = complete({"screen": {"resolution": [PIXELS] * 2}, "lens": {"control": [CONTROL] * 2}}, 1.0)
         scene = build_scene(full)
@@ -112,7 +118,9 @@ def candidates(
         target = project.target(scene)
     stages = [s for s in build_stages(full) if not s.waves]
     if not stages or scene.second is not None or scene.lens.arrayed:
-        raise InputError("⟨networks⟩ are compared on the rays of a lens with one free-form side, and this project has none such")
+        raise InputError(
+            "⟨networks⟩ are compared on ray images of a lens with one free-form side, which this project does not have"
+        )
     stage = replace(stages[-1], blur=0.0, iterations=10**9, tolerance=0.0, source=None, spread=False, control=scene.lens.control)
     own, goal = build_options(full), torch.from_numpy(target)
     base = replace(own, dtype=dtype or own.dtype, seed=own.seed if seed is None else seed, optimizer="adam", robust=None)
@@ -154,7 +162,7 @@ def candidates(
             over.scene(scene, values),
             replace(blind, over=Ranges(tuple(Range(k, v, v) for k, v in zip(over.keys, values, strict=True)))),
         )
-        for values in over.judged()
+        for values in over.evaluation_points()
     ]
     found.append(made("each value alone", blind, "alone", alone))
     return found

@@ -1,4 +1,4 @@
-"""The designs that `convergence study design` lets run against each other."""
+"""Design runs for the comparison of optimisers, `convergence study design`."""
 
 from __future__ import annotations
 
@@ -35,20 +35,20 @@ ENDLESS = 10**9
 TRANSPORT = "lbfgs, from transport"
 
 
-class Turns(Designer):
-    """A designer that keeps what a stage prepares from one turn to the next."""
+class CachingDesigner(Designer):
+    """A designer that caches the objective of a stage between time slices."""
 
     _kept: tuple[int, Objective] | None = None
 
     def _objective(self, k: int, heights: Heights) -> Objective:
         if self._kept is None or self._kept[0] != k:
-            self._kept = None  # never two at once: they are large
+            self._kept = None  # released first: objectives are large
             self._kept = k, super()._objective(k, heights)
         return self._kept[1]
 
 
-class Entry:
-    """A design that takes turns; a `studies.training.Contender`.
+class TimedDesign:
+    """A `studies.optimiser_comparison.DesignRun`: a design that is advanced in time slices.
 
     Raises:
         InputError: the lens leaves the heights no room.
@@ -57,13 +57,13 @@ class Entry:
 
     def __init__(self, series: str, stages: list[Stage], options: Options, scene: Scene, target: Tensor, device: str = "cpu"):
         self.series, self.optimizer, self.network = series, options.optimizer, options.network
-        self.designer = Turns(scene, target, stages, options, device)
-        self.designer.run(self._begin(target), iterations=1)  # what the first iteration alone waits for
+        self.designer = CachingDesigner(scene, target, stages, options, device)
+        self.designer.run(self._begin(target), iterations=1)  # warm-up: compilation and caches
         self.state, self.done, self.pixels = self._begin(target), False, target.numel()
         self.waited = self.state.seconds
 
     def _begin(self, target: Tensor) -> State:
-        """The state before the first iteration, with the time its start took."""
+        """The initial state, with the time of its computation."""
         if self.series != TRANSPORT:
             return self.designer.begin()
         began = time.monotonic()
@@ -72,36 +72,36 @@ class Entry:
 
     @property
     def field(self) -> HeightField:
-        """The spline spaces of the stage it is in."""
+        """Spline spaces of the current stage."""
         return self.designer.field(self.state.stage)
 
     @property
     def heights(self) -> Tensor:
-        """(n, m) mm."""
+        """Control heights (n, m) mm."""
         return self.state.heights
 
     @property
     def seconds(self) -> float:
-        """Spent so far."""
+        """Seconds so far."""
         return self.state.seconds
 
     @property
     def iterations(self) -> int:
-        """Done so far."""
+        """Iterations so far."""
         return self.state.total
 
     @property
     def steps(self) -> list[float]:
-        """Seconds of every iteration so far."""
+        """Seconds of each iteration so far."""
         return np.diff([self.waited, *(row[4] for row in self.state.history)]).tolist()
 
     @property
     def loss(self) -> float | None:
-        """Of the last iteration, times the pixels; None before the first."""
+        """Loss of the last iteration, times the pixels; None before the first."""
         return self.state.history[-1][2] * self.pixels if self.state.history else None
 
     def advance(self, seconds: float) -> None:
-        """Iterate for so long, at least once."""
+        """Iterate for this number of seconds, at least once."""
         end, steps = time.monotonic() + seconds, 0
 
         def count(_: State) -> None:
@@ -114,13 +114,13 @@ class Entry:
         self.done = self.state.reason != "interrupted"
 
 
-def entries_of(
+def timed_designs(
     project: Project | None, device: str, dtype: torch.dtype | None = None, seed: int | None = None
-) -> tuple[Scene, np.ndarray, list[Entry]]:
-    """Scene, target (n_x, n_y) and contenders of a project; without one, of a bright disc on fewer pixels and control points.
+) -> tuple[Scene, np.ndarray, list[TimedDesign]]:
+    """Scene, target (n_x, n_y) and design runs for a project; without one, for a bright disc on fewer pixels and control points.
 
     Raises:
-        InputError, CausticError: as of `plans` and `Entry`.
+        InputError, CausticError: as of `variants` and `TimedDesign`.
     """
     if project is None:
         full = complete({"screen": {"resolution": [PIXELS, PIXELS]}, "lens": {"control": [CONTROL, CONTROL]}}, 1.0)
@@ -130,11 +130,11 @@ def entries_of(
         full, scene = project.settings, project.scene()
         target = project.target(scene)
     goal = torch.from_numpy(target)
-    return scene, target, [Entry(*plan, scene, goal, device) for plan in plans(scene, full, dtype, seed)]
+    return scene, target, [TimedDesign(*plan, scene, goal, device) for plan in variants(scene, full, dtype, seed)]
 
 
 def lens_of_disc() -> tuple[Scene, HeightField, Tensor]:
-    """The default scene with the transport's lens for a bright disc: its field and heights."""
+    """The default scene, and field and heights (n, m) mm of the transport lens for a bright disc."""
     full = complete({}, 1.0)
     scene = settings.build_scene(full)
     field = HeightField.of(scene.lens)
@@ -152,10 +152,10 @@ def picture_of_disc() -> np.ndarray:
     return (np.hypot(x[:, None], x) <= DISC).astype(float)
 
 
-def plans(
+def variants(
     scene: Scene, full: Settings, dtype: torch.dtype | None = None, seed: int | None = None
 ) -> list[tuple[str, list[Stage], Options]]:
-    """What every contender for a target is called, and how it designs; dtype and seed replace those of the settings.
+    """Name, stages and options of every design run; dtype and seed replace those of the settings.
 
     L-BFGS on the finished control net, on nets of half and a quarter of its knot spans, coarse to fine, and from transport where
     the design would begin there; Adam on the heights themselves and on the networks of the thesis, on its control net.  Rays,

@@ -1,8 +1,7 @@
-"""The device that traces, and its kernels.  The first run on a machine compiles the CPU's: their parts side by side, in processes
-of their own.
+"""Selection of the device, and compilation of its kernels: in parallel subprocesses on the first run on a machine.
 
-What they have compiled they keep in `kernels.cache.DIRECTORY`, where this process finds it afterwards; what another has not
-compiled after all, it compiles itself.
+Subprocesses write to the cache in `kernels.cache.DIRECTORY`, from which this process loads the kernels; it compiles any that are
+missing itself.
 """
 
 from __future__ import annotations
@@ -28,16 +27,16 @@ from caustic_cli.optics.trace import warm_up
 from caustic_cli.scene import Lens, PlaneWave, Points, Scene, Screen
 from caustic_cli.workflow.reporter import Reporter
 
-#: s that are compiled before it is spoken of.
+#: Seconds of compilation before the user is told.
 PATIENCE = 2.0
-#: What is compiled by itself, and about how long that takes, s.
+#: Independent parts, and approximate compilation time of each, s.
 PARTS = {"adjoint": 5.0, "transport": 5.5, "splat": 4.0, "surface": 2.8}
-#: Parts that call the same functions, and how much sooner they are compiled one after the other in one process, s.
+#: Parts that share functions, and the time saved by compiling them in the same process, s.
 ALIKE, SAVED = {"adjoint", "splat"}, 2.2
 
 
 def choose_device(asked: str, say: Reporter) -> str:
-    """The device for auto, cpu or cuda, which is at hand: auto takes a CUDA device where torch finds one and numba its kernels."""
+    """The device for auto, cpu or cuda: auto selects a CUDA device if torch finds one and numba has kernels for it."""
     if asked == "cpu" or not torch.cuda.is_available():
         return "cpu"
     name, kernels = torch.cuda.get_device_name(), cuda_kernels()
@@ -52,14 +51,14 @@ def choose_device(asked: str, say: Reporter) -> str:
     return "cuda"
 
 
-def kept() -> bool:
-    """Whether an earlier run has compiled the kernels, as far as their names tell; or nothing can be kept anyway."""
+def is_cached() -> bool:
+    """Whether the cache holds compiled kernels, judged by file names; also True if nothing can be cached."""
     place = plane.backward.stats.cache_path
     return cache.DIRECTORY is None or place is None or any(Path(place).glob("plane.backward-*.nbi"))
 
 
 def compile_part(part: str) -> None:
-    """Have one of PARTS compiled, and kept, by calling it."""
+    """Compile one of PARTS into the cache, by calling it."""
     if part == "splat":
         functions.compile_splat()
     elif part == "adjoint":
@@ -73,8 +72,8 @@ def compile_part(part: str) -> None:
             transport.solve(light, np.ones((64, 64)), (1.0, 1.0), (1.0, 1.0))
 
 
-def shares(processes: int) -> list[list[str]]:
-    """PARTS in so many lists that the longest takes as short as it can; it comes first."""
+def partition(processes: int) -> list[list[str]]:
+    """Partition PARTS into this number of lists with minimal longest compilation time; the longest comes first."""
 
     def cost(parts: list[str]) -> float:
         return sum(PARTS[p] for p in parts) - (SAVED if set(parts) >= ALIKE else 0.0)
@@ -88,11 +87,11 @@ def shares(processes: int) -> list[list[str]]:
 
 
 def compile_side_by_side() -> None:
-    """Compile what is not kept, on as many cores as this process may use."""
+    """Compile all PARTS in parallel, on the cores available to this process."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    mine, *others = shares(min(len(PARTS), cores))
+    mine, *others = partition(min(len(PARTS), cores))
     path = os.pathsep.join([str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
-    env = os.environ | {"PYTHONPATH": path, "NUMBA_CACHE_DIR": str(cache.DIRECTORY.parent)}  # so that theirs is this one too
+    env = os.environ | {"PYTHONPATH": path, "NUMBA_CACHE_DIR": str(cache.DIRECTORY.parent)}  # the same cache for subprocesses
     running: list[subprocess.Popen] = []
     try:
         for parts in others:
@@ -109,7 +108,7 @@ def compile_side_by_side() -> None:
             compile_part(part)
         for process in running:
             process.wait()
-    finally:  # also where this process is interrupted: nothing of it stays at work
+    finally:  # also after an interrupt: no subprocess is left running
         for process in running:
             process.terminate()
         for process in running:
@@ -117,21 +116,21 @@ def compile_side_by_side() -> None:
 
 
 class _Compiled(event.Listener):
-    """Says a text, once, when numba has compiled for `PATIENCE` seconds: what is read from its cache is no compilation."""
+    """Numba listener that reports a text once, after `PATIENCE` seconds of compilation; loading from the cache does not count."""
 
     def __init__(self, say: Reporter, text: str):
         self.say, self.text = say, text
         self.depth, self.spent, self.since, self.waiting = 0, 0.0, 0.0, ExitStack()
 
     def on_start(self, event: event.Event) -> None:
-        """A function is compiled, by itself or within another."""
+        """Compilation of a function begins, possibly within that of another."""
         self.depth += 1
         if self.depth == 1 and self.spent < PATIENCE:
             self.since = time.monotonic()
             self.waiting.enter_context(self.say.notify_if_slow(self.text, PATIENCE - self.spent))
 
     def on_end(self, event: event.Event) -> None:
-        """It is done."""
+        """Compilation of a function ends."""
         self.depth -= 1
         if self.depth == 0 and self.spent < PATIENCE:
             self.waiting.close()
@@ -139,29 +138,29 @@ class _Compiled(event.Listener):
 
 
 @contextmanager
-def told_of(say: Reporter, text: str) -> Iterator[None]:
-    """Say `text` while the block compiles kernels, if that takes long."""
+def announce_compilation(say: Reporter, text: str) -> Iterator[None]:
+    """Report `text` if the block compiles kernels for more than `PATIENCE` seconds."""
     with event.install_listener("numba:compile", _Compiled(say, text)):
         yield
 
 
 def compile_usual(device: str, say: Reporter) -> None:
-    """Compile the kernels that every design and render takes, where the device's are compiled."""
+    """Compile the kernels that every design and render uses, if the backend of the device is compiled."""
     if not backend_for(device).compiled:
         return
-    with told_of(say, "compiling the kernels for this machine, once: about ten seconds"):
-        if not kept():
+    with announce_compilation(say, "compiling the kernels for this machine, once: about ten seconds"):
+        if not is_cached():
             compile_side_by_side()
         backend_for(device).compile_plane()
 
 
 def compile_for(scene: Scene | None, device: str, say: Reporter, requests: Requests | None = None, gradient: bool = False) -> None:
-    """Have the CPU's kernels compiled that the light of a scene needs, beyond the usual ones too.
+    """Compile the usual kernels and those that tracing this scene needs in addition.
 
     Args:
-        scene: None for whatever any scene may need.
+        scene: None for the kernels of all scenes.
         requests: of a plan, or None.
-        gradient: derivatives are needed too.
+        gradient: also compile derivatives.
     """
     compile_usual(device, say)
     if not backend_for(device).compiled:
@@ -173,12 +172,12 @@ def compile_for(scene: Scene | None, device: str, say: Reporter, requests: Reque
             (Scene(Points(((0.0, 0.0, -50.0),)), lens, screen), NO_REQUESTS),
             (Scene(PlaneWave(), lens, screen), Requests(stages=True)),
         ]
-    with told_of(say, "compiling the kernels that this scene needs, once: about half a minute"):
+    with announce_compilation(say, "compiling the kernels that this scene needs, once: about half a minute"):
         try:
             for one, asked in wanted:
                 warm_up(one, asked, gradient)
         except (MemoryError, RuntimeError) as problem:
-            if not is_out_of_memory(problem):  # the work itself knows what to do about that, and compiles what it needs
+            if not is_out_of_memory(problem):  # out of memory is handled, and kernels compiled, during the actual work
                 raise
 
 

@@ -1,4 +1,4 @@
-"""Studies of what accuracy costs in time, each of a lens or of a scene of its own where none is given."""
+"""Dispatch of the convergence studies, each for a given lens or a default scene."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 
 from caustic_cli.config import checks
 from caustic_cli.errors import InputError
-from caustic_cli.studies import architectures, diffraction, effects, intersection, light, training
+from caustic_cli.studies import architectures, diffraction, effects, efficiency, intersection, optimiser_comparison
 from caustic_cli.studies.convergence import run_study
 from caustic_cli.studies.report import Study
 from caustic_cli.workflow import architectures as networks
@@ -19,18 +19,18 @@ from caustic_cli.workflow.design import sphere
 from caustic_cli.workflow.lens import Lens
 from caustic_cli.workflow.reporter import Reporter
 
-#: Plots of the studies that bring their own.
+#: Plots of the studies that define their own.
 PLOTS = {
     "intersection": intersection.PLOTS,
-    "design": training.PLOTS,
+    "design": optimiser_comparison.PLOTS,
     "networks": architectures.PLOTS,
     "effects": effects.PLOTS,
     "diffraction": diffraction.PLOTS,
-    "light": light.PLOTS,
+    "light": efficiency.PLOTS,
 }
-#: Studies that trace whatever a scene has.
+#: Studies that support all scenes.
 OF_ANY_SCENE = ("rays", "reconstruction", "precision")
-#: What the progress of a study counts.
+#: Unit of the progress of a study.
 UNITS = {
     "intersection": "evaluations",
     "effects": "effects",
@@ -43,9 +43,9 @@ UNITS = {
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked of a study; None for its own default.
+    """Parameters of a study; None for its default.
 
-    rays: of the largest setting; repeats: rounds; seconds: for each contender or lens; dtype: of the rays.
+    rays: of the largest setting; repeats: rounds; seconds: for each design; dtype: of the rays.
     """
 
     rays: int | None = None
@@ -58,18 +58,18 @@ class Request:
 def measure(
     name: str, lens: Lens | None, asked: Request, device: str, say: Reporter, progress: Callable[[int, int], None]
 ) -> Study:
-    """Make a study.
+    """Run a study.
 
     Args:
-        lens: None for the study's own: the sphere a design begins from, the scene of table D.3, a bright disc.
-        progress: told how much of how much is done, in UNITS.
+        lens: None for the default of the study: the initial sphere of a design, the scene of table D.3, or a bright disc.
+        progress: called with (done, in total), in UNITS.
 
     Raises:
-        InputError: a value out of range, or a study that knows a lens by itself, of one that has other elements beside it.
+        InputError: a value out of range, or a scene with other elements in a study of a single lens.
     """
     if lens and lens.scene.elements and name not in OF_ANY_SCENE:
         raise InputError(
-            f"⟨study⟩ {name} knows a lens by itself, and this one has [[element]] tables; of such scenes there are"
+            f"⟨study⟩ {name} supports single lenses only, and this scene has [[element]] tables; studies of such scenes are"
             f" {', '.join(OF_ANY_SCENE)}"
         )
     seed = asked.seed or 0
@@ -83,8 +83,8 @@ def measure(
         return intersection.run_intersection(case, seed=seed, repeats=asked.repeats, progress=progress)
     project = lens.project if lens else None
     if name == "design":
-        scene, target, entries = comparison.entries_of(project, device, asked.dtype, asked.seed)
-        return training.run_training(
+        scene, target, entries = comparison.timed_designs(project, device, asked.dtype, asked.seed)
+        return optimiser_comparison.run_comparison(
             scene, target, entries, seconds=asked.seconds, seed=seed, rays=asked.rays, device=device, progress=progress
         )
     if name == "networks":
@@ -93,9 +93,9 @@ def measure(
             compared, seconds=asked.seconds, about={"seed": seed, "device": device}, progress=progress
         )
     if name == "light":
-        each = checks.number("⟨seconds⟩", light.SECONDS if asked.seconds is None else asked.seconds, 0.0, 1e6, open_low=True)
+        each = checks.number("⟨seconds⟩", efficiency.SECONDS if asked.seconds is None else asked.seconds, 0.0, 1e6, open_low=True)
         count, lenses = tradeoff.lenses(project, each, device)
-        return light.run_light(lenses, count, rays=asked.rays, seed=seed, device=device, progress=progress)
+        return efficiency.run_efficiency(lenses, count, rays=asked.rays, seed=seed, device=device, progress=progress)
     other = comparison.lens_of_disc if name == "diffraction" else sphere
     scene, field, heights = (lens.scene, lens.field, lens.heights) if lens else other()
     heights = heights.to(device)

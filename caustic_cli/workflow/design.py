@@ -1,4 +1,4 @@
-"""A design from beginning to end: make or open the project, run the loop, keep checkpoints, judge the lens, report.
+"""A complete design: create or open the project, run the optimisation, save checkpoints, evaluate the lens, report.
 
 Nothing is written before everything the user gave has been checked.
 """
@@ -28,13 +28,13 @@ from caustic_cli.config.settings import Settings
 from caustic_cli.errors import CausticError, InputError, Interrupted
 from caustic_cli.inverse import ranks
 from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
-from caustic_cli.inverse.designer import Designer, First, State
-from caustic_cli.inverse.extended import best_light, centre_of, limits, shift_of
-from caustic_cli.inverse.initial_sides import first_sides
+from caustic_cli.inverse.designer import Designer, InitialHeights, State
 from caustic_cli.inverse.initial_surface import InitialSurface, first_surface
-from caustic_cli.inverse.lenslets import first_array
-from caustic_cli.inverse.reach import largest_magnification, refuse_unreachable
+from caustic_cli.inverse.initial_two_sided import first_sides
+from caustic_cli.inverse.lenslets import initial_array
+from caustic_cli.inverse.reachability import largest_magnification, refuse_unreachable
 from caustic_cli.inverse.sharpness import advice
+from caustic_cli.inverse.source_limits import best_irradiance, performance_limits, point_source, source_spread
 from caustic_cli.inverse.surface_from_map import OutOfReach
 from caustic_cli.inverse.target import grey
 from caustic_cli.io.files import Piped
@@ -50,22 +50,22 @@ from caustic_cli.project.packing import expected_bytes, rounded
 from caustic_cli.project.project import CHECKPOINT, RENDER, Project, is_project
 from caustic_cli.scene import Scene
 from caustic_cli.studies.manufacture import preview, wall_and_stock
-from caustic_cli.workflow.compilation import compile_usual, told_of
-from caustic_cli.workflow.evaluation import expected_seconds, judge
-from caustic_cli.workflow.gradient import design_index, index_figures, is_free, limit_of
+from caustic_cli.workflow.compilation import announce_compilation, compile_usual
+from caustic_cli.workflow.evaluation import evaluate_and_write, expected_seconds
+from caustic_cli.workflow.gradient_index import design_index, index_figures, is_free, limit_of
 from caustic_cli.workflow.movie import Movie
 from caustic_cli.workflow.reporter import Reporter
 
-#: Part of a picture that is brighter than NEARLY of its maximum from which on it looks like a drawing on white.
+#: Fraction of pixels brighter than NEARLY of the maximum above which a picture is taken for a drawing on white.
 GROUND, NEARLY = 0.6, 0.98
-#: Reasons after which a design that says no iterations of its own keeps nothing of its optimiser, which is many times the lens on
-#: disk: to go on begins that anew.
+#: Reasons of termination after which the state of the optimiser, much larger than the lens, is not saved, unless the number of
+#: iterations was given: resuming then restarts the optimiser.
 DONE = ("iterations", "no progress")
-#: Part of a time limit that is left to the iterations, however long the start took; and that a first surface may take.
+#: Fractions of a time limit: least for the iterations, whatever the initial surface took; and most for the initial surface.
 LEAST_PART, START_PART = 0.25, 0.3
-#: A checkpoint that takes longer than so many seconds is followed by so many times the seconds more without one.
+#: Time of a checkpoint, s, beyond which the interval to the next one grows, and the factor of the excess.
 QUICK, RARELY = 0.5, 10.0
-#: Source cells along a lenslet, at least.
+#: Least number of source cells along a lenslet.
 LEAST_CELLS = 128
 
 
@@ -77,23 +77,24 @@ def begin(
     config: Path | None = None,
     out: Path | None = None,
     force: bool = False,
+    recorded: bool = False,
     say: Reporter,
     device: str = "cpu",
-) -> tuple[Project, First | None]:
-    """Check everything, then make the project directory, if there is to be one; also returns the first heights, None for the
-    offset surface.
+) -> tuple[Project, InitialHeights | None]:
+    """Validate all input, then create the project directory, if any; also returns the initial heights, None for the offset surface.
 
-    Where the same has been designed already, or begun, that project is opened instead (`Project.found`).
+    If the same design exists already, finished or not, its project is opened instead (`Project.found`).
 
     Args:
-        given: path in `config.table` -> value, parameters such as "mag" among them.
-        preset: a name of `config.presets`, whose settings those of config replace.
-        config: a TOML file of further settings, which those `given` replace.
+        given: path in `config.table` -> value, including derived parameters such as "mag".
+        preset: a name of `config.presets`, whose settings are overridden by those of config.
+        config: a TOML file of further settings, which are overridden by those `given`.
         out: the directory; None for a design in memory.
-        force: replace a project there; device: of the design, whose kernels are compiled once all is checked.
+        force: replace a project there; recorded: whether a movie of the design is to be made.
+        device: of the design, whose kernels are compiled after the validation.
 
     Raises:
-        InputError: something is wrong; nothing was written.
+        InputError: invalid input; nothing was written.
     """
     read = [settings.read(path, parameters=True) for path in (preset and presets.path_of(preset), config) if path]
     if config and "source" in read[-1]:
@@ -109,16 +110,16 @@ def begin(
         section, _, key = path.rpartition(".")
         chosen.setdefault(section, {})[key] = value
     said = settings.merged({}, *read, chosen)
-    if {"index", "glass"} <= {*said.get("lens", {})}:  # only where both are given beside each other
+    if {"index", "glass"} <= {*said.get("lens", {})}:  # only where both are given at the same level
         glass = said["lens"].pop("glass")
-        say.say(f"⟨lens.index⟩ {said['lens']['index']:g} is taken at every wavelength, and nothing of {glass}")
+        say.say(f"⟨lens.index⟩ {said['lens']['index']:g} is used at all wavelengths, and {glass} is ignored")
     if "design" in said:
         said["design"] = attachments.with_errors(said["design"])
     if "screen" in said:
         said["screen"] = attachments.with_shape(said["screen"])
     parameters = said.pop("", {})
     invert = parameters.pop("invert", False)
-    if "elements" in parameters:  # those of the command line, instead of a configuration's
+    if "elements" in parameters:  # those of the command line replace those of a configuration
         said["element"] = {"list": parameters.pop("elements")}
     by = Derivation(**parameters)
     if "source" in said:
@@ -131,7 +132,7 @@ def begin(
         if isinstance(target, Picture)
         else read_picture(target, goal.get("encoding") == "linear", goal.get("color", False), invert)
     )
-    if not said.get("source", {}).get("weights", True):  # of wavelengths without any, which may be the picture's
+    if not said.get("source", {}).get("weights", True):  # an empty list: weights may follow from the picture
         del said["source"]["weights"]
     if goal.get("color", False):
         light = [float(c) for c in picture.irradiance().sum((1, 2))]
@@ -159,9 +160,11 @@ def begin(
         uptodate.digest(full, picture, light, second),
         without_waves=without_waves(full, "stages" in said.get("design", {})),
     )
+    if recorded and is_free(project):
+        raise InputError("⟨movie⟩ records the design of a surface; ⟨lens.gradient⟩ free designs the index")
     if out is not None and not force and (same := uptodate.same_design(out, project.asked)):
         return replace(same[0], found=same[1]), None
-    designer, goal = _designer(project, "cpu")  # builds and so checks scene, target, stages, options
+    designer, goal = _designer(project, "cpu")  # builds and thereby validates scene, target, stages, options
     if out is not None:
         directory.check(out, force)  # before the transport, which may take a minute
     if designer.scene.second is None and not designer.scene.elements:
@@ -171,7 +174,7 @@ def begin(
         say.say(words)
     compile_usual(device, say)
     with (
-        told_of(say, "compiling the kernels of the transport, once: about half a minute"),
+        announce_compilation(say, "compiling the kernels of the transport, once: about half a minute"),
         say.notify_if_slow("solving the transport of the light to the picture"),
     ):
         try:
@@ -181,13 +184,13 @@ def begin(
             within = f"; ⟨+mag⟩ of at most about {most:.2g} is within reach at this throw" if most else ""
             raise InputError(f"{error}{within}") from error
     if out is not None:
-        directory.settle(project, force)
+        directory.create(project, force)
     return project, first
 
 
-def first_heights(project: Project, said: Settings) -> tuple[Project, First | None]:
-    """The heights that a design begins from, None for the offset surface; and the project whose thickness and height range are
-    what they need, but for what was `said`.
+def first_heights(project: Project, said: Settings) -> tuple[Project, InitialHeights | None]:
+    """Initial heights of a design, None for the offset surface; and the project with thickness and height range adapted to them,
+    except for values `said` by the user.
 
     Raises:
         InputError: as of `begin`.
@@ -196,7 +199,7 @@ def first_heights(project: Project, said: Settings) -> tuple[Project, First | No
     lens = project.settings["lens"]
     first, middle = _solved(project, fixed)
     if "second" in project.settings:
-        return project, _designer(project, "cpu")[0].first(first)
+        return project, _designer(project, "cpu")[0].initial_heights(first)
     if middle is not None:
         lens["thickness"] = middle
     if first is not None and not fixed and (spare := _spare(lens, said, first)) > 0:
@@ -205,14 +208,14 @@ def first_heights(project: Project, said: Settings) -> tuple[Project, First | No
     if first is not None and _make_room(project.settings, said, first) and middle is None:
         _designer(project, "cpu")
         first, _ = _solved(project, fixed)
-    return project, _designer(project, "cpu")[0].first(first)
+    return project, _designer(project, "cpu")[0].initial_heights(first)
 
 
 @dataclass(frozen=True)
 class Result:
-    """A design that is done: its project, its lens, and the figures of the JSON table.
+    """A finished design: its project, its lens, and the figures of the JSON table.
 
-    scene: with its designed entrance, if that is free-form; heights: (n, m) mm of the exit.
+    scene: with the designed entrance, if that is free-form; heights: (n, m) mm of the exit.
     """
 
     project: Project
@@ -224,10 +227,12 @@ class Result:
     figures: dict[str, Any]
 
 
-def design(project: Project, first: First | None, device: str, say: Reporter, began: float, movie: Movie | None = None) -> Result:
-    """Run a new design from its first heights to its end; movie: records it.
+def design(
+    project: Project, first: InitialHeights | None, device: str, say: Reporter, began: float, movie: Movie | None = None
+) -> Result:
+    """Run a new design from its initial heights to its end; movie: records it.
 
-    One that `begin` found needs no work, or goes on.
+    A finished design found by `begin` is returned; an unfinished one is continued.
     """
     if project.found is not None:
         figures = uptodate.finished(project, project.found)
@@ -236,43 +241,42 @@ def design(project: Project, first: First | None, device: str, say: Reporter, be
             + (
                 "there is nothing to do; ⟨force⟩ designs it anew"
                 if figures
-                else "it is designed to its end"
+                else "it is designed again"
                 if is_free(project)
-                else "it goes on from its checkpoint"
+                else "it continues from its checkpoint"
             )
         )
         if not figures and is_free(project):
+            project.hold.enter_context(directory.locked(project.path))
             return design(replace(project, asked=uptodate.asked_of(project, project.found), found=None), None, device, say, began)
         if not figures:
             return resume(project, None, None, device, say, began, movie)
         if movie is not None:
-            say.say(f"{movie.path}: is not written, since nothing was designed")
+            say.say(f"{movie.path}: is not written, since no design was run")
         scene = project.scene()
         target = project.target(scene)
         scene, field, heights, checkpoint = project.lens(scene)
         return Result(project, scene, field, heights, target, checkpoint.state, figures)
     with project.hold:
         if is_free(project):
-            if movie is not None:
-                raise InputError("⟨movie⟩ is of a surface's design; ⟨lens.gradient⟩ free designs the index")
             return _run_index(project, say, began, device)
         designer, target = _designer(project, device)
         _say_limits(project, designer, target, first, say)
         return _run(project, designer, target, designer.begin(*first or ()), say, began, None, device, movie)
 
 
-def _say_limits(project: Project, designer: Designer, target: np.ndarray, first: First | None, say: Reporter) -> None:
-    """What no lens can do about diffraction and an extended source, and what this one will be like, before time is spent on it."""
+def _say_limits(project: Project, designer: Designer, target: np.ndarray, first: InitialHeights | None, say: Reporter) -> None:
+    """Report the limits set by diffraction and an extended source, and manufacturing figures of the initial surface."""
     light = grey(project.picture.irradiance())
     if (ground := float((light >= NEARLY * light.max()).mean())) > GROUND and light.min() < 0.5 * light.max():
-        say.say(f"{ground:.0%} of the picture are as bright as can be: of a drawing on white, ⟨invert⟩ makes the lines bright")
+        say.say(f"{ground:.0%} of the picture are at its maximum: for a drawing on white, ⟨invert⟩ makes the lines bright")
     if coarse := coarse_words(designer.scene):
         say.say(coarse)
     seen = Resolution.before(designer.scene, tuple(project.settings["target"]["size"]))
     if not designer.scene.elements:
         say.say(seen.sentence())
     timed = math.isfinite(project.settings["design"]["time_limit"])
-    words = limits(designer.scene, grey(target), steps=SMOOTH_STEPS if timed else None).sentence()
+    words = performance_limits(designer.scene, grey(target), steps=SMOOTH_STEPS if timed else None).sentence()
     if words:
         say.say(words)
     if designer.scene.jointly:
@@ -286,7 +290,7 @@ def _say_limits(project: Project, designer: Designer, target: np.ndarray, first:
 
 
 def _listed(wavelengths: tuple[float, ...]) -> str:
-    """Numbers in a clause."""
+    """Numbers as a comma-separated list."""
     return ", ".join(f"{w:.4g}" for w in wavelengths)
 
 
@@ -299,17 +303,17 @@ def resume(
     began: float,
     movie: Movie | None = None,
 ) -> Result:
-    """Go on from the last checkpoint; with nothing left to do, judge the lens again."""
+    """Continue from the last checkpoint; with nothing left to do, evaluate the lens again."""
     with project.hold:
         if is_free(project):
-            raise project.error("⟨lens.gradient⟩ free is designed in one go: design it anew, with more ⟨iterations⟩")
+            raise project.error("⟨lens.gradient⟩ free cannot be resumed: design it anew, with more ⟨iterations⟩")
         project.hold.enter_context(directory.locked(project.path))
         designer, target = _designer(project, device)
-        begun = (project.path / CHECKPOINT).exists()  # if not, it was killed before its first checkpoint
+        begun = (project.path / CHECKPOINT).exists()  # else it was killed before its first checkpoint
         before = project.load() if begun else None
-        state = before.state if begun else designer.begin(*designer.first(_solved(project, fixed=True)[0]) or ())
+        state = before.state if begun else designer.begin(*designer.initial_heights(_solved(project, fixed=True)[0]) or ())
         if state.stage >= len(designer.stages):
-            raise project.error(f"has {len(designer.stages)} stages, but the checkpoint stands in stage {state.stage + 1}")
+            raise project.error(f"has {len(designer.stages)} stages, but the checkpoint is in stage {state.stage + 1}")
         if tuple(state.heights.shape[-2:]) != designer.stages[state.stage].control:
             raise project.error(
                 f"stage {state.stage + 1} has control"
@@ -330,8 +334,8 @@ def resume(
 
 
 def follow(device: str) -> None:
-    """What every rank but the first does: design along with it, reading, deciding and writing nothing."""
-    with _signals():  # the first rank's to answer
+    """Main loop of all ranks but the first: run each design it sends, without reading or writing files."""
+    with _signals():  # handled by the first rank
         while task := ranks.receive():
             *parts, state, limit = task
             project = Project(None, *parts)
@@ -339,7 +343,7 @@ def follow(device: str) -> None:
 
 
 def _on_cpu(state: State) -> State:
-    """A state that can be sent."""
+    """The state with all tensors on the CPU, to be sent to other ranks."""
     start, unrounded = (None if z is None else z.cpu() for z in (state.start, state.unrounded))
     return replace(
         state,
@@ -353,7 +357,7 @@ def _on_cpu(state: State) -> State:
 
 
 def sphere() -> tuple[Scene, HeightField, torch.Tensor]:
-    """The lens a design begins from when nothing but defaults is said, its field and heights."""
+    """The default scene, and field and heights (n, m) mm of its offset surface."""
     full = complete({}, 1.0)
     scene = settings.build_scene(full)
     field = HeightField.of(scene.lens)
@@ -373,13 +377,14 @@ def _designer(project: Project, device: str) -> tuple[Designer, np.ndarray]:
 
 
 def _solved(project: Project, fixed: bool) -> tuple[torch.Tensor | None, float | None]:
-    """Heights of the transport start or of start on the first stage's net, or None for the offset surface; and the thickness that
-    goes with them, None if it is the project's.
+    """Initial heights on the control net of the first stage, by transport or from another lens, None for the offset surface; and
+    the thickness that belongs to them, None if unchanged.
 
-    fixed: of the thickness by the user; so raise a transport start that would reach below the least one: light follows slopes.
+    fixed: the thickness is given by the user; a transport surface below the least thickness is raised, which leaves slopes
+    unchanged.
 
     Raises:
-        InputError: no such project or surface, its lens is of another size, or transport cannot reach the picture.
+        InputError: the project or surface cannot be read, its lens has another size, or the picture cannot be reached.
     """
     start = project.settings["design"]["start"]
     if start == "offset":
@@ -391,14 +396,14 @@ def _solved(project: Project, fixed: bool) -> tuple[torch.Tensor | None, float |
             return first_sides(scene, goal, project.second_target(scene), designer.field(0)), None
         spans = min(n - p for n, p in zip(designer.stages[0].control, scene.lens.degree, strict=True))
         cells = transport_cells(max(s.rays for s in designer.stages), not scene.source.collimated, spans)
-        spread = shift_of(scene) if designer.stages[0].spread else None
+        spread = source_spread(scene) if designer.stages[0].spread else None
         if spread is not None:
-            light = best_light(scene, goal, spread, SMOOTH_STEPS)
-            scene, goal = replace(scene, source=centre_of(scene), screen=scene.screen.grown(light.beside)), light.light
+            light = best_irradiance(scene, goal, spread, SMOOTH_STEPS)
+            scene, goal = replace(scene, source=point_source(scene), screen=scene.screen.grown(light.beside)), light.light
         if scene.lens.arrayed:
             goals = [goal] if len(designer.own) == 1 else [grey(own.numpy()) for own in designer.own]
             cells = max(LEAST_CELLS, cells // max(scene.lens.array))
-            found = InitialSurface(first_array(scene, goals, designer.stages[0].control, cells).heights)
+            found = InitialSurface(initial_array(scene, goals, designer.stages[0].control, cells).heights)
         else:
             seconds = START_PART * project.settings["design"]["time_limit"]
             found = first_surface(scene, goal, designer.field(0), cells, fixed, seconds)
@@ -423,7 +428,7 @@ def _solved(project: Project, fixed: bool) -> tuple[torch.Tensor | None, float |
 
 
 def _spare(lens: dict[str, Any], said: Settings, first: torch.Tensor) -> float:
-    """Glass that a plate has below its first surface beyond its wall, which may have been said, mm; 0 of another lens."""
+    """Excess thickness of a plate below its initial surface beyond the wall, which may be given, mm; 0 for another lens."""
     if max(lens["size"]) <= PLATE:
         return 0.0
     wall = lens["min_thickness"] if "min_thickness" in said.get("lens", {}) else WALL
@@ -431,7 +436,7 @@ def _spare(lens: dict[str, Any], said: Settings, first: torch.Tensor) -> float:
 
 
 def _make_room(full: Settings, said: Settings, first: torch.Tensor) -> bool:
-    """Widen height_range and thickness, unless the user fixed them, to what the first surface needs; True if they changed."""
+    """Widen height_range and thickness as the initial surface requires, unless the user fixed them; True if they changed."""
     lens = settings.build_lens(full)
     offset = HeightField.of(replace(lens, control=tuple(first.shape)))
     x, y = (c.numpy() for c in offset.control_xy())
@@ -461,7 +466,7 @@ def _run(
     chosen = project.settings["design"]
     limit = chosen["time_limit"] if time_limit is None else time_limit
     timed = math.isfinite(limit)
-    if timed:  # the limit is the command's: what the start took counts, and what the evaluation will take
+    if timed:  # the limit includes the initial surface and the evaluation
         after = expected_seconds(designer, target, state, device)
         limit = max(LEAST_PART * limit, limit - (time.monotonic() - began) - after)
     records = _Records(project, designer, device)
@@ -492,7 +497,7 @@ def _run(
         def keep_if_due(now: State) -> None:
             nonlocal saved
             if time.monotonic() - saved >= max(chosen["checkpoint_every"], RARELY * (records.seconds - QUICK)):
-                saved = time.monotonic()  # before the writing, which takes its time too
+                saved = time.monotonic()  # before writing, which takes time itself
                 records.keep(now)
 
         records.keep(state)
@@ -514,12 +519,12 @@ def _run(
                 movie.write()
             raise Interrupted(
                 f"interrupted after {state.total} iterations; {project.path / CHECKPOINT} is saved,"
-                f" caustic design ⟨resume⟩ {project.path} goes on",
+                f" caustic design ⟨resume⟩ {project.path} continues it",
                 128 + asked[0],
             )
         keep_if_due(state)
         state.heights = rounded(designer.within_limits(state))
-        found = judge(project, designer, target, state, device, timed)
+        found = evaluate_and_write(project, designer, target, state, device, timed)
         made = wall_and_stock(designer.scene, designer.field(found.state.stage), designer.exit(found.state))
         figures = (
             found.figures | made | {"iterations": state.total, "seconds": time.monotonic() - began, "reason": found.state.reason}
@@ -533,7 +538,7 @@ def _run(
             say.say(f"{movie.path}: {len(movie.frames)} frames of the design")
             figures = figures | {"movie": str(movie.path)}
         if asked:
-            raise Interrupted(f"interrupted when the design was done; {project.path} is whole", 128 + asked[0])
+            raise Interrupted(f"interrupted after the design had ended; {project.path} is complete", 128 + asked[0])
     field = designer.field(found.state.stage)
     scene, heights = sides_of(designer.scene, field, found.state.heights)
     size = tuple(project.settings["target"]["size"])
@@ -543,38 +548,38 @@ def _run(
 
 
 def _run_index(project: Project, say: Reporter, began: float, device: str) -> Result:
-    """Design a free gradient, judge it, and keep both."""
+    """Design a free gradient index, evaluate and save it."""
     with _signals(project.path is not None) as asked:
         found = design_index(project, say, began, limit_of(project), lambda: bool(asked))
         project, state = found.project, found.state
         designer, target = _designer(project, device)
-        judged = judge(project, designer, target, state, device, math.isfinite(limit_of(project)))
+        judged = evaluate_and_write(project, designer, target, state, device, math.isfinite(limit_of(project)))
         figures = judged.figures | index_figures(project)
         figures |= {"iterations": state.total, "seconds": time.monotonic() - began, "reason": state.reason}
         if project.path is not None:
             figures |= {"image": str(project.path / RENDER), "project": str(project.path)}
         _Records(project, designer, device).keep(state, figures)
         if asked:
-            raise Interrupted(f"interrupted after {state.total} iterations; {project.path} is whole", 128 + asked[0])
+            raise Interrupted(f"interrupted after {state.total} iterations; {project.path} is complete", 128 + asked[0])
     return Result(project, designer.scene, designer.field(0), state.heights, target, state, figures)
 
 
 class _Records:
-    """Checkpoints of a design, if it has a directory."""
+    """Writes the checkpoints of a design, if it has a directory."""
 
     def __init__(self, project: Project, designer: Designer, device: str):
         self.project, self.designer, self.inputs = project, designer, uptodate.inputs(project)
         self.provenance = provenance(project, device)
-        self._goes_on = f"caustic design ⟨resume⟩ {project.path} goes on from it"
+        self._resumes = f"caustic design ⟨resume⟩ {project.path} continues from it"
         before = project.path is not None and (project.path / CHECKPOINT).exists()
-        self._safe = f"the one before is whole, {self._goes_on}" if before else "nothing of it is on disk"
+        self._safe = f"the one before is intact, {self._resumes}" if before else "nothing of it is on disk"
         self.seconds = 0.0  # that the last checkpoint took
 
     def keep(self, now: State, figures: dict[str, Any] | None = None) -> None:
         """Write a checkpoint, with the figures of a finished design.
 
         Raises:
-            CausticError: it could not be written, and what is safe.
+            CausticError: it could not be written; says which checkpoint is intact.
         """
         if self.project.path is None:
             return
@@ -583,12 +588,12 @@ class _Records:
             self.project.save(Checkpoint(now, self.designer.field(now.stage).spaces, self.provenance, figures or {}, self.inputs))
         except CausticError as error:
             raise CausticError(f"{error} after iteration {now.total}; {self._safe}") from error
-        self._safe = f"the one of iteration {now.total} is whole, {self._goes_on}"
+        self._safe = f"the one of iteration {now.total} is intact, {self._resumes}"
         self.seconds = time.monotonic() - began
 
 
 def provenance(project: Project, device: str) -> dict[str, Any]:
-    """What made a lens: versions, device, threads, seed and the picture's hash."""
+    """Provenance of a lens: versions, device, threads, seed and hash of the picture."""
     return {
         "caustic": __version__,
         "torch": torch.__version__,
@@ -602,7 +607,7 @@ def provenance(project: Project, device: str) -> dict[str, Any]:
 
 @contextmanager
 def _signals(collect: bool = True) -> Iterator[list[int]]:
-    """Collect SIGINT and SIGTERM instead of dying of them, where wanted and in the main thread; a second SIGINT interrupts."""
+    """Collect SIGINT and SIGTERM instead of terminating, if asked and in the main thread; a second SIGINT interrupts."""
     asked: list[int] = []
     if not collect or threading.current_thread() is not threading.main_thread():
         yield asked

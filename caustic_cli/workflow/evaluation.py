@@ -1,6 +1,6 @@
-"""Evaluation of a finished design: its lens retraced with rays of its own, beside the one it began from; render and report.
+"""Evaluation of a finished design: its lens and the initial one, retraced with independent rays; render and report.
 
-What the optimiser saw is no judge of what it did: it learns its own rays and its own filter.
+The loss of the optimiser does not qualify: it overfits its own rays and reconstruction filter.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import torch
 
 from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
 from caustic_cli.inverse.designer import Designer, State
-from caustic_cli.inverse.extended import limits
 from caustic_cli.inverse.losses import parse
+from caustic_cli.inverse.source_limits import performance_limits
 from caustic_cli.inverse.target import grey
 from caustic_cli.io.files import discard
 from caustic_cli.io.picture import WIDE, write_image
@@ -26,35 +26,35 @@ from caustic_cli.optics.system import sides_of, traced_of
 from caustic_cli.optics.waves import WaveImage
 from caustic_cli.project import uptodate
 from caustic_cli.project.project import FARTHER, RENDER, REPORT, WAVE, Project
+from caustic_cli.studies.design_report import write_report
 from caustic_cli.studies.irradiance import irradiance
-from caustic_cli.studies.panels import write_report
-from caustic_cli.studies.retrace import FINAL_RAYS, QUIET, judging_rays, retrace, white_level
-from caustic_cli.studies.second import second_figures
+from caustic_cli.studies.retrace import FINAL_RAYS, RELATIVE_NOISE, evaluation_rays, retrace, white_level
+from caustic_cli.studies.second_target import second_figures
 from caustic_cli.studies.waves import unseen_figures, wave_figures
-from caustic_cli.workflow import over_range
+from caustic_cli.workflow import range_evaluation
 
-#: Points along each side of the aperture at which the report draws the surface.
+#: Points along each side of the aperture for the plot of the surface.
 REPORT_SAMPLES = 401
-#: Losses whose aim is the likeness itself; another may rightly pay for what it wants with likeness.
+#: Losses that measure the error of the picture alone; others may increase it in exchange for another objective.
 LIKENESS = {"rms", "rms-light", "throughput"}
-#: For `expected_seconds`: part of FINAL_RAYS that are traced, retraces and wave images of an evaluation, more retraces with a least
-#: radius, and time of its report.
+#: For `expected_seconds`: divisor of FINAL_RAYS for the probe, retraces and wave images of an evaluation, further retraces with a
+#: least radius, and time of the report, s.
 PROBE, RETRACES, WAVE_IMAGES, RADIUS, REPORT_SECONDS = 16, 2.5, 4, 1.5, 2.5
-#: Fewer rays, by this factor, judge the first surfaces of a lens with two free-form sides.
+#: Divisor of the rays for the initial surfaces of a lens with two free-form sides.
 STARTS = 4
-#: Fewer rays, by this factor, judge each of the lenses that a network gives.
+#: Divisor of the rays for each of the lenses of a network over ranges.
 OVER = 4
-#: From so many times the light on the screen, a lens is kept although the surface it began from is more like the target.
+#: Ratio of the light on the screen from which a lens is kept although the initial surface has a smaller error.
 BRIGHTER = 1.01
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """What a finished design is worth.
+    """Result of the evaluation of a design.
 
-    state: with the lens that was kept; figures: of the JSON table, with start_relative_rms where a start was retraced; image,
-    waves: irradiance on the screen, power per pixel, by rays and as a wave (None where that was not refined), (n_x, n_y) or
-    (3, n_x, n_y), float64; second: that on a second screen, None where there is none.
+    state: with the lens that was kept; figures: of the JSON table, with start_relative_rms if the initial surface was retraced;
+    image, waves: power per pixel on the screen, ray image and wave image (None if that was not refined), (n_x, n_y) or
+    (3, n_x, n_y), float64; second: that on a second screen, or None.
     """
 
     state: State
@@ -64,7 +64,9 @@ class Evaluation:
     second: np.ndarray | None = None
 
 
-def judge(project: Project, designer: Designer, target: np.ndarray, state: State, device: str, timed: bool = False) -> Evaluation:
+def evaluate_and_write(
+    project: Project, designer: Designer, target: np.ndarray, state: State, device: str, timed: bool = False
+) -> Evaluation:
     """Evaluate the finished lens; write render.png, wave.png and report.png into the project, if it has a directory."""
     chosen = project.settings["design"]
     found = evaluate(designer, target, state, device, chosen["seed"], tuple(project.settings["target"]["size"]), timed)
@@ -72,9 +74,9 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
         return found
     encoding = project.settings["target"]["encoding"]
     seen, aim = (irradiance(a, designer.scene.screen) for a in (found.image, target))
-    made = uptodate.depicted(project, found.state.heights, found.figures)
+    made = uptodate.image_provenance(project, found.state.heights, found.figures)
     write_image(project.path / RENDER, seen, white_level(seen, aim), encoding, WIDE, made)
-    discard(project.path / WAVE)  # of another lens
+    discard(project.path / WAVE)  # of an earlier lens
     if found.waves is not None:
         write_image(project.path / WAVE, found.waves, white_level(found.waves, target), encoding, WIDE)
     discard(project.path / FARTHER)
@@ -99,13 +101,21 @@ def judge(project: Project, designer: Designer, target: np.ndarray, state: State
 
 
 def expected_seconds(designer: Designer, target: np.ndarray, state: State, device: str) -> float:
-    """About how long `judge` will take under a time limit, s: by a retrace of few rays, and a wave image where one was refined."""
+    """Estimated time of `evaluate_and_write` under a time limit, s, from a retrace with few rays, and a wave image if refined."""
     scene, field, began = designer.scene, designer.field(state.stage), time.monotonic()
     retrace(
-        *traced_of(scene, field, state.heights), target, rays=judging_rays(scene, FINAL_RAYS) // PROBE, device=device, noise=False
+        *traced_of(scene, field, state.heights),
+        target,
+        rays=evaluation_rays(scene, FINAL_RAYS) // PROBE,
+        device=device,
+        noise=False,
     )
     over = designer.options.over
-    retraces = RETRACES + (0.0 if state.unrounded is None else RADIUS) + (0.0 if over is None else 2.0 * len(over.judged()) / OVER)
+    retraces = (
+        RETRACES
+        + (0.0 if state.unrounded is None else RADIUS)
+        + (0.0 if over is None else 2.0 * len(over.evaluation_points()) / OVER)
+    )
     seconds = retraces * PROBE * (time.monotonic() - began) + REPORT_SECONDS
     if any(s.waves for s in designer.stages):
         began = time.monotonic()
@@ -123,14 +133,14 @@ def evaluate(
     size: tuple[float, float],
     timed: bool = False,
 ) -> Evaluation:
-    """Retrace the finished lens with rays that it was not designed with, and where diffraction was refined, as a wave.
+    """Retrace the finished lens with independent rays, and compute its wave image if that was refined.
 
-    Where nothing but likeness was asked for, a lens that is worse than what the design began from is replaced by that: by the wave
-    image where that was refined, whose figures are then there too.
+    If the loss measures the error of the picture alone, a lens that is worse than the initial one is replaced by it; they are
+    compared by the wave image if that was refined.
 
     Args:
-        seed: of the rays; size: width and height of the picture, mm; timed: under a time limit, leave the noise at what FINAL_RAYS
-            make of it, and the least error at what a few iterations find.
+        seed: of the rays; size: width and height of the picture, mm; timed: under a time limit, do not increase the number of rays,
+            and limit the iterations for the least error.
     """
     scene, field = designer.scene, designer.field(state.stage)
     if scene.second is not None:
@@ -140,11 +150,11 @@ def evaluate(
         return retrace(
             *traced_of(scene, field, heights),
             target,
-            rays=judging_rays(scene, FINAL_RAYS),
+            rays=evaluation_rays(scene, FINAL_RAYS),
             device=device,
             seed=seed,
             noise=noise,
-            quiet=None if timed else QUIET,
+            quiet=None if timed else RELATIVE_NOISE,
         )
 
     refined = any(s.waves for s in designer.stages[: state.stage + 1])
@@ -159,10 +169,12 @@ def evaluate(
         figures |= more
     began = None
     by_likeness = {name for _, name in parse(designer.options.loss)} <= LIKENESS
-    for_one = designer.options.robust is None and designer.options.over is None  # others pay for what they want with likeness
+    for_one = designer.options.robust is None and designer.options.over is None  # these have other objectives
     if state.start is not None and by_likeness and for_one:
         start = designer.within_limits(replace(state, heights=designer.begun(state)))
-        _, began = trace(start, noise=not scene.source.collimated or state.unrounded is not None)  # other light has it anyway
+        _, began = trace(
+            start, noise=not scene.source.collimated or state.unrounded is not None
+        )  # other light has an estimate of the noise anyway
         of_start = None
         if refined:
             of_start, more = as_waves(start)
@@ -186,7 +198,7 @@ def evaluate(
         rounded = began or trace(designer.within_limits(replace(state, heights=designer.begun(state))))[1]
         unrounded = trace(designer.begun(state, rounded=False))[1]
         figures |= {"min_radius": radius_figures(designer.options.min_radius, rounded, unrounded)}
-    bounds = limits(scene, grey(target), field, state.heights, SMOOTH_STEPS if timed else None)
+    bounds = performance_limits(scene, grey(target), field, state.heights, SMOOTH_STEPS if timed else None)
     if bounds.light is not None:
         figures |= {"least_relative_rms": bounds.light.error}
     if bounds.etendue is not None:
@@ -194,12 +206,12 @@ def evaluate(
     if light is not None:
         figures |= unseen_figures(scene, field, state.heights.to(device), target)
     if designer.options.over is not None:
-        figures |= {"over": over_range.errors(designer, state, target, rays=FINAL_RAYS // OVER, seed=seed, device=device)}
+        figures |= {"over": range_evaluation.errors(designer, state, target, rays=FINAL_RAYS // OVER, seed=seed, device=device)}
     return Evaluation(state, figures, exposure.image.cpu().numpy(), None if light is None else light.image.cpu().numpy())
 
 
 def _both_sides(designer: Designer, target: np.ndarray, state: State, device: str, seed: int) -> Evaluation:
-    """Of a lens with two free-form sides: what it throws on the screen, and what its light does behind that."""
+    """`evaluate` for a lens with two free-form sides: its picture, and a second picture or the ray directions behind it."""
     field, farther = designer.field(state.stage), None if designer.second is None else designer.second.numpy()
 
     def trace(heights: torch.Tensor, rays: int = FINAL_RAYS):
@@ -219,14 +231,15 @@ def _both_sides(designer: Designer, target: np.ndarray, state: State, device: st
 
 
 def radius_figures(radius: float, rounded: dict, unrounded: dict) -> dict[str, float | None]:
-    """What a least radius of concave places costs: light in black of the surface that a design began from, with it and without.
+    """Cost of a least radius of concave regions: light in black regions for the initial surface, with the limit and without.
 
     Args:
-        radius: mm; rounded, unrounded: figures of that surface, of the same rays, within all limits and within all but the radius.
+        radius: mm; rounded, unrounded: figures of that surface, with the same rays, within all limits and within all but the
+            radius.
 
     Returns:
-        radius_mm; start_in_black and start_in_black_without, parts of the light on the screen; in_black_per_mm, their difference
-        over the radius, and its noise; None where the picture has no black.
+        radius_mm; start_in_black and start_in_black_without, fractions of the light on the screen; in_black_per_mm, their
+        difference over the radius, and its noise; None if the picture has no black region.
     """
     one, other = rounded["in_black"], unrounded["in_black"]
     noises = rounded["in_black_noise"], unrounded["in_black_noise"]
@@ -240,13 +253,13 @@ def radius_figures(radius: float, rounded: dict, unrounded: dict) -> dict[str, f
 
 
 def _keys(figures: dict, than: dict) -> tuple[str, str]:
-    """By which figures two lenses are compared, error and light: those of the wave image where both have one."""
+    """Names of the figures by which two lenses are compared, error and light: those of the wave image if both have one."""
     as_waves = None not in (f.get("wave_relative_rms") for f in (figures, than))
     return ("wave_relative_rms", "wave_on_screen") if as_waves else ("relative_rms", "on_screen")
 
 
 def _worse(figures: dict, than: dict) -> bool:
-    """Whether a picture is less like its target without being brighter; a black one is worse than any other."""
+    """Whether a picture has a larger error without being brighter; a black one is worse than any other."""
     if than["on_screen"] == 0:
         return False
     likeness, light = _keys(figures, than)
@@ -254,6 +267,6 @@ def _worse(figures: dict, than: dict) -> bool:
 
 
 def _surface(field: HeightField, heights: torch.Tensor) -> np.ndarray:
-    """The surface on an even grid over the aperture, mm."""
+    """Heights on a regular grid over the aperture, mm."""
     u = torch.linspace(0.0, 1.0, REPORT_SAMPLES, dtype=torch.float64)
     return field.prepare(Sample(u, u, True, torch.ones(())), torch.float64)(heights)[0].numpy()

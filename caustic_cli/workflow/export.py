@@ -1,4 +1,4 @@
-"""A lens into the file of another program."""
+"""Export of a lens to files of other programs."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ from caustic_cli.workflow.reporter import Reporter
 def export(
     project: Path, format: str, output: Path | None, script: bool, given: dict, force: bool, say: Reporter, at: str | None = None
 ) -> tuple[dict, bool]:
-    """Write the lens of a project.
+    """Export the lens of a project.
 
     Args:
         format: a name of FORMATS.
         output: file to write, None for the project's name here.
         script: of lighttools: also the script that rebuilds the scene.
         given: samples (n, m) or tolerance, mm, of the sampled formats; mould, block; milling, a dictionary.
-        force: replace files that are not ours, and do again what is up to date.
-        at: values of the ranges that a network was trained over, "throw=300", which the file's own name then says.
+        force: replace files not made by this program, and repeat what is up to date.
+        at: parameter values for a network that was trained over ranges, "throw=300"; also part of the default file name.
 
     Returns:
-        file, format, bytes, seconds and what was written beside it; whether an earlier run of the same had made all of it.
+        figures file, format, bytes, seconds, and beside, the companion files; and whether all of it was up to date already.
 
     Raises:
-        InputError: no lens there, one that the format cannot hold, or a file in the way; nothing was written.
+        InputError: there is no lens, the format does not support it, or a file exists already; nothing was written.
     """
     began, opened = time.monotonic(), Project.open(project).at(at)
     which = "" if at is None else f"-{at.replace(' ', '').replace(',', '-').replace('=', '-')}"
@@ -49,7 +49,7 @@ def export(
     values = {"at": at} if at is not None else {}
     made = Outputs(opened, "export", {"format": format, "script": script, **values, **given}, written)
     if not force and (found := made.found()):
-        say.say(f"{path}: is what the same options made of the same project, so there is nothing to do; ⟨force⟩ does it again")
+        say.say(f"{path}: is up to date: the same options and the same project, so there is nothing to do; ⟨force⟩ repeats it")
         return found, True
     made.refuse_foreign(force)
     scene, field, heights, _ = opened.lens(scene)
@@ -78,9 +78,11 @@ def write(
     milling: dict | None = None,
     **given,
 ) -> dict:
-    """Write a lens' files, see `files`; given: samples or tolerance, mm; what of it goes into the figures: samples and how far the
-    surface that is read from them is off (`export.accuracy`), or what is said of milling and height maps.  Of light of one
-    wavelength, a file of one index has that for it."""
+    """Write the files of a lens, see `files`, and return their figures: samples and deviation of the surface that is read from them
+    (`export.accuracy`), or those of milling and height maps.
+
+    given: samples or tolerance, mm.  For light of a single wavelength, the refractive index in the file is that at this wavelength.
+    """
     if len(scene.light.wavelengths) == 1:
         scene = scene.at(scene.light.wavelengths[0])
     if scene.lens.front is not None and (script or mould or format not in TWO_SIDED):
@@ -90,7 +92,7 @@ def write(
         )
     if scene.elements and (script or format == "zemax"):
         raise InputError(
-            f"⟨format⟩ {format} holds a lens by itself; with other elements {', '.join(TWO_SIDED)} hold the scene, without ⟨script⟩"
+            f"⟨format⟩ {format} holds a single lens; with other elements {', '.join(TWO_SIDED)} hold the scene, without ⟨script⟩"
         )
     part = part_of(format, scene, field, heights, mould, block)
     writer = getattr(_home(format), f"write_{format}")
@@ -110,14 +112,14 @@ def write(
 
 
 def accuracy_words(figures: dict) -> str:
-    """How a file's surface differs from the designed one: a clause."""
+    """Deviation of the exported surface from the designed one, as a phrase."""
     if "heightmap" in figures:
         said = figures["heightmap"]
         return f"{said['columns']} x {said['rows']} points; between them heights are at most {_length(said['height_error_mm'])} off"
     if "read_as" not in figures:
         return "the spline itself" if figures["format"] == "step" else ""
     nx, ny = figures["samples"]
-    exact = {"step": "; ⟨tolerance⟩ 0 writes the exact one", "lighttools": "; the exact spline stands beside them"}
+    exact = {"step": "; ⟨tolerance⟩ 0 writes the exact one", "lighttools": "; the exact spline is stored beside them"}
     return (
         f"{nx} x {ny} points; read as {figures['read_as']}, heights are at most {_length(figures['height_error_mm'])} off and"
         f" light {_shift(figures['shift_pixels'])} (RMS){exact.get(figures['format'], '')}"
@@ -125,7 +127,7 @@ def accuracy_words(figures: dict) -> str:
 
 
 def _length(length: float) -> str:
-    """A length in mm, as whoever makes a surface reads it."""
+    """A length, given in mm, in micrometres."""
     return f"{1e3 * length:.2g} µm" if length >= 1e-6 else "a nanometre"
 
 
@@ -134,12 +136,12 @@ def _shift(pixels: float) -> str:
 
 
 def _scallops(scene: Scene, field: HeightField, found: dict) -> dict:
-    """What scallops do to the light: see `studies.scallops`."""
+    """Optical effect of the scallops: see `studies.scallops`."""
     return import_module("caustic_cli.studies.scallops").scallops(scene, found["step_over_mm"], found["tool_radius_mm"])
 
 
 def files(path: Path, scene: Scene, format: str, script: bool = False) -> list[Path]:
-    """All that an export writes, the lens first."""
+    """All files of an export, the lens first."""
     if format == "heightmap":
         return [path, beside(path)]
     if format == "mitsuba":

@@ -1,4 +1,4 @@
-"""A lens in its scene, opened or just designed: its surface, its image, its files."""
+"""The public `Lens`: a lens in its scene, loaded or designed, with its surface, renders and exports."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from caustic_cli.project import directory, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Scene
-from caustic_cli.studies.retrace import FINAL_RAYS, QUIET, judging_rays, retrace
+from caustic_cli.studies.retrace import FINAL_RAYS, RELATIVE_NOISE, evaluation_rays, retrace
 from caustic_cli.studies.waves import wave_figures
 from caustic_cli.workflow.compilation import compile_for
-from caustic_cli.workflow.cut import FINER, departure
 from caustic_cli.workflow.export import write
+from caustic_cli.workflow.machining import FINER, height_deviation
 from caustic_cli.workflow.reporter import Listener, Reporter
 
 
@@ -49,10 +49,10 @@ class Lens:
         scene: source, lens, screen.
         field: spline spaces of the exit surface over the aperture.
         heights: its control heights (n, m), mm, float64.
-        target: (n_x, n_y) or (3, n_x, n_y) on the screen's pixels, None of an archive.
-        figures: of the design's own evaluation, by rays it was not designed with; empty of what was loaded unfinished.
-        project: settings and picture, None of an archive.
-        state: where its design stands; provenance: of that, see `workflow.design.provenance`.
+        target: (n_x, n_y) or (3, n_x, n_y) on the screen's pixels, None for an archive.
+        figures: of the evaluation of the design with independent rays; empty for an unfinished design.
+        project: settings and picture, None for an archive.
+        state: of the design; provenance: of that, see `workflow.design.provenance`.
     """
 
     scene: Scene
@@ -87,8 +87,8 @@ class Lens:
 
     @classmethod
     def of(cls, project: Project, given: Mapping[str, Any] | None = None) -> Lens:
-        """The lens of a project's last checkpoint, for the project's values; given: path in `config.table` -> value, which replace
-        the project's settings."""
+        """The lens of the last checkpoint of a project, at its parameter values; given: path in `config.table` -> value, overriding
+        the settings of the project."""
         scene = project.scene(dict(given or {}))
         target = project.target(scene)
         scene, field, heights, checkpoint = project.lens(scene)
@@ -96,22 +96,22 @@ class Lens:
 
     @classmethod
     def of_archive(cls, path: str | Path) -> Lens:
-        """The lens of an `.npz` as exported."""
+        """The lens of an exported `.npz` archive."""
         return cls(*open_archive(path), None, {})
 
     @property
     def seed(self) -> int:
-        """Of its design's rays."""
+        """Seed of the rays of its design."""
         return 0 if self.project is None else self.project.settings["design"]["seed"]
 
     @property
     def encoding(self) -> str:
-        """Of its picture's values, and of pictures of its images."""
+        """Encoding of its picture, and of its images."""
         return "srgb" if self.project is None else self.project.settings["target"]["encoding"]
 
     def plan(self, effects: str = "auto", steeper: float = 0.0) -> Plan:
-        """The effects to simulate: what the scene calls for, "none" that can be left out, or just those named; steeper: by how much
-        the slopes of what is traced may exceed the lens'."""
+        """The effects to simulate: those that the scene calls for ("auto"), only those that cannot be left out ("none"), or those
+        named; steeper: by how much the slopes of the traced surface may exceed those of the lens."""
         return compile_plan(self.scene, self.field, self.heights, parse_effects(effects), steeper)
 
     def render(
@@ -127,17 +127,17 @@ class Lens:
         say: Reporter | None = None,
         cut: CutSurface | None = None,
     ) -> Render:
-        """Retrace the lens with rays of its own, under the effects that the scene calls for.
+        """Retrace the lens with independent rays, with the effects that the scene calls for.
 
         Args:
-            rays: how many; with `tolerance`, where the number begins.  None for those that judge a finished design, `judging_rays`,
-                of other light than a plane wave's more until the noise is `QUIET`.
-            seed: of the rays, the design's own unless given.
-            tolerance: relative RMS noise of the image that rays are added for.
-            filter: reconstruction filter; None counts rays in pixels.
+            rays: their number; with `tolerance`, the initial one.  None for those of the evaluation of a design,
+                `evaluation_rays`, of other light than a plane wave's more until the noise is `RELATIVE_NOISE`.
+            seed: of the rays, that of the design unless given.
+            tolerance: relative RMS noise of the image, for which the number of rays is increased.
+            filter: reconstruction filter; None for a bincount.
             effects: as of `plan`, or a plan.
             dtype: of the ray arithmetic.
-            cut: the surface that a tool left, instead of the lens' own (`workflow.cut`).
+            cut: a machined surface instead of that of the lens (`workflow.machining`).
         """
         plan = effects if isinstance(effects, Plan) else self.plan(effects)
         compile_for(plan.scene, device, say or Listener(), plan.requests)
@@ -146,8 +146,8 @@ class Lens:
             self.field if cut is None else cut,
             self.heights,
             self.target,
-            rays=judging_rays(plan.scene, FINAL_RAYS) if rays is None else count(rays),
-            quiet=QUIET if rays is None else None,
+            rays=evaluation_rays(plan.scene, FINAL_RAYS) if rays is None else count(rays),
+            quiet=RELATIVE_NOISE if rays is None else None,
             seed=self.seed if seed is None else seed,
             filter=filter,
             tolerance=tolerance,
@@ -160,11 +160,11 @@ class Lens:
     def render_waves(
         self, *, effects: str | Plan = "auto", required: bool = True, device: str = "cpu", cut: CutSurface | None = None
     ) -> Render:
-        """The wave image at the scene's wavelengths; its figures alone where it is not `required` and out of reach (image empty).
-        cut: as of `render`.
+        """The wave image at the wavelengths of the scene; only its figures if it is not `required` and not available (empty image).
+        cut: as in `render`.
 
         Raises:
-            InputError: it is out of reach.
+            InputError: it is required and not available.
         """
         plan = effects if isinstance(effects, Plan) else self.plan(effects)
         light, figures = wave_figures(
@@ -175,12 +175,12 @@ class Lens:
             self._resolution(plan.scene),
             finer=1.0 if cut is None else FINER,
             required=required,
-            departure=None if cut is None else departure(cut, self.field, self.heights),
+            departure=None if cut is None else height_deviation(cut, self.field, self.heights),
         )
         return Render(np.empty((0, 0)) if light is None else light.image.cpu().numpy(), figures)
 
     def _resolution(self, scene: Scene) -> Resolution:
-        """What diffraction lets the scene show."""
+        """Resolution of the scene by diffraction."""
         if self.project is None:
             return Resolution.at(scene, self.field, self.heights)
         return Resolution.before(scene, tuple(self.project.settings["target"]["size"]))
@@ -197,12 +197,12 @@ class Lens:
         block: float | None = None,
         milling: dict | None = None,
     ) -> Path:
-        """Write the lens for another program; the format follows from the suffix (.step, .stl, .npz, ...) unless it is named.
+        """Export the lens; the format follows from the suffix (.step, .stl, .npz, ...) unless it is given.
 
         Args:
-            samples: points along x and y of sampled formats; tolerance: of meshes instead, mm; of step, 0 for the exact spline.
-            script: of lighttools: also a script that rebuilds the scene.
-            mould: the negative; block: least material behind a mirror or a mould, mm; milling: of gcode, see `export.milling`.
+            samples: points along x and y, for sampled formats; tolerance: for meshes instead, mm; for step, 0 for the exact spline.
+            script: for lighttools: also write a script that rebuilds the scene.
+            mould: the negative; block: least material behind a mirror or a mould, mm; milling: for gcode, see `export.milling`.
         """
         path = Path(path)
         name = format_of(path, format)
@@ -211,25 +211,25 @@ class Lens:
         return path
 
     def save(self, path: str | Path, force: bool = False) -> Path:
-        """Write the lens as a project directory, which `load` and the command line open; force: replace a project there."""
+        """Save the lens as a project directory, which `load` and the command line open; force: replace a project there."""
         if self.project is None or self.state is None or self.provenance is None:
             raise InputError("an archive's lens has no picture and no design, so it cannot be saved as a project")
         place = Path(path)
         project = replace(self.project, path=place)
         directory.check(place, force)
-        directory.settle(project, force)
+        directory.create(project, force)
         with project.hold:
             project.save(Checkpoint(self.state, self.field.spaces, self.provenance, self.figures, uptodate.inputs(project)))
         return place
 
 
 def load(path: str | Path, at: str | None = None) -> Lens:
-    """The lens of a project directory, or of an .npz archive as exported.
+    """The lens of a project directory, or of an exported .npz archive.
 
-    at: of a network trained over a range, what the lens is for: "throw=300"; the middle where it says nothing.
+    at: parameter values for a network trained over ranges, "throw=300"; the middle of each range that is not named.
 
     Raises:
-        InputError: there is none, it is damaged, or `at` is none of its values.
+        InputError: there is none, it is damaged, or `at` is out of range.
     """
     if is_archive(Path(path)):
         refuse_at(at)
@@ -238,18 +238,18 @@ def load(path: str | Path, at: str | None = None) -> Lens:
 
 
 def refuse_at(at: str | None) -> None:
-    """Refuse values of a network's ranges where there is no network."""
+    """Refuse parameter values of a network for an archive, which holds a single lens."""
     if at is not None:
         raise InputError(f"⟨at⟩ {at} needs a project, whose network gives a lens for every value; an archive holds one lens")
 
 
 def is_archive(path: Path) -> bool:
-    """Whether a path is that of an exported archive rather than of a project."""
+    """Whether a path is an exported archive rather than a project."""
     return path.suffix.lower() == ".npz" and path.is_file()
 
 
 def count(rays: float) -> int:
-    """A number of rays, also given as 1e7."""
+    """A number of rays as int, also given as 1e7."""
     if not (isinstance(rays, int | float) and rays == int(rays) and 1 <= rays <= 1e12):
         raise InputError(f"rays must be a whole number 1 to 1e12, got {rays!r}")
     return int(rays)

@@ -1,4 +1,4 @@
-"""The library: design, load and render lenses from Python, without files unless asked.
+"""Public Python interface: design, load and render lenses, without writing files unless asked.
 
     from caustic_cli import design, load, render, trace
 
@@ -8,7 +8,7 @@
     lens.save("flame.caustic")
 
 Lengths are millimetres, angles degrees, wavelengths nanometres, powers watts; arrays are indexed [i, j] with i along +x and j along
-+y.  Errors are `caustic_cli.errors.InputError` for what was given, and `CausticError` for what could not be finished.
++y.  Errors are `caustic_cli.errors.InputError` for invalid input, and `CausticError` for what could not be completed.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from caustic_cli.workflow.lens import Lens, Render, count, load
 from caustic_cli.workflow.movie import Movie
 from caustic_cli.workflow.reporter import Listener, Reporter
 
-#: Told of a design's progress: stage, what it is at, iterations done, and in all.
+#: Progress callback of a design: stage, status, iterations done, and in total.
 Progress = Callable[[str, str, int | None, int | None], None]
 
 
@@ -66,12 +66,12 @@ def design(
     on_message: Callable[[str], None] | None = None,
     device: str = "cpu",
 ) -> Lens:
-    """The lens that throws a picture, as `caustic design` finds it.
+    """Design a lens for a picture, as `caustic design` does.
 
     Args:
         picture: a file, or irradiance (n_x, n_y), not negative, [i, j] with j upwards.
         source: a type such as "point", or a section as of project.toml: {"type": "disc", "position": [0, 0, -500], "size": [5, 5]}.
-        mag: width of the picture over that of the lens; margin: dark border around it, part of its width in all.
+        mag: width of the picture over that of the lens; margin: dark border around it, in total, over its width.
         throw: distance of the screen from the lens' origin, mm.
         quality: draft, standard or fine; rays: of the last stage.
         settings: further sections and keys of project.toml: {"lens": {"size": [20, 20]}, "design": {"max_slope": 0.5}},
@@ -79,17 +79,17 @@ def design(
         linear: whether values of the file are irradiance rather than sRGB codes.
         waves: auto, on or off: refine the wave image after the ray image.
         time_limit: seconds for the optimisation.
-        preset: settings for what people make, by name: "plate-100", see `config.presets`.
-        invert: take what is dark in the picture file as bright.
+        preset: name of a set of settings, "plate-100", see `config.presets`.
+        invert: exchange dark and bright in the picture file.
         out: a project directory to keep checkpoints and pictures in; without it, no file is touched.
         force: replace a project there.
         movie: a GIF or MP4 file that shows the image at its iterations.
-        on_progress, on_message: told while it works.
+        on_progress, on_message: callbacks.
         device: cpu or cuda.
 
     Raises:
-        InputError: a value out of range, or a picture that no lens of this scene can throw.
-        CausticError: the design could not be finished.
+        InputError: a value is out of range, or the picture cannot be reached in this scene.
+        CausticError: the design could not be completed.
     """
     sections: dict[str, Any] = {
         section: dict(values) if isinstance(values, Mapping) else list(values) for section, values in (settings or {}).items()
@@ -133,15 +133,15 @@ def design_of(
     say: Reporter,
     device: str = "cpu",
 ) -> Lens:
-    """The lens for a picture and settings by their paths in `config.table`: {"mag": 3, "lens.size": [20, 20]}.
+    """Design a lens for a picture and settings by their paths in `config.table`: {"mag": 3, "lens.size": [20, 20]}.
 
     Args:
-        preset: settings by name, see `config.presets`; config: a TOML file of further ones, which replace those of the preset, and
-            which those `given` replace.
-        out, force, movie, device: as of `design`; say: who is told while it works.
+        preset: settings by name, see `config.presets`; config: a TOML file of further ones, which override those of the preset and
+            are overridden by those `given`.
+        out, force, movie, device: as in `design`; say: receives progress and messages.
 
     Raises:
-        InputError, CausticError: as of `design`.
+        InputError, CausticError: as in `design`.
     """
     began, recorder = time.monotonic(), None if movie is None else Movie(movie, force)
     project, first = workflow.begin(
@@ -151,6 +151,7 @@ def design_of(
         config=config,
         out=out,
         force=force,
+        recorded=recorder is not None,
         say=say,
         device=device,
     )
@@ -168,11 +169,11 @@ def resume(
     say: Reporter | None = None,
     device: str = "cpu",
 ) -> Lens:
-    """Go on with the design of a project directory from its last checkpoint.
+    """Continue the design of a project directory from its last checkpoint.
 
     Args:
-        iterations: in all, counted from the very first, instead of the project's; time_limit: s.
-        movie: as of `design`, of what is done from here on; force: replace one there.
+        iterations: in total, counted from the beginning, instead of those of the project; time_limit: s.
+        movie: as in `design`, from this checkpoint on; force: replace an existing one.
 
     Raises:
         InputError: there is no project, or it was edited into another design.
@@ -206,13 +207,13 @@ def trace(
     """The irradiance image of a lens as a differentiable function of its control heights.
 
     Args:
-        scene: whose lens has the net's degree; its knots, or equispaced ones.
+        scene: its lens gives degree and knots of the net, equispaced by default.
         heights: (n, m) mm float64, the control net; gradients flow to it.
         rays: how many, in a sampler of `optics.sampling.SAMPLERS`.
-        filter: reconstruction filter, a 3 x 3 cosine unless given; counting rays in pixels has no derivative.
+        filter: reconstruction filter, a 3 x 3 cosine unless given; a bincount has no derivative.
 
     Returns:
-        (n_x, n_y), or (3, n_x, n_y) of a coloured scene: power per pixel as a part of the source's.
+        (n_x, n_y), or (3, n_x, n_y) for a coloured scene: power per pixel as a fraction of the source's.
     """
     scene = replace(scene, lens=replace(scene.lens, control=cast("tuple[int, int]", tuple(heights.shape))))
     filter = filter or Filter("cosine", (3, 3))

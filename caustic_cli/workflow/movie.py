@@ -1,7 +1,7 @@
-"""A design as a movie: the image that the optimiser judged at its iterations, then that of the finished lens.
+"""Movie of a design: the images of the objective at its iterations, then that of the finished lens.
 
-An iteration's image is there anyway, so that recording takes no tracing: it is made of the design's own rays and filter, or of its
-waves where these are refined.  The last one is of the independent evaluation.
+The image of an iteration is a by-product of the objective, so that recording needs no tracing: it has the rays and filter of the
+design, or is its wave image.  The last one is that of the independent evaluation.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from caustic_cli.studies.irradiance import irradiance
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.retrace import white_level
 
-#: Frames that are kept: of a longer design every second, fourth, ... iteration.
+#: Most frames; for a longer design every second, fourth, ... iteration is kept.
 MOST = 160
-#: How long all of them are shown together, one at least and at most, and the finished lens, milliseconds.
+#: Duration of the movie, of a frame at least and at most, and of the finished lens, milliseconds.
 LENGTH, LEAST, LONGEST, LAST = 10_000, 60, 300, 2000
-#: Height of the picture, of a line of words and of their letters, pixels.
+#: Height of the picture and of a line of text, and font size, pixels.
 HEIGHT, LINE, LETTERS = 480, 24, 15
 
 
 @dataclass(frozen=True)
 class Frame:
-    """codes: 8-bit, (rows, columns) or (rows, columns, 3); words: two lines below them."""
+    """codes: 8-bit pixels, (rows, columns) or (rows, columns, 3); words: two lines of text below."""
 
     codes: np.ndarray
     words: tuple[str, str]
@@ -43,7 +43,7 @@ class Movie:
     """Records a design.
 
     Args:
-        path: a .gif or .mp4; force: replace what is there.
+        path: a .gif or .mp4; force: replace an existing file.
 
     Raises:
         InputError: it could not be written, see `io.movie.refuse_unwritable`.
@@ -59,11 +59,11 @@ class Movie:
         self._target: np.ndarray | None = None
         self._encoding = "srgb"
         self._last = ""
-        #: Whose pixels' true areas turn power into what is shown.
+        #: Screen whose pixel areas convert power to irradiance.
         self.screen: Screen | None = None
 
     def record(self, state: State, target: np.ndarray, encoding: str, waves: bool) -> None:
-        """Keep the image of the last iteration; waves: it is one of light as a wave."""
+        """Record the image of the last iteration; waves: whether it is a wave image."""
         self._target, self._encoding, self._seen = target, encoding, self._seen + 1
         total, stage, _, _, seconds = state.history[-1]
         self._last = f"iteration {total}, {seconds:.1f} s"
@@ -72,18 +72,18 @@ class Movie:
         if len(self.frames) >= MOST:
             self.frames, self._every = self.frames[::2], 2 * self._every
         image = state.image.cpu().numpy()
-        how = "light as a wave" if waves else "the design's own rays"
+        how = "wave image" if waves else "the rays of the design"
         self._add(image, f"stage {stage + 1}, {self._last}", f"relative RMS error {self._error(image):.3f}, by {how}")
 
     def finish(self, image: np.ndarray, figures: dict[str, Any]) -> None:
-        """The finished lens' image and the figures of its evaluation, which the last frame shows."""
+        """Record the image of the finished lens with the figures of its evaluation, as the last frame."""
         waves = figures.get("wave_relative_rms")
         error = figures["relative_rms"] if waves is None else waves
         how = f"{figures['rays']:,} independent rays" if waves is None else "independent wave image"
         self._add(image, f"finished after {self._last}" if self._last else "finished", f"relative RMS error {error:.3f}, {how}")
 
     def write(self) -> None:
-        """Write the file, whole or not at all; nothing where nothing was recorded."""
+        """Write the file atomically; none if nothing was recorded."""
         if self.frames:
             each = min(max(LENGTH // len(self.frames), LEAST), LONGEST)
             shown = [_drawn(frame) for frame in self.frames]
@@ -102,7 +102,7 @@ class Movie:
 
 
 def _drawn(frame: Frame) -> Image.Image:
-    """The picture, enlarged, over its two lines of words, white on black."""
+    """The enlarged picture above its two lines of text, white on black."""
     rows, columns = frame.codes.shape[:2]
     width = max(320, round(HEIGHT * columns / rows / 2) * 2)
     picture = Image.fromarray(frame.codes).resize((round(HEIGHT * columns / rows), HEIGHT), Image.Resampling.BILINEAR)

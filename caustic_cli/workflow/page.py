@@ -1,4 +1,4 @@
-"""A lens as a page for whoever will make it: its names and figures beside what the page traces itself."""
+"""HTML page of a lens for its manufacturer: data and figures of the lens for the interactive page of `export.page`."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from caustic_cli.optics.plan import Plan
 from caustic_cli.scene import Scene
 from caustic_cli.workflow.lens import Lens
 
-#: Points along each axis at which walls and slopes are looked at.
+#: Sample points along each axis for wall thickness and slopes.
 SAMPLES = 601
-#: What is missing where the page does not trace an effect that the scene calls for.
+#: Descriptions of effects that the page does not simulate.
 MISSING = {
     "polarisation": "polarised light is taken as unpolarised",
     "roughness": "the blur of a rough surface",
@@ -32,10 +32,10 @@ def write(path: str | Path, lens: Lens, plan: Plan, figures: Mapping[str, Any], 
     """Write the page.
 
     Args:
-        plan: of the lens' scene; figures: of its render; waves: its wave image, where that was taken; title: any text.
+        plan: of the scene of the lens; figures: of its render; waves: its wave image, or None; title: any text.
 
     Raises:
-        InputError: the light cannot be traced on a page, or the file not be written.
+        InputError: the page does not support the scene, or the file cannot be written.
     """
     scene = plan.scene
     write_page(
@@ -57,7 +57,7 @@ def _size(values: tuple[float, float], unit: str = " mm") -> str:
 
 
 def _lens_rows(lens: Lens) -> list[tuple[str, str]]:
-    """What it is made of, and how thick and steep it is within its aperture."""
+    """Material, thickness and slopes of the lens within its aperture."""
     one, grid = lens.scene.lens, sample_grid(lens.field, lens.heights, (SAMPLES, SAMPLES))
     rx, ry = one.half_size
     inside = (grid.x[:, None] / rx) ** 2 + (grid.y[None, :] / ry) ** 2 <= 1.0 if one.round else np.ones(grid.z.shape, dtype=bool)
@@ -87,7 +87,7 @@ def _light_rows(scene: Scene) -> list[tuple[str, str]]:
 
 
 def _figure_rows(figures: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What the render found, by rays of its own."""
+    """Figures of the render."""
     rms, noise, waves = (figures.get(key) for key in ("relative_rms", "noise", "wave_relative_rms"))
     rows = [("Rendered", f"{figures['rays']:,} rays; {figures['on_screen']:.2%} of the light on the screen")]
     if rms is not None:

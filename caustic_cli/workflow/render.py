@@ -1,4 +1,4 @@
-"""A render from beginning to end: open the lens, compile the scene into a plan, retrace it, write images and figures."""
+"""A complete render: open the lens, compile the scene into a plan, retrace it, write images and figures."""
 
 from __future__ import annotations
 
@@ -23,49 +23,49 @@ from caustic_cli.optics.emission.measured import coarse_words
 from caustic_cli.optics.plan import Plan, parse_effects
 from caustic_cli.optics.surfaces.cut import CutSurface
 from caustic_cli.project.project import FARTHER, RENDER, WAVE, Project, beside
-from caustic_cli.project.uptodate import FILES, Outputs, depicted
+from caustic_cli.project.uptodate import FILES, Outputs, image_provenance
 from caustic_cli.scene import Scene
 from caustic_cli.studies import effects as effects_study
 from caustic_cli.studies import manufacture
 from caustic_cli.studies.irradiance import irradiance
 from caustic_cli.studies.retrace import FINAL_RAYS, white_level
-from caustic_cli.studies.second import second_figures
+from caustic_cli.studies.second_target import second_figures
 from caustic_cli.studies.verify import require_mitsuba, verify, write_panels
 from caustic_cli.workflow import page
 from caustic_cli.workflow.compilation import compile_for
-from caustic_cli.workflow.cut import compared, cut_surface, mark
+from caustic_cli.workflow.illumination import solve_brightness, target_illumination
 from caustic_cli.workflow.lens import Lens, is_archive, refuse_at
+from caustic_cli.workflow.machining import cut_surface, fingerprint, form_deviation
 from caustic_cli.workflow.reporter import Reporter
 from caustic_cli.workflow.tolerances import tolerances
-from caustic_cli.workflow.wanted import illumination, wanted
 
-#: Rays where a tolerance begins, and of what is looked at beside the image, unless said.
+#: Default number of rays: initial for a tolerance, and for evaluations other than the image.
 BESIDE_RAYS = 1_000_000
-#: An image stays where its noise is less than this part of what a new one of the same would have.
+#: Ratio of the noise of an existing image to that of a new one below which the existing one is kept.
 QUIETER = 0.9
 
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked of a render.
+    """Parameters of a render.
 
     Args:
-        lens: project directory, or an .npz archive as exported.
-        rays: traced; with `tolerance`, where the number begins; None for those that judge a finished design.
-        tolerance: relative RMS noise of the image that rays are added for, None for none.
+        lens: project directory, or an exported .npz archive.
+        rays: traced; with `tolerance`, the initial number; None for that of the evaluation of a design.
+        tolerance: relative RMS noise of the image, for which the number of rays is increased, or None.
         reconstruction, filter_size, alpha: of the image; alpha in 1/mm^2, None for 1 per pixel^2.
-        given: path in `config.table` -> value, settings that replace the project's own.
+        given: path in `config.table` -> value, overriding the settings of the project.
         screen_at: the screen's z instead of the scene's, mm.
-        effects: auto, none or names, see `optics.plan.parse_effects`; explain: measure what each costs.
-        image, npy: files to write; None for render.png in the project, and for none.
-        html: file for a page that traces the lens itself, None for none.
-        verify: compare with Mitsuba; report: say what making the lens asks for, tool_radius in mm.
-        cut: a program for a mill, whose cut is traced instead of the surface as designed.
-        force: replace files that are not ours, and do again what is up to date.
-        seed, dtype: of rays; None for the project's own and for float64.
-        tolerances: TOML file of errors whose effect is studied.
-        want: picture of the illumination that an array's sources are to be as bright for.
-        at: values of the ranges that a network was trained over, "throw=300"; None for their middle.
+        effects: auto, none or names, see `optics.plan.parse_effects`; explain: measure the cost of each.
+        image, npy: files to write; None for render.png in the project, and for no .npy.
+        html: file for an interactive page, or None.
+        verify: compare with Mitsuba; report: write manufacturing figures, tool_radius in mm.
+        cut: G-code program whose machined surface is traced instead of the designed one.
+        force: replace files not made by this program, and repeat what is up to date.
+        seed, dtype: of rays; None for the seed of the project, and float64.
+        tolerances: TOML file of errors for a tolerance analysis.
+        want: picture of a target illumination, for the brightness of the sources of an array.
+        at: parameter values for a network that was trained over ranges, "throw=300"; None for their middle.
     """
 
     lens: Path
@@ -94,21 +94,21 @@ class Request:
 
     @property
     def count(self) -> int:
-        """Rays of what is looked at beside the image."""
+        """Number of rays for evaluations other than the image."""
         return BESIDE_RAYS if self.rays is None else self.rays
 
     @property
     def shows(self) -> dict[str, object]:
-        """What decides what is seen in the image, beside its noise, by name, where it is not as usual."""
+        """Parameters that determine the image, except for its noise, where they differ from their defaults."""
         usual = {f.name: f.default for f in fields(self)}
         names = ("reconstruction", "filter_size", "alpha", "screen_at", "effects", "at")
-        cut = {"cut": mark(self.cut)} if self.cut else {}
-        given = {key: mark(Path(value)) if key in FILES else value for key, value in dict(self.given).items()}
+        cut = {"cut": fingerprint(self.cut)} if self.cut else {}
+        given = {key: fingerprint(Path(value)) if key in FILES else value for key, value in dict(self.given).items()}
         return {name: getattr(self, name) for name in names if getattr(self, name) != usual[name]} | cut | given
 
     @property
     def asks(self) -> dict[str, object]:
-        """What decides the outcome, by name; where it goes does not."""
+        """Parameters that determine the result, without the names of outputs."""
         names = (
             "rays",
             "tolerance",
@@ -124,9 +124,9 @@ class Request:
             "dtype",
             "at",
         )
-        cut = {"cut": mark(self.cut)} if self.cut else {}
+        cut = {"cut": fingerprint(self.cut)} if self.cut else {}
         off = {} if self.tolerances is None else {"tolerances": read_tolerances(self.tolerances)}
-        want = {"want": mark(self.want)} if self.want else {}
+        want = {"want": fingerprint(self.want)} if self.want else {}
         return {name: getattr(self, name) for name in names} | cut | off | want | dict(self.given)
 
 
@@ -134,11 +134,11 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     """Trace a lens and write its irradiance image.
 
     Returns:
-        the figures of the JSON table; `effects`, `report` and `verify` where asked for; `reused` where an earlier run of the same
-        has made them, and nothing was done.
+        the figures of the JSON table; `effects`, `report` and `verify` if requested; `reused` if they were up to date and nothing
+        was done.
 
     Raises:
-        InputError: no lens there, a value out of range, or a file in the way; nothing was written.
+        InputError: there is no lens, a value is out of range, or a file exists already; nothing was written.
     """
     began = time.monotonic()
     parse_effects(asked.effects)
@@ -173,14 +173,14 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     made = Outputs(project, "render", asked.asks | {"device": device}, paths) if project and not asked.verify else None
     if made and not asked.force and (figures := made.found()):
         say.say(
-            f"{image_path}: is what the same options made of the same project, so there is nothing to do; ⟨force⟩ does it again"
+            f"{image_path}: is up to date: the same options and the same project, so there is nothing to do; ⟨force⟩ repeats it"
         )
         return figures | {"reused": True}
     lens = archived or Lens.of(cast(Project, project), asked.given)
     if asked.screen_at is not None:
         lens = replace(lens, scene=replace(lens.scene, screen=replace(lens.scene.screen, z=asked.screen_at)))
     scene = lens.scene
-    goal = None if asked.want is None else illumination(lens, asked.want)
+    goal = None if asked.want is None else target_illumination(lens, asked.want)
     if asked.verify:
         require_mitsuba(scene)
     if asked.html is not None:
@@ -189,7 +189,7 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     filter = filter_from(asked.reconstruction, asked.filter_size, scene.screen, asked.alpha)
     seed = lens.seed if asked.seed is None else asked.seed
     cut = None if asked.cut is None else cut_surface(asked.cut, scene, lens.field, asked.tool_radius)
-    deviation = {} if cut is None else compared(cut, lens.field, lens.heights, scene.lens.round)
+    deviation = {} if cut is None else form_deviation(cut, lens.field, lens.heights, scene.lens.round)
     plan = lens.plan(asked.effects, deviation.get("cut_slope_most", 0.0))
     if coarse := coarse_words(scene):
         say.say(coarse)
@@ -214,11 +214,11 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     shown = irradiance(image, scene.screen)
     aim = None if lens.target is None else irradiance(lens.target, scene.screen)
     wide = WIDE if asked.image is None else 1
-    own = depicted(project, lens.state.heights, figures, asked.shows) if project and lens.state else {}
+    own = image_provenance(project, lens.state.heights, figures, asked.shows) if project and lens.state else {}
     there = said_of(image_path) if in_project and own and not asked.force else {}
     if there.get("of") == own.get("of") and float(there.get("noise", "inf")) < QUIETER * float(own.get("noise", "inf")):
         say.say(
-            f"{image_path}: its noise is {there['noise']}, less than the {own['noise']} that these rays leave, so it stays; ⟨force⟩"
+            f"{image_path}: its noise is {there['noise']}, less than the {own['noise']} of these rays, so it is kept; ⟨force⟩"
             " replaces it, ⟨out⟩ writes another beside it"
         )
         figures["image_kept"] = True
@@ -226,7 +226,7 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
         write_image(image_path, shown, white_level(shown, aim), lens.encoding, wide, own)
     if scene.second is not None:
         farther_target = None if lens.project is None else lens.project.second_target(scene)
-        with say.notify_if_slow("following the light behind the picture"):
+        with say.notify_if_slow("tracing the light behind the picture"):
             light, more = second_figures(
                 plan.scene,
                 lens.field,
@@ -242,12 +242,12 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
             write_image(farther, light, white_level(light, farther_target), lens.encoding, wide)
             figures["second_image"] = str(farther)
     if wave_path == asked.lens / WAVE:
-        discard(wave_path)  # of what render.png was before
+        discard(wave_path)  # of an earlier render.png
     if asked.npy is not None:
         write_npy(asked.npy, image)
     waves = None
     if plan["diffraction"].on:
-        with say.notify_if_slow("taking the wave image"):
+        with say.notify_if_slow("computing the wave image"):
             waves, more = _wave_image(plan, lens, device, asked.effects != "auto", wave_path, wave_npy, cut, wide)
         figures |= more
     if asked.html is not None:
@@ -271,11 +271,11 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     if sheet is not None:
         figures["report"] = manufacture.manufacture(scene, lens.field, lens.heights, asked.tool_radius, seed)
         manufacture.write_json(sheet, figures["report"])
-        say.say(f"{sheet}: what making the lens asks for")
+        say.say(f"{sheet}: manufacturing figures of the lens")
     if off is not None and draws[0] is not None and draws[1] is not None:
         figures["tolerances"] = tolerances(lens, plan, off, *draws, say)
     if goal is not None and lit is not None:
-        figures["want"] = wanted(lens, plan, goal, lit, asked.count, seed, device, say)
+        figures["want"] = solve_brightness(lens, plan, goal, lit, asked.count, seed, device, say)
     if panels is not None:
         figures["verify"] = _verified(scene, lens, asked.count, seed, panels)
     if made:
@@ -284,22 +284,22 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
 
 
 def _refuse_unknown(asked: Request, scene: Scene) -> None:
-    """Refuse studies that know lenses of one index with a flat entrance alone.
+    """Refuse studies that support only single lenses of uniform index with a flat entrance.
 
     Raises:
-        InputError: saying which.
+        InputError: naming the study.
     """
     beyond = "a free-form entrance" if scene.two_sided else "an index that varies" if scene.lens.gradient is not None else ""
     beyond = "other elements beside it" if scene.elements else beyond
     for name, given in (("tolerances", asked.tolerances is not None), ("report", asked.report)):
         if given and beyond:
-            raise InputError(f"⟨{name}⟩ knows lenses of one index with a flat entrance, and this one has {beyond}")
+            raise InputError(f"⟨{name}⟩ supports lenses of uniform index with a flat entrance, and this one has {beyond}")
 
 
 def _wave_image(
     plan: Plan, lens: Lens, device: str, required: bool, path: Path, npy: Path | None, cut: CutSurface | None, wide: int
 ) -> tuple[np.ndarray | None, dict]:
-    """Write the wave image, `wide` columns at least; it, None where there is none, and its figures."""
+    """Write the wave image, at least `wide` columns; returns it, or None if it is not available, and its figures."""
     image, figures = lens.render_waves(effects=plan, required=required, device=device, cut=cut)
     if not image.size:
         return None, figures
@@ -310,7 +310,7 @@ def _wave_image(
 
 
 def _verified(scene: Scene, lens: Lens, rays: int, seed: int, panels: Path) -> dict:
-    """The figures of the comparison with Mitsuba, of glass that has one index; its picture is written to `panels`."""
+    """Compare with Mitsuba, at the index of a single wavelength; the figures.  The plot is written to `panels`."""
     if len(scene.light.wavelengths) == 1:
         scene = scene.at(scene.light.wavelengths[0])
     with TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""What a workflow tells while it works, and to whom: a terminal, a program, a notebook or nobody."""
+"""Progress and messages of a workflow: the interface, and an implementation by callbacks."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ from typing import Protocol
 
 from caustic_cli.errors import plain
 
-#: Called with what is being done, a text about it, how much of it is done and of how much in all (None where unknown).
+#: Progress callback: activity, status text, steps done, and steps in total (None where unknown).
 Tell = Callable[..., None]
 
 
 class Reporter(Protocol):
-    """Whoever listens."""
+    """Receiver of progress and messages."""
 
     def say(self, text: str) -> None:
-        """A line for the user."""
+        """Report a line to the user."""
 
     def progress(self, total: int | None) -> AbstractContextManager[Tell]:
-        """What is told of the work in the block, of `total` steps in all."""
+        """Report the progress of the work in the block, of `total` steps."""
 
     def notify_if_slow(self, text: str, seconds: float = 4.0) -> AbstractContextManager[None]:
-        """Say `text` if the block is still at work after so many seconds."""
+        """Report `text` if the block takes longer than `seconds`."""
 
 
 class Listener:
-    """Passes progress on to a function, or to nobody.
+    """Reporter that calls functions, if any.
 
     Args:
         on_progress: called with (stage, text, done, total) after every step.
@@ -41,13 +41,13 @@ class Listener:
         self.on_progress, self.on_message = on_progress, on_message
 
     def say(self, text: str) -> None:
-        """Pass a line on."""
+        """Report a line to `on_message`."""
         if self.on_message is not None:
             self.on_message(plain(text))
 
     @contextmanager
     def progress(self, total: int | None) -> Iterator[Tell]:
-        """Pass every step on."""
+        """Report every step to `on_progress`."""
 
         def tell(description: str = "", text: str = "", done: int | None = None, whole: int | None = None) -> None:
             if self.on_progress is not None:
@@ -57,5 +57,5 @@ class Listener:
 
     @contextmanager
     def notify_if_slow(self, text: str, seconds: float = 4.0) -> Iterator[None]:
-        """Wait in silence."""
+        """Report nothing."""
         yield

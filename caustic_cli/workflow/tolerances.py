@@ -1,4 +1,4 @@
-"""The study of tolerances of a lens, from its file to its figures, table, CSV and plot."""
+"""Tolerance analysis of a lens: figures, CSV of all draws and plot."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from caustic_cli.workflow.reporter import Reporter
 
 
 def tolerances(lens: Lens, plan: Plan, asked: Tolerances, sheet: Path, plot: Path, say: Reporter) -> dict:
-    """Study a lens under errors; write all draws to `sheet`, CSV, and `plot`, PNG.
+    """Analyse a lens under errors; write all draws to `sheet`, CSV, and `plot`, PNG.
 
-    Of a lens that was refined on its wave image, that is judged; of others, the ray image.
+    A lens that was refined on its wave image is evaluated by that, others by the ray image.
 
     Returns:
         the figures for JSON, with the paths of both files.
 
     Raises:
-        InputError: an error makes its scene impossible.
+        InputError: an error makes the scene invalid.
     """
     assert lens.target is not None
     refined = lens.figures.get("wave_relative_rms") is not None and plan["diffraction"].on

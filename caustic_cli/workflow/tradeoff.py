@@ -1,4 +1,4 @@
-"""The designs that `convergence study light` makes: one scene, of several thicknesses and weights of the light that is kept."""
+"""Designs for the trade-off between error and efficiency, `convergence study light`: several thicknesses and loss weights."""
 
 from __future__ import annotations
 
@@ -12,24 +12,23 @@ import torch
 from caustic_cli.config import settings
 from caustic_cli.config.completion import build_options, build_stages, complete
 from caustic_cli.errors import CausticError
-from caustic_cli.inverse.designer import Designer, First
+from caustic_cli.inverse.designer import Designer, InitialHeights
 from caustic_cli.io.picture import Picture
 from caustic_cli.project.project import Project
-from caustic_cli.studies.light import Lens
+from caustic_cli.studies.efficiency import DesignedLens
 from caustic_cli.workflow.comparison import picture_of_disc
 from caustic_cli.workflow.design import first_heights
 
-#: Weights of the loss "light" beside "rms"; of light from infinity, whose lens may be of any thickness, and of light close by.
+#: Weights of the loss "light" relative to "rms", for distant sources, where thickness has no influence, and for near sources.
 DISTANT_WEIGHTS, NEAR_WEIGHTS = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0), (0.0, 1.0, 10.0)
-#: Thicknesses that are tried with light close by, in parts of the scene's own.
+#: Thicknesses for near sources, relative to that of the scene.
 PARTS = (0.7, 1.0, 1.4, 2.0)
-#: Without a project: the width of an LED, mm, so close that much of its light is lost, its cone in degrees, and
-#: pixels across the screen.
+#: Default scene: width of an LED and its distance, mm, at which much of its light is lost; cone, degrees; pixels across the screen.
 LED, BEFORE, CONE, PIXELS = 2.0, 3.0, 90.0, 100
 
 
 def led() -> dict:
-    """Settings of the scene of a study without a project."""
+    """Settings of the default scene of the study."""
     full = complete(
         {
             "source": {"type": "disc", "position": [[0.0, 0.0, -BEFORE]], "size": [LED, LED], "cone": CONE},
@@ -41,16 +40,16 @@ def led() -> dict:
     return full
 
 
-def lenses(project: Project | None, seconds: float, device: str) -> tuple[int, Iterator[Lens]]:
-    """How many lenses there are, and each when it is designed, for at most so many seconds of iterations; one whose light cannot
-    reach the picture is left out."""
+def lenses(project: Project | None, seconds: float, device: str) -> tuple[int, Iterator[DesignedLens]]:
+    """Largest number of lenses, and an iterator that designs them, each with at most `seconds` of iterations; those whose light
+    cannot reach the picture are left out."""
     full = led() if project is None else project.settings
     near = not settings.build_source(full).distant and not full["lens"].get("mirror", False)
     weights, parts = (NEAR_WEIGHTS, PARTS) if near else (DISTANT_WEIGHTS, (1.0,))
     return len(weights) * len(parts), _designed(project, full, weights, parts, seconds, device)
 
 
-def _designed(project: Project | None, full: dict, weights, parts, seconds: float, device: str) -> Iterator[Lens]:
+def _designed(project: Project | None, full: dict, weights, parts, seconds: float, device: str) -> Iterator[DesignedLens]:
     for part in parts:
         own = copy.deepcopy(full)
         lens = own["lens"]
@@ -71,13 +70,13 @@ def _designed(project: Project | None, full: dict, weights, parts, seconds: floa
                 state = designer.run(designer.begin(*first or ()), time_limit=seconds)
             except CausticError:
                 continue
-            yield Lens(
+            yield DesignedLens(
                 thickness, weight, loss, scene, designer.field(state.stage), designer.within_limits(state), goal, state.seconds
             )
 
 
-def _first(project: Project | None, own: dict) -> tuple[First | None, dict, np.ndarray]:
-    """First heights for settings, the settings as they need them, and the target (n_x, n_y)."""
+def _first(project: Project | None, own: dict) -> tuple[InitialHeights | None, dict, np.ndarray]:
+    """Initial heights for settings, the settings adapted to them, and the target (n_x, n_y)."""
     project = Project(None, own, Picture(picture_of_disc(), "linear")) if project is None else replace(project, settings=own)
     project, first = first_heights(project, {"lens": {"thickness": own["lens"]["thickness"]}})
     return first, project.settings, project.target(project.scene())

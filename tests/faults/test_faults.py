@@ -93,7 +93,7 @@ def test_a_full_disk_ends_in_1_with_what_was_there_before(capfd):
     assert done.stdout.split() == ["1"] * 4, done.stderr
     said = done.stderr.splitlines()
     assert len(said) == 4 and all("could not be written (File too large)" in line for line in said)
-    assert "the one before is whole" in said[0] and "nothing of it is on disk" in said[1]
+    assert "the one before is intact" in said[0] and "nothing of it is on disk" in said[1]
     after = content("blob.caustic")
     assert {k: v for k, v in after.items() if k != "project.toml"} == {k: v for k, v in before.items() if k != "project.toml"}
     assert sorted(p.name for p in Path().iterdir()) == ["blob.caustic", "blob.png", "new.caustic"]
@@ -174,16 +174,16 @@ def test_one_design_at_a_time_holds_a_project(capfd, monkeypatch):
     before, inner = content("blob.caustic"), []
     with directory.locked(Path("blob.caustic")):
         for arguments in (["design", "--resume", "blob.caustic", "--iterations", "5", "--quiet"], [*DESIGN, "--force"]):
-            assert "another caustic design is at work there" in run(arguments, capfd, 2)
+            assert "another caustic design is running there" in run(arguments, capfd, 2)
         assert content("blob.caustic") == before
         run(["export", "blob.caustic", "--quiet"], capfd, 0)  # to look is allowed
-    judged = workflow.judge
+    judged = workflow.evaluate_and_write
 
     def judge(*arguments):
         inner.append(cli.run(["design", "--resume", str(arguments[0].path), "--quiet"]))
         return judged(*arguments)
 
-    monkeypatch.setattr(workflow, "judge", judge)
+    monkeypatch.setattr(workflow, "evaluate_and_write", judge)
     for arguments in ([*DESIGN, "-o", "fresh"], [*DESIGN, "--force"], ["design", "--resume", "fresh", "--quiet"]):
         assert cli.run(arguments) == 0
     assert inner == [2, 2, 2]

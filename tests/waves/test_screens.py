@@ -1,4 +1,4 @@
-"""Tilted and shifted screens, extended sources, large lenses, the energy account, and what no wave image can be made of."""
+"""Tilted and shifted screens, extended sources, large lenses, the energy balance, and scenes without a wave image."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""What a three-axis mill is told: the settings of `export format gcode`, in mm, mm/min and revolutions per minute.
+"""Machining parameters of `export format gcode` for a three-axis mill, in mm, mm/min and revolutions per minute.
 
-Loaded by the command line, which makes an option of each: no torch here.
+The command line makes an option of each, so that this module must not import torch.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ from caustic_cli.errors import InputError
 
 PATHS = ("raster", "raster-y", "spiral")
 TOOLS = ("ball", "flat")
-#: Part of the tool's curvature up to which hollows are followed by finer passes; beyond, material is left in any case.
+#: Largest concave curvature, over that of the tool, for which the step-over is reduced; beyond, material is left in any case.
 FITS = 0.75
 
 
 def _setting(default, help: str, unit: str = "", high: float = 1e6, choices: tuple[str, ...] = ()):
-    """A setting above 0 and up to `high`, or one of `choices`; None for what follows from others."""
+    """A parameter above 0 and up to `high`, or one of `choices`; default None if it follows from others."""
     return field(default=default, metadata={"help": help, "unit": unit, "high": high, "choices": choices})
 
 
 @dataclass(frozen=True)
 class Milling:
-    """How a surface is milled; see the help of each."""
+    """Machining parameters; see the help of each."""
 
     tool_radius: float = _setting(2.0, "Radius of the ball-nose tool that finishes.", "mm", 1e3)
     scallop: float = _setting(0.001, "Height of the scallops that finishing leaves, at most; sets the step-over.", "mm", 10.0)
@@ -59,10 +59,10 @@ class Milling:
             )
 
     def step(self, concave: float = 0.0, slope: float = 0.0) -> float:
-        """Distance of passes, mm in the plane, that leaves scallops of at most `scallop`: see `scallop_of`.
+        """Step-over, mm in the plane, for scallops of at most `scallop`: inverse of `scallop_of`.
 
         Args:
-            concave: largest concave curvature of the surface, 1/mm, 0 where it has none; slope: largest.
+            concave: largest concave curvature of the surface, 1/mm, 0 for none; slope: largest slope.
         """
         if self.step_over is not None:
             return self.step_over
@@ -70,21 +70,20 @@ class Milling:
         return math.sqrt(4.0 * h * (2.0 * r - h) * self._room(concave) / (1.0 + slope * slope))
 
     def scallop_of(self, step: float, concave: float = 0.0, slope: float = 0.0) -> float:
-        """Largest height, mm, of the scallops that passes `step` mm apart leave, along the surface's normal.
+        """Largest height of the scallops along the surface normal, mm, for a step-over `step`, mm in the plane.
 
-        The tool's middles are s apart, seen from above s times the cosine of the slope.  In a hollow of curvature k they touch the
-        surface s / (1 - R k) apart, and their spheres rise by the curvature 1 / R - k above it: h = s^2 / (8 R (1 - R k)) to first
-        order, and s^2 = 4 h (2 R - h) exactly on a flat surface.  Hollows into which the ball hardly fits count as curved by FITS /
-        R.
+        The centres of the tool are s apart, projected s times the cosine of the slope.  In a concave region of curvature k the
+        contact points are s / (1 - R k) apart, and the spheres have the curvature 1 / R - k relative to the surface: h = s^2 / (8 R
+        (1 - R k)) to first order, and s^2 = 4 h (2 R - h) exactly on a plane.  Curvatures above FITS / R count as FITS / R.
         """
         r, square = self.tool_radius, step * step * (1.0 + slope * slope) / self._room(concave)
         return square / (4.0 * (r + math.sqrt(max(0.0, r * r - 0.25 * square))))
 
     def _room(self, concave: float) -> float:
-        """1 - R k."""
+        """1 - R k, at least 1 - FITS."""
         return 1.0 - min(FITS, self.tool_radius * max(0.0, concave))
 
     @property
     def rough_radius(self) -> float:
-        """Of the tool that roughs, mm."""
+        """Radius of the roughing tool, mm."""
         return self.tool_radius if self.roughing_radius is None else self.roughing_radius

@@ -1,16 +1,16 @@
-"""A program for a three-axis mill: G-code of the common kind (RS-274: G0, G1, G17, G21, G90, G94, M0, M3, M5, M30).
+"""G-code programs for a three-axis mill (RS-274: G0, G1, G17, G21, G90, G94, M0, M3, M5, M30).
 
-X0 Y0 is the middle of the part, on its axis; Z0 is its flat face, which lies on the table; Z goes up.  X, Y, Z are those of the
-tool's tip.  A mirror, or the mould of a lens, lies on its back: the scene's (x, y, z) is (x, -y, -z) of the program, more the
-height of Z0, which a comment says.
+X0 Y0 is the centre of the part, on its axis; Z0 is its flat face, on the table; Z points up.  X, Y, Z are coordinates of the tool
+tip.  A mirror, or the mould of a lens, is turned over: the (x, y, z) of the scene is (x, -y, -z) of the program, plus the height of
+Z0, which is given in a comment.
 
-Finishing follows the offset surface (`offset`), so that the ball cuts nowhere into the part, in straight moves whose tips are off
-by at most a tolerance: a hundredth of the scallops unless said.  With curvature k along the path a move's middle is then off by t =
-k l^2 / 8 and its ends tilt by sqrt(2 t k), where scallops tilt by sqrt(2 h / R): a tenth of that where k = 1 / R, and less where
-the surface bends less.  Numbers have so many digits that rounding stays below a tenth of the tolerance.
+Finishing follows the offset surface (`offset`), so that the ball does not gouge the part, in linear moves within a tolerance, by
+default a hundredth of the scallop height.  With curvature k along the path the midpoint of a move of length l deviates by t = k l^2
+/ 8 and its ends by the slope sqrt(2 t k), compared with sqrt(2 h / R) of scallops: a tenth of that for k = 1 / R, and less for
+smaller k.  Rounding of coordinates is below a tenth of the tolerance.
 
-Roughing goes down in layers over a raster, at the tolerance of the allowance, and where a layer's floor is below the surface's
-offset stays above that.  It is written with half the tool's radius between passes.
+Roughing removes the stock in layers by a raster, at a tolerance relative to the allowance, above the offset surface, with a
+step-over of half the tool radius.
 """
 
 from __future__ import annotations
@@ -29,31 +29,32 @@ from caustic_cli.config.checks import LENGTH
 from caustic_cli.errors import InputError
 from caustic_cli.export.milling import Milling
 from caustic_cli.export.milling.offset import BallOffset, FlatOffset, shape_of
-from caustic_cli.export.milling.paths import heightened, raster, spacing, spiral
+from caustic_cli.export.milling.paths import raster, spacing, spiral, with_heights
 from caustic_cli.export.part import Part
 from caustic_cli.export.text import CREATED
 from caustic_cli.io.files import atomic_path
 from caustic_cli.optics.surfaces.heightfield import HeightField
 
-#: Tolerance of the path in parts of the scallops' height; digits of a number beyond those of the tolerance; and at least.
+#: Tolerance of the path over the scallop height; digits of a coordinate beyond those of the tolerance; least number of digits.
 PATH_PART, MORE_DIGITS, LEAST_DIGITS = 0.01, 1, 4
-#: Passes go beyond the aperture by at most this part of the tool's radius.
+#: Largest overrun of the passes beyond the aperture, over the tool radius.
 MOST_OVER = 0.7
-#: First moves of a path, in parts of the radius, and at most a knot span; first moves worked on at a time, which bounds the memory.
+#: Length of the initial moves of a path over the radius, at most a knot span; initial moves processed at a time, which bounds the
+#: memory.
 FIRST_MOVE, AT_A_TIME = 0.125, 4096
-#: What stock has above the highest point, at least, unless said, mm.
+#: Default least stock above the highest point, mm.
 FACING = 0.1
-#: Roughing: distance of passes in parts of the radius, tolerance in parts of the allowance.
+#: Roughing: step-over over the radius, tolerance over the allowance.
 ROUGH_STEP, ROUGH_PART = 0.5, 0.05
-#: Rapid moves, mm/min, for the time said: mills have 3 to 30 m/min.
+#: Rapid feed for the estimated time, mm/min: mills have 3 to 30 m/min.
 RAPID = 3000.0
-#: Letters of the line that says lines and time, which is written last.
+#: Reserved length of the comment with the number of lines and the time, which is written last.
 COUNTED = 100
 
 
 @dataclass
 class _Writer:
-    """Writes moves and adds up what they are."""
+    """Writes moves and accumulates lines, length and time."""
 
     file: object
     digits: int
@@ -73,7 +74,7 @@ class _Writer:
         self.lines += len(lines)
 
     def rapid(self, x: float | None = None, y: float | None = None, z: float | None = None) -> None:
-        """G0 to what is given of a place."""
+        """Rapid move (G0) in x and y, or in z."""
         if x is not None:
             self.say(f"G0 {self.forms[3] % (x, y)}")
         else:
@@ -84,7 +85,7 @@ class _Writer:
         self.at = to
 
     def cut(self, points: np.ndarray, feed: float) -> None:
-        """G1 through points (m, 3); coordinates that stay are not said again."""
+        """Linear moves (G1) through points (m, 3), mm; unchanged coordinates are omitted."""
         points = np.round(points, self.digits) + 0.0
         before = np.concatenate([[self.at], points[:-1]])
         changed = points != before
@@ -107,17 +108,17 @@ class _Writer:
 
 
 def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, tolerance: float | None = None) -> dict:
-    """Write the program whole or not at all.
+    """Write the program atomically.
 
     Args:
-        milling: tools, speeds and the path; tolerance: of straight moves, mm.
+        milling: tools, speeds and path; tolerance: of linear moves, mm.
 
     Returns:
-        what was written: lines, minutes, length_mm, step_over_mm, scallop_mm, scallop_slope, tolerance_mm, tool_radius_mm,
+        figures: lines, minutes, length_mm, step_over_mm, scallop_mm, scallop_slope, tolerance_mm, tool_radius_mm,
         stock_mm.
 
     Raises:
-        InputError: stock below the surface, a tool that would cut into the table, or a file that cannot be written there.
+        InputError: the stock is below the surface, the tool would cut into the table, or the file cannot be written.
     """
     if tolerance is not None:
         checks.number("⟨tolerance⟩", tolerance, 0.0, LENGTH, open_low=True)
@@ -157,7 +158,7 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
             FIRST_MOVE * m.tool_radius, *(2.0 * r / (len(s.breaks) - 1) for s, r in zip(field.spaces, field.half_size, strict=True))
         )
         for line in _batches(passes, move):
-            points = heightened(line, offset, move, tolerance)
+            points = with_heights(line, offset, move, tolerance)
             if first:
                 _descend(out, points[0], top, m.plunge)
                 first = False
@@ -180,7 +181,7 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
 
 
 def _head(part: Part, m: Milling, step: float, scallop: float, top: float, digits: int, tolerance: float) -> list[str]:
-    """Comments: what is made, with what, and where zero is.  `io.gcode` reads those with a colon."""
+    """Header comments: part, tools and datum.  `io.gcode` reads those with a colon."""
     wide, high = part.lens.size
     turned = "yes, the scene's x, y, z is x, -y, -z here" if part.turned else "no"
     return [
@@ -203,7 +204,7 @@ def _begin(out: _Writer, tool: str, radius: float, spindle: float, safe: float) 
 
 
 def _descend(out: _Writer, to: np.ndarray, top: float, plunge: float) -> None:
-    """To a point: over it, down to the stock, and into it."""
+    """Approach a point: rapid above it, rapid down to the stock, plunge."""
     out.rapid(x=float(to[0]), y=float(to[1]))
     if to[2] < top < out.at[2]:
         out.rapid(z=top)
@@ -211,7 +212,7 @@ def _descend(out: _Writer, to: np.ndarray, top: float, plunge: float) -> None:
 
 
 def _batches(passes: Iterator[np.ndarray], move: float) -> Iterator[np.ndarray]:
-    """Consecutive passes as one line each time they have AT_A_TIME first moves."""
+    """Concatenate consecutive passes into lines of about AT_A_TIME initial moves."""
     held, moves = [], 0.0
     for line in passes:
         held.append(line if not held else line[1:])
@@ -224,7 +225,7 @@ def _batches(passes: Iterator[np.ndarray], move: float) -> Iterator[np.ndarray]:
 
 
 def _rough(out: _Writer, m: Milling, field: HeightField, heights: Tensor, lens, top: float, low: float, safe: float) -> None:
-    """Layers from the top of the stock down to the allowance above the surface."""
+    """Write layers from the top of the stock down to the allowance above the surface."""
     make, radius = {"ball": BallOffset, "flat": FlatOffset}[m.roughing_tool], m.rough_radius
     offset = make(field, heights, radius, m.allowance)
     deep = top - low - m.allowance
@@ -238,11 +239,11 @@ def _rough(out: _Writer, m: Milling, field: HeightField, heights: Tensor, lens, 
             return np.maximum(offset(x, y), floor)
 
         for line in raster(lens.half_size, 0.5 * radius, ROUGH_STEP * radius, lens.round):
-            points = heightened(line, height, FIRST_MOVE * radius, ROUGH_PART * m.allowance)
-            kept = points[:, 2] < above  # the rest is as low as it may be, or nothing is there any more
+            points = with_heights(line, height, FIRST_MOVE * radius, ROUGH_PART * m.allowance)
+            kept = points[:, 2] < above  # elsewhere the material is removed already, or the surface reached
             for run in np.split(np.arange(len(points)), np.flatnonzero(np.diff(kept.astype(int))) + 1):
                 if kept[run[0]]:
-                    run = points[max(0, run[0] - 1) : run[-1] + 2]  # with a point above on either side
+                    run = points[max(0, run[0] - 1) : run[-1] + 2]  # including a point above on either side
                     _descend(out, np.array([*run[0, :2], max(run[0, 2], floor)]), top, m.plunge)
                     out.cut(run, m.feed)
                     out.rapid(z=safe)

@@ -1,4 +1,4 @@
-"""Where a tool may go: the lowest place of its tip over each point that cuts nowhere into the surface.
+"""Cutter-location surface: the lowest gouge-free height of the tool tip over each point of the plane.
 
 Notation
     q           the tool's axis in the plane, (x, y);  c  the point of the surface it touches;  D = q - c,  all mm
@@ -6,11 +6,11 @@ Notation
     C(q)        height of a ball's centre: max over c of F(c) = Z(c) + sqrt(R^2 - |D|^2), the surface's dilation by the ball
     g, H        slopes and second derivatives of Z at c
 
-C is the offset surface along the normals where that can be reached, and lies above it where the surface is hollower than the tool:
-there the ball touches in two places and leaves what is between.  The place to begin from is that of the highest sample of a grid
-(`optics.envelope`, turned over).  Newton's method then makes grad F = g + D / S, S = sqrt(R^2 - |D|^2), vanish, with the second
-derivatives H - (1 + D D^T / S^2) / S; along an edge of the aperture only the derivative along it.  Where a ball touches in two
-places that are nearly as high, samples may tell the lower one: those of tools half a sample away, on all four sides, are tried too.
+C is the normal offset surface where the tool fits, and lies above it where the concave curvature of the surface exceeds that of the
+tool: there the ball has two contact points, and material remains between them.  The initial contact point is the highest sample on
+a grid (`optics.envelope`, inverted).  Newton's method then solves grad F = g + D / S = 0, S = sqrt(R^2 - |D|^2), with the Hessian H
+- (1 + D D^T / S^2) / S; on an edge of the aperture only for the derivative along it.  With two contact points of nearly equal
+height the grid may find the lower one, so the contact points of tools half a sample away, on all four sides, are tried too.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ from caustic_cli.optics.envelope import Envelope
 from caustic_cli.optics.surfaces.base import FIRST, SECOND
 from caustic_cli.optics.surfaces.heightfield import HeightField
 
-#: Samples a knot span, a tool's radius, and at most, from which the search for the point of contact begins.
+#: Samples per knot span, per tool radius, and at most, for the initial contact point.
 A_SPAN, A_RADIUS, MOST = 3, 40, 6001
-#: Two points of contact are not the same if they are so many samples apart.
+#: Distance, samples, beyond which two contact points are distinct.
 APART = 2.0
-#: Newton's steps, and the move, in parts of the radius, below which no more are made.
+#: Most Newton iterations, and their tolerance over the radius.
 STEPS, STILL = 12, 1e-10
 
 
 def shape_of(field: HeightField, heights: Tensor) -> tuple[float, float, float, float]:
-    """Least and largest height, mm, largest slope, and largest concave curvature, 1/mm, 0 for none; of samples."""
+    """Least and largest height, mm, largest slope, and largest concave curvature, 1/mm, 0 for none; from samples."""
     lines = [np.linspace(-r, r, min(801, 4 * (len(s.breaks) - 1) + 1)) for s, r in zip(field.spaces, field.half_size, strict=True)]
     x, y = (torch.from_numpy(np.ascontiguousarray(c.ravel())) for c in np.meshgrid(*lines, indexing="ij"))
     z, *derivatives = field.at(heights, x, y, ((0, 0), *ORDERS))
@@ -47,10 +47,10 @@ def shape_of(field: HeightField, heights: Tensor) -> tuple[float, float, float, 
 
 
 class BallOffset:
-    """The lowest heights of a ball's tip over a surface.
+    """Cutter-location surface of a ball-nose tool.
 
     Args:
-        heights: (n, m) mm; radius: of the ball, mm; allowance: left above the surface, mm.
+        heights: (n, m) mm; radius: of the ball, mm; allowance: above the surface, mm.
     """
 
     def __init__(self, field: HeightField, heights: Tensor, radius: float, allowance: float = 0.0):
@@ -61,14 +61,19 @@ class BallOffset:
         self.spacing = max(x[1] - x[0], y[1] - y[0])
 
     def __call__(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Heights of the tip (N,) mm over points (N,) mm; NaN where the ball is beside the surface."""
+        """Heights of the tip (N,) mm over points (N,) mm; NaN where the ball does not touch the surface."""
         low, cx, cy = self.envelope(x, y)
         inside = np.isfinite(low)
         q, c = torch.from_numpy(np.stack([x, y])), torch.from_numpy(np.stack([cx, cy]))
         found = torch.full((len(x),), -torch.inf, dtype=torch.float64)
         found[inside] = self._climb(q[:, inside], c[:, inside])
         beside = 0.5 * self.spacing
-        for dx, dy in ((beside, 0.0), (-beside, 0.0), (0.0, beside), (0.0, -beside)):  # samples may miss the higher of two places
+        for dx, dy in (
+            (beside, 0.0),
+            (-beside, 0.0),
+            (0.0, beside),
+            (0.0, -beside),
+        ):  # the grid may have missed the higher contact point
             other, ox, oy = self.envelope(x + dx, y + dy)
             apart = inside & np.isfinite(other) & (np.hypot(ox - cx, oy - cy) > APART * self.spacing)
             apart &= np.hypot(ox - x, oy - y) < self.radius
@@ -80,7 +85,7 @@ class BallOffset:
         return tip
 
     def _climb(self, q: Tensor, c: Tensor) -> Tensor:
-        """F (N,) at the maximum near points c (2, N) of the surface, for tools at q."""
+        """Local maximum of F (N,) from initial points c (2, N) of the surface, for tools at q."""
         c, best, found = c.clone(), c.clone(), torch.full_like(c[0], -torch.inf)
         busy = torch.arange(len(found))
         limits = torch.tensor(self.field.half_size, dtype=torch.float64)[:, None]
@@ -100,33 +105,36 @@ class BallOffset:
             hxx, hyy = torch.where(held_x, -1.0, hxx), torch.where(held_y, -1.0, hyy)
             fx, fy = torch.where(held_x, 0.0, fx), torch.where(held_y, 0.0, fy)
             determinant = hxx * hyy - hxy * hxy
-            falls = (hxx < 0) & (determinant > 0)  # else it is no maximum that Newton's step goes to: up the slope instead
+            falls = (hxx < 0) & (determinant > 0)  # otherwise the Hessian is not negative definite: gradient ascent
             safe = torch.where(falls, determinant, 1.0)
             mx = torch.where(falls, -(hyy * fx - hxy * fy) / safe, self.radius * fx)
             my = torch.where(falls, -(hxx * fy - hxy * fx) / safe, self.radius * fy)
             scale = (self.spacing / torch.hypot(mx, my).clamp_min(1e-300)).clamp_max(1.0)
             moved = torch.maximum(torch.minimum(at + torch.stack([mx * scale, my * scale]), limits), -limits)
-            c[:, busy] = torch.where(better, moved, 0.5 * (at + best[:, busy]))  # back half way where a step went too far
+            c[:, busy] = torch.where(
+                better, moved, 0.5 * (at + best[:, busy])
+            )  # bisect towards the best point if the step was too long
             busy = busy[((c[:, busy] - at).abs().amax(0) > STILL * self.radius)]
         return found
 
 
 class FlatOffset:
-    """The same of a flat end, on the safe side: the highest sample within reach, more what may lie between samples.
+    """Upper bound of the cutter-location surface of a flat end mill: the highest sample under the tool, plus a bound between
+    samples.
 
-    Arguments as of `BallOffset`.
+    Arguments as in `BallOffset`.
     """
 
     def __init__(self, field: HeightField, heights: Tensor, radius: float, allowance: float = 0.0):
         x, y, z = _samples(field, heights.detach().double().cpu(), radius)
         self.step = np.array([x[1] - x[0], y[1] - y[0]])
         half = 0.5 * math.hypot(*self.step)
-        reach = radius + 2.0 * half  # of the sample next to the tool's axis, over all samples next to what the tool covers
+        reach = radius + 2.0 * half  # covers all points under the tool for any position of its axis in a cell
         wide = np.ceil(reach / self.step).astype(int)
         z = np.pad(z, [(n, n) for n in wide], constant_values=-np.inf)
         self.low = np.array([x[0], y[0]]) - wide * self.step
         self.highest = np.full(z.shape, -np.inf)
-        for k in range(-wide[0], wide[0] + 1):  # the disc by its chords
+        for k in range(-wide[0], wide[0] + 1):  # dilation by a disc, decomposed into chords
             across = reach**2 - (k * self.step[0]) ** 2
             if across >= 0:
                 chord = maximum_filter1d(z, 2 * int(math.sqrt(across) / self.step[1]) + 1, 1, mode="constant", cval=-np.inf)
@@ -135,7 +143,7 @@ class FlatOffset:
         self.more = half * field.slope_bound(heights) + allowance
 
     def __call__(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """As of `BallOffset`."""
+        """As in `BallOffset`."""
         at = np.rint((np.stack([x, y], -1) - self.low) / self.step).astype(int)
         beside = ((at < 0) | (at >= self.highest.shape)).any(1)
         i, j = np.where(beside[:, None], 0, at).T
@@ -145,7 +153,7 @@ class FlatOffset:
 
 
 def _samples(field: HeightField, heights: Tensor, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Grid lines (a,), (b,) over the aperture, borders included, and heights (a, b)."""
+    """Grid lines (a,), (b,) over the aperture, borders included, mm, and heights (a, b) mm."""
 
     def line(space: SplineSpace, r: float) -> Tensor:
         spans = len(space.breaks) - 1

@@ -1,6 +1,6 @@
-"""Where a tool goes: lines in the plane, and along them as many points as keep straight moves within a tolerance of a height.
+"""Tool paths: raster and spiral in the plane, and adaptive subdivision into linear moves within a tolerance of the height.
 
-Lines go `over` mm beyond the aperture on all sides, so that a ball which leans on the edge of a slope gets there.
+Paths overrun the aperture by `over` mm on all sides, so that a ball reaches the contact points on sloped edges.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-#: Straight pieces of a spiral leave it by at most this part of the step-over.
+#: Largest deviation of the polygon from a spiral, over the step-over.
 OFF = 0.02
-#: Halvings of a move, at most.
+#: Most bisections of a move.
 HALVINGS = 14
 
 
 def spacing(path: str, half_size: tuple[float, float], over: float, step: float, round: bool) -> float:
-    """How far apart passes are of which a whole number fits, at most `step` mm.  path: raster, raster-y or spiral."""
+    """Step-over, at most `step` mm, for a whole number of passes.  path: raster, raster-y or spiral."""
     if path == "spiral":
         reach = min(half_size) + over
         return step if round else reach / math.ceil(reach / step)
@@ -27,9 +27,9 @@ def spacing(path: str, half_size: tuple[float, float], over: float, step: float,
 
 
 def raster(half_size: tuple[float, float], over: float, step: float, round: bool, along: int = 0) -> Iterator[np.ndarray]:
-    """Passes there and back, at most `step` apart, each with its way to the next: points (k, 2) mm.  along: 0 for x, 1 for y.
+    """Zigzag passes, at most `step` apart, each with the link to the next: points (k, 2) mm.  along: 0 for x, 1 for y.
 
-    Consecutive ones share a point: each begins where the one before ends.
+    Each pass begins at the end point of the one before.
     """
     across = half_size[1 - along] + over
     count = max(1, math.ceil(2.0 * across / step))
@@ -45,8 +45,7 @@ def raster(half_size: tuple[float, float], over: float, step: float, round: bool
 
 
 def spiral(half_size: tuple[float, float], over: float, step: float, round: bool, turns: int = 8) -> Iterator[np.ndarray]:
-    """One line from the middle outwards, some turns at a time: r = step t / (2 pi) over a circle, a rectangular one over a
-    rectangle.
+    """Spiral from the centre outwards, yielded in pieces of several turns: Archimedean, r = step t / (2 pi), or rectangular.
 
     On a rectangle's diagonals passes are 1.17 times as far apart as elsewhere.
     """
@@ -64,12 +63,12 @@ def _circular(radius: float, step: float) -> np.ndarray:
         r = max(step * at / (2.0 * math.pi), 0.25 * step)
         at += min(0.5 * math.pi / 2.0, math.sqrt(8.0 * OFF * step / r))
     angle = np.array([*found, *np.linspace(end, end + 2.0 * math.pi, math.ceil(2.0 * math.pi / (end - found[-2])) + 1)])
-    r = np.minimum(step * angle / (2.0 * math.pi), radius)  # and once around at the end
+    r = np.minimum(step * angle / (2.0 * math.pi), radius)  # with a full circle at the end
     return np.stack([r * np.cos(angle), r * np.sin(angle)], -1)
 
 
 def _rectangular(half: list[float], step: float) -> np.ndarray:
-    """Rectangles of one shape, each side `step` further out than the one before it, that end at the outline."""
+    """Rectangular spiral with sides `step` apart that ends at the outline."""
     turns = math.ceil(min(half) / step)
     longer = [h - min(half) for h in half]
     points = [(-longer[0], -longer[1])]
@@ -79,13 +78,13 @@ def _rectangular(half: list[float], step: float) -> np.ndarray:
     return np.array([*points, (half[0], -half[1])])
 
 
-def heightened(
+def with_heights(
     line: np.ndarray, height: Callable[[np.ndarray, np.ndarray], np.ndarray], step: float, tolerance: float
 ) -> np.ndarray:
-    """Points (m, 3) along a line of points (k, 2), with those heights.
+    """Points (m, 3), mm, along a polyline (k, 2) with heights from a function.
 
-    Begins with moves of at most `step` and halves each whose middle is further than `tolerance` below or above the height there.
-    Points without a height are left out.
+    Starts with moves of at most `step` and bisects each whose midpoint deviates from the height by more than `tolerance`.  Points
+    without a height (NaN) are omitted.
     """
     length = np.hypot(*np.diff(line, axis=0).T)
     parts = np.maximum(1, np.ceil(length / step)).astype(int)

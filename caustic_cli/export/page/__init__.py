@@ -1,13 +1,14 @@
-"""A lens as one HTML page that traces itself: `page.html`, `page.css` and `page.js`, and in them the lens, light and screen.
+"""Self-contained HTML page with a ray tracer for a lens: `page.html`, `page.css` and `page.js` with the data of lens, light and
+screen.
 
-The page holds the exit surface as a cloud of points on an even grid, heights and slopes, and traces from that in the browser
-whatever is to be seen, without a network.  Numbers are 16-bit codes between the least and the greatest value: a slope's last
-code moves light by 1/65,535 of the picture that all slopes together span, far less than a pixel.
+The page holds heights and slopes of the exit surface on a regular grid, and traces rays in the browser, offline.  Values are
+quantised to 16 bits between the least and the largest: one quantum of a slope displaces light by 1/65,535 of the range of all
+slopes, far less than a pixel.
 
 Notation
-    c[i, j]     codes, i along +x and j along +y; kept are their differences along both axes, modulo 2^16, which deflate well
-    i(theta)    intensity of a near source, part of its power per solid angle, 1/sr
-    s           |d - a| / 2 sin(theta_c / 2): how far a ray's direction is from the axis of its cone, in parts of the cone's edge
+    c[i, j]     codes, i along +x and j along +y; stored as their differences along both axes, modulo 2^16, for compression
+    i(theta)    intensity of a near source over its power, 1/sr
+    s           |d - a| / 2 sin(theta_c / 2): distance of a ray direction from the axis of its cone, over that of the cone's edge
 """
 
 from __future__ import annotations
@@ -34,20 +35,20 @@ from caustic_cli.optics.emission.brightness import bright_points
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene, Screen, Source
 
-#: Cells of the cloud across its longer side, the finest that fits; multiples of COARSEST, by which the page thins them out.
+#: Cells of the grid along its longer side, the finest that fits is used; multiples of COARSEST, by which the page subsamples it.
 CELLS = (1024, 768, 512, 384)
 COARSEST = 32
-#: Largest page, bytes: what mail takes; and what of it is for the cloud.
+#: Largest size of the page, bytes, for e-mail, and of the grid in it.
 MOST, MOST_CLOUD = 5_000_000, 3_400_000
-#: Of deflation; the highest takes twenty times as long for a fiftieth of the size.
+#: Compression level; the highest takes twenty times as long for 2 % of the size.
 LEVEL = 6
 #: Pixels of the page's screen across, at most; a finer target is averaged down to them.
 PIXELS = 512
-#: Positions of a source, at most; of more, so many are taken evenly.
+#: Most positions of a source; more are subsampled evenly.
 PLACES = 1024
-#: Angles of an intensity's table, and points of a source's picture.
+#: Angles of a table of intensities, and points that represent a picture of a source.
 ANGLES, BRIGHT = 257, 256
-#: What the page traces, by the names of effects; of others it says that it leaves them out.
+#: Effects that the page simulates; it lists others as left out.
 TRACED = frozenset(
     {
         "source-size",
@@ -63,12 +64,12 @@ TRACED = frozenset(
         "dispersion",
     }
 )
-#: The plastic number's powers, whose multiples fill a square evenly (Roberts 2018).
+#: Additive quasi-random sequence R2 in the unit square, powers of the inverse plastic number (Roberts 2018).
 EVEN = (0.7548776662466927, 0.5698402909980532)
 
 
 def refuse_untraceable(scene: Scene) -> None:
-    """Stop before work begins where the page could not trace the light.
+    """Refuse before work begins a scene that the page does not support.
 
     Raises:
         InputError: the source is a ray file, the screen is curved, or the lens' index or both its sides vary.
@@ -78,7 +79,7 @@ def refuse_untraceable(scene: Scene) -> None:
     if scene.lens.gradient is not None:
         raise InputError("⟨html⟩: the page traces lenses of one index, and this one's varies")
     if scene.elements:
-        raise InputError("⟨html⟩: the page traces a lens by itself, and this scene has [[element]] tables")
+        raise InputError("⟨html⟩: the page traces a single lens, and this scene has [[element]] tables")
     if scene.two_sided:
         raise InputError("⟨html⟩: the page traces lenses with a flat entrance, and this one's is free-form")
     if any(one.rays is not None for one in scene.source.members):
@@ -104,15 +105,15 @@ def write_page(
     """Write the page.
 
     Args:
-        scene: as a plan leaves it; what its effects are beyond TRACED is for `notes` to say.
+        scene: of a plan; effects beyond TRACED should be listed in `notes`.
         heights: (n, m) control heights, mm.
         target: (n_x, n_y) or (3, n_x, n_y) on the scene's screen, any scale; None for a page without it.
-        title: of the page; rows: names and figures in a table; notes: sentences below it.  Any text, which is escaped.
-        waves: the wave image, shown as it is; as `target`.
-        encoding: of the picture, srgb or linear, by which images are shown.
+        title: of the page; rows: names and figures of a table; notes: sentences below it.  All text is escaped.
+        waves: the wave image, like `target`.
+        encoding: of displayed images, srgb or linear.
 
     Raises:
-        InputError: as of `refuse_untraceable`, or the file cannot be written.
+        InputError: as in `refuse_untraceable`, or the file cannot be written.
     """
     refuse_untraceable(scene)
     screen = _coarser(scene.screen)
@@ -157,12 +158,12 @@ def write_page(
 
 
 def _assembled(words: dict[str, str], data: dict) -> str:
-    """The files of the page in one; a text in `data` cannot end the element that holds it, since none has a < of its own."""
+    """The page with all files inlined; < is escaped in `data`, so that no text can end its script element."""
     here = resources.files(__name__)
     style, script, page = ((here / f"page.{kind}").read_text("utf-8") for kind in ("css", "js", "html"))
     held = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     parts = words | {"created": f"{CREATED_BY} {__version__}", "style": style, "script": script, "data": held}
-    pieces = page.split("@@")  # text, name, text, name, ..., text: what is put in is not looked at again
+    pieces = page.split("@@")  # text, name, text, ..., text: inserted text is not scanned again
     pieces[1::2] = [parts[name] for name in pieces[1::2]]
     return "".join(pieces)
 
@@ -172,7 +173,7 @@ def _table(rows: Sequence[tuple[str, str]]) -> str:
 
 
 def _cloud(scene: Scene, field: HeightField, heights: Tensor, cells: int) -> dict:
-    """The exit surface on an even grid over the aperture, and the profile of a plane wave there."""
+    """The exit surface on a regular grid over the aperture, and the profile of a plane wave there."""
     longest = max(scene.lens.size)
     counts = tuple(COARSEST * max(1, round(cells * w / longest / COARSEST)) + 1 for w in scene.lens.size)
     grid = sample_grid(field, heights, counts)
@@ -186,7 +187,7 @@ def _cloud(scene: Scene, field: HeightField, heights: Tensor, cells: int) -> dic
 
 
 def _at_points(profile: np.ndarray, counts: tuple[int, int]) -> np.ndarray:
-    """A profile's cells, over their mean, at the points of an even grid over the aperture, borders included."""
+    """A profile over its mean, by nearest cell, at the points of a regular grid over the aperture, borders included."""
     at = [np.minimum((np.linspace(0.0, 1.0, n) * m).astype(int), m - 1) for n, m in zip(counts, profile.shape, strict=True)]
     return (profile / profile.mean())[np.ix_(*at)]
 
@@ -199,13 +200,13 @@ def _coarser(screen: Screen) -> Screen:
 
 
 def _onto(image: np.ndarray, screen: Screen) -> np.ndarray:
-    """An image's light, of all colours, on the pixels of a screen of the same size."""
+    """An image summed over colours, resampled to the pixels of a screen of the same size."""
     grey = image.sum(0) if image.ndim == 3 else image
     return shared_out(grey, screen.resolution) * (grey.size / math.prod(screen.resolution))
 
 
 def _coded(values: np.ndarray) -> dict:
-    """Codes of values (n, m): their differences' low bytes, then their high bytes, deflated, in base64."""
+    """Quantise and compress values (n, m): differences of codes, low bytes, then high bytes, deflate, base64."""
     low, high = float(values.min()), float(values.max())
     span = (high - low) or 1.0
     codes = np.rint((values - low) * (65535.0 / span)).astype(np.int64)
@@ -215,7 +216,7 @@ def _coded(values: np.ndarray) -> dict:
 
 
 def _lights(scene: Scene) -> list[dict]:
-    """What shines: a part of all power each, at its refractive indices with their parts of its own."""
+    """The sources: fraction of the total power of each, and its refractive indices with their weights."""
     lights = []
     for k, one in enumerate(scene.by_source):
         indices: dict[float, float] = {}
@@ -235,7 +236,8 @@ def _lights(scene: Scene) -> list[dict]:
 
 
 def _source(scene: Scene, source: Source) -> dict:
-    """Places from the middle of the entrance, mm, with their parts; half widths about each; the cone and i(theta) by s."""
+    """Positions relative to the centre of the entrance, mm, with their weights; half sizes; the cone and i(theta) as a function of
+    s."""
     if source.distant:
         wide = math.sin(source.half_angle)
         return {"near": False, "places": [[0.0, 0.0, 0.0, 1.0]], "extent": [wide, wide], "picture": _picture(source)}
@@ -257,7 +259,7 @@ def _source(scene: Scene, source: Source) -> dict:
 
 
 def _intensity(source: Source, angles: np.ndarray, cone: float) -> np.ndarray:
-    """i(theta) at angles from the axis, rad, within the cone."""
+    """i(theta), 1/sr, at angles from the axis, rad, within the cone."""
     if isinstance(source.intensity, str):
         lambertian = source.intensity == "lambertian"
         whole = math.pi * (math.sin(cone) ** 2 if lambertian else 4.0 * math.sin(0.5 * cone) ** 2)
@@ -266,7 +268,7 @@ def _intensity(source: Source, angles: np.ndarray, cone: float) -> np.ndarray:
 
 
 def _picture(source: Source) -> list[list[float]] | None:
-    """Points of [-1, 1]^2, as many where the source is twice as bright; None of an ellipse that is even."""
+    """Points of [-1, 1]^2 with a density proportional to the radiance; None for a uniform ellipse."""
     if source.brightness is None:
         return None
     a, b = (torch.from_numpy(np.arange(1, BRIGHT + 1) * step % 1.0) for step in EVEN)

@@ -1,6 +1,6 @@
-"""Ray files of light sources: IES TM-25, Zemax binary and LightTools text, told apart by what they begin with.
+"""Readers of ray files of light sources: IES TM-25, Zemax binary and LightTools text, recognised by their signatures.
 
-Every count in a file is checked against the file's size before anything is allocated for it.  Lengths become mm, wavelengths nm.
+Every count in a file is validated against its size before memory is allocated.  Lengths are converted to mm, wavelengths to nm.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from caustic_cli.scene.sources.rayset import RaySet
 
 __all__ = ["ACCEPTED", "MAX_BYTES", "SUFFIXES", "parse_rays"]
 
-#: Suffixes by which a file is taken for one of rays.
+#: Suffixes of ray files.
 SUFFIXES = (".tm25ray", ".tm25", ".dat", ".sdf", ".ray", ".txt")
 #: Largest file read: 38 million rays of TM-25.
 MAX_BYTES = 1 << 30
@@ -20,10 +20,10 @@ _FORMATS = (tm25, zemax, lighttools)
 
 
 def parse_rays(data: bytes, where: str) -> RaySet:
-    """The rays in a file's bytes.
+    """Parse the contents of a ray file.
 
     Raises:
-        InputError: naming `where`: it is none of these formats, or breaks its own.
+        InputError: naming `where`: none of these formats, or invalid.
     """
     for form in _FORMATS:
         if form.begins(data):

@@ -1,4 +1,5 @@
-"""LightTools ray files as text, `.ray` and `.txt`: comments after #, lines `lt_name: value`, then a ray a line.
+"""Reader of LightTools ray files in text format, `.ray` and `.txt`: comments after #, lines `lt_name: value`, then one ray per
+line.
 
     lt_rdf_version: 2.0
     lt_datatype: radiant_power            or luminous_flux
@@ -11,7 +12,7 @@
     x y z  L M N  flux [wavelength, nm] [more columns, such as Stokes parameters]
     lt_endofdata
 
-Names are read in any case.
+Names are case-insensitive.
 """
 
 from __future__ import annotations
@@ -53,32 +54,32 @@ MOST_COLUMNS = 24
 
 
 def begins(data: bytes) -> bool:
-    """Whether a file is one of these."""
+    """Whether the data are of this format."""
     head = data[:HEADER].lower()
     return b"\0" not in head and re.search(rb"^[ \t]*lt_", head, re.MULTILINE) is not None
 
 
 def parse(data: bytes) -> RaySet:
-    """The rays in a file's bytes.
+    """Parse the contents of a file.
 
     Raises:
-        InputError: it breaks the format.
+        InputError: it is invalid.
     """
     start = data[:HEADER].lower().find(BEGIN)
     if start < 0:
         raise InputError(f"has no line {BEGIN.decode()} within its first {HEADER:,} bytes")
-    said = _header(data[:start])
-    unit = said.get("length_units", "millimeters").lower()
+    header = _header(data[:start])
+    unit = header.get("length_units", "millimeters").lower()
     if unit not in MILLIMETRES:
         raise InputError(f"has lt_length_units {unit!r}; one of {', '.join(MILLIMETRES)} is needed")
-    kind = said.get("datatype", "radiant_power").lower()
+    kind = header.get("datatype", "radiant_power").lower()
     if kind not in FLUXES:
         raise InputError(f"has lt_datatype {kind!r}; radiant_power or luminous_flux is needed")
-    if said.get("far_field_data", "no").lower() not in ("no", "0", "false"):
+    if header.get("far_field_data", "no").lower() not in ("no", "0", "false"):
         raise InputError("has far-field data, whose rays start nowhere; lt_far_field_data must be NO")
-    if any(float(v) != 0 for v in _numbers(said.get("data_origin", "0 0 0"), "lt_data_origin")):
+    if any(float(v) != 0 for v in _numbers(header.get("data_origin", "0 0 0"), "lt_data_origin")):
         raise InputError("has an lt_data_origin that is not 0 0 0; ⟨source_position⟩ moves a source")
-    colored = said.get("color_info", "none").lower()
+    colored = header.get("color_info", "none").lower()
     if colored not in ("none", "wavelength"):
         raise InputError(f"has lt_color_info {colored!r}; none or wavelength is needed")
     first = data.find(b"\n", start) + 1
@@ -88,7 +89,7 @@ def parse(data: bytes) -> RaySet:
     least = 8 if colored == "wavelength" else 7
     table = _rows(data, first, stop, least) if first else np.zeros((0, least))
     unit_of_flux, key = FLUXES[kind]
-    totals = _numbers(said.get(f"{key}", "0"), f"lt_{key}")
+    totals = _numbers(header.get(key, "0"), f"lt_{key}")
     return RaySet(
         MILLIMETRES[unit] * table[:, 0:3],
         table[:, 3:6],
@@ -100,13 +101,13 @@ def parse(data: bytes) -> RaySet:
 
 
 def _header(data: bytes) -> dict[str, str]:
-    """What its lines say, by their names without lt_."""
-    said = {}
+    """Values of the header by their names without lt_."""
+    header = {}
     for line in data.decode("ascii", "replace").splitlines():
         name, colon, value = line.partition("#")[0].strip().partition(":")
         if colon and name.lower().startswith("lt_"):
-            said[name.lower()[3:].strip()] = value.strip()
-    return said
+            header[name.lower()[3:].strip()] = value.strip()
+    return header
 
 
 def _numbers(text: str, name: str) -> list[float]:

@@ -1,6 +1,6 @@
-"""IES TM-25 ray files (ANSI/IES TM-25-13 and -20), `.tm25ray`: little-endian, floats of 32 bits, mm, nm.
+"""Reader of IES TM-25 ray files (ANSI/IES TM-25-13 and -20), `.tm25ray`: little-endian, floats of 32 bits, mm, nm.
 
-    offset  0   "TM25", int32 version (2013 or 2020), int32 how it was made
+    offset  0   "TM25", int32 version (2013 or 2020), int32 method of creation
            12   float32 luminous flux, lm; float32 radiant flux, W; uint64 number of rays
            28   28 bytes date, int32 where rays start
            60   int32 spectrum: 0 none, 1 one wavelength, 2 each ray its own, 3 one table, 4 each ray a table's number
@@ -14,7 +14,7 @@
                 rays, one after another, all float32: x y z, unit k, W, nm, lm, 3 Stokes and 3 ellipse, 2 tristimulus, table
                 number, each if its flag is set, and the additional columns
 
-Quantities that are not known are 0 or NaN.
+Unknown quantities are 0 or NaN.
 """
 
 from __future__ import annotations
@@ -31,21 +31,21 @@ VERSIONS = (2013, 2020)
 #: Bytes before the tables, their unit of padding, and of a column's name.
 HEADER, BLOCK, NAME = 36_288, 32, 512
 MOST_TABLES = 10_000
-#: Columns by the flag that brings them along.
+#: Number of columns for each flag.
 COLUMNS = (3, 3, 1, 1, 1, 6, 2, 1)
 FLAGS = ("position", "direction", "radiant flux", "wavelength", "luminous flux", "Stokes", "tristimulus", "table number")
 
 
 def begins(data: bytes) -> bool:
-    """Whether a file is one of these."""
+    """Whether the data are of this format."""
     return data.startswith(MAGIC)
 
 
 def parse(data: bytes) -> RaySet:
-    """The rays in a file's bytes.
+    """Parse the contents of a file.
 
     Raises:
-        InputError: it breaks the format.
+        InputError: it is invalid.
     """
     if len(data) < HEADER:
         raise InputError(f"is cut off: the header of TM-25 is {HEADER:,} bytes, the file {len(data):,}")
@@ -61,7 +61,7 @@ def parse(data: bytes) -> RaySet:
     tables, more, text = struct.unpack_from("<iii", data, 76)
     flags = struct.unpack_from("<8i", data, 256)
     if not 0 <= spectrum <= 4:
-        raise InputError(f"has a spectral data identifier of {spectrum}; TM-25 knows 0 to 4")
+        raise InputError(f"has a spectral data identifier of {spectrum}; TM-25 defines 0 to 4")
     if min(tables, more, text) < 0 or tables > MOST_TABLES:
         raise InputError(
             f"counts {tables} spectral tables, {more} additional columns and {text} bytes of text; none may be"
@@ -71,11 +71,11 @@ def parse(data: bytes) -> RaySet:
         if flag not in (0, 1):
             raise InputError(f"has a {name} flag of {flag}; 0 or 1 is needed")
     if not (flags[0] and flags[1]):
-        raise InputError("says that its rays have no position or no direction; both are needed")
+        raise InputError("declares rays without position or direction; both are needed")
     if not (flags[2] or flags[4]):
-        raise InputError("says that its rays have neither radiant nor luminous flux; one is needed")
+        raise InputError("declares rays with neither radiant nor luminous flux; one is needed")
     if spectrum == 2 and not flags[3]:
-        raise InputError("says that each ray has a wavelength, but has no column for it")
+        raise InputError("declares a wavelength for each ray, but has no column for it")
     start = _after_tables(data, tables) + NAME * more + text
     each = sum(n for n, flag in zip(COLUMNS, flags, strict=True) if flag) + more
     if rays == 0:
@@ -90,7 +90,7 @@ def parse(data: bytes) -> RaySet:
     wavelengths = table[:, at["wavelength"]] if flags[3] else None
     if spectrum == 1:
         if not single > 0:
-            raise InputError(f"says that it has one wavelength, but that is {single:g} nm")
+            raise InputError(f"declares a single wavelength of {single:g} nm")
         wavelengths = np.full(rays, single)
     total = watts if radiant else lumens
     return RaySet(table[:, 0:3], table[:, 3:6], flux, total if np.isfinite(total) else 0.0, "W" if radiant else "lm", wavelengths)

@@ -1,12 +1,12 @@
-"""Zemax (Ansys OpticStudio) binary source files, `.dat` and `.sdf`: little-endian, numbers of 32 bits.
+"""Reader of Zemax (Ansys OpticStudio) binary source files, `.dat` and `.sdf`: little-endian, numbers of 32 bits.
 
     offset  0   int identifier (1010, or 8675309 of old), unsigned number of rays, 100 characters of description
           108   float flux of the source, of these rays; wavelength, micrometres; 4 angles
-          136   int unit of length: m, in, cm, ft, mm; 9 floats of place, turn and scale, and 4 more, unused
+          136   int unit of length: m, in, cm, ft, mm; 9 floats of position, rotation and scale, and 4 more, unused
           192   int ray format: 0 flux alone, 2 with wavelengths; int flux: 0 W, 1 lm; 2 more, unused
           208   rays, one after another: x y z, l m n, flux, and with format 2 the wavelength, micrometres
 
-OpticStudio itself uses the number of rays, the unit of length and the two formats, and so does this.
+Like OpticStudio, the reader uses the number of rays, the unit of length and the two formats.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ COLUMNS = {0: 7, 2: 8}
 
 
 def begins(data: bytes) -> bool:
-    """Whether a file is one of these, in either order of bytes."""
+    """Whether the data are of this format, in either byte order."""
     return len(data) >= 4 and any(struct.unpack_from(f"{order}i", data)[0] in IDENTIFIERS for order in "<>")
 
 
 def parse(data: bytes) -> RaySet:
-    """The rays in a file's bytes.
+    """Parse the contents of a file.
 
     Raises:
-        InputError: it breaks the format.
+        InputError: it is invalid.
     """
     if struct.unpack_from("<i", data)[0] not in IDENTIFIERS:
         raise InputError("has its bytes in big-endian order; Zemax source files are little-endian")

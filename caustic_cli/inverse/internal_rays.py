@@ -1,4 +1,4 @@
-"""Rays between two free-form sides, and what is known at the points where they meet one of them, carried to a grid."""
+"""Rays between the two surfaces of a lens, and scattered-data interpolation of quantities known at their intersection points."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ from caustic_cli.optics.system import EXIT, sides_of
 from caustic_cli.optics.trace import CHUNK, tracers
 from caustic_cli.scene import Scene
 
-#: Rays that `origins` are found from: so many for each of them, and their most.
+#: Rays traced for `entrance_points`: per control point, and at most.
 AN_ORIGIN, MOST_RAYS = 8, 300_000
 
 
 @dataclass(frozen=True, eq=False)
-class Within:
-    """Rays inside the glass that get to the exit: where they enter (2, N) and leave (3, N), mm, directions (3, N), powers (N,)."""
+class InternalRays:
+    """Rays inside the glass that reach the exit: entrance points (2, N) and exit points (3, N), mm, unit directions (3, N), powers
+    (N,)."""
 
     entrance: np.ndarray
     exit: np.ndarray
@@ -29,8 +30,8 @@ class Within:
     power: np.ndarray
 
 
-def rays_within(scene: Scene, field: HeightField, nets: Tensor, count: int) -> Within:
-    """About so many regular rays of the source through a lens of these nets (2, n, m), mm."""
+def internal_rays(scene: Scene, field: HeightField, nets: Tensor, count: int) -> InternalRays:
+    """About `count` rays of the source on a regular grid, traced inside a lens with these control nets (2, n, m), mm."""
     lit, net = sides_of(scene, field, nets)
     found = []
     for traced in tracers(lit, field, rays_of(lit, "grid", count), torch.float64, CHUNK):
@@ -39,11 +40,12 @@ def rays_within(scene: Scene, field: HeightField, nets: Tensor, count: int) -> W
         found.append(torch.stack(torch.broadcast_tensors(*full))[:, last.arriving > 0])
     rays = torch.cat(found, 1).numpy()
     exit, direction = rays[:3], rays[3:6]
-    return Within((exit - rays[7] * direction)[:2], exit, direction, rays[6])
+    return InternalRays((exit - rays[7] * direction)[:2], exit, direction, rays[6])
 
 
-def spread(points: np.ndarray, values: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Values (k, N) at scattered points (2, N), linear between them and the nearest beyond, at x, y: (k, *x.shape)."""
+def interpolate_scattered(points: np.ndarray, values: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Values (k, N) given at scattered points (2, N), interpolated at x, y: linear within their convex hull, nearest neighbour
+    beyond; (k, *x.shape)."""
     at = np.stack([x.ravel(), y.ravel()], -1)
     found = LinearNDInterpolator(points.T, values.T)(at)
     beyond = np.isnan(found).any(-1)
@@ -52,9 +54,10 @@ def spread(points: np.ndarray, values: np.ndarray, x: np.ndarray, y: np.ndarray)
     return found.T.reshape(len(values), *x.shape)
 
 
-def origins(scene: Scene, field: HeightField, nets: Tensor) -> Tensor:
-    """Where light of each of the exit's controls enters, in parts of the half size along y and x: (n, m, 2) float64."""
-    light = rays_within(scene, field, nets, min(MOST_RAYS, AN_ORIGIN * nets[1].numel()))
+def entrance_points(scene: Scene, field: HeightField, nets: Tensor) -> Tensor:
+    """Entrance point of the ray that leaves at each control point of the exit, over the half size, y before x: (n, m, 2)
+    float64."""
+    light = internal_rays(scene, field, nets, min(MOST_RAYS, AN_ORIGIN * nets[1].numel()))
     x, y = np.meshgrid(*(c.numpy() for c in field.control_xy()), indexing="ij")
-    u, v = (c / r for c, r in zip(spread(light.exit[:2], light.entrance, x, y), field.half_size, strict=True))
+    u, v = (c / r for c, r in zip(interpolate_scattered(light.exit[:2], light.entrance, x, y), field.half_size, strict=True))
     return torch.from_numpy(np.stack([v, u], -1))

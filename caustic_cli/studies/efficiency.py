@@ -1,8 +1,8 @@
-"""What light a picture costs: lenses of one scene whose losses weigh the light that is kept against the picture, and their front.
+"""Trade-off between optical efficiency and picture error: the Pareto front over thickness and weight of the light in the loss.
 
-A lens close to its source keeps the more light the thinner it is, up to a point, and shows the source the larger.  So lenses of
-several thicknesses are designed, each with the loss `rms + w light` for several weights w, and all are judged by rays that no
-design has seen.  A lens is on the Pareto front if none other is both brighter and closer to the picture.
+For a near source a thinner lens collects more light, up to a point, and has a larger blur.  So lenses of several thicknesses are
+designed, each with the loss `rms + w light` for several weights w, and all are evaluated with independent rays.  A lens is on the
+Pareto front if no other has both a higher efficiency and a smaller error.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from caustic_cli.studies.fit import pareto
 from caustic_cli.studies.report import Study, legend_beside, styles
 from caustic_cli.studies.retrace import FINAL_RAYS, retrace
 
-#: Least percentage points of light that a picture of it spans.
+#: Least range of the efficiency axis, percentage points.
 LEAST_SPAN = 0.1
-#: Seconds of iterations for each lens, unless said.
+#: Default seconds of iterations for each lens.
 SECONDS = 10.0
 #: Rays of a retrace per pixel.
 RAYS_PER_PIXEL = 64
@@ -34,18 +34,18 @@ RAYS_PER_PIXEL = 64
 COLUMNS = {
     "series": "thickness of the design, mm",
     "thickness": "the same, mm",
-    "weight": "of light beside the picture",
-    "loss": "what the lens was designed with",
+    "weight": "of the term `light` of the loss, relative to `rms`",
+    "loss": "loss of the design",
     "error": "relative RMS between the retraced image and the target, each over its own mean",
-    "noise": "standard error of that",
-    "on_screen": "part of the source's power on the screen",
-    "front": "whether no other lens is both brighter and closer to the picture",
+    "noise": "standard error of `error`",
+    "on_screen": "fraction of the source's power on the screen",
+    "front": "whether the lens is on the Pareto front: none other is both brighter and has a smaller error",
     "seconds": "of the design's iterations",
 }
 
 
 @dataclass(frozen=True, eq=False)
-class Lens:
+class DesignedLens:
     """A designed lens: its thickness, mm, the weight of the light, the loss, the scene, the spline spaces and heights (n, m) mm,
     the target (n_x, n_y), and the seconds its iterations took."""
 
@@ -59,8 +59,8 @@ class Lens:
     seconds: float
 
 
-def run_light(
-    lenses: Iterable[Lens],
+def run_efficiency(
+    lenses: Iterable[DesignedLens],
     count: int,
     *,
     rays: int | None = None,
@@ -68,15 +68,15 @@ def run_light(
     device: str = "cpu",
     progress: Callable[[int, int], None] | None = None,
 ) -> Study:
-    """Judge lenses one by one.
+    """Evaluate lenses one by one.
 
     Args:
-        count: how many there may be.
-        rays: of every retrace, None for RAYS_PER_PIXEL a pixel.
-        progress: told (lenses done, in all) after each.
+        count: largest number of lenses, for the progress.
+        rays: of every retrace, None for RAYS_PER_PIXEL per pixel.
+        progress: called with (lenses done, in total) after each.
 
     Raises:
-        CausticError: there is none.
+        CausticError: there are no lenses.
     """
     rows: list[dict] = []
     for k, lens in enumerate(lenses):
@@ -114,12 +114,12 @@ def run_light(
 
 
 def _advice(rows: list[dict]) -> str:
-    """The ends of the front in one sentence."""
+    """The ends of the Pareto front in one sentence."""
     front = sorted((r for r in rows if r["front"]), key=lambda r: r["error"])
     sharp, bright = front[0], front[-1]
     if sharp is bright:
-        return f"one lens is both the sharpest and the brightest: {_words(sharp)}"
-    return f"{len(front)} lenses are on the front, from {_words(sharp)} to {_words(bright)}"
+        return f"one lens has both the least error and the highest efficiency: {_words(sharp)}"
+    return f"{len(front)} lenses are on the Pareto front, from {_words(sharp)} to {_words(bright)}"
 
 
 def _words(row: dict) -> str:
@@ -127,8 +127,8 @@ def _words(row: dict) -> str:
     return f"error {row['error']:.3g} with {row['on_screen']:.1%} of the light ({made})"
 
 
-def draw_light(study: Study, figure: Figure) -> None:
-    """Error against light, a curve for each thickness, the Pareto front ringed and joined."""
+def draw_efficiency(study: Study, figure: Figure) -> None:
+    """Error against efficiency, a curve for each thickness, and the Pareto front."""
     axes = figure.add_subplot()
     for series, style in styles(row["series"] for row in study.rows).items():
         mine = [row for row in study.rows if row["series"] == series]
@@ -152,18 +152,18 @@ def draw_light(study: Study, figure: Figure) -> None:
     axes.set(
         xlabel="light on the screen (% of the source's)",
         ylabel="relative RMS error of the picture",
-        title="light: error against light, which weighs {:g} to {:g} in the loss".format(
+        title="light: error against efficiency, weights {:g} to {:g} of the light in the loss".format(
             *(pick(r["weight"] for r in study.rows) for pick in (min, max))
         ),
     )
     axes.set_ylim(0.0, 1.15 * max(r["error"] for r in study.rows))
     low, high = axes.get_xlim()
     short = max(0.0, LEAST_SPAN - (high - low))
-    axes.set_xlim(low - 0.5 * short, high + 0.5 * short)  # rounding is no difference
+    axes.set_xlim(low - 0.5 * short, high + 0.5 * short)  # a range within rounding is widened
     axes.ticklabel_format(useOffset=False)
     axes.grid(which="major", linewidth=0.4)
     legend_beside(figure)
 
 
 #: Endings of the pictures' names, and what draws them.
-PLOTS = {"": draw_light}
+PLOTS = {"": draw_efficiency}

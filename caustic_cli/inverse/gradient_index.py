@@ -1,17 +1,17 @@
-"""A flat blank whose index, not whose surface, throws the picture (thesis 7.2.1).
+"""Design of a flat gradient-index (GRIN) plate for a picture (thesis 7.2.1).
 
 Notation
-    x, T        a point of the blank, and where its light shall land: T = grad phi of the optimal transport
-    t, D        thickness of the blank, and the way from its exit to the screen, mm
-    n, n_0      index, and its middle
+    x, T        a point of the plate, and the target point of its light: T = grad phi of the optimal transport
+    t, D        thickness of the plate, and the distance from its exit to the screen, mm
+    n, n_0      index, and the middle of its range
 
-Light along the axis through a thin blank leaves with the sine t grad n, so that n = n_0 + (phi - |x|^2 / 2) / (D t) to first order
-in all angles.  Within it has moved already, by half of t / n times that: D is counted from there.  The sines needed are not quite
-a gradient; what is nearest to them in the least-squares sense is the start, the same at every z.
+Axial light leaves a thin plate with the sine t grad n, so that n = n_0 + (phi - |x|^2 / 2) / (D t) to first order in all angles.
+The displacement inside the plate, half of t / n times the sine, is added to D.  The required sines are not exactly integrable;
+their least-squares potential, independent of z, is the initial index.
 
-From there L-BFGS goes down on the control values of a B-spline volume, the image coming from rays that bend.  They are kept within
-the range of a material by tanh, in the coordinates of the inverse Laplacian of each layer (`parametrisation`), since a picture
-responds to the Laplacian of the index as it does to that of a surface.
+L-BFGS then optimises the control values of a B-spline volume, with the image from curved rays.  The values are kept within the
+range of the material by tanh, in the coordinates of the inverse Laplacian of each layer (`parametrisation`), since the image
+depends on the Laplacian of the index as it does on that of a surface.
 """
 
 from __future__ import annotations
@@ -43,21 +43,21 @@ from caustic_cli.optics.system import ENTRANCE, EXIT, Element, Medium, System
 from caustic_cli.optics.trace import Tracer, index_name
 from caustic_cli.scene import Aperture, Scene
 
-#: Repeats of the start's slopes, each with the sines of the last.
+#: Fixed-point iterations of the initial sines.
 SINES = 3
-#: Rays a pixel of the refinement; pixels of the render to one of the screen, along each axis, where so many rays fall there.
+#: Rays per pixel of the optimisation; oversampling of the render along each axis.
 RAYS_A_PIXEL, OVERSAMPLE = 16, 2
-#: Part of the screen's pixels around it on which stray light is still seen.
+#: Width of the apron around the screen, in parts of its pixels.
 APRON = 0.04
-#: Part of the range of the index from its ends that a start is kept within.
+#: Relative margin of the initial index to the ends of its range.
 INSIDE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Blank:
-    """A designed blank.
+class GradientIndexDesign:
+    """A designed gradient-index plate.
 
-    index: its field; start: what the design began from; history: loss, in units of eq. 5.2.1, and part of the light on the screen,
+    index: the designed field; start: the initial one; history: loss, in units of eq. 5.2.1, and fraction of the light on the screen
     after each iteration.
     """
 
@@ -66,8 +66,8 @@ class Blank:
     history: tuple[tuple[float, float], ...]
 
 
-def blank_system(scene: Scene, index: SplineIndex) -> System:
-    """Flat entrance, flat exit at the lens' thickness, and the index between them."""
+def plate_system(scene: Scene, index: SplineIndex) -> System:
+    """System of a flat entrance, a flat exit at the thickness of the lens, and the index field between them."""
     lens, aperture = scene.lens, Aperture(scene.lens.half_size, scene.lens.round)
     inside = Medium(lens.index, lens.absorption, lens.glass, index)
     return System(
@@ -82,7 +82,7 @@ def blank_system(scene: Scene, index: SplineIndex) -> System:
     )
 
 
-def design_blank(
+def design_gradient_index(
     scene: Scene,
     target: np.ndarray,
     control: tuple[int, int],
@@ -95,21 +95,21 @@ def design_blank(
     seed: int = 0,
     on_iteration: Callable[[int, float, float, Tensor | None], None] = lambda k, loss, on_screen, image: None,
     stop: Callable[[], bool] = lambda: False,
-) -> Blank:
-    """The index that throws a picture.
+) -> GradientIndexDesign:
+    """Design the index field for a picture.
 
     Args:
-        scene: a plane wave, the blank (size, z_in, thickness of the offset, index n_0, fresnel) and the screen.
+        scene: a plane wave, the plate (size, z_in, thickness of the offset, index n_0, fresnel) and the screen.
         target: (n_x, n_y) irradiance on the screen's pixels.
         control: control values along x and y; layers: along z.
-        limits: least and largest control value, n_0 less 0.05 and more unless given.
+        limits: least and largest control value; n_0 - 0.05 and n_0 + 0.05 unless given.
         cells: source cells of the transport along the longer side.
-        iterations: of L-BFGS; rays: traced in each, None for RAYS_A_PIXEL a pixel; seed: of the rays.
-        on_iteration: told the iteration, the loss, the part of the light on the screen and the image there.
-        stop: asked before every iteration; True ends the design with what it has.
+        iterations: of L-BFGS; rays: traced in each, None for RAYS_A_PIXEL per pixel; seed: of the rays.
+        on_iteration: called with the iteration, the loss, the fraction of the light on the screen and the image there.
+        stop: called before every iteration; True ends the design.
 
     Raises:
-        InputError: other light than a plane wave, a mirror, or an index that the picture asks for and the limits exclude.
+        InputError: a source other than a plane wave, a mirror, or a range of index that is too small for the picture.
     """
     lens, screen = scene.lens, scene.screen
     low, high = limits or (lens.index - 0.05, lens.index + 0.05)
@@ -135,7 +135,7 @@ def design_blank(
         return SplineIndex(values, lens.half_size, lens.offset.thickness - lens.z_in)
 
     begun = volume(layer[:, :, None].expand(-1, -1, layers).contiguous())
-    objective = _BlankObjective(scene, target, begun, rays or RAYS_A_PIXEL * math.prod(screen.resolution), seed)
+    objective = _IndexObjective(scene, target, begun, rays or RAYS_A_PIXEL * math.prod(screen.resolution), seed)
     low_net, high_net = (torch.full(control, v, dtype=torch.float64) for v in (low, high))
     nets = [FreeHeights(low_net, high_net, layer, laplacian=True) for _ in range(layers)]
     seen: dict[float, Evaluation] = {}
@@ -152,7 +152,7 @@ def design_blank(
         except NoLight:
             if search.f is None:
                 raise
-            return math.inf, torch.zeros_like(x)  # a step too far: the line search turns back
+            return math.inf, torch.zeros_like(x)  # treated as too long by the line search
         seen[found.loss] = found
         by = torch.autograd.grad(values, [one.y for one in nets], found.gradients[objective.name])
         return found.loss, torch.stack(by).reshape(-1)
@@ -168,14 +168,14 @@ def design_blank(
         history.append((search.f, found.on_screen))
         on_iteration(k + 1, search.f, found.on_screen, found.image)
     with torch.no_grad():
-        return Blank(volume(controls(search.x)), begun, tuple(history))
+        return GradientIndexDesign(volume(controls(search.x)), begun, tuple(history))
 
 
-class _BlankObjective(Objective):
+class _IndexObjective(Objective):
     """The loss as a function of the control values of the index, {name: (n, m, k)}."""
 
     def __init__(self, scene: Scene, target: np.ndarray, index: SplineIndex, rays: int, seed: int):
-        self.system = blank_system(scene, index)
+        self.system = plate_system(scene, index)
         self.name = index_name(self.system.elements[0])
         flat = HeightField.of(replace(scene.lens, control=(4, 4), degree=(3, 3), knots=None))
         apron = math.ceil(APRON * max(scene.screen.resolution))
@@ -193,7 +193,7 @@ class _BlankObjective(Objective):
         )
 
     def _tracers(self) -> Iterator[tuple[int, Tracer]]:
-        """Chunks of rays through the blank."""
+        """Tracers of the chunks of rays."""
         traced = None
         for sample in self.samplers[0].chunks(self.chunk):
             traced = Tracer(self.system, sample, torch.float64, like=traced)
@@ -201,7 +201,7 @@ class _BlankObjective(Objective):
 
 
 def _start(scene: Scene, target: np.ndarray, net: HeightField, cells: int) -> Tensor:
-    """Control values (n, m) of the index that sends thin light to the picture; its mean is any."""
+    """Control values (n, m) of the initial index, to first order in the thickness and up to a constant."""
     lens, screen = scene.lens, scene.screen
     (a, b), t = lens.half_size, lens.offset.thickness - lens.z_in
     n, m = (max(4, round(cells * r / max(a, b))) for r in (a, b))
@@ -212,7 +212,7 @@ def _start(scene: Scene, target: np.ndarray, net: HeightField, cells: int) -> Te
     throw = np.full_like(away[0], screen.z - lens.offset.thickness + 0.5 * t / lens.index)
     for _ in range(SINES):
         sines = [c / np.sqrt(throw**2 + away[0] ** 2 + away[1] ** 2) for c in away]
-        # within, light moves by t / (2 n) times its sine; behind, by the throw times its tangent
+        # displacement inside: t / (2 n) times the sine; behind: the throw times the tangent
         tangents = [s / np.sqrt(1.0 - sines[0] ** 2 - sines[1] ** 2) for s in sines]
         behind = screen.z - lens.offset.thickness
         rest = [c - 0.5 * t / lens.index * s for c, s in zip(away, sines, strict=True)]

@@ -1,10 +1,10 @@
-"""What a design reaches in how much time: optimisers, networks and control nets against each other.
+"""Comparison of optimisers, networks and control nets: error against computation time of a design.
 
-Every contender is a design of its own for the same target.  They take turns, a slice of time each, round after round, so that a
-machine that slows down for a while slows all of them.  After rounds 1, 2, 4, .. every lens is retraced with the same rays, which
-no design has seen: the error is the relative RMS between that bincount image and the target, each over its own mean.
+Each run is a separate design for the same target.  The runs are interleaved in time slices, so that a temporary slowdown of the
+machine affects all of them.  After rounds 1, 2, 4, .. every lens is retraced with the same independent rays: the error is the
+relative RMS between that bincount image and the target, each over its own mean.
 
-A contender's time is that of its iterations; retracing, and what is prepared once before the first iteration, are left out.
+The time of a run is that of its iterations; retracing, and preparations before the first iteration, are left out.
 """
 
 from __future__ import annotations
@@ -25,36 +25,36 @@ from caustic_cli.scene import Scene
 from caustic_cli.studies.report import Study, draw_front, legend_beside, plain_ticks
 from caustic_cli.studies.retrace import FINAL_RAYS, retrace
 
-#: Slices that the time of every contender is cut into; a power of 2.
+#: Time slices per run; a power of 2.
 ROUNDS = 16
-#: Seconds for each contender, unless said.
+#: Default seconds for each run.
 SECONDS = 4.0
-#: Rays of a retrace per pixel: stratified, they leave an error of a few per cent.
+#: Rays of a retrace per pixel: stratified, with an error of a few per cent.
 RAYS_PER_PIXEL = 32
-#: Lenses whose errors are this close, relatively, are called equally good.
+#: Relative difference of errors below which lenses count as equally good.
 ALIKE = 0.02
 
 COLUMNS = {
     "series": "optimiser or network, and its control net or nets",
     "optimizer": "lbfgs or adam",
-    "network": "what the heights come from: none, sparse or dense",
+    "network": "parametrisation of the heights: none, sparse or dense",
     "control": "control points along x and y, now",
     "iterations": "done so far",
     "seconds": "spent in iterations so far, s",
     "iteration": "wall time of one iteration so far, s; median",
-    "iteration_min": "least of them, s",
-    "iteration_max": "most of them, s",
+    "iteration_min": "shortest of them, s",
+    "iteration_max": "longest of them, s",
     "loss": "the last iteration's own loss times the pixels, for rms a relative RMS (filtered, blurred in early stages); empty"
     " before the first iteration",
     "error": "relative RMS between the retraced image and the target, each over its own mean",
 }
 
 
-class Contender(Protocol):
-    """A design that goes on when it is its turn.
+class DesignRun(Protocol):
+    """A design that is advanced in time slices.
 
     series, optimizer, network: see COLUMNS; heights (n, m) mm over `field`; seconds, iterations: spent so far; steps: seconds of
-    every iteration so far; loss: the last iteration's, times the pixels; done: it cannot be improved further.
+    every iteration so far; loss: the last iteration's, times the pixels; done: no further improvement is possible.
     """
 
     series: str
@@ -77,13 +77,13 @@ class Contender(Protocol):
     def done(self) -> bool: ...
 
     def advance(self, seconds: float) -> None:
-        """Iterate for so long, at least once."""
+        """Iterate for this number of seconds, at least once."""
 
 
-def run_training(
+def run_comparison(
     scene: Scene,
     target: np.ndarray,
-    contenders: Sequence[Contender],
+    runs: Sequence[DesignRun],
     *,
     seconds: float | None = None,
     seed: int = 0,
@@ -91,14 +91,14 @@ def run_training(
     device: str = "cpu",
     progress: Callable[[int, int], None] | None = None,
 ) -> Study:
-    """Let all contenders run for the same time.  Neither errors nor times repeat: a faster machine gets further.
+    """Run all designs for the same time.  Neither errors nor times are reproducible, as they depend on the speed of the machine.
 
     Args:
         target: (n_x, n_y) irradiance on the scene's screen.
         seconds: for each, None for SECONDS.
         seed: of the retrace's rays.
-        rays: of every retrace, None for RAYS_PER_PIXEL a pixel.
-        progress: told (slices done, in all) after each.
+        rays: of every retrace, None for RAYS_PER_PIXEL per pixel.
+        progress: called with (slices done, in total) after each.
 
     Raises:
         InputError: numbers out of range.
@@ -106,24 +106,24 @@ def run_training(
     """
     seconds = checks.number("⟨seconds⟩", SECONDS if seconds is None else seconds, 0.0, 1e6, open_low=True)
     rays = checks.whole("⟨rays⟩", min(FINAL_RAYS, RAYS_PER_PIXEL * target.size) if rays is None else rays, 256, 1 << 32)
-    tables: list[list[dict]] = [[] for _ in contenders]
+    tables: list[list[dict]] = [[] for _ in runs]
 
-    def judge() -> None:
-        for table, c in zip(tables, contenders, strict=True):
+    def evaluate() -> None:
+        for table, c in zip(tables, runs, strict=True):
             if not table or c.iterations > table[-1]["iterations"]:
                 _, figures = retrace(scene, c.field, c.heights, target, rays=rays, seed=seed, device=device, noise=False)
                 table.append(_row(c, figures["relative_rms"]))
 
-    judge()
+    evaluate()
     for k in range(1, ROUNDS + 1):
-        for i, c in enumerate(contenders):
+        for i, c in enumerate(runs):
             left = seconds * k / ROUNDS - c.seconds
             if left > 0 and not c.done:
                 c.advance(left)
             if progress is not None:
-                progress((k - 1) * len(contenders) + i + 1, ROUNDS * len(contenders))
+                progress((k - 1) * len(runs) + i + 1, ROUNDS * len(runs))
         if k & (k - 1) == 0:
-            judge()
+            evaluate()
     rows = [row for table in tables for row in table]
     made = {
         "version": __version__,
@@ -139,7 +139,7 @@ def run_training(
     return Study("design", COLUMNS, rows, {}, _advice(tables), made, "seconds", PLOTS)
 
 
-def _row(c: Contender, error: float) -> dict:
+def _row(c: DesignRun, error: float) -> dict:
     steps = c.steps
     return {
         "series": c.series,
@@ -157,7 +157,7 @@ def _row(c: Contender, error: float) -> dict:
 
 
 def _advice(tables: list[list[dict]]) -> str:
-    """Who comes furthest, and when it had passed where the next one ends, in one sentence."""
+    """The run with the least error, and the time at which it reached the final error of the next best, in one sentence."""
     best = min(tables, key=lambda table: table[-1]["error"])
     rest = [table[-1] for table in tables if table is not best]
     last = best[-1]
@@ -175,7 +175,7 @@ def _advice(tables: list[list[dict]]) -> str:
 
 
 def draw_design(study: Study, figure: Figure) -> None:
-    """Error against time, a curve for each contender."""
+    """Error against time, a curve for each run."""
     figure.set_size_inches(8.4, 5.6)
     axes = figure.add_subplot()
     draw_front(axes, study)

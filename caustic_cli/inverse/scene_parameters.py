@@ -1,13 +1,13 @@
-"""Values of the scene that a network of heights takes as inputs: a lens for each of them (thesis 2.5.2 and 7.2).
+"""Scene parameters over whose ranges a network is trained, which takes them as inputs (thesis 2.5.2 and 7.2).
 
     throw                            distance of the screen from the lens' origin, mm (of a mirror, before it)
-    source.x, source.y, source.z     place of a point source, or of the middle of a grid of points, mm
+    source.x, source.y, source.z     position of a point source, or of the centre of a grid of points, mm
 
 Each varies over a range.  These are the independent parameters of eq. 2.5.8, and the network is the map from them to the lens:
 
     heights(v) = network(c),    c = (2 v - low - high) / (high - low)    in [-1, 1] along each range
 
-The picture keeps its size in mm whatever they are, and so does the offset surface, which is that of the middle of every range.
+Neither the size of the picture in mm nor the offset surface depends on them; both are those of the middle of every range.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from caustic_cli.errors import InputError
 from caustic_cli.optics.sampling import stream
 from caustic_cli.scene import Scene, Source
 
-#: What may vary, and the setting whose range holds for it.
+#: Parameters that may vary, and the setting whose bounds apply.
 KEYS = {"throw": "screen.z", "source.x": "source.position", "source.y": "source.position", "source.z": "source.position"}
 FORM = f"KEY=LOW:HIGH separated by commas, KEY one of {', '.join(KEYS)}, like throw=250:350"
-#: Parts of a range at which its lenses are judged: its ends, its middle, and between.
-JUDGED = (0.0, 0.25, 0.5, 0.75, 1.0)
+#: Fractions of a range at which a trained network is evaluated.
+EVALUATED = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
 @dataclass(frozen=True)
@@ -48,10 +48,10 @@ class Range:
 
 @dataclass(frozen=True)
 class Ranges:
-    """What a network is trained over; rows of values (k, d) have one for each range, in their order.
+    """The ranges a network is trained over; rows of values (k, d) have one column per range, in order.
 
     Raises:
-        InputError: a key stands twice.
+        InputError: a key occurs twice.
     """
 
     each: tuple[Range, ...]
@@ -66,7 +66,8 @@ class Ranges:
         """ "throw=250:350, source.z=-80:-40" as ranges, None where the text is empty.
 
         Raises:
-            InputError: it is none, a key is unknown, or a range is empty, reversed or beyond what the setting accepts.
+            InputError: the text cannot be parsed, a key is unknown, or a range is empty, reversed or beyond the bounds of its
+                setting.
         """
         if not text.strip():
             return None
@@ -83,23 +84,23 @@ class Ranges:
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """In order."""
+        """Keys of all ranges, in order."""
         return tuple(one.key for one in self.each)
 
     @property
     def middle(self) -> tuple[float, ...]:
-        """Of every range, mm."""
+        """Middle of every range, mm."""
         return tuple(one.middle for one in self.each)
 
     def words(self) -> str:
-        """Keys and ranges in a clause."""
+        """Keys and ranges as a phrase for messages."""
         return ", ".join(f"{one.key} {one.low:g} to {one.high:g} mm" for one in self.each)
 
     def values(self, text: str) -> tuple[float, ...]:
-        """ "throw=300" as values; the middle of what it does not name.
+        """ "throw=300" as values, mm; the middle of each range that is not named.
 
         Raises:
-            InputError: naming what is unknown, no number, or outside its range.
+            InputError: a key is unknown, or a value is not a number or outside its range.
         """
         form = f"KEY=VALUE separated by commas, of {self.words()}"
         said = dict(_assignments("⟨at⟩", text, form, self.keys))
@@ -113,21 +114,21 @@ class Ranges:
     def scaled(self, values: Sequence[Sequence[float]] | np.ndarray) -> Tensor:
         """Rows of values (k, d), mm, as the network's inputs (k, d) in [-1, 1], float64."""
         low, high = (np.array([getattr(one, end) for one in self.each]) for end in ("low", "high"))
-        width = np.where(high > low, high - low, 1.0)  # of a range of one value, whose input is 0
+        width = np.where(high > low, high - low, 1.0)  # a range of a single value has the input 0
         return torch.from_numpy((2.0 * np.asarray(values, dtype=np.float64) - low - high) / width)
 
-    def drawn(self, seed: int, iteration: int, count: int) -> np.ndarray:
-        """Values (count, d) of one iteration: a Latin hypercube, one in each of `count` equal parts of every range."""
+    def sampled(self, seed: int, iteration: int, count: int) -> np.ndarray:
+        """Values (count, d) of one iteration, mm: a Latin hypercube sample of the ranges."""
         rng = np.random.default_rng(stream(seed, f"values {iteration}"))
         parts = np.stack([(rng.permutation(count) + rng.random(count)) / count for _ in self.each], 1)
         return np.array([one.low for one in self.each]) + parts * np.array([one.high - one.low for one in self.each])
 
-    def judged(self) -> list[tuple[float, ...]]:
-        """Values at which a network is judged: along every range at the parts JUDGED, all others in their middle."""
+    def evaluation_points(self) -> list[tuple[float, ...]]:
+        """Values at which a network is evaluated: at the fractions EVALUATED of each range, all others at their middle."""
         rows = [
             tuple(one.low + part * (one.high - one.low) if one is along else one.middle for one in self.each)
             for along in self.each
-            for part in JUDGED
+            for part in EVALUATED
         ]
         return list(dict.fromkeys(rows))
 
@@ -135,7 +136,7 @@ class Ranges:
         """The scene at these values.
 
         Raises:
-            InputError: nothing of it can have them, or it is none.
+            InputError: the source has no single position, or the resulting scene is invalid.
         """
         at = dict(zip(self.keys, values, strict=True))
         if "throw" in at:
@@ -153,27 +154,27 @@ class Ranges:
         return scene
 
     def refuse(self, source: Source) -> None:
-        """Refuse a source that has no one place, where its place varies.
+        """Refuse a source without a single position where its position varies.
 
         Raises:
-            InputError: there is a range of its place.
+            InputError: one of the ranges is of its position.
         """
         key = next((key for key in self.keys if key.startswith("source.")), "")
         if key and (source.distant or source.apart or source.rays is not None or max(source.extent) > 0):
             raise InputError(f"⟨design.over⟩ {key} needs ⟨+source.type⟩ point, of one place, or grid, got {source.label}")
 
     def ends(self, scene: Scene) -> list[Scene]:
-        """The scene at all combinations of ends of ranges.
+        """The scenes at all combinations of the ends of the ranges.
 
         Raises:
-            InputError: one of them is none.
+            InputError: one of these scenes is invalid.
         """
         corners = np.stack(np.meshgrid(*([one.low, one.high] for one in self.each), indexing="ij"), -1).reshape(-1, len(self.each))
         return [self.scene(scene, row.tolist()) for row in corners]
 
 
 def _assignments(where: str, text: str, form: str, known: Sequence[str] = tuple(KEYS)) -> list[tuple[str, str]]:
-    """KEY=TEXT separated by commas."""
+    """Parse KEY=TEXT pairs separated by commas."""
     found = []
     for part in text.split(","):
         key, equals, value = (word.strip() for word in part.partition("="))
@@ -188,7 +189,7 @@ def _assignments(where: str, text: str, form: str, known: Sequence[str] = tuple(
 
 
 def _number(where: str, key: str, text: str, form: str) -> float:
-    """A finite number that the key's setting accepts."""
+    """Parse a finite number within the bounds of the key's setting."""
     try:
         value = float(text)
     except ValueError:

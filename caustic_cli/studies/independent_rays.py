@@ -1,4 +1,4 @@
-"""Independent rays of a source, drawn in NumPy all over its cone or the aperture: no line is shared with `optics/emission`."""
+"""Independent Monte-Carlo sampling of source rays in NumPy, for verification: it shares no code with `optics/emission`."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from caustic_cli.scene import Scene, Source
 
 #: Rays at a time.
 BATCH = 1 << 20
-#: Angles by which a table of intensities is summed.
+#: Angles of the quadrature of a tabulated intensity.
 TABLE = 20_001
 
 
-def emitted(scene: Scene, rays: int, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Starts and directions (3, N) of independent rays, batch by batch, and what each carries: 1 on average over all of them."""
+def sample_rays(scene: Scene, rays: int, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Origins, mm, and directions (3, N) of independent rays in batches, and their weights (N,), whose mean is 1."""
     source, pupil, lowest = scene.source, scene.pupil, scene.lowest
     (rx, ry), z_in, round_ = pupil.half_size, pupil.z, pupil.round
     if source.profile is not None:
@@ -48,23 +48,23 @@ def emitted(scene: Scene, rays: int, rng: np.random.Generator) -> Iterator[tuple
         elif source.intensity != "uniform":
             angles = np.linspace(0, cone, TABLE)
             sine = np.sin(np.interp(a, *_summed(source.intensity.relative(angles) * np.sin(angles), angles)))
-        else:  # even in the cosine, reckoned from 1
+        else:  # uniform in 1 - cos, without cancellation
             drop = a * 2 * np.sin(cone / 2) ** 2
             sine = np.sqrt(drop * (2 - drop))
         d = np.array([sine * np.cos(2 * np.pi * b), sine * np.sin(2 * np.pi * b), np.sqrt(1 - sine**2)])
         o = STARTS[source.kind](source, u, v, rng)
-        near = d[2] > 1e-6  # from 1 mm or less before the entrance: single precision knows no far origin
+        near = d[2] > 1e-6  # start at most 1 mm before the entrance, for single precision
         yield o + d * np.where(near, np.maximum((lowest - o[2]) / np.where(near, d[2], 1) - 1, 0), 0), d, one
 
 
 def _on_points(source: Source, u: np.ndarray, _v: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """(3, N): one of the points each, as often as its power asks for."""
+    """(3, N): points drawn with probabilities proportional to their powers."""
     positions, parts = source.points()
     return positions[rng.choice(len(parts), len(u), p=parts)].T
 
 
 def _on_disc(source: Source, u: np.ndarray, v: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """(3, N): even over the ellipse, or by a picture."""
+    """(3, N): uniform over the ellipse, or distributed by a picture of the radiance."""
     if source.brightness is not None:
         x, y = np.array(source.frame)[:, None] * _on_picture(source.brightness, len(u), rng)
         return source.points()[0].T + np.array([x, y, 0 * u])
@@ -73,19 +73,19 @@ def _on_disc(source: Source, u: np.ndarray, v: np.ndarray, rng: np.random.Genera
 
 
 def _on_picture(light: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """(2, N): points of [-1, 1]^2, as many in each pixel as its light asks for."""
+    """(2, N): points of [-1, 1]^2 with a density proportional to a picture."""
     cell = rng.choice(light.size, count, p=light.ravel() / light.sum())
     places = zip(np.unravel_index(cell, light.shape), light.shape, strict=True)
     return np.array([2 * (k + rng.random(count)) / n - 1 for k, n in places])
 
 
 def _summed(density: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Parts of a density up to each place, by trapezia, and the places."""
+    """Cumulative distribution of a density at its nodes, by the trapezoidal rule, and the nodes."""
     sums = np.append(0.0, np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(at)))
     return sums / sums[-1], at
 
 
-#: Where rays of a near source of each kind start, and the kinds of which rays can be drawn.
+#: Sampling of the origins on a near source, by its kind; kinds of sources that can be sampled.
 STARTS = {"point": _on_points, "grid": _on_points, "disc": _on_disc}
 KINDS = ("plane", *STARTS)
 

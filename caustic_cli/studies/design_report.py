@@ -1,4 +1,4 @@
-"""report.png: target, caustic, error, lens height and its relief, loss against time and where the light goes, side by side."""
+"""report.png of a design: target, caustic, error, lens height and relief, loss against time, and energy balance."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from caustic_cli.io.picture import SOFTWARE, to_linear, to_srgb
 from caustic_cli.scene import Lens, Screen
 from caustic_cli.studies.report import COLOURS, plain_ticks
 
-#: A scale of irradiance that ends below this has no room for ticks between numbers; a black image has such a one.
+#: Upper end of an irradiance scale below which ticks cannot be placed, as for a black image.
 DARK = 1e-250
-#: Part of the pixels whose errors the scale of the error holds.
+#: Quantile of the absolute errors at which the error scale ends.
 NEARLY = 0.995
-#: Points along an axis of the relief, at most; light, as a part of all, of which nothing is said.
+#: Most points along an axis of the relief; fraction of the light below which a loss is not listed.
 RELIEF, LITTLE = 130, 5e-5
-#: Where a bar of colours stands beside its picture, in parts of that: left, bottom, width, height.
+#: Position of a colour bar relative to its panel: left, bottom, width, height.
 BAR = (1.03, 0.0, 0.046, 1.0)
-#: Of the panels.  Finding places that just fit took as long as drawing.
+#: Positions of the panels.  An automatic layout took as long as drawing.
 PLACES = {"left": 0.035, "right": 0.95, "bottom": 0.065, "top": 0.925, "wspace": 0.62, "hspace": 0.42}
-#: What is seen through a blur in a panel of its own, in parts of that of the error.
+#: Height of the panel of blurred losses relative to that of the error.
 BLURRED = 0.6
 
 
@@ -46,13 +46,13 @@ def write_report(
     """Write the panels.
 
     Args:
-        target, image: (n_x, n_y) irradiance; drawn at the same exposure and in the picture's encoding, images beside a bar of
-            what they are on the screen.
-        heights: (a, b) surface heights on an even grid over the aperture, mm; the paraboloid that fits best is
-            taken out, because it hides the relief; of a lens whose index is a volume, that is drawn instead.
+        target, image: (n_x, n_y) irradiance; drawn at the same exposure and in the encoding of the picture, images with a colour
+            bar of absolute irradiance.
+        heights: (a, b) surface heights on a regular grid over the aperture, mm; the best-fit paraboloid is subtracted, because it
+            hides the relief; for a gradient index the index is drawn instead.
         history: (k, 5) rows iteration, stage, loss, on_screen, seconds.
-        waves: (n_x, n_y), the wave image, where there is one: light follows it, and errors are its errors.
-        stages: how the loss of each sees the picture: through which blur, pixels, and whether as waves.
+        waves: (n_x, n_y), the wave image, or None; if given, the error is that of the wave image.
+        stages: of each, the blur in its loss, pixels, and whether it uses the wave image.
     """
     import matplotlib  # noqa: PLC0415
 
@@ -76,8 +76,8 @@ def write_report(
     else:
         shown = [
             (target, "target"),
-            (image, titled("by rays", figures["relative_rms"])),
-            (waves, titled("what light will do (waves)", figures["wave_relative_rms"])),
+            (image, titled("ray image", figures["relative_rms"])),
+            (waves, titled("wave image", figures["wave_relative_rms"])),
         ]
         image = waves
     for axis, (picture, title) in zip(axes[0], shown, strict=False):
@@ -107,7 +107,7 @@ def write_report(
     rx, ry = lens.half_size
     volume = None if lens.gradient is None else lens.gradient.volume
     relief, unit, name = (
-        (_without_sphere(heights, rx, ry) * 1e3, "µm", "lens height, best paraboloid removed")
+        (_without_paraboloid(heights, rx, ry) * 1e3, "µm", "lens height, best paraboloid removed")
         if volume is None
         else (volume.mean(-1), "index", "index, mean along z")
     )
@@ -118,7 +118,7 @@ def write_report(
     axes[1, 1].remove()
     solid = figure.add_subplot(place, projection="3d")
     _draw_losses(axes[1, 2], history, target.size, figures, stages)
-    _draw_account(axes[1, 3], figures)
+    _draw_energy_balance(axes[1, 3], figures)
     _draw_relief(solid, relief, (rx, ry), unit)
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", dpi=100, metadata={"Software": SOFTWARE})
@@ -126,18 +126,18 @@ def write_report(
 
 
 def _bar(drawn: AxesImage, axis: Axes, label: str, extend: str = "neither") -> None:
-    """A bar of colours, as high as the picture."""
+    """Add a colour bar as high as the panel."""
     axis.get_figure().colorbar(drawn, cax=axis.inset_axes(BAR), label=label, extend=extend)
 
 
 def _scale_of(error: np.ndarray, seen: np.ndarray) -> float:
-    """Where the scale of an error ends: what nearly all pixels that are `seen`, dark in neither image, keep within."""
+    """End of the error scale: a quantile over the pixels that are `seen`, not dark in both images."""
     sizes = np.abs(error[seen]) if seen.any() else np.abs(error)
     return float(np.quantile(sizes, NEARLY)) or 1.0
 
 
 def _draw_section(axis: Axes, target: np.ndarray, image: np.ndarray, screen: Screen) -> None:
-    """Both along x where the target is brightest, over the target's mean."""
+    """Sections of both along x through the brightest row of the target, over their means."""
     row = int(target.sum(0).argmax())
     n, half = target.shape[0], screen.half_size
     x = ((np.arange(n) + 0.5) * (2.0 / n) - 1.0) * half[0]
@@ -162,21 +162,21 @@ def _draw_relief(axis: Axes3D, relief: np.ndarray, half: tuple[float, float], un
 
 
 def _draw_losses(axis: Axes, history: np.ndarray, pixels: int, figures: dict, stages: Sequence[tuple[float, bool]]) -> None:
-    """The loss of each stage as it sees the picture, and what the lenses it began and ended with are worth by rays of their own.
+    """Loss of each stage against time, and the retraced errors of the initial and the final lens.
 
-    Stages that see the picture through a blur have a panel below: the wider the blur the smaller their loss, which is of the lens
-    only within a stage.
+    Stages with a blur have a panel of their own below: their losses decrease with the width of the blur and cannot be compared with
+    each other.
     """
     found = [int(k) for k in np.unique(history[:, 1])]
     how = {k: stages[k] if k < len(stages) else (0.0, False) for k in found}
-    mixed = len({waves for _, waves in how.values()}) > 1  # two measures, of which one may rise where the other falls
+    mixed = len({waves for _, waves in how.values()}) > 1  # two different losses
     last, least = (history[-1, 4], history[-1, 2] * pixels) if len(history) else (0.0, 0.0)
     below = None
     if any(blur > 0 for blur, _ in how.values()):
         grid = axis.get_subplotspec().subgridspec(2, 1, height_ratios=(1.0, BLURRED))
         axis.set_subplotspec(grid[0])
         below = axis.get_figure().add_subplot(grid[1], sharex=axis)
-        below.set_title("each stage as it sees both images, blurred", fontsize="medium")
+        below.set_title("loss of each stage, with blur", fontsize="medium")
     for k, (blur, waves) in how.items():
         rows, colour = history[history[:, 1] == k], COLOURS[k % len(COLOURS)]
         own = axis if blur == 0 or below is None else below
@@ -208,7 +208,7 @@ def _draw_losses(axis: Axes, history: np.ndarray, pixels: int, figures: dict, st
                 bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0, "alpha": 0.8},
                 **side,
             )
-    axis.set(title="error: as the design sees it (lines),\nretraced with other rays (points)")
+    axis.set(title="error: loss of the design (lines),\nretraced with independent rays (points)")
     for own in (axis,) if below is None else (axis, below):
         own.margins(x=0.08, y=0.12 if own is axis else 0.25)
         own.set_ylabel("relative RMS")
@@ -219,20 +219,20 @@ def _draw_losses(axis: Axes, history: np.ndarray, pixels: int, figures: dict, st
         axis.tick_params(labelbottom=False)
 
 
-def _draw_account(axis: Axes, figures: dict) -> None:
-    """Where the light of the source goes."""
+def _draw_energy_balance(axis: Axes, figures: dict) -> None:
+    """Energy balance: where the light of the source goes."""
     parts = [("on the picture", figures["on_target"] or 0.0, COLOURS[2])]
     parts += [("beside it, on the screen", figures["on_screen"] - (figures["on_target"] or 0.0), COLOURS[0])]
     parts += [(name.replace("_", " "), value, COLOURS[1]) for name, value in figures["lost"].items() if value > LITTLE]
     axis.barh(range(len(parts)), [100.0 * value for _, value, _ in parts], 0.35, color=[colour for _, _, colour in parts])
     for k, (name, value, _) in enumerate(parts):
         axis.annotate(f"{name} {value:.2%}", (1.0, k - 0.22), va="bottom")
-    axis.set(title=_account_words(figures), xlabel="% of the source's light", xlim=(0.0, 100.0), yticks=[])
+    axis.set(title=_balance_words(figures), xlabel="% of the source's light", xlim=(0.0, 100.0), yticks=[])
     axis.set_ylim(len(parts) - 0.5, -0.6)
 
 
-def _account_words(figures: dict) -> str:
-    """The title of the account: how much light is in the picture's black, and what a least radius adds to that."""
+def _balance_words(figures: dict) -> str:
+    """Title of the energy balance: light in black regions of the picture, and what a least radius adds to that."""
     words, radius = "where the light goes", figures.get("min_radius")
     if figures.get("in_black") is not None:
         words += f"\nof that on the screen, in black {figures['in_black']:.2%}"
@@ -242,13 +242,13 @@ def _account_words(figures: dict) -> str:
 
 
 def _irradiance_words(figures: dict, prefix: str) -> str:
-    """What a bar of irradiance shows, its unit, and the peak and the mean of the image."""
+    """Label of an irradiance colour bar: quantity, unit, and peak and mean of the image."""
     unit = figures["irradiance_unit"].replace("^2", "²")
     peak, mean = (figures[f"{prefix}{k}_irradiance"] for k in ("peak", "mean"))
     return f"{'illuminance' if unit == 'lux' else 'irradiance'} ({unit})\npeak {peak:.3g}, mean {mean:.3g}"
 
 
-def _without_sphere(heights: np.ndarray, rx: float, ry: float) -> np.ndarray:
+def _without_paraboloid(heights: np.ndarray, rx: float, ry: float) -> np.ndarray:
     """`heights` less its least-squares fit by 1, x, y, x^2 + y^2."""
     x = np.linspace(-rx, rx, heights.shape[0])[:, None] + np.zeros(heights.shape[1])
     y = np.linspace(-ry, ry, heights.shape[1]) + np.zeros(heights.shape)

@@ -1,16 +1,16 @@
-"""A screen seen through the lenses and mirrors behind a lens' exit, for the first surface of a design.
+"""The screen imaged through the lenses and mirrors behind the lens, for the initial surface of a design.
 
 Notation
-    p = (x, y, z)   a point of the exit; q = (q_x, q_y), tangents of a direction that light leaves it in
-    X(p, q)         where that light lands, in the screen's own coordinates, mm, by tracing it through all that follows
-    A, B            diagonal derivatives of X by (x, y) and by q, on the axis: X = A x + B q to first order
+    p = (x, y, z)   a point of the exit; q = (q_x, q_y), tangents of the direction of a ray that leaves it
+    X(p, q)         landing point of that ray in the coordinates of the screen, mm, traced through the following elements
+    A, B            first-order (ABCD matrix) coefficients on the axis: X = A x + B q, diagonal in x and y
     L               distance of the screen along the axis
-    u = s L X / B   the screen as a plane at L, s = +-1: without anything behind the exit, u = X
+    u = s L X / B   coordinates of an equivalent bare screen at L, s = +-1: without elements behind the exit, u = X
 
-Light that a lens turns by a slope g leaves with q = q_0 + (n - 1) g, so that u = s ((L A / B) x + L q): the map x -> u that a
-surface can make is, to first order, the gradient of a potential, as that to a bare screen is (`surface_from_map`), but with L A / B
-for 1. The sign s is that of A / B, by which the map asks for least of the surface: lenses may turn the image over. Beyond the first
-order, q is found by Newton's method, with derivatives by differences.
+A surface of slope g deflects light to q = q_0 + (n - 1) g, so that u = s ((L A / B) x + L q): to first order the map x -> u is the
+gradient of a potential, as for a bare screen (`surface_from_map`), with L A / B in place of 1.  The sign s is that of A / B, which
+minimises the deflection, since the elements may invert the image.  Beyond the first order, q is found by Newton's method with
+finite-difference derivatives.
 """
 
 from __future__ import annotations
@@ -29,53 +29,54 @@ from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Aperture, Scene
 
-#: Steps of tangents over which X is differentiated, most of Newton's steps, and parts of a pixel that are left.
+#: Finite-difference step of tangents, most Newton iterations, and their tolerance in pixels.
 STEP, NEWTON, LEFT = 1e-6, 8, 1e-6
-#: |B| / L below which the exit is imaged on the screen: no slope of it moves light there.
+#: |B| / L below which the exit is conjugate to the screen, where its slopes do not move light.
 IMAGED = 1e-3
 
 
-def bare(scene: Scene) -> Scene:
-    """A scene whose other surfaces are the spheres that a design begins from."""
+def without_freeforms(scene: Scene) -> Scene:
+    """The scene with spheres, the initial surfaces, in place of the free-form surfaces of other elements."""
     return replace(scene, elements=tuple(replace(e, free="none", fronts=(None, None)) for e in scene.elements))
 
 
-def opened(system: System, first: int, last: int) -> System:
-    """Elements first to last of a system without their apertures, lit beyond any bound."""
+def without_apertures(system: System, first: int, last: int) -> System:
+    """Elements first to last of a system, without their apertures."""
     elements = tuple(replace(e, aperture=Aperture()) for e in system.elements[first:last])
     return replace(system, elements=elements, lit=system.pupil, leg=system.leg if last == len(system.elements) else None)
 
 
-def passed(system: System, origin: tuple, direction: tuple) -> RayState:
-    """Rays, components of one shape each, behind a system that has nothing free."""
+def trace_through(system: System, origin: tuple, direction: tuple) -> RayState:
+    """Rays, given by components of one shape each, traced through a system without free parameters."""
     like = np.broadcast_shapes(*map(np.shape, (*origin, *direction)))
     o, d = (tuple(torch.from_numpy(np.broadcast_to(c, like).astype(np.float64).ravel()) for c in v) for v in (origin, direction))
     return Tracer(system, RayState(o, d, torch.ones_like(o[0])))({})[0]
 
 
 @dataclass(frozen=True, eq=False)
-class Relayed:
-    """The screen of a scene as its lens' exit, at height `eye` on the axis, mm, sees it; a `view.View` of what follows."""
+class RelayedScreen:
+    """The equivalent screen u for the exit at height `centre_z` on the axis, mm; same interface as
+    `projection.ScreenProjection`."""
 
     scene: Scene
-    eye: float
+    centre_z: float
 
     @cached_property
     def system(self) -> System:
-        """What follows the exit."""
-        whole = System.of(bare(self.scene))
+        """The elements behind the exit."""
+        whole = System.of(without_freeforms(self.scene))
         after = [e.name for e in whole.elements].index(EXIT) + 1
-        return opened(whole, after, len(whole.elements))
+        return without_apertures(whole, after, len(whole.elements))
 
     @property
     def distance(self) -> float:
         """L, mm."""
-        return self.scene.screen.z - self.eye
+        return self.scene.screen.z - self.centre_z
 
     def landing(self, origin: tuple, direction: tuple) -> tuple[np.ndarray, np.ndarray]:
-        """X of rays, NaN where they do not get to the screen."""
+        """X of rays, NaN where they do not reach the screen."""
         shape = np.broadcast_shapes(*map(np.shape, (*origin, *direction)))
-        state = passed(self.system, origin, direction)
+        state = trace_through(self.system, origin, direction)
         tracer = Tracer(self.system, RayState(state.origin, state.direction, state.power))
         ray = tracer.onto(state, self.scene.screen)
         x, y = (torch.where(ray.power > 0, c, torch.nan).numpy().reshape(shape) for c in ray.origin[:2])
@@ -89,24 +90,23 @@ class Relayed:
         """A and B, (2,) each.
 
         Raises:
-            InputError: the exit is imaged on the screen, or its axis does not get there.
+            InputError: the exit is conjugate to the screen, or the axial ray does not reach the screen.
         """
         reach = 1e-3 * min(self.scene.lens.half_size)
         x = reach * np.array([0.0, 1.0, 0.0, 0.0, 0.0])
         y = reach * np.array([0.0, 0.0, 1.0, 0.0, 0.0])
         q = reach / self.distance * np.array([[0.0, 0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 0.0, 1.0]])
-        found = self._from(x, y, np.full(5, self.eye), q)
+        found = self._from(x, y, np.full(5, self.centre_z), q)
         if not np.isfinite(found).all():
             raise InputError(
-                "[[element]] light along the axis does not get from the lens to the screen; its mirrors and radii bar it"
+                "[[element]] the axial ray does not reach the screen from the lens; check the mirrors' tilts and the radii"
             )
         a = np.array([found[0, 1] - found[0, 0], found[1, 2] - found[1, 0]]) / reach
         b = np.array([found[0, 3] - found[0, 0], found[1, 4] - found[1, 0]]) / (reach / self.distance)
         if (np.abs(b) < IMAGED * self.distance).any():
             raise InputError(
-                "⟨screen.z⟩ of"
-                f" {self.scene.screen.z:g} mm is where the elements behind the lens image it: nothing of its surface shows there;"
-                " another distance is needed"
+                f"⟨screen.z⟩ of {self.scene.screen.z:g} mm is conjugate to the lens through the elements behind it, so that its"
+                " slopes do not move light there; another distance is needed"
             )
         return a, b
 
@@ -117,37 +117,37 @@ class Relayed:
         return math.copysign(1.0, float((a / b).sum())) if (a / b).any() else 1.0
 
     @property
-    def straight(self) -> tuple[float, float]:
-        """L A / B: u is s times so many times x for light that leaves along the axis."""
+    def axial_scale(self) -> tuple[float, float]:
+        """L A / B along x and y: u / (s x) of light that leaves parallel to the axis."""
         a, b = self.first_order
         x, y = self.distance * a / b
         return float(x), float(y)
 
     @property
     def scale(self) -> np.ndarray:
-        """u over X, (2,)."""
+        """Scale factors u / X along x and y, (2,)."""
         return self.sign * self.distance / self.first_order[1]
 
-    def picture(self, target: np.ndarray) -> tuple[np.ndarray, tuple[float, float], tuple[float, float]]:
-        """Power on the pixels as u has them, (n_x, n_y), the half width and height of their frame, and its middle, mm."""
+    def projected_target(self, target: np.ndarray) -> tuple[np.ndarray, tuple[float, float], tuple[float, float]]:
+        """Power on the pixels in coordinates u, (n_x, n_y), the half width and height of their frame, and its centre, mm."""
         sx, sy = self.scale
         turned = target[:: 1 if sx > 0 else -1, :: 1 if sy > 0 else -1]
         half, shift = self.scene.screen.half_size, self.scene.screen.shift
         return turned, (half[0] * abs(sx), half[1] * abs(sy)), (shift[0] * sx, shift[1] * sy)
 
-    def seen(self, origin: tuple, direction: tuple) -> tuple[np.ndarray, np.ndarray]:
-        """u of rays that leave the exit, NaN where they do not get to the screen."""
+    def intersections(self, origin: tuple, direction: tuple) -> tuple[np.ndarray, np.ndarray]:
+        """u of rays that leave the exit, NaN where they do not reach the screen."""
         x, y = self.landing(origin, direction)
         return x * self.scale[0], y * self.scale[1]
 
-    def own(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The screen's own coordinates X behind u, counted from its middle."""
+    def screen_coordinates(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Coordinates X of the screen for given u, from its centre, mm."""
         shift = self.scene.screen.shift
         return u / self.scale[0] - shift[0], v / self.scale[1] - shift[1]
 
-    def towards(self, u: np.ndarray, v: np.ndarray) -> Callable[..., tuple]:
-        """Directions, of any length, that points x, y, z of the exit have to send light in for it to land at u; where none is
-        found, those of the first order."""
+    def directions_to(self, u: np.ndarray, v: np.ndarray) -> Callable[..., tuple]:
+        """A function of points x, y, z of the exit that returns the directions, of any length, of rays that land at u; to first
+        order where Newton's method finds none."""
         (a, b), scale, pixel = self.first_order, self.scale, min(self.scene.screen.pixel)
         aim, found = np.stack([u / scale[0], v / scale[1]]), None
         steps = STEP * np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])[:, :, None]  # (2, 3, 1)
@@ -175,6 +175,6 @@ class Relayed:
 
 
 def _direction(q: np.ndarray) -> tuple:
-    """Unit vectors with tangents q."""
+    """Unit vectors with tangents q to the axis."""
     length = np.sqrt(1.0 + q[0] ** 2 + q[1] ** 2)
     return q[0] / length, q[1] / length, 1.0 / length

@@ -1,7 +1,7 @@
-"""What an extended source lets a lens do: the best light behind its blur, the least error, and the most light that etendue lets by.
+"""Fundamental limits set by an extended source: the least error behind its blur, and the most light that etendue allows.
 
-Etendue, the integral of cos cos / r^2 dA dA' over two areas that see each other, is kept from the source's light to the screen's:
-of light of etendue E_1 through the lens no more than E_2 / E_1 lands on a screen that sees the lens under E_2.
+Etendue, the integral of cos cos / r^2 dA dA' over two areas, is conserved from the source to the screen: of light of etendue E_1
+through the lens at most the fraction E_2 / E_1 reaches a screen whose etendue with the lens is E_2.
 """
 
 from __future__ import annotations
@@ -23,66 +23,66 @@ from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.scene import Scene, Source
 from caustic_cli.scene.sources.distribution import relative
 
-#: A source shifts the image where it misplaces light by no more than this part of what it spreads it over.
+#: The blur is taken as a convolution where the deviation from it is at most this fraction of its half width.
 SHIFTS = 0.35
-#: How much of it may be misplaced in a refinement, and how many points of a source are taken for that, at most.
+#: Tolerated fraction of that deviation in a refinement, and most points that a source is sampled by to keep within it.
 EXACT, MOST_MODES = 0.04, 24
 #: Points along each axis of an area.
 POINTS = 12
-#: Pixels over which light is spread at least where anything is said of the least error.
+#: Least half width of the blur, pixels, for which the least error is computed.
 LEAST_REACH = 0.5
-#: Control points along each axis of the offset surface by which this is judged before there is a lens.
+#: Control points along each axis of the offset surface that stands for the lens before it is designed.
 NET = 24
 
 
 @dataclass(frozen=True)
-class Limits:
-    """light: the best behind the source's blur; etendue: the most of the light that the lens is lit with that the screen can get, a
-    part; None of either where it does not follow from the source's image or extent."""
+class SourceLimits:
+    """light: deconvolution of the picture by the source's blur; etendue: largest fraction of the light on the lens that can reach
+    the screen; each None where the source does not determine it."""
 
     light: Deconvolved | None
     etendue: float | None
 
     def sentence(self) -> str:
-        """What cannot be."""
+        """The limits as a sentence for the user; empty without any."""
         found = []
         if self.light is not None:
             found.append(
-                f"behind the source's blur the best light there can be is {self.light.bound:.3g} (proven) to"
-                f" {self.light.error:.3g} (found) relative RMS from the picture"
+                f"with the blur of the source the least possible relative RMS error is between {self.light.bound:.3g} (lower bound)"
+                f" and {self.light.error:.3g} (reached)"
             )
         if self.etendue is not None:
-            found.append(f"etendue lets {self.etendue:.0%} of the light on the lens reach the screen")
+            found.append(f"by etendue, at most {self.etendue:.0%} of the light on the lens can reach the screen")
         return "; ".join(found)
 
 
-def limits(
+def performance_limits(
     scene: Scene,
     target: np.ndarray,
     field: HeightField | None = None,
     heights: torch.Tensor | None = None,
     steps: int | None = None,
-) -> Limits:
-    """What the source of a scene lets any lens do, by the spread of this lens, or of the offset surface.
+) -> SourceLimits:
+    """Limits for any lens under the source of a scene, from the blur of this lens, or of the offset surface without one.
 
-    target: (n, m); steps: as of `best_light`.
+    target: (n, m) irradiance; steps: as of `best_irradiance`.
     """
     if not scene.source.extended or scene.source.apart or scene.elements:
-        return Limits(None, None)
-    spread = shift_of(scene, field, heights)
+        return SourceLimits(None, None)
+    spread = source_spread(scene, field, heights)
     seen = spread is not None and max(spread.reach()) > LEAST_REACH * max(scene.screen.pixel)
-    light = best_light(scene, target, spread, steps) if seen else None
-    return Limits(light, etendue_limit(scene))
+    light = best_irradiance(scene, target, spread, steps) if seen else None
+    return SourceLimits(light, etendue_limit(scene))
 
 
-def best_light(scene: Scene, target: np.ndarray, spread: Spread, steps: int | None = None) -> Deconvolved:
-    """The best light on a scene's screen behind a source's spread; see `deconvolved`."""
+def best_irradiance(scene: Scene, target: np.ndarray, spread: Spread, steps: int | None = None) -> Deconvolved:
+    """The deconvolution of a target by the source's blur on the screen of a scene; see `deconvolved`."""
     return deconvolved(target, spread.on(scene.screen.pixel, FINEST), steps)
 
 
-def shift_of(scene: Scene, field: HeightField | None = None, heights: torch.Tensor | None = None) -> Spread | None:
-    """How an extended source spreads its middle's image; None where it has no extent, does much else, or lights far more than the
-    screen."""
+def source_spread(scene: Scene, field: HeightField | None = None, heights: torch.Tensor | None = None) -> Spread | None:
+    """The point-spread function of an extended source; None for a point source, where the blur is not well approximated by a
+    convolution, or where it is wider than the screen."""
     if not scene.source.extended or scene.source.apart or any(scene.screen.tilt) or scene.screen.curved or scene.elements:
         return None
     if heights is None:
@@ -97,8 +97,8 @@ def shift_of(scene: Scene, field: HeightField | None = None, heights: torch.Tens
     return found
 
 
-def centre_of(scene: Scene) -> Source:
-    """The source without its extent, that shines into the same cone."""
+def point_source(scene: Scene) -> Source:
+    """A point source at the centre of the extended one, with the same cone."""
     source = scene.source.pointlike()
     if not source.distant and source.cone is None:
         cone = scene.source.cone_over(scene.lens.half_size, scene.lens.z_in, scene.lens.round)
@@ -109,11 +109,11 @@ def centre_of(scene: Scene) -> Source:
 def regular_rays(
     scene: Scene, spread: Spread, stage: Stage, seed: int, device: str | torch.device
 ) -> tuple[Scene, Rays | list[Rays], list[Convolution]]:
-    """The rays of a stage that are spread: of the source's middle, or of a few of its points where its light does more than shift;
-    with the scene that they are for, and what the image of each point's is convolved with."""
+    """Rays of a stage whose images are convolved with the blur: from the centre of the source, or from several of its points where
+    the blur varies over it; with the scene to trace them in and the convolution for the image of each point."""
     pixel, each = scene.screen.pixel, math.ceil((spread.usual / (EXACT * max(spread.reach()))) ** 2)
     if each <= 1 or not min(spread.half) > 0:
-        scene = replace(scene, source=centre_of(scene))
+        scene = replace(scene, source=point_source(scene))
         return scene, rays_of(scene, stage.sampler, stage.rays, seed, device), [spread.on(pixel, stage.oversample)]
     each = min(each, MOST_MODES)
     parts = spread.parts_on(pixel, spots(scene.source, each), stage.oversample)
@@ -121,7 +121,7 @@ def regular_rays(
 
 
 def etendue_limit(scene: Scene) -> float | None:
-    """E_2 / E_1, at most 1; None for a source that has no area, or is not evenly bright over it."""
+    """E_2 / E_1, at most 1; None for a source without area or of uneven radiance."""
     lens, screen, source = scene.lens, scene.screen, scene.source
     if not source.even:
         return None
@@ -132,7 +132,7 @@ def etendue_limit(scene: Scene) -> float | None:
     elif min(source.extent) > 0 and len(source.points()[0]) == 1:
         a, b, part = _area(source.extent, True)
         x0, y0, z0 = source.points()[0][0]
-        seen = _seen(x, y, (a + x0, b + y0, z0 - lens.z_in))
+        seen = _geometric_factor(x, y, (a + x0, b + y0, z0 - lens.z_in))
         slope = np.hypot(a + x0 - x[:, None], b + y0 - y[:, None]) / (lens.z_in - z0)
         cone = source.cone_over(lens.half_size, lens.z_in, lens.round)
         given = cell * part * seen[(np.arctan(slope) <= cone) & (relative(source.intensity, slope) > 0)].sum()
@@ -140,12 +140,12 @@ def etendue_limit(scene: Scene) -> float | None:
         return None
     a, b, part = _area(screen.half_size, False)
     px, py, pz = space(screen, a, b)
-    taken = cell * part * _seen(x, y, (px, py, pz - lens.offset.thickness), normals(screen, a, b)).sum()
+    taken = cell * part * _geometric_factor(x, y, (px, py, pz - lens.offset.thickness), normals(screen, a, b)).sum()
     return min(1.0, float(taken / given)) if given > 0 else None
 
 
 def _area(half: tuple[float, float], round: bool) -> tuple[np.ndarray, np.ndarray, float]:
-    """Even points of a rectangle or an ellipse, and the area of each."""
+    """Midpoint-rule nodes of a rectangle or an ellipse, mm, and the area of each, mm^2."""
     x, y = (h * ((np.arange(POINTS) + 0.5) * (2.0 / POINTS) - 1.0) for h in half)
     x, y = (c.ravel() for c in np.meshgrid(x, y, indexing="ij"))
     area = 4.0 * half[0] * half[1]
@@ -155,9 +155,10 @@ def _area(half: tuple[float, float], round: bool) -> tuple[np.ndarray, np.ndarra
     return x, y, area / len(x)
 
 
-def _seen(x: np.ndarray, y: np.ndarray, point: tuple, normal: tuple = (0.0, 0.0, 1.0)) -> np.ndarray:
-    """cos cos / r^2 between points (x, y, 0) of the lens' plane and points of a surface with these normals, (len(x), points); a
-    normal's length is the area that its point stands for."""
+def _geometric_factor(x: np.ndarray, y: np.ndarray, point: tuple, normal: tuple = (0.0, 0.0, 1.0)) -> np.ndarray:
+    """Geometric factor cos cos / r^2 between points (x, y, 0) of the lens' plane and points of a surface: (len(x), points).
+
+    The length of each normal is the area that its point represents."""
     dx, dy, dz = point[0] - x[:, None], point[1] - y[:, None], point[2]
     r2 = dx * dx + dy * dy + dz * dz
     return np.abs(dz) * np.abs(normal[0] * dx + normal[1] * dy + normal[2] * dz) / (r2 * r2)

@@ -1,8 +1,8 @@
-"""Whether any light of a source can be refracted to a picture at all, before time is spent on a lens.
+"""Reachability of a picture by refraction: bounds on the deflection, checked before a design.
 
-Light turns by refraction out of glass of index n by less than arccos(1 / n): so much lies between a ray d in the glass and the
-direction t that it leaves with at most, n (d . t) > 1.  Entrance and picture are sampled; the surface is taken at its offset's
-height and, for light that leaves a thick lens by its sides, at the least one.
+Refraction out of glass of index n deflects a ray by less than arccos(1 / n): between the direction d in the glass and t behind the
+surface, n (d . t) > 1.  Entrance and picture are sampled; the exit is taken at the height of its offset and, for light that would
+leave a thick lens through its sides, at the least height.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ ENTRANCE, PICTURE = 17, 15
 
 
 def refuse_unreachable(scene: Scene, target: np.ndarray) -> None:
-    """Stop where no light of the source can reach the picture, (n_x, n_y) on the scene's screen.
+    """Refuse a scene in which no light of the source can reach the picture, (n_x, n_y) on the scene's screen.
 
     Raises:
-        InputError: none meets the lens, or none that does can be turned so far.
+        InputError: no light falls on the lens, or none of it can be deflected far enough.
     """
     lens = scene.lens
     if lens.mirror or scene.source.rays is not None or scene.source.apart:
@@ -33,7 +33,7 @@ def refuse_unreachable(scene: Scene, target: np.ndarray) -> None:
     x, y, d = _in_glass(scene)
     if not len(x):
         raise InputError(
-            "[source] none of its light meets the lens: its position, aim or cone point past the aperture of"
+            "[source] none of its light falls on the lens: its position, direction or cone miss the aperture of"
             f" {lens.size[0]:g} x {lens.size[1]:g} mm at z = {lens.z_in:g} mm"
         )
     goal = _lit(scene, target)
@@ -48,16 +48,16 @@ def refuse_unreachable(scene: Scene, target: np.ndarray) -> None:
     if not lens.inside * most > 1.0:
         turn, limit = (math.degrees(math.acos(min(1.0, c))) for c in (most, 1.0 / lens.inside))
         raise InputError(
-            "[screen] no light can leave the lens for the picture: it would have to turn by at least"
-            f" {turn:.3g} degrees, and glass of index {lens.inside:g} turns it by less than {limit:.3g}; a picture"
-            " nearer the light's way, or a higher index, is needed"
+            "[screen] no light can be refracted to the picture: it would have to be deflected by at least"
+            f" {turn:.3g} degrees, and glass of index {lens.inside:g} deflects it by less than {limit:.3g}; a picture"
+            " closer to the undeflected light, or a higher index, is needed"
         )
 
 
 def largest_magnification(scene: Scene, picture: Sequence[float]) -> float | None:
-    """About how many times as wide as the lens a picture of this width and height, mm, can be made; None where that is not known.
+    """Approximate largest magnification of a picture of this width and height, mm, over the lens width; None where unknown.
 
-    Of parallel light: a map that does not fold sends a corner of the lens to the picture's, which is turned most.
+    For collimated light: a map without folds sends the corner of the lens, whose rays are deflected most, to that of the picture.
     """
     lens = scene.lens
     if lens.mirror or not scene.source.collimated:
@@ -71,7 +71,7 @@ def largest_magnification(scene: Scene, picture: Sequence[float]) -> float | Non
 
 
 def _in_glass(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points of the entrance x, y (k,), mm, that light of the source meets, and unit directions of it in the glass there (3, k)."""
+    """Points x, y (k,) of the entrance where light of the source falls, mm, and its unit directions in the glass there (3, k)."""
     source, lens = scene.source, scene.lens
     x, y = (c.ravel() for c in np.meshgrid(*(np.linspace(-h, h, ENTRANCE) for h in lens.half_size), indexing="ij"))
     if lens.round:
@@ -99,7 +99,7 @@ def _in_glass(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _lit(scene: Scene, target: np.ndarray) -> np.ndarray:
-    """Points of the picture's bright part in space (3, k), mm."""
+    """Sampled points in space of the bright part of the picture (3, k), mm."""
     screen = scene.screen
     i, j = np.nonzero(target)
     every = max(1, len(i) // PICTURE**2)

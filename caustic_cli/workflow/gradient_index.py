@@ -1,7 +1,6 @@
-"""The design of a free gradient from beginning to end: a flat blank's index by `inverse.gradient_blank`, judged as any lens is.
+"""A complete design of a free gradient index: a flat plate by `inverse.gradient_index`, evaluated like any lens.
 
-The project keeps the control values beside project.toml, in the file that [lens] index_file names; its checkpoint holds the flat
-side.
+The control values of the index are a file of the project, which [lens] index_file names; the checkpoint holds the flat exit.
 """
 
 from __future__ import annotations
@@ -19,33 +18,33 @@ from caustic_cli.config.completion import build_stages
 from caustic_cli.config.plans import transport_cells
 from caustic_cli.config.settings import value_of
 from caustic_cli.inverse.designer import State
-from caustic_cli.inverse.gradient_blank import design_blank
+from caustic_cli.inverse.gradient_index import design_gradient_index
 from caustic_cli.project import attachments
 from caustic_cli.project.project import Project
 from caustic_cli.workflow.reporter import Reporter
 
 
 def is_free(project: Project) -> bool:
-    """Whether a project's index is designed, not its surface."""
+    """Whether the refractive index of a project is designed instead of its surface."""
     return project.settings["lens"].get("gradient") == "free"
 
 
 @dataclass(frozen=True)
-class Designed:
-    """The project with the index it now has, and where the design ended."""
+class IndexDesign:
+    """The project with its designed index, and the final state."""
 
     project: Project
     state: State
 
 
-def design_index(project: Project, say: Reporter, began: float, limit: float, stop: Callable[[], bool]) -> Designed:
-    """Find the index of a project's flat blank.
+def design_index(project: Project, say: Reporter, began: float, limit: float, stop: Callable[[], bool]) -> IndexDesign:
+    """Design the index of the flat plate of a project.
 
     Args:
-        began: of the command, as `time.monotonic` counts; limit: s, of the command; stop: asked before every iteration.
+        began: start of the command by `time.monotonic`; limit: of the command, s; stop: called before every iteration.
 
     Raises:
-        InputError: as of `design_blank`.
+        InputError: as of `design_gradient_index`.
     """
     lens, chosen = project.settings["lens"], project.settings["design"]
     blank = replace(project, settings=_without_index(project.settings)).scene()
@@ -66,7 +65,7 @@ def design_index(project: Project, say: Reporter, began: float, limit: float, st
             rows.append((k, 0, loss, on_screen, time.monotonic() - began))
             show("index", f"loss {loss * target.size:.4f}  on screen {on_screen:.1%}", k, total)
 
-        found = design_blank(
+        found = design_gradient_index(
             blank,
             target,
             tuple(lens["index_control"]),
@@ -90,7 +89,7 @@ def design_index(project: Project, say: Reporter, began: float, limit: float, st
     )
     flat = torch.full(tuple(lens["control"]), float(blank.lens.offset.thickness), dtype=torch.float64)
     seconds = rows[-1][-1] if rows else 0.0
-    return Designed(project, State(flat, iteration=done, total=done, history=rows, seconds=seconds, reason=reason))
+    return IndexDesign(project, State(flat, iteration=done, total=done, history=rows, seconds=seconds, reason=reason))
 
 
 def index_figures(project: Project) -> dict[str, float]:
@@ -100,7 +99,7 @@ def index_figures(project: Project) -> dict[str, float]:
 
 
 def limit_of(project: Project) -> float:
-    """The design's time limit, s, less a third for what judges it."""
+    """Time limit of the iterations, s: two thirds of that of the design; the rest is for its evaluation."""
     limit = project.settings["design"]["time_limit"]
     return limit if math.isinf(limit) else 2.0 * limit / 3.0
 

@@ -1,4 +1,4 @@
-"""What light does behind the picture, of a lens with two free-form sides: another picture, or the directions it leaves in."""
+"""Evaluation behind the picture for a lens with two free-form sides: a second picture, or the error of the ray directions."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from caustic_cli.optics.trace import tracers
 from caustic_cli.scene import Scene
 from caustic_cli.studies.retrace import retrace, sampler_for
 
-#: Rays at a time, and those that tell directions.
+#: Rays traced at a time, and rays for the directions.
 CHUNK, ENOUGH = 1 << 19, 500_000
 
 
@@ -36,7 +36,7 @@ def second_figures(
 
     Returns:
         figures: second_relative_rms, second_noise, second_on_target and second_on_screen of a second picture; angle_rms_mrad, the
-        root mean square over all light of the angle to the wanted direction, where light shall go on parallel or towards a focus.
+        RMS angle to the prescribed directions, weighted by power, for collimated or focused light.
     """
     second = scene.second
     assert second is not None

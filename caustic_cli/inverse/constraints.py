@@ -1,12 +1,13 @@
-"""The last word of a design on what a lens may not exceed: its surface is moved, as little as it takes, within all limits.
+"""Enforcement of the constraints of slope, concave radius and height on a finished surface, by minimising their violation.
 
-While a design runs, limits of slope and concave radius are penalties: the picture may win a little over them.  Here rays have no
-say any more.  The sum of squares
+During a design the limits of slope and concave radius are penalty terms, which the optimum may violate slightly.  Here the loss is
+left out, and the sum of squares
 
     max(0, |grad z| / slope - 1)^2 + max(0, k r - 1)^2 + max(0, (low - P) / scale)^2 + max(0, (P - high) / scale)^2
 
-over the surface is brought to zero by L-BFGS.  Slopes and largest principal curvatures k are those at some points a knot span, with
-a little room to spare for the places between, which grows until finer points obey too; P are the control heights.
+over the surface is brought to zero by L-BFGS from the designed heights.  Slopes and largest principal curvatures k are evaluated at
+a few points per knot span, with a safety margin that is increased until a finer grid satisfies the limits too; P are the control
+heights.
 """
 
 from __future__ import annotations
@@ -22,33 +23,33 @@ from caustic_cli.optics import curvature
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.surfaces.heightfield import HeightField
 
-#: Points a knot span at which limits are kept and at which that is checked in the end, and most along an axis.
+#: Points per knot span at which the limits are enforced and at which they are finally checked, and most along an axis.
 A_SPAN, CHECKED, MOST = 4, 10, 4001
-#: The part by which limits are kept tighter than asked at first, for the places between points, and how often more is tried.
+#: First relative safety margin for places between the points, and number of attempts with larger ones.
 ROOM, TRIES = 2e-3, 6
-#: The part of a limit by which it may be exceeded where it is kept, and by which the checked points must stay below it.
+#: Relative violation tolerated where the limits are enforced, and margin that the final check demands.
 LEFT, SPARE = 1e-3, 1e-3
 STEPS = 400
-#: Points looked at together.
+#: Points evaluated at a time, which bounds the memory.
 BLOCK = 400_000
 
 
 def within_limits(
     field: HeightField, heights: Tensor, bounds: tuple[Tensor, Tensor], max_slope: float = 0.0, min_radius: float = 0.0
 ) -> Tensor:
-    """Heights (n, m) mm that obey all limits, as near to `heights` as a descent leaves them; the same where these do already.
+    """Feasible heights (n, m) mm near the given ones, which are returned unchanged if they are feasible.
 
     Args:
         bounds: least and largest height of each control point, mm.
         max_slope: of |grad z|, 0 for none.
-        min_radius: least radius of curvature of concave places, mm, 0 for any.
+        min_radius: least radius of curvature of concave regions, mm, 0 for any.
 
     Raises:
-        CausticError: no such surface was found.
+        CausticError: no feasible surface was found.
     """
     if not (max_slope > 0 or min_radius > 0):
         return heights
-    asked = _Limits(field, bounds, max_slope * (1.0 - SPARE), min_radius / (1.0 - SPARE), CHECKED)
+    asked = _Constraints(field, bounds, max_slope * (1.0 - SPARE), min_radius / (1.0 - SPARE), CHECKED)
     found, room = heights, LEFT + ROOM
     for _ in range(TRIES):
         over = asked.excess(found)
@@ -56,13 +57,13 @@ def within_limits(
             return found
         if found is not heights:
             room += max(1.5 * over, LEFT)
-        found = _descend(_Limits(field, bounds, max_slope * (1.0 - room), min_radius / (1.0 - room), A_SPAN), found)
+        found = _descend(_Constraints(field, bounds, max_slope * (1.0 - room), min_radius / (1.0 - room), A_SPAN), found)
     if asked.excess(found) <= 0:
         return found
     raise _none(asked.excess(found))
 
 
-def _descend(limits: _Limits, heights: Tensor) -> Tensor:
+def _descend(limits: _Constraints, heights: Tensor) -> Tensor:
     def evaluate(flat: Tensor) -> tuple[float, Tensor]:
         value, gradient = limits.violation(flat.view(heights.shape))
         return value, gradient.reshape(-1)
@@ -85,8 +86,8 @@ def _none(excess: float) -> CausticError:
     )
 
 
-class _Limits:
-    """What exceeds the limits, on points (a, b) of an even grid with `a_span` of them a knot span."""
+class _Constraints:
+    """Violation of the limits on a regular grid of `a_span` points per knot span."""
 
     def __init__(self, field: HeightField, bounds: tuple[Tensor, Tensor], slope: float, radius: float, a_span: int):
         self.low, self.high = bounds
@@ -102,12 +103,12 @@ class _Limits:
         return [torch.sparse.mm(u, heights) for u in self.u]
 
     def _blocks(self) -> Iterator[slice]:
-        """Points a, a block at a time, which bounds the memory and what of it is written anew."""
+        """Slices of the rows of points, which bound the memory."""
         count, step = self.u[0].shape[0], max(1, BLOCK // self.v[0].shape[0])
         return (slice(start, start + step) for start in range(0, count, step))
 
     def _shape(self, along: list[Tensor]) -> Iterator[Tensor]:
-        """Slopes and radii beyond their limits, as parts of these."""
+        """Relative excess of slopes and curvatures over their limits, negative where they are satisfied."""
         need = curvature.ORDERS if self.radius > 0 else curvature.ORDERS[:2]
         zx, zy, *second = (torch.sparse.mm(self.v[b], along[a].T).T for a, b in need)
         if self.slope > 0:
@@ -116,8 +117,8 @@ class _Limits:
             yield curvature.largest(zx, zy, *second) * self.radius - 1.0
 
     def violation(self, heights: Tensor) -> tuple[float, Tensor]:
-        """Sum of squares of what exceeds, and its gradient (n, m); heights are asked to keep off their bounds, too, by more than is
-        left in the end."""
+        """Sum of squares of the excess, and its gradient (n, m) per mm; heights keep a margin to their bounds beyond the
+        tolerance."""
         room = 2.0 * LEFT * self.scale
         short, tall = (t.clamp_min(0.0) / self.scale for t in (self.low + room - heights, heights - self.high + room))
         value, gradient = float(short.square().sum() + tall.square().sum()), 2.0 * (tall - short) / self.scale
@@ -134,13 +135,13 @@ class _Limits:
 
     @torch.no_grad()
     def excess(self, heights: Tensor) -> float:
-        """The largest excess, 0 or less where all is obeyed."""
+        """The largest relative excess, 0 or less for feasible heights."""
         along = self._along(heights)
         beyond = max(float((self.low - heights).max()), float((heights - self.high).max())) / self.scale
         return max(beyond, *(float(t.max()) for rows in self._blocks() for t in self._shape([a[rows] for a in along])))
 
 
 def _grid(space: SplineSpace, a_span: int) -> Tensor:
-    """Even points on [0, 1]: all knots among them where these are equispaced."""
+    """Equispaced points on [0, 1], which include all knots where these are equispaced."""
     spans = len(space.breaks) - 1
     return torch.linspace(0.0, 1.0, max(1, min(a_span, MOST // spans)) * spans + 1, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""A wanted illumination by an array: the image of each lenslet alone, and the brightness of each one's source."""
+"""Target illumination by a lenslet array: image of each lenslet, and brightness of its source by non-negative least squares."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from caustic_cli.workflow.lens import Lens
 from caustic_cli.workflow.reporter import Reporter
 
 
-def illumination(lens: Lens, picture: Path) -> np.ndarray:
-    """A wanted illumination on the screen's pixels (n_x, n_y), laid there like the project's own picture.
+def target_illumination(lens: Lens, picture: Path) -> np.ndarray:
+    """The target illumination on the pixels of the screen (n_x, n_y), placed like the picture of the project.
 
     Raises:
-        InputError: the lens is no array, or an archive's; the picture cannot be read.
+        InputError: the lens is not an array, or comes from an archive; the picture cannot be read.
     """
     scene, project = lens.scene, lens.project
     if project is None or not scene.lens.arrayed:
@@ -35,18 +35,18 @@ def illumination(lens: Lens, picture: Path) -> np.ndarray:
     return target_on_screen(light.irradiance(), tuple(goal["size"]), scene.screen, goal["flip"])
 
 
-def wanted(
+def solve_brightness(
     lens: Lens, plan: Plan, asked: np.ndarray, image: Path, rays: int, seed: int, device: str, say: Reporter
 ) -> dict[str, Any]:
-    """Solve for the brightnesses and write the image that they give.
+    """Solve for the brightnesses and write the resulting image.
 
     Args:
-        asked: of `illumination`.
-        rays: of all lenslets together.
+        asked: from `target_illumination`.
+        rays: in total, over all lenslets.
 
     Returns:
         the figures for JSON: `brightness`, N lists of M, in parts of the largest; `error`, relative RMS of the image, both scaled
-        to the same power; `kkt_residual`, see `studies.brightness`; `power`, the part of the source's that they take, if the
+        to the same power; `kkt_residual`, see `studies.brightness`; `power`, the fraction of the source's that they take, if the
         largest is one; `image`.
     """
     scene = plan.scene
@@ -84,7 +84,7 @@ def wanted(
 
 
 def rows(figures: dict[str, Any]) -> list[tuple[str, str]]:
-    """As a person reads them: brightnesses as the lenslets stand seen from the screen's far side, +y up, +x to the right."""
+    """The figures as rows of a table (name, text); brightnesses in the layout of the lenslets seen from +z, +y up, +x right."""
     level = np.array(figures["brightness"]).T[::-1]
     lines = [("brightness" if k == 0 else "", "  ".join(f"{b:.4f}" for b in line)) for k, line in enumerate(level)]
     return [

@@ -1,4 +1,4 @@
-"""A lens as a program would cut it: the surface that a tool leaves, and how it differs from the design."""
+"""Simulated machining: the surface that a tool path leaves, and its form deviation from the design."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from caustic_cli.optics.surfaces.cut import CutSurface
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 
-#: Points at which the cut surface is compared with the design.
+#: Points at which the machined surface is compared with the design.
 POINTS = 400_000
-#: Samples of a wave image, finer than are needed for the screen by so many times: scallops scatter light beside it.
+#: Oversampling of a wave image, since scallops scatter light beside the screen.
 FINER = 1.5
-#: mm by which a part may be off before it is taken for another one, in parts of its size.
+#: Largest deviation over the size of the part; beyond it, the program is for another part.
 FAR = 0.05
 
 
@@ -30,23 +30,23 @@ def cut_surface(path: Path, scene: Scene, field: HeightField, tool_radius: float
     """The surface that a program's ball-nose tools leave, in the scene's coordinates.
 
     Args:
-        tool_radius: mm, of a program that does not say it.
+        tool_radius: mm, for a program that does not give it.
 
     Raises:
-        InputError: no such program, a tool whose radius nobody says, or none with a ball nose.
+        InputError: the program cannot be read, the radius of a tool is unknown, or no tool has a ball nose.
     """
     program, envelopes = read_program(path), []
     for cut in program.cuts:
         radius = cut.radius or tool_radius
-        if cut.kind == "flat end":  # roughs, above what is left in the end
+        if cut.kind == "flat end":  # roughing, above the finished surface
             continue
         if radius is None:
-            raise InputError(f"{path}: does not say the radius of its ball-nose tool; ⟨tool_radius⟩ does")
+            raise InputError(f"{path}: does not give the radius of its ball-nose tool; ⟨tool_radius⟩ is needed")
         centres = cut.tips + np.array([0.0, 0.0, radius])
         top = math.inf if program.top is None else program.top
         envelopes.append(Envelope(radius, *_near(centres, top + radius), top=top))
     if not envelopes:
-        raise InputError(f"{path}: has no ball-nose tool, whose cut is known")
+        raise InputError(f"{path}: has no ball-nose tool, the only kind that is simulated")
     mirror = scene.lens.mirror
     turned = mirror if program.turned is None else program.turned
     zero = scene.lens.z_in if program.zero is None else program.zero
@@ -54,18 +54,18 @@ def cut_surface(path: Path, scene: Scene, field: HeightField, tool_radius: float
 
 
 def _near(centres: np.ndarray, top: float) -> tuple[np.ndarray, np.ndarray]:
-    """Begin and end of the moves that come below the top of the stock."""
+    """Begin and end points (k, 3) mm of the moves below the top of the stock."""
     begin, end = centres[:-1], centres[1:]
     cuts = np.minimum(begin[:, 2], end[:, 2]) < top
     return (begin[cuts], end[cuts]) if cuts.any() else (centres[:1], centres[:1])
 
 
-def compared(cut: CutSurface, field: HeightField, heights: Tensor, round: bool) -> dict:
-    """How a cut surface departs from the design, along +z where material is left, for JSON: cut_left_mm and cut_gouge_mm, the most
-    that is left and the most that is missing; cut_rms_mm about the mean; cut_slope_rms and cut_slope_most, of the departure.
+def form_deviation(cut: CutSurface, field: HeightField, heights: Tensor, round: bool) -> dict:
+    """Form deviation of a machined surface, positive where material is left, for JSON: cut_left_mm and cut_gouge_mm, its extrema;
+    cut_rms_mm about the mean; cut_slope_rms and cut_slope_most, of its slope.
 
     Raises:
-        InputError: it is another part.
+        InputError: the program is for another part.
     """
     n = math.isqrt(POINTS)
     line = torch.linspace(-1.0, 1.0, n, dtype=torch.float64) * (1.0 - 1e-9)
@@ -78,7 +78,7 @@ def compared(cut: CutSurface, field: HeightField, heights: Tensor, round: bool) 
     off = (z - nominal) * (-1.0 if cut.turned else 1.0)
     if float(off.abs().max()) > FAR * max(field.half_size):
         raise InputError(
-            f"the program cuts another part than this: it is up to {float(off.abs().max()):.3g} mm off; export this lens' own"
+            f"the program is for another part: its surface is up to {float(off.abs().max()):.3g} mm off; export this lens' own"
         )
     slopes = torch.hypot(gx - hx, gy - hy)
     return {
@@ -90,8 +90,9 @@ def compared(cut: CutSurface, field: HeightField, heights: Tensor, round: bool) 
     }
 
 
-def departure(cut: CutSurface, field: HeightField, heights: Tensor) -> Callable[[Tensor, Tensor], Tensor]:
-    """By how much a cut surface is higher than the design at points (N,) mm; beyond the aperture as beside it."""
+def height_deviation(cut: CutSurface, field: HeightField, heights: Tensor) -> Callable[[Tensor, Tensor], Tensor]:
+    """Function of points (N,) mm that returns the height of a machined surface above the design, mm, constant beyond the
+    aperture."""
 
     def higher(x: Tensor, y: Tensor) -> Tensor:
         x, y = (c.double().cpu().clamp(-r, r) for c, r in zip((x, y), field.half_size, strict=True))
@@ -101,7 +102,7 @@ def departure(cut: CutSurface, field: HeightField, heights: Tensor) -> Callable[
 
 
 def rows(figures: dict) -> list[tuple[str, str]]:
-    """The same as a person reads it, with the design's error beside the cut's."""
+    """The figures as rows of a table (name, text), with the error of the design for comparison."""
     f, nominal = figures["cut"], []
     if f.get("nominal_relative_rms") is not None:
         nominal = [
@@ -118,8 +119,8 @@ def rows(figures: dict) -> list[tuple[str, str]]:
     ]
 
 
-def mark(path: Path) -> str:
-    """What tells one program from another of the same name."""
+def fingerprint(path: Path) -> str:
+    """Path and hash of a file, which change with its content."""
     try:
         with open(path, "rb") as file:
             return f"{path} {hashlib.file_digest(file, 'sha256').hexdigest()}"

@@ -1,4 +1,4 @@
-"""What a network that was trained over ranges of the scene's values is worth: its lens for some of them, retraced there."""
+"""Evaluation of a network trained over ranges of scene parameters: its lenses at several values, retraced there."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from caustic_cli.studies.retrace import retrace
 def errors(
     designer: Designer, state: State, target: np.ndarray, *, rays: int, seed: int = 0, device: str = "cpu", middle: bool = True
 ) -> list[dict[str, float]]:
-    """At each of the values that are judged (`Ranges.judged`), by rays that the design has not seen: the values by their keys, mm;
-    relative_rms and noise of the lens for them, on_screen; and middle_relative_rms of the lens for the middle, used there, unless
-    that is left out.
+    """Figures at each of `Ranges.evaluation_points`, with independent rays: the parameter values by their keys, mm; relative_rms,
+    noise and on_screen of the lens for them; and, with `middle`, middle_relative_rms, of the lens for the middle of the ranges used
+    there.
 
     Raises:
         CausticError: no light reaches the screen.
@@ -22,7 +22,7 @@ def errors(
     if over is None:
         return []
     lens_of_middle, found = designer.heights_at(state, over.middle), []
-    for values in over.judged():
+    for values in over.evaluation_points():
         scene, row = over.scene(designer.scene, values), dict(zip(over.keys, values, strict=True))
         own = retrace(scene, field, designer.heights_at(state, values), target, rays=rays, seed=seed, device=device)[1]
         row |= {key: own[key] for key in ("relative_rms", "noise", "on_screen")}

@@ -1,6 +1,6 @@
-"""The two ways to step downhill, on one objective and one parametrisation: Adam as the thesis runs it, and L-BFGS.
+"""Optimisers over an objective and a parametrisation: Adam, as in the thesis, and L-BFGS.
 
-Both look at a step before it counts, and take it back where it leads to nothing finite or to no light.
+Both evaluate a step before accepting it, and reject one that leads to a loss that is not finite or to an image without light.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from caustic_cli.inverse.losses import NoLight
 from caustic_cli.inverse.objective import Evaluation, Objective
 from caustic_cli.inverse.parametrisation import Heights
 
-#: How often a step of Adam's is halved before it is given up.
+#: Most halvings of a rejected step of Adam.
 MOST_HALVINGS = 200
 
 
 class NotFinite(CausticError):
-    """A loss or a derivative that is not a finite number."""
+    """The loss or its derivative is not finite."""
 
     def __init__(self):
         super().__init__("the loss or its derivative is not finite for this lens; heights within a smaller height_range may help")
 
 
 class Adam:
-    """Adam on the loss itself, as the thesis runs it; `loss`, `on_screen` and `image` belong to the point before the step.
+    """Adam on the loss (Kingma and Ba, 2015); `loss`, `on_screen` and `image` are those of the point before the step.
 
-    A step is looked at before it counts: where it leads to nothing finite, or to no light, half of it is tried, and so on, so
-    that what a checkpoint holds has always been evaluated.  `taken_back` counts such steps.
+    A step to a loss that is not finite, or to an image without light, is rejected and halved until it is accepted, so that the
+    parameters in a checkpoint have always been evaluated.  `rejected` counts such steps.
     """
 
     def __init__(self, objective: Objective, heights: Heights, lr: float):
@@ -40,10 +40,10 @@ class Adam:
         self.image: Tensor | None = None
         self.adam = torch.optim.Adam(heights.parameters(), lr=lr)
         self.here: tuple[Tensor, Evaluation] | None = None
-        self.taken_back = 0
+        self.rejected = 0
 
     def step(self) -> bool:
-        z, e = self.here or self._look()
+        z, e = self.here or self._evaluate_here()
         before = [p.detach().clone() for p in self.heights.parameters()]
         self.adam.zero_grad()
         z.backward(e.gradient.to(z.device))
@@ -51,33 +51,33 @@ class Adam:
         self.loss, self.on_screen, self.image, self.here = e.loss, e.on_screen, e.image, None
         for halvings in range(MOST_HALVINGS):
             try:
-                self.here = self._look()
+                self.here = self._evaluate_here()
                 return True
             except (NoLight, NotFinite):
-                self.taken_back += halvings == 0
+                self.rejected += halvings == 0
                 for p, old in zip(self.heights.parameters(), before, strict=True):
                     p.data = 0.5 * (p.data + old)
         raise CausticError("no step along the gradient leads to a finite loss with light on the screen; a smaller ⟨lr⟩ may help")
 
-    def _look(self) -> tuple[Tensor, Evaluation]:
+    def _evaluate_here(self) -> tuple[Tensor, Evaluation]:
         """Heights, with their graph, and their evaluation.
 
         Raises:
-            NotFinite, NoLight: something there is not finite, or no light reaches the screen.
+            NotFinite, NoLight: the loss or its gradient is not finite, or no light reaches the screen.
         """
-        z, objective = self._judged()
+        z, objective = self._objective_here()
         e = objective(z.detach()) if bool(torch.isfinite(z).all()) else None
         if e is None or not math.isfinite(e.loss) or not bool(torch.isfinite(e.gradient).all()):
             raise NotFinite
         return z, e
 
-    def _judged(self) -> tuple[Tensor, Callable[[Tensor], Evaluation]]:
-        """Heights, with their graph, and what judges them."""
+    def _objective_here(self) -> tuple[Tensor, Callable[[Tensor], Evaluation]]:
+        """Heights, with their graph, and the objective to evaluate them with."""
         return self.heights(), self.objective
 
     @property
     def steps(self) -> int:
-        """Taken so far, those before a checkpoint included."""
+        """Number of steps so far, including those before a checkpoint."""
         state = self.adam.state_dict()["state"]
         return int(state[0]["step"]) if state else 0
 
@@ -88,10 +88,10 @@ class Adam:
         return out
 
     def load(self, state: dict[str, Tensor]) -> None:
-        """Go on from `state()`.
+        """Continue from a `state()`.
 
         Raises:
-            InputError: it is that of another method, or of other parameters.
+            InputError: the state is of another method or of other parameters.
         """
         own = {}
         for k, p in enumerate(self.heights.parameters()):
@@ -115,7 +115,7 @@ class QuasiNewton:
         self.pixels = objective.loss.target.numel()
         self.seen: dict[float, tuple[float, Tensor]] = {}
         self.image: Tensor | None = None
-        self.taken_back = 0
+        self.rejected = 0
         self.method = LBFGS(self._evaluate, self.parameter.detach().reshape(-1).clone())
         self.loss, self.on_screen = math.inf, 0.0
 
@@ -129,12 +129,12 @@ class QuasiNewton:
         except (NoLight, NotFinite):
             if self.method.f is None:
                 raise
-            self.taken_back += 1
-            return math.inf, torch.zeros_like(x)  # a step too far: the line search turns back
+            self.rejected += 1
+            return math.inf, torch.zeros_like(x)  # treated as too long by the line search
         relative = e.loss * self.pixels
         (g,) = torch.autograd.grad(z, self.parameter, e.gradient.to(z.device) * (self.pixels * relative))
         value = 0.5 * relative * relative
-        least = min(self.seen, default=value)  # what the search takes is the best it found, or the last
+        least = min(self.seen, default=value)  # the line search accepts the best or the last evaluation
         self.seen = {key: found for key, found in self.seen.items() if key == least} | {value: (e.on_screen, e.image)}
         return value, g.reshape(-1)
 

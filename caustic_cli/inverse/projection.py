@@ -1,0 +1,131 @@
+"""Central projection of a tilted or curved screen from the centre of the lens onto the plane z = z_screen.
+
+Notation
+    c           centre of projection, the centre of the exit surface, on the axis
+    x, y        coordinates on the screen from its centre, mm;  P(x, y) its points in space
+    u, v        intersection of the line from c through P with the plane z = z_screen, mm
+
+To first order a slope of the lens determines (u, v), whatever the shape of the screen.  So the map that a surface can realise is
+close to optimal transport onto (u, v), not onto (x, y): the picture, power on the screen, is projected onto the plane cell by cell.
+The depth of the screen beyond the first order is taken into account by `surface_from_map`, which aims at P itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.ndimage import map_coordinates
+
+from caustic_cli.errors import InputError
+from caustic_cli.optics.backends.reference import Torch
+from caustic_cli.optics.screen_shape import shape_of, space
+from caustic_cli.scene import Screen
+
+#: Cells of the plane per pixel along each axis: with 1 the picture is blurred, and the initial error on a sphere 0.28, not 0.24.
+FINER = 2
+
+
+@dataclass(frozen=True, eq=False)
+class ScreenProjection:
+    """Projection of a screen from (0, 0, centre_z), mm, by light that travels towards +z (forward 1) or -z (-1)."""
+
+    screen: Screen
+    centre_z: float
+    forward: float = 1.0
+
+    def project(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(u, v) of points x, y of the screen, mm."""
+        px, py, pz = space(self.screen, x, y)
+        scale = (self.screen.z - self.centre_z) / (pz - self.centre_z)
+        return px * scale, py * scale
+
+    def screen_coordinates(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """x, y of the points of the screen that project to (u, v); NaN where there is none."""
+        shape = np.shape(u)
+        ahead = np.stack([u, v, np.full(shape, self.screen.z - self.centre_z)]).reshape(3, -1)
+        ahead = torch.from_numpy(ahead / np.sqrt((ahead * ahead).sum(0)))
+        x, y, there = self.land((0.0, 0.0, self.centre_z), tuple(ahead))
+        u, v = (torch.where(there, c, torch.nan).reshape(shape).numpy() for c in (x, y))
+        return u, v
+
+    def points(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Points in space of the screen that project to (u, v), mm; those of the plane where there is none."""
+        x, y = self.screen_coordinates(u, v)
+        there = np.isfinite(x)
+        found = space(self.screen, np.where(there, x, 0.0), np.where(there, y, 0.0))
+        px, py, pz = (np.where(there, a, b) for a, b in zip(found, (u, v, self.screen.z), strict=True))
+        return px, py, pz
+
+    sign, axial_scale = 1.0, (1.0, 1.0)  # as of `relay.RelayedScreen`, without elements between lens and screen
+
+    def directions_to(self, u: np.ndarray, v: np.ndarray) -> Callable[..., tuple]:
+        """A function of points x, y, z of the exit that returns directions, of any length, to the points that project to (u, v)."""
+        px, py, pz = self.points(u, v)
+        return lambda x, y, z: (px - x, py - y, pz - z)
+
+    def intersections(self, origin: tuple, direction: tuple) -> tuple[np.ndarray, np.ndarray]:
+        """(u, v) of rays, components (N,), NaN where they miss the screen."""
+        *own, there = self.land(*(tuple(_tensor(c) for c in v) for v in (origin, direction)))
+        u, v = self.project(*(c.numpy() for c in own))
+        return np.where(there, u, np.nan), np.where(there, v, np.nan)
+
+    def land(self, origin, direction) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Intersection of rays, components (N,) float64 or numbers, with the screen: x, y (N,) mm, and whether they reach it."""
+        s, shape = self.screen, shape_of(self.screen)
+        land = Torch().land if shape is None else shape.land
+        forward = self.forward if s.axes[2][2] >= 0 else -self.forward
+        return land(origin, direction, (*s.shift, s.z), s.axes, forward)
+
+    def projected_target(self, target: np.ndarray) -> tuple[np.ndarray, tuple[float, float], tuple[float, float]]:
+        """Power on a regular grid of cells of the plane, FINER per pixel, from that on the screen's pixels (n_x, n_y), not all
+        black; half width and height of the frame of these cells, which holds the bright pixels, and its centre, mm.
+
+        Raises:
+            InputError: part of the picture faces away from the lens.
+        """
+        s = self.screen
+        bright = [np.nonzero(target.any(axis))[0] for axis in (1, 0)]
+        x, y = (np.arange(b[0], b[-1] + 2) * w - h for b, w, h in zip(bright, s.pixel, s.half_size, strict=True))
+        u, v = self.project(x[:, None], y[None, :])
+        if not _same_orientation(u, v):
+            raise InputError(
+                "[screen] part of the picture faces away from the lens, which cannot light it; less tilt or curvature is needed"
+            )
+        low, high = (u.min(), v.min()), (u.max(), v.max())
+        half = 0.5 * float(high[0] - low[0]), 0.5 * float(high[1] - low[1])
+        middle = 0.5 * float(high[0] + low[0]), 0.5 * float(high[1] + low[1])
+        edges = [np.linspace(a, b, FINER * (len(c) - 1) + 1) for a, b, c in zip(low, high, (x, y), strict=True)]
+        own = self.screen_coordinates(*np.broadcast_arrays(edges[0][:, None], edges[1][None, :]))
+        return _integrals(target, s, *own), half, middle
+
+
+def _tensor(value):
+    return value if isinstance(value, float) else torch.from_numpy(value)
+
+
+def _integrals(target: np.ndarray, screen: Screen, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Power within cells with corners x, y (a + 1, b + 1) on the screen, mm, from power (n, m) uniform within its pixels: (a, b).
+
+    By summed-area table.  Cells are approximated by rectangles between the midpoints of their sides; 0 where a corner is NaN.
+    """
+    whole = np.pad(target.cumsum(0).cumsum(1), ((1, 0), (1, 0)))  # power below and left of every pixel's corner
+    x, y = ((c + h) / w for c, h, w in zip((x, y), screen.half_size, screen.pixel, strict=True))
+    sides = [0.5 * (x[:-1, 1:] + x[:-1, :-1]), 0.5 * (x[1:, 1:] + x[1:, :-1])]
+    ends = [0.5 * (y[1:, :-1] + y[:-1, :-1]), 0.5 * (y[1:, 1:] + y[:-1, 1:])]
+
+    def up_to(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return map_coordinates(whole, np.nan_to_num([a, b]), order=1, mode="nearest")
+
+    power = sum((1 if i == j else -1) * up_to(sides[i], ends[j]) for i in (0, 1) for j in (0, 1))
+    known = np.isfinite(sides[0] + sides[1] + ends[0] + ends[1])
+    return np.where(known, np.maximum(power, 0.0), 0.0)
+
+
+def _same_orientation(u: np.ndarray, v: np.ndarray) -> bool:
+    """Whether all quadrilaterals between points (n + 1, m + 1) have the same orientation: the sign of the cross product of
+    diagonals."""
+    du, dv = u[1:, 1:] - u[:-1, :-1], v[1:, 1:] - v[:-1, :-1]
+    return bool((du * (v[:-1, 1:] - v[1:, :-1]) > dv * (u[:-1, 1:] - u[1:, :-1])).all())
