@@ -28,7 +28,7 @@ from caustic_cli.optics.plan import compile_plan
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces import HeightField, Sphere
-from caustic_cli.optics.system import EXIT, System, sides_of
+from caustic_cli.optics.system import EXIT, System, split_heights
 from caustic_cli.optics.trace import Tracer, expose, render
 from caustic_cli.scene import Component, Lens, Light, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies.retrace import retrace
@@ -171,8 +171,8 @@ ALL = (
 def test_the_loss_has_the_gradients_of_all_surfaces_together():
     """Taylor's remainder along a direction in all of them falls with the square of the step; and each by central differences."""
     scene = replace(SCENE, elements=(*ALL[:2], replace(ALL[2], free="front")), lens=replace(LENS, fresnel="exact"))
-    assert scene.shaped == ("element-1-back", "element-2-front", "element-2-back", "element-3-front", "exit")
-    nets = [sphere_net(e, side, FIELD) for e in scene.elements for side in e.shaped]
+    assert scene.free_surfaces == ("element-1-back", "element-2-front", "element-2-back", "element-3-front", "exit")
+    nets = [sphere_net(e, side, FIELD) for e in scene.elements for side in e.free_sides]
     nets = torch.stack([*nets, wavy(0.01)])
     target = torch.ones(PIXELS, PIXELS, dtype=torch.float64)
     target[10:20, 8:24] = 3.0
@@ -196,9 +196,9 @@ def test_the_loss_has_the_gradients_of_all_surfaces_together():
 
 def test_designed_surfaces_trace_as_the_free_ones_and_as_the_spheres_that_they_began_as():
     scene = replace(SCENE, elements=ALL)
-    nets = torch.stack([*(sphere_net(e, s, FIELD) for e in ALL for s in e.shaped), wavy()])
-    (free,) = render(System.of(scene, FIELD), dict(zip(scene.shaped, nets, strict=True)), 20_000, kind="grid")
-    fixed, exit = sides_of(scene, FIELD, nets)
+    nets = torch.stack([*(sphere_net(e, s, FIELD) for e in ALL for s in e.free_sides), wavy()])
+    (free,) = render(System.of(scene, FIELD), dict(zip(scene.free_surfaces, nets, strict=True)), 20_000, kind="grid")
+    fixed, exit = split_heights(scene, FIELD, nets)
     rays = rays_of(fixed, "grid", 20_000)
     found = expose(fixed, FIELD, exit, rays)
     assert torch.allclose(free.image, found.image, atol=1e-12) and free.lost == pytest.approx(found.lost, abs=1e-12)
@@ -290,8 +290,8 @@ def test_solids_are_closed_and_their_spheres_are_spheres(aperture):
         of_lens = math.pi * r * r * (t - sag) + math.pi * sag * (3 * r * r + sag * sag) / 6.0
         most = 40.0 * 40.0 * 3.0 * 1.3
         assert of_lens < volume - without < of_lens + most
-    z = body.lens.front
-    assert z is not None and plate.lens.front is not None
+    z = body.lens.entrance
+    assert z is not None and plate.lens.entrance is not None
     field = HeightField(body.field.spaces, body.field.half_size)
     assert field.half_size == (6.0, 6.0)
     sphere, net = Sphere(30.0), torch.from_numpy(z.heights)
@@ -303,7 +303,7 @@ def test_solids_are_closed_and_their_spheres_are_spheres(aperture):
     normal = np.array(plate.pose.axes[2])
     own = vertices[vertices[:, 2] > 60.0]
     depth = (own - np.array(plate.pose.position)) @ normal
-    back = 3.0 + max(0.0, float(plate.lens.front.heights.max()))
+    back = 3.0 + max(0.0, float(plate.lens.entrance.heights.max()))
     assert depth.min() > -1.0 and depth.max() == pytest.approx(back, abs=1e-9)
 
 
@@ -365,7 +365,7 @@ def test_surfaces_of_two_lenses_are_shaped_together(_here, capfd, monkeypatch):
     assert both["relative_rms"] < 1.1 * one["relative_rms"] and both["relative_rms"] < 0.8 * both["start_relative_rms"]
     lens = load("p")
     assert lens.state is not None and lens.state.heights.shape == (3, 35, 35)
-    assert lens.scene.elements[0].fronts[0] is not None and torch.equal(lens.heights, lens.state.heights[-1])
+    assert lens.scene.elements[0].surfaces[0] is not None and torch.equal(lens.heights, lens.state.heights[-1])
     begun = torch.stack([sphere_net(lens.scene.elements[0], side, lens.field) for side in ("front", "back")])
     assert (lens.state.heights[:2] - begun).abs().amax((1, 2)).min() > 1e-6
     figures = run(capfd, "render", "p", "--rays", "400000", "--effects", "fresnel", "--quiet", "--json")
@@ -459,6 +459,6 @@ def test_a_screen_where_the_lens_is_imaged_is_refused():
 
 def test_a_scene_without_elements_is_as_it_was():
     scene = replace(SCENE, elements=())
-    assert scene.pupil.z == LENS.z_in and scene.axial and not scene.jointly and System.of(scene, FIELD).leg is None
+    assert scene.pupil.z == LENS.z_in and scene.axial and not scene.joint and System.of(scene, FIELD).leg is None
     rays = next(iter(rays_of(scene, "lines", 4_000).chunks()))
     assert Tracer(System.of(scene, FIELD), rays).fused is not None

@@ -60,7 +60,7 @@ def test_the_example_is_read_and_names_every_error():
         ("[throw]\nsigma = [1, 2]", "[throw] sigma must be a number, got 2 numbers"),
         ("[lens_tilt]\nsigma = 'a'", "must be a number or a pair of numbers"),
         ("[lens_tilt]\nsigma = -1", "must be 0 to 10, got -1"),
-        ("[throw]\nsigma = 0", "nothing is off"),
+        ("[throw]\nsigma = 0", "all widths are 0"),
         ("draws = 3\n[throw]\nsigma = 1", "draws must be a whole number 10 to 100000, got 3"),
         ("[form_error]\nexponent = 2", "rms is missing"),
         ("[form_error]\nrms = 1e-4\nlongest = 1\nshortest = 2", "longest must exceed shortest"),

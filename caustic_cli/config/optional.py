@@ -21,7 +21,7 @@ from caustic_cli.config.table import check, default
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.conditions import Ranges
 from caustic_cli.scene import Source
-from caustic_cli.scene.elements import refuse_beside
+from caustic_cli.scene.elements import check_compatible_with_elements
 
 OVER_WIDTH = 128  # of a dense network over a range: caustic convergence, study design, networks
 BEAM = 1.2  # width of another lens or a mirror over that of a beam from the lens' edges to the picture's
@@ -141,7 +141,7 @@ def complete_elements(s: Settings) -> None:
         return
     s["element"] = {"list": tables}
     free = any(table.get("free", "none") != "none" for table in tables)
-    refuse_beside(
+    check_compatible_with_elements(
         {
             "second.file": "second" in s,
             "design.robust": bool(design.get("robust")),

@@ -21,7 +21,7 @@ from caustic_cli import __version__
 from caustic_cli.config.table import Setting, check, default, in_section
 from caustic_cli.errors import InputError, near
 from caustic_cli.io.files import read_bytes
-from caustic_cli.scene import Component, Lens, Light, Offset, Scene, Screen, Second, Source, sources
+from caustic_cli.scene import Component, Lens, Light, Offset, Scene, Screen, SecondTarget, Source, sources
 from caustic_cli.scene.gradient import KINDS, Gradient
 from caustic_cli.scene.materials import refractive_index
 from caustic_cli.scene.screen import PLANE, Sags
@@ -329,9 +329,9 @@ def build_source(settings: Settings, profile: np.ndarray | None = None, type: st
     made, lit = sources.type_of(type or s["type"]), sources.used_by("profile")
     check("source.power", s["power"])  # before it is shared among points
     if "profile" in s and not {made.name, s["type"]} & set(lit):
-        raise InputError(f"⟨source.profile⟩ belongs to type {sources.either(lit)}, got type {s['type']}")
+        raise InputError(f"⟨source.profile⟩ belongs to type {sources.alternatives(lit)}, got type {s['type']}")
     one = made.from_settings(s, profile)
-    return one if type is not None else sources.together(one, s)
+    return one if type is not None else sources.combined(one, s)
 
 
 def build_scene(settings: Settings, profile: np.ndarray | None = None) -> Scene:
@@ -376,16 +376,16 @@ def _element(table: dict[str, Any], lens: dict[str, Any]) -> Component:
     )
 
 
-def build_second(settings: Settings) -> Second | None:
+def build_second(settings: Settings) -> SecondTarget | None:
     """What the [second] section says that light does behind the picture."""
     s = settings.get("second", {})
     if "file" in s:
         screen = build_screen(settings)
         margin = [a / b for a, b in zip(screen.size, settings["target"]["size"], strict=True)]
-        return Second(Screen((margin[0] * s["size"][0], margin[1] * s["size"][1]), s["z"], screen.resolution))
+        return SecondTarget(Screen((margin[0] * s["size"][0], margin[1] * s["size"][1]), s["z"], screen.resolution))
     if "focus" in s:
-        return Second(focus=tuple(s["focus"]))
-    return Second() if s.get("collimate") else None
+        return SecondTarget(focus=tuple(s["focus"]))
+    return SecondTarget() if s.get("collimate") else None
 
 
 def build_screen(settings: Settings) -> Screen:
@@ -422,7 +422,9 @@ def refuse_unused(source: dict[str, Any], given: Iterable[str], stages: Sequence
     keys = [path.removeprefix("source.") for path in given if path.startswith("source.")]
     for key in filter(sources.used_by, keys):
         if not types & set(sources.used_by(key)):
-            raise InputError(f"⟨source.{key}⟩ belongs to ⟨source⟩ {sources.either(sources.used_by(key))}, got {source['type']}")
+            raise InputError(
+                f"⟨source.{key}⟩ belongs to ⟨source⟩ {sources.alternatives(sources.used_by(key))}, got {source['type']}"
+            )
     if len(types) == 1 and types <= set(sources.names()):
         idle = sources.type_of(*types).idle(source)
         for key in keys:

@@ -37,7 +37,7 @@ from caustic_cli.export.surface import (
     usual_steps,
 )
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import front_of
+from caustic_cli.optics.system import entrance_of
 from caustic_cli.scene import Lens, Scene
 
 STRETCH = 1.28
@@ -110,7 +110,7 @@ def patches(
 ) -> tuple[Patch, ...]:
     """The sides of a solid that are free-form, the exit last; arguments as of `closed_mesh`; most: points of all of them, where
     neither samples nor tolerance is given."""
-    if lens.front is None:
+    if lens.entrance is None:
         return (patch(lens, field, heights, samples, tolerance, most),)
     return both_patches(lens, field, heights, samples, tolerance, None if most is None else most // 2)
 
@@ -129,7 +129,7 @@ def both_patches(
     most: int | None = None,
 ) -> tuple[Patch, Patch]:
     """Free-form entrance and exit of a lens, on as many points, normals towards +z; arguments as of `patch`."""
-    entrance = front_of(lens)
+    entrance = entrance_of(lens)
     surfaces = (entrance.field, entrance.heights + lens.z_in), (field, heights)
     found = [patch(lens, *surface, samples, tolerance, most) for surface in surfaces]
     shapes = [p.points.shape[:2] for p in found]

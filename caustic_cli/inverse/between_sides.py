@@ -11,7 +11,7 @@ from torch import Tensor
 
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import EXIT, sides_of
+from caustic_cli.optics.system import EXIT, split_heights
 from caustic_cli.optics.trace import CHUNK, tracers
 from caustic_cli.scene import Scene
 
@@ -31,7 +31,7 @@ class Within:
 
 def rays_within(scene: Scene, field: HeightField, nets: Tensor, count: int) -> Within:
     """About so many regular rays of the source through a lens of these nets (2, n, m), mm."""
-    lit, net = sides_of(scene, field, nets)
+    lit, net = split_heights(scene, field, nets)
     found = []
     for traced in tracers(lit, field, rays_of(lit, "grid", count), torch.float64, CHUNK):
         last = traced.last({EXIT: net})

@@ -42,7 +42,7 @@ from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.screen_shape import reach
 from caustic_cli.optics.spread import Convolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import EXIT, sides_of
+from caustic_cli.optics.system import EXIT, split_heights
 from caustic_cli.optics.waves import NoWaveImage
 from caustic_cli.scene import Scene
 from caustic_cli.scene.tolerances import Tolerances
@@ -150,7 +150,7 @@ class Designer:
         own: (n_x, n_y) of each lenslet of an array; or one for all, the target unless given.
         second: (k_x, k_y) irradiance on the scene's second screen, where it has one.
 
-    Where several surfaces are shaped together, heights are those of all, (k, n, m): see `Scene.shaped`.
+    Where several surfaces are shaped together, heights are those of all, (k, n, m): see `Scene.free_surfaces`.
     """
 
     def __init__(
@@ -198,14 +198,14 @@ class Designer:
 
     def exit(self, state: State) -> Tensor:
         """Heights of the exit alone (n, m), on the net of the state's stage."""
-        return sides_of(self.scene, self.field(state.stage), state.heights)[1]
+        return split_heights(self.scene, self.field(state.stage), state.heights)[1]
 
     def whole(self, heights: Tensor | None) -> Tensor | None:
         """Heights of the exit (n, m) on the first stage's net with those of the spheres that surfaces of other elements begin as,
         (k, n, m); others as they are."""
-        if heights is None or heights.ndim == 3 or not self.scene.jointly:
+        if heights is None or heights.ndim == 3 or not self.scene.joint:
             return heights
-        others = [sphere_net(e, side, self.field(0)) for e in self.scene.elements for side in e.shaped]
+        others = [sphere_net(e, side, self.field(0)) for e in self.scene.elements for side in e.free_sides]
         return torch.stack([*others, heights])
 
     def first(self, heights: Tensor | None) -> First | None:
@@ -300,12 +300,12 @@ class Designer:
         """
         field, bounds, o = self.field(state.stage), self._bounds(self.stages[state.stage]), self.options
         radius = o.min_radius if rounded else 0.0
-        if not self.scene.jointly:
+        if not self.scene.joint:
             return _as_cut(field, state.heights, bounds, o.max_slope, radius, self.scene.lens.cut_from)
         found = []
-        halves = [e.half_size for e in self.scene.elements for _ in e.shaped] or [field.half_size]
+        halves = [e.half_size for e in self.scene.elements for _ in e.free_sides] or [field.half_size]
         for name, half, heights, low, high in zip(
-            self.scene.shaped, [*halves, field.half_size], state.heights, *bounds, strict=True
+            self.scene.free_surfaces, [*halves, field.half_size], state.heights, *bounds, strict=True
         ):
             field = replace(field, half_size=half)
             side = self.scene.lens.cut_from if name == EXIT else -1 if name.endswith(("entrance", "front")) else 1
@@ -521,9 +521,9 @@ class Designer:
         if self.scene.second is not None:
             most = np.full_like(low, lens.height_range[1])
             low, high = np.stack([-most, low]), np.stack([most, high])
-        elif self.scene.jointly:
+        elif self.scene.joint:
             field = HeightField.of(lens)
-            others = [(sphere_net(e, side, field).numpy(), room_of(e, lens)) for e in self.scene.elements for side in e.shaped]
+            others = [(sphere_net(e, side, field).numpy(), room_of(e, lens)) for e in self.scene.elements for side in e.free_sides]
             low = np.stack([*(net - room for net, room in others), low])
             high = np.stack([*(net + room for net, room in others), high])
         return torch.from_numpy(low), torch.from_numpy(high)

@@ -59,7 +59,7 @@ def incident(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple
 
 def on_entrance(scene: Scene, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, tuple | None]:
     """The same in air, on the plane of the entrance: as if the lens there had the index 1 and no thickness."""
-    air = replace(scene, lens=replace(scene.lens, index=1.0 + 1e-9, glass=None, fresnel="none", front=None), second=None)
+    air = replace(scene, lens=replace(scene.lens, index=1.0 + 1e-9, glass=None, fresnel="none", entrance=None), second=None)
     return incident(air, x, y, np.full((len(x), len(y)), scene.lens.z_in))
 
 

@@ -177,7 +177,7 @@ class Objective:
 
     def __call__(self, heights: Tensor) -> Evaluation:
         """`evaluate` at the heights (n, m) mm float64 of a lens' exit, or at those of all surfaces that are `shaped`, (k, n, m)."""
-        return self.evaluate({EXIT: heights} if heights.ndim == 2 else dict(zip(self.scene.shaped, heights, strict=True)))
+        return self.evaluate({EXIT: heights} if heights.ndim == 2 else dict(zip(self.scene.free_surfaces, heights, strict=True)))
 
     def evaluate(self, parameters: Parameters) -> Evaluation:
         """Value and gradients at heights {name of a surface: (n, m) mm float64}.

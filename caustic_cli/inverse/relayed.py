@@ -37,7 +37,7 @@ IMAGED = 1e-3
 
 def bare(scene: Scene) -> Scene:
     """A scene whose other surfaces are the spheres that a design begins from."""
-    return replace(scene, elements=tuple(replace(e, free="none", fronts=(None, None)) for e in scene.elements))
+    return replace(scene, elements=tuple(replace(e, free="none", surfaces=(None, None)) for e in scene.elements))
 
 
 def opened(system: System, first: int, last: int) -> System:

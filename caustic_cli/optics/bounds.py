@@ -27,7 +27,7 @@ from caustic_cli.optics.interface import reflectance, reflectances
 from caustic_cli.optics.resolution import Resolution, paraxial
 from caustic_cli.optics.sampling import LARGEST_NORMAL
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import System, front_of
+from caustic_cli.optics.system import System, entrance_of
 from caustic_cli.scene import Scene
 
 
@@ -87,7 +87,7 @@ def bounds_of(scene: Scene, field: HeightField, heights: Tensor, steeper: float 
         low, high, steepest = field_of_index.extremes(lens.half_size, depth)
         least, most = least * low / lens.index, most * high / lens.index
         bent = steepest * depth / low
-    front = 0.0 if lens.front is None else math.atan(math.hypot(*front_of(lens).slope_bounds(None)))
+    front = 0.0 if lens.entrance is None else math.atan(math.hypot(*entrance_of(lens).slope_bounds(None)))
     inside = min(front + math.asin(max(-1.0, min(1.0, math.sin(incidence - front) / least))) + bent, 0.5 * math.pi)
     slope = field.slope_bound(heights) + steeper
     lean = math.atan(slope + lens.roughness * LARGEST_NORMAL)
@@ -137,7 +137,7 @@ def _reach(scene: Scene, inside: float, lowest: float, top: float) -> float:
         return 1.0
     if lowest < lens.z_in or scene.before:
         return math.inf
-    low = min(0.0, front_of(lens).hull(None)[0]) if lens.front is not None else 0.0
+    low = min(0.0, entrance_of(lens).hull(None)[0]) if lens.entrance is not None else 0.0
     drift = (top - lens.z_in - low) * math.tan(min(inside, 1.57))
     if source.distant:
         return 1.0 + drift / min(lens.half_size)

@@ -106,7 +106,7 @@ class Misalignment:
             if any(self.lens_tilt):
                 rays = replace(rays, positions=rays.positions @ turn.T, directions=rays.directions @ turn.T)
             return replace(source, rays=rays, position=moved(source.position))
-        return source.misplaced(moved, scale)
+        return source.displaced(moved, scale)
 
     def upright(self, scene: Scene) -> Scene:
         """The nearest scene whose lens stands where it belongs, thickness aside.

@@ -25,7 +25,7 @@ from caustic_cli.optics.frames import Leg, Pose
 from caustic_cli.optics.gradient.fields import IndexField, field_of
 from caustic_cli.optics.surfaces import Fixed, HeightField, Plane, Sphere, Surface
 from caustic_cli.optics.tolerances import PARALLEL
-from caustic_cli.scene import Aperture, Component, Front, Lens, Light, Pupil, Scene, Screen, Source
+from caustic_cli.scene import Aperture, Component, FreeForm, Lens, Light, Pupil, Scene, Screen, Source
 from caustic_cli.scene.elements import SIDES, surface_name
 from caustic_cli.scene.materials import refractive_index
 
@@ -95,13 +95,13 @@ class Element:
         return self.interaction == "reflect"
 
 
-def front_of(lens: Lens) -> Fixed:
+def entrance_of(lens: Lens) -> Fixed:
     """The free-form entrance of a lens that has one."""
-    assert lens.front is not None
-    return fixed_of(lens.front, lens.half_size)
+    assert lens.entrance is not None
+    return fixed_surface(lens.entrance, lens.half_size)
 
 
-def fixed_of(front: Front, half_size: tuple[float, float]) -> Fixed:
+def fixed_surface(front: FreeForm, half_size: tuple[float, float]) -> Fixed:
     """The surface with these heights over an aperture."""
     if front.knots is None:
         u, v = (SplineSpace.uniform(n, p) for n, p in zip(front.heights.shape, front.degree, strict=True))
@@ -110,30 +110,30 @@ def fixed_of(front: Front, half_size: tuple[float, float]) -> Fixed:
     return Fixed(HeightField((u, v), half_size), torch.from_numpy(front.heights))
 
 
-def sides_of(scene: Scene, field: HeightField, heights: Tensor) -> tuple[Scene, Tensor]:
+def split_heights(scene: Scene, field: HeightField, heights: Tensor) -> tuple[Scene, Tensor]:
     """A scene and the heights (n, m) of its exit, from heights that may be those of all `shaped` surfaces, (k, n, m), which the
     scene then says."""
     if heights.ndim == 2:
         return scene, heights
-    fronts = {name: front_from(field, h) for name, h in zip(scene.shaped, heights[:-1], strict=False)}
-    lens = replace(scene.lens, front=fronts[ENTRANCE]) if ENTRANCE in fronts else scene.lens
+    fronts = {name: freeform_of(field, h) for name, h in zip(scene.free_surfaces, heights[:-1], strict=False)}
+    lens = replace(scene.lens, entrance=fronts[ENTRANCE]) if ENTRANCE in fronts else scene.lens
     elements = tuple(
-        replace(e, fronts=(fronts.get(surface_name(k, SIDES[0])), fronts.get(surface_name(k, SIDES[1])))) if e.shaped else e
+        replace(e, surfaces=(fronts.get(surface_name(k, SIDES[0])), fronts.get(surface_name(k, SIDES[1])))) if e.free_sides else e
         for k, e in enumerate(scene.elements)
     )
     return replace(scene, lens=lens, elements=elements), heights[-1]
 
 
-def traced_of(scene: Scene, field: HeightField, heights: Tensor) -> tuple[Scene, HeightField, Tensor]:
+def trace_arguments(scene: Scene, field: HeightField, heights: Tensor) -> tuple[Scene, HeightField, Tensor]:
     """`sides_of`, with the exit's field: what a trace takes."""
-    scene, exit = sides_of(scene, field, heights)
+    scene, exit = split_heights(scene, field, heights)
     return scene, field, exit
 
 
-def front_from(field: HeightField, heights: Tensor) -> Front:
+def freeform_of(field: HeightField, heights: Tensor) -> FreeForm:
     """A surface with these heights (n, m), counted from its vertex' plane, mm."""
     u, v = field.spaces
-    return Front(heights.detach().cpu().double().numpy(), (u.degree, v.degree), (u.knots.tolist(), v.knots.tolist()))
+    return FreeForm(heights.detach().cpu().double().numpy(), (u.degree, v.degree), (u.knots.tolist(), v.knots.tolist()))
 
 
 def _elements_of(
@@ -142,11 +142,11 @@ def _elements_of(
     """The surfaces of a lens or a mirror on a straight part of the axis; a free one without heights is on these spline spaces."""
     found, glass = [], Medium(component.index, component.absorption, component.glass)
     for side in component.sides:
-        front, radius = component.fronts[SIDES.index(side)], component.radius[SIDES.index(side)]
+        front, radius = component.surfaces[SIDES.index(side)], component.radius[SIDES.index(side)]
         surface: Surface
         if front is not None:
-            surface = fixed_of(front, component.half_size)
-        elif side in component.shaped:
+            surface = fixed_surface(front, component.half_size)
+        elif side in component.free_sides:
             surface = HeightField(spaces, component.half_size)
         else:
             surface = Sphere(radius, component.reach) if math.isfinite(radius) else Plane()
@@ -212,7 +212,7 @@ class System:
         is free beside the exit is on its spline spaces, unless the scene says its heights: of two free-form sides the entrance."""
         lens = scene.lens
         surface = surface or HeightField.of(lens)
-        entrance = Plane() if not scene.two_sided else surface if lens.front is None else front_of(lens)
+        entrance = Plane() if not scene.two_sided else surface if lens.entrance is None else entrance_of(lens)
         aperture = Aperture(lens.half_size, lens.round)
         elements: tuple[Element, ...]
         if lens.mirror:

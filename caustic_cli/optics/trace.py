@@ -276,7 +276,7 @@ class Tracer:
         if prepared is None or state.sample is None or not within:  # a sample of the same aperture stands on the surface
             found = hit.found
             if aperture.round or aperture.half_size != element.surface.half_size:
-                found = found & aperture.holds(*m.local[:2])
+                found = found & aperture.contains(*m.local[:2])
             kept = torch.where(found, state.power, torch.zeros_like(state.power))
             state.lose("missed_surface", (state.power - kept).detach())
             if self.track:
@@ -319,7 +319,7 @@ class Tracer:
             self.steps[way] = found.steps, [None if c is None else c.clone() for c in given]
         m.local, m.incoming = seen(found.point, found.direction)
         m.slopes, m.length, m.n_in = found.slopes, found.length, scale * found.n
-        met = found.found & element.aperture.holds(*m.local[:2])
+        met = found.found & element.aperture.contains(*m.local[:2])
         kept = torch.where(met, state.power, torch.zeros_like(state.power))
         state.lose("missed_surface", (state.power - kept).detach())
         if self.track:

@@ -27,7 +27,7 @@ from caustic_cli.io.files import write_bytes
 from caustic_cli.io.picture import Picture, read_picture
 from caustic_cli.optics.bounds import refuse_without_glass
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import sides_of
+from caustic_cli.optics.system import split_heights
 from caustic_cli.project import attachments, checkpoint
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.scene import Scene, sources
@@ -222,12 +222,12 @@ class Project:
                 f"⟨lens.control⟩ {list(scene.lens.control)} is not that of the designed lens,"
                 f" {list(field.shape)}; design again to change it"
             )
-        has, says = state.state.heights.shape[0] if state.state.heights.ndim == 3 else 1, len(scene.shaped)
+        has, says = state.state.heights.shape[0] if state.state.heights.ndim == 3 else 1, len(scene.free_surfaces)
         if has != says:
             raise self.error(
                 f"[second] and [[element]] say {says} free-form surface(s), and what was designed has {has}; design again"
             )
-        scene, heights = sides_of(scene, field, state.state.heights if self.values is None else self._trained(state.state))
+        scene, heights = split_heights(scene, field, state.state.heights if self.values is None else self._trained(state.state))
         try:
             refuse_without_glass(scene, field, heights)
         except InputError as error:

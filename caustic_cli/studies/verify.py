@@ -35,7 +35,7 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import System
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Scene
-from caustic_cli.scene.plain import beyond_plain
+from caustic_cli.scene.features import special_features
 from caustic_cli.studies.drawn import KINDS, emitted
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.retrace import BATCHES
@@ -61,8 +61,8 @@ def require_mitsuba(scene: Scene) -> None:
     """
     if find_spec("mitsuba") is None:
         raise InputError("⟨verify⟩ mitsuba needs Mitsuba 3, which is not installed: pip install mitsuba")
-    if beyond_plain(scene):
-        raise InputError(f"⟨verify⟩ mitsuba traces clear lenses and straight screens, not {', '.join(beyond_plain(scene))}")
+    if special_features(scene):
+        raise InputError(f"⟨verify⟩ mitsuba traces clear lenses and straight screens, not {', '.join(special_features(scene))}")
     if scene.source.kind not in KINDS:
         raise InputError(f"⟨verify⟩ mitsuba knows no source of type {scene.source.kind}")
     if scene.lens.fresnel != "exact":

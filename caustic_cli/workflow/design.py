@@ -43,7 +43,7 @@ from caustic_cli.io.surfaces import SUFFIXES, onto, read_surface
 from caustic_cli.optics.emission.measured import coarse_words
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import sides_of
+from caustic_cli.optics.system import split_heights
 from caustic_cli.project import attachments, directory, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.packing import expected_bytes, rounded
@@ -275,7 +275,7 @@ def _say_limits(project: Project, designer: Designer, target: np.ndarray, first:
     words = limits(designer.scene, grey(target), steps=SMOOTH_STEPS if timed else None).sentence()
     if words:
         say.say(words)
-    if designer.scene.jointly:
+    if designer.scene.joint:
         return
     if seen.matters and project.settings["design"]["waves"] == "auto" and project.without_waves:
         say.say(f"the wave image is not refined: {project.without_waves}")
@@ -534,7 +534,7 @@ def _run(
         if asked:
             raise Interrupted(f"interrupted when the design was done; {project.path} is whole", 128 + asked[0])
     field = designer.field(found.state.stage)
-    scene, heights = sides_of(designer.scene, field, found.state.heights)
+    scene, heights = split_heights(designer.scene, field, found.state.heights)
     size = tuple(project.settings["target"]["size"])
     if not timed and scene.second is None and (words := advice(scene, grey(target), size, field, heights)):
         say.say(words)

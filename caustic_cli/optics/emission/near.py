@@ -89,7 +89,7 @@ class Near(Emission):
 
         sx, sy = torch.where(from_cone, cx, ax), torch.where(from_cone, cy, ay)
         x, y = x0 + h * sx, y0 + h * sy
-        on_lens = pupil.aperture.holds(x, y)
+        on_lens = pupil.aperture.contains(x, y)
         flux = torch.where(on_lens, torch.where(from_cone, part, aimed), torch.zeros_like(part))
         x, y = x.clamp(-rx, rx), y.clamp(-ry, ry)
         sx, sy = (x - x0) / h, (y - y0) / h  # rays that miss the lens stay finite; they carry nothing
