@@ -13,7 +13,7 @@ import threading
 import warnings
 
 
-class Stopped(KeyboardInterrupt):
+class SignalReceived(KeyboardInterrupt):
     """A signal ended what was done.  A plain KeyboardInterrupt out of `exec` would have Python end itself by SIGINT, whatever came
     of it."""
 
@@ -45,7 +45,7 @@ def _run(arguments: list[str]) -> int:
     from caustic_cli.commands.parser import parser  # noqa: PLC0415
     from caustic_cli.errors import Interrupted  # noqa: PLC0415
 
-    console.speak({})
+    console.set_option_names({})
     debug = "--debug" in arguments or bool(os.environ.get("CAUSTIC_DEBUG"))
     try:
         status = parser().main(arguments, prog_name="caustic", standalone_mode=False, auto_envvar_prefix="CAUSTIC")
@@ -79,7 +79,7 @@ def _run(arguments: list[str]) -> int:
 def _report(problem: Exception) -> int:
     """Say in one line what went wrong; the exit status."""
     from caustic_cli.commands import console  # noqa: PLC0415
-    from caustic_cli.commands.help import answer  # noqa: PLC0415
+    from caustic_cli.commands.help import usage_message  # noqa: PLC0415
     from caustic_cli.errors import CausticError, InputError, is_out_of_memory  # noqa: PLC0415
 
     if isinstance(problem, CausticError):
@@ -88,7 +88,7 @@ def _report(problem: Exception) -> int:
     if hasattr(problem, "format_message"):  # a usage error of the command-line parser, whichever version wraps it
         if type(problem).__name__ == "NoArgsIsHelpError":  # no command at all: the message is the whole help
             sys.stderr.write(problem.format_message() + "\n")
-        elif message := answer(problem):
+        elif message := usage_message(problem):
             console.error(message)
         return 2
     if is_out_of_memory(problem):
@@ -117,7 +117,7 @@ def _variables_of(problem: Exception) -> list[str]:
 def main() -> None:
     """Entry point of the `caustic` script."""
     try:
-        _answer_signals()
+        _install_signal_handlers()
         _open_streams()
         os.environ |= THREADS | os.environ  # before a library reads them
         if not sys.warnoptions:
@@ -129,12 +129,12 @@ def main() -> None:
     sys.exit(status)
 
 
-def _answer_signals() -> None:
+def _install_signal_handlers() -> None:
     """Have SIGNALS interrupt what is done, and not be lost where Python can pass no exception on."""
 
     def answer(number: int, _frame) -> None:
         _sent.append(number)
-        raise Stopped
+        raise SignalReceived
 
     def lost(what) -> None:
         if not _sent:

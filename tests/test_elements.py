@@ -13,7 +13,7 @@ from helpers import small_designs
 from PIL import Image
 
 from caustic_cli import cli, load
-from caustic_cli.config import plans
+from caustic_cli.config import default_stages
 from caustic_cli.errors import InputError
 from caustic_cli.export.bodies import CLOSE, bodies
 from caustic_cli.export.mesh import closed_mesh
@@ -23,7 +23,7 @@ from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.relayed import Relayed
 from caustic_cli.io.archive import open_archive
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.frames import Leg
+from caustic_cli.optics.frames import AxisSegment
 from caustic_cli.optics.plan import compile_plan
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.reconstruction import Filter
@@ -141,7 +141,7 @@ def test_two_mirrors_make_a_periscope_whose_picture_is_upright():
 
 
 def test_a_folded_axis_is_that_of_the_reflected_ray():
-    leg, normal = Leg().folded(70.0, (35.0, 0.0)), np.array([0.0, -math.sin(math.radians(35)), math.cos(math.radians(35))])
+    leg, normal = AxisSegment().folded(70.0, (35.0, 0.0)), np.array([0.0, -math.sin(math.radians(35)), math.cos(math.radians(35))])
     axis = np.array([0.0, 0.0, 1.0])
     assert np.allclose(leg.frame[2], axis - 2.0 * normal[2] * normal)
     assert np.allclose(leg.at(0.0, 0.0, 70.0), [0.0, 0.0, 70.0])
@@ -356,7 +356,7 @@ def test_design_render_resume_and_files(_here, capfd):
 
 
 def test_surfaces_of_two_lenses_are_shaped_together(_here, capfd, monkeypatch):
-    monkeypatch.setattr(plans, "LEAST_CELLS", 256)
+    monkeypatch.setattr(default_stages, "LEAST_CELLS", 256)
     beside = ("--element", "lens z=60 thickness=6 radius=150,-150 index=1.5 size=26 free=both")
     fixed = ("--element", beside[1].removesuffix(" free=both"))
     one = run(capfd, "design", "one.png", *SMALL, *fixed, "--iterations", "8", "-o", "one")

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from caustic_cli.config import settings
 from caustic_cli.config.completion import Derivation, build_options, build_stages, complete
-from caustic_cli.config.plans import GAPS, transport_cells
+from caustic_cli.config.default_stages import GAPS, transport_cells
 from caustic_cli.config.settings import ELEMENT, SCHEMA, STAGE, build_lens, build_scene, dump, parse
 from caustic_cli.errors import InputError
 

@@ -117,18 +117,18 @@ class Reporter:
 
 
 #: The options by which this run was told of settings, by their path.
-_spoken: dict[str, str] = {}
+_option_names: dict[str, str] = {}
 
 
-def spoken() -> dict[str, str]:
+def option_names() -> dict[str, str]:
     """Those options, by path."""
-    return dict(_spoken)
+    return dict(_option_names)
 
 
-def speak(options: dict[str, str]) -> None:
+def set_option_names(options: dict[str, str]) -> None:
     """From now on, call settings (path) by the options that said them; others by their key in project.toml."""
-    _spoken.clear()
-    _spoken.update(options)
+    _option_names.clear()
+    _option_names.update(options)
 
 
 def named(text: str) -> str:
@@ -138,7 +138,7 @@ def named(text: str) -> str:
         row = TABLE.get(path[1:]) if path.startswith("+") else None
         if row and row.option:
             return row.option.name
-        return _spoken.get(path) or (plain_name(path) if "." in path else "--" + path.replace("_", "-"))
+        return _option_names.get(path) or (plain_name(path) if "." in path else "--" + path.replace("_", "-"))
 
     return MARK.sub(lambda found: name(found[1]), text)
 

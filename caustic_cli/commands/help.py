@@ -93,7 +93,7 @@ SECTIONS = {
 }
 
 
-def answer(problem: Any) -> str:
+def usage_message(problem: Any) -> str:
     """What is wrong with a command line, and what was probably meant; '' where the parser says nothing."""
     said = problem.format_message().rstrip(".")
     context = getattr(problem, "ctx", None)

@@ -68,7 +68,7 @@ def from_table(command: str):
             said = {name: value for name in rows if not ((value := values.pop(name)) is None or value is False or value == [])}
             spoken = {path: rows[name].option.name for name in said for path in (rows[name].path, *rows[name].speaks_for)}
             common = {name: row for name, row in COMMON.items() if values.get(name) is not None}
-            console.speak(spoken | {row.path: row.option.name for row in common.values()})
+            console.set_option_names(spoken | {row.path: row.option.name for row in common.values()})
             given: dict[str, Any] = {row.path: values[name] for name, row in common.items()}
             for name, value in said.items():
                 given |= _read(rows[name], value)

@@ -161,7 +161,7 @@ def run(
     if "source.angle" in given:
         given.setdefault("source.type", "disc")
     if screen_at is not None:
-        console.speak(console.spoken() | {"screen.z": "--screen-at"})
+        console.set_option_names(console.option_names() | {"screen.z": "--screen-at"})
     options.require_project(project, archives=True)
     device = options.start_torch(device, threads, say)
 

@@ -13,18 +13,7 @@ from typing import Any
 
 import torch
 
-from caustic_cli.config.optional import (
-    complete_blank,
-    complete_elements,
-    complete_farther,
-    complete_index_design,
-    complete_over,
-    complete_second,
-    complete_two_sided,
-    first_magnification,
-    put_in_the_middle,
-)
-from caustic_cli.config.plans import (
+from caustic_cli.config.default_stages import (
     GAPS,
     LEAST_SPANS,
     LEAST_WAVES,
@@ -42,6 +31,17 @@ from caustic_cli.config.plans import (
     two_sided,
     usual_sampler,
     wave_refinement,
+)
+from caustic_cli.config.optional import (
+    centre_screen,
+    complete_blank,
+    complete_elements,
+    complete_index_design,
+    complete_over,
+    complete_second,
+    complete_second_size,
+    complete_two_sided,
+    default_magnification,
 )
 from caustic_cli.config.settings import (
     DEFAULTS,
@@ -148,7 +148,7 @@ def complete(
             lens.setdefault("glass", COLOR_GLASS)
     over = Ranges.parse(value_of(s["design"], "design.over"))
     if over and "throw" in over.keys:
-        put_in_the_middle(over, s, given, by.throw)
+        centre_screen(over, s, given, by.throw)
     mag, margin = by.mag, default("margin") if by.margin is None else by.margin
     check("lens.size", lens["size"])
     if check("screen.z", screen["z"]) == 0:
@@ -162,21 +162,21 @@ def complete(
     complete_source(s["source"], lens, [stage.get("source", "") for stage in s["design"].get("stages", [])])
     if over:
         complete_over(over, s, given)
-    if (over or _counted(s["design"])) and "initial" not in given.get("design", {}):
+    if (over or _relative_to_initial(s["design"])) and "initial" not in given.get("design", {}):
         s["design"]["initial"] = "zero-last"
     complete_second(s)
     if "size" not in target or mag is not None:
         if mag is None and "size" in screen:
             fit = min(screen["size"][0], screen["size"][1] / aspect) / (1.0 + margin)
         else:
-            fit = (mag or first_magnification(s)) * lens["size"][0]
+            fit = (mag or default_magnification(s)) * lens["size"][0]
         target["size"] = [fit, fit * aspect]
     if "size" not in screen:
         screen["size"] = [(1.0 + margin) * x for x in target["size"]]
     if "resolution" not in screen:
         nx = by.resolution[0] if by.resolution else DEFAULT_RESOLUTION
         screen["resolution"] = [nx, max(2, round(nx * screen["size"][1] / screen["size"][0]))]
-    complete_farther(s)
+    complete_second_size(s)
     complete_elements(s)
     build_screen(s)
     source = build_source(s)
@@ -277,9 +277,9 @@ def _complete_design(
     fine_net = "control" not in lens or min(n - p for n, p in zip(lens["control"], degree, strict=True)) >= LEAST_SPANS
     fine_net = fine_net or max(array) > 1  # whose lenslets have to be solved for
     spread = plain and fine_net and not source.sharp and not elements_of(s) and _shifts(s, source)
-    shaped = (plain or _counted(design)) and fine_net and not source.apart
+    shaped = (plain or _relative_to_initial(design)) and fine_net and not source.apart
     design.setdefault("start", "transport" if "second" in s or shaped else "offset")
-    if design["start"] != "offset" and design["network"] != "none" and not _counted(design):
+    if design["start"] != "offset" and design["network"] != "none" and not _relative_to_initial(design):
         raise InputError(
             f"⟨design.start⟩ {design['start']} gives a surface, which a network can begin from only with"
             " ⟨+design.preconditioner⟩ laplacian; use that, start offset, or network none"
@@ -359,7 +359,7 @@ def _complete_design(
     design["stages"] = stages
 
 
-def _counted(design: dict[str, Any]) -> bool:
+def _relative_to_initial(design: dict[str, Any]) -> bool:
     """Whether it is by a network whose outputs are counted from a first surface, whichever that is."""
     return design["network"] != "none" and design.get("preconditioner") == "laplacian"
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from caustic_cli.config.plans import (
+from caustic_cli.config.default_stages import (
     TWO_SIDED_SPANS,
     Table,
     completed_stage,
@@ -30,7 +30,7 @@ BEAM = 1.2  # width of another lens or a mirror over that of a beam from the len
 HALF_RANGE, INDEX_DEGREE, INDEX_SPANS, MOST_SPANS, RAYS_BENT = 0.05, 3, 2, 768, 16
 
 
-def put_in_the_middle(over: Ranges, s: Settings, given: Settings, throw: float | None) -> None:
+def centre_screen(over: Ranges, s: Settings, given: Settings, throw: float | None) -> None:
     """The screen of a network that is trained over throws: at their middle, and nowhere else."""
     screen, z = s["screen"], over.middle[over.keys.index("throw")]
     z = -z if value_of(s["lens"], "lens.mirror") else z
@@ -62,7 +62,7 @@ def complete_over(over: Ranges, s: Settings, given: Settings) -> None:
         design.setdefault("network_width", OVER_WIDTH)
 
 
-def first_magnification(s: Settings) -> float:
+def default_magnification(s: Settings) -> float:
     """Of the picture, where nobody said it; where light goes on parallel or to a focus, a beam's as wide as the lens."""
     second = s.get("second", {})
     if "focus" in second and second["focus"][2] != 0:
@@ -104,7 +104,7 @@ def complete_second(s: Settings) -> None:
         raise InputError(f"⟨second.{said[0]}⟩ needs one source that is no ray file")
 
 
-def complete_farther(s: Settings) -> None:
+def complete_second_size(s: Settings) -> None:
     """Size of a second picture: that of a beam from the lens' edge through the first one's, farther on."""
     second = s.get("second", {})
     if "file" not in second:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.frames import Leg, Pose, out_of, turned_back
+from caustic_cli.optics.frames import AxisSegment, Pose, rotate_to_global, to_global
 from caustic_cli.optics.surfaces import Sphere
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import fixed_surface, freeform_of
@@ -44,11 +44,11 @@ class Body:
 
     def placed(self, points: np.ndarray) -> np.ndarray:
         """Points (..., 3) of its own frame in the scene, mm."""
-        return np.stack(out_of(self.pose, tuple(np.moveaxis(points, -1, 0)), 0.0), -1)
+        return np.stack(to_global(self.pose, tuple(np.moveaxis(points, -1, 0)), 0.0), -1)
 
     def turned(self, vectors: np.ndarray) -> np.ndarray:
         """Vectors (..., 3) likewise."""
-        return np.stack(turned_back(self.pose, tuple(np.moveaxis(vectors, -1, 0))), -1)
+        return np.stack(rotate_to_global(self.pose, tuple(np.moveaxis(vectors, -1, 0))), -1)
 
 
 def bodies(scene: Scene) -> Iterator[Body]:
@@ -57,7 +57,7 @@ def bodies(scene: Scene) -> Iterator[Body]:
     Raises:
         InputError: a sphere too steep to be written as a spline.
     """
-    leg = Leg()
+    leg = AxisSegment()
     for number, component in enumerate(scene.elements):
         entrance = _side(component, "front")
         if component.mirror:

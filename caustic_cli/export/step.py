@@ -36,7 +36,7 @@ from caustic_cli.export.surface import STEPS_PER_SPAN, knot_lines, most_points, 
 from caustic_cli.export.text import CREATED
 from caustic_cli.io.files import atomic_path
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.frames import Pose, out_of, turned_back
+from caustic_cli.optics.frames import Pose, rotate_to_global, to_global
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import entrance_of, freeform_of
 from caustic_cli.scene import Lens, Scene
@@ -79,11 +79,11 @@ class Entities:
         return f"#{len(self.lines)}"
 
     def point(self, p) -> str:
-        at = out_of(self.pose, (p[0], p[1], self.up * p[2] + 0.0), 0.0)
+        at = to_global(self.pose, (p[0], p[1], self.up * p[2] + 0.0), 0.0)
         return self.add(f"CARTESIAN_POINT('',{reals(at, self.decimals)})")
 
     def direction(self, d) -> str:
-        return self.add(f"DIRECTION('',{reals(turned_back(self.pose, (d[0], d[1], self.up * d[2] + 0.0)))})")
+        return self.add(f"DIRECTION('',{reals(rotate_to_global(self.pose, (d[0], d[1], self.up * d[2] + 0.0)))})")
 
     def placement(self, at, normal, along) -> str:
         return self.add(f"AXIS2_PLACEMENT_3D('',{self.point(at)},{self.direction(normal)},{self.direction(along)})")

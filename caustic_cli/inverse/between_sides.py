@@ -35,8 +35,8 @@ def rays_within(scene: Scene, field: HeightField, nets: Tensor, count: int) -> W
     found = []
     for traced in tracers(lit, field, rays_of(lit, "grid", count), torch.float64, CHUNK):
         last = traced.last({EXIT: net})
-        full = [*last.state.full(last.local), *last.state.full(last.incoming), last.arriving, torch.as_tensor(last.length)]
-        found.append(torch.stack(torch.broadcast_tensors(*full))[:, last.arriving > 0])
+        full = [*last.state.full(last.local), *last.state.full(last.incoming), last.power_in, torch.as_tensor(last.length)]
+        found.append(torch.stack(torch.broadcast_tensors(*full))[:, last.power_in > 0])
     rays = torch.cat(found, 1).numpy()
     exit, direction = rays[:3], rays[3:6]
     return Within((exit - rays[7] * direction)[:2], exit, direction, rays[6])

@@ -24,9 +24,9 @@ from scipy.interpolate import RegularGridInterpolator
 
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.relayed import bare, opened, passed
-from caustic_cli.optics.averages import shared_out
 from caustic_cli.optics.emission.measured import irradiance
 from caustic_cli.optics.interface import reflectance
+from caustic_cli.optics.resampling import resampled
 from caustic_cli.optics.system import ENTRANCE, System
 from caustic_cli.scene import Scene
 from caustic_cli.scene.sources.distribution import relative
@@ -162,7 +162,7 @@ def _square(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[
     source, lens, shape = scene.source, scene.lens, (len(x) - 1, len(y) - 1)
     if source.distant:
         profile = source.profile
-        return (np.ones(shape) if profile is None else shared_out(profile, shape)), None
+        return (np.ones(shape) if profile is None else resampled(profile, shape)), None
     x0, y0, z0 = source.centre
     h, t, n = lens.z_in - z0, z - lens.z_in, lens.inside
     if h <= 0:

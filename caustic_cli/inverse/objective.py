@@ -20,7 +20,7 @@ from caustic_cli.inverse import ranks
 from caustic_cli.inverse.losses import PENALTIES, ColorLoss, Loss, parse
 from caustic_cli.inverse.penalties import Penalty
 from caustic_cli.optics.emission import Rays
-from caustic_cli.optics.memory import smaller
+from caustic_cli.optics.memory import smaller_chunk
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.spread import Convolution
@@ -124,7 +124,7 @@ class Objective:
             if sum(s.count for s in self.samplers) <= kept:
                 self.kept = list(self._tracers())
         except (MemoryError, RuntimeError) as error:
-            self.chunk = smaller(self.chunk, error)
+            self.chunk = smaller_chunk(self.chunk, error)
 
     def moved(self, scene: Scene, rays: Rays) -> Objective:
         """The same in a scene whose screen or source stands elsewhere, by other rays; the target is not filtered anew."""
@@ -196,7 +196,7 @@ class Objective:
                 if ranks.rank_and_size()[1] > 1:  # the others wait for this chunk's image
                     raise
                 problem = error.with_traceback(None)  # which would hold all that was allocated
-            self.chunk, self.kept = smaller(self.chunk, problem), None
+            self.chunk, self.kept = smaller_chunk(self.chunk, problem), None
 
     def _evaluate(self, given: Parameters) -> Evaluation:
         parameters = {name: heights.detach().to(self.device).clone() for name, heights in given.items()}

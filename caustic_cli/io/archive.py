@@ -13,7 +13,7 @@ from torch import Tensor
 from caustic_cli.errors import InputError
 from caustic_cli.io.arrays import Archive, open_npz
 from caustic_cli.io.surfaces import ACCEPTED, MAX_CONTROL, surface_of
-from caustic_cli.optics.bounds import refuse_without_glass
+from caustic_cli.optics.bounds import check_exit_above_entrance
 from caustic_cli.optics.bspline import MAX_DEGREE
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import freeform_of
@@ -59,7 +59,7 @@ def open_archive(path: str | Path) -> tuple[Scene, HeightField, Tensor]:
             lens = replace(lens, entrance=freeform_of(entrance, low - lens.z_in))
         screen = _screen(data)
         scene = Scene(_source(data), lens, screen, _light(data), elements=_elements(data))
-        refuse_without_glass(scene, field, heights)
+        check_exit_above_entrance(scene, field, heights)
         return scene, field, heights
 
 

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.optics.gradient.fields import field_of
+from caustic_cli.optics.gradient.fields import index_field_of
 from caustic_cli.optics.interface import reflectance, reflectances
 from caustic_cli.optics.resolution import Resolution, paraxial
 from caustic_cli.optics.sampling import LARGEST_NORMAL
@@ -59,7 +59,7 @@ class Bounds:
     resolution: Resolution
 
 
-def refuse_without_glass(scene: Scene, field: HeightField, heights: Tensor) -> None:
+def check_exit_above_entrance(scene: Scene, field: HeightField, heights: Tensor) -> None:
     """Refuse a lens whose exit dips below its entrance: light would gain what it is absorbed over a negative thickness.
 
     Raises:
@@ -83,7 +83,7 @@ def bounds_of(scene: Scene, field: HeightField, heights: Tensor, steeper: float 
     pupil = scene.pupil
     incidence = _through(scene, scene.source.incidence(pupil.half_size, pupil.z, pupil.round))
     bent, depth = 0.0, float(heights.max()) - lens.z_in
-    if field_of_index := field_of(lens):
+    if field_of_index := index_field_of(lens):
         low, high, steepest = field_of_index.extremes(lens.half_size, depth)
         least, most = least * low / lens.index, most * high / lens.index
         bent = steepest * depth / low

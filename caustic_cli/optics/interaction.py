@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from torch import Tensor
 
-from caustic_cli.optics.frames import turned_back
+from caustic_cli.optics.frames import rotate_to_global
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.system import Element, Medium, System
 
@@ -16,7 +16,7 @@ from caustic_cli.optics.system import Element, Medium, System
 Parameters = Mapping[str, Tensor]
 
 
-class Walker(Protocol):
+class RayTracer(Protocol):
     """What takes rays from element to element: a `trace.Tracer`.
 
     system: what they go through; media: before each element and behind the last; start: the rays where its walks begin; backend:
@@ -28,14 +28,14 @@ class Walker(Protocol):
     start: RayState
     backend: Any
 
-    def cross(
+    def trace_element(
         self,
         k: int,
         state: RayState,
         heights: Tensor | None,
         *,
         forward: bool = True,
-        straight: bool = True,
+        direct: bool = True,
         parameters: Parameters = ...,
     ) -> Interaction:
         """Rays to element k and behind it."""
@@ -55,22 +55,22 @@ class Interaction:
     itself, not stray light.
     """
 
-    tracer: Walker
+    tracer: RayTracer
     index: int
     element: Element
     forward: bool
     side: float
     n_in: float | Tensor
     n_out: float | Tensor
-    straight: bool
+    direct: bool
     state: RayState
     local: tuple = ()
     incoming: tuple = ()
     slopes: tuple = ()
     length: Tensor | float = 0.0
     lift: Tensor | None = None
-    arriving: Tensor | None = None
-    departing: Tensor | None = None
+    power_in: Tensor | None = None
+    power_out: Tensor | None = None
     passes: Tensor | None = None
 
     @property
@@ -85,14 +85,14 @@ class Interaction:
 
     def returned(self) -> RayState:
         """The light that this refracting element reflects, at its surface."""
-        assert self.arriving is not None and self.departing is not None
+        assert self.power_in is not None and self.power_out is not None
         found = self.tracer.backend.interact(
-            self.incoming, self.slopes, self.arriving, eta=1.0, reflects=True, fresnel=self.element.fresnel, side=self.side
+            self.incoming, self.slopes, self.power_in, eta=1.0, reflects=True, fresnel=self.element.fresnel, side=self.side
         )
         return replace(
             self.state,
-            direction=turned_back(self.element.pose, found.direction),
-            power=self.arriving - self.departing,
+            direction=rotate_to_global(self.element.pose, found.direction),
+            power=self.power_in - self.power_out,
             lost={},
             sample=None,
         )

@@ -19,11 +19,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.polarisation import part_s
+from caustic_cli.optics.polarisation import s_fraction
 from caustic_cli.optics.tolerances import CRITICAL
 
 
-class Departure(NamedTuple):
+class OutgoingRays(NamedTuple):
     """Rays as they leave a surface: unit directions, the power they carry on, and whether they leave at all (False: total internal
     reflection, power 0, a direction that is finite and means nothing)."""
 
@@ -34,7 +34,7 @@ class Departure(NamedTuple):
 
 def interact(
     direction, slopes, power: Tensor, *, eta: float | Tensor, reflects: bool, fresnel: str, polarised=None, side: float = 1.0
-) -> Departure:
+) -> OutgoingRays:
     """Refract or reflect rays of N at a height field.
 
     Args:
@@ -58,18 +58,18 @@ def interact(
             polarised=None if polarised is None else (polarised[0], polarised[1], -polarised[2]),
         )
         tx, ty, tz = flipped.direction
-        return Departure((tx, ty, -tz), flipped.power, flipped.passes)
+        return OutgoingRays((tx, ty, -tz), flipped.power, flipped.passes)
     gx, gy = slopes
     if reflects:
-        return Departure(reflect(direction, gx, gy)[0], power, torch.ones_like(power, dtype=torch.bool))
+        return OutgoingRays(reflect(direction, gx, gy)[0], power, torch.ones_like(power, dtype=torch.bool))
     if isinstance(gx, float) and gx == 0.0 and gy == 0.0:
         return _flat(direction, power, eta, fresnel, polarised)
     out, passes, c, s = refract(direction, gx, gy, eta)
     reflected = _reflected(direction, (-gx, -gy, 1.0), c, s, eta, fresnel, polarised)
-    return Departure(out, torch.where(passes, power * (1.0 - reflected), torch.zeros_like(power)), passes)
+    return OutgoingRays(out, torch.where(passes, power * (1.0 - reflected), torch.zeros_like(power)), passes)
 
 
-def _flat(direction, power: Tensor, eta: float | Tensor, fresnel: str, polarised) -> Departure:
+def _flat(direction, power: Tensor, eta: float | Tensor, fresnel: str, polarised) -> OutgoingRays:
     """At z = const Snell's law keeps n (d_x, d_y)."""
     dx, dy, dz = direction
     tx, ty = (d / (1.0 / eta) for d in (dx, dy))
@@ -81,14 +81,14 @@ def _flat(direction, power: Tensor, eta: float | Tensor, fresnel: str, polarised
     dz_ = dz if isinstance(dz, Tensor) else torch.tensor(dz, dtype=power.dtype, device=power.device)
     reflected = _reflected(direction, (0.0, 0.0, 1.0), dz_, tz, eta, fresnel, polarised)
     if not any(isinstance(c, Tensor) for c in direction):  # one direction for all rays stays one
-        return Departure((tx, ty, float(tz)), torch.where(passes, power * (1.0 - reflected), torch.zeros_like(power)), passes)
-    return Departure((tx, ty, tz), torch.where(passes, power - reflected * power, torch.zeros_like(power)), passes)
+        return OutgoingRays((tx, ty, float(tz)), torch.where(passes, power * (1.0 - reflected), torch.zeros_like(power)), passes)
+    return OutgoingRays((tx, ty, tz), torch.where(passes, power - reflected * power, torch.zeros_like(power)), passes)
 
 
 def _reflected(direction, normal, c, s, eta: float | Tensor, fresnel: str, polarised):
     """Part of the power reflected, of light polarised or not."""
     if polarised is not None and fresnel == "exact":
-        (rs, rp), part = reflectances(c, s, eta), part_s(polarised, direction, normal)
+        (rs, rp), part = reflectances(c, s, eta), s_fraction(polarised, direction, normal)
         return part * rs + (1.0 - part) * rp
     length = 1.0
     if fresnel == "schlick":

@@ -58,7 +58,7 @@ class Method:
         checks.choice("intersection method", self.name, METHODS)
 
 
-def meet_any(surface: Surface, heights: Tensor | None, origin, direction, side: float) -> SurfaceIntersection:
+def intersect_any(surface: Surface, heights: Tensor | None, origin, direction, side: float) -> SurfaceIntersection:
     """`Surface.meet` for any surface, in plain torch."""
     t, status = reference(surface, heights, origin, direction, side)
     found = status == Status.HIT

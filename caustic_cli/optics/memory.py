@@ -17,7 +17,7 @@ LEAST = 1 << 14
 T = TypeVar("T")
 
 
-def smaller(chunk: int, problem: BaseException) -> int:
+def smaller_chunk(chunk: int, problem: BaseException) -> int:
     """The number of rays to try next after memory ran out with `chunk` of them.
 
     Raises:
@@ -35,11 +35,11 @@ def smaller(chunk: int, problem: BaseException) -> int:
     return max(LEAST, chunk // 4)
 
 
-def with_less(work: Callable[[int], T], chunk: int) -> T:
+def with_smaller_chunks(work: Callable[[int], T], chunk: int) -> T:
     """`work(chunk)`, again with fewer rays at a time for as long as memory runs out (see `smaller`)."""
     while True:
         try:
             return work(chunk)
         except (MemoryError, RuntimeError) as error:
             problem = error.with_traceback(None)  # which would hold all that was allocated
-        chunk = smaller(chunk, problem)
+        chunk = smaller_chunk(chunk, problem)

@@ -23,7 +23,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.optics.effects import NO_REQUESTS, Requests
 from caustic_cli.optics.emission import Rays, of_member
 from caustic_cli.optics.emission.base import intensity_of
-from caustic_cli.optics.frames import Pose, turned, turned_back
+from caustic_cli.optics.frames import Pose, rotate_to_global, rotate_to_local
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.screen_shape import shape_of
 from caustic_cli.optics.surfaces import HeightField
@@ -68,7 +68,7 @@ class Misalignment:
     def point(self, scene: Scene, point: Sequence[float]) -> tuple[float, float, float]:
         """A point of the scene in the lens' frame."""
         pose = self.lens_pose(scene)
-        x, y, z = turned(pose, tuple(p - o for p, o in zip(point, pose.position, strict=True)))
+        x, y, z = rotate_to_local(pose, tuple(p - o for p, o in zip(point, pose.position, strict=True)))
         return x, y, z + scene.lens.z_in
 
     def screen(self, scene: Scene) -> tuple[tuple[float, float, float], tuple]:
@@ -76,7 +76,7 @@ class Misalignment:
         s, pose = scene.screen, self.lens_pose(scene)
         tilt = (s.tilt[0] + self.screen_tilt[0], s.tilt[1] + self.screen_tilt[1])
         middle = self.point(scene, (s.shift[0] + self.screen_shift[0], s.shift[1] + self.screen_shift[1], s.z + self.throw))
-        return middle, tuple(turned(pose, axis) for axis in Pose(tilt=tilt).axes)
+        return middle, tuple(rotate_to_local(pose, axis) for axis in Pose(tilt=tilt).axes)
 
     def scene(self, scene: Scene) -> Scene:
         """The scene with index, source and its size as they are, in the lens' frame; the direction of light from infinity and the
@@ -119,7 +119,7 @@ class Misalignment:
         """
         changed, ((x, y, z), _) = self.scene(scene), self.screen(scene)
         if scene.source.distant:
-            ahead = turned(self.lens_pose(scene), turned_back(Pose(tilt=self.source_tilt), (0.0, 0.0, 1.0)))
+            ahead = rotate_to_local(self.lens_pose(scene), rotate_to_global(Pose(tilt=self.source_tilt), (0.0, 0.0, 1.0)))
             reach = abs(z - scene.lens.offset.thickness)  # a mirror's light goes back, but aside as before
             x, y = x - reach * ahead[0] / ahead[2], y - reach * ahead[1] / ahead[2]
         return replace(changed, screen=replace(scene.screen, z=z, shift=(x, y)))
@@ -142,13 +142,13 @@ class Misalignment:
         """Rays of light from infinity, turned as source and lens are; others as they are."""
         if not source.distant or not (any(self.source_tilt) or any(self.lens_tilt)):
             return state
-        state = state.spread()
-        direction = turned(self.lens_pose(scene), turned_back(Pose(tilt=self.source_tilt), state.direction))
+        state = state.expanded()
+        direction = rotate_to_local(self.lens_pose(scene), rotate_to_global(Pose(tilt=self.source_tilt), state.direction))
         return replace(state, direction=direction, sample=None)
 
 
 @dataclass(frozen=True)
-class Landed:
+class LandingPoints:
     """Rays on the screen: x, y on its own axes from its middle, mm, and power (N,), float64; channel: of a coloured image."""
 
     x: Tensor
@@ -157,14 +157,14 @@ class Landed:
     channel: int | None = None
 
 
-def landed(
+def landing_points(
     scene: Scene,
     field: HeightField,
     heights: Tensor,
     rays: Rays,
     errors: Misalignment,
     requests: Requests = NO_REQUESTS,
-) -> Iterator[Landed]:
+) -> Iterator[LandingPoints]:
     """Rays of a scene with these errors on its screen, chunk by chunk.
 
     Args:
@@ -184,7 +184,7 @@ def landed(
             system = System.of(band.scene, field)
             for state in of_member(rays, band.member).chunks(CHUNK):
                 if not isinstance(state, RayState):
-                    state = RayState.on_axis(state, system.pupil.half_size, system.pupil.z).spread()
+                    state = RayState.on_axis(state, system.pupil.half_size, system.pupil.z).expanded()
                 state = errors.directed(scene, band.scene.source, state)
                 tracer = Tracer(system, state, torch.float64, requests)
                 forward = math.copysign(1.0, sum(a * b for a, b in zip(system.axis, axes[2], strict=True)))
@@ -193,10 +193,10 @@ def landed(
                     middle = (point[0], point[1], point[2] - out.datum)
                     x, y, there = land(out.origin, out.direction, middle, axes, forward)
                     power = torch.where(there, out.power, torch.zeros_like(out.power)) * (band.weight * scale)
-                    yield Landed(x.double(), y.double(), power.double(), band.channel)
+                    yield LandingPoints(x.double(), y.double(), power.double(), band.channel)
 
 
-def idle(scene: Scene, error: str) -> str:
+def reason_ignored(scene: Scene, error: str) -> str:
     """Why an error means nothing in a scene, "" where it does."""
     source = scene.source
     if error in ("source_shift", "source_distance") and source.distant:

@@ -66,7 +66,7 @@ def compile_plan(
         steeper: by how much the slopes of what is traced may exceed those of the spline.
     """
     bounds = bounds_of(scene, field, heights, steeper)
-    decisions = [effect.judge(scene, bounds) for effect in EFFECTS]
+    decisions = [effect.decide(scene, bounds) for effect in EFFECTS]
     if wanted is not None:
         chosen = frozenset(wanted)
         decisions = [
@@ -81,6 +81,6 @@ def compile_plan(
         ]
     traced, requests = scene, NO_REQUESTS
     for effect, decision in zip(EFFECTS, decisions, strict=True):
-        traced = effect.within(traced) if decision.on else effect.without(traced)
+        traced = effect.including(traced) if decision.on else effect.without(traced)
         requests |= effect.request(scene, decision.on, bounds)
     return Plan(tuple(decisions), traced, requests)

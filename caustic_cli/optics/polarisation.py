@@ -19,7 +19,7 @@ from torch import Tensor
 from caustic_cli.optics.tolerances import NORMAL
 
 
-def field_of(angle: float, d):
+def polarisation_vector(angle: float, d):
     """E of light polarised along `angle` (degrees from +x) on the axis, in direction d: turned with it, without twist."""
     a = math.radians(angle)
     ax, ay = math.cos(a), math.sin(a)
@@ -27,14 +27,14 @@ def field_of(angle: float, d):
     return ax - along * d[0], ay - along * d[1], -along * (1.0 + d[2])
 
 
-def part_s(e, d, normal):
+def s_fraction(e, d, normal):
     """Part of the power that is s-polarised at an interface."""
     s, square = _across(d, normal)
     across = _dot(e, s)
     return torch.where(square > NORMAL, across * across / square.clamp_min(NORMAL), torch.full_like(square, 0.5))
 
 
-def beyond(e, d, t, normal, c, s, eta: float):
+def transmitted_field(e, d, t, normal, c, s, eta: float):
     """E behind an interface; c, s as of `interface.refract`."""
     sx, square = _across(d, normal)
     length = square.clamp_min(NORMAL).sqrt()

@@ -128,7 +128,7 @@ class RayState:
             x, y = x[:, None], y[None, :]
         return cls((x, y, z), (0.0, 0.0, 1.0), sample.flux, sample=sample)
 
-    def spread(self) -> RayState:
+    def expanded(self) -> RayState:
         """The same with x, y and power (N,): of a sample they are rows, columns and a number until rays go their own ways."""
         s = self.sample
         if s is None or (not s.tensor and self.power.ndim):

@@ -23,7 +23,7 @@ HALVINGS = 50
 
 
 @torch.no_grad()
-def again(field: HeightField, heights: Tensor, o, d, below: bool, round: bool = False) -> tuple[Tensor, Tensor]:
+def next_intersection(field: HeightField, heights: Tensor, o, d, below: bool, round: bool = False) -> tuple[Tensor, Tensor]:
     """Next intersection with the surface of rays that start on it, by steps and bisection.
 
     The slopes bound how fast a ray can come nearer, so its distance from the surface is a step that cannot miss it.
@@ -41,7 +41,7 @@ def again(field: HeightField, heights: Tensor, o, d, below: bool, round: bool = 
     o, d = ([c.detach().double() for c in v] for v in (o, d))
     step = min(2.0 * r * float(torch.diff(s.breaks).min()) for s, r in zip(field.spaces, field.half_size, strict=True))
     step /= STEPS_PER_SPAN
-    t = backend_for(h.device).next_meetings(field, h, o, d, below, round, step)
+    t = backend_for(h.device).next_intersections(field, h, o, d, below, round, step)
     return t, t > 0
 
 
@@ -85,7 +85,7 @@ def reference(field: HeightField, h: Tensor, o, d, below: bool, round: bool, ste
     return t_found
 
 
-def touch(field: HeightField, heights: Tensor, o, d, t: Tensor):
+def hit_with_derivatives(field: HeightField, heights: Tensor, o, d, t: Tensor):
     """The hit at distance t (N,), not differentiated, of rays o, d that may depend on the heights.
 
     Returns:

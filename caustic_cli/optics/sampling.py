@@ -112,7 +112,9 @@ def _forwarded(engine: torch.quasirandom.SobolEngine, count: int) -> torch.quasi
     return engine
 
 
-def spread(seed: int, start: int, stop: int, shape: tuple[int, int], stratified: bool, device: str | torch.device) -> list[Tensor]:
+def scattered_points(
+    seed: int, start: int, stop: int, shape: tuple[int, int], stratified: bool, device: str | torch.device
+) -> list[Tensor]:
     """Random u, v (stop - start,) of rays start..stop, anywhere, or one in each of nu x nv cells over and over."""
     k, (nu, nv) = torch.arange(start, stop, device=device), shape
     du, dv = random_numbers(seed, 0, k), random_numbers(seed, 1, k)

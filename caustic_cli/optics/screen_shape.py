@@ -45,7 +45,7 @@ class ScreenShape:
         d = tuple(_dot([_double(c) for c in direction], axis) for axis in axes)
         o, d = (tuple(torch.as_tensor(c, dtype=torch.float64, device=like.device).expand(like.shape) for c in v) for v in (o, d))
         heights = None if self.heights is None else self.heights.to(like.device)
-        hit = self.surface.meet(heights, o, d, forward)
+        hit = self.surface.intersect(heights, o, d, forward)
         x, y = (torch.where(hit.found, a + hit.t * b, a).to(like.dtype) for a, b in zip(o[:2], d[:2], strict=True))
         return x, y, hit.found
 
@@ -82,7 +82,7 @@ def _made(radius: tuple[float, float], sags: Sags | None) -> ScreenShape:
     return ScreenShape(*HeightField.through(values, tuple(half)))
 
 
-def space(screen: Screen, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def points_in_space(screen: Screen, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points of a screen in space, mm, from coordinates along its own axes counted from its middle."""
     shape, (ax, ay, n) = shape_of(screen), screen.axes
     s = 0.0 if shape is None else shape.at(x, y)[0]
@@ -118,5 +118,5 @@ def reach(screen: Screen) -> tuple[float, float]:
     if screen.upright:
         return 0.0, 0.0
     x, y = (np.linspace(-h, h, SURVEY) for h in screen.half_size)
-    z = space(screen, x[:, None], y[None, :])[2] - screen.z
+    z = points_in_space(screen, x[:, None], y[None, :])[2] - screen.z
     return min(0.0, float(z.min())), max(0.0, float(z.max()))

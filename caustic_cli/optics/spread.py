@@ -18,8 +18,8 @@ from scipy.fft import next_fast_len
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from caustic_cli.optics.emission.base import Lit
-from caustic_cli.optics.emission.coherent import Mode, edges, middle
+from caustic_cli.optics.emission.base import Illuminated
+from caustic_cli.optics.emission.coherent import Mode, central_mode, outermost_modes
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer
@@ -186,20 +186,20 @@ def spread_at(scene: Scene, field: HeightField, heights: Tensor) -> Spread | Non
 
     def landing(mode: Mode, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         tracer = Tracer(system, mode.through(u, v, system.before.index_at(None)))
-        state, left = tracer.land(parameters, scene.screen)[0].spread(), tracer.last(parameters).state.spread()
+        state, left = tracer.land(parameters, scene.screen)[0].expanded(), tracer.last(parameters).state.expanded()
         return *state.full(state.origin)[:2], state.power, *left.full(left.origin)[:2]
 
     return spread_of(system, landing, heights.device)
 
 
 @torch.no_grad()
-def spread_of(lit: Lit, landing: Landing, device: str | torch.device = "cpu") -> Spread | None:
+def spread_of(lit: Illuminated, landing: Landing, device: str | torch.device = "cpu") -> Spread | None:
     """How an extended source spreads the image of its middle; None where it is none, or its light misses or lies in depth.
 
     Raises:
         as `landing`.
     """
-    source, outer, centre = lit.source, edges(lit), middle(lit)
+    source, outer, centre = lit.source, outermost_modes(lit), central_mode(lit)
     if source.rays is not None or len(source.members) > 1:
         return None
     if not outer or (not source.distant and float(np.ptp(source.points()[0][:, 2])) > 0):

@@ -21,8 +21,8 @@ from caustic_cli.config import checks
 from caustic_cli.config.table import TABLE
 from caustic_cli.errors import InputError
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.frames import Leg, Pose
-from caustic_cli.optics.gradient.fields import IndexField, field_of
+from caustic_cli.optics.frames import AxisSegment, Pose
+from caustic_cli.optics.gradient.fields import IndexField, index_field_of
 from caustic_cli.optics.surfaces import Fixed, HeightField, Plane, Sphere, Surface
 from caustic_cli.optics.tolerances import PARALLEL
 from caustic_cli.scene import Aperture, Component, FreeForm, Lens, Light, Pupil, Scene, Screen, Source
@@ -137,7 +137,7 @@ def freeform_of(field: HeightField, heights: Tensor) -> FreeForm:
 
 
 def _elements_of(
-    component: Component, number: int, leg: Leg, scene: Scene, spaces: tuple[SplineSpace, SplineSpace]
+    component: Component, number: int, leg: AxisSegment, scene: Scene, spaces: tuple[SplineSpace, SplineSpace]
 ) -> list[Element]:
     """The surfaces of a lens or a mirror on a straight part of the axis; a free one without heights is on these spline spaces."""
     found, glass = [], Medium(component.index, component.absorption, component.glass)
@@ -161,7 +161,7 @@ def _elements_of(
 
 
 @dataclass(frozen=True)
-class Placed:
+class PlacedScreen:
     """A screen anywhere: `screen` says its size, pixels and shift, `pose` where its middle stands and which way it looks."""
 
     screen: Screen
@@ -186,11 +186,11 @@ class System:
 
     sources: tuple[Source, ...]
     elements: tuple[Element, ...]
-    screens: tuple[Screen | Placed, ...] = ()
+    screens: tuple[Screen | PlacedScreen, ...] = ()
     light: Light = field(default_factory=Light)
     before: Medium = AIR
     lit: Pupil | None = None
-    leg: Leg | None = None
+    leg: AxisSegment | None = None
 
     def __post_init__(self):
         if self.before.gradient is not None:
@@ -223,28 +223,28 @@ class System:
                     ENTRANCE,
                     entrance,
                     aperture,
-                    behind=Medium(lens.index, lens.absorption, lens.glass, field_of(lens)),
+                    behind=Medium(lens.index, lens.absorption, lens.glass, index_field_of(lens)),
                     pose=Pose((0.0, 0.0, lens.z_in)),
                     fresnel=lens.fresnel,
                 ),
                 Element(EXIT, surface, aperture, fresnel=lens.fresnel, roughness=lens.roughness),
             )
-        lit, leg = None if scene.two_sided or scene.before else scene.pupil, Leg()
+        lit, leg = None if scene.two_sided or scene.before else scene.pupil, AxisSegment()
         if scene.elements:
             first, number = elements, len(scene.before)
             elements = tuple(e for k, c in enumerate(scene.before) for e in _elements_of(c, k, leg, scene, surface.spaces)) + first
             for k, component in enumerate(scene.behind, number):
                 elements += tuple(_elements_of(component, k, leg, scene, surface.spaces))
                 leg = leg.folded(component.z, component.tilt) if component.mirror else leg
-        return cls((scene.source,), elements, (scene.screen,), scene.light, lit=lit, leg=leg if leg != Leg() else None)
+        return cls((scene.source,), elements, (scene.screen,), scene.light, lit=lit, leg=leg if leg != AxisSegment() else None)
 
-    def placed(self, screen: Screen) -> Placed:
+    def placed(self, screen: Screen) -> PlacedScreen:
         """A screen on the folded axis: its own tilt, shift and shape are those that it would have on a straight one."""
         assert self.leg is not None
         (sx, sy), turned = screen.shift, Pose(tilt=screen.tilt, frame=self.leg.frame)
         middle = self.leg.at(sx, sy, screen.z)  # about which a tilted one is turned; its coordinates are counted from the axis
         x, y, z = (m - sx * a - sy * b for m, a, b in zip(middle, *turned.axes[:2], strict=True))
-        return Placed(screen, replace(turned, position=(x, y, z)))
+        return PlacedScreen(screen, replace(turned, position=(x, y, z)))
 
     @property
     def pupil(self) -> Pupil:

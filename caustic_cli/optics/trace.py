@@ -33,19 +33,19 @@ from caustic_cli.errors import InputError
 from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.effects import EFFECTS, NO_REQUESTS, Action, Requests
 from caustic_cli.optics.emission import Rays, of_member, rays_of
-from caustic_cli.optics.frames import IDENTITY, Pose, advanced, into, out_of, turned, turned_back
-from caustic_cli.optics.gradient.crossing import cross, index_at
+from caustic_cli.optics.frames import IDENTITY, Pose, advance, rotate_to_global, rotate_to_local, to_global, to_local
 from caustic_cli.optics.gradient.fields import IndexField
+from caustic_cli.optics.gradient.transfer import index_at, transfer
 from caustic_cli.optics.image import Image
 from caustic_cli.optics.interaction import Interaction, Parameters
 from caustic_cli.optics.interface import interact
-from caustic_cli.optics.memory import with_less
+from caustic_cli.optics.memory import with_smaller_chunks
 from caustic_cli.optics.rays import LOSSES, RayState, Status
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.screen_shape import reach, shape_of
 from caustic_cli.optics.surfaces import HeightField, SurfaceIntersection
-from caustic_cli.optics.system import EXIT, Element, Placed, System
+from caustic_cli.optics.system import EXIT, Element, PlacedScreen, System
 from caustic_cli.scene import Light, PlaneWave, Points, Scene, Screen
 
 #: Rays traced at a time, which bounds the memory.
@@ -112,7 +112,7 @@ class Tracer:
                 and system.elements[self.first].surface.shape is None
                 and not any(medium.gradient for medium in self.media[self.first : self.first + 2])
             ):
-                interaction = self.cross(self.first, state, None)
+                interaction = self.trace_element(self.first, state, None)
                 if self.recorded:
                     self.before.append(interaction)
                 state, self.first, self._behind = interaction.state, self.first + 1, interaction
@@ -122,7 +122,7 @@ class Tracer:
     def __call__(self, parameters: Parameters) -> list[RayState]:
         """Heights {name: (n, m) mm float64} -> rays behind the last element: those that went straight on, then those of stray."""
         state, interactions = self.start, list(self.before)
-        for interaction in self._walk(parameters):
+        for interaction in self._interactions(parameters):
             state = interaction.state
             if self.recorded:
                 interactions.append(interaction)
@@ -137,30 +137,30 @@ class Tracer:
         """As of the system."""
         return self.system.owners()
 
-    def _walk(self, parameters: Parameters) -> Iterator[Interaction]:
+    def _interactions(self, parameters: Parameters) -> Iterator[Interaction]:
         """Straight on, from the first free surface to the last element."""
         state = self.start
         for k in range(self.first, len(self.system.elements)):
-            interaction = self.cross(k, state, parameters.get(self.system.elements[k].name), parameters=parameters)
+            interaction = self.trace_element(k, state, parameters.get(self.system.elements[k].name), parameters=parameters)
             yield interaction
             state = interaction.state
 
     def last(self, parameters: Parameters) -> Interaction:
         """The rays at the last element, behind which they have gone straight on."""
-        return cast(Interaction, [self._behind, *self._walk(parameters)][-1])  # a system has at least one element
+        return cast(Interaction, [self._behind, *self._interactions(parameters)][-1])  # a system has at least one element
 
     @torch.no_grad()
     def exit_of(self, parameters: Parameters) -> tuple[tuple, tuple, Tensor]:
         """How rays arrive at a lens' exit, in its frame: slopes there, directions, powers."""
-        exit = next((m for m in self._walk(parameters) if m.element.name == EXIT), None) or self.last(parameters)
-        assert exit.arriving is not None
-        return exit.slopes, exit.incoming, exit.arriving
+        exit = next((m for m in self._interactions(parameters) if m.element.name == EXIT), None) or self.last(parameters)
+        assert exit.power_in is not None
+        return exit.slopes, exit.incoming, exit.power_in
 
-    def land(self, parameters: Parameters, screen: Screen | Placed) -> list[RayState]:
+    def land(self, parameters: Parameters, screen: Screen | PlacedScreen) -> list[RayState]:
         """The same on a screen: x and y of their origins are the screen's own coordinates, mm."""
         return [self.onto(state, screen) for state in self(parameters)]
 
-    def expose(self, parameters: Parameters, screen: Screen | Placed, filter: Filter) -> Image[Tensor]:
+    def expose(self, parameters: Parameters, screen: Screen | PlacedScreen, filter: Filter) -> Image[Tensor]:
         """Heights {name: (n, m) mm float64} -> image and energy account on a screen."""
         if self.fused is not None and isinstance(screen, Screen) and screen.upright:
             image, leaving, lost = self.fused(parameters[self.system.elements[-1].name], screen, filter)
@@ -169,7 +169,7 @@ class Tracer:
             return self._weighed(image, leaving, lost)
         return self.collect(self(parameters), screen, filter)
 
-    def collect(self, states: list[RayState], screen: Screen | Placed, filter: Filter) -> Image[Tensor]:
+    def collect(self, states: list[RayState], screen: Screen | PlacedScreen, filter: Filter) -> Image[Tensor]:
         """Image and energy account on a screen of rays behind the last element."""
         image: Tensor | float = 0.0
         leaving: Tensor | float = 0.0
@@ -199,14 +199,14 @@ class Tracer:
 
     # One element.
 
-    def cross(
+    def trace_element(
         self,
         k: int,
         state: RayState,
         heights: Tensor | None,
         *,
         forward: bool = True,
-        straight: bool = True,
+        direct: bool = True,
         parameters: Parameters = NOTHING,
     ) -> Interaction:
         """Rays to element k and behind it.
@@ -229,16 +229,16 @@ class Tracer:
             side,
             n_in,
             n_out,
-            straight,
+            direct,
             state,
         )
         self._meet(m, heights, parameters)
         for action in self.actions:
-            action.arrive(m)
-        m.arriving = m.state.power
-        m.departing = m.state.power = self._interact(m)
+            action.before_interaction(m)
+        m.power_in = m.state.power
+        m.power_out = m.state.power = self._interact(m)
         for action in self.actions:
-            action.depart(m)
+            action.after_interaction(m)
         return m
 
     def _meet(self, m: Interaction, heights: Tensor | None, parameters: Parameters) -> None:
@@ -246,31 +246,33 @@ class Tracer:
         element = m.element
         ahead, behind = (m.index, m.index + 1) if m.forward else (m.index + 1, m.index)
         if self.media[ahead].gradient is not None:
-            self._bend(m, ahead, heights, parameters)
-            self._leave_into(m, behind, parameters)
+            self._intersect_through_gradient(m, ahead, heights, parameters)
+            self._set_index_behind(m, behind, parameters)
             return
-        prepared = self.meets if m.state is getattr(self, "start", None) else None  # for the rays that it was prepared for
+        prepared = (
+            self.prepared_intersection if m.state is getattr(self, "start", None) else None
+        )  # for the rays that it was prepared for
         state = replace(m.state, lost=dict(m.state.lost))
         if m.index == self.first and m.forward and heights is not None:
             state = state.counted_from(element.pose.position[2] + element.surface.centred(heights)[1])
         if self._at_pupil(m):
-            state = state if self.media[behind].gradient is None else state.spread()
-            o, d = into(element.pose, state.origin, state.direction, state.datum)
+            state = state if self.media[behind].gradient is None else state.expanded()
+            o, d = to_local(element.pose, state.origin, state.direction, state.datum)
             m.state, m.local, m.incoming, m.slopes = state, o, d, (0.0, 0.0)
-            self._leave_into(m, behind, parameters)
+            self._set_index_behind(m, behind, parameters)
             return
-        state = state.spread()
-        o, d = into(element.pose, state.origin, state.direction, state.datum)
+        state = state.expanded()
+        o, d = to_local(element.pose, state.origin, state.direction, state.datum)
         if m.index == 0 and m.forward and prepared is None and self.system.lit is None and not element.surface.flat:
-            o, state = self._backed_up(o, d, state, element, heights)
-        hit = next((h for a in self.actions if (h := a.meet(m, o, d, heights)) is not None), None)
+            o, state = self._moved_before_surface(o, d, state, element, heights)
+        hit = next((h for a in self.actions if (h := a.intersect(m, o, d, heights)) is not None), None)
         if hit is None:
-            hit = prepared(heights) if prepared else element.surface.meet(heights, o, d, m.side)
+            hit = prepared(heights) if prepared else element.surface.intersect(heights, o, d, m.side)
         if state.power.dtype != self.dtype:  # the first surface is met in float64 whatever follows
             t, gx, gy = (_cast(c, self.dtype) for c in hit[:3])
             state, hit = state.to(self.dtype), SurfaceIntersection(t, gx, gy, hit.found)
             o, d = (tuple(_cast(c, self.dtype) for c in v) for v in (o, d))
-        m.local, m.incoming, m.slopes, m.length = advanced(o, d, hit.t), d, (hit.gx, hit.gy), hit.t
+        m.local, m.incoming, m.slopes, m.length = advance(o, d, hit.t), d, (hit.gx, hit.gy), hit.t
         aperture, pupil = element.aperture, self.system.pupil
         within = (aperture.half_size, aperture.round) == (pupil.half_size, pupil.round)
         if prepared is None or state.sample is None or not within:  # a sample of the same aperture stands on the surface
@@ -282,28 +284,28 @@ class Tracer:
             if self.track:
                 state.mark(~found, Status.MISSED_SURFACE)
             state.power = kept
-        state.origin = out_of(element.pose, m.local, state.datum)
+        state.origin = to_global(element.pose, m.local, state.datum)
         state.path = state.path + m.n_in * hit.t
         m.state = state
-        self._leave_into(m, behind, parameters)
+        self._set_index_behind(m, behind, parameters)
 
-    def _bend(self, m: Interaction, medium: int, heights: Tensor | None, parameters: Parameters) -> None:
+    def _intersect_through_gradient(self, m: Interaction, medium: int, heights: Tensor | None, parameters: Parameters) -> None:
         """Carry rays through a medium of varying index to the surface (`gradient.crossing`)."""
-        element, state = m.element, replace(m.state, lost=dict(m.state.lost)).spread()
+        element, state = m.element, replace(m.state, lost=dict(m.state.lost)).expanded()
         name, pose, field, scale = self._medium(medium, state.wavelength)
         point, direction = (
-            tuple(c.double() for c in state.full(v)) for v in into(pose, state.origin, state.direction, state.datum)
+            tuple(c.double() for c in state.full(v)) for v in to_local(pose, state.origin, state.direction, state.datum)
         )
 
         def seen(points, vectors):
-            o, d = out_of(pose, points, state.datum), turned_back(pose, vectors)
-            return into(element.pose, o, d, state.datum)
+            o, d = to_global(pose, points, state.datum), rotate_to_global(pose, vectors)
+            return to_local(element.pose, o, d, state.datum)
 
         way, given = (medium, m.index, m.forward), [None if c is None else c.detach() for c in (parameters.get(name), heights)]
         steps, before = self.steps.get(way, (None, given))
         if not all(a is b or (a is not None and b is not None and torch.equal(a, b)) for a, b in zip(given, before, strict=True)):
             steps = None  # as many as other parameters asked for may be too few
-        found = cross(
+        found = transfer(
             self.backend.flow,
             field,
             parameters.get(name),
@@ -325,17 +327,17 @@ class Tracer:
         if self.track:
             state.mark(~met, Status.MISSED_SURFACE)
         state.power, state.sample = kept, None
-        state.origin = out_of(element.pose, m.local, state.datum)
+        state.origin = to_global(element.pose, m.local, state.datum)
         state.path = state.path + scale * found.path
         m.state = state
 
-    def _leave_into(self, m: Interaction, medium: int, parameters: Parameters) -> None:
+    def _set_index_behind(self, m: Interaction, medium: int, parameters: Parameters) -> None:
         """Behind the surface, the index of a medium where it varies."""
         if self.media[medium].gradient is None or m.reflects:
             return
         state = m.state
         name, pose, field, scale = self._medium(medium, state.wavelength)
-        point = into(pose, tuple(c.double() for c in state.full(state.origin)), (0.0, 0.0, 1.0), state.datum)[0]
+        point = to_local(pose, tuple(c.double() for c in state.full(state.origin)), (0.0, 0.0, 1.0), state.datum)[0]
         m.incoming = state.full(m.incoming)
         m.n_out = scale * index_at(self.backend.flow, field, parameters.get(name), point)
 
@@ -348,16 +350,16 @@ class Tracer:
 
     def _interact(self, m: Interaction) -> Tensor:
         """Change the directions, and give the power that goes on."""
-        state, element, arriving = m.state, m.element, m.arriving
-        assert arriving is not None
+        state, element, power_in = m.state, m.element, m.power_in
+        assert power_in is not None
         polarised = None
         if state.polarised is not None:
-            polarised = turned(element.pose, state.polarised)
+            polarised = rotate_to_local(element.pose, state.polarised)
         eta = m.n_in / m.n_out
         found = (self.backend.interact if isinstance(eta, float) else interact)(
             m.incoming,
             m.slopes,
-            arriving,
+            power_in,
             eta=eta,
             reflects=m.reflects,
             fresnel=element.fresnel,
@@ -365,10 +367,10 @@ class Tracer:
             side=m.side,
         )
         m.passes = found.passes
-        state.direction = turned_back(element.pose, found.direction)
+        state.direction = rotate_to_global(element.pose, found.direction)
         if not m.reflects:
             with torch.no_grad():
-                gone = arriving - found.power
+                gone = power_in - found.power
                 if bool(found.passes.all()):
                     state.lose("fresnel", gone)
                 else:
@@ -376,7 +378,7 @@ class Tracer:
                     state.lose("fresnel", gone - totally)
                     state.lose("total_internal_reflection", totally)
             if self.track:
-                state.mark(~found.passes & (arriving > 0), Status.TOTAL_INTERNAL_REFLECTION)
+                state.mark(~found.passes & (power_in > 0), Status.TOTAL_INTERNAL_REFLECTION)
         if not any(isinstance(c, Tensor) for c in state.direction) and state.direction == (0.0, 0.0, 1.0):
             return found.power
         state.sample = None
@@ -394,7 +396,7 @@ class Tracer:
             and (e.aperture.half_size, e.aperture.round) == (pupil.half_size, pupil.round)
         )
 
-    def _backed_up(self, o, d, state: RayState, element: Element, heights) -> tuple[tuple, RayState]:
+    def _moved_before_surface(self, o, d, state: RayState, element: Element, heights) -> tuple[tuple, RayState]:
         """Rays of a pupil that the first surface reaches through, from before it."""
         low = element.surface.hull(heights)[0]
         back = max(0.0, float(torch.as_tensor(o[2], dtype=torch.float64).max()) - low)
@@ -406,7 +408,7 @@ class Tracer:
         return tuple(c.expand(state.power.shape) for c in moved), replace(state, path=path)
 
     @cached_property
-    def meets(self):
+    def prepared_intersection(self):
         """The intersections of the rays of `start` with the first free surface as a function of its heights; None for the general
         way."""
         if self.first == len(self.system.elements) or self.requests.off & {"intersection"}:
@@ -430,10 +432,10 @@ class Tracer:
                 return SurfaceIntersection(sag - below, gx, gy, found)
 
             return sampled
-        spread = start.spread()
+        spread = start.expanded()
         full = spread.full((*spread.origin, *spread.direction))
         origin = (full[0] - px, full[1] - py, full[2] + (start.datum - pz))
-        return self.backend.meet_fixed(surface, origin, full[3:])
+        return self.backend.intersect_fixed(surface, origin, full[3:])
 
     def _lowered(self, like: Tracer | None):
         """The rest of the system as one fused kernel, a function of heights, screen and filter; None where it is none such."""
@@ -465,14 +467,14 @@ class Tracer:
             return self.backend.plane_image(surface, start, eta, element.fresnel, before)
         return self.backend.ray_image(surface, start, eta, element.fresnel, element.aperture.radius, before)
 
-    def onto(self, state: RayState, screen: Screen | Placed) -> RayState:
+    def onto(self, state: RayState, screen: Screen | PlacedScreen) -> RayState:
         """Rays straight on to a screen; x and y of their origins are the screen's own coordinates, mm."""
-        state = state.spread()
+        state = state.expanded()
         if isinstance(screen, Screen) and self.system.leg is not None:
             screen = self.system.placed(screen)
         frame = screen if isinstance(screen, Screen) else screen.screen
         (sx, sy), shape = frame.shift, shape_of(frame)
-        if isinstance(screen, Placed):
+        if isinstance(screen, PlacedScreen):
             axes, middle = screen.pose.axes, screen.pose.position
             if shape is not None:  # which stands about the screen's middle
                 px, py, pz = (m + sx * a + sy * b for m, a, b in zip(middle, *axes[:2], strict=True))
@@ -573,14 +575,14 @@ def expose(
     """
     screen, filter = screen or scene.screen, filter or Filter()
     heights = heights.detach().to(sampler.device, torch.float64)
-    check_room(scene, heights, screen)
+    check_clearance(scene, heights, screen)
     shape = (3, *screen.resolution) if scene.colored else screen.resolution
 
     def traced_by(size: int) -> Image[float]:
         parts = tracers(scene, field, sampler, dtype, size, requests)
         return _total(parts, {EXIT: heights}, [screen], [shape], filter, sampler.count, sampler.device)[0]
 
-    return with_less(traced_by, chunk)
+    return with_smaller_chunks(traced_by, chunk)
 
 
 def render(
@@ -611,7 +613,7 @@ def render(
         raise InputError(f"a system's heights must be {system.free}, got {shapes}")
     parameters = {name: heights.detach().to(device, torch.float64) for name, heights in parameters.items()}
     samplers = [rays_of(system.with_source(s), kind, rays, seed, device) for s in system.sources]
-    screens = [s.screen if isinstance(s, Placed) else s for s in system.screens]
+    screens = [s.screen if isinstance(s, PlacedScreen) else s for s in system.screens]
 
     def traced_by(size: int) -> list[Image[float]]:
         parts = (
@@ -629,7 +631,7 @@ def render(
             device,
         )
 
-    return with_less(traced_by, chunk)
+    return with_smaller_chunks(traced_by, chunk)
 
 
 def system_tracers(
@@ -662,7 +664,7 @@ def _total(
     return [Image(*of, rays) for of in zip(images, leaving, accounts, strict=True)]
 
 
-def check_room(scene: Scene, heights: Tensor, screen: Screen) -> None:
+def check_clearance(scene: Scene, heights: Tensor, screen: Screen) -> None:
     """Refuse a screen that the surface reaches, the corners of a tilted or curved one included.
 
     Raises:

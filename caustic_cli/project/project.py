@@ -25,7 +25,7 @@ from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.target import target_on_screen, tiles
 from caustic_cli.io.files import write_bytes
 from caustic_cli.io.picture import Picture, read_picture
-from caustic_cli.optics.bounds import refuse_without_glass
+from caustic_cli.optics.bounds import check_exit_above_entrance
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import split_heights
 from caustic_cli.project import attachments, checkpoint
@@ -229,7 +229,7 @@ class Project:
             )
         scene, heights = split_heights(scene, field, state.state.heights if self.values is None else self._trained(state.state))
         try:
-            refuse_without_glass(scene, field, heights)
+            check_exit_above_entrance(scene, field, heights)
         except InputError as error:
             raise self.error(f"{error}") from error
         return Designed(scene, field, heights, state)

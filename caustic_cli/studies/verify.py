@@ -29,7 +29,7 @@ from torch import Tensor
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.io.files import SOFTWARE, atomic_path
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.frames import Leg
+from caustic_cli.optics.frames import AxisSegment
 from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import System
@@ -139,7 +139,7 @@ def _trace(mi, world, scene: Scene, rays: int, seed: int) -> tuple[np.ndarray, n
     follow = _follow if "scalar" not in mi.variant() else _follow_scalar
     image, squares = np.zeros((2, *scene.screen.resolution))
     system = System.of(scene)
-    surfaces, leg = [(e.name, e.reflects) for e in system.elements], system.leg or Leg()
+    surfaces, leg = [(e.name, e.reflects) for e in system.elements], system.leg or AxisSegment()
     for start, direction, share in emitted(scene, rays, rng):
         *points, weight = follow(mi, world, shapes, [*surfaces, ("screen", False)], start, direction)
         x, y = (sum((p - o) * a for p, o, a in zip(points, leg.origin, axis, strict=True)) for axis in leg.frame[:2])

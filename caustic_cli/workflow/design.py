@@ -23,7 +23,7 @@ import torch
 from caustic_cli import __version__
 from caustic_cli.config import presets, settings
 from caustic_cli.config.completion import PLATE, WALL, Derivation, build_options, build_stages, complete, shape_words, without_waves
-from caustic_cli.config.plans import transport_cells
+from caustic_cli.config.default_stages import transport_cells
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import CausticError, InputError, Interrupted
 from caustic_cli.inverse import ranks

@@ -175,7 +175,7 @@ class Lens:
             self._resolution(plan.scene),
             finer=1.0 if cut is None else FINER,
             required=required,
-            departure=None if cut is None else departure(cut, self.field, self.heights),
+            perturbation=None if cut is None else departure(cut, self.field, self.heights),
         )
         return Render(np.empty((0, 0)) if light is None else light.image.cpu().numpy(), figures)
 

@@ -262,7 +262,7 @@ def test_other_errors_are_not_taken_for_short_memory():
         raise RuntimeError("mat1 and mat2 shapes cannot be multiplied")
 
     with pytest.raises(RuntimeError, match="shapes"):
-        memory.with_less(work, 1 << 20)
+        memory.with_smaller_chunks(work, 1 << 20)
     assert tried == [1 << 20]
 
 

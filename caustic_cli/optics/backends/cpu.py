@@ -15,16 +15,16 @@ from caustic_cli.optics import intersection
 from caustic_cli.optics.backends.reference import Torch, by_mesh
 from caustic_cli.optics.gradient.fields import LEAST_SQUARE, SplineIndex
 from caustic_cli.optics.gradient.integrator import ORDER, WEIGHTS, Flow
-from caustic_cli.optics.interface import Departure
-from caustic_cli.optics.kernels import functions
-from caustic_cli.optics.kernels.formula import formula_flow
+from caustic_cli.optics.interface import OutgoingRays
+from caustic_cli.optics.kernels import fused_functions
 from caustic_cli.optics.kernels.grid import GridSurface
 from caustic_cli.optics.kernels.interact import interact
+from caustic_cli.optics.kernels.polynomial_index import formula_flow
 from caustic_cli.optics.kernels.ray_intersections import hits_of_rays
 from caustic_cli.optics.kernels.splat import splat_rays
-from caustic_cli.optics.kernels.surface import FusedSurface, RayIntersections, next_meetings, scattered_surface
+from caustic_cli.optics.kernels.spline_index import VolumeAxis, volume_flow
+from caustic_cli.optics.kernels.surface import FusedSurface, RayIntersections, next_intersections, scattered_surface
 from caustic_cli.optics.kernels.transfer import land
-from caustic_cli.optics.kernels.volume import VolumeAxis, volume_flow
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.reintersection import HALVINGS, MOST_STEPS
@@ -41,7 +41,7 @@ class Numba(Torch):
 
     def compile_plane(self) -> None:
         """Have ready what a plane wave's rays need: from the files kept, or compiled for this machine."""
-        functions.compile_kernels()
+        fused_functions.compile_kernels()
 
     def precision(self, dtype: torch.dtype) -> torch.dtype:
         """float64."""
@@ -51,7 +51,9 @@ class Numba(Torch):
         self, seed: int, start: int, stop: int, shape: tuple[int, int], stratified: bool, device: torch.device | str
     ) -> list[Tensor]:
         """As the reference."""
-        return list(functions.scattered_points([key(seed, d) for d in (0, 1)], [salt(0), salt(1)], start, stop, *shape, stratified))
+        return list(
+            fused_functions.scattered_points([key(seed, d) for d in (0, 1)], [salt(0), salt(1)], start, stop, *shape, stratified)
+        )
 
     def spline_on(self, field, sample: Sample, dtype: torch.dtype):
         """As the reference; rows of a tensor product of points from nets contracted along v."""
@@ -67,27 +69,27 @@ class Numba(Torch):
         at = ((0.5 * (c / r + 1.0)).contiguous().numpy() for c, r in zip((x, y), field.half_size, strict=True))
         return scattered_surface(FusedSurface(field.spaces, field.half_size), heights.double(), *at)
 
-    def meet_spline(self, field, heights: Tensor, origin, direction, side: float) -> SurfaceIntersection:
+    def intersect_spline(self, field, heights: Tensor, origin, direction, side: float) -> SurfaceIntersection:
         """As the reference."""
         rays = [torch.as_tensor(c, dtype=torch.float64) for c in (*origin, *direction)]
         ox, oy, oz, dx, dy, dz = (c.contiguous() for c in torch.broadcast_tensors(*rays))
         if not ox.numel():
-            return super().meet_spline(field, heights, origin, direction, side)
+            return super().intersect_spline(field, heights, origin, direction, side)
         surface = FusedSurface(field.spaces, field.half_size)
         return SurfaceIntersection(*hits_of_rays(surface, heights, (ox, oy, oz), (dx, dy, dz), side=side))
 
-    def meet_fixed(self, field, origin, direction):
+    def intersect_fixed(self, field, origin, direction):
         """As the reference; what does not depend on the heights is prepared, for rays that all begin within the aperture."""
         if any(bool((c.abs() > half).any()) for c, half in zip(origin[:2], field.half_size, strict=True)):
-            return lambda heights: self.meet_spline(field, heights, origin, direction, 1.0)
+            return lambda heights: self.intersect_spline(field, heights, origin, direction, 1.0)
         hits = RayIntersections(FusedSurface(field.spaces, field.half_size), origin, direction, None)
 
-        def meet(heights: Tensor) -> SurfaceIntersection:
+        def intersect(heights: Tensor) -> SurfaceIntersection:
             t, gx, gy = hits(heights)
             found = t.detach() >= 0
             return SurfaceIntersection(torch.where(found, t, torch.zeros_like(t)), gx, gy, found)
 
-        return meet
+        return intersect
 
     def flow(self, field, coefficients: Tensor | None, point, momentum, time: Tensor, steps: int, order: int = ORDER) -> Flow:
         """As the reference; a B-spline volume and the formulas of a lens ray by ray."""
@@ -122,24 +124,24 @@ class Numba(Torch):
 
         return find
 
-    def next_meetings(self, field, heights: Tensor, origin, direction, below: bool, round: bool, step: float) -> Tensor:
+    def next_intersections(self, field, heights: Tensor, origin, direction, below: bool, round: bool, step: float) -> Tensor:
         """As the reference."""
         if not len(origin[0]):
-            return super().next_meetings(field, heights, origin, direction, below, round, step)
-        return next_meetings(
+            return super().next_intersections(field, heights, origin, direction, below, round, step)
+        return next_intersections(
             FusedSurface(field.spaces, field.half_size), heights, origin, direction, below, round, step, HALVINGS, MOST_STEPS
         )
 
     def interact(
         self, direction, slopes, power: Tensor, *, eta: float, reflects: bool, fresnel: str, polarised=None, side: float = 1.0
-    ) -> Departure:
+    ) -> OutgoingRays:
         """As the reference, which does constant slopes itself; the kernel tells the side by the sign of d . N."""
         if not isinstance(slopes[0], Tensor):
             return super().interact(
                 direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, polarised=polarised, side=side
             )
         direction, polarised = _components(direction), None if polarised is None else _components(polarised)
-        return Departure(*interact(direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, field=polarised))
+        return OutgoingRays(*interact(direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, field=polarised))
 
     def land(self, origin, direction, point, axes, forward: float) -> tuple[Tensor, Tensor, Tensor]:
         """As the reference."""
@@ -170,7 +172,7 @@ class PlaneImage:
         s = rays.sample
         assert s is not None
         self.interface = eta, fresnel
-        self.kernel: functions.PlaneKernel = functions.PlaneKernel(
+        self.kernel: fused_functions.PlaneKernel = fused_functions.PlaneKernel(
             field.spaces, field.half_size, s.u, s.v, s.tensor, rays.power, like.kernel if isinstance(like, PlaneImage) else None
         )
 
@@ -186,7 +188,7 @@ class RayImage:
     def __init__(self, field, rays: RayState, eta: float, fresnel: str, radius: float | None, like: RayImage | None):
         self.interface = eta, fresnel
         x, y, *direction = (c.contiguous() for c in rays.full((*rays.origin[:2], *rays.direction)))
-        self.kernel: functions.RayKernel = functions.RayKernel(
+        self.kernel: fused_functions.RayKernel = fused_functions.RayKernel(
             field.spaces,
             field.half_size,
             (x, y, rays.origin[2] + rays.datum),

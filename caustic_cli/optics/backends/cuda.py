@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.optics.backends.reference import Torch
-from caustic_cli.optics.interface import Departure
+from caustic_cli.optics.interface import OutgoingRays
 from caustic_cli.optics.kernels.cuda import rays as by_ray
 from caustic_cli.optics.kernels.cuda import sums
 from caustic_cli.optics.kernels.cuda.image import Light, expose
@@ -43,28 +43,30 @@ class Cuda(Torch):
         u, v = ((0.5 * (c.detach().double() / r + 1.0)).contiguous() for c, r in zip((x, y), field.half_size, strict=True))
         return surface_at(surface_of(field, u.device), heights, u, v)
 
-    def meet_spline(self, field, heights: Tensor, origin, direction, side: float) -> SurfaceIntersection:
+    def intersect_spline(self, field, heights: Tensor, origin, direction, side: float) -> SurfaceIntersection:
         """As the reference."""
         rays = [torch.as_tensor(c, dtype=torch.float64, device=heights.device) for c in (*origin, *direction)]
         ox, oy, oz, dx, dy, dz = torch.broadcast_tensors(*rays)
         if not ox.numel():
-            return super().meet_spline(field, heights, origin, direction, side)
+            return super().intersect_spline(field, heights, origin, direction, side)
         surface = surface_of(field, heights.device)
         return SurfaceIntersection(*hits_of_rays(surface, heights, (ox, oy, oz), (dx, dy, dz), side=side))
 
-    def meet_fixed(self, field, origin, direction):
+    def intersect_fixed(self, field, origin, direction):
         """As the reference."""
-        return lambda heights: self.meet_spline(field, heights, origin, direction, 1.0)
+        return lambda heights: self.intersect_spline(field, heights, origin, direction, 1.0)
 
     def interact(
         self, direction, slopes, power: Tensor, *, eta: float, reflects: bool, fresnel: str, polarised=None, side: float = 1.0
-    ) -> Departure:
+    ) -> OutgoingRays:
         """As the reference, which does constant slopes and varying indices; the kernel tells the side by the sign of d . N."""
         if not isinstance(slopes[0], Tensor) or isinstance(eta, Tensor):
             return super().interact(
                 direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, polarised=polarised, side=side
             )
-        return Departure(*by_ray.interact(direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, field=polarised))
+        return OutgoingRays(
+            *by_ray.interact(direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, field=polarised)
+        )
 
     def land(self, origin, direction, point, axes, forward: float) -> tuple[Tensor, Tensor, Tensor]:
         """As the reference."""

@@ -11,10 +11,10 @@ from torch import Tensor
 from caustic_cli.errors import InputError
 from caustic_cli.optics import intersection, reintersection
 from caustic_cli.optics.gradient.integrator import ORDER, Flow, flow
-from caustic_cli.optics.interface import Departure, interact
+from caustic_cli.optics.interface import OutgoingRays, interact
 from caustic_cli.optics.mesh import TriangleMesh
 from caustic_cli.optics.reconstruction import Filter, splat
-from caustic_cli.optics.sampling import Sample, spread
+from caustic_cli.optics.sampling import Sample, scattered_points
 from caustic_cli.optics.surfaces.base import SurfaceIntersection
 from caustic_cli.optics.tolerances import PARALLEL
 from caustic_cli.scene import Screen
@@ -38,7 +38,7 @@ class Torch:
         self, seed: int, start: int, stop: int, shape: tuple[int, int], stratified: bool, device: torch.device | str
     ) -> list[Tensor]:
         """Random points u, v of the unit square for rays start..stop, `stratified` in cells: see `sampling`."""
-        return spread(seed, start, stop, shape, stratified, device)
+        return scattered_points(seed, start, stop, shape, stratified, device)
 
     def spline_on(self, field, sample: Sample, dtype: torch.dtype):
         """A function of sags (n, m) mm: height (mm) and slopes at the points of a sample, (N,) each in `dtype`."""
@@ -49,17 +49,17 @@ class Torch:
         """Height and slopes at fixed points (N,) mm, float64, linear in the heights."""
         return tuple(field.at(heights, x, y))
 
-    def meet(self, surface, heights: Tensor | None, origin, direction, side: float) -> SurfaceIntersection:
+    def intersect(self, surface, heights: Tensor | None, origin, direction, side: float) -> SurfaceIntersection:
         """`Surface.meet` of any surface."""
-        return intersection.meet_any(surface, heights, origin, direction, side)
+        return intersection.intersect_any(surface, heights, origin, direction, side)
 
-    def meet_spline(self, field, heights: Tensor, origin, direction, side: float) -> SurfaceIntersection:
+    def intersect_spline(self, field, heights: Tensor, origin, direction, side: float) -> SurfaceIntersection:
         """`Surface.meet` of a B-spline."""
-        return intersection.meet_any(field, heights, origin, direction, side)
+        return intersection.intersect_any(field, heights, origin, direction, side)
 
-    def meet_fixed(self, field, origin, direction):
+    def intersect_fixed(self, field, origin, direction):
         """A function of heights (n, m) mm: `SurfaceIntersection`s from below of rays that do not depend on them."""
-        return lambda heights: intersection.meet_any(field, heights, origin, direction, 1.0)
+        return lambda heights: intersection.intersect_any(field, heights, origin, direction, 1.0)
 
     def find(
         self, field, heights: Tensor, origin, direction, method: intersection.Method, radius: float | None
@@ -76,13 +76,13 @@ class Torch:
         """`find` by Newton's method for rays known beforehand: a function of heights."""
         return lambda heights: intersection.reference(field, heights, origin, direction)
 
-    def next_meetings(self, field, heights: Tensor, origin, direction, below: bool, round: bool, step: float) -> Tensor:
+    def next_intersections(self, field, heights: Tensor, origin, direction, below: bool, round: bool, step: float) -> Tensor:
         """Distances (N,) mm to the next intersection of rays that start on a B-spline, 0 for none: see `reintersection.again`."""
         return reintersection.reference(field, heights, origin, direction, below, round, step)
 
     def interact(
         self, direction, slopes, power: Tensor, *, eta: float, reflects: bool, fresnel: str, polarised=None, side: float = 1.0
-    ) -> Departure:
+    ) -> OutgoingRays:
         """What a surface does to rays: `interface.interact`."""
         return interact(direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, polarised=polarised, side=side)
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import Action, Amount, Decision, Effect, Requests
+from caustic_cli.optics.effects.base import Action, Decision, Effect, Probe, Requests
 from caustic_cli.scene import Scene
 
 #: Coefficient that is measured where there is none, 1/mm.
@@ -19,7 +19,7 @@ class Absorption(Effect):
 
     name = "absorption"
 
-    def judge(self, scene: Scene, bounds) -> Decision:
+    def decide(self, scene: Scene, bounds) -> Decision:
         """By the coefficient."""
         a = 0.0 if scene.lens.mirror else max(scene.lens.absorption, *(e.absorption for e in scene.elements), 0.0)
         why = f"the glass absorbs {a:g} per mm" if a > 0 else "the glass is clear"
@@ -32,21 +32,21 @@ class Absorption(Effect):
         clear = tuple(replace(e, absorption=0.0) for e in scene.elements)
         return replace(scene, lens=replace(scene.lens, absorption=0.0), elements=clear)
 
-    def sample(self, scene: Scene, heights: Tensor) -> Amount | None:
+    def probe(self, scene: Scene, heights: Tensor) -> Probe | None:
         """A little."""
         if scene.lens.mirror:
             return None
-        return Amount(replace(scene, lens=replace(scene.lens, absorption=AMOUNT)), None, f"{AMOUNT:g} per mm")
+        return Probe(replace(scene, lens=replace(scene.lens, absorption=AMOUNT)), None, f"{AMOUNT:g} per mm")
 
     def action(self, system, requests: Requests) -> Action | None:
         """In every medium that absorbs."""
-        return Absorb() if any(medium.absorption for medium in system.media()) else None
+        return AbsorptionAction() if any(medium.absorption for medium in system.media()) else None
 
 
-class Absorb(Action):
+class AbsorptionAction(Action):
     """Takes its part on the way to every surface."""
 
-    def arrive(self, m) -> None:
+    def before_interaction(self, m) -> None:
         """After `length` mm."""
         if m.absorption:
             before = m.state.power

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from torch import Tensor
 
 from caustic_cli.optics.bounds import Bounds
-from caustic_cli.optics.interaction import Interaction, Parameters, Walker
+from caustic_cli.optics.interaction import Interaction, Parameters, RayTracer
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.surfaces import SurfaceIntersection
 from caustic_cli.optics.system import System
@@ -63,12 +63,12 @@ NO_REQUESTS = Requests()
 
 
 @dataclass(frozen=True)
-class Amount:
+class Probe:
     """An amount of an effect at which a study measures it: the scene with it, the scene to compare it with (None: the same
     without it), and the amount in words."""
 
     scene: Scene
-    bare: Scene | None
+    baseline: Scene | None
     words: str
 
 
@@ -78,17 +78,17 @@ class Action:
     #: Whether `stray_light` adds light that goes another way.
     stray = False
 
-    def meet(self, interaction: Interaction, origin, direction, heights: Tensor | None) -> SurfaceIntersection | None:
+    def intersect(self, interaction: Interaction, origin, direction, heights: Tensor | None) -> SurfaceIntersection | None:
         """Another way to meet the surface, from rays in its frame; None for the usual one."""
         return None
 
-    def arrive(self, interaction: Interaction) -> None:
+    def before_interaction(self, interaction: Interaction) -> None:
         """At the surface, before Snell's law."""
 
-    def depart(self, interaction: Interaction) -> None:
+    def after_interaction(self, interaction: Interaction) -> None:
         """Behind the surface."""
 
-    def stray_light(self, tracer: Walker, parameters: Parameters, interactions: list[Interaction]) -> list[RayState]:
+    def stray_light(self, tracer: RayTracer, parameters: Parameters, interactions: list[Interaction]) -> list[RayState]:
         """Light behind the last element that has not gone straight on; takes it off the `interactions`' states and accounts."""
         return []
 
@@ -103,14 +103,14 @@ class Effect(ABC):
     waves = False
 
     @abstractmethod
-    def judge(self, scene: Scene, bounds: Bounds) -> Decision:
+    def decide(self, scene: Scene, bounds: Bounds) -> Decision:
         """Whether a scene calls for it, and why."""
 
     def without(self, scene: Scene) -> Scene:
         """The scene with nothing of it."""
         return scene
 
-    def within(self, scene: Scene) -> Scene:
+    def including(self, scene: Scene) -> Scene:
         """The scene with it, where it was asked for."""
         return scene
 
@@ -118,7 +118,7 @@ class Effect(ABC):
         """What to ask of the trace for the effect to be on, or off."""
         return NO_REQUESTS
 
-    def sample(self, scene: Scene, heights: Tensor) -> Amount | None:
+    def probe(self, scene: Scene, heights: Tensor) -> Probe | None:
         """An amount to measure in a scene that has nothing of it; None where there is none."""
         return None
 
@@ -131,7 +131,7 @@ class Effect(ABC):
         return None
 
 
-class GeneralWay(Effect):
+class GeneralRayEffect(Effect):
     """An effect that rays of a plane wave do not need, but can be put through; that others go through, unless it is left out."""
 
     def request(self, scene: Scene, on: bool, bounds: Bounds) -> Requests:
@@ -144,5 +144,5 @@ class GeneralWay(Effect):
         """A plane wave's rays as any others: they forget that they stand on a sample of the aperture."""
         if self.name not in requests.on:
             return rays
-        rays = rays.spread()
+        rays = rays.expanded()
         return replace(rays, direction=rays.full(rays.direction), sample=None)

@@ -16,7 +16,7 @@ class Diffraction(Effect):
     name = "diffraction"
     waves = True
 
-    def judge(self, scene: Scene, bounds) -> Decision:
+    def decide(self, scene: Scene, bounds) -> Decision:
         """By what it adds to the blur of source and pixel."""
         r = bounds.resolution
         if scene.source.rays is not None:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import Amount, Decision, Effect
+from caustic_cli.optics.effects.base import Decision, Effect, Probe
 from caustic_cli.scene import Light, Scene
 from caustic_cli.scene.materials import D_LINE, refractive_index
 
@@ -19,7 +19,7 @@ class Dispersion(Effect):
 
     name = "dispersion"
 
-    def judge(self, scene: Scene, bounds) -> Decision:
+    def decide(self, scene: Scene, bounds) -> Decision:
         """On where several wavelengths meet a glass."""
         if scene.dispersive:
             spans = {glass: [refractive_index(glass, w) for w in scene.light.wavelengths] for glass in scene.glasses}
@@ -46,11 +46,11 @@ class Dispersion(Effect):
         elements = tuple(replace(e, glass=None) for e in scene.elements)
         return replace(scene, lens=replace(scene.lens, glass=None), light=light, elements=elements)
 
-    def sample(self, scene: Scene, heights: Tensor) -> Amount | None:
+    def probe(self, scene: Scene, heights: Tensor) -> Probe | None:
         """Three lines in the lens' glass, or a common one."""
         if scene.lens.mirror:
             return None
         glass = scene.lens.glass or GLASS
         lens = replace(scene.lens, glass=glass, index=refractive_index(glass))
         dispersed = replace(scene, lens=lens, light=Light(scene.light.polarisation, LINES))
-        return Amount(dispersed, None, f"{len(LINES)} wavelengths in {glass}")
+        return Probe(dispersed, None, f"{len(LINES)} wavelengths in {glass}")

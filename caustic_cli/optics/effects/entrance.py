@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 
-from caustic_cli.optics.effects.base import Action, Decision, GeneralWay, Requests
-from caustic_cli.optics.frames import turned_back
+from caustic_cli.optics.effects.base import Action, Decision, GeneralRayEffect, Requests
+from caustic_cli.optics.frames import rotate_to_global
 from caustic_cli.scene import Scene
 
 
-class Entrance(GeneralWay):
+class Entrance(GeneralRayEffect):
     """Left out, rays enter the glass unbent, with Fresnel's losses."""
 
     name = "entrance"
 
-    def judge(self, scene: Scene, b) -> Decision:
+    def decide(self, scene: Scene, b) -> Decision:
         """On where rays come oblique."""
         angle, collimated = math.degrees(b.incidence), scene.source.collimated
         if scene.two_sided:
@@ -29,13 +29,13 @@ class Entrance(GeneralWay):
     def action(self, system, requests: Requests) -> Action | None:
         """Keeps directions at a flat first element."""
         first = system.elements[0]
-        return Unbent() if self.name in requests.off and first.surface.flat and not first.reflects else None
+        return NoRefraction() if self.name in requests.off and first.surface.flat and not first.reflects else None
 
 
-class Unbent(Action):
+class NoRefraction(Action):
     """Straight through the first element."""
 
-    def depart(self, m) -> None:
+    def after_interaction(self, m) -> None:
         """Directions as they came."""
         if m.index == 0 and m.forward:
-            m.state.direction = turned_back(m.element.pose, m.incoming)
+            m.state.direction = rotate_to_global(m.element.pose, m.incoming)

@@ -13,7 +13,7 @@ class Fresnel(Effect):
 
     name = "fresnel"
 
-    def judge(self, scene: Scene, b) -> Decision:
+    def decide(self, scene: Scene, b) -> Decision:
         """On unless the scene says otherwise."""
         if scene.lens.mirror:
             return Decision(self.name, False, "a mirror is taken to reflect all light", present=False)
@@ -26,6 +26,6 @@ class Fresnel(Effect):
         """Perfectly coated."""
         return scene if scene.lens.fresnel == "none" else replace(scene, lens=replace(scene.lens, fresnel="none"))
 
-    def within(self, scene: Scene) -> Scene:
+    def including(self, scene: Scene) -> Scene:
         """By the exact formulas."""
         return replace(scene, lens=replace(scene.lens, fresnel="exact")) if scene.lens.fresnel == "none" else scene

@@ -22,7 +22,7 @@ class Ghosts(Effect):
 
     name = "ghosts"
 
-    def judge(self, scene: Scene, b) -> Decision:
+    def decide(self, scene: Scene, b) -> Decision:
         """By a bound of the power that is reflected twice, and by what its image, should that be small and bright, adds."""
         if scene.lens.mirror:
             return Decision(self.name, False, "there is no glass", present=False)
@@ -41,10 +41,10 @@ class Ghosts(Effect):
 
     def action(self, system, requests: Requests) -> Action | None:
         """Between refracting elements."""
-        return Reflections() if self.name in requests.on and sum(not e.reflects for e in system.elements) > 1 else None
+        return DoubleReflections() if self.name in requests.on and sum(not e.reflects for e in system.elements) > 1 else None
 
 
-class Reflections(Action):
+class DoubleReflections(Action):
     """One bundle of rays for each pair of elements."""
 
     stray = True
@@ -54,7 +54,7 @@ class Reflections(Action):
         found, elements = [], tracer.system.elements
         heights = [parameters.get(e.name) for e in elements]
         for j, m in enumerate(interactions):
-            if m.reflects or not bool((m.arriving > m.departing).any()):
+            if m.reflects or not bool((m.power_in > m.power_out).any()):
                 continue
             totally = ~m.passes
             for i in range(j - 1, -1, -1):
@@ -62,10 +62,10 @@ class Reflections(Action):
                     break
                 ghost = replace(m.returned(), lost={}, status=None, polarised=None)
                 for k in range(j - 1, i, -1):
-                    ghost = tracer.cross(k, ghost, heights[k], forward=False, straight=False, parameters=parameters).state
-                ghost = tracer.cross(i, ghost, heights[i], forward=False, straight=False, parameters=parameters).returned()
+                    ghost = tracer.trace_element(k, ghost, heights[k], forward=False, direct=False, parameters=parameters).state
+                ghost = tracer.trace_element(i, ghost, heights[i], forward=False, direct=False, parameters=parameters).returned()
                 for k in range(i + 1, len(elements)):
-                    ghost = tracer.cross(k, ghost, heights[k], straight=False, parameters=parameters).state
+                    ghost = tracer.trace_element(k, ghost, heights[k], direct=False, parameters=parameters).state
                 with torch.no_grad():
                     of_total = torch.where(totally, ghost.power, torch.zeros_like(ghost.power)).sum(dtype=torch.float64)
                     lost = {"total_internal_reflection": -of_total, "fresnel": of_total - ghost.power.sum(dtype=torch.float64)}

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import Amount, Decision, Effect
-from caustic_cli.optics.gradient.fields import field_of
+from caustic_cli.optics.effects.base import Decision, Effect, Probe
+from caustic_cli.optics.gradient.fields import index_field_of
 from caustic_cli.scene import Scene
 from caustic_cli.scene.gradient import Gradient
 
@@ -23,12 +23,12 @@ class GradientIndex(Effect):
 
     name = "gradient-index"
 
-    def judge(self, scene: Scene, bounds) -> Decision:
+    def decide(self, scene: Scene, bounds) -> Decision:
         """By a bound of how far bending moves light on the screen, and by how much the index differs from the lens' own.
 
         A ray through t mm turns by at most t |grad n| / n within, n times that behind the exit, over the way to the screen.
         """
-        lens, field = scene.lens, field_of(scene.lens)
+        lens, field = scene.lens, index_field_of(scene.lens)
         if field is None:
             return Decision(self.name, False, "the lens has one index", 0.0, UNSEEN, present=False)
         least, most, steepest = field.extremes(lens.half_size, bounds.depth)
@@ -46,7 +46,7 @@ class GradientIndex(Effect):
         """One index."""
         return scene if scene.lens.gradient is None else replace(scene, lens=replace(scene.lens, gradient=None))
 
-    def sample(self, scene: Scene, heights: Tensor) -> Amount | None:
+    def probe(self, scene: Scene, heights: Tensor) -> Probe | None:
         """A radial gradient, whose index falls towards the edge by little."""
         lens = scene.lens
         if lens.mirror:
@@ -55,4 +55,4 @@ class GradientIndex(Effect):
         if not depth > 0:
             return None
         gradient = Gradient("radial", (-TURN / (2.0 * depth * edge),))
-        return Amount(replace(scene, lens=replace(lens, gradient=gradient)), None, f"{TURN:g} rad at the edge")
+        return Probe(replace(scene, lens=replace(lens, gradient=gradient)), None, f"{TURN:g} rad at the edge")

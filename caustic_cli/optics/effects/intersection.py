@@ -7,17 +7,17 @@ import math
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import Action, Decision, GeneralWay, Requests
+from caustic_cli.optics.effects.base import Action, Decision, GeneralRayEffect, Requests
 from caustic_cli.optics.surfaces import HeightField, SurfaceIntersection
 from caustic_cli.scene import Scene
 
 
-class Intersection(GeneralWay):
+class Intersection(GeneralRayEffect):
     """Left out, rays leave where they cross the surface's mean height."""
 
     name = "intersection"
 
-    def judge(self, scene: Scene, b) -> Decision:
+    def decide(self, scene: Scene, b) -> Decision:
         """On where rays run oblique inside the lens."""
         if scene.axial:
             return Decision(self.name, False, "rays of a plane wave are sampled on the surface itself", 0.0, 0.0)
@@ -32,7 +32,7 @@ class Intersection(GeneralWay):
 class MeanPlane(Action):
     """A B-spline met where rays cross its mean height, with the height and the slopes that it has there."""
 
-    def meet(self, m, origin, direction, heights: Tensor | None) -> SurfaceIntersection | None:
+    def intersect(self, m, origin, direction, heights: Tensor | None) -> SurfaceIntersection | None:
         """The height there is what the ray goes on from; no time passes between it and the mean plane."""
         surface = m.element.surface
         if not isinstance(surface, HeightField) or m.state.sample is not None:  # a plane wave's rays stand on the surface itself
@@ -48,7 +48,7 @@ class MeanPlane(Action):
         t = torch.where(found, t, torch.zeros_like(t))
         return SurfaceIntersection(t, gx, gy, found)
 
-    def arrive(self, m) -> None:
+    def before_interaction(self, m) -> None:
         """Onto the surface above or below."""
         if m.lift is not None:
             x, y, z = m.state.origin

@@ -14,7 +14,7 @@ class MissedSurface(Effect):
     name = "missed-surface"
     free = True
 
-    def judge(self, scene: Scene, b) -> Decision:
+    def decide(self, scene: Scene, b) -> Decision:
         """By how far rays get at the surface's greatest height."""
         if scene.elements:
             return Decision(self.name, True, "the apertures of other elements may stop light", fixed=True)

@@ -7,10 +7,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import NEGLIGIBLE, Action, Amount, Decision, Effect, Requests
-from caustic_cli.optics.frames import turned, turned_back
+from caustic_cli.optics.effects.base import NEGLIGIBLE, Action, Decision, Effect, Probe, Requests
+from caustic_cli.optics.frames import rotate_to_global, rotate_to_local
 from caustic_cli.optics.interface import refract
-from caustic_cli.optics.polarisation import beyond, field_of
+from caustic_cli.optics.polarisation import polarisation_vector, transmitted_field
 from caustic_cli.optics.rays import RayState
 from caustic_cli.scene import Scene
 
@@ -20,7 +20,7 @@ class Polarisation(Effect):
 
     name = "polarisation"
 
-    def judge(self, scene: Scene, b) -> Decision:
+    def decide(self, scene: Scene, b) -> Decision:
         """On for polarised light, and where what the entrance polarises changes what the exit reflects."""
         light, lens = scene.light, scene.lens
         if lens.mirror or lens.fresnel != "exact":
@@ -45,38 +45,38 @@ class Polarisation(Effect):
         light = scene.light
         return scene if light.polarisation is None else replace(scene, light=replace(light, polarisation=None))
 
-    def within(self, scene: Scene) -> Scene:
+    def including(self, scene: Scene) -> Scene:
         """Unpolarised light as two crossed polarisations."""
         return scene if scene.light.polarisation is not None else replace(scene, light=replace(scene.light, tracked=True))
 
-    def sample(self, scene: Scene, heights: Tensor) -> Amount | None:
+    def probe(self, scene: Scene, heights: Tensor) -> Probe | None:
         """Along x."""
         if scene.lens.fresnel != "exact" or scene.lens.mirror:
             return None
-        return Amount(replace(scene, light=replace(scene.light, polarisation=0.0)), None, "along x")
+        return Probe(replace(scene, light=replace(scene.light, polarisation=0.0)), None, "along x")
 
     def prepare(self, system, rays: RayState, requests: Requests) -> RayState:
         """Rays with a field."""
         angle = system.light.polarisation
         if angle is None or not any(e.fresnel == "exact" and not e.reflects for e in system.elements):
             return rays
-        return replace(rays, polarised=field_of(angle, rays.direction))
+        return replace(rays, polarised=polarisation_vector(angle, rays.direction))
 
     def action(self, system, requests: Requests) -> Action | None:
         """Carries the field through surfaces that are followed by others."""
-        return Carry() if system.light.polarisation is not None and len(system.elements) > 1 else None
+        return FieldPropagation() if system.light.polarisation is not None and len(system.elements) > 1 else None
 
 
-class Carry(Action):
+class FieldPropagation(Action):
     """The field behind a surface."""
 
-    def depart(self, m) -> None:
+    def after_interaction(self, m) -> None:
         """Fresnel's amplitudes, or a perfect mirror's."""
         state, last = m.state, m.index == len(m.tracer.system.elements) - 1
         if state.polarised is None or (last and m.forward):
             return
         pose = m.element.pose
-        e, flip = turned(pose, state.polarised), m.side
+        e, flip = rotate_to_local(pose, state.polarised), m.side
         d = (m.incoming[0], m.incoming[1], flip * m.incoming[2])
         e = (e[0], e[1], flip * e[2])
         gx, gy = (flip * g for g in m.slopes)
@@ -89,5 +89,5 @@ class Carry(Action):
             gx, gy = (torch.as_tensor(g, dtype=state.power.dtype, device=state.power.device) for g in (gx, gy))
             d = state.full(d)
             t, _, c, s = refract(d, gx, gy, m.n_in / m.n_out)
-            e = beyond(state.full(e), d, t, normal, c, s, m.n_in / m.n_out)
-        state.polarised = turned_back(pose, (e[0], e[1], flip * e[2]))
+            e = transmitted_field(state.full(e), d, t, normal, c, s, m.n_in / m.n_out)
+        state.polarised = rotate_to_global(pose, (e[0], e[1], flip * e[2]))

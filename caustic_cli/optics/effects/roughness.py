@@ -11,7 +11,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import Action, Amount, Decision, Effect, Requests
+from caustic_cli.optics.effects.base import Action, Decision, Effect, Probe, Requests
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import normal_numbers
 from caustic_cli.scene import Scene
@@ -29,7 +29,7 @@ class Roughness(Effect):
 
     name = "roughness"
 
-    def judge(self, scene: Scene, bounds) -> Decision:
+    def decide(self, scene: Scene, bounds) -> Decision:
         """By the facets' standard deviation."""
         r = scene.lens.roughness
         why = f"microfacets of slopes {r:g}" if r > 0 else "the surface is smooth"
@@ -39,24 +39,24 @@ class Roughness(Effect):
         """A smooth surface."""
         return replace(scene, lens=replace(scene.lens, roughness=0.0)) if scene.lens.roughness else scene
 
-    def sample(self, scene: Scene, heights: Tensor) -> Amount:
+    def probe(self, scene: Scene, heights: Tensor) -> Probe:
         """A little."""
-        return Amount(replace(scene, lens=replace(scene.lens, roughness=AMOUNT)), None, f"slopes {AMOUNT:g}")
+        return Probe(replace(scene, lens=replace(scene.lens, roughness=AMOUNT)), None, f"slopes {AMOUNT:g}")
 
     def action(self, system, requests: Requests) -> Action | None:
         """At every element that is rough."""
-        return Facets() if any(e.roughness for e in system.elements) else None
+        return Microfacets() if any(e.roughness for e in system.elements) else None
 
 
-class Facets(Action):
+class Microfacets(Action):
     """Adds to the slopes what each ray's facet has; the same in every walk of a tracer."""
 
     def __init__(self) -> None:
         self.noise: dict[int, tuple[Tensor, ...]] = {}
 
-    def arrive(self, m) -> None:
+    def before_interaction(self, m) -> None:
         """At the surface, on the straight way only."""
-        if not (m.element.roughness and m.straight):
+        if not (m.element.roughness and m.direct):
             return
         if m.index not in self.noise:
             last = len(m.tracer.system.elements) - 1

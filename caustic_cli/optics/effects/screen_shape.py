@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import Amount, Decision, Effect
-from caustic_cli.optics.screen_shape import space
+from caustic_cli.optics.effects.base import Decision, Effect, Probe
+from caustic_cli.optics.screen_shape import points_in_space
 from caustic_cli.scene import Scene
 
 #: Radius of the sphere that is measured where there is none, in screen widths.
@@ -22,7 +22,7 @@ def displacement(scene: Scene) -> float:
     screen, lens = scene.screen, scene.lens
     x, y = (np.linspace(-h, h, POINTS) for h in screen.half_size)
     x, y = (c.ravel() for c in np.meshgrid(x, y, indexing="ij"))
-    point = np.stack(space(screen, x, y))
+    point = np.stack(points_in_space(screen, x, y))
     way = point - np.array([0.0, 0.0, lens.offset.thickness])[:, None]
     axes = np.array(screen.axes)
     back = axes[2] @ (point - np.array([*screen.shift, screen.z])[:, None]) / (axes[2] @ way)
@@ -34,7 +34,7 @@ class ScreenShape(Effect):
 
     name = "screen-shape"
 
-    def judge(self, scene: Scene, bounds) -> Decision:
+    def decide(self, scene: Scene, bounds) -> Decision:
         """By how far light would land elsewhere on the plane screen."""
         if not scene.screen.curved:
             return Decision(self.name, False, "the screen is plane", 0.0, 0.0, present=False)
@@ -46,7 +46,7 @@ class ScreenShape(Effect):
         """Plane."""
         return replace(scene, screen=scene.screen.uncurved) if scene.screen.curved else scene
 
-    def sample(self, scene: Scene, heights: Tensor) -> Amount:
+    def probe(self, scene: Scene, heights: Tensor) -> Probe:
         """A sphere."""
         radius = AMOUNT * max(scene.screen.size)
-        return Amount(replace(scene, screen=replace(scene.screen, radius=(radius, radius))), None, f"a radius of {radius:.4g} mm")
+        return Probe(replace(scene, screen=replace(scene.screen, radius=(radius, radius))), None, f"a radius of {radius:.4g} mm")

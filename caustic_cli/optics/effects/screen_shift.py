@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import Amount, Decision, Effect
+from caustic_cli.optics.effects.base import Decision, Effect, Probe
 from caustic_cli.scene import Scene
 
 #: Distance that is measured where there is none, mm.
@@ -19,7 +19,7 @@ class ScreenShift(Effect):
     name = "screen-shift"
     free = True
 
-    def judge(self, scene: Scene, bounds) -> Decision:
+    def decide(self, scene: Scene, bounds) -> Decision:
         """By the distances."""
         (a, b), some = scene.screen.shift, any(scene.screen.shift)
         return Decision(
@@ -35,6 +35,6 @@ class ScreenShift(Effect):
         """On the axis."""
         return replace(scene, screen=replace(scene.screen, shift=(0.0, 0.0))) if any(scene.screen.shift) else scene
 
-    def sample(self, scene: Scene, heights: Tensor) -> Amount:
+    def probe(self, scene: Scene, heights: Tensor) -> Probe:
         """Along x."""
-        return Amount(replace(scene, screen=replace(scene.screen, shift=(AMOUNT, 0.0))), None, f"{AMOUNT:g} mm")
+        return Probe(replace(scene, screen=replace(scene.screen, shift=(AMOUNT, 0.0))), None, f"{AMOUNT:g} mm")

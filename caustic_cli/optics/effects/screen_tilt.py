@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import Amount, Decision, Effect
+from caustic_cli.optics.effects.base import Decision, Effect, Probe
 from caustic_cli.scene import Scene
 
 #: Angle that is measured where there is none, degrees.
@@ -18,7 +18,7 @@ class ScreenTilt(Effect):
 
     name = "screen-tilt"
 
-    def judge(self, scene: Scene, bounds) -> Decision:
+    def decide(self, scene: Scene, bounds) -> Decision:
         """By the angles."""
         (a, b), some = scene.screen.tilt, any(scene.screen.tilt)
         return Decision(
@@ -34,6 +34,6 @@ class ScreenTilt(Effect):
         """Upright."""
         return replace(scene, screen=replace(scene.screen, tilt=(0.0, 0.0))) if any(scene.screen.tilt) else scene
 
-    def sample(self, scene: Scene, heights: Tensor) -> Amount:
+    def probe(self, scene: Scene, heights: Tensor) -> Probe:
         """About y."""
-        return Amount(replace(scene, screen=replace(scene.screen, tilt=(0.0, AMOUNT))), None, f"{AMOUNT:g} degrees")
+        return Probe(replace(scene, screen=replace(scene.screen, tilt=(0.0, AMOUNT))), None, f"{AMOUNT:g} degrees")

@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from caustic_cli.optics.effects.base import NO_REQUESTS, Action, Decision, Effect, Requests
-from caustic_cli.optics.frames import out_of, turned, turned_back
+from caustic_cli.optics.frames import rotate_to_global, rotate_to_local, to_global
 from caustic_cli.optics.rays import RayState
-from caustic_cli.optics.reintersection import again, touch
+from caustic_cli.optics.reintersection import hit_with_derivatives, next_intersection
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.scene import Scene
 
@@ -25,7 +25,7 @@ class SecondaryIntersection(Effect):
 
     name = "secondary-intersection"
 
-    def judge(self, scene: Scene, b) -> Decision:
+    def decide(self, scene: Scene, b) -> Decision:
         """By whether a slope can catch a ray."""
         if scene.behind:
             return Decision(
@@ -48,10 +48,10 @@ class SecondaryIntersection(Effect):
 
     def action(self, system, requests: Requests) -> Action | None:
         """At a last surface that is a B-spline."""
-        return Again() if self.name in requests.on and isinstance(system.elements[-1].surface, HeightField) else None
+        return SecondaryHits() if self.name in requests.on and isinstance(system.elements[-1].surface, HeightField) else None
 
 
-class Again(Action):
+class SecondaryHits(Action):
     """Takes rays that meet the last surface again off the straight light."""
 
     stray = True
@@ -62,9 +62,9 @@ class Again(Action):
         element, state, side = m.element, m.state, m.side
         surface, pose, heights = element.surface, element.pose, parameters[element.name]
         round_, interact = element.aperture.round, tracer.backend.interact
-        full = state.full((*m.local, *turned(pose, state.direction)))
+        full = state.full((*m.local, *rotate_to_local(pose, state.direction)))
         full = [c.double() for c in full]
-        t, met = again(surface, heights, full[:3], full[3:], below=(side > 0) == m.reflects, round=round_)
+        t, met = next_intersection(surface, heights, full[:3], full[3:], below=(side > 0) == m.reflects, round=round_)
         met = met & (state.power > 0)
         at = met.nonzero()[:, 0]
         if not len(at):
@@ -72,14 +72,14 @@ class Again(Action):
         power = state.power.double()[at]
         state.power = torch.where(met, torch.zeros_like(state.power), state.power)
         d = [c[at] for c in full[3:]]
-        o, g, _ = touch(surface, heights, [c[at] for c in full[:3]], d, t[at])
+        o, g, _ = hit_with_derivatives(surface, heights, [c[at] for c in full[:3]], d, t[at])
 
         def leaving(o, d, power, account: dict) -> list[RayState]:
             return [
                 replace(
                     state,
-                    origin=out_of(pose, o, state.datum),
-                    direction=turned_back(pose, d),
+                    origin=to_global(pose, o, state.datum),
+                    direction=rotate_to_global(pose, d),
                     power=power,
                     path=0.0,
                     polarised=None,
@@ -96,11 +96,11 @@ class Again(Action):
         if isinstance(eta, Tensor):  # of varying index: that where the ray left, and the short way back within is straight
             eta = eta[at]
         entered = interact(d, g, power, eta=1.0 / eta, reflects=False, fresnel=fresnel, side=-side)
-        t, through = again(surface, heights, o, entered.direction, below=side > 0, round=round_)
+        t, through = next_intersection(surface, heights, o, entered.direction, below=side > 0, round=round_)
         none = torch.zeros_like(power)
-        o, g, t = touch(surface, heights, o, entered.direction, t)
-        arriving = torch.where(through, entered.power, none)
-        kept = arriving * torch.exp(-m.absorption * t) if m.absorption else arriving
+        o, g, t = hit_with_derivatives(surface, heights, o, entered.direction, t)
+        power_in = torch.where(through, entered.power, none)
+        kept = power_in * torch.exp(-m.absorption * t) if m.absorption else power_in
         out = interact(entered.direction, g, kept, eta=eta, reflects=False, fresnel=fresnel, side=side)
         return leaving(
             o,
@@ -109,8 +109,8 @@ class Again(Action):
             {
                 "fresnel": torch.where(entered.passes, power - entered.power, none)
                 + torch.where(out.passes, kept - out.power, none),
-                "missed_surface": entered.power - arriving,
-                "absorbed": arriving - kept,
+                "missed_surface": entered.power - power_in,
+                "absorbed": power_in - kept,
                 "total_internal_reflection": torch.where(out.passes, none, kept) + torch.where(entered.passes, none, power),
             },
         )

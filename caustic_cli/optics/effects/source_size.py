@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import Amount, Decision, Effect
+from caustic_cli.optics.effects.base import Decision, Effect, Probe
 from caustic_cli.scene import Disc, Scene
 from caustic_cli.scene.sources.disc import SUN
 
@@ -19,7 +19,7 @@ class SourceSize(Effect):
 
     name = "source-size"
 
-    def judge(self, scene: Scene, bounds) -> Decision:
+    def decide(self, scene: Scene, bounds) -> Decision:
         """By the angle under which the lens sees a disc, or the number of points."""
         s, z_in = scene.source, scene.lens.z_in
         bound, limit = (float(len(s.points()[0])), 1.0) if s.several else (s.apparent_angle(z_in), 0.0)
@@ -29,9 +29,9 @@ class SourceSize(Effect):
         """From the middle of the source."""
         return replace(scene, source=scene.source.pointlike()) if scene.source.extended else scene
 
-    def sample(self, scene: Scene, heights: Tensor) -> Amount:
+    def probe(self, scene: Scene, heights: Tensor) -> Probe:
         """The sun, or a small disc."""
         s = scene.source
         if s.distant:
-            return Amount(replace(scene, source=Disc(power=s.power, angle=SUN)), None, f"{SUN} degrees")
-        return Amount(replace(scene, source=Disc(s.centre, (SIZE, SIZE), s.power, s.cone)), None, f"{SIZE:g} mm")
+            return Probe(replace(scene, source=Disc(power=s.power, angle=SUN)), None, f"{SUN} degrees")
+        return Probe(replace(scene, source=Disc(s.centre, (SIZE, SIZE), s.power, s.cone)), None, f"{SIZE:g} mm")

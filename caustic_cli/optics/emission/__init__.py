@@ -14,7 +14,7 @@ from typing import cast
 import torch
 
 from caustic_cli.errors import InputError
-from caustic_cli.optics.emission.base import Emission, Lit
+from caustic_cli.optics.emission.base import Emission, Illuminated
 from caustic_cli.optics.emission.measured import MeasuredRays
 from caustic_cli.optics.emission.several import SeveralRays
 from caustic_cli.optics.sampling import Sampler
@@ -23,7 +23,7 @@ __all__ = ["Emission", "Lit", "Rays", "of_member", "rays_of", "register"]
 
 Rays = Sampler | Emission | MeasuredRays | SeveralRays
 #: what is lit, sampler, number of rays, seed, device -> rays.
-Maker = Callable[[Lit, str, int, int, str | torch.device], Rays]
+Maker = Callable[[Illuminated, str, int, int, str | torch.device], Rays]
 
 _MAKERS: dict[str, Maker] = {}
 
@@ -33,7 +33,7 @@ def register(name: str, maker: Maker) -> None:
     _MAKERS[name] = maker
 
 
-def rays_of(scene: Lit, kind: str, rays: int, seed: int = 0, device: str | torch.device = "cpu") -> Rays:
+def rays_of(scene: Illuminated, kind: str, rays: int, seed: int = 0, device: str | torch.device = "cpu") -> Rays:
     """About `rays` rays of the source of a scene or system, at least one for each of its points.
 
     Raises:

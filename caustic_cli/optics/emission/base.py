@@ -21,7 +21,7 @@ from caustic_cli.scene import Pupil, Source
 from caustic_cli.scene.sources.distribution import Distribution
 
 
-class Lit(Protocol):
+class Illuminated(Protocol):
     """What a source lights: a one-lens scene, or a system."""
 
     @property
@@ -46,7 +46,7 @@ class Emission:
     dimensions: numbers in [0, 1] that a ray is drawn from; the first two fill the cells.
     """
 
-    scene: Lit
+    scene: Illuminated
     kind: str
     shape: tuple[int, int]
     seed: int = 0
@@ -59,16 +59,16 @@ class Emission:
             raise InputError(f"sampler must be one of {', '.join(SAMPLERS)}, got {self.kind!r}")
 
     @classmethod
-    def of_size(cls, scene: Lit, kind: str, rays: int, seed: int = 0, device: str | torch.device = "cpu") -> Self:
+    def of_size(cls, scene: Illuminated, kind: str, rays: int, seed: int = 0, device: str | torch.device = "cpu") -> Self:
         """About `rays` rays in cells as nearly square as whole numbers allow, at least one for each of its points."""
-        aspect, each = scene.pupil.half_size[0] / scene.pupil.half_size[1], max(1, round(rays / _starts(scene)))
+        aspect, each = scene.pupil.half_size[0] / scene.pupil.half_size[1], max(1, round(rays / _positions(scene)))
         nu = max(1, min(each, round(math.sqrt(each * aspect))))
         return cls(scene, kind, (nu, max(1, round(each / nu))), seed, device)
 
     @cached_property
     def count(self) -> int:
         """Number of rays."""
-        return self.shape[0] * self.shape[1] * _starts(self.scene)
+        return self.shape[0] * self.shape[1] * _positions(self.scene)
 
     def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[RayState]:
         """The rays in order, at most `size` at a time; their powers and what they lost sum to 1 over all chunks.
@@ -108,6 +108,6 @@ def _by_table(given: Distribution, angle: Tensor) -> Tensor:
     return torch.where(angle <= angles[-1], found, torch.zeros_like(found))
 
 
-def _starts(scene: Lit) -> int:
+def _positions(scene: Illuminated) -> int:
     """Positions of the source; a distant one counts as one."""
     return max(1, len(scene.source.points()[0]))

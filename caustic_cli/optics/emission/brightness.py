@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 
-def bright_points(picture: np.ndarray, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+def points_by_brightness(picture: np.ndarray, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     """Points x, y (N,) of [-1, 1]^2 for numbers a, b (N,) in [0, 1]; picture: brightness (n, m), [i, j] with i along +x."""
     light = torch.as_tensor(np.asarray(picture, dtype=np.float64), device=a.device)
     rows = light.sum(1)

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.emission.base import Lit, intensity_of
-from caustic_cli.optics.emission.brightness import bright_points
+from caustic_cli.optics.emission.base import Illuminated, intensity_of
+from caustic_cli.optics.emission.brightness import points_by_brightness
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.scene import Source
@@ -34,7 +34,7 @@ class Mode:
     position: mm, of a near source; of a distant one the unit vector along which its light runs; part: of the source's power.
     """
 
-    scene: Lit
+    scene: Illuminated
     position: tuple[float, float, float]
     part: float
 
@@ -82,13 +82,13 @@ class Mode:
         return self.part / area * table[a, b] / mean
 
 
-def middle(scene: Lit) -> Mode:
+def central_mode(scene: Illuminated) -> Mode:
     """The whole source, gathered in its middle."""
     source = scene.source
     return Mode(scene, (0.0, 0.0, 1.0) if source.distant else source.centre, 1.0)
 
 
-def edges(scene: Lit) -> list[Mode]:
+def outermost_modes(scene: Illuminated) -> list[Mode]:
     """Its outermost points along x, -x, y and -y, each with all its power: what their light does differently."""
     source = scene.source
     if source.distant:
@@ -108,7 +108,7 @@ def edges(scene: Lit) -> list[Mode]:
     return found
 
 
-def modes(scene: Lit, each: int) -> list[Mode]:
+def modes(scene: Illuminated, each: int) -> list[Mode]:
     """The source as points: `each` in place of every position that has an extent, evenly over its ellipse."""
     source = scene.source
     if source.distant:
@@ -136,13 +136,13 @@ def spots(source: Source, each: int) -> list[tuple[float, float]]:
     if not max(source.frame) > 0:
         return [(0.0, 0.0)]
     if source.brightness is None:
-        return even_disc(each)
+        return vogel_disc(each)
     k = torch.arange(each, dtype=torch.float64) + 0.5
-    x, y = bright_points(source.brightness, k / each, torch.frac(k / RATIO))
+    x, y = points_by_brightness(source.brightness, k / each, torch.frac(k / RATIO))
     return list(zip(x.tolist(), y.tolist(), strict=True))
 
 
-def even_disc(count: int) -> list[tuple[float, float]]:
+def vogel_disc(count: int) -> list[tuple[float, float]]:
     """Points of the unit disc, each for the same area of it: Vogel's spiral."""
     radii = [math.sqrt((k + 0.5) / count) for k in range(count)]
     return [(r * math.cos(k * GOLDEN), r * math.sin(k * GOLDEN)) for k, r in enumerate(radii)]

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.optics.emission.base import Emission
-from caustic_cli.optics.emission.brightness import bright_points
+from caustic_cli.optics.emission.brightness import points_by_brightness
 from caustic_cli.optics.rays import RayState
 
 
@@ -24,7 +24,7 @@ class Distant(Emission):
             sine = a.sqrt() * math.sin(source.half_angle)  # even over the projected solid angle: an evenly bright disc
             dx, dy = sine * torch.cos(2 * math.pi * b), sine * torch.sin(2 * math.pi * b)
         else:
-            dx, dy = (w * c for w, c in zip(source.frame, bright_points(source.brightness, a, b), strict=True))
+            dx, dy = (w * c for w, c in zip(source.frame, points_by_brightness(source.brightness, a, b), strict=True))
         flux, x, y = torch.full_like(u, 1.0 / self.count), (2.0 * u - 1.0) * rx, (2.0 * v - 1.0) * ry
         if self.scene.pupil.round:  # even over the disc
             x, y = rx * u.sqrt() * torch.cos(2 * math.pi * v), rx * u.sqrt() * torch.sin(2 * math.pi * v)

@@ -21,7 +21,7 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.optics.emission.base import Lit
+from caustic_cli.optics.emission.base import Illuminated
 from caustic_cli.optics.interface import reflectance
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import SAMPLERS, random_numbers
@@ -50,7 +50,7 @@ class MeasuredRays:
         InputError: none of them meets the pupil.
     """
 
-    scene: Lit
+    scene: Illuminated
     kind: str
     rays: int
     seed: int = 0

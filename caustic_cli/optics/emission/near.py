@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.optics.emission.base import Emission, intensity_of
-from caustic_cli.optics.emission.brightness import bright_points
+from caustic_cli.optics.emission.brightness import points_by_brightness
 from caustic_cli.optics.rays import RayState
 from caustic_cli.scene.sources.distribution import Distribution
 
@@ -44,7 +44,7 @@ class Near(Emission):
         powers = torch.tensor(source.powers, dtype=torch.float64, device=self.device)
         return torch.from_numpy(source.points()[0]).to(self.device), powers / powers.sum()
 
-    def _aside(self, *draws: Tensor) -> tuple[Tensor, Tensor]:
+    def _offsets(self, *draws: Tensor) -> tuple[Tensor, Tensor]:
         """Where about its position each ray starts, mm along x and y, of the draws beyond the first two."""
         raise NotImplementedError
 
@@ -57,7 +57,7 @@ class Near(Emission):
         part = powers[which] / per  # emitted by each ray
         x0, y0, z0 = positions[which].unbind(1)
         if aside:  # each point of the source has a cone of its own
-            across, along = self._aside(*aside)
+            across, along = self._offsets(*aside)
             x0, y0 = x0 + across, y0 + along
         h = pupil.z - z0
         radius = h * math.tan(cone) if cone < math.pi / 2 else torch.full_like(h, math.inf)
@@ -70,7 +70,7 @@ class Near(Emission):
             within &= torch.maximum(-lows[0], highs[0]) ** 2 + torch.maximum(-lows[1], highs[1]) ** 2 <= rx * rx
         from_cone = within | (room >= NEAR * h) if source.aimed else torch.ones_like(within)
 
-        w = _drops(source.intensity, cone, u)
+        w = _one_minus_cosine(source.intensity, cone, u)
         sine, cosine = torch.sqrt(w * (2.0 - w)), 1.0 - w
         tangent = sine / cosine.clamp_min(1e-300)
         cx, cy = tangent * torch.cos(2 * math.pi * v), tangent * torch.sin(2 * math.pi * v)  # tangents along x and y
@@ -78,9 +78,9 @@ class Near(Emission):
         lows = [torch.maximum(lo, torch.full_like(lo, -r)) for lo, r in zip(lows, (rx, ry), strict=True)]
         highs = [torch.minimum(hi, torch.full_like(hi, r)) for hi, r in zip(highs, (rx, ry), strict=True)]
         wide, tall = (highs[0] - lows[0]).clamp_min(0.0), (highs[1] - lows[1]).clamp_min(0.0)
-        ax, by_angle = _even_angle((lows[0] - x0) / h, (highs[0] - x0) / h, wide / h, u)
+        ax, by_angle = _uniform_angle((lows[0] - x0) / h, (highs[0] - x0) / h, wide / h, u)
         stretch = torch.sqrt(1.0 + ax * ax)  # 1 / cos a
-        tan_b, by_sine = _even_sine((lows[1] - y0) / (h * stretch), (highs[1] - y0) / (h * stretch), tall / (h * stretch), v)
+        tan_b, by_sine = _uniform_sine((lows[1] - y0) / (h * stretch), (highs[1] - y0) / (h * stretch), tall / (h * stretch), v)
         ay = tan_b * stretch
         rho2 = ax * ax + ay * ay  # in units of h
         aimed = part * by_angle * by_sine * intensity_of(source, cone, torch.sqrt(1.0 + rho2))
@@ -102,16 +102,16 @@ class NearDisc(Near):
 
     dimensions: ClassVar[int] = 4
 
-    def _aside(self, *draws: Tensor) -> tuple[Tensor, Tensor]:
+    def _offsets(self, *draws: Tensor) -> tuple[Tensor, Tensor]:
         (a, b), source = draws, self.scene.source
         if source.brightness is not None:
-            x, y = (w * c for w, c in zip(source.frame, bright_points(source.brightness, a, b), strict=True))
+            x, y = (w * c for w, c in zip(source.frame, points_by_brightness(source.brightness, a, b), strict=True))
             return x, y
         (ex, ey), turn = source.extent, 2 * math.pi * b
         return ex * a.sqrt() * torch.cos(turn), ey * a.sqrt() * torch.sin(turn)
 
 
-def _drops(intensity: str | Distribution, cone: float, part: Tensor) -> Tensor:
+def _one_minus_cosine(intensity: str | Distribution, cone: float, part: Tensor) -> Tensor:
     """w = 1 - cos theta of the angles within which such parts of the light into a cone lie."""
     if isinstance(intensity, Distribution):
         theta = torch.from_numpy(intensity.angle_of(part.cpu().numpy(), cone)).to(part.device)
@@ -122,7 +122,7 @@ def _drops(intensity: str | Distribution, cone: float, part: Tensor) -> Tensor:
     return part * (2.0 * math.sin(cone / 2.0) ** 2)
 
 
-def _even_angle(low: Tensor, high: Tensor, width: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
+def _uniform_angle(low: Tensor, high: Tensor, width: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
     """Tangent of the angle `part` of the way between those of tangents low and high = low + width, and that way, rad.
 
     Where both angles lie on one side the tangent is counted from the nearer to 0, or the two would agree in all digits
@@ -134,7 +134,7 @@ def _even_angle(low: Tensor, high: Tensor, width: Tensor, part: Tensor) -> tuple
     return torch.where(low * high > 0, aside, torch.tan(torch.atan(low) + part * way)), way
 
 
-def _even_sine(low: Tensor, high: Tensor, width: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
+def _uniform_sine(low: Tensor, high: Tensor, width: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
     """The same for the angle whose sine lies `part` of the way between, and the sines' distance.
 
     cos^2 = cos_0^2 - 2 s_0 d - d^2 at the distance d from the nearer sine s_0: where s is close to 1, 1 - s^2 has no digits.

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from caustic_cli.optics.emission.base import Lit
+from caustic_cli.optics.emission.base import Illuminated
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.scene import Pupil, Source
@@ -44,7 +44,7 @@ class _Alone:
     pupil: Pupil
 
 
-def several(scene: Lit, kind: str, rays: int, seed: int = 0, device: str | torch.device = "cpu") -> SeveralRays:
+def several(scene: Illuminated, kind: str, rays: int, seed: int = 0, device: str | torch.device = "cpu") -> SeveralRays:
     """About `rays` rays in all."""
     from caustic_cli.optics.emission import rays_of  # noqa: PLC0415  every way of drawing is registered there by now
 

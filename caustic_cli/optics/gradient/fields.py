@@ -237,7 +237,7 @@ class SplineIndex(IndexField):
         return Extremes(float(c.min()), float(c.max()), math.hypot(*slopes))
 
 
-def field_of(lens: Lens) -> IndexField | None:
+def index_field_of(lens: Lens) -> IndexField | None:
     """The index field of a lens, z counted from its entrance; None where its index is the same everywhere."""
     gradient = lens.gradient
     if gradient is None:

@@ -278,7 +278,7 @@ def _guess(ou, ov, oz, du, dv, dz, middle, thick, c, bu, mu, wu, bv, mv, wv):
 
 
 @njit(inline="always", **FAST)
-def meet_alone(ray, limits, slopes, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y):
+def first_hit(ray, limits, slopes, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y):
     """What `meet` finds of one ray, but for a circular aperture: status, span product (-1: none), reach, dz/dx, dz/dy."""
     ou, ov, oz, du, dv, dz = ray
     slope = slopes[0] * abs(du) + slopes[1] * abs(dv)
@@ -299,7 +299,7 @@ def beyond(ou, ov, du, dv, reach, round_, scale_x, scale_y):
 
 
 @njit(entry=True, **FAST)
-def meet(
+def first_hits(
     block,
     order,
     batched,
@@ -439,7 +439,7 @@ def meet(
             r = alone[k]
             ray = (ou[r], ov[r], oz[r], du[r], dv[r], dz[r])
             met[to] = r
-            status[r], where[to], reach[r], gx[r], gy[r] = meet_alone(
+            status[r], where[to], reach[r], gx[r], gy[r] = first_hit(
                 ray, limits, slopes, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y
             )
             to += 1

@@ -116,7 +116,7 @@ class _HitsOfRays(torch.autograd.Function):
         order, used = batches.order(*rays[:2], surface.geometry[0], surface.geometry[3])
         status, *out = batches.found(len(way))
         top = high + 1e-6 * (high - low)  # above what touches the hull's top, by whatever rounding
-        batches.meet(
+        batches.first_hits(
             ALL,
             order,
             len(way) >= batches.CROWD * used,

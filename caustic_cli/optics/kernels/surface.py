@@ -113,7 +113,7 @@ def _sag(heights: Tensor) -> tuple[Tensor, float]:
     return h - middle, middle
 
 
-def next_meetings(
+def next_intersections(
     surface: FusedSurface, heights: Tensor, o, d, below: bool, round: bool, step: float, halvings: int, most: int
 ) -> Tensor:
     """The fused form of `reintersection.reference`: distances (N,) mm, 0 for none."""
@@ -192,7 +192,7 @@ class RayIntersections:
         """Coefficients of the surface, and what `batches.meet` finds."""
         c, *bounds = self._shape(heights)
         out = batches.found(len(self.t))
-        batches.meet(
+        batches.first_hits(
             ALL,
             self.order,
             self.batched,

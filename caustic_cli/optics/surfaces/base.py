@@ -76,7 +76,7 @@ class Surface(ABC, Generic[Heights]):
         """Heights of the same surface moved to where its numbers are small, and by how far it was higher, mm."""
         return heights, 0.0
 
-    def meet(self, heights: Heights, origin, direction, side: float) -> SurfaceIntersection:
+    def intersect(self, heights: Heights, origin, direction, side: float) -> SurfaceIntersection:
         """First intersections of rays (N,), mm, unit directions with side d_z > 0; differentiable by all three."""
         (device,) = {c.device for c in (*origin, *direction) if isinstance(c, Tensor)} or {torch.device("cpu")}
-        return backend_for(device).meet(self, heights, origin, direction, side)
+        return backend_for(device).intersect(self, heights, origin, direction, side)

@@ -77,11 +77,11 @@ class CutSurface(Surface[None]):
         """From the same survey."""
         return self._survey[1]
 
-    def meet(self, heights: None, origin, direction, side: float) -> SurfaceIntersection:
+    def intersect(self, heights: None, origin, direction, side: float) -> SurfaceIntersection:
         """As of any surface; rays along the axis without a search."""
         if side > 0 and not any(isinstance(c, Tensor) for c in direction) and tuple(direction) == (0.0, 0.0, 1.0):
             x, y, oz = torch.broadcast_tensors(*(torch.as_tensor(c, dtype=torch.float64) for c in origin))
             z, gx, gy = self.at(None, x, y)
             found = (x.abs() <= self.half_size[0]) & (y.abs() <= self.half_size[1]) & (z >= oz)
             return SurfaceIntersection(z - oz, gx, gy, found)
-        return super().meet(heights, origin, direction, side)
+        return super().intersect(heights, origin, direction, side)

@@ -54,7 +54,7 @@ class Cylinder(Surface[None]):
         steepest = EQUATOR / math.sqrt(1.0 - EQUATOR**2)
         return (0.0, steepest) if self.bent else (steepest, 0.0)
 
-    def meet(self, heights: None, origin, direction, side: float) -> SurfaceIntersection:
+    def intersect(self, heights: None, origin, direction, side: float) -> SurfaceIntersection:
         """The closed form, from either side."""
         k, (bo, oz), (bd, dz) = self.curvature, (origin[self.bent], origin[2]), (direction[self.bent], direction[2])
         big_f = k * (bo * bo + oz * oz) - 2.0 * oz

@@ -34,7 +34,7 @@ class Fixed(Surface[None]):
         """As of the field."""
         return self.field.slope_bounds(self.heights)
 
-    def meet(self, heights: None, origin, direction, side: float) -> SurfaceIntersection:
+    def intersect(self, heights: None, origin, direction, side: float) -> SurfaceIntersection:
         """As of the field, without derivatives by its heights."""
         device = next(c.device for c in (*origin, *direction) if isinstance(c, Tensor))
-        return self.field.meet(self.heights.to(device), origin, direction, side)
+        return self.field.intersect(self.heights.to(device), origin, direction, side)

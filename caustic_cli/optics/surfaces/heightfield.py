@@ -136,9 +136,9 @@ class HeightField(Surface[Tensor]):
         """As of any surface, by the kernels of the device's backend; linear in the heights."""
         return list(backend_for(x.device).spline_at(self, heights, x, y))
 
-    def meet(self, heights: Tensor, origin, direction, side: float) -> SurfaceIntersection:
+    def intersect(self, heights: Tensor, origin, direction, side: float) -> SurfaceIntersection:
         """As of any surface, by the kernels of the device's backend."""
-        return backend_for(heights.device).meet_spline(self, heights, origin, direction, side)
+        return backend_for(heights.device).intersect_spline(self, heights, origin, direction, side)
 
     def slope_bound(self, heights: Tensor) -> float:
         """An upper bound of |grad z|."""

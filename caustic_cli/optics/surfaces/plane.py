@@ -29,7 +29,7 @@ class Plane(Surface[None]):
         """(0, 0)."""
         return 0.0, 0.0
 
-    def meet(self, heights: None, origin, direction, side: float) -> SurfaceIntersection:
+    def intersect(self, heights: None, origin, direction, side: float) -> SurfaceIntersection:
         """t = -o_z / d_z; the slopes are the number 0."""
         like = next(c for c in (*origin, *direction) if isinstance(c, Tensor))
         oz, dz = (torch.as_tensor(c, dtype=like.dtype, device=like.device) for c in (origin[2], direction[2]))

@@ -70,7 +70,7 @@ class Sphere(Surface[None]):
         sine = min(self.reach * abs(self.curvature), EQUATOR) if math.isfinite(self.radius) else 0.0
         return (sine / math.sqrt(1.0 - sine * sine),) * 2
 
-    def meet(self, heights: None, origin, direction, side: float) -> SurfaceIntersection:
+    def intersect(self, heights: None, origin, direction, side: float) -> SurfaceIntersection:
         """The closed form, from either side."""
         (ox, oy, oz), (dx, dy, dz), k = origin, direction, self.curvature
         big_f = k * (ox * ox + oy * oy + oz * oz) - 2.0 * oz

@@ -19,12 +19,12 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.emission.coherent import Mode, edges, middle, modes, spots
+from caustic_cli.optics.emission.coherent import Mode, central_mode, modes, outermost_modes, spots
 from caustic_cli.optics.interaction import Parameters
 from caustic_cli.optics.resolution import WHITE_LINES, white
 from caustic_cli.optics.spread import Convolution, Spread, spread_of
 from caustic_cli.optics.surfaces import HeightField
-from caustic_cli.optics.system import EXIT, Placed, System
+from caustic_cli.optics.system import EXIT, PlacedScreen, System
 from caustic_cli.optics.waves.propagation import cells, phase_of, power_by_blocks, power_on_pixels
 from caustic_cli.optics.waves.receiver import Plane, Receiver, receiver_of
 from caustic_cli.optics.waves.sampling import NoWaveImage, Sampling, memory_free
@@ -48,7 +48,7 @@ ALLOWED = 0.25
 EACH, LEAST_EACH = 24, 4
 
 #: Points (N,) mm -> by how much a surface is higher there, mm.
-Departure = Callable[[Tensor, Tensor], Tensor]
+Perturbation = Callable[[Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ def wave_image(
     screen: Screen | None = None,
     finer: float = 1.0,
     dtype: torch.dtype = torch.float32,
-    departure: Departure | None = None,
+    perturbation: Perturbation | None = None,
     most: float = math.inf,
 ) -> WaveImage:
     """The wave image of a one-lens scene at heights (n, m) mm; differentiable by them.
@@ -157,17 +157,17 @@ def wave_image(
     """
     lines = lines_of(scene, field, wavelengths)
     parameters = {EXIT: heights.double()}
-    return image_of(lines, parameters, screen or scene.screen, finer=finer, dtype=dtype, departure=departure, most=most)
+    return image_of(lines, parameters, screen or scene.screen, finer=finer, dtype=dtype, perturbation=perturbation, most=most)
 
 
 def image_of(
     lines: list[Line],
     parameters: Parameters,
-    screen: Screen | Placed,
+    screen: Screen | PlacedScreen,
     *,
     finer: float = 1.0,
     dtype: torch.dtype = torch.float32,
-    departure: Departure | None = None,
+    perturbation: Perturbation | None = None,
     most: float = math.inf,
 ) -> WaveImage:
     """The wave image of lines of light on one screen, the sources of a system one by one; see `wave_image`."""
@@ -176,8 +176,8 @@ def image_of(
     for line in lines:
         by_source.setdefault(id(line.system.source), []).append(line)
     for light in by_source.values():
-        imager = Imager.of(light, parameters, receiver_of(light[0].system, screen), finer, exact, dense=departure is not None)
-        imager = replace(imager, departure=departure)
+        imager = Imager.of(light, parameters, receiver_of(light[0].system, screen), finer, exact, dense=perturbation is not None)
+        imager = replace(imager, perturbation=perturbation)
         if (samples := imager.sampling.samples * len(light) * len(imager.modes(light[0].system))) > most:
             raise NoWaveImage(
                 f"a wave image of this scene takes {samples:.2g} samples, about {samples / A_SECOND / 60:.0f} minutes on two cores;"
@@ -227,7 +227,7 @@ class Imager:
     upright: bool
     exact: bool = False
     tapered: bool = True
-    departure: Departure | None = None
+    perturbation: Perturbation | None = None
 
     @classmethod
     def of(
@@ -257,8 +257,8 @@ class Imager:
             raise NoWaveImage("a ray file says nothing of its light's phase, so that it has no wave image")
         plane, upright = receiver.plane(system.axis), receiver.across(system.axis)
         distance = distance_of(system, parameters, plane)
-        alike = [Optics(k.system, middle(system), parameters, k.length, k.label, plane, distance) for k in ways]
-        outer = edges(system)
+        alike = [Optics(k.system, central_mode(system), parameters, k.length, k.label, plane, distance) for k in ways]
+        outer = outermost_modes(system)
         surveys = [survey(replace(one, mode=mode)) for one in alike for mode in (one.mode, *outer)]
         lengths = tuple(k.behind for k in lines)
         blur = math.sqrt(max(lengths) * distance * surveys[0].magnification)
@@ -313,7 +313,7 @@ class Imager:
 
     def modes(self, system: System) -> list[Mode]:
         """Points that the source is taken as."""
-        return modes(system, self.each) if self.each else [middle(system)]
+        return modes(system, self.each) if self.each else [central_mode(system)]
 
     def optics(self, line: Line, mode: Mode, parameters: Parameters) -> Optics:
         """What makes a wavefront of one of them."""
@@ -324,11 +324,11 @@ class Imager:
         optics, s = self.optics(line, mode, parameters), self.sampling
         dx, dy = (d * n / m for d, n, m in zip(s.step, s.count, self.nodes, strict=True))
         seen = survey(optics) if self.each else self.seen
-        if self.departure is None:
+        if self.perturbation is None:
             return wavefront(optics, seen, s.low, (dx, dy), self.nodes, sensitive, self.exact)
         found = wavefront(optics, seen, s.low, (dx, dy), self.nodes, True, self.exact)
         assert found.sensitivity is not None and found.at_x is not None and found.at_y is not None
-        off = self.departure(found.at_x.reshape(-1), found.at_y.reshape(-1)).view(found.path.shape)
+        off = self.perturbation(found.at_x.reshape(-1), found.at_y.reshape(-1)).view(found.path.shape)
         return replace(found, path=found.path + found.sensitivity * off)
 
     def watched(self, front: Wavefront, length: float) -> Wavefront:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.frames import IDENTITY, Axes
-from caustic_cli.optics.system import Placed, System
+from caustic_cli.optics.system import PlacedScreen, System
 from caustic_cli.optics.waves.sampling import NoWaveImage
 from caustic_cli.scene import Screen
 
@@ -53,9 +53,9 @@ class Receiver:
     resolution: tuple[int, int]
 
     @classmethod
-    def of(cls, screen: Screen | Placed) -> Receiver:
+    def of(cls, screen: Screen | PlacedScreen) -> Receiver:
         """A scene's or a system's screen."""
-        if isinstance(screen, Placed):
+        if isinstance(screen, PlacedScreen):
             inner = screen.screen
             return cls(screen.pose.position, screen.pose.axes, inner.low, inner.pixel, inner.resolution)
         if not any(screen.tilt):
@@ -94,7 +94,7 @@ class Receiver:
         return (min(x), min(y)), (max(x), max(y))
 
 
-def receiver_of(system: System, screen: Screen | Placed) -> Receiver:
+def receiver_of(system: System, screen: Screen | PlacedScreen) -> Receiver:
     """The receiver of one of a system's screens.
 
     Raises:

@@ -30,10 +30,10 @@ from caustic_cli.optics.emission.coherent import Mode
 from caustic_cli.optics.interaction import Interaction, Parameters
 from caustic_cli.optics.system import System
 from caustic_cli.optics.trace import Tracer
-from caustic_cli.optics.waves.nodes import Refined, between, filled, interpolated, within_pupil
+from caustic_cli.optics.waves.interpolation import FineWavefront, extrapolated, interpolate, lagrange_weights, pupil_coverage
+from caustic_cli.optics.waves.ray_aiming import aimed_rays
 from caustic_cli.optics.waves.receiver import Plane, dot
 from caustic_cli.optics.waves.sampling import NoWaveImage
-from caustic_cli.optics.waves.seeking import sought
 
 #: Points along each side of the pupil from which extents are found.
 SURVEY, FEW = 65, 0.01
@@ -57,7 +57,7 @@ SOFT = 0.02
 
 
 @dataclass
-class Feet:
+class Intercepts:
     """Rays by their feet, (N,) each: x, y, path v, directions qx, qy, landing X, Y, and power, a density on the pupil."""
 
     x: Tensor
@@ -96,26 +96,26 @@ class Optics:
         rays = self.mode.through(u, v, self.system.before.index_at(self.label))
         return Tracer(self.system, rays, requests=STAGES, wavelength=self.label).last(self.parameters)
 
-    def feet(self, u: Tensor, v: Tensor) -> Feet:
+    def intercepts(self, u: Tensor, v: Tensor) -> Intercepts:
         """The same by their feet."""
         parts = []
         step = len(u) if torch.is_grad_enabled() else CHUNK
         for start in range(0, len(u), step):
-            parts.append(self.footed(self.interactions(u[start : start + step], v[start : start + step])))
+            parts.append(self.intercepts_of(self.interactions(u[start : start + step], v[start : start + step])))
         if len(parts) == 1:
             return parts[0]
-        return Feet(*(torch.cat([getattr(p, name) for p in parts]) for name in Feet.__dataclass_fields__))
+        return Intercepts(*(torch.cat([getattr(p, name) for p in parts]) for name in Intercepts.__dataclass_fields__))
 
     def landing(self, mode: Mode, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Where another mode's light lands, X, Y, mm, its power, and where it leaves the last element, mm."""
         met = replace(self, mode=mode).interactions(u, v)
-        f, state = self.footed(met), met.state.spread()
+        f, state = self.intercepts_of(met), met.state.expanded()
         x, y = (c.expand(len(u)) if isinstance(c, Tensor) else torch.full_like(u, c) for c in state.origin[:2])
         return f.big_x, f.big_y, f.power, x, y
 
-    def footed(self, m: Interaction) -> Feet:
+    def intercepts_of(self, m: Interaction) -> Intercepts:
         """Rays behind the last element by their feet."""
-        state, (e1, e2, e3) = m.state.spread(), self.plane.axes
+        state, (e1, e2, e3) = m.state.expanded(), self.plane.axes
         o, d = state.full((state.origin[0], state.origin[1], state.origin[2] + state.datum)), state.full(state.direction)
         qx, qy, qz = (sum(a * b for a, b in zip(d, e, strict=True)) for e in (e1, e2, e3))
         t = (self.plane.z - sum(a * b for a, b in zip(o, e3, strict=True))) / qz
@@ -125,7 +125,7 @@ class Optics:
         n, far = self.index, self.distance
         path = state.path + n * t - n * far * (1.0 + 0.5 * (qx * qx + qy * qy))
         power = torch.where(ahead, state.power, torch.zeros_like(state.power))
-        return Feet(big_x - far * qx, big_y - far * qy, path, qx, qy, big_x, big_y, power)
+        return Intercepts(big_x - far * qx, big_y - far * qy, path, qx, qy, big_x, big_y, power)
 
 
 def distance_of(system: System, parameters: Parameters, plane: Plane) -> float:
@@ -161,7 +161,7 @@ def survey(optics: Optics) -> Survey:
     """
     line = torch.linspace(0.0, 1.0, SURVEY, dtype=torch.float64, device=device_of(optics))
     u, v = (c.reshape(-1) for c in torch.meshgrid(line, line, indexing="ij"))
-    f = optics.feet(u, v)
+    f = optics.intercepts(u, v)
     lit = f.power > 0
     pupil = optics.mode.scene.pupil
     if pupil.round:
@@ -238,22 +238,24 @@ class Wavefront:
 
     def power(self) -> float:
         """Of all its light."""
-        lit = within_pupil(self.edge_x, self.edge_y, self.step).detach()
+        lit = pupil_coverage(self.edge_x, self.edge_y, self.step).detach()
         if self.shade is not None:
             lit = lit * self.shade
         return float((self.density.detach() * lit).sum()) * self.step[0] * self.step[1]
 
-    def on(self, low: tuple[float, float], step: tuple[float, float], count: tuple[int, int]) -> Refined:
+    def on(self, low: tuple[float, float], step: tuple[float, float], count: tuple[int, int]) -> FineWavefront:
         """The same on a finer grid; kept for the next who asks for that grid."""
         key = low, step, count
         if self._fine is not None and self._fine[0] == key:
             return self._fine[1]
-        x, y = (between(self.path.shape[k], self.low[k], self.step[k], low[k], step[k], count[k], self.path) for k in (0, 1))
+        x, y = (
+            lagrange_weights(self.path.shape[k], self.low[k], self.step[k], low[k], step[k], count[k], self.path) for k in (0, 1)
+        )
         bright = self.density > 0  # at 0 a root has no derivative
         root = torch.where(bright, self.density, torch.ones_like(self.density)).sqrt() * bright * (step[0] * step[1]) ** 0.5
-        path, root, edge_x = (interpolated(c, None, y) for c in (self.path, root, self.edge_x))
-        edge_y, shade = (None if c is None else interpolated(c, None, y) for c in (self.edge_y, self.shade))
-        fine = Refined(path, root, edge_x, edge_y, shade, step, x)
+        path, root, edge_x = (interpolate(c, None, y) for c in (self.path, root, self.edge_x))
+        edge_y, shade = (None if c is None else interpolate(c, None, y) for c in (self.edge_y, self.shade))
+        fine = FineWavefront(path, root, edge_x, edge_y, shade, step, x)
         self._fine = key, fine
         return fine
 
@@ -282,13 +284,13 @@ def wavefront(
     shape = (len(x), len(y))
     x, y = (c.reshape(-1) for c in torch.meshgrid(x, y, indexing="ij"))
     with torch.no_grad():
-        f, held, behind = sought(optics, seen, (x, y), shape, step, left)
+        f, held, behind = aimed_rays(optics, seen, (x, y), shape, step, left)
     at: dict[str, Tensor] = {}
     if sensitive:
         with torch.no_grad():
             f, at = _sensitive(optics, *held)
     elif differentiable:
-        f = optics.feet(*held)
+        f = optics.intercepts(*held)
     ex, ey = x - f.x, y - f.y
     path = f.path + optics.index * (f.qx * ex + f.qy * ey)
     dark = (f.power <= 0) | (behind & ((ex.abs() > AT_EDGE * step[0]) | (ey.abs() > AT_EDGE * step[1]))).detach()
@@ -300,7 +302,7 @@ def wavefront(
     ex, ey = ex.view(shape), ey.view(shape)
     # Where on the pupil light with its foot on the grid comes from, in mm of this plane; its stretch is the density's.
     px, py = (((h - 0.5) * c).view(shape) for h, c in zip(held, seen.scale, strict=True))
-    gone = [filled((p + e).detach() - c.view(shape), dark) + c.view(shape) for p, e, c in ((px, ex, x), (py, ey, y))]
+    gone = [extrapolated((p + e).detach() - c.view(shape), dark) + c.view(shape) for p, e, c in ((px, ex, x), (py, ey, y))]
     (pxx, pxy), (pyx, pyy) = (torch.gradient(p, spacing=step, dim=(0, 1), edge_order=2) for p in gone)
     px = torch.where(dark, gone[0], px + pxx * ex + pxy * ey)
     py = torch.where(dark, gone[1], py + pyx * ex + pyy * ey)
@@ -311,7 +313,7 @@ def wavefront(
     crossed = torch.where((squeeze.detach() <= 0) & ~dark, power.detach(), torch.zeros_like(power))
     if float(crossed.sum()) > CROSSED * float(power.detach().sum()):
         raise NoWaveImage(CROSSES)
-    power = torch.where(dark, filled(power.detach(), dark), power)
+    power = torch.where(dark, extrapolated(power.detach(), dark), power)
     by_x, by_y = torch.gradient(power.detach(), spacing=step, dim=(0, 1), edge_order=2)
     density = (power + torch.where(dark, torch.zeros_like(ex), by_x * ex + by_y * ey)).clamp_min(0.0) * squeeze.clamp_min(0.0)
     rx, ry = (abs(s) / 2.0 for s in seen.scale)
@@ -331,17 +333,17 @@ def wavefront(
     )
 
 
-def _sensitive(optics: Optics, u: Tensor, v: Tensor) -> tuple[Feet, dict[str, Tensor]]:
+def _sensitive(optics: Optics, u: Tensor, v: Tensor) -> tuple[Intercepts, dict[str, Tensor]]:
     """Rays by their feet, with where they meet the last surface and how its height changes their path."""
-    feet, found = [], []
+    rays, found = [], []
     for start in range(0, len(u), CHUNK):
         m = optics.interactions(u[start : start + CHUNK], v[start : start + CHUNK])
-        feet.append(optics.footed(m))
+        rays.append(optics.intercepts_of(m))
         into = m.incoming[2]
         normal = m.element.pose.axes[2]
         out = sum(c * a for c, a in zip(m.state.full(m.state.direction), normal, strict=True))
         found.append((m.n_in * into - m.n_out * out, *(c.expand(out.shape) for c in m.local[:2])))
-    f = Feet(*(torch.cat([getattr(p, name) for p in feet]) for name in Feet.__dataclass_fields__))
+    f = Intercepts(*(torch.cat([getattr(p, name) for p in rays]) for name in Intercepts.__dataclass_fields__))
     return f, dict(zip(("sensitivity", "at_x", "at_y"), (torch.cat(c) for c in zip(*found, strict=True)), strict=True))
 
 

@@ -17,7 +17,7 @@ from numba import cuda, float64, int64
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from caustic_cli.optics.kernels import axial_refraction, filter_weights, pixels, plane
+from caustic_cli.optics.kernels import axial_refraction, filter_weights, fused, pixels
 from caustic_cli.optics.kernels import oblique_refraction as oblique
 from caustic_cli.optics.kernels.arguments import Exit, Frame, Splat
 from caustic_cli.optics.kernels.axial_refraction import (
@@ -45,13 +45,13 @@ from caustic_cli.optics.kernels.axial_refraction import (
 from caustic_cli.optics.kernels.cuda import sums
 from caustic_cli.optics.kernels.cuda.launch import device, start
 from caustic_cli.optics.kernels.cuda.scatter import scatter, scatter_tangent, size_of_tangent, units
+from caustic_cli.optics.kernels.fused import COLUMNS, FRESNEL, LEAVING, MISSED, OFF_SCREEN, REFLECTED
 from caustic_cli.optics.kernels.oblique_refraction import MISSED_POWER
-from caustic_cli.optics.kernels.plane import COLUMNS, FRESNEL, LEAVING, MISSED, OFF_SCREEN, REFLECTED
 from caustic_cli.optics.reconstruction import Filter, padding
 from caustic_cli.scene import Screen
 
-limits, share, gather = device(pixels.limits), device(plane.share), device(plane.gather)
-carry, pull_axial, push_axial = device(plane.carry), device(axial_refraction.pull), device(axial_refraction.push)
+limits, share, gather = device(pixels.limits), device(fused.share), device(fused.gather)
+carry, pull_axial, push_axial = device(fused.carry), device(axial_refraction.pull), device(axial_refraction.push)
 aim_batch, pull_batch, push_oblique = device(oblique._aim), device(oblique._pull), device(oblique.push)
 VECTORS = axial_refraction.VECTORS + axial_refraction.SCRATCH
 

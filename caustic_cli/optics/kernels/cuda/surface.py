@@ -25,7 +25,7 @@ from caustic_cli.optics.kernels.cuda.launch import device, start
 from caustic_cli.optics.kernels.intersect import HIT
 
 piece, jet, push_powers, value_at = (device(f) for f in (spline.piece, spline.jet, spline.push_powers, intersect._value))
-meet_alone, beyond = device(batches.meet_alone), device(batches.beyond)
+first_hit, beyond = device(batches.first_hit), device(batches.beyond)
 pull_alone, push_alone = device(batches.pull_alone), device(batches.push_alone)
 enter_alone, units = device(ray_intersections.enter_alone), device(sums.units)
 
@@ -188,7 +188,7 @@ class _AtPoints(torch.autograd.Function):
 
 
 @cuda.jit
-def _meet(rays, bounds, radius, geometry, scale, c, out, where):
+def _first_hits(rays, bounds, radius, geometry, scale, c, out, where):
     ox, oy, oz, dx, dy, dz = rays
     (bu, mu, wu, bv, mv, wv), (scale_x, scale_y), (t, gx, gy) = geometry, scale, out
     low, high, slope_u, slope_v, floor = bounds[0], bounds[1], bounds[2], bounds[3], bounds[4]
@@ -196,7 +196,7 @@ def _meet(rays, bounds, radius, geometry, scale, c, out, where):
         du, dv = dx[k] * scale_x, dy[k] * scale_y
         ray = (ox[k] * scale_x + 0.5, oy[k] * scale_y + 0.5, oz[k], du, dv, dz[k])
         ou, ov, up, way = enter_alone(ray, floor)
-        status, here, reach, zx, zy = meet_alone(
+        status, here, reach, zx, zy = first_hit(
             (ou, ov, up, du, dv, dz[k]), (low, high), (slope_u, slope_v), c, bu, mu, wu, bv, mv, wv, scale_x, scale_y
         )
         found = status == HIT and way + reach > 0.0 and not beyond(ou, ov, du, dv, reach, radius, scale_x, scale_y)
@@ -307,7 +307,7 @@ class _Hits(torch.autograd.Function):
         rays = tuple(c.detach().contiguous() for c in (ox, oy, oz - middle, dx, dy, dz))
         out, where = tuple(torch.empty_like(ox) for _ in range(3)), torch.empty(ox.shape, dtype=torch.int64, device=ox.device)
         bounds, c = _bounds(surface, h), surface.coefficients(h)
-        start(_meet, len(ox), rays, bounds, radius, surface.geometry, surface.scale, c, out, where)
+        start(_first_hits, len(ox), rays, bounds, radius, surface.geometry, surface.scale, c, out, where)
         return *out, where >= 0, where
 
     @staticmethod

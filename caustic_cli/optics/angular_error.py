@@ -12,7 +12,7 @@ from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Scene
 
 
-def misdirection(traced: Tracer, state: RayState, scene: Scene) -> Tensor:
+def squared_angular_error(traced: Tracer, state: RayState, scene: Scene) -> Tensor:
     """Sum over rays behind the lens of power times the square of the tangent of their angle to the way they should go."""
     ray = traced.onto(state, scene.screen)
     dz = torch.as_tensor(ray.direction[2])

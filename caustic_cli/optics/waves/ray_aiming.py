@@ -10,7 +10,7 @@ from torch import Tensor
 TRIES, AT_EDGES, INWARDS = 16, 10, 0.02
 
 
-def sought(optics, seen, at: tuple[Tensor, Tensor], shape: tuple[int, int], step: tuple[float, float], left: float) -> tuple:
+def aimed_rays(optics, seen, at: tuple[Tensor, Tensor], shape: tuple[int, int], step: tuple[float, float], left: float) -> tuple:
     """Rays (`Feet`) of an `Optics` surveyed as `seen`, with their feet at points (N,) each; where they pass the pupil; and which of
     them stand at the edge of what is dark; left: see `_left`.
 
@@ -24,7 +24,7 @@ def sought(optics, seen, at: tuple[Tensor, Tensor], shape: tuple[int, int], step
     held = u.clamp(0.0, 1.0), v.clamp(0.0, 1.0)
     for k in range(TRIES):
         hu, hv = u.clamp(0.0, 1.0), v.clamp(0.0, 1.0)
-        f = optics.feet(hu, hv)
+        f = optics.intercepts(hu, hv)
         lit = f.power > 0
         found, behind = found | lit, behind | ~lit
         held_u, held_v = (torch.where(lit | ~found, h, before) for h, before in zip((hu, hv), held, strict=True))
@@ -38,7 +38,7 @@ def sought(optics, seen, at: tuple[Tensor, Tensor], shape: tuple[int, int], step
             for a, h, b, m in zip(ahead, (hu, hv), held, middle, strict=True)
         )
     if bool(behind.any()):
-        f = optics.feet(*held)
+        f = optics.intercepts(*held)
     return f, held, behind
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.kernels import axial_refraction, blocks, filter_weights, pixels, plane, points
+from caustic_cli.optics.kernels import axial_refraction, blocks, filter_weights, fused, pixels, random_points
 from caustic_cli.optics.kernels.arguments import Exit, Frame, Splat
 from caustic_cli.optics.kernels.banded import AlongV
 from caustic_cli.optics.kernels.surface import FusedSurface, RayIntersections, scattered_surface
@@ -158,15 +158,15 @@ def _splat(
     (nx, ny), (rx, ry) = screen.resolution, filter.reach
     padded = padded[:, : ny + 4 * ry]  # beyond lies what rounds the scatter's steps up to four pixels
     image = padded[2 * rx : 2 * rx + nx, 2 * ry : 2 * ry + ny]
-    lost = {"missed_surface": ledger[plane.MISSED]} if oblique else {}
+    lost = {"missed_surface": ledger[fused.MISSED]} if oblique else {}
     return (
         image,
         leaving,
         lost
         | {
-            "fresnel": ledger[plane.FRESNEL],
-            "total_internal_reflection": ledger[plane.REFLECTED],
-            "off_screen": ledger[plane.OFF_SCREEN] + padding(padded.detach(), filter.reach),
+            "fresnel": ledger[fused.FRESNEL],
+            "total_internal_reflection": ledger[fused.REFLECTED],
+            "off_screen": ledger[fused.OFF_SCREEN] + padding(padded.detach(), filter.reach),
         },
     )
 
@@ -248,10 +248,10 @@ class _Image(torch.autograd.Function):
     @staticmethod
     def forward(net: Tensor, net_x: Tensor, net_y: Tensor, rows: tuple, apart: bool, arguments: tuple, workspace: _Workspace):
         images, scratch = _images(arguments, workspace)
-        ledgers = np.empty((len(images), plane.COLUMNS))
-        plane.forward(ALL, images, ledgers, scratch, *rows, *_arrays(net, net_x, net_y), *arguments)
+        ledgers = np.empty((len(images), fused.COLUMNS))
+        fused.forward(ALL, images, ledgers, scratch, *rows, *_arrays(net, net_x, net_y), *arguments)
         ledger = ledgers.sum(0)
-        leaving = torch.tensor(ledger[plane.LEAVING], dtype=torch.float64)
+        leaving = torch.tensor(ledger[fused.LEAVING], dtype=torch.float64)
         return torch.from_numpy(pixels.total(images)), leaving, torch.from_numpy(ledger)
 
     @staticmethod
@@ -274,7 +274,7 @@ class _Image(torch.autograd.Function):
         along = [torch.zeros_like(n) if t is None else t for t, n in zip(tangents[:3], nets, strict=True)]
         images, scratch = _images(ctx.arguments, ctx.workspace)
         leaving = np.empty(len(images))
-        plane.tangent(ALL, *_arrays(*along), images, leaving, scratch, *ctx.rows, *_arrays(*nets), *ctx.arguments)
+        fused.tangent(ALL, *_arrays(*along), images, leaving, scratch, *ctx.rows, *_arrays(*nets), *ctx.arguments)
         return torch.from_numpy(pixels.total(images)), torch.tensor(leaving.sum(), dtype=torch.float64), None
 
 
@@ -284,7 +284,7 @@ def _adjoint(
     """Derivatives by the three nets (n, b), a sum for each block: (3, blocks, n, b), or (3, 1, n, b) with `apart`."""
     scratch, shape = _images(arguments, workspace)[1], nets[0].shape
     sums = np.empty((3, 1, *shape)) if apart else workspace("nets", 3, len(scratch), *shape)
-    plane.backward(ALL, by_image.contiguous().numpy(), by_leaving, apart, sums, scratch, *rows, *_arrays(*nets), *arguments)
+    fused.backward(ALL, by_image.contiguous().numpy(), by_leaving, apart, sums, scratch, *rows, *_arrays(*nets), *arguments)
     return sums
 
 
@@ -293,7 +293,7 @@ def _images(arguments: tuple, workspace: _Workspace) -> tuple[np.ndarray, np.nda
     x, *_, frame, splat, _ = arguments
     count, nx, ny = blocks(), frame.pixels_x + 2 * (splat.size_x - 1), frame.pixels_y + 2 * (splat.size_y - 1)
     images = workspace("images", count, nx, ny + -splat.size_y % 4)
-    return images, workspace("scratch", count, plane.scratch_rows(splat), x.shape[1])
+    return images, workspace("scratch", count, fused.scratch_rows(splat), x.shape[1])
 
 
 def _arrays(*tensors: Tensor) -> list[np.ndarray]:
@@ -304,5 +304,5 @@ def scattered_points(keys, salts, start: int, stop: int, nu: int, nv: int, strat
     """The points u, v of rays start..stop of a stratified or uniform `Sampler`: (stop - start,) float64 each."""
     blocks()
     keys, salts = (tuple(np.uint64(k) for k in pair) for pair in (keys, salts))
-    u, v = (torch.from_numpy(a) for a in points.scatter(keys, salts, start, stop, nu, nv, stratified))
+    u, v = (torch.from_numpy(a) for a in random_points.scatter(keys, salts, start, stop, nu, nv, stratified))
     return u, v

@@ -29,7 +29,7 @@ TOLERANCE = 1e-7
 ON_SURFACE, NEWTON, GUESSES = 1e-12, 12, 12
 
 
-class Crossing(NamedTuple):
+class Transfer(NamedTuple):
     """Rays at the next surface.
 
     point, direction: in the medium's frame, three (N,) each, mm and unit; n: there; path, length: optical and geometric, mm;
@@ -52,7 +52,7 @@ def index_at(march, field: IndexField, coefficients: Tensor | None, point) -> Te
     return march(field, coefficients, point, (zero, zero, zero), one, 1, 2).length
 
 
-def cross(
+def transfer(
     march: Callable[..., Flow],
     field: IndexField,
     coefficients: Tensor | None,
@@ -64,7 +64,7 @@ def cross(
     side: float,
     steps: int | None = None,
     order: int = ORDER,
-) -> Crossing:
+) -> Transfer:
     """Rays to a surface through a field.
 
     Args:
@@ -128,7 +128,7 @@ def cross(
     end = march(field, coefficients, arrived.point, arrived.momentum, delta, 1, order)
     _, _, slopes, within = above(end)
     norm = (end.momentum[0] ** 2 + end.momentum[1] ** 2 + end.momentum[2] ** 2).sqrt()
-    return Crossing(
+    return Transfer(
         end.point,
         tuple(c / norm for c in end.momentum),
         norm,

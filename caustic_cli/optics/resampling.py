@@ -22,12 +22,12 @@ def overlap(cells: np.ndarray, pixels: np.ndarray) -> sparse.csr_array:
     return sparse.coo_array((value, (row[inside], column[inside])), shape=(rows, columns)).tocsr()
 
 
-def averaged(image: np.ndarray, cells: Edges, pixels: Edges) -> np.ndarray:
+def area_average(image: np.ndarray, cells: Edges, pixels: Edges) -> np.ndarray:
     """Averages (c, d) over pixels of what is constant on cells, (a, b), and 0 beside them; edges along each axis, ascending, mm."""
     across, along = (overlap(*edges) for edges in zip(cells, pixels, strict=True))
     return np.ascontiguousarray((along @ (across @ image).T).T)
 
 
-def shared_out(image: np.ndarray, resolution: tuple[int, int]) -> np.ndarray:
+def resampled(image: np.ndarray, resolution: tuple[int, int]) -> np.ndarray:
     """The same over as many other equal cells of the same whole, `resolution` in number."""
-    return averaged(image, *([np.linspace(0.0, 1.0, n + 1) for n in shape] for shape in (image.shape, resolution)))
+    return area_average(image, *([np.linspace(0.0, 1.0, n + 1) for n in shape] for shape in (image.shape, resolution)))

@@ -14,7 +14,7 @@ POINTS = 6
 BLOCK = 256
 
 
-def between(nodes: int, low: float, step: float, fine_low: float, fine_step: float, count: int, like: Tensor):
+def lagrange_weights(nodes: int, low: float, step: float, fine_low: float, fine_step: float, count: int, like: Tensor):
     """First node and weights (count, POINTS) of Lagrange's interpolation at finer cells; None where they are the nodes."""
     if nodes == count:
         return None
@@ -25,7 +25,7 @@ def between(nodes: int, low: float, step: float, fine_low: float, fine_step: flo
     return first, weights
 
 
-def _mixed(c: Tensor, first: Tensor, weights: Tensor) -> Tensor:
+def _combined_rows(c: Tensor, first: Tensor, weights: Tensor) -> Tensor:
     """Rows of c (n, m) in these mixtures (count, m), a block of them at a time by a matrix of the few rows that it needs."""
     found = []
     for start in range(0, len(first), BLOCK):
@@ -44,16 +44,16 @@ def _product(factors: list[Tensor]) -> Tensor:
     return found
 
 
-def interpolated(c: Tensor, along_x, along_y) -> Tensor:
+def interpolate(c: Tensor, along_x, along_y) -> Tensor:
     """A function (n, m) at finer rows and columns, by what `between` gives for each, None for the nodes themselves."""
     if along_x is not None:
-        c = _mixed(c, *along_x)
+        c = _combined_rows(c, *along_x)
     if along_y is not None:
-        c = _mixed(c.T, *along_y).T.contiguous()
+        c = _combined_rows(c.T, *along_y).T.contiguous()
     return c
 
 
-def filled(c: Tensor, dark: Tensor) -> Tensor:
+def extrapolated(c: Tensor, dark: Tensor) -> Tensor:
     """A function (n, m) with what it is beside the dark in a few cells of that, 0 beyond."""
     if not bool(dark.any()):
         return c
@@ -67,7 +67,7 @@ def filled(c: Tensor, dark: Tensor) -> Tensor:
 
 
 @dataclass
-class Refined:
+class FineWavefront:
     """A wavefront on a finer grid: its columns are there, rows are made when asked for.
 
     root: of the power of a whole cell; shade: see `Wavefront`; step: of the finer grid; along_x: of rows, see `between`.
@@ -83,7 +83,7 @@ class Refined:
 
     def rows(self, part: slice = slice(None)) -> tuple[Tensor, Tensor, Tensor]:
         """Path, mm; root of the power of a whole cell; part of it that is lit: (rows, m) float64 each."""
-        lit = within_pupil(self._at(self.edge_x, part), None if self.edge_y is None else self._at(self.edge_y, part), self.step)
+        lit = pupil_coverage(self._at(self.edge_x, part), None if self.edge_y is None else self._at(self.edge_y, part), self.step)
         if self.shade is not None:
             lit = lit * self._at(self.shade, part).clamp(0.0, 1.0)
         return self._at(self.path, part), self._at(self.root, part), lit
@@ -95,10 +95,10 @@ class Refined:
         return path, root * lit
 
     def _at(self, c: Tensor, part: slice) -> Tensor:
-        return c[part] if self.along_x is None else interpolated(c, tuple(t[part] for t in self.along_x), None)
+        return c[part] if self.along_x is None else interpolate(c, tuple(t[part] for t in self.along_x), None)
 
 
-def within_pupil(edge_x: Tensor, edge_y: Tensor | None, step: tuple[float, float]) -> Tensor:
+def pupil_coverage(edge_x: Tensor, edge_y: Tensor | None, step: tuple[float, float]) -> Tensor:
     """Part of each cell that lies inside the pupil's edges."""
     if edge_y is None:
         return (edge_x / (0.5 * (step[0] + step[1])) + 0.5).clamp(0.0, 1.0)
