@@ -22,9 +22,9 @@ from caustic_cli.optics.gradient import (
     Radial,
     Selfoc,
     SplineIndex,
-    transfer,
     flow,
     steps_for,
+    transfer,
 )
 from caustic_cli.optics.gradient.integrator import WEIGHTS, drift, kick
 from caustic_cli.optics.rays import RayState

@@ -5,11 +5,11 @@ ratio eta = n_in / n_out and c = d . N, the refracted unit direction is
 
     t = eta d + gamma N,    gamma = (1 - eta^2) / (s + eta c),    s = t . N = sqrt(|N|^2 (1 - eta^2) + eta^2 c^2),
 
-Snell's law (eq. 2.1.10) without normalising anything; a negative radicand is total internal reflection.  gamma is
-(s - eta c) / |N|^2 without its cancellation: an index close to 1 bends light by n - 1, of which a difference leaves nothing.
+Snell's law (eq. 2.1.10) without any normalisation; a negative radicand means total internal reflection.  This form of gamma avoids
+the cancellation in (s - eta c) / |N|^2 for indices close to 1.
 For a plane wave along +z inside a lens it is the closed form of 3.2 (erratum E1) with s = S.
 
-Light that meets the surface from above (side -1) does what light from below does at the surface's mirror image in z = 0.
+Light from above the surface (side -1) is treated as light from below at the surface mirrored in z = 0.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from caustic_cli.optics.tolerances import CRITICAL
 
 
 class OutgoingRays(NamedTuple):
-    """Rays as they leave a surface: unit directions, the power they carry on, and whether they leave at all (False: total internal
-    reflection, power 0, a direction that is finite and means nothing)."""
+    """Rays behind a surface: unit directions, power, and whether they are transmitted (False: total internal reflection, with power
+    0 and a finite but meaningless direction).  For a mirror all are."""
 
     direction: tuple
     power: Tensor
@@ -42,7 +42,7 @@ def interact(
         slopes: z_x, z_y at the hits, tensors or plain floats.
         power: (N,).
         eta: n_in / n_out, a number, or (N,) of media whose index varies.
-        reflects: a mirror, which keeps all power; otherwise the part is refracted that `fresnel` leaves.
+        reflects: whether the surface is a mirror, of reflectance 1; otherwise light is refracted, less the Fresnel loss.
         fresnel: none, schlick or exact.
         polarised: unit vectors of the field of linearly polarised light, as `direction`; None for unpolarised light.
         side: +1 for rays from below the surface, -1 from above.
@@ -106,13 +106,13 @@ def refract(d, slope_x: Tensor, slope_y: Tensor, eta: float | Tensor):
         eta: n_in / n_out.
 
     Returns:
-        t: (t_x, t_y, t_z) unit directions (finite, and meaningless, where reflected),
+        t: (t_x, t_y, t_z) unit directions (finite but meaningless where totally reflected),
         passes: bool, False where the ray is totally reflected,
         c, s: d . N and t . N, both cosines times |N|, for the Fresnel terms.
     """
     norm2 = 1.0 + slope_x * slope_x + slope_y * slope_y
     c = d[2] - d[0] * slope_x - d[1] * slope_y
-    # |N|^2 (1 - eta^2) + eta^2 c^2, with the constant part 1 split off where c = d_z = 1 so that nothing cancels
+    # |N|^2 (1 - eta^2) + eta^2 c^2 in a form without cancellation where c = d_z = 1
     radicand = norm2 + (eta * eta) * (c * c - norm2)
     passes = radicand > CRITICAL * norm2
     s = torch.where(passes, radicand, torch.ones_like(radicand)).sqrt()  # a masked argument keeps NaN out of gradients
@@ -121,20 +121,20 @@ def refract(d, slope_x: Tensor, slope_y: Tensor, eta: float | Tensor):
 
 
 def reflect(d, slope_x: Tensor, slope_y: Tensor):
-    """Unit directions reflected at a height field, d - 2 (d . N) / |N|^2 N: Snell's law with index -1.  And c = d . N."""
+    """Unit directions reflected at a height field, d - 2 (d . N) / |N|^2 N (Snell's law with index -1), and c = d . N."""
     c = d[2] - d[0] * slope_x - d[1] * slope_y
     twice = 2.0 * c / (1.0 + slope_x * slope_x + slope_y * slope_y)
     return (d[0] + twice * slope_x, d[1] + twice * slope_y, d[2] - twice), c
 
 
 def reflectances(c, s, eta: float | Tensor):
-    """(R_s, R_p), parts of s- and p-polarised power reflected, from c and s of `refract`: r_s^2, r_p^2 of `reflectance`."""
+    """Fresnel reflectances (R_s, R_p) for s- and p-polarised light, from c and s of `refract`: r_s^2, r_p^2 of `reflectance`."""
     rs, rp = (eta * c - s) / (eta * c + s), (c - eta * s) / (c + eta * s)
     return rs * rs, rp * rp
 
 
 def reflectance(kind: str, c, s, eta: float | Tensor):
-    """Part of the power reflected, from c and s of `refract` (any common factor): none, schlick or exact (unpolarised).
+    """Reflectance from c and s of `refract` (up to a common factor); kind: none, schlick or exact, for unpolarised light.
 
     Exact: (r_s^2 + r_p^2) / 2 with r_s = (eta c - s) / (eta c + s), r_p = (c - eta s) / (c + eta s).
     Schlick: R0 + (1 - R0) (1 - cos)^5 with the larger of the two angles, eqs. 2.1.13 and 2.1.14; it needs true cosines.

@@ -1,4 +1,4 @@
-"""Effects: one file each, here in the sequence in which light meets them."""
+"""Physical effects, one file each; listed in the order in which they act on the light."""
 
 from __future__ import annotations
 

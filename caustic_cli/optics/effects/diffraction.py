@@ -1,6 +1,6 @@
-"""Diffraction: light is a wave, and its image is taken from fields instead of rays (`optics.waves`).
+"""Diffraction: a wave image, computed from the field by scalar diffraction theory (`optics.waves`).
 
-It changes no ray: the wave image stands beside the ray image, which is that of no wavelength at all.
+It does not change rays: the wave image is an additional result beside the ray image, the limit of vanishing wavelength.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from caustic_cli.scene import Scene
 
 
 class Diffraction(Effect):
-    """Left out, there is no wave image."""
+    """Without it there is no wave image."""
 
     name = "diffraction"
     waves = True
 
     def decide(self, scene: Scene, bounds) -> Decision:
-        """By what it adds to the blur of source and pixel."""
+        """Needed if it increases the blur of source and pixel noticeably."""
         r = bounds.resolution
         if scene.source.rays is not None:
             return Decision(self.name, False, "a ray file says nothing of its light's phase", r.widened, WIDENED)

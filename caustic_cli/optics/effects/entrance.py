@@ -10,12 +10,12 @@ from caustic_cli.scene import Scene
 
 
 class Entrance(GeneralRayEffect):
-    """Left out, rays enter the glass unbent, with Fresnel's losses."""
+    """Without it rays enter the glass undeviated, with Fresnel losses."""
 
     name = "entrance"
 
     def decide(self, scene: Scene, b) -> Decision:
-        """On where rays come oblique."""
+        """Needed at oblique incidence."""
         angle, collimated = math.degrees(b.incidence), scene.source.collimated
         if scene.two_sided:
             return Decision(self.name, True, "the entrance is free-form", fixed=True)
@@ -27,15 +27,15 @@ class Entrance(GeneralRayEffect):
         return Decision(self.name, True, f"rays meet the entrance at up to {angle:.3g} degrees", angle, 0.0)
 
     def action(self, system, requests: Requests) -> Action | None:
-        """Keeps directions at a flat first element."""
+        """The action that omits refraction at a plane first element, on request."""
         first = system.elements[0]
         return NoRefraction() if self.name in requests.off and first.surface.flat and not first.reflects else None
 
 
 class NoRefraction(Action):
-    """Straight through the first element."""
+    """Undeviated transmission through the first element."""
 
     def after_interaction(self, m) -> None:
-        """Directions as they came."""
+        """Restore the incident directions."""
         if m.index == 0 and m.forward:
             m.state.direction = rotate_to_global(m.element.pose, m.incoming)

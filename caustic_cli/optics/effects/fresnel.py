@@ -1,4 +1,4 @@
-"""Fresnel's losses by reflection at every surface of glass."""
+"""Fresnel reflection losses at glass surfaces."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from caustic_cli.scene import Scene
 
 
 class Fresnel(Effect):
-    """Left out, surfaces are perfectly coated."""
+    """Without it surfaces have perfect anti-reflection coatings."""
 
     name = "fresnel"
 
     def decide(self, scene: Scene, b) -> Decision:
-        """On unless the scene says otherwise."""
+        """Needed unless the scene has fresnel = none."""
         if scene.lens.mirror:
             return Decision(self.name, False, "a mirror is taken to reflect all light", present=False)
         if scene.lens.fresnel == "none":
@@ -23,9 +23,9 @@ class Fresnel(Effect):
         return Decision(self.name, True, f"each surface reflects {normal:.2%} of normal light; {scene.lens.fresnel}", normal, 0.0)
 
     def without(self, scene: Scene) -> Scene:
-        """Perfectly coated."""
+        """With perfect anti-reflection coatings."""
         return scene if scene.lens.fresnel == "none" else replace(scene, lens=replace(scene.lens, fresnel="none"))
 
     def including(self, scene: Scene) -> Scene:
-        """By the exact formulas."""
+        """With the exact Fresnel equations."""
         return replace(scene, lens=replace(scene.lens, fresnel="exact")) if scene.lens.fresnel == "none" else scene

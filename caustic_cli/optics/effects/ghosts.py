@@ -1,9 +1,9 @@
-"""Ghosts: light reflected at one surface and again at one before it, which then goes through after all.
+"""Ghost images: light that is reflected at two surfaces before it leaves the system.
 
-The thesis takes it for negligible; here it is measured.  Light that is reflected twice is followed, for every pair of refracting
-elements i < j: returned at j, back through those between, returned at i, and on through all that follow.  Each reflects as
-Fresnel's or Schlick's formula says, for unpolarised light.  Microfacets are met on the straight way only.  What a ghost carries
-out of the system is taken off what had been lost at j.
+The thesis neglects it; here it is computed.  For every pair of refracting elements i < j the light reflected at j is traced
+backwards through the elements in between, reflected at i, and traced forwards through all that follow.  Reflectances follow the
+Fresnel equations or Schlick's approximation for unpolarised light.  Roughness acts on direct light only.  The power of a ghost
+behind the system is subtracted from the losses at j.
 """
 
 from __future__ import annotations
@@ -18,12 +18,13 @@ from caustic_cli.scene import Scene
 
 
 class Ghosts(Effect):
-    """Left out, light that is reflected inside is lost."""
+    """Without it internally reflected light is lost."""
 
     name = "ghosts"
 
     def decide(self, scene: Scene, b) -> Decision:
-        """By a bound of the power that is reflected twice, and by what its image, should that be small and bright, adds."""
+        """By a bound of the power that is reflected twice, and by an estimate of its contribution to the image, where it may
+        focus."""
         if scene.lens.mirror:
             return Decision(self.name, False, "there is no glass", present=False)
         amount = max(b.ghost, b.ghost_error)
@@ -36,16 +37,16 @@ class Ghosts(Effect):
         return Decision(self.name, True, f"up to {b.ghost:.2%} of the power may be reflected twice", amount, NEGLIGIBLE)
 
     def request(self, scene: Scene, on: bool, bounds) -> Requests:
-        """To trace them."""
+        """A request to trace them."""
         return Requests.to(self.name) if on and not scene.lens.mirror else NO_REQUESTS
 
     def action(self, system, requests: Requests) -> Action | None:
-        """Between refracting elements."""
+        """The action, if requested and if there are two refracting elements."""
         return DoubleReflections() if self.name in requests.on and sum(not e.reflects for e in system.elements) > 1 else None
 
 
 class DoubleReflections(Action):
-    """One bundle of rays for each pair of elements."""
+    """A set of stray rays for each pair of elements."""
 
     stray = True
 
@@ -58,7 +59,7 @@ class DoubleReflections(Action):
                 continue
             totally = ~m.passes
             for i in range(j - 1, -1, -1):
-                if elements[i].reflects:  # a folded path is not gone back over
+                if elements[i].reflects:  # ghosts between elements separated by a mirror are not traced
                     break
                 ghost = replace(m.returned(), lost={}, status=None, polarised=None)
                 for k in range(j - 1, i, -1):

@@ -1,4 +1,4 @@
-"""The point where a ray meets the free-form surface, which is not the one above the point where it entered."""
+"""Intersection of oblique rays with the free-form surface."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from caustic_cli.scene import Scene
 
 
 class Intersection(GeneralRayEffect):
-    """Left out, rays leave where they cross the surface's mean height."""
+    """Without it rays leave at their intersection with the plane of mean height."""
 
     name = "intersection"
 
     def decide(self, scene: Scene, b) -> Decision:
-        """On where rays run oblique inside the lens."""
+        """Needed for oblique rays inside the lens."""
         if scene.axial:
             return Decision(self.name, False, "rays of a plane wave are sampled on the surface itself", 0.0, 0.0)
         angle = math.degrees(b.inside)
         return Decision(self.name, True, f"rays cross the lens at up to {angle:.3g} degrees", angle, 0.0)
 
     def action(self, system, requests: Requests) -> Action | None:
-        """Meets the mean plane instead."""
+        """The action that uses the mean plane instead, on request."""
         return MeanPlane() if self.name in requests.off else None
 
 
 class MeanPlane(Action):
-    """A B-spline met where rays cross its mean height, with the height and the slopes that it has there."""
+    """The approximation by the plane of mean height: the surface's height and slopes at the intersection with that plane."""
 
     def intersect(self, m, origin, direction, heights: Tensor | None) -> SurfaceIntersection | None:
-        """The height there is what the ray goes on from; no time passes between it and the mean plane."""
+        """Intersect the mean plane; the ray continues from the surface's height there, without additional path length."""
         surface = m.element.surface
-        if not isinstance(surface, HeightField) or m.state.sample is not None:  # a plane wave's rays stand on the surface itself
+        if not isinstance(surface, HeightField) or m.state.sample is not None:  # rays of a plane wave lie on the surface already
             return None
         assert heights is not None
         sag, mean = surface.centred(heights)
@@ -49,7 +49,7 @@ class MeanPlane(Action):
         return SurfaceIntersection(t, gx, gy, found)
 
     def before_interaction(self, m) -> None:
-        """Onto the surface above or below."""
+        """Shift the points from the mean plane to the surface."""
         if m.lift is not None:
             x, y, z = m.state.origin
             m.state.origin = (x, y, z + m.lift)

@@ -1,4 +1,4 @@
-"""A free-form surface that reflects."""
+"""Reflection by a free-form mirror."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from caustic_cli.scene import Scene
 
 
 class Mirror(Effect):
-    """Part of what the element is: it cannot be left out."""
+    """It cannot be omitted."""
 
     name = "mirror"
 
     def decide(self, scene: Scene, bounds) -> Decision:
-        """As the scene says."""
+        """Given by the scene."""
         if scene.lens.mirror:
             return Decision(self.name, True, "the surface is a mirror", fixed=True)
         return Decision(self.name, False, "the surface is glass", fixed=True, present=False)
 
     def probe(self, scene: Scene, heights: Tensor) -> Probe | None:
-        """The same surface as a mirror, with the screen as far before it; a lens whose index is a volume has none such."""
+        """The same surface as a mirror, with the screen at the same distance in front of it; None for a gradient-index lens."""
         if scene.lens.gradient is not None:
             return None
         z = 2.0 * float(heights.mean()) - scene.screen.z

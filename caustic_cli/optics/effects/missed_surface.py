@@ -1,4 +1,4 @@
-"""Rays that leave the lens by its side before they meet the exit."""
+"""Vignetting: rays that leave the aperture before they reach the exit, or miss an aperture."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from caustic_cli.scene import Scene
 
 
 class MissedSurface(Effect):
-    """A mask that every path has."""
+    """It is always evaluated, as a mask."""
 
     name = "missed-surface"
     free = True
 
     def decide(self, scene: Scene, b) -> Decision:
-        """By how far rays get at the surface's greatest height."""
+        """By the bound of the rays' distance from the axis at the surface's greatest height."""
         if scene.elements:
             return Decision(self.name, True, "the apertures of other elements may stop light", fixed=True)
         if scene.axial:

@@ -1,4 +1,4 @@
-"""Linear polarisation: what a surface reflects of s- and of p-polarised light, see `optics.polarisation`."""
+"""Polarisation: different Fresnel reflectances of s- and p-polarised light, see `optics.polarisation`."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from caustic_cli.scene import Scene
 
 
 class Polarisation(Effect):
-    """Left out, every surface reflects the mean of s and p."""
+    """Without it every surface has the mean reflectance of s and p."""
 
     name = "polarisation"
 
     def decide(self, scene: Scene, b) -> Decision:
-        """On for polarised light, and where what the entrance polarises changes what the exit reflects."""
+        """Needed for polarised light, and where the polarisation by the entrance changes the reflectance of the exit noticeably."""
         light, lens = scene.light, scene.lens
         if lens.mirror or lens.fresnel != "exact":
             why = "a mirror reflects all light alike" if lens.mirror else f"fresnel = {lens.fresnel} knows no polarisation"
@@ -41,37 +41,37 @@ class Polarisation(Effect):
         )
 
     def without(self, scene: Scene) -> Scene:
-        """Unpolarised light."""
+        """With unpolarised light."""
         light = scene.light
         return scene if light.polarisation is None else replace(scene, light=replace(light, polarisation=None))
 
     def including(self, scene: Scene) -> Scene:
-        """Unpolarised light as two crossed polarisations."""
+        """With unpolarised light traced as two orthogonal polarisations."""
         return scene if scene.light.polarisation is not None else replace(scene, light=replace(scene.light, tracked=True))
 
     def probe(self, scene: Scene, heights: Tensor) -> Probe | None:
-        """Along x."""
+        """Linear polarisation along x."""
         if scene.lens.fresnel != "exact" or scene.lens.mirror:
             return None
         return Probe(replace(scene, light=replace(scene.light, polarisation=0.0)), None, "along x")
 
     def prepare(self, system, rays: RayState, requests: Requests) -> RayState:
-        """Rays with a field."""
+        """Rays with their electric field."""
         angle = system.light.polarisation
         if angle is None or not any(e.fresnel == "exact" and not e.reflects for e in system.elements):
             return rays
         return replace(rays, polarised=polarisation_vector(angle, rays.direction))
 
     def action(self, system, requests: Requests) -> Action | None:
-        """Carries the field through surfaces that are followed by others."""
+        """The action that propagates the field through several surfaces."""
         return FieldPropagation() if system.light.polarisation is not None and len(system.elements) > 1 else None
 
 
 class FieldPropagation(Action):
-    """The field behind a surface."""
+    """Propagation of the electric field through a surface."""
 
     def after_interaction(self, m) -> None:
-        """Fresnel's amplitudes, or a perfect mirror's."""
+        """Apply Fresnel's transmission coefficients, or the reflection of a perfect conductor."""
         state, last = m.state, m.index == len(m.tracer.system.elements) - 1
         if state.polarised is None or (last and m.forward):
             return

@@ -1,4 +1,4 @@
-"""A screen that is curved: a sphere, a cylinder, or a measured shape."""
+"""Curved screens: spherical, cylindrical, or of measured shape."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from caustic_cli.optics.effects.base import Decision, Effect, Probe
 from caustic_cli.optics.screen_shape import points_in_space
 from caustic_cli.scene import Scene
 
-#: Radius of the sphere that is measured where there is none, in screen widths.
+#: Radius of curvature for the measurement in a scene with a plane screen, in screen widths.
 AMOUNT = 1.5
-#: Points along each axis of the screen at which it is seen how far light would land elsewhere.
+#: Points along each axis of the screen at which the displacement is evaluated.
 POINTS = 65
 
 
 def displacement(scene: Scene) -> float:
-    """How far light from the lens' middle to points of the screen would land from their places, were it plane, pixels at most."""
+    """Largest displacement, in pixels, of light from the centre of the lens if the screen were plane."""
     screen, lens = scene.screen, scene.lens
     x, y = (np.linspace(-h, h, POINTS) for h in screen.half_size)
     x, y = (c.ravel() for c in np.meshgrid(x, y, indexing="ij"))
@@ -30,12 +30,12 @@ def displacement(scene: Scene) -> float:
 
 
 class ScreenShape(Effect):
-    """Left out, the screen is plane."""
+    """Without it the screen is plane."""
 
     name = "screen-shape"
 
     def decide(self, scene: Scene, bounds) -> Decision:
-        """By how far light would land elsewhere on the plane screen."""
+        """Needed if the screen is curved."""
         if not scene.screen.curved:
             return Decision(self.name, False, "the screen is plane", 0.0, 0.0, present=False)
         off = displacement(scene)
@@ -43,10 +43,10 @@ class ScreenShape(Effect):
         return Decision(self.name, True, why, off, 0.0)
 
     def without(self, scene: Scene) -> Scene:
-        """Plane."""
+        """With a plane screen."""
         return replace(scene, screen=scene.screen.uncurved) if scene.screen.curved else scene
 
     def probe(self, scene: Scene, heights: Tensor) -> Probe:
-        """A sphere."""
+        """A spherical screen."""
         radius = AMOUNT * max(scene.screen.size)
         return Probe(replace(scene, screen=replace(scene.screen, radius=(radius, radius))), None, f"a radius of {radius:.4g} mm")

@@ -1,7 +1,7 @@
-"""Rays that leave a surface and meet it again: caught by a slope, they go through the glass, or off the mirror, once more.
+"""Secondary intersections: rays that leave a surface and hit it again, passing through the glass or being reflected once more.
 
-The thesis takes it for negligible; here it is measured, at the last surface of a system, once for every ray.  Each surface reflects
-as Fresnel's or Schlick's formula says, for unpolarised light; microfacets are met on the straight way only.
+The thesis neglects them; here they are computed at the last surface of a system, once per ray.  Reflectances follow the Fresnel
+equations or Schlick's approximation for unpolarised light; roughness acts on direct light only.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from caustic_cli.scene import Scene
 
 
 class SecondaryIntersection(Effect):
-    """Left out, rays go straight on."""
+    """Without it rays behind the surface are unobstructed."""
 
     name = "secondary-intersection"
 
     def decide(self, scene: Scene, b) -> Decision:
-        """By whether a slope can catch a ray."""
+        """By a bound of the slopes against the angles of the exit rays."""
         if scene.behind:
             return Decision(
                 self.name, False, "it is looked for at a last surface alone, and light goes on to others", present=False
@@ -43,21 +43,21 @@ class SecondaryIntersection(Effect):
         )
 
     def request(self, scene: Scene, on: bool, bounds) -> Requests:
-        """To look for them."""
+        """A request to search for them."""
         return Requests.to(self.name) if on else NO_REQUESTS
 
     def action(self, system, requests: Requests) -> Action | None:
-        """At a last surface that is a B-spline."""
+        """The action, if requested and if the last surface is a B-spline."""
         return SecondaryHits() if self.name in requests.on and isinstance(system.elements[-1].surface, HeightField) else None
 
 
 class SecondaryHits(Action):
-    """Takes rays that meet the last surface again off the straight light."""
+    """Removes rays with a secondary intersection from the direct light and traces them on."""
 
     stray = True
 
     def stray_light(self, tracer, parameters, interactions) -> list[RayState]:
-        """What becomes of them, behind the surface."""
+        """The rays behind their secondary intersection, with losses."""
         m = interactions[-1]
         element, state, side = m.element, m.state, m.side
         surface, pose, heights = element.surface, element.pose, parameters[element.name]
@@ -93,7 +93,7 @@ class SecondaryHits(Action):
             d = interact(d, g, power, eta=1.0, reflects=True, fresnel=element.fresnel, side=side).direction
             return leaving(o, d, power, {})
         eta, fresnel = m.n_in / m.n_out, element.fresnel
-        if isinstance(eta, Tensor):  # of varying index: that where the ray left, and the short way back within is straight
+        if isinstance(eta, Tensor):  # gradient index: its value at the exit point, with a straight path inside, which is short
             eta = eta[at]
         entered = interact(d, g, power, eta=1.0 / eta, reflects=False, fresnel=fresnel, side=-side)
         t, through = next_intersection(surface, heights, o, entered.direction, below=side > 0, round=round_)

@@ -1,4 +1,4 @@
-"""The plane z = 0."""
+"""Plane surfaces, z = 0."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from caustic_cli.optics.tolerances import PARALLEL
 
 @dataclass(frozen=True)
 class Plane(Surface[None]):
-    """z = 0 in its own frame; its element's pose places and tilts it."""
+    """The plane z = 0 of its element's frame."""
 
     flat = True
 
     def at(self, heights: None, x: Tensor, y: Tensor, orders=FIRST) -> list[Tensor]:
-        """0 everywhere."""
+        """Zeros."""
         return [torch.zeros_like(x) for _ in orders]
 
     def hull(self, heights: None) -> tuple[float, float]:
