@@ -1,6 +1,6 @@
-"""Stages by compiled kernels, on a CPU: float64 whatever is asked, which costs no more here.
+"""The CPU backend: compiled kernels, always in float64, which costs no more here.
 
-What has no kernel, or no rays, is done by the reference.
+The reference handles stages without a kernel, and empty sets of rays.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Numba(Torch):
     compiled = True
 
     def compile_plane(self) -> None:
-        """Have ready what a plane wave's rays need: from the files kept, or compiled for this machine."""
+        """Load the kernels for plane waves from the cache, or compile them."""
         fused_functions.compile_kernels()
 
     def precision(self, dtype: torch.dtype) -> torch.dtype:
@@ -56,7 +56,7 @@ class Numba(Torch):
         )
 
     def spline_on(self, field, sample: Sample, dtype: torch.dtype):
-        """As the reference; rows of a tensor product of points from nets contracted along v."""
+        """As the reference; tensor-product samples by rows, from nets contracted along v."""
         if sample.tensor:
             return GridSurface(field.spaces, field.half_size, sample.u, sample.v)
         surface, u, v = FusedSurface(field.spaces, field.half_size), sample.u.contiguous().numpy(), sample.v.contiguous().numpy()
@@ -79,7 +79,7 @@ class Numba(Torch):
         return SurfaceIntersection(*hits_of_rays(surface, heights, (ox, oy, oz), (dx, dy, dz), side=side))
 
     def intersect_fixed(self, field, origin, direction):
-        """As the reference; what does not depend on the heights is prepared, for rays that all begin within the aperture."""
+        """As the reference; for rays that start inside the aperture, data independent of the heights is precomputed."""
         if any(bool((c.abs() > half).any()) for c, half in zip(origin[:2], field.half_size, strict=True)):
             return lambda heights: self.intersect_spline(field, heights, origin, direction, 1.0)
         hits = RayIntersections(FusedSurface(field.spaces, field.half_size), origin, direction, None)
@@ -92,7 +92,7 @@ class Numba(Torch):
         return intersect
 
     def flow(self, field, coefficients: Tensor | None, point, momentum, time: Tensor, steps: int, order: int = ORDER) -> Flow:
-        """As the reference; a B-spline volume and the formulas of a lens ray by ray."""
+        """As the reference; B-spline volumes and polynomial fields by kernels."""
         if time.numel() and field.formula is not None:
             terms, axial, squared = field.formula
             out = formula_flow(terms, axial, squared, LEAST_SQUARE, (*point, *momentum), time, WEIGHTS[order], steps)
@@ -135,7 +135,7 @@ class Numba(Torch):
     def interact(
         self, direction, slopes, power: Tensor, *, eta: float, reflects: bool, fresnel: str, polarised=None, side: float = 1.0
     ) -> OutgoingRays:
-        """As the reference, which does constant slopes itself; the kernel tells the side by the sign of d . N."""
+        """As the reference, which handles constant slopes; the kernel infers the side from the sign of d . N."""
         if not isinstance(slopes[0], Tensor):
             return super().interact(
                 direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, polarised=polarised, side=side
@@ -152,11 +152,11 @@ class Numba(Torch):
         return splat_rays(x, y, weight, screen, filter)
 
     def plane_image(self, field, rays: RayState, eta: float, fresnel: str, like: PlaneImage | None) -> PlaneImage:
-        """The fused kernel of a plane wave's rays on a B-spline: a function of heights, screen and filter."""
+        """The fused kernel for rays of a plane wave on a B-spline: a function of heights, screen and filter."""
         return PlaneImage(field, rays, eta, fresnel, like)
 
     def ray_image(self, field, rays: RayState, eta: float, fresnel: str, radius: float | None, like: RayImage | None) -> RayImage:
-        """The fused kernel of any rays below a B-spline."""
+        """The fused kernel for arbitrary rays below a B-spline."""
         return RayImage(field, rays, eta, fresnel, radius, like)
 
 
@@ -166,7 +166,7 @@ def _components(vector) -> tuple:
 
 
 class PlaneImage:
-    """See `Numba.plane_image`; like: that of the chunk before, whose basis values along v serve again where they are the same."""
+    """See `Numba.plane_image`; like: that of the previous chunk, whose basis values along v are reused if they are the same."""
 
     def __init__(self, field, rays: RayState, eta: float, fresnel: str, like: PlaneImage | None):
         s = rays.sample
@@ -183,7 +183,7 @@ class PlaneImage:
 
 
 class RayImage:
-    """See `Numba.ray_image`; like: as of `PlaneImage`."""
+    """See `Numba.ray_image`; like: as for `PlaneImage`."""
 
     def __init__(self, field, rays: RayState, eta: float, fresnel: str, radius: float | None, like: RayImage | None):
         self.interface = eta, fresnel
@@ -205,6 +205,6 @@ class RayImage:
 
 @lru_cache(maxsize=8)
 def _axes(field: SplineIndex) -> tuple[VolumeAxis, VolumeAxis, VolumeAxis]:
-    """The kernels' axes of a volume."""
+    """Kernel data of the axes of a B-spline volume."""
     x, y, z = (VolumeAxis(s, *place) for s, place in zip(field.spaces, field.frame, strict=True))
     return x, y, z

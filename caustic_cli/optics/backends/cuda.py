@@ -1,6 +1,6 @@
-"""Stages by kernels of a CUDA device: float64 whatever is asked, and every sum the same from run to run.
+"""The CUDA backend: compiled kernels, always in float64, with sums that are bitwise reproducible.
 
-What has no kernel here, or no rays, is done by the reference, on the device too.
+The reference handles stages without a kernel, and empty sets of rays, on the device, too.
 """
 
 from __future__ import annotations
@@ -59,7 +59,8 @@ class Cuda(Torch):
     def interact(
         self, direction, slopes, power: Tensor, *, eta: float, reflects: bool, fresnel: str, polarised=None, side: float = 1.0
     ) -> OutgoingRays:
-        """As the reference, which does constant slopes and varying indices; the kernel tells the side by the sign of d . N."""
+        """As the reference, which handles constant slopes and varying indices; the kernel infers the side from the sign of d .
+        N."""
         if not isinstance(slopes[0], Tensor) or isinstance(eta, Tensor):
             return super().interact(
                 direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, polarised=polarised, side=side
@@ -77,11 +78,11 @@ class Cuda(Torch):
         return splat_rays(x, y, weight, screen, filter)
 
     def plane_image(self, field, rays: RayState, eta: float, fresnel: str, like: PlaneImage | None) -> PlaneImage:
-        """The fused kernel of a plane wave's rays on a B-spline: a function of heights, screen and filter."""
+        """The fused kernel for rays of a plane wave on a B-spline: a function of heights, screen and filter."""
         return PlaneImage(field, rays, eta, fresnel)
 
     def ray_image(self, field, rays: RayState, eta: float, fresnel: str, radius: float | None, like: RayImage | None) -> RayImage:
-        """The fused kernel of any rays below a B-spline."""
+        """The fused kernel for arbitrary rays below a B-spline."""
         return RayImage(field, rays, eta, fresnel, radius)
 
 

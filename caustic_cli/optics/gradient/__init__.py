@@ -1,4 +1,4 @@
-"""Media whose refractive index varies from place to place: index fields, the rays in them, and where these meet a surface."""
+"""Gradient-index media: index fields, integration of the ray equation, and ray transfer between surfaces."""
 
 from __future__ import annotations
 

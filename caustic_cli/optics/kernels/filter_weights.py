@@ -1,6 +1,6 @@
-"""Shares of rays among pixels, and their derivatives, a batch at a time: the functions of `reconstruction.Filter`.
+"""Filter weights of rays on pixels, and their derivatives, in batches: the functions of `reconstruction.Filter`.
 
-Every loop writes one array from a few others, which is what lets the compiler turn it into vector instructions.
+Every loop writes one array from a few others, so that the compiler can vectorise it.
 
 Notation, in pixels: v filter size, r = (v - 1) / 2, phi sub-pixel position, q = 1/2 - phi, d = k - r + q the distance from
 the centre of pixel k = 0..v - 1.  A Gaussian on the integer lattice needs two exponentials, whatever v.

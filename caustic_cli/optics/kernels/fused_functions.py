@@ -1,7 +1,7 @@
-"""The kernels as differentiable torch functions: reverse mode by the written adjoint, forward mode by the tangent.
+"""The fused kernels as differentiable torch functions: reverse mode by the hand-written adjoint, forward mode by the tangent.
 
-A surface at the rays (along a tensor product of points, at scattered points, at the rays' hits) feeds one kernel that
-refracts, carries to the screen and splats.  All in float64, whatever precision the plain-torch reference would take.
+The surface at the rays (at a tensor product of points, at scattered points, or at intersections) is the input of one kernel that
+refracts, transfers to the screen and splats.  Everything is float64, whatever the precision of the plain-torch reference.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from caustic_cli.scene import Screen
 
 
 class _Workspace:
-    """Arrays that the kernels overwrite, kept from one call to the next."""
+    """Arrays that the kernels overwrite, reused from call to call."""
 
     def __init__(self) -> None:
         self.arrays: dict[str, np.ndarray] = {}
@@ -36,7 +36,7 @@ class _Workspace:
         return array
 
 
-#: Scattered rays are handed to the kernel in rows of so many.
+#: Length of the rows in which scattered rays are passed to the kernel.
 ROW = 1024
 
 
@@ -174,7 +174,7 @@ def _splat(
 def _arguments(
     rays, interface: tuple[float, str], height: float, start: float, screen: Screen, filter: Filter
 ) -> tuple[bool, tuple]:
-    """Whether rays are oblique, and what `plane` takes after the nets."""
+    """Whether rays are oblique, and the arguments of the `fused` kernels after the nets."""
     eta, fresnel = interface
     oblique = rays[2] is not _NONE
     exit_ = Exit(float(eta), axial_refraction.FRESNEL[fresnel], float(start), float(height))
@@ -184,7 +184,7 @@ def _arguments(
 
 
 def _layout(count: int) -> tuple[int, int]:
-    """Rows and columns for so many scattered rays: at least two rows, because one alone is always contiguous, see `_strided`."""
+    """Rows and columns for so many scattered rays: at least two rows, since a single one is always contiguous, see `_strided`."""
     rows = max(2, -(-count // ROW))
     return rows, -(-count // rows)
 
@@ -198,19 +198,19 @@ def _strided(array: np.ndarray) -> np.ndarray:
     return array
 
 
-#: What stands for directions where all rays run along z.
+#: Placeholder for directions where all rays are parallel to z.
 _NONE = _strided(np.zeros((2, 2)))
 
 
 def compile_kernels() -> None:
-    """Have the kernels ready for a plane wave's rays: from the files kept, or compiled for this machine."""
+    """Load the kernels for plane waves from the cache, or compile them."""
     compile_surface()
     compile_splat()
     compile_adjoint()
 
 
 def compile_surface() -> None:
-    """What gives the surface at rays of a plane wave, and its adjoint."""
+    """Compile the evaluation of the surface at rays of a plane wave, and its adjoint."""
     space, at = SplineSpace.uniform(4, 3), torch.linspace(0.0, 1.0, ROW, dtype=torch.float64)
     heights = torch.zeros(4, 4, dtype=torch.float64, requires_grad=True)
     net, slope = AlongV(space, at, 0.5)(heights)
@@ -219,12 +219,12 @@ def compile_surface() -> None:
 
 
 def compile_splat() -> None:
-    """What bends, carries and splats the rays."""
+    """Compile the fused refraction, transfer and splat."""
     _Image.apply(*_example())
 
 
 def compile_adjoint() -> None:
-    """The adjoint of `compile_splat`'s kernel."""
+    """Compile the adjoint of the kernel of `compile_splat`."""
     *nets, rows, apart, arguments, workspace = _example()
     _adjoint(
         torch.zeros(_images(arguments, workspace)[0].shape[1:], dtype=torch.float64), 1.0, nets, rows, apart, arguments, workspace
@@ -232,7 +232,7 @@ def compile_adjoint() -> None:
 
 
 def _example() -> tuple:
-    """What `_Image` takes, for a few rays."""
+    """Arguments of `_Image` for a few rays."""
     space, at = SplineSpace.uniform(4, 3), torch.linspace(0.0, 1.0, 2, dtype=torch.float64)
     kernel = PlaneKernel((space, space), (1.0, 1.0), at, at, True, torch.tensor(0.25, dtype=torch.float64))
     (x, y, flux), net = kernel.rays, torch.zeros(4, 2, dtype=torch.float64)
@@ -243,7 +243,7 @@ def _example() -> tuple:
 
 
 class _Image(torch.autograd.Function):
-    """Three nets (n, b), and how `plane.forward` is to use them -> padded image, power leaving the lens (), ledger."""
+    """Three nets (n, b) and the arguments of `fused.forward` -> padded image, power behind the lens (), ledger."""
 
     @staticmethod
     def forward(net: Tensor, net_x: Tensor, net_y: Tensor, rows: tuple, apart: bool, arguments: tuple, workspace: _Workspace):

@@ -27,7 +27,7 @@ from caustic_cli.optics.kernels.threads import ALL, on_threads
 
 
 class GridSurface:
-    """What does not depend on the heights.
+    """A height field on a fixed grid of points, prepared for any heights.
 
     Args:
         spaces, half_size: of the height field; half widths in mm.

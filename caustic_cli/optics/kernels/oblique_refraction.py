@@ -1,7 +1,8 @@
-"""A row of rays of any direction, refracted at their hits and carried to the screen, with derivatives, for the CPU kernels.
+"""Refraction of a row of rays of any direction at the exit surface and transfer to the screen, with derivatives, for the CPU
+kernels.
 
-The same physics as `axial_refraction`, which knows that a plane wave's rays all run along z.  Rays are copied into rows of a
-small scratch, a batch at a time, for the reason that `stage` gives; what a ray has lost its way to is masked, not branched around.
+The same physics as `axial_refraction`, which is specialised to rays parallel to z.  Rays are copied in batches to rows of a small
+scratch array, for the reason given in `stage`; invalid rays are masked instead of branched around.
 
 Notation, a ray with unit direction d inside the lens, slopes g at the hit, N = (-g_x, -g_y, 1), index n
     c, s    d . N and t . N with t the refracted unit direction; s = sqrt(|N|^2 (1 - n^2) + n^2 c^2), 1 if light is reflected

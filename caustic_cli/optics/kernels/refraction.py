@@ -1,7 +1,7 @@
-"""CPU kernels for light that passes a smooth surface: Snell's law and Fresnel's, with adjoint and tangent.
+"""CPU kernels for refraction at a smooth surface: Snell's law and the Fresnel equations, with adjoint and tangent.
 
-Rays are float64 components, see `stage`; the reference is `interface` with `polarisation.part_s`.  A ray may run along the
-surface's normal or, with d . N < 0, against it: the law knows no sides, so such a ray is refracted with -N for N.
+Rays are float64 components, see `stage`; the reference is `interface` with `polarisation.s_fraction`.  For rays with d . N < 0 the
+normal is reversed.
 
 Notation, a ray with unit direction d, power P, and slopes g of the surface at its hit; N = (-g_x, -g_y, 1), eta = n_in / n_out
     sigma   1 where d . N >= 0, else -1;  sigma N is the normal along which light passes
@@ -38,7 +38,7 @@ BY_TX, BY_TY, BY_TZ, BY_AFTER, BY_F, BY_DX, BY_DY, BY_DZ, BY_GX, BY_GY, BY_P, BY
 
 
 class Interface(NamedTuple):
-    """What the kernels know of a surface: n_in / n_out, kind of Fresnel losses, whether they heed the field's direction."""
+    """Parameters of an interface: n_in / n_out, kind of Fresnel losses, and whether the polarisation is used."""
 
     eta: float
     fresnel: int

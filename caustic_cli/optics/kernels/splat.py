@@ -1,4 +1,4 @@
-"""The stage on the screen: landing points into an image, with kernels, adjoint and tangent.
+"""Splatting: accumulation of landing points on pixels, with adjoint and tangent.
 
 The fused form of `reconstruction.splat` for float64 rays.  Each of a fixed number of blocks of rays has an image of its own and
 they are added in order, so the result does not depend on timing, only on the number of blocks (the number of threads).  Only the
@@ -43,7 +43,7 @@ SCRATCH = 5
 
 
 class Frame(NamedTuple):
-    """What the kernels know of screen and filter: pixels, low edges and sizes of a pixel in mm; kind, sizes and alphas."""
+    """Parameters of screen and filter: pixels, lower edges and pixel sizes in mm; kind, sizes and alphas."""
 
     pixels_x: int
     pixels_y: int

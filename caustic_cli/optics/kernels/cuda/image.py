@@ -1,6 +1,6 @@
-"""Rays refracted at the exit, carried to the screen and splatted there, in one kernel of a CUDA device.
+"""Fused CUDA kernel: refraction at the exit, transfer to the screen and splat.
 
-The functions of `kernels.plane`, with their notation: what becomes of a ray and all that is differentiated come from there, from
+The functions of `kernels.fused`, with their notation: the per-ray functions and their derivatives come from there, from
 `axial_refraction` and from `oblique_refraction`, a row of one ray at a time.  A kernel is made for each filter, so that its loops
 over pixels have a known length.
 """
@@ -57,7 +57,7 @@ VECTORS = axial_refraction.VECTORS + axial_refraction.SCRATCH
 
 
 class Setting(NamedTuple):
-    """What a kernel takes beside arrays: index and kind of Fresnel losses, as of an `Exit`, a `Frame`, and alpha of the filter."""
+    """Scalar arguments of a kernel: index and kind of Fresnel losses, as of an `Exit`, a `Frame`, and alpha of the filter."""
 
     index: float  # type: ignore[assignment]  # nobody asks a `Setting` for the place of a value
     fresnel: int
@@ -68,9 +68,9 @@ class Setting(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """Rays below the exit, (N,) each on the device: where they begin, mm, what of their directions lies across, and their powers.
+    """Rays below the exit, (N,) each on the device: origins, mm, transverse direction components, and powers.
 
-    oblique: whether they have a direction each; else all run along z, and `along` is empty.
+    oblique: whether they have individual directions; otherwise all are parallel to z, and `along` is empty.
     """
 
     x: Tensor

@@ -1,4 +1,4 @@
-"""The stages ray by ray on a CUDA device: refraction, a mirror and the way to a plane, with adjoint and tangent.
+"""CUDA kernels of the stages ray by ray: refraction, reflection and transfer to a plane, with adjoint and tangent.
 
 The functions of `kernels.refraction`, `kernels.mirror` and `kernels.transfer`, a batch of one ray at a time.
 """

@@ -1,4 +1,4 @@
-"""Where a ray's shares go on a CUDA device: into an image of whole units, by atomic additions (`sums`).
+"""Accumulation of filter weights on a CUDA device: atomic additions to an image in fixed point (`sums`).
 
 A filter's shares are not negative and sum to 1, so that the power of all rays bounds every pixel.  Of a tangent
 

@@ -1,4 +1,4 @@
-"""The stage on the screen on a CUDA device: landing points into an image, with adjoint and tangent.
+"""CUDA kernel for splatting: accumulation of landing points on pixels, with adjoint and tangent.
 
 The functions of `kernels.splat`, with their notation; a row of one ray at a time.
 """

@@ -1,4 +1,4 @@
-"""The height field on a CUDA device, at points and where rays meet it: differentiable functions of heights and rays.
+"""Height fields on a CUDA device: evaluation and ray intersection as differentiable functions of heights and rays.
 
 The functions of `kernels.surface` and `kernels.ray_intersections`, with their notation; formulas are in `kernels.spline`,
 `kernels.intersect` and `kernels.batches`.  Here each ray goes its own way, by the scalar functions of those files.
@@ -70,7 +70,7 @@ class Axis(NamedTuple):
 
 
 class DeviceSurface:
-    """What kernels know of a height field of half widths (r_x, r_y) mm, made once for all heights."""
+    """Kernel data of a height field of half widths (r_x, r_y) mm, for any heights."""
 
     def __init__(self, spaces: tuple[SplineSpace, SplineSpace], half_size: tuple[float, float], place: torch.device):
         self.shape = tuple(s.n for s in spaces)
@@ -184,7 +184,7 @@ class _AtPoints(torch.autograd.Function):
         return *_AtPoints.apply(tangent.detach(), ctx.surface, u, v)[:3], None  # within torch.func numbers are within reach only so
 
 
-# Where rays meet it.
+# Ray intersections.
 
 
 @cuda.jit
