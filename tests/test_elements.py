@@ -295,7 +295,7 @@ def test_solids_are_closed_and_their_spheres_are_spheres(aperture):
     field = HeightField(body.field.spaces, body.field.half_size)
     assert field.half_size == (6.0, 6.0)
     sphere, net = Sphere(30.0), torch.from_numpy(z.heights)
-    spline = System.of(replace(scene, elements=(replace(elements[0], fronts=(z, None)),))).elements[0].surface
+    spline = System.of(replace(scene, elements=(replace(elements[0], surfaces=(z, None)),))).elements[0].surface
     line = torch.linspace(-4.2, 4.2, 50, dtype=torch.float64)
     assert float((spline.at(None, line, 0.7 * line)[0] - sphere.at(None, line, 0.7 * line)[0]).abs().max()) <= CLOSE
     assert net.shape[0] >= 16

@@ -1,6 +1,6 @@
-"""What few scenes have, and what follows from it: networks over ranges, two free-form sides, other elements, a designed index.
+"""Completion of optional features: networks trained over ranges, two free-form sides, other elements, a designed gradient index.
 
-Each function completes its own part of the settings, where there is one, for `completion`.
+Each function completes its own part of the settings, if present, for `completion`.
 """
 
 from __future__ import annotations
@@ -23,15 +23,19 @@ from caustic_cli.inverse.conditions import Ranges
 from caustic_cli.scene import Source
 from caustic_cli.scene.elements import check_compatible_with_elements
 
-OVER_WIDTH = 128  # of a dense network over a range: caustic convergence, study design, networks
-BEAM = 1.2  # width of another lens or a mirror over that of a beam from the lens' edges to the picture's
-#: Of a free gradient: range to either side of the index; degree of its splines, knot spans a pixel and the most of them; and rays a
-#: pixel at most, since they cost more.
+OVER_WIDTH = 128  # width of a dense network over a range: caustic convergence, study design, networks
+BEAM = 1.2  # width of a further lens or mirror over that of a beam from the lens' edges to those of the picture
+#: For a free gradient: half range about the index; degree of its splines, knot spans per pixel and their largest number; and
+#: largest number of rays per pixel, since they cost more.
 HALF_RANGE, INDEX_DEGREE, INDEX_SPANS, MOST_SPANS, RAYS_BENT = 0.05, 3, 2, 768, 16
 
 
 def centre_screen(over: Ranges, s: Settings, given: Settings, throw: float | None) -> None:
-    """The screen of a network that is trained over throws: at their middle, and nowhere else."""
+    """Place the screen of a network that is trained over throws at the middle of their range.
+
+    Raises:
+        InputError: another position is given.
+    """
     screen, z = s["screen"], over.middle[over.keys.index("throw")]
     z = -z if value_of(s["lens"], "lens.mirror") else z
     said = throw is not None or "z" in given.get("screen", {})
@@ -41,12 +45,16 @@ def centre_screen(over: Ranges, s: Settings, given: Settings, throw: float | Non
 
 
 def complete_over(over: Ranges, s: Settings, given: Settings) -> None:
-    """What a network that is trained over ranges has beside them: its source at their middle, its outputs and its width."""
+    """Complete a network that is trained over ranges: source at their middle, preconditioner and width.
+
+    Raises:
+        InputError: another source position is given, or the source does not support ranges.
+    """
     source, design = s["source"], s["design"]
     middle = {key.removeprefix("source."): v for key, v in zip(over.keys, over.middle, strict=True) if key != "throw"}
     if middle:
         over.refuse(build_source(s))
-    if middle and "position" in source:  # which a type of one's own may do without
+    if middle and "position" in source:  # a user-defined source type may have none
         place = [middle.get(axis, c) for axis, c in zip("xyz", source["position"][0], strict=True)]
         if "position" in given.get("source", {}) and not all(
             math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-9) for a, b in zip(place, source["position"][0], strict=True)
@@ -63,7 +71,7 @@ def complete_over(over: Ranges, s: Settings, given: Settings) -> None:
 
 
 def default_magnification(s: Settings) -> float:
-    """Of the picture, where nobody said it; where light goes on parallel or to a focus, a beam's as wide as the lens."""
+    """Default magnification of the picture; for collimated or focused light that of a beam as wide as the lens."""
     second = s.get("second", {})
     if "focus" in second and second["focus"][2] != 0:
         return abs(1.0 - s["screen"]["z"] / second["focus"][2])
@@ -71,7 +79,11 @@ def default_magnification(s: Settings) -> float:
 
 
 def complete_second(s: Settings) -> None:
-    """What makes the lens' entrance free-form; nothing at all where nobody said anything of it."""
+    """Complete and check the [second] section, which makes the entrance free-form; an empty section is removed.
+
+    Raises:
+        InputError: keys contradict each other, or are combined with unsupported features.
+    """
     second = s.get("second", {})
     said = [key for key in ("file", "collimate", "focus") if second.get(key)]
     if not said:
@@ -105,7 +117,7 @@ def complete_second(s: Settings) -> None:
 
 
 def complete_second_size(s: Settings) -> None:
-    """Size of a second picture: that of a beam from the lens' edge through the first one's, farther on."""
+    """Default size of a second picture: that of a beam from the lens' edge through that of the first picture."""
     second = s.get("second", {})
     if "file" not in second:
         return
@@ -116,7 +128,7 @@ def complete_second_size(s: Settings) -> None:
 
 
 def complete_two_sided(s: Settings, source: Source, quality: str, rays: int | None) -> None:
-    """How a lens with two free-form sides is designed."""
+    """Complete the design settings of a lens with two free-form sides."""
     lens, screen, design = s["lens"], s["screen"], s["design"]
     if design["start"] != "transport":
         raise InputError(f"⟨design.start⟩ of two free-form sides must be transport, got {design['start']}")
@@ -134,7 +146,7 @@ def complete_two_sided(s: Settings, source: Source, quality: str, rays: int | No
 
 
 def complete_elements(s: Settings) -> None:
-    """Sizes of other lenses and mirrors, and what cannot be had with them."""
+    """Default sizes of other lenses and mirrors, and checks of unsupported combinations."""
     tables, design = [dict(table) for table in elements_of(s)], s["design"]
     if not tables:
         s.pop("element", None)
@@ -162,7 +174,7 @@ def complete_elements(s: Settings) -> None:
 
 
 def complete_blank(lens: Table, screen: Table, index: float) -> None:
-    """What a flat blank has whose index is designed; its sides are the least net."""
+    """Complete a plane-parallel blank whose gradient index is designed; its sides have the smallest control net."""
     if value_of(lens, "lens.mirror"):
         raise InputError("⟨lens.gradient⟩ free needs a lens: light never enters a mirror")
     if any(map(math.isfinite, lens.setdefault("radius", [math.inf, math.inf]))):
@@ -177,7 +189,7 @@ def complete_blank(lens: Table, screen: Table, index: float) -> None:
 
 
 def complete_index_design(s: Settings, source: Source, quality: str, rays: int | None) -> None:
-    """How a free gradient is found: L-BFGS from transport, on rays."""
+    """Complete the design settings of a free gradient: L-BFGS from optimal transport, on rays."""
     lens, screen, design = s["lens"], s["screen"], s["design"]
     if not source.collimated:
         raise InputError(f"⟨lens.gradient⟩ free is designed for light of ⟨source.type⟩ plane, got {s['source']['type']}")
