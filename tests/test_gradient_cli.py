@@ -95,7 +95,7 @@ def test_a_file_of_indices_is_kept(capfd):
         (("--gradient", "free", "--index-range", "1.54,1.542"), "thickness"),
         (("--gradient", "free", "--index-range", "1.6,1.5"), "ascend"),
         (("--gradient", "free", "--source", "point"), "plane"),
-        (("--gradient", "free", "--waves", "on"), "one index"),
+        (("--gradient", "free", "--waves", "on"), "a homogeneous lens"),
         (("--gradient", "free", "--loss", "rms"), "rms-light"),
         (("--gradient", "free", "--mirror"), "mirror"),
         (("--gradient", "lens"), "must be one of"),

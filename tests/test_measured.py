@@ -307,7 +307,7 @@ def test_another_file_is_another_design(here, capfd):
             "one [x, y, z]",
         ),
         (["--source", "rays", "--source-file", "led.dat", "--cone", "3"], "--cone belongs to --source"),
-        (["--source", "rays", "--source-file", "led.dat", "--waves", "on"], "--waves on: a ray file says nothing"),
+        (["--source", "rays", "--source-file", "led.dat", "--waves", "on"], "--waves on: a ray file contains no phase"),
         (["--source", "point", "--source-file", "led.dat"], "--source-file belongs to --source disc or rays"),
     ],
 )

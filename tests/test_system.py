@@ -426,7 +426,7 @@ def test_a_wavelength_at_every_medium():
 def test_bad_systems_are_refused_in_a_sentence():
     with pytest.raises(InputError, match="at least one source"):
         System((), (Element("a", Plane(), FLAT),))
-    with pytest.raises(InputError, match="names of their own"):
+    with pytest.raises(InputError, match="unique names"):
         System((PlaneWave(),), (Element("a", Plane(), FLAT), Element("a", Plane())))
     with pytest.raises(InputError, match="must have an aperture"):
         System((PlaneWave(),), (Element("a", Plane()),))

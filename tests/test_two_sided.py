@@ -228,8 +228,8 @@ def test_two_pictures_by_the_command_line(_here, capfd):
     [
         (("--second", "two.png"), "--second needs --second-at"),
         (("--second-at", "400"), "--second-at belongs to --second"),
-        (("--collimate", "--focus", "0,0,300"), "--collimate and --focus both say"),
-        (("--collimate", "--mirror"), "--mirror cannot be had with --collimate"),
+        (("--collimate", "--focus", "0,0,300"), "--collimate and --focus both define"),
+        (("--collimate", "--mirror"), "--mirror cannot be combined with --collimate"),
         (("--focus", "0,0,20"), "must lie behind the picture's screen at 50 mm"),
         (("--collimate", "--waves", "on"), "--waves on"),
         (("--collimate", "--source", "point", "--start", "offset"), "must be transport"),

@@ -338,7 +338,7 @@ def test_a_wave_image_that_takes_long_is_taken_where_it_is_asked_for(_here, capf
     monkeypatch.setattr("caustic_cli.studies.waves.UNASKED", 1e6)
     left_out = json.loads(_render(capfd, "p"))
     assert left_out["wave_relative_rms"] is None
-    assert "about 0 minutes on two cores; the effect diffraction, asked for by name, takes it" in left_out["no_wave_image"]
+    assert "about 0 minutes on two cores; the effect diffraction, requested by name, computes it" in left_out["no_wave_image"]
     assert json.loads(_render(capfd, "p", "--effects", "diffraction"))["wave_relative_rms"] > 0
 
 

@@ -283,7 +283,7 @@ def _complete_design(
     design.setdefault("start", "transport" if "second" in s or shaped else "offset")
     if design["start"] != "offset" and design["network"] != "none" and not _relative_to_initial(design):
         raise InputError(
-            f"⟨design.start⟩ {design['start']} gives a surface, which a network can begin from only with"
+            f"⟨design.start⟩ {design['start']} gives a surface, from which a network can start only with"
             " ⟨+design.preconditioner⟩ laplacian; use that, start offset, or network none"
         )
     if max(array) > 1 and (design["start"] == "offset" or not plain):
@@ -390,11 +390,11 @@ def _not_by_default(s: Settings) -> str:
     """The feature for which `waves = "auto"` never refines the wave image, and how to include it; "" if there is none."""
     design = s["design"]
     if "gradient" in s["lens"]:
-        return "the wave image is taken of lenses of one index"
+        return "wave images are implemented for homogeneous lenses only"
     if elements_of(s):
-        return "the wave image is taken of a lens by itself"
+        return "wave images are implemented for a single lens only"
     if s["source"]["type"] == "rays":
-        return "a ray file says nothing of its light's phase"
+        return "a ray file contains no phase"
     if s["source"].get("also"):
         return "light of several sources is refined by rays alone"
     if design["network"] != "none":
@@ -414,11 +414,11 @@ def _wave_stages(s: Settings, source: Source, quality: str, lit: tuple[float, fl
     """Stages that refine the wave image after the ray image, on request or where diffraction matters."""
     design, lens, screen, asked = s["design"], s["lens"], s["screen"], s["design"]["waves"]
     if asked == "on" and design["network"] != "none":
-        raise InputError("⟨design.waves⟩ on needs network none: the wave image refines the heights themselves")
+        raise InputError("⟨design.waves⟩ on needs network none: the wave image is refined by control heights")
     if asked == "on" and "gradient" in lens:
-        raise InputError("⟨design.waves⟩ on needs a lens of one index, of which the wave image is taken")
+        raise InputError("⟨design.waves⟩ on needs a homogeneous lens: with a gradient index there is no wave image")
     if asked == "on" and source.rays is not None:
-        raise InputError("⟨design.waves⟩ on: a ray file says nothing of its light's phase, so that it has no wave image to refine")
+        raise InputError("⟨design.waves⟩ on: a ray file contains no phase, so that it has no wave image to refine")
     if asked == "on" and build_screen(s).curved:
         raise InputError("⟨design.waves⟩ on needs a plane screen: a curved one has no wave image to refine")
     if asked == "on" and len(source.members) > 1:

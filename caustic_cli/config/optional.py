@@ -40,7 +40,7 @@ def centre_screen(over: Ranges, s: Settings, given: Settings, throw: float | Non
     z = -z if value_of(s["lens"], "lens.mirror") else z
     said = throw is not None or "z" in given.get("screen", {})
     if said and not math.isclose(screen["z"], z, rel_tol=1e-9):
-        raise InputError(f"⟨screen.z⟩ must be the middle of ⟨design.over⟩ throw, {z:g} mm, or not be said, got {screen['z']:g} mm")
+        raise InputError(f"⟨screen.z⟩ must be the middle of ⟨design.over⟩ throw, {z:g} mm, or not be given, got {screen['z']:g} mm")
     screen["z"] = z
 
 
@@ -93,7 +93,7 @@ def complete_second(s: Settings) -> None:
         s.pop("second", None)
         return
     if len(said) > 1:
-        raise InputError(f"⟨second.{said[0]}⟩ and ⟨second.{said[1]}⟩ both say what light does behind the picture: give one of them")
+        raise InputError(f"⟨second.{said[0]}⟩ and ⟨second.{said[1]}⟩ both define the light behind the picture: give one of them")
     if "focus" in second:
         places = second["focus"]
         second["focus"] = list(check("second.focus", places[0] if len(places) == 1 else places))
@@ -111,7 +111,9 @@ def complete_second(s: Settings) -> None:
     }
     for path, given in wrong.items():
         if given:
-            raise InputError(f"⟨{path}⟩ cannot be had with ⟨second.{said[0]}⟩, which needs two free-form sides of heights by lbfgs")
+            raise InputError(
+                f"⟨{path}⟩ cannot be combined with ⟨second.{said[0]}⟩, which needs two free-form sides of heights by lbfgs"
+            )
     if source.get("also") or source["type"] == "rays":
         raise InputError(f"⟨second.{said[0]}⟩ needs one source that is no ray file")
 
@@ -194,14 +196,14 @@ def complete_index_design(s: Settings, source: Source, quality: str, rays: int |
     if not source.collimated:
         raise InputError(f"⟨lens.gradient⟩ free is designed for light of ⟨source.type⟩ plane, got {s['source']['type']}")
     if max(value_of(lens, "lens.array")) > 1:
-        raise InputError("⟨lens.array⟩ cannot be had with a free gradient, whose sides are flat")
+        raise InputError("⟨lens.array⟩ cannot be combined with a free gradient, whose sides are flat")
     if value_of(s["target"], "target.color"):
         raise InputError("⟨target.color⟩ is not for a free gradient, whose index is designed at one wavelength")
     for key, only in (("network", "none"), ("optimizer", "lbfgs"), ("loss", default("design.loss"))):
         if design[key] != only:
             raise InputError(f"⟨design.{key}⟩ of a free gradient must be {only}, got {design[key]}")
     if check("design.waves", design["waves"]) == "on":
-        raise InputError("⟨design.waves⟩ on needs a lens of one index, of which the wave image is taken")
+        raise InputError("⟨design.waves⟩ on needs a homogeneous lens: with a gradient index there is no wave image")
     design["start"] = "offset"
     design.setdefault("preconditioner", "laplacian")
     if "stages" not in design:

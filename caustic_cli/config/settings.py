@@ -356,7 +356,7 @@ def _element(table: dict[str, Any], lens: dict[str, Any]) -> Component:
     kind = check("element.type", table.get("type", "lens"))
     for key in ("z", "size"):
         if key not in table:
-            raise InputError(f"⟨element.{key}⟩ must be said of every [[element]]")
+            raise InputError(f"⟨element.{key}⟩ must be given in every [[element]]")
     only = ("thickness", "index", "glass", "absorption") if kind == "mirror" else ()
     for key in only:
         if key in table:

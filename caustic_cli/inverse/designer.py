@@ -103,7 +103,7 @@ class Options:
                 "⟨design.initial⟩ zero leaves the inputs of a network without any effect, for good: zero-last, uniform or random"
             )
         if self.robust is not None:
-            raise InputError("⟨design.robust⟩ cannot be had with ⟨design.over⟩, which is a mean over scenes already")
+            raise InputError("⟨design.robust⟩ cannot be combined with ⟨design.over⟩, which is a mean over scenes already")
 
 
 @dataclass
@@ -180,7 +180,7 @@ class Designer:
         if any(s.lenslets and (s.waves or s.spread or not scene.lens.arrayed) for s in stages):
             raise InputError("⟨design.stages.lenslets⟩ needs ⟨lens.array⟩, and neither waves nor spread in the same stage")
         if options.network != "none" and any(s.waves for s in stages):
-            raise InputError("⟨design.stages.waves⟩ needs network none: the wave image refines the heights themselves")
+            raise InputError("⟨design.stages.waves⟩ needs network none: the wave image is refined by control heights")
         if options.over and any(s.spread or s.source for s in stages):
             raise InputError("⟨design.over⟩ needs stages on the rays of the scene's own source, without spread")
         self._room: tuple[tuple[int, int], tuple[Tensor, Tensor]] | None = None

@@ -85,7 +85,9 @@ class SplineSpace:
             if bool((values <= 0).any()) or bool((values >= 1).any()):
                 raise InputError(f"inner knots must lie strictly between 0 and 1 for degree {p}")
             if bool((counts > p).any()):
-                raise InputError(f"an inner knot may be repeated at most {p} times for degree {p}: more tears the surface")
+                raise InputError(
+                    f"an inner knot may be repeated at most {p} times for degree {p}: more makes the surface discontinuous"
+                )
             gaps = torch.cat([values.new_zeros(1), values, values.new_ones(1)]).diff()
             if bool((gaps < KNOT_RESOLUTION).any()):
                 raise InputError(f"distinct knots must be at least {KNOT_RESOLUTION:g} apart")

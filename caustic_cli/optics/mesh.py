@@ -51,7 +51,7 @@ class TriangleMesh:
 
     def __init__(self, field: HeightField, heights: Tensor, n_u: int, n_v: int):
         if min(n_u, n_v) < 1:
-            raise InputError(f"knot spans must be cut in at least 1 x 1 parts, got {n_u} x {n_v}")
+            raise InputError(f"knot spans must be divided into at least 1 x 1 parts, got {n_u} x {n_v}")
         self.field, self.shape = field, (n_u, n_v)
         self._breaks = [((2.0 * s.breaks - 1.0) * r).numpy() for s, r in zip(field.spaces, field.half_size, strict=True)]
         self._vertices = vertices_of(*field.spaces, heights, n_u, n_v).numpy()

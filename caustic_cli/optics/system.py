@@ -200,12 +200,12 @@ class System:
             raise InputError("a system needs at least one source and one element")
         names = [e.name for e in self.elements]
         if len(set(names)) < len(names):
-            raise InputError(f"elements must have names of their own, got {', '.join(names)}")
+            raise InputError(f"elements must have unique names, got {', '.join(names)}")
         if not all(map(math.isfinite, self.pupil.half_size)):
-            raise InputError(f"the first element, {names[0]}, must have an aperture: sources shine into it")
+            raise InputError(f"the first element, {names[0]}, must have an aperture, which the sources illuminate")
         for name, cosine in zip(names, self._along()[0], strict=True):
             if abs(cosine) < PARALLEL:
-                raise InputError(f"element {name} must face the light: the axis runs along its surface")
+                raise InputError(f"element {name} must face the light: the axis is parallel to its surface")
 
     @classmethod
     def of(cls, scene: Scene, surface: HeightField | None = None) -> System:

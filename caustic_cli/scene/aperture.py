@@ -22,7 +22,7 @@ class Aperture:
 
     def __post_init__(self):
         if self.round and self.half_size[0] != self.half_size[1]:
-            raise InputError(f"half_size of a circular aperture must be its radius, twice the same, got {self.half_size}")
+            raise InputError(f"half_size of a circular aperture must be its radius, given twice, got {self.half_size}")
 
     @property
     def radius(self) -> float | None:

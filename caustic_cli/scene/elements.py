@@ -73,8 +73,7 @@ class Component:
                 raise InputError(f"⟨element.radius⟩ must be non-zero numbers of mm or inf, got {list(self.radius)}")
         if self.round and self.size[0] != self.size[1]:
             raise InputError(
-                "⟨element.size⟩ of a circular aperture must be its diameter, twice the same, got"
-                f" {self.size[0]:g} x {self.size[1]:g}"
+                f"⟨element.size⟩ of a circular aperture must be its diameter, given twice, got {self.size[0]:g} x {self.size[1]:g}"
             )
         for side, r in zip(self.sides, self.radius, strict=False):
             if self.reach > STEEPEST * abs(r):
@@ -91,7 +90,7 @@ class Component:
         for key in ("thickness", "index", "absorption"):
             check(f"element.{key}", getattr(self, key))
         if any(self.tilt):
-            raise InputError("⟨element.tilt⟩ is for mirrors: a lens stands square to the axis")
+            raise InputError("⟨element.tilt⟩ is for mirrors: lenses are perpendicular to the axis")
         rim = self.thickness + self.sag("back") - self.sag("front")
         if rim <= 0:
             raise InputError(
@@ -189,7 +188,7 @@ def check_positions(elements: Sequence[Component], lens: tuple[float, float], so
         if e.mirror and low < lens[0]:
             raise InputError(
                 f"⟨element.z⟩ of a mirror must lie behind the lens (beyond {lens[1]:g} mm), got {low:g} mm: the lens stands on its"
-                " source's axis, so that a mirror before it is the source turned"
+                " source's axis, so that a mirror in front of it is equivalent to a rotated source"
             )
     own = ("the free-form lens", *lens)
     before = [b for b in bodies if b[1] < lens[0]]
@@ -197,8 +196,8 @@ def check_positions(elements: Sequence[Component], lens: tuple[float, float], so
     for (name, _, high), (other, low, _) in itertools.pairwise(sequence):
         if low < high:
             raise InputError(
-                f"⟨element.z⟩: {other} begins at {low:.4g} mm, before {name} ends at {high:.4g} mm; [[element]] tables stand in the"
-                " order in which light meets them, clear of each other"
+                f"⟨element.z⟩: {other} begins at {low:.4g} mm, before {name} ends at {high:.4g} mm; [[element]] tables must be in"
+                " the order in which light reaches them, without overlap"
             )
     if before and source >= before[0][1]:
         raise InputError(
@@ -218,4 +217,4 @@ def check_compatible_with_elements(wrong: dict[str, bool]) -> None:
     """
     for path, there in wrong.items():
         if there:
-            raise InputError(f"⟨{path}⟩ cannot be had with [[element]]: beside other lenses and mirrors it is not worked out")
+            raise InputError(f"⟨{path}⟩ cannot be combined with [[element]]: it is not implemented beside other lenses and mirrors")

@@ -45,7 +45,7 @@ class SecondTarget:
 
     def __post_init__(self):
         if self.screen is not None and self.focus is not None:
-            raise InputError("⟨second.z⟩ and ⟨second.focus⟩ both say what light does behind the picture: give one of them")
+            raise InputError("⟨second.z⟩ and ⟨second.focus⟩ both define the light behind the picture: give one of them")
         if self.focus is not None:
             check("second.focus", self.focus)
 

@@ -71,7 +71,7 @@ class Offset:
                 continue
             if square.max(initial=0.0) >= rho * rho:
                 raise InputError(
-                    f"⟨lens.radius⟩ must exceed the lens' own reach of {math.sqrt(square.max()):.4g} mm, got {abs(rho):.4g} mm"
+                    f"⟨lens.radius⟩ must exceed the lens' semi-aperture of {math.sqrt(square.max()):.4g} mm, got {abs(rho):.4g} mm"
                     " (a smaller ⟨mag⟩ or a longer ⟨throw⟩ gives a larger radius)"
                 )
             # s / (rho + sign sqrt(rho^2 - s)), which is rho - sign sqrt(rho^2 - s) without cancellation
@@ -172,7 +172,7 @@ class Lens:
             raise InputError("⟨lens.gradient⟩ needs a lens: light never enters a mirror")
         if self.round and self.size[0] != self.size[1]:
             raise InputError(
-                f"⟨lens.size⟩ of a circular aperture must be its diameter, twice the same, got {self.size[0]:g} x {self.size[1]:g}"
+                f"⟨lens.size⟩ of a circular aperture must be its diameter, given twice, got {self.size[0]:g} x {self.size[1]:g}"
             )
 
     def _check_array(self) -> None:
@@ -230,7 +230,7 @@ class Lens:
         high = f + self.height_range[1]
         if not (low < high).all():
             raise InputError(
-                f"⟨lens.min_thickness⟩ of {self.min_thickness:g} mm leaves the heights no room: offset plus height_range"
+                f"⟨lens.min_thickness⟩ of {self.min_thickness:g} mm leaves no room for the heights: base surface plus height_range"
                 f" reaches only {high.min() - self.z_in:.4g} mm above z_in; raise thickness or height_range"
             )
         return low, high

@@ -119,7 +119,7 @@ def material(name: str) -> Material:
     if plain in _BY_NAME:
         return MATERIALS[_BY_NAME[plain]]
     if plain in map(_plain, METALS):
-        raise InputError(f"⟨lens.glass⟩ must be what light goes through; {name} reflects: give ⟨+lens.mirror⟩ instead")
+        raise InputError(f"⟨lens.glass⟩ must be a transparent material; {name} is a metal: give ⟨+lens.mirror⟩ instead")
     near = difflib.get_close_matches(plain, _BY_NAME, 1, 0.7)
     hint = f"; did you mean {_BY_NAME[near[0]]}?" if near else "; of any other material, give its ⟨+lens.index⟩"
     raise InputError(f"⟨lens.glass⟩ must be one of {', '.join(MATERIALS)}, got {name!r}{hint}")

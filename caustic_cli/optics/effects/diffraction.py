@@ -20,14 +20,14 @@ class Diffraction(Effect):
         """Needed if it increases the blur of source and pixel noticeably."""
         r = bounds.resolution
         if scene.source.rays is not None:
-            return Decision(self.name, False, "a ray file says nothing of its light's phase", r.widened, WIDENED)
+            return Decision(self.name, False, "a ray file contains no phase", r.widened, WIDENED)
         if scene.screen.curved:
             return Decision(self.name, False, "a curved screen has no wave image", r.widened, WIDENED)
         if scene.lens.gradient is not None:
-            why = "the wave image is taken of lenses of one index"
+            why = "wave images are implemented for homogeneous lenses only"
             return Decision(self.name, False, why, r.widened, WIDENED, fixed=True)
         if scene.elements:
-            return Decision(self.name, False, "the wave image is taken of a lens by itself", r.widened, WIDENED, fixed=True)
+            return Decision(self.name, False, "wave images are implemented for a single lens only", r.widened, WIDENED, fixed=True)
         light = f"{r.wavelength:.4g} nm" if r.said else f"{r.wavelength:g} nm, as the scene says no wavelength,"
         why = f"light of {light} blurs over {r.diffraction:.2g} mm, the source over {r.source:.2g} mm, a pixel is {r.pixel:.2g} mm"
         return Decision(self.name, r.matters, why, r.widened, WIDENED)

@@ -34,7 +34,7 @@ class Dispersion(Effect):
             if not scene.light.wavelengths
             else "a mirror treats all wavelengths alike"
             if scene.lens.mirror
-            else "the lens has one index for all wavelengths"
+            else "the lens' index is the same at all wavelengths"
         )
         return Decision(self.name, False, why, 0.0, 0.0, present=False)
 

@@ -16,11 +16,13 @@ class Fresnel(Effect):
     def decide(self, scene: Scene, b) -> Decision:
         """Needed unless the scene has fresnel = none."""
         if scene.lens.mirror:
-            return Decision(self.name, False, "a mirror is taken to reflect all light", present=False)
+            return Decision(self.name, False, "mirrors have a reflectance of 1", present=False)
         if scene.lens.fresnel == "none":
             return Decision(self.name, False, "fresnel = none: perfectly coated", 0.0, 0.0)
         normal = ((b.index - 1.0) / (b.index + 1.0)) ** 2
-        return Decision(self.name, True, f"each surface reflects {normal:.2%} of normal light; {scene.lens.fresnel}", normal, 0.0)
+        return Decision(
+            self.name, True, f"each surface reflects {normal:.2%} of light at normal incidence; {scene.lens.fresnel}", normal, 0.0
+        )
 
     def without(self, scene: Scene) -> Scene:
         """With perfect anti-reflection coatings."""

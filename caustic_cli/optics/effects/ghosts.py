@@ -32,7 +32,7 @@ class Ghosts(Effect):
             why = f"at most {b.ghost:.2%} of the power is reflected twice, which changes the image by about {b.ghost_error:.1g}"
             return Decision(self.name, False, why, amount, NEGLIGIBLE)
         if b.ghost_error > b.ghost:
-            why = f"{b.ghost:.2%} of the power, reflected twice, comes together: it may change the image by {b.ghost_error:.2g}"
+            why = f"{b.ghost:.2%} of the power, reflected twice, may be focused and change the image by {b.ghost_error:.2g}"
             return Decision(self.name, True, why, amount, NEGLIGIBLE)
         return Decision(self.name, True, f"up to {b.ghost:.2%} of the power may be reflected twice", amount, NEGLIGIBLE)
 

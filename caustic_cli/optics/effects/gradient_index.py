@@ -30,7 +30,7 @@ class GradientIndex(Effect):
         """
         lens, field = scene.lens, index_field_of(scene.lens)
         if field is None:
-            return Decision(self.name, False, "the lens has one index", 0.0, UNSEEN, present=False)
+            return Decision(self.name, False, "the lens has a homogeneous index", 0.0, UNSEEN, present=False)
         least, most, steepest = field.extremes(lens.half_size, bounds.depth)
         turn = min(steepest * bounds.depth * most / least, 0.5 * math.pi)
         moved = turn * (bounds.depth / (2.0 * least) + scene.screen.z - lens.offset.thickness) / min(scene.screen.pixel)

@@ -24,5 +24,5 @@ class MissedSurface(Effect):
             return Decision(self.name, False, f"no ray gets beyond {b.reach:.4g} of the aperture's half width", b.reach, 1.0)
         if math.isinf(b.reach):
             return Decision(self.name, True, "the surface may dip below the entrance", None, 1.0, fixed=True)
-        why = f"rays may get to {b.reach:.4g} of the aperture's half width: its side takes them"
+        why = f"rays may get to {b.reach:.4g} of the aperture's half width, where its edge absorbs them"
         return Decision(self.name, True, why, b.reach, 1.0, fixed=True)

@@ -29,12 +29,12 @@ class Polarisation(Effect):
         if light.polarisation is not None:
             return Decision(self.name, True, f"the source is polarised at {light.polarisation:g} degrees")
         if b.incidence == 0:
-            return Decision(self.name, False, "unpolarised light, which normal incidence leaves so", 0.0, NEGLIGIBLE)
+            return Decision(self.name, False, "unpolarised light at normal incidence stays unpolarised", 0.0, NEGLIGIBLE)
         some = b.polarised > NEGLIGIBLE
         return Decision(
             self.name,
             some,
-            "unpolarised light; what the entrance polarises changes what the exit reflects by"
+            "unpolarised light; polarisation at the entrance changes the reflectance of the exit by"
             f" {'up to' if some else 'at most'} {b.polarised:.1e}",
             b.polarised,
             NEGLIGIBLE,

@@ -29,7 +29,7 @@ class SecondaryIntersection(Effect):
         """By a bound of the slopes against the angles of the exit rays."""
         if scene.behind:
             return Decision(
-                self.name, False, "it is looked for at a last surface alone, and light goes on to others", present=False
+                self.name, False, "it is implemented at the last surface only, and other elements follow", present=False
             )
         if b.slope_ratio < 1.0:
             why = f"slopes up to {b.slope:.3g} are {b.slope_ratio:.3g} of those at which a ray that left could meet it again"
@@ -37,7 +37,7 @@ class SecondaryIntersection(Effect):
         return Decision(
             self.name,
             True,
-            f"slopes up to {b.slope:.3g} may catch a ray that has left",
+            f"slopes up to {b.slope:.3g} may intersect a ray that has left",
             b.slope_ratio if math.isfinite(b.slope_ratio) else None,
             1.0,
         )

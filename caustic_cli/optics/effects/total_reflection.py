@@ -23,7 +23,7 @@ class TotalReflection(Effect):
         if b.critical < 1.0 and not scene.elements:
             return Decision(self.name, False, f"n sin i <= {b.critical:.4g} at slopes up to {b.slope:.3g}", b.critical, 1.0)
         if scene.elements:
-            return Decision(self.name, True, "surfaces of other lenses may reflect all of a ray", fixed=True)
+            return Decision(self.name, True, "total reflection may occur at other lenses", fixed=True)
         return Decision(self.name, True, f"n sin i may reach {b.critical:.4g} at slopes up to {b.slope:.3g}", b.critical, 1.0)
 
     def request(self, scene: Scene, on: bool, bounds) -> Requests:

@@ -101,7 +101,7 @@ def _meeting(source: Measured, half_size: tuple[float, float], z: float, round: 
     (met,) = np.nonzero(met)
     if not len(met):
         raise InputError(
-            f"⟨source.file⟩: none of its {source.rays.count:,} rays meets the lens, which stands along +z from them;"
+            f"⟨source.file⟩: none of its {source.rays.count:,} rays meets the lens, which must lie in the direction +z;"
             " ⟨source_position⟩ moves them"
         )
     return x[met], y[met], met, source.rays.flux[met] / source.rays.flux.sum()

@@ -76,7 +76,7 @@ class IndexField(ABC):
         lines = [torch.linspace(*ends, SURVEY, dtype=torch.float64) for ends in ((-rx, rx), (-ry, ry), (0.0, depth))]
         square, force = self.at([c.reshape(-1) for c in torch.meshgrid(*lines, indexing="ij")])
         if not float(square.min()) >= LEAST_SQUARE:
-            raise InputError("⟨lens.gradient_terms⟩ must leave the index above 0.5 all over the lens")
+            raise InputError("⟨lens.gradient_terms⟩ must keep the index above 0.5 everywhere in the lens")
         n = square.sqrt()
         steepest = float((square_of(force).sqrt() / n).max()) * BETWEEN
         return Extremes(float(n.min()), float(n.max()), steepest)

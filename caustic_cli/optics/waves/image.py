@@ -182,7 +182,7 @@ def image_of(
         if (samples := imager.sampling.samples * len(light) * len(imager.modes(light[0].system))) > most:
             raise NoWaveImage(
                 f"a wave image of this scene takes {samples:.2g} samples, about {samples / A_SECOND / 60:.0f} minutes on two cores;"
-                " the effect diffraction, asked for by name, takes it"
+                " the effect diffraction, requested by name, computes it"
             )
         found.append(imager.expose(light, parameters, dtype))
     return (
@@ -256,7 +256,7 @@ class Imager:
         ways = [group[0] for group in _alike(lines)]
         system = ways[0].system
         if system.source.rays is not None:
-            raise NoWaveImage("a ray file says nothing of its light's phase, so that it has no wave image")
+            raise NoWaveImage("a ray file contains no phase, so that it has no wave image")
         plane, upright = receiver.plane(system.axis), receiver.across(system.axis)
         distance = distance_of(system, parameters, plane)
         alike = [Optics(k.system, central_mode(system), parameters, k.length, k.label, plane, distance) for k in ways]

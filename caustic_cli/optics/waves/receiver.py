@@ -105,5 +105,5 @@ def receiver_of(system: System, screen: Screen | PlacedScreen) -> Receiver:
         raise NoWaveImage("a curved screen has no wave image: the field is taken on planes")
     found = Receiver.of(screen)
     if abs(dot(found.axes[2], system.axis)) < LEAST_COSINE:
-        raise InputError("⟨screen.tilt⟩ leaves the screen along the light, where no wave image can be taken")
+        raise InputError("⟨screen.tilt⟩ makes the screen nearly parallel to the light, where there is no wave image")
     return found

@@ -37,7 +37,7 @@ class Several(Source):
         if not 2 <= len(self.members) <= MOST:
             raise InputError(f"[[source]] must be 1 to {MOST} sources, got {len(self.members)}")
         if len({bool(wavelengths) for wavelengths, _ in self.spectra}) > 1:
-            raise InputError("⟨source.also.wavelengths⟩ must be said of every source, or of none")
+            raise InputError("⟨source.also.wavelengths⟩ must be given for every source, or for none")
 
     @property
     def power(self) -> float:
