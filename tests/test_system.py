@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -437,3 +438,15 @@ def test_bad_systems_are_refused_in_a_sentence():
     with pytest.raises(InputError, match="refract, reflect"):
         Element("a", Plane(), interaction="absorb")
     assert len({effect.name for effect in EFFECTS}) == len(EFFECTS)
+
+
+@pytest.mark.parametrize("source", [PlaneWave(), Points(((0.0, 0.0, -50.0),))])
+def test_an_absorbing_medium_in_front_of_the_pupil(source):
+    """Powers are those on the pupil, so that a medium in front of a first plane element there absorbs nothing."""
+    elements = (
+        Element("in", Plane(), Aperture((5.0, 5.0)), behind=GLASS),
+        Element("out", Plane(), Aperture((6.0, 6.0)), pose=Pose((0.0, 0.0, 4.0))),
+    )
+    clear = System((source,), elements, (Screen((20.0, 20.0), 100.0),))
+    (without,), (image,) = (render(s, {}, 1000) for s in (clear, replace(clear, before=Medium(1.0, 0.1))))
+    assert torch.equal(image.image, without.image) and image.lost == without.lost

@@ -50,5 +50,5 @@ class AbsorptionAction(Action):
         """Attenuate by the factor exp(-a length)."""
         if m.absorption:
             before = m.state.power
-            m.state.power = before * torch.exp(-m.absorption * m.length)
+            m.state.power = before * torch.exp(-m.absorption * torch.as_tensor(m.length))  # 0.0 for rays on the pupil already
             m.state.lose("absorbed", (before - m.state.power).detach())
