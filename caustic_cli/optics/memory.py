@@ -41,5 +41,7 @@ def with_smaller_chunks(work: Callable[[int], T], chunk: int) -> T:
         try:
             return work(chunk)
         except (MemoryError, RuntimeError) as error:
+            if not is_out_of_memory(error):
+                raise
             problem = error.with_traceback(None)  # whose frames hold everything that was allocated
         chunk = smaller_chunk(chunk, problem)
