@@ -192,7 +192,7 @@ def image_of(
             cast(Tensor, sum(w.image for w in found)),
             sum(w.leaving for w in found),
             sum(w.off_screen for w in found),
-            found[0].wavelengths,
+            tuple(dict.fromkeys(w for one in found for w in one.wavelengths)),
             sum(w.points for w in found),
             max(w.spread_error for w in found),
             max(w.samples for w in found),
