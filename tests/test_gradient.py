@@ -219,7 +219,7 @@ def test_what_is_no_field_is_refused():
             Gradient("volume", (), wrong)
     with pytest.raises(InputError, match=r"0\.5"):
         Selfoc(1.5, 0.3).extremes((4.0, 4.0), 1.0)
-    with pytest.raises(InputError, match="before"):
+    with pytest.raises(InputError, match="in front of"):
         System((PlaneWave(),), block(None, 4.0), before=Medium(1.5, gradient=Axial(1.5, (0.1,))))
 
 

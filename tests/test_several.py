@@ -109,7 +109,7 @@ def test_the_coarsest_ray_file_speaks():
     ("what", "message"),
     [
         (lambda: Several((MEMBERS[0],), (NONE,)), "must be 1 to 64 sources"),
-        (lambda: Several(MEMBERS[:2], (((500.0,), ()), NONE)), "said of every source, or of none"),
+        (lambda: Several(MEMBERS[:2], (((500.0,), ()), NONE)), "given for every source, or for none"),
         (lambda: settings.parse("source = 3", "a"), "source must be a section"),
         (lambda: settings.parse("[[source]]\nsise = 3", "a"), r"\[source\] sise is not a key"),
         (lambda: settings.parse("[[source]]\n[[source]]\nsise = 3", "a"), r"\[\[source\]\] sise is not a key"),

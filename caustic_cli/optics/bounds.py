@@ -72,7 +72,7 @@ def check_exit_above_entrance(scene: Scene, field: HeightField, heights: Tensor)
     dip = lens.z_in - field.least(heights, lens.round)
     if dip > 0:
         raise InputError(
-            f"⟨lens.z_in⟩ of {lens.z_in:g} mm lies above a part of the exit surface, which is up to {dip:.3g} mm lower; it must"
+            f"⟨lens.z_in⟩ of {lens.z_in:g} mm lies above a part of the exit surface, which dips {dip:.3g} mm below it; it must"
             f" be at most {lens.z_in - dip:.6g} mm"
         )
 

@@ -16,7 +16,7 @@ class Exit(NamedTuple):
     of the origins of oblique rays, height: of the screen, mm, both above the zero of the sag.
     """
 
-    index: float  # type: ignore[assignment]  # nobody asks an `Exit` for the place of a value
+    index: float  # type: ignore[assignment]  # shadows `tuple.index`, which is not used
     fresnel: int
     start: float
     height: float

@@ -18,8 +18,8 @@ from caustic_cli.optics.tolerances import CRITICAL
 NONE, SCHLICK, EXACT = 0, 1, 2
 #: Kinds of Fresnel losses by name.
 FRESNEL = {"none": NONE, "schlick": SCHLICK, "exact": EXACT}
-# Rows of a block's scratch of vectors: the surface, powers, landing points, derivatives, what turns the results of `filter_weights`
-# into shares, the rays' points and powers; five more for its own use.
+# Rows of a block's scratch vectors: the surface, powers, landing points, derivatives, normalisation of the results of
+# `filter_weights`, the rays' points and powers; five more for internal use.
 SAG, GX, GY, POWER, PX, PY, PHI, BY_POWER, BY_PX, BY_PY, BY_A, T_SAG, T_GX, T_GY, T_POWER, REACH = range(16)
 OVER_X, OVER_Y, LEAN_X, LEAN_Y, X, Y, FLUX, VECTORS = range(16, 24)
 SCRATCH = 5

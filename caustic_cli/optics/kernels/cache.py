@@ -62,7 +62,7 @@ def bases() -> Iterator[Path]:
     elif common and Path(common).is_absolute():  # the XDG Base Directory Specification asks for others to be ignored
         yield Path(common) / "caustic"
     else:
-        with contextlib.suppress(RuntimeError):  # no HOME, and nobody of this number among the users
+        with contextlib.suppress(RuntimeError):  # no HOME, and an unknown user id
             yield Path.home() / ".cache" / "caustic"
     with contextlib.suppress(OSError):  # no directory for temporary files either
         if private(path := Path(tempfile.gettempdir()) / f"{PREFIX}{os.getuid() if hasattr(os, 'getuid') else 'user'}"):
@@ -83,7 +83,7 @@ def writable(path: Path) -> bool:
     """Whether a directory, created if necessary, is writable; leaves `USED` in it."""
     try:
         path.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path):  # of a name of its own: another process may be asking the same
+        with tempfile.TemporaryFile(dir=path):  # with a unique name: another process may do the same
             (path / USED).touch()
     except OSError:
         return False

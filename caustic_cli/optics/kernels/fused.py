@@ -250,7 +250,7 @@ def _cut(scratch, vx, vy):
 def forward(
     block, images, ledgers, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, flux, exit_, frame, splat, oblique
 ):
-    """Blocks' ledgers (blocks, COLUMNS), power by what became of it, and their images, whose `pixels.total` is the padded one.
+    """Ledgers (blocks, COLUMNS) of the losses, and partial images, whose `pixels.total` is the padded image.
 
     The surface comes by rows.  Row i of the sag is sum_k bu[i, k] net[first[i] + k], of dz/dx the same with du and net_x,
     of dz/dy with bu and net_y.  first (a,) int64; bu, du (a, p + 1); nets (n, b); x, y mm and flux, parts of the
@@ -332,7 +332,7 @@ def backward(
 
     nets (3, 1 if apart else blocks, n, b) are overwritten: the `pixels.total` of each is the derivative by a net (n, b).
 
-    apart: no two rows share a row of the nets, so that one sum serves all blocks.  Otherwise net_x is taken to be net
+    apart: no two rows share a row of the nets, so that a single sum suffices for all blocks.  Otherwise net_x is taken to be net
     itself, and the sum of both derivatives comes as the first.  scratch: overwritten, as in `forward`.
     """
     if block == ALL:

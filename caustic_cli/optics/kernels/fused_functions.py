@@ -151,7 +151,7 @@ def _splat(
     """Call the kernel.  interface: n_in / n_out and the kind of Fresnel losses; start: height at which oblique rays begin, mm.
 
     Returns:
-        image (n_x, n_y) and the power leaving the lens (), float64, differentiable; what was lost, by name.
+        image (n_x, n_y) and the power behind the lens (), float64, differentiable; losses by name.
     """
     oblique, arguments = _arguments(rays, interface, height, start, screen, filter)
     padded, leaving, ledger = _Image.apply(*nets, rows, apart, arguments, workspace)
@@ -190,7 +190,7 @@ def _layout(count: int) -> tuple[int, int]:
 
 
 def _strided(array: np.ndarray) -> np.ndarray:
-    """The same values read-only and not contiguous: tensor and scattered rays then share one compiled kernel."""
+    """The same values as a read-only, non-contiguous array: tensor-product and scattered rays then share one compiled kernel."""
     if array.flags.c_contiguous:
         wide = np.empty((array.shape[0], array.shape[1] + 1), array.dtype)
         wide[:, :-1] = array

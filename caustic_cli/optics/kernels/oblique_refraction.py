@@ -10,8 +10,8 @@ Notation, a ray with unit direction d inside the lens, slopes g at the hit, N = 
     R       reflectance of the exit surface
     q       (h - sag) / t_z, length of the path to the screen
 
-In, beside the directions: the distances along the rays to their hits (mm; -1 for none), dz/dx and dz/dy there, x and y where the
-rays begin, and their powers.  Out, in rows of `axial_refraction`'s vectors: SAG, POWER, PX, PY, FLUX.
+Input, besides the directions: distances along the rays to their intersections (mm; -1 for none), dz/dx and dz/dy there, x and y of
+the origins, and powers.  Output, in rows of `axial_refraction`'s vectors: SAG, POWER, PX, PY, FLUX.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from caustic_cli.optics.kernels.stage import BATCH
 from caustic_cli.optics.tolerances import CRITICAL, PARALLEL
 
 REFLECTED_POWER, MISSED_POWER = -1.0, -2.0
-# Rows of a batch's scratch: the ray, what comes out, what is differentiated by it, and derivatives by the hit.
+# Rows of a batch's scratch: the ray, outputs, derivatives by the outputs, and derivatives by the intersection.
 REACH, GX, GY, DX, DY, PART, X, Y, OUT_SAG, OUT_POWER, OUT_PX, OUT_PY, BY_REACH, BY_GX, BY_GY, ROWS = range(16)
 
 

@@ -31,7 +31,7 @@ from caustic_cli.optics.kernels.stage import BATCH, load, store
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 from caustic_cli.optics.tolerances import CRITICAL, NORMAL
 
-# Rows of a batch's scratch: the ray, what its refraction is made of, R and its derivatives, the derivatives that come and go.
+# Rows of a batch's scratch: the ray, intermediate results, R and its derivatives, input and output derivatives.
 DX, DY, DZ, GX, GY, P, EX, EY, EZ = range(9)
 NORM2, C, SIDE, S, PASSES, F, R, R_C, R_S, R_NORM2, R_F = range(9, 20)
 BY_TX, BY_TY, BY_TZ, BY_AFTER, BY_F, BY_DX, BY_DY, BY_DZ, BY_GX, BY_GY, BY_P, BY_EX, BY_EY, BY_EZ, ROWS = range(20, 35)

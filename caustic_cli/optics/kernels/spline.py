@@ -106,7 +106,7 @@ def pull_coefficients(i, grads, first_u, mu, first_v, mv, rows, out):
 
 @njit(inline="always", **FAST)
 def piece(x, breaks):
-    """The piece that holds x; the outermost ones also hold what lies beyond."""
+    """The piece that contains x; the outermost pieces extend to infinity."""
     last = len(breaks) - 2  # guess from equal spans, then walk: at once right on an equispaced knot vector
     i = min(max(int(x * (last + 1)), 0), last)
     while i > 0 and x < breaks[i]:

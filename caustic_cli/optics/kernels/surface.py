@@ -107,7 +107,7 @@ class _ScatteredSurface(torch.autograd.Function):
 
 
 def _sag(heights: Tensor) -> tuple[Tensor, float]:
-    """Heights (n, m) less their mean, float64, and the mean, mm: a sag small against the thickness keeps all its digits."""
+    """Heights (n, m) minus their mean, float64, and the mean, mm: a sag small compared with the thickness keeps all its digits."""
     h = heights.detach().double()
     middle = float(h.mean())
     return h - middle, middle
@@ -175,7 +175,7 @@ class RayIntersections:
     def find(self, heights: Tensor, start: np.ndarray | None = None) -> np.ndarray:
         """Fill t (mm) and status of every ray; returns the coefficients of the surface, counted from the heights' mean.
 
-        start: distances (N,) near which the hits are, infinite for none; None if that is not known.
+        start: estimates of the distances (N,), infinite for none; None if unknown.
         """
         if start is None:
             c, self.status, reach, *_ = self.search(heights)

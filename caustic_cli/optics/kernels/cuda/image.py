@@ -59,7 +59,7 @@ VECTORS = axial_refraction.VECTORS + axial_refraction.SCRATCH
 class Setting(NamedTuple):
     """Scalar arguments of a kernel: index and kind of Fresnel losses, as of an `Exit`, a `Frame`, and alpha of the filter."""
 
-    index: float  # type: ignore[assignment]  # nobody asks a `Setting` for the place of a value
+    index: float  # type: ignore[assignment]  # shadows `tuple.index`, which is not used
     fresnel: int
     frame: Frame
     alpha_x: float
@@ -81,7 +81,7 @@ class Light:
 
     @property
     def rays(self) -> tuple[Tensor, ...]:
-        """As the kernels take them."""
+        """Components in the order of the kernels' arguments."""
         return (self.x, self.y, *self.along, self.power)
 
 
@@ -234,7 +234,8 @@ def _kernels(slanted: bool, kind: int, vx: int, vy: int):
 
 
 class Splatting(NamedTuple):
-    """Everything but the hits: light, its sums' unit, start and height of the `Exit` (2,), the kernels and what they take."""
+    """All inputs except the intersections: light, unit of its sums, start and height of the `Exit` (2,), kernels and their
+    arguments."""
 
     light: Light
     unit: Tensor
@@ -255,7 +256,7 @@ def expose(
         place: (2,) float64 on the device, the heights where oblique rays begin and of the screen, above the zero of the sag, mm.
 
     Returns:
-        image (n_x, n_y) and the power leaving the lens (), float64, differentiable; what was lost, by name.
+        image (n_x, n_y) and the power behind the lens (), float64, differentiable; losses by name.
     """
     (nx, ny), (rx, ry) = screen.resolution, filter.reach
     vx, vy, kind = 2 * rx + 1, 2 * ry + 1, filter_weights.KINDS[filter.kind]
@@ -272,7 +273,7 @@ def expose(
 
 
 class _Image(torch.autograd.Function):
-    """Distance (or sag) and slopes -> padded image, power leaving the lens (), ledger."""
+    """Distance (or sag) and slopes -> padded image, power behind the lens (), ledger."""
 
     @staticmethod
     def forward(t: Tensor, gx: Tensor, gy: Tensor, how: Splatting):
@@ -307,7 +308,7 @@ class _Image(torch.autograd.Function):
 
 
 class _Pushed(torch.autograd.Function):
-    """The tangent of `_Image`, a function of its own because within torch.func a tensor's numbers are within reach only there."""
+    """The tangent of `_Image`, a separate function because within torch.func the data of a tensor is accessible only there."""
 
     @staticmethod
     def forward(how: Splatting, *values):

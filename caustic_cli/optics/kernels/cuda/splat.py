@@ -148,7 +148,7 @@ class _Splat(torch.autograd.Function):
 
 
 class _Pushed(torch.autograd.Function):
-    """The tangent of `_Splat`, a function of its own because within torch.func a tensor's numbers are within reach only there."""
+    """The tangent of `_Splat`, a separate function because within torch.func the data of a tensor is accessible only there."""
 
     @staticmethod
     def forward(frame: Frame, *values):

@@ -206,7 +206,7 @@ def _first_hits(rays, bounds, radius, geometry, scale, c, out, where):
 
 @cuda.jit
 def _pull_rays(rays, found, where, given, geometry, scale, c, out):
-    """X + L_Z Z_x, Y + L_Z Z_y and L_Z in `out`, and the hits' u and v."""
+    """X + L_Z Z_x, Y + L_Z Z_y and L_Z in `out`, and u and v of the intersections."""
     (ox, oy, dx, dy, dz), (t, gx, gy), (by_t, by_gx, by_gy) = rays, found, given
     (_, mu, wu, _, mv, wv), (scale_x, scale_y), (by_x, by_y, by_z, u, v) = geometry, scale, out
     wide = len(mv)
@@ -284,7 +284,7 @@ def hits_of_rays(
 
 
 def _sag(heights: Tensor) -> tuple[Tensor, Tensor]:
-    """Heights less their mean, and the mean (), float64: a sag small against the thickness keeps all its digits."""
+    """Heights minus their mean, and the mean (), float64: a sag small compared with the thickness keeps all its digits."""
     h = heights.detach().double()
     return h - h.mean(), h.mean()
 
@@ -348,7 +348,7 @@ class _Hits(torch.autograd.Function):
 
 
 class _Pushed(torch.autograd.Function):
-    """The tangent of `_Hits`, a function of its own because within torch.func a tensor's numbers are within reach only there."""
+    """The tangent of `_Hits`, a separate function because within torch.func the data of a tensor is accessible only there."""
 
     @staticmethod
     def forward(surface: DeviceSurface, heights, ox, oy, dx, dy, dz, t, gx, gy, where, change, *moves):
