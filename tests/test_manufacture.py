@@ -205,6 +205,8 @@ def test_a_thick_plate_says_what_would_make_it_thin(wall):
     words = preview(scene, field, heights, 2e4)
     if wall == 3.0:
         assert "; a ⟨+throw⟩ of about 600 mm or a smaller ⟨+mag⟩ would make it 8 mm thick" in words
+        near = replace(scene, source=Points(((0.0, 0.0, -20.0),)))  # whose light the relief gathers, whatever the throw
+        assert "throw" not in preview(near, field, heights, 2e4)
         words = preview(scene, field, 3.0 + 0.45 * (heights - 3.0), 2e4)
     assert "throw" not in words and "stock" in words  # a thin plate, and a lens that is none
 

@@ -114,9 +114,9 @@ def test_what_is_said_before_a_design_begins(monkeypatch):
     assert any(line.startswith(white) and line.endswith("of a drawing on white, invert makes the lines bright") for line in lines)
     (first,) = [line for line in lines if line.startswith("first surface: wall 2.")]
     assert "totally reflected from 0.90" in first and "project about 21 kB" in first
-    assert any("source 5.1 mm or" in line and "pixels" in line for line in lines)
+    assert any("source 4.6 mm or" in line and "pixels" in line for line in lines)
     low, high = float(lens.heights.min()), float(lens.heights.max())
-    assert 1.9 < low < 3.0 and high < 15.0  # a plate: a wall of 2 mm, as the preset says, and its relief
+    assert 1.9 < low < 3.0 and high < 8.0  # a plate: a wall of 2 mm, as the preset says, and its relief
 
 
 def test_figures_are_json(capfd):

@@ -3,6 +3,7 @@
 import math
 import tomllib
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -156,6 +157,18 @@ def test_mag_1_is_flat():
 def test_mag_counts_lens_widths():
     s = complete({"lens": {"size": [20.0, 20.0]}}, 1.0, Derivation(mag=2.0, margin=0.5))
     assert s["target"]["size"] == pytest.approx([40.0, 40.0]) and s["screen"]["size"] == pytest.approx([60.0, 60.0])
+
+
+@pytest.mark.parametrize(("at", "thickness"), [(-10.0, 11.607), (-60.0, 6.0)])
+def test_a_lens_close_to_its_source_is_thick_enough_for_its_corners(at, thickness):
+    """A source 10 mm before a lens of 30 mm: the offset gathers 56 degrees, and its corners lie 10.6 mm below its middle."""
+    said = {"source": {"type": "point", "position": [[0.0, 0.0, at]]}, "lens": {"size": [30.0, 30.0]}}
+    s = complete(said, 1.0, Derivation(mag=3.0))
+    low, _ = build_lens(s).height_bounds(np.array([-15.0, 0.0, 15.0]), np.array([-15.0, 0.0, 15.0]))
+    assert low.min() >= 1.0 and s["lens"]["thickness"] == pytest.approx(thickness, abs=1e-3)
+    with pytest.raises(InputError, match="leaves no room for the heights"):
+        thin = complete({**said, "lens": said["lens"] | {"thickness": 0.9}}, 1.0, Derivation(mag=3.0))
+        build_lens(thin).height_bounds(np.array([-15.0, 0.0, 15.0]), np.array([-15.0, 0.0, 15.0]))
 
 
 def test_a_non_square_picture_keeps_its_shape():

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 
 from caustic_cli.config.default_stages import (
@@ -220,6 +221,7 @@ def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[st
         lens["index"] = index
     else:
         lens.setdefault("wavelength", default("lens.wavelength"))
+    free = "thickness" not in lens
     lens.setdefault("thickness", THICK * max(lens["size"]) if sides == 2 else first_thickness(lens["size"]))
     lens.setdefault("height_range", [-scale, scale] if sides == 1 else [c * SAG * lens["thickness"] for c in (-1.0, 1.0)])
     if sides == 2:
@@ -246,6 +248,19 @@ def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[st
         ).radius
         least = STEEPEST * math.hypot(*lens["size"]) / 2.0  # an oblong picture or a near source may ask for a smaller radius
         lens["radius"] = [math.copysign(max(abs(r), least), r) for r in radius]
+    if free and sides == 1:
+        lens["thickness"] += _missing_room(lens)
+
+
+def _missing_room(lens: dict[str, Any]) -> float:
+    """Thickness by which a lens has to grow for its offset to keep the least thickness, mm; 0 where its heights have room already.
+
+    A lens that gathers much light, of a source close by for instance, is thinnest at its corners.
+    """
+    x, y = (np.array([0.0, width / 2.0]) for width in lens["size"])
+    lowest = lens["thickness"] + float(Offset(0.0, tuple(lens["radius"])).sag(x[:, None], y[None, :]).min())
+    short = lens["z_in"] + value_of(lens, "lens.min_thickness") - lowest
+    return short if short >= lens["height_range"][1] else 0.0
 
 
 def shape_words(s: Settings) -> str:

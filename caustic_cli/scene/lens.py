@@ -231,6 +231,6 @@ class Lens:
         if not (low < high).all():
             raise InputError(
                 f"⟨lens.min_thickness⟩ of {self.min_thickness:g} mm leaves no room for the heights: base surface plus height_range"
-                f" reaches only {high.min() - self.z_in:.4g} mm above z_in; raise thickness or height_range"
+                f" reaches only {high.min() - self.z_in:.4g} mm above z_in; raise ⟨+lens.thickness⟩ or ⟨lens.height_range⟩"
             )
         return low, high

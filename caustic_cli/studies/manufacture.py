@@ -137,10 +137,12 @@ def preview(scene: Scene, field: HeightField, heights: Tensor, project: float) -
 
 
 def _thinner(scene: Scene, low: float, high: float) -> str:
-    """What would make a plate whose surface is between two heights, mm, as thin as a sheet: its relief goes as 1 / throw."""
+    """What would make a plate whose surface is between two heights, mm, as thin as a sheet: its relief goes as 1 / throw, if the
+    light comes from infinity; that of a lens near its source gathers the light, whatever the throw."""
     sheet = SHEET * max(scene.lens.size)
     room = sheet - (low - scene.lens.z_in)  # none in a lens that is no plate
-    if scene.lens.mirror or scene.elements or not 0.0 < room < high - low:
+    near = math.isfinite(scene.source.nearest)
+    if near or scene.lens.mirror or scene.elements or not 0.0 < room < high - low:
         return ""
     middle = scene.lens.offset.thickness
     throw = float(f"{middle + (scene.screen.z - middle) * (high - low) / room:.2g}")
