@@ -253,9 +253,9 @@ def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[st
 
 
 def _missing_room(lens: dict[str, Any]) -> float:
-    """Thickness by which a lens has to grow for its offset to keep the least thickness, mm; 0 where its heights have room already.
+    """Increase of the thickness, mm, with which the base surface keeps the least thickness; 0 if the heights have room already.
 
-    A lens that gathers much light, of a source close by for instance, is thinnest at its corners.
+    A strongly converging lens, for a close source for instance, is thinnest at its corners.
     """
     x, y = (np.array([0.0, width / 2.0]) for width in lens["size"])
     lowest = lens["thickness"] + float(Offset(0.0, tuple(lens["radius"])).sag(x[:, None], y[None, :]).min())
