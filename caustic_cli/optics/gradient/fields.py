@@ -191,7 +191,7 @@ class SplineIndex(IndexField):
         object.__setattr__(self, "coefficients", self.coefficients.double())
 
     @property
-    def shape(self) -> tuple[int, ...]:  # type: ignore[override]  # nobody sets a field's
+    def shape(self) -> tuple[int, ...]:  # type: ignore[override]  # read-only here
         """Shape of the control values."""
         return tuple(self.coefficients.shape)
 

@@ -18,7 +18,7 @@ class Fixed(Surface[None]):
     heights: Tensor
 
     @property
-    def half_size(self) -> tuple[float, float]:  # type: ignore[override]  # nobody sets a surface's
+    def half_size(self) -> tuple[float, float]:  # type: ignore[override]  # read-only here
         """Half widths of the field, mm."""
         return self.field.half_size
 

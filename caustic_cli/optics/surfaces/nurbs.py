@@ -44,7 +44,7 @@ class Nurbs(Surface[Tensor]):
         return self.field.shape
 
     @property
-    def half_size(self) -> tuple[float, float]:  # type: ignore[override]  # nobody sets a surface's
+    def half_size(self) -> tuple[float, float]:  # type: ignore[override]  # read-only here
         """Half widths of the aperture, mm."""
         return self.field.half_size
 
