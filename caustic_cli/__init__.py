@@ -1,6 +1,6 @@
-"""caustic: free-form lenses that throw a picture as a caustic.
+"""caustic: design of free-form lenses that project a picture as a caustic.
 
-`from caustic_cli import design, render, load, trace` is the library (`workflow.library`), loaded on first use.
+`from caustic_cli import design, render, load, trace` is the library interface (`workflow.library`), loaded on first use.
 """
 
 from __future__ import annotations

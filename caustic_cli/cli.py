@@ -1,6 +1,7 @@
-"""The `caustic` command: runs one command line, and turns errors and signals into one line and an exit status.
+"""Entry point of the `caustic` command: runs a command line, and converts errors and signals to a one-line message and an exit
+status.
 
-The parser and all that it needs are loaded by `run`, after `main` has begun to answer signals.
+The parser and its dependencies are imported by `run`, after `main` has installed the signal handlers.
 """
 
 from __future__ import annotations
@@ -13,20 +14,20 @@ import threading
 import warnings
 
 
-class Stopped(KeyboardInterrupt):
-    """A signal ended what was done.  A plain KeyboardInterrupt out of `exec` would have Python end itself by SIGINT, whatever came
-    of it."""
+class SignalReceived(KeyboardInterrupt):
+    """Raised by the signal handlers.  After a plain KeyboardInterrupt in `exec`, Python would terminate itself by SIGINT even if it
+    was handled."""
 
 
-#: How a signal is called that ends a command.
+#: Signals that terminate a command, with the words for the message.
 SIGNALS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
-#: Those that this process was sent.
+#: Signals received by this process.
 _sent: list[int] = []
-#: Seconds after which an interruption that was lost is tried again.
-AGAIN = 0.05
-#: For the libraries' threads, where the environment does not say otherwise.  Threads that wait for one another sleep: beside other
-#: programs on the same cores they would otherwise keep these from working.  And OpenBLAS, which only solves small systems here, has
-#: one: it hands systems of two equations to a second.
+#: Seconds after which a lost signal is sent again.
+RETRY_SECONDS = 0.05
+#: Environment variables for the libraries' threads, unless set already.  Waiting threads sleep instead of spinning, which would
+#: slow down other programs on the same cores.  OpenBLAS, which solves only small systems here, gets a single thread: it would
+#: distribute even systems of two equations.
 THREADS = {"OMP_WAIT_POLICY": "passive", "OPENBLAS_NUM_THREADS": "1"}
 
 
@@ -45,18 +46,18 @@ def _run(arguments: list[str]) -> int:
     from caustic_cli.commands.parser import parser  # noqa: PLC0415
     from caustic_cli.errors import Interrupted  # noqa: PLC0415
 
-    console.speak({})
+    console.set_option_names({})
     debug = "--debug" in arguments or bool(os.environ.get("CAUSTIC_DEBUG"))
     try:
         status = parser().main(arguments, prog_name="caustic", standalone_mode=False, auto_envvar_prefix="CAUSTIC")
         sys.stdout.flush()
-        if status == 130:  # how some versions of Typer pass a KeyboardInterrupt on
+        if status == 130:  # some versions of Typer convert a KeyboardInterrupt to this
             raise KeyboardInterrupt
         return status if isinstance(status, int) else 0
-    except BrokenPipeError:  # whoever read our results has read enough
+    except BrokenPipeError:  # the reader of stdout has closed the pipe
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except SystemExit as stop:  # how Typer ends a command whose output nobody reads any more
+    except SystemExit as stop:  # Typer's reaction to a closed pipe
         if isinstance(stop.__context__, OSError) and stop.__context__.errno == errno.EPIPE:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0
@@ -69,7 +70,7 @@ def _run(arguments: list[str]) -> int:
         console.error(f"{stop}")
         return stop.status
     except Exception as problem:
-        if _sent:  # what an interruption became within numba's compiler, for instance
+        if _sent:  # a signal during numba's compilation, for instance, may surface as another exception
             raise KeyboardInterrupt from problem
         if debug:
             raise
@@ -77,25 +78,25 @@ def _run(arguments: list[str]) -> int:
 
 
 def _report(problem: Exception) -> int:
-    """Say in one line what went wrong; the exit status."""
+    """Print a one-line error message; returns the exit status."""
     from caustic_cli.commands import console  # noqa: PLC0415
-    from caustic_cli.commands.help import answer  # noqa: PLC0415
+    from caustic_cli.commands.help import usage_message  # noqa: PLC0415
     from caustic_cli.errors import CausticError, InputError, is_out_of_memory  # noqa: PLC0415
 
     if isinstance(problem, CausticError):
         console.error(f"{problem}")
         return 2 if isinstance(problem, InputError) else 1
     if hasattr(problem, "format_message"):  # a usage error of the command-line parser, whichever version wraps it
-        if type(problem).__name__ == "NoArgsIsHelpError":  # no command at all: the message is the whole help
+        if type(problem).__name__ == "NoArgsIsHelpError":  # no command was given: the message is the help
             sys.stderr.write(problem.format_message() + "\n")
-        elif message := answer(problem):
+        elif message := usage_message(problem):
             console.error(message)
         return 2
     if is_out_of_memory(problem):
         console.error("out of memory; fewer --rays, a smaller --control or --resolution needs less")
     elif isinstance(problem, OSError) and problem.strerror:
         console.error(f"{problem.filename or 'a file'}: {problem.strerror}")
-        return 2 if problem.errno in (errno.ENAMETOOLONG, errno.ELOOP) else 1  # no name but the user's is like that
+        return 2 if problem.errno in (errno.ENAMETOOLONG, errno.ELOOP) else 1  # such a name comes from the user
     elif names := _variables_of(problem):
         console.error(f"the environment's {', '.join(names)}: {problem}")
         return 2
@@ -105,7 +106,7 @@ def _report(problem: Exception) -> int:
 
 
 def _variables_of(problem: Exception) -> list[str]:
-    """The variables of the environment that a library may have objected to."""
+    """Environment variables that a library may have rejected, judged by the library that raised the error."""
     raised = problem.__traceback__
     while raised is not None and raised.tb_next is not None:
         raised = raised.tb_next
@@ -117,46 +118,46 @@ def _variables_of(problem: Exception) -> list[str]:
 def main() -> None:
     """Entry point of the `caustic` script."""
     try:
-        _answer_signals()
+        _install_signal_handlers()
         _open_streams()
         os.environ |= THREADS | os.environ  # before a library reads them
         if not sys.warnoptions:
-            warnings.simplefilter("ignore")  # libraries' own, which are for developers
+            warnings.simplefilter("ignore")  # warnings of libraries address developers
         status = run(sys.argv[1:])
         _ignore_signals()
-    except KeyboardInterrupt:  # while an error was told, or an interruption
+    except KeyboardInterrupt:  # a second signal, during the report of an error or signal
         status = _interrupted()
     sys.exit(status)
 
 
-def _answer_signals() -> None:
-    """Have SIGNALS interrupt what is done, and not be lost where Python can pass no exception on."""
+def _install_signal_handlers() -> None:
+    """Make SIGNALS raise `SignalReceived`, and repeat a signal where Python cannot propagate the exception."""
 
-    def answer(number: int, _frame) -> None:
+    def handle(number: int, _frame) -> None:
         _sent.append(number)
-        raise Stopped
+        raise SignalReceived
 
     def lost(what) -> None:
         if not _sent:
             sys.__unraisablehook__(what)
-        elif isinstance(what.exc_value, KeyboardInterrupt):  # in a function that C called back, of LLVM's for instance
-            again = threading.Timer(AGAIN, os.kill, (os.getpid(), _sent[0]))
+        elif isinstance(what.exc_value, KeyboardInterrupt):  # in a callback from C code, for instance from LLVM
+            again = threading.Timer(RETRY_SECONDS, os.kill, (os.getpid(), _sent[0]))
             again.daemon = True
             again.start()
 
     sys.unraisablehook = lost
     for number in SIGNALS:
-        signal.signal(number, answer)
+        signal.signal(number, handle)
 
 
 def _ignore_signals() -> None:
-    """Nothing is left to be saved, and the process ends by itself."""
+    """Ignore SIGNALS from now on, when the process is about to exit."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
 
 
 def _interrupted() -> int:
-    """Say in one line which signal ended the command; the exit status."""
+    """Print which signal terminated the command; returns the exit status."""
     if _sent:
         _ignore_signals()
     number = _sent[0] if _sent else signal.SIGINT
@@ -165,8 +166,8 @@ def _interrupted() -> int:
 
 
 def _open_streams() -> None:
-    """Have standard streams that are closed read nothing and write nowhere: a file would take their numbers otherwise, and get
-    what libraries write to them."""
+    """Redirect closed standard streams to the null device: otherwise the next opened file would get their descriptor, and with it
+    the output of libraries."""
     for number, mode in enumerate(("r", "w", "w")):
         try:
             os.fstat(number)

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 from PIL import Image
 
-from caustic_cli.config import plans
+from caustic_cli.config import default_stages
 from caustic_cli.inverse import deconvolution, initial_surface
 from caustic_cli.workflow import design as workflow
 from caustic_cli.workflow import evaluation
@@ -34,8 +34,8 @@ def small_designs(patch, rays: int, report: bool = False) -> None:
     all the rest, unless asked for.
 
     patch: pytest's monkeypatch."""
-    patch.setattr(plans, "LEAST_CELLS", 64)
-    patch.setattr(plans, "LEAST_CREASED", 64)
+    patch.setattr(default_stages, "LEAST_CELLS", 64)
+    patch.setattr(default_stages, "LEAST_CREASED", 64)
     patch.setattr(workflow, "LEAST_CELLS", 32)
     patch.setattr(initial_surface, "FEW_CELLS", 32)
     patch.setattr(deconvolution, "MOST_STEPS", 400)

@@ -10,10 +10,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from caustic_cli.optics.frames import Pose, turned_back
+from caustic_cli.optics.frames import Pose, rotate_to_global
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.surfaces import HeightField
-from caustic_cli.optics.system import EXIT, Placed, System
+from caustic_cli.optics.system import EXIT, PlacedScreen, System
 from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Pupil, Scene
 
@@ -21,11 +21,11 @@ from caustic_cli.scene import Pupil, Scene
 BEYOND, BEFORE = 0.05, 2.0
 
 
-def room(scene: Scene, field: HeightField, e) -> tuple[System, Placed]:
+def room(scene: Scene, field: HeightField, e) -> tuple[System, PlacedScreen]:
     """The system and the screen with errors `e` (a Misalignment) in the room's frame."""
     changed = replace(scene, lens=replace(scene.lens, index=scene.lens.index + e.index))
     plain, stand = System.of(changed, field), Pose((*e.lens_shift, scene.lens.z_in), e.lens_tilt)
-    down = turned_back(stand, (0.0, 0.0, e.thickness - scene.lens.z_in))
+    down = rotate_to_global(stand, (0.0, 0.0, e.thickness - scene.lens.z_in))
     foot = tuple(a + b for a, b in zip(stand.position, down, strict=True))
     poses = (stand, Pose(foot, e.lens_tilt))
     elements = tuple(replace(element, pose=pose) for element, pose in zip(plain.elements, poses, strict=True))
@@ -34,7 +34,9 @@ def room(scene: Scene, field: HeightField, e) -> tuple[System, Placed]:
     s = scene.screen
     middle = (s.shift[0] + e.screen_shift[0], s.shift[1] + e.screen_shift[1], s.z + e.throw)
     tilt = (s.tilt[0] + e.screen_tilt[0], s.tilt[1] + e.screen_tilt[1])
-    return replace(plain, elements=elements, lit=lit), Placed(replace(s, shift=(0.0, 0.0), tilt=(0.0, 0.0)), Pose(middle, tilt))
+    return replace(plain, elements=elements, lit=lit), PlacedScreen(
+        replace(s, shift=(0.0, 0.0), tilt=(0.0, 0.0)), Pose(middle, tilt)
+    )
 
 
 def image(scene: Scene, field: HeightField, heights: torch.Tensor, e, rays: int, rng: np.random.Generator) -> np.ndarray:
@@ -43,7 +45,7 @@ def image(scene: Scene, field: HeightField, heights: torch.Tensor, e, rays: int,
     (rx, ry), n = scene.lens.half_size, round(np.sqrt(rays))
     cells = (np.indices((n, n)).reshape(2, -1) + rng.random((2, n * n))) / n
     x, y = ((2.0 * c - 1.0) * (1.0 + BEYOND) * r + d for c, r, d in zip(cells, (rx, ry), e.lens_shift, strict=True))
-    direction = turned_back(Pose(tilt=e.source_tilt), (0.0, 0.0, 1.0))
+    direction = rotate_to_global(Pose(tilt=e.source_tilt), (0.0, 0.0, 1.0))
     z = scene.lens.z_in - BEFORE  # so that its middle falls on the lens' middle
     start = tuple(torch.from_numpy(c - BEFORE * d / direction[2]) for c, d in zip((x, y), direction, strict=False))
     power = torch.full((n * n,), 1.0 / (n * n), dtype=torch.float64)

@@ -197,7 +197,7 @@ def test_a_message_names_the_option_that_said_it(capfd):
     assert str(error) == "[lens] size must be a pair; a larger mag will do"
     assert f"{InputError(f'x: {error}')}" == f"x: {error}"
     for spoken, words in (({}, "[lens] size"), ({"lens.size": "--lens-size"}, "--lens-size")):
-        console.speak(spoken)
+        console.set_option_names(spoken)
         console.error(f"{error}")
         assert capfd.readouterr().err == f"caustic: {words} must be a pair; a larger --mag will do\n"
 

@@ -14,7 +14,7 @@ from caustic_cli.io.files import is_ours
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import SAMPLERS
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import front_from
+from caustic_cli.optics.system import freeform_of
 from caustic_cli.scene import Lens, Offset, PlaneWave, Scene, Screen
 from caustic_cli.studies import diffraction, intersection
 from caustic_cli.studies.convergence import FILTERS, run_study, single_precision
@@ -276,7 +276,7 @@ def front(lens: Lens) -> Lens:
     """The same with a free-form entrance."""
     field = HeightField.of(lens)
     bumps = 0.05 * torch.rand(field.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
-    return replace(lens, front=front_from(field, bumps))
+    return replace(lens, entrance=freeform_of(field, bumps))
 
 
 def test_intersections_behind_a_free_form_entrance():

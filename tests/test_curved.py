@@ -28,12 +28,12 @@ from caustic_cli.io.sags import read_sags
 from caustic_cli.optics.effects.screen_shape import displacement
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.frames import Pose
-from caustic_cli.optics.misalignment import Misalignment, landed
+from caustic_cli.optics.misalignment import Misalignment, landing_points
 from caustic_cli.optics.plan import compile_plan
 from caustic_cli.optics.reconstruction import Filter
-from caustic_cli.optics.screen_shape import areas, normals, reach, shape_of, space
+from caustic_cli.optics.screen_shape import areas, normals, points_in_space, reach, shape_of
 from caustic_cli.optics.surfaces import HeightField
-from caustic_cli.optics.system import EXIT, Placed, System
+from caustic_cli.optics.system import EXIT, PlacedScreen, System
 from caustic_cli.optics.trace import Tracer, expose, is_lowered, tracers
 from caustic_cli.optics.waves import NoWaveImage, wave_image
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
@@ -74,7 +74,7 @@ def landing(scene: Scene, heights: torch.Tensor, count: int = 200):
     rays = next(iter(rays_of(scene, "stratified", count, 3).chunks()))
     tracer = Tracer(System.of(scene, HeightField.of(scene.lens)), rays)
     (state,), (at,) = tracer.land({EXIT: heights}, scene.screen), tracer({EXIT: heights})
-    at = at.spread()
+    at = at.expanded()
     origin = [c + (at.datum if k == 2 else 0.0) for k, c in enumerate(at.full(at.origin))]
     return state, np.stack([c.numpy() for c in origin]), np.stack([c.numpy() for c in at.full(at.direction)])
 
@@ -143,8 +143,8 @@ def test_a_placed_screen_is_the_same_screen():
     """A system's screen by its pose, the scene's by tilt and shift: the same image."""
     scene = scene_of(screen_of(SPHERE, (10.0, 20.0)))
     system = System.of(scene, HeightField.of(scene.lens))
-    placed = Placed(replace(scene.screen, tilt=(0.0, 0.0), shift=(1.0, -0.5)), Pose((0.0, 0.0, 60.0), (10.0, 20.0)))
-    middle = space(replace(scene.screen, radius=(math.inf, math.inf)), np.array(1.0), np.array(-0.5))
+    placed = PlacedScreen(replace(scene.screen, tilt=(0.0, 0.0), shift=(1.0, -0.5)), Pose((0.0, 0.0, 60.0), (10.0, 20.0)))
+    middle = points_in_space(replace(scene.screen, radius=(math.inf, math.inf)), np.array(1.0), np.array(-0.5))
     moved = replace(scene.screen, shift=(float(middle[0]), float(middle[1])), z=float(middle[2]))
     rays, heights = next(iter(rays_of(scene, "stratified", 500, 1).chunks())), {EXIT: bumpy(scene)}
     images = [Tracer(system, rays).expose(heights, s, Filter("cosine", (3, 3))).image for s in (placed, moved)]
@@ -245,8 +245,8 @@ def test_areas(radius):
     step, (nx, ny, nz) = 1e-5, normals(replace(screen, tilt=(20.0, 10.0)), x, y)
     a, b = (
         (
-            np.stack(space(replace(screen, tilt=(20.0, 10.0)), x + step * i, y + step * j))
-            - np.stack(space(replace(screen, tilt=(20.0, 10.0)), x - step * i, y - step * j))
+            np.stack(points_in_space(replace(screen, tilt=(20.0, 10.0)), x + step * i, y + step * j))
+            - np.stack(points_in_space(replace(screen, tilt=(20.0, 10.0)), x - step * i, y - step * j))
         )
         / (2 * step)
         for i, j in ((1, 0), (0, 1))
@@ -308,7 +308,7 @@ def test_a_projection_is_inverted_and_conserves_power(screen):
     u, v = view.project(x, y)
     np.testing.assert_allclose(view.screen_coordinates(u, v), [x, y], atol=1e-9)
     px, py, pz = view.points(u, v)
-    np.testing.assert_allclose([px, py, pz], space(screen, x, y), atol=1e-9)
+    np.testing.assert_allclose([px, py, pz], points_in_space(screen, x, y), atol=1e-9)
     np.testing.assert_allclose(np.cross(np.stack([px, py, pz - 3.0]).T, np.stack([u, v, 57.0 + 0.0 * u]).T), 0.0, atol=1e-7)
     spot = np.zeros(screen.resolution)
     spot[20, 9] = 1.0  # a pixel: its power, and its middle as seen
@@ -378,7 +378,7 @@ def test_an_error_of_placing_meets_the_same_shape():
     """Without errors the rays of a study of tolerances land where a trace's do."""
     scene = scene_of(screen_of(SPHERE, (5.0, 10.0), (1.0, 2.0)), POINT)
     rays, field, heights = rays_of(scene, "stratified", 300, 1), HeightField.of(scene.lens), bumpy(scene)
-    (found,) = landed(scene, field, heights, rays, Misalignment())
+    (found,) = landing_points(scene, field, heights, rays, Misalignment())
     (state,) = Tracer(System.of(scene, field), next(iter(rays.chunks()))).land({EXIT: heights}, scene.screen)
     torch.testing.assert_close(found.x + 1.0, state.origin[0], rtol=0, atol=1e-10)
     torch.testing.assert_close(found.y + 2.0, state.origin[1], rtol=0, atol=1e-10)

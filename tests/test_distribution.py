@@ -24,8 +24,8 @@ from caustic_cli.io.archive import open_archive
 from caustic_cli.io.intensities import parse_distribution
 from caustic_cli.optics.bounds import bounds_of
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.emission.brightness import bright_points
-from caustic_cli.optics.emission.coherent import Mode, edges, modes
+from caustic_cli.optics.emission.brightness import points_by_brightness
+from caustic_cli.optics.emission.coherent import Mode, modes, outermost_modes
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Disc, Lens, Points, Scene, Screen
@@ -167,16 +167,16 @@ def test_ways_of_writing_a_table(data):
 
 def test_points_of_a_picture():
     a, b = torch.rand(2, 200_000, dtype=torch.float64)
-    x, y = bright_points(PICTURE, a, b)
+    x, y = points_by_brightness(PICTURE, a, b)
     count, _, _ = np.histogram2d(x, y, PICTURE.shape, [[-1, 1], [-1, 1]])
     part = PICTURE / PICTURE.sum()
     assert (count[PICTURE == 0] == 0).all()
     assert np.abs(count / len(a) - part).max() < 5e-3
     line = (torch.arange(64, dtype=torch.float64) + 0.5) / 64
     a, b = (c.ravel() for c in torch.meshgrid(line, line, indexing="ij"))
-    even, _, _ = np.histogram2d(*bright_points(np.ones((5, 7)), a, b), 16, [[-1, 1], [-1, 1]])
+    even, _, _ = np.histogram2d(*points_by_brightness(np.ones((5, 7)), a, b), 16, [[-1, 1], [-1, 1]])
     assert even.min() == even.max() == 16  # a white picture leaves even points where they are
-    x, y = bright_points(PICTURE, torch.tensor([0.0, 1.0]).double(), torch.tensor([0.0, 1.0]).double())
+    x, y = points_by_brightness(PICTURE, torch.tensor([0.0, 1.0]).double(), torch.tensor([0.0, 1.0]).double())
     assert x.tolist() == pytest.approx([-1.0, 1.0]) and y.tolist() == pytest.approx([-1 / 3, 1.0])
 
 
@@ -247,7 +247,7 @@ def test_a_source_as_points():
     assert sum(m.part for m in found) == pytest.approx(1.0) and {m.position[2] for m in found} == {AT[2]}
     mean = np.mean([m.position for m in found], 0)
     assert mean == pytest.approx(disc.centre, abs=0.02)
-    assert len(edges(scene(disc))) == 4
+    assert len(outermost_modes(scene(disc))) == 4
     sun = modes(scene(Disc(angle=4.0, brightness=PICTURE)), 50)
     assert len(sun) == 50 and all(abs(sum(c * c for c in m.position) - 1) < 1e-12 for m in sun)
 

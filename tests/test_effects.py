@@ -12,12 +12,12 @@ from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.interface import reflectances
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.reconstruction import Filter
-from caustic_cli.optics.reintersection import again
+from caustic_cli.optics.reintersection import next_intersection
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.screen_shape import reach
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT, System
-from caustic_cli.optics.trace import Tracer, check_room, expose, tracers
+from caustic_cli.optics.trace import Tracer, check_clearance, expose, tracers
 from caustic_cli.scene import Disc, Lens, Light, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.scene.materials import refractive_index
 
@@ -247,7 +247,7 @@ def test_a_shifted_screen_sees_the_same_light_elsewhere(source, kernels):
 def test_a_tilted_screen_that_cuts_into_the_lens_is_refused():
     scene = scene_of(screen=Screen((16.0, 14.0), 9.0, (8, 8), (0.0, 60.0)))
     with pytest.raises(ValueError, match=r"its tilt takes it 6\.928 mm nearer"):
-        check_room(scene, torch.full((9, 8), 3.0), scene.screen)
+        check_clearance(scene, torch.full((9, 8), 3.0), scene.screen)
 
 
 # Stray light
@@ -338,7 +338,7 @@ def test_a_ray_that_meets_the_surface_twice():
     at, none = (0.8 * x - x / tangent) / (4.0 - 1.0 / tangent), torch.zeros_like(x)
     length = math.hypot(1.0, tangent)
     o, d = (x, none, 5.0 + 0.8 * x), (none + tangent / length, none, none + 1.0 / length)
-    t, found = again(field, heights, o, d, below=False)
+    t, found = next_intersection(field, heights, o, d, below=False)
     assert found.tolist() == [True, True, True, False]
     torch.testing.assert_close((x + t * d[0])[:3], at[:3], rtol=0, atol=1e-12)
 
@@ -353,9 +353,9 @@ def test_secondary_intersections_by_kernel_and_by_reference(below, round_, monke
     d = np.stack([np.sin(lean) * np.cos(angle), np.sin(lean) * np.sin(angle), np.cos(lean) * random.choice([-1, 1], 3000)])
     x, y = (torch.from_numpy(random.uniform(-3.5, 3.5, 3000)) for _ in range(2))
     o = x, y, field.at(heights, x, y)[0]
-    t, found = again(field, heights, o, tuple(torch.from_numpy(d)), below, round_)
+    t, found = next_intersection(field, heights, o, tuple(torch.from_numpy(d)), below, round_)
     monkeypatch.setenv("CAUSTIC_KERNELS", "torch")
-    other, found_too = again(field, heights, o, tuple(torch.from_numpy(d)), below, round_)
+    other, found_too = next_intersection(field, heights, o, tuple(torch.from_numpy(d)), below, round_)
     assert bool((found == found_too).all())
     assert 500 < int(found.sum()) < 2500
     torch.testing.assert_close(t, other, rtol=0, atol=1e-12)

@@ -244,7 +244,7 @@ def test_the_study_of_effects(capfd, tmp_path):
 def test_a_lens_of_many_indices_makes_no_mirror():
     """The study leaves out what the scene cannot have."""
     lens = Lens(control=(6, 6), gradient=Gradient("selfoc", (0.1,)))
-    assert Mirror().sample(Scene(PlaneWave(), lens, Screen((20.0, 20.0))), torch.ones(6, 6)) is None
+    assert Mirror().probe(Scene(PlaneWave(), lens, Screen((20.0, 20.0))), torch.ones(6, 6)) is None
 
 
 def test_rounds_of_a_wave_image(monkeypatch):

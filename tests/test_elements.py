@@ -13,7 +13,7 @@ from helpers import small_designs
 from PIL import Image
 
 from caustic_cli import cli, load
-from caustic_cli.config import plans
+from caustic_cli.config import default_stages
 from caustic_cli.errors import InputError
 from caustic_cli.export.bodies import CLOSE, bodies
 from caustic_cli.export.mesh import closed_mesh
@@ -23,12 +23,12 @@ from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.relay import RelayedScreen
 from caustic_cli.io.archive import open_archive
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.frames import Leg
+from caustic_cli.optics.frames import AxisSegment
 from caustic_cli.optics.plan import compile_plan
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces import HeightField, Sphere
-from caustic_cli.optics.system import EXIT, System, sides_of
+from caustic_cli.optics.system import EXIT, System, split_heights
 from caustic_cli.optics.trace import Tracer, expose, render
 from caustic_cli.scene import Component, Lens, Light, Offset, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies.retrace import retrace
@@ -141,7 +141,7 @@ def test_two_mirrors_make_a_periscope_whose_picture_is_upright():
 
 
 def test_a_folded_axis_is_that_of_the_reflected_ray():
-    leg, normal = Leg().folded(70.0, (35.0, 0.0)), np.array([0.0, -math.sin(math.radians(35)), math.cos(math.radians(35))])
+    leg, normal = AxisSegment().folded(70.0, (35.0, 0.0)), np.array([0.0, -math.sin(math.radians(35)), math.cos(math.radians(35))])
     axis = np.array([0.0, 0.0, 1.0])
     assert np.allclose(leg.frame[2], axis - 2.0 * normal[2] * normal)
     assert np.allclose(leg.at(0.0, 0.0, 70.0), [0.0, 0.0, 70.0])
@@ -171,8 +171,8 @@ ALL = (
 def test_the_loss_has_the_gradients_of_all_surfaces_together():
     """Taylor's remainder along a direction in all of them falls with the square of the step; and each by central differences."""
     scene = replace(SCENE, elements=(*ALL[:2], replace(ALL[2], free="front")), lens=replace(LENS, fresnel="exact"))
-    assert scene.shaped == ("element-1-back", "element-2-front", "element-2-back", "element-3-front", "exit")
-    nets = [sphere_net(e, side, FIELD) for e in scene.elements for side in e.shaped]
+    assert scene.free_surfaces == ("element-1-back", "element-2-front", "element-2-back", "element-3-front", "exit")
+    nets = [sphere_net(e, side, FIELD) for e in scene.elements for side in e.free_sides]
     nets = torch.stack([*nets, wavy(0.01)])
     target = torch.ones(PIXELS, PIXELS, dtype=torch.float64)
     target[10:20, 8:24] = 3.0
@@ -196,9 +196,9 @@ def test_the_loss_has_the_gradients_of_all_surfaces_together():
 
 def test_designed_surfaces_trace_as_the_free_ones_and_as_the_spheres_that_they_began_as():
     scene = replace(SCENE, elements=ALL)
-    nets = torch.stack([*(sphere_net(e, s, FIELD) for e in ALL for s in e.shaped), wavy()])
-    (free,) = render(System.of(scene, FIELD), dict(zip(scene.shaped, nets, strict=True)), 20_000, kind="grid")
-    fixed, exit = sides_of(scene, FIELD, nets)
+    nets = torch.stack([*(sphere_net(e, s, FIELD) for e in ALL for s in e.free_sides), wavy()])
+    (free,) = render(System.of(scene, FIELD), dict(zip(scene.free_surfaces, nets, strict=True)), 20_000, kind="grid")
+    fixed, exit = split_heights(scene, FIELD, nets)
     rays = rays_of(fixed, "grid", 20_000)
     found = expose(fixed, FIELD, exit, rays)
     assert torch.allclose(free.image, found.image, atol=1e-12) and free.lost == pytest.approx(found.lost, abs=1e-12)
@@ -290,12 +290,12 @@ def test_solids_are_closed_and_their_spheres_are_spheres(aperture):
         of_lens = math.pi * r * r * (t - sag) + math.pi * sag * (3 * r * r + sag * sag) / 6.0
         most = 40.0 * 40.0 * 3.0 * 1.3
         assert of_lens < volume - without < of_lens + most
-    z = body.lens.front
-    assert z is not None and plate.lens.front is not None
+    z = body.lens.entrance
+    assert z is not None and plate.lens.entrance is not None
     field = HeightField(body.field.spaces, body.field.half_size)
     assert field.half_size == (6.0, 6.0)
     sphere, net = Sphere(30.0), torch.from_numpy(z.heights)
-    spline = System.of(replace(scene, elements=(replace(elements[0], fronts=(z, None)),))).elements[0].surface
+    spline = System.of(replace(scene, elements=(replace(elements[0], surfaces=(z, None)),))).elements[0].surface
     line = torch.linspace(-4.2, 4.2, 50, dtype=torch.float64)
     assert float((spline.at(None, line, 0.7 * line)[0] - sphere.at(None, line, 0.7 * line)[0]).abs().max()) <= CLOSE
     assert net.shape[0] >= 16
@@ -303,7 +303,7 @@ def test_solids_are_closed_and_their_spheres_are_spheres(aperture):
     normal = np.array(plate.pose.axes[2])
     own = vertices[vertices[:, 2] > 60.0]
     depth = (own - np.array(plate.pose.position)) @ normal
-    back = 3.0 + max(0.0, float(plate.lens.front.heights.max()))
+    back = 3.0 + max(0.0, float(plate.lens.entrance.heights.max()))
     assert depth.min() > -1.0 and depth.max() == pytest.approx(back, abs=1e-9)
 
 
@@ -356,7 +356,7 @@ def test_design_render_resume_and_files(_here, capfd):
 
 
 def test_surfaces_of_two_lenses_are_shaped_together(_here, capfd, monkeypatch):
-    monkeypatch.setattr(plans, "LEAST_CELLS", 256)
+    monkeypatch.setattr(default_stages, "LEAST_CELLS", 256)
     beside = ("--element", "lens z=60 thickness=6 radius=150,-150 index=1.5 size=26 free=both")
     fixed = ("--element", beside[1].removesuffix(" free=both"))
     one = run(capfd, "design", "one.png", *SMALL, *fixed, "--iterations", "8", "-o", "one")
@@ -365,7 +365,7 @@ def test_surfaces_of_two_lenses_are_shaped_together(_here, capfd, monkeypatch):
     assert both["relative_rms"] < 1.1 * one["relative_rms"] and both["relative_rms"] < 0.8 * both["start_relative_rms"]
     lens = load("p")
     assert lens.state is not None and lens.state.heights.shape == (3, 35, 35)
-    assert lens.scene.elements[0].fronts[0] is not None and torch.equal(lens.heights, lens.state.heights[-1])
+    assert lens.scene.elements[0].surfaces[0] is not None and torch.equal(lens.heights, lens.state.heights[-1])
     begun = torch.stack([sphere_net(lens.scene.elements[0], side, lens.field) for side in ("front", "back")])
     assert (lens.state.heights[:2] - begun).abs().amax((1, 2)).min() > 1e-6
     figures = run(capfd, "render", "p", "--rays", "400000", "--effects", "fresnel", "--quiet", "--json")
@@ -399,7 +399,7 @@ def test_mitsuba_traces_them(_here, capfd, text):
     ("text", "words"),
     [
         ("prism z=3", "must begin with lens or mirror"),
-        ("lens", "⟨z⟩ must be said"),
+        ("lens", "⟨z⟩ must be given"),
         ("lens z", "must be KEY=VALUE"),
         ("lens zz=3", "zz is not a key; did you mean z?"),
         ("lens z=3 z=4", "says z twice"),
@@ -411,15 +411,15 @@ def test_mitsuba_traces_them(_here, capfd, text):
         ("lens z=-30 tilt=10,0", "is for mirrors"),
         ("lens z=-30 index=1.5 glass=BK7", "index or glass, not both"),
         ("lens z=-30 index=0.5", "greater than 1"),
-        ("lens z=-30 glass=brass", "reflects"),
-        ("lens z=2", "in the order in which light meets them"),
+        ("lens z=-30 glass=brass", "metal"),
+        ("lens z=2", "in the order in which light reaches them"),
         ("lens z=-60", "⟨source.position⟩ must lie before"),
         ("lens z=299", "⟨screen.z⟩ must lie behind"),
         ("mirror z=150", "turn it about x or about y"),
         ("mirror z=150 tilt=45,45", "turn it about x or about y"),
         ("mirror z=150 tilt=45,0 thickness=3", "is for lenses"),
         ("mirror z=150 tilt=45,0 free=back", "its only surface"),
-        ("mirror z=-60 tilt=45,0", "the source turned"),
+        ("mirror z=-60 tilt=45,0", "a rotated source"),
         ("lens z=-30 aperture=circle size=10x8", "its diameter"),
         ("lens z=30 free=top", "must be one of"),
     ],
@@ -459,6 +459,6 @@ def test_a_screen_where_the_lens_is_imaged_is_refused():
 
 def test_a_scene_without_elements_is_as_it_was():
     scene = replace(SCENE, elements=())
-    assert scene.pupil.z == LENS.z_in and scene.axial and not scene.jointly and System.of(scene, FIELD).leg is None
+    assert scene.pupil.z == LENS.z_in and scene.axial and not scene.joint and System.of(scene, FIELD).leg is None
     rays = next(iter(rays_of(scene, "lines", 4_000).chunks()))
     assert Tracer(System.of(scene, FIELD), rays).fused is not None

@@ -14,7 +14,7 @@ from caustic_cli.config import settings
 from caustic_cli.config.completion import complete
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.inverse.source_limits import point_source
-from caustic_cli.optics.bounds import bounds_of, refuse_without_glass
+from caustic_cli.optics.bounds import bounds_of, check_exit_above_entrance
 from caustic_cli.optics.effects import EFFECTS
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.plan import compile_plan
@@ -44,9 +44,9 @@ def sphere(index: float, magnification: float, pixels: int = 100, **lens) -> tup
 def test_a_surface_below_its_entrance_is_refused():
     scene, field, heights = sphere(1.5, 3.0, z_in=4.9)
     lowest = float(heights.min())
-    refuse_without_glass(scene, field, heights + 4.9 - lowest)
+    check_exit_above_entrance(scene, field, heights + 4.9 - lowest)
     with pytest.raises(InputError, match=r"\[lens\] z_in of 4.9 mm lies above .* dips 0.0998 mm below it; it must be at most 4.80"):
-        refuse_without_glass(scene, field, heights + 4.8 - lowest)
+        check_exit_above_entrance(scene, field, heights + 4.8 - lowest)
 
 
 def test_a_corner_that_a_round_lens_has_not_may_dip():
@@ -56,9 +56,9 @@ def test_a_corner_that_a_round_lens_has_not_may_dip():
         scene = Scene(PlaneWave(), Lens(control=(8, 8), aperture=aperture), Screen((12.0, 12.0), 300.0, (16, 16)))
         if refused:
             with pytest.raises(InputError, match="dips 1 mm"):
-                refuse_without_glass(scene, HeightField.of(scene.lens), heights)
+                check_exit_above_entrance(scene, HeightField.of(scene.lens), heights)
         else:
-            refuse_without_glass(scene, HeightField.of(scene.lens), heights)
+            check_exit_above_entrance(scene, HeightField.of(scene.lens), heights)
 
 
 def test_projects_and_archives_without_glass_are_not_opened(tmp_path, monkeypatch, capfd):
@@ -236,7 +236,7 @@ def balance_of(seed: int) -> dict[str, float] | None:
     rng = np.random.default_rng(seed)
     try:
         scene, field, heights = random_scene(rng)
-        refuse_without_glass(scene, field, heights)
+        check_exit_above_entrance(scene, field, heights)
         wanted = None if rng.random() < 0.7 else {e.name for e in EFFECTS if rng.random() < 0.5}
         plan = compile_plan(scene, field, heights, wanted)
         _, figures = retrace(plan.scene, field, heights, None, rays=1000, seed=seed, requests=plan.requests, noise=False)

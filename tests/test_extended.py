@@ -22,7 +22,7 @@ from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.schedule import Stage
 from caustic_cli.inverse.source_limits import etendue_limit, performance_limits, point_source, regular_rays, source_spread
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.emission.coherent import even_disc, modes
+from caustic_cli.optics.emission.coherent import modes, vogel_disc
 from caustic_cli.optics.emission.regular import RegularGrid
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.spread import Convolution, Spread
@@ -115,7 +115,7 @@ def test_kernel_has_the_moments_of_the_ellipse(half):
 
 def test_parts_of_a_kernel_are_the_whole():
     """Each about its own point, put back where that stands."""
-    whole, pixel, places = Spread((1.0, 1.0), ((0.0, 0.0, 1.0),), 0.0), (0.1, 0.1), even_disc(7)
+    whole, pixel, places = Spread((1.0, 1.0), ((0.0, 0.0, 1.0),), 0.0), (0.1, 0.1), vogel_disc(7)
     parts = whole.parts_on(pixel, places, most=1)
     picture = torch.zeros(81, 81, dtype=torch.float64)
     at, total, mean = np.arange(81) - 40, 0.0, np.zeros(2)
@@ -133,7 +133,7 @@ def test_parts_of_a_kernel_are_the_whole():
 def test_parts_of_a_kernel_look_at_as_many_pixels(half):
     """A wave image takes as many cut pixels beside the screen for all of them; two halves of a disc reach beyond their points
     differently."""
-    parts = Spread(half, ((0.0, 0.0, 1.0),), 0.0).parts_on((0.1536, 0.1536), even_disc(2))
+    parts = Spread(half, ((0.0, 0.0, 1.0),), 0.0).parts_on((0.1536, 0.1536), vogel_disc(2))
     assert len({part.beside for part in parts}) == len({part.kernel.shape for part in parts}) == 1
     assert sum(float(part.kernel.sum()) for part in parts) == pytest.approx(len(parts))
 

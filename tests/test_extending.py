@@ -145,12 +145,12 @@ EFFECT = Addition(
 
 
     class Dust(Effect):
-        """Only where it is asked for."""
+        """Simulated on request only."""
 
         name = "dust"
 
-        def judge(self, scene, bounds):
-            """Nobody knows."""
+        def decide(self, scene, bounds):
+            """Never by itself."""
             return Decision(self.name, False, "surfaces are taken to be clean")
 
         def request(self, scene, on, bounds):
@@ -163,9 +163,9 @@ EFFECT = Addition(
 
 
     class Covered(Action):
-        """Takes its part."""
+        """Absorbs a fraction of the light."""
 
-        def arrive(self, interaction):
+        def before_interaction(self, interaction):
             """Before the surface."""
             interaction.state.lose("absorbed", (COVERED * interaction.state.power).detach())
             interaction.state.power = (1.0 - COVERED) * interaction.state.power

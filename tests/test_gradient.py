@@ -22,9 +22,9 @@ from caustic_cli.optics.gradient import (
     Radial,
     Selfoc,
     SplineIndex,
-    cross,
     flow,
     steps_for,
+    transfer,
 )
 from caustic_cli.optics.gradient.integrator import WEIGHTS, drift, kick
 from caustic_cli.optics.rays import RayState
@@ -103,7 +103,7 @@ def test_maxwells_fish_eye_images_every_point():
     def seen(points, vectors):
         return (points[0], points[1], points[2] - 6.0), vectors
 
-    found = cross(flow, field, None, (zero, zero, zero), d, Plane(), None, seen, 1.0)
+    found = transfer(flow, field, None, (zero, zero, zero), d, Plane(), None, seen, 1.0)
     assert bool(found.found.all()) and found.steps > 4
     assert max(float(c.abs().max()) for c in found.point[:2]) < 3e-6  # 1e-7 of ways of up to 15 mm
     assert (found.path / (0.5 * math.pi * 2.0 * 3.0) - 1.0).abs().max() < 1e-6
@@ -219,7 +219,7 @@ def test_what_is_no_field_is_refused():
             Gradient("volume", (), wrong)
     with pytest.raises(InputError, match=r"0\.5"):
         Selfoc(1.5, 0.3).extremes((4.0, 4.0), 1.0)
-    with pytest.raises(InputError, match="before"):
+    with pytest.raises(InputError, match="in front of"):
         System((PlaneWave(),), block(None, 4.0), before=Medium(1.5, gradient=Axial(1.5, (0.1,))))
 
 

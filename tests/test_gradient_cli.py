@@ -15,7 +15,7 @@ from caustic_cli import cli, load
 from caustic_cli.inverse.gradient_index import design_gradient_index, plate_system
 from caustic_cli.optics.effects import EFFECTS
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.gradient import field_of
+from caustic_cli.optics.gradient import index_field_of
 from caustic_cli.optics.gradient.fields import SplineIndex
 from caustic_cli.optics.plan import compile_plan
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -74,7 +74,9 @@ def test_a_gradient_index_plate_is_designed_saved_and_rendered(capfd):
     seen = run(capfd, "render", "free.caustic", "--rays", "40000", "--quiet", "--threads", "1", "-o", "far.png", *far)
     assert seen["relative_rms"] == pytest.approx(again["relative_rms"], abs=0.02)
     lens = load("free.caustic")
-    assert field_of(lens.scene.lens).shape == (51, 51, 1) and float(np.ptp(lens.surface(np.linspace(-4, 4, 9), 0.0)[0])) < 1e-12
+    assert (
+        index_field_of(lens.scene.lens).shape == (51, 51, 1) and float(np.ptp(lens.surface(np.linspace(-4, 4, 9), 0.0)[0])) < 1e-12
+    )
 
 
 def test_a_design_of_an_index_that_is_run_again_locks_its_project(capfd, monkeypatch):
@@ -98,7 +100,7 @@ def test_a_file_of_indices_is_kept(capfd):
     run(capfd, "design", "blob.png", *options, *TINY, "-o", "volume.caustic")
     Path("mine.npy").unlink()
     assert np.array_equal(np.load("volume.caustic/index.npy"), rows)
-    held = field_of(load("volume.caustic").scene.lens)
+    held = index_field_of(load("volume.caustic").scene.lens)
     assert isinstance(held, SplineIndex) and np.array_equal(held.coefficients[:, :, 0].numpy(), rows)
 
 
@@ -108,7 +110,7 @@ def test_a_file_of_indices_is_kept(capfd):
         (("--gradient", "free", "--index-range", "1.54,1.542"), "thickness"),
         (("--gradient", "free", "--index-range", "1.6,1.5"), "ascend"),
         (("--gradient", "free", "--source", "point"), "plane"),
-        (("--gradient", "free", "--waves", "on"), "one index"),
+        (("--gradient", "free", "--waves", "on"), "a homogeneous lens"),
         (("--gradient", "free", "--loss", "rms"), "rms-light"),
         (("--gradient", "free", "--mirror"), "mirror"),
         (("--gradient", "lens"), "must be one of"),

@@ -216,11 +216,11 @@ def meet_fused(f, heights, rays):
 
 
 def meet_plainly(f, heights, rays):
-    return intersection.meet_any(f, heights, rays.origin, rays.direction, 1.0)[:3]
+    return intersection.intersect_any(f, heights, rays.origin, rays.direction, 1.0)[:3]
 
 
 def meet_from_anywhere(f, heights, rays):
-    return f.meet(heights, rays.origin, rays.direction, 1.0)[:3]
+    return f.intersect(heights, rays.origin, rays.direction, 1.0)[:3]
 
 
 @pytest.mark.parametrize("meet", [meet_plainly, meet_fused, meet_from_anywhere], ids=["reference", "kernel", "surface"])
@@ -261,7 +261,7 @@ def test_derivatives_equal_those_of_unrolled_newton():
         z, zx, zy = f.at(leaf, rays.origin[0] + t * rays.direction[0], rays.origin[1] + t * rays.direction[1])
         t = t - (rays.origin[2] + t * rays.direction[2] - z) / (rays.direction[2] - zx * rays.direction[0] - zy * rays.direction[1])
     (unrolled,) = torch.autograd.grad(t[hit].sum(), leaf, retain_graph=True)
-    (implicit,) = torch.autograd.grad(f.meet(leaf, rays.origin, rays.direction, 1.0).t[hit].sum(), leaf)
+    (implicit,) = torch.autograd.grad(f.intersect(leaf, rays.origin, rays.direction, 1.0).t[hit].sum(), leaf)
     torch.testing.assert_close(implicit, unrolled, rtol=1e-11, atol=1e-12)
 
 
@@ -274,10 +274,10 @@ def test_numbers_that_all_rays_share_keep_their_digits():
     spread = tuple(torch.full_like(x, c) for c in direction)
     for by_numbers, by_tensors in (
         (
-            intersection.meet_any(f, heights, (x, y, z), direction, 1.0),
-            intersection.meet_any(f, heights, (x, y, torch.full_like(x, z)), spread, 1.0),
+            intersection.intersect_any(f, heights, (x, y, z), direction, 1.0),
+            intersection.intersect_any(f, heights, (x, y, torch.full_like(x, z)), spread, 1.0),
         ),
-        (Plane().meet(None, (x, y, z), direction, 1.0), Plane().meet(None, (x, y, torch.full_like(x, z)), spread, 1.0)),
+        (Plane().intersect(None, (x, y, z), direction, 1.0), Plane().intersect(None, (x, y, torch.full_like(x, z)), spread, 1.0)),
         (
             Torch().land((x, y, z), direction, (0.0, 0.0, 40.0), IDENTITY, 1.0),
             Torch().land((x, y, torch.full_like(x, z)), spread, (0.0, 0.0, 40.0), IDENTITY, 1.0),

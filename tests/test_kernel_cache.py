@@ -146,7 +146,7 @@ def test_a_temporary_directory_of_others_is_not_trusted(tmp_path):
 def test_every_file_with_a_kernel_counts():
     names = {p.relative_to(cache.PACKAGE).as_posix() for p in cache.sources()}
     assert {
-        "optics/kernels/plane.py",
+        "optics/kernels/fused.py",
         "optics/kernels/axial_refraction.py",
         "optics/tolerances.py",
         "optics/kernels/laguerre.py",

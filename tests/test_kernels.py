@@ -19,9 +19,9 @@ from caustic_cli.commands import console
 from caustic_cli.optics.backends import backend_for, plain
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.frames import IDENTITY
-from caustic_cli.optics.kernels import banded, pixels, plane, spline
+from caustic_cli.optics.kernels import banded, fused, pixels, spline
 from caustic_cli.optics.kernels import filter_weights as kernel_shares
-from caustic_cli.optics.kernels.functions import PlaneKernel
+from caustic_cli.optics.kernels.fused_functions import PlaneKernel
 from caustic_cli.optics.kernels.jit import njit
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 from caustic_cli.optics.reconstruction import Filter, splat
@@ -241,7 +241,7 @@ def test_the_first_run_compiles_what_designs_and_renders_use(dtype):
     """A kernel that is called in another way than it was compiled ahead for would be compiled again, half a minute each time."""
     for part in compilation.PARTS:
         compilation.compile_part(part)
-    kernels = (plane.forward, plane.backward, pixels.sums, spline.evaluate, spline.pull_back, banded._contract, banded._spread)
+    kernels = (fused.forward, fused.backward, pixels.sums, spline.evaluate, spline.pull_back, banded._contract, banded._spread)
     ahead = [list(kernel.signatures) for kernel in kernels]
     for kind, rays in (("lines", 900), ("stratified", 1500), ("uniform", 900), ("uniform", 1)):
         image, *_ = next(exposures(scene("schlick"), heights().requires_grad_(), FILTERS[-1], kind, dtype, rays))

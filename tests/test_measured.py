@@ -127,7 +127,7 @@ def test_bounds_hold_for_the_very_rays():
     assert bounds_of(here, HeightField.of(LENS), heights(LENS)).incidence == pytest.approx(lean, rel=1e-12)
     plan = compile_plan(here, HeightField.of(LENS), heights(LENS))
     assert plan["source-size"].on and plan["intersection"].on and not plan["diffraction"].on
-    with pytest.raises(NoWaveImage, match="nothing of its light's phase"):
+    with pytest.raises(NoWaveImage, match="contains no phase"):
         wave_image(here, HeightField.of(LENS), heights(LENS))
 
 
@@ -307,7 +307,7 @@ def test_another_file_is_another_design(here, capfd):
             "one [x, y, z]",
         ),
         (["--source", "rays", "--source-file", "led.dat", "--cone", "3"], "--cone belongs to --source"),
-        (["--source", "rays", "--source-file", "led.dat", "--waves", "on"], "--waves on: a ray file says nothing"),
+        (["--source", "rays", "--source-file", "led.dat", "--waves", "on"], "--waves on: a ray file contains no phase"),
         (["--source", "point", "--source-file", "led.dat"], "--source-file belongs to --source disc or rays"),
     ],
 )

@@ -346,7 +346,7 @@ def test_contradictions_of_networks_are_refused():
     counted = complete({"design": {"network": "dense", "optimizer": "adam", "preconditioner": "laplacian"}}, 1.0)["design"]
     assert (counted["initial"], counted["start"]) == ("zero-last", "transport")
     assert complete({}, 1.0)["design"]["initial"] == "zero"
-    with pytest.raises(InputError, match="begin from only with"):
+    with pytest.raises(InputError, match="start only with"):
         complete({"design": {"network": "dense", "optimizer": "adam", "start": "transport"}}, 1.0)
 
 

@@ -13,7 +13,7 @@ from caustic_cli.optics.effects import EFFECTS, NEGLIGIBLE, NO_REQUESTS, Request
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.plan import compile_plan, parse_effects
 from caustic_cli.optics.reconstruction import Filter
-from caustic_cli.optics.reintersection import again
+from caustic_cli.optics.reintersection import next_intersection
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import is_lowered
 from caustic_cli.scene import Disc, Lens, Light, Offset, PlaneWave, Points, Scene, Screen
@@ -78,11 +78,11 @@ def test_no_ray_breaks_a_proof(source, bumps):
         (rays,) = rays_of(scene, "stratified", 1000, seed).chunks()
         traced = traced_through(scene, rays)
         assert traced.first == len(traced.system.elements) - 1
-        interaction = traced.cross(traced.first, traced.start, heights)
+        interaction = traced.trace_element(traced.first, traced.start, heights)
         alive = interaction.state.power > 0
         o, d = ([c[alive] for c in interaction.state.full(v)] for v in (interaction.local, interaction.state.direction))
         if not plan["secondary-intersection"].on:
-            _, found = again(field, heights, o, d, below=False)
+            _, found = next_intersection(field, heights, o, d, below=False)
             assert not bool(found.any())
             leaning = torch.hypot(d[0], d[1]) / d[2]
             assert bounds.slope * float(leaning.max()) <= bounds.slope_ratio * (1 + 1e-12)

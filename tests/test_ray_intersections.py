@@ -93,7 +93,7 @@ def test_adjoint_of_batches(degrees, batched):
     by = [torch.randn(3000, generator=g, dtype=torch.float64) for _ in range(3)]
     leaf = heights.clone().requires_grad_()
     (fast,) = torch.autograd.grad(hits(leaf), leaf, by)
-    (plain,) = torch.autograd.grad(intersection.meet_any(field, leaf, *rays, 1.0)[:3], leaf, by)
+    (plain,) = torch.autograd.grad(intersection.intersect_any(field, leaf, *rays, 1.0)[:3], leaf, by)
     assert float((fast - plain).norm() / plain.norm()) < 1e-12
     along = torch.randn(field.shape, generator=g, dtype=torch.float64)
     with forward_ad.dual_level():
@@ -249,11 +249,11 @@ def test_derivatives_by_heights_origin_and_direction(degrees, count, side):
     along = [torch.randn(c.shape, generator=g, dtype=torch.float64) for c in inputs]
     by = [torch.randn(count, generator=g, dtype=torch.float64) for _ in range(3)]
 
-    def meet(h, *rays):
+    def first_hits(h, *rays):
         return hits_of_rays(fused, h, rays[:3], rays[3:], side=side)
 
     leaves = [c.clone().requires_grad_() for c in inputs]
-    *values, found = meet(*leaves)
+    *values, found = first_hits(*leaves)
     assert 20 < int(found.sum()) < count
     pulled = torch.autograd.grad(values, leaves, by)
     there = [c[found] for c in leaves[1:]]
@@ -263,12 +263,12 @@ def test_derivatives_by_heights_origin_and_direction(degrees, count, side):
     for a, b in zip(pulled, plain, strict=True):
         assert float((a - b).norm() / b.norm()) < 1e-11
     with forward_ad.dual_level():
-        duals = meet(*(forward_ad.make_dual(c, a) for c, a in zip(inputs, along, strict=True)))[:3]
+        duals = first_hits(*(forward_ad.make_dual(c, a) for c, a in zip(inputs, along, strict=True)))[:3]
         tangents = [forward_ad.unpack_dual(d).tangent for d in duals]
     forward = float(sum((a * b).sum() for a, b in zip(by, tangents, strict=True)))
     assert float(sum((a * b).sum() for a, b in zip(pulled, along, strict=True))) == pytest.approx(forward, rel=1e-11)
     step = 1e-6
-    up, down = (meet(*(c + s * a for c, a in zip(inputs, along, strict=True))) for s in (step, -step))
+    up, down = (first_hits(*(c + s * a for c, a in zip(inputs, along, strict=True))) for s in (step, -step))
     both = up[3] & down[3] & found
     for tangent, a, b in zip(tangents, up, down, strict=False):
         torch.testing.assert_close(tangent[both], ((a - b) / (2 * step))[both], rtol=1e-6, atol=1e-5)

@@ -112,7 +112,7 @@ def test_different_radii_make_two_profiles_and_inf_is_flat():
 @pytest.mark.parametrize("radius", [(5.0, 5.0), (-5.0, -5.0), (4.9, INF), (INF, 3.0)])
 def test_a_sphere_that_ends_inside_the_aperture_is_refused(radius):
     x, y = np.linspace(-5, 5, 11)[:, None], np.linspace(-4, 4, 9)[None, :]
-    with pytest.raises(InputError, match="radius must exceed the lens' own reach"):
+    with pytest.raises(InputError, match="radius must exceed the lens' semi-aperture"):
         Offset(3.0, radius).sag(x, y)
 
 
@@ -138,7 +138,7 @@ def test_height_bounds():
 
 
 def test_height_bounds_without_room_are_refused():
-    with pytest.raises(InputError, match="min_thickness of 7 mm leaves the heights no room"):
+    with pytest.raises(InputError, match="min_thickness of 7 mm leaves no room for the heights"):
         Lens(min_thickness=7.0).height_bounds(np.zeros(3), np.zeros(2))
 
 
@@ -225,7 +225,7 @@ def test_unknown_glass_and_wavelength():
         refractive_index("acryllic")
     with pytest.raises(InputError, match=r"must be one of .*, got 'diamond'; of any other material, give its \[lens\] index"):
         refractive_index("diamond")
-    with pytest.raises(InputError, match=r"brass reflects: give \[lens\] mirror"):
+    with pytest.raises(InputError, match=r"brass is a metal: give \[lens\] mirror"):
         refractive_index("brass")
     for wavelength in (300.0, 2600.0, NAN):
         with pytest.raises(InputError, match="wavelength for N-BK7 must be 310 to 2500 nm"):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from caustic_cli.config import settings
 from caustic_cli.config.completion import Derivation, build_options, build_stages, complete
-from caustic_cli.config.plans import GAPS, transport_cells
+from caustic_cli.config.default_stages import GAPS, transport_cells
 from caustic_cli.config.settings import ELEMENT, SCHEMA, STAGE, build_lens, build_scene, dump, parse
 from caustic_cli.errors import InputError
 
@@ -166,7 +166,7 @@ def test_a_lens_close_to_its_source_is_thick_enough_for_its_corners(at, thicknes
     s = complete(said, 1.0, Derivation(mag=3.0))
     low, _ = build_lens(s).height_bounds(np.array([-15.0, 0.0, 15.0]), np.array([-15.0, 0.0, 15.0]))
     assert low.min() >= 1.0 and s["lens"]["thickness"] == pytest.approx(thickness, abs=1e-3)
-    with pytest.raises(InputError, match="leaves the heights no room"):
+    with pytest.raises(InputError, match="leaves no room for the heights"):
         thin = complete({**said, "lens": said["lens"] | {"thickness": 0.9}}, 1.0, Derivation(mag=3.0))
         build_lens(thin).height_bounds(np.array([-15.0, 0.0, 15.0]), np.array([-15.0, 0.0, 15.0]))
 

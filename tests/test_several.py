@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -22,7 +23,7 @@ from caustic_cli.optics.emission.measured import coarse_words
 from caustic_cli.optics.plan import compile_plan
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
-from caustic_cli.optics.waves.image import lines_of
+from caustic_cli.optics.waves.image import lines_of, wave_image
 from caustic_cli.scene import Disc, Lens, Light, PlaneWave, Points, Scene, Screen
 from caustic_cli.scene.sources.rays import Measured
 from caustic_cli.scene.sources.rayset import RaySet
@@ -108,7 +109,7 @@ def test_the_coarsest_ray_file_speaks():
     ("what", "message"),
     [
         (lambda: Several((MEMBERS[0],), (NONE,)), "must be 1 to 64 sources"),
-        (lambda: Several(MEMBERS[:2], (((500.0,), ()), NONE)), "said of every source, or of none"),
+        (lambda: Several(MEMBERS[:2], (((500.0,), ()), NONE)), "given for every source, or for none"),
         (lambda: settings.parse("source = 3", "a"), "source must be a section"),
         (lambda: settings.parse("[[source]]\nsise = 3", "a"), r"\[source\] sise is not a key"),
         (lambda: settings.parse("[[source]]\n[[source]]\nsise = 3", "a"), r"\[\[source\]\] sise is not a key"),
@@ -185,3 +186,12 @@ def test_a_design_in_several_lights(tmp_path, monkeypatch, capfd):
     assert json.loads(capfd.readouterr().out)["maps"][0]["check"]["relative_error"] < 1e-4
     Path("two.toml").write_text("[[source]]\n[[source]]\ntype = 'point'\n")
     assert "--waves on needs one source" in run(*base, "-o", "c.caustic", "--waves", "on", code=2)
+
+
+def test_a_wave_image_names_the_wavelengths_of_all_sources():
+    waves = Several((PlaneWave(1.0), PlaneWave(2.0)), (((620.0,), ()), ((450.0, 500.0), ())))
+    light = Light(wavelengths=(620.0, 450.0, 500.0), weights=(1.0, 1.0, 1.0))
+    scene = Scene(waves, replace(LENS, size=(0.5, 0.5)), Screen((1.0, 1.0), 100.0, (8, 8)), light)
+    field = HeightField.of(scene.lens)
+    z = torch.full(field.shape, 5.0, dtype=torch.float64)
+    assert wave_image(scene, field, z).wavelengths == (620.0, 450.0, 500.0)

@@ -17,7 +17,7 @@ from caustic_cli.optics.kernels.grid import GridSurface
 from caustic_cli.optics.kernels.interact import interact
 from caustic_cli.optics.kernels.splat import splat_rays
 from caustic_cli.optics.kernels.transfer import land
-from caustic_cli.optics.polarisation import field_of, part_s
+from caustic_cli.optics.polarisation import polarisation_vector, s_fraction
 from caustic_cli.optics.reconstruction import Filter, splat
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -60,7 +60,7 @@ def plain_interact(d, g, power, *, eta, reflects, fresnel, field=None):
         return reflect(d, *g)[0], power, torch.ones_like(power, dtype=torch.bool)
     t, passes, c, s = refract(d, *g, eta)
     if field is not None and fresnel == "exact":
-        (rs, rp), part = reflectances(c, s, eta), part_s(field, d, (-g[0], -g[1], 1.0))
+        (rs, rp), part = reflectances(c, s, eta), s_fraction(field, d, (-g[0], -g[1], 1.0))
         lost = part * rs + (1.0 - part) * rp
     else:
         length = torch.sqrt(1.0 + g[0] ** 2 + g[1] ** 2)
@@ -339,7 +339,7 @@ def test_polarised_light_in_normal_incidence_is_any_light():
     """Without a plane of incidence half of the light counts as s-polarised, and nothing is divided by zero."""
     none, one = torch.zeros(3, dtype=torch.float64), torch.ones(3, dtype=torch.float64)
     results = []
-    for field in (None, field_of(30.0, (0.0, 0.0, 1.0)), tuple(one * c for c in (0.6, 0.8, 0.0))):
+    for field in (None, polarisation_vector(30.0, (0.0, 0.0, 1.0)), tuple(one * c for c in (0.6, 0.8, 0.0))):
         leaves = [t.clone().requires_grad_() for t in (none, none, one)]
         t, after, _ = interact((0.0, 0.0, 1.0), leaves[:2], leaves[2], eta=1.5, reflects=False, fresnel="exact", field=field)
         results.append([after.detach(), *torch.autograd.grad(after.sum() + t[0].sum(), leaves)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -20,7 +21,7 @@ from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces import HeightField, Nurbs, Plane, Sphere
-from caustic_cli.optics.system import Element, Medium, Placed, System
+from caustic_cli.optics.system import Element, Medium, PlacedScreen, System
 from caustic_cli.optics.trace import Tracer, render, trace
 from caustic_cli.scene import Aperture, Light, PlaneWave, Points, Screen
 
@@ -111,7 +112,7 @@ def test_a_folding_mirror_behind_a_lens():
     mirror = Element("fold", Plane(), Aperture((30.0, 30.0)), "reflect", pose=Pose((0, 0, 20.0), (0.0, 45.0)))
     heights = {"front": parabola(FIELD, 30.0) + bumpy(FIELD, 0.02, 1)}
     straight = System((PlaneWave(),), (front, back), (Screen((30.0, 30.0), 60.0, (20, 20)),))
-    turned = Placed(Screen((30.0, 30.0), 0.0, (20, 20)), Pose((-40.0, 0.0, 20.0), (0.0, -90.0)))
+    turned = PlacedScreen(Screen((30.0, 30.0), 0.0, (20, 20)), Pose((-40.0, 0.0, 20.0), (0.0, -90.0)))
     folded = System((PlaneWave(),), (front, back, mirror), (turned,))
     assert folded.axis == pytest.approx((-1.0, 0.0, 0.0), abs=1e-15)
     (sample,) = Sampler("stratified", (20, 20), 1).chunks()
@@ -236,7 +237,7 @@ def folded() -> tuple[System, dict]:
         "back": parabola(WIDE, -45.0),
         "fold": bumpy(FIELD, 0.02, 5) + parabola(elements[2].surface, 400.0),
     }
-    aside = Placed(Screen((20.0, 20.0), 0.0, (20, 20)), Pose((-40.0, 0, 20.0), (0, -90.0)))
+    aside = PlacedScreen(Screen((20.0, 20.0), 0.0, (20, 20)), Pose((-40.0, 0, 20.0), (0, -90.0)))
     return System((PlaneWave(),), elements, (aside,)), heights
 
 
@@ -357,7 +358,7 @@ def test_a_sphere_by_its_closed_form_is_the_general_search():
             lean = [torch.from_numpy(g.uniform(-0.3, 0.3, 200)) for _ in range(2)]
             d = [*lean, side * torch.sqrt(1 - lean[0] ** 2 - lean[1] ** 2)]
             sphere = Sphere(radius, reach=9.0)
-            closed, searched = sphere.meet(None, o, d, side), super(Sphere, sphere).meet(None, o, d, side)
+            closed, searched = sphere.intersect(None, o, d, side), super(Sphere, sphere).intersect(None, o, d, side)
             both = closed.found & searched.found
             assert int(both.sum()) > 150
             for a, b in zip(closed[:3], searched[:3], strict=True):
@@ -426,7 +427,7 @@ def test_a_wavelength_at_every_medium():
 def test_bad_systems_are_refused_in_a_sentence():
     with pytest.raises(InputError, match="at least one source"):
         System((), (Element("a", Plane(), FLAT),))
-    with pytest.raises(InputError, match="names of their own"):
+    with pytest.raises(InputError, match="unique names"):
         System((PlaneWave(),), (Element("a", Plane(), FLAT), Element("a", Plane())))
     with pytest.raises(InputError, match="must have an aperture"):
         System((PlaneWave(),), (Element("a", Plane()),))
@@ -437,3 +438,15 @@ def test_bad_systems_are_refused_in_a_sentence():
     with pytest.raises(InputError, match="refract, reflect"):
         Element("a", Plane(), interaction="absorb")
     assert len({effect.name for effect in EFFECTS}) == len(EFFECTS)
+
+
+@pytest.mark.parametrize("source", [PlaneWave(), Points(((0.0, 0.0, -50.0),))])
+def test_an_absorbing_medium_in_front_of_the_pupil(source):
+    """Powers are those on the pupil, so that a medium in front of a first plane element there absorbs nothing."""
+    elements = (
+        Element("in", Plane(), Aperture((5.0, 5.0)), behind=GLASS),
+        Element("out", Plane(), Aperture((6.0, 6.0)), pose=Pose((0.0, 0.0, 4.0))),
+    )
+    clear = System((source,), elements, (Screen((20.0, 20.0), 100.0),))
+    (without,), (image,) = (render(s, {}, 1000) for s in (clear, replace(clear, before=Medium(1.0, 0.1))))
+    assert torch.equal(image.image, without.image) and image.lost == without.lost

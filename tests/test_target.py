@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.target import target_on_screen
-from caustic_cli.optics.averages import overlap
+from caustic_cli.optics.resampling import overlap
 from caustic_cli.scene import Screen
 
 

@@ -20,8 +20,8 @@ from caustic_cli.inverse.objective import Evaluation
 from caustic_cli.inverse.robust import RobustObjective
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.form_error import FormErrors, refined
-from caustic_cli.optics.frames import Pose, turned_back
-from caustic_cli.optics.misalignment import Misalignment, landed
+from caustic_cli.optics.frames import Pose, rotate_to_global
+from caustic_cli.optics.misalignment import Misalignment, landing_points
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT
@@ -60,7 +60,7 @@ def test_the_example_is_read_and_names_every_error():
         ("[throw]\nsigma = [1, 2]", "[throw] sigma must be a number, got 2 numbers"),
         ("[lens_tilt]\nsigma = 'a'", "must be a number or a pair of numbers"),
         ("[lens_tilt]\nsigma = -1", "must be 0 to 10, got -1"),
-        ("[throw]\nsigma = 0", "nothing is off"),
+        ("[throw]\nsigma = 0", "all widths are 0"),
         ("draws = 3\n[throw]\nsigma = 1", "draws must be a whole number 10 to 100000, got 3"),
         ("[form_error]\nexponent = 2", "rms is missing"),
         ("[form_error]\nrms = 1e-4\nlongest = 1\nshortest = 2", "longest must exceed shortest"),
@@ -135,13 +135,13 @@ def test_the_lens_frame_is_the_rooms():
     """The same rays in the room's frame, where surfaces are turned and shifted, land at the same points."""
     scene, field, heights = small()
     rays = rays_of(scene, "stratified", 900, 4)
-    (here,) = landed(scene, field, heights, rays, ALL)
+    (here,) = landing_points(scene, field, heights, rays, ALL)
     system, screen = misaligned.room(scene, field, ALL)
     stand = ALL.lens_pose(scene)
     (sample,) = rays.chunks()
-    on = RayState.on_axis(sample, scene.lens.half_size, scene.lens.z_in).spread()
-    inside = turned_back(stand, (on.origin[0], on.origin[1], torch.zeros_like(on.power)))
-    direction = turned_back(Pose(tilt=ALL.source_tilt), (0.0, 0.0, 1.0))
+    on = RayState.on_axis(sample, scene.lens.half_size, scene.lens.z_in).expanded()
+    inside = rotate_to_global(stand, (on.origin[0], on.origin[1], torch.zeros_like(on.power)))
+    direction = rotate_to_global(Pose(tilt=ALL.source_tilt), (0.0, 0.0, 1.0))
     start = tuple(p + o - 3.0 * d for p, o, d in zip(inside, stand.position, direction, strict=True))
     state = RayState(start, tuple(torch.full_like(on.power, d) for d in direction), on.power)
     there = Tracer(system, state).land({EXIT: heights}, screen)[0]
@@ -156,14 +156,15 @@ def test_a_near_source_moves_against_the_lens():
     scene, field, heights = small(Points(((0.0, 0.0, -100.0),)))
     together = Misalignment(source_shift=(0.4, 0.3), lens_shift=(0.4, 0.3), screen_shift=(0.4, 0.3))
     found = [
-        next(iter(landed(scene, field, heights, rays_of(e.scene(scene), "sobol", 500, 1), e))) for e in (Misalignment(), together)
+        next(iter(landing_points(scene, field, heights, rays_of(e.scene(scene), "sobol", 500, 1), e)))
+        for e in (Misalignment(), together)
     ]
     assert float((found[0].x - found[1].x).abs().max()) < 1e-9 and float((found[0].power - found[1].power).abs().max()) < 1e-12
     disc = replace(scene, source=Disc((0.0, 0.0, -100.0), (2.0, 3.0)))
     assert Misalignment(source_size=0.1).scene(disc).source.size == pytest.approx((2.2, 3.3))
     nearer = Misalignment(source_distance=10.0)
     power = [
-        sum(float(p.power.sum()) for p in landed(scene, field, heights, rays_of(e.scene(scene), "sobol", 4000, 1), e))
+        sum(float(p.power.sum()) for p in landing_points(scene, field, heights, rays_of(e.scene(scene), "sobol", 4000, 1), e))
         for e in (Misalignment(), nearer)
     ]
     assert power[1] / power[0] == pytest.approx((100.0 / 90.0) ** 2, rel=0.01)  # the lens catches more of the same light
@@ -174,10 +175,10 @@ def test_an_upright_scene_is_close():
     scene, field, heights = small()
     e = replace(ALL, source_shift=(0.0, 0.0), source_distance=0.0, source_size=0.0, screen_tilt=(0.0, 0.0))
     rays = rays_of(scene, "stratified", 400, 4)
-    (exact,) = landed(scene, field, heights, rays, e)
+    (exact,) = landing_points(scene, field, heights, rays, e)
     near = e.upright(scene)
-    (close,) = landed(near, field, heights + e.thickness, rays, Misalignment())
-    (still,) = landed(scene, field, heights, rays, Misalignment())
+    (close,) = landing_points(near, field, heights + e.thickness, rays, Misalignment())
+    (still,) = landing_points(scene, field, heights, rays, Misalignment())
     apart = [float(torch.hypot(exact.x - o.x, exact.y - o.y).mean()) for o in (close, still)]
     assert apart[0] < 0.2 and apart[1] > 1.5
 
@@ -191,8 +192,8 @@ def test_an_upright_mirror_is_close(error):
     scene, field = Scene(PlaneWave(), lens, Screen((30.0, 30.0), -100.0, (32, 32))), HeightField.of(lens)
     heights = torch.full((8, 8), 5.0, dtype=torch.float64)
     rays = rays_of(scene, "stratified", 400, 4)
-    (exact,), (still,) = (landed(scene, field, heights, rays, e) for e in (error, Misalignment()))
-    (close,) = landed(error.upright(scene), field, heights, rays, Misalignment())
+    (exact,), (still,) = (landing_points(scene, field, heights, rays, e) for e in (error, Misalignment()))
+    (close,) = landing_points(error.upright(scene), field, heights, rays, Misalignment())
     apart = [float(torch.hypot(exact.x - o.x, exact.y - o.y).mean()) for o in (close, still)]
     assert apart[0] < 0.15 * apart[1] and apart[1] > 0.8
 

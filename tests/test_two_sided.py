@@ -18,9 +18,9 @@ from caustic_cli.io.archive import open_archive
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces import HeightField
-from caustic_cli.optics.system import ENTRANCE, EXIT, System, sides_of
+from caustic_cli.optics.system import ENTRANCE, EXIT, System, split_heights
 from caustic_cli.optics.trace import expose, render
-from caustic_cli.scene import Lens, Offset, PlaneWave, Points, Scene, Screen, Second
+from caustic_cli.scene import Lens, Offset, PlaneWave, Points, Scene, Screen, SecondTarget
 from caustic_cli.studies.retrace import retrace
 from caustic_cli.studies.second_target import second_figures
 
@@ -42,7 +42,7 @@ ONE, TWO = spots((-0.3, 0.1), (0.35, -0.2)), spots((0.0, 0.3), width=0.3)
 
 
 def judged(scene, field, nets, second):
-    behind, exit = sides_of(scene, field, nets)
+    behind, exit = split_heights(scene, field, nets)
     _, figures = retrace(behind, field, exit, ONE, rays=400_000)
     return figures | second_figures(behind, field, exit, second, rays=400_000, seed=1)[1]
 
@@ -50,7 +50,7 @@ def judged(scene, field, nets, second):
 @pytest.mark.parametrize("focus", [None, (0.5, -0.5, 800.0)])
 @pytest.mark.parametrize("source", [PlaneWave(), Points(((0.0, 0.0, -80.0),))])
 def test_first_sides_send_light_to_the_picture_and_on(focus, source):
-    scene = Scene(source, LENS, NEAR, second=Second(focus=focus))
+    scene = Scene(source, LENS, NEAR, second=SecondTarget(focus=focus))
     field = HeightField.of(LENS)
     found = judged(scene, field, first_sides(scene, ONE, None, field, 128), None)
     assert found["relative_rms"] < 0.25 and found["angle_rms_mrad"] < 2.0
@@ -58,7 +58,7 @@ def test_first_sides_send_light_to_the_picture_and_on(focus, source):
 
 
 def test_first_sides_of_two_pictures():
-    scene = Scene(PlaneWave(), LENS, NEAR, second=Second(FAR))
+    scene = Scene(PlaneWave(), LENS, NEAR, second=SecondTarget(FAR))
     field = HeightField.of(LENS)
     found = judged(scene, field, first_sides(scene, ONE, TWO, field, 128), TWO)
     assert found["relative_rms"] < 0.35 and found["second_relative_rms"] < 0.7
@@ -66,7 +66,7 @@ def test_first_sides_of_two_pictures():
 
 def test_a_loss_of_zero_has_no_gradient():
     """Collimated light through a plate has its own image as picture, and stays collimated: the gradient is zero, not NaN."""
-    scene, field = Scene(PlaneWave(), LENS, NEAR, second=Second()), HeightField.of(LENS)
+    scene, field = Scene(PlaneWave(), LENS, NEAR, second=SecondTarget()), HeightField.of(LENS)
     plate = torch.stack([torch.zeros(field.shape, dtype=torch.float64), torch.full(field.shape, LENS.offset.thickness).double()])
 
     def evaluation(target: torch.Tensor):
@@ -80,14 +80,14 @@ def test_a_loss_of_zero_has_no_gradient():
 @pytest.mark.parametrize("loss", ["rms", "uniformity"])
 def test_losses_of_the_images_alone_have_gradients_of_both_sides(loss):
     """They do not depend on what leaves the lens."""
-    scene = Scene(PlaneWave(), LENS, NEAR, second=Second(FAR))
+    scene = Scene(PlaneWave(), LENS, NEAR, second=SecondTarget(FAR))
     field, targets = HeightField.of(LENS), (torch.from_numpy(ONE), torch.from_numpy(TWO))
     objective = TwoSidedObjective(scene, field, rays_of(scene, "grid", 10_000), Filter("cosine", (5, 5)), targets, loss, apron=6)
     nets = torch.stack([torch.zeros(field.shape, dtype=torch.float64), torch.full(field.shape, 15.0, dtype=torch.float64)])
     assert bool(torch.isfinite(objective(nets).gradient).all())
 
 
-@pytest.mark.parametrize("second", [Second(), Second(FAR), Second(focus=(1.0, 2.0, 200.0))])
+@pytest.mark.parametrize("second", [SecondTarget(), SecondTarget(FAR), SecondTarget(focus=(1.0, 2.0, 200.0))])
 def test_the_loss_has_the_gradients_of_both_sides(second):
     """Against central differences along random directions, each side's own and both."""
     scene, generator = Scene(PlaneWave(), LENS, NEAR, second=second), torch.Generator().manual_seed(1)
@@ -121,11 +121,11 @@ def test_the_loss_has_the_gradients_of_both_sides(second):
 
 
 def test_a_designed_entrance_traces_as_the_free_one():
-    scene = Scene(PlaneWave(), LENS, NEAR, second=Second())
+    scene = Scene(PlaneWave(), LENS, NEAR, second=SecondTarget())
     field = HeightField.of(LENS)
     nets = first_sides(scene, ONE, None, field, 64)
     (free,) = render(System.of(scene, field), {ENTRANCE: nets[0], EXIT: nets[1]}, 40_000, kind="grid")
-    behind, exit = sides_of(scene, field, nets)
+    behind, exit = split_heights(scene, field, nets)
     fixed = expose(behind, field, exit, rays_of(behind, "grid", 40_000))
     assert torch.allclose(free.image, fixed.image, atol=1e-12) and free.lost == pytest.approx(fixed.lost, abs=1e-12)
 
@@ -182,7 +182,7 @@ def test_design_render_resume_and_files(_here, capfd):
     lens = load("p")
     lens.export("lens.npz")
     scene, field, heights = open_archive("lens.npz")
-    assert np.array_equal(scene.lens.front.heights, lens.scene.lens.front.heights + 0.0)
+    assert np.array_equal(scene.lens.entrance.heights, lens.scene.lens.entrance.heights + 0.0)
     a, b = (
         expose(s, f, h, rays_of(s, "grid", 10_000)).image
         for s, f, h in ((scene, field, heights), (lens.scene, lens.field, lens.heights))
@@ -241,8 +241,8 @@ def test_two_pictures_by_the_command_line(_here, capfd):
     [
         (("--second", "two.png"), "--second needs --second-at"),
         (("--second-at", "400"), "--second-at belongs to --second"),
-        (("--collimate", "--focus", "0,0,300"), "--collimate and --focus both say"),
-        (("--collimate", "--mirror"), "--mirror cannot be had with --collimate"),
+        (("--collimate", "--focus", "0,0,300"), "--collimate and --focus both define"),
+        (("--collimate", "--mirror"), "--mirror cannot be combined with --collimate"),
         (("--focus", "0,0,20"), "must lie behind the picture's screen at 50 mm"),
         (("--collimate", "--waves", "on"), "--waves on"),
         (("--collimate", "--source", "point", "--start", "offset"), "must be transport"),

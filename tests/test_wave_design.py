@@ -15,7 +15,7 @@ from PIL import Image
 
 from caustic_cli import cli
 from caustic_cli.config import completion
-from caustic_cli.config.plans import LEAST_WAVES, WAVES, wave_refinement
+from caustic_cli.config.default_stages import LEAST_WAVES, WAVES, wave_refinement
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.waves import WaveObjective
 from caustic_cli.optics.resolution import Resolution, diffraction_blur, local_magnification, white
@@ -195,7 +195,7 @@ def test_what_is_said_before_a_design(extra, reason, _here, capfd, monkeypatch):
 
     monkeypatch.setattr(workflow, "_run", begun)
     if "fine" in extra:
-        monkeypatch.setattr("caustic_cli.config.plans.SECONDS_A_SAMPLE", 1.0)
+        monkeypatch.setattr("caustic_cli.config.default_stages.SECONDS_A_SAMPLE", 1.0)
     Path("own.toml").write_text(OWN)
     small = [a for a in SMALL if a != "--quiet" and not ("--resolution" in extra and a in ("--resolution", "32"))]
     assert cli.run(["design", "blob.png", *small, *extra, "-o", "p"]) == 0
@@ -338,7 +338,7 @@ def test_a_wave_image_that_takes_long_is_taken_where_it_is_asked_for(_here, capf
     monkeypatch.setattr("caustic_cli.studies.waves.UNASKED", 1e6)
     left_out = json.loads(_render(capfd, "p"))
     assert left_out["wave_relative_rms"] is None
-    assert "about 0 minutes on two cores; the effect diffraction, asked for by name, takes it" in left_out["no_wave_image"]
+    assert "about 0 minutes on two cores; the effect diffraction, requested by name, computes it" in left_out["no_wave_image"]
     assert json.loads(_render(capfd, "p", "--effects", "diffraction"))["wave_relative_rms"] > 0
 
 

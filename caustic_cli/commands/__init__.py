@@ -1,1 +1,1 @@
-"""One file per subcommand: parse, call, present.  Nothing here knows physics; torch is imported inside the bodies."""
+"""The subcommands, one file each: parsing of arguments, call of the workflow, output of results.  torch is imported on demand."""

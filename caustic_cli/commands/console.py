@@ -1,6 +1,6 @@
-"""What goes where: results to stdout, everything meant for a person to stderr.
+"""Console output: results to stdout, messages and progress to stderr.
 
-Results never pass through Rich, which wraps at 80 columns when piped.
+Results are not printed through Rich, which wraps lines at 80 columns when piped.
 """
 
 from __future__ import annotations
@@ -19,21 +19,20 @@ from rich.table import Table
 from caustic_cli.config.table import TABLE
 from caustic_cli.errors import MARK, InputError, plain_name
 
-#: Characters of an error line; more is what somebody put into a file.
+#: Largest length of an error line in characters: a longer one repeats the content of a file.
 LONGEST_LINE = 4000
-#: Seconds between two lines of --progress json.
+#: Seconds between lines of --progress json.
 LINE_EVERY = 0.5
-#: What is said of a lens that a network gives, beside the values that it is for.
+#: Keys of the figures of a network's lens that are not values of its inputs.
 OF_LENS = ("relative_rms", "noise", "on_screen", "middle_relative_rms")
-#: Columns that a bar and its clocks ask for beside the numbers.
+#: Terminal width from which on a progress bar and clocks are shown.
 WIDE = 90
 
 
 class Reporter:
-    """Talks to the user on stderr unless `quiet`.  Colour follows the terminal and NO_COLOR.
+    """Messages to the user on stderr, unless `quiet`.  Colour follows the terminal and NO_COLOR.
 
-    With `progress` json it talks to a program instead, one JSON object a line, of the kind (`event`) message, progress or
-    result.
+    With `progress` json the output is for programs: one JSON object per line, with the `event` message, progress or result.
 
     Raises:
         InputError: `progress` is neither auto nor json.
@@ -46,7 +45,7 @@ class Reporter:
         self.lines = progress == "json"
 
     def say(self, text: str) -> None:
-        """A line for the user."""
+        """Print a message."""
         text = named(text)
         if self.lines:
             self._line(event="message", text=text)
@@ -59,11 +58,11 @@ class Reporter:
             sys.stderr.flush()
 
     def table(self, title: str, rows: list[tuple[str, str]]) -> None:
-        """Two columns: what, and its value."""
+        """Print a table of names and values."""
         if self.lines:
             self._line(event="result", title=title, rows=dict(rows))
             return
-        if not self.console.is_terminal:  # a log: nothing wrapped, nothing cut
+        if not self.console.is_terminal:  # a log: no wrapping or truncation
             width = max(len(name) for name, _ in rows)
             self.say("\n".join([title, *(f"  {name:<{width}}  {value}" for name, value in rows)]))
             return
@@ -76,7 +75,7 @@ class Reporter:
 
     @contextmanager
     def notify_if_slow(self, text: str, seconds: float = 4.0):
-        """Say `text` if the block is still at work after so many seconds."""
+        """Print `text` if the block is still running after `seconds`."""
         timer = threading.Timer(seconds, self.say, (text,))
         timer.daemon = True
         timer.start()
@@ -87,7 +86,8 @@ class Reporter:
 
     @contextmanager
     def progress(self, total: int | None):
-        """A progress bar on a terminal, nothing elsewhere; `total` may become known later.  Lines come every LINE_EVERY seconds."""
+        """A progress bar on a terminal, nothing elsewhere; `total` may be set later.  JSON lines are printed every LINE_EVERY
+        seconds."""
         if self.lines:
             began, last = time.monotonic(), -math.inf
 
@@ -116,53 +116,54 @@ class Reporter:
             )
 
 
-#: The options by which this run was told of settings, by their path.
-_spoken: dict[str, str] = {}
+#: Names of the options with which settings were given in this run, by path.
+_option_names: dict[str, str] = {}
 
 
-def spoken() -> dict[str, str]:
-    """Those options, by path."""
-    return dict(_spoken)
+def option_names() -> dict[str, str]:
+    """The names of the options with which settings were given, by path."""
+    return dict(_option_names)
 
 
-def speak(options: dict[str, str]) -> None:
-    """From now on, call settings (path) by the options that said them; others by their key in project.toml."""
-    _spoken.clear()
-    _spoken.update(options)
+def set_option_names(options: dict[str, str]) -> None:
+    """Set the names under which messages refer to settings, by path: the options used; other settings are named as in
+    project.toml."""
+    _option_names.clear()
+    _option_names.update(options)
 
 
 def named(text: str) -> str:
-    """A text whose marked settings are called by the options that said them, and parameters by their options."""
+    """A text with marks replaced by option names, or by names of project.toml where no option was used."""
 
     def name(path: str) -> str:
         row = TABLE.get(path[1:]) if path.startswith("+") else None
         if row and row.option:
             return row.option.name
-        return _spoken.get(path) or (plain_name(path) if "." in path else "--" + path.replace("_", "-"))
+        return _option_names.get(path) or (plain_name(path) if "." in path else "--" + path.replace("_", "-"))
 
     return MARK.sub(lambda found: name(found[1]), text)
 
 
 def emit_json(value: dict) -> None:
-    """Exactly one JSON object on stdout."""
+    """Print one JSON object on stdout."""
     sys.stdout.write(json.dumps(value, allow_nan=False) + "\n")
     sys.stdout.flush()
 
 
 def emit(line: str) -> None:
-    """A line of results on stdout."""
+    """Print a line of results on stdout."""
     sys.stdout.write(line + "\n")
     sys.stdout.flush()
 
 
 def error(message: str) -> None:
-    """One line on stderr, said even when quiet; nothing in it, a hostile file's name for instance, commands the terminal."""
+    """Print one line on stderr, even if quiet, with control characters replaced, for instance in a malicious file name."""
     line = "".join(c if c.isprintable() else "?" for c in " ".join(named(message).split()))
     sys.stderr.write(f"caustic: {line if len(line) <= LONGEST_LINE else line[:LONGEST_LINE] + ' ...'}\n")
 
 
 def _wavelengths(values: list[float]) -> str:
-    """Wavelengths in a clause."""
+    """Wavelengths as a clause."""
     if len(values) == 1:
         return f"at {values[0]:.4g} nm"
     return f"at {len(values)} wavelengths, {min(values):.4g} to {max(values):.4g} nm"
@@ -182,7 +183,7 @@ def _absolute(figures: dict, prefix: str) -> list[tuple[str, str]]:
 
 
 def figures_rows(figures: dict) -> list[tuple[str, str]]:
-    """The JSON figures as a person reads them."""
+    """The figures of merit as rows for display."""
 
     def number(key: str, form: str) -> str:
         value = figures.get(key)
@@ -213,7 +214,7 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
         seen = f"relative RMS error {number('wave_relative_rms', '.4f')}, on the picture {number('wave_on_target', '.2%')}"
         if figures.get("wave_in_black") is not None:
             seen += f", in black {number('wave_in_black', '.2%')}"
-        if figures["wave_relative_rms"] is None:  # an archive has no picture to be like
+        if figures["wave_relative_rms"] is None:  # an archive has no target picture
             seen = f"on the screen {number('wave_on_screen', '.2%')}"
         waves = [
             ("of light as a wave", f"{seen}, {_wavelengths(figures['wave_wavelengths'])}"),

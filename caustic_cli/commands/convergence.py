@@ -1,4 +1,4 @@
-"""caustic convergence: what accuracy costs in time."""
+"""caustic convergence: studies of error against computing time."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ EXAMPLES = """Examples:
 """
 
 STUDIES = ("intersection", "rays", "reconstruction", "precision", "effects", "design", "diffraction", "light")
-#: Those whose --rays is that of their largest setting, also where all are made.
+#: Studies that use --rays for their largest setting also in --study all.
 BY_RAYS = ("rays", "reconstruction", "precision", "effects")
 
 
@@ -29,8 +29,8 @@ def run(
         typer.Argument(
             metavar="[PROJECT]",
             help="Project made by caustic design; without one, the"
-            " sphere a design begins from (intersection: the scene of the thesis' table"
-            " D.3; design: a bright disc; light: the same, from an LED 3 mm before"
+            " base sphere of a design (intersection: the scene of the thesis' table"
+            " D.3; design: a bright disc; light: the same, from an LED 3 mm in front of"
             " the lens).",
             show_default=False,
         ),
@@ -42,7 +42,7 @@ def run(
             " method; rays: samplers; reconstruction: filters; precision: float32 and float64;"
             " effects: each on and off; design:"
             " optimisers, networks and control nets; diffraction: rays against waves over lens"
-            " size, wavelength and source size; light: the picture against the light that is kept, over"
+            " size, wavelength and source size; light: image error against efficiency, over"
             " thickness and the loss' weight of light; all: one after the other."
         ),
     ] = "intersection",
@@ -50,8 +50,8 @@ def run(
         bool,
         typer.Option(
             "--networks",
-            help="Of design: a grid of networks, by layers, width, activation, learning rate and preconditioner, all trained"
-            " alike; of a project designed --over a range, over that, beside one lens for all of it and a network for each value.",
+            help="Study design: a grid of networks over layers, width, activation, learning rate and preconditioner, all trained"
+            " equally; for a project designed --over a range also one lens for the whole range and a network for each value.",
         ),
     ] = False,
     rays: Annotated[
@@ -59,7 +59,7 @@ def run(
         typer.Option(
             metavar="N",
             help="Rays of the largest setting; the reference takes 16 times as"
-            " many.  Of intersection: rays intersected; of design: rays of a retrace."
+            " many.  Study intersection: rays intersected; study design: rays of a retrace."
             "  [default: by study, about half a minute in all]",
         ),
     ] = None,
@@ -73,10 +73,12 @@ def run(
     seconds: Annotated[
         float | None,
         typer.Option(
-            help="Of design: for each contender, of --networks on average.  [default: 4]  Of light: for each lens.  [default: 10]"
+            help="Study design: time per method, with --networks on average.  [default: 4]  Study light: per lens.  [default: 10]"
         ),
     ] = None,
-    output: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Where CSV, JSON and PNG go.")] = Path("convergence"),
+    output: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Directory for CSV, JSON and PNG.")] = Path(
+        "convergence"
+    ),
     force: options.Force = False,
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -87,7 +89,7 @@ def run(
     threads: options.Threads = None,
     debug: options.Debug = False,
 ) -> None:
-    """Measure errors, and the time they took, for many settings in one run."""
+    """Measure errors and computing times for many settings."""
     began, say = time.monotonic(), console.Reporter(quiet, progress)
     if study not in (*STUDIES, "all"):
         raise InputError(f"--study must be one of {', '.join(STUDIES)} or all, got {study!r}")
@@ -136,7 +138,7 @@ def run(
 
 
 def _takes(study: str, option: str) -> bool:
-    """Whether an option has a meaning for a study."""
+    """Whether an option applies to a study."""
     if option == "--seconds":
         return study in ("design", "networks", "light")
     if option == "--repeats":

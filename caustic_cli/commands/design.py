@@ -1,4 +1,4 @@
-"""caustic design: find the lens whose caustic is TARGET."""
+"""caustic design: compute the lens whose caustic is the picture TARGET."""
 
 from __future__ import annotations
 
@@ -35,13 +35,15 @@ def run(
         str | None,
         typer.Option(
             metavar="NAME",
-            help="Settings for what people make, plate-100 for instance (list: all of them); --config and options win.",
+            help="Settings of a common product, such as plate-100 (list: all of them); --config and options take precedence.",
             callback=options.listing("preset"),
             is_eager=True,
         ),
     ] = None,
-    config: Annotated[Path | None, typer.Option(metavar="FILE", help="TOML with any keys of project.toml; options win.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the project TARGET from its last checkpoint.")] = False,
+    config: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="TOML with any keys of project.toml; options take precedence.")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Resume the project TARGET from its last checkpoint.")] = False,
     out: Annotated[
         Path | None,
         typer.Option("-o", "--out", metavar="DIR", help="Project directory.  [default: TARGET's stem + .caustic, here]"),
@@ -50,8 +52,8 @@ def run(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Also record the design: the image at its iterations, as the optimiser sees it, then the finished lens'; .gif, or"
-            " .mp4 where ffmpeg is installed.",
+            help="Also record the design: the image during the iterations, as the optimiser sees it, then that of the final lens;"
+            " .gif, or .mp4 where ffmpeg is installed.",
         ),
     ] = None,
     force: options.Force = False,
@@ -64,8 +66,8 @@ def run(
     threads: options.Threads = None,
     debug: options.Debug = False,
 ) -> None:
-    """Find the lens whose caustic is the picture TARGET."""
-    speaks = checks.rank_and_size()[0] == 0  # under torchrun, the first of all
+    """Compute the lens whose caustic is the picture TARGET."""
+    speaks = checks.rank_and_size()[0] == 0  # under torchrun, rank 0
     say = console.Reporter(quiet or not speaks, progress)
     iterations, time_limit = given.get("design.iterations"), given.get("design.time_limit")
     if iterations is not None and not 1 <= iterations <= 10**9:
@@ -95,11 +97,11 @@ def run(
 
         if (target / "project.toml").is_file():
             raise InputError(f"{target}: is a project, not a picture; caustic design --resume {target} goes on with it")
-        # before torch is loaded and kernels are compiled for nothing
+        # checked before torch is loaded and kernels are compiled
         if preset is not None:
             path_of(preset)
         picture = read_stdin(ACCEPTED, MAX_BYTES) if piped else target
-        if config is None:  # which may say how it is read
+        if config is None:  # a configuration may set its encoding
             read_picture(picture, "target.encoding" in given, given.get("target.color", False), given.get("invert", False))
     device = options.start_torch(device, threads, say)
 
@@ -128,7 +130,7 @@ def run(
 
 
 def _beside_resume(given: dict[str, Any], preset: str | None, config: Path | None) -> list[str]:
-    """Options that a resumed project does not take."""
+    """Names of the given options that cannot be combined with --resume."""
     others = [TABLE[path].option for path in given if path not in ("design.iterations", "design.time_limit")]
     files = [name for name, value in (("--preset", preset), ("--config", config)) if value is not None]
     return [*(option.name for option in others if option), *files]

@@ -1,4 +1,4 @@
-"""caustic export: hand the lens to other programs."""
+"""caustic export: write the lens in formats of other programs."""
 
 from __future__ import annotations
 
@@ -43,26 +43,29 @@ def run(
         str | None,
         typer.Option(
             metavar="N[xM]",
-            help="Points along x and y.  [default: 4 a knot span, so that every knot is a grid line; fewer where the file would"
-            " be larger than 20 MB]",
+            help="Points along x and y.  [default: 4 per knot span, so that every knot is a grid line; fewer if the file would"
+            " exceed 20 MB]",
         ),
     ] = None,
     tolerance: Annotated[
         float | None,
         typer.Option(
             metavar="MM",
-            help="stl, ply, obj, mitsuba: as many points as keep every triangle so close to the surface, instead of --samples;"
-            " heightmap: a bilinear surface (1e-4); gcode: straight moves (a hundredth of the scallops); step: a spline on as few"
-            " knots as that takes, by measure, and with 0 the exact one.  [default of step: at most 20 MB]",
+            help="Largest deviation from the surface.  stl, ply, obj, mitsuba: of the triangles, instead of --samples; heightmap:"
+            " of bilinear interpolation (1e-4); gcode: of linear moves (a hundredth of the scallops); step: of a spline with as few"
+            " knots as possible, 0 for the exact one.  [default for step: at most 20 MB]",
         ),
     ] = None,
     mould: Annotated[
-        bool, typer.Option("--mould", help="step, stl, ply, obj, heightmap, gcode: the negative, turned to be cut from above.")
+        bool,
+        typer.Option(
+            "--mould", help="step, stl, ply, obj, heightmap, gcode: the negative form, oriented for machining from above."
+        ),
     ] = False,
     block: Annotated[
         float | None,
         typer.Option(
-            metavar="MM", help="Of a mirror or a mould: least material behind the surface.  [default: a fifth of the larger side]"
+            metavar="MM", help="Mirror or mould: least material behind the surface.  [default: a fifth of the larger side]"
         ),
     ] = None,
     *,
@@ -132,12 +135,12 @@ def run(
 
 
 def _either(names: Sequence[str]) -> str:
-    """Names in a clause."""
+    """Names as a clause: "a, b or c"."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"
 
 
 def _check_milling(given: dict[str, Any]) -> None:
-    """Refuse options of a mill that contradict each other or are out of range."""
+    """Check that milling options are within range and do not contradict each other."""
     rough = [name for name in given if name in ("roughing_tool", "roughing_radius", "allowance")]
     if rough and "roughing" not in given:
         raise InputError(f"--{rough[0].replace('_', '-')} belongs to --roughing, which is not given")

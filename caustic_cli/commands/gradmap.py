@@ -1,4 +1,4 @@
-"""caustic gradmap: how the image changes with one control point."""
+"""caustic gradmap: the derivative of the image with respect to a control height."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def run(
     rays: Annotated[str, typer.Option(metavar="N", help="Number of rays.")] = "1000000",
     reconstruction: Annotated[str, typer.Option(help="gaussian or cosine; bincount has no derivative.")] = "cosine",
     filter_size: Annotated[str, typer.Option(metavar="V[xW]", help="Filter size, odd, 3 or more (pixels).")] = "3",
-    alpha: Annotated[float | None, typer.Option(help="Of the gaussian (1/mm^2).  [default: 1 per pixel^2]")] = None,
+    alpha: Annotated[float | None, typer.Option(help="Alpha of the gaussian filter (1/mm^2).  [default: 1 per pixel^2]")] = None,
     check: Annotated[bool, typer.Option("--check", help="Compare with central differences.")] = False,
     output: Annotated[
         Path | None,
@@ -43,7 +43,7 @@ def run(
     ] = None,
     npy: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Also write the derivative, parts of the source's power per mm, float64, [i, j]."),
+        typer.Option(metavar="FILE", help="Also write the derivative, fractions of the source's power per mm, float64, [i, j]."),
     ] = None,
     at: options.At = None,
     force: options.Force = False,
@@ -55,7 +55,7 @@ def run(
     threads: options.Threads = None,
     debug: options.Debug = False,
 ) -> None:
-    """Show how the image changes with one control height, by one forward-mode pass."""
+    """Compute the derivative of the image with respect to a control height, by one forward-mode pass."""
     began, say = time.monotonic(), console.Reporter(quiet)
     count = options.rays("--rays", rays)
     size = options.both(options.counts("--filter-size", filter_size))

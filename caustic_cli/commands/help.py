@@ -1,4 +1,4 @@
-"""How a command's options are listed, and what is answered to one that does not exist."""
+"""Grouped help of the commands' options, and messages for unknown options."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Any
 
 from caustic_cli.config import table
 
-#: Options that most people need, in this order, at the head of a command's help.
+#: The most common options, in this order, at the beginning of a command's help.
 BASICS = {
     "design": ("preset", "source", "mag", "lens_size", "glass", "throw", "quality", "out"),
     "render": ("rays", "screen_at", "source", "effects", "explain", "report", "out"),
 }
-#: Headings of groups, and the sections of the table whose settings they hold.
+#: Headings of the groups, and the sections of the table that they contain.
 GROUPS = {
     "Picture": ("target",),
     "Light source": ("source",),
@@ -25,7 +25,7 @@ GROUPS = {
     "Image": (),
     "Output and run": (),
 }
-#: Where an option belongs that no section places, by its name.
+#: Groups of options that do not follow from a section, by option name.
 PLACED = {
     **dict.fromkeys(("mag", "margin", "invert"), "Picture"),
     "element": "Lens",
@@ -34,7 +34,7 @@ PLACED = {
     **dict.fromkeys(("absorption", "roughness", "polarisation", "wavelengths", "waves", "effects", "explain"), "Effects"),
     **dict.fromkeys(("tolerance", "reconstruction", "filter_size", "alpha"), "Image"),
 }
-#: What people call options, and what they are called here.
+#: Synonyms of options.
 SYNONYMS = {
     **dict.fromkeys(("--magnification", "--magnify", "--scale", "--picture-size"), "--mag"),
     **dict.fromkeys(("--size", "--width", "--lens", "--lens-width", "--plate"), "--lens-size"),
@@ -54,7 +54,7 @@ SYNONYMS = {
 
 
 def grouped(name: str, command: Any) -> None:
-    """Have a command list its options by groups, its basics first, where it has settings among them."""
+    """Make a command list its options in groups, the most common ones first, if it has settings among them."""
     if name in BASICS:
         command.format_options = MethodType(_format_options, command)
 
@@ -85,7 +85,7 @@ def _heading(command: str, parameter) -> str:
     return next((heading for heading, sections in GROUPS.items() if section in sections), "Output and run")
 
 
-#: Sections of the settings that have options, by the options' names.
+#: Sections of settings with options, by option name.
 SECTIONS = {
     row.option.name.lstrip("-").replace("-", "_"): row.section
     for row in table.TABLE.values()
@@ -93,8 +93,8 @@ SECTIONS = {
 }
 
 
-def answer(problem: Any) -> str:
-    """What is wrong with a command line, and what was probably meant; '' where the parser says nothing."""
+def usage_message(problem: Any) -> str:
+    """A message for a usage error, with the probably intended option; "" if the parser has no message."""
     said = problem.format_message().rstrip(".")
     context = getattr(problem, "ctx", None)
     name = getattr(problem, "option_name", None)

@@ -1,4 +1,5 @@
-"""Options: those that are settings, made from the table; those that several commands share; and the reading of their texts."""
+"""Command-line options: those generated from the table of settings, those shared by several commands, and parsing of their
+values."""
 
 from __future__ import annotations
 
@@ -22,24 +23,24 @@ from caustic_cli.errors import InputError, near, no_project
 #: Parameters of mallopt(3), from glibc's malloc.h.
 TRIM_THRESHOLD, MMAP_MAX = -1, -4
 Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", envvar="CAUSTIC_QUIET", help="Say nothing on stderr but errors.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", envvar="CAUSTIC_QUIET", help="Print nothing on stderr except errors.")]
 Debug = Annotated[bool, typer.Option("--debug", envvar="CAUSTIC_DEBUG", help="Show the traceback of an error.")]
-Force = Annotated[bool, typer.Option("--force", help="Replace what is in the way.")]
+Force = Annotated[bool, typer.Option("--force", help="Overwrite existing files.")]
 At = Annotated[
     str | None,
     typer.Option(
         metavar="KEY=VALUE[,...]",
-        help="Of a network trained --over a range: the lens for this value, like throw=300 (mm).  [default: the middle]",
+        help="For a network trained --over a range: the lens for this value, like throw=300 (mm).  [default: the middle]",
     ),
 ]
 Seed = Annotated[
     int | None,
-    typer.Option(envvar="CAUSTIC_SEED", help="Seed of every random number; the same seed gives the same bytes.  [default: 0]"),
+    typer.Option(envvar="CAUSTIC_SEED", help="Seed of all random numbers; the same seed gives the same bytes.  [default: 0]"),
 ]
 Device = Annotated[str, typer.Option(envvar="CAUSTIC_DEVICE", help="auto, cpu or cuda.")]
 Dtype = Annotated[
     str | None,
-    typer.Option(envvar="CAUSTIC_DTYPE", help="Precision of the rays: float32 or float64. The CPU's kernels are float64 always."),
+    typer.Option(envvar="CAUSTIC_DTYPE", help="Precision of the rays: float32 or float64. The CPU kernels always use float64."),
 ]
 Threads = Annotated[int | None, typer.Option(envvar="CAUSTIC_THREADS", help="Threads to use; default: all cores.")]
 Progress = Annotated[
@@ -47,17 +48,17 @@ Progress = Annotated[
     typer.Option(
         envvar="CAUSTIC_PROGRESS",
         metavar="auto|json",
-        help="json: everything on stderr but errors is JSON, one object a line, and the work's progress is among it.",
+        help="json: print JSON on stderr, one object per line, including the progress; errors stay plain text.",
     ),
 ]
 Project = Annotated[Path, typer.Argument(help="Project directory made by caustic design.", show_default=False)]
 
 
 def from_table(command: str):
-    """Give a command the options that the table of settings has for it, in place of its parameter `given`.
+    """Decorator that replaces the parameter `given` of a command by the options that the table of settings defines for it.
 
-    The command gets `given`: path -> value of the settings that options said, in the table's kinds; from then on, messages about
-    them name the options (`console.speak`).
+    The command receives `given`: path -> value of the settings given by options; messages then refer to these settings by
+    option (`console.speak`).
     """
     rows = {row.option.name.lstrip("-").replace("-", "_"): row for row in table.options_of(command)}
 
@@ -68,7 +69,7 @@ def from_table(command: str):
             said = {name: value for name in rows if not ((value := values.pop(name)) is None or value is False or value == [])}
             spoken = {path: rows[name].option.name for name in said for path in (rows[name].path, *rows[name].speaks_for)}
             common = {name: row for name, row in COMMON.items() if values.get(name) is not None}
-            console.speak(spoken | {row.path: row.option.name for row in common.values()})
+            console.set_option_names(spoken | {row.path: row.option.name for row in common.values()})
             given: dict[str, Any] = {row.path: values[name] for name, row in common.items()}
             for name, value in said.items():
                 given |= _read(rows[name], value)
@@ -90,9 +91,9 @@ def from_table(command: str):
 
 
 def from_fields(kind: type, parameter: str):
-    """Give a command an option for each field of a dataclass, in place of its parameter of that name.
+    """Decorator that replaces a parameter of a command by an option for each field of a dataclass.
 
-    The command gets a dictionary of those that were said.  Fields carry help and unit in their metadata.
+    The command receives a dictionary of the options given.  Fields have help and unit in their metadata.
     """
 
     def decorate(body):
@@ -126,7 +127,7 @@ def _of_field(row: dataclasses.Field) -> inspect.Parameter:
 
 
 def _parameter(name: str, row: Setting) -> inspect.Parameter:
-    """The option of a setting as the command line's parser wants it."""
+    """The option of a setting, as a parameter for Typer."""
     option, flag = row.option, row.kind == "flag" or row.option.constant is not None
     words = HELP.get(row.path) or f"{_capital(row)}{f' ({row.unit})' if row.unit else ''}."
     if not flag:
@@ -138,7 +139,7 @@ def _parameter(name: str, row: Setting) -> inspect.Parameter:
 
 
 def listing(what: str):
-    """A callback of an option that prints all its values where it is given `list`."""
+    """A callback for an option that prints all accepted values for the value `list`."""
 
     def show(value: str | None) -> str | None:
         if value != "list":
@@ -161,20 +162,20 @@ def listing(what: str):
 
 
 def _capital(row: Setting) -> str:
-    """The help as a sentence begins, unless it begins with a value or a symbol."""
+    """The help with a capital first letter, unless it begins with a value or a symbol."""
     first = row.help.split(maxsplit=1)[0]
     return row.help if first.endswith(":") or first in row.choices or len(first) == 1 else f"{row.help[0].upper()}{row.help[1:]}"
 
 
 def _scalar(row: Setting) -> type:
-    """What the parser itself reads; what may have a unit or several numbers is text to it."""
+    """The type for Typer: a string for values with units or several numbers."""
     if row.path in READERS or row.unit == "mm":
         return str
     return {"number": float, "whole": int}.get(row.kind, str)
 
 
 def default_words(row: Setting) -> str:
-    """The default in words."""
+    """The default as text."""
     value = row.default
     if value is None or row.derived:
         return row.derived or "none"
@@ -188,7 +189,7 @@ def default_words(row: Setting) -> str:
 
 
 def _read(row: Setting, value: Any) -> dict[str, Any]:
-    """Settings by path that an option's text stands for."""
+    """The settings, by path, that an option's value represents."""
     option = row.option
     if row.path in READERS:
         return READERS[row.path](option.name, value)
@@ -210,7 +211,7 @@ def _read(row: Setting, value: Any) -> dict[str, Any]:
 
 
 def _spectrum(option: str, text: str) -> dict[str, Any]:
-    """Wavelengths and their weights: "450:2,550"."""
+    """Wavelengths with optional weights: "450:2,550"."""
     form = "wavelengths in nm, each with a weight or without, like 450:2,550"
     lines = [numbers(option, part, (1, 2), ":", form) for part in text.split(",")]
     weighed = any(len(line) == 2 for line in lines)
@@ -224,7 +225,7 @@ def _power(option: str, text: str) -> dict[str, Any]:
 
 
 def _radius(option: str, text: str) -> dict[str, Any]:
-    """Radii of a screen: "60", of a sphere; "60,inf" or "inf,60", of a cylinder."""
+    """Radii of a screen: "60" for a sphere; "60,inf" or "inf,60" for a cylinder."""
     form = "one number of mm, or two with inf for straight, like 60, 60,inf or -8cm"
     parts = [part.strip() for part in text.split(",")]
     if len(parts) > 2:
@@ -244,7 +245,7 @@ def _elements(option: str, texts: list[str]) -> dict[str, Any]:
 
 
 def _element(option: str, text: str) -> dict[str, Any]:
-    """The [[element]] table that a text says."""
+    """The [[element]] table of a text."""
     rows = table.in_section("element")
     keys = {key: row for key, row in rows.items() if key != "type"}
     kind, *words = text.split() or [""]
@@ -266,7 +267,7 @@ def _element(option: str, text: str) -> dict[str, Any]:
 
 
 def _element_value(where: str, row: Setting, text: str, kind: str) -> Any:
-    """A value of one of its keys."""
+    """The value of a key of an [[element]] table."""
     if row.kind == "text":
         return text
     if row.kind == "number":
@@ -278,7 +279,7 @@ def _element_value(where: str, row: Setting, text: str, kind: str) -> Any:
     return both(numbers(where, text, alone, ",", form, unit=row.unit, endless=row.key == "radius"))
 
 
-#: Options whose text is read in a way of their own.
+#: Options with their own parser.
 READERS = {
     "elements": _elements,
     "lens.gradient_terms": _terms,
@@ -289,20 +290,20 @@ READERS = {
     "screen_size": lambda option, text: {"screen_size": size(option, text)},
     "resolution": lambda option, text: {"resolution": counts(option, text)},
 }
-#: Help of options that say less than their setting can hold.
+#: Help of options that are more restricted than their setting.
 HELP = {
-    "target.encoding": "Pixel values are irradiance as they are, not sRGB-encoded.",
-    "design.iterations": "Iterations in all; with --resume, counted from the very first.",
+    "target.encoding": "Pixel values are linear irradiance, not sRGB-encoded.",
+    "design.iterations": "Total number of iterations, including those before --resume.",
     "source.position": "Point (may be repeated), centre of a grid or disc, or origin of a ray file (mm).",
-    "design.over": "Train a network over ranges (mm), whose values are its inputs, so that it gives a lens for each, which --at of"
-    " the other commands names: throw=250:350; also source.x, source.y, source.z.",
+    "design.over": "Train a network whose inputs vary over ranges (mm), so that it gives a lens for every value, selected with --at"
+    " in the other commands: throw=250:350; also source.x, source.y, source.z.",
     "target.flip": "Mirror the picture along x, y or xy, for a viewer on the lens' side.",
-    "lens.mirror": "The surface reflects; the screen stands on the source's side, --throw before it.",
-    "source.wavelengths": "The source's spectrum: wavelengths (nm) and relative powers; a --glass refracts each by its own index.",
+    "lens.mirror": "The surface is a mirror; the screen is on the source's side, at the distance --throw.",
+    "source.wavelengths": "Spectrum of the source: wavelengths (nm) and relative powers; a --glass has its own index at each.",
 }
-#: Options that are settings and that every command has.
+#: Settings that are options of every command.
 COMMON = {row.option.name.lstrip("-"): row for row in table.TABLE.values() if row.option and row.option.common}
-#: Millimetres in units that may follow a length.
+#: Units of length, mm.
 UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
 
 
@@ -315,9 +316,9 @@ def numbers(
     unit: str = "",
     endless: bool = False,
 ) -> tuple[float, ...]:
-    """Numbers separated by x ("10x8") or by what `separator` matches; `form` says what would be accepted.
+    """Numbers separated by x ("10x8") or by a match of `separator`; form: description of the accepted form.
 
-    unit: mm for lengths, which may say another unit, the last one for all that say none: "10x8cm"; endless: inf is a number too.
+    unit: mm for lengths, which may have another unit, the last one applying to all without one: "10x8cm"; endless: accept inf.
 
     Raises:
         InputError: naming the option.
@@ -347,7 +348,7 @@ def size(option: str, text: str) -> tuple[float, float] | tuple[float]:
 
 
 def power(option: str, text: str) -> tuple[float, str]:
-    """A power and its unit, W where none is said: "100lm", "2 W", "2".
+    """A power and its unit, W by default: "100lm", "2 W", "2".
 
     Raises:
         InputError: naming the option.
@@ -355,7 +356,7 @@ def power(option: str, text: str) -> tuple[float, str]:
     found = re.fullmatch(r"([0-9.]+(?:[eE][+-]?[0-9]+)?) ?(W|lm)?", text.strip(), re.ASCII)
     try:
         value = float(found[1]) if found else math.nan
-    except ValueError:  # of two points
+    except ValueError:  # more than one decimal point
         value = math.nan
     if not 0 < value <= checks.POWER:
         raise InputError(
@@ -373,12 +374,12 @@ def counts(option: str, text: str) -> tuple[int, ...]:
 
 
 def both(values: tuple) -> list:
-    """One value for both axes, or one each."""
+    """A pair from one value for both axes, or from one each."""
     return list(values) if len(values) == 2 else [values[0], values[0]]
 
 
 def rays(option: str, text: str) -> int:
-    """A number of rays, also written 2e6."""
+    """A number of rays, possibly in the form 2e6."""
     (value,) = numbers(option, text, (1,))
     if value != int(value) or not 1 <= value <= 1e12:
         raise InputError(f"{option} must be a whole number 1 to 1e12 (2e6 is fine), got {text!r}")
@@ -386,10 +387,10 @@ def rays(option: str, text: str) -> int:
 
 
 def require_project(path: Path, archives: bool = False) -> None:
-    """Refuse what is no project, nor an archive where one will do, before anything is loaded or compiled for it.
+    """Check that a path is a project, or an archive if accepted, before anything is loaded or compiled.
 
     Raises:
-        InputError: as of opening it.
+        InputError: it is neither.
     """
     if (path / "project.toml").is_file() or (archives and path.suffix.lower() == ".npz" and path.is_file()):
         return
@@ -402,10 +403,10 @@ def require_project(path: Path, archives: bool = False) -> None:
 
 
 def start_torch(device: str, threads: int | None, say: Reporter):
-    """Load torch, set its threads and choose the device ("cpu" or "cuda").  What traces on a CUDA device, and why not, is said.
+    """Load torch, set its number of threads and choose the device ("cpu" or "cuda"), with a message about CUDA.
 
     Raises:
-        InputError: an unknown device, CUDA asked for but absent, or fewer than one thread.
+        InputError: the device is unknown, CUDA is requested but absent, or the number of threads is invalid.
     """
     if device not in ("auto", "cpu", "cuda"):
         raise InputError(f"--device must be auto, cpu or cuda, got {device!r}")
@@ -417,19 +418,19 @@ def start_torch(device: str, threads: int | None, say: Reporter):
     if threads:
         torch.set_num_threads(threads)
     if device == "cuda" and not torch.cuda.is_available():
-        raise InputError("--device cuda: no CUDA device is at hand here; use auto or cpu")
+        raise InputError("--device cuda: no CUDA device is available; use auto or cpu")
     from caustic_cli.workflow.compilation import choose_device  # noqa: PLC0415
 
     return choose_device(device, say)
 
 
 def _keep_freed_memory() -> None:
-    """Large arrays come from what this process has freed before, and in large pages: a third of the time of a design on a net of
-    3003 x 3003 points went into pages that the system cleared (tests/benchmarks/README.md).
+    """Reuse freed memory for large arrays, and use huge pages: a third of the time of a design on a net of 3003 x 3003 points was
+    spent on clearing new pages (tests/benchmarks/README.md).
 
-    For glibc, whose malloc otherwise maps every large array anew (mallopt(3)); others do as they do.  Before torch is loaded.
+    For glibc, whose malloc otherwise maps every large array anew (mallopt(3)); no effect elsewhere.  Call before torch is loaded.
     """
-    os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")  # torch's own
+    os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")  # read by torch
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError, TypeError):  # no glibc; no C library by that name

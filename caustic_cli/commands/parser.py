@@ -1,4 +1,4 @@
-"""The parser of the whole command line; torch is loaded inside the commands' bodies only, so that --help answers at once."""
+"""The command-line parser; torch is imported inside the commands only, so that --help responds immediately."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from caustic_cli import __version__
 from caustic_cli.commands import console, convergence, design, export, gradmap, render
 from caustic_cli.commands.help import grouped
 
-DESCRIPTION = """Design free-form lenses that throw a picture as a caustic.
+DESCRIPTION = """Design free-form lenses that project a picture as a caustic.
 
 Lengths are millimetres, angles degrees, wavelengths nanometres, powers watts. Results go to stdout, everything else to
 stderr. Exit status: 0 done; 1 could not finish; 2 bad usage or bad input; 130 or 143 interrupted, state saved.
@@ -48,10 +48,10 @@ for _info, _name in zip(app.registered_commands, ("design", "render", "gradmap",
 
 
 def parser():
-    """The parser, a Click group of the commands."""
+    """The parser: a Click group of the commands."""
     root = typer.main.get_command(app)
     for name, command in root.commands.items():
         grouped(name, command)
         for parameter in command.params:
-            parameter.show_envvar = False  # every option has a variable; the manual says how it is called
+            parameter.show_envvar = False  # every option has a variable, named in the manual page
     return root

@@ -1,4 +1,4 @@
-"""caustic render: trace the lens of a project, write the irradiance image and its figures."""
+"""caustic render: trace the lens of a project, and write the irradiance image and its figures of merit."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def run(
         str | None,
         typer.Option(
             metavar="N",
-            help="Number of rays, independent of those of the design.  [default: as at the end of a design: 4e6, of a plane"
-            " wave 64 a pixel where those are more (at most 6.4e7), of other light up to 1.6e7 until the noise is a tenth of the"
+            help="Number of rays, independent of those of the design.  [default: as at the end of a design: 4e6; for a plane"
+            " wave at least 64 per pixel (at most 6.4e7); for other light up to 1.6e7 until the noise is a tenth of the"
             " error; with --tolerance, 1e6]",
         ),
     ] = None,
@@ -38,26 +38,26 @@ def run(
         float | None,
         typer.Option(
             metavar="ERROR",
-            help="Add rays until the image's noise, estimated, is below this relative RMS; --rays is where it begins.",
+            help="Add rays until the estimated noise of the image is below this relative RMS; --rays is the initial number.",
         ),
     ] = None,
     reconstruction: Annotated[
         str, typer.Option(help="bincount, gaussian or cosine; the figures are always by bincount.")
     ] = "bincount",
     filter_size: Annotated[str, typer.Option(metavar="V[xW]", help="Filter size, odd (pixels).")] = "3",
-    alpha: Annotated[float | None, typer.Option(help="Of the gaussian (1/mm^2).  [default: 1 per pixel^2]")] = None,
+    alpha: Annotated[float | None, typer.Option(help="Alpha of the gaussian filter (1/mm^2).  [default: 1 per pixel^2]")] = None,
     at: options.At = None,
-    screen_at: Annotated[float | None, typer.Option(metavar="Z", help="Put the screen here instead (mm).")] = None,
+    screen_at: Annotated[float | None, typer.Option(metavar="Z", help="Move the screen to this position (mm).")] = None,
     effects: Annotated[
         str,
         typer.Option(
             metavar="auto|none|NAME[,NAME...]",
-            help="Effects to simulate: what the scene calls for, none that can be left out, or just these (--explain lists them).",
+            help="Effects to simulate: those that the scene needs, none that can be omitted, or the listed ones (see --explain).",
         ),
     ] = "auto",
     explain: Annotated[
         bool,
-        typer.Option("--explain", help="Show which effects are simulated, why, what each costs, and what leaving it out does."),
+        typer.Option("--explain", help="Show which effects are simulated, why, the cost of each, and the error of omitting it."),
     ] = False,
     output: Annotated[
         Path | None,
@@ -65,20 +65,22 @@ def run(
             "-o",
             "--out",
             metavar="PNG",
-            help="Image to write, a pixel for each of the screen's.  [default: render.png in PROJECT, at least 800 pixels wide,"
-            " unless a less noisy one of the same is there; of an archive, its name + -render.png, here]",
+            help="Image to write, with the pixels of the screen.  [default: render.png in PROJECT, at least 800 pixels wide,"
+            " unless a less noisy one of the same scene exists; for an archive, its name + -render.png, here]",
         ),
     ] = None,
     npy: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Also write the irradiance: power per pixel as a part of the source's, float64, [i, j]."),
+        typer.Option(
+            metavar="FILE", help="Also write the irradiance: power per pixel as a fraction of the source's, float64, [i, j]."
+        ),
     ] = None,
     html: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Also write a page that traces the lens itself in any browser, without a network: the lens in three dimensions,"
-            " the caustic as screen and light are moved, target and difference.",
+            help="Also write a self-contained page that traces the lens in any browser: the lens in three dimensions,"
+            " the caustic for movable screen and light, target and difference.",
         ),
     ] = None,
     verify: Annotated[
@@ -94,7 +96,7 @@ def run(
         bool,
         typer.Option(
             "--report",
-            help="Also say what making the lens asks for: wall, stock, slopes, concave"
+            help="Also report the manufacturing data of the lens: wall, stock, slopes, concave"
             " radius, margin to internal reflection, sharpness, tolerances; writes report.json"
             " beside the image.",
         ),
@@ -103,22 +105,22 @@ def run(
         float | None,
         typer.Option(
             metavar="MM",
-            help="Radius of the tool that --report tries in concave places, and of a --cut whose program does not say it (mm).",
+            help="Tool radius that --report checks in concave regions, and that of a --cut program that does not state it (mm).",
         ),
     ] = None,
     cut: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Trace the surface that this program (G-code, as of caustic export --format gcode) leaves of its ball-nose tool,"
-            " scallops and all.",
+            help="Trace the surface machined by this program (G-code, as from caustic export --format gcode) with a ball-nose tool,"
+            " including scallops.",
         ),
     ] = None,
     tolerances: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Also study what errors of making and placing do, as this TOML says (like examples/tolerances.toml):"
+            help="Also analyse the manufacturing and alignment errors of this TOML file (like examples/tolerances.toml):"
             " sensitivities, percentiles of error and light, worst offenders; writes tolerances.csv and .png beside the image.",
         ),
     ] = None,
@@ -126,8 +128,8 @@ def run(
         Path | None,
         typer.Option(
             metavar="PICTURE",
-            help="Of an array of lenslets: how bright each one's source has to be for this illumination (non-negative least"
-            " squares over the image of each lenslet alone); writes wanted.png beside the image.",
+            help="For a lenslet array: the source brightness of each lenslet that gives this illumination (non-negative least"
+            " squares over the images of the single lenslets); writes wanted.png beside the image.",
         ),
     ] = None,
     force: options.Force = False,
@@ -140,7 +142,7 @@ def run(
     threads: options.Threads = None,
     debug: options.Debug = False,
 ) -> None:
-    """Trace the lens of PROJECT; write the irradiance image and its figures."""
+    """Trace the lens of PROJECT; write the irradiance image and its figures of merit."""
     say = console.Reporter(quiet, progress)
     count = None if rays is None else options.rays("--rays", rays)
     if tolerance is not None and not 0 < tolerance < 100:
@@ -157,11 +159,13 @@ def run(
         raise InputError("--verify compares on the project's own screen: give no --screen-at")
     if alpha is not None and reconstruction != "gaussian":
         raise InputError(f"--alpha belongs to --reconstruction gaussian, got {reconstruction}")
-    given = {path: value for path, value in given.items() if not path.startswith("design.")}  # of the rays of this render
+    given = {
+        path: value for path, value in given.items() if not path.startswith("design.")
+    }  # seed and dtype apply to this render's rays
     if "source.angle" in given:
         given.setdefault("source.type", "disc")
     if screen_at is not None:
-        console.speak(console.spoken() | {"screen.z": "--screen-at"})
+        console.set_option_names(console.option_names() | {"screen.z": "--screen-at"})
     options.require_project(project, archives=True)
     device = options.start_torch(device, threads, say)
 
@@ -202,7 +206,7 @@ def run(
 
 
 def _show(title: str, figures: dict, say: console.Reporter) -> None:
-    """The figures, and what was asked for beside them, as a person reads them."""
+    """Print the figures of merit and the requested reports."""
     say.table(title, console.figures_rows(figures))
     if "cut" in figures:
         from caustic_cli.workflow.machining import rows as of_cut  # noqa: PLC0415

@@ -1,1 +1,1 @@
-"""What project.toml may say: its keys, their defaults, and the values that follow from others."""
+"""Configuration: the keys of project.toml, their defaults, and derived values."""

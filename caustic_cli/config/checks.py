@@ -1,4 +1,4 @@
-"""Validation shared by the scene's parts, and of what torchrun says: one sentence saying what, where and what would be accepted."""
+"""Validation of numbers, choices and environment variables, with messages that give the accepted range."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from caustic_cli.errors import InputError
 
-#: Largest height or thickness, mm, and power, W: squares and products of them stay far from the ends of float32.
+#: Largest height or thickness, mm, and power, W: their squares and products stay within the range of float32.
 LENGTH, POWER = 1e9, 1e30
 
 
@@ -22,7 +22,7 @@ def number(where: str, value, low: float = -math.inf, high: float = math.inf, *,
         raise InputError(f"{where} must be a number, got {value!r}")
     try:
         value = float(value)
-    except OverflowError:  # a whole number of hundreds of digits
+    except OverflowError:  # an integer of hundreds of digits
         value = math.inf if value > 0 else -math.inf
     ok = math.isfinite(value) and value <= high and (value > low if open_low else value >= low)
     if not ok:
@@ -52,7 +52,7 @@ def choice(where: str, value, names: Sequence[str]) -> str:
 
 
 def of_environment(name: str, default: int | None, low: int, high: int) -> int:
-    """A variable of the environment as an int in [low, high]; without a default it has to be set.
+    """An environment variable as an int in [low, high]; without a default it is required.
 
     Raises:
         InputError: naming the variable, the accepted range and the value.
@@ -67,10 +67,10 @@ def of_environment(name: str, default: int | None, low: int, high: int) -> int:
 
 
 def rank_and_size() -> tuple[int, int]:
-    """This process' rank, and how many there are, as torchrun says in the environment; 0 and 1 where it did not start this one.
+    """Rank of this process and number of processes, from torchrun's environment variables; (0, 1) without torchrun.
 
     Raises:
-        InputError: RANK or WORLD_SIZE is no such number.
+        InputError: RANK or WORLD_SIZE is invalid.
     """
     size = of_environment("WORLD_SIZE", 1, 1, 10**6)
     of_environment("RANK", 0, 0, 10**6)

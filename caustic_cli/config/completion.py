@@ -1,7 +1,7 @@
-"""The settings that follow from others: a complete project from a picture and what the user said.
+"""Completion of settings: a complete project from a picture and the user's settings.
 
-Screen, picture and offset surface follow from the magnification; the stages from control net, rays and pixels.  What few scenes
-have is completed in `optional`.
+Screen, picture and base surface follow from the magnification, the stages from control net, rays and pixels.  Optional features are
+completed in `optional`.
 """
 
 from __future__ import annotations
@@ -14,18 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from caustic_cli.config.optional import (
-    complete_blank,
-    complete_elements,
-    complete_farther,
-    complete_index_design,
-    complete_over,
-    complete_second,
-    complete_two_sided,
-    first_magnification,
-    put_in_the_middle,
-)
-from caustic_cli.config.plans import (
+from caustic_cli.config.default_stages import (
     GAPS,
     LEAST_SPANS,
     LEAST_WAVES,
@@ -43,6 +32,17 @@ from caustic_cli.config.plans import (
     two_sided,
     usual_sampler,
     wave_refinement,
+)
+from caustic_cli.config.optional import (
+    centre_screen,
+    complete_blank,
+    complete_elements,
+    complete_index_design,
+    complete_over,
+    complete_second,
+    complete_second_size,
+    complete_two_sided,
+    default_magnification,
 )
 from caustic_cli.config.settings import (
     DEFAULTS,
@@ -73,25 +73,27 @@ from caustic_cli.scene.sources.section import content
 from caustic_cli.scene.tolerances import Tolerances
 
 DEFAULT_RESOLUTION = 250
-DEFAULT_SPANS = 128  # knot spans of the finished net; 128 halve evenly through the stages
+DEFAULT_SPANS = 128  # knot spans of the final net; divisible by 2 through the stages
 NETWORK_CONTROL = 50  # table D.2
-OVER_ITERATIONS = 200  # of a network over a range: caustic convergence, study design, networks
-DRAFT_SECONDS, FINE_SECONDS = 8.0, 60.0  # time limits below and from which another quality is the better use of the time
-EXTENDED = 5.0  # so many times these of a source with an extent, whose start is solved for behind its blur
-STEEPEST = 1.25  # least radius of a derived sphere, in half diagonals of the lens: slopes up to 1.3
-PLATE, WALL = 20.0, 3.0  # width beyond which a lens is a plate, as thin as its relief and this wall allow, mm
-THICK, SAG = 2.0, 0.45  # thickness over width of a lens with two free-form sides, and what of it each of them may take
-OBLONG = 2.5  # ratio of the magnifications along the axes from which on another shape of lens is advised
-COLOR_GLASS = "N-BK7"  # of a coloured picture, unless glass or index is said: dispersion has to be known
+OVER_ITERATIONS = 200  # for a network over a range: caustic convergence, study design, networks
+DRAFT_SECONDS, FINE_SECONDS = 8.0, 60.0  # time limits below and above which another quality uses the time better
+EXTENDED = 5.0  # factor of these limits for an extended source, whose start includes a deconvolution
+STEEPEST = 1.25  # least radius of a derived sphere in half diagonals of the lens: slopes up to 1.3
+PLATE, WALL = 20.0, 3.0  # width beyond which a lens is a thin plate, and its least wall thickness, mm
+THICK, SAG = 2.0, 0.45  # thickness over width of a lens with two free-form sides, and largest height of a side over thickness
+OBLONG = 2.5  # anamorphic ratio of the magnifications from which on another lens shape is recommended
+COLOR_GLASS = "N-BK7"  # for a coloured picture without glass or index, since dispersion has to be known
 
 
 @dataclass(frozen=True)
 class Derivation:
-    """What settings are derived from that no project holds, by its path in the table: `mag` and the like; None where not given.
+    """Parameters from which settings are derived and which are not stored in a project, by their paths in the table; None if not
+    given.
 
-    mag: picture width over lens width; margin: black border, part of the picture's width in all; throw: distance of the screen;
-    screen_size: of the screen, mm, (width,) or (width, height); resolution: pixels, (across,) or (across, up); quality: of the
-    default stages; rays: of the last default stage.
+    mag: picture width over lens width; margin: total width of the dark border relative to the picture; throw: distance of the
+    screen;
+    screen_size: mm, (width,) or (width, height); resolution: pixels, (across,) or (across, up); quality: of the default stages;
+    rays: of the last default stage.
     """
 
     mag: float | None = None
@@ -111,14 +113,14 @@ class Derivation:
 def complete(
     given: Settings, aspect: float, by: Derivation | None = None, lit: tuple[float, float] = (1.0, 1.0), gaps: float = 0.0
 ) -> Settings:
-    """Every setting a project needs.
+    """The complete settings of a project.
 
     Args:
-        given: what the user fixed, by options or config.
+        given: the user's settings, from options or a configuration.
         aspect: height over width of the picture.
-        by: what else was said.
-        lit: parts of the picture's width and height that light is to cover.
-        gaps: of the picture between its bright parts, see `Picture.gaps`.
+        by: the user's parameters.
+        lit: fractions of the picture's width and height that are not dark.
+        gaps: dark gaps between its bright parts, see `Picture.gaps`.
 
     Raises:
         InputError: a value is out of range, or two contradict each other.
@@ -149,7 +151,7 @@ def complete(
             lens.setdefault("glass", COLOR_GLASS)
     over = Ranges.parse(value_of(s["design"], "design.over"))
     if over and "throw" in over.keys:
-        put_in_the_middle(over, s, given, by.throw)
+        centre_screen(over, s, given, by.throw)
     mag, margin = by.mag, default("margin") if by.margin is None else by.margin
     check("lens.size", lens["size"])
     if check("screen.z", screen["z"]) == 0:
@@ -163,21 +165,21 @@ def complete(
     complete_source(s["source"], lens, [stage.get("source", "") for stage in s["design"].get("stages", [])])
     if over:
         complete_over(over, s, given)
-    if (over or _counted(s["design"])) and "initial" not in given.get("design", {}):
+    if (over or _relative_to_initial(s["design"])) and "initial" not in given.get("design", {}):
         s["design"]["initial"] = "zero-last"
     complete_second(s)
     if "size" not in target or mag is not None:
         if mag is None and "size" in screen:
             fit = min(screen["size"][0], screen["size"][1] / aspect) / (1.0 + margin)
         else:
-            fit = (mag or first_magnification(s)) * lens["size"][0]
+            fit = (mag or default_magnification(s)) * lens["size"][0]
         target["size"] = [fit, fit * aspect]
     if "size" not in screen:
         screen["size"] = [(1.0 + margin) * x for x in target["size"]]
     if "resolution" not in screen:
         nx = by.resolution[0] if by.resolution else DEFAULT_RESOLUTION
         screen["resolution"] = [nx, max(2, round(nx * screen["size"][1] / screen["size"][0]))]
-    complete_farther(s)
+    complete_second_size(s)
     complete_elements(s)
     build_screen(s)
     source = build_source(s)
@@ -187,9 +189,9 @@ def complete(
 
 
 def complete_source(source: dict[str, Any], lens: dict[str, Any], stages: Sequence[str] = (), where: str = "⟨source.type⟩") -> None:
-    """What the types of source in use need and nobody said, without what none of them has: a plane wave has no intensity.
+    """Complete the keys of the source types in use, and remove defaults that none of them uses.
 
-    `stages`: the types that stages name, "" for the source's own; they need their keys too.
+    stages: the source types of the stages, "" for the source's own; their keys are needed, too.
     """
     if "also" in source:
         source["also"] = [{**DEFAULTS["source"], **table} for table in source["also"]]
@@ -205,7 +207,7 @@ def complete_source(source: dict[str, Any], lens: dict[str, Any], stages: Sequen
 
 
 def first_thickness(size: Sequence[float]) -> float:
-    """Thickness that a lens is first solved with, mm, where none was said."""
+    """Default thickness of a lens, mm."""
     width = max(size)
     return width / 2.0 if width <= PLATE else WALL + width / 10.0
 
@@ -236,24 +238,24 @@ def _complete_lens(lens: dict[str, Any], screen: dict[str, Any], target: dict[st
             f" {lens['thickness'] + lens['height_range'][1]:.4g} mm thick, got {screen['z']:g} mm"
         )
     if "radius" not in lens:
-        # Lenslets side by side throw their pictures onto one another, as a lens that gathers the light of their middles.
+        # The pictures of lenslets are superimposed: the light through their centres converges like that of a focusing lens.
         across, along = (t / w if k == 1 else 0.0 for t, w, k in zip(target["size"], lens["size"], array, strict=True))
         vergence = 0.0
-        if source.nearest < lens["z_in"]:  # divergence at the surface, 1/mm; 0 from infinity
+        if source.nearest < lens["z_in"]:  # vergence at the surface, 1/mm; 0 for a source at infinity
             vergence = 1.0 / (lens["z_in"] - source.centre[2] + (lens["thickness"] - lens["z_in"]) / (1.0 if mirror else index))
         radius = Offset.for_magnification(
             (across, along), -1.0 if mirror else index, screen["z"], lens["thickness"], vergence
         ).radius
-        least = STEEPEST * math.hypot(*lens["size"]) / 2.0  # what a long picture, or light from nearby, asks for may be more
+        least = STEEPEST * math.hypot(*lens["size"]) / 2.0  # an oblong picture or a near source may ask for a smaller radius
         lens["radius"] = [math.copysign(max(abs(r), least), r) for r in radius]
     if free and sides == 1:
         lens["thickness"] += _missing_room(lens)
 
 
 def _missing_room(lens: dict[str, Any]) -> float:
-    """Thickness by which a lens has to grow for its offset to keep the least thickness, mm; 0 where its heights have room already.
+    """Increase of the thickness, mm, with which the base surface keeps the least thickness; 0 if the heights have room already.
 
-    A lens that gathers much light, of a source close by for instance, is thinnest at its corners.
+    A strongly converging lens, for a close source for instance, is thinnest at its corners.
     """
     x, y = (np.array([0.0, width / 2.0]) for width in lens["size"])
     lowest = lens["thickness"] + float(Offset(0.0, tuple(lens["radius"])).sag(x[:, None], y[None, :]).min())
@@ -262,7 +264,7 @@ def _missing_room(lens: dict[str, Any]) -> float:
 
 
 def shape_words(s: Settings) -> str:
-    """Which lens would follow the shape of a long picture, where this one does not."""
+    """A recommendation of a lens shape for an oblong picture; "" if the magnifications are similar."""
     (w, h), (a, b) = s["target"]["size"], s["lens"]["size"]
     if OBLONG > h * a / (w * b) > 1.0 / OBLONG:
         return ""
@@ -290,13 +292,13 @@ def _complete_design(
     asked = check("design.waves", design["waves"])
     array = value_of(lens, "lens.array")
     fine_net = "control" not in lens or min(n - p for n, p in zip(lens["control"], degree, strict=True)) >= LEAST_SPANS
-    fine_net = fine_net or max(array) > 1  # whose lenslets have to be solved for
+    fine_net = fine_net or max(array) > 1  # lenslets need a transport start
     spread = plain and fine_net and not source.sharp and not elements_of(s) and _shifts(s, source)
-    shaped = (plain or _counted(design)) and fine_net and not source.apart
+    shaped = (plain or _relative_to_initial(design)) and fine_net and not source.apart
     design.setdefault("start", "transport" if "second" in s or shaped else "offset")
-    if design["start"] != "offset" and design["network"] != "none" and not _counted(design):
+    if design["start"] != "offset" and design["network"] != "none" and not _relative_to_initial(design):
         raise InputError(
-            f"⟨design.start⟩ {design['start']} gives a surface, which a network can begin from only with"
+            f"⟨design.start⟩ {design['start']} gives a surface, from which a network can start only with"
             " ⟨+design.preconditioner⟩ laplacian; use that, start offset, or network none"
         )
     if max(array) > 1 and (design["start"] == "offset" or not plain):
@@ -315,8 +317,8 @@ def _complete_design(
             f"⟨design.start⟩ of several free surfaces must be transport, got {design['start']}; a small net or several points"
             " have no such start"
         )
-    # Sharp light's transport is right at every scale at once, if the net can hold it, and so is that of a source that shifts the
-    # image, for the light behind its blur; otherwise from coarse to fine.
+    # A transport start is accurate at every scale for a point source or plane wave, if the net resolves it, and for an extended
+    # source that shifts the image, apart from its blur; otherwise the stages are coarse to fine.
     moved = plain and fine_net and design["start"] != "offset" and (source.sharp or spread or max(array) > 1)
     own = "control" in lens
     if not own:
@@ -345,7 +347,7 @@ def _complete_design(
         stages = two_sided(tuple(lens["control"]), rays, (nx, ny), quality)
     elif moved:
         centre = source.pointlike() if spread else source
-        # Diffraction rounds creases by more than a fine net would.
+        # Diffraction smooths creases more than a coarser net.
         creased = gaps >= GAPS and not (own or waves or spread) and source.distant and max(array) == 1
         if creased:
             lens["control"] = [creased_control(max(nx, ny), p, quality) for p in degree]
@@ -369,25 +371,25 @@ def _complete_design(
             )
         ]
     stages += waves
-    if design["loss"].strip() == "rms":  # eq. 5.2.1 knows the screen alone
+    if design["loss"].strip() == "rms":  # eq. 5.2.1 is defined on the screen only
         stages = [stage | {"apron": 0} for stage in stages]
     design["stages"] = stages
 
 
-def _counted(design: dict[str, Any]) -> bool:
-    """Whether it is by a network whose outputs are counted from a first surface, whichever that is."""
+def _relative_to_initial(design: dict[str, Any]) -> bool:
+    """Whether the design uses a network whose outputs are relative to an initial surface."""
     return design["network"] != "none" and design.get("preconditioner") == "laplacian"
 
 
 def _of_array(control: Sequence[int], degree: Sequence[int], array: Sequence[int]) -> list[int]:
-    """The least control points, so many or more, that an array of lenslets can have; of one lens, these."""
+    """The least admissible numbers of control points of a lenslet array, at least `control`; unchanged for a single lens."""
     return [array_control(n, p, k) if k > 1 else n for n, p, k in zip(control, degree, array, strict=True)]
 
 
 def without_waves(s: Settings, given: bool) -> str:
-    """Why `waves = "auto"` leaves the wave image out of complete settings although diffraction matters, and what puts it in.
+    """Why `waves = "auto"` omits the wave image from complete settings although diffraction matters, and how to include it.
 
-    given: whether the stages are the user's own.
+    given: whether the stages are user-defined.
     """
     design = s["design"]
     if any(stage.get("waves") for stage in design["stages"]):
@@ -400,14 +402,14 @@ def without_waves(s: Settings, given: bool) -> str:
 
 
 def _not_by_default(s: Settings) -> str:
-    """What `waves = "auto"` does not refine the wave image with, however long that takes, and what puts it in."""
+    """The feature for which `waves = "auto"` never refines the wave image, and how to include it; "" if there is none."""
     design = s["design"]
     if "gradient" in s["lens"]:
-        return "the wave image is taken of lenses of one index"
+        return "wave images are implemented for homogeneous lenses only"
     if elements_of(s):
-        return "the wave image is taken of a lens by itself"
+        return "wave images are implemented for a single lens only"
     if s["source"]["type"] == "rays":
-        return "a ray file says nothing of its light's phase"
+        return "a ray file contains no phase"
     if s["source"].get("also"):
         return "light of several sources is refined by rays alone"
     if design["network"] != "none":
@@ -424,14 +426,14 @@ def _not_by_default(s: Settings) -> str:
 
 
 def _wave_stages(s: Settings, source: Source, quality: str, lit: tuple[float, float]) -> list[Table]:
-    """What refines the wave image after the ray image, where that is asked for or called for."""
+    """Stages that refine the wave image after the ray image, on request or where diffraction matters."""
     design, lens, screen, asked = s["design"], s["lens"], s["screen"], s["design"]["waves"]
     if asked == "on" and design["network"] != "none":
-        raise InputError("⟨design.waves⟩ on needs network none: the wave image refines the heights themselves")
+        raise InputError("⟨design.waves⟩ on needs network none: the wave image is refined by control heights")
     if asked == "on" and "gradient" in lens:
-        raise InputError("⟨design.waves⟩ on needs a lens of one index, of which the wave image is taken")
+        raise InputError("⟨design.waves⟩ on needs a homogeneous lens: with a gradient index there is no wave image")
     if asked == "on" and source.rays is not None:
-        raise InputError("⟨design.waves⟩ on: a ray file says nothing of its light's phase, so that it has no wave image to refine")
+        raise InputError("⟨design.waves⟩ on: a ray file contains no phase, so that it has no wave image to refine")
     if asked == "on" and build_screen(s).curved:
         raise InputError("⟨design.waves⟩ on needs a plane screen: a curved one has no wave image to refine")
     if asked == "on" and len(source.members) > 1:
@@ -448,12 +450,13 @@ def _wave_stages(s: Settings, source: Source, quality: str, lit: tuple[float, fl
 
 
 def _resolution(s: Settings, source: Source) -> Resolution:
-    """What complete settings let light show."""
+    """The resolution limit of complete settings."""
     return Resolution.before(Scene(source, build_lens(s), build_screen(s), build_light(s)), tuple(s["target"]["size"]))
 
 
 def _wave_samples(s: Settings, seen: Resolution, lit: tuple[float, float]) -> float:
-    """About how many samples the field of one wavelength needs: the bright part and its blur on each side, times the lens."""
+    """Estimated number of samples of the field at one wavelength: space-bandwidth product of the lens and the blurred bright
+    region."""
     throw, shortest = abs(s["screen"]["z"]), min(s["source"].get("wavelengths", []) or BAND[:1]) * 1e-6
     return math.prod(
         w * (part * t + 4.0 * seen.diffraction) / (shortest * throw)
@@ -462,13 +465,13 @@ def _wave_samples(s: Settings, seen: Resolution, lit: tuple[float, float]) -> fl
 
 
 def _quality(time_limit: float, source: Source) -> str:
-    """What a time limit leaves room for at 250 x 250 pixels on two cores."""
+    """The quality that a time limit permits at 250 x 250 pixels on two cores."""
     seconds = time_limit / (EXTENDED if source.extended else 1.0)
     return "draft" if seconds < DRAFT_SECONDS else "fine" if FINE_SECONDS <= seconds < math.inf else "standard"
 
 
 def _shifts(s: Settings, source: Source) -> bool:
-    """Whether all that a source's extent does is to shift the image."""
+    """Whether the source's extent only shifts the image."""
     lens = build_lens({**s, "lens": {"control": [LEAST_SPANS] * 2, **s["lens"]}})
     return source_spread(Scene(source, lens, build_screen(s), build_light(s))) is not None
 
@@ -492,7 +495,7 @@ def build_stages(settings: Settings) -> list[Stage]:
     """The stages of complete settings.
 
     Raises:
-        InputError: there are none, a value is out of range, or the last stage is not on the lens' own control net.
+        InputError: there are none, a value is out of range, or the last stage does not use the lens' control net.
     """
     stages = [stage_of(table, settings) for table in settings["design"].get("stages", [])]
     if not stages:
@@ -506,7 +509,7 @@ def build_stages(settings: Settings) -> list[Stage]:
 
 
 def stage_of(table: Table, settings: Settings) -> Stage:
-    """The stage that a table of complete settings describes."""
+    """The stage of a table of complete settings."""
     t = stage_base(settings, "grid") | table
     filter = filter_from(
         t["reconstruction"], t["filter_size"], build_screen(settings), t.get("alpha_per_mm2"), t.get("alpha_per_pixel2")
@@ -534,7 +537,7 @@ def build_options(settings: Settings) -> Options:
     d = settings["design"]
     for key in ("dtype", "seed", "iterations"):
         check(f"design.{key}", d[key])
-    for key in ("time_limit", "checkpoint_every"):  # which may be without end
+    for key in ("time_limit", "checkpoint_every"):  # which may be infinite
         if not d[key] > 0:
             raise InputError(f"⟨design.{key}⟩ must be greater than 0 s, got {d[key]:g}")
     return Options(

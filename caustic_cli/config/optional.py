@@ -1,13 +1,13 @@
-"""What few scenes have, and what follows from it: networks over ranges, two free-form sides, other elements, a designed index.
+"""Completion of optional features: networks trained over ranges, two free-form sides, other elements, a designed gradient index.
 
-Each function completes its own part of the settings, where there is one, for `completion`.
+Each function completes its own part of the settings, if present, for `completion`.
 """
 
 from __future__ import annotations
 
 import math
 
-from caustic_cli.config.plans import (
+from caustic_cli.config.default_stages import (
     TWO_SIDED_SPANS,
     Table,
     completed_stage,
@@ -21,32 +21,40 @@ from caustic_cli.config.table import check, default
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.scene_parameters import Ranges
 from caustic_cli.scene import Source
-from caustic_cli.scene.elements import refuse_beside
+from caustic_cli.scene.elements import check_compatible_with_elements
 
-OVER_WIDTH = 128  # of a dense network over a range: caustic convergence, study design, networks
-BEAM = 1.2  # width of another lens or a mirror over that of a beam from the lens' edges to the picture's
-#: Of a free gradient: range to either side of the index; degree of its splines, knot spans a pixel and the most of them; and rays a
-#: pixel at most, since they cost more.
+OVER_WIDTH = 128  # width of a dense network over a range: caustic convergence, study design, networks
+BEAM = 1.2  # width of a further lens or mirror over that of a beam from the lens' edges to those of the picture
+#: For a free gradient: half range about the index; degree of its splines, knot spans per pixel and their largest number; and
+#: largest number of rays per pixel, since they cost more.
 HALF_RANGE, INDEX_DEGREE, INDEX_SPANS, MOST_SPANS, RAYS_BENT = 0.05, 3, 2, 768, 16
 
 
-def put_in_the_middle(over: Ranges, s: Settings, given: Settings, throw: float | None) -> None:
-    """The screen of a network that is trained over throws: at their middle, and nowhere else."""
+def centre_screen(over: Ranges, s: Settings, given: Settings, throw: float | None) -> None:
+    """Place the screen of a network that is trained over throws at the middle of their range.
+
+    Raises:
+        InputError: another position is given.
+    """
     screen, z = s["screen"], over.middle[over.keys.index("throw")]
     z = -z if value_of(s["lens"], "lens.mirror") else z
     said = throw is not None or "z" in given.get("screen", {})
     if said and not math.isclose(screen["z"], z, rel_tol=1e-9):
-        raise InputError(f"⟨screen.z⟩ must be the middle of ⟨design.over⟩ throw, {z:g} mm, or not be said, got {screen['z']:g} mm")
+        raise InputError(f"⟨screen.z⟩ must be the middle of ⟨design.over⟩ throw, {z:g} mm, or not be given, got {screen['z']:g} mm")
     screen["z"] = z
 
 
 def complete_over(over: Ranges, s: Settings, given: Settings) -> None:
-    """What a network that is trained over ranges has beside them: its source at their middle, its outputs and its width."""
+    """Complete a network that is trained over ranges: source at their middle, preconditioner and width.
+
+    Raises:
+        InputError: another source position is given, or the source does not support ranges.
+    """
     source, design = s["source"], s["design"]
     middle = {key.removeprefix("source."): v for key, v in zip(over.keys, over.middle, strict=True) if key != "throw"}
     if middle:
         over.refuse(build_source(s))
-    if middle and "position" in source:  # which a type of one's own may do without
+    if middle and "position" in source:  # a user-defined source type may have none
         place = [middle.get(axis, c) for axis, c in zip("xyz", source["position"][0], strict=True)]
         if "position" in given.get("source", {}) and not all(
             math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-9) for a, b in zip(place, source["position"][0], strict=True)
@@ -62,8 +70,8 @@ def complete_over(over: Ranges, s: Settings, given: Settings) -> None:
         design.setdefault("network_width", OVER_WIDTH)
 
 
-def first_magnification(s: Settings) -> float:
-    """Of the picture, where nobody said it; where light goes on parallel or to a focus, a beam's as wide as the lens."""
+def default_magnification(s: Settings) -> float:
+    """Default magnification of the picture; for collimated or focused light that of a beam as wide as the lens."""
     second = s.get("second", {})
     if "focus" in second and second["focus"][2] != 0:
         return abs(1.0 - s["screen"]["z"] / second["focus"][2])
@@ -71,7 +79,11 @@ def first_magnification(s: Settings) -> float:
 
 
 def complete_second(s: Settings) -> None:
-    """What makes the lens' entrance free-form; nothing at all where nobody said anything of it."""
+    """Complete and check the [second] section, which makes the entrance free-form; an empty section is removed.
+
+    Raises:
+        InputError: keys contradict each other, or are combined with unsupported features.
+    """
     second = s.get("second", {})
     said = [key for key in ("file", "collimate", "focus") if second.get(key)]
     if not said:
@@ -81,7 +93,7 @@ def complete_second(s: Settings) -> None:
         s.pop("second", None)
         return
     if len(said) > 1:
-        raise InputError(f"⟨second.{said[0]}⟩ and ⟨second.{said[1]}⟩ both say what light does behind the picture: give one of them")
+        raise InputError(f"⟨second.{said[0]}⟩ and ⟨second.{said[1]}⟩ both define the light behind the picture: give one of them")
     if "focus" in second:
         places = second["focus"]
         second["focus"] = list(check("second.focus", places[0] if len(places) == 1 else places))
@@ -99,13 +111,15 @@ def complete_second(s: Settings) -> None:
     }
     for path, given in wrong.items():
         if given:
-            raise InputError(f"⟨{path}⟩ cannot be had with ⟨second.{said[0]}⟩, which needs two free-form sides of heights by lbfgs")
+            raise InputError(
+                f"⟨{path}⟩ cannot be combined with ⟨second.{said[0]}⟩, which needs two free-form sides of heights by lbfgs"
+            )
     if source.get("also") or source["type"] == "rays":
         raise InputError(f"⟨second.{said[0]}⟩ needs one source that is no ray file")
 
 
-def complete_farther(s: Settings) -> None:
-    """Size of a second picture: that of a beam from the lens' edge through the first one's, farther on."""
+def complete_second_size(s: Settings) -> None:
+    """Default size of a second picture: that of a beam from the lens' edge through that of the first picture."""
     second = s.get("second", {})
     if "file" not in second:
         return
@@ -116,7 +130,7 @@ def complete_farther(s: Settings) -> None:
 
 
 def complete_two_sided(s: Settings, source: Source, quality: str, rays: int | None) -> None:
-    """How a lens with two free-form sides is designed."""
+    """Complete the design settings of a lens with two free-form sides."""
     lens, screen, design = s["lens"], s["screen"], s["design"]
     if design["start"] != "transport":
         raise InputError(f"⟨design.start⟩ of two free-form sides must be transport, got {design['start']}")
@@ -134,14 +148,14 @@ def complete_two_sided(s: Settings, source: Source, quality: str, rays: int | No
 
 
 def complete_elements(s: Settings) -> None:
-    """Sizes of other lenses and mirrors, and what cannot be had with them."""
+    """Default sizes of other lenses and mirrors, and checks of unsupported combinations."""
     tables, design = [dict(table) for table in elements_of(s)], s["design"]
     if not tables:
         s.pop("element", None)
         return
     s["element"] = {"list": tables}
     free = any(table.get("free", "none") != "none" for table in tables)
-    refuse_beside(
+    check_compatible_with_elements(
         {
             "second.file": "second" in s,
             "design.robust": bool(design.get("robust")),
@@ -162,7 +176,7 @@ def complete_elements(s: Settings) -> None:
 
 
 def complete_blank(lens: Table, screen: Table, index: float) -> None:
-    """What a flat blank has whose index is designed; its sides are the least net."""
+    """Complete a plane-parallel blank whose gradient index is designed; its sides have the smallest control net."""
     if value_of(lens, "lens.mirror"):
         raise InputError("⟨lens.gradient⟩ free needs a lens: light never enters a mirror")
     if any(map(math.isfinite, lens.setdefault("radius", [math.inf, math.inf]))):
@@ -177,19 +191,19 @@ def complete_blank(lens: Table, screen: Table, index: float) -> None:
 
 
 def complete_index_design(s: Settings, source: Source, quality: str, rays: int | None) -> None:
-    """How a free gradient is found: L-BFGS from transport, on rays."""
+    """Complete the design settings of a free gradient: L-BFGS from optimal transport, on rays."""
     lens, screen, design = s["lens"], s["screen"], s["design"]
     if not source.collimated:
         raise InputError(f"⟨lens.gradient⟩ free is designed for light of ⟨source.type⟩ plane, got {s['source']['type']}")
     if max(value_of(lens, "lens.array")) > 1:
-        raise InputError("⟨lens.array⟩ cannot be had with a free gradient, whose sides are flat")
+        raise InputError("⟨lens.array⟩ cannot be combined with a free gradient, whose sides are flat")
     if value_of(s["target"], "target.color"):
         raise InputError("⟨target.color⟩ is not for a free gradient, whose index is designed at one wavelength")
     for key, only in (("network", "none"), ("optimizer", "lbfgs"), ("loss", default("design.loss"))):
         if design[key] != only:
             raise InputError(f"⟨design.{key}⟩ of a free gradient must be {only}, got {design[key]}")
     if check("design.waves", design["waves"]) == "on":
-        raise InputError("⟨design.waves⟩ on needs a lens of one index, of which the wave image is taken")
+        raise InputError("⟨design.waves⟩ on needs a homogeneous lens: with a gradient index there is no wave image")
     design["start"] = "offset"
     design.setdefault("preconditioner", "laplacian")
     if "stages" not in design:

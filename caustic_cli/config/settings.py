@@ -1,7 +1,7 @@
-"""What project.toml may say: sections, keys, units, defaults; and how it becomes a scene and a schedule.
+"""Reading and writing of project.toml, and construction of the scene from it.
 
-Settings are a plain nested dict with the file's own keys (`Settings`), whose names, types and defaults stand in `config.table`.
-Here keys and types are checked, ranges where the scene and the stages are built.
+Settings are a nested dict with the keys of the file (`Settings`); names, types and defaults are defined in `config.table`.  Keys
+and types are checked here, ranges when the scene and the stages are constructed.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from caustic_cli import __version__
 from caustic_cli.config.table import Setting, check, default, in_section
 from caustic_cli.errors import InputError, near
 from caustic_cli.io.files import read_bytes
-from caustic_cli.scene import Component, Lens, Light, Offset, Scene, Screen, Second, Source, sources
+from caustic_cli.scene import Component, Lens, Light, Offset, Scene, Screen, SecondTarget, Source, sources
 from caustic_cli.scene.gradient import KINDS, Gradient
 from caustic_cli.scene.materials import refractive_index
 from caustic_cli.scene.screen import PLANE, Sags
@@ -30,13 +30,13 @@ from caustic_cli.scene.sources.section import content
 #: Settings by section and key.
 Settings = dict[str, dict[str, Any]]
 FORMAT_VERSION = 1
-MAX_BYTES = 1 << 23  # of a TOML file: a hundred thousand source points fit
+MAX_BYTES = 1 << 23  # of a TOML file, enough for a hundred thousand source points
 ACCEPTED = "a TOML file is needed"
-#: Most names of a key joined by dots, most brackets within each other, and most keys and headings in all.
+#: Limits of a TOML file: components of a dotted key, nesting of brackets, and number of keys and headings.
 MOST_NAMES, MOST_NESTED, MOST_KEYS = 4, 16, 20_000
 _NAME = r"""(?:"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+'|[A-Za-z0-9_+-]++)"""
 _DOT = r"[ \t]*+\.[ \t]*+"
-#: What of a TOML text matters to how deep it is.
+#: Tokens of a TOML text that determine its nesting.
 _TOKEN = re.compile(
     r"""#[^\n]*+|\"{3}(?s:[^"\\]|\\.|"{1,2}(?!"))*+\"{3,5}|'{3}(?:[^']|'{1,2}(?!'))*+'{3,5}"""
     rf"|(?P<names>{_NAME}(?:{_DOT}{_NAME}){{{MOST_NAMES}}})|(?!\"{{3}}|'{{3}}){_NAME}"
@@ -45,7 +45,7 @@ _TOKEN = re.compile(
 
 
 def _schema() -> dict[str, dict[str, Setting]]:
-    """Keys of every section: those of the table, and of [source] what types of source have of their own."""
+    """Keys of every section: those of the table, and in [source] those that source types define."""
     found = {section: in_section(section) for section in ("source", "lens", "screen", "target", "second", "design")}
     found["source"]["type"] = replace(found["source"]["type"], help=sources.in_words())
     found["source"] |= {key: Setting(f"source.{key}", *spec) for key, spec in sources.own_keys().items()}
@@ -54,25 +54,26 @@ def _schema() -> dict[str, dict[str, Setting]]:
 
 
 SCHEMA = _schema()
-#: Sections without which a project is whole.
+#: Optional sections.
 OPTIONAL = ("second", "element")
 STAGE, ELEMENT = in_section("design.stages"), in_section("element")
-#: Keys that hold tables: their heading in the file, and what each may say.  Sources beside the first are those of [source] also;
-#: FIRST is the first's alone.
+#: Keys that hold tables: their heading in the file, and their keys.  Sources after the first are stored in [source] also; keys in
+#: FIRST belong to the first source only.
 FIRST = ("polarisation", "profile", "power_unit")
 TABLES = {
     ("design", "stages"): ("design.stages", STAGE),
     ("element", "list"): ("element", ELEMENT),
     ("source", "also"): ("source", {k: v for k, v in SCHEMA["source"].items() if k not in FIRST}),
 }
-#: What a new project's file says where nothing else is said.
+#: Defaults that are written to a new project's file.
 DEFAULTS = {
     section: {key: row.default for key, row in keys.items() if row.written and row.default is not None}
     for section, keys in SCHEMA.items()
 }
 
 
-#: What settings are derived from, such as mag: a configuration may say it, before its first section; a project does not.
+#: Parameters from which settings are derived, such as mag: allowed in a configuration, before its first section, but not in a
+#: project.
 PARAMETERS = {key: row for key, row in in_section("").items() if row.kind != "tables"}
 
 
@@ -80,7 +81,7 @@ def parse(text: str, where: str, parameters: bool = False) -> Settings:
     """Settings from TOML text: every key known and of its type; defaults are not filled in.
 
     Args:
-        parameters: PARAMETERS may be said too; they become the section "".
+        parameters: allow PARAMETERS, too; they become the section "".
 
     Raises:
         InputError: naming `where` and the offending key.
@@ -114,15 +115,15 @@ def parse(text: str, where: str, parameters: bool = False) -> Settings:
 
 
 def toml_of(text: str, where: str) -> dict[str, Any]:
-    """What TOML text says, of any schema.
+    """The content of a TOML text, of any schema.
 
     Raises:
-        InputError: it is no TOML, too deep, too long, or holds a whole number beyond 64 bits.
+        InputError: it is invalid TOML, nested too deeply, too long, or contains an integer beyond 64 bits.
     """
     _refuse_deep(text, where)
     try:
         raw = tomllib.loads(text)
-    except ValueError as error:  # besides TOML's own: digits without end
+    except ValueError as error:  # also raised for integers with too many digits
         raise InputError(f"{where}: is not valid TOML: {error}") from error
     if not _fits(raw):
         raise InputError(f"{where}: holds a whole number of more than 64 bits")
@@ -130,10 +131,10 @@ def toml_of(text: str, where: str) -> dict[str, Any]:
 
 
 def _refuse_deep(text: str, where: str) -> None:
-    """Refuse more than MOST_NAMES names joined by dots, MOST_NESTED brackets within each other, or MOST_KEYS keys and headings.
+    """Reject dotted keys of more than MOST_NAMES names, brackets nested deeper than MOST_NESTED, and more than MOST_KEYS keys.
 
-    tomllib takes time in proportion to the square of such names, recurs over both, and takes a kilobyte for every key.  In one pass
-    that tells strings and comments from the rest as it does itself, and stops where one does not end, since it stops there too.
+    tomllib's time is quadratic in the number of names, it recurses over both, and takes a kilobyte per key.  A single pass
+    recognises strings and comments like tomllib, and stops at an unterminated one, where tomllib raises an error.
     """
     depth = keys = 0
     for found in _TOKEN.finditer(text):
@@ -156,7 +157,7 @@ def _refuse_deep(text: str, where: str) -> None:
 
 
 def checked(given: Mapping[str, Any], where: str) -> Settings:
-    """Settings given as Python values, NumPy's too, with the refusals of a file."""
+    """Settings given as Python or NumPy values, with the same checks as those of a file."""
 
     def plain(value):
         if isinstance(value, Mapping):
@@ -173,7 +174,7 @@ def checked(given: Mapping[str, Any], where: str) -> Settings:
 
 
 def _fits(value) -> bool:
-    """Whether all whole numbers within have at most the 64 bits that TOML asks for."""
+    """Whether all integers are within the 64 bits that TOML specifies."""
     if isinstance(value, dict | list):
         return all(map(_fits, value.values() if isinstance(value, dict) else value))
     return not isinstance(value, int) or -(2**63) <= value < 2**63
@@ -217,13 +218,13 @@ def _numeric(where: str, value, whole: bool):
 
 
 def with_defaults(settings: Settings) -> Settings:
-    """Settings with every section present that a project must have, and constant defaults filled in."""
+    """Settings with all mandatory sections, and with constant defaults filled in."""
     sections = [section for section in SCHEMA if section in settings or section not in OPTIONAL]
     return {section: {**DEFAULTS[section], **settings.get(section, {})} for section in sections}
 
 
 def dump(settings: Settings) -> str:
-    """TOML text in the schema's order, each key with its unit or meaning beside it."""
+    """TOML text in the order of the schema, each key with a comment of its unit and meaning."""
     lines = [
         "# A caustic project: edit by hand as you like, then render it or resume its design.",
         f"format_version = {FORMAT_VERSION}",
@@ -259,7 +260,7 @@ def elements_of(settings: Settings) -> list[dict[str, Any]]:
 
 
 def value_of(table: Mapping[str, Any], path: str) -> Any:
-    """What a section's table says of a setting, or the setting's default."""
+    """The value of a setting in a section's table, or its default."""
     return table.get(path.rpartition(".")[2], default(path))
 
 
@@ -273,7 +274,7 @@ def index_of(lens: dict[str, Any]) -> float:
 
 
 def build_lens(settings: Settings) -> Lens:
-    """The lens that the [lens] section describes; all its keys must be there."""
+    """The lens of the [lens] section, whose keys must be complete."""
     lens = settings["lens"]
     if ("knots_u" in lens) != ("knots_v" in lens):
         raise InputError("⟨lens.knots_u⟩ and knots_v go together: give both or neither")
@@ -299,7 +300,7 @@ def build_lens(settings: Settings) -> Lens:
 
 
 def build_gradient(lens: dict[str, Any], values: np.ndarray | None) -> Gradient | None:
-    """What the [lens] section says of an index that varies, None where it is one; values: of its index_file.
+    """The gradient index of the [lens] section, None if the lens is homogeneous; values: of its index_file.
 
     Raises:
         InputError: terms or a file are missing, or belong to another kind.
@@ -321,21 +322,21 @@ def build_gradient(lens: dict[str, Any], values: np.ndarray | None) -> Gradient 
 
 
 def build_source(settings: Settings, profile: np.ndarray | None = None, type: str | None = None) -> Source:
-    """What the [source] section describes, or that as another `type`.  `profile`: its irradiance if it names one.
+    """The source of the [source] section, or the same with another `type`; profile: its irradiance, if any.
 
-    A key that the type has no use for is left alone, so that stages may change the type.
+    Keys that the type does not use are ignored, so that stages can change the type.
     """
     s = settings["source"]
     made, lit = sources.type_of(type or s["type"]), sources.used_by("profile")
-    check("source.power", s["power"])  # before it is shared among points
+    check("source.power", s["power"])  # before it is distributed to points
     if "profile" in s and not {made.name, s["type"]} & set(lit):
-        raise InputError(f"⟨source.profile⟩ belongs to type {sources.either(lit)}, got type {s['type']}")
+        raise InputError(f"⟨source.profile⟩ belongs to type {sources.alternatives(lit)}, got type {s['type']}")
     one = made.from_settings(s, profile)
-    return one if type is not None else sources.together(one, s)
+    return one if type is not None else sources.combined(one, s)
 
 
 def build_scene(settings: Settings, profile: np.ndarray | None = None) -> Scene:
-    """The whole scene; `profile` is the source's irradiance if [source] names one."""
+    """The complete scene; profile: irradiance of the source, if [source] has one."""
     return Scene(
         build_source(settings, profile),
         build_lens(settings),
@@ -347,7 +348,7 @@ def build_scene(settings: Settings, profile: np.ndarray | None = None) -> Scene:
 
 
 def build_elements(settings: Settings) -> tuple[Component, ...]:
-    """The lenses and mirrors that the [[element]] tables describe; their sizes must be there."""
+    """The lenses and mirrors of the [[element]] tables, whose sizes must be given."""
     return tuple(_element(table, settings["lens"]) for table in elements_of(settings))
 
 
@@ -355,7 +356,7 @@ def _element(table: dict[str, Any], lens: dict[str, Any]) -> Component:
     kind = check("element.type", table.get("type", "lens"))
     for key in ("z", "size"):
         if key not in table:
-            raise InputError(f"⟨element.{key}⟩ must be said of every [[element]]")
+            raise InputError(f"⟨element.{key}⟩ must be given in every [[element]]")
     only = ("thickness", "index", "glass", "absorption") if kind == "mirror" else ()
     for key in only:
         if key in table:
@@ -376,20 +377,20 @@ def _element(table: dict[str, Any], lens: dict[str, Any]) -> Component:
     )
 
 
-def build_second(settings: Settings) -> Second | None:
-    """What the [second] section says that light does behind the picture."""
+def build_second(settings: Settings) -> SecondTarget | None:
+    """The second target of the [second] section, None without one."""
     s = settings.get("second", {})
     if "file" in s:
         screen = build_screen(settings)
         margin = [a / b for a, b in zip(screen.size, settings["target"]["size"], strict=True)]
-        return Second(Screen((margin[0] * s["size"][0], margin[1] * s["size"][1]), s["z"], screen.resolution))
+        return SecondTarget(Screen((margin[0] * s["size"][0], margin[1] * s["size"][1]), s["z"], screen.resolution))
     if "focus" in s:
-        return Second(focus=tuple(s["focus"]))
-    return Second() if s.get("collimate") else None
+        return SecondTarget(focus=tuple(s["focus"]))
+    return SecondTarget() if s.get("collimate") else None
 
 
 def build_screen(settings: Settings) -> Screen:
-    """The screen that the [screen] section describes."""
+    """The screen of the [screen] section."""
     s = settings["screen"]
     sags = content(s, "shape_file", np.ndarray)
     if "shape_file" in s and sags is None:
@@ -406,14 +407,14 @@ def build_screen(settings: Settings) -> Screen:
 
 
 def build_light(settings: Settings) -> Light:
-    """Wavelengths and polarisation of the [source] section, whatever its type; of several sources, of all."""
+    """Wavelengths and polarisation of the [source] section, combined for several sources."""
     return sources.light_of_all(settings["source"], value_of(settings["target"], "target.color"))
 
 
 def refuse_unused(source: dict[str, Any], given: Iterable[str], stages: Sequence[str | None] = ()) -> None:
-    """Refuse settings, given by their paths for this one run, that the source's type, and that of every stage, would ignore.
+    """Reject settings, given by path for the current run, that the source type and those of all stages ignore.
 
-    Keys in a file may stay when the type changes.
+    Keys in a file may remain when the type changes.
 
     Raises:
         InputError: naming the setting.
@@ -422,7 +423,9 @@ def refuse_unused(source: dict[str, Any], given: Iterable[str], stages: Sequence
     keys = [path.removeprefix("source.") for path in given if path.startswith("source.")]
     for key in filter(sources.used_by, keys):
         if not types & set(sources.used_by(key)):
-            raise InputError(f"⟨source.{key}⟩ belongs to ⟨source⟩ {sources.either(sources.used_by(key))}, got {source['type']}")
+            raise InputError(
+                f"⟨source.{key}⟩ belongs to ⟨source⟩ {sources.alternatives(sources.used_by(key))}, got {source['type']}"
+            )
     if len(types) == 1 and types <= set(sources.names()):
         idle = sources.type_of(*types).idle(source)
         for key in keys:
@@ -431,7 +434,7 @@ def refuse_unused(source: dict[str, Any], given: Iterable[str], stages: Sequence
 
 
 def merged(first: Settings, *others: Settings) -> Settings:
-    """Settings of which each replaces those before it, key by key; an index replaces a glass, and a glass an index."""
+    """Settings merged key by key, later ones taking precedence; an index replaces a glass, and vice versa."""
     out = {section: dict(table) for section, table in first.items()}
     for other in others:
         if {"index", "glass"} & {*other.get("lens", {})}:
@@ -443,19 +446,19 @@ def merged(first: Settings, *others: Settings) -> Settings:
 
 
 def read(path: Path, parameters: bool = False) -> Settings:
-    """Settings from a TOML file of at most MAX_BYTES; parameters: as of `parse`.
+    """Settings from a TOML file of at most MAX_BYTES; parameters: as for `parse`.
 
     Raises:
-        InputError: there is none, it is too large, no text, or `parse` refuses it.
+        InputError: the file is missing, too large or not text, or `parse` rejects it.
     """
     return parse(read_text(path), str(path), parameters)
 
 
 def read_text(path: Path) -> str:
-    """The text of a file of at most MAX_BYTES, its lines ended by a newline alone.
+    """The text of a file of at most MAX_BYTES, with newlines normalised.
 
     Raises:
-        InputError: there is none, it is too large, or no text.
+        InputError: the file is missing, too large or not text.
     """
     data = read_bytes(path, MAX_BYTES, ACCEPTED, least=0)
     try:

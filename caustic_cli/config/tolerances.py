@@ -1,4 +1,4 @@
-"""tolerances.toml: what may be off, read and checked; see `scene.tolerances`.
+"""Reading of tolerances.toml, see `scene.tolerances`.
 
 draws = 200                     # and seed = 0
 [throw]                         # one section for each error of KINDS
@@ -38,7 +38,7 @@ def read(path: Path) -> Tolerances:
     """Tolerances from a TOML file.
 
     Raises:
-        InputError: there is none, it is too large, no text, or `parse` refuses it.
+        InputError: the file is missing, too large or not text, or `parse` rejects it.
     """
     return parse(read_text(path), str(path))
 

@@ -17,11 +17,11 @@ from torch import Tensor
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.frames import Leg, Pose, out_of, turned_back
+from caustic_cli.optics.frames import AxisSegment, Pose, rotate_to_global, to_global
 from caustic_cli.optics.surfaces import Sphere
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import fixed_of, front_from
-from caustic_cli.scene import Component, Front, Lens, Scene
+from caustic_cli.optics.system import fixed_surface, freeform_of
+from caustic_cli.scene import Component, FreeForm, Lens, Scene
 from caustic_cli.scene.elements import PLATE, SIDES
 
 #: Spline of a sphere: degree, first and largest number of control points along an axis, and largest deviation, mm.
@@ -44,11 +44,11 @@ class Body:
 
     def placed(self, points: np.ndarray) -> np.ndarray:
         """Points (..., 3) of its own frame in that of the scene, mm."""
-        return np.stack(out_of(self.pose, tuple(np.moveaxis(points, -1, 0)), 0.0), -1)
+        return np.stack(to_global(self.pose, tuple(np.moveaxis(points, -1, 0)), 0.0), -1)
 
     def turned(self, vectors: np.ndarray) -> np.ndarray:
         """Vectors (..., 3) of its own frame in that of the scene."""
-        return np.stack(turned_back(self.pose, tuple(np.moveaxis(vectors, -1, 0))), -1)
+        return np.stack(rotate_to_global(self.pose, tuple(np.moveaxis(vectors, -1, 0))), -1)
 
 
 def bodies(scene: Scene) -> Iterator[Body]:
@@ -57,7 +57,7 @@ def bodies(scene: Scene) -> Iterator[Body]:
     Raises:
         InputError: a sphere is too steep to be approximated by a spline.
     """
-    leg = Leg()
+    leg = AxisSegment()
     for number, component in enumerate(scene.elements):
         entrance = _side(component, "front")
         if component.mirror:
@@ -65,8 +65,8 @@ def bodies(scene: Scene) -> Iterator[Body]:
             exit = _constant(max(0.0, most) + PLATE)
         else:
             exit = _side(component, "back")
-            exit = Front(exit.heights + component.thickness, exit.degree, exit.knots)
-        surface = fixed_of(exit, component.half_size)
+            exit = FreeForm(exit.heights + component.thickness, exit.degree, exit.knots)
+        surface = fixed_surface(exit, component.half_size)
         lens = Lens(
             component.size,
             0.0,
@@ -75,16 +75,16 @@ def bodies(scene: Scene) -> Iterator[Body]:
             exit.degree,
             exit.knots,
             aperture=component.aperture,
-            front=entrance,
+            entrance=entrance,
         )
         pose = leg.pose(component.z, component.tilt)
         yield Body(component, number, lens, surface.field, surface.heights, pose)
         leg = leg.folded(component.z, component.tilt) if component.mirror else leg
 
 
-def _side(component: Component, side: str) -> Front:
+def _side(component: Component, side: str) -> FreeForm:
     """A surface of a lens or mirror, with heights from its vertex plane, mm."""
-    front, radius = component.fronts[SIDES.index(side)], component.radius[SIDES.index(side)]
+    front, radius = component.surfaces[SIDES.index(side)], component.radius[SIDES.index(side)]
     if front is not None:
         return front
     if math.isinf(radius):
@@ -102,7 +102,7 @@ def _side(component: Component, side: str) -> Front:
         if component.round:
             off = off[line[0][:, None].square() + line[1][None, :].square() <= component.half_size[0] ** 2]
         if float(off.max()) <= CLOSE:
-            return front_from(field, net)
+            return freeform_of(field, net)
         count *= 2
     raise InputError(f"⟨element.radius⟩ of {radius:g} mm is too steep within its aperture to be approximated by a spline")
 
@@ -113,6 +113,6 @@ def _sag(sphere: Sphere, x: Tensor, y: Tensor) -> Tensor:
     return sphere.at(None, a.reshape(-1), b.reshape(-1), ((0, 0),))[0].reshape(a.shape)
 
 
-def _constant(z: float) -> Front:
+def _constant(z: float) -> FreeForm:
     """A plane at z, mm."""
-    return Front(np.full((2, 2), z), (1, 1))
+    return FreeForm(np.full((2, 2), z), (1, 1))

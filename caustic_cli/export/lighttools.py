@@ -22,7 +22,7 @@ from caustic_cli.export.accuracy import Deviation, of_spline
 from caustic_cli.export.surface import SurfaceGrid, most_points, sample_grid
 from caustic_cli.io.files import MARK, atomic_path
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import front_of
+from caustic_cli.optics.system import entrance_of
 from caustic_cli.scene import Lens, Light, Scene, Screen, Source
 from caustic_cli.scene.elements import SIDES
 
@@ -90,7 +90,7 @@ def write_lighttools(
 
 def usual_cloud(scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None) -> SurfaceGrid:
     """Grid of the point cloud of an archive; arguments as in `write_lighttools`."""
-    nets = 24 * (heights.numel() + (0 if scene.lens.front is None else front_of(scene.lens).heights.numel()))
+    nets = 24 * (heights.numel() + (0 if scene.lens.entrance is None else entrance_of(scene.lens).heights.numel()))
     return sample_grid(field, heights, samples, most_points(A_POINT, nets + BESIDE))
 
 
@@ -113,9 +113,9 @@ def _light(light: Light) -> dict[str, np.ndarray]:
 
 def _entrance(scene: Scene) -> dict[str, np.ndarray]:
     """Keys of a free-form entrance: entrance_control_points (n, m, 3), entrance_degrees, entrance_knots_u, entrance_knots_v."""
-    if scene.lens.front is None:
+    if scene.lens.entrance is None:
         return {}
-    front = front_of(scene.lens)
+    front = entrance_of(scene.lens)
     x, y = (c.numpy() for c in front.field.control_xy())
     x, y = np.broadcast_arrays(x[:, None], y[None, :])
     u, v = front.field.spaces
@@ -141,7 +141,7 @@ def _elements(scene: Scene) -> dict[str, np.ndarray]:
         found[f"element_{key}"] = _reals([getattr(e, key) for e in elements])
     found["element_curvature"] = 1.0 / _reals([e.radius for e in elements])
     for k, e in enumerate(elements):
-        for side, front in zip(SIDES, e.fronts, strict=True):
+        for side, front in zip(SIDES, e.surfaces, strict=True):
             if front is not None and front.knots is not None:
                 name = f"element_{k + 1}_{side}_"
                 found |= {

@@ -22,7 +22,7 @@ from caustic_cli.export.text import CREATED, real
 from caustic_cli.io.files import atomic_path, write_bytes
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
-from caustic_cli.scene.plain import beyond_plain
+from caustic_cli.scene.features import special_features
 
 #: Points of the flat entrance along each axis.
 FLAT = 5
@@ -155,7 +155,7 @@ def refuse(scene: Scene) -> None:
     Raises:
         InputError: naming what is not supported.
     """
-    source, beyond = scene.source, beyond_plain(scene)
+    source, beyond = scene.source, special_features(scene)
     if beyond:
         raise InputError(
             f"⟨script⟩ builds clear lenses and straight screens, not {', '.join(beyond)}, which the archive alone holds"

@@ -38,7 +38,7 @@ from caustic_cli.export.surface import (
     usual_steps,
 )
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import front_of
+from caustic_cli.optics.system import entrance_of
 from caustic_cli.scene import Lens, Scene
 
 STRETCH = 1.28
@@ -111,7 +111,7 @@ def patches(
 ) -> tuple[Patch, ...]:
     """Patches of the free-form sides of a solid, the exit last; arguments as in `closed_mesh`; most: default number of points of
     all of them."""
-    if lens.front is None:
+    if lens.entrance is None:
         return (patch(lens, field, heights, samples, tolerance, most),)
     return both_patches(lens, field, heights, samples, tolerance, None if most is None else most // 2)
 
@@ -130,7 +130,7 @@ def both_patches(
     most: int | None = None,
 ) -> tuple[Patch, Patch]:
     """Patches of the free-form entrance and the exit of a lens, with equal numbers of points; arguments as in `patch`."""
-    entrance = front_of(lens)
+    entrance = entrance_of(lens)
     surfaces = (entrance.field, entrance.heights + lens.z_in), (field, heights)
     found = [patch(lens, *surface, samples, tolerance, most) for surface in surfaces]
     shapes = [p.points.shape[:2] for p in found]

@@ -38,7 +38,7 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import System
 from caustic_cli.scene import Component, Lens, Scene, Screen
 from caustic_cli.scene.elements import surface_name
-from caustic_cli.scene.plain import beyond_plain
+from caustic_cli.scene.features import special_features
 
 #: Samples per pixel of the scene, Mitsuba's `spp`.
 SAMPLES = 256
@@ -91,7 +91,7 @@ def write_mitsuba(
     """
     light = [] if dark else _light(scene)
     *fronts, surface = patches(
-        scene.lens, field, heights, samples, tolerance, (1 if scene.lens.front is None else 2) * most_points(A_POINT, 1e3)
+        scene.lens, field, heights, samples, tolerance, (1 if scene.lens.entrance is None else 2) * most_points(A_POINT, 1e3)
     )
     found, front = of_triangles(surface, field, heights, shaded=True), fronts[0] if fronts else None
     if scene.lens.mirror:
@@ -282,7 +282,7 @@ def _light(scene: Scene) -> list[str]:
     Raises:
         InputError: Mitsuba has no equivalent emitter.
     """
-    beyond = [name for name in beyond_plain(scene) if name != "a mirror"]
+    beyond = [name for name in special_features(scene) if name != "a mirror"]
     if beyond:
         raise InputError(f"⟨format⟩ mitsuba is written for clear lenses and straight screens, not {', '.join(beyond)}")
     if scene.source.kind not in _EMITTERS:

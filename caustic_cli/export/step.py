@@ -36,9 +36,9 @@ from caustic_cli.export.surface import STEPS_PER_SPAN, knot_lines, most_points, 
 from caustic_cli.export.text import CREATED
 from caustic_cli.io.files import atomic_path
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.frames import Pose, out_of, turned_back
+from caustic_cli.optics.frames import Pose, rotate_to_global, to_global
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import front_from, front_of
+from caustic_cli.optics.system import entrance_of, freeform_of
 from caustic_cli.scene import Lens, Scene
 
 HEAD = f"""ISO-10303-21;
@@ -79,11 +79,11 @@ class Entities:
         return f"#{len(self.lines)}"
 
     def point(self, p) -> str:
-        at = out_of(self.pose, (p[0], p[1], self.up * p[2] + 0.0), 0.0)
+        at = to_global(self.pose, (p[0], p[1], self.up * p[2] + 0.0), 0.0)
         return self.add(f"CARTESIAN_POINT('',{reals(at, self.decimals)})")
 
     def direction(self, d) -> str:
-        return self.add(f"DIRECTION('',{reals(turned_back(self.pose, (d[0], d[1], self.up * d[2] + 0.0)))})")
+        return self.add(f"DIRECTION('',{reals(rotate_to_global(self.pose, (d[0], d[1], self.up * d[2] + 0.0)))})")
 
     def placement(self, at, normal, along) -> str:
         return self.add(f"AXIS2_PLACEMENT_3D('',{self.point(at)},{self.direction(normal)},{self.direction(along)})")
@@ -141,15 +141,15 @@ class Solid:
     @property
     def sides(self) -> list[tuple[HeightField, Tensor]]:
         """The B-spline surfaces, the exit first."""
-        if self.lens.front is None:
+        if self.lens.entrance is None:
             return [(self.field, self.heights)]
-        front = front_of(self.lens)
+        front = entrance_of(self.lens)
         return [(self.field, self.heights), (front.field, front.heights)]
 
     def with_sides(self, exit: tuple[HeightField, Tensor], *entrance: tuple[HeightField, Tensor]) -> Solid:
         """The solid with other surfaces."""
-        fronts = [front_from(*side) for side in entrance]
-        return replace(self, lens=replace(self.lens, front=fronts[0]) if fronts else self.lens, field=exit[0], heights=exit[1])
+        fronts = [freeform_of(*side) for side in entrance]
+        return replace(self, lens=replace(self.lens, entrance=fronts[0]) if fronts else self.lens, field=exit[0], heights=exit[1])
 
 
 def write_step(
@@ -171,9 +171,9 @@ def write_step(
     if mirror:  # built upside down and reflected in z
         heights = -heights
         scene = replace(scene, lens=replace(scene.lens, z_in=-scene.lens.z_in))
-    if scene.lens.front is None:
+    if scene.lens.entrance is None:
         refuse_open(float(heights.min()), scene.lens.z_in)
-    if scene.lens.front is not None or scene.elements:
+    if scene.lens.entrance is not None or scene.elements:
         closed_mesh(scene, field, heights)  # raises an error if it is not a solid
     solids = [Solid(scene.lens, field, heights, Pose()), *(Solid(b.lens, b.field, b.heights, b.pose) for b in bodies(scene))]
     decimals = None if tolerance == 0 else _decimals(solids, tolerance)
@@ -256,8 +256,8 @@ def lens_solid(out: Entities, lens: Lens, field: HeightField, heights: Tensor, p
     else:
         rim, lowest = _rim(out, poles, points, field.spaces), _lowest_on_rim(field, heights)
     faces, upper, z_in = [out.face(exit_surface, out.bound(rim.edges), along=not lens.mirror)], rim, lens.z_in
-    if lens.front is not None:
-        front = front_of(lens)
+    if lens.entrance is not None:
+        front = entrance_of(lens)
         low = front.heights + z_in
         entrance, points = _spline_surface(out, front.field, poles := poles_of(front.field, low.numpy()))
         foot = _round_rim(out, front.field, low)[0] if lens.round else _rim(out, poles, points, front.field.spaces)

@@ -42,7 +42,7 @@ from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.screen_shape import reach
 from caustic_cli.optics.spread import Convolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import EXIT, sides_of
+from caustic_cli.optics.system import EXIT, split_heights
 from caustic_cli.optics.waves import NoWaveImage
 from caustic_cli.scene import Scene
 from caustic_cli.scene.tolerances import Tolerances
@@ -198,14 +198,14 @@ class Designer:
 
     def exit(self, state: State) -> Tensor:
         """Heights of the exit alone (n, m) mm, on the control net of the stage of the state."""
-        return sides_of(self.scene, self.field(state.stage), state.heights)[1]
+        return split_heights(self.scene, self.field(state.stage), state.heights)[1]
 
     def whole(self, heights: Tensor | None) -> Tensor | None:
         """Heights of the exit (n, m) on the control net of the first stage, with the initial spheres of other designed surfaces,
         (k, n, m); heights of all surfaces are returned unchanged."""
-        if heights is None or heights.ndim == 3 or not self.scene.jointly:
+        if heights is None or heights.ndim == 3 or not self.scene.joint:
             return heights
-        others = [sphere_net(e, side, self.field(0)) for e in self.scene.elements for side in e.shaped]
+        others = [sphere_net(e, side, self.field(0)) for e in self.scene.elements for side in e.free_sides]
         return torch.stack([*others, heights])
 
     def initial_heights(self, heights: Tensor | None) -> InitialHeights | None:
@@ -303,12 +303,12 @@ class Designer:
         """
         field, bounds, o = self.field(state.stage), self._bounds(self.stages[state.stage]), self.options
         radius = o.min_radius if rounded else 0.0
-        if not self.scene.jointly:
+        if not self.scene.joint:
             return _within_limits_from(field, state.heights, bounds, o.max_slope, radius, self.scene.lens.cut_from)
         found = []
-        halves = [e.half_size for e in self.scene.elements for _ in e.shaped] or [field.half_size]
+        halves = [e.half_size for e in self.scene.elements for _ in e.free_sides] or [field.half_size]
         for name, half, heights, low, high in zip(
-            self.scene.shaped, [*halves, field.half_size], state.heights, *bounds, strict=True
+            self.scene.free_surfaces, [*halves, field.half_size], state.heights, *bounds, strict=True
         ):
             field = replace(field, half_size=half)
             side = self.scene.lens.cut_from if name == EXIT else -1 if name.endswith(("entrance", "front")) else 1
@@ -524,10 +524,10 @@ class Designer:
         if self.scene.second is not None:
             most = np.full_like(low, lens.height_range[1])
             low, high = np.stack([-most, low]), np.stack([most, high])
-        elif self.scene.jointly:
+        elif self.scene.joint:
             field = HeightField.of(lens)
             others = [
-                (sphere_net(e, side, field).numpy(), departure_bound(e, lens)) for e in self.scene.elements for side in e.shaped
+                (sphere_net(e, side, field).numpy(), departure_bound(e, lens)) for e in self.scene.elements for side in e.free_sides
             ]
             low = np.stack([*(net - room for net, room in others), low])
             high = np.stack([*(net + room for net, room in others), high])

@@ -25,9 +25,9 @@ from scipy.interpolate import RegularGridInterpolator
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.relay import trace_through, without_apertures, without_freeforms
 from caustic_cli.inverse.transport import cell_means
-from caustic_cli.optics.averages import shared_out
 from caustic_cli.optics.emission.measured import irradiance
 from caustic_cli.optics.interface import reflectance
+from caustic_cli.optics.resampling import resampled
 from caustic_cli.optics.system import ENTRANCE, System
 from caustic_cli.scene import Scene
 from caustic_cli.scene.sources.distribution import relative
@@ -59,7 +59,7 @@ def incident(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple
 
 def on_entrance(scene: Scene, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, tuple | None]:
     """The same in air on the plane of the entrance."""
-    air = replace(scene, lens=replace(scene.lens, index=1.0 + 1e-9, glass=None, fresnel="none", front=None), second=None)
+    air = replace(scene, lens=replace(scene.lens, index=1.0 + 1e-9, glass=None, fresnel="none", entrance=None), second=None)
     return incident(air, x, y, np.full((len(x), len(y)), scene.lens.z_in))
 
 
@@ -163,7 +163,7 @@ def _direct(scene: Scene, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[
     source, lens, shape = scene.source, scene.lens, (len(x) - 1, len(y) - 1)
     if source.distant:
         profile = source.profile
-        return (np.ones(shape) if profile is None else shared_out(profile, shape)), None
+        return (np.ones(shape) if profile is None else resampled(profile, shape)), None
     x0, y0, z0 = source.centre
     h, t, n = lens.z_in - z0, z - lens.z_in, lens.inside
     if h <= 0:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import EXIT, sides_of
+from caustic_cli.optics.system import EXIT, split_heights
 from caustic_cli.optics.trace import CHUNK, tracers
 from caustic_cli.scene import Scene
 
@@ -32,12 +32,12 @@ class InternalRays:
 
 def internal_rays(scene: Scene, field: HeightField, nets: Tensor, count: int) -> InternalRays:
     """About `count` rays of the source on a regular grid, traced inside a lens with these control nets (2, n, m), mm."""
-    lit, net = sides_of(scene, field, nets)
+    lit, net = split_heights(scene, field, nets)
     found = []
     for traced in tracers(lit, field, rays_of(lit, "grid", count), torch.float64, CHUNK):
         last = traced.last({EXIT: net})
-        full = [*last.state.full(last.local), *last.state.full(last.incoming), last.arriving, torch.as_tensor(last.length)]
-        found.append(torch.stack(torch.broadcast_tensors(*full))[:, last.arriving > 0])
+        full = [*last.state.full(last.local), *last.state.full(last.incoming), last.power_in, torch.as_tensor(last.length)]
+        found.append(torch.stack(torch.broadcast_tensors(*full))[:, last.power_in > 0])
     rays = torch.cat(found, 1).numpy()
     exit, direction = rays[:3], rays[3:6]
     return InternalRays((exit - rays[7] * direction)[:2], exit, direction, rays[6])

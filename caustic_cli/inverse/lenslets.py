@@ -29,7 +29,7 @@ from caustic_cli.inverse.initial_surface import CELLS, first_surface
 from caustic_cli.inverse.losses import ColorLoss, Loss
 from caustic_cli.inverse.objective import Evaluation
 from caustic_cli.inverse.robust import SceneObjective
-from caustic_cli.optics.averages import shared_out
+from caustic_cli.optics.resampling import resampled
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT
 from caustic_cli.scene import Scene
@@ -94,7 +94,7 @@ def _light(profile: np.ndarray | None, array: tuple[int, int]) -> list[list[np.n
         return [[np.ones((1, 1))] * array[1]] * array[0]
     cells = [max(1, -(-n // k)) for n, k in zip(profile.shape, array, strict=True)]
     (a, b) = cells
-    profile = shared_out(profile, (a * array[0], b * array[1]))
+    profile = resampled(profile, (a * array[0], b * array[1]))
     return [[profile[i * a : (i + 1) * a, j * b : (j + 1) * b] for j in range(array[1])] for i in range(array[0])]
 
 

@@ -20,7 +20,7 @@ from caustic_cli.inverse import ranks
 from caustic_cli.inverse.losses import PENALTIES, ColorLoss, Loss, parse
 from caustic_cli.inverse.penalties import Penalty
 from caustic_cli.optics.emission import Rays
-from caustic_cli.optics.memory import smaller
+from caustic_cli.optics.memory import smaller_chunk
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.spread import Convolution
@@ -122,7 +122,7 @@ class Objective:
             if sum(s.count for s in self.samplers) <= kept:
                 self.kept = list(self._tracers())
         except (MemoryError, RuntimeError) as error:
-            self.chunk = smaller(self.chunk, error)
+            self.chunk = smaller_chunk(self.chunk, error)
 
     def moved(self, scene: Scene, rays: Rays) -> Objective:
         """The same objective for another position of screen or source and other rays, sharing the filtered target."""
@@ -175,7 +175,7 @@ class Objective:
 
     def __call__(self, heights: Tensor) -> Evaluation:
         """`evaluate` at the heights (n, m) mm float64 of the exit, or of all surfaces that are `shaped`, (k, n, m)."""
-        return self.evaluate({EXIT: heights} if heights.ndim == 2 else dict(zip(self.scene.shaped, heights, strict=True)))
+        return self.evaluate({EXIT: heights} if heights.ndim == 2 else dict(zip(self.scene.free_surfaces, heights, strict=True)))
 
     def evaluate(self, parameters: Parameters) -> Evaluation:
         """Value and gradients at heights {name of a surface: (n, m) mm float64}.
@@ -195,7 +195,7 @@ class Objective:
                 if ranks.rank_and_size()[1] > 1:  # the other ranks wait for the image of this chunk
                     raise
                 problem = error.with_traceback(None)  # the traceback would keep all allocations alive
-            self.chunk, self.kept = smaller(self.chunk, problem), None
+            self.chunk, self.kept = smaller_chunk(self.chunk, problem), None
 
     def _evaluate(self, given: Parameters) -> Evaluation:
         parameters = {name: heights.detach().to(self.device).clone() for name, heights in given.items()}

@@ -21,7 +21,7 @@ from scipy.ndimage import map_coordinates
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.backends.reference import Torch
-from caustic_cli.optics.screen_shape import shape_of, space
+from caustic_cli.optics.screen_shape import points_in_space, shape_of
 from caustic_cli.scene import Screen
 
 #: Cells of the plane per pixel along each axis: with 1 the picture is blurred, and the initial error on a sphere 0.28, not 0.24.
@@ -38,7 +38,7 @@ class ScreenProjection:
 
     def project(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(u, v) of points x, y of the screen, mm."""
-        px, py, pz = space(self.screen, x, y)
+        px, py, pz = points_in_space(self.screen, x, y)
         scale = (self.screen.z - self.centre_z) / (pz - self.centre_z)
         return px * scale, py * scale
 
@@ -55,7 +55,7 @@ class ScreenProjection:
         """Points in space of the screen that project to (u, v), mm; those of the plane where there is none."""
         x, y = self.screen_coordinates(u, v)
         there = np.isfinite(x)
-        found = space(self.screen, np.where(there, x, 0.0), np.where(there, y, 0.0))
+        found = points_in_space(self.screen, np.where(there, x, 0.0), np.where(there, y, 0.0))
         px, py, pz = (np.where(there, a, b) for a, b in zip(found, (u, v, self.screen.z), strict=True))
         return px, py, pz
 

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from caustic_cli.errors import InputError
-from caustic_cli.optics.screen_shape import space
+from caustic_cli.optics.screen_shape import points_in_space
 from caustic_cli.scene import Scene
 from caustic_cli.scene.sources.distribution import relative
 
@@ -106,4 +106,4 @@ def _lit(scene: Scene, target: np.ndarray) -> np.ndarray:
     edge = np.array([i.argmin(), i.argmax(), j.argmin(), j.argmax()])
     chosen = np.concatenate([np.arange(0, len(i), every), edge])
     along = [(k[chosen] + 0.5) * w - h for k, w, h in zip((i, j), screen.pixel, screen.half_size, strict=True)]
-    return np.stack(space(screen, *along))
+    return np.stack(points_in_space(screen, *along))

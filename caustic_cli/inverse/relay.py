@@ -37,7 +37,7 @@ IMAGED = 1e-3
 
 def without_freeforms(scene: Scene) -> Scene:
     """The scene with spheres, the initial surfaces, in place of the free-form surfaces of other elements."""
-    return replace(scene, elements=tuple(replace(e, free="none", fronts=(None, None)) for e in scene.elements))
+    return replace(scene, elements=tuple(replace(e, free="none", surfaces=(None, None)) for e in scene.elements))
 
 
 def without_apertures(system: System, first: int, last: int) -> System:

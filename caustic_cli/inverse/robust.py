@@ -20,7 +20,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.inverse.losses import ColorLoss, Loss
 from caustic_cli.inverse.objective import Evaluation
 from caustic_cli.optics.form_error import FormErrors
-from caustic_cli.optics.misalignment import Misalignment, idle
+from caustic_cli.optics.misalignment import Misalignment, reason_ignored
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT
 from caustic_cli.scene import Scene
@@ -61,7 +61,7 @@ class RobustObjective:
         begun: Tensor,
         tolerances: Tolerances,
     ):
-        parameters = tuple(p for p in tolerances.parameters if p.error != "roughness" and not idle(scene, p.error))
+        parameters = tuple(p for p in tolerances.parameters if p.error != "roughness" and not reason_ignored(scene, p.error))
         fits = tolerances.surface and _resolves(field, tolerances.shortest)
         if not (parameters or fits):
             raise InputError("⟨design.robust⟩ names no error that a design can take into account in this scene")

@@ -150,7 +150,7 @@ class Ranges:
             def place(p: Sequence[float]) -> tuple[float, float, float]:
                 return p[0] + shift[0], p[1] + shift[1], p[2] + shift[2]
 
-            scene = replace(scene, source=source.misplaced(place, 1.0))
+            scene = replace(scene, source=source.displaced(place, 1.0))
         return scene
 
     def refuse(self, source: Source) -> None:

@@ -17,7 +17,7 @@ from caustic_cli.inverse.schedule import Stage
 from caustic_cli.optics.emission import Rays, rays_of
 from caustic_cli.optics.emission.coherent import modes, spots
 from caustic_cli.optics.emission.regular import RegularGrid
-from caustic_cli.optics.screen_shape import normals, space
+from caustic_cli.optics.screen_shape import normals, points_in_space
 from caustic_cli.optics.spread import Convolution, Spread, spread_at
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.scene import Scene, Source
@@ -139,7 +139,7 @@ def etendue_limit(scene: Scene) -> float | None:
     else:
         return None
     a, b, part = _area(screen.half_size, False)
-    px, py, pz = space(screen, a, b)
+    px, py, pz = points_in_space(screen, a, b)
     taken = cell * part * _geometric_factor(x, y, (px, py, pz - lens.offset.thickness), normals(screen, a, b)).sum()
     return min(1.0, float(taken / given)) if given > 0 else None
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from caustic_cli.errors import InputError
-from caustic_cli.optics.averages import averaged
+from caustic_cli.optics.resampling import area_average
 from caustic_cli.optics.screen_shape import areas
 from caustic_cli.scene import Screen
 
@@ -38,7 +38,7 @@ def target_on_screen(irradiance: np.ndarray, size: tuple[float, float], screen: 
     for own, whole in zip(cells, pixels, strict=True):
         if abs(own[0] - whole[0]) < 2e-9 * whole[-1]:  # a picture as wide as the screen has exactly its edges
             own[[0, -1]] = whole[[0, -1]]
-    mean = averaged(irradiance, cells, pixels)
+    mean = area_average(irradiance, cells, pixels)
     if not mean.sum() > 0:
         raise InputError("target is black all over: a picture with some light in it is needed")
     true = areas(screen)

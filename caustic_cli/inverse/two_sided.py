@@ -16,7 +16,7 @@ from torch import Tensor
 
 from caustic_cli.inverse.losses import Loss
 from caustic_cli.inverse.objective import CHUNK, Evaluation, penalty_of
-from caustic_cli.optics.direction import misdirection
+from caustic_cli.optics.angular_error import squared_angular_error
 from caustic_cli.optics.emission import Rays
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -121,7 +121,7 @@ class TwoSidedObjective:
         images = [traced.collect(states, screen, self.filter) for screen in self.screens]
         found = [self._pool(image.image) for image in images] + [images[0].leaving]
         if len(images) == 1:
-            found.append(traced.weight * misdirection(traced, states[0], self.scene))
+            found.append(traced.weight * squared_angular_error(traced, states[0], self.scene))
         return found
 
     def _penalty(self, entrance: Tensor, exit: Tensor) -> Tensor | float:

@@ -13,11 +13,11 @@ from torch import Tensor
 from caustic_cli.errors import InputError
 from caustic_cli.io.arrays import Archive, open_npz
 from caustic_cli.io.surfaces import ACCEPTED, MAX_CONTROL, surface_of
-from caustic_cli.optics.bounds import refuse_without_glass
+from caustic_cli.optics.bounds import check_exit_above_entrance
 from caustic_cli.optics.bspline import MAX_DEGREE
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import front_from
-from caustic_cli.scene import Component, Disc, Front, Lens, Light, Offset, PlaneWave, Points, Scene, Screen, Source
+from caustic_cli.optics.system import freeform_of
+from caustic_cli.scene import Component, Disc, FreeForm, Lens, Light, Offset, PlaneWave, Points, Scene, Screen, Source
 from caustic_cli.scene.elements import SIDES
 from caustic_cli.scene.light import MAX_WAVELENGTHS
 from caustic_cli.scene.materials import material
@@ -56,10 +56,10 @@ def open_archive(path: str | Path) -> tuple[Scene, HeightField, Tensor]:
             material(lens.glass)
         if "entrance_control_points" in data:
             entrance, low = surface_of(data, "entrance_")
-            lens = replace(lens, front=front_from(entrance, low - lens.z_in))
+            lens = replace(lens, entrance=freeform_of(entrance, low - lens.z_in))
         screen = _screen(data)
         scene = Scene(_source(data), lens, screen, _light(data), elements=_elements(data))
-        refuse_without_glass(scene, field, heights)
+        check_exit_above_entrance(scene, field, heights)
         return scene, field, heights
 
 
@@ -96,13 +96,13 @@ def _elements(data: Archive) -> tuple[Component, ...]:
             absorption[k],
             aperture=apertures[k],
             tilt=tuple(tilt[k]),
-            fronts=tuple(_front(data, f"element_{k + 1}_{side}_") for side in SIDES),
+            surfaces=tuple(_front(data, f"element_{k + 1}_{side}_") for side in SIDES),
         )
         for k in range(count)
     )
 
 
-def _front(data: Archive, name: str) -> Front | None:
+def _front(data: Archive, name: str) -> FreeForm | None:
     """A designed surface of another element, or None."""
     if f"{name}heights" not in data:
         return None
@@ -110,7 +110,7 @@ def _front(data: Archive, name: str) -> Front | None:
     u, v = (data.reals(f"{name}knots_{axis}", None, most=MAX_CONTROL + MAX_DEGREE + 1).tolist() for axis in "uv")
     if [len(u), len(v)] != [n + p + 1 for n, p in zip(heights.shape, degree, strict=True)]:
         raise InputError(f"{name}knots must have control + degree + 1 entries along each axis")
-    return Front(heights, degree, (u, v))
+    return FreeForm(heights, degree, (u, v))
 
 
 def _screen(data: Archive) -> Screen:

@@ -1,1 +1,2 @@
-"""What light does: spline surfaces, refraction, tracing, image reconstruction.  Knows no files and no command line."""
+"""Optics: spline surfaces, refraction, sequential ray tracing, image reconstruction, wave propagation.  Independent of files and of
+the command line."""

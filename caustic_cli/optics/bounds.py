@@ -1,15 +1,15 @@
-"""What the control net and the source prove about every ray of a scene, without tracing one.
+"""Bounds that hold for every ray of a scene, derived from the control net and the source without tracing.
 
 Notation
-    L           bound of |grad Z|: the derivative of a spline is a spline, and lies within the hull of its control net
-    phi         atan L, the most that the surface's normal leans from z; psi, the most that a free-form entrance's does
-    theta       the most that rays lean from z inside the lens
-    a           the most that rays lean from z before the lens: theta = psi + asin(sin(a - psi) / n), since a ray that leans to one
-                side is turned furthest from z where the normal leans to that side most
+    L           bound of |grad Z|: the derivative of a spline is a spline, which lies in the convex hull of its control net
+    phi         atan L, largest angle of the surface normal to z; psi, the same for a free-form entrance
+    theta       largest angle of rays to z inside the lens
+    a           largest angle of rays to z in front of the lens: theta = psi + asin(sin(a - psi) / n), the worst case being a ray
+                and a normal inclined to the same side
     i, o        angles of incidence and refraction at the exit: i <= theta + phi, sin o = n sin i
 
-A ray leaves with at most theta + (o - i) from z, because refraction turns it more the larger i is.  Over a surface of slope L it
-cannot come down again if L tan of that is below 1.  A mirror sends it off -z by at most theta + 2 phi instead.
+A ray leaves at an angle of at most theta + (o - i) to z, because the deviation o - i increases with i.  If L times the tangent of
+this angle is below 1, it cannot intersect the surface again.  For a mirror the angle to -z is at most theta + 2 phi.
 """
 
 from __future__ import annotations
@@ -22,26 +22,27 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.optics.gradient.fields import field_of
+from caustic_cli.optics.gradient.fields import index_field_of
 from caustic_cli.optics.interface import reflectance, reflectances
 from caustic_cli.optics.resolution import Resolution, paraxial
 from caustic_cli.optics.sampling import LARGEST_NORMAL
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import System, front_of
+from caustic_cli.optics.system import System, entrance_of
 from caustic_cli.scene import Scene
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """See above.  angles in rad; slope without unit; heights mm.
+    """Bounds over all rays; see the module.  Angles in rad, slopes dimensionless, heights in mm.
 
-    incidence: the most that rays lean from z before the entrance; inside: behind it; slope: of the surface; lean: that of the
-    microfacets' normals; index: the largest of all wavelengths; critical: n sin i, total reflection is impossible below 1;
-    slope_ratio: of the slope bound to the exit ray's slope, a secondary intersection is impossible below 1; reach: how far rays get
-    to the aperture's edge, in parts of its half width, at the greatest height; ghost: part of the power that is reflected twice
-    inside; depth: of the glass, mm; polarised: of unpolarised light, how much the exit's reflectance changes by what the entrance
-    makes of s and p; ghost_error: about what relative RMS that light adds to the image, see `ghost_error`; resolution: what
-    diffraction, source and pixels let it show.
+    incidence, inside: angle of rays to z in front of and behind the entrance; slope: of the surface; lean: angle of the
+    microfacets' normals to z; index: largest over all wavelengths; critical: n sin i, below 1 there is no total internal
+    reflection; slope_ratio: slope bound times the tangent of the exit ray's angle, below 1 there is no secondary intersection;
+    reach: distance of rays from the axis at the greatest height, in half widths of the aperture; ghost: fraction of the power that
+    is reflected twice inside;
+    depth: of the glass, mm; ghost_error: estimate of the relative RMS that this light adds to the image, see `ghost_error`;
+    polarised: for unpolarised light, the change of the exit's reflectance by the polarisation acquired at the entrance; resolution:
+    limit set by diffraction, source and pixels.
     """
 
     incidence: float
@@ -59,14 +60,14 @@ class Bounds:
     resolution: Resolution
 
 
-def refuse_without_glass(scene: Scene, field: HeightField, heights: Tensor) -> None:
-    """Refuse a lens whose exit dips below its entrance: light would gain what it is absorbed over a negative thickness.
+def check_exit_above_entrance(scene: Scene, field: HeightField, heights: Tensor) -> None:
+    """Check that the exit lies nowhere below the plane z_in: absorption over a negative thickness would amplify light.
 
     Raises:
-        InputError: how far it does.
+        InputError: giving the depth by which it does.
     """
     lens = scene.lens
-    if lens.mirror or float(heights.min()) >= lens.z_in:  # the surface lies in the hull of its net
+    if lens.mirror or float(heights.min()) >= lens.z_in:  # the convex hull of the net contains the surface
         return
     dip = lens.z_in - field.least(heights, lens.round)
     if dip > 0:
@@ -77,17 +78,17 @@ def refuse_without_glass(scene: Scene, field: HeightField, heights: Tensor) -> N
 
 
 def bounds_of(scene: Scene, field: HeightField, heights: Tensor, steeper: float = 0.0) -> Bounds:
-    """Bounds that hold for every ray of a scene at these heights (n, m) mm; steeper: by how much slopes may exceed the spline's."""
+    """Bounds for every ray of a scene at heights (n, m) mm; steeper: by how much slopes may exceed those of the spline."""
     lens, indices = scene.lens, [band.scene.lens.inside for band in scene.bands]
     least, most = min(indices), max(indices)
     pupil = scene.pupil
     incidence = _through(scene, scene.source.incidence(pupil.half_size, pupil.z, pupil.round))
     bent, depth = 0.0, float(heights.max()) - lens.z_in
-    if field_of_index := field_of(lens):
+    if field_of_index := index_field_of(lens):
         low, high, steepest = field_of_index.extremes(lens.half_size, depth)
         least, most = least * low / lens.index, most * high / lens.index
         bent = steepest * depth / low
-    front = 0.0 if lens.front is None else math.atan(math.hypot(*front_of(lens).slope_bounds(None)))
+    front = 0.0 if lens.entrance is None else math.atan(math.hypot(*entrance_of(lens).slope_bounds(None)))
     inside = min(front + math.asin(max(-1.0, min(1.0, math.sin(incidence - front) / least))) + bent, 0.5 * math.pi)
     slope = field.slope_bound(heights) + steeper
     lean = math.atan(slope + lens.roughness * LARGEST_NORMAL)
@@ -106,7 +107,7 @@ def bounds_of(scene: Scene, field: HeightField, heights: Tensor, steeper: float 
 
 
 def _through(scene: Scene, lean: float) -> float:
-    """The most that rays lean from z behind the lenses before the lens, which leaned so much at most before them."""
+    """Bound of the rays' angle to z behind the elements in front of the lens, from the bound `lean` in front of these."""
     system = System.of(scene) if scene.before else None
     for k, element in enumerate(system.elements[: 2 * len(scene.before)] if system else ()):
         assert system is not None
@@ -124,20 +125,20 @@ def _polarised(incidence: float, critical: float, n: float) -> float:
         return reflectances(c, s, eta)
 
     rs, rp = split(math.sin(incidence), 1.0 / n)
-    outer = split(critical / n, n) if critical < 1.0 else (1.0, 0.0)  # R_s - R_p is largest at the critical angle, below 1
+    outer = split(critical / n, n) if critical < 1.0 else (1.0, 0.0)  # R_s - R_p stays below its value 1 at the critical angle
     passed = 2.0 - rs - rp  # 0 at grazing incidence, where all that enters may be of one polarisation
     return ((rs - rp) / passed if passed > 0 else 1.0) * (outer[0] - outer[1]) / 2.0
 
 
 def _reach(scene: Scene, inside: float, lowest: float, top: float) -> float:
-    """How far from the axis rays can be at the surface's greatest height, in half widths of the aperture; infinite where the
-    surface may dip below the entrance, which rays then never meet from below."""
+    """Bound of the rays' distance from the axis at the surface's greatest height, in half widths of the aperture; infinite where
+    the surface may dip below the entrance, so that rays do not reach it from below."""
     source, lens = scene.source, scene.lens
     if scene.axial:
         return 1.0
     if lowest < lens.z_in or scene.before:
         return math.inf
-    low = min(0.0, front_of(lens).hull(None)[0]) if lens.front is not None else 0.0
+    low = min(0.0, entrance_of(lens).hull(None)[0]) if lens.entrance is not None else 0.0
     drift = (top - lens.z_in - low) * math.tan(min(inside, 1.57))
     if source.distant:
         return 1.0 + drift / min(lens.half_size)
@@ -152,8 +153,8 @@ def _reach(scene: Scene, inside: float, lowest: float, top: float) -> float:
 
 
 def _ghost(scene: Scene, field: HeightField, heights: Tensor, inside: float, n: float) -> float:
-    """Bound of the part of the power that is reflected at the exit and then at the entrance: a mean over the knot spans for even
-    light of a plane wave, their largest for other light."""
+    """Bound of the fraction of the power that is reflected at the exit and then at the entrance: an average over the knot spans for
+    a uniform plane wave, their maximum for other light."""
     lens, kind = scene.lens, scene.lens.fresnel
     if lens.mirror:
         return 0.0
@@ -164,7 +165,7 @@ def _ghost(scene: Scene, field: HeightField, heights: Tensor, inside: float, n: 
     lean = torch.atan(slope + lens.roughness * LARGEST_NORMAL)
 
     def part(angle: Tensor) -> Tensor:
-        """Greatest reflectance up to an angle of incidence inside; unpolarised light's falls nowhere below that at 0 and rises."""
+        """Largest reflectance up to an internal angle of incidence; for unpolarised light it is bounded below by that at 0."""
         c = torch.cos(angle.clamp_max(math.pi / 2.0))
         square = 1.0 - n * n * (1.0 - c * c)
         s = square.clamp_min(0.0).sqrt()
@@ -182,12 +183,12 @@ def _ghost(scene: Scene, field: HeightField, heights: Tensor, inside: float, n: 
 
 
 def ghost_error(scene: Scene, field: HeightField, heights: Tensor, part: float, n: float) -> float:
-    """Relative RMS that the first ghost adds to the image, about, if `part` of the power is in it; n: index.
+    """Estimate of the relative RMS that the first ghost adds to the image if it carries the fraction `part` of the power; n: index.
 
-    To first order a slope g turns light by (n - 1) g and its first ghost by (3 n - 1) g.  A ghost whose map x -> X has the
-    Jacobian J carries part / (A |det J|) to X, A the aperture's area, so that over a screen of area S the squares of its irradiance
-    have the mean part^2 S / A times the mean over the lens of 1 / |det J|.  The eigenvalues of J are taken as smaller by what the
-    first order may be wrong, and never below a pixel over the lens.
+    To first order a slope g deflects light by (n - 1) g and its first ghost by (3 n - 1) g.  A ghost whose map x -> X has the
+    Jacobian J gives the irradiance part / (A |det J|) at X, A the aperture's area, so that over a screen of area S its mean square
+    is part^2 S / A times the mean over the lens of 1 / |det J|.  The eigenvalues of J are reduced by the error of the first-order
+    approximation, and bounded below by a pixel over the lens' width.
     """
     if part == 0.0:
         return 0.0
@@ -211,7 +212,7 @@ def ghost_error(scene: Scene, field: HeightField, heights: Tensor, part: float, 
 
 
 def _slopes(field: HeightField, heights: Tensor) -> tuple[Tensor, Tensor]:
-    """Bound of |grad Z| on every knot span, and the span's part of the aperture: (spans along x, along y) each."""
+    """Bound of |grad Z| on every knot span, and the span's fraction of the aperture: (spans along x, along y) each."""
     (su, sv), (rx, ry) = field.spaces, field.half_size
     gx, gy = su.differences(heights).abs() / (2 * rx), sv.differences(heights, 1).abs() / (2 * ry)
     p, q = su.degree, sv.degree

@@ -26,15 +26,15 @@ from torch import Tensor
 from caustic_cli.errors import InputError
 
 MAX_DEGREE = 15
-#: Two knots closer than this (relative to the domain's length 1) cannot be told apart by float64 basis values.
+#: Least distance of distinct knots on the domain [0, 1]: closer knots are not resolved by float64 basis values.
 KNOT_RESOLUTION = 1e-12
 
 
 def open_knots(n: int, degree: int, parts: int = 1) -> Tensor:
     """Open, equispaced knot vector on [0, 1] for `n` control points of `degree`: (n + degree + 1,), float64.
 
-    parts: of equal width that meet in height but not in slope: their borders are knots of multiplicity `degree`, so that each part
-    of s spans is a spline of its own over an open, equispaced knot vector, and shares one control point with the next:
+    parts: number of pieces of equal width that join with C0 continuity: their borders are knots of multiplicity `degree`, so that
+    each piece of s spans is an independent spline over an open, equispaced knot vector and shares one control point with the next:
     n = parts (s + degree - 1) + 1.
     """
     if n < degree + 1:
@@ -59,7 +59,7 @@ class SplineSpace:
     Args:
         degree: polynomial degree p, 1 to 15.
         knots: (n + p + 1,) non-decreasing; end knots 0 and 1 with multiplicity p + 1, inner ones at most p
-            (a knot of multiplicity p + 1 tears the surface, so it is refused).
+            (multiplicity p + 1 makes the surface discontinuous and is rejected).
 
     Raises:
         InputError: the degree or the knot vector is not of that form.
@@ -85,15 +85,17 @@ class SplineSpace:
             if bool((values <= 0).any()) or bool((values >= 1).any()):
                 raise InputError(f"inner knots must lie strictly between 0 and 1 for degree {p}")
             if bool((counts > p).any()):
-                raise InputError(f"an inner knot may be repeated at most {p} times for degree {p}: more tears the surface")
+                raise InputError(
+                    f"an inner knot may be repeated at most {p} times for degree {p}: more makes the surface discontinuous"
+                )
             gaps = torch.cat([values.new_zeros(1), values, values.new_ones(1)]).diff()
             if bool((gaps < KNOT_RESOLUTION).any()):
                 raise InputError(f"distinct knots must be at least {KNOT_RESOLUTION:g} apart")
 
     @classmethod
-    @lru_cache(maxsize=16)  # so that what follows from a space is found once for all surfaces of it
+    @lru_cache(maxsize=16)  # so that quantities derived from a space are computed once for all its surfaces
     def uniform(cls, n: int, degree: int, parts: int = 1) -> SplineSpace:
-        """Open and equispaced knots for `n` control points (the thesis' lenses); parts: as of `open_knots`."""
+        """The space over open, equispaced knots for `n` control points (the lenses of the thesis); parts: as for `open_knots`."""
         if not 1 <= degree <= MAX_DEGREE:
             raise InputError(f"spline degree must be 1 to {MAX_DEGREE}, got {degree}")
         return cls(degree, open_knots(n, degree, parts))
@@ -105,7 +107,7 @@ class SplineSpace:
 
     @cached_property
     def breaks(self) -> Tensor:
-        """The distinct knots, ascending: the borders of the polynomial pieces."""
+        """The distinct knots, ascending: the breakpoints of the polynomial pieces."""
         return torch.unique(self.knots)
 
     @cached_property
@@ -159,7 +161,7 @@ class SplineSpace:
         return values.new_zeros(len(x), self.n).scatter(1, columns, values)
 
     def banded(self, x: Tensor, derivative: int = 0) -> Tensor:
-        """`matrix` as a sparse tensor: its product with a net takes p + 1 operations a point, not n."""
+        """`matrix` as a sparse tensor: its product with a net takes p + 1 operations per point instead of n."""
         first, values = self.basis(x, derivative)
         columns = first[:, None] + torch.arange(self.degree + 1, device=x.device)
         rows = torch.arange(len(x), device=x.device)[:, None].expand_as(columns)
@@ -169,13 +171,13 @@ class SplineSpace:
     def interpolated(self, values: Tensor) -> Tensor:
         """Control points of the spline that has the values (n, ...) at the Greville abscissae: (n, ...) float64.
 
-        The matrix is banded and totally positive: elimination needs no pivoting (de Boor, Pinkus, SIAM J. Numer. Anal. 14, 1977).
-        It goes by whole rows of the values, which is many times as fast as LAPACK's, column by column, where there are many.
+        The matrix is banded and totally positive, so Gaussian elimination needs no pivoting (de Boor, Pinkus, SIAM J. Numer. Anal.
+        14, 1977).  It works on whole rows of the values, which for many columns is much faster than LAPACK's column by column.
         """
         p, n = self.degree, self.n
         first, basis = self.basis(self.greville)
         rows, columns = torch.arange(n)[:, None].expand_as(basis), first[:, None] + torch.arange(p + 1)
-        bands = np.zeros((n, 2 * p + 1))  # row i has its columns i - p to i + p
+        bands = np.zeros((n, 2 * p + 1))  # row i holds columns i - p to i + p
         bands[rows, p + columns - rows] = basis
         out = np.array(values.double().numpy(), order="C")
         for i in range(n):
@@ -190,9 +192,9 @@ class SplineSpace:
         return torch.from_numpy(out)
 
     def differences(self, points: Tensor, axis: int = 0, order: int = 1) -> Tensor:
-        """Control points of a derivative, a spline of degree p - order, of those with `points` along an axis: n - order there.
+        """Control points of the derivative of this order, a spline of degree p - order, from `points`: n - order along `axis`.
 
-        Where knots coincide p - order + 1 times, or oftener, it may jump; the jump itself is left out.  order: at most p.
+        At knots of multiplicity p - order + 1 or more the derivative may jump; the jump itself is omitted.  order: at most p.
         """
         for k in range(order):
             p, t, n = self.degree - k, self.knots[k : len(self.knots) - k], self.n - k
@@ -225,7 +227,7 @@ class SplineSpace:
         return SplineSpace(p, t), matrix
 
     def change_of_basis(self, finer: SplineSpace) -> Tensor:
-        """Matrix T (n', n) that carries control points into another space of splines.
+        """Matrix T (n', n) that maps control points to another spline space.
 
         Exact (knot insertion) where `finer` has the same degree and all these knots; otherwise the interpolant at the
         new Greville abscissae.
@@ -243,12 +245,12 @@ class SplineSpace:
 
 
 def over_grid(u: Tensor, net: Tensor, v: Tensor) -> Tensor:
-    """u net v^T, (a, b), of `banded` u (a, n) and v (b, m), and a net (n, m)."""
+    """u net v^T, (a, b): a net (n, m) evaluated on a grid, from collocation matrices u (a, n) and v (b, m) of `banded`."""
     return derivatives_over_grid([u], net, [v], [(0, 0)])[0]
 
 
 def derivatives_over_grid(u: Sequence[Tensor], net: Tensor, v: Sequence[Tensor], orders: Iterable[tuple[int, int]]) -> list[Tensor]:
-    """`over_grid` of u[j] and v[k], derivatives by order, for every (j, k) in `orders`."""
+    """`over_grid` for every (j, k) in `orders`, with u[j] and v[k] the collocation matrices of derivatives of these orders."""
     orders = list(orders)
     along = {j: (u[j] @ net).T.contiguous() for j in {j for j, _ in orders}}
     return [(v[k] @ along[j]).T for j, k in orders]

@@ -1,4 +1,4 @@
-"""Curvature of a height field: how a tool must bend to follow it.
+"""Principal curvatures of a height field.
 
 With slopes g = (z_x, z_y), s = 1 + |g|^2 and second derivatives z_xx, z_xy, z_yy, for the normal towards +z:
 
@@ -11,9 +11,9 @@ from __future__ import annotations
 
 from torch import Tensor
 
-#: Derivatives (by x, by y) that `largest` takes, in its order.
+#: Orders of the derivatives by (x, y) that `largest` takes, in the order of its arguments.
 ORDERS = ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
-#: Part of the curvatures' scale below which they count as equal: keeps the root's slope finite.
+#: Relative difference below which the principal curvatures count as equal: it keeps the derivative of the square root finite.
 EQUAL = 1e-12
 
 

@@ -1,17 +1,18 @@
-"""The lower envelope of a ball that moves along a path: what a ball-nose tool leaves of the stock, exact to rounding.
+"""The swept lower envelope of a ball along a tool path: the surface that a ball-nose tool leaves, exact to rounding.
 
 Notation
     R           radius of the ball, mm
-    A, e, l, m  of a segment of the path: the centre's first place, its direction in the plane (unit), length there, rise per length
-    q           a point of the plane;  a = (q - A) . e, its place along the segment;  p its distance from the segment's line
+    A, e, l, m  a segment of the path: initial position of the centre, unit direction in the plane, projected length, rise per
+    length
+    q           a point of the plane;  a = (q - A) . e, its coordinate along the segment;  p its distance from the segment's line
 
-The ball's lower side at q is Z(w) = A_z + m w - sqrt(R^2 - p^2 - (a - w)^2) while its centre is at w in [0, l].  That is convex in
-w and least at w = a - m sqrt((R^2 - p^2) / (1 + m^2)), or at the end next to it.  The surface is the least over all segments;
-between two passes it has an edge, the cusp of a scallop.  The slope at q is that of the lowest ball, (q - c) / sqrt(R^2 - |q -
-c|^2), with its centre over c.
+The underside of the ball at q is Z(w) = A_z + m w - sqrt(R^2 - p^2 - (a - w)^2) with its centre at w in [0, l].  It is convex in w
+with its minimum at w = a - m sqrt((R^2 - p^2) / (1 + m^2)), or at the nearer end.  The machined surface is the minimum over all
+segments; between two passes it has an edge, the cusp of a scallop.  The slope at q is that of the lowest ball,
+(q - c) / sqrt(R^2 - |q - c|^2), with its centre above c.
 
-The same envelope turned over says where a ball can be: over a surface of points P the centre must be at least max(P_z +
-sqrt(R^2 - |q - P|^2)) high, which is minus the lower envelope of balls at the points with heights -P_z.
+The dual problem gives collision-free positions: above a surface of points P the centre must be at least at the height
+max(P_z + sqrt(R^2 - |q - P|^2)), which is minus the lower envelope of balls at the points with heights -P_z.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from caustic_cli.optics.kernels import blocks
 from caustic_cli.optics.kernels.envelope import COARSE, envelope
 from caustic_cli.optics.kernels.threads import ALL
 
-#: Cells of a side of at most this part of the radius hold the segments; most of them.
+#: Side of the cells that bin the segments, as a fraction of the radius; largest number of cells.
 PART, MOST_CELLS = 1.0 / 16.0, 1 << 24
 
 
@@ -34,11 +35,11 @@ class Envelope:
 
     Args:
         radius: of the ball, mm.
-        begins, ends: (S, 3) centres at either end of each segment, mm; the same for a ball that only stands there.
-        top: height of the stock, where no ball comes lower, mm.
+        begins, ends: (S, 3) centres at the ends of each segment, mm; equal for a stationary ball.
+        top: height of the stock, where no ball is lower, mm.
 
     Raises:
-        InputError: no segment, or numbers that are not finite.
+        InputError: there is no segment, or a coordinate is not finite.
     """
 
     def __init__(self, radius: float, begins: np.ndarray, ends: np.ndarray, top: float = math.inf):
@@ -65,7 +66,8 @@ class Envelope:
         self.blocks = padded.reshape(padded.shape[0] // COARSE, COARSE, -1, COARSE).min((1, 3))
 
     def __call__(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Height and centre of the lowest ball at points (N,) mm: z, c_x, c_y (N,), mm; top and the point itself where none is."""
+        """Height and centre of the lowest ball at points (N,) mm: z, c_x, c_y (N,), mm; `top` and the point itself where there is
+        none."""
         x, y = (np.ascontiguousarray(c, dtype=np.float64) for c in (x, y))
         z, cx, cy = (np.empty_like(x) for _ in range(3))
         low, n = self.low, blocks()
@@ -75,14 +77,14 @@ class Envelope:
         return z, cx, cy
 
     def slopes(self, x: np.ndarray, y: np.ndarray, cx: np.ndarray, cy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Z_x and Z_y at points, from the centres there."""
+        """Slopes Z_x and Z_y at points, from the ball centres there."""
         dx, dy = x - cx, y - cy
         under = np.sqrt(np.maximum(self.radius**2 - dx * dx - dy * dy, 1e-300))
         return dx / under, dy / under
 
 
 def _segments(begins: np.ndarray, ends: np.ndarray, most: float) -> tuple[np.ndarray, np.ndarray]:
-    """Segments (S, 7) as the kernel takes them, cut to at most `most` mm, and their middles (S, 2)."""
+    """Segments (S, 7) in the kernel's format, subdivided to at most `most` mm, and their midpoints (S, 2)."""
     step = ends - begins
     length = np.hypot(step[:, 0], step[:, 1])
     parts = np.maximum(1, np.ceil(length / most)).astype(np.int64)
@@ -90,7 +92,7 @@ def _segments(begins: np.ndarray, ends: np.ndarray, most: float) -> tuple[np.nda
     part = np.arange(len(number)) - np.repeat(np.cumsum(parts) - parts, parts)
     begin, step, length = begins[number], step[number] / parts[number, None], length[number] / parts[number]
     begin = begin + part[:, None] * step
-    begin[length == 0, 2] = np.minimum(begins[number, 2], ends[number, 2])[length == 0]  # straight up and down
+    begin[length == 0, 2] = np.minimum(begins[number, 2], ends[number, 2])[length == 0]  # vertical moves
     moves = np.where(length > 0, length, 1.0)
     along = np.stack([np.where(length > 0, step[:, 0] / moves, 1.0), step[:, 1] / moves], -1)
     rise = np.where(length > 0, step[:, 2] / moves, 0.0)

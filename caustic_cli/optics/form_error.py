@@ -1,10 +1,10 @@
-"""Random errors of a surface's form as control heights: a Gaussian field of given power spectral density, and a tool's waviness.
+"""Random form errors of a surface as control heights: a Gaussian random field of given power spectral density, and waviness.
 
     h(x, y) = sum over modes of sqrt(v_k) (a_k cos(2 pi f_k.(x, y)) + b_k sin(...)),    a_k, b_k normal,    v_k ~ |f_k|^-exponent
 
-with sum v_k = rms^2.  Frequencies stand on a grid of 1 / (PERIODS sizes): the field has no period within the aperture.  It is
-interpolated by the spline at the Greville abscissae, on a net of at least A_WAVE spans to the shortest wavelength: the lens' own,
-or one with knots inserted, in which the lens is the same surface.
+with sum v_k = rms^2.  The frequencies form a grid of spacing 1 / (PERIODS sizes), so the field is not periodic within the aperture.
+The spline interpolates it at the Greville abscissae, on a net of at least A_WAVE spans per shortest wavelength: that of the lens,
+or a refined one in which knot insertion reproduces the same surface.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.scene.tolerances import FormError, Waviness
 
-#: Aperture sizes after which a realisation would come again.
+#: Period of a realisation, in aperture sizes.
 PERIODS = 2.0
-#: Knot spans to the shortest wavelength: cubics then show it with an error below 1 % of its slope.
+#: Knot spans per shortest wavelength: a cubic spline then reproduces its slope to 1 %.
 A_WAVE = 6.0
-#: Most control points along an axis of a net with knots inserted, and most modes along one.
+#: Largest number of control points of a refined net, and of modes, along an axis.
 MOST_NET, MOST_MODES = 2048, 2048
 
 
 def refined(field: HeightField, heights: Tensor, shortest: float) -> tuple[HeightField, Tensor]:
-    """The same surface on a net that holds waves of `shortest` mm.
+    """The same surface on a net that resolves wavelengths of `shortest` mm, by knot insertion.
 
     Raises:
         InputError: it would have more than MOST_NET control points along an axis.
@@ -58,7 +58,7 @@ def refined(field: HeightField, heights: Tensor, shortest: float) -> tuple[Heigh
 
 
 def _carried(coarse: SplineSpace, finer: SplineSpace):
-    """Interpolation by a finer space at its Greville abscissae, exact for splines of the coarser one."""
+    """Change of basis by interpolation at the finer space's Greville abscissae, exact for splines of the coarser space."""
     solve, values = _interpolation(finer), _collocation(coarse, finer.greville)
     return lambda net: solve(values @ net)
 
@@ -71,19 +71,19 @@ def _collocation(space: SplineSpace, at: Tensor) -> sparse.csr_array:
 
 
 def _interpolation(space: SplineSpace):
-    """Values at the Greville abscissae (n, ...) -> control heights."""
+    """A function: values at the Greville abscissae (n, ...) -> control heights."""
     return linalg.splu(sparse.csc_matrix(_collocation(space, space.greville))).solve
 
 
 class FormErrors:
-    """Realisations of the errors of a surface.
+    """Realisations of a surface's form errors.
 
     Args:
-        field: of the lens, on a net that holds their shortest wavelength (`refined`).
-        form, waviness: what there is of them.
+        field: of the lens, on a net that resolves their shortest wavelength (`refined`).
+        form, waviness: their statistics, None for none.
 
     Raises:
-        InputError: no wave of the form error fits on the lens, or too many.
+        InputError: no mode of the form error fits on the lens, or too many do.
     """
 
     def __init__(self, field: HeightField, form: FormError | None, waviness: Waviness | None):
@@ -121,7 +121,7 @@ class FormErrors:
         return np.real((np.exp(2j * np.pi * np.outer(x, fx)) @ a) @ np.exp(2j * np.pi * np.outer(fy, y)))
 
     def wave_values(self, rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """A realisation of the waviness there: its phase is anything."""
+        """A realisation of the waviness there, with a uniformly random phase, mm."""
         assert self.waviness is not None
         w, turn = self.waviness, math.radians(self.waviness.direction)
         way = math.cos(turn) * x[:, None] + math.sin(turn) * y[None, :]

@@ -1,4 +1,4 @@
-"""An image and its energy account, and how rays on a screen become one."""
+"""The irradiance image with its energy balance."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from typing import Generic, TypeVar
 
 from torch import Tensor
 
-#: A tensor while rays are traced, a number of a whole exposure.
+#: A tensor while rays are traced, a number for a complete image.
 Amount = TypeVar("Amount", bound=Tensor | float)
 
 
 @dataclass(frozen=True)
 class Image(Generic[Amount]):
-    """Power on a screen's pixels and what became of the rest, as parts of the source's power.
+    """Power on a screen's pixels and all losses, as fractions of the source's power.
 
-    image: (n_x, n_y) float64, or (3, n_x, n_y) with colours; leaving: the power that left the last element, () or (3,); lost: by a
-    name of `rays.LOSSES`.  While rays are traced all three are tensors, image and leaving differentiable; of a whole exposure
-    leaving and lost are numbers.  rays: how many.  image.sum() + sum(lost.values()) = 1 over all rays of a source.
+    image: (n_x, n_y) float64, or (3, n_x, n_y) with colours; leaving: power behind the last element, () or (3,); lost: power lost,
+    by name, see `rays.LOSSES`.  While rays are traced all three are tensors, image and leaving differentiable; for a complete image
+    leaving and lost are numbers.  rays: their number.  Over all rays of a source image.sum() + sum(lost.values()) = 1.
     """
 
     image: Tensor

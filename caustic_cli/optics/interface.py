@@ -5,11 +5,11 @@ ratio eta = n_in / n_out and c = d . N, the refracted unit direction is
 
     t = eta d + gamma N,    gamma = (1 - eta^2) / (s + eta c),    s = t . N = sqrt(|N|^2 (1 - eta^2) + eta^2 c^2),
 
-Snell's law (eq. 2.1.10) without normalising anything; a negative radicand is total internal reflection.  gamma is
-(s - eta c) / |N|^2 without its cancellation: an index close to 1 bends light by n - 1, of which a difference leaves nothing.
+Snell's law (eq. 2.1.10) without any normalisation; a negative radicand means total internal reflection.  This form of gamma avoids
+the cancellation in (s - eta c) / |N|^2 for indices close to 1.
 For a plane wave along +z inside a lens it is the closed form of 3.2 (erratum E1) with s = S.
 
-Light that meets the surface from above (side -1) does what light from below does at the surface's mirror image in z = 0.
+Light from above the surface (side -1) is treated as light from below at the surface mirrored in z = 0.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.polarisation import part_s
+from caustic_cli.optics.polarisation import s_fraction
 from caustic_cli.optics.tolerances import CRITICAL
 
 
-class Departure(NamedTuple):
-    """Rays as they leave a surface: unit directions, the power they carry on, and whether they leave at all (False: total internal
-    reflection, power 0, a direction that is finite and means nothing)."""
+class OutgoingRays(NamedTuple):
+    """Rays behind a surface: unit directions, power, and whether they are transmitted (False: total internal reflection, with power
+    0 and a finite but meaningless direction).  For a mirror all are."""
 
     direction: tuple
     power: Tensor
@@ -34,7 +34,7 @@ class Departure(NamedTuple):
 
 def interact(
     direction, slopes, power: Tensor, *, eta: float | Tensor, reflects: bool, fresnel: str, polarised=None, side: float = 1.0
-) -> Departure:
+) -> OutgoingRays:
     """Refract or reflect rays of N at a height field.
 
     Args:
@@ -42,7 +42,7 @@ def interact(
         slopes: z_x, z_y at the hits, tensors or plain floats.
         power: (N,).
         eta: n_in / n_out, a number, or (N,) of media whose index varies.
-        reflects: a mirror, which keeps all power; otherwise the part is refracted that `fresnel` leaves.
+        reflects: whether the surface is a mirror, of reflectance 1; otherwise light is refracted, less the Fresnel loss.
         fresnel: none, schlick or exact.
         polarised: unit vectors of the field of linearly polarised light, as `direction`; None for unpolarised light.
         side: +1 for rays from below the surface, -1 from above.
@@ -58,18 +58,18 @@ def interact(
             polarised=None if polarised is None else (polarised[0], polarised[1], -polarised[2]),
         )
         tx, ty, tz = flipped.direction
-        return Departure((tx, ty, -tz), flipped.power, flipped.passes)
+        return OutgoingRays((tx, ty, -tz), flipped.power, flipped.passes)
     gx, gy = slopes
     if reflects:
-        return Departure(reflect(direction, gx, gy)[0], power, torch.ones_like(power, dtype=torch.bool))
+        return OutgoingRays(reflect(direction, gx, gy)[0], power, torch.ones_like(power, dtype=torch.bool))
     if isinstance(gx, float) and gx == 0.0 and gy == 0.0:
         return _flat(direction, power, eta, fresnel, polarised)
     out, passes, c, s = refract(direction, gx, gy, eta)
     reflected = _reflected(direction, (-gx, -gy, 1.0), c, s, eta, fresnel, polarised)
-    return Departure(out, torch.where(passes, power * (1.0 - reflected), torch.zeros_like(power)), passes)
+    return OutgoingRays(out, torch.where(passes, power * (1.0 - reflected), torch.zeros_like(power)), passes)
 
 
-def _flat(direction, power: Tensor, eta: float | Tensor, fresnel: str, polarised) -> Departure:
+def _flat(direction, power: Tensor, eta: float | Tensor, fresnel: str, polarised) -> OutgoingRays:
     """At z = const Snell's law keeps n (d_x, d_y)."""
     dx, dy, dz = direction
     tx, ty = (d / (1.0 / eta) for d in (dx, dy))
@@ -81,14 +81,14 @@ def _flat(direction, power: Tensor, eta: float | Tensor, fresnel: str, polarised
     dz_ = dz if isinstance(dz, Tensor) else torch.tensor(dz, dtype=power.dtype, device=power.device)
     reflected = _reflected(direction, (0.0, 0.0, 1.0), dz_, tz, eta, fresnel, polarised)
     if not any(isinstance(c, Tensor) for c in direction):  # one direction for all rays stays one
-        return Departure((tx, ty, float(tz)), torch.where(passes, power * (1.0 - reflected), torch.zeros_like(power)), passes)
-    return Departure((tx, ty, tz), torch.where(passes, power - reflected * power, torch.zeros_like(power)), passes)
+        return OutgoingRays((tx, ty, float(tz)), torch.where(passes, power * (1.0 - reflected), torch.zeros_like(power)), passes)
+    return OutgoingRays((tx, ty, tz), torch.where(passes, power - reflected * power, torch.zeros_like(power)), passes)
 
 
 def _reflected(direction, normal, c, s, eta: float | Tensor, fresnel: str, polarised):
     """Part of the power reflected, of light polarised or not."""
     if polarised is not None and fresnel == "exact":
-        (rs, rp), part = reflectances(c, s, eta), part_s(polarised, direction, normal)
+        (rs, rp), part = reflectances(c, s, eta), s_fraction(polarised, direction, normal)
         return part * rs + (1.0 - part) * rp
     length = 1.0
     if fresnel == "schlick":
@@ -106,13 +106,13 @@ def refract(d, slope_x: Tensor, slope_y: Tensor, eta: float | Tensor):
         eta: n_in / n_out.
 
     Returns:
-        t: (t_x, t_y, t_z) unit directions (finite, and meaningless, where reflected),
+        t: (t_x, t_y, t_z) unit directions (finite but meaningless where totally reflected),
         passes: bool, False where the ray is totally reflected,
         c, s: d . N and t . N, both cosines times |N|, for the Fresnel terms.
     """
     norm2 = 1.0 + slope_x * slope_x + slope_y * slope_y
     c = d[2] - d[0] * slope_x - d[1] * slope_y
-    # |N|^2 (1 - eta^2) + eta^2 c^2, with the constant part 1 split off where c = d_z = 1 so that nothing cancels
+    # |N|^2 (1 - eta^2) + eta^2 c^2 in a form without cancellation where c = d_z = 1
     radicand = norm2 + (eta * eta) * (c * c - norm2)
     passes = radicand > CRITICAL * norm2
     s = torch.where(passes, radicand, torch.ones_like(radicand)).sqrt()  # a masked argument keeps NaN out of gradients
@@ -121,20 +121,20 @@ def refract(d, slope_x: Tensor, slope_y: Tensor, eta: float | Tensor):
 
 
 def reflect(d, slope_x: Tensor, slope_y: Tensor):
-    """Unit directions reflected at a height field, d - 2 (d . N) / |N|^2 N: Snell's law with index -1.  And c = d . N."""
+    """Unit directions reflected at a height field, d - 2 (d . N) / |N|^2 N (Snell's law with index -1), and c = d . N."""
     c = d[2] - d[0] * slope_x - d[1] * slope_y
     twice = 2.0 * c / (1.0 + slope_x * slope_x + slope_y * slope_y)
     return (d[0] + twice * slope_x, d[1] + twice * slope_y, d[2] - twice), c
 
 
 def reflectances(c, s, eta: float | Tensor):
-    """(R_s, R_p), parts of s- and p-polarised power reflected, from c and s of `refract`: r_s^2, r_p^2 of `reflectance`."""
+    """Fresnel reflectances (R_s, R_p) for s- and p-polarised light, from c and s of `refract`: r_s^2, r_p^2 of `reflectance`."""
     rs, rp = (eta * c - s) / (eta * c + s), (c - eta * s) / (c + eta * s)
     return rs * rs, rp * rp
 
 
 def reflectance(kind: str, c, s, eta: float | Tensor):
-    """Part of the power reflected, from c and s of `refract` (any common factor): none, schlick or exact (unpolarised).
+    """Reflectance from c and s of `refract` (up to a common factor); kind: none, schlick or exact, for unpolarised light.
 
     Exact: (r_s^2 + r_p^2) / 2 with r_s = (eta c - s) / (eta c + s), r_p = (c - eta s) / (c + eta s).
     Schlick: R0 + (1 - R0) (1 - cos)^5 with the larger of the two angles, eqs. 2.1.13 and 2.1.14; it needs true cosines.

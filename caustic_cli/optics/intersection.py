@@ -1,18 +1,18 @@
-"""Where a ray meets a surface, and its derivatives by the implicit function theorem (thesis 4.3.2).
+"""Ray-surface intersection, differentiated by the implicit function theorem (thesis 4.3.2).
 
 Notation, in the frame of the surface
-    o, d    the ray's start and unit direction, mm
-    side    +1 for rays that meet the surface from below, -1 from above
+    o, d    the ray's origin, mm, and unit direction
+    side    +1 for rays that reach the surface from below, -1 from above
     f(t)    side (o_z + t d_z - Z(o_x + t d_x, o_y + t d_y)), negative before the crossing (eq. 4.3.3)
-    c       d_z - Z_x d_x - Z_y d_y, f'(t) up to the side: at the hit the cosine of incidence times |N|
-    L       bound of |Z_x d_x| + |Z_y d_y|; a spline's is that of the derivative's control net, which holds it in its convex hull
+    c       d_z - Z_x d_x - Z_y d_y, f'(t) up to the sign `side`: at the intersection the cosine of incidence times |N|
+    L       bound of |Z_x d_x| + |Z_y d_y|, for a spline from the control net of its derivative (convex hull property)
 
-A ray with L < |d_z| meets the surface once.  Newton's iteration then runs inside a bracket, from the hull and the aperture, that
-bisection takes over where a step leaves it.  For any other ray the first root is isolated before that.
+A ray with L < |d_z| intersects the surface once.  Newton's method is then safeguarded by a bracket from the convex hull and the
+aperture, with bisection where a step leaves it.  For any other ray the first root is isolated beforehand.
 
 `reference` is plain torch, for any surface and device; `kernels.batches`, by `kernels.intersect`, is its fused form for B-splines.
-The thesis' triangle mesh is in `mesh`.  At the hit f(t; P, o, d) = 0 gives every derivative of t (`attach`), whatever found it: no
-iteration is ever differentiated.
+The thesis' triangle mesh is in `mesh`.  At the root, f(t; P, o, d) = 0 gives all derivatives of t (`attach`) whatever method found
+it; no iteration is differentiated.
 """
 
 from __future__ import annotations
@@ -33,21 +33,21 @@ METHODS = ("newton", "mesh", "mesh+newton")
 
 
 class Status(IntEnum):
-    """What became of a ray on its way to a surface."""
+    """Outcome of an intersection search."""
 
     HIT = 0
-    MISSED = 1  # it leaves the aperture before the surface: the lens' side absorbs it
-    UNRESOLVED = 2  # the search gave up; counted as missed
+    MISSED = 1  # the ray leaves the aperture before it reaches the surface; the edge of the lens absorbs it
+    UNRESOLVED = 2  # no convergence; counted as missed
 
 
 @dataclass(frozen=True)
 class Method:
-    """How hits with a B-spline are found.
+    """Method of intersection with a B-spline.
 
     Args:
-        name: newton, mesh, or mesh+newton, which begins Newton's iteration at the mesh's hit.
-        parts: (n_u, n_v), parts that the mesh cuts each knot span into.
-        recursive: look for the mesh's span products four rectangles at a time, or through all of them.
+        name: newton, mesh, or mesh+newton, Newton's method started from the intersection with the mesh.
+        parts: (n_u, n_v), subdivisions of each knot span by the mesh.
+        recursive: find the mesh's knot span products by a quadtree, or by testing all of them.
     """
 
     name: str = "newton"
@@ -58,8 +58,8 @@ class Method:
         checks.choice("intersection method", self.name, METHODS)
 
 
-def meet_any(surface: Surface, heights: Tensor | None, origin, direction, side: float) -> SurfaceIntersection:
-    """`Surface.meet` for any surface, in plain torch."""
+def intersect_any(surface: Surface, heights: Tensor | None, origin, direction, side: float) -> SurfaceIntersection:
+    """`Surface.intersect` for any surface, in plain torch."""
     t, status = reference(surface, heights, origin, direction, side)
     found = status == Status.HIT
     t, gx, gy = attach(surface, heights, origin, direction, t, found)
@@ -67,9 +67,10 @@ def meet_any(surface: Surface, heights: Tensor | None, origin, direction, side: 
 
 
 def attach(surface: Surface, heights: Tensor | None, origin, direction, t: Tensor, found: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """t (N,) mm of hits, not differentiated, and the slopes there: with their first derivatives by everything, in either mode.
+    """Make intersections differentiable: t (N,) mm and the slopes there, with first derivatives by heights and rays, in both modes.
 
-    One Newton step from the root, whose value is 0 and whose derivative is that of the root.  Where nothing was found all are 0.
+    t: roots without derivatives; found: where they are valid, 0 is returned elsewhere.  One Newton step from the root has the value
+    0 and the derivative of the root.  Second derivatives are wrong.
     """
     sag, middle = surface.centred(heights)
     (ox, oy, oz), (dx, dy, dz) = origin, direction
@@ -88,13 +89,13 @@ def attach(surface: Surface, heights: Tensor | None, origin, direction, t: Tenso
         c = torch.where(c.abs() > LEAST_COSINE, c, torch.full_like(c, LEAST_COSINE))
     f = z_ray - z - sx * (x - at[0]) - sy * (y - at[1])
     move = torch.where(found, -(f - _primal(f)) / c, torch.zeros_like(t))
-    ax, ay = (x - at[0]) + move * fx, (y - at[1]) + move * fy  # zeros that carry the derivative
+    ax, ay = (x - at[0]) + move * fx, (y - at[1]) + move * fy  # 0 in value, with the derivative of the point
     none = torch.zeros_like(t)
     return (t + move, torch.where(found, gx + zxx * ax + zxy * ay, none), torch.where(found, gy + zxy * ax + zyy * ay, none))
 
 
 def _primal(value: Tensor) -> Tensor:
-    """The value alone, without derivatives of either mode."""
+    """The value without derivatives of either mode."""
     return forward_ad.unpack_dual(value).primal.detach()
 
 
@@ -102,12 +103,12 @@ def _primal(value: Tensor) -> Tensor:
 def find(
     field, heights: Tensor, origin, direction, method: Method | None = None, radius: float | None = None
 ) -> tuple[Tensor, Tensor]:
-    """t (N,) float64 of the first hit, from below, of rays with a B-spline, and its `Status` (N,), by a method."""
+    """First intersections of rays from below with a B-spline: t (N,) float64 mm, and `Status` (N,)."""
     return backend_for(heights.device).find(field, heights, origin, direction, method or Method(), radius)
 
 
 def within(status: Tensor, t: Tensor, origin, direction, radius: float | None) -> Tensor:
-    """`status` with hits beyond a circular aperture as what they are, rays that left by the side."""
+    """`status` with intersections outside a circular aperture marked as missed."""
     if radius is None:
         return status
     beyond = (origin[0] + t * direction[0]) ** 2 + (origin[1] + t * direction[1]) ** 2 > radius**2
@@ -118,7 +119,7 @@ def within(status: Tensor, t: Tensor, origin, direction, radius: float | None) -
 def reference(
     surface: Surface, heights: Tensor | None, origin, direction, side: float = 1.0, radius: float | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Distances t (N,) to first hits and their `Status`, by Newton's method in plain torch."""
+    """Distances t (N,) mm to the first intersections, and `Status` (N,), by safeguarded Newton iteration in plain torch."""
     h, middle = surface.centred(None if heights is None else heights.detach())
     tensors = [torch.as_tensor(c, dtype=torch.float64).detach() for c in (*origin, *direction)]
     ox, oy, oz, dx, dy, dz = torch.broadcast_tensors(*tensors)
@@ -128,7 +129,7 @@ def reference(
     ahead = dz > 0
     dz = torch.where(ahead, dz, torch.ones_like(dz))
     enter, leave = torch.zeros_like(dz), torch.full_like(dz, torch.inf)
-    for o, d, r in ((ox, dx, rx), (oy, dy, ry)):  # where the ray is over the aperture
+    for o, d, r in ((ox, dx, rx), (oy, dy, ry)):  # the interval in which the ray is above the aperture
         near = torch.where(d == 0, torch.where(o.abs() <= r, -torch.inf, torch.inf), (torch.where(d > 0, -r, r) - o) / d)
         far = torch.where(d == 0, torch.inf, (torch.where(d > 0, r, -r) - o) / d)
         near = torch.where(o.abs() <= r, torch.full_like(near, -torch.inf), near)
@@ -182,9 +183,10 @@ def reference(
 
 
 def _first_brackets(f, low: Tensor, high: Tensor, f_low: Tensor, rise: Tensor, fall: Tensor):
-    """Brackets a, b with f(a) < 0 <= f(b) around the first roots in [low, high], and a status each.
+    """Brackets a, b with f(a) < 0 <= f(b) of the first roots in [low, high], and a status each.
 
-    No root lies between a and b if the two lines that bound f, of slope `rise` from a and `fall` from b, stay below 0.
+    By the Lipschitz bounds of f there is no root between a and b if the lines of slope `rise` from a and `fall` from b intersect
+    below 0.
     """
     a, f_a, b, step = low.clone(), f_low.clone(), high.clone(), high - low
     least = FINEST * (high - low)

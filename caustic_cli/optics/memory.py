@@ -1,6 +1,6 @@
-"""Out of memory: the same work with fewer rays at a time.
+"""Recovery from out-of-memory errors: the work is repeated with smaller chunks of rays.
 
-Memory is taken by the rays of one chunk, and their number changes nothing but the rounding of sums.
+Memory use is proportional to the rays of a chunk, whose number changes nothing but the rounding of sums.
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ import torch
 
 from caustic_cli.errors import CausticError, is_out_of_memory
 
-#: Fewer rays at a time than these save nothing that matters.
+#: Least number of rays in a chunk: smaller ones save no memory of note.
 LEAST = 1 << 14
 T = TypeVar("T")
 
 
-def smaller(chunk: int, problem: BaseException) -> int:
-    """The number of rays to try next after memory ran out with `chunk` of them.
+def smaller_chunk(chunk: int, problem: BaseException) -> int:
+    """The chunk size to try after memory ran out with `chunk` rays.
 
     Raises:
-        CausticError: it is too small already.
-        BaseException: `problem` itself, if it is not about memory.
+        CausticError: `chunk` is the least size already.
+        BaseException: `problem` itself, if it is not an out-of-memory error.
     """
     if not is_out_of_memory(problem):
         raise problem
@@ -35,11 +35,13 @@ def smaller(chunk: int, problem: BaseException) -> int:
     return max(LEAST, chunk // 4)
 
 
-def with_less(work: Callable[[int], T], chunk: int) -> T:
-    """`work(chunk)`, again with fewer rays at a time for as long as memory runs out (see `smaller`)."""
+def with_smaller_chunks(work: Callable[[int], T], chunk: int) -> T:
+    """`work(chunk)`, repeated with smaller chunks while memory runs out (see `smaller_chunk`)."""
     while True:
         try:
             return work(chunk)
         except (MemoryError, RuntimeError) as error:
-            problem = error.with_traceback(None)  # which would hold all that was allocated
-        chunk = smaller(chunk, problem)
+            if not is_out_of_memory(error):
+                raise
+            problem = error.with_traceback(None)  # whose frames hold everything that was allocated
+        chunk = smaller_chunk(chunk, problem)

@@ -1,6 +1,6 @@
-"""The height field as triangles, for rays that have to be intersected with it (thesis 4.3.2): vertices, boxes, and the search.
+"""Triangle mesh of a height field for ray intersection (thesis 4.3.2): vertices and bounding boxes.
 
-The search itself is `kernels.mesh`.
+The search is in `kernels.mesh`.
 """
 
 from __future__ import annotations
@@ -13,24 +13,24 @@ from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels import blocks
 from caustic_cli.optics.surfaces.heightfield import HeightField
 
-#: Boxes are wider than the control net by this part of the largest height: rounding in the vertices, at degree 15.
+#: Padding of the boxes beyond the control net, relative to the largest height: rounding errors of the vertices at degree 15.
 PADDING = 256 * 2.0**-52
 
 
 def _bases(space: SplineSpace, n: int) -> Tensor:
-    """Basis values at the grid lines of `space`, every span cut in n parts: (a n + 1, control points)."""
+    """Basis values at the grid lines of `space`, with every span subdivided into n parts: (a n + 1, control points)."""
     parts = torch.arange(n, dtype=torch.float64) / n
     inner = space.breaks[:-1, None] + space.breaks.diff()[:, None] * parts
     return space.matrix(torch.cat([inner.reshape(-1), space.breaks[-1:]]))
 
 
 def vertices_of(space_u: SplineSpace, space_v: SplineSpace, heights: Tensor, n_u: int, n_v: int) -> Tensor:
-    """Heights of the surface at the grid points, every non-empty span cut in n_u and n_v: (a n_u + 1, b n_v + 1)."""
+    """Surface heights at the grid points, every non-empty span subdivided into n_u and n_v parts: (a n_u + 1, b n_v + 1), mm."""
     return _bases(space_u, n_u) @ heights.detach().double().cpu() @ _bases(space_v, n_v).T
 
 
 def boxes_of(space_u: SplineSpace, space_v: SplineSpace, heights: Tensor) -> tuple[Tensor, Tensor]:
-    """Lowest and highest control point of every non-empty knot span product (eq. 4.3.5), a little wider: (a, b) each."""
+    """Lowest and highest control point of every non-empty knot span product (eq. 4.3.5), padded: (a, b) each, mm."""
     low = high = heights.detach().double().cpu()
     pad = PADDING * float(low.abs().max())
     for axis, space in enumerate((space_u, space_v)):
@@ -41,17 +41,17 @@ def boxes_of(space_u: SplineSpace, space_v: SplineSpace, heights: Tensor) -> tup
 
 
 class TriangleMesh:
-    """A height field replaced by triangles, for rays to meet.
+    """A height field approximated by triangles.
 
     Args:
         field: the height field.
         heights: (n, m) control heights, mm.
-        n_u, n_v: parts that each knot span is cut into along x and y.
+        n_u, n_v: subdivisions of each knot span along x and y.
     """
 
     def __init__(self, field: HeightField, heights: Tensor, n_u: int, n_v: int):
         if min(n_u, n_v) < 1:
-            raise InputError(f"knot spans must be cut in at least 1 x 1 parts, got {n_u} x {n_v}")
+            raise InputError(f"knot spans must be divided into at least 1 x 1 parts, got {n_u} x {n_v}")
         self.field, self.shape = field, (n_u, n_v)
         self._breaks = [((2.0 * s.breaks - 1.0) * r).numpy() for s, r in zip(field.spaces, field.half_size, strict=True)]
         self._vertices = vertices_of(*field.spaces, heights, n_u, n_v).numpy()
@@ -60,11 +60,12 @@ class TriangleMesh:
     def intersect(
         self, x: Tensor, y: Tensor, z: Tensor, dx: Tensor, dy: Tensor, dz: Tensor, recursive: bool = True
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Times t (N,) of the rays' hits, infinite without; status (N,) int8, 0 for a hit; triangles tested (N,) int32.
+        """First intersections: parameters t (N,), infinite without one; status (N,) int8, 0 for a hit; triangles tested, (N,)
+        int32.
 
         Args:
             x, y, z, dx, dy, dz: points and directions (of any length) of rays, mm; scalars where they agree.
-            recursive: whether to look for knot span products four rectangles at a time, or through all of them.
+            recursive: find knot span products by a quadtree, or by testing all of them.
         """
         from caustic_cli.optics.kernels.mesh import intersect  # noqa: PLC0415 - numba is slow to load
 

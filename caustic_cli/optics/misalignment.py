@@ -1,11 +1,12 @@
-"""A lens that is not quite what it was meant to be, nor quite where: the light of a scene with given errors on its screen.
+"""Ray tracing of a scene with given manufacturing and alignment errors.
 
-Everything is traced in the lens' own frame.  Source and screen are carried into it, p' = R (p - c - d) + c with the lens' axes as
-rows of R, its decentre d and its entrance's middle c; so rays are drawn on the lens' aperture as always, and those of one seed
-stand at the same points of it whatever the errors: the difference of two images is one of the errors, not of the rays.
+Everything is traced in the frame of the lens.  Source and screen are transformed into it, p' = R (p - c - d) + c, with the lens'
+axes as rows of R, its decentre d and the centre c of its entrance.  Rays are sampled on the lens' aperture as usual, and rays of
+one seed have the same points there for all errors (common random numbers), so the difference of two images is due to the errors
+alone.
 
-Light from infinity comes under the direction that its and the lens' tilt leave, over the whole aperture, its profile with it.  A
-near source keeps the axis of its emission along the lens', and its power in a solid angle.
+Light from infinity arrives in the direction given by its own and the lens' tilt, over the whole aperture, with its profile fixed to
+the aperture.  The emission axis of a near source stays parallel to that of the lens, and its radiant intensity is kept.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.optics.effects import NO_REQUESTS, Requests
 from caustic_cli.optics.emission import Rays, of_member
 from caustic_cli.optics.emission.base import intensity_of
-from caustic_cli.optics.frames import Pose, turned, turned_back
+from caustic_cli.optics.frames import Pose, rotate_to_global, rotate_to_local
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.screen_shape import shape_of
 from caustic_cli.optics.surfaces import HeightField
@@ -36,7 +37,7 @@ from caustic_cli.scene.sources.several import Several
 
 @dataclass(frozen=True)
 class Misalignment:
-    """Errors of one lens in its place, as of `scene.tolerances.KINDS`; mm, degrees, source_size a part of the size."""
+    """One set of errors, see `scene.tolerances.KINDS`; mm and degrees, source_size relative to the size."""
 
     index: float = 0.0
     thickness: float = 0.0
@@ -52,7 +53,7 @@ class Misalignment:
 
     @classmethod
     def of(cls, values: Mapping[tuple[str, int], float]) -> Misalignment:
-        """From numbers by error and axis; errors that are none of a place or a scale are left out."""
+        """From values by (error, axis); errors of other kinds are ignored."""
         found: dict[str, Any] = {}
         for f in fields(cls):
             if isinstance(f.default, tuple):
@@ -62,34 +63,34 @@ class Misalignment:
         return cls(**found)
 
     def lens_pose(self, scene: Scene) -> Pose:
-        """Where the lens stands: turned about its entrance's middle, and shifted."""
+        """Pose of the lens: rotated about the centre of its entrance, and decentred."""
         return Pose((*self.lens_shift, scene.lens.z_in), self.lens_tilt)
 
     def point(self, scene: Scene, point: Sequence[float]) -> tuple[float, float, float]:
-        """A point of the scene in the lens' frame."""
+        """A point of the scene in the frame of the lens, mm."""
         pose = self.lens_pose(scene)
-        x, y, z = turned(pose, tuple(p - o for p, o in zip(point, pose.position, strict=True)))
+        x, y, z = rotate_to_local(pose, tuple(p - o for p, o in zip(point, pose.position, strict=True)))
         return x, y, z + scene.lens.z_in
 
     def screen(self, scene: Scene) -> tuple[tuple[float, float, float], tuple]:
-        """The screen's middle and axes in the lens' frame."""
+        """Centre, mm, and axes of the screen in the frame of the lens."""
         s, pose = scene.screen, self.lens_pose(scene)
         tilt = (s.tilt[0] + self.screen_tilt[0], s.tilt[1] + self.screen_tilt[1])
         middle = self.point(scene, (s.shift[0] + self.screen_shift[0], s.shift[1] + self.screen_shift[1], s.z + self.throw))
-        return middle, tuple(turned(pose, axis) for axis in Pose(tilt=tilt).axes)
+        return middle, tuple(rotate_to_local(pose, axis) for axis in Pose(tilt=tilt).axes)
 
     def scene(self, scene: Scene) -> Scene:
-        """The scene with index, source and its size as they are, in the lens' frame; the direction of light from infinity and the
-        screen are not in it.
+        """The scene with the erroneous index, source position and source size, in the frame of the lens; the direction of light
+        from infinity and the screen are unchanged.
 
         Raises:
-            InputError: the errors make an impossible scene.
+            InputError: the scene is invalid with these errors.
         """
         lens = replace(scene.lens, index=scene.lens.index + self.index) if self.index else scene.lens
         try:
             return replace(scene, lens=lens, source=self._source(scene, scene.source))
         except InputError as error:
-            raise InputError(f"an error takes the scene beyond what there can be: {error}") from error
+            raise InputError(f"with these errors the scene is invalid: {error}") from error
 
     def _source(self, scene: Scene, source: Source) -> Source:
         shift = (*self.source_shift, self.source_distance)
@@ -106,27 +107,27 @@ class Misalignment:
             if any(self.lens_tilt):
                 rays = replace(rays, positions=rays.positions @ turn.T, directions=rays.directions @ turn.T)
             return replace(source, rays=rays, position=moved(source.position))
-        return source.misplaced(moved, scale)
+        return source.displaced(moved, scale)
 
     def upright(self, scene: Scene) -> Scene:
-        """The nearest scene whose lens stands where it belongs, thickness aside.
+        """An approximately equivalent scene with the lens in its nominal position, without the thickness error.
 
-        Light from infinity comes along the axis, onto a screen that is moved by what its direction moves the picture by, and not
-        turned any further.
+        Light from infinity is parallel to the axis, and the screen is decentred by the shift of the picture that its direction
+        causes, without additional tilt.
 
         Raises:
             InputError: as of `scene`.
         """
         changed, ((x, y, z), _) = self.scene(scene), self.screen(scene)
         if scene.source.distant:
-            ahead = turned(self.lens_pose(scene), turned_back(Pose(tilt=self.source_tilt), (0.0, 0.0, 1.0)))
-            reach = abs(z - scene.lens.offset.thickness)  # a mirror's light goes back, but aside as before
+            ahead = rotate_to_local(self.lens_pose(scene), rotate_to_global(Pose(tilt=self.source_tilt), (0.0, 0.0, 1.0)))
+            reach = abs(z - scene.lens.offset.thickness)  # light from a mirror returns, with the same lateral shift
             x, y = x - reach * ahead[0] / ahead[2], y - reach * ahead[1] / ahead[2]
         return replace(changed, screen=replace(scene.screen, z=z, shift=(x, y)))
 
     def brightness(self, scene: Scene, changed: Scene) -> float:
-        """What the power of a near source that shines into the narrowest cone is multiplied with, since that cone follows the
-        source's place, so that its power in a solid angle stays."""
+        """Factor of the power that keeps the radiant intensity of a near source whose cone is the narrowest that covers the lens,
+        since that cone changes with the source's position."""
         before = scene.source
         if before.distant or before.cone is not None or before.rays is not None or len(before.members) > 1:
             return 1.0
@@ -139,17 +140,18 @@ class Misalignment:
         return float(axial[0]) / float(axial[1])
 
     def directed(self, scene: Scene, source: Source, state: RayState) -> RayState:
-        """Rays of light from infinity, turned as source and lens are; others as they are."""
+        """Rays of light from infinity rotated by the tilts of source and lens; other rays unchanged."""
         if not source.distant or not (any(self.source_tilt) or any(self.lens_tilt)):
             return state
-        state = state.spread()
-        direction = turned(self.lens_pose(scene), turned_back(Pose(tilt=self.source_tilt), state.direction))
+        state = state.expanded()
+        direction = rotate_to_local(self.lens_pose(scene), rotate_to_global(Pose(tilt=self.source_tilt), state.direction))
         return replace(state, direction=direction, sample=None)
 
 
 @dataclass(frozen=True)
-class Landed:
-    """Rays on the screen: x, y on its own axes from its middle, mm, and power (N,), float64; channel: of a coloured image."""
+class LandingPoints:
+    """Landing points on the screen: x, y along its axes from its centre, mm, and power, (N,) float64; channel: of a coloured
+    image."""
 
     x: Tensor
     y: Tensor
@@ -157,20 +159,20 @@ class Landed:
     channel: int | None = None
 
 
-def landed(
+def landing_points(
     scene: Scene,
     field: HeightField,
     heights: Tensor,
     rays: Rays,
     errors: Misalignment,
     requests: Requests = NO_REQUESTS,
-) -> Iterator[Landed]:
-    """Rays of a scene with these errors on its screen, chunk by chunk.
+) -> Iterator[LandingPoints]:
+    """Landing points of a scene with these errors, chunk by chunk.
 
     Args:
-        heights: (n, m) mm, of the surface as made; its thickness error is added here.
-        rays: drawn for `errors.scene(scene)`.
-        requests: of the plan of the scene without errors.
+        heights: (n, m) mm, of the surface as manufactured; the thickness error is added here.
+        rays: sampled for `errors.scene(scene)`.
+        requests: of the plan of the nominal scene.
     """
     changed = errors.scene(scene)
     scale = errors.brightness(scene, changed)
@@ -178,13 +180,13 @@ def landed(
     parameters = {EXIT: heights + errors.thickness}
     with torch.no_grad():
         for band, plain in zip(changed.bands, scene.bands, strict=True):
-            if errors.index and band.scene.lens.index == plain.scene.lens.index:  # the index of a glass, by its own formula
+            if errors.index and band.scene.lens.index == plain.scene.lens.index:  # a glass, by its formula
                 lens = replace(band.scene.lens, index=plain.scene.lens.index + errors.index)
                 band = replace(band, scene=replace(band.scene, lens=lens))
             system = System.of(band.scene, field)
             for state in of_member(rays, band.member).chunks(CHUNK):
                 if not isinstance(state, RayState):
-                    state = RayState.on_axis(state, system.pupil.half_size, system.pupil.z).spread()
+                    state = RayState.on_axis(state, system.pupil.half_size, system.pupil.z).expanded()
                 state = errors.directed(scene, band.scene.source, state)
                 tracer = Tracer(system, state, torch.float64, requests)
                 forward = math.copysign(1.0, sum(a * b for a, b in zip(system.axis, axes[2], strict=True)))
@@ -193,16 +195,16 @@ def landed(
                     middle = (point[0], point[1], point[2] - out.datum)
                     x, y, there = land(out.origin, out.direction, middle, axes, forward)
                     power = torch.where(there, out.power, torch.zeros_like(out.power)) * (band.weight * scale)
-                    yield Landed(x.double(), y.double(), power.double(), band.channel)
+                    yield LandingPoints(x.double(), y.double(), power.double(), band.channel)
 
 
-def idle(scene: Scene, error: str) -> str:
-    """Why an error means nothing in a scene, "" where it does."""
+def reason_ignored(scene: Scene, error: str) -> str:
+    """Why an error has no effect in a scene; "" if it has one."""
     source = scene.source
     if error in ("source_shift", "source_distance") and source.distant:
-        return "light from infinity stands nowhere; source_tilt is its direction"
+        return "a source at infinity has no position; source_tilt is its direction"
     if error == "source_tilt" and not source.distant:
-        return "the source stands somewhere; source_shift moves it"
+        return "the source is at a finite distance; source_shift moves it"
     if error == "source_size" and not source.sized:
         return f"{source.label} has no size"
     if error == "index" and scene.lens.mirror:

@@ -1,8 +1,8 @@
-"""Which effects a scene calls for, and why: compiled once from the scene and the heights, by proof where there is one.
+"""The simulation plan: which physical effects a scene needs, and why, decided from rigorous bounds where there are any.
 
-A plan holds the scene without the effects that are left out, and what to ask of the trace beyond what that scene says.  What is in
-neither is not executed at all.  A design, whose heights change, goes by the scene alone: bounds proved for one surface say nothing
-about the next, and the masks for total reflection and missed surfaces stay in its path, where they cost nothing.
+A plan holds the scene without the omitted effects, and requests to the tracer that the scene does not express.  Effects in neither
+are not executed.  A design, whose heights change, uses the scene alone: bounds for one surface say nothing about the next, and the
+masks for total reflection and missed surfaces stay in its path, where they cost nothing.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from caustic_cli.scene import Scene
 
 @dataclass(frozen=True)
 class Plan:
-    """effects, a decision on each of EFFECTS; scene, what to trace; requests, how."""
+    """effects: a decision on each of EFFECTS; scene: the scene to trace; requests: to the tracer."""
 
     effects: tuple[Decision, ...]
     scene: Scene
@@ -33,15 +33,15 @@ class Plan:
 
     @property
     def simulated(self) -> tuple[str, ...]:
-        """Names of the effects that are on."""
+        """Names of the effects that are simulated."""
         return tuple(e.name for e in self.effects if e.on)
 
 
 def parse_effects(text: str) -> frozenset[str] | None:
-    """What effects says: None for auto, else the names.
+    """The value of the option effects: None for auto, otherwise the set of names.
 
     Raises:
-        InputError: an unknown name.
+        InputError: a name is unknown.
     """
     if text.strip() == "auto":
         return None
@@ -61,12 +61,12 @@ def compile_plan(
     """The plan of a scene at heights (n, m) mm.
 
     Args:
-        wanted: names of the effects to simulate instead of those that the scene calls for, or None; one without which there is
-            no image stays on.
-        steeper: by how much the slopes of what is traced may exceed those of the spline.
+        wanted: names of the effects to simulate, or None for those that the scene needs; an effect without which there is no image
+            stays on.
+        steeper: by how much slopes of the traced surface may exceed those of the spline.
     """
     bounds = bounds_of(scene, field, heights, steeper)
-    decisions = [effect.judge(scene, bounds) for effect in EFFECTS]
+    decisions = [effect.decide(scene, bounds) for effect in EFFECTS]
     if wanted is not None:
         chosen = frozenset(wanted)
         decisions = [
@@ -81,6 +81,6 @@ def compile_plan(
         ]
     traced, requests = scene, NO_REQUESTS
     for effect, decision in zip(EFFECTS, decisions, strict=True):
-        traced = effect.within(traced) if decision.on else effect.without(traced)
+        traced = effect.including(traced) if decision.on else effect.without(traced)
         requests |= effect.request(scene, decision.on, bounds)
     return Plan(tuple(decisions), traced, requests)

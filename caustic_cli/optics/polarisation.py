@@ -1,12 +1,12 @@
-"""Linearly polarised light through an interface, s and p apart.
+"""Linearly polarised light at an interface, decomposed into s and p components.
 
 Notation
-    d, t    unit directions before and behind the interface;  N the normal of a height field, (-z_x, -z_y, 1)
-    E       unit vector of the field, normal to d
+    d, t    unit directions in front of and behind the interface;  N the normal of a height field, (-z_x, -z_y, 1)
+    E       unit vector of the electric field, perpendicular to d
     s, p    s = d x N / |d x N|, normal to the plane of incidence;  p = s x d within it
 
-Fresnel's amplitudes behind are t_s E_s and t_p E_p; light without retardation stays linearly polarised.  In normal incidence s
-and p are the same and any plane of incidence will do.  Born and Wolf, Principles of Optics, 1.5.2.
+The transmitted amplitudes are t_s E_s and t_p E_p; without retardation the light stays linearly polarised.  At normal incidence s
+and p are equivalent, and any plane of incidence will do.  Born and Wolf, Principles of Optics, 1.5.2.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from torch import Tensor
 from caustic_cli.optics.tolerances import NORMAL
 
 
-def field_of(angle: float, d):
-    """E of light polarised along `angle` (degrees from +x) on the axis, in direction d: turned with it, without twist."""
+def polarisation_vector(angle: float, d):
+    """E of light in direction d, polarised along `angle` (degrees from +x) on the axis: rotated with d by parallel transport."""
     a = math.radians(angle)
     ax, ay = math.cos(a), math.sin(a)
     along = (ax * d[0] + ay * d[1]) / (1.0 + d[2])
     return ax - along * d[0], ay - along * d[1], -along * (1.0 + d[2])
 
 
-def part_s(e, d, normal):
-    """Part of the power that is s-polarised at an interface."""
+def s_fraction(e, d, normal):
+    """Fraction of the power that is s-polarised at an interface, (N,); 1/2 at normal incidence."""
     s, square = _across(d, normal)
     across = _dot(e, s)
     return torch.where(square > NORMAL, across * across / square.clamp_min(NORMAL), torch.full_like(square, 0.5))
 
 
-def beyond(e, d, t, normal, c, s, eta: float):
-    """E behind an interface; c, s as of `interface.refract`."""
+def transmitted_field(e, d, t, normal, c, s, eta: float):
+    """E behind an interface, a unit vector; c, s as for `interface.refract`."""
     sx, square = _across(d, normal)
     length = square.clamp_min(NORMAL).sqrt()
     unit = tuple(v / length for v in sx)

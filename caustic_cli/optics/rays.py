@@ -1,14 +1,14 @@
-"""The one state of light between source and screen: rays, what they carry, and what was lost on the way.
+"""The ray state: the representation of light between source and screen, with the account of losses.
 
 Notation, a ray of N
-    o       origin, (x, y, z), z counted from `datum`, mm
+    o       origin, (x, y, z), z measured from `datum`, mm
     d       unit direction
-    power   part of what the source emits
-    path    optical path length, the sum of n t over the media behind it, mm
-    E       unit vector of the field of linearly polarised light, normal to d; None where that is not asked for
+    power   fraction of the source's power
+    path    optical path length so far, the sum of n t over the media, mm
+    E       unit vector of the electric field of linearly polarised light, perpendicular to d; None if not tracked
 
-Components of o, d and E are (N,) tensors, or plain floats where all rays share them: the products with 0 and 1 of a plane wave
-are then never computed.  Sources emit such rays, every element hands them on, screens collect them.
+Components of o, d and E are (N,) tensors, or plain floats where all rays share them, so that products with the 0 and 1 of a plane
+wave are never computed.  Sources emit ray states, elements transform them, screens collect them.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from torch import Tensor
 
 from caustic_cli.optics.sampling import Sample
 
-#: What may become of the source's power besides the image; with it they sum to 1.
+#: Kinds of losses; with the image they sum to the source's power, 1.
 LOSSES = ("missed_lens", "missed_surface", "total_internal_reflection", "fresnel", "absorbed", "off_screen")
 
 Vector = tuple
 
 
 class Status(IntEnum):
-    """What became of a ray before the screen."""
+    """Outcome of a ray in front of the screen."""
 
     OK = 0
     TOTAL_INTERNAL_REFLECTION = 1
@@ -39,12 +39,12 @@ class Status(IntEnum):
 
 @dataclass
 class RayState:
-    """Rays at one place of their way.
+    """Rays at one stage of a trace.
 
-    origin, direction, power, path, polarised (E): see above; status (N,) int64, a `Status` each, None while all are OK; lost, the
-    power lost so far, by a name of LOSSES; wavelength, nm, None where no medium asks; sample, the points of the aperture on which
-    rays of a plane wave stand, all of which still run along the axis; datum, mm; leaving, the power that left the last element, of
-    rays that have got to a screen.
+    origin, direction, power, path, polarised (E): see the module; status: (N,) int64, a `Status` each, None while all are OK; lost:
+    power lost so far, by name, see LOSSES; wavelength: nm, None if no medium needs it; sample: points of the aperture through which
+    the rays of a plane wave pass while they are still parallel to the axis; datum: mm; leaving: power behind the last element, for
+    rays on a screen.
     """
 
     origin: Vector
@@ -66,23 +66,23 @@ class RayState:
 
     @property
     def along_axis(self) -> bool:
-        """Whether they are those of a plane wave along the axis, known by their sample of the aperture."""
+        """Whether they are rays of an axial plane wave with a sample of the aperture."""
         return self.sample is not None and self.direction == (0.0, 0.0, 1.0)
 
     def total(self, power: Tensor) -> Tensor:
-        """Power of all rays together: of a number that all of them carry, so many times that."""
+        """Total power, (); a scalar `power` is that of each ray."""
         return power.sum(dtype=torch.float64) if power.ndim else power.double() * self.count
 
     def lose(self, name: str, power: Tensor) -> None:
-        """Enter power of each ray in the account."""
+        """Add the rays' power to the account of losses under `name`."""
         self.book(name, self.total(power))
 
     def book(self, name: str, amount: Tensor | float) -> None:
-        """Enter an amount of power in the account."""
+        """Add an amount of power to the account of losses under `name`."""
         self.lost[name] = self.lost.get(name, 0.0) + amount
 
     def mark(self, where: Tensor, status: Status) -> None:
-        """Say what became of the rays `where`, if nothing has been said before."""
+        """Set the status of the rays `where` that are still OK."""
         before = torch.zeros(where.shape, dtype=torch.int64, device=where.device) if self.status is None else self.status
         self.status = torch.where(where & (before == Status.OK), int(status), before)
 
@@ -93,14 +93,14 @@ class RayState:
         return self.status
 
     def counted_from(self, datum: float) -> RayState:
-        """The same rays with z counted from another height."""
+        """The same rays with z measured from another datum, mm."""
         if datum == self.datum:
             return self
         x, y, z = self.origin
         return replace(self, origin=(x, y, z - (datum - self.datum)), lost=dict(self.lost), datum=datum)
 
     def full(self, vector: Vector) -> Vector:
-        """A vector of this state with every component (N,)."""
+        """A vector of this state with all components expanded to (N,)."""
         return tuple(c if isinstance(c, Tensor) else torch.full_like(self.power, c) for c in vector)
 
     def to(self, dtype: torch.dtype) -> RayState:
@@ -121,15 +121,15 @@ class RayState:
 
     @classmethod
     def on_axis(cls, sample: Sample, half_size: tuple[float, float], z: float) -> RayState:
-        """Rays along +z through the points of a sample of an aperture of half widths `half_size` at z, mm."""
+        """Rays parallel to +z through sampled points of an aperture of half widths `half_size` at z, mm."""
         (rx, ry) = half_size
         x, y = (2.0 * sample.u - 1.0) * rx, (2.0 * sample.v - 1.0) * ry
         if sample.tensor:
             x, y = x[:, None], y[None, :]
         return cls((x, y, z), (0.0, 0.0, 1.0), sample.flux, sample=sample)
 
-    def spread(self) -> RayState:
-        """The same with x, y and power (N,): of a sample they are rows, columns and a number until rays go their own ways."""
+    def expanded(self) -> RayState:
+        """The same rays with x, y and power expanded to (N,): of a tensor-product sample they are a column, a row and a number."""
         s = self.sample
         if s is None or (not s.tensor and self.power.ndim):
             return self

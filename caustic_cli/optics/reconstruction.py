@@ -1,14 +1,14 @@
-"""From landing points to an image: bincount, truncated Gaussian, raised cosine (thesis 4.4).
+"""Image reconstruction from landing points (splatting): bincount, truncated Gaussian or raised-cosine filters (thesis 4.4).
 
 Notation, in pixels (w = 1)
-    x        landing coordinate, 0 at the frame's low edge
-    i0       pixel that holds it, floor(x);  phi = x - i0 in [0, 1)
+    x        landing coordinate, 0 at the lower edge of the frame
+    i0       index of its pixel, floor(x);  phi = x - i0 in [0, 1)
     v        filter size, odd;  r = (v - 1) / 2
     d_k      distance k + 1/2 - phi from the centre of pixel i0 + k, k = -r..r
 
-Every ray's weights are normalised over its v x v pixels, so its weight is conserved.  Rays in the r ghost pixels around
-the frame still reach into it; their weights reach 2 r pixels out, so the image is accumulated on a frame padded by 2 r
-and cropped (errata E7 and E8).  What falls on the padding is counted as lost, never renormalised.
+The weights of a ray are normalised over its v x v pixels, so its power is conserved.  Rays within r pixels outside the frame still
+contribute to it, and their weights extend to 2 r pixels, so the image is accumulated on a frame padded by 2 r and cropped (errata
+E7 and E8).  Power on the padding is counted as lost, never renormalised.
 """
 
 from __future__ import annotations
@@ -51,11 +51,11 @@ class Filter:
 
     @property
     def reach(self) -> tuple[int, int]:
-        """Pixels a share can travel from the ray's own, (r_x, r_y)."""
+        """Radius of the filter, (r_x, r_y) pixels."""
         return (0, 0) if self.kind == "bincount" else ((self.size[0] - 1) // 2, (self.size[1] - 1) // 2)
 
     def weights(self, phi: Tensor, axis: int) -> Tensor:
-        """Shares of a ray at sub-pixel position phi (...) among its v pixels along an axis: (..., v), sum 1."""
+        """Weights of a ray at sub-pixel position phi (...) on its v pixels along an axis: (..., v), sum 1."""
         r = self.reach[axis]
         v = 2 * r + 1
         if v == 1:
@@ -77,16 +77,16 @@ class Filter:
         return f / f.sum(-1, keepdim=True)
 
     def kernel(self, axis: int) -> Tensor:
-        """Mean weights of rays spread evenly over a pixel: (v,), float64, sum 1.
+        """Mean weights of rays uniformly distributed over a pixel: (v,), float64, sum 1.
 
-        Convolving a target with it gives the image a perfect lens would render: both sides of a loss, filtered alike.
+        A target convolved with it is filtered like the image of a perfect lens, so that a loss compares like with like.
         """
         fine = 512
         phi = (torch.arange(fine, dtype=torch.float64) + 0.5) / fine
         return self.weights(phi, axis).mean(0)
 
     def smooth(self, image: Tensor) -> Tensor:
-        """`image` (n_x, n_y) as this filter would render it; light that leaves the frame is lost."""
+        """`image` (n_x, n_y) convolved with the mean weights; light outside the frame is lost."""
         kernels = [self.kernel(axis).to(image) for axis in (0, 1)]
         out = image[None, None]
         out = torch.nn.functional.conv2d(out, kernels[0].view(1, 1, -1, 1), padding=(self.reach[0], 0))
@@ -101,8 +101,7 @@ def splat(x: Tensor, y: Tensor, weight: Tensor, screen: Screen, filter: Filter) 
         weight: power of each ray; differentiable.
 
     Returns:
-        image (n_x, n_y), power per pixel; off_screen, the power that fell outside the frame; both float64.  They sum to
-        weight.sum().
+        image (n_x, n_y), power per pixel; off_screen, the power outside the frame; both float64.  They sum to weight.sum().
     """
     x, y, weight = x.reshape(-1), y.reshape(-1), weight.reshape(-1)
     first, weights = [], []
@@ -113,14 +112,14 @@ def splat(x: Tensor, y: Tensor, weight: Tensor, screen: Screen, filter: Filter) 
         near = (at >= -r) & (at < n + r)  # False for NaN and infinity too, so that floor() below is always defined
         at = torch.where(near, at, torch.zeros_like(at))
         i0 = at.detach().floor()
-        first.append(i0.long() + r)  # index of the first share on the padded frame, whose origin is -2 r
+        first.append(i0.long() + r)  # index of the first weight on the padded frame, whose origin is -2 r
         weights.append(filter.weights(at - i0, axis))
         inside = near if inside is None else inside & near
     assert inside is not None
     kept = torch.where(inside, weight, torch.zeros_like(weight))
     (nx, ny), (rx, ry) = screen.resolution, filter.reach
     shape = (nx + 4 * rx, ny + 4 * ry)
-    padded = torch.zeros(shape[0] * shape[1], dtype=torch.float64, device=x.device)  # float32 stops counting at 2^24 rays
+    padded = torch.zeros(shape[0] * shape[1], dtype=torch.float64, device=x.device)  # float32 would saturate at 2^24 rays
     for k in range(weights[0].shape[1]):
         at = ((first[0] + k) * shape[1] + first[1])[:, None] + torch.arange(weights[1].shape[1], device=x.device)
         part = (kept * weights[0][:, k])[:, None] * weights[1]

@@ -1,7 +1,7 @@
-"""Where light meets the free-form surface that has met it before, with derivatives by the ray as well as by the heights.
+"""Secondary intersections of rays that start on a free-form surface, with derivatives by rays and heights.
 
-Such a ray starts wherever the surface sent it, so o and d depend on the heights.  Differentiated at a root t of
-f = o_z + t d_z - Z(o_x + t d_x, o_y + t d_y), everything that moves the ray moves the hit.
+Origin o and direction d of such a ray depend on the heights.  The root t of f = o_z + t d_z - Z(o_x + t d_x, o_y + t d_y) is
+therefore differentiated by both.
 """
 
 from __future__ import annotations
@@ -13,26 +13,27 @@ from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.intersection import attach
 from caustic_cli.optics.surfaces import HeightField
 
-#: Least steps of the search over a knot span: a dip under the surface narrower than that is not seen.  It carries little light, at
+#: Least step of the search, in parts of a knot span: a narrower excursion below the surface is missed.  It carries little light, at
 #: grazing incidence.
 STEPS_PER_SPAN = 128
-#: Most steps of one search: a ray that crept along the whole diagonal of the largest net would need more.
+#: Largest number of steps of a search, less than a ray along the whole diagonal of the largest net would need.
 MOST_STEPS = 1 << 18
-#: Halvings of a step: it is then shorter than a rounding of the lens' size.
+#: Number of bisections of a step, after which it is below a rounding of the lens' size.
 HALVINGS = 50
 
 
 @torch.no_grad()
-def again(field: HeightField, heights: Tensor, o, d, below: bool, round: bool = False) -> tuple[Tensor, Tensor]:
-    """Next intersection with the surface of rays that start on it, by steps and bisection.
+def next_intersection(field: HeightField, heights: Tensor, o, d, below: bool, round: bool = False) -> tuple[Tensor, Tensor]:
+    """Next intersection of rays that start on the surface, by marching and bisection.
 
-    The slopes bound how fast a ray can come nearer, so its distance from the surface is a step that cannot miss it.
+    The bound of the slopes bounds the rate of approach, so the step derived from the height above the surface cannot pass through
+    it (sphere tracing).
 
     Args:
         heights: (n, m) mm.
-        o: (x, y, z) of the start, (N,) float64 each, mm; d: unit directions.
-        below: whether the rays run under the surface, or above it.
-        round: the surface ends at the circle inscribed in its aperture.
+        o: (x, y, z) of the origins, (N,) float64 each, mm; d: unit directions.
+        below: whether the rays start below the surface, or above it.
+        round: whether the surface ends at the circle inscribed in its aperture.
 
     Returns:
         t (N,) mm, 0 where there is none; found (N,) bool.
@@ -41,17 +42,17 @@ def again(field: HeightField, heights: Tensor, o, d, below: bool, round: bool = 
     o, d = ([c.detach().double() for c in v] for v in (o, d))
     step = min(2.0 * r * float(torch.diff(s.breaks).min()) for s, r in zip(field.spaces, field.half_size, strict=True))
     step /= STEPS_PER_SPAN
-    t = backend_for(h.device).next_meetings(field, h, o, d, below, round, step)
+    t = backend_for(h.device).next_intersections(field, h, o, d, below, round, step)
     return t, t > 0
 
 
 @torch.no_grad()
 def reference(field: HeightField, h: Tensor, o, d, below: bool, round: bool, step: float) -> Tensor:
-    """The same distances in plain torch, from float64; `step` mm is the least one."""
+    """Distances (N,) mm, 0 where there is none, in plain torch, from float64; step: least step, mm."""
     side, (rx, ry), (lowest, highest) = -1.0 if below else 1.0, field.half_size, (float(h.min()), float(h.max()))
     gx, gy = field.slope_bounds(h)
     t_found, reached = torch.zeros_like(o[0]), torch.zeros_like(o[0])
-    rise = side * d[2] - gx * d[0].abs() - gy * d[1].abs()  # where it is positive, no slope of the surface catches the ray
+    rise = side * d[2] - gx * d[0].abs() - gy * d[1].abs()  # positive: the ray rises faster than the surface can
     at = (rise <= 0).nonzero()[:, 0]
     before = torch.full_like(t_found, 1e-3 * step)[at]
 
@@ -85,8 +86,8 @@ def reference(field: HeightField, h: Tensor, o, d, below: bool, round: bool, ste
     return t_found
 
 
-def touch(field: HeightField, heights: Tensor, o, d, t: Tensor):
-    """The hit at distance t (N,), not differentiated, of rays o, d that may depend on the heights.
+def hit_with_derivatives(field: HeightField, heights: Tensor, o, d, t: Tensor):
+    """The points of intersection at distances t (N,) without derivatives, for rays o, d that may depend on the heights.
 
     Returns:
         (x, y, z) mm, slopes (z_x, z_y), and the distance, (N,) each, with their first derivatives.

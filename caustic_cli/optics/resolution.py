@@ -1,7 +1,7 @@
-"""What diffraction lets a lens show: the width over which it blurs, how many details that leaves, and which light is meant.
+"""Resolution limit of a lens: the blur by diffraction and source extent, and the number of resolvable details.
 
-The phase of a lens of local magnification M, thrown over L, blurs a point over about sqrt(lambda L M): the geometric mean of the
-Fresnel scale and what M makes of it.
+At local magnification M and distance L, diffraction blurs a point to a width of about sqrt(lambda L M), the geometric mean of the
+Fresnel scale sqrt(lambda L) and M times that scale.
 """
 
 from __future__ import annotations
@@ -16,31 +16,31 @@ from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.surfaces.base import FIRST, SECOND
 from caustic_cli.scene import Lens, Scene
 
-#: nm: the wavelength at which light without one is judged, and the band of white light.
+#: Wavelength, nm, that represents light of unspecified wavelength, and the band of white light.
 GREEN, BAND = 550.0, (450.0, 650.0)
-#: Wavelengths that stand for white light in an image.
+#: Number of wavelengths that represent white light in an image.
 WHITE_LINES = 6
-#: Diffraction matters where it widens what source and pixel blur anyway by more than this part.
+#: Relative increase of the blur of source and pixel from which on diffraction matters.
 WIDENED = 0.05
-#: Points along each axis of the lens at which its local magnification is looked at.
+#: Points along each axis of the lens at which the local magnification is evaluated.
 POINTS = 128
 
 
 def white(count: int) -> tuple[float, ...]:
-    """Wavelengths, nm, for white light: the middles of so many equal parts of its band."""
+    """Wavelengths, nm, that represent white light: midpoints of `count` equal parts of its band."""
     low, high = BAND
     return tuple(low + (k + 0.5) * (high - low) / count for k in range(count))
 
 
 def diffraction_blur(wavelength: float, throw: float, magnification: float) -> float:
-    """sqrt(lambda L M), mm, of a wavelength in nm."""
+    """Blur by diffraction, sqrt(lambda L M), mm; wavelength in nm, throw L in mm."""
     return math.sqrt(wavelength * 1e-6 * abs(throw) * abs(magnification))
 
 
 @dataclass(frozen=True)
 class Resolution:
-    """Widths, mm on the screen, over which diffraction and the source blur, of a pixel, and of the picture; that of the lens; and
-    the wavelength that was judged by, nm, with whether the scene says it."""
+    """Widths on the screen, mm: blur by diffraction and by the source, pixel, picture; width of the lens, mm; and the wavelength
+    assumed, nm, with whether the scene specifies it."""
 
     diffraction: float
     source: float
@@ -52,7 +52,7 @@ class Resolution:
 
     @classmethod
     def of(cls, scene: Scene, picture: float, magnification: float) -> Resolution:
-        """What holds in a scene whose picture is so many mm wide, by a lens of that (local) magnification."""
+        """Of a scene with a picture of this width, mm, and a lens of this (local) magnification."""
         lens, screen = scene.lens, scene.screen
         said = scene.light.wavelengths
         wavelength = sum(w * p for w, p in zip(said, scene.light.parts, strict=True)) if said else GREEN
@@ -69,52 +69,52 @@ class Resolution:
 
     @classmethod
     def before(cls, scene: Scene, picture: tuple[float, float]) -> Resolution:
-        """What will hold of a lens for a picture of this width and height, mm, with the magnification that it, or each lenslet of
-        an array, is to have."""
+        """Of a lens to be designed, for a picture of this width and height, mm, from the nominal magnification of the lens or of
+        each lenslet."""
         (w, h), (lw, lh) = picture, (width / k for width, k in zip(scene.lens.size, scene.lens.array, strict=True))
         return cls.of(scene, w, math.sqrt(w * h / (lw * lh)))
 
     @classmethod
     def at(cls, scene: Scene, field: HeightField, heights: Tensor) -> Resolution:
-        """The same of a lens with these heights (n, m) mm, by its own local magnification; the picture is the screen.  Of two
-        free-form sides, or beside other elements, by that which it is to have."""
+        """Of a lens with heights (n, m) mm, from its local magnification, with the screen for the picture; with two free-form sides
+        or other elements from the nominal magnification."""
         if scene.two_sided or scene.elements:
             return cls.before(scene, scene.screen.size)
         return cls.of(scene, scene.screen.size[0], local_magnification(scene, field, heights))
 
     @property
     def blur(self) -> float:
-        """Of diffraction and source."""
+        """Combined blur of diffraction and source, mm."""
         return math.hypot(self.diffraction, self.source)
 
     @property
     def widened(self) -> float:
-        """By what part diffraction widens what source and pixel blur anyway."""
+        """Relative increase of the blur of source and pixel by diffraction."""
         without = math.hypot(self.source, self.pixel)
         return math.hypot(self.diffraction, without) / without - 1.0
 
     @property
     def matters(self) -> bool:
-        """Whether rays alone would show too much."""
+        """Whether diffraction is significant."""
         return self.widened > WIDENED
 
     @property
     def wanted(self) -> int:
-        """Details across the picture that the pixels can show."""
+        """Number of details across the picture that the pixels can represent."""
         return max(1, round(self.picture / self.pixel))
 
     @property
     def resolvable(self) -> int:
-        """Details across the picture that light carries, at most a pixel each."""
+        """Number of details across the picture that are resolved, at most one per pixel."""
         return max(1, min(self.wanted, round(self.picture / self.blur))) if self.blur > 0 else self.wanted
 
     def lens_for_all(self) -> float | None:
-        """Width of a lens, mm, at the same throw and magnification that would carry a detail for every pixel; None where this one
-        does.  The picture grows with the lens, the blurs do not."""
+        """Width of a lens, mm, that would resolve every pixel at the same throw and magnification; None if this one does.  The
+        picture scales with the lens, the blurs do not."""
         return None if self.resolvable >= self.wanted else self.lens * self.blur * self.wanted / self.picture
 
     def sentence(self) -> str:
-        """What light carries here."""
+        """The resolution limit as a sentence."""
         n = self.resolvable
         text = (
             f"light carries about {n} x {n} details here (diffraction {self.diffraction:.2g} mm, source {self.source:.2g} mm"
@@ -126,10 +126,10 @@ class Resolution:
 
 @dataclass(frozen=True)
 class Paraxial:
-    """A lens to first order at even points of it: x, y (N,), mm; the surface's slopes gx, gy there and its second derivatives xx,
-    xy, yy, 1/mm; throw, mm; straight, what light that is not turned at all is magnified by.
+    """A lens to first order at points of a uniform grid: x, y (N,), mm; slopes gx, gy of the surface and second derivatives xx, xy,
+    yy, 1/mm; throw, mm; straight, the magnification of undeflected light by its divergence.
 
-    Light that a slope g turns by c g lands at X = x straight + throw c g.
+    Light that is deflected by c times the slope g lands at X = x straight + throw c g.
     """
 
     x: Tensor
@@ -144,12 +144,12 @@ class Paraxial:
 
 
 def _seen_from(lens: Lens) -> float:
-    """z, mm, from which a source is as far away as a point of the exit sees it: through glass, which is index times thinner."""
+    """z, mm, from which the apparent distance of a source at the exit is measured: glass appears thinner by the factor n."""
     return lens.z_in + (lens.offset.thickness - lens.z_in) / lens.inside
 
 
 def paraxial(scene: Scene, field: HeightField, heights: Tensor) -> Paraxial:
-    """The lens of a scene with these heights (n, m) mm at POINTS^2 points, in light of its source's centre."""
+    """Paraxial data of a scene's lens with heights (n, m) mm at POINTS^2 points, for light from the source's centre."""
     lens = scene.lens
     distance = abs(scene.screen.z - lens.offset.thickness)
     vergence = 0.0 if scene.source.distant else 1.0 / (_seen_from(lens) - scene.source.centre[2])
@@ -160,7 +160,7 @@ def paraxial(scene: Scene, field: HeightField, heights: Tensor) -> Paraxial:
 
 
 def local_magnification(scene: Scene, field: HeightField, heights: Tensor) -> float:
-    """Root of the mean area over which a lens throws light, over its own: paraxial, from the surface's second derivatives.
+    """Square root of the mean areal magnification |det dX/ds|: paraxial, from the surface's second derivatives.
 
     Light from s lands at X = s (1 + L / a) + L g grad h, a the distance of the source and g = n - 1, or 2 for a mirror.
     """

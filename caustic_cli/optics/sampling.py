@@ -1,14 +1,14 @@
-"""Where rays start: samples of the unit square (u, v), the lens' aperture (thesis 4.2.1).
+"""Ray sampling: points of the unit square (u, v), which is mapped to the lens' aperture (thesis 4.2.1).
 
-Every random number is a hash of (seed, dimension, ray index), so a sample does not depend on how it is cut into
-chunks, on the device or on the number of threads, and any ray can be traced again alone.
+Random numbers are hashes of (seed, dimension, ray index) (a counter-based generator), so a sample does not depend on its division
+into chunks, on the device or on the number of threads, and any ray can be traced again individually.
 
     grid        centres of nu x nv equal cells
-    lines       a grid whose columns and rows are each shifted at random within their cell: fresh rays that keep the
-                tensor-product structure which makes a spline surface cheap to evaluate
-    stratified  one ray anywhere in each cell (the perturbed grid of 4.2.1, kept inside [0, 1]: erratum E9)
-    uniform     independent rays
-    sobol       a scrambled Sobol sequence (torch's), which fills the square more evenly than chance
+    lines       a grid whose columns and rows are each jittered within their cells: random rays with the tensor-product structure
+                that makes a spline surface cheap to evaluate
+    stratified  one uniformly distributed ray in each cell (the perturbed grid of 4.2.1, kept inside [0, 1]: erratum E9)
+    uniform     independent, uniformly distributed rays
+    sobol       a scrambled Sobol sequence (torch's), of low discrepancy
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from torch import Tensor
 from caustic_cli.errors import InputError
 from caustic_cli.optics.backends import backend_for
 
-#: Kinds whose points are rows and columns, and all kinds.
+#: Samplers with tensor-product structure, and all samplers.
 TENSOR = ("grid", "lines")
 SAMPLERS = (*TENSOR, "stratified", "uniform", "sobol")
-#: Length of torch's Sobol sequence.
+#: Largest length of torch's Sobol sequence.
 SOBOL_RAYS = 1 << 30
-#: Largest of `normal_numbers`, whose uniform ones are at least 2^-33.
+#: Largest value of `normal_numbers`, whose uniform numbers are at least 2^-33.
 LARGEST_NORMAL = math.sqrt(66.0 * math.log(2.0))
 _MASK = 0xFFFFFFFF
 
@@ -57,18 +57,18 @@ def normal_numbers(seed: int, index: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def key(seed: int, dimension: int) -> int:
-    """What a ray's index is mixed with."""
+    """Hash key of a seed and dimension, to be combined with a ray's index."""
     start = torch.tensor((seed * 0x9E3779B1 + dimension * 0x85EBCA77 + 1) & _MASK) ^ ((seed >> 16) & _MASK)
     return int(_mix(start))
 
 
 def salt(dimension: int) -> int:
-    """What keeps the dimensions of one seed apart."""
+    """Additive constant that decorrelates the dimensions of one seed."""
     return 0x632BE5AB * (dimension + 1)
 
 
 def stream(seed: int, name: str) -> int:
-    """A seed for the rays of one purpose ("render", "stage 3"), unrelated to the same user's seed for another."""
+    """A seed for one purpose ("render", "stage 3"), independent of those for other purposes."""
     return zlib.crc32(f"{seed}/{name}".encode())
 
 
@@ -77,7 +77,8 @@ def numbers(
 ) -> list[Tensor]:
     """Points of the unit cube for rays start..stop: `dimensions` tensors (stop - start,) float64.
 
-    The first two fill nu x nv cells, over and over for more rays than cells; the others are independent, or Sobol's.
+    The first two dimensions are stratified in nu x nv cells, repeatedly if there are more rays than cells; the others are
+    independent, or further dimensions of the Sobol sequence.
     """
     if kind == "sobol":
         if stop > SOBOL_RAYS:
@@ -99,9 +100,9 @@ def numbers(
 
 
 def _forwarded(engine: torch.quasirandom.SobolEngine, count: int) -> torch.quasirandom.SobolEngine:
-    """A new engine whose next point is number `count`, as by its own fast_forward, which takes `count` steps to get there.
+    """A new engine advanced to point number `count`, like its own fast_forward, which takes `count` steps.
 
-    The point before, number k, is the sum modulo 2 of the direction numbers of the ones in Gray's code k ^ (k >> 1), and the shift.
+    The preceding point k is the shift plus, modulo 2, the sum of the direction numbers of the ones in the Gray code k ^ (k >> 1).
     """
     if count:
         gray = (count - 1) ^ ((count - 1) >> 1)
@@ -112,8 +113,10 @@ def _forwarded(engine: torch.quasirandom.SobolEngine, count: int) -> torch.quasi
     return engine
 
 
-def spread(seed: int, start: int, stop: int, shape: tuple[int, int], stratified: bool, device: str | torch.device) -> list[Tensor]:
-    """Random u, v (stop - start,) of rays start..stop, anywhere, or one in each of nu x nv cells over and over."""
+def scattered_points(
+    seed: int, start: int, stop: int, shape: tuple[int, int], stratified: bool, device: str | torch.device
+) -> list[Tensor]:
+    """Random u, v (stop - start,) of rays start..stop, independent, or stratified in nu x nv cells, repeatedly."""
     k, (nu, nv) = torch.arange(start, stop, device=device), shape
     du, dv = random_numbers(seed, 0, k), random_numbers(seed, 1, k)
     if stratified:
@@ -124,9 +127,9 @@ def spread(seed: int, start: int, stop: int, shape: tuple[int, int], stratified:
 
 @dataclass(frozen=True)
 class Sample:
-    """Some rays of a sampler: the points (u_k, v_k), or with `tensor` all pairs (u_a, v_b), a fastest last.
+    """Some rays of a sampler: the points (u_k, v_k), or with `tensor` all pairs (u_a, v_b), in row-major order.
 
-    `flux` is each ray's part of the source's power, a scalar or one value a ray (shape of the ray grid).
+    flux: fraction of the source's power of each ray, a scalar or of the shape of the ray grid.
     """
 
     u: Tensor
@@ -142,14 +145,14 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class Sampler:
-    """A whole set of rays, cut into chunks on demand.
+    """A sampler of the aperture, evaluated in chunks.
 
     Args:
         kind: one of SAMPLERS.
         shape: cells (nu, nv) along u and v; nu * nv rays.
         seed: of the random kinds.
         profile: relative irradiance (a, b) over the aperture, constant per cell, or None (eq. 4.2.3).
-        round: light comes through the circle inscribed in the aperture alone.
+        round: whether the aperture is the inscribed circle.
         device: where the samples live.
     """
 
@@ -166,7 +169,7 @@ class Sampler:
 
     @classmethod
     def of_size(cls, kind: str, rays: int, aspect: float = 1.0, **options) -> Sampler:
-        """About `rays` rays in cells as nearly square as whole numbers allow on an aperture of width / height `aspect`."""
+        """A sampler of about `rays` rays in nearly square cells, for an aperture of width / height `aspect`."""
         nu = max(1, round(math.sqrt(rays * aspect)))
         return cls(kind, (nu, max(1, round(rays / nu))), **options)
 
@@ -177,7 +180,7 @@ class Sampler:
 
     @property
     def tensor(self) -> bool:
-        """Whether its samples are rows and columns."""
+        """Whether its samples have tensor-product structure."""
         return self.kind in TENSOR
 
     def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[Sample]:
@@ -189,7 +192,7 @@ class Sampler:
         if not even:
             total = sum(float(self._irradiance(s).sum()) for s in self._points(size))
             if not total > 0:
-                raise InputError("⟨source.profile⟩: every ray fell where it is black; use more rays")
+                raise InputError("⟨source.profile⟩: it is black at every sampled point; use more rays")
             norm = 1.0 / total
         for s in self._points(size, first, step):
             flux = torch.tensor(norm, dtype=torch.float64) if even else norm * self._irradiance(s)

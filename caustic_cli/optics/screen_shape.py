@@ -1,11 +1,11 @@
-"""The shape of a curved screen: where rays meet it, where its points are, and how large its pixels are.
+"""Geometry of curved screens: ray intersection, points and normals in space, and pixel areas.
 
-Notation, in the screen's own frame, whose origin is its middle and whose axes are those of its plane (`Screen.axes`)
-    x, y    its own coordinates less its shift, in which pixels are equal cells;  S(x, y) its height, mm, see `scene.screen`
-    A       sqrt(1 + S_x^2 + S_y^2), the area of the screen over that of its plane
+Notation, in the screen's frame, with its origin at the screen's centre and the axes of its tangent plane (`Screen.axes`)
+    x, y    coordinates in the tangent plane, in which pixels are equal cells;  S(x, y) the screen's height, mm, see `scene.screen`
+    A       sqrt(1 + S_x^2 + S_y^2), surface area per area of the tangent plane
 
-Light on a pixel is power; irradiance is that over the pixel's true area, A times the cell's.  A picture looks right on a screen
-that scatters evenly where its values are irradiance, from wherever one looks.
+Images are power per pixel; irradiance is power over the true area of the pixel, A times that of its cell.  On a Lambertian screen
+the luminance is proportional to the irradiance from every direction.
 """
 
 from __future__ import annotations
@@ -23,29 +23,30 @@ from caustic_cli.optics.surfaces import Cylinder, HeightField, Sphere, Surface
 from caustic_cli.scene import Screen
 from caustic_cli.scene.screen import Sags
 
-#: Part of a measured shape's width that it goes on for beyond each border, turned about that: light beside the screen is seen.
+#: Extension of a measured shape beyond each border, as a fraction of its width, by point reflection: it catches light off the
+#: screen.
 BESIDE = 0.25
-#: Gauss points of a pixel along each axis, in parts of its width, at which its area is taken.
+#: Gauss points of a pixel along each axis, as fractions of its width, for the quadrature of its area.
 GAUSS = (0.5 - 0.5 / math.sqrt(3.0), 0.5 + 0.5 / math.sqrt(3.0))
-#: Points along each axis by which it is found how far a screen reaches.
+#: Points along each axis at which the axial extent of a screen is evaluated.
 SURVEY = 129
 
 
 @dataclass(frozen=True, eq=False)
 class ScreenShape:
-    """A surface in the screen's frame, and its heights where it has some."""
+    """A surface in the screen's frame, with its control heights if it has any."""
 
     surface: Surface
     heights: Tensor | None = None
 
     def land(self, origin, direction, point, axes, forward: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Rays to the surface: arguments and what comes back as of the backends' `land`, with the screen's middle for `point`."""
+        """Landing points of rays: arguments and results as for the backends' `land`, with the screen's centre for `point`."""
         like = next(c for c in (*origin, *direction) if isinstance(c, Tensor))
         o = tuple(_dot([_double(c) - p for c, p in zip(origin, point, strict=True)], axis) for axis in axes)
         d = tuple(_dot([_double(c) for c in direction], axis) for axis in axes)
         o, d = (tuple(torch.as_tensor(c, dtype=torch.float64, device=like.device).expand(like.shape) for c in v) for v in (o, d))
         heights = None if self.heights is None else self.heights.to(like.device)
-        hit = self.surface.meet(heights, o, d, forward)
+        hit = self.surface.intersect(heights, o, d, forward)
         x, y = (torch.where(hit.found, a + hit.t * b, a).to(like.dtype) for a, b in zip(o[:2], d[:2], strict=True))
         return x, y, hit.found
 
@@ -65,7 +66,7 @@ def _dot(vector: Sequence, axis: Sequence[float]):
 
 
 def shape_of(screen: Screen) -> ScreenShape | None:
-    """The shape of a screen, None of a plane one."""
+    """The shape of a screen; None for a plane one."""
     return _made(tuple(screen.radius), screen.sags) if screen.curved else None
 
 
@@ -82,8 +83,8 @@ def _made(radius: tuple[float, float], sags: Sags | None) -> ScreenShape:
     return ScreenShape(*HeightField.through(values, tuple(half)))
 
 
-def space(screen: Screen, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points of a screen in space, mm, from coordinates along its own axes counted from its middle."""
+def points_in_space(screen: Screen, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points of a screen in space, mm, from its own coordinates x, y, mm, measured from its centre."""
     shape, (ax, ay, n) = shape_of(screen), screen.axes
     s = 0.0 if shape is None else shape.at(x, y)[0]
     px, py, pz = (m + x * a + y * b + s * c for m, a, b, c in zip((*screen.shift, screen.z), ax, ay, n, strict=True))
@@ -91,7 +92,7 @@ def space(screen: Screen, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def normals(screen: Screen, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Normals there in space, of length A."""
+    """Normals in space, of length A, at points of a screen given by its own coordinates."""
     shape, (ax, ay, n) = shape_of(screen), screen.axes
     sx, sy = (0.0 * x, 0.0 * y) if shape is None else shape.at(x, y)[1:]
     nx, ny, nz = (c - sx * a - sy * b for a, b, c in zip(ax, ay, n, strict=True))
@@ -99,7 +100,7 @@ def normals(screen: Screen, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, n
 
 
 def areas(screen: Screen) -> np.ndarray | None:
-    """A of every pixel, (n_x, n_y); None of a plane screen, where it is 1."""
+    """A of every pixel, (n_x, n_y); None for a plane screen, where it is 1."""
     shape = shape_of(screen)
     if shape is None:
         return None
@@ -114,9 +115,9 @@ def areas(screen: Screen) -> np.ndarray | None:
 
 @lru_cache(maxsize=16)
 def reach(screen: Screen) -> tuple[float, float]:
-    """How far a screen goes before and behind its middle along the system's z, mm: at most 0, at least 0."""
+    """Axial extent of a screen relative to its centre along the system's z, mm: (least, at most 0; greatest, at least 0)."""
     if screen.upright:
         return 0.0, 0.0
     x, y = (np.linspace(-h, h, SURVEY) for h in screen.half_size)
-    z = space(screen, x[:, None], y[None, :])[2] - screen.z
+    z = points_in_space(screen, x[:, None], y[None, :])[2] - screen.z
     return min(0.0, float(z.min())), max(0.0, float(z.max()))

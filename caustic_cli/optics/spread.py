@@ -1,8 +1,8 @@
-"""An extended source that shifts the image: the image of its middle, convolved with its own shape.
+"""The point-spread function of an extended source: its image is that of a point source at its centre convolved with its shape.
 
-Light of a source point beside the middle that leaves the lens at the same point lands shifted by (S_x dx, S_y dy), nearly alike for
-all of the lens.  How nearly is measured on the outermost points: `error` is the most by which light lands elsewhere than so
-shifted, `usual` what most of it keeps below.
+Light from a source point at (dx, dy) from the centre that leaves the lens at the same point lands shifted by (S_x dx, S_y dy),
+nearly independent of that point (shift invariance).  The deviation is measured for the outermost source points: `error` is its
+maximum over the light, `usual` a quantile of it.
 """
 
 from __future__ import annotations
@@ -18,35 +18,38 @@ from scipy.fft import next_fast_len
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from caustic_cli.optics.emission.base import Lit
-from caustic_cli.optics.emission.coherent import Mode, edges, middle
+from caustic_cli.optics.emission.base import Illuminated
+from caustic_cli.optics.emission.coherent import Mode, central_mode, outermost_modes
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, System
 from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Scene
 
-#: The part of light that is most of it.
+#: Quantile of the deviation that `usual` is.
 MOST = 0.8
-#: Points along each axis of the pupil whose light says how a source shifts the image.
+#: Points along each axis of the pupil at which the shifts are measured.
 POINTS = 33
-#: Cells of an image in the half axes of an ellipse that are aimed at, and into how many a pixel is cut at most for that.  Light is
-#: taken to be in the middle of its cell: with 6 in a half axis that is wrong by 0.02 relative RMS, with 24 by 0.001.
+#: Desired number of cells per half axis of the ellipse, and largest subdivision of a pixel for that.  Light is assigned to the
+#: centre of its cell: with 6 cells per half axis the error is 0.02 relative RMS, with 24 it is 0.001.
 CELLS, MOST_CUT = 16.0, 4
-#: Points of an ellipse: least along an axis, and to a cell of an image.
+#: Sample points of an ellipse: least number along an axis, and per cell.
 LEAST, A_CELL = 64, 6
 
-#: How often points of the pupil are corrected until light of another mode leaves the lens where the middle's does.
+#: Iterations that move pupil points until the light of another mode leaves the lens at the same points as that of the central mode.
 CORRECTIONS = 3
-#: Where the light of a point of the source lands that passes points (N,) of the pupil: X, Y, mm, its power, and where it leaves the
-#: lens, mm.
+#: Light of a source point through points (N,) of the pupil -> landing points X, Y, mm, power, and points where it leaves the lens,
+#: mm.
 Landing = Callable[[Mode, Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]
 
 
 @dataclass(frozen=True)
 class Spread:
-    """half: half axes of the ellipse over which a point of the image is spread, mm, 0 for points; shifts: of the source's positions
-    on the screen (dx, dy), mm, and their parts of the power; error, usual: see above; brightness: of the source over its frame,
-    (n, m) [i, j], None if even over the ellipse; frame: half widths of that on the screen, mm, negative where it is mirrored."""
+    """The point-spread function of a source on the screen.
+
+    half: half axes of its ellipse, mm, 0 for point sources; shifts: images (dx, dy), mm, of the source's positions, with their
+    fractions of the power; error, usual: see the module; brightness: of the source over its frame, (n, m) [i, j], None if uniform
+    over the ellipse; frame: half widths of the frame's image, mm, negative where it is mirrored.
+    """
 
     half: tuple[float, float]
     shifts: tuple[tuple[float, float, float], ...]
@@ -56,32 +59,33 @@ class Spread:
     frame: tuple[float, float] = (0.0, 0.0)
 
     def reach(self) -> tuple[float, float]:
-        """How far it spreads, mm."""
+        """Radius of the point-spread function along x and y, mm."""
         x, y = (max(abs(s[k]) for s in self.shifts) + self.half[k] for k in (0, 1))
         return x, y
 
     def on(self, pixel: tuple[float, float], most: int = MOST_CUT) -> Convolution:
-        """The same on an image of such pixels, mm, that are cut into a divisor of `most` along each axis if they are too wide."""
+        """The convolution on an image with these pixels, mm, which are subdivided into a divisor of `most` along each axis if too
+        wide."""
         cut = _cut(min((h for h in self.half if h > 0), default=max(self.reach()) / 2.0), pixel, most)
         return Convolution(torch.from_numpy(self.kernel((pixel[0] / cut, pixel[1] / cut))), cut)
 
     def parts_on(self, pixel: tuple[float, float], places: list[tuple[float, float]], most: int = MOST_CUT) -> list[Convolution]:
-        """The same of parts of every position: of all that is nearest to each of these points of its frame, [-1, 1]^2, about it.
+        """Convolutions with parts of the source: the Voronoi cells of these points of its frame, [-1, 1]^2, each about its point.
 
-        Their kernels are of one shape; their sums are their parts of the whole times the number of parts.
+        All kernels have one shape; the sum of a kernel is its part's fraction of the power times the number of parts.
         """
         cut = _cut(min(h for h in self.half if h > 0) / math.sqrt(len(places)), pixel, most)
         cell = (pixel[0] / cut, pixel[1] / cut)
         kernels = [self.kernel(cell, (places, k)) for k in range(len(places))]
-        a, b = (max(kernel.shape[axis] for kernel in kernels) for axis in (0, 1))  # odd, as each is
+        a, b = (max(kernel.shape[axis] for kernel in kernels) for axis in (0, 1))  # all are odd
         alike = [np.pad(k, [((n - m) // 2,) * 2 for n, m in zip((a, b), k.shape, strict=True)]) for k in kernels]
         return [Convolution(torch.from_numpy(kernel), cut) for kernel in alike]
 
     def kernel(self, cell: tuple[float, float], part: tuple[list[tuple[float, float]], int] | None = None) -> np.ndarray:
-        """Part of the light of a cell that each cell about it gets: (2 a + 1, 2 b + 1), of sum 1, not negative.
+        """The discrete kernel on cells of this size, mm: (2 a + 1, 2 b + 1), non-negative, of sum 1.
 
-        Points of the ellipse are shared out linearly among cells, which widens it; its half axes are less by so much that its
-        second moments stay what they are.  part: see `parts_on`, points and the number of one.
+        Sample points are distributed bilinearly to cells, which widens the ellipse; its half axes are reduced so that the second
+        moments are preserved.  part: points and the index of one of them, see `parts_on`.
         """
         if self.brightness is None:
             rx, ry = (math.sqrt(max(0.0, h * h - 2.0 / 3.0 * w * w)) for h, w in zip(self.half, cell, strict=True))
@@ -98,7 +102,7 @@ class Spread:
             mine = cKDTree(places).query(np.stack([x, y], 1))[1] == k
             x, y, light = x[mine] - places[k, 0], y[mine] - places[k, 1], light[mine] * len(places)
         x, y = (h / w * c for h, w, c in zip(half, cell, (x, y), strict=True))
-        # A part of the source may lie farther from its own point than the source from its middle.
+        # A part of the source may extend farther from its own point than the source from its centre.
         a, b = (
             max(math.ceil(r / w), math.ceil(float(np.abs(d).max() / w + np.abs(c).max(initial=0.0)))) + 1
             for r, w, d, c in zip(self.reach(), cell, (dx, dy), (x, y), strict=True)
@@ -114,7 +118,8 @@ class Spread:
 
 
 def _bright(picture: np.ndarray, half: tuple[float, float], cell: tuple[float, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points of [-1, 1]^2, even within every pixel of a picture of brightness and many to a cell, and their parts of its light."""
+    """Points of [-1, 1]^2, uniform within every pixel of a brightness picture and several per cell, and their fractions of its
+    light."""
     fine = [math.ceil(A_CELL * 2.0 * abs(h) / (w * n)) for h, w, n in zip(half, cell, picture.shape, strict=True)]
     light = picture.repeat(max(1, fine[0]), 0).repeat(max(1, fine[1]), 1)
     x, y = ((np.arange(n) + 0.5) * (2.0 / n) - 1.0 for n in light.shape)
@@ -124,13 +129,14 @@ def _bright(picture: np.ndarray, half: tuple[float, float], cell: tuple[float, f
 
 
 def _cut(fine: float, pixel: tuple[float, float], most: int) -> int:
-    """Into how many cells a pixel is cut along each axis for what is so fine, mm: a divisor of `most`, whose cells make up each."""
+    """Subdivision of a pixel along each axis that resolves a length `fine`, mm: a divisor of `most`."""
     wanted = min(MOST_CUT, CELLS * max(pixel) / fine) if fine > 0 else 1.0
     return next((k for k in range(1, most) if most % k == 0 and k >= wanted), most)
 
 
 def _even_disc(half: tuple[float, float], cell: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Even points of the unit disc, so close that an ellipse of these half axes has many in each cell; the middle of none."""
+    """Uniform points of the unit disc, dense enough for several points per cell of an ellipse of these half axes; (0, 0) for a
+    point."""
     if max(half) == 0:
         return np.zeros(1), np.zeros(1)
     n = max(LEAST, math.ceil(A_CELL * max(2.0 * h / w for h, w in zip(half, cell, strict=True))))
@@ -142,7 +148,7 @@ def _even_disc(half: tuple[float, float], cell: tuple[float, float]) -> tuple[np
 
 @dataclass(frozen=True, eq=False)
 class Convolution:
-    """A kernel (2 a + 1, 2 b + 1) for images whose pixels are cut into `cut` along each axis."""
+    """Convolution with a kernel (2 a + 1, 2 b + 1) on images whose pixels are subdivided into `cut` cells along each axis."""
 
     kernel: Tensor
     cut: int
@@ -150,19 +156,19 @@ class Convolution:
 
     @cached_property
     def beside(self) -> tuple[int, int]:
-        """Cut pixels beside the screen, whole pixels of them, whose light reaches it."""
+        """Cells around the screen that contribute to it, along x and y, a whole number of pixels."""
         a, b = (self.cut * math.ceil((n // 2) / self.cut) for n in self.kernel.shape)
         return a, b
 
     def __call__(self, image: Tensor) -> Tensor:
-        """An image on cut pixels, with those beside, (a, b) -> that on the screen's pixels alone; differentiable."""
+        """An image on cells, with those around the screen, (a, b) -> the convolved image on the screen's pixels; differentiable."""
         (n, m), (a, b) = image.shape, self.beside
         found = self.whole(image)[a : n - a, b : m - b]
         n, m = (s // self.cut for s in found.shape)
         return found.reshape(n, self.cut, m, self.cut).sum((1, 3))
 
     def whole(self, image: Tensor, adjoint: bool = False) -> Tensor:
-        """An image convolved with the kernel, dark beyond its frame; adjoint: with the kernel turned round."""
+        """An image on cells convolved with the kernel, with zero padding; adjoint: with the point-reflected kernel."""
         reach = tuple(n // 2 for n in self.kernel.shape)
         shape = tuple(next_fast_len(n + r, real=True) for n, r in zip(image.shape, reach, strict=True))
         spectrum = self._spectrum(shape, image)
@@ -180,26 +186,25 @@ class Convolution:
 
 
 def spread_at(scene: Scene, field: HeightField, heights: Tensor) -> Spread | None:
-    """How an extended source spreads the image of its middle on the screen of a scene whose lens has these heights (n, m) mm; None
-    where it does not."""
+    """Point-spread function of a scene's source on its screen, for a lens with heights (n, m) mm; None if there is none."""
     system, parameters = System.of(scene, field), {EXIT: heights.detach().double()}
 
     def landing(mode: Mode, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         tracer = Tracer(system, mode.through(u, v, system.before.index_at(None)))
-        state, left = tracer.land(parameters, scene.screen)[0].spread(), tracer.last(parameters).state.spread()
+        state, left = tracer.land(parameters, scene.screen)[0].expanded(), tracer.last(parameters).state.expanded()
         return *state.full(state.origin)[:2], state.power, *left.full(left.origin)[:2]
 
     return spread_of(system, landing, heights.device)
 
 
 @torch.no_grad()
-def spread_of(lit: Lit, landing: Landing, device: str | torch.device = "cpu") -> Spread | None:
-    """How an extended source spreads the image of its middle; None where it is none, or its light misses or lies in depth.
+def spread_of(lit: Illuminated, landing: Landing, device: str | torch.device = "cpu") -> Spread | None:
+    """Point-spread function of an extended source; None for other sources, for positions at several depths, or if light misses.
 
     Raises:
         as `landing`.
     """
-    source, outer, centre = lit.source, edges(lit), middle(lit)
+    source, outer, centre = lit.source, outermost_modes(lit), central_mode(lit)
     if source.rays is not None or len(source.members) > 1:
         return None
     if not outer or (not source.distant and float(np.ptp(source.points()[0][:, 2])) > 0):
@@ -219,7 +224,7 @@ def spread_of(lit: Lit, landing: Landing, device: str | torch.device = "cpu") ->
         if not bool(lit_too.any()):
             return None
         moved.append([(to_x - x)[lit_too], (to_y - y)[lit_too]])
-    # Shifts in proportion to the place on the source, by the outermost along each axis, and what departs from that.
+    # Shift per displacement of the source point, from the outermost points along each axis, and the deviation from linearity.
     slope = []
     for k in (0, 1):
         (up, down), (high, low) = outer[2 * k : 2 * k + 2], moved[2 * k : 2 * k + 2]

@@ -1,20 +1,20 @@
-"""Light through a sequential system, from the sources to the screens: one walk over the elements (thesis 4.3.1).
+"""Sequential ray tracing from the sources to the screens (thesis 4.3.1).
 
-    trace(system, rays, {surface name: heights}) = fold over the elements of  meet -> arrive -> interact -> depart
+    trace(system, rays, {surface name: heights}) = fold over the elements of
+        intersect -> before_interaction -> interact -> after_interaction
     image = splat(land(trace(...)))
 
-    meet      intersect the rays with the element's surface, in its own frame
-    arrive    what effects do on the way there and at the surface: absorption, roughness
-    interact  Snell and Fresnel, or a mirror
-    depart    what effects do behind it
-    stray   light that goes another way than straight on, after the walk: ghosts, secondary intersections
+    intersect            ray transfer to the element's surface, in its own frame
+    before_interaction   effects on the path and at the surface: absorption, roughness
+    interact             refraction with Fresnel losses, or reflection by a mirror
+    after_interaction    effects behind the surface
+    stray light          non-sequential paths, traced afterwards: ghosts, secondary intersections
 
-Elements before the first surface that a design may shape do not depend on any heights: they are walked once, when a `Tracer` is
-made.  What follows is *lowered* where it is one B-spline, upright, between the rays and an upright screen, with no effect but
-Snell's and Fresnel's: that runs as one fused kernel (`_lowered` is the only place that knows).  All else goes through the stages
-of the device's backend.
+Elements in front of the first free-form surface do not depend on heights and are traced once, when a `Tracer` is constructed.  The
+rest is *lowered* to one fused kernel where it is a single upright B-spline in front of an upright screen, without effects other
+than refraction and Fresnel losses (decided in `_lowered` alone).  Everything else uses the stages of the device's backend.
 
-Powers are parts of what the sources emit.  Nothing vanishes: image + every entry of `lost` = 1.
+Powers are fractions of the sources' power.  Energy is conserved: image + every entry of `lost` = 1.
 """
 
 from __future__ import annotations
@@ -33,44 +33,44 @@ from caustic_cli.errors import InputError
 from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.effects import EFFECTS, NO_REQUESTS, Action, Requests
 from caustic_cli.optics.emission import Rays, of_member, rays_of
-from caustic_cli.optics.frames import IDENTITY, Pose, advanced, into, out_of, turned, turned_back
-from caustic_cli.optics.gradient.crossing import cross, index_at
+from caustic_cli.optics.frames import IDENTITY, Pose, advance, rotate_to_global, rotate_to_local, to_global, to_local
 from caustic_cli.optics.gradient.fields import IndexField
+from caustic_cli.optics.gradient.transfer import index_at, transfer
 from caustic_cli.optics.image import Image
 from caustic_cli.optics.interaction import Interaction, Parameters
 from caustic_cli.optics.interface import interact
-from caustic_cli.optics.memory import with_less
+from caustic_cli.optics.memory import with_smaller_chunks
 from caustic_cli.optics.rays import LOSSES, RayState, Status
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.screen_shape import reach, shape_of
 from caustic_cli.optics.surfaces import HeightField, SurfaceIntersection
-from caustic_cli.optics.system import EXIT, Element, Placed, System
+from caustic_cli.optics.system import EXIT, Element, PlacedScreen, System
 from caustic_cli.scene import Light, PlaneWave, Points, Scene, Screen
 
-#: Rays traced at a time, which bounds the memory.
+#: Rays per chunk, which bounds the memory.
 CHUNK = 1 << 19
 #: No parameters at all.
 NOTHING: Parameters = MappingProxyType({})
 
 
 def index_name(element: Element) -> str:
-    """Under which `Parameters` have the coefficients of the index behind an element, where a design shapes it."""
+    """Key in `Parameters` of the coefficients of the gradient-index field behind an element."""
     return f"{element.name}.index"
 
 
 class Tracer:
-    """Traces some rays through a system; prepared once, called for any heights.
+    """Traces a set of rays through a system: prepared once, then called for any heights.
 
     Args:
-        system: what is traced; of its sources only the rays' own matters.
-        rays: on the pupil, before the first element: points of it that a plane wave comes through, or any others.
-        dtype: precision of the ray arithmetic, where the backend has more than one.  Rays meet surfaces in float64 in any case.
-        requests: what a plan says of effects beyond what the system itself says.
-        like: the tracer of the chunk before through the same system, whose prepared arrays serve again where they are the same.
-        weight, channel: part of the power that this light is of the whole, and the colour of the image that it goes into.
-        wavelength: nm, at which glasses refract; None for the indices that media give.
-        track: keep what became of every ray (`RayState.status`).
+        system: the system.
+        rays: on the pupil, in front of the first element: sampled points of a plane wave, or a ray state.
+        dtype: precision of the ray arithmetic, where the backend has a choice.  Intersections are always computed in float64.
+        requests: of a plan, on effects that the system does not express.
+        like: the tracer of the previous chunk through the same system, whose prepared arrays are reused where they are equal.
+        weight, channel: fraction of the total power of this light, and its colour channel.
+        wavelength: nm, at which the indices of glasses are evaluated; None for the indices of the media.
+        track: record the outcome of every ray (`RayState.status`).
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class Tracer:
     ):
         self.system, self.requests, self.weight, self.channel, self.track = system, requests, weight, channel, track
         self.media, self.sides = system.media(), system.sides()
-        #: Steps through media of varying index to elements, forward or not, and the parameters that they were chosen for.
+        #: Numbers of integration steps by (medium, element, forward), and the parameters for which they were chosen.
         self.steps: dict[tuple[int, int, bool], tuple[int, list]] = {} if like is None else dict(like.steps)
         pupil = system.pupil
         state = rays if isinstance(rays, RayState) else RayState.on_axis(rays, pupil.half_size, pupil.z)
@@ -98,7 +98,7 @@ class Tracer:
         for effect in EFFECTS:
             state = effect.prepare(system, state, requests)
         made = (effect.action(system, requests) for effect in EFFECTS)
-        #: Power that comes through the pupil, () or, with colours, (3,).
+        #: Power through the pupil, () or, with colours, (3,).
         shape = state.power.shape if state.sample is None else state.sample.shape
         self.entering = self._of_color(weight * state.power.expand(shape).sum(dtype=torch.float64))
         self.actions: tuple[Action, ...] = tuple(a for a in made if a is not None)
@@ -112,7 +112,7 @@ class Tracer:
                 and system.elements[self.first].surface.shape is None
                 and not any(medium.gradient for medium in self.media[self.first : self.first + 2])
             ):
-                interaction = self.cross(self.first, state, None)
+                interaction = self.trace_element(self.first, state, None)
                 if self.recorded:
                     self.before.append(interaction)
                 state, self.first, self._behind = interaction.state, self.first + 1, interaction
@@ -120,9 +120,9 @@ class Tracer:
         self.fused = None if requests.stages else self._lowered(like)
 
     def __call__(self, parameters: Parameters) -> list[RayState]:
-        """Heights {name: (n, m) mm float64} -> rays behind the last element: those that went straight on, then those of stray."""
+        """Heights {name: (n, m) mm float64} -> rays behind the last element: the direct light, then stray light."""
         state, interactions = self.start, list(self.before)
-        for interaction in self._walk(parameters):
+        for interaction in self._interactions(parameters):
             state = interaction.state
             if self.recorded:
                 interactions.append(interaction)
@@ -134,34 +134,34 @@ class Tracer:
 
     @cached_property
     def owners(self) -> tuple[int | None, ...]:
-        """As of the system."""
+        """See `System.owners`."""
         return self.system.owners()
 
-    def _walk(self, parameters: Parameters) -> Iterator[Interaction]:
-        """Straight on, from the first free surface to the last element."""
+    def _interactions(self, parameters: Parameters) -> Iterator[Interaction]:
+        """The sequential trace from the first free surface to the last element."""
         state = self.start
         for k in range(self.first, len(self.system.elements)):
-            interaction = self.cross(k, state, parameters.get(self.system.elements[k].name), parameters=parameters)
+            interaction = self.trace_element(k, state, parameters.get(self.system.elements[k].name), parameters=parameters)
             yield interaction
             state = interaction.state
 
     def last(self, parameters: Parameters) -> Interaction:
-        """The rays at the last element, behind which they have gone straight on."""
-        return cast(Interaction, [self._behind, *self._walk(parameters)][-1])  # a system has at least one element
+        """The direct light at the last element."""
+        return cast(Interaction, [self._behind, *self._interactions(parameters)][-1])  # a system has at least one element
 
     @torch.no_grad()
     def exit_of(self, parameters: Parameters) -> tuple[tuple, tuple, Tensor]:
-        """How rays arrive at a lens' exit, in its frame: slopes there, directions, powers."""
-        exit = next((m for m in self._walk(parameters) if m.element.name == EXIT), None) or self.last(parameters)
-        assert exit.arriving is not None
-        return exit.slopes, exit.incoming, exit.arriving
+        """Rays at a lens' exit in its frame: slopes of the surface, directions in front of it, powers in front of it."""
+        exit = next((m for m in self._interactions(parameters) if m.element.name == EXIT), None) or self.last(parameters)
+        assert exit.power_in is not None
+        return exit.slopes, exit.incoming, exit.power_in
 
-    def land(self, parameters: Parameters, screen: Screen | Placed) -> list[RayState]:
-        """The same on a screen: x and y of their origins are the screen's own coordinates, mm."""
+    def land(self, parameters: Parameters, screen: Screen | PlacedScreen) -> list[RayState]:
+        """Rays on a screen: x and y of their origins are the screen's coordinates, mm."""
         return [self.onto(state, screen) for state in self(parameters)]
 
-    def expose(self, parameters: Parameters, screen: Screen | Placed, filter: Filter) -> Image[Tensor]:
-        """Heights {name: (n, m) mm float64} -> image and energy account on a screen."""
+    def expose(self, parameters: Parameters, screen: Screen | PlacedScreen, filter: Filter) -> Image[Tensor]:
+        """Heights {name: (n, m) mm float64} -> image and energy balance on a screen."""
         if self.fused is not None and isinstance(screen, Screen) and screen.upright:
             image, leaving, lost = self.fused(parameters[self.system.elements[-1].name], screen, filter)
             for name, value in self.start.lost.items():
@@ -169,8 +169,8 @@ class Tracer:
             return self._weighed(image, leaving, lost)
         return self.collect(self(parameters), screen, filter)
 
-    def collect(self, states: list[RayState], screen: Screen | Placed, filter: Filter) -> Image[Tensor]:
-        """Image and energy account on a screen of rays behind the last element."""
+    def collect(self, states: list[RayState], screen: Screen | PlacedScreen, filter: Filter) -> Image[Tensor]:
+        """Image and energy balance on a screen, from rays behind the last element."""
         image: Tensor | float = 0.0
         leaving: Tensor | float = 0.0
         lost: dict[str, Tensor | float] = {}
@@ -192,118 +192,118 @@ class Tracer:
         return Image(self._of_color(image), self._of_color(leaving), lost, self.start.count)
 
     def _of_color(self, value: Tensor) -> Tensor:
-        """The same in this light's channel of three, where the scene has colours."""
+        """`value` in this light's colour channel of three; unchanged without colours."""
         if self.channel is None:
             return value
         return torch.stack([value if k == self.channel else torch.zeros_like(value) for k in range(3)])
 
     # One element.
 
-    def cross(
+    def trace_element(
         self,
         k: int,
         state: RayState,
         heights: Tensor | None,
         *,
         forward: bool = True,
-        straight: bool = True,
+        direct: bool = True,
         parameters: Parameters = NOTHING,
     ) -> Interaction:
-        """Rays to element k and behind it.
+        """Trace rays to element k and through it.
 
         Args:
-            heights: of its surface, None where it has none.
-            parameters: those of the media, see `index_name`; a medium's own where they are not there.
-            forward: in the system's own direction, or back.
-            straight: whether this is the walk itself, or stray light.
+            heights: control heights of its surface, None if it has none.
+            forward: in the nominal direction of light, or backwards.
+            direct: whether this is the nominal path, or stray light.
+            parameters: those of gradient-index media, see `index_name`; a medium's own where they are missing.
         """
         element = self.system.elements[k]
         n = [medium.index_at(state.wavelength) for medium in self.media[k : k + 2]]
         n_in, n_out = n if forward else n[::-1]
         side = self.sides[k] if forward else -self.sides[k]
         m = Interaction(
-            weakref.proxy(self),  # which holds the last of them: a cycle would keep its arrays until the collector comes by
+            weakref.proxy(self),  # which refers to the last interaction: a reference cycle would delay the release of its arrays
             k,
             element,
             forward,
             side,
             n_in,
             n_out,
-            straight,
+            direct,
             state,
         )
         self._meet(m, heights, parameters)
         for action in self.actions:
-            action.arrive(m)
-        m.arriving = m.state.power
-        m.departing = m.state.power = self._interact(m)
+            action.before_interaction(m)
+        m.power_in = m.state.power
+        m.power_out = m.state.power = self._interact(m)
         for action in self.actions:
-            action.depart(m)
+            action.after_interaction(m)
         return m
 
     def _meet(self, m: Interaction, heights: Tensor | None, parameters: Parameters) -> None:
-        """Carry the rays of a interaction to the surface."""
+        """Ray transfer to the surface of an interaction's element."""
         element = m.element
         ahead, behind = (m.index, m.index + 1) if m.forward else (m.index + 1, m.index)
         if self.media[ahead].gradient is not None:
-            self._bend(m, ahead, heights, parameters)
-            self._leave_into(m, behind, parameters)
+            self._intersect_through_gradient(m, ahead, heights, parameters)
+            self._set_index_behind(m, behind, parameters)
             return
-        prepared = self.meets if m.state is getattr(self, "start", None) else None  # for the rays that it was prepared for
+        prepared = self.prepared_intersection if m.state is getattr(self, "start", None) else None  # valid for these rays only
         state = replace(m.state, lost=dict(m.state.lost))
         if m.index == self.first and m.forward and heights is not None:
             state = state.counted_from(element.pose.position[2] + element.surface.centred(heights)[1])
         if self._at_pupil(m):
-            state = state if self.media[behind].gradient is None else state.spread()
-            o, d = into(element.pose, state.origin, state.direction, state.datum)
+            state = state if self.media[behind].gradient is None else state.expanded()
+            o, d = to_local(element.pose, state.origin, state.direction, state.datum)
             m.state, m.local, m.incoming, m.slopes = state, o, d, (0.0, 0.0)
-            self._leave_into(m, behind, parameters)
+            self._set_index_behind(m, behind, parameters)
             return
-        state = state.spread()
-        o, d = into(element.pose, state.origin, state.direction, state.datum)
+        state = state.expanded()
+        o, d = to_local(element.pose, state.origin, state.direction, state.datum)
         if m.index == 0 and m.forward and prepared is None and self.system.lit is None and not element.surface.flat:
-            o, state = self._backed_up(o, d, state, element, heights)
-        hit = next((h for a in self.actions if (h := a.meet(m, o, d, heights)) is not None), None)
+            o, state = self._moved_before_surface(o, d, state, element, heights)
+        hit = next((h for a in self.actions if (h := a.intersect(m, o, d, heights)) is not None), None)
         if hit is None:
-            hit = prepared(heights) if prepared else element.surface.meet(heights, o, d, m.side)
-        if state.power.dtype != self.dtype:  # the first surface is met in float64 whatever follows
+            hit = prepared(heights) if prepared else element.surface.intersect(heights, o, d, m.side)
+        if state.power.dtype != self.dtype:  # the first intersection is always computed in float64
             t, gx, gy = (_cast(c, self.dtype) for c in hit[:3])
             state, hit = state.to(self.dtype), SurfaceIntersection(t, gx, gy, hit.found)
             o, d = (tuple(_cast(c, self.dtype) for c in v) for v in (o, d))
-        m.local, m.incoming, m.slopes, m.length = advanced(o, d, hit.t), d, (hit.gx, hit.gy), hit.t
+        m.local, m.incoming, m.slopes, m.length = advance(o, d, hit.t), d, (hit.gx, hit.gy), hit.t
         aperture, pupil = element.aperture, self.system.pupil
         within = (aperture.half_size, aperture.round) == (pupil.half_size, pupil.round)
-        if prepared is None or state.sample is None or not within:  # a sample of the same aperture stands on the surface
+        if prepared is None or state.sample is None or not within:  # a sample of the same aperture lies on the surface
             found = hit.found
             if aperture.round or aperture.half_size != element.surface.half_size:
-                found = found & aperture.holds(*m.local[:2])
+                found = found & aperture.contains(*m.local[:2])
             kept = torch.where(found, state.power, torch.zeros_like(state.power))
             state.lose("missed_surface", (state.power - kept).detach())
             if self.track:
                 state.mark(~found, Status.MISSED_SURFACE)
             state.power = kept
-        state.origin = out_of(element.pose, m.local, state.datum)
+        state.origin = to_global(element.pose, m.local, state.datum)
         state.path = state.path + m.n_in * hit.t
         m.state = state
-        self._leave_into(m, behind, parameters)
+        self._set_index_behind(m, behind, parameters)
 
-    def _bend(self, m: Interaction, medium: int, heights: Tensor | None, parameters: Parameters) -> None:
-        """Carry rays through a medium of varying index to the surface (`gradient.crossing`)."""
-        element, state = m.element, replace(m.state, lost=dict(m.state.lost)).spread()
+    def _intersect_through_gradient(self, m: Interaction, medium: int, heights: Tensor | None, parameters: Parameters) -> None:
+        """Ray transfer through a gradient-index medium to the surface (`gradient.transfer`)."""
+        element, state = m.element, replace(m.state, lost=dict(m.state.lost)).expanded()
         name, pose, field, scale = self._medium(medium, state.wavelength)
         point, direction = (
-            tuple(c.double() for c in state.full(v)) for v in into(pose, state.origin, state.direction, state.datum)
+            tuple(c.double() for c in state.full(v)) for v in to_local(pose, state.origin, state.direction, state.datum)
         )
 
         def seen(points, vectors):
-            o, d = out_of(pose, points, state.datum), turned_back(pose, vectors)
-            return into(element.pose, o, d, state.datum)
+            o, d = to_global(pose, points, state.datum), rotate_to_global(pose, vectors)
+            return to_local(element.pose, o, d, state.datum)
 
         way, given = (medium, m.index, m.forward), [None if c is None else c.detach() for c in (parameters.get(name), heights)]
         steps, before = self.steps.get(way, (None, given))
         if not all(a is b or (a is not None and b is not None and torch.equal(a, b)) for a, b in zip(given, before, strict=True)):
-            steps = None  # as many as other parameters asked for may be too few
-        found = cross(
+            steps = None  # the number for other parameters may be too small
+        found = transfer(
             self.backend.flow,
             field,
             parameters.get(name),
@@ -319,45 +319,45 @@ class Tracer:
             self.steps[way] = found.steps, [None if c is None else c.clone() for c in given]
         m.local, m.incoming = seen(found.point, found.direction)
         m.slopes, m.length, m.n_in = found.slopes, found.length, scale * found.n
-        met = found.found & element.aperture.holds(*m.local[:2])
+        met = found.found & element.aperture.contains(*m.local[:2])
         kept = torch.where(met, state.power, torch.zeros_like(state.power))
         state.lose("missed_surface", (state.power - kept).detach())
         if self.track:
             state.mark(~met, Status.MISSED_SURFACE)
         state.power, state.sample = kept, None
-        state.origin = out_of(element.pose, m.local, state.datum)
+        state.origin = to_global(element.pose, m.local, state.datum)
         state.path = state.path + scale * found.path
         m.state = state
 
-    def _leave_into(self, m: Interaction, medium: int, parameters: Parameters) -> None:
-        """Behind the surface, the index of a medium where it varies."""
+    def _set_index_behind(self, m: Interaction, medium: int, parameters: Parameters) -> None:
+        """Set the index behind the surface where the medium has a gradient."""
         if self.media[medium].gradient is None or m.reflects:
             return
         state = m.state
         name, pose, field, scale = self._medium(medium, state.wavelength)
-        point = into(pose, tuple(c.double() for c in state.full(state.origin)), (0.0, 0.0, 1.0), state.datum)[0]
+        point = to_local(pose, tuple(c.double() for c in state.full(state.origin)), (0.0, 0.0, 1.0), state.datum)[0]
         m.incoming = state.full(m.incoming)
         m.n_out = scale * index_at(self.backend.flow, field, parameters.get(name), point)
 
     def _medium(self, medium: int, wavelength: float | None) -> tuple[str, Pose, IndexField, float]:
-        """Of a medium of varying index: name of its coefficients, its frame, its field, and by what this wavelength scales it."""
+        """Of a gradient-index medium: key of its coefficients, frame, field, and scale factor of the index at this wavelength."""
         owner, is_of = self.owners[medium], self.media[medium]
         assert owner is not None and is_of.gradient is not None
         element = self.system.elements[owner]
         return index_name(element), element.pose, is_of.gradient, is_of.index_at(wavelength) / is_of.index
 
     def _interact(self, m: Interaction) -> Tensor:
-        """Change the directions, and give the power that goes on."""
-        state, element, arriving = m.state, m.element, m.arriving
-        assert arriving is not None
+        """Refract or reflect the rays; returns the power behind the surface."""
+        state, element, power_in = m.state, m.element, m.power_in
+        assert power_in is not None
         polarised = None
         if state.polarised is not None:
-            polarised = turned(element.pose, state.polarised)
+            polarised = rotate_to_local(element.pose, state.polarised)
         eta = m.n_in / m.n_out
         found = (self.backend.interact if isinstance(eta, float) else interact)(
             m.incoming,
             m.slopes,
-            arriving,
+            power_in,
             eta=eta,
             reflects=m.reflects,
             fresnel=element.fresnel,
@@ -365,10 +365,10 @@ class Tracer:
             side=m.side,
         )
         m.passes = found.passes
-        state.direction = turned_back(element.pose, found.direction)
+        state.direction = rotate_to_global(element.pose, found.direction)
         if not m.reflects:
             with torch.no_grad():
-                gone = arriving - found.power
+                gone = power_in - found.power
                 if bool(found.passes.all()):
                     state.lose("fresnel", gone)
                 else:
@@ -376,14 +376,14 @@ class Tracer:
                     state.lose("fresnel", gone - totally)
                     state.lose("total_internal_reflection", totally)
             if self.track:
-                state.mark(~found.passes & (arriving > 0), Status.TOTAL_INTERNAL_REFLECTION)
+                state.mark(~found.passes & (power_in > 0), Status.TOTAL_INTERNAL_REFLECTION)
         if not any(isinstance(c, Tensor) for c in state.direction) and state.direction == (0.0, 0.0, 1.0):
             return found.power
         state.sample = None
         return found.power
 
     def _at_pupil(self, m: Interaction) -> bool:
-        """Whether the rays stand on this flat first element as they come from their source, which has left out all that miss it."""
+        """Whether the rays lie on this plane first element already, without any that miss it, as their source emits them."""
         e, pupil, z = m.element, self.system.pupil, m.state.origin[2]
         if m.index or not m.forward or not isinstance(z, float) or z + m.state.datum != pupil.z:
             return False
@@ -394,8 +394,8 @@ class Tracer:
             and (e.aperture.half_size, e.aperture.round) == (pupil.half_size, pupil.round)
         )
 
-    def _backed_up(self, o, d, state: RayState, element: Element, heights) -> tuple[tuple, RayState]:
-        """Rays of a pupil that the first surface reaches through, from before it."""
+    def _moved_before_surface(self, o, d, state: RayState, element: Element, heights) -> tuple[tuple, RayState]:
+        """Rays on a pupil that intersects the first surface, moved back in front of it."""
         low = element.surface.hull(heights)[0]
         back = max(0.0, float(torch.as_tensor(o[2], dtype=torch.float64).max()) - low)
         if back == 0.0:
@@ -406,9 +406,9 @@ class Tracer:
         return tuple(c.expand(state.power.shape) for c in moved), replace(state, path=path)
 
     @cached_property
-    def meets(self):
-        """The intersections of the rays of `start` with the first free surface as a function of its heights; None for the general
-        way."""
+    def prepared_intersection(self):
+        """Intersections of the rays `start` with the first free surface as a prepared function of its heights; None if that case is
+        not covered."""
         if self.first == len(self.system.elements) or self.requests.off & {"intersection"}:
             return None
         element, start = self.system.elements[self.first], self.start
@@ -430,13 +430,13 @@ class Tracer:
                 return SurfaceIntersection(sag - below, gx, gy, found)
 
             return sampled
-        spread = start.spread()
+        spread = start.expanded()
         full = spread.full((*spread.origin, *spread.direction))
         origin = (full[0] - px, full[1] - py, full[2] + (start.datum - pz))
-        return self.backend.meet_fixed(surface, origin, full[3:])
+        return self.backend.intersect_fixed(surface, origin, full[3:])
 
     def _lowered(self, like: Tracer | None):
-        """The rest of the system as one fused kernel, a function of heights, screen and filter; None where it is none such."""
+        """The rest of the system as one fused kernel, a function of heights, screen and filter; None where it does not apply."""
         if any(medium.gradient for medium in self.media):
             return None
         if self.first != len(self.system.elements) - 1 or self.actions or self.track or self.start.polarised is not None:
@@ -456,7 +456,7 @@ class Tracer:
         if not plain:
             return None
         eta = m[-2].index_at(start.wavelength) / m[-1].index_at(start.wavelength)
-        if element.fresnel == "schlick" and eta < 1.0:  # the fused kernels take its cosine behind the surface
+        if element.fresnel == "schlick" and eta < 1.0:  # the fused kernels use the cosine behind the surface
             return None
         if start.along_axis and element.aperture.round != self.system.pupil.round:
             return None
@@ -465,16 +465,16 @@ class Tracer:
             return self.backend.plane_image(surface, start, eta, element.fresnel, before)
         return self.backend.ray_image(surface, start, eta, element.fresnel, element.aperture.radius, before)
 
-    def onto(self, state: RayState, screen: Screen | Placed) -> RayState:
-        """Rays straight on to a screen; x and y of their origins are the screen's own coordinates, mm."""
-        state = state.spread()
+    def onto(self, state: RayState, screen: Screen | PlacedScreen) -> RayState:
+        """Ray transfer to a screen; x and y of the origins are then the screen's coordinates, mm."""
+        state = state.expanded()
         if isinstance(screen, Screen) and self.system.leg is not None:
             screen = self.system.placed(screen)
         frame = screen if isinstance(screen, Screen) else screen.screen
         (sx, sy), shape = frame.shift, shape_of(frame)
-        if isinstance(screen, Placed):
+        if isinstance(screen, PlacedScreen):
             axes, middle = screen.pose.axes, screen.pose.position
-            if shape is not None:  # which stands about the screen's middle
+            if shape is not None:  # defined relative to the screen's centre
                 px, py, pz = (m + sx * a + sy * b for m, a, b in zip(middle, *axes[:2], strict=True))
                 middle = (px, py, pz)
         else:
@@ -499,17 +499,15 @@ def _cast(value, dtype: torch.dtype):
 
 
 def is_lowered(scene: Scene, field: HeightField, requests: Requests = NO_REQUESTS) -> bool:
-    """Whether the light of a scene goes to its screen by a fused kernel."""
+    """Whether a scene is traced by a fused kernel."""
     few = next(iter(rays_of(scene, "grid", 4).chunks()))
     return scene.screen.upright and Tracer(System.of(scene, field), few, requests=requests).fused is not None
 
 
 def warm_up(scene: Scene, requests: Requests = NO_REQUESTS, gradient: bool = False) -> None:
-    """Trace a few rays of a scene, so that whatever its light needs is compiled.
+    """Trace a few rays of a scene, so that all kernels that it needs are compiled.
 
-    The net and the pixels are few, and a plane wave or a point stands for the source.
-
-    gradient: the adjoints too.
+    Net and image are small, and a plane wave or a point represents the source.  gradient: compile the adjoints, too.
     """
     lens = replace(scene.lens, control=(4, 4), degree=(3, 3), knots=None, array=(1, 1))
     source = PlaneWave() if scene.source.collimated else Points(((0.0, 0.0, lens.z_in - 5.0 * max(lens.size)),))
@@ -525,7 +523,7 @@ def warm_up(scene: Scene, requests: Requests = NO_REQUESTS, gradient: bool = Fal
 
 
 def trace(system: System, rays: Sample | RayState, parameters: Parameters, **options) -> list[RayState]:
-    """Rays behind the last element of a system: those that went straight on, then those of stray.  options: of a `Tracer`."""
+    """Rays behind the last element of a system: the direct light, then stray light.  options: of a `Tracer`."""
     return Tracer(system, rays, **options)(parameters)
 
 
@@ -539,9 +537,9 @@ def tracers(
     part: tuple[int, int] = (0, 1),
     **options,
 ) -> Iterator[Tracer]:
-    """Tracers of all rays of a sampler through a one-lens scene, chunk by chunk; of several bands, one after the other.
+    """Tracers of all rays of a sampler through a scene, chunk by chunk, band by band.
 
-    part: (k, n) takes every n-th chunk from number k on, what one of n processes traces.
+    part: (k, n) takes every n-th chunk from number k on, the share of one of n processes.
     """
     bands = scene.bands
     for band in bands:
@@ -562,25 +560,25 @@ def expose(
     chunk: int = CHUNK,
     requests: Requests = NO_REQUESTS,
 ) -> Image[float]:
-    """Trace all rays of a sampler and collect them: the value of the one function every command asks about.
+    """The image of a scene: all rays of a sampler, traced and accumulated.
 
-    Chunks are accumulated in float64, so neither memory nor rounding grows with the number of rays.  Where memory runs out,
-    smaller ones are tried.
+    Chunks are accumulated in float64, so neither memory nor rounding errors grow with the number of rays.  Smaller chunks are used
+    if memory runs out.
 
     Raises:
-        InputError: the lens reaches the screen.
+        InputError: the surface reaches the screen.
         CausticError: out of memory.
     """
     screen, filter = screen or scene.screen, filter or Filter()
     heights = heights.detach().to(sampler.device, torch.float64)
-    check_room(scene, heights, screen)
+    check_clearance(scene, heights, screen)
     shape = (3, *screen.resolution) if scene.colored else screen.resolution
 
     def traced_by(size: int) -> Image[float]:
         parts = tracers(scene, field, sampler, dtype, size, requests)
         return _total(parts, {EXIT: heights}, [screen], [shape], filter, sampler.count, sampler.device)[0]
 
-    return with_less(traced_by, chunk)
+    return with_smaller_chunks(traced_by, chunk)
 
 
 def render(
@@ -599,11 +597,11 @@ def render(
     """The image on every screen of a system, from about `rays` rays of every source at every wavelength.
 
     Args:
-        parameters: heights {name: (n, m) mm} of every surface that has some.
-        kind: of sampler, see `sampling`.
+        parameters: heights {name: (n, m) mm} of all free-form surfaces.
+        kind: sampler, see `sampling`.
 
     Raises:
-        InputError: heights are missing, unknown or of another shape.
+        InputError: heights are missing, unknown or of the wrong shape.
         CausticError: out of memory.
     """
     shapes = {name: tuple(heights.shape) for name, heights in parameters.items()}
@@ -611,7 +609,7 @@ def render(
         raise InputError(f"a system's heights must be {system.free}, got {shapes}")
     parameters = {name: heights.detach().to(device, torch.float64) for name, heights in parameters.items()}
     samplers = [rays_of(system.with_source(s), kind, rays, seed, device) for s in system.sources]
-    screens = [s.screen if isinstance(s, Placed) else s for s in system.screens]
+    screens = [s.screen if isinstance(s, PlacedScreen) else s for s in system.screens]
 
     def traced_by(size: int) -> list[Image[float]]:
         parts = (
@@ -629,13 +627,13 @@ def render(
             device,
         )
 
-    return with_less(traced_by, chunk)
+    return with_smaller_chunks(traced_by, chunk)
 
 
 def system_tracers(
     system: System, sampler: Rays, part: float, dtype: torch.dtype, chunk: int, requests: Requests = NO_REQUESTS
 ) -> Iterator[Tracer]:
-    """Tracers of all rays of one of a system's sources, `part` of all power, at every wavelength, chunk by chunk."""
+    """Tracers of all rays of one source, with the fraction `part` of the total power, at every wavelength, chunk by chunk."""
     lines = zip(system.light.wavelengths, system.light.parts, strict=True) if system.light.wavelengths else [(None, 1.0)]
     for wavelength, weight in lines:
         traced = None
@@ -647,7 +645,7 @@ def system_tracers(
 def _total(
     parts: Iterator[Tracer], parameters: Parameters, screens, shapes, filter: Filter, rays: int, device: str | torch.device
 ) -> list[Image[float]]:
-    """Sums over tracers, without derivatives: one image for each screen; rays are walked once for all."""
+    """Sums over tracers, without derivatives: an image for each screen, from one trace of the rays."""
     images = [torch.zeros(shape, dtype=torch.float64, device=device) for shape in shapes]
     accounts, leaving = [dict.fromkeys(LOSSES, 0.0) for _ in screens], [0.0] * len(images)
     with torch.no_grad():
@@ -662,11 +660,11 @@ def _total(
     return [Image(*of, rays) for of in zip(images, leaving, accounts, strict=True)]
 
 
-def check_room(scene: Scene, heights: Tensor, screen: Screen) -> None:
-    """Refuse a screen that the surface reaches, the corners of a tilted or curved one included.
+def check_clearance(scene: Scene, heights: Tensor, screen: Screen) -> None:
+    """Check that the surface does not reach the screen, including the corners of a tilted or curved one.
 
     Raises:
-        InputError: saying how far the surface reaches.
+        InputError: giving the extreme height of the surface.
     """
     before, behind = reach(screen)
     nearer = behind if scene.lens.mirror else -before

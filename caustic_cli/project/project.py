@@ -25,9 +25,9 @@ from caustic_cli.inverse.scene_parameters import Ranges
 from caustic_cli.inverse.target import target_on_screen, tiles
 from caustic_cli.io.files import write_bytes
 from caustic_cli.io.picture import Picture, read_picture
-from caustic_cli.optics.bounds import refuse_without_glass
+from caustic_cli.optics.bounds import check_exit_above_entrance
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import sides_of
+from caustic_cli.optics.system import split_heights
 from caustic_cli.project import attachments, checkpoint
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.scene import Scene, sources
@@ -222,12 +222,12 @@ class Project:
                 f"⟨lens.control⟩ {list(scene.lens.control)} is not that of the designed lens,"
                 f" {list(field.shape)}; design again to change it"
             )
-        has, says = state.state.heights.shape[0] if state.state.heights.ndim == 3 else 1, len(scene.shaped)
+        has, says = state.state.heights.shape[0] if state.state.heights.ndim == 3 else 1, len(scene.free_surfaces)
         if has != says:
             raise self.error(f"[second] and [[element]] give {says} free-form surface(s), and the design has {has}; design again")
-        scene, heights = sides_of(scene, field, state.state.heights if self.values is None else self._trained(state.state))
+        scene, heights = split_heights(scene, field, state.state.heights if self.values is None else self._trained(state.state))
         try:
-            refuse_without_glass(scene, field, heights)
+            check_exit_above_entrance(scene, field, heights)
         except InputError as error:
             raise self.error(f"{error}") from error
         return Designed(scene, field, heights, state)

@@ -1,10 +1,11 @@
-"""What is there: lens, source, screen, materials.  Frozen, validated on construction, no light yet."""
+"""The optical scene: light source, lens, other elements, screen.  Immutable data, validated on construction; nothing is traced
+here."""
 
 from __future__ import annotations
 
 from caustic_cli.scene.aperture import Aperture, Pupil
-from caustic_cli.scene.elements import Component, check_places, refuse_beside, surface_name
-from caustic_cli.scene.front import Front, Second
+from caustic_cli.scene.elements import Component, check_compatible_with_elements, check_positions, surface_name
+from caustic_cli.scene.freeform import FreeForm, SecondTarget
 from caustic_cli.scene.lens import Lens, Offset
 from caustic_cli.scene.light import Light
 from caustic_cli.scene.screen import Screen
@@ -15,7 +16,7 @@ __all__ = [
     "Band",
     "Component",
     "Disc",
-    "Front",
+    "FreeForm",
     "Lens",
     "Light",
     "Offset",
@@ -24,7 +25,7 @@ __all__ = [
     "Pupil",
     "Scene",
     "Screen",
-    "Second",
+    "SecondTarget",
     "Source",
 ]
 
@@ -36,9 +37,10 @@ from caustic_cli.scene.materials import refractive_index
 
 @dataclass(frozen=True)
 class Band:
-    """Light that is traced in one go: a part of the source's power, with one index and one state of polarisation.
+    """Light that one trace covers: one source, one refractive index and one state of polarisation.
 
-    channel: of a coloured image, or None where the image has no colours; member: which of several sources shines, None of one.
+    weight: fraction of the total power; channel: colour channel of the image, None for an image without colours; member: index of
+    the source among several, None for a single one.
     """
 
     scene: Scene
@@ -51,20 +53,20 @@ class Band:
 class Scene:
     """Source, lens and screen on one optical axis (z); lengths in mm, powers in the unit of `light`.
 
-    second: what light does behind the screen, of a lens with two free-form sides.
-    elements: other lenses and folding mirrors, in the order in which light meets them; behind a mirror z counts along the folded
-    axis, which the screen stands on.
+    second: what the light must do behind the screen, for a lens with two free-form sides.
+    elements: other lenses and fold mirrors, in the order in which light reaches them; behind a mirror, z and the screen refer to
+    the folded axis.
 
     Raises:
-        InputError: the screen does not stand behind the lens, or the source not before it; the screen does not fit on its sphere;
-            elements that stand in each other's way, or beside what they cannot be had with.
+        InputError: the screen is not behind the lens, or the source not in front of it; a curved screen is larger than its sphere
+            or cylinder allows; elements overlap, or are combined with something that does not support them.
     """
 
     source: Source
     lens: Lens
     screen: Screen
     light: Light = field(default_factory=Light)
-    second: Second | None = None
+    second: SecondTarget | None = None
     elements: tuple[Component, ...] = ()
 
     def __post_init__(self):
@@ -73,7 +75,7 @@ class Scene:
             self.second.check(self.screen)
         if not self.lens.mirror and self.screen.z <= self.lens.z_in:
             raise InputError(f"⟨screen.z⟩ must lie behind the lens (beyond z_in = {self.lens.z_in:g} mm), got {self.screen.z:g} mm")
-        self.screen.refuse_beyond()
+        self.screen.check_curvature()
         if self.source.nearest >= self.lens.z_in:
             raise InputError(
                 f"⟨source.position⟩ must lie before the lens (z below z_in = {self.lens.z_in:g} mm),"
@@ -89,33 +91,33 @@ class Scene:
             return
         lens = self.lens
         wrong = {"lens.mirror": lens.mirror, "lens.gradient": lens.gradient is not None, "lens.array": lens.arrayed}
-        refuse_beside(wrong | {"second.file": self.two_sided, "source.type": self.source.rays is not None})
-        check_places(self.elements, (lens.z_in, lens.offset.thickness), self.source.nearest, self.screen.z)
+        check_compatible_with_elements(wrong | {"second.file": self.two_sided, "source.type": self.source.rays is not None})
+        check_positions(self.elements, (lens.z_in, lens.offset.thickness), self.source.nearest, self.screen.z)
 
     @property
     def before(self) -> tuple[Component, ...]:
-        """The elements that light meets before the lens."""
+        """The elements in front of the lens, in the order in which light reaches them."""
         return tuple(e for e in self.elements if e.z < self.lens.z_in)
 
     @property
     def behind(self) -> tuple[Component, ...]:
-        """Those that it meets behind it."""
+        """The elements behind the lens."""
         return self.elements[len(self.before) :]
 
     @property
-    def shaped(self) -> tuple[str, ...]:
-        """Names of the surfaces that a design shapes, the lens' exit last."""
-        beside = [surface_name(k, side) for k, e in enumerate(self.elements) for side in e.shaped]
+    def free_surfaces(self) -> tuple[str, ...]:
+        """Names of the free-form surfaces that a design optimises, the lens' exit last."""
+        beside = [surface_name(k, side) for k, e in enumerate(self.elements) for side in e.free_sides]
         return (*(["entrance"] if self.second is not None else beside), "exit")
 
     @property
-    def jointly(self) -> bool:
-        """Whether a design shapes other surfaces beside the exit: heights are then (k, n, m), in the sequence of `shaped`."""
-        return len(self.shaped) > 1
+    def joint(self) -> bool:
+        """Whether several surfaces are optimised together: heights are then (k, n, m), in the order of `free_surfaces`."""
+        return len(self.free_surfaces) > 1
 
     @property
     def pupil(self) -> Pupil:
-        """What the source lights: the lens' entrance, or the first element before it."""
+        """The aperture that the source illuminates: the lens' entrance, or the first element in front of it."""
         first = next(iter(self.before), None)
         if first is not None:
             return Pupil(first.half_size, first.z, first.round)
@@ -123,52 +125,52 @@ class Scene:
 
     @property
     def lowest(self) -> float:
-        """z that no surface lies below where light comes from the source, mm."""
+        """Lower bound of z over the first surface that light reaches, mm."""
         return min([e.extent[0] for e in self.before[:1]] + [self.lens.lowest])
 
     @property
     def glasses(self) -> tuple[str, ...]:
-        """Materials by name of the lens and of other lenses, whose indices change with the wavelength."""
+        """Names of the dispersive materials of the lens and of the other lenses, without repeats."""
         named = (None if self.lens.mirror else self.lens.glass, *(e.glass for e in self.elements))
         return tuple(dict.fromkeys(glass for glass in named if glass is not None))
 
     def at(self, wavelength: float) -> Scene:
-        """The same with every glass' index at a wavelength, nm."""
+        """The scene with every glass' refractive index evaluated at a wavelength, nm."""
         lens = self.lens if self.lens.glass is None else replace(self.lens, index=refractive_index(self.lens.glass, wavelength))
         return replace(self, lens=lens, elements=tuple(e.at(wavelength) for e in self.elements))
 
     @property
     def axial(self) -> bool:
-        """Whether all light within the lens runs along the axis."""
+        """Whether all light inside the lens is parallel to the axis."""
         return self.source.collimated and not self.two_sided and self.lens.gradient is None and not self.before
 
     def part(self, k: int, of: int) -> Scene:
-        """The same in the k-th of so many lights that are alike and independent: a ray file's rays are shared out among them,
-        other light's are drawn anew."""
+        """The scene with the k-th of `of` statistically independent parts of its light: the rays of a ray file are partitioned, the
+        rays of any other source are sampled afresh."""
         return replace(self, source=self.source.part(k, of))
 
     def onto(self, screen: Screen) -> Scene:
-        """The same light on another screen, with nothing said of what it does behind that."""
+        """The scene with another screen and without a second target."""
         return replace(self, screen=screen, second=None)
 
     @property
     def two_sided(self) -> bool:
-        """Whether the lens' entrance is free-form, too."""
-        return self.second is not None or self.lens.front is not None
+        """Whether the entrance is free-form as well as the exit."""
+        return self.second is not None or self.lens.entrance is not None
 
     @property
     def dispersive(self) -> bool:
-        """Whether the source's wavelengths are refracted differently."""
+        """Whether several wavelengths pass a dispersive material."""
         return bool(self.light.wavelengths and self.glasses)
 
     @property
     def colored(self) -> bool:
-        """Whether images keep red, green and blue apart: (3, n_x, n_y)."""
+        """Whether images have three colour channels, (3, n_x, n_y)."""
         return self.light.color
 
     @property
     def by_source(self) -> tuple[Scene, ...]:
-        """The scene in the light of each of its sources alone."""
+        """One scene for each of its sources, with that source alone."""
         if len(self.source.members) == 1:
             return (self,)
         spectra = self.source.spectra if self.light.wavelengths else [((), ())] * len(self.source.members)
@@ -179,7 +181,8 @@ class Scene:
 
     @property
     def bands(self) -> tuple[Band, ...]:
-        """What has to be traced apart, by source, wavelength and polarisation: the scene itself where one trace says it all."""
+        """The separate traces that the scene needs, by source, wavelength and polarisation; the scene itself where one is
+        enough."""
         if len(self.source.members) > 1:
             each = zip(self.by_source, self.source.fractions, strict=True)
             return tuple(

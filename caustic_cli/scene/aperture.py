@@ -1,4 +1,4 @@
-"""The part of a plane or of a surface that light may pass."""
+"""Apertures: the clear area of a surface, and the pupil that sources illuminate."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from caustic_cli.errors import InputError
 
 @dataclass(frozen=True)
 class Aperture:
-    """The part of a surface that light may pass: a rectangle or a circle about the element's axis; infinite for all of it.
+    """The clear aperture of a surface: a rectangle or a circle centred on the element's axis; infinite for an unbounded surface.
 
     Args:
-        half_size: half widths of the rectangle, mm; radius twice of a circle.
-        round: a circle.
+        half_size: half widths of the rectangle, mm; for a circle its radius, given twice.
+        round: whether it is a circle.
     """
 
     half_size: tuple[float, float] = (math.inf, math.inf)
@@ -22,15 +22,15 @@ class Aperture:
 
     def __post_init__(self):
         if self.round and self.half_size[0] != self.half_size[1]:
-            raise InputError(f"half_size of a circular aperture must be its radius, twice the same, got {self.half_size}")
+            raise InputError(f"half_size of a circular aperture must be its radius, given twice, got {self.half_size}")
 
     @property
     def radius(self) -> float | None:
-        """Of a circle, mm; None of a rectangle."""
+        """Radius of a circular aperture, mm; None for a rectangle."""
         return self.half_size[0] if self.round else None
 
-    def holds(self, x, y):
-        """Whether points lie within it."""
+    def contains(self, x, y):
+        """Whether points x, y (mm) lie inside the aperture, borders included."""
         (rx, ry) = self.half_size
         if self.round:
             return x * x + y * y <= rx * rx
@@ -39,7 +39,7 @@ class Aperture:
 
 @dataclass(frozen=True)
 class Pupil:
-    """The aperture that sources light: half widths mm, z mm, and whether it is a circle."""
+    """The aperture that sources illuminate: half widths, mm; z, mm; and whether it is a circle."""
 
     half_size: tuple[float, float]
     z: float
@@ -47,5 +47,5 @@ class Pupil:
 
     @property
     def aperture(self) -> Aperture:
-        """Without its place."""
+        """The aperture without its position."""
         return Aperture(self.half_size, self.round)

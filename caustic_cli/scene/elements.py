@@ -1,11 +1,11 @@
-"""Lenses and folding mirrors beside the free-form lens, on its axis.
+"""Spherical lenses and fold mirrors on the axis of the free-form lens.
 
 Notation
-    z       where the first vertex meets the axis, mm; behind a mirror it goes on counting along the folded axis
-    R       radius of curvature, mm: positive where the centre lies behind the surface, along the light's way; inf for a plane
-    sag     R - sign(R) sqrt(R^2 - r^2), height of a sphere over its vertex at distance r from the axis
+    z       position of the first vertex along the axis, mm; behind a mirror it is measured along the folded axis
+    R       radius of curvature, mm: positive if the centre lies behind the surface in the direction of the light; inf for a plane
+    sag     R - sign(R) sqrt(R^2 - r^2), height of a sphere above its vertex at distance r from the axis
 
-A mirror of R > 0 bulges towards the light and spreads it; one of R < 0 is hollow and gathers it.
+A mirror with R > 0 is convex and diverges the light; one with R < 0 is concave and converges it.
 """
 
 from __future__ import annotations
@@ -18,38 +18,38 @@ from dataclasses import dataclass, replace
 from caustic_cli.config.table import check, default
 from caustic_cli.errors import InputError
 from caustic_cli.scene.aperture import Aperture
-from caustic_cli.scene.front import Front
+from caustic_cli.scene.freeform import FreeForm
 from caustic_cli.scene.materials import refractive_index
 
-#: Part of a sphere's radius that an aperture may reach from the axis: farther out light meets it edge on.
+#: Largest semi-aperture of a sphere, as a fraction of its radius: beyond it light arrives near grazing incidence.
 STEEPEST = 0.95
-#: Least turn of a mirror, degrees: one that stands straight across the axis sends the light back into the lens.
+#: Least tilt of a fold mirror, degrees: one perpendicular to the axis sends the light back into the lens.
 LEAST_TILT = 5.0
-#: Thickness of the plate that a mirror is made as, mm.
+#: Thickness of the plate that carries a mirror in exported solids, mm.
 PLATE = 3.0
 SIDES = ("front", "back")
 
 
 @dataclass(frozen=True)
 class Component:
-    """A lens of two surfaces, or a mirror; see above.
+    """A singlet lens or a mirror; see the module.
 
     Args:
         kind: lens or mirror.
         z: of its first vertex, mm.
         size: full width and height of its aperture, mm.
-        thickness: between the vertices of a lens, mm.
-        radius: (front, back), mm; of a mirror the first alone.
+        thickness: centre thickness of a lens, mm.
+        radius: radii of curvature (front, back), mm; a mirror uses the first only.
         index: refractive index of a lens.
-        absorption: coefficient of its glass, 1/mm.
-        glass: a name of `materials`, whose index changes with the wavelength; None for `index` at every wavelength.
-        aperture: rectangle, or circle, the largest within size.
-        tilt: turns of a mirror about x or about y, degrees.
-        free: which of its surfaces a design shapes: none, front, back or both.
-        fronts: what a design has made of them: heights of (front, back) from their vertices' planes, None of a sphere.
+        absorption: absorption coefficient of its glass, 1/mm.
+        glass: a dispersive material, by its name in `materials`; None for `index` at every wavelength.
+        aperture: rectangle, or circle, the largest that fits into size.
+        tilt: rotations of a mirror about x or about y, degrees.
+        free: which of its surfaces a design optimises: none, front, back or both.
+        surfaces: the optimised (front, back), heights above the vertex planes; None for a sphere.
 
     Raises:
-        InputError: a value out of range, surfaces that cross within the aperture, or a mirror that does not turn the axis aside.
+        InputError: a value is out of range, the surfaces cross within the aperture, or a mirror does not fold the axis.
     """
 
     kind: str
@@ -63,7 +63,7 @@ class Component:
     aperture: str = default("element.aperture")
     tilt: tuple[float, float] = (0.0, 0.0)
     free: str = default("element.free")
-    fronts: tuple[Front | None, Front | None] = (None, None)
+    surfaces: tuple[FreeForm | None, FreeForm | None] = (None, None)
 
     def __post_init__(self):
         for key, value in (("type", self.kind), *((k, getattr(self, k)) for k in ("z", "size", "aperture", "free", "tilt"))):
@@ -73,8 +73,7 @@ class Component:
                 raise InputError(f"⟨element.radius⟩ must be non-zero numbers of mm or inf, got {list(self.radius)}")
         if self.round and self.size[0] != self.size[1]:
             raise InputError(
-                "⟨element.size⟩ of a circular aperture must be its diameter, twice the same, got"
-                f" {self.size[0]:g} x {self.size[1]:g}"
+                f"⟨element.size⟩ of a circular aperture must be its diameter, given twice, got {self.size[0]:g} x {self.size[1]:g}"
             )
         for side, r in zip(self.sides, self.radius, strict=False):
             if self.reach > STEEPEST * abs(r):
@@ -91,7 +90,7 @@ class Component:
         for key in ("thickness", "index", "absorption"):
             check(f"element.{key}", getattr(self, key))
         if any(self.tilt):
-            raise InputError("⟨element.tilt⟩ is for mirrors: a lens stands square to the axis")
+            raise InputError("⟨element.tilt⟩ is for mirrors: lenses are perpendicular to the axis")
         rim = self.thickness + self.sag("back") - self.sag("front")
         if rim <= 0:
             raise InputError(
@@ -111,17 +110,17 @@ class Component:
 
     @property
     def mirror(self) -> bool:
-        """Whether it reflects."""
+        """Whether it is a mirror."""
         return self.kind == "mirror"
 
     @property
     def sides(self) -> tuple[str, ...]:
-        """Its surfaces."""
+        """Names of its surfaces."""
         return SIDES[:1] if self.mirror else SIDES
 
     @property
-    def shaped(self) -> tuple[str, ...]:
-        """Those of its surfaces that a design shapes."""
+    def free_sides(self) -> tuple[str, ...]:
+        """Names of the surfaces that a design optimises."""
         return tuple(side for side in self.sides if self.free in (side, "both"))
 
     @property
@@ -131,21 +130,21 @@ class Component:
 
     @property
     def half_size(self) -> tuple[float, float]:
-        """Half widths, mm."""
+        """Half widths of the aperture, mm."""
         return self.size[0] / 2.0, self.size[1] / 2.0
 
     @property
     def opening(self) -> Aperture:
-        """The aperture of each of its surfaces."""
+        """Clear aperture of each of its surfaces."""
         return Aperture(self.half_size, self.round)
 
     @property
     def reach(self) -> float:
-        """How far the aperture reaches from the axis, mm."""
+        """Semi-aperture: largest distance of the aperture from the axis, mm."""
         return self.half_size[0] if self.round else math.hypot(*self.half_size)
 
     def sag(self, side: str) -> float:
-        """Of a side at the rim of the aperture, mm."""
+        """Sag of a side at the edge of the aperture, mm."""
         k = 1.0 / self.radius[SIDES.index(side)]
         return k * self.reach**2 / (1.0 + math.sqrt(1.0 - (k * self.reach) ** 2))
 
@@ -155,41 +154,41 @@ class Component:
 
     @property
     def extent(self) -> tuple[float, float]:
-        """Between which z it stands, mm; a mirror, which leans, is taken at its vertex."""
+        """Range of z that it occupies, mm; a tilted mirror is represented by its vertex."""
         if self.mirror:
             return self.z, self.z
         low, high = (
             self.sag(side) if f is None else float(f.heights.min() if side == "front" else f.heights.max())
-            for side, f in zip(SIDES, self.fronts, strict=True)
+            for side, f in zip(SIDES, self.surfaces, strict=True)
         )
         return self.z + min(0.0, low), self.z + self.thickness + max(0.0, high)
 
     def at(self, wavelength: float) -> Component:
-        """The same in light of a wavelength, nm."""
+        """The component with its index evaluated at a wavelength, nm."""
         return self if self.glass is None else replace(self, index=refractive_index(self.glass, wavelength))
 
 
 def surface_name(number: int, side: str) -> str:
-    """Of a surface of the element of this number, counted from 0, among those of a system."""
+    """Name of a surface within a system; number: of its element, counted from 0."""
     return f"element-{number + 1}-{side}"
 
 
-def check_places(elements: Sequence[Component], lens: tuple[float, float], source: float, screen: float) -> None:
-    """Refuse elements that do not stand one behind the other, clear of the free-form lens.
+def check_positions(elements: Sequence[Component], lens: tuple[float, float], source: float, screen: float) -> None:
+    """Check that elements are in order along the axis and overlap neither each other nor the free-form lens.
 
     Args:
-        lens: where the lens begins, and where its exit's middle is, mm; source, screen: how far back the source reaches, and where
-            the screen is.
+        lens: z of the lens' entrance and of the centre of its exit, mm.
+        source, screen: largest z of the source, and z of the screen, mm.
 
     Raises:
-        InputError: saying which, and where it would be accepted.
+        InputError: naming the element and the accepted range.
     """
     bodies = [(f"the {e.kind} of [[element]] {k + 1}", *e.extent) for k, e in enumerate(elements)]
     for (_, low, _), e in zip(bodies, elements, strict=True):
         if e.mirror and low < lens[0]:
             raise InputError(
                 f"⟨element.z⟩ of a mirror must lie behind the lens (beyond {lens[1]:g} mm), got {low:g} mm: the lens stands on its"
-                " source's axis, so that a mirror before it is the source turned"
+                " source's axis, so that a mirror in front of it is equivalent to a rotated source"
             )
     own = ("the free-form lens", *lens)
     before = [b for b in bodies if b[1] < lens[0]]
@@ -197,8 +196,8 @@ def check_places(elements: Sequence[Component], lens: tuple[float, float], sourc
     for (name, _, high), (other, low, _) in itertools.pairwise(sequence):
         if low < high:
             raise InputError(
-                f"⟨element.z⟩: {other} begins at {low:.4g} mm, before {name} ends at {high:.4g} mm; [[element]] tables stand in the"
-                " order in which light meets them, clear of each other"
+                f"⟨element.z⟩: {other} begins at {low:.4g} mm, before {name} ends at {high:.4g} mm; [[element]] tables must be in"
+                " the order in which light reaches them, without overlap"
             )
     if before and source >= before[0][1]:
         raise InputError(
@@ -210,12 +209,12 @@ def check_places(elements: Sequence[Component], lens: tuple[float, float], sourc
         )
 
 
-def refuse_beside(wrong: dict[str, bool]) -> None:
-    """Refuse what cannot be had with elements beside the lens: settings by path, and whether they are there.
+def check_compatible_with_elements(wrong: dict[str, bool]) -> None:
+    """Refuse settings that do not support other elements: paths, and whether each is set.
 
     Raises:
         InputError: naming the setting.
     """
     for path, there in wrong.items():
         if there:
-            raise InputError(f"⟨{path}⟩ cannot be had with [[element]]: beside other lenses and mirrors it is not worked out")
+            raise InputError(f"⟨{path}⟩ cannot be combined with [[element]]: it is not implemented beside other lenses and mirrors")

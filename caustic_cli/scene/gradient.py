@@ -1,11 +1,11 @@
-"""A refractive index that varies within the lens (thesis 7.2.1): what [lens] gradient says, as plain data.
+"""Gradient-index (GRIN) media of the lens (thesis 7.2.1): the index distribution of [lens] gradient as data.
 
 Notation
-    n_0     the lens' index;  r  distance from the axis, mm;  z  counted from the entrance, mm
-    selfoc  n^2 = n_0^2 (1 - (g r)^2), terms (g,), 1/mm: a rod that images with the pitch 2 pi / g (Merchand, Gradient Index Optics)
+    n_0     the lens' index;  r  distance from the axis, mm;  z  distance from the entrance, mm
+    selfoc  n^2 = n_0^2 (1 - (g r)^2), terms (g,), 1/mm: a GRIN rod lens of pitch 2 pi / g (Marchand, Gradient Index Optics)
     radial  n = n_0 + a_1 r^2 + a_2 r^4 + ..., terms (a_1, a_2, ...), mm^-2k
     axial   n = n_0 + a_1 z + a_2 z^2 + ..., terms (a_1, a_2, ...), mm^-k
-    volume  control values (n, m, k) of a B-spline volume over aperture and thickness; k = 1 is an index that z does not change
+    volume  control values (n, m, k) of a B-spline volume over aperture and thickness; k = 1 is an index independent of z
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ import numpy as np
 from caustic_cli.errors import InputError
 
 KINDS = ("selfoc", "radial", "axial")
-#: Of a B-spline volume: least and largest control value, and most of them.
+#: For a B-spline volume: range of the control values, and their largest number.
 INDEX, MOST_VALUES = (1.0, 5.0), 50_000_000
-#: Degree of a volume along every axis, or one less than its control values there.
+#: Degree of a volume along every axis; where there are too few control values, their number less one.
 DEGREE = 3
 
 
 @dataclass(frozen=True, eq=False)
 class Gradient:
-    """See above.
+    """A gradient-index distribution; see the module.
 
     Args:
         kind: selfoc, radial, axial or volume.
-        terms: of a formula.
+        terms: coefficients of a formula.
         volume: (n, m, k) or (n, m) float64 control values.
 
     Raises:
-        InputError: an unknown kind, terms of another number, or a volume that is none.
+        InputError: the kind is unknown, the number of terms is wrong, or the volume is invalid.
     """
 
     kind: str
@@ -52,10 +52,10 @@ class Gradient:
 
 
 def checked_volume(values: np.ndarray | None, where: str = "⟨lens.index_file⟩") -> np.ndarray:
-    """Control values (n, m, k) float64 of (n, m, k) or (n, m).
+    """Validated control values (n, m, k) float64, from an array (n, m, k) or (n, m).
 
     Raises:
-        InputError: they are no such array, or beyond INDEX.
+        InputError: the array has another shape, or values outside INDEX.
     """
     array = np.asarray(values, dtype=np.float64) if isinstance(values, np.ndarray) else np.empty(0)
     array = array[:, :, None] if array.ndim == 2 else array

@@ -1,9 +1,9 @@
-"""The lens: flat or B-spline entrance at z_in, a B-spline exit surface over a rectangular aperture (thesis 4.1).
+"""The free-form lens: plane or B-spline entrance at z_in, B-spline exit over a rectangular or circular aperture (thesis 4.1).
 
 Notation
     r_x, r_y     half widths of the aperture [-r_x, r_x] x [-r_y, r_y], mm
-    f(x, y)      offset surface: what the control heights vary about, mm (eq. 5.1.2)
-    rho          radius of curvature of a spherical offset; rho > 0 is concave towards the screen (it spreads light)
+    f(x, y)      offset surface (base surface): control heights are bounded relative to it, mm (eq. 5.1.2)
+    rho          radius of curvature of a spherical offset; rho > 0 is concave towards the screen, a diverging surface
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ import numpy as np
 from caustic_cli.config import checks
 from caustic_cli.config.table import TABLE, check, check_all, default
 from caustic_cli.errors import InputError
-from caustic_cli.scene.front import Front
+from caustic_cli.scene.freeform import FreeForm
 from caustic_cli.scene.gradient import Gradient
 
 
 @dataclass(frozen=True)
 class Offset:
-    """f(x, y) = thickness + sag_x(x) + sag_y(y), the surface that a height of zero stands for.
+    """The base surface f(x, y) = thickness + sag_x(x) + sag_y(y).
 
     Args:
         thickness: f(0, 0), mm.
@@ -44,11 +44,12 @@ class Offset:
     def for_magnification(
         cls, mag: tuple[float, float], index: float, throw: float, thickness: float, vergence: float = 0.0
     ) -> Offset:
-        """The sphere that spreads light over `mag` times the aperture: rho = (n - 1) T / (mag - 1 - T V), T = z_screen - z_lens.
+        """The sphere that spreads the light over `mag` times the aperture: rho = (n - 1) T / (mag - 1 - T V), T = z_screen -
+        z_lens.
 
-        For parallel light (V = 0) that is table 6.1's, erratum E12.  `throw` is z_screen, `thickness` is z_lens (mm);
-        `vergence` V is one over the distance, behind the lens, from which the light seems to come (1/mm): paraxially a ray
-        at height x lands at x (1 + T V + (n - 1) T / rho).
+        For parallel light (V = 0) this is the sphere of table 6.1, erratum E12.  `throw` is z_screen, `thickness` is z_lens (mm).
+        `vergence` V is the reciprocal of the distance from the apparent source, behind the lens, to the lens (1/mm): paraxially a
+        ray at height x lands at x (1 + T V + (n - 1) T / rho).
         """
         reach = throw - thickness
         powers = [(m - 1.0 - reach * vergence) / ((index - 1.0) * reach) for m in mag]
@@ -59,7 +60,7 @@ class Offset:
         """f(x, y) - thickness at points x, y (broadcast), float64 mm.
 
         Raises:
-            InputError: the sphere ends inside the aperture.
+            InputError: the aperture is larger than the sphere.
         """
         xx, yy = (np.square(np.asarray(c, float)) for c in (x, y))
         rx, ry = self.radius
@@ -70,10 +71,10 @@ class Offset:
                 continue
             if square.max(initial=0.0) >= rho * rho:
                 raise InputError(
-                    f"⟨lens.radius⟩ must exceed the lens' own reach of {math.sqrt(square.max()):.4g} mm, got {abs(rho):.4g} mm"
+                    f"⟨lens.radius⟩ must exceed the lens' semi-aperture of {math.sqrt(square.max()):.4g} mm, got {abs(rho):.4g} mm"
                     " (a smaller ⟨mag⟩ or a longer ⟨throw⟩ gives a larger radius)"
                 )
-            # rho - sign sqrt(rho^2 - s) without its cancellation
+            # s / (rho + sign sqrt(rho^2 - s)), which is rho - sign sqrt(rho^2 - s) without cancellation
             root = rho * rho - square
             np.sqrt(root, out=root)
             root *= math.copysign(1.0, rho)
@@ -83,7 +84,7 @@ class Offset:
 
 
 def array_control(n: int, degree: int, lenslets: int) -> int:
-    """The least number of control points, n or more, that so many lenslets side by side of equally many spans have; see
+    """The least number of control points, at least n, for which all lenslets of a row have equally many knot spans; see
     `open_knots`."""
     spans = max(1, math.ceil((n - 1) / lenslets) - degree + 1)
     return lenslets * (spans + degree - 1) + 1
@@ -91,28 +92,32 @@ def array_control(n: int, degree: int, lenslets: int) -> int:
 
 @dataclass(frozen=True)
 class Lens:
-    """A lens of refractive index n with flat entrance and B-spline exit.
+    """A lens with a plane or free-form entrance and a B-spline exit, in air; or a free-form mirror.
 
     Args:
         size: full width and height of the aperture, mm.
-        z_in: position of the flat entrance surface, mm.
+        z_in: position of the plane entrance, or of the reference plane of a free-form one, mm.
         index: refractive index (the surroundings have 1).
         control: control points along x and y.
         degree: spline degrees along x and y.
         knots: (knots_u, knots_v) on [0, 1], or None for open equispaced ones.
         min_thickness: least distance of every control height from z_in, mm (4.1.2).
-        offset: the surface the heights vary about.
-        height_range: least and largest departure from the offset, mm (5.1.1).
+        offset: base surface.
+        height_range: least and largest height above the base surface, mm (5.1.1).
         fresnel: reflection losses at both surfaces: none, schlick or exact (unpolarised).
-        absorption: absorption coefficient a of the glass, 1/mm: exp(-a t) passes t mm (Beer-Lambert).
-        roughness: standard deviation, along either axis, of the slopes of the exit's microfacets about the surface's own.
-        glass: a name of `materials`, whose index changes with the wavelength; None for `index` at every wavelength.
-        aperture: rectangle, or circle, the largest that fits into the size; the spline goes on beyond it, light and glass do not.
+        absorption: absorption coefficient a of the glass, 1/mm; the transmittance of t mm is exp(-a t) (Beer-Lambert).
+        roughness: standard deviation, along either axis, of the slopes of the exit's microfacets relative to the smooth surface.
+        glass: a dispersive material, by its name in `materials`; None for `index` at every wavelength.
+        aperture: rectangle, or circle, the largest that fits into the size; the spline is defined beyond it, light and glass end
+            there.
         border: width of a dark rim around the aperture, which the exported solid has for its mount, mm.
-        array: lenslets along x and y, side by side over the aperture, which meet in height; (1, 1) is one lens.
-        gradient: how the index varies from place to place, `index` being that of its formula; None where it does not.
-        mirror: the surface reflects, the light comes through air, and `index`, `fresnel` and `absorption` mean nothing.
-        front: the entrance where it is free-form, None for the plane.
+        array: numbers of lenslets along x and y, whose surfaces are continuous across their borders; (1, 1) is a single lens.
+        gradient: gradient-index distribution, with `index` for n_0 of its formula; None for a homogeneous lens.
+        mirror: the free-form surface reflects, in air; `index`, `fresnel` and `absorption` are ignored.
+        entrance: the free-form entrance; None for a plane one.
+
+    Raises:
+        InputError: a value is out of range, or two contradict each other.
     """
 
     size: tuple[float, float] = default("lens.size")
@@ -132,7 +137,7 @@ class Lens:
     aperture: str = default("lens.aperture")
     border: float = default("lens.border")
     array: tuple[int, int] = default("lens.array")
-    front: Front | None = None
+    entrance: FreeForm | None = None
     gradient: Gradient | None = None
 
     def __post_init__(self):
@@ -167,7 +172,7 @@ class Lens:
             raise InputError("⟨lens.gradient⟩ needs a lens: light never enters a mirror")
         if self.round and self.size[0] != self.size[1]:
             raise InputError(
-                f"⟨lens.size⟩ of a circular aperture must be its diameter, twice the same, got {self.size[0]:g} x {self.size[1]:g}"
+                f"⟨lens.size⟩ of a circular aperture must be its diameter, given twice, got {self.size[0]:g} x {self.size[1]:g}"
             )
 
     def _check_array(self) -> None:
@@ -178,7 +183,8 @@ class Lens:
 
     @property
     def cut_from(self) -> int:
-        """The side from which a tool cuts the shaped surface: 1 from +z, or -1 from -z, from where light reaches a mirror."""
+        """The side from which a tool machines the free-form surface: 1 from +z, or -1 from -z for a mirror, the side of its
+        light."""
         return -1 if self.mirror else 1
 
     @property
@@ -198,33 +204,33 @@ class Lens:
 
     @property
     def lowest(self) -> float:
-        """z that no part of the entrance lies below, mm."""
-        return self.z_in + (0.0 if self.front is None else min(0.0, float(self.front.heights.min())))
+        """Lower bound of z over the entrance, mm."""
+        return self.z_in + (0.0 if self.entrance is None else min(0.0, float(self.entrance.heights.min())))
 
     @property
     def inside(self) -> float:
-        """Refractive index before the free-form surface: the glass', or 1 before a mirror."""
+        """Refractive index of the medium in front of the exit: that of the glass, or 1 for a mirror."""
         return 1.0 if self.mirror else self.index
 
     @property
     def effective_index(self) -> float:
-        """n in "a slope turns light by n - 1 times itself": the index, or -1 for a mirror (Snell's law with index -1)."""
+        """n of the paraxial deflection (n - 1) times the slope: the index, or -1 for a mirror (Snell's law with index -1)."""
         return -1.0 if self.mirror else self.index
 
     def height_bounds(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Least and largest control height at control points x (n,), y (m,): two (n, m) float64, mm.
+        """Bounds of the control heights at control points x (n,), y (m,): two (n, m) float64, mm.
 
-        Every height at least z_in + min_thickness keeps the whole surface there, by the convex hull property (4.1.2).
+        With every height at least z_in + min_thickness the whole surface is, too, by the convex hull property (4.1.2).
 
         Raises:
-            InputError: the bounds leave no room.
+            InputError: the lower bound exceeds the upper one somewhere.
         """
         f = self.offset.thickness + self.offset.sag(x[:, None], y[None, :])
         low = np.maximum(f + self.height_range[0], self.z_in + self.min_thickness)
         high = f + self.height_range[1]
         if not (low < high).all():
             raise InputError(
-                f"⟨lens.min_thickness⟩ of {self.min_thickness:g} mm leaves the heights no room: offset plus height_range"
+                f"⟨lens.min_thickness⟩ of {self.min_thickness:g} mm leaves no room for the heights: base surface plus height_range"
                 f" reaches only {high.min() - self.z_in:.4g} mm above z_in; raise ⟨+lens.thickness⟩ or ⟨lens.height_range⟩"
             )
         return low, high

@@ -1,4 +1,4 @@
-"""What the light is, wherever it comes from: wavelengths, polarisation, unit of power, and whether colours are told apart."""
+"""Spectrum, polarisation and unit of power of the light, whatever its source."""
 
 from __future__ import annotations
 
@@ -7,23 +7,26 @@ from dataclasses import dataclass
 from caustic_cli.config.table import check
 from caustic_cli.errors import InputError
 
-#: Dominant wavelengths of the primaries of sRGB (IEC 61966-2-1), nm: what stands for red, green and blue.
+#: Dominant wavelengths of the sRGB primaries (IEC 61966-2-1), nm, which represent red, green and blue.
 RGB = (611.4, 549.1, 464.3)
-#: Most wavelengths of one source: each is traced.
+#: Largest number of wavelengths of one source: each takes a trace.
 MAX_WAVELENGTHS = 99
 
 
 @dataclass(frozen=True)
 class Light:
-    """Quality of a source's light.
+    """Spectrum and polarisation of a source's light.
 
     Args:
         polarisation: direction of linear polarisation in the x-y plane, degrees from +x; None for unpolarised light.
-        wavelengths: nm; empty for light of the one wavelength at which the lens' index is given.
-        weights: part of the power at each wavelength, any scale; empty for equal parts.
-        tracked: unpolarised light is traced as two polarisations, for the exit to know what the entrance did to each.
-        color: the wavelengths are red, green and blue, and the image is kept apart for each.
-        unit: of the source's power, W, radiant power, or lm, luminous flux.
+        wavelengths: nm; empty for monochromatic light at the wavelength of the lens' index.
+        weights: relative power at each wavelength; empty for equal power.
+        tracked: unpolarised light is traced as two orthogonal polarisations, since the entrance transmits s and p differently.
+        color: the wavelengths are red, green and blue, and the image has a channel for each.
+        unit: unit of the source's power: W (radiant flux) or lm (luminous flux).
+
+    Raises:
+        InputError: a value is out of range, or the numbers of wavelengths and weights do not match.
     """
 
     polarisation: float | None = None
@@ -54,6 +57,6 @@ class Light:
 
     @property
     def parts(self) -> tuple[float, ...]:
-        """Part of the power at each wavelength; they sum to 1."""
+        """Fraction of the power at each wavelength; they sum to 1."""
         weights = self.weights or (1.0,) * len(self.wavelengths)
         return tuple(w / sum(weights) for w in weights)

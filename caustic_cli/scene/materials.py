@@ -1,4 +1,4 @@
-"""Materials of lenses by the names that people give them: refractive index by wavelength, density, and what follows from them.
+"""Optical materials by their common names: dispersion formulas, Abbe number and density.
 
 Two formulas, lambda in micrometres:
 
@@ -27,8 +27,11 @@ D_LINE, F_LINE, C_LINE = 587.5618, 486.1327, 656.2725
 
 @dataclass(frozen=True)
 class Material:
-    """sellmeier: terms (B_k, C_k), or cauchy: terms (A_k, p_k); range_nm: wavelengths they hold for; source; density, g/cm^3, None
-    where its source says none; also: other names; spread: of n_d between batches, 0 of a catalogue's."""
+    """An optical material.
+
+    sellmeier: terms (B_k, C_k), or cauchy: terms (A_k, p_k); range_nm: range of validity; source: reference; density: g/cm^3, None
+    if the reference gives none; also: other names; spread: of n_d between batches, 0 for catalogue glasses.
+    """
 
     source: str
     range_nm: tuple[float, float]
@@ -39,7 +42,7 @@ class Material:
     spread: float = 0.0
 
     def index(self, wavelength: float) -> float:
-        """Refractive index at `wavelength` nm, of any range."""
+        """Refractive index at `wavelength` nm, without a check of the range."""
         length = wavelength * 1e-3
         if self.cauchy:
             return sum(a * length**p for a, p in self.cauchy)
@@ -47,17 +50,17 @@ class Material:
 
     @property
     def abbe(self) -> float:
-        """V_d = (n_d - 1) / (n_F - n_C)."""
+        """Abbe number V_d = (n_d - 1) / (n_F - n_C)."""
         return (self.index(D_LINE) - 1.0) / (self.index(F_LINE) - self.index(C_LINE))
 
     @property
     def steepest(self) -> float:
-        """Slope of a surface, mm per mm, from which on light along the axis inside is totally reflected: 1 / sqrt(n_d^2 - 1)."""
+        """Surface slope, mm per mm, at which axial light inside reaches the critical angle: 1 / sqrt(n_d^2 - 1)."""
         return 1.0 / math.sqrt(self.index(D_LINE) ** 2 - 1.0)
 
 
 def _typical(n_d: float, abbe: float, spread: float, density: float, *also: str) -> Material:
-    """A material known by its index and dispersion, about."""
+    """A material with a two-term Cauchy formula through typical values of n_d and the Abbe number."""
     b = (n_d - 1.0) / abbe / (1e6 / F_LINE**2 - 1e6 / C_LINE**2)
     cauchy = ((n_d - b * 1e6 / D_LINE**2, 0.0), (b, -2.0))
     return Material("typical", (400, 750), density, cauchy=cauchy, also=also, spread=spread)
@@ -94,12 +97,12 @@ MATERIALS = {
         (0.02086189578, 0.02620722293), (0.1130748688, 10.69792721))),
 }
 # fmt: on
-#: What people name when they mean a mirror.
+#: Names of metals, which ask for a mirror.
 METALS = ("aluminium", "aluminum", "brass", "bronze", "chrome", "copper", "gold", "silver", "steel", "stainless steel", "metal")
 
 
 def _plain(name: str) -> str:
-    """A name without what people write differently: case, blanks, hyphens."""
+    """A name without case, blanks and hyphens, for comparison."""
     return "".join(c for c in name.casefold() if c.isalnum())
 
 
@@ -107,7 +110,7 @@ _BY_NAME = {_plain(other): name for name, material in MATERIALS.items() for othe
 
 
 def material(name: str) -> Material:
-    """The material that people call `name`, whatever its case, blanks and hyphens.
+    """The material of this name; case, blanks and hyphens do not matter.
 
     Raises:
         InputError: it is unknown.
@@ -116,14 +119,14 @@ def material(name: str) -> Material:
     if plain in _BY_NAME:
         return MATERIALS[_BY_NAME[plain]]
     if plain in map(_plain, METALS):
-        raise InputError(f"⟨lens.glass⟩ must be what light goes through; {name} reflects: give ⟨+lens.mirror⟩ instead")
+        raise InputError(f"⟨lens.glass⟩ must be a transparent material; {name} is a metal: give ⟨+lens.mirror⟩ instead")
     near = difflib.get_close_matches(plain, _BY_NAME, 1, 0.7)
     hint = f"; did you mean {_BY_NAME[near[0]]}?" if near else "; of any other material, give its ⟨+lens.index⟩"
     raise InputError(f"⟨lens.glass⟩ must be one of {', '.join(MATERIALS)}, got {name!r}{hint}")
 
 
 def refractive_index(name: str, wavelength: float = D_LINE) -> float:
-    """Index of the material that people call `name` at `wavelength` nm.
+    """Refractive index of a material, by name, at `wavelength` nm.
 
     Raises:
         InputError: the material is unknown, or the wavelength outside the range of its formula.
@@ -136,7 +139,7 @@ def refractive_index(name: str, wavelength: float = D_LINE) -> float:
 
 
 def rows() -> list[tuple[str, str, str, str, str, str]]:
-    """The table of materials as text: name, n_d, Abbe number, density in g/cm^3, steepest slope, other names."""
+    """The table of materials as text: name, n_d, Abbe number, density in g/cm^3, slope at the critical angle, other names."""
     return [
         (
             name,

@@ -1,7 +1,8 @@
-"""The screen: a rectangle of pixels, in the plane z = const unless it is tilted or curved.
+"""The screen: a rectangular pixel grid, in a plane z = const unless it is tilted or curved.
 
-A curved screen is a height field S(x, y) over its own plane: its pixels are equal cells of x and y there, so that the picture is as
-seen from far away along the screen's normal.  S > 0 lies on the side of the normal, which an upright screen has along +z.
+A curved screen is a height field S(x, y) over its tangent plane.  Its pixels are equal cells of x and y in that plane, so the
+picture appears undistorted in orthographic projection along the screen's normal.  S > 0 lies on the side of the normal, which is +z
+for an upright screen.
 """
 
 from __future__ import annotations
@@ -14,9 +15,9 @@ import numpy as np
 from caustic_cli.config.table import check_all, default
 from caustic_cli.errors import InputError
 
-#: Most points of a measured shape along an axis.
+#: Largest number of points of a measured shape along an axis.
 MAX_SAGS = 4096
-#: Part of a sphere's or a cylinder's radius that the screen may reach from its middle: farther out light meets it edge on.
+#: Largest half extent of a spherical or cylindrical screen, as a fraction of its radius: beyond it incidence is near grazing.
 STEEPEST = 0.98
 #: Radii of a plane screen.
 PLANE = (math.inf, math.inf)
@@ -24,11 +25,11 @@ PLANE = (math.inf, math.inf)
 
 @dataclass(frozen=True, eq=False)
 class Sags:
-    """Measured heights S of a screen: values (a, b) mm, [i, j] with i along +x, on an even grid over a rectangle of this full width
-    and height, mm, about the screen's middle, borders included.
+    """Measured heights S of a screen: values (a, b) mm, [i, j] with i along +x, on a uniform grid over a rectangle of full width
+    and height `size`, mm, centred on the screen, borders included.
 
     Raises:
-        InputError: too few or too many values, or some that are not finite.
+        InputError: there are too few or too many values, or some are not finite.
     """
 
     values: np.ndarray
@@ -56,15 +57,15 @@ class Screen:
         size: full width and height (2 R_x, 2 R_y), mm.
         z: position, mm.
         resolution: pixels along x and y.
-        tilt: right-handed turns of the screen about its own centre, first about the fixed x axis, then about the fixed y axis,
+        tilt: right-handed rotations of the screen about its own centre, first about the fixed x axis, then about the fixed y axis,
             degrees.
-        shift: of its middle from the axis along x and y, mm.
-        radius: of curvature along x and y, mm: both the same for a sphere, one of them inf for a cylinder; positive has its centre
-            on the side of the normal, so that the edges bend that way.
+        shift: decentre of the screen along x and y, mm.
+        radius: radii of curvature along x and y, mm: equal for a sphere, one of them inf for a cylinder; positive if the centre of
+            curvature lies on the side of the normal, so that the edges bend that way.
         sags: a measured shape instead.
 
     Raises:
-        InputError: a value out of range, or a radius of neither a sphere nor a cylinder.
+        InputError: a value is out of range, or the radii are those of neither a sphere nor a cylinder.
     """
 
     size: tuple[float, float]
@@ -89,29 +90,29 @@ class Screen:
 
     @property
     def rounded(self) -> bool:
-        """Whether it is a sphere or a cylinder."""
+        """Whether it is spherical or cylindrical."""
         return any(map(math.isfinite, self.radius))
 
     @property
     def curved(self) -> bool:
-        """Whether it lies in no plane."""
+        """Whether it is not plane."""
         return self.rounded or self.sags is not None
 
     @property
     def upright(self) -> bool:
-        """Whether it lies in the plane z = const."""
+        """Whether it is plane and perpendicular to the axis."""
         return not (self.curved or any(self.tilt))
 
     @property
     def uncurved(self) -> Screen:
-        """The plane screen in its place."""
+        """The tangent plane screen, with the same pixels."""
         return replace(self, radius=PLANE, sags=None) if self.curved else self
 
-    def refuse_beyond(self) -> None:
-        """Refuse a sphere or a cylinder that the screen does not lie on.
+    def check_curvature(self) -> None:
+        """Check that a spherical or cylindrical screen is no larger than its radius allows.
 
         Raises:
-            InputError: saying how large its radius has to be.
+            InputError: giving the least radius.
         """
         bent = [(h, abs(r)) for h, r in zip(self.half_size, self.radius, strict=True) if math.isfinite(r)]
         if bent and (far := math.hypot(*(h for h, _ in bent))) > STEEPEST * bent[0][1]:
@@ -121,7 +122,7 @@ class Screen:
             )
 
     def shape_words(self) -> str:
-        """What shape it has: "a sphere of radius 60 mm"."""
+        """Its shape in words, such as "a sphere of radius 60 mm"."""
         if self.sags is not None:
             a, b = self.sags.values.shape
             return f"a measured shape of {a} x {b} heights"
@@ -141,22 +142,22 @@ class Screen:
         return self.size[0] / self.resolution[0], self.size[1] / self.resolution[1]
 
     def grown(self, pixels: tuple[int, int]) -> Screen:
-        """The same screen with so many more pixels on each side."""
+        """The screen padded by so many pixels on each side along x and y."""
         (wx, wy), (nx, ny), (ax, ay) = self.pixel, self.resolution, pixels
         return replace(self, size=(self.size[0] + 2 * ax * wx, self.size[1] + 2 * ay * wy), resolution=(nx + 2 * ax, ny + 2 * ay))
 
     @property
     def low(self) -> tuple[float, float]:
-        """Its low edges along its own axes, counted from the foot of the optical axis, mm: -R + shift."""
+        """Lower edges along its own axes, measured from the optical axis, mm: -R + shift."""
         return self.shift[0] - self.half_size[0], self.shift[1] - self.half_size[1]
 
     @property
     def axes(self) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]:
-        """Unit vectors along its x and y, and its normal."""
+        """Unit vectors along its x and y axes, and its unit normal."""
         return tilted(self.tilt)
 
 
 def tilted(tilt: tuple[float, float]) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]:
-    """Axes x, y, z turned right-handedly about x first, then about y, degrees: unit vectors."""
+    """The axes x, y, z after right-handed rotations about x first, then about y, degrees: unit vectors."""
     (sa, ca), (sb, cb) = ((math.sin(t), math.cos(t)) for t in map(math.radians, tilt))
     return (cb, 0.0, -sb), (sb * sa, ca, cb * sa), (sb * ca, -sa, cb * ca)

@@ -1,10 +1,11 @@
-"""How far a lens, its light and its screen may be off: a distribution for each error of making and of placing.
+"""Tolerances: probability distributions of manufacturing and alignment errors of source, lens and screen.
 
-An error is normal, of standard deviation sigma, or uniform within a half width; an error of two axes has one of each.  Errors are
-independent of each other.  Lengths are mm, angles degrees.
+An error is normally distributed, with standard deviation sigma, or uniformly within a half width; an error of two axes has one
+width for each.  Errors are mutually independent.  Lengths are mm, angles degrees.
 
-The form error is a random surface, added to the exit: Gaussian, isotropic, of power spectral density f^-exponent between the
-frequencies 1 / longest and 1 / shortest, and nothing beyond.  Waviness is a sine of unknown phase, as a tool leaves it.
+The form error is a random surface added to the exit: a Gaussian, isotropic field whose power spectral density is f^-exponent
+between the frequencies 1 / longest and 1 / shortest, and 0 outside.  Waviness is a sine wave of random phase, as machining leaves
+it.
 """
 
 from __future__ import annotations
@@ -19,13 +20,13 @@ from caustic_cli.config import checks
 from caustic_cli.errors import InputError
 
 NORMAL, UNIFORM = "sigma", "half_width"
-#: Fewest and most draws.
+#: Least and largest number of Monte Carlo samples.
 LEAST_DRAWS, MOST_DRAWS = 10, 100_000
 
 
 @dataclass(frozen=True)
 class Kind:
-    """An error that there may be: its axes ("" of a scalar), unit, the largest width that is accepted, and what it is."""
+    """A kind of error: its axes ("" for a scalar), unit, largest accepted width, and meaning."""
 
     axes: tuple[str, ...]
     unit: str
@@ -36,26 +37,26 @@ class Kind:
 XY, ABOUT = ("x", "y"), ("x", "y")
 KINDS = {
     "index": Kind(("",), "", 0.5, "refractive index, at every wavelength alike"),
-    "thickness": Kind(("",), "mm", 1e3, "of the lens: the exit as a whole stands farther from the entrance"),
+    "thickness": Kind(("",), "mm", 1e3, "centre thickness of the lens: the exit as a whole is shifted along the axis"),
     "throw": Kind(("",), "mm", 1e6, "distance of the screen"),
-    "source_shift": Kind(XY, "mm", 1e6, "of a source that stands somewhere, across the axis"),
-    "source_distance": Kind(("",), "mm", 1e6, "of a source that stands somewhere, along the axis"),
-    "source_size": Kind(("",), "", 0.25, "width of a disc or grid, as a part of itself"),
-    "source_tilt": Kind(ABOUT, "degrees", 20.0, "direction of light from infinity: turns about the x and y axes"),
+    "source_shift": Kind(XY, "mm", 1e6, "decentre of a source at a finite distance"),
+    "source_distance": Kind(("",), "mm", 1e6, "axial shift of a source at a finite distance"),
+    "source_size": Kind(("",), "", 0.25, "width of a disc or grid, as a fraction of itself"),
+    "source_tilt": Kind(ABOUT, "degrees", 20.0, "direction of light from infinity: rotations about the x and y axes"),
     "lens_shift": Kind(XY, "mm", 1e4, "decentre of the lens, its entrance and exit together"),
-    "lens_tilt": Kind(ABOUT, "degrees", 10.0, "turns of the lens about the x and y axes through its entrance's middle"),
+    "lens_tilt": Kind(ABOUT, "degrees", 10.0, "rotations of the lens about the x and y axes through the centre of its entrance"),
     "screen_shift": Kind(XY, "mm", 1e6, "decentre of the screen"),
-    "screen_tilt": Kind(ABOUT, "degrees", 20.0, "turns of the screen about its own centre"),
-    "roughness": Kind(("",), "", 0.1, "RMS slope, along either axis, of what the exit scatters beyond the scene's own"),
+    "screen_tilt": Kind(ABOUT, "degrees", 20.0, "rotations of the screen about its own centre"),
+    "roughness": Kind(("",), "", 0.1, "RMS slope, along either axis, of the exit's microfacets in addition to the scene's own"),
 }
 
 
 @dataclass(frozen=True)
 class Tolerance:
-    """An error: name, of KINDS; distribution, NORMAL or UNIFORM; width, sigma or half width along each of its axes, its unit.
+    """An error: its name in KINDS; distribution, NORMAL or UNIFORM; width, sigma or half width along each of its axes.
 
     Raises:
-        InputError: a width is negative, too large, or there are too many.
+        InputError: a width is negative or too large, or their number is wrong.
     """
 
     name: str
@@ -75,10 +76,10 @@ class Tolerance:
 
 @dataclass(frozen=True)
 class FormError:
-    """A random surface.
+    """A random form error.
 
-    rms: mm, over all realisations; exponent: of its two-dimensional power spectral density; longest, shortest: wavelengths in it,
-    mm, the longest None for the lens' larger side.
+    rms: mm, over all realisations; exponent: of its two-dimensional power spectral density; longest, shortest: its range of spatial
+    wavelengths, mm, longest None for the lens' larger side.
     """
 
     rms: float
@@ -98,7 +99,7 @@ class FormError:
 
 @dataclass(frozen=True)
 class Waviness:
-    """A sine of this amplitude and period, mm, whose crests stand across `direction`, degrees from +x."""
+    """A sine wave of this amplitude and period, mm, with wave vector along `direction`, degrees from +x."""
 
     amplitude: float
     period: float
@@ -112,8 +113,7 @@ class Waviness:
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number of an error: name, "lens_shift x"; of which error and axis; unit; distribution and width; sigma, its standard
-    deviation."""
+    """One random variable of a tolerance study: its name, such as "lens_shift x"; error and axis; unit; distribution and width."""
 
     name: str
     error: str
@@ -124,16 +124,16 @@ class Parameter:
 
     @property
     def sigma(self) -> float:
-        """Standard deviation."""
+        """Standard deviation, in `unit`."""
         return self.width if self.distribution == NORMAL else self.width / math.sqrt(3.0)
 
 
 @dataclass(frozen=True)
 class Tolerances:
-    """All errors, how many draws of them are taken, and the seed of these.
+    """All errors, with the number of Monte Carlo samples and their seed.
 
     Raises:
-        InputError: nothing is off, an error stands twice, or a number is out of range.
+        InputError: all widths are 0, an error is given twice, or a number is out of range.
     """
 
     errors: tuple[Tolerance, ...] = ()
@@ -147,13 +147,13 @@ class Tolerances:
         checks.whole("seed", self.seed, 0, 2**31 - 1)
         names = [e.name for e in self.errors]
         if len(set(names)) < len(names):
-            raise InputError(f"every error may stand once, got {', '.join(names)}")
+            raise InputError(f"every error may be given once, got {', '.join(names)}")
         if not (self.parameters or self.surface):
-            raise InputError("nothing is off: a width above 0 is needed of at least one error")
+            raise InputError("all widths are 0: at least one error must have a width above 0")
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """The numbers that vary, those of width 0 left out."""
+        """The random variables with a width above 0."""
         found = []
         for error in self.errors:
             kind = KINDS[error.name]
@@ -165,21 +165,21 @@ class Tolerances:
 
     @property
     def surface(self) -> tuple[str, ...]:
-        """Names of the errors of the surface itself, a new one in every draw."""
+        """Names of the errors of the surface itself, of which every sample has a new realisation."""
         form = ("form_error",) if self.form is not None and self.form.rms > 0 else ()
         return form + (("waviness",) if self.waviness is not None and self.waviness.amplitude > 0 else ())
 
     @property
     def shortest(self) -> float:
-        """The shortest wavelength of the surface's errors, mm; inf where there are none."""
+        """The shortest spatial wavelength of the surface's errors, mm; inf if there are none."""
         form = self.form.shortest if self.form is not None and self.form.rms > 0 else math.inf
         return min(form, self.waviness.period if self.waviness is not None and self.waviness.amplitude > 0 else math.inf)
 
 
 def hypercube(parameters: tuple[Parameter, ...], draws: int, seed: int, purpose: int = 0) -> np.ndarray:
-    """A Latin hypercube of the parameters: (draws, len(parameters)).
+    """A Latin hypercube sample of the parameters, in their units: (draws, len(parameters)).
 
-    purpose: draws of two have nothing in common.
+    purpose: different numbers give independent samples.
     """
     rng = np.random.default_rng([seed, purpose])
     columns = []

@@ -272,7 +272,7 @@ def _row(
 ) -> dict | None:
     name, amount, bare = effect.name, OWN, None
     if not effect.present:
-        made = BY_NAME[name].sample(scene, heights)
+        made = BY_NAME[name].probe(scene, heights)
         if made is None:
             return None
         scene, bare, amount = made.scene, made.bare, made.words

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.direction import misdirection, rms_angle
+from caustic_cli.optics.angular_error import rms_angle, squared_angular_error
 from caustic_cli.optics.effects import NO_REQUESTS, Requests
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT
@@ -49,6 +49,6 @@ def second_figures(
     with torch.no_grad():
         for traced in tracers(scene, field, sampler_for(scene, min(rays, ENOUGH), seed, device), torch.float64, CHUNK, requests):
             state = traced({EXIT: heights.to(device)})[0]
-            squares += traced.weight * float(misdirection(traced, state, scene))
+            squares += traced.weight * float(squared_angular_error(traced, state, scene))
             power += traced.weight * float(state.power.sum())
     return None, {"angle_rms_mrad": 1e3 * rms_angle(squares, power)}

@@ -48,7 +48,7 @@ from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.effects import NO_REQUESTS, Requests
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.form_error import FormErrors, refined
-from caustic_cli.optics.misalignment import Landed, Misalignment, idle, landed
+from caustic_cli.optics.misalignment import LandingPoints, Misalignment, landing_points, reason_ignored
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import SOBOL_RAYS, stream
 from caustic_cli.optics.surfaces import HeightField
@@ -128,7 +128,7 @@ class Trials:
         self.target = target if target.ndim == 3 else target[None]
         self.waves = waves
         self.rays, self.near = max(2, rays // (2 if waves is None else FEWER)), max(near, NEAR)
-        self.parameters = tuple(p for p in tolerances.parameters if not idle(scene, p.error))
+        self.parameters = tuple(p for p in tolerances.parameters if not reason_ignored(scene, p.error))
         self.surfaces = FormErrors(self.field, tolerances.form, tolerances.waviness) if tolerances.surface else None
         self.gain: tuple[float, float] | None = None
         self.smooth: dict[tuple[int, tuple[str, ...]], list[np.ndarray]] = {}
@@ -215,25 +215,25 @@ class Trials:
         assert self.surfaces is not None
         return self.surfaces.heights(np.random.default_rng([self.tolerances.seed, 1, number]), which)
 
-    def _rays(self, errors: Misalignment, heights: Tensor, half: int) -> list[Landed]:
+    def _rays(self, errors: Misalignment, heights: Tensor, half: int) -> list[LandingPoints]:
         changed, even = errors.scene(self.scene), self.scene.source.collimated or self.rays > SOBOL_RAYS // 4
         kind, seed = "stratified" if even else "sobol", stream(self.tolerances.seed, f"tolerances {half}")
         rays = rays_of(changed.part(half % 2, 2), kind, self.rays, seed)
-        return list(landed(self.scene, self.field, heights, rays, errors, self.requests))
+        return list(landing_points(self.scene, self.field, heights, rays, errors, self.requests))
 
-    def _image(self, parts: Iterable[Landed]) -> np.ndarray:
+    def _image(self, parts: Iterable[LandingPoints]) -> np.ndarray:
         image = np.zeros(self.target.shape)
         for part in parts:
             found, _ = backend_for("cpu").splat(*self._placed(part), part.power, self.scene.screen, Filter())
             image[part.channel or 0] += found.numpy()
         return image
 
-    def _placed(self, part: Landed) -> tuple[Tensor, Tensor]:
+    def _placed(self, part: LandingPoints) -> tuple[Tensor, Tensor]:
         """Landing points relative to the axis, as a splat takes them, mm."""
         sx, sy = self.scene.screen.shift
         return part.x + sx, part.y + sy
 
-    def _moved(self, now: list[Landed], smooth: list[np.ndarray]) -> np.ndarray:
+    def _moved(self, now: list[LandingPoints], smooth: list[np.ndarray]) -> np.ndarray:
         """A wave image, given by splines, warped by the displacement of the rays."""
         shape, (wx, wy), (rx, ry) = self.target.shape[1:], self.scene.screen.pixel, self.scene.screen.half_size
         out = np.zeros(self.target.shape)
@@ -401,7 +401,7 @@ def study(trials: Trials, progress: Callable[[str, int, int], None] = lambda wha
         InputError: no error of the tolerances applies to the scene, or one makes the scene invalid.
     """
     t = trials.tolerances
-    unused = {e.name: why for e in t.errors if (why := idle(trials.scene, e.name))}
+    unused = {e.name: why for e in t.errors if (why := reason_ignored(trials.scene, e.name))}
     if not (trials.parameters or t.surface):
         raise InputError(f"no error of the tolerances applies to this scene: {'; '.join(f'{k}: {v}' for k, v in unused.items())}")
     nominal = trials.nominal()

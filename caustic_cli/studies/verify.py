@@ -29,13 +29,13 @@ from torch import Tensor
 from caustic_cli.errors import CausticError, InputError
 from caustic_cli.io.files import SOFTWARE, atomic_path
 from caustic_cli.optics.emission import rays_of
-from caustic_cli.optics.frames import Leg
+from caustic_cli.optics.frames import AxisSegment
 from caustic_cli.optics.sampling import stream
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import System
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Scene
-from caustic_cli.scene.plain import beyond_plain
+from caustic_cli.scene.features import special_features
 from caustic_cli.studies.independent_rays import KINDS, sample_rays
 from caustic_cli.studies.metrics import relative_rms
 from caustic_cli.studies.retrace import BATCHES
@@ -61,8 +61,8 @@ def require_mitsuba(scene: Scene) -> None:
     """
     if find_spec("mitsuba") is None:
         raise InputError("⟨verify⟩ mitsuba needs Mitsuba 3, which is not installed: pip install mitsuba")
-    if beyond_plain(scene):
-        raise InputError(f"⟨verify⟩ mitsuba traces clear lenses and straight screens, not {', '.join(beyond_plain(scene))}")
+    if special_features(scene):
+        raise InputError(f"⟨verify⟩ mitsuba traces clear lenses and straight screens, not {', '.join(special_features(scene))}")
     if scene.source.kind not in KINDS:
         raise InputError(f"⟨verify⟩ mitsuba does not support sources of type {scene.source.kind}")
     if scene.lens.fresnel != "exact":
@@ -142,7 +142,7 @@ def _trace(mi, world, scene: Scene, rays: int, seed: int) -> tuple[np.ndarray, n
     follow = _follow if "scalar" not in mi.variant() else _follow_scalar
     image, squares = np.zeros((2, *scene.screen.resolution))
     system = System.of(scene)
-    surfaces, leg = [(e.name, e.reflects) for e in system.elements], system.leg or Leg()
+    surfaces, leg = [(e.name, e.reflects) for e in system.elements], system.leg or AxisSegment()
     for start, direction, share in sample_rays(scene, rays, rng):
         *points, weight = follow(mi, world, shapes, [*surfaces, ("screen", False)], start, direction)
         x, y = (sum((p - o) * a for p, o, a in zip(points, leg.origin, axis, strict=True)) for axis in leg.frame[:2])

@@ -12,7 +12,7 @@ from caustic_cli.optics.image import Image
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.waves import NoWaveImage, WaveImage, wave_image
-from caustic_cli.optics.waves.image import UNASKED, Departure
+from caustic_cli.optics.waves.image import UNASKED, Perturbation
 from caustic_cli.scene import Scene
 from caustic_cli.scene.materials import material
 from caustic_cli.studies.irradiance import irradiance_figures
@@ -33,7 +33,7 @@ def wave_figures(
     *,
     finer: float = FINER,
     required: bool = True,
-    departure: Departure | None = None,
+    perturbation: Perturbation | None = None,
 ) -> tuple[WaveImage | None, dict]:
     """The wave image of a lens at the scene's wavelengths, white light's where it says none, and its figures.  departure: of its
     exit from the heights, as of `optics.waves.wave_image`; required: take it however long that takes, or raise NoWaveImage.
@@ -46,7 +46,7 @@ def wave_figures(
     """
     most = math.inf if required else UNASKED
     try:
-        found = wave_image(scene, field, heights.detach(), finer=finer, departure=departure, most=most)
+        found = wave_image(scene, field, heights.detach(), finer=finer, perturbation=perturbation, most=most)
     except NoWaveImage as error:
         if required:
             raise

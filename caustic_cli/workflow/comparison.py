@@ -12,7 +12,7 @@ from torch import Tensor
 
 from caustic_cli.config import settings
 from caustic_cli.config.completion import NETWORK_CONTROL, build_options, build_stages, complete, stage_of
-from caustic_cli.config.plans import LEAST_CELLS, coarse_to_fine
+from caustic_cli.config.default_stages import LEAST_CELLS, coarse_to_fine
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import InputError
 from caustic_cli.inverse.designer import Designer, Options, State

@@ -23,7 +23,7 @@ import torch
 from caustic_cli import __version__
 from caustic_cli.config import presets, settings
 from caustic_cli.config.completion import PLATE, WALL, Derivation, build_options, build_stages, complete, shape_words, without_waves
-from caustic_cli.config.plans import transport_cells
+from caustic_cli.config.default_stages import transport_cells
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import CausticError, InputError, Interrupted
 from caustic_cli.inverse import ranks
@@ -43,7 +43,7 @@ from caustic_cli.io.surfaces import SUFFIXES, onto, read_surface
 from caustic_cli.optics.emission.measured import coarse_words
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import sides_of
+from caustic_cli.optics.system import split_heights
 from caustic_cli.project import attachments, directory, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.packing import expected_bytes, rounded
@@ -279,7 +279,7 @@ def _say_limits(project: Project, designer: Designer, target: np.ndarray, first:
     words = performance_limits(designer.scene, grey(target), steps=SMOOTH_STEPS if timed else None).sentence()
     if words:
         say.say(words)
-    if designer.scene.jointly:
+    if designer.scene.joint:
         return
     if seen.matters and project.settings["design"]["waves"] == "auto" and project.without_waves:
         say.say(f"the wave image is not refined: {project.without_waves}")
@@ -540,7 +540,7 @@ def _run(
         if asked:
             raise Interrupted(f"interrupted after the design had ended; {project.path} is complete", 128 + asked[0])
     field = designer.field(found.state.stage)
-    scene, heights = sides_of(designer.scene, field, found.state.heights)
+    scene, heights = split_heights(designer.scene, field, found.state.heights)
     size = tuple(project.settings["target"]["size"])
     if not timed and scene.second is None and (words := advice(scene, grey(target), size, field, heights)):
         say.say(words)

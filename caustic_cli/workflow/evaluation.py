@@ -22,7 +22,7 @@ from caustic_cli.io.picture import WIDE, write_image
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import sides_of, traced_of
+from caustic_cli.optics.system import split_heights, trace_arguments
 from caustic_cli.optics.waves import WaveImage
 from caustic_cli.project import uptodate
 from caustic_cli.project.project import FARTHER, RENDER, REPORT, WAVE, Project
@@ -104,7 +104,7 @@ def expected_seconds(designer: Designer, target: np.ndarray, state: State, devic
     """Estimated time of `evaluate_and_write` under a time limit, s, from a retrace with few rays, and a wave image if refined."""
     scene, field, began = designer.scene, designer.field(state.stage), time.monotonic()
     retrace(
-        *traced_of(scene, field, state.heights),
+        *trace_arguments(scene, field, state.heights),
         target,
         rays=evaluation_rays(scene, FINAL_RAYS) // PROBE,
         device=device,
@@ -148,7 +148,7 @@ def evaluate(
 
     def trace(heights: torch.Tensor, noise: bool = True):
         return retrace(
-            *traced_of(scene, field, heights),
+            *trace_arguments(scene, field, heights),
             target,
             rays=evaluation_rays(scene, FINAL_RAYS),
             device=device,
@@ -215,7 +215,7 @@ def _both_sides(designer: Designer, target: np.ndarray, state: State, device: st
     field, farther = designer.field(state.stage), None if designer.second is None else designer.second.numpy()
 
     def trace(heights: torch.Tensor, rays: int = FINAL_RAYS):
-        scene, exit = sides_of(designer.scene, field, heights)
+        scene, exit = split_heights(designer.scene, field, heights)
         exposure, figures = retrace(scene, field, exit, target, rays=rays, device=device, seed=seed, noise=rays == FINAL_RAYS)
         second, more = second_figures(scene, field, exit, farther, rays=rays, seed=seed, device=device)
         return exposure.image.cpu().numpy(), second, figures | more

@@ -85,7 +85,7 @@ def write(
     """
     if len(scene.light.wavelengths) == 1:
         scene = scene.at(scene.light.wavelengths[0])
-    if scene.lens.front is not None and (script or mould or format not in TWO_SIDED):
+    if scene.lens.entrance is not None and (script or mould or format not in TWO_SIDED):
         raise InputError(
             f"⟨format⟩ {format} holds one free-form side; of this lens, which has two, {', '.join(TWO_SIDED)} hold both, without"
             " ⟨script⟩ or ⟨mould⟩"

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from caustic_cli.config.completion import build_stages
-from caustic_cli.config.plans import transport_cells
+from caustic_cli.config.default_stages import transport_cells
 from caustic_cli.config.settings import value_of
 from caustic_cli.inverse.designer import State
 from caustic_cli.inverse.gradient_index import design_gradient_index

@@ -21,7 +21,7 @@ from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.surfaces.cut import CutSurface
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import front_of
+from caustic_cli.optics.system import entrance_of
 from caustic_cli.project import directory, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.project import Project
@@ -77,8 +77,8 @@ class Lens:
         u, v = (torch.from_numpy(c.ravel().copy()) for c in (x, y))
         if side == "exit":
             found = self.field.at(self.heights, u, v)
-        elif self.scene.lens.front is not None:
-            found = front_of(self.scene.lens).at(None, u, v)
+        elif self.scene.lens.entrance is not None:
+            found = entrance_of(self.scene.lens).at(None, u, v)
             found[0] = found[0] + self.scene.lens.z_in
         else:
             found = [torch.full_like(u, self.scene.lens.z_in), torch.zeros_like(u), torch.zeros_like(u)]
@@ -175,7 +175,7 @@ class Lens:
             self._resolution(plan.scene),
             finer=1.0 if cut is None else FINER,
             required=required,
-            departure=None if cut is None else height_deviation(cut, self.field, self.heights),
+            perturbation=None if cut is None else height_deviation(cut, self.field, self.heights),
         )
         return Render(np.empty((0, 0)) if light is None else light.image.cpu().numpy(), figures)
 

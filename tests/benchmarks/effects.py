@@ -128,7 +128,7 @@ def main(checkout: Path | None) -> None:
         here.close()
     out += ["", "| effect put in | iteration, ms | ratio to bare |", "| --- | --- | --- |"]
     for effect in EFFECTS:
-        with_it = effect.sample(own, heights)
+        with_it = effect.probe(own, heights)
         if with_it is None or effect.name == "mirror":
             continue
         changed = iteration(with_it.scene)

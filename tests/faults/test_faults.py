@@ -261,9 +261,9 @@ def test_other_errors_are_not_taken_for_short_memory():
         tried.append(chunk)
         raise RuntimeError("mat1 and mat2 shapes cannot be multiplied")
 
-    with pytest.raises(RuntimeError, match="shapes"):
-        memory.with_less(work, 1 << 20)
-    assert tried == [1 << 20]
+    with pytest.raises(RuntimeError, match="shapes") as caught:
+        memory.with_smaller_chunks(work, 1 << 20)
+    assert tried == [1 << 20] and caught.traceback[-1].name == "work"  # --debug shows where it came from
 
 
 @pytest.mark.parametrize("error", [MemoryError(), RuntimeError("CUDA out of memory. Tried to allocate 2 GiB")])

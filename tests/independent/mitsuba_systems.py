@@ -50,7 +50,7 @@ from caustic_cli.optics.frames import Pose
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import Sampler
 from caustic_cli.optics.surfaces import Plane, Sphere
-from caustic_cli.optics.system import Element, Placed, System
+from caustic_cli.optics.system import Element, PlacedScreen, System
 from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Aperture, PlaneWave, Screen
 
@@ -95,7 +95,7 @@ def behind_mirror() -> tuple[System, dict]:
         Element("front", WIDE, Aperture((9.0, 9.0)), behind=GLASS, pose=front),
         Element("back", Plane(), Aperture((15.0, 15.0)), pose=back),
     )
-    aside = Placed(Screen((20.0, 20.0), 0.0, (20, 20)), Pose(tuple(there - 60.0 * along), (0.0, turn)))
+    aside = PlacedScreen(Screen((20.0, 20.0), 0.0, (20, 20)), Pose(tuple(there - 60.0 * along), (0.0, turn)))
     return System((PlaneWave(),), elements, (aside,)), {"front": parabola(WIDE, -35.0) + bumpy(WIDE, 0.02, 6)}
 
 
@@ -116,7 +116,7 @@ def lights(system: System, rays: int, seed: int):
 
 def starts(system: System, rays: RayState) -> tuple[np.ndarray, np.ndarray]:
     """Points before the pupil and directions of rays, (N, 3)."""
-    rays = rays.spread()
+    rays = rays.expanded()
     o, d = (np.stack([c.double().numpy() for c in rays.full(v)], 1) for v in (rays.origin, rays.direction))
     return o + d * ((system.pupil.z - BEFORE - o[:, 2]) / d[:, 2])[:, None], d
 
@@ -180,7 +180,7 @@ def follow(scene: mi.Scene, system: System, rays: RayState) -> tuple[np.ndarray,
             ray, past = mi.Ray3f(hit.p + PAST * wo, wo), PAST  # along itself: `spawn_ray` moves it along the normal, by some um
         else:
             power[n], o[n], d[n] = weight, np.array(ray.o), np.array(ray.d)
-    pose = screen.pose if isinstance(screen, Placed) else Pose((0.0, 0.0, screen.z), screen.tilt)
+    pose = screen.pose if isinstance(screen, PlacedScreen) else Pose((0.0, 0.0, screen.z), screen.tilt)
     return onto(o, d, pose.position, pose.tilt), power
 
 
@@ -203,7 +203,7 @@ def interact(hit: mi.SurfaceInteraction3f, reflects: bool) -> tuple[mi.Vector3f,
 def program(system: System, heights: dict, rays: RayState) -> tuple[np.ndarray, np.ndarray]:
     """The same by the program."""
     (landed,) = Tracer(system, rays).land(heights, system.screens[0])
-    share = rays.spread().power
+    share = rays.expanded().power
     return np.stack([c.numpy() for c in landed.origin[:2]], 1), (landed.power / share).numpy()
 
 

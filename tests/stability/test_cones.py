@@ -116,7 +116,7 @@ def test_from_afar_a_point_is_a_plane_wave(kernels, dtype, compare):
     assert value < 2e-3
     assert slope < 1e-2
     inside = Tracer(System.of(s, field), rays).start
-    t, _, _, hit = field.meet(heights, inside.origin, inside.direction, 1.0)
+    t, _, _, hit = field.intersect(heights, inside.origin, inside.direction, 1.0)
     assert int(hit.sum()) > 2000
     x, y, z = (o + t * d for o, d in zip(inside.origin, inside.direction, strict=True))
     off = (z - field.at(heights, x, y)[0])[hit].abs().max()

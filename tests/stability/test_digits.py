@@ -90,7 +90,7 @@ def test_slopes_of_hits_do_not_see_the_thickness(kernels):
     sag = (1e-4 * torch.rand(9, 9, dtype=torch.float64) * 2.0**33).round() * 2.0**-33
     s = Scene(Disc(angle=1e-6), lens, Screen((3.0, 3.0), 2e6))
     b = Tracer(System.of(s, field), next(rays_of(s, "stratified", 400, 2).chunks())).start
-    _, gx, gy, hit = field.meet(sag + 1e6, b.origin, b.direction, 1.0)
+    _, gx, gy, hit = field.intersect(sag + 1e6, b.origin, b.direction, 1.0)
     t = (1e6 + 5e-5) / b.direction[2]
     expected = field.at(sag, *(o + t * d for o, d in zip(b.origin[:2], b.direction[:2], strict=True)), ((1, 0), (0, 1)))
     assert int(hit.sum()) > 300

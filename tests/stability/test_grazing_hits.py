@@ -94,7 +94,7 @@ def test_derivatives_at_the_hits(angle, kernels, compare):
     z = spline(heights)
     expected, margin = marched(0.63, angle)
     leaf = heights.clone().requires_grad_()
-    t, gx, _, hit = FIELD.meet(leaf, b.origin, b.direction, 1.0)
+    t, gx, _, hit = FIELD.intersect(leaf, b.origin, b.direction, 1.0)
     use = np.isfinite(expected) & (margin > 1e-5) & hit.numpy()
     x = b.origin[0].numpy() + np.where(use, expected, 0.0) * b.direction[0].numpy()
     c = b.direction[2].numpy() - z.derivative()(x) * b.direction[0].numpy()

@@ -1,7 +1,7 @@
 """A wave through a relief once more, by other means: NumPy, exact refraction of a plane wave, and the angular spectrum.
 
 Nothing here is shared with the package.  The field is made on the plane just behind the relief, on which rays have moved hardly at
-all, and every plane wave of it goes on with its exact phase, exp(i k_z z): no parabola, no feet.
+all, and every plane wave of it goes on with its exact phase, exp(i k_z z): no parabola, no intercepts.
 """
 
 from __future__ import annotations

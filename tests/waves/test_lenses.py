@@ -253,7 +253,7 @@ SOURCES = {
 @pytest.mark.parametrize("source", SOURCES)
 @pytest.mark.parametrize("losses", ["none", "exact"])
 def test_taylor_of_a_lens(source, losses):
-    """What is left falls with the square of the step, of power and path that change as feet move."""
+    """What is left falls with the square of the step, of power and path that change as intercepts move."""
     field = HeightField((SplineSpace.uniform(6, 3),) * 2, (1.5, 1.5))
     elements = (
         Element("front", Plane(), Aperture((0.2, 0.2)), behind=Medium(1.5), fresnel=losses),

@@ -30,8 +30,8 @@ from caustic_cli import __version__
 from caustic_cli.errors import InputError
 from caustic_cli.export.surface import sample_grid
 from caustic_cli.io.files import CREATED_BY, write_bytes
-from caustic_cli.optics.averages import shared_out
-from caustic_cli.optics.emission.brightness import bright_points
+from caustic_cli.optics.emission.brightness import points_by_brightness
+from caustic_cli.optics.resampling import resampled
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene, Screen, Source
 
@@ -202,7 +202,7 @@ def _coarser(screen: Screen) -> Screen:
 def _onto(image: np.ndarray, screen: Screen) -> np.ndarray:
     """An image summed over colours, resampled to the pixels of a screen of the same size."""
     grey = image.sum(0) if image.ndim == 3 else image
-    return shared_out(grey, screen.resolution) * (grey.size / math.prod(screen.resolution))
+    return resampled(grey, screen.resolution) * (grey.size / math.prod(screen.resolution))
 
 
 def _coded(values: np.ndarray) -> dict:
@@ -272,5 +272,5 @@ def _picture(source: Source) -> list[list[float]] | None:
     if source.brightness is None:
         return None
     a, b = (torch.from_numpy(np.arange(1, BRIGHT + 1) * step % 1.0) for step in EVEN)
-    x, y = bright_points(source.brightness, a, b)
+    x, y = points_by_brightness(source.brightness, a, b)
     return torch.stack([x, y], -1).tolist()

@@ -1,18 +1,18 @@
-"""What does the arithmetic: an object that offers the stages of a trace, chosen once for a device.
+"""Computational backends: implementations of the stages of a trace, selected by device.
 
 Stages, each with its adjoint and tangent
-    scatter                   points of the aperture, at random
-    spline_on, spline_at      a B-spline's height and slopes at the points of a sample, or at points
-    meet, meet_spline, meet_fixed   where rays meet any surface, a B-spline, or a B-spline if they are known beforehand
-    find, finder, next_meetings   where they meet it, without derivatives, once or again
-    flow                      through a medium of varying index
-    interact                  Snell, Fresnel, or a mirror
-    land                      to a plane
-    splat                     onto pixels
+    scatter                    random points of the aperture
+    spline_on, spline_at       height and slopes of a B-spline at a sample, or at given points
+    intersect, intersect_spline, intersect_fixed   intersections with any surface, with a B-spline, or of fixed rays with a B-spline
+    find, finder, next_intersections   first and next intersections without derivatives
+    flow                       ray integration in a gradient-index medium
+    interact                   refraction with Fresnel losses, or reflection
+    land                       ray transfer to a plane
+    splat                      accumulation on pixels
 
-`reference.Torch` does every stage in plain torch, on any device; `cpu.Numba` and `cuda.Cuda` do them by kernels.  No caller asks
-which it has.  CAUSTIC_KERNELS=torch asks for the reference; CAUSTIC_KERNELS=cuda for the device's kernels on a CPU too, in numba's
-simulator (NUMBA_ENABLE_CUDASIM=1), which is for tests.
+`reference.Torch` implements every stage in plain torch, on any device; `cpu.Numba` and `cuda.Cuda` use compiled kernels.  Callers
+do not depend on which one is used.  CAUSTIC_KERNELS=torch selects the reference; CAUSTIC_KERNELS=cuda the device's kernels also on
+a CPU, in numba's simulator (NUMBA_ENABLE_CUDASIM=1), for tests.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ import torch
 
 from caustic_cli.errors import InputError
 
-#: Name -> module and class, looked up when they are needed: they know surfaces, which know this, and numba is slow to load.
+#: Name -> module and class, imported on demand: surfaces and backends refer to each other, and numba is slow to load.
 BACKENDS = {"torch": ("reference", "Torch"), "numba": ("cpu", "Numba"), "cuda": ("cuda", "Cuda")}
-#: What CAUSTIC_KERNELS may be.
+#: Accepted values of CAUSTIC_KERNELS.
 KERNELS = ("", "torch", "cuda")
 
 
@@ -47,8 +47,7 @@ def backend_for(device: torch.device | str):
 
 @cache
 def cuda_kernels() -> bool:
-    """Whether the kernels of a CUDA device can be compiled here: numba finds a device and a compiler for it, as the extra `cuda`
-    brings one."""
+    """Whether CUDA kernels can be compiled: numba finds a device and a compiler, which the extra `cuda` installs."""
     from numba import config, cuda  # noqa: PLC0415
 
     return not config.ENABLE_CUDASIM and cuda.is_available()  # type: ignore[attr-defined]  # numba makes its settings as it is loaded
@@ -56,7 +55,7 @@ def cuda_kernels() -> bool:
 
 @contextlib.contextmanager
 def plain() -> Iterator[None]:
-    """Rays prepared meanwhile go by the plain-torch reference."""
+    """A context in which rays are traced by the plain-torch reference."""
     before = os.environ.get("CAUSTIC_KERNELS")
     os.environ["CAUSTIC_KERNELS"] = "torch"
     try:

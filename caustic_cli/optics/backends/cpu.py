@@ -1,6 +1,6 @@
-"""Stages by compiled kernels, on a CPU: float64 whatever is asked, which costs no more here.
+"""The CPU backend: compiled kernels, always in float64, which costs no more here.
 
-What has no kernel, or no rays, is done by the reference.
+The reference handles stages without a kernel, and empty sets of rays.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from caustic_cli.optics import intersection
 from caustic_cli.optics.backends.reference import Torch, by_mesh
 from caustic_cli.optics.gradient.fields import LEAST_SQUARE, SplineIndex
 from caustic_cli.optics.gradient.integrator import ORDER, WEIGHTS, Flow
-from caustic_cli.optics.interface import Departure
-from caustic_cli.optics.kernels import functions
-from caustic_cli.optics.kernels.formula import formula_flow
+from caustic_cli.optics.interface import OutgoingRays
+from caustic_cli.optics.kernels import fused_functions
 from caustic_cli.optics.kernels.grid import GridSurface
 from caustic_cli.optics.kernels.interact import interact
+from caustic_cli.optics.kernels.polynomial_index import formula_flow
 from caustic_cli.optics.kernels.ray_intersections import hits_of_rays
 from caustic_cli.optics.kernels.splat import splat_rays
-from caustic_cli.optics.kernels.surface import FusedSurface, RayIntersections, next_meetings, scattered_surface
+from caustic_cli.optics.kernels.spline_index import VolumeAxis, volume_flow
+from caustic_cli.optics.kernels.surface import FusedSurface, RayIntersections, next_intersections, scattered_surface
 from caustic_cli.optics.kernels.transfer import land
-from caustic_cli.optics.kernels.volume import VolumeAxis, volume_flow
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.reintersection import HALVINGS, MOST_STEPS
@@ -40,8 +40,8 @@ class Numba(Torch):
     compiled = True
 
     def compile_plane(self) -> None:
-        """Have ready what a plane wave's rays need: from the files kept, or compiled for this machine."""
-        functions.compile_kernels()
+        """Load the kernels for plane waves from the cache, or compile them."""
+        fused_functions.compile_kernels()
 
     def precision(self, dtype: torch.dtype) -> torch.dtype:
         """float64."""
@@ -51,10 +51,12 @@ class Numba(Torch):
         self, seed: int, start: int, stop: int, shape: tuple[int, int], stratified: bool, device: torch.device | str
     ) -> list[Tensor]:
         """As the reference."""
-        return list(functions.scattered_points([key(seed, d) for d in (0, 1)], [salt(0), salt(1)], start, stop, *shape, stratified))
+        return list(
+            fused_functions.scattered_points([key(seed, d) for d in (0, 1)], [salt(0), salt(1)], start, stop, *shape, stratified)
+        )
 
     def spline_on(self, field, sample: Sample, dtype: torch.dtype):
-        """As the reference; rows of a tensor product of points from nets contracted along v."""
+        """As the reference; tensor-product samples by rows, from nets contracted along v."""
         if sample.tensor:
             return GridSurface(field.spaces, field.half_size, sample.u, sample.v)
         surface, u, v = FusedSurface(field.spaces, field.half_size), sample.u.contiguous().numpy(), sample.v.contiguous().numpy()
@@ -67,30 +69,30 @@ class Numba(Torch):
         at = ((0.5 * (c / r + 1.0)).contiguous().numpy() for c, r in zip((x, y), field.half_size, strict=True))
         return scattered_surface(FusedSurface(field.spaces, field.half_size), heights.double(), *at)
 
-    def meet_spline(self, field, heights: Tensor, origin, direction, side: float) -> SurfaceIntersection:
+    def intersect_spline(self, field, heights: Tensor, origin, direction, side: float) -> SurfaceIntersection:
         """As the reference."""
         rays = [torch.as_tensor(c, dtype=torch.float64) for c in (*origin, *direction)]
         ox, oy, oz, dx, dy, dz = (c.contiguous() for c in torch.broadcast_tensors(*rays))
         if not ox.numel():
-            return super().meet_spline(field, heights, origin, direction, side)
+            return super().intersect_spline(field, heights, origin, direction, side)
         surface = FusedSurface(field.spaces, field.half_size)
         return SurfaceIntersection(*hits_of_rays(surface, heights, (ox, oy, oz), (dx, dy, dz), side=side))
 
-    def meet_fixed(self, field, origin, direction):
-        """As the reference; what does not depend on the heights is prepared, for rays that all begin within the aperture."""
+    def intersect_fixed(self, field, origin, direction):
+        """As the reference; for rays that start inside the aperture, data independent of the heights is precomputed."""
         if any(bool((c.abs() > half).any()) for c, half in zip(origin[:2], field.half_size, strict=True)):
-            return lambda heights: self.meet_spline(field, heights, origin, direction, 1.0)
+            return lambda heights: self.intersect_spline(field, heights, origin, direction, 1.0)
         hits = RayIntersections(FusedSurface(field.spaces, field.half_size), origin, direction, None)
 
-        def meet(heights: Tensor) -> SurfaceIntersection:
+        def intersect(heights: Tensor) -> SurfaceIntersection:
             t, gx, gy = hits(heights)
             found = t.detach() >= 0
             return SurfaceIntersection(torch.where(found, t, torch.zeros_like(t)), gx, gy, found)
 
-        return meet
+        return intersect
 
     def flow(self, field, coefficients: Tensor | None, point, momentum, time: Tensor, steps: int, order: int = ORDER) -> Flow:
-        """As the reference; a B-spline volume and the formulas of a lens ray by ray."""
+        """As the reference; B-spline volumes and polynomial fields by kernels."""
         if time.numel() and field.formula is not None:
             terms, axial, squared = field.formula
             out = formula_flow(terms, axial, squared, LEAST_SQUARE, (*point, *momentum), time, WEIGHTS[order], steps)
@@ -122,24 +124,24 @@ class Numba(Torch):
 
         return find
 
-    def next_meetings(self, field, heights: Tensor, origin, direction, below: bool, round: bool, step: float) -> Tensor:
+    def next_intersections(self, field, heights: Tensor, origin, direction, below: bool, round: bool, step: float) -> Tensor:
         """As the reference."""
         if not len(origin[0]):
-            return super().next_meetings(field, heights, origin, direction, below, round, step)
-        return next_meetings(
+            return super().next_intersections(field, heights, origin, direction, below, round, step)
+        return next_intersections(
             FusedSurface(field.spaces, field.half_size), heights, origin, direction, below, round, step, HALVINGS, MOST_STEPS
         )
 
     def interact(
         self, direction, slopes, power: Tensor, *, eta: float, reflects: bool, fresnel: str, polarised=None, side: float = 1.0
-    ) -> Departure:
-        """As the reference, which does constant slopes itself; the kernel tells the side by the sign of d . N."""
+    ) -> OutgoingRays:
+        """As the reference, which handles constant slopes; the kernel infers the side from the sign of d . N."""
         if not isinstance(slopes[0], Tensor):
             return super().interact(
                 direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, polarised=polarised, side=side
             )
         direction, polarised = _components(direction), None if polarised is None else _components(polarised)
-        return Departure(*interact(direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, field=polarised))
+        return OutgoingRays(*interact(direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, field=polarised))
 
     def land(self, origin, direction, point, axes, forward: float) -> tuple[Tensor, Tensor, Tensor]:
         """As the reference."""
@@ -150,11 +152,11 @@ class Numba(Torch):
         return splat_rays(x, y, weight, screen, filter)
 
     def plane_image(self, field, rays: RayState, eta: float, fresnel: str, like: PlaneImage | None) -> PlaneImage:
-        """The fused kernel of a plane wave's rays on a B-spline: a function of heights, screen and filter."""
+        """The fused kernel for rays of a plane wave on a B-spline: a function of heights, screen and filter."""
         return PlaneImage(field, rays, eta, fresnel, like)
 
     def ray_image(self, field, rays: RayState, eta: float, fresnel: str, radius: float | None, like: RayImage | None) -> RayImage:
-        """The fused kernel of any rays below a B-spline."""
+        """The fused kernel for arbitrary rays below a B-spline."""
         return RayImage(field, rays, eta, fresnel, radius, like)
 
 
@@ -164,13 +166,13 @@ def _components(vector) -> tuple:
 
 
 class PlaneImage:
-    """See `Numba.plane_image`; like: that of the chunk before, whose basis values along v serve again where they are the same."""
+    """See `Numba.plane_image`; like: that of the previous chunk, whose basis values along v are reused if they are the same."""
 
     def __init__(self, field, rays: RayState, eta: float, fresnel: str, like: PlaneImage | None):
         s = rays.sample
         assert s is not None
         self.interface = eta, fresnel
-        self.kernel: functions.PlaneKernel = functions.PlaneKernel(
+        self.kernel: fused_functions.PlaneKernel = fused_functions.PlaneKernel(
             field.spaces, field.half_size, s.u, s.v, s.tensor, rays.power, like.kernel if isinstance(like, PlaneImage) else None
         )
 
@@ -181,12 +183,12 @@ class PlaneImage:
 
 
 class RayImage:
-    """See `Numba.ray_image`; like: as of `PlaneImage`."""
+    """See `Numba.ray_image`; like: as for `PlaneImage`."""
 
     def __init__(self, field, rays: RayState, eta: float, fresnel: str, radius: float | None, like: RayImage | None):
         self.interface = eta, fresnel
         x, y, *direction = (c.contiguous() for c in rays.full((*rays.origin[:2], *rays.direction)))
-        self.kernel: functions.RayKernel = functions.RayKernel(
+        self.kernel: fused_functions.RayKernel = fused_functions.RayKernel(
             field.spaces,
             field.half_size,
             (x, y, rays.origin[2] + rays.datum),
@@ -203,6 +205,6 @@ class RayImage:
 
 @lru_cache(maxsize=8)
 def _axes(field: SplineIndex) -> tuple[VolumeAxis, VolumeAxis, VolumeAxis]:
-    """The kernels' axes of a volume."""
+    """Kernel data of the axes of a B-spline volume."""
     x, y, z = (VolumeAxis(s, *place) for s, place in zip(field.spaces, field.frame, strict=True))
     return x, y, z

@@ -1,6 +1,6 @@
-"""Stages by kernels of a CUDA device: float64 whatever is asked, and every sum the same from run to run.
+"""The CUDA backend: compiled kernels, always in float64, with sums that are bitwise reproducible.
 
-What has no kernel here, or no rays, is done by the reference, on the device too.
+The reference handles stages without a kernel, and empty sets of rays, on the device, too.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from caustic_cli.optics.backends.reference import Torch
-from caustic_cli.optics.interface import Departure
+from caustic_cli.optics.interface import OutgoingRays
 from caustic_cli.optics.kernels.cuda import rays as by_ray
 from caustic_cli.optics.kernels.cuda import sums
 from caustic_cli.optics.kernels.cuda.image import Light, expose
@@ -43,28 +43,31 @@ class Cuda(Torch):
         u, v = ((0.5 * (c.detach().double() / r + 1.0)).contiguous() for c, r in zip((x, y), field.half_size, strict=True))
         return surface_at(surface_of(field, u.device), heights, u, v)
 
-    def meet_spline(self, field, heights: Tensor, origin, direction, side: float) -> SurfaceIntersection:
+    def intersect_spline(self, field, heights: Tensor, origin, direction, side: float) -> SurfaceIntersection:
         """As the reference."""
         rays = [torch.as_tensor(c, dtype=torch.float64, device=heights.device) for c in (*origin, *direction)]
         ox, oy, oz, dx, dy, dz = torch.broadcast_tensors(*rays)
         if not ox.numel():
-            return super().meet_spline(field, heights, origin, direction, side)
+            return super().intersect_spline(field, heights, origin, direction, side)
         surface = surface_of(field, heights.device)
         return SurfaceIntersection(*hits_of_rays(surface, heights, (ox, oy, oz), (dx, dy, dz), side=side))
 
-    def meet_fixed(self, field, origin, direction):
+    def intersect_fixed(self, field, origin, direction):
         """As the reference."""
-        return lambda heights: self.meet_spline(field, heights, origin, direction, 1.0)
+        return lambda heights: self.intersect_spline(field, heights, origin, direction, 1.0)
 
     def interact(
         self, direction, slopes, power: Tensor, *, eta: float, reflects: bool, fresnel: str, polarised=None, side: float = 1.0
-    ) -> Departure:
-        """As the reference, which does constant slopes and varying indices; the kernel tells the side by the sign of d . N."""
+    ) -> OutgoingRays:
+        """As the reference, which handles constant slopes and varying indices; the kernel infers the side from the sign of d .
+        N."""
         if not isinstance(slopes[0], Tensor) or isinstance(eta, Tensor):
             return super().interact(
                 direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, polarised=polarised, side=side
             )
-        return Departure(*by_ray.interact(direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, field=polarised))
+        return OutgoingRays(
+            *by_ray.interact(direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, field=polarised)
+        )
 
     def land(self, origin, direction, point, axes, forward: float) -> tuple[Tensor, Tensor, Tensor]:
         """As the reference."""
@@ -75,11 +78,11 @@ class Cuda(Torch):
         return splat_rays(x, y, weight, screen, filter)
 
     def plane_image(self, field, rays: RayState, eta: float, fresnel: str, like: PlaneImage | None) -> PlaneImage:
-        """The fused kernel of a plane wave's rays on a B-spline: a function of heights, screen and filter."""
+        """The fused kernel for rays of a plane wave on a B-spline: a function of heights, screen and filter."""
         return PlaneImage(field, rays, eta, fresnel)
 
     def ray_image(self, field, rays: RayState, eta: float, fresnel: str, radius: float | None, like: RayImage | None) -> RayImage:
-        """The fused kernel of any rays below a B-spline."""
+        """The fused kernel for arbitrary rays below a B-spline."""
         return RayImage(field, rays, eta, fresnel, radius)
 
 

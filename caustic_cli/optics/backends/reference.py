@@ -1,4 +1,4 @@
-"""Every stage of a trace in plain torch: the reference for all other backends, and the backend of devices without one."""
+"""The reference backend: every stage of a trace in plain torch, for any device."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from torch import Tensor
 from caustic_cli.errors import InputError
 from caustic_cli.optics import intersection, reintersection
 from caustic_cli.optics.gradient.integrator import ORDER, Flow, flow
-from caustic_cli.optics.interface import Departure, interact
+from caustic_cli.optics.interface import OutgoingRays, interact
 from caustic_cli.optics.mesh import TriangleMesh
 from caustic_cli.optics.reconstruction import Filter, splat
-from caustic_cli.optics.sampling import Sample, spread
+from caustic_cli.optics.sampling import Sample, scattered_points
 from caustic_cli.optics.surfaces.base import SurfaceIntersection
 from caustic_cli.optics.tolerances import PARALLEL
 from caustic_cli.scene import Screen
 
-#: Heights, screen and filter -> image, power that leaves the surface, and what was lost there, by one kernel.
+#: A fused kernel: heights, screen and filter -> image, power behind the surface, and losses there.
 Fused = Callable[[Tensor, Screen, Filter], tuple[Tensor, Tensor, dict]]
 
 
@@ -27,18 +27,18 @@ class Torch:
     """See the package."""
 
     name = "torch"
-    #: Whether something has to be compiled before the first trace.
+    #: Whether kernels are compiled before the first trace.
     compiled = False
 
     def precision(self, dtype: torch.dtype) -> torch.dtype:
-        """The precision in which rays asked for in `dtype` are traced."""
+        """The precision used for rays requested in `dtype`."""
         return dtype
 
     def scatter(
         self, seed: int, start: int, stop: int, shape: tuple[int, int], stratified: bool, device: torch.device | str
     ) -> list[Tensor]:
         """Random points u, v of the unit square for rays start..stop, `stratified` in cells: see `sampling`."""
-        return spread(seed, start, stop, shape, stratified, device)
+        return scattered_points(seed, start, stop, shape, stratified, device)
 
     def spline_on(self, field, sample: Sample, dtype: torch.dtype):
         """A function of sags (n, m) mm: height (mm) and slopes at the points of a sample, (N,) each in `dtype`."""
@@ -49,17 +49,17 @@ class Torch:
         """Height and slopes at fixed points (N,) mm, float64, linear in the heights."""
         return tuple(field.at(heights, x, y))
 
-    def meet(self, surface, heights: Tensor | None, origin, direction, side: float) -> SurfaceIntersection:
-        """`Surface.meet` of any surface."""
-        return intersection.meet_any(surface, heights, origin, direction, side)
+    def intersect(self, surface, heights: Tensor | None, origin, direction, side: float) -> SurfaceIntersection:
+        """`Surface.intersect` for any surface."""
+        return intersection.intersect_any(surface, heights, origin, direction, side)
 
-    def meet_spline(self, field, heights: Tensor, origin, direction, side: float) -> SurfaceIntersection:
-        """`Surface.meet` of a B-spline."""
-        return intersection.meet_any(field, heights, origin, direction, side)
+    def intersect_spline(self, field, heights: Tensor, origin, direction, side: float) -> SurfaceIntersection:
+        """`Surface.intersect` for a B-spline."""
+        return intersection.intersect_any(field, heights, origin, direction, side)
 
-    def meet_fixed(self, field, origin, direction):
-        """A function of heights (n, m) mm: `SurfaceIntersection`s from below of rays that do not depend on them."""
-        return lambda heights: intersection.meet_any(field, heights, origin, direction, 1.0)
+    def intersect_fixed(self, field, origin, direction):
+        """A function of heights (n, m) mm: `SurfaceIntersection` from below, of rays that do not depend on the heights."""
+        return lambda heights: intersection.intersect_any(field, heights, origin, direction, 1.0)
 
     def find(
         self, field, heights: Tensor, origin, direction, method: intersection.Method, radius: float | None
@@ -73,32 +73,32 @@ class Torch:
         return intersection.reference(field, heights, origin, direction, 1.0, radius)
 
     def finder(self, field, origin, direction):
-        """`find` by Newton's method for rays known beforehand: a function of heights."""
+        """`find` by Newton's method for fixed rays: a function of heights."""
         return lambda heights: intersection.reference(field, heights, origin, direction)
 
-    def next_meetings(self, field, heights: Tensor, origin, direction, below: bool, round: bool, step: float) -> Tensor:
-        """Distances (N,) mm to the next intersection of rays that start on a B-spline, 0 for none: see `reintersection.again`."""
+    def next_intersections(self, field, heights: Tensor, origin, direction, below: bool, round: bool, step: float) -> Tensor:
+        """Distances (N,) mm to the next intersection of rays that start on a B-spline, 0 for none: see `reintersection`."""
         return reintersection.reference(field, heights, origin, direction, below, round, step)
 
     def interact(
         self, direction, slopes, power: Tensor, *, eta: float, reflects: bool, fresnel: str, polarised=None, side: float = 1.0
-    ) -> Departure:
-        """What a surface does to rays: `interface.interact`."""
+    ) -> OutgoingRays:
+        """Refraction or reflection: `interface.interact`."""
         return interact(direction, slopes, power, eta=eta, reflects=reflects, fresnel=fresnel, polarised=polarised, side=side)
 
     def flow(self, field, coefficients: Tensor | None, point, momentum, time: Tensor, steps: int, order: int = ORDER) -> Flow:
-        """Rays after `time` in a medium of varying index: `integrator.flow`."""
+        """Rays in a gradient-index medium: `integrator.flow`."""
         return flow(field, coefficients, point, momentum, time, steps, order)
 
     def land(self, origin, direction, point, axes, forward: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Rays to a plane.
+        """Ray transfer to a plane.
 
         Args:
             point, axes: a point of the plane, mm, and unit vectors along its x and y and along its normal.
             forward: +1 for rays that arrive along the normal, -1 against it.
 
         Returns:
-            x, y (N,) mm from `point` along the plane's axes, and whether the rays get there; those that do not stay where they are.
+            x, y (N,) mm from `point` along the plane's axes, and whether the rays reach the plane; others keep their position.
         """
         away = [p - o for p, o in zip(point, origin, strict=True)]
         along, up, normal = axes
@@ -125,7 +125,7 @@ class Torch:
 
 
 def by_mesh(field, heights, origin, direction, method: intersection.Method, radius):
-    """Where the mesh has the hits (None: not asked for), and (t, status) if that is the whole method."""
+    """Distances to the intersections with the mesh (None if not requested), and (t, status) if the mesh is the whole method."""
     if method.name == "newton":
         return None, None
     mesh = TriangleMesh(field, heights, *method.parts)
@@ -139,7 +139,7 @@ def by_mesh(field, heights, origin, direction, method: intersection.Method, radi
 
 
 def _dot(a, b):
-    """Sum over three components, of which zeros and ones of plain floats cost nothing."""
+    """Scalar product of three components, skipping plain zeros and ones."""
     total = 0.0
     for u, v in zip(a, b, strict=True):
         if (isinstance(v, float) and v == 0.0) or (isinstance(u, float) and u == 0.0):

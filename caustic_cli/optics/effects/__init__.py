@@ -1,9 +1,9 @@
-"""Effects: one file each, here in the sequence in which light meets them."""
+"""Physical effects, one file each; listed in the order in which they act on the light."""
 
 from __future__ import annotations
 
 from caustic_cli.optics.effects.absorption import Absorption
-from caustic_cli.optics.effects.base import NEGLIGIBLE, NO_REQUESTS, Action, Amount, Decision, Effect, Requests
+from caustic_cli.optics.effects.base import NEGLIGIBLE, NO_REQUESTS, Action, Decision, Effect, Probe, Requests
 from caustic_cli.optics.effects.diffraction import Diffraction
 from caustic_cli.optics.effects.dispersion import Dispersion
 from caustic_cli.optics.effects.entrance import Entrance
@@ -43,4 +43,4 @@ EFFECTS: tuple[Effect, ...] = (
     Diffraction(),
 )
 
-__all__ = ["EFFECTS", "NEGLIGIBLE", "NO_REQUESTS", "Action", "Amount", "Decision", "Effect", "Requests"]
+__all__ = ["EFFECTS", "NEGLIGIBLE", "NO_REQUESTS", "Action", "Decision", "Effect", "Probe", "Requests"]

@@ -1,4 +1,4 @@
-"""Absorption in glass: exp(-a t) passes t mm (Beer-Lambert)."""
+"""Absorption in glass: transmittance exp(-a t) over t mm (Beer-Lambert law)."""
 
 from __future__ import annotations
 
@@ -7,48 +7,48 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import Action, Amount, Decision, Effect, Requests
+from caustic_cli.optics.effects.base import Action, Decision, Effect, Probe, Requests
 from caustic_cli.scene import Scene
 
-#: Coefficient that is measured where there is none, 1/mm.
+#: Absorption coefficient for the measurement in a scene without absorption, 1/mm.
 AMOUNT = 0.01
 
 
 class Absorption(Effect):
-    """Left out, the glass is clear."""
+    """Without it the glass is perfectly transparent."""
 
     name = "absorption"
 
-    def judge(self, scene: Scene, bounds) -> Decision:
-        """By the coefficient."""
+    def decide(self, scene: Scene, bounds) -> Decision:
+        """Needed if a coefficient is above 0."""
         a = 0.0 if scene.lens.mirror else max(scene.lens.absorption, *(e.absorption for e in scene.elements), 0.0)
         why = f"the glass absorbs {a:g} per mm" if a > 0 else "the glass is clear"
         return Decision(self.name, a > 0, why, a, 0.0, present=a > 0)
 
     def without(self, scene: Scene) -> Scene:
-        """Clear glass."""
+        """With transparent glass."""
         if not (scene.lens.absorption or any(e.absorption for e in scene.elements)):
             return scene
         clear = tuple(replace(e, absorption=0.0) for e in scene.elements)
         return replace(scene, lens=replace(scene.lens, absorption=0.0), elements=clear)
 
-    def sample(self, scene: Scene, heights: Tensor) -> Amount | None:
-        """A little."""
+    def probe(self, scene: Scene, heights: Tensor) -> Probe | None:
+        """Weak absorption."""
         if scene.lens.mirror:
             return None
-        return Amount(replace(scene, lens=replace(scene.lens, absorption=AMOUNT)), None, f"{AMOUNT:g} per mm")
+        return Probe(replace(scene, lens=replace(scene.lens, absorption=AMOUNT)), None, f"{AMOUNT:g} per mm")
 
     def action(self, system, requests: Requests) -> Action | None:
-        """In every medium that absorbs."""
-        return Absorb() if any(medium.absorption for medium in system.media()) else None
+        """The action, if a medium absorbs."""
+        return AbsorptionAction() if any(medium.absorption for medium in system.media()) else None
 
 
-class Absorb(Action):
-    """Takes its part on the way to every surface."""
+class AbsorptionAction(Action):
+    """Attenuation on the path to every surface."""
 
-    def arrive(self, m) -> None:
-        """After `length` mm."""
+    def before_interaction(self, m) -> None:
+        """Attenuate by the factor exp(-a length)."""
         if m.absorption:
             before = m.state.power
-            m.state.power = before * torch.exp(-m.absorption * m.length)
+            m.state.power = before * torch.exp(-m.absorption * torch.as_tensor(m.length))  # 0.0 for rays on the pupil already
             m.state.lose("absorbed", (before - m.state.power).detach())

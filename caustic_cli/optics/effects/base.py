@@ -1,8 +1,8 @@
-"""What an effect is: why a scene calls for it or not, what it does to rays, how it is left out, and how its cost is measured.
+"""The interface of physical effects: whether a scene needs one, its action on rays, its omission, and the measurement of its cost.
 
-A new effect is one file with a subclass of `Effect`, and its line in the registry of this package.  Most effects are either told
-by the numbers of a scene (absorption: the coefficient), so that leaving them out is another scene, or by a request to the trace
-(ghosts), which no number of a scene says.
+A new effect is one file with a subclass of `Effect` and a line in the registry of this package.  An effect is controlled either by
+parameters of the scene (absorption: the coefficient), so that it is omitted by changing the scene, or by a request to the tracer
+(ghosts).
 """
 
 from __future__ import annotations
@@ -13,22 +13,23 @@ from dataclasses import dataclass, replace
 from torch import Tensor
 
 from caustic_cli.optics.bounds import Bounds
-from caustic_cli.optics.interaction import Interaction, Parameters, Walker
+from caustic_cli.optics.interaction import Interaction, Parameters, RayTracer
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.surfaces import SurfaceIntersection
 from caustic_cli.optics.system import System
 from caustic_cli.scene import Scene
 
-#: Ghost light below this part of the source's power is left out: the other effects' own models are no better than that.
+#: Fraction of the source's power below which stray light is neglected: the models of other effects are no more accurate.
 NEGLIGIBLE = 0.01
 
 
 @dataclass(frozen=True)
 class Decision:
-    """What was decided of an effect in a scene.
+    """The decision on an effect in a scene.
 
-    name: of the effect; on: whether it is simulated; why: one clause; bound, limit: the number that decides and what it is compared
-    with, or None; fixed: without it there is no image of this scene; present: False where the scene has nothing of it.
+    name: of the effect; on: whether it is simulated; why: the reason, a clause; bound, limit: the deciding quantity and the value
+    that it is compared with, or None; fixed: whether the effect cannot be switched; present: False if the scene has no such effect
+    at all.
     """
 
     name: str
@@ -42,8 +43,8 @@ class Decision:
 
 @dataclass(frozen=True)
 class Requests:
-    """What a trace is asked beyond what its system says: names of effects to simulate, and to leave out where they matter; and
-    whether to go by stages even where a fused kernel does the same."""
+    """Requests to a tracer beyond its system: names of effects to simulate, and to omit although the system has them; and whether
+    to use the stages even where a fused kernel is equivalent."""
 
     on: frozenset[str] = frozenset()
     off: frozenset[str] = frozenset()
@@ -55,7 +56,7 @@ class Requests:
         return cls(frozenset(on), frozenset(without), stages)
 
     def __or__(self, other: Requests) -> Requests:
-        """Both."""
+        """The union of both."""
         return Requests(self.on | other.on, self.off | other.off, self.stages or other.stages)
 
 
@@ -63,86 +64,86 @@ NO_REQUESTS = Requests()
 
 
 @dataclass(frozen=True)
-class Amount:
-    """An amount of an effect at which a study measures it: the scene with it, the scene to compare it with (None: the same
-    without it), and the amount in words."""
+class Probe:
+    """A scene for the measurement of an effect: the scene with it, the scene to compare with (None: the same without the effect),
+    and the magnitude in words."""
 
     scene: Scene
-    bare: Scene | None
+    baseline: Scene | None
     words: str
 
 
 class Action:
-    """What an effect does to rays in one trace; an `Interaction`'s fields are read and changed in place."""
+    """The action of an effect on rays in one trace; it reads and modifies the fields of an `Interaction` in place."""
 
-    #: Whether `stray_light` adds light that goes another way.
+    #: Whether `stray_light` adds rays.
     stray = False
 
-    def meet(self, interaction: Interaction, origin, direction, heights: Tensor | None) -> SurfaceIntersection | None:
-        """Another way to meet the surface, from rays in its frame; None for the usual one."""
+    def intersect(self, interaction: Interaction, origin, direction, heights: Tensor | None) -> SurfaceIntersection | None:
+        """Intersection with the surface in place of the usual one, from rays in its frame; None for the usual one."""
         return None
 
-    def arrive(self, interaction: Interaction) -> None:
-        """At the surface, before Snell's law."""
+    def before_interaction(self, interaction: Interaction) -> None:
+        """Called at the surface, before refraction or reflection."""
 
-    def depart(self, interaction: Interaction) -> None:
-        """Behind the surface."""
+    def after_interaction(self, interaction: Interaction) -> None:
+        """Called behind the surface, after refraction or reflection."""
 
-    def stray_light(self, tracer: Walker, parameters: Parameters, interactions: list[Interaction]) -> list[RayState]:
-        """Light behind the last element that has not gone straight on; takes it off the `interactions`' states and accounts."""
+    def stray_light(self, tracer: RayTracer, parameters: Parameters, interactions: list[Interaction]) -> list[RayState]:
+        """Stray light behind the last element; it is subtracted from the states and losses of `interactions`."""
         return []
 
 
 class Effect(ABC):
-    """One effect; see the package for the sequence."""
+    """A physical effect."""
 
     name: str
-    #: It costs nothing that could be saved: a mask of every path, or an addend in a sum.
+    #: Whether omitting it saves no time.
     free = False
-    #: It is seen in the wave image alone.
+    #: Whether it affects the wave image only.
     waves = False
 
     @abstractmethod
-    def judge(self, scene: Scene, bounds: Bounds) -> Decision:
-        """Whether a scene calls for it, and why."""
+    def decide(self, scene: Scene, bounds: Bounds) -> Decision:
+        """Whether a scene needs the effect, and why."""
 
     def without(self, scene: Scene) -> Scene:
-        """The scene with nothing of it."""
+        """The scene without the effect."""
         return scene
 
-    def within(self, scene: Scene) -> Scene:
-        """The scene with it, where it was asked for."""
+    def including(self, scene: Scene) -> Scene:
+        """The scene with the effect, on request."""
         return scene
 
     def request(self, scene: Scene, on: bool, bounds: Bounds) -> Requests:
-        """What to ask of the trace for the effect to be on, or off."""
+        """Requests to the tracer that switch the effect on or off."""
         return NO_REQUESTS
 
-    def sample(self, scene: Scene, heights: Tensor) -> Amount | None:
-        """An amount to measure in a scene that has nothing of it; None where there is none."""
+    def probe(self, scene: Scene, heights: Tensor) -> Probe | None:
+        """A scene for the measurement of the effect where `scene` has none of it; None if there is no such scene."""
         return None
 
     def prepare(self, system: System, rays: RayState, requests: Requests) -> RayState:
-        """Rays of the source as the effect would have them."""
+        """The source's rays, modified by the effect."""
         return rays
 
     def action(self, system: System, requests: Requests) -> Action | None:
-        """What it does to rays in a trace of this system; None for nothing."""
+        """Its action in a trace of this system; None if there is none."""
         return None
 
 
-class GeneralWay(Effect):
-    """An effect that rays of a plane wave do not need, but can be put through; that others go through, unless it is left out."""
+class GeneralRayEffect(Effect):
+    """An effect that axial plane waves do not need but that can be simulated for them on request; other rays always need it."""
 
     def request(self, scene: Scene, on: bool, bounds: Bounds) -> Requests:
-        """Of a plane wave, to go by the general way; of others, not to."""
+        """For an axial plane wave a request to simulate it, for other light a request to omit it."""
         if on == scene.axial:
             return Requests.to(self.name) if on else Requests.to(without=(self.name,))
         return NO_REQUESTS
 
     def prepare(self, system: System, rays: RayState, requests: Requests) -> RayState:
-        """A plane wave's rays as any others: they forget that they stand on a sample of the aperture."""
+        """On request, the rays of a plane wave as general rays, without their sample of the aperture."""
         if self.name not in requests.on:
             return rays
-        rays = rays.spread()
+        rays = rays.expanded()
         return replace(rays, direction=rays.full(rays.direction), sample=None)

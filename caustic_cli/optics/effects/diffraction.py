@@ -1,6 +1,6 @@
-"""Diffraction: light is a wave, and its image is taken from fields instead of rays (`optics.waves`).
+"""Diffraction: a wave image, computed from the field by scalar diffraction theory (`optics.waves`).
 
-It changes no ray: the wave image stands beside the ray image, which is that of no wavelength at all.
+It does not change rays: the wave image is an additional result beside the ray image, the limit of vanishing wavelength.
 """
 
 from __future__ import annotations
@@ -11,23 +11,23 @@ from caustic_cli.scene import Scene
 
 
 class Diffraction(Effect):
-    """Left out, there is no wave image."""
+    """Without it there is no wave image."""
 
     name = "diffraction"
     waves = True
 
-    def judge(self, scene: Scene, bounds) -> Decision:
-        """By what it adds to the blur of source and pixel."""
+    def decide(self, scene: Scene, bounds) -> Decision:
+        """Needed if it increases the blur of source and pixel noticeably."""
         r = bounds.resolution
         if scene.source.rays is not None:
-            return Decision(self.name, False, "a ray file says nothing of its light's phase", r.widened, WIDENED)
+            return Decision(self.name, False, "a ray file contains no phase", r.widened, WIDENED)
         if scene.screen.curved:
             return Decision(self.name, False, "a curved screen has no wave image", r.widened, WIDENED)
         if scene.lens.gradient is not None:
-            why = "the wave image is taken of lenses of one index"
+            why = "wave images are implemented for homogeneous lenses only"
             return Decision(self.name, False, why, r.widened, WIDENED, fixed=True)
         if scene.elements:
-            return Decision(self.name, False, "the wave image is taken of a lens by itself", r.widened, WIDENED, fixed=True)
+            return Decision(self.name, False, "wave images are implemented for a single lens only", r.widened, WIDENED, fixed=True)
         light = f"{r.wavelength:.4g} nm" if r.said else f"{r.wavelength:g} nm, as the scene says no wavelength,"
         why = f"light of {light} blurs over {r.diffraction:.2g} mm, the source over {r.source:.2g} mm, a pixel is {r.pixel:.2g} mm"
         return Decision(self.name, r.matters, why, r.widened, WIDENED)

@@ -1,4 +1,4 @@
-"""Dispersion: every wavelength has its own index."""
+"""Dispersion: the refractive index depends on the wavelength."""
 
 from __future__ import annotations
 
@@ -6,21 +6,21 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import Amount, Decision, Effect
+from caustic_cli.optics.effects.base import Decision, Effect, Probe
 from caustic_cli.scene import Light, Scene
 from caustic_cli.scene.materials import D_LINE, refractive_index
 
-#: What is measured where there is none.
+#: Glass and wavelengths, nm, for the measurement in a scene without dispersion.
 GLASS, LINES = "N-BK7", (486.1, D_LINE, 656.3)
 
 
 class Dispersion(Effect):
-    """Left out, all wavelengths have the lens' index."""
+    """Without it the index is the same at all wavelengths."""
 
     name = "dispersion"
 
-    def judge(self, scene: Scene, bounds) -> Decision:
-        """On where several wavelengths meet a glass."""
+    def decide(self, scene: Scene, bounds) -> Decision:
+        """Needed if several wavelengths pass a glass."""
         if scene.dispersive:
             spans = {glass: [refractive_index(glass, w) for w in scene.light.wavelengths] for glass in scene.glasses}
             glass, indices = max(spans.items(), key=lambda item: max(item[1]) - min(item[1]))
@@ -34,23 +34,23 @@ class Dispersion(Effect):
             if not scene.light.wavelengths
             else "a mirror treats all wavelengths alike"
             if scene.lens.mirror
-            else "the lens has one index for all wavelengths"
+            else "the lens' index is the same at all wavelengths"
         )
         return Decision(self.name, False, why, 0.0, 0.0, present=False)
 
     def without(self, scene: Scene) -> Scene:
-        """One index."""
+        """With indices independent of the wavelength."""
         if not scene.dispersive:
             return scene
         light = scene.light if scene.light.color else replace(scene.light, wavelengths=(), weights=())
         elements = tuple(replace(e, glass=None) for e in scene.elements)
         return replace(scene, lens=replace(scene.lens, glass=None), light=light, elements=elements)
 
-    def sample(self, scene: Scene, heights: Tensor) -> Amount | None:
-        """Three lines in the lens' glass, or a common one."""
+    def probe(self, scene: Scene, heights: Tensor) -> Probe | None:
+        """Three spectral lines in the lens' glass, or in a common one."""
         if scene.lens.mirror:
             return None
         glass = scene.lens.glass or GLASS
         lens = replace(scene.lens, glass=glass, index=refractive_index(glass))
         dispersed = replace(scene, lens=lens, light=Light(scene.light.polarisation, LINES))
-        return Amount(dispersed, None, f"{len(LINES)} wavelengths in {glass}")
+        return Probe(dispersed, None, f"{len(LINES)} wavelengths in {glass}")

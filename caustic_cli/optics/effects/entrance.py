@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import math
 
-from caustic_cli.optics.effects.base import Action, Decision, GeneralWay, Requests
-from caustic_cli.optics.frames import turned_back
+from caustic_cli.optics.effects.base import Action, Decision, GeneralRayEffect, Requests
+from caustic_cli.optics.frames import rotate_to_global
 from caustic_cli.scene import Scene
 
 
-class Entrance(GeneralWay):
-    """Left out, rays enter the glass unbent, with Fresnel's losses."""
+class Entrance(GeneralRayEffect):
+    """Without it rays enter the glass undeviated, with Fresnel losses."""
 
     name = "entrance"
 
-    def judge(self, scene: Scene, b) -> Decision:
-        """On where rays come oblique."""
+    def decide(self, scene: Scene, b) -> Decision:
+        """Needed at oblique incidence."""
         angle, collimated = math.degrees(b.incidence), scene.source.collimated
         if scene.two_sided:
             return Decision(self.name, True, "the entrance is free-form", fixed=True)
@@ -27,15 +27,15 @@ class Entrance(GeneralWay):
         return Decision(self.name, True, f"rays meet the entrance at up to {angle:.3g} degrees", angle, 0.0)
 
     def action(self, system, requests: Requests) -> Action | None:
-        """Keeps directions at a flat first element."""
+        """The action that omits refraction at a plane first element, on request."""
         first = system.elements[0]
-        return Unbent() if self.name in requests.off and first.surface.flat and not first.reflects else None
+        return NoRefraction() if self.name in requests.off and first.surface.flat and not first.reflects else None
 
 
-class Unbent(Action):
-    """Straight through the first element."""
+class NoRefraction(Action):
+    """Undeviated transmission through the first element."""
 
-    def depart(self, m) -> None:
-        """Directions as they came."""
+    def after_interaction(self, m) -> None:
+        """Restore the incident directions."""
         if m.index == 0 and m.forward:
-            m.state.direction = turned_back(m.element.pose, m.incoming)
+            m.state.direction = rotate_to_global(m.element.pose, m.incoming)

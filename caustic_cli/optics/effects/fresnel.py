@@ -1,4 +1,4 @@
-"""Fresnel's losses by reflection at every surface of glass."""
+"""Fresnel reflection losses at glass surfaces."""
 
 from __future__ import annotations
 
@@ -9,23 +9,25 @@ from caustic_cli.scene import Scene
 
 
 class Fresnel(Effect):
-    """Left out, surfaces are perfectly coated."""
+    """Without it surfaces have perfect anti-reflection coatings."""
 
     name = "fresnel"
 
-    def judge(self, scene: Scene, b) -> Decision:
-        """On unless the scene says otherwise."""
+    def decide(self, scene: Scene, b) -> Decision:
+        """Needed unless the scene has fresnel = none."""
         if scene.lens.mirror:
-            return Decision(self.name, False, "a mirror is taken to reflect all light", present=False)
+            return Decision(self.name, False, "mirrors have a reflectance of 1", present=False)
         if scene.lens.fresnel == "none":
             return Decision(self.name, False, "fresnel = none: perfectly coated", 0.0, 0.0)
         normal = ((b.index - 1.0) / (b.index + 1.0)) ** 2
-        return Decision(self.name, True, f"each surface reflects {normal:.2%} of normal light; {scene.lens.fresnel}", normal, 0.0)
+        return Decision(
+            self.name, True, f"each surface reflects {normal:.2%} of light at normal incidence; {scene.lens.fresnel}", normal, 0.0
+        )
 
     def without(self, scene: Scene) -> Scene:
-        """Perfectly coated."""
+        """With perfect anti-reflection coatings."""
         return scene if scene.lens.fresnel == "none" else replace(scene, lens=replace(scene.lens, fresnel="none"))
 
-    def within(self, scene: Scene) -> Scene:
-        """By the exact formulas."""
+    def including(self, scene: Scene) -> Scene:
+        """With the exact Fresnel equations."""
         return replace(scene, lens=replace(scene.lens, fresnel="exact")) if scene.lens.fresnel == "none" else scene

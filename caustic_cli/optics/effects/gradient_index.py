@@ -1,4 +1,4 @@
-"""An index that varies within the lens: rays bend between its surfaces (thesis 7.2.1)."""
+"""Gradient index: curved rays inside the lens (thesis 7.2.1)."""
 
 from __future__ import annotations
 
@@ -7,30 +7,30 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import Amount, Decision, Effect
-from caustic_cli.optics.gradient.fields import field_of
+from caustic_cli.optics.effects.base import Decision, Effect, Probe
+from caustic_cli.optics.gradient.fields import index_field_of
 from caustic_cli.scene import Scene
 from caustic_cli.scene.gradient import Gradient
 
-#: Part of a pixel by which bending may move light without being simulated.
+#: Displacement on the screen, in pixels, below which the curvature of rays is neglected.
 UNSEEN = 0.05
-#: Angle, rad, by which a ray at the aperture's edge is turned where the effect is measured in a scene that has none.
+#: Deflection of a marginal ray, rad, for the measurement in a scene without a gradient.
 TURN = 0.01
 
 
 class GradientIndex(Effect):
-    """Left out, the lens has its own index everywhere."""
+    """Without it the lens is homogeneous."""
 
     name = "gradient-index"
 
-    def judge(self, scene: Scene, bounds) -> Decision:
-        """By a bound of how far bending moves light on the screen, and by how much the index differs from the lens' own.
+    def decide(self, scene: Scene, bounds) -> Decision:
+        """By a bound of the displacement on the screen due to the curvature of rays and to the deviation of the index.
 
-        A ray through t mm turns by at most t |grad n| / n within, n times that behind the exit, over the way to the screen.
+        Over t mm a ray is deflected by at most t |grad n| / n inside, and by n times that behind the exit.
         """
-        lens, field = scene.lens, field_of(scene.lens)
+        lens, field = scene.lens, index_field_of(scene.lens)
         if field is None:
-            return Decision(self.name, False, "the lens has one index", 0.0, UNSEEN, present=False)
+            return Decision(self.name, False, "the lens has a homogeneous index", 0.0, UNSEEN, present=False)
         least, most, steepest = field.extremes(lens.half_size, bounds.depth)
         turn = min(steepest * bounds.depth * most / least, 0.5 * math.pi)
         moved = turn * (bounds.depth / (2.0 * least) + scene.screen.z - lens.offset.thickness) / min(scene.screen.pixel)
@@ -43,11 +43,11 @@ class GradientIndex(Effect):
         return Decision(self.name, moved > UNSEEN, why, moved, UNSEEN)
 
     def without(self, scene: Scene) -> Scene:
-        """One index."""
+        """With a homogeneous lens."""
         return scene if scene.lens.gradient is None else replace(scene, lens=replace(scene.lens, gradient=None))
 
-    def sample(self, scene: Scene, heights: Tensor) -> Amount | None:
-        """A radial gradient, whose index falls towards the edge by little."""
+    def probe(self, scene: Scene, heights: Tensor) -> Probe | None:
+        """A weak radial gradient with the index decreasing towards the edge."""
         lens = scene.lens
         if lens.mirror:
             return None
@@ -55,4 +55,4 @@ class GradientIndex(Effect):
         if not depth > 0:
             return None
         gradient = Gradient("radial", (-TURN / (2.0 * depth * edge),))
-        return Amount(replace(scene, lens=replace(lens, gradient=gradient)), None, f"{TURN:g} rad at the edge")
+        return Probe(replace(scene, lens=replace(lens, gradient=gradient)), None, f"{TURN:g} rad at the edge")

@@ -1,4 +1,4 @@
-"""The point where a ray meets the free-form surface, which is not the one above the point where it entered."""
+"""Intersection of oblique rays with the free-form surface."""
 
 from __future__ import annotations
 
@@ -7,35 +7,35 @@ import math
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import Action, Decision, GeneralWay, Requests
+from caustic_cli.optics.effects.base import Action, Decision, GeneralRayEffect, Requests
 from caustic_cli.optics.surfaces import HeightField, SurfaceIntersection
 from caustic_cli.scene import Scene
 
 
-class Intersection(GeneralWay):
-    """Left out, rays leave where they cross the surface's mean height."""
+class Intersection(GeneralRayEffect):
+    """Without it rays leave at their intersection with the plane of mean height."""
 
     name = "intersection"
 
-    def judge(self, scene: Scene, b) -> Decision:
-        """On where rays run oblique inside the lens."""
+    def decide(self, scene: Scene, b) -> Decision:
+        """Needed for oblique rays inside the lens."""
         if scene.axial:
             return Decision(self.name, False, "rays of a plane wave are sampled on the surface itself", 0.0, 0.0)
         angle = math.degrees(b.inside)
         return Decision(self.name, True, f"rays cross the lens at up to {angle:.3g} degrees", angle, 0.0)
 
     def action(self, system, requests: Requests) -> Action | None:
-        """Meets the mean plane instead."""
+        """The action that uses the mean plane instead, on request."""
         return MeanPlane() if self.name in requests.off else None
 
 
 class MeanPlane(Action):
-    """A B-spline met where rays cross its mean height, with the height and the slopes that it has there."""
+    """The approximation by the plane of mean height: the surface's height and slopes at the intersection with that plane."""
 
-    def meet(self, m, origin, direction, heights: Tensor | None) -> SurfaceIntersection | None:
-        """The height there is what the ray goes on from; no time passes between it and the mean plane."""
+    def intersect(self, m, origin, direction, heights: Tensor | None) -> SurfaceIntersection | None:
+        """Intersect the mean plane; the ray continues from the surface's height there, without additional path length."""
         surface = m.element.surface
-        if not isinstance(surface, HeightField) or m.state.sample is not None:  # a plane wave's rays stand on the surface itself
+        if not isinstance(surface, HeightField) or m.state.sample is not None:  # rays of a plane wave lie on the surface already
             return None
         assert heights is not None
         sag, mean = surface.centred(heights)
@@ -48,8 +48,8 @@ class MeanPlane(Action):
         t = torch.where(found, t, torch.zeros_like(t))
         return SurfaceIntersection(t, gx, gy, found)
 
-    def arrive(self, m) -> None:
-        """Onto the surface above or below."""
+    def before_interaction(self, m) -> None:
+        """Shift the points from the mean plane to the surface."""
         if m.lift is not None:
             x, y, z = m.state.origin
             m.state.origin = (x, y, z + m.lift)

@@ -1,4 +1,4 @@
-"""A free-form surface that reflects."""
+"""Reflection by a free-form mirror."""
 
 from __future__ import annotations
 
@@ -6,25 +6,25 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import Amount, Decision, Effect
+from caustic_cli.optics.effects.base import Decision, Effect, Probe
 from caustic_cli.scene import Scene
 
 
 class Mirror(Effect):
-    """Part of what the element is: it cannot be left out."""
+    """It cannot be omitted."""
 
     name = "mirror"
 
-    def judge(self, scene: Scene, bounds) -> Decision:
-        """As the scene says."""
+    def decide(self, scene: Scene, bounds) -> Decision:
+        """Given by the scene."""
         if scene.lens.mirror:
             return Decision(self.name, True, "the surface is a mirror", fixed=True)
         return Decision(self.name, False, "the surface is glass", fixed=True, present=False)
 
-    def sample(self, scene: Scene, heights: Tensor) -> Amount | None:
-        """The same surface as a mirror, with the screen as far before it; a lens whose index is a volume has none such."""
+    def probe(self, scene: Scene, heights: Tensor) -> Probe | None:
+        """The same surface as a mirror, with the screen at the same distance in front of it; None for a gradient-index lens."""
         if scene.lens.gradient is not None:
             return None
         z = 2.0 * float(heights.mean()) - scene.screen.z
         lens, screen = replace(scene.lens, mirror=True), replace(scene.screen, z=z)
-        return Amount(Scene(scene.source, lens, screen, scene.light), scene, f"the screen at {z:.4g} mm")
+        return Probe(Scene(scene.source, lens, screen, scene.light), scene, f"the screen at {z:.4g} mm")

@@ -1,4 +1,4 @@
-"""Rays that leave the lens by its side before they meet the exit."""
+"""Vignetting: rays that leave the aperture before they reach the exit, or miss an aperture."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from caustic_cli.scene import Scene
 
 
 class MissedSurface(Effect):
-    """A mask that every path has."""
+    """It is always evaluated, as a mask."""
 
     name = "missed-surface"
     free = True
 
-    def judge(self, scene: Scene, b) -> Decision:
-        """By how far rays get at the surface's greatest height."""
+    def decide(self, scene: Scene, b) -> Decision:
+        """By the bound of the rays' distance from the axis at the surface's greatest height."""
         if scene.elements:
             return Decision(self.name, True, "the apertures of other elements may stop light", fixed=True)
         if scene.axial:
@@ -24,5 +24,5 @@ class MissedSurface(Effect):
             return Decision(self.name, False, f"no ray gets beyond {b.reach:.4g} of the aperture's half width", b.reach, 1.0)
         if math.isinf(b.reach):
             return Decision(self.name, True, "the surface may dip below the entrance", None, 1.0, fixed=True)
-        why = f"rays may get to {b.reach:.4g} of the aperture's half width: its side takes them"
+        why = f"rays may get to {b.reach:.4g} of the aperture's half width, where its edge absorbs them"
         return Decision(self.name, True, why, b.reach, 1.0, fixed=True)

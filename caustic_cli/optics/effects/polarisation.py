@@ -1,4 +1,4 @@
-"""Linear polarisation: what a surface reflects of s- and of p-polarised light, see `optics.polarisation`."""
+"""Polarisation: different Fresnel reflectances of s- and p-polarised light, see `optics.polarisation`."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import NEGLIGIBLE, Action, Amount, Decision, Effect, Requests
-from caustic_cli.optics.frames import turned, turned_back
+from caustic_cli.optics.effects.base import NEGLIGIBLE, Action, Decision, Effect, Probe, Requests
+from caustic_cli.optics.frames import rotate_to_global, rotate_to_local
 from caustic_cli.optics.interface import refract
-from caustic_cli.optics.polarisation import beyond, field_of
+from caustic_cli.optics.polarisation import polarisation_vector, transmitted_field
 from caustic_cli.optics.rays import RayState
 from caustic_cli.scene import Scene
 
 
 class Polarisation(Effect):
-    """Left out, every surface reflects the mean of s and p."""
+    """Without it every surface has the mean reflectance of s and p."""
 
     name = "polarisation"
 
-    def judge(self, scene: Scene, b) -> Decision:
-        """On for polarised light, and where what the entrance polarises changes what the exit reflects."""
+    def decide(self, scene: Scene, b) -> Decision:
+        """Needed for polarised light, and where the polarisation by the entrance changes the reflectance of the exit noticeably."""
         light, lens = scene.light, scene.lens
         if lens.mirror or lens.fresnel != "exact":
             why = "a mirror reflects all light alike" if lens.mirror else f"fresnel = {lens.fresnel} knows no polarisation"
@@ -29,54 +29,54 @@ class Polarisation(Effect):
         if light.polarisation is not None:
             return Decision(self.name, True, f"the source is polarised at {light.polarisation:g} degrees")
         if b.incidence == 0:
-            return Decision(self.name, False, "unpolarised light, which normal incidence leaves so", 0.0, NEGLIGIBLE)
+            return Decision(self.name, False, "unpolarised light at normal incidence stays unpolarised", 0.0, NEGLIGIBLE)
         some = b.polarised > NEGLIGIBLE
         return Decision(
             self.name,
             some,
-            "unpolarised light; what the entrance polarises changes what the exit reflects by"
+            "unpolarised light; polarisation at the entrance changes the reflectance of the exit by"
             f" {'up to' if some else 'at most'} {b.polarised:.1e}",
             b.polarised,
             NEGLIGIBLE,
         )
 
     def without(self, scene: Scene) -> Scene:
-        """Unpolarised light."""
+        """With unpolarised light."""
         light = scene.light
         return scene if light.polarisation is None else replace(scene, light=replace(light, polarisation=None))
 
-    def within(self, scene: Scene) -> Scene:
-        """Unpolarised light as two crossed polarisations."""
+    def including(self, scene: Scene) -> Scene:
+        """With unpolarised light traced as two orthogonal polarisations."""
         return scene if scene.light.polarisation is not None else replace(scene, light=replace(scene.light, tracked=True))
 
-    def sample(self, scene: Scene, heights: Tensor) -> Amount | None:
-        """Along x."""
+    def probe(self, scene: Scene, heights: Tensor) -> Probe | None:
+        """Linear polarisation along x."""
         if scene.lens.fresnel != "exact" or scene.lens.mirror:
             return None
-        return Amount(replace(scene, light=replace(scene.light, polarisation=0.0)), None, "along x")
+        return Probe(replace(scene, light=replace(scene.light, polarisation=0.0)), None, "along x")
 
     def prepare(self, system, rays: RayState, requests: Requests) -> RayState:
-        """Rays with a field."""
+        """Rays with their electric field."""
         angle = system.light.polarisation
         if angle is None or not any(e.fresnel == "exact" and not e.reflects for e in system.elements):
             return rays
-        return replace(rays, polarised=field_of(angle, rays.direction))
+        return replace(rays, polarised=polarisation_vector(angle, rays.direction))
 
     def action(self, system, requests: Requests) -> Action | None:
-        """Carries the field through surfaces that are followed by others."""
-        return Carry() if system.light.polarisation is not None and len(system.elements) > 1 else None
+        """The action that propagates the field through several surfaces."""
+        return FieldPropagation() if system.light.polarisation is not None and len(system.elements) > 1 else None
 
 
-class Carry(Action):
-    """The field behind a surface."""
+class FieldPropagation(Action):
+    """Propagation of the electric field through a surface."""
 
-    def depart(self, m) -> None:
-        """Fresnel's amplitudes, or a perfect mirror's."""
+    def after_interaction(self, m) -> None:
+        """Apply Fresnel's transmission coefficients, or the reflection of a perfect conductor."""
         state, last = m.state, m.index == len(m.tracer.system.elements) - 1
         if state.polarised is None or (last and m.forward):
             return
         pose = m.element.pose
-        e, flip = turned(pose, state.polarised), m.side
+        e, flip = rotate_to_local(pose, state.polarised), m.side
         d = (m.incoming[0], m.incoming[1], flip * m.incoming[2])
         e = (e[0], e[1], flip * e[2])
         gx, gy = (flip * g for g in m.slopes)
@@ -89,5 +89,5 @@ class Carry(Action):
             gx, gy = (torch.as_tensor(g, dtype=state.power.dtype, device=state.power.device) for g in (gx, gy))
             d = state.full(d)
             t, _, c, s = refract(d, gx, gy, m.n_in / m.n_out)
-            e = beyond(state.full(e), d, t, normal, c, s, m.n_in / m.n_out)
-        state.polarised = turned_back(pose, (e[0], e[1], flip * e[2]))
+            e = transmitted_field(state.full(e), d, t, normal, c, s, m.n_in / m.n_out)
+        state.polarised = rotate_to_global(pose, (e[0], e[1], flip * e[2]))

@@ -1,7 +1,7 @@
-"""A rough surface: microfacets, of which every ray meets one, whose slopes scatter about the surface's own.
+"""Surface roughness: a microfacet model with normally distributed slopes, one facet per ray.
 
-Facets neither shade nor hide each other, which needs slopes of a few tenths at most.  Their slopes are a pure function of where a
-ray runs.
+Shadowing and masking are neglected, which requires slopes of a few tenths at most.  The facet slopes are a deterministic function
+(hash) of the ray.
 """
 
 from __future__ import annotations
@@ -11,63 +11,63 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import Action, Amount, Decision, Effect, Requests
+from caustic_cli.optics.effects.base import Action, Decision, Effect, Probe, Requests
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import normal_numbers
 from caustic_cli.scene import Scene
 
-#: Odd constants that mix the bits of a ray's coordinates into one index (Knuth's and Steele's multipliers).
+#: Odd multipliers that hash a ray's coordinates to one index (Knuth; Steele).
 MIX = (-7046029254386353131, -4417276706812531889, 0x632BE59BD9B4E019)
-#: Seed of the microfacets' slopes; that of element k is k more than that of a lens' exit.
+#: Seed of the facet slopes at the last element; at the k-th element in front of it the seed is greater by k.
 FACETS = 0xFACE7
-#: Standard deviation that is measured where there is none.
+#: Slope standard deviation for the measurement in a scene with smooth surfaces.
 AMOUNT = 0.001
 
 
 class Roughness(Effect):
-    """Left out, the surface is smooth."""
+    """Without it the surface is smooth."""
 
     name = "roughness"
 
-    def judge(self, scene: Scene, bounds) -> Decision:
-        """By the facets' standard deviation."""
+    def decide(self, scene: Scene, bounds) -> Decision:
+        """Needed if the standard deviation of the facet slopes is above 0."""
         r = scene.lens.roughness
         why = f"microfacets of slopes {r:g}" if r > 0 else "the surface is smooth"
         return Decision(self.name, r > 0, why, r, 0.0, present=r > 0)
 
     def without(self, scene: Scene) -> Scene:
-        """A smooth surface."""
+        """With a smooth surface."""
         return replace(scene, lens=replace(scene.lens, roughness=0.0)) if scene.lens.roughness else scene
 
-    def sample(self, scene: Scene, heights: Tensor) -> Amount:
-        """A little."""
-        return Amount(replace(scene, lens=replace(scene.lens, roughness=AMOUNT)), None, f"slopes {AMOUNT:g}")
+    def probe(self, scene: Scene, heights: Tensor) -> Probe:
+        """Slight roughness."""
+        return Probe(replace(scene, lens=replace(scene.lens, roughness=AMOUNT)), None, f"slopes {AMOUNT:g}")
 
     def action(self, system, requests: Requests) -> Action | None:
-        """At every element that is rough."""
-        return Facets() if any(e.roughness for e in system.elements) else None
+        """The action, if an element is rough."""
+        return Microfacets() if any(e.roughness for e in system.elements) else None
 
 
-class Facets(Action):
-    """Adds to the slopes what each ray's facet has; the same in every walk of a tracer."""
+class Microfacets(Action):
+    """Adds the facet slopes to those of the surface; they are the same in every trace by one tracer."""
 
     def __init__(self) -> None:
         self.noise: dict[int, tuple[Tensor, ...]] = {}
 
-    def arrive(self, m) -> None:
-        """At the surface, on the straight way only."""
-        if not (m.element.roughness and m.straight):
+    def before_interaction(self, m) -> None:
+        """Perturb the slopes, for direct light only."""
+        if not (m.element.roughness and m.direct):
             return
         if m.index not in self.noise:
             last = len(m.tracer.system.elements) - 1
-            rays = getattr(m.tracer, "start", m.state)  # before the first free surface a tracer has not begun: as they come there
+            rays = getattr(m.tracer, "start", m.state)  # `start` is not set in front of the first free surface
             numbers = normal_numbers(FACETS + last - m.index, index_of(rays))
             self.noise[m.index] = tuple(m.element.roughness * n.to(m.state.power.dtype) for n in numbers)
         m.slopes = tuple(g + n for g, n in zip(m.slopes, self.noise[m.index], strict=True))
 
 
 def index_of(rays: RayState) -> Tensor:
-    """A number for each ray, from where it runs: (N,) int64."""
+    """A hash of each ray's coordinates: (N,) int64."""
     if rays.sample is not None:
         s = rays.sample
         mixed = [c.double().contiguous().view(torch.int64) * m for c, m in zip((s.u, s.v), MIX, strict=False)]

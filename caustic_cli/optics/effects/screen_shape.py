@@ -1,4 +1,4 @@
-"""A screen that is curved: a sphere, a cylinder, or a measured shape."""
+"""Curved screens: spherical, cylindrical, or of measured shape."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ from dataclasses import replace
 import numpy as np
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import Amount, Decision, Effect
-from caustic_cli.optics.screen_shape import space
+from caustic_cli.optics.effects.base import Decision, Effect, Probe
+from caustic_cli.optics.screen_shape import points_in_space
 from caustic_cli.scene import Scene
 
-#: Radius of the sphere that is measured where there is none, in screen widths.
+#: Radius of curvature for the measurement in a scene with a plane screen, in screen widths.
 AMOUNT = 1.5
-#: Points along each axis of the screen at which it is seen how far light would land elsewhere.
+#: Points along each axis of the screen at which the displacement is evaluated.
 POINTS = 65
 
 
 def displacement(scene: Scene) -> float:
-    """How far light from the lens' middle to points of the screen would land from their places, were it plane, pixels at most."""
+    """Largest displacement, in pixels, of light from the centre of the lens if the screen were plane."""
     screen, lens = scene.screen, scene.lens
     x, y = (np.linspace(-h, h, POINTS) for h in screen.half_size)
     x, y = (c.ravel() for c in np.meshgrid(x, y, indexing="ij"))
-    point = np.stack(space(screen, x, y))
+    point = np.stack(points_in_space(screen, x, y))
     way = point - np.array([0.0, 0.0, lens.offset.thickness])[:, None]
     axes = np.array(screen.axes)
     back = axes[2] @ (point - np.array([*screen.shift, screen.z])[:, None]) / (axes[2] @ way)
@@ -30,12 +30,12 @@ def displacement(scene: Scene) -> float:
 
 
 class ScreenShape(Effect):
-    """Left out, the screen is plane."""
+    """Without it the screen is plane."""
 
     name = "screen-shape"
 
-    def judge(self, scene: Scene, bounds) -> Decision:
-        """By how far light would land elsewhere on the plane screen."""
+    def decide(self, scene: Scene, bounds) -> Decision:
+        """Needed if the screen is curved."""
         if not scene.screen.curved:
             return Decision(self.name, False, "the screen is plane", 0.0, 0.0, present=False)
         off = displacement(scene)
@@ -43,10 +43,10 @@ class ScreenShape(Effect):
         return Decision(self.name, True, why, off, 0.0)
 
     def without(self, scene: Scene) -> Scene:
-        """Plane."""
+        """With a plane screen."""
         return replace(scene, screen=scene.screen.uncurved) if scene.screen.curved else scene
 
-    def sample(self, scene: Scene, heights: Tensor) -> Amount:
-        """A sphere."""
+    def probe(self, scene: Scene, heights: Tensor) -> Probe:
+        """A spherical screen."""
         radius = AMOUNT * max(scene.screen.size)
-        return Amount(replace(scene, screen=replace(scene.screen, radius=(radius, radius))), None, f"a radius of {radius:.4g} mm")
+        return Probe(replace(scene, screen=replace(scene.screen, radius=(radius, radius))), None, f"a radius of {radius:.4g} mm")

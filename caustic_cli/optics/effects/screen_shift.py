@@ -1,4 +1,4 @@
-"""A screen whose middle is off the axis."""
+"""Decentred screens."""
 
 from __future__ import annotations
 
@@ -6,21 +6,21 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import Amount, Decision, Effect
+from caustic_cli.optics.effects.base import Decision, Effect, Probe
 from caustic_cli.scene import Scene
 
-#: Distance that is measured where there is none, mm.
+#: Decentre for the measurement in a scene without one, mm.
 AMOUNT = 1.0
 
 
 class ScreenShift(Effect):
-    """Left out, the screen is on the axis."""
+    """Without it the screen is centred on the axis."""
 
     name = "screen-shift"
     free = True
 
-    def judge(self, scene: Scene, bounds) -> Decision:
-        """By the distances."""
+    def decide(self, scene: Scene, bounds) -> Decision:
+        """Needed if the screen is decentred."""
         (a, b), some = scene.screen.shift, any(scene.screen.shift)
         return Decision(
             self.name,
@@ -32,9 +32,9 @@ class ScreenShift(Effect):
         )
 
     def without(self, scene: Scene) -> Scene:
-        """On the axis."""
+        """With a centred screen."""
         return replace(scene, screen=replace(scene.screen, shift=(0.0, 0.0))) if any(scene.screen.shift) else scene
 
-    def sample(self, scene: Scene, heights: Tensor) -> Amount:
-        """Along x."""
-        return Amount(replace(scene, screen=replace(scene.screen, shift=(AMOUNT, 0.0))), None, f"{AMOUNT:g} mm")
+    def probe(self, scene: Scene, heights: Tensor) -> Probe:
+        """A decentre along x."""
+        return Probe(replace(scene, screen=replace(scene.screen, shift=(AMOUNT, 0.0))), None, f"{AMOUNT:g} mm")

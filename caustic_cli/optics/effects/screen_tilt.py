@@ -1,4 +1,4 @@
-"""A screen that is turned about its own middle."""
+"""Tilted screens."""
 
 from __future__ import annotations
 
@@ -6,20 +6,20 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from caustic_cli.optics.effects.base import Amount, Decision, Effect
+from caustic_cli.optics.effects.base import Decision, Effect, Probe
 from caustic_cli.scene import Scene
 
-#: Angle that is measured where there is none, degrees.
+#: Tilt for the measurement in a scene without one, degrees.
 AMOUNT = 10.0
 
 
 class ScreenTilt(Effect):
-    """Left out, the screen is upright."""
+    """Without it the screen is perpendicular to the axis."""
 
     name = "screen-tilt"
 
-    def judge(self, scene: Scene, bounds) -> Decision:
-        """By the angles."""
+    def decide(self, scene: Scene, bounds) -> Decision:
+        """Needed if the screen is tilted."""
         (a, b), some = scene.screen.tilt, any(scene.screen.tilt)
         return Decision(
             self.name,
@@ -31,9 +31,9 @@ class ScreenTilt(Effect):
         )
 
     def without(self, scene: Scene) -> Scene:
-        """Upright."""
+        """With an upright screen."""
         return replace(scene, screen=replace(scene.screen, tilt=(0.0, 0.0))) if any(scene.screen.tilt) else scene
 
-    def sample(self, scene: Scene, heights: Tensor) -> Amount:
-        """About y."""
-        return Amount(replace(scene, screen=replace(scene.screen, tilt=(0.0, AMOUNT))), None, f"{AMOUNT:g} degrees")
+    def probe(self, scene: Scene, heights: Tensor) -> Probe:
+        """A tilt about y."""
+        return Probe(replace(scene, screen=replace(scene.screen, tilt=(0.0, AMOUNT))), None, f"{AMOUNT:g} degrees")

@@ -5,53 +5,55 @@ from __future__ import annotations
 import torch
 
 from caustic_cli.optics.effects.base import NO_REQUESTS, Action, Decision, Effect, Requests
-from caustic_cli.optics.frames import turned, turned_back
+from caustic_cli.optics.frames import rotate_to_global, rotate_to_local
 from caustic_cli.optics.tolerances import PARALLEL
 from caustic_cli.scene import Scene
 
 
 class TotalReflection(Effect):
-    """Left out, light beyond the critical angle leaves along the surface."""
+    """Without it light beyond the critical angle leaves tangentially to the surface."""
 
     name = "total-reflection"
     free = True
 
-    def judge(self, scene: Scene, b) -> Decision:
-        """By n sin i at the steepest place of the surface."""
+    def decide(self, scene: Scene, b) -> Decision:
+        """By the bound of n sin i."""
         if scene.lens.mirror:
             return Decision(self.name, False, "a mirror has no critical angle", present=False)
         if b.critical < 1.0 and not scene.elements:
             return Decision(self.name, False, f"n sin i <= {b.critical:.4g} at slopes up to {b.slope:.3g}", b.critical, 1.0)
         if scene.elements:
-            return Decision(self.name, True, "surfaces of other lenses may reflect all of a ray", fixed=True)
+            return Decision(self.name, True, "total reflection may occur at other lenses", fixed=True)
         return Decision(self.name, True, f"n sin i may reach {b.critical:.4g} at slopes up to {b.slope:.3g}", b.critical, 1.0)
 
     def request(self, scene: Scene, on: bool, bounds) -> Requests:
-        """To do without, where it may happen."""
+        """A request to omit it, where it may occur."""
         return NO_REQUESTS if on or bounds.critical < 1.0 else Requests.to(without=(self.name,))
 
     def action(self, system, requests: Requests) -> Action | None:
-        """Sends reflected light on."""
-        return Grazing() if self.name in requests.off else None
+        """The action that transmits the light instead, on request."""
+        return GrazingExit() if self.name in requests.off else None
 
 
-class Grazing(Action):
-    """Light that would be reflected leaves along the surface, with what Fresnel's formulas leave of it at grazing angles."""
+class GrazingExit(Action):
+    """Transmission of totally reflected light tangentially to the surface, with the Fresnel losses of grazing incidence."""
 
-    def depart(self, m) -> None:
-        """Along the surface, in the plane of incidence."""
-        if m.reflects or not m.straight or bool(m.passes.all()) or not isinstance(m.slopes[0], torch.Tensor):
+    def after_interaction(self, m) -> None:
+        """Replace directions by the tangent in the plane of incidence."""
+        if m.reflects or not m.direct or bool(m.passes.all()) or not isinstance(m.slopes[0], torch.Tensor):
             return
         d, g, pose = m.incoming, m.slopes, m.element.pose
         c = (d[2] - d[0] * g[0] - d[1] * g[1]) / (1.0 + g[0] * g[0] + g[1] * g[1])
         along = d[0] + c * g[0], d[1] + c * g[1], d[2] - c
         length = torch.sqrt(along[0] ** 2 + along[1] ** 2 + along[2] ** 2).clamp_min(PARALLEL)
-        out = turned(pose, m.state.direction)
-        m.state.direction = turned_back(pose, tuple(torch.where(m.passes, o, v / length) for o, v in zip(out, along, strict=True)))
-        fresnel = 0.0 if m.element.fresnel == "none" else 1.0  # at grazing incidence all is reflected
-        back = torch.where(m.passes, torch.zeros_like(m.arriving), m.arriving)
+        out = rotate_to_local(pose, m.state.direction)
+        m.state.direction = rotate_to_global(
+            pose, tuple(torch.where(m.passes, o, v / length) for o, v in zip(out, along, strict=True))
+        )
+        fresnel = 0.0 if m.element.fresnel == "none" else 1.0  # the reflectance at grazing incidence is 1
+        back = torch.where(m.passes, torch.zeros_like(m.power_in), m.power_in)
         m.state.power = m.state.power + (1.0 - fresnel) * back
-        m.departing = m.departing + (1.0 - fresnel) * back  # of which no ghost is made
+        m.power_out = m.power_out + (1.0 - fresnel) * back  # so that it causes no ghosts
         m.state.lose("total_internal_reflection", -back.detach())
         m.state.lose("fresnel", fresnel * back.detach())
         m.passes = torch.ones_like(m.passes)

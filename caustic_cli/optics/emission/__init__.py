@@ -1,7 +1,8 @@
-"""The rays of a source, up to the pupil of the system that it lights (thesis 4.2, 4.3.1), and the ways of drawing them.
+"""Sampling of the rays of light sources, up to the pupil of the illuminated system (thesis 4.2, 4.3.1).
 
-A source says by name, `Source.emission`, how its rays are drawn.  A new way is a file here, which names it in EMISSIONS: what makes
-about so many rays, mostly `of_size` of a class of `Emission`; it is found by itself.
+A source names its sampling method in `Source.emission`.  A new method is a module of this package with a dictionary EMISSIONS of
+names and functions that sample about a given number of rays, usually `of_size` of a subclass of `Emission`; it is discovered
+automatically.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import cast
 import torch
 
 from caustic_cli.errors import InputError
-from caustic_cli.optics.emission.base import Emission, Lit
+from caustic_cli.optics.emission.base import Emission, Illuminated
 from caustic_cli.optics.emission.measured import MeasuredRays
 from caustic_cli.optics.emission.several import SeveralRays
 from caustic_cli.optics.sampling import Sampler
@@ -22,22 +23,22 @@ from caustic_cli.optics.sampling import Sampler
 __all__ = ["Emission", "Lit", "Rays", "of_member", "rays_of", "register"]
 
 Rays = Sampler | Emission | MeasuredRays | SeveralRays
-#: what is lit, sampler, number of rays, seed, device -> rays.
-Maker = Callable[[Lit, str, int, int, str | torch.device], Rays]
+#: Illuminated system, sampler, number of rays, seed, device -> rays.
+Maker = Callable[[Illuminated, str, int, int, str | torch.device], Rays]
 
 _MAKERS: dict[str, Maker] = {}
 
 
 def register(name: str, maker: Maker) -> None:
-    """Make a way of drawing rays known to the sources that name it."""
+    """Add a sampling method to the registry."""
     _MAKERS[name] = maker
 
 
-def rays_of(scene: Lit, kind: str, rays: int, seed: int = 0, device: str | torch.device = "cpu") -> Rays:
+def rays_of(scene: Illuminated, kind: str, rays: int, seed: int = 0, device: str | torch.device = "cpu") -> Rays:
     """About `rays` rays of the source of a scene or system, at least one for each of its points.
 
     Raises:
-        InputError: nobody has said how such a source's rays are drawn, or there is no such sampler.
+        InputError: no sampling method is registered for the source, or the sampler is unknown.
     """
     name = scene.source.emission
     if name not in _MAKERS:
@@ -46,7 +47,7 @@ def rays_of(scene: Lit, kind: str, rays: int, seed: int = 0, device: str | torch
 
 
 def of_member(rays: Rays, member: int | None) -> Rays:
-    """The rays of one of several sources, by its number; all of them where that is None."""
+    """The rays of one of several sources, by its index; all rays for None."""
     return rays if member is None else cast(SeveralRays, rays).members[member]
 
 

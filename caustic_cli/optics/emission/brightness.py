@@ -1,7 +1,8 @@
-"""Points of a source whose brightness a picture shows, as many where it is twice as bright as light asks for.
+"""Importance sampling of a source's brightness picture by the inverse transform method.
 
-A number a in [0, 1] picks the row of the picture by the power of the rows before it, and the place within that; b likewise the
-pixel of the row.  Both maps ascend, so that even numbers, or those of a sequence of low discrepancy, stay as even as they are.
+A number a in [0, 1] selects a row of the picture from the cumulative power of the rows, and a position within it; b likewise
+selects a pixel of the row from its conditional distribution.  Both maps are monotonic, so stratification and low discrepancy are
+preserved.
 """
 
 from __future__ import annotations
@@ -11,8 +12,11 @@ import torch
 from torch import Tensor
 
 
-def bright_points(picture: np.ndarray, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """Points x, y (N,) of [-1, 1]^2 for numbers a, b (N,) in [0, 1]; picture: brightness (n, m), [i, j] with i along +x."""
+def points_by_brightness(picture: np.ndarray, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    """Points x, y (N,) of [-1, 1]^2, distributed like the brightness, from numbers a, b (N,) in [0, 1].
+
+    picture: brightness (n, m), [i, j] with i along +x.
+    """
     light = torch.as_tensor(np.asarray(picture, dtype=np.float64), device=a.device)
     rows = light.sum(1)
     i, x = _place(rows / rows.sum(), a, torch.zeros_like(a, dtype=torch.int64), len(rows))
@@ -21,13 +25,14 @@ def bright_points(picture: np.ndarray, a: Tensor, b: Tensor) -> tuple[Tensor, Te
 
 
 def _place(parts: Tensor, number: Tensor, first: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """The cell that each number falls into, among the `count` from `first` on, whose parts sum to 1, and where between 0 and 1."""
+    """Inverse cumulative distribution over `count` cells from `first` on, whose probabilities sum to 1: cell, and position in [0,
+    1]."""
     sums = torch.cat([parts.new_zeros(1), torch.cumsum(parts, 0)])
     before = sums[first]
     wanted = (before + number * (sums[first + count] - before)).contiguous()
     k = torch.searchsorted(sums, wanted, right=True) - 1
     k = torch.minimum(torch.maximum(k, first), first + count - 1)
-    dark = parts[k] <= 0  # rounding at the end of a row: the last cell with light before it
+    dark = parts[k] <= 0  # by rounding at the end of a row: take the last lit cell before it
     if bool(dark.any()):
         lit = torch.where(parts > 0, torch.arange(len(parts), device=parts.device), -1).cummax(0).values
         k = torch.where(dark, lit[k], k)

@@ -1,7 +1,8 @@
-"""Points of a source, each of which is coherent light of its own: rays through given points of the pupil.
+"""Spatially coherent modes of a source: mutually incoherent point sources, with rays through given points of the pupil.
 
-A mode's rays carry its optical path length from the source, and a density: its part of the source's power per mm^2 of the pupil.
-Near points shine into the source's cone, uniform in solid angle or Lambertian (see `near`); a distant one lights all the pupil.
+Rays of a mode carry the optical path length from the source, and a density: the fraction of the source's power per mm^2 of the
+pupil. Near points emit into the source's cone, with its intensity distribution (see `near`); a distant one illuminates the whole
+pupil.
 """
 
 from __future__ import annotations
@@ -13,35 +14,36 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.emission.base import Lit, intensity_of
-from caustic_cli.optics.emission.brightness import bright_points
+from caustic_cli.optics.emission.base import Illuminated, intensity_of
+from caustic_cli.optics.emission.brightness import points_by_brightness
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.scene import Source
 
-#: Turn between one point of a disc and the next, rad: such a spiral fills it evenly.
+#: Golden angle, rad, between successive points of Vogel's spiral.
 GOLDEN = math.pi * (3.0 - math.sqrt(5.0))
-#: Parts of this number, counted up, fill a line evenly: the golden ratio.
+#: Golden ratio, for an additive recurrence of low discrepancy.
 RATIO = (1.0 + math.sqrt(5.0)) / 2.0
-#: Points along each axis by which the mean of a profile over a circle is found.
+#: Points along each axis for the mean of a profile over a circle.
 ROUND = 1000
 
 
 @dataclass(frozen=True)
 class Mode:
-    """One point of the source of what is lit.
+    """One point of a source.
 
-    position: mm, of a near source; of a distant one the unit vector along which its light runs; part: of the source's power.
+    position: mm, for a near source; for a distant one the unit direction of its light; part: fraction of the source's power.
     """
 
-    scene: Lit
+    scene: Illuminated
     position: tuple[float, float, float]
     part: float
 
     def through(self, u: Tensor, v: Tensor, index: float = 1.0) -> RayState:
-        """Rays through points (N,) of the pupil, u and v in [0, 1] over its rectangle; index: of the medium before it.
+        """Rays through points (N,) of the pupil, u and v in [0, 1] over its bounding rectangle; index: of the medium in front of
+        it.
 
-        Their power is a density, per mm^2.
+        Their power is a density, 1/mm^2.
         """
         source, pupil = self.scene.source, self.scene.pupil
         if source.collimated:
@@ -65,7 +67,7 @@ class Mode:
         return RayState((x, y, pupil.z), (dx / r, dy / r, cosine), power, path=index * r)
 
     def _even(self, u: Tensor, v: Tensor) -> Tensor:
-        """Density of light from infinity, which a profile may shape."""
+        """Density of light from infinity on the pupil, 1/mm^2, with the profile if there is one."""
         pupil, profile = self.scene.pupil, self.scene.source.profile
         (rx, ry) = pupil.half_size
         area = math.pi * rx * ry if pupil.round else 4.0 * rx * ry
@@ -74,7 +76,7 @@ class Mode:
         table = torch.as_tensor(np.asarray(profile), dtype=torch.float64, device=u.device)
         a, b = ((c * n).long().clamp(0, n - 1) for c, n in zip((u, v), table.shape, strict=True))
         mean = table.mean()
-        if pupil.round:  # over the circle, which cuts through cells of the table
+        if pupil.round:  # over the circle, which intersects cells of the profile
             at = (torch.arange(ROUND).to(table) + 0.5) / ROUND
             inside = ((2.0 * at[:, None] - 1.0) ** 2 + (2.0 * at[None, :] - 1.0) ** 2 <= 1.0).double()
             i, j = ((at * n).long() for n in table.shape)
@@ -82,14 +84,14 @@ class Mode:
         return self.part / area * table[a, b] / mean
 
 
-def middle(scene: Lit) -> Mode:
-    """The whole source, gathered in its middle."""
+def central_mode(scene: Illuminated) -> Mode:
+    """A point at the source's centre with all its power."""
     source = scene.source
     return Mode(scene, (0.0, 0.0, 1.0) if source.distant else source.centre, 1.0)
 
 
-def edges(scene: Lit) -> list[Mode]:
-    """Its outermost points along x, -x, y and -y, each with all its power: what their light does differently."""
+def outermost_modes(scene: Illuminated) -> list[Mode]:
+    """The outermost points of the source along x, -x, y and -y, each with all its power; empty for a point source."""
     source = scene.source
     if source.distant:
         s = math.sin(source.half_angle)
@@ -108,8 +110,8 @@ def edges(scene: Lit) -> list[Mode]:
     return found
 
 
-def modes(scene: Lit, each: int) -> list[Mode]:
-    """The source as points: `each` in place of every position that has an extent, evenly over its ellipse."""
+def modes(scene: Illuminated, each: int) -> list[Mode]:
+    """The source as points of equal power: `each` for every position with an extent, distributed like its brightness."""
     source = scene.source
     if source.distant:
         spread = _spots(source, each)
@@ -126,23 +128,23 @@ def modes(scene: Lit, each: int) -> list[Mode]:
 
 
 def _spots(source: Source, each: int) -> list[tuple[float, float]]:
-    """Points about a position of a source that stand for the same part of its light each, mm, or sines of a distant one."""
+    """Points about a position of a source, each for the same fraction of its power: mm, or direction sines of a distant source."""
     fx, fy = source.frame
     return [(fx * a, fy * b) for a, b in spots(source, each)]
 
 
 def spots(source: Source, each: int) -> list[tuple[float, float]]:
-    """The same in the source's frame, [-1, 1]^2."""
+    """These points in the source's frame, [-1, 1]^2."""
     if not max(source.frame) > 0:
         return [(0.0, 0.0)]
     if source.brightness is None:
-        return even_disc(each)
+        return vogel_disc(each)
     k = torch.arange(each, dtype=torch.float64) + 0.5
-    x, y = bright_points(source.brightness, k / each, torch.frac(k / RATIO))
+    x, y = points_by_brightness(source.brightness, k / each, torch.frac(k / RATIO))
     return list(zip(x.tolist(), y.tolist(), strict=True))
 
 
-def even_disc(count: int) -> list[tuple[float, float]]:
-    """Points of the unit disc, each for the same area of it: Vogel's spiral."""
+def vogel_disc(count: int) -> list[tuple[float, float]]:
+    """Points of the unit disc, each for an equal area: Vogel's spiral."""
     radii = [math.sqrt((k + 0.5) / count) for k in range(count)]
     return [(r * math.cos(k * GOLDEN), r * math.sin(k * GOLDEN)) for k, r in enumerate(radii)]

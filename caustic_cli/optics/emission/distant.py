@@ -1,4 +1,5 @@
-"""Rays of a disc at infinity, such as the sun: even over the aperture, and over the projected solid angle or by its brightness."""
+"""Sampling of a disc at infinity, such as the sun: uniform over the aperture, and over projected solid angle or by its
+brightness."""
 
 from __future__ import annotations
 
@@ -9,24 +10,24 @@ import torch
 from torch import Tensor
 
 from caustic_cli.optics.emission.base import Emission
-from caustic_cli.optics.emission.brightness import bright_points
+from caustic_cli.optics.emission.brightness import points_by_brightness
 from caustic_cli.optics.rays import RayState
 
 
 class Distant(Emission):
-    """Rays that lean from z by at most the source's half angle."""
+    """Rays at angles to z of at most the source's half-angle."""
 
     dimensions: ClassVar[int] = 4
 
     def _drawn(self, start: int, *draws: Tensor) -> RayState:
         (u, v, a, b), (rx, ry), source = draws, self.scene.pupil.half_size, self.scene.source
         if source.brightness is None:
-            sine = a.sqrt() * math.sin(source.half_angle)  # even over the projected solid angle: an evenly bright disc
+            sine = a.sqrt() * math.sin(source.half_angle)  # uniform over projected solid angle: a disc of uniform radiance
             dx, dy = sine * torch.cos(2 * math.pi * b), sine * torch.sin(2 * math.pi * b)
         else:
-            dx, dy = (w * c for w, c in zip(source.frame, bright_points(source.brightness, a, b), strict=True))
+            dx, dy = (w * c for w, c in zip(source.frame, points_by_brightness(source.brightness, a, b), strict=True))
         flux, x, y = torch.full_like(u, 1.0 / self.count), (2.0 * u - 1.0) * rx, (2.0 * v - 1.0) * ry
-        if self.scene.pupil.round:  # even over the disc
+        if self.scene.pupil.round:  # uniform over the disc
             x, y = rx * u.sqrt() * torch.cos(2 * math.pi * v), rx * u.sqrt() * torch.sin(2 * math.pi * v)
         return self._at_pupil(x, y, (dx, dy, torch.sqrt(1.0 - dx * dx - dy * dy)), flux, len(u) / self.count)
 

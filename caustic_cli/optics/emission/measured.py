@@ -1,10 +1,10 @@
-"""Rays of a file, carried to the pupil: all of them, or an even part of those that meet it.
+"""Rays of a ray file, traced to the pupil: all that reach it, or a systematic sample of them.
 
-Fewer than those are drawn by systematic resampling in Morton's order of where they pass the pupil: of every stretch of that order
-with the same power one ray is taken, so that the part is as even over the pupil as the whole, and every ray carries the same.
+A smaller number of rays is selected by systematic resampling in Morton order of their points on the pupil: one ray from each
+interval of equal power, so that the sample is as uniform over the pupil as the whole set, and all its rays have equal power.
 
-An image of N independent rays that carry the same has on P pixels a noise of sqrt(P / N), root mean square in units of its mean
-pixel: the variance of a pixel is its power times that of a ray.
+An image of P pixels from N independent rays of equal power has the noise sqrt(P / N), root mean square relative to the mean pixel:
+the variance of a pixel is its power times that of a ray.
 """
 
 from __future__ import annotations
@@ -21,36 +21,36 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.optics.emission.base import Lit
+from caustic_cli.optics.emission.base import Illuminated
 from caustic_cli.optics.interface import reflectance
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import SAMPLERS, random_numbers
 from caustic_cli.scene import Scene, Source
 from caustic_cli.scene.sources.rays import Measured
 
-#: Bits of each coordinate in Morton's order: finer than a million rays stand apart.
+#: Bits of each coordinate of the Morton code: finer than the spacing of a million rays.
 BITS = 12
-#: Noise of an image from which its pictures are worth looking at.
+#: Noise of an image that is good enough to look at.
 WORTHY = 0.1
-#: Rays over whose light the irradiance of a lens is smoothed, and the widest smoothing, in parts of the lens.
+#: Number of rays under the smoothing kernel of the irradiance on a lens, and the largest width of the kernel relative to the lens.
 SMOOTHED, WIDEST = 1000.0, 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredRays:
-    """The rays of a file, or about as many of them as are asked for.
+    """The rays of a file, or a sample of them.
 
     Args:
-        scene: what is lit, by rays of a file.
-        kind: sampler, one of `sampling.SAMPLERS`; all of them mean the same here.
-        rays: at most so many.
-        seed: of the part that is taken; device: where they live.
+        scene: the illuminated scene or system, with a ray-file source.
+        kind: sampler, one of `sampling.SAMPLERS`; ignored.
+        rays: largest number of rays.
+        seed: of the sample; device: of its tensors.
 
     Raises:
-        InputError: none of them meets the pupil.
+        InputError: no ray reaches the pupil.
     """
 
-    scene: Lit
+    scene: Illuminated
     kind: str
     rays: int
     seed: int = 0
@@ -63,7 +63,7 @@ class MeasuredRays:
 
     @cached_property
     def _drawn(self) -> tuple[Tensor, ...]:
-        """Points of the pupil x, y, mm, directions, and parts of the source's power: (N,) each."""
+        """Points of the pupil x, y, mm, directions, and fractions of the source's power: (N,) each."""
         source, pupil = _of_file(self.scene.source), self.scene.pupil
         x, y, met, part = _meeting(source, pupil.half_size, pupil.z, pupil.round)
         if self.rays < len(met):
@@ -78,7 +78,7 @@ class MeasuredRays:
 
     @property
     def count(self) -> int:
-        """Number of rays: of those that meet the pupil."""
+        """Number of rays, all through the pupil."""
         return len(self._drawn[0])
 
     def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[RayState]:
@@ -91,24 +91,24 @@ class MeasuredRays:
 
 
 def _of_file(source: Source) -> Measured:
-    """A source whose rays are those of a file, as what it is."""
+    """A source as a `Measured`."""
     return cast(Measured, source)
 
 
 def _meeting(source: Measured, half_size: tuple[float, float], z: float, round: bool) -> tuple[np.ndarray, ...]:
-    """Where rays meet an aperture, x and y mm, their numbers in the file, and their parts of the power."""
+    """Rays through an aperture: points x and y, mm, indices in the file, and fractions of the power."""
     x, y, met = source.crossing(half_size, z, round)
     (met,) = np.nonzero(met)
     if not len(met):
         raise InputError(
-            f"⟨source.file⟩: none of its {source.rays.count:,} rays meets the lens, which stands along +z from them;"
+            f"⟨source.file⟩: none of its {source.rays.count:,} rays meets the lens, which must lie in the direction +z;"
             " ⟨source_position⟩ moves them"
         )
     return x[met], y[met], met, source.rays.flux[met] / source.rays.flux.sum()
 
 
 def _morton(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Morton's code of points of the unit square: the bits of both coordinates by turns."""
+    """Morton codes of points of the unit square: interleaved bits of both coordinates."""
     code = np.zeros(len(u), dtype=np.int64)
     i, j = ((c * (1 << BITS)).astype(np.int64).clip(0, (1 << BITS) - 1) for c in (u, v))
     for bit in range(BITS):
@@ -117,19 +117,19 @@ def _morton(u: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def coarseness(scene: Scene) -> tuple[float, int] | None:
-    """Noise of the image of all rays of a scene's file, in units of its mean pixel, and how many rays a file like it would have to
-    hold for that to be WORTHY; None of a source that has as many as are asked for."""
+    """Noise of the image of all rays of a scene's ray file, relative to the mean pixel, and the number of rays in such a file for
+    the noise WORTHY; None for other sources."""
     if scene.source.rays is None:
         return None
     source, lens = _of_file(scene.source), scene.lens
     *_, part = _meeting(source, lens.half_size, lens.z_in, lens.round)
-    equal = float(part.sum()) ** 2 / float((part * part).sum())  # so many rays of the same power
+    equal = float(part.sum()) ** 2 / float((part * part).sum())  # effective number of rays of equal power
     noise = math.sqrt(math.prod(scene.screen.resolution) / equal)
     return noise, math.ceil(source.rays.count * (noise / WORTHY) ** 2)
 
 
 def coarse_words(scene: Scene) -> str | None:
-    """That a scene's ray file is too coarse for its picture, and how many rays it would take; None where it is not."""
+    """A warning that a scene's ray file has too few rays for its picture; None if it has enough."""
     noise, wanted, rays = 0.0, 0, 0
     for one in scene.by_source:
         found, file = coarseness(one), one.source.rays
@@ -145,14 +145,14 @@ def coarse_words(scene: Scene) -> str | None:
 
 
 def _rounded(count: int) -> str:
-    """Two digits of a number of rays, rounded up."""
+    """A number of rays rounded up to two digits."""
     scale = 10 ** max(0, len(str(count)) - 2)
     return f"{-(-count // scale) * scale:,}"
 
 
 def irradiance(scene: Scene, x: np.ndarray, y: np.ndarray, height: float) -> np.ndarray | None:
-    """Power of a ray file in the cells between corners x (n + 1,), y (m + 1,) of the plane at `height`, mm, behind the entrance:
-    (n, m), smoothed over as many cells as hold SMOOTHED rays; None of a source that has no such rays."""
+    """Power of a ray file on the cells between edges x (n + 1,), y (m + 1,) of the plane at `height`, mm, behind the entrance: (n,
+    m), smoothed by a Gaussian over about SMOOTHED rays; None for other sources."""
     if scene.source.rays is None:
         return None
     source, lens = _of_file(scene.source), scene.lens

@@ -1,17 +1,16 @@
-"""Rays of sources that stand before the lens: points, and what has an extent about them (thesis 4.2.2).
+"""Sampling of near sources: points, and extended sources about their positions (thesis 4.2.2).
 
-Notation, a source point at distance h before the entrance plane
+Notation, for a source point at distance h in front of the entrance plane
     theta   angle of a ray to +z; theta_c half-angle of the cone
-    w       1 - cos theta = 2 sin^2(theta / 2), which stays exact where 1 - cos loses all digits
-    rho     distance on the entrance plane from the point below the source; r^2 = rho^2 + h^2
+    w       1 - cos theta = 2 sin^2(theta / 2), computed without the cancellation in 1 - cos
+    rho     distance on the entrance plane from the projection of the source; r^2 = rho^2 + h^2
 
-A ray sampled evenly over the cone carries an even flux.  Aimed at the aperture, it carries I(theta) dOmega with
-I = 1 / (4 pi sin^2(theta_c / 2)), or for a Lambertian source I = cos theta / (pi sin^2 theta_c), or that of a table.  Its
-direction is (sin a cos b, sin b, cos a cos b) with a and sin b even between the aperture's edges, so that dOmega = da d(sin b):
-from afar an even sample of the aperture, and from nearby, where nearly all light meets the lens at the source's foot, one of the
-directions.
-A cone that lies within the aperture is sampled itself, and so is that of a source NEAR the aperture, which hardly any ray misses:
-few rays are wasted either way.
+Rays sampled over the cone in proportion to the intensity have equal power.  Rays sampled over the aperture (importance sampling)
+have the power I(theta) dOmega with I = 1 / (4 pi sin^2(theta_c / 2)), or for a Lambertian source I = cos theta / (pi sin^2
+theta_c), or that of a table.  Their direction is (sin a cos b, sin b, cos a cos b) with a and sin b uniform between the aperture's
+edges, so that dOmega = da d(sin b).  This is nearly uniform over the aperture for a distant source point, and over directions for a
+close one, where nearly all light reaches the lens near the projection of the source.
+The cone itself is sampled if it lies within the aperture, or if the source is NEAR the aperture, so that hardly any ray misses it.
 """
 
 from __future__ import annotations
@@ -24,28 +23,29 @@ import torch
 from torch import Tensor
 
 from caustic_cli.optics.emission.base import Emission, intensity_of
-from caustic_cli.optics.emission.brightness import bright_points
+from caustic_cli.optics.emission.brightness import points_by_brightness
 from caustic_cli.optics.rays import RayState
 from caustic_cli.scene.sources.distribution import Distribution
 
-#: A source whose foot is this many of its distances inside the aperture's edge is near: 1 - cos = 0.32 of a hemisphere misses.
+#: A source is near if its projection is at least this many of its distances h inside the aperture's edge: of a hemisphere the
+#: fraction 1 / sqrt(1 + 3^2) = 0.32 misses.
 NEAR = 3.0
-#: Keeps the cosine squared of a ray along the entrance off 0; such a ray is clamped to the aperture.
+#: Lower bound of the squared cosine of a ray parallel to the entrance; such a ray is clamped to the aperture.
 TINY = 1e-300
 
 
 class Near(Emission):
-    """Rays of the positions of a source; those of a source with an extent start aside of them."""
+    """Rays of a near source; those of an extended source start at points about its positions."""
 
     @cached_property
     def _points(self) -> tuple[Tensor, Tensor]:
-        """Positions (k, 3) mm, and parts of the power (k,)."""
+        """Positions (k, 3) mm, and fractions of the power (k,)."""
         source = self.scene.source
         powers = torch.tensor(source.powers, dtype=torch.float64, device=self.device)
         return torch.from_numpy(source.points()[0]).to(self.device), powers / powers.sum()
 
-    def _aside(self, *draws: Tensor) -> tuple[Tensor, Tensor]:
-        """Where about its position each ray starts, mm along x and y, of the draws beyond the first two."""
+    def _offsets(self, *draws: Tensor) -> tuple[Tensor, Tensor]:
+        """Offset of each ray's start from its position along x and y, mm, from the samples beyond the first two dimensions."""
         raise NotImplementedError
 
     def _drawn(self, start: int, *draws: Tensor) -> RayState:
@@ -54,23 +54,23 @@ class Near(Emission):
         (rx, ry), cone = pupil.half_size, source.cone_over(pupil.half_size, pupil.z, pupil.round)
         per, (positions, powers) = self.shape[0] * self.shape[1], self._points
         which = torch.arange(start, start + len(u), device=self.device) // per
-        part = powers[which] / per  # emitted by each ray
+        part = powers[which] / per  # power of each ray at the source
         x0, y0, z0 = positions[which].unbind(1)
-        if aside:  # each point of the source has a cone of its own
-            across, along = self._aside(*aside)
+        if aside:  # every source point has its own cone
+            across, along = self._offsets(*aside)
             x0, y0 = x0 + across, y0 + along
         h = pupil.z - z0
         radius = h * math.tan(cone) if cone < math.pi / 2 else torch.full_like(h, math.inf)
         lows = [x0 - radius, y0 - radius]
         highs = [x0 + radius, y0 + radius]
-        # From the source's foot to the edge of the lens.
+        # Distance from the projection of the source to the edge of the aperture.
         room = rx - torch.hypot(x0, y0) if pupil.round else torch.minimum(rx - x0.abs(), ry - y0.abs())
         within = (lows[0] >= -rx) & (highs[0] <= rx) & (lows[1] >= -ry) & (highs[1] <= ry)
         if pupil.round:
             within &= torch.maximum(-lows[0], highs[0]) ** 2 + torch.maximum(-lows[1], highs[1]) ** 2 <= rx * rx
         from_cone = within | (room >= NEAR * h) if source.aimed else torch.ones_like(within)
 
-        w = _drops(source.intensity, cone, u)
+        w = _one_minus_cosine(source.intensity, cone, u)
         sine, cosine = torch.sqrt(w * (2.0 - w)), 1.0 - w
         tangent = sine / cosine.clamp_min(1e-300)
         cx, cy = tangent * torch.cos(2 * math.pi * v), tangent * torch.sin(2 * math.pi * v)  # tangents along x and y
@@ -78,9 +78,9 @@ class Near(Emission):
         lows = [torch.maximum(lo, torch.full_like(lo, -r)) for lo, r in zip(lows, (rx, ry), strict=True)]
         highs = [torch.minimum(hi, torch.full_like(hi, r)) for hi, r in zip(highs, (rx, ry), strict=True)]
         wide, tall = (highs[0] - lows[0]).clamp_min(0.0), (highs[1] - lows[1]).clamp_min(0.0)
-        ax, by_angle = _even_angle((lows[0] - x0) / h, (highs[0] - x0) / h, wide / h, u)
+        ax, by_angle = _uniform_angle((lows[0] - x0) / h, (highs[0] - x0) / h, wide / h, u)
         stretch = torch.sqrt(1.0 + ax * ax)  # 1 / cos a
-        tan_b, by_sine = _even_sine((lows[1] - y0) / (h * stretch), (highs[1] - y0) / (h * stretch), tall / (h * stretch), v)
+        tan_b, by_sine = _uniform_sine((lows[1] - y0) / (h * stretch), (highs[1] - y0) / (h * stretch), tall / (h * stretch), v)
         ay = tan_b * stretch
         rho2 = ax * ax + ay * ay  # in units of h
         aimed = part * by_angle * by_sine * intensity_of(source, cone, torch.sqrt(1.0 + rho2))
@@ -89,30 +89,30 @@ class Near(Emission):
 
         sx, sy = torch.where(from_cone, cx, ax), torch.where(from_cone, cy, ay)
         x, y = x0 + h * sx, y0 + h * sy
-        on_lens = pupil.aperture.holds(x, y)
+        on_lens = pupil.aperture.contains(x, y)
         flux = torch.where(on_lens, torch.where(from_cone, part, aimed), torch.zeros_like(part))
         x, y = x.clamp(-rx, rx), y.clamp(-ry, ry)
-        sx, sy = (x - x0) / h, (y - y0) / h  # rays that miss the lens stay finite; they carry nothing
+        sx, sy = (x - x0) / h, (y - y0) / h  # rays that miss the lens stay finite, with power 0
         dz = 1.0 / torch.sqrt(1.0 + sx * sx + sy * sy)
         return self._at_pupil(x, y, (sx * dz, sy * dz, dz), flux, float(part.sum()))
 
 
 class NearDisc(Near):
-    """Rays of ellipses, whose half axes are the source's extent, or of pictures of its brightness."""
+    """Rays of extended sources: ellipses of uniform radiance, or brightness pictures."""
 
     dimensions: ClassVar[int] = 4
 
-    def _aside(self, *draws: Tensor) -> tuple[Tensor, Tensor]:
+    def _offsets(self, *draws: Tensor) -> tuple[Tensor, Tensor]:
         (a, b), source = draws, self.scene.source
         if source.brightness is not None:
-            x, y = (w * c for w, c in zip(source.frame, bright_points(source.brightness, a, b), strict=True))
+            x, y = (w * c for w, c in zip(source.frame, points_by_brightness(source.brightness, a, b), strict=True))
             return x, y
         (ex, ey), turn = source.extent, 2 * math.pi * b
         return ex * a.sqrt() * torch.cos(turn), ey * a.sqrt() * torch.sin(turn)
 
 
-def _drops(intensity: str | Distribution, cone: float, part: Tensor) -> Tensor:
-    """w = 1 - cos theta of the angles within which such parts of the light into a cone lie."""
+def _one_minus_cosine(intensity: str | Distribution, cone: float, part: Tensor) -> Tensor:
+    """w = 1 - cos theta of the angles that enclose the fractions `part` of the flux into a cone (inverse transform)."""
     if isinstance(intensity, Distribution):
         theta = torch.from_numpy(intensity.angle_of(part.cpu().numpy(), cone)).to(part.device)
         return 2.0 * torch.sin(0.5 * theta) ** 2
@@ -122,11 +122,11 @@ def _drops(intensity: str | Distribution, cone: float, part: Tensor) -> Tensor:
     return part * (2.0 * math.sin(cone / 2.0) ** 2)
 
 
-def _even_angle(low: Tensor, high: Tensor, width: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
-    """Tangent of the angle `part` of the way between those of tangents low and high = low + width, and that way, rad.
+def _uniform_angle(low: Tensor, high: Tensor, width: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
+    """Tangent of the angle at the fraction `part` between those of tangents low and high = low + width, and their difference, rad.
 
-    Where both angles lie on one side the tangent is counted from the nearer to 0, or the two would agree in all digits
-    from far off the axis.
+    If both have one sign the tangent is computed by the addition theorem from the smaller one: far off the axis atan would lose the
+    digits of their difference.
     """
     way, first = torch.atan2(width, 1.0 + low * high), low.abs() < high.abs()
     near, turn = torch.where(first, low, high), torch.tan(torch.where(first, part, part - 1.0) * way)
@@ -134,10 +134,10 @@ def _even_angle(low: Tensor, high: Tensor, width: Tensor, part: Tensor) -> tuple
     return torch.where(low * high > 0, aside, torch.tan(torch.atan(low) + part * way)), way
 
 
-def _even_sine(low: Tensor, high: Tensor, width: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
-    """The same for the angle whose sine lies `part` of the way between, and the sines' distance.
+def _uniform_sine(low: Tensor, high: Tensor, width: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
+    """Tangent of the angle whose sine is at the fraction `part` between the two sines, and the difference of the sines.
 
-    cos^2 = cos_0^2 - 2 s_0 d - d^2 at the distance d from the nearer sine s_0: where s is close to 1, 1 - s^2 has no digits.
+    cos^2 = cos_0^2 - 2 s_0 d - d^2 at the distance d from the smaller sine s_0, without the cancellation in 1 - s^2 for s near 1.
     """
     way, first = torch.atan2(width, 1.0 + low * high), low.abs() < high.abs()
     way = 2.0 * torch.sin(0.5 * way) * torch.cos(torch.atan(low) + 0.5 * way)

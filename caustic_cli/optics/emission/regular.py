@@ -1,4 +1,4 @@
-"""Rays of one point of a source on a regular grid of the pupil, whose light stands for its part of the source's."""
+"""Rays of one mode of a source on a regular grid of the pupil."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from caustic_cli.optics.emission.base import Emission
 from caustic_cli.optics.emission.coherent import Mode
 from caustic_cli.optics.rays import RayState
 
-#: Shifts of one grid against the next, in cells: the additive recurrence of Roberts' R2 sequence.
+#: Offsets between successive grids, in cells: the additive recurrence of Roberts' R2 sequence.
 SHIFTS = (0.7548776662466927, 0.5698402909980532)
 
 
 @dataclass(frozen=True, eq=False)
 class RegularGrid(Emission):
-    """Rays through points of the pupil in even cells, one grid shifted against the next by a part of a cell.
+    """Rays through the points of a regular grid on the pupil, offset by a fraction of a cell.
 
-    mode: the point; number: of the grid, which says how it is shifted.
+    mode: the source point; number: of the grid, which determines the offset.
     """
 
     mode: Mode | None = None
@@ -27,7 +27,7 @@ class RegularGrid(Emission):
 
     @classmethod
     def of_modes(cls, modes: list[Mode], rays: int, device: str | torch.device = "cpu") -> list[RegularGrid]:
-        """About `rays` rays in all."""
+        """Grids for all modes, about `rays` rays in total."""
         scene = modes[0].scene
         base = cls.of_size(scene, "grid", max(1, rays // len(modes)), 0, device)
         return [replace(base, mode=mode, number=k) for k, mode in enumerate(modes)]
@@ -38,7 +38,7 @@ class RegularGrid(Emission):
         return self.shape[0] * self.shape[1]
 
     def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[RayState]:
-        """As of an emission; powers sum to the mode's part of the light on the pupil, to the grid's accuracy."""
+        """As of an `Emission`; powers sum to the mode's power on the pupil within the accuracy of the quadrature."""
         assert self.mode is not None
         (nu, nv), pupil = self.shape, self.scene.pupil
         shift = [(0.5 + self.number * s) % 1.0 for s in SHIFTS]

@@ -1,4 +1,4 @@
-"""Rays of several sources: those of each, as many as its part of the power asks for."""
+"""Sampling of several sources, with numbers of rays in proportion to their powers."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from caustic_cli.optics.emission.base import Lit
+from caustic_cli.optics.emission.base import Illuminated
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.scene import Pupil, Source
@@ -15,7 +15,7 @@ from caustic_cli.scene import Pupil, Source
 
 @dataclass(frozen=True, eq=False)
 class SeveralRays:
-    """members: the rays of each source; fractions: each one's part of all power."""
+    """Rays of several sources: members, the rays of each; fractions, of the total power of each."""
 
     members: tuple
     fractions: tuple[float, ...]
@@ -23,11 +23,11 @@ class SeveralRays:
 
     @property
     def count(self) -> int:
-        """Number of all rays."""
+        """Total number of rays."""
         return sum(one.count for one in self.members)
 
     def chunks(self, size: int = 1 << 20, first: int = 0, step: int = 1) -> Iterator[Sample | RayState]:
-        """As of an `Emission`, one source after the other; powers and losses of all sum to 1."""
+        """As of an `Emission`, source by source; powers and losses of all sum to 1."""
         for one, fraction in zip(self.members, self.fractions, strict=True):
             for rays in one.chunks(size, first, step):
                 if isinstance(rays, Sample):
@@ -38,14 +38,14 @@ class SeveralRays:
 
 @dataclass(frozen=True)
 class _Alone:
-    """What is lit, by one of its sources."""
+    """An illuminated pupil with one of several sources."""
 
     source: Source
     pupil: Pupil
 
 
-def several(scene: Lit, kind: str, rays: int, seed: int = 0, device: str | torch.device = "cpu") -> SeveralRays:
-    """About `rays` rays in all."""
+def several(scene: Illuminated, kind: str, rays: int, seed: int = 0, device: str | torch.device = "cpu") -> SeveralRays:
+    """About `rays` rays in total."""
     from caustic_cli.optics.emission import rays_of  # noqa: PLC0415  every way of drawing is registered there by now
 
     source = scene.source

@@ -1,8 +1,7 @@
-"""Media whose refractive index varies from place to place: index fields, the rays in them, and where these meet a surface."""
+"""Gradient-index media: index fields, integration of the ray equation, and ray transfer between surfaces."""
 
 from __future__ import annotations
 
-from caustic_cli.optics.gradient.crossing import Crossing, cross
 from caustic_cli.optics.gradient.fields import (
     Axial,
     Extremes,
@@ -12,13 +11,13 @@ from caustic_cli.optics.gradient.fields import (
     Radial,
     Selfoc,
     SplineIndex,
-    field_of,
+    index_field_of,
 )
 from caustic_cli.optics.gradient.integrator import Flow, flow, steps_for
+from caustic_cli.optics.gradient.transfer import Transfer, transfer
 
 __all__ = [
     "Axial",
-    "Crossing",
     "Extremes",
     "FishEye",
     "Flow",
@@ -27,8 +26,9 @@ __all__ = [
     "Radial",
     "Selfoc",
     "SplineIndex",
-    "cross",
-    "field_of",
+    "Transfer",
     "flow",
+    "index_field_of",
     "steps_for",
+    "transfer",
 ]

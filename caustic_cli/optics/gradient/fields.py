@@ -1,6 +1,6 @@
-"""Fields of refractive index: what the ray equation asks of a medium (thesis 7.2.1).
+"""Refractive-index fields n(q) with the derivatives in the ray equation (thesis 7.2.1).
 
-Notation, in the medium's own frame, that of the element it lies behind
+Notation, in the medium's frame, that of the element in front of it
     q = (x, y, z)   a point, mm
     n(q)            refractive index;  F = n grad n = grad(n^2) / 2, 1/mm
 
@@ -10,7 +10,7 @@ Notation, in the medium's own frame, that of the element it lies behind
     FishEye         n = n_0 / (1 + rho^2 / a^2), rho the distance from the centre (Maxwell; Born & Wolf, 4.2.2)
     Luneburg        n^2 = 2 - rho^2 / a^2 within the ball of radius a, 1 beyond (Luneburg, Mathematical Theory of Optics)
     SplineIndex     n = sum_ijk c_ijk N_i(u) N_j(v) N_k(w), a tensor-product B-spline volume over a box, eq. 7.2.1 with a box for
-                    its X, Y and Z; beyond the box basis functions go on along their tangents, so that F stays continuous
+                    its X, Y and Z; outside the box basis functions are extrapolated linearly, so that F is continuous
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.scene import Lens
 from caustic_cli.scene.gradient import DEGREE, Gradient
 
-#: n^2 below which a formula is cut off: beyond the reach of n^2 = n_0^2 (1 - g^2 r^2), no light is.
+#: Lower bound of n^2: the formula n_0^2 (1 - g^2 r^2) is invalid where it becomes smaller.
 LEAST_SQUARE = 0.25
-#: Points along each axis of a box from which bounds of a formula are found, and by what part slopes may be larger between them.
+#: Points along each axis of a box at which bounds of a formula are sampled, and safety factor for the slopes in between.
 SURVEY, BETWEEN = 33, 1.2
 
 Point = Sequence[Tensor]
@@ -48,30 +48,35 @@ class Extremes(NamedTuple):
 
 
 class IndexField(ABC):
-    """n(q); see the module.  shape: of coefficients that a design may change, None where there are none."""
+    """An index field n(q).  shape: of its free coefficients, None if there are none."""
 
     shape: tuple[int, ...] | None = None
 
     @property
     def formula(self) -> tuple[tuple[float, ...], bool, bool] | None:
-        """Coefficients of a polynomial in r^2, or in z (True), which n is, or n^2 (True); None where the field is none such."""
+        """Polynomial form: coefficients, whether the variable is z instead of r^2, whether the value is n^2 instead of n; None if
+        the field is not polynomial."""
         return None
 
     @abstractmethod
     def at(self, point: Point, coefficients: Tensor | None = None) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
-        """n^2 and F at points, three (N,) mm; differentiable by the points and the coefficients, None for the field's own."""
+        """n^2 and F at points, three (N,) mm; differentiable by points and coefficients (None: the field's own)."""
 
     def index(self, point: Point) -> Tensor:
         """n at points (N,)."""
         return self.at(point)[0].clamp_min(LEAST_SQUARE).sqrt()
 
     def extremes(self, half_size: tuple[float, float], depth: float) -> Extremes:
-        """Bounds over [-r_x, r_x] x [-r_y, r_y] x [0, depth], mm: from a survey, widened by what may lie between its points."""
+        """Bounds over [-r_x, r_x] x [-r_y, r_y] x [0, depth], mm, from sampled points, with a safety factor for the slope.
+
+        Raises:
+            InputError: the index falls below 0.5.
+        """
         (rx, ry) = half_size
         lines = [torch.linspace(*ends, SURVEY, dtype=torch.float64) for ends in ((-rx, rx), (-ry, ry), (0.0, depth))]
         square, force = self.at([c.reshape(-1) for c in torch.meshgrid(*lines, indexing="ij")])
         if not float(square.min()) >= LEAST_SQUARE:
-            raise InputError("⟨lens.gradient_terms⟩ must leave the index above 0.5 all over the lens")
+            raise InputError("⟨lens.gradient_terms⟩ must keep the index above 0.5 everywhere in the lens")
         n = square.sqrt()
         steepest = float((square_of(force).sqrt() / n).max()) * BETWEEN
         return Extremes(float(n.min()), float(n.max()), steepest)
@@ -79,14 +84,14 @@ class IndexField(ABC):
 
 @dataclass(frozen=True)
 class Selfoc(IndexField):
-    """n^2 = n_0^2 (1 - g^2 r^2); rays are harmonic oscillations."""
+    """n^2 = n_0^2 (1 - g^2 r^2): a GRIN rod, in which rays are sinusoidal."""
 
     n0: float
     g: float
 
     @property
     def formula(self):
-        """n^2, of r^2."""
+        """n^2 as a polynomial in r^2."""
         return (self.n0**2, -((self.n0 * self.g) ** 2)), False, True
 
     def at(self, point: Point, coefficients: Tensor | None = None):
@@ -105,7 +110,7 @@ class Radial(IndexField):
 
     @property
     def formula(self):
-        """n, of r^2."""
+        """n as a polynomial in r^2."""
         return (self.n0, *self.terms), False, False
 
     def at(self, point: Point, coefficients: Tensor | None = None):
@@ -125,7 +130,7 @@ class Axial(IndexField):
 
     @property
     def formula(self):
-        """n, of z."""
+        """n as a polynomial in z."""
         return (self.n0, *self.terms), True, False
 
     def at(self, point: Point, coefficients: Tensor | None = None):
@@ -136,7 +141,7 @@ class Axial(IndexField):
 
 @dataclass(frozen=True)
 class FishEye(IndexField):
-    """Maxwell's: rays are circles, and those of a point q meet again at -a^2 q / |q|^2, counted from the centre."""
+    """Maxwell's fish-eye: rays are circles; a point q is imaged to -a^2 q / |q|^2, relative to the centre."""
 
     n0: float
     radius: float
@@ -152,7 +157,7 @@ class FishEye(IndexField):
 
 @dataclass(frozen=True)
 class Luneburg(IndexField):
-    """Parallel light meets in the point of the rim that is farthest along it."""
+    """The Luneburg lens: collimated light is focused on the opposite point of its surface."""
 
     radius: float
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -170,9 +175,9 @@ class SplineIndex(IndexField):
     """A B-spline volume.
 
     Args:
-        coefficients: (n, m, k) float64 control values; one value along an axis is a field that does not change along it.
+        coefficients: (n, m, k) float64 control values; a single value along an axis makes the field constant along it.
         half_size, depth: of the box [-r_x, r_x] x [-r_y, r_y] x [0, depth], mm.
-        degree: along every axis, less where there are too few control values.
+        degree: along every axis, reduced where there are too few control values.
     """
 
     coefficients: Tensor
@@ -186,22 +191,22 @@ class SplineIndex(IndexField):
         object.__setattr__(self, "coefficients", self.coefficients.double())
 
     @property
-    def shape(self) -> tuple[int, ...]:  # type: ignore[override]  # nobody sets a field's
-        """Of the control values."""
+    def shape(self) -> tuple[int, ...]:  # type: ignore[override]  # read-only here
+        """Shape of the control values."""
         return tuple(self.coefficients.shape)
 
     @cached_property
     def spaces(self) -> tuple[SplineSpace | None, ...]:
-        """Of each axis, None where nothing changes along it."""
+        """Spline space of each axis, None if the field is constant along it."""
         return tuple(None if n == 1 else SplineSpace.uniform(n, min(self.degree, n - 1)) for n in self.coefficients.shape)
 
     @property
     def frame(self) -> tuple[tuple[float, float], ...]:
-        """(middle, half width) of the box along each axis, mm: u = (x - middle) / (2 half) + 1 / 2."""
+        """(centre, half width) of the box along each axis, mm: u = (x - centre) / (2 half) + 1 / 2."""
         return (0.0, self.half_size[0]), (0.0, self.half_size[1]), (0.5 * self.depth, 0.5 * self.depth)
 
     def at(self, point: Point, coefficients: Tensor | None = None):
-        """See the module; the reference of `kernels.volume`."""
+        """See the module; the reference for `kernels.spline_index`."""
         c = self.coefficients if coefficients is None else coefficients
         parts = [self._basis(k, q) for k, q in enumerate(point)]
         flat, (_, m, depth) = c.reshape(-1), self.coefficients.shape
@@ -218,7 +223,7 @@ class SplineIndex(IndexField):
         return n * n, tuple(n * s for s in slopes)
 
     def _basis(self, axis: int, q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """First basis function, values and derivatives by mm there; beyond the box every one goes on along its tangent."""
+        """First basis function, values and derivatives per mm; linearly extrapolated outside the box."""
         space, (middle, half) = self.spaces[axis], self.frame[axis]
         if space is None:
             one = torch.ones_like(q)[:, None]
@@ -229,7 +234,7 @@ class SplineIndex(IndexField):
         return first, values + slopes * (u - within)[:, None], slopes / (2.0 * half)
 
     def extremes(self, half_size: tuple[float, float], depth: float) -> Extremes:
-        """Over the whole box: field and derivatives lie in the hull of their control values."""
+        """Over the whole box, by the convex hull property of the field and of its derivatives."""
         c, slopes = self.coefficients.detach().cpu(), []
         for axis, (space, (_, half)) in enumerate(zip(self.spaces, self.frame, strict=True)):
             if space is not None:
@@ -237,8 +242,8 @@ class SplineIndex(IndexField):
         return Extremes(float(c.min()), float(c.max()), math.hypot(*slopes))
 
 
-def field_of(lens: Lens) -> IndexField | None:
-    """The index field of a lens, z counted from its entrance; None where its index is the same everywhere."""
+def index_field_of(lens: Lens) -> IndexField | None:
+    """The index field of a lens, z measured from its entrance; None for a homogeneous lens."""
     gradient = lens.gradient
     if gradient is None:
         return None
@@ -254,7 +259,7 @@ def _made(gradient: Gradient, lens: Lens) -> IndexField:
 
 
 def square_of(v: Sequence[Tensor]) -> Tensor:
-    """v . v of three components."""
+    """v . v of a vector with three components."""
     return v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
 
 

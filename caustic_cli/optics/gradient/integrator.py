@@ -1,28 +1,28 @@
-"""Rays in a medium of varying index, by a symplectic integrator, and its adjoint in constant memory.
+"""Symplectic integration of rays in gradient-index media, with a reversible adjoint of constant memory.
 
 Notation
-    q, p        point, mm, and optical momentum n d of a ray; |p| = n along it
+    q, p        position, mm, and optical momentum n d of a ray; |p| = n along it
     tau         parameter of the ray, d tau = ds / n, mm
-    S, L        optical path length and length of the ray, mm
+    S, L        optical and geometric path length, mm
     F           grad(n^2) / 2
 
 The ray equation d/ds(n dq/ds) = grad n is Hamilton's with H = (p^2 - n^2) / 2 = 0 (Sharma, Kumar & Ghatak, Appl. Opt. 21, 1982):
 
     dq/dtau = p,    dp/dtau = F(q),    dS/dtau = n^2 = (p^2 + n^2) / 2,    dL/dtau = n
 
-H is the sum of a part of p and a part of q, whose flows are known in closed form:
+H is the sum of a function of p and a function of q, whose flows are known in closed form:
 
     drift by a      q += a p,      S += a p^2 / 2
     kick by b       p += b F(q),   S += b n^2 / 2,   L += b n
 
 drift (h / 2), kick (h), drift (h / 2) is of second order, symplectic, and its own inverse with -h.  Compositions of it with steps
-w_i h of a palindrome w are of the orders 4 (Suzuki, Phys. Lett. A 146, 1990) and 6 (Kahan & Li, Math. Comp. 66, 1997).  Since every
-step can be taken back, the adjoint retraces a ray from its end, and keeps nothing of its way:
+w_i h, w symmetric, have order 4 (Suzuki, Phys. Lett. A 146, 1990) and 6 (Kahan & Li, Math. Comp. 66, 1997).  Since every step is
+reversible, the adjoint retraces the ray from its end and stores no intermediate states:
 
     drift back      lp += a lq + s a p
     kick back       lq += b (dF/dq)^T lp + s b F + l b grad n,      lc += b (dF/dc)^T lp + ...
 
-with lq, lp, s, l the derivatives by q, p, S and L, and lc that by the field's coefficients.
+with lq, lp, s, l the adjoint variables of q, p, S and L, and lc that of the field's coefficients.
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ from caustic_cli.optics.gradient.fields import LEAST_SQUARE, IndexField, square_
 
 _S4 = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
 _S6 = (0.39216144400731413928, 0.33259913678935943860, -0.70624617255763935981, 0.082213596293550800230, 0.79854399093482996340)
-#: Parts of a step by the order of the method.
+#: Coefficients w of the composition, by order of the method.
 WEIGHTS = {2: (1.0,), 4: (_S4, _S4, 1.0 - 4.0 * _S4, _S4, _S4), 6: (*_S6, *_S6[-2::-1])}
-#: Order of the method where nothing is said.
+#: Default order of the method.
 ORDER = 4
-#: Rays on which the number of steps is chosen, and the most steps.
+#: Number of rays for the choice of the number of steps, and its maximum.
 PROBES, MOST_STEPS = 256, 1 << 14
 
 
 class Flow(NamedTuple):
-    """Rays at their end: point q (mm) and momentum p, three (N,) each; optical path length S and length L, (N,) mm."""
+    """Final state of rays: point q (mm) and momentum p, three (N,) each; optical and geometric path lengths S and L, (N,) mm."""
 
     point: tuple[Tensor, ...]
     momentum: tuple[Tensor, ...]
@@ -57,28 +57,28 @@ class Flow(NamedTuple):
 
 
 def flow(field: IndexField, coefficients: Tensor | None, point, momentum, time: Tensor, steps: int, order: int = ORDER) -> Flow:
-    """Rays after `time` (N,) mm of tau, in so many equal steps; the plain-torch reference, for any field.
+    """Integrate rays over `time` (N,) mm of tau in equal steps; the plain-torch reference, for any field.
 
-    Differentiable once by the coefficients, points, momenta and times.
+    Differentiable once, in reverse mode, by coefficients, points, momenta and times.
     """
     out = _Flow.apply(field, steps, order, coefficients, time, *point, *momentum)
     return Flow(out[:3], out[3:6], out[6], out[7])
 
 
 def drift(q, p, path: Tensor, a):
-    """Straight on; see the module."""
+    """The flow of p^2 / 2; see the module."""
     return tuple(x + a * v for x, v in zip(q, p, strict=True)), path + 0.5 * a * square_of(p)
 
 
 def kick(field: IndexField, coefficients, q, p, path: Tensor, length: Tensor, b):
-    """The medium's part; see the module."""
+    """The flow of -n^2 / 2; see the module."""
     square, force = field.at(q, coefficients)
     p = tuple(v + b * f for v, f in zip(p, force, strict=True))
     return p, path + 0.5 * b * square, length + b * square.clamp_min(LEAST_SQUARE).sqrt()
 
 
 class _Flow(torch.autograd.Function):
-    """See `flow`; inputs and outputs by components."""
+    """`flow` with inputs and outputs by components."""
 
     @staticmethod
     def forward(field, steps, order, coefficients, time, *ray):
@@ -138,15 +138,16 @@ class _Flow(torch.autograd.Function):
 def steps_for(
     march, field: IndexField, coefficients: Tensor | None, point, momentum, time: Tensor, tolerance: float, order: int = ORDER
 ) -> int:
-    """The least power of 2 of steps whose rays agree with those of twice as many, on some of the rays.
+    """Number of steps by step doubling: the least power of 2 whose result agrees with that of twice as many, on a subset of the
+    rays.
 
     Args:
         march: `flow` of a backend.
-        tolerance: root mean square, of points as a part of the way, and of directions.  The error of twice as many steps is
-            2^order times smaller.
+        tolerance: of the root mean square difference of points, relative to the path length, and of momenta.  The error with twice
+            as many steps is 2^order times smaller.
 
     Raises:
-        CausticError: MOST_STEPS are not enough.
+        CausticError: no convergence with MOST_STEPS.
     """
     every = max(1, time.numel() // PROBES)
     some = [c.detach()[::every].contiguous() for c in (*point, *momentum, time)]

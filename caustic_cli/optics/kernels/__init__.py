@@ -1,4 +1,4 @@
-"""CPU kernels behind the stages of a trace, each tested against its plain-torch reference; `backends.cpu` calls them."""
+"""Compiled CPU kernels of the stages of a trace, each tested against its plain-torch reference; called by `backends.cpu`."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import os
 
 import torch
 
-#: numba's threads are OpenMP's, as torch's are.  By itself it takes TBB first, whose parallel loops started ever more slowly here:
-#: in 26 microseconds at first, in 500 after 20,000 of them; OpenMP's in 3 throughout.
+#: numba uses OpenMP threads, as torch does.  Its default is TBB, whose parallel loops became slower to start in measurements: from
+#: 26 microseconds at first to 500 after 20,000 of them; those of OpenMP take 3 throughout.
 THREADING = ["omp", "workqueue", "tbb"]
 
 
 def blocks() -> int:
-    """Blocks to cut the rays into, each with sums of its own: torch's threads, which numba's follow."""
+    """Number of blocks of rays, each with its own partial sums: the number of torch's threads, which numba uses, too."""
     import numba  # noqa: PLC0415
 
     if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:

@@ -1,7 +1,7 @@
-"""What the kernels of `plane` take beside arrays, by name.
+"""Scalar arguments of the kernels in `fused`, as named tuples.
 
-Numba compiles a kernel for each combination of types it meets: whole numbers are `int` and others `float` always, so that there
-is one.
+Numba compiles a kernel for each combination of argument types: integers are always `int` and other numbers `float`, so that there
+is only one.
 """
 
 from __future__ import annotations
@@ -10,20 +10,20 @@ from typing import NamedTuple
 
 
 class Exit(NamedTuple):
-    """The exit surface, and the screen beyond it.
+    """The exit surface and the screen behind it.
 
-    index: before it over that behind it; fresnel: kind of Fresnel losses, as in `axial_refraction`; start: height at which
-    oblique rays begin, height: of the screen, mm, both above the zero of the sag.
+    index: ratio of the indices in front of and behind it; fresnel: kind of Fresnel losses, as in `axial_refraction`; start: height
+    of the origins of oblique rays, height: of the screen, mm, both above the zero of the sag.
     """
 
-    index: float  # type: ignore[assignment]  # nobody asks an `Exit` for the place of a value
+    index: float  # type: ignore[assignment]  # shadows `tuple.index`, which is not used
     fresnel: int
     start: float
     height: float
 
 
 class Frame(NamedTuple):
-    """The screen's pixels: how many, the coordinates of the frame's lower left corner and a pixel's size, mm."""
+    """The screen's pixels: their numbers, the coordinates of the lower left corner and the pixel size, mm."""
 
     pixels_x: int
     pixels_y: int

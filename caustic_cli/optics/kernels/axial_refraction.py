@@ -1,6 +1,6 @@
-"""A row of rays refracted at the exit surface and carried to the screen, with derivatives, for the CPU kernels.
+"""Refraction of a row of axial rays at the exit surface and transfer to the screen, with derivatives, for the CPU kernels.
 
-Every loop writes one array from a few others, which is what lets the compiler turn it into vector instructions.
+Every loop writes one array from a few others, so that the compiler can vectorise it.
 
 Notation, a ray with slopes g = (z_x, z_y) at the exit surface, a = |g|^2, index n
     s       sqrt(1 - (n^2 - 1) a), cosine of refraction times |N|
@@ -18,8 +18,8 @@ from caustic_cli.optics.tolerances import CRITICAL
 NONE, SCHLICK, EXACT = 0, 1, 2
 #: Kinds of Fresnel losses by name.
 FRESNEL = {"none": NONE, "schlick": SCHLICK, "exact": EXACT}
-# Rows of a block's scratch of vectors: the surface, powers, landing points, derivatives, what turns the results of `filter_weights`
-# into shares, the rays' points and powers; five more for its own use.
+# Rows of a block's scratch vectors: the surface, powers, landing points, derivatives, normalisation of the results of
+# `filter_weights`, the rays' points and powers; five more for internal use.
 SAG, GX, GY, POWER, PX, PY, PHI, BY_POWER, BY_PX, BY_PY, BY_A, T_SAG, T_GX, T_GY, T_POWER, REACH = range(16)
 OVER_X, OVER_Y, LEAN_X, LEAN_Y, X, Y, FLUX, VECTORS = range(16, 24)
 SCRATCH = 5
@@ -62,10 +62,10 @@ def _reflected(fresnel, a, n):
 
 @njit(**FAST)
 def load(row, out):
-    """A row that may be one value repeated, as a vector: of anything but consecutive numbers the loops make no vectors."""
+    """Copy a row, possibly a repeated value, to contiguous memory, since only contiguous loops are vectorised."""
     if row.strides[0] == 0:
         out[:] = row[0]
-    elif row.strides[0] == 8:  # a distance known when compiling: this copy is one of vectors
+    elif row.strides[0] == 8:  # a stride known at compile time: this copy is vectorised
         for j in range(len(out)):
             out[j] = row[j]
     else:
@@ -85,7 +85,7 @@ def powers(fresnel, gx, gy, flux, n, out):
 
 @njit(**FAST)
 def reach(sag, gx, gy, n, height, out):
-    """h m: how far a ray of unit slope is carried, mm."""
+    """h m: displacement of a ray of unit slope on the screen, mm."""
     for j in range(len(out)):
         m, _ = _m(gx[j] * gx[j] + gy[j] * gy[j], n)
         out[j] = (height - sag[j]) * m
@@ -132,7 +132,7 @@ def _by_sag(reach, sag, gx, gy, by_px, by_py, height, out):
 
 @njit(inline="always", **FAST)
 def pull(vectors, exit_):
-    """Derivatives by the surface, left in T_SAG, T_GX, T_GY, from those by power and pixel coordinates."""
+    """Adjoint: derivatives by sag and slopes, in T_SAG, T_GX, T_GY, from those by power and pixel coordinates."""
     n, height, v = exit_.index, exit_.height, vectors
     _by_a(exit_.fresnel, v[SAG], v[GX], v[GY], v[FLUX], v[BY_POWER], v[BY_PX], v[BY_PY], n, height, v[BY_A])
     _by_slope(v[REACH], v[GX], v[BY_PX], v[BY_A], v[T_GX])
@@ -142,7 +142,7 @@ def pull(vectors, exit_):
 
 @njit(**FAST)
 def push(vectors, exit_, frame):
-    """Tangents of power and pixel coordinates, left in T_POWER, BY_PX, BY_PY, along T_SAG, T_GX, T_GY."""
+    """Tangents of power and pixel coordinates, in T_POWER, BY_PX, BY_PY, along T_SAG, T_GX, T_GY."""
     n, height, v = exit_.index, exit_.height, vectors
     for j in range(v.shape[1]):
         gx, gy, tx, ty = v[GX, j], v[GY, j], v[T_GX, j], v[T_GY, j]

@@ -1,7 +1,7 @@
-"""CPU kernels for a control net contracted along v: the p + 1 basis functions that do not vanish, and none that do.
+"""CPU kernels for the contraction of a control net along v with a banded collocation matrix: the p + 1 non-zero basis functions
+only.
 
-A dense product with the collocation matrix costs as many operations as there are control points along v; on a net of 500 that
-was half of an iteration.
+A dense product takes as many operations as there are control points along v; on a net of 500 it was half of an iteration.
 """
 
 from __future__ import annotations

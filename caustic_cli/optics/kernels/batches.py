@@ -1,31 +1,32 @@
-"""CPU kernels: hits of rays, and their adjoint, by batches of rays that meet the same polynomial of the height field.
+"""CPU kernels: ray intersections and their adjoint, in batches of rays that hit the same polynomial piece of the height field.
 
     z = sum_ab c[i, j, a, b] xi^a eta^b    in the knot-span product (i, j), as in `spline`
 
-Ray by ray, every one fetches the (p + 1)(q + 1) coefficients of its own span product.  LANES rays of one span product share them:
-Horner's scheme then runs over the rays in its inner loop, without branches, as wide as the CPU's vectors are.  To find such rays
+Processed individually, every ray loads the (p + 1)(q + 1) coefficients of its span product.  LANES rays of one span product share
+them: the inner loop of Horner's scheme then runs over the rays, without branches, and is vectorised.  To find such rays
 
-    order   sorts the rays once, by where they start;
-    _group  sorts a tile of them, as often as need be, by where they hit.
+    order   sorts all rays once, by their starting points;
+    _group  sorts a tile of them, as often as necessary, by their intersections.
 
-Newton's iteration runs in all lanes of a batch at once.  From t it goes to t' = t - f / c, and with
+Newton's method runs in all lanes of a batch at once.  A step goes from t to t' = t - f / c, and with
 
     H_uu, H_uv, H_vv   bounds of |Z_uu|, |Z_uv|, |Z_vv| in the span product, from the coefficients
     B = H_uu d_u^2 + 2 H_uv |d_u d_v| + H_vv d_v^2 >= |f''|    (f as in `intersect`)
 
-Taylor's formula leaves |t' - t*| <= B (t - t*)^2 / 2c there.  So the step that is known to end within a rounding of the root t*
-is the last one, and f is not evaluated once more to see it; the slopes at t are those at t' where the same bounds say so.  The
-first steps take the terms of second order alone.
+Taylor's theorem gives |t' - t*| <= B (t - t*)^2 / 2c for the root t*.  A step that is known to end within a rounding of t* is thus
+the last one, without another evaluation of f; by the same bounds the slopes at t serve for t'.  The first steps use terms up to
+second order only.
 
-What is not plain, ray by ray, goes to `intersect._root`, which decides: rays that start outside or above, that may meet the surface
-more than once (L >= d_z), that leave by the side, that do not converge.  What is found is a function of the rays, the heights and
-the number of blocks, not of what was found before; which rays share a batch changes a hit by a rounding at most.
+Special cases are passed ray by ray to `intersect._root`: rays that start outside or above, that may intersect the surface more than
+once (L >= d_z), that leave the aperture, or that do not converge.  The result depends on the rays, the heights and the number of
+blocks only; the composition of batches changes an intersection by a rounding at most.
 
-At the hit, f(t; P, o, d) = 0 gives, with the point's move m = do + t dd at fixed t and the surface's change dZ there,
+At the root, f(t; P, o, d) = 0 gives, with the displacement m = do + t dd of the point at fixed t and the change dZ of the surface
+there,
 
     dt = (dZ + Z_x m_x + Z_y m_y - m_z) / c,    dZ_x = (dZ)_x + Z_xx (m_x + d_x dt) + Z_xy (m_y + d_y dt),
 
-whatever method found t.  In reverse, where a loss L has the derivatives L_t, L_gx, L_gy by distance and slopes,
+whatever method found t.  In reverse mode, for a loss L with derivatives L_t, L_gx, L_gy by distance and slopes,
 
     X = Z_xx L_gx + Z_xy L_gy,  Y = Z_xy L_gx + Z_yy L_gy,    L_Z = (L_t + X d_x + Y d_y) / c,
     L_o = (X + L_Z Z_x, Y + L_Z Z_y, -L_Z),    L_d = t L_o.
@@ -51,15 +52,17 @@ from caustic_cli.optics.tolerances import FEW_ULP, LEAST_COSINE
 LANES = 32
 #: Rays sorted at a time, in the next cache; and the largest box of span products that they may hit.
 TILE, BOX = 4096, 16_384
-#: A batch is not worth its empty lanes below so many rays times coefficients, in a tile, and rays in a span product, on average.
+#: Least numbers for batches to pay off despite empty lanes: rays times coefficients in a tile, and rays per span product on
+#: average.
 FEWEST, CROWD = 64, 8
 #: Rays times (p + q + 2) below which a batch's sums take longer than the rays' own, one by one.
 ALONE = 64
-#: Times that rays are handed to the next span product, steps with the terms of second order and with all terms.
+#: Largest numbers of moves to another span product, of steps with second-order terms, and of steps with all terms.
 TURNS, FIRST_STEPS, STEPS = 4, 2, 5
 #: Sums over a batch, whose order is left to the compiler.
 _SUMS: dict[str, Any] = {"fastmath": {"contract", "nsz", "reassoc"}}
-#: So far beyond its span product, in its widths, a polynomial is still evaluated; and so near the border hits are `_root`'s.
+#: Margin around a span product, in its widths, within which its polynomial is evaluated; margin at the border in which `_root`
+#: decides.
 BEYOND, MARGIN = 0.02, 1e-12
 #: An unsigned index is never taken to count from the end.
 UINT = np.uintp
@@ -254,13 +257,14 @@ def _settle(w, size, c, i, j, bounds, ends_u, ends_v, mi, wi, mj, wj, scale_x, s
 
 
 def found(count: int) -> tuple[np.ndarray, ...]:
-    """What `meet` finds of that many rays, to be written: status, reach, gx, gy, met, where."""
+    """Output arrays of `first_hits` for that many rays: status, reach, gx, gy, met, where."""
     return (np.empty(count, np.int8), *(np.empty(count) for _ in range(3)), *(np.empty(count, np.int32) for _ in range(2)))
 
 
 @njit(inline="always", **FAST)
 def _guess(ou, ov, oz, du, dv, dz, middle, thick, c, bu, mu, wu, bv, mv, wv):
-    """About where a ray hits: on the plane through the middle of the hull, or where that is too rough, on planes below it."""
+    """Initial estimate of an intersection: with the plane in the middle of the hull, or if that is too rough, with planes below
+    it."""
     t = max((middle - oz) / dz, 0.0)
     i, j = piece(ou + t * du, bu), piece(ov + t * dv, bv)
     if thick * abs(du) * wu[i] < 0.1 * dz and thick * abs(dv) * wv[j] < 0.1 * dz:
@@ -278,8 +282,8 @@ def _guess(ou, ov, oz, du, dv, dz, middle, thick, c, bu, mu, wu, bv, mv, wv):
 
 
 @njit(inline="always", **FAST)
-def meet_alone(ray, limits, slopes, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y):
-    """What `meet` finds of one ray, but for a circular aperture: status, span product (-1: none), reach, dz/dx, dz/dy."""
+def first_hit(ray, limits, slopes, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y):
+    """First intersection of one ray, without a circular aperture: status, span product (-1: none), reach, dz/dx, dz/dy."""
     ou, ov, oz, du, dv, dz = ray
     slope = slopes[0] * abs(du) + slopes[1] * abs(dv)
     t, status = _root((ou, ov, oz, du, dv, dz), -1.0, limits, slope, c, bu, mu, wu, bv, mv, wv)
@@ -293,13 +297,13 @@ def meet_alone(ray, limits, slopes, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y)
 
 @njit(inline="always", **FAST)
 def beyond(ou, ov, du, dv, reach, round_, scale_x, scale_y):
-    """Whether a hit is farther from the axis than `round_`, mm."""
+    """Whether an intersection is farther from the axis than `round_`, mm."""
     x, y = (ou - 0.5 + reach * du) / scale_x, (ov - 0.5 + reach * dv) / scale_y
     return x * x + y * y > round_ * round_
 
 
 @njit(entry=True, **FAST)
-def meet(
+def first_hits(
     block,
     order,
     batched,
@@ -329,11 +333,11 @@ def meet(
     where,
     blocks,
 ):
-    """First hits of rays (N,): status, distances (-1 for none), dz/dx and dz/dy there into status, reach, gx, gy.
+    """First intersections of rays (N,): status, distances (-1 for none), dz/dx and dz/dy there into status, reach, gx, gy.
 
     order (N,): of the rays; batched: whether to look for batches; limits: least and largest control height; slopes: bounds of
-    |Z_u| and |Z_v|; round_: radius of a circular aperture, mm, or infinite.  met (N,): the rays in the order in which they were
-    met, where (N,): the span products where they hit, counted row by row, -1 for none.
+    |Z_u| and |Z_v|; round_: radius of a circular aperture, mm, or infinite.  met (N,): the rays in the order of processing; where
+    (N,): the span products of the intersections in row-major order, -1 for none.
     """
     if block == ALL:
         on_threads(
@@ -439,11 +443,11 @@ def meet(
             r = alone[k]
             ray = (ou[r], ov[r], oz[r], du[r], dv[r], dz[r])
             met[to] = r
-            status[r], where[to], reach[r], gx[r], gy[r] = meet_alone(
+            status[r], where[to], reach[r], gx[r], gy[r] = first_hit(
                 ray, limits, slopes, c, bu, mu, wu, bv, mv, wv, scale_x, scale_y
             )
             to += 1
-        if round_ < np.inf:  # beyond a circular aperture there is the lens' side
+        if round_ < np.inf:  # outside a circular aperture the ray has left the lens
             for k in range(first, last):
                 r = met[k]
                 if status[r] == HIT and beyond(ou[r], ov[r], du[r], dv[r], reach[r], round_, scale_x, scale_y):
@@ -586,9 +590,9 @@ def pull_back(
     by_oy,
     by_oz,
 ):
-    """Adjoint of `meet`: derivatives by the coefficients (blocks, I, J, p + 1, q + 1), overwritten, and by the rays' starts.
+    """Adjoint of `first_hits`: derivatives by the coefficients (blocks, I, J, p + 1, q + 1), overwritten, and by the rays' starts.
 
-    by_*: derivatives by distance and slopes (N,); met, where, t, gx, gy: as `meet` found them, t its reach; grads may have no
+    by_*: derivatives by distance and slopes (N,); met, where, t, gx, gy: from `first_hits`, t its reach; grads may have no
     coefficients, and by_ox, by_oy, by_oz (N,), per mm, no rays, if these are not asked for.
     """
     count, blocks, p, q, wide = len(t), len(grads), c.shape[2], c.shape[3], len(bv) - 1
@@ -720,7 +724,7 @@ def push(
     out_y,
     blocks,
 ):
-    """Tangents of the distances and slopes that `meet` found, into out_t, out_x, out_y (N,).
+    """Tangents of the distances and slopes of `first_hits`, into out_t, out_x, out_y (N,).
 
     change: of the coefficients; move_x, move_y, move_z (N,): of the rays' points that hit, at fixed t, mm; either may be empty.
     """

@@ -1,15 +1,15 @@
-"""Where the compiled kernels are kept: a directory of their own for each state of their sources.
+"""The cache directory of compiled kernels: one for each state of their sources.
 
-Numba keys what it keeps by the path and time stamp of the one file that a function stands in, so that an edit of a function or a
-constant of another file, which is compiled into it, would go unnoticed, and every installation compiles anew.  Here every state
-of all the kernels' files, together with the versions of numba and Python, has its own directory `caustic-<hash>` below the first of
+Numba identifies a cached function by the path and time stamp of its own file, so that changes of functions or constants in other
+files that are compiled into it go unnoticed, and every installation compiles again.  Here every state of all kernel sources,
+together with the versions of numba and Python, has its own directory `caustic-<hash>` below the first of
 
-    NUMBA_CACHE_DIR, where the user wants numba's files;
-    XDG_CACHE_HOME/caustic, by default ~/.cache/caustic: one for each user, which leaves an installation as it was packed and
-    serves one that the user may not write to;
-    caustic-<user> in the system's directory for temporary files, if it is this user's alone: numba unpickles what it finds there.
+    NUMBA_CACHE_DIR, the user's choice;
+    XDG_CACHE_HOME/caustic, by default ~/.cache/caustic: one per user, which leaves the installation unchanged and works for one
+    that is read-only;
+    caustic-<user> in the system's temporary directory, if only this user can write to it, since numba unpickles its files,
 
-that can be written to.  If none can, kernels are compiled anew in every process.
+that is writable.  If none is, kernels are compiled again in every process.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parents[2]
 PREFIX, DIGITS = "caustic-", 20
-#: In each directory, touched on every use of it: its age tells how long the directory has not been needed.
+#: Marker file in each directory, touched on every use, so that its age shows how long the directory has been unused.
 USED = "last-used"
 KEPT_DAYS = 30.0
 
 
 def sources(package: Path = PACKAGE) -> list[Path]:
-    """The files that compiled code is made of: all of the kernels', others that define some, and their constants."""
+    """The source files of compiled code: all kernel files, other files with compiled functions, and those with their constants."""
     own = package / "optics" / "kernels"
     found = {p for p in package.rglob("*.py") if own in p.parents or b"njit" in p.read_bytes()}
     return sorted(found | {package / "optics" / "tolerances.py"})
 
 
 def name(package: Path = PACKAGE) -> str:
-    """Of the directory for the present state of the sources."""
+    """Name of the directory for the current state of the sources."""
     state = hashlib.sha256()
     for path in sources(package):
         state.update(f"{path.relative_to(package).as_posix()}\0".encode())
@@ -55,14 +55,14 @@ def name(package: Path = PACKAGE) -> str:
 
 
 def bases() -> Iterator[Path]:
-    """Where the directory may be, the best first."""
+    """Candidate parent directories, in order of preference."""
     asked, common = os.environ.get("NUMBA_CACHE_DIR"), os.environ.get("XDG_CACHE_HOME")
     if asked:
         yield Path(asked)
     elif common and Path(common).is_absolute():  # the XDG Base Directory Specification asks for others to be ignored
         yield Path(common) / "caustic"
     else:
-        with contextlib.suppress(RuntimeError):  # no HOME, and nobody of this number among the users
+        with contextlib.suppress(RuntimeError):  # no HOME, and an unknown user id
             yield Path.home() / ".cache" / "caustic"
     with contextlib.suppress(OSError):  # no directory for temporary files either
         if private(path := Path(tempfile.gettempdir()) / f"{PREFIX}{os.getuid() if hasattr(os, 'getuid') else 'user'}"):
@@ -70,7 +70,7 @@ def bases() -> Iterator[Path]:
 
 
 def private(path: Path) -> bool:
-    """Whether a directory is this user's alone to write to, made if it is not there."""
+    """Whether only this user can write to a directory, which is created if necessary."""
     with contextlib.suppress(FileExistsError):
         path.mkdir(mode=0o700)
     state = path.lstat()
@@ -80,10 +80,10 @@ def private(path: Path) -> bool:
 
 
 def writable(path: Path) -> bool:
-    """Whether files can be kept in a directory, made with those above it if it is not there; leaves `USED` in it."""
+    """Whether a directory, created if necessary, is writable; leaves `USED` in it."""
     try:
         path.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path):  # of a name of its own: another process may be asking the same
+        with tempfile.TemporaryFile(dir=path):  # with a unique name: another process may do the same
             (path / USED).touch()
     except OSError:
         return False
@@ -91,7 +91,7 @@ def writable(path: Path) -> bool:
 
 
 def choose() -> Path | None:
-    """The directory to keep compiled code in; None if there is none that can be written to."""
+    """The cache directory; None if no candidate is writable."""
     own = name()
     for base in bases():
         if writable(base / own):
@@ -100,7 +100,7 @@ def choose() -> Path | None:
 
 
 def tidy(directory: Path, days: float = KEPT_DAYS) -> None:
-    """Remove the neighbours of a directory that are such directories too and were not used for so long."""
+    """Remove sibling cache directories that have not been used for `days`."""
     ours, before = re.compile(f"{PREFIX}[0-9a-f]{{{DIGITS}}}"), time.time() - days * 86400.0
     with contextlib.suppress(OSError):  # whatever cannot be read or removed stays: another process may be removing it
         for path in list(directory.parent.iterdir()):

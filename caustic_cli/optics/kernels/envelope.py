@@ -1,8 +1,8 @@
-"""CPU kernel for the lower envelope of a ball that moves along straight segments: see `envelope`, whose notation this follows.
+"""CPU kernel for the lower envelope of a ball along straight segments; notation of `optics.envelope`.
 
-Segments lie in square cells of side `side`, sorted by the cell of their middle and no longer than a cell, and cells in blocks of
-COARSE x COARSE.  A ball whose centre is at least z0 high and at least d away stands nowhere lower than z0 - sqrt(R^2 - d^2) here:
-cells and blocks that cannot hold the lowest ball are passed over.
+Segments are binned in square cells of side `side` by their midpoints and are no longer than a cell; cells are grouped in blocks of
+COARSE x COARSE.  A ball whose centre is at a height of at least z0 and a distance of at least d is nowhere lower than
+z0 - sqrt(R^2 - d^2) at the query point: cells and blocks that cannot contain the lowest ball are skipped.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ COARSE = 8
 
 @njit(inline="always", **FAST)
 def _away(x, y, i, j, side, low_x, low_y):
-    """Squared distance of a point from all centres of the segments of a cell, at least: they reach half a cell beyond it."""
+    """Lower bound of the squared distance of a point to the segments of a cell, which extend up to half a cell beyond it."""
     dx = max(0.0, abs(x - (low_x + (i + 0.5) * side)) - side)
     dy = max(0.0, abs(y - (low_y + (j + 0.5) * side)) - side)
     return dx * dx + dy * dy
@@ -28,7 +28,7 @@ def _away(x, y, i, j, side, low_x, low_y):
 
 @njit(**FAST)
 def _search(x, y, begin, end, radius, segments, best, at):
-    """The lowest ball of some segments, if it is lower than `best`: its height, and its centre into at (2,)."""
+    """The lowest ball of a range of segments, if lower than `best`: its height, and its centre into at (2,)."""
     square = radius * radius
     for k in range(begin, end):
         ax, ay, az, ex, ey, length, rise = segments[k]

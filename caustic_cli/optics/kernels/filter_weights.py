@@ -1,6 +1,6 @@
-"""Shares of rays among pixels, and their derivatives, a batch at a time: the functions of `reconstruction.Filter`.
+"""Filter weights of rays on pixels, and their derivatives, in batches: the functions of `reconstruction.Filter`.
 
-Every loop writes one array from a few others, which is what lets the compiler turn it into vector instructions.
+Every loop writes one array from a few others, so that the compiler can vectorise it.
 
 Notation, in pixels: v filter size, r = (v - 1) / 2, phi sub-pixel position, q = 1/2 - phi, d = k - r + q the distance from
 the centre of pixel k = 0..v - 1.  A Gaussian on the integer lattice needs two exponentials, whatever v.
@@ -89,7 +89,7 @@ def _short_series(phi, offset, square, alpha, out):
 
 @njit(inline="always", **FAST)
 def _series(phi, offset, square, alpha, out):
-    """A pixel's share of a very wide Gaussian, over alpha exp(-alpha (v/2)^2); the series' arguments are below SMALL."""
+    """A pixel's weight of a very wide Gaussian, divided by alpha exp(-alpha (v/2)^2), by a series in arguments below SMALL."""
     for j in range(len(phi)):
         d = offset - phi[j]
         room = max(square - d * d, 0.0)
@@ -185,10 +185,10 @@ def _level(value, over, lean, slope):
 
 @njit(**FAST)
 def pixel_weights(kind, v, alpha, phi, out, slope, over, lean, scratch):
-    """Weights of rays at sub-pixel positions phi (b,), up to a factor: out (v, b), the share is out * over.
+    """Weights of rays at sub-pixel positions phi (b,), up to normalisation: out (v, b), the weight is out * over.
 
-    And what their derivatives by phi are made of, unless `slope` is empty: (slope - out * lean) * over.  Left to the reader, the
-    factor costs a ray one product instead of one a pixel.
+    Unless `slope` is empty, their derivatives by phi are (slope - out * lean) * over.  The normalisation by `over` is left to the
+    caller, which needs one product per ray instead of one per pixel.
 
     scratch: (5, b).
     """

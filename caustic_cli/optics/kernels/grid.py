@@ -1,7 +1,7 @@
 """The height field on a grid of points: heights -> z and its slopes, with kernels, adjoint and tangent.
 
 The fused form of `heightfield.HeightField.prepare` for a tensor product of points: the net is contracted along v once, and each
-row of points then combines p + 1 rows of it, where a product with the whole collocation matrix would take all.
+row of points then combines p + 1 rows of it, where a product with the dense collocation matrix would use all rows.
 
 Notation
     P           heights (n, m) mm;  B_u, B_v the basis values at the points u (a,) and v (b,)
@@ -27,7 +27,7 @@ from caustic_cli.optics.kernels.threads import ALL, on_threads
 
 
 class GridSurface:
-    """What does not depend on the heights.
+    """A height field on a fixed grid of points, prepared for any heights.
 
     Args:
         spaces, half_size: of the height field; half widths in mm.

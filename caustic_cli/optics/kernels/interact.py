@@ -1,6 +1,6 @@
-"""The stage at a smooth surface: light is refracted there, less what it reflects, or meets a mirror.
+"""The interaction with a smooth surface: refraction with Fresnel losses, or reflection by a mirror.
 
-The fused form of `interface` and `polarisation.part_s`, differentiable in reverse and in forward mode by direction, slopes,
+The fused form of `interface` and `polarisation.s_fraction`, differentiable in reverse and in forward mode by direction, slopes,
 power and field; formulas are with the kernels, in `refraction` and `mirror`.
 """
 
@@ -32,7 +32,7 @@ def interact(direction, slopes, power: Tensor, *, eta: float, reflects: bool, fr
             polarisation.  Only exact Fresnel losses heed it.
 
     Returns:
-        direction: three tensors (N,), finite where light is totally reflected, and meaningless.
+        direction: three tensors (N,), finite but meaningless where light is totally reflected.
         power: (N,), 0 where light is totally reflected.
         passes: (N,) bool, False where it is.
     """

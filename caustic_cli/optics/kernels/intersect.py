@@ -1,12 +1,12 @@
-"""CPU kernels: where rays meet the height field, ray by ray (thesis 4.3.2).
+"""CPU kernels: ray-surface intersection with a height field, ray by ray (thesis 4.3.2).
 
 Notation, in (u, v, z)-space (eq. 4.3.2)
     f(t) = o_z + t d_z - Z(o_u + t d_u, o_v + t d_v), negative below the surface
     c    = f'(t) = d_z - Z_u d_u - Z_v d_v, at the hit the cosine of incidence times |N|
     L    bound of |Z_u| |d_u| + |Z_v| |d_v| from the derivative's control net: d_z - L <= c <= d_z + L
 
-A ray with L < d_z meets the surface once: Newton's iteration inside a bracket that bisection takes over.  For any other one
-the first root is isolated before that.  `batches` takes the plain rays of a bundle together, and differentiates.
+A ray with L < d_z intersects the surface once: Newton's method, safeguarded by bisection of a bracket.  For any other ray the first
+root is isolated beforehand.  `batches` processes the regular rays of a bundle together, and differentiates.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from caustic_cli.optics.kernels.threads import ALL, on_threads
 from caustic_cli.optics.tolerances import FEW_ULP, FINEST, MOST_PROBES, MOST_STEPS
 
 HIT, MISSED, UNRESOLVED = 0, 1, 2
-#: A hit is looked for at first within this part of the way through the box from where a mesh has it.
+#: Half width of the first search interval around the intersection with a mesh, relative to the path through the box.
 NEAR = 1e-3
 
 
@@ -84,7 +84,7 @@ def _bracket_around(start, low, high, ray, c, bu, mu, wu, bv, mv, wv):
 
 @njit(**FAST)
 def _root(ray, start, limits, slope, c, bu, mu, wu, bv, mv, wv):
-    """(t, status) of the first hit.  limits: least and largest height; start: near which it is, negative if not known."""
+    """(t, status) of the first intersection.  limits: least and largest height; start: estimate of t, negative if unknown."""
     ou, ov, oz, du, dv, dz = ray
     z_low, z_high = limits
     if not (ou >= 0.0 and ou <= 1.0 and ov >= 0.0 and ov <= 1.0 and dz > 0.0):
@@ -146,10 +146,10 @@ def _root(ray, start, limits, slope, c, bu, mu, wu, bv, mv, wv):
 
 @njit(entry=True, **FAST)
 def intersect(block, ou, ov, oz, du, dv, dz, start, limits, slopes, c, bu, mu, wu, bv, mv, wv, t, status, blocks):
-    """First hits of rays (N,) into t and status (N,).
+    """First intersections of rays (N,) into t and status (N,).
 
-    limits: least and largest control height; slopes: bounds of |Z_u| and |Z_v|; start (N,): near which the hits are, infinite
-    for none; or empty, if that is not known.
+    limits: least and largest control height; slopes: bounds of |Z_u| and |Z_v|; start (N,): estimates of t, infinite for none; or
+    empty, if unknown.
     """
     if block == ALL:
         on_threads(blocks, (ou, ov, oz, du, dv, dz, start, limits, slopes, c, bu, mu, wu, bv, mv, wv, t, status, blocks))
@@ -184,7 +184,7 @@ def intersect_again(
     for k in range(block * count // blocks, (block + 1) * count // blocks):
         t[k] = 0.0
         rise = side * dz[k] - slopes[0] * abs(du[k]) - slopes[1] * abs(dv[k])
-        if rise > 0.0:  # no slope of the surface catches the ray
+        if rise > 0.0:  # the ray rises faster than the surface can
             continue
         before, after, f = 0.0, 1e-3 * step, 0.0
         for probe in range(most):

@@ -1,7 +1,7 @@
-"""How kernels are compiled: numba's `njit` as all files of this package use it.
+"""Compilation of kernels: the configuration of numba's `njit` that all files of this package use.
 
-Most of the time it takes is LLVM's, which optimises a function by itself and again in everything that calls it.  What this
-leaves out for functions that only others call is half of that.
+Most of the compilation time is spent in LLVM, which optimises a function by itself and again in everything that calls it.  Omitting
+the wrappers of functions that are called by compiled code only halves it.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ PARALLEL = {
 if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]  # kernels call one another by address, which only compiled code has
     raise InputError("the environment's NUMBA_DISABLE_JIT is set, and the kernels run compiled only; unset it")
 
-# Off by default in numba: it turns the steps of four neighbouring pixels in `plane` into vector instructions.
+# Off by default in numba: it turns the steps of four neighbouring pixels in `fused` into vector instructions.
 numba.config.SLP_VECTORIZE = 1  # type: ignore[attr-defined]  # numba makes its settings as it is loaded
 
 
 class _Place(UserProvidedCacheLocator):
-    """Below `cache.DIRECTORY`, which is of one state of the sources, wherever these are installed and whenever they were."""
+    """A cache location below `cache.DIRECTORY`, which belongs to one state of the sources, independent of path and time stamp."""
 
     def __init__(self, function, file: str):
         assert cache.DIRECTORY is not None
@@ -51,14 +51,14 @@ class _Place(UserProvidedCacheLocator):
 
     @classmethod
     def from_function(cls, function, file: str):
-        """The place of a function of a file; None if it cannot be written to, or is no file of this package's."""
+        """The cache location of a function; None if it is not writable, or the file does not belong to this package."""
         with contextlib.suppress(OSError, ValueError):
             place = cls(function, file)
             place.ensure_cache_path()
             return place
 
     def get_source_stamp(self) -> str:
-        """Nothing: the directory is the stamp."""
+        """Constant, since the directory identifies the sources."""
         return ""
 
 
@@ -67,17 +67,17 @@ class _Placed(CompileResultCacheImpl):
 
 
 class _Kept(FunctionCache):
-    """What numba keeps of a function; a file that cannot be read or written, on a full disk for instance, is as none."""
+    """The cache of a function's compiled code; files that cannot be read or written, for instance on a full disk, are ignored."""
 
     _impl_class = _Placed
 
     def load_overload(self, sig, target_context):
-        """The compiled code of a signature, None if none is kept."""
+        """The compiled code of a signature, None if there is none in the cache."""
         with contextlib.suppress(OSError, EOFError, pickle.PickleError):
             return super().load_overload(sig, target_context)
 
     def save_overload(self, sig, data):
-        """Keep the compiled code of a signature, if it can be; an index that cannot be read, which is before that, begins anew."""
+        """Store the compiled code of a signature, if possible; an unreadable index is replaced."""
         with contextlib.suppress(OSError, EOFError, pickle.PickleError):
             try:
                 super().save_overload(sig, data)
@@ -87,11 +87,11 @@ class _Kept(FunctionCache):
 
 
 def njit(*, entry: bool = False, parallel: bool = False, **options):
-    """The decorator of a function that is compiled when it is first called, and kept in `cache.DIRECTORY` if it can be.
+    """Decorator of a function that is compiled when first called, and cached in `cache.DIRECTORY` if possible.
 
     Args:
-        entry: Python calls it.  Otherwise only other such functions do, and it needs no wrapper for that.
-        parallel: its loops over `prange` run in parallel; Python calls it.
+        entry: the function is called from Python; otherwise only from compiled code, and no wrapper is generated.
+        parallel: its loops over `prange` run in parallel; implies `entry`.
         options: as of numba.njit.
     """
     if parallel:

@@ -1,4 +1,4 @@
-"""Laguerre cells of point masses over a rectangle: a raster finds who borders whom, clipping finds areas and borders.
+"""Laguerre cells (power diagram) of point masses over a rectangle: adjacency from a raster, areas and borders by polygon clipping.
 
 Notation
     y_p, psi_p    site p and its price, mm and mm^2;  phi(x) = max_p (x . y_p - psi_p), convex and piecewise linear

@@ -1,4 +1,4 @@
-"""CPU kernel: where a ray first leaves the height field through its triangle mesh (thesis 4.3.2).
+"""CPU kernel: first intersection of rays with the triangle mesh of a height field (thesis 4.3.2).
 
 Notation
     o + t d      the ray, in mm;  z(t) its height o_z + t d_z
@@ -145,7 +145,7 @@ def _walk(ray, first, cells, gx, gy, hx, hy, z):
 
 @njit()
 def _meets(lo, hi, oz, dz, low, high):
-    """Whether the ray meets a box's heights between two times; the edges belong to it."""
+    """Whether the ray passes the height interval of a box, borders included, between two times."""
     if not lo <= hi:
         return False
     a, b = oz + lo * dz, oz + hi * dz

@@ -1,4 +1,4 @@
-"""CPU kernels for light reflected at a smooth surface, with adjoint and tangent.
+"""CPU kernels for reflection at a smooth surface, with adjoint and tangent.
 
 Rays are float64 components, see `stage`; the reference is `interface.reflect`.
 

@@ -23,7 +23,7 @@ def matrix(head, link, end, weight, mass, goal, missing, touched, bond):
 
     Args:
         head, link, end, weight: the cells' borders, as of `laguerre.borders` and `laguerre.cells`.
-        mass, goal (N,): of each cell, and wanted: a cell too light counts by the secant.
+        mass, goal (N,): mass of each cell and target mass; for a cell below its target the secant is used.
         missing, touched, bond: sites without a cell (ascending), the sites they are tied to, and how firmly.
     """
     n = len(head)

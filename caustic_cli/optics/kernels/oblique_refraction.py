@@ -1,7 +1,8 @@
-"""A row of rays of any direction, refracted at their hits and carried to the screen, with derivatives, for the CPU kernels.
+"""Refraction of a row of rays of any direction at the exit surface and transfer to the screen, with derivatives, for the CPU
+kernels.
 
-The same physics as `axial_refraction`, which knows that a plane wave's rays all run along z.  Rays are copied into rows of a
-small scratch, a batch at a time, for the reason that `stage` gives; what a ray has lost its way to is masked, not branched around.
+The same physics as `axial_refraction`, which is specialised to rays parallel to z.  Rays are copied in batches to rows of a small
+scratch array, for the reason given in `stage`; invalid rays are masked instead of branched around.
 
 Notation, a ray with unit direction d inside the lens, slopes g at the hit, N = (-g_x, -g_y, 1), index n
     c, s    d . N and t . N with t the refracted unit direction; s = sqrt(|N|^2 (1 - n^2) + n^2 c^2), 1 if light is reflected
@@ -9,8 +10,8 @@ Notation, a ray with unit direction d inside the lens, slopes g at the hit, N = 
     R       reflectance of the exit surface
     q       (h - sag) / t_z, length of the path to the screen
 
-In, beside the directions: the distances along the rays to their hits (mm; -1 for none), dz/dx and dz/dy there, x and y where the
-rays begin, and their powers.  Out, in rows of `axial_refraction`'s vectors: SAG, POWER, PX, PY, FLUX.
+Input, besides the directions: distances along the rays to their intersections (mm; -1 for none), dz/dx and dz/dy there, x and y of
+the origins, and powers.  Output, in rows of `axial_refraction`'s vectors: SAG, POWER, PX, PY, FLUX.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from caustic_cli.optics.kernels.stage import BATCH
 from caustic_cli.optics.tolerances import CRITICAL, PARALLEL
 
 REFLECTED_POWER, MISSED_POWER = -1.0, -2.0
-# Rows of a batch's scratch: the ray, what comes out, what is differentiated by it, and derivatives by the hit.
+# Rows of a batch's scratch: the ray, outputs, derivatives by the outputs, and derivatives by the intersection.
 REACH, GX, GY, DX, DY, PART, X, Y, OUT_SAG, OUT_POWER, OUT_PX, OUT_PY, BY_REACH, BY_GX, BY_GY, ROWS = range(16)
 
 

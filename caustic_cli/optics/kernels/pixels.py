@@ -1,4 +1,4 @@
-"""What scattering rays into a padded image, and gathering from it, have in common, for the CPU kernels; the sum of images."""
+"""Common functions of the scatter to and the gather from padded images, for the CPU kernels; the sum of partial images."""
 
 from __future__ import annotations
 

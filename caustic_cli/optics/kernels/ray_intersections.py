@@ -1,12 +1,12 @@
-"""Where rays of any origin meet a height field, differentiable by the rays as well as by the heights.
+"""Intersections of rays of any origin with a height field, differentiable by rays and heights.
 
-Of `surface.RayIntersections`, rays begin inside the aperture and below the surface, wherever a source puts them once and for all.
-Behind another surface their origin o and direction d depend on that surface, and o may lie beyond this one's aperture: a long way
-off, a ray comes in at an angle.  So each is first taken to where it enters the
+The rays of `surface.RayIntersections` are fixed and start inside the aperture below the surface.  Behind another surface origin o
+and direction d depend on that surface, and o may lie outside this surface's aperture.  Each ray is therefore first advanced to its
+entry into the
 
     box    aperture x [a little below the least control height, infinity)
 
-and t is counted from o nevertheless.  The search and the derivatives are those of `batches`.
+while t is still measured from o.  The search and the derivatives are those of `batches`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from caustic_cli.optics.kernels.jit import FAST, njit
 from caustic_cli.optics.kernels.surface import FusedSurface, _sag
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 
-#: What the box's floor lies below the least height, in heights of the hull and in widths of the aperture.
+#: Depth of the box's floor below the least height, relative to the height of the hull and to the width of the aperture.
 BELOW = 0.01, 1e-3
 
 
@@ -33,7 +33,7 @@ def hits_of_rays(
     *,
     side: float = 1.0,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """First hits of rays, in the surface's own frame.
+    """First intersections of rays, in the surface's frame.
 
     Args:
         heights: (n, m) mm.
@@ -77,9 +77,9 @@ def enter_alone(ray, floor):
 
 @njit(entry=True, **FAST)
 def enter(block, ou, ov, oz, du, dv, dz, floor, way, blocks):
-    """Take rays (N,) to where they enter the box, ou, ov, oz overwritten; way (N,): how far that is.
+    """Advance rays (N,) to their entry into the box, overwriting ou, ov, oz; way (N,): the distance.
 
-    floor: of the box, mm.  A ray that never enters is put beside the aperture.
+    floor: of the box, mm.  A ray that never enters is placed outside the aperture.
     """
     if block == ALL:
         on_threads(blocks, (ou, ov, oz, du, dv, dz, floor, way, blocks))
@@ -116,7 +116,7 @@ class _HitsOfRays(torch.autograd.Function):
         order, used = batches.order(*rays[:2], surface.geometry[0], surface.geometry[3])
         status, *out = batches.found(len(way))
         top = high + 1e-6 * (high - low)  # above what touches the hull's top, by whatever rounding
-        batches.meet(
+        batches.first_hits(
             ALL,
             order,
             len(way) >= batches.CROWD * used,

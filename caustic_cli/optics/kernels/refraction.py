@@ -1,7 +1,7 @@
-"""CPU kernels for light that passes a smooth surface: Snell's law and Fresnel's, with adjoint and tangent.
+"""CPU kernels for refraction at a smooth surface: Snell's law and the Fresnel equations, with adjoint and tangent.
 
-Rays are float64 components, see `stage`; the reference is `interface` with `polarisation.part_s`.  A ray may run along the
-surface's normal or, with d . N < 0, against it: the law knows no sides, so such a ray is refracted with -N for N.
+Rays are float64 components, see `stage`; the reference is `interface` with `polarisation.s_fraction`.  For rays with d . N < 0 the
+normal is reversed.
 
 Notation, a ray with unit direction d, power P, and slopes g of the surface at its hit; N = (-g_x, -g_y, 1), eta = n_in / n_out
     sigma   1 where d . N >= 0, else -1;  sigma N is the normal along which light passes
@@ -31,14 +31,14 @@ from caustic_cli.optics.kernels.stage import BATCH, load, store
 from caustic_cli.optics.kernels.threads import ALL, on_threads
 from caustic_cli.optics.tolerances import CRITICAL, NORMAL
 
-# Rows of a batch's scratch: the ray, what its refraction is made of, R and its derivatives, the derivatives that come and go.
+# Rows of a batch's scratch: the ray, intermediate results, R and its derivatives, input and output derivatives.
 DX, DY, DZ, GX, GY, P, EX, EY, EZ = range(9)
 NORM2, C, SIDE, S, PASSES, F, R, R_C, R_S, R_NORM2, R_F = range(9, 20)
 BY_TX, BY_TY, BY_TZ, BY_AFTER, BY_F, BY_DX, BY_DY, BY_DZ, BY_GX, BY_GY, BY_P, BY_EX, BY_EY, BY_EZ, ROWS = range(20, 35)
 
 
 class Interface(NamedTuple):
-    """What the kernels know of a surface: n_in / n_out, kind of Fresnel losses, whether they heed the field's direction."""
+    """Parameters of an interface: n_in / n_out, kind of Fresnel losses, and whether the polarisation is used."""
 
     eta: float
     fresnel: int

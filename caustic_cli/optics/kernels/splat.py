@@ -1,13 +1,13 @@
-"""The stage on the screen: landing points into an image, with kernels, adjoint and tangent.
+"""Splatting: accumulation of landing points on pixels, with adjoint and tangent.
 
-The fused form of `reconstruction.splat` for float64 rays.  Each of a fixed number of blocks of rays has an image of its own and
-they are added in order, so the result does not depend on timing, only on the number of blocks (the number of threads).  Only the
-scatter and the gather of pixels go ray by ray; the rest goes a row of rays at a time in vector instructions.
+The fused form of `reconstruction.splat` for float64 rays.  Each of a fixed number of blocks of rays accumulates its own image, and
+these are added in order, so the result depends on the number of blocks (threads) but not on timing.  Only the scatter to and the
+gather from pixels are per ray; the rest is vectorised over rows of rays.
 
 Notation, in pixels (w = 1)
     p           landing coordinate, 0 at the frame's low edge, one for x and one for y;  phi = p - floor(p)
     v           filter size;  r = (v - 1) / 2
-    a_k, o      what `filter_weights` gives: the weight of pixel floor(p) - r + k is a_k o, so that they sum to 1
+    a_k, o      from `filter_weights`: the weight of pixel floor(p) - r + k is a_k o, with sum 1
     a'_k, l     and its derivative by p is (a'_k - a_k l) o
     W           weight of a ray;  G the derivatives by the padded image's pixels
     image       sum over rays of W o_x o_y a_i a_j on the frame padded by 2 r, less its padding
@@ -37,13 +37,13 @@ from caustic_cli.scene import Screen
 
 #: Rays in a row.
 ROW = 512
-# Rows of a block's scratch; then what `filter_weights` works in, then weights and slopes along x and y.
+# Rows of a block's scratch; then the scratch of `filter_weights`, then weights and slopes along x and y.
 PX, PY, W, PHI, OVER_X, OVER_Y, LEAN_X, LEAN_Y, BY_X, BY_Y, BY_W, VECTORS = range(12)
 SCRATCH = 5
 
 
 class Frame(NamedTuple):
-    """What the kernels know of screen and filter: pixels, low edges and sizes of a pixel in mm; kind, sizes and alphas."""
+    """Parameters of screen and filter: pixels, lower edges and pixel sizes in mm; kind, sizes and alphas."""
 
     pixels_x: int
     pixels_y: int

@@ -24,7 +24,7 @@ from caustic_cli.optics.kernels.threads import ALL, on_threads
 
 
 class Axis:
-    """The pieces of a spline space, and what the kernels know of them.
+    """Kernel data of a spline space, by polynomial pieces.
 
     first (I,): first basis function that does not vanish on a piece; matrices (I, p + 1, p + 1): [i, a, k] is the
     coefficient of xi^a in basis function first + k; geometry: breaks (I + 1,), middles (I,), one over widths (I,).
@@ -41,7 +41,7 @@ class Axis:
 
 @lru_cache(maxsize=16)
 def axis(space: SplineSpace) -> Axis:
-    """The pieces of a space, which many surfaces in turn are of."""
+    """Kernel data of a space, cached since many surfaces share one."""
     return Axis(space)
 
 
@@ -106,7 +106,7 @@ def pull_coefficients(i, grads, first_u, mu, first_v, mv, rows, out):
 
 @njit(inline="always", **FAST)
 def piece(x, breaks):
-    """The piece that holds x; the outermost ones also hold what lies beyond."""
+    """The piece that contains x; the outermost pieces extend to infinity."""
     last = len(breaks) - 2  # guess from equal spans, then walk: at once right on an equispaced knot vector
     i = min(max(int(x * (last + 1)), 0), last)
     while i > 0 and x < breaks[i]:

@@ -1,9 +1,9 @@
-"""What the stages of a trace have in common: rays by components, a batch at a time, and derivatives only where they are wanted.
+"""Common conventions of the stage kernels: rays by components, in batches, with derivatives only on request.
 
-A component of all rays is an array (N,), or (1,) where it is one number for all: both compile to the same kernel.  A derivative
-that nobody wants is an array (0,).  Kernels copy a batch of rays into rows of a small scratch that stays in the first cache, and
-loop over these rows: their distances are known when compiling, so the loops turn into vector instructions without any check for
-overlaps.  Everything is float64.
+A component of all rays is an array (N,), or (1,) if it is the same for all: both compile to the same kernel.  A derivative that is
+not requested is an array (0,).  Kernels copy a batch of rays to rows of a small scratch array that fits into the L1 cache, and loop
+over these rows: their strides are known at compile time, so the loops are vectorised without checks for overlap.  Everything is
+float64.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from caustic_cli.optics.kernels.jit import FAST, njit
 
-#: Rays in a batch: thirty rows of them fill the first cache.
+#: Rays in a batch: thirty rows of them fill the L1 cache.
 BATCH = 128
 
 
@@ -34,7 +34,7 @@ def load(component, start, count, out):
 
 @njit(inline="always", **FAST)
 def store(row, start, count, component):
-    """A row into a batch of one component, if that is wanted."""
+    """A row into a batch of one component, if it is requested."""
     if len(component):
         batch = component[start : start + count]
         for j in range(count):
@@ -54,7 +54,7 @@ def components(values) -> tuple[np.ndarray, ...]:
 
 
 def keep(ctx, values: tuple) -> None:
-    """Keep components for both modes of differentiation: tensors where torch wants them, numbers beside them."""
+    """Save components for both modes of differentiation: tensors for torch's bookkeeping, numbers separately."""
     tensors = [v if isinstance(v, Tensor) else None for v in values]
     ctx.save_for_backward(*tensors)
     ctx.save_for_forward(*tensors)
@@ -63,22 +63,22 @@ def keep(ctx, values: tuple) -> None:
 
 
 def kept(ctx) -> tuple:
-    """The components that `keep` kept."""
+    """The components saved by `keep`."""
     return tuple(n if t is None else t for t, n in zip(ctx.saved_tensors, ctx.numbers, strict=True))
 
 
 def wanted(ctx, values: int, count: int) -> tuple[np.ndarray, ...]:
-    """Where the derivatives by the first so many inputs go."""
+    """Output arrays for the derivatives by the first `values` inputs, empty where not needed."""
     return tuple(np.empty(count if need else 0) for need in ctx.needs_input_grad[:values])
 
 
 def new(values: int, count: int) -> tuple[np.ndarray, ...]:
-    """Room for so many components."""
+    """Output arrays for `values` components."""
     return tuple(np.empty(count) for _ in range(values))
 
 
 class _Apart(torch.autograd.Function):
-    """A function of arrays that torch does not look into."""
+    """A function of arrays that is opaque to torch."""
 
     @staticmethod
     def forward(function: Callable, *values):
@@ -92,7 +92,7 @@ class _Apart(torch.autograd.Function):
 def tangent(ctx, along: tuple, push: Callable) -> tuple[Tensor, ...]:
     """The outputs' tangents: arrays that `push` returns, given arrays of the kept components and of as many of `along`.
 
-    By way of a function of its own, because within torch.func a tensor's numbers are within reach only there.
+    It is a function of its own, because within torch.func the data of a tensor is accessible only there.
     """
     values = kept(ctx)
     count = len(values)
@@ -101,5 +101,5 @@ def tangent(ctx, along: tuple, push: Callable) -> tuple[Tensor, ...]:
 
 
 def given(ctx, arrays: tuple[np.ndarray, ...]) -> list[Tensor | None]:
-    """The derivatives that are wanted, as tensors."""
+    """The requested derivatives, as tensors."""
     return [torch.from_numpy(a) if need else None for a, need in zip(arrays, ctx.needs_input_grad, strict=False)]

@@ -1,4 +1,4 @@
-"""The height field at arbitrary points as differentiable torch functions of the control heights, by the kernels of `spline`."""
+"""Evaluation and intersection of a height field as differentiable torch functions of the control heights, by the CPU kernels."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels import batches, blocks, intersect, spline
 from caustic_cli.optics.kernels.threads import ALL
 
-#: Points to a piece of the surface below which they are evaluated from the control heights, and not from the coefficients of all.
+#: Points per piece of the surface below which they are evaluated from the control heights instead of from all coefficients.
 FEW = 1.0
 
 
 class FusedSurface:
-    """What the kernels know of a height field of half widths (r_x, r_y) mm, made once for all heights."""
+    """Kernel data of a height field of half widths (r_x, r_y) mm, for any heights."""
 
     def __init__(self, spaces: tuple[SplineSpace, SplineSpace], half_size: tuple[float, float]):
         self.axes = tuple(spline.axis(s) for s in spaces)
@@ -30,8 +30,8 @@ class FusedSurface:
         self.last: tuple[Tensor, np.ndarray] | None = None
 
     def coefficients(self, heights: Tensor) -> np.ndarray:
-        """(n, m) mm -> the polynomial of every span product, (I, J, p + 1, q + 1) float64; those of the last call where the heights
-        are the same, as they are for all rays of an image."""
+        """(n, m) mm -> the polynomial of every span product, (I, J, p + 1, q + 1) float64; cached for the last heights, since all
+        rays of an image use the same."""
         heights = heights.detach().double()
         if self.last is not None and torch.equal(self.last[0], heights):
             return self.last[1]
@@ -107,13 +107,13 @@ class _ScatteredSurface(torch.autograd.Function):
 
 
 def _sag(heights: Tensor) -> tuple[Tensor, float]:
-    """Heights (n, m) less their mean, float64, and the mean, mm: a sag small against the thickness keeps all its digits."""
+    """Heights (n, m) minus their mean, float64, and the mean, mm: a sag small compared with the thickness keeps all its digits."""
     h = heights.detach().double()
     middle = float(h.mean())
     return h - middle, middle
 
 
-def next_meetings(
+def next_intersections(
     surface: FusedSurface, heights: Tensor, o, d, below: bool, round: bool, step: float, halvings: int, most: int
 ) -> Tensor:
     """The fused form of `reintersection.reference`: distances (N,) mm, 0 for none."""
@@ -146,7 +146,7 @@ def next_meetings(
 
 
 class RayIntersections:
-    """Where rays known beforehand meet a height field from below: the fused form of `intersection.reference`.
+    """Intersections of fixed rays from below with a height field: the fused form of `intersection.reference`.
 
     Args:
         origin, direction: (N,) float64 each, mm, inside the aperture, and unit vectors; z of the origins may be one number.
@@ -175,7 +175,7 @@ class RayIntersections:
     def find(self, heights: Tensor, start: np.ndarray | None = None) -> np.ndarray:
         """Fill t (mm) and status of every ray; returns the coefficients of the surface, counted from the heights' mean.
 
-        start: distances (N,) near which the hits are, infinite for none; None if that is not known.
+        start: estimates of the distances (N,), infinite for none; None if unknown.
         """
         if start is None:
             c, self.status, reach, *_ = self.search(heights)
@@ -184,15 +184,15 @@ class RayIntersections:
         c, limits, slopes = self._shape(heights)
         intersect.intersect(ALL, *self.rays, start, limits, slopes, c, *self.surface.geometry, self.t, self.status, blocks())
         x, y = ((o - 0.5 + self.t * d) / s for o, d, s in zip(self.rays[:2], self.rays[3:5], self.surface.scale, strict=True))
-        beyond = (x * x + y * y > self.radius**2) & (self.status == 0)  # there is the lens' side
+        beyond = (x * x + y * y > self.radius**2) & (self.status == 0)  # the ray has left the lens
         self.t[beyond], self.status[beyond] = 0.0, 1
         return c
 
     def search(self, heights: Tensor) -> tuple[np.ndarray, ...]:
-        """Coefficients of the surface, and what `batches.meet` finds."""
+        """Coefficients of the surface, and the results of `batches.first_hits`."""
         c, *bounds = self._shape(heights)
         out = batches.found(len(self.t))
-        batches.meet(
+        batches.first_hits(
             ALL,
             self.order,
             self.batched,
@@ -208,7 +208,8 @@ class RayIntersections:
         return c, *out
 
     def _shape(self, heights: Tensor) -> tuple:
-        """Coefficients counted from the heights' mean, from which the rays then start; limits and slopes, as of `batches.meet`."""
+        """Coefficients counted from the heights' mean, from which the rays then start; limits and slopes, as of
+        `batches.first_hits`."""
         h, middle = _sag(heights)
         self.rays[2][:] = self.z - middle
         return self.surface.coefficients(h), (float(h.min()), float(h.max())), self.surface.slope_bounds(h)

@@ -1,7 +1,7 @@
-"""Kernels on all threads: functions that call themselves with 0, 1, ... for their first argument, in no order.
+"""Multithreading of kernels: functions that are called with 0, 1, ... for their first argument, in no particular order.
 
-Of every parallel loop numba makes a function of its own in four nested modules, and LLVM optimises all that the loop calls in
-each of them.  Here is the only such loop; it calls functions by their addresses, so that each is optimised once.
+Numba turns every parallel loop into a function in four nested modules, and LLVM optimises everything that the loop calls in each of
+them.  Here is the only such loop; it calls functions by their addresses, so that each is optimised once.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from caustic_cli.optics.kernels.jit import njit, prange
 # compiled, and kept, around a loop that itself came from the cache.
 blocks()
 
-#: First argument of a kernel that is to do the whole.
+#: First argument of a kernel that processes all blocks.
 ALL = -1
 #: What is called by its address: (arguments, number) -> whether it failed.
 BITS = types.intp.bitwidth  # type: ignore[attr-defined]  # of numba's own integers, which are not numpy's

@@ -1,9 +1,9 @@
-"""The stage from a surface on to a plane: the landing points of straight rays, with kernels, adjoint and tangent.
+"""Ray transfer to a plane: the landing points of straight rays, with adjoint and tangent.
 
 Rays are float64 components, see `stage`; the reference is `backends.reference`.
 
 Notation, a ray from o in direction d, a plane through p with unit vectors a (along), b (up) and n (normal)
-    v       d . n; the ray arrives where forward v > PARALLEL, forward being 1, or -1 for light that comes back from a mirror
+    v       d . n; the ray reaches the plane where forward v > PARALLEL, forward being 1, or -1 for light returned by a mirror
     k       (p - o) . n / v, length of the path; the ray is on its way where it arrives and k > 0, and k is 0 where it is not
     r       (o - p) + k d
     x, y    r . a and r . b
@@ -32,7 +32,7 @@ Vector = tuple[float, float, float]
 
 
 class Plane(NamedTuple):
-    """Where the kernels take rays to: p, a, b and n by components, and `forward`."""
+    """The target plane: p, a, b and n by components, and `forward`."""
 
     px: float
     py: float
@@ -50,7 +50,7 @@ class Plane(NamedTuple):
 
 
 def land(origin, direction, point: Vector, axes: tuple[Vector, Vector, Vector], forward: float):
-    """Where rays meet a plane.
+    """Intersections of rays with a plane.
 
     Args:
         origin, direction: by components, each a tensor (N,) float64 or a number for all rays, at least one of them a tensor.

@@ -1,4 +1,4 @@
-"""Surfaces that rays meet: one file each, all of `base.Surface`."""
+"""Optical surfaces, one file each; all implement `base.Surface`."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""A surface as a ball-nose tool has cut it: the lower envelope of its ball along the path, cusps and all.
+"""A machined surface: the lower envelope of a ball-nose tool along its path, including the cusps between passes.
 
-It has no heights.  Turned over, for a part that was cut upside down or a mould that is pressed, it is the scene's z = -Z(x, -y).
-Second derivatives are those of the ball, 1 / R across a pass: nothing smooths the edges between passes.
+It has no free parameters.  For a part that was cut upside down, or a mould, it is turned over: the scene's z = -Z(x, -y).  Across a
+pass the curvature is that of the ball, 1 / R; at the cusps the slope is discontinuous.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from caustic_cli.errors import InputError
 from caustic_cli.optics.envelope import Envelope
 from caustic_cli.optics.surfaces.base import FIRST, Surface, SurfaceIntersection
 
-#: Points along each axis from which bounds are found.
+#: Points along each axis at which bounds are sampled.
 SURVEY = 801
-#: By what part slopes may be larger between them.
+#: Safety factor for the slopes between these points.
 BETWEEN = 1.2
 
 
 @dataclass(frozen=True, eq=False)
 class CutSurface(Surface[None]):
-    """The least of some tools' envelopes over an aperture.
+    """The minimum of the envelopes of one or several tools over an aperture.
 
     Args:
-        envelopes: of each tool, in the program's own coordinates.
-        half_size: of the aperture, mm.
-        base: the program's Z0 in the scene; turned: whether its Y and Z point the other way there.
+        envelopes: of each tool, in the program's coordinates.
+        half_size: half widths of the aperture, mm.
+        base: z of the program's origin in the scene, mm; turned: whether its Y and Z axes are reversed there.
     """
 
     envelopes: tuple[Envelope, ...]
@@ -49,13 +49,13 @@ class CutSurface(Surface[None]):
         return (float(z.min()) - wide, float(z.max()) + wide), (along, across)
 
     def at(self, heights: None, x: Tensor, y: Tensor, orders=FIRST) -> list[Tensor]:
-        """Height and slopes; of higher derivatives there are none.
+        """Height and slopes.
 
         Raises:
-            InputError: they are asked for.
+            InputError: higher derivatives are requested.
         """
         if not set(orders) <= set(FIRST):
-            raise InputError("a cut surface has edges, and no second derivatives")
+            raise InputError("a cut surface has edges and no second derivatives")
         across = -1.0 if self.turned else 1.0
         px, py = x.detach().numpy(), across * y.detach().numpy()
         found = []
@@ -70,18 +70,18 @@ class CutSurface(Surface[None]):
         return [torch.from_numpy(np.ascontiguousarray(values[order])) for order in orders]
 
     def hull(self, heights: None) -> tuple[float, float]:
-        """From a survey of points, widened by what may lie between them."""
+        """From sampled points, with a margin for the points in between."""
         return self._survey[0]
 
     def slope_bounds(self, heights: None) -> tuple[float, float]:
-        """From the same survey."""
+        """From the same points."""
         return self._survey[1]
 
-    def meet(self, heights: None, origin, direction, side: float) -> SurfaceIntersection:
-        """As of any surface; rays along the axis without a search."""
+    def intersect(self, heights: None, origin, direction, side: float) -> SurfaceIntersection:
+        """As of any surface; axial rays need no search."""
         if side > 0 and not any(isinstance(c, Tensor) for c in direction) and tuple(direction) == (0.0, 0.0, 1.0):
             x, y, oz = torch.broadcast_tensors(*(torch.as_tensor(c, dtype=torch.float64) for c in origin))
             z, gx, gy = self.at(None, x, y)
             found = (x.abs() <= self.half_size[0]) & (y.abs() <= self.half_size[1]) & (z >= oz)
             return SurfaceIntersection(z - oz, gx, gy, found)
-        return super().meet(heights, origin, direction, side)
+        return super().intersect(heights, origin, direction, side)

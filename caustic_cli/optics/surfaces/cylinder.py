@@ -1,11 +1,11 @@
-"""The cylinder, by its curvature at the line in which it touches the plane z = 0.
+"""Cylindrical surfaces, by their curvature at the line of contact with the plane z = 0.
 
 Notation
-    k       1 / R, curvature along the bent axis b, x or y; R > 0 puts the axis at z = +R
-    sag     Z = k b^2 / (1 + sqrt(1 - k^2 b^2)): only the half next to that line is a surface
+    k       1 / R, curvature along the coordinate b, x or y; the cylinder's axis is at z = +R for R > 0
+    sag     Z = k b^2 / (1 + sqrt(1 - k^2 b^2)), the half next to the line of contact
 
-Across its axis a ray is that of a circle, but not of unit length: it meets the surface at t = F / (G + side sqrt(G^2 - k A F)),
-F = k (b_o^2 + o_z^2) - 2 o_z, G = d_z - k (b_o b_d + o_z d_z), A = b_d^2 + d_z^2, as in `sphere`.
+Projected along the axis, the intersection is that of a ray, not of unit length, with a circle: t = F / (G + side sqrt(G^2 - k A
+F)), F = k (b_o^2 + o_z^2) - 2 o_z, G = d_z - k (b_o b_d + o_z d_z), A = b_d^2 + d_z^2, as in `sphere`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from caustic_cli.optics.surfaces.sphere import EQUATOR
 
 @dataclass(frozen=True)
 class Cylinder(Surface[None]):
-    """A cylindrical surface of signed radius R, mm, finite and not 0, bent along an axis: 0 for x, 1 for y."""
+    """A cylindrical surface of signed radius R, mm, finite and not 0; bent: the coordinate with curvature, 0 for x, 1 for y."""
 
     radius: float
     bent: int = 0
@@ -38,7 +38,7 @@ class Cylinder(Surface[None]):
         return 1.0 / self.radius
 
     def at(self, heights: None, x: Tensor, y: Tensor, orders=FIRST) -> list[Tensor]:
-        """Sag and its derivatives up to the second; beyond the equator those of points on it."""
+        """Sag and its derivatives up to second order; beyond the equator those of points on it."""
         k, b = self.curvature, (x, y)[self.bent]
         cosine = (1.0 - k * k * b * b).clamp_min(1.0 - EQUATOR**2).sqrt()
         slope = k * b / cosine
@@ -46,15 +46,15 @@ class Cylinder(Surface[None]):
         return [torch.zeros_like(b) if order[1 - self.bent] else along[order[self.bent]] for order in orders]
 
     def hull(self, heights: None) -> tuple[float, float]:
-        """From the line to the equator."""
+        """From the line of contact to the equator."""
         return min(0.0, self.radius), max(0.0, self.radius)
 
     def slope_bounds(self, heights: None) -> tuple[float, float]:
-        """That at the equator, along the bent axis."""
+        """The slope near the equator, along the curved coordinate."""
         steepest = EQUATOR / math.sqrt(1.0 - EQUATOR**2)
         return (0.0, steepest) if self.bent else (steepest, 0.0)
 
-    def meet(self, heights: None, origin, direction, side: float) -> SurfaceIntersection:
+    def intersect(self, heights: None, origin, direction, side: float) -> SurfaceIntersection:
         """The closed form, from either side."""
         k, (bo, oz), (bd, dz) = self.curvature, (origin[self.bent], origin[2]), (direction[self.bent], direction[2])
         big_f = k * (bo * bo + oz * oz) - 2.0 * oz

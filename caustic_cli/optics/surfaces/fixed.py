@@ -1,4 +1,4 @@
-"""A B-spline height field whose heights are given: nothing of it is free."""
+"""B-spline height fields with fixed control heights, without free parameters."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from caustic_cli.optics.surfaces.heightfield import HeightField
 
 @dataclass(frozen=True, eq=False)
 class Fixed(Surface[None]):
-    """A height field at heights (n, m) mm."""
+    """A height field with control heights (n, m) mm."""
 
     field: HeightField
     heights: Tensor
 
     @property
-    def half_size(self) -> tuple[float, float]:  # type: ignore[override]  # nobody sets a surface's
-        """Of the field, mm."""
+    def half_size(self) -> tuple[float, float]:  # type: ignore[override]  # read-only here
+        """Half widths of the field, mm."""
         return self.field.half_size
 
     def at(self, heights: None, x: Tensor, y: Tensor, orders=FIRST) -> list[Tensor]:
@@ -34,7 +34,7 @@ class Fixed(Surface[None]):
         """As of the field."""
         return self.field.slope_bounds(self.heights)
 
-    def meet(self, heights: None, origin, direction, side: float) -> SurfaceIntersection:
+    def intersect(self, heights: None, origin, direction, side: float) -> SurfaceIntersection:
         """As of the field, without derivatives by its heights."""
         device = next(c.device for c in (*origin, *direction) if isinstance(c, Tensor))
-        return self.field.meet(self.heights.to(device), origin, direction, side)
+        return self.field.intersect(self.heights.to(device), origin, direction, side)

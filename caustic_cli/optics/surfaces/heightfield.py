@@ -1,7 +1,7 @@
 """A B-spline height field over a rectangle: z(x, y) = sum_ij P_ij N_i(u) N_j(v) (thesis 4.1).
 
-The control points stand at the Greville abscissae, so (u, v) -> (x, y) is linear, x = (2u - 1) r_x, and a ray of a
-plane wave needs no intersection: it is sampled on the surface itself.
+The control points are placed at the Greville abscissae, so (u, v) -> (x, y) is linear, x = (2u - 1) r_x, and rays of an
+axial plane wave need no intersection: they are sampled on the surface itself.
 
 On a tensor-product sample the basis values are constants and the surface is three small matrix products,
     Z = B_u P B_v^T,    Z_x = B_u' P B_v^T / (2 r_x),    Z_y = B_u P B_v'^T / (2 r_y),
@@ -36,7 +36,7 @@ class HeightField(Surface[Tensor]):
 
     @classmethod
     def of(cls, lens: Lens) -> HeightField:
-        """The field a lens describes."""
+        """The height field of a lens' exit."""
         if lens.knots is None:
             u, v = (SplineSpace.uniform(n, p, k) for n, p, k in zip(lens.control, lens.degree, lens.array, strict=True))
         else:
@@ -45,8 +45,8 @@ class HeightField(Surface[Tensor]):
 
     @classmethod
     def through(cls, z: np.ndarray, half_size: tuple[float, float]) -> tuple[HeightField, Tensor]:
-        """The spline through heights (a, b) mm on an even grid over the aperture, borders included, and its control heights: cubic,
-        or of a lower degree through fewer."""
+        """The interpolating spline of heights (a, b) mm on a uniform grid over the aperture, borders included, and its control
+        heights: cubic, or of lower degree for fewer points."""
         degrees = [min(3, n - 1) for n in z.shape]
         spline = RectBivariateSpline(*(np.linspace(0.0, 1.0, n) for n in z.shape), z, kx=degrees[0], ky=degrees[1], s=0)
         u, v = (SplineSpace(p, torch.from_numpy(t)) for p, t in zip(degrees, spline.get_knots(), strict=True))
@@ -103,7 +103,7 @@ class HeightField(Surface[Tensor]):
         return [cast(Tensor, t) / ((2.0 * rx) ** a * (2.0 * ry) ** b) for t, (a, b) in zip(totals, orders, strict=True)]
 
     def slope_bounds(self, heights: Tensor) -> tuple[float, float]:
-        """Upper bounds of |dz/dx| and |dz/dy|: the derivative's control net holds the derivative in its convex hull."""
+        """Upper bounds of |dz/dx| and |dz/dy|, by the convex hull property of the derivatives' control nets."""
         (su, sv), (rx, ry) = self.spaces, self.half_size
         h = heights.detach().double().cpu()
         return (
@@ -112,13 +112,13 @@ class HeightField(Surface[Tensor]):
         )
 
     def hull(self, heights: Tensor) -> tuple[float, float]:
-        """Least and largest control height: the surface lies in the hull of its net."""
+        """Least and largest control height, by the convex hull property."""
         low, high = torch.aminmax(heights.detach())
         return float(low), float(high)
 
     def least(self, heights: Tensor, round: bool = False) -> float:
-        """The least height over the aperture, a rectangle or the circle within, mm: of 8 points a knot span, at most
-        4001 along an axis; never more than that of the corners and the centre."""
+        """Least height over the aperture, a rectangle or its inscribed circle, mm, sampled at 8 points per knot span, at most 4001
+        along an axis, including the corners and the centre."""
         points = [torch.linspace(0.0, 1.0, min(4001, 8 * (len(s.breaks) - 1) + 1), dtype=torch.float64) for s in self.spaces]
         u, v = (s.banded(p) for s, p in zip(self.spaces, points, strict=True))
         z = over_grid(u, heights.detach().double().cpu(), v)
@@ -128,7 +128,7 @@ class HeightField(Surface[Tensor]):
         return float(z.min())
 
     def centred(self, heights: Tensor) -> tuple[Tensor, float]:
-        """Heights less their mean, and the mean: a sag small against the thickness keeps all its digits."""
+        """Heights minus their mean, and the mean, mm: a sag small compared with the thickness keeps all its digits."""
         middle = float(heights.detach().double().mean())
         return heights.double() - middle, middle
 
@@ -136,9 +136,9 @@ class HeightField(Surface[Tensor]):
         """As of any surface, by the kernels of the device's backend; linear in the heights."""
         return list(backend_for(x.device).spline_at(self, heights, x, y))
 
-    def meet(self, heights: Tensor, origin, direction, side: float) -> SurfaceIntersection:
+    def intersect(self, heights: Tensor, origin, direction, side: float) -> SurfaceIntersection:
         """As of any surface, by the kernels of the device's backend."""
-        return backend_for(heights.device).meet_spline(self, heights, origin, direction, side)
+        return backend_for(heights.device).intersect_spline(self, heights, origin, direction, side)
 
     def slope_bound(self, heights: Tensor) -> float:
         """An upper bound of |grad z|."""
@@ -146,7 +146,7 @@ class HeightField(Surface[Tensor]):
 
 
 class Evaluator:
-    """Heights (n, m) -> z, dz/dx, dz/dy at the prepared rays (mm and dimensionless), linear in the heights."""
+    """A function of heights (n, m): z (mm), dz/dx, dz/dy at the prepared points, linear in the heights."""
 
     def __call__(self, heights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         raise NotImplementedError

@@ -1,7 +1,7 @@
-"""A height field with NURBS weights: z = A / W, A = sum_ij w_ij P_ij N_i(u) N_j(v), W = sum_ij w_ij N_i(u) N_j(v) (eq. 2.4.8).
+"""NURBS height fields: z = A / W, A = sum_ij w_ij P_ij N_i(u) N_j(v), W = sum_ij w_ij N_i(u) N_j(v) (eq. 2.4.8).
 
-The control points stand at the Greville abscissae with equal weights along each axis' mapping, so x and y stay linear in u and v:
-the weights bend the height alone, and a ray meets the surface as it meets a B-spline's.
+x and y are linear in u and v, as for a B-spline height field: the weights affect the height only, and rays are intersected in the
+same way.
 
     Z_x = (A_x - z W_x) / W
     Z_xy = (A_xy - z W_xy - Z_x W_y - Z_y W_x) / W          (quotient rule, Piegl & Tiller eq. 4.20)
@@ -44,12 +44,12 @@ class Nurbs(Surface[Tensor]):
         return self.field.shape
 
     @property
-    def half_size(self) -> tuple[float, float]:  # type: ignore[override]  # nobody sets a surface's
+    def half_size(self) -> tuple[float, float]:  # type: ignore[override]  # read-only here
         """Half widths of the aperture, mm."""
         return self.field.half_size
 
     def at(self, heights: Tensor, x: Tensor, y: Tensor, orders=FIRST) -> list[Tensor]:
-        """By the quotient rule, up to the second derivatives; linear in the heights."""
+        """By the quotient rule, up to second order; linear in the heights."""
         need = sorted({(i, j) for a, b in orders for i in range(a + 1) for j in range(b + 1)}, key=sum)
         top = dict(zip(need, self.field.at(self.weights * heights.double(), x, y, need), strict=True))
         low = dict(zip(need, self.field.at(self.weights, x, y, need), strict=True))
@@ -65,12 +65,12 @@ class Nurbs(Surface[Tensor]):
         return [z[order] for order in orders]
 
     def hull(self, heights: Tensor) -> tuple[float, float]:
-        """Least and largest control height: positive weights keep the surface between them."""
+        """Least and largest control height, by the convex hull property for positive weights."""
         low, high = torch.aminmax(heights.detach())
         return float(low), float(high)
 
     def slope_bounds(self, heights: Tensor) -> tuple[float, float]:
-        """|Z_x| <= (|(A - m W)_x| + |z - m| |W_x|) / W with m the middle of the hull, each from its control net."""
+        """|Z_x| <= (|(A - m W)_x| + |z - m| |W_x|) / W with m the midpoint of the hull, each term from its control net."""
         low, high = self.hull(heights)
         middle, half, least = 0.5 * (low + high), 0.5 * (high - low), float(self.weights.min())
         over = self.field.slope_bounds(self.weights * (heights.detach().double() - middle))
@@ -79,6 +79,7 @@ class Nurbs(Surface[Tensor]):
         return x, y
 
     def centred(self, heights: Tensor) -> tuple[Tensor, float]:
-        """Heights less their mean: weights add up to one share, so the surface moves as its net."""
+        """Heights minus their mean, and the mean, mm: the rational basis is a partition of unity, so the surface shifts with its
+        net."""
         middle = float(heights.detach().double().mean())
         return heights.double() - middle, middle

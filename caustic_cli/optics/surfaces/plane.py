@@ -1,4 +1,4 @@
-"""The plane z = 0."""
+"""Plane surfaces, z = 0."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from caustic_cli.optics.tolerances import PARALLEL
 
 @dataclass(frozen=True)
 class Plane(Surface[None]):
-    """z = 0 in its own frame; its element's pose places and tilts it."""
+    """The plane z = 0 of its element's frame."""
 
     flat = True
 
     def at(self, heights: None, x: Tensor, y: Tensor, orders=FIRST) -> list[Tensor]:
-        """0 everywhere."""
+        """Zeros."""
         return [torch.zeros_like(x) for _ in orders]
 
     def hull(self, heights: None) -> tuple[float, float]:
@@ -29,7 +29,7 @@ class Plane(Surface[None]):
         """(0, 0)."""
         return 0.0, 0.0
 
-    def meet(self, heights: None, origin, direction, side: float) -> SurfaceIntersection:
+    def intersect(self, heights: None, origin, direction, side: float) -> SurfaceIntersection:
         """t = -o_z / d_z; the slopes are the number 0."""
         like = next(c for c in (*origin, *direction) if isinstance(c, Tensor))
         oz, dz = (torch.as_tensor(c, dtype=like.dtype, device=like.device) for c in (origin[2], direction[2]))

@@ -1,11 +1,11 @@
-"""The sphere, by its curvature at the vertex in the origin.
+"""Spherical surfaces, by their curvature, with the vertex at the origin.
 
 Notation
-    k       1 / R, curvature; R > 0 puts the centre at z = +R
-    sag     Z = k r^2 / (1 + sqrt(1 - k^2 r^2)),  r^2 = x^2 + y^2: only the half next to the vertex is a surface
+    k       1 / R, curvature; the centre is at z = +R
+    sag     Z = k r^2 / (1 + sqrt(1 - k^2 r^2)),  r^2 = x^2 + y^2, the hemisphere next to the vertex
 
-A ray from o along d meets it at t = F / (G + side sqrt(G^2 - k F)), F = k o.o - 2 o_z, G = d_z - k o.d (Welford, Aberrations of
-Optical Systems, 4.4), which holds for a plane too and loses no digits for long radii.
+A ray from o along d intersects it at t = F / (G + side sqrt(G^2 - k F)), F = k o.o - 2 o_z, G = d_z - k o.d (Welford, Aberrations
+of Optical Systems, 4.4), which also holds for a plane and loses no digits for large radii.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from torch import Tensor
 from caustic_cli.errors import InputError
 from caustic_cli.optics.surfaces.base import FIRST, Surface, SurfaceIntersection
 
-#: Part of the radius up to which the surface goes: at the equator its slope is infinite.
+#: Largest distance from the axis relative to the radius: at the equator the slope is infinite.
 EQUATOR = 1.0 - 1e-9
 
 
@@ -29,7 +29,7 @@ class Sphere(Surface[None]):
 
     Args:
         radius: R.
-        reach: how far from the axis it is looked at, mm: its bounds hold up to there.
+        reach: semi-aperture for which its bounds hold, mm.
     """
 
     radius: float
@@ -45,7 +45,7 @@ class Sphere(Surface[None]):
         return 1.0 / self.radius
 
     def at(self, heights: None, x: Tensor, y: Tensor, orders=FIRST) -> list[Tensor]:
-        """Sag and its derivatives up to the second; beyond the equator those of points on it."""
+        """Sag and its derivatives up to second order; beyond the equator those of points on it."""
         k = self.curvature
         cosine = (1.0 - k * k * (x * x + y * y)).clamp_min(1.0 - EQUATOR**2).sqrt()
         zx, zy = k * x / cosine, k * y / cosine
@@ -60,17 +60,17 @@ class Sphere(Surface[None]):
         return [values[order] for order in orders]
 
     def hull(self, heights: None) -> tuple[float, float]:
-        """From the vertex to the sag at the reach."""
+        """From the vertex to the sag at the semi-aperture."""
         r = min(self.reach, EQUATOR * abs(self.radius)) if math.isfinite(self.radius) else 0.0
         sag = self.curvature * r * r / (1.0 + math.sqrt(1.0 - (self.curvature * r) ** 2))
         return min(0.0, sag), max(0.0, sag)
 
     def slope_bounds(self, heights: None) -> tuple[float, float]:
-        """That at the reach, along either axis."""
+        """The slope at the semi-aperture, along either axis."""
         sine = min(self.reach * abs(self.curvature), EQUATOR) if math.isfinite(self.radius) else 0.0
         return (sine / math.sqrt(1.0 - sine * sine),) * 2
 
-    def meet(self, heights: None, origin, direction, side: float) -> SurfaceIntersection:
+    def intersect(self, heights: None, origin, direction, side: float) -> SurfaceIntersection:
         """The closed form, from either side."""
         (ox, oy, oz), (dx, dy, dz), k = origin, direction, self.curvature
         big_f = k * (ox * ox + oy * oy + oz * oz) - 2.0 * oz

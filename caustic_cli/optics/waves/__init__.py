@@ -1,11 +1,13 @@
-"""Light as a wave: the field behind a lens from an exact trace of rays, and its propagation to the screen.
+"""Wave optics: the field behind a lens from an exact ray trace, and its propagation to the screen by the Fresnel integral.
 
-wavefront   optical path and density of rays by their feet on a plane behind the lens
-nodes       functions between the nodes at which rays are traced
-seeking     the rays whose feet stand on an even grid
-sampling    how finely field and screen are sampled
-propagation Fresnel's integral as one Fourier transform, on pixels, with its adjoint
-image       wavelengths and points of the source added up
+wavefront      optical path and density of rays on a reference plane behind the lens
+ray_aiming     rays through the points of a uniform grid on that plane
+interpolation  interpolation of the wavefront between the traced nodes
+sampling       sampling of the field on the reference plane and on the screen
+propagation    the Fresnel integral as a single Fourier transform, integrated over pixels, with its adjoint
+receiver       the plane of an image in space
+tilted         images on tilted screens
+image          incoherent sum over wavelengths and source points
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""The wave image: what diffraction makes of the light on a screen.
+"""The wave image: irradiance on a screen including diffraction.
 
-Every wavelength and every point of the source is coherent in itself; their powers are added.  A source with an extent that only
-shifts the image of its middle, to within a part of what the image shows anyway, is taken as that image spread by the source's own;
-otherwise as so many points, each spread by its part of the source.
+Wavelengths and source points are mutually incoherent, so their irradiances are added.  If an extended source only shifts the image
+of its centre, within a fraction of the resolution, its image is that of the centre convolved with the point-spread function of the
+source; otherwise the source is represented by several points, each with the point-spread function of its part.
 
-What rays carry through the system counts: Fresnel's losses, absorption, dispersion, polarisation.  Light that does not go straight
-on (ghosts, secondary intersections, rough surfaces) is no part of it.
+Fresnel losses, absorption, dispersion and polarisation are included.  Stray light (ghosts, secondary intersections) and surface
+roughness are not.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from caustic_cli.optics.emission.coherent import Mode, edges, middle, modes, spots
+from caustic_cli.optics.emission.coherent import Mode, central_mode, modes, outermost_modes, spots
 from caustic_cli.optics.interaction import Parameters
 from caustic_cli.optics.resolution import WHITE_LINES, white
 from caustic_cli.optics.spread import Convolution, Spread, spread_of
 from caustic_cli.optics.surfaces import HeightField
-from caustic_cli.optics.system import EXIT, Placed, System
+from caustic_cli.optics.system import EXIT, PlacedScreen, System
 from caustic_cli.optics.waves.propagation import cells, phase_of, power_by_blocks, power_on_pixels
 from caustic_cli.optics.waves.receiver import Plane, Receiver, receiver_of
 from caustic_cli.optics.waves.sampling import NoWaveImage, Sampling, memory_free
@@ -34,27 +34,27 @@ from caustic_cli.scene import Light, Scene, Screen, Source
 from caustic_cli.scene.materials import refractive_index
 
 NM = 1e-6
-#: Samples of transforms that two cores take in a second; the most of a wave image that nobody asked for by name.
+#: Transform samples per second on two cores; largest number of samples of a wave image that was not requested explicitly.
 A_SECOND, UNASKED = 1e8, 120e8
-#: Nodes at which rays are traced: to a knot span of the finest surface, and least along an axis.
+#: Traced nodes per knot span of the finest surface, and their least number along an axis.
 A_SPAN, LEAST_NODES = 3, 384
-#: The screen and so much of it on each side are watched, at most, where light lands beside it.
+#: Largest margin of the computed region on each side of the screen, relative to the screen's width.
 BESIDE = 0.5
-#: Light is watched as far beyond where rays land as so many of the widths over which diffraction blurs.
+#: Margin of the computed region beyond the landing points of rays, in diffraction blurs.
 BLURS = 2.0
-#: What the misplacement of light that is taken as spread may be, of diffraction's blur or a pixel, the larger.
+#: Tolerance of the shift-invariance error of a point-spread function, relative to the larger of diffraction blur and pixel.
 ALLOWED = 0.25
-#: Points that stand for an extended source where its image is not simply spread, at most, and least of each of its positions.
+#: Largest number of points that represent an extended source, and least number per position.
 EACH, LEAST_EACH = 24, 4
 
-#: Points (N,) mm -> by how much a surface is higher there, mm.
-Departure = Callable[[Tensor, Tensor], Tensor]
+#: Height perturbation of a surface: points (N,) mm -> additional height, mm.
+Perturbation = Callable[[Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True)
 class Line:
-    """Light of one wavelength: nm, its part of the power, the system for it, the wavelength that media are asked for (None where
-    the system has it already), and the channel of a coloured image."""
+    """One spectral line: wavelength, nm; fraction of the power; the system at this wavelength; label, the wavelength at which media
+    are evaluated (None if the system has the indices already); and the channel of a coloured image."""
 
     wavelength: float
     part: float
@@ -69,17 +69,17 @@ class Line:
 
     @property
     def behind(self) -> float:
-        """The wavelength in the medium before the screen, mm."""
+        """The wavelength in the image space, the medium in front of the screen, mm."""
         return self.length / self.system.media()[-1].index_at(self.label)
 
 
 @dataclass(frozen=True)
 class WaveImage:
-    """Power on pixels (n_x, n_y), or (3, n_x, n_y) with colours, and what reached the screen's plane, as parts of the source's.
+    """Power on pixels (n_x, n_y), or (3, n_x, n_y) with colours, as fractions of the source's power.
 
-    image: float64, differentiable where the heights were; leaving: power of all light behind the system; off_screen: of what of
-    it lands beside the pixels; wavelengths: nm; points: of the source that were taken; spread_error: by how much taking an extended
-    source's image as spread misplaces light, mm; samples: along each axis of the largest transform.
+    image: float64, differentiable if the heights were; leaving: power behind the system; off_screen: power outside the pixels;
+    wavelengths: nm; points: number of source points; spread_error: displacement error of the point-spread approximation, mm;
+    samples: of the largest transform along each axis.
     """
 
     image: Tensor
@@ -92,7 +92,8 @@ class WaveImage:
 
 
 def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | None = None) -> list[Line]:
-    """The light of a scene by wavelength and polarisation: its own, or these with equal parts; white where it has none."""
+    """Spectral lines of a scene, by wavelength and polarisation: its own, or the given ones with equal powers; white light if it
+    has none."""
     if len(scene.source.members) > 1:
         return [
             replace(line, part=fraction * line.part)
@@ -113,7 +114,7 @@ def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | 
         if lens.glass is not None and not lens.mirror:
             lens = replace(lens, index=refractive_index(lens.glass, wavelength))
         for state in states:
-            if (lens.index, state) not in systems:  # light of one index and polarisation goes the same ways
+            if (lens.index, state) not in systems:  # light of one index and polarisation takes the same paths
                 one = replace(scene, lens=lens, light=Light(state))
                 systems[lens.index, state] = System.of(one, field)
             found.append(Line(wavelength, part / len(states), systems[lens.index, state], None, channel))
@@ -121,7 +122,7 @@ def lines_of(scene: Scene, field: HeightField, wavelengths: tuple[float, ...] | 
 
 
 def lines_of_system(system: System) -> list[Line]:
-    """The same of any system, whose sources are taken one by one."""
+    """Spectral lines of a system, source by source."""
     given = system.light.wavelengths or white(WHITE_LINES)
     parts = system.light.parts if system.light.wavelengths else (1.0 / len(given),) * len(given)
     return [
@@ -140,48 +141,48 @@ def wave_image(
     screen: Screen | None = None,
     finer: float = 1.0,
     dtype: torch.dtype = torch.float32,
-    departure: Departure | None = None,
+    perturbation: Perturbation | None = None,
     most: float = math.inf,
 ) -> WaveImage:
-    """The wave image of a one-lens scene at heights (n, m) mm; differentiable by them.
+    """The wave image of a scene at heights (n, m) mm; differentiable by them.
 
     Args:
-        wavelengths: nm, in equal parts, instead of the scene's; a scene without any has white light.
-        finer: samples more than are needed by so many times along each axis, on both planes.
-        dtype: of the field; paths are float64.
-        departure: of the exit from those heights, see `Imager`.
-        most: samples that its transforms may have together.
+        wavelengths: nm, of equal power, instead of the scene's; a scene without any has white light.
+        finer: oversampling factor along each axis of both planes.
+        dtype: of the field; optical paths are float64.
+        perturbation: of the exit's height, see `Imager`.
+        most: largest total number of samples of its transforms.
 
     Raises:
-        NoWaveImage: no light reaches the screen, light crosses itself within the lens, or memory or `most` is short.
+        NoWaveImage: no light reaches the screen, rays cross in front of the reference plane, or memory or `most` is insufficient.
     """
     lines = lines_of(scene, field, wavelengths)
     parameters = {EXIT: heights.double()}
-    return image_of(lines, parameters, screen or scene.screen, finer=finer, dtype=dtype, departure=departure, most=most)
+    return image_of(lines, parameters, screen or scene.screen, finer=finer, dtype=dtype, perturbation=perturbation, most=most)
 
 
 def image_of(
     lines: list[Line],
     parameters: Parameters,
-    screen: Screen | Placed,
+    screen: Screen | PlacedScreen,
     *,
     finer: float = 1.0,
     dtype: torch.dtype = torch.float32,
-    departure: Departure | None = None,
+    perturbation: Perturbation | None = None,
     most: float = math.inf,
 ) -> WaveImage:
-    """The wave image of lines of light on one screen, the sources of a system one by one; see `wave_image`."""
+    """The wave image of spectral lines on one screen, source by source; see `wave_image`."""
     exact, found = any(h.requires_grad for h in parameters.values()), []
     by_source: dict[int, list[Line]] = {}
     for line in lines:
         by_source.setdefault(id(line.system.source), []).append(line)
     for light in by_source.values():
-        imager = Imager.of(light, parameters, receiver_of(light[0].system, screen), finer, exact, dense=departure is not None)
-        imager = replace(imager, departure=departure)
+        imager = Imager.of(light, parameters, receiver_of(light[0].system, screen), finer, exact, dense=perturbation is not None)
+        imager = replace(imager, perturbation=perturbation)
         if (samples := imager.sampling.samples * len(light) * len(imager.modes(light[0].system))) > most:
             raise NoWaveImage(
                 f"a wave image of this scene takes {samples:.2g} samples, about {samples / A_SECOND / 60:.0f} minutes on two cores;"
-                " the effect diffraction, asked for by name, takes it"
+                " the effect diffraction, requested by name, computes it"
             )
         found.append(imager.expose(light, parameters, dtype))
     return (
@@ -191,7 +192,7 @@ def image_of(
             cast(Tensor, sum(w.image for w in found)),
             sum(w.leaving for w in found),
             sum(w.off_screen for w in found),
-            found[0].wavelengths,
+            tuple(dict.fromkeys(w for one in found for w in one.wavelengths)),
             sum(w.points for w in found),
             max(w.spread_error for w in found),
             max(w.samples for w in found),
@@ -200,7 +201,7 @@ def image_of(
 
 
 def _alike(lines: list[Line]) -> list[list[Line]]:
-    """Lines whose light goes the same ways, together; the shortest wavelength first, which asks for the most."""
+    """Lines grouped by ray paths; the shortest wavelength, which needs the finest sampling, comes first."""
     groups: dict[tuple, list[Line]] = {}
     for line in sorted(lines, key=lambda k: k.wavelength):
         groups.setdefault((id(line.system), line.label), []).append(line)
@@ -209,11 +210,11 @@ def _alike(lines: list[Line]) -> list[list[Line]]:
 
 @dataclass(frozen=True)
 class Imager:
-    """What the images of a source's lines and modes have in common: where their light is watched, and how finely.
+    """Common settings of the images of a source's lines and modes: the computed region and the sampling.
 
-    spread: of the light of a mode; each: modes for every position of the source, 0 for one that stands for all of it; departure:
-    how much higher the last surface is at points (N,) than its heights say, mm: small, fine structure, of which light takes the
-    path to first order and no change of its way.
+    spread: point-spread function of a mode; each: modes per position of the source, 0 for a single mode of the whole source;
+    perturbation: additional height of the last surface at points (N,), mm: fine structure of small amplitude, which changes optical
+    paths to first order and does not deflect rays.
     """
 
     source: Source
@@ -227,7 +228,7 @@ class Imager:
     upright: bool
     exact: bool = False
     tapered: bool = True
-    departure: Departure | None = None
+    perturbation: Perturbation | None = None
 
     @classmethod
     def of(
@@ -240,13 +241,14 @@ class Imager:
         watched: tuple | None = None,
         dense: bool = False,
     ) -> Imager:
-        """Look where the light goes, and choose samples for it.
+        """Determine the extent of the light, and choose the sampling.
 
         Args:
             exact: see `wavefront`.
-            watched: lows and highs, mm, on an upright screen, of what has to be seen of it besides nearly all of the light, whose
-                rest then comes in from the other side; None for all of the screen and the light, the rest being left out.
-            dense: trace a ray for every sample of the light.
+            watched: lower and upper limits, mm, on an upright screen, of a region that must be covered together with nearly all of
+                the light, whose remainder is then aliased; None to cover the whole screen and all light, tapering off the
+                remainder.
+            dense: trace a ray for every sample of the field.
 
         Raises:
             NoWaveImage: see `wave_image`.
@@ -254,11 +256,11 @@ class Imager:
         ways = [group[0] for group in _alike(lines)]
         system = ways[0].system
         if system.source.rays is not None:
-            raise NoWaveImage("a ray file says nothing of its light's phase, so that it has no wave image")
+            raise NoWaveImage("a ray file contains no phase, so that it has no wave image")
         plane, upright = receiver.plane(system.axis), receiver.across(system.axis)
         distance = distance_of(system, parameters, plane)
-        alike = [Optics(k.system, middle(system), parameters, k.length, k.label, plane, distance) for k in ways]
-        outer = edges(system)
+        alike = [Optics(k.system, central_mode(system), parameters, k.length, k.label, plane, distance) for k in ways]
+        outer = outermost_modes(system)
         surveys = [survey(replace(one, mode=mode)) for one in alike for mode in (one.mode, *outer)]
         lengths = tuple(k.behind for k in lines)
         blur = math.sqrt(max(lengths) * distance * surveys[0].magnification)
@@ -288,7 +290,7 @@ class Imager:
         return cls(system.source, receiver, plane, surveys[0], sampling, spread, nodes, each, upright, exact, watched is None)
 
     def expose(self, lines: list[Line], parameters: Parameters, dtype: torch.dtype = torch.float32) -> WaveImage:
-        """The wave image of such lines, at heights {name: (n, m) mm} close to those that samples were chosen for."""
+        """The wave image of these lines, at heights {name: (n, m) mm} close to those for which the sampling was chosen."""
         colours = [line.channel for line in lines if line.channel is not None]
         images: dict[int | None, Tensor] = {}
         leaving = 0.0
@@ -312,27 +314,27 @@ class Imager:
         )
 
     def modes(self, system: System) -> list[Mode]:
-        """Points that the source is taken as."""
-        return modes(system, self.each) if self.each else [middle(system)]
+        """The modes that represent the source."""
+        return modes(system, self.each) if self.each else [central_mode(system)]
 
     def optics(self, line: Line, mode: Mode, parameters: Parameters) -> Optics:
-        """What makes a wavefront of one of them."""
+        """The wavefront computation of one mode."""
         return Optics(line.system, mode, parameters, line.length, line.label, self.plane, self.sampling.distance)
 
     def front(self, line: Line, mode: Mode, parameters: Parameters, sensitive: bool = False) -> Wavefront:
-        """The light of a mode behind the lens, on `nodes`."""
+        """The wavefront of a mode behind the lens, on `nodes`."""
         optics, s = self.optics(line, mode, parameters), self.sampling
         dx, dy = (d * n / m for d, n, m in zip(s.step, s.count, self.nodes, strict=True))
         seen = survey(optics) if self.each else self.seen
-        if self.departure is None:
+        if self.perturbation is None:
             return wavefront(optics, seen, s.low, (dx, dy), self.nodes, sensitive, self.exact)
         found = wavefront(optics, seen, s.low, (dx, dy), self.nodes, True, self.exact)
         assert found.sensitivity is not None and found.at_x is not None and found.at_y is not None
-        off = self.departure(found.at_x.reshape(-1), found.at_y.reshape(-1)).view(found.path.shape)
+        off = self.perturbation(found.at_x.reshape(-1), found.at_y.reshape(-1)).view(found.path.shape)
         return replace(found, path=found.path + found.sensitivity * off)
 
     def watched(self, front: Wavefront, length: float) -> Wavefront:
-        """The part of it that lands where its transform at a wavelength in mm reaches."""
+        """The wavefront restricted to light that lands inside the transform's field of view at a wavelength, mm."""
         if not self.tapered:
             return front
         wide, high = (length * self.sampling.distance / d for d in self.sampling.step)
@@ -340,14 +342,14 @@ class Imager:
 
     @cached_property
     def spreading(self) -> list[Convolution]:
-        """The spread on the screen's pixels: of the whole source, or of each mode of a position; none of points."""
+        """Convolutions on the screen's pixels: of the whole source, or of each mode of a position; empty for point sources."""
         if self.spread is None:
             return []
         pixel = self.receiver.pixel
         return self.spread.parts_on(pixel, spots(self.source, self.each)) if self.each else [self.spread.on(pixel)]
 
     def masks(self, line: Line, device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-        """Which samples of an upright screen fall on which of the cut pixels, along each axis."""
+        """Overlap matrices between samples and (subdivided) pixels of an upright screen, along each axis."""
         s, low, found = self.sampling, self.receiver.extent(self.plane)[0], []
         sub, beside = (self.spreading[0].cut, self.spreading[0].beside) if self.spreading else (1, (0, 0))
         first, spacing = s.first(line.behind), s.spacing(line.behind)
@@ -368,17 +370,17 @@ class Imager:
         return rows, columns
 
     def spread_out(self, image: Tensor, mode: int) -> Tensor:
-        """An image of a mode's light on cut pixels -> that of its part of the source on the screen's pixels."""
+        """An image of a mode on subdivided pixels -> that of its part of the source on the screen's pixels."""
         return self.spreading[mode % len(self.spreading)](image) if self.spreading else image
 
     def field(self, line: Line, front: Wavefront, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-        """Phase, rad, with the kernel's, and amplitude of each sample of a wavefront, (n, m)."""
+        """Phase, rad, including that of the Fresnel kernel, and amplitude of each sample of a wavefront, (n, m)."""
         s, front = self.sampling, self.watched(front, line.behind)
         path, amplitude = front.on(s.low, s.step, s.count).whole
         return phase_of(path, s, line.length, line.behind).to(dtype), amplitude.to(dtype)
 
     def image(self, line: Line, front: Wavefront, mode: int, dtype: torch.dtype) -> tuple[Tensor, float]:
-        """Power on the pixels of the light of one mode, by its number, at one wavelength, float64, and that of all of it."""
+        """Power on pixels of one mode, by its number, at one wavelength, float64, and its total power."""
         s, wide = self.sampling, 8 if dtype == torch.float32 else 16
         if not self.upright:
             found = power_on_tilted(self.receiver, self.plane, s, self.watched(front, line.behind), line.length, line.behind, dtype)

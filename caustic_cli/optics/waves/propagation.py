@@ -1,12 +1,12 @@
-"""Light from the plane behind a lens to the screen: Fresnel's integral as one Fourier transform, with its complex adjoint.
+"""Fresnel propagation from the reference plane to the screen by a single Fourier transform, with its adjoint.
 
     U(X) = 1 / (i lambda L) exp(i k X^2 / 2 L)  integral  u(x) exp(i k x^2 / 2 L) exp(-i k x X / L) dx
 
-Of U only |U|^2 is asked for, so the factor before the integral is left out; what remains is a discrete transform of samples dx
-apart (`sampling`), and unitary: sum |U|^2 = sum |u|^2 to rounding.  Light's path is given so that this integral, which is exact for
-parabolic wavefronts, lands every ray where the trace says (`wavefront`).
+Only |U|^2 is needed, so the factor in front of the integral is omitted; the rest is a discrete Fourier transform of samples dx
+apart (`sampling`), unitary up to rounding: sum |U|^2 = sum |u|^2.  The phase is defined such that this integral, which is exact for
+parabolic wavefronts, reproduces the landing point of every traced ray (`wavefront`).
 
-Without derivatives, a transform is made along y for blocks of rows and along x for blocks of columns, in bounded memory.
+Without derivatives, the transform is computed along y for blocks of rows and along x for blocks of columns, in bounded memory.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from torch import Tensor
 from caustic_cli.optics.waves.sampling import Sampling
 
 TURN = 2.0 * math.pi
-#: Rows or columns that are transformed at a time.
+#: Rows or columns transformed at a time.
 BLOCK = 256
 
 
 def ramp(sampling: Sampling, wavelength: float, axis: int, device: torch.device) -> Tensor:
-    """Phase (n,) rad of the integral's kernel along one axis, for a screen whose samples begin at `Sampling.first`; float64."""
+    """Phase (n,) rad of the Fresnel kernel along one axis, with the shift to the first screen sample `Sampling.first`; float64."""
     j = torch.arange(sampling.count[axis], dtype=torch.float64, device=device)
     x = sampling.low[axis] + (j + 0.5) * sampling.step[axis]
     k, x0 = TURN / wavelength, sampling.first(wavelength)[axis]
@@ -34,30 +34,31 @@ def ramp(sampling: Sampling, wavelength: float, axis: int, device: torch.device)
 
 
 def phase_of(path: Tensor, sampling: Sampling, length: float, behind: float, part: slice = slice(None)) -> Tensor:
-    """Phase, rad in [0, 2 pi), of samples with these paths, mm, the kernel's added: rows `part` of all, (rows, m) float64.
+    """Phase, rad in [0, 2 pi), of samples with these optical paths, mm, including the Fresnel kernel: rows `part`, (rows, m)
+    float64.
 
-    length, behind: wavelength in vacuum and in the medium before the screen, mm.
+    length, behind: wavelength in vacuum and in the image space, mm.
     """
     across, along = (ramp(sampling, behind, k, path.device) for k in (0, 1))
-    phase = path * (TURN / length)  # in place from here: new memory costs more than the sums
+    phase = path * (TURN / length)  # in place from here on: allocations cost more than the sums
     phase += across[part, None]
     phase += along
     return phase.remainder_(TURN)
 
 
 def cells(low: float, width: float, count: int, first: float, spacing: float, samples: int, device: torch.device) -> Tensor:
-    """Parts of the screen's samples, `spacing` wide about their middles, that fall on each pixel along one axis: (count, N).
+    """Fractions of the screen's samples, intervals of width `spacing`, inside each pixel along one axis: (count, N).
 
-    low, width: of the first pixel; first: middle of the first sample; all mm.
+    low, width: of the first pixel; first: centre of the first sample; all mm.
     """
     edges = low + width * torch.arange(count + 1, dtype=torch.float64, device=device)
     start = first + spacing * (torch.arange(samples, dtype=torch.float64, device=device) - 0.5)
-    reach = ((edges[:, None] - start[None, :]) / spacing).clamp(0.0, 1.0)  # of each sample, the part below each edge
+    reach = ((edges[:, None] - start[None, :]) / spacing).clamp(0.0, 1.0)  # fraction of each sample below each edge
     return reach[1:] - reach[:-1]
 
 
 class _Illuminance(torch.autograd.Function):
-    """Phase and amplitude of a field (n, m) -> power on pixels, of one transform; see `power_on_pixels`."""
+    """Phase and amplitude of a field (n, m) -> power on pixels; see `power_on_pixels`."""
 
     @staticmethod
     def forward(ctx, phase: Tensor, amplitude: Tensor, shape: tuple[int, int], rows: Tensor, columns: Tensor) -> Tensor:
@@ -77,10 +78,10 @@ class _Illuminance(torch.autograd.Function):
 
 
 def power_on_pixels(phase: Tensor, amplitude: Tensor, shape: tuple[int, int], rows: Tensor, columns: Tensor) -> Tensor:
-    """Power on the pixels of a screen, (a, b), of a field on the plane behind the lens; differentiable by phase and amplitude.
+    """Power on the pixels of a screen, (a, b), from the field on the reference plane; differentiable by phase and amplitude.
 
     Args:
-        phase, amplitude: (n, m), rad, the kernel's `ramp` added, and the root of the power of each sample.
+        phase, amplitude: (n, m), rad, including `ramp`, and the square root of the power of each sample.
         shape: (N, M) of the transform.
         rows, columns: (a, N) and (b, M), see `cells`.
     """
@@ -91,12 +92,12 @@ def power_on_pixels(phase: Tensor, amplitude: Tensor, shape: tuple[int, int], ro
 def power_by_blocks(
     field: Callable[[slice], Tensor], sampling: Sampling, pieces: int, rows: Tensor, columns: Tensor, block: int = BLOCK
 ) -> tuple[Tensor, float]:
-    """The same without derivatives for a field that is given block of rows by block of rows, complex (rows, m).
+    """`power_on_pixels` without derivatives, for a complex field that is provided in blocks of rows, (rows, m).
 
-    Of the transform, a piece of the screen's columns and a block of it at a time take memory: (n, M / pieces) + (N, block).
+    The transform is computed in pieces of the screen's columns with bounded memory, (n, M / pieces) + (N, block).
 
     Returns:
-        power on the pixels (a, b) float64, and that of the whole transform.
+        power on the pixels (a, b) float64, and the total power of the transform.
     """
     (n, _), (big, wide) = sampling.count, sampling.padded
     width = math.ceil(wide / pieces)

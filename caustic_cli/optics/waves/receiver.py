@@ -1,7 +1,7 @@
-"""The plane on which a wave image is taken, as frame, middle and pixels; and the plane across the axis through its middle.
+"""The receiving plane of a wave image, with its frame, centre and pixels; and the plane through its centre normal to the axis.
 
 Notation
-    e1, e2, e3  unit vectors along the plane and normal to it, e3 along the light's way
+    e1, e2, e3  unit vectors along the plane and normal to it, e3 in the direction of light
     Z           distance of the plane along e3 from the system's origin, mm
     X, Y        coordinates on it along e1, e2, mm
 """
@@ -13,13 +13,13 @@ from dataclasses import dataclass
 
 from caustic_cli.errors import InputError
 from caustic_cli.optics.frames import IDENTITY, Axes
-from caustic_cli.optics.system import Placed, System
+from caustic_cli.optics.system import PlacedScreen, System
 from caustic_cli.optics.waves.sampling import NoWaveImage
 from caustic_cli.scene import Screen
 
-#: Cosine between a screen's normal and the axis from which it counts as lying across it.
+#: Cosine between a screen's normal and the axis from which on it counts as perpendicular to the axis.
 ACROSS = 1.0 - 1e-12
-#: Least cosine between a screen's normal and the axis: closer to grazing, light beside the axis runs along the screen.
+#: Least cosine between a screen's normal and the axis: near grazing incidence off-axis light is parallel to the screen.
 LEAST_COSINE = 0.08
 
 Vector = tuple[float, float, float]
@@ -32,7 +32,7 @@ def dot(a: Vector, b: Vector) -> float:
 
 @dataclass(frozen=True)
 class Plane:
-    """A plane across the light's way: its frame (e1, e2, e3) and Z, mm; see above."""
+    """A plane normal to the light: its frame (e1, e2, e3) and Z, mm; see the module."""
 
     axes: Axes
     z: float
@@ -42,7 +42,7 @@ class Plane:
 class Receiver:
     """A screen's pixels in space.
 
-    middle: a point of its plane, mm; axes: along its x, along its y, normal to it; low: its low edges counted from there along
+    middle: origin on its plane, mm; axes: along its x, along its y, normal to it; low: lower edges relative to the origin along
     both, mm; pixel: widths, mm; resolution: pixels along x and y.
     """
 
@@ -53,9 +53,9 @@ class Receiver:
     resolution: tuple[int, int]
 
     @classmethod
-    def of(cls, screen: Screen | Placed) -> Receiver:
-        """A scene's or a system's screen."""
-        if isinstance(screen, Placed):
+    def of(cls, screen: Screen | PlacedScreen) -> Receiver:
+        """The receiver of a scene's or a system's screen."""
+        if isinstance(screen, PlacedScreen):
             inner = screen.screen
             return cls(screen.pose.position, screen.pose.axes, inner.low, inner.pixel, inner.resolution)
         if not any(screen.tilt):
@@ -64,7 +64,7 @@ class Receiver:
         return cls((*screen.shift, screen.z), screen.axes, (-rx, -ry), screen.pixel, screen.resolution)
 
     def plane(self, axis: Vector) -> Plane:
-        """The plane through its middle across the axis; its own where it lies so."""
+        """The plane through its centre normal to the axis; its own plane if that is normal to the axis."""
         u, _, n = self.axes
         if abs(dot(n, axis)) >= ACROSS:
             return Plane(self.axes, dot(self.middle, n))
@@ -75,7 +75,7 @@ class Receiver:
         return Plane((e1, e2, axis), dot(self.middle, axis))
 
     def across(self, axis: Vector) -> bool:
-        """Whether it lies across the axis."""
+        """Whether it is perpendicular to the axis."""
         return abs(dot(self.axes[2], axis)) >= ACROSS
 
     def corners(self) -> list[Vector]:
@@ -89,21 +89,21 @@ class Receiver:
         return found
 
     def extent(self, plane: Plane) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Where it lies on a plane seen along the plane's normal: lows and highs of X and Y, mm."""
+        """Limits of its orthogonal projection onto a plane: lower and upper X and Y, mm."""
         x, y = ([dot(c, e) for c in self.corners()] for e in plane.axes[:2])
         return (min(x), min(y)), (max(x), max(y))
 
 
-def receiver_of(system: System, screen: Screen | Placed) -> Receiver:
+def receiver_of(system: System, screen: Screen | PlacedScreen) -> Receiver:
     """The receiver of one of a system's screens.
 
     Raises:
-        InputError: it stands along the light.
+        InputError: it is nearly parallel to the axis.
         NoWaveImage: it is curved.
     """
     if (screen if isinstance(screen, Screen) else screen.screen).curved:
         raise NoWaveImage("a curved screen has no wave image: the field is taken on planes")
     found = Receiver.of(screen)
     if abs(dot(found.axes[2], system.axis)) < LEAST_COSINE:
-        raise InputError("⟨screen.tilt⟩ leaves the screen along the light, where no wave image can be taken")
+        raise InputError("⟨screen.tilt⟩ makes the screen nearly parallel to the light, where there is no wave image")
     return found

@@ -1,13 +1,13 @@
-"""How finely light is sampled on its way from lens to screen, and what that takes.
+"""Sampling of the field on the reference plane and on the screen.
 
 Notation, along one axis
-    W, S        widths that light covers on the plane behind the lens and that are watched on the screen, mm
-    n, dx       samples across W and their distance, n dx = W
-    N, dX       samples of the transform, N > n, and their distance on the screen, dX = lambda L / (N dx)
+    W, S        width of the light on the reference plane, and width of the computed region on the screen, mm
+    n, dx       number of samples across W, and their spacing, n dx = W
+    N, dX       samples of the transform, N > n, and their spacing on the screen, dX = lambda L / (N dx)
 
-The phase of the transformed field has the slope k X / L at the place whose light lands at X.  So n = W S / (lambda L) samples just
-hold what lands within S, and the screen's samples reach over S = lambda L / dx: both grids follow from lens and screen.  The field
-on the screen is that of an aperture W and is held by samples lambda L / W apart.
+The phase of the transformed field has the slope k X / L where its light lands at X.  By the sampling theorem n = W S / (lambda L)
+samples represent the light that lands within S, and the samples on the screen cover S = lambda L / dx: both grids follow from lens
+and screen.  The field on the screen is band-limited by the aperture W, with the Nyquist spacing lambda L / W.
 """
 
 from __future__ import annotations
@@ -21,13 +21,14 @@ from scipy.fft import next_fast_len
 
 from caustic_cli.errors import CausticError
 
-#: What is watched, in parts of screen and light; N over n; least samples across the light, so many diffraction widths are watched.
+#: Width of the computed region relative to screen and light; N over n; least number of samples across the light.
 BEYOND, FINER, LEAST = 1.06, 1.08, 128
-#: Samples of the transform to a pixel, at least: a pixel a few samples wide is off by the square of their distance over its width.
+#: Least number of transform samples per pixel: the error of a pixel is the square of the spacing over its width.
 A_PIXEL = 6.0
-#: Most samples along an axis; bytes that one piece of a transform may take in any case, and in parts of the free memory.
+#: Largest number of samples along an axis; memory of a piece of a transform: least limit in bytes, and limit relative to free
+#: memory.
 MOST, PIECE, OF_FREE = 1 << 17, 1 << 30, 0.3
-#: How often a piece is in memory at a time.
+#: Copies of a piece in memory.
 COPIES = 2
 
 
@@ -36,14 +37,15 @@ Number = TypeVar("Number", int, float)
 
 
 class NoWaveImage(CausticError):
-    """A scene whose light has no wave image, or none that can be made."""
+    """The wave image of a scene is undefined, or cannot be computed."""
 
 
 @dataclass(frozen=True)
 class Sampling:
-    """Samples of the light on the plane behind the lens and of its transform, of each axis.
+    """Sample grids on the reference plane and of the transform, for each axis.
 
-    low: of the light there, mm; step: dx; count: n; padded: N; middle: of what is watched on the screen, mm; distance: L, mm.
+    low: lower edge of the light on the reference plane, mm; step: dx; count: n; padded: N; middle: centre of the computed region on
+    the screen, mm; distance: L, mm.
     """
 
     low: tuple[float, float]
@@ -63,14 +65,17 @@ class Sampling:
         wavelengths: tuple[float, ...],
         finer: float = 1.0,
     ) -> Sampling:
-        """Samples that are enough at every wavelength.
+        """Sufficient sampling for all wavelengths.
 
         Args:
-            light: lows and highs of the light behind the lens, mm; landing: of what is watched on the screen, mm.
-            pixel: widths, mm; wavelengths: mm; finer: than is needed by so many times along each axis of both planes.
+            light: lower and upper limits of the light on the reference plane, mm.
+            landing: of the computed region on the screen, mm.
+            pixel: widths, mm.
+            wavelengths: in the image space, mm.
+            finer: oversampling factor along each axis of both planes.
 
         Raises:
-            NoWaveImage: more than MOST.
+            NoWaveImage: more than MOST samples are needed.
         """
         short, long = min(wavelengths), max(wavelengths)
         low, step, count, padded, middle = [], [], [], [], []
@@ -97,17 +102,17 @@ class Sampling:
         return _pair([wavelength * self.distance / (n * d) for n, d in zip(self.padded, self.step, strict=True)])
 
     def first(self, wavelength: float) -> tuple[float, float]:
-        """X and Y of the screen's first sample at a wavelength in mm, so that all of them lie evenly about the middle."""
+        """X and Y of the first screen sample at a wavelength in mm; the samples are centred on `middle`."""
         spacing = self.spacing(wavelength)
         return _pair([m - 0.5 * (n - 1) * d for m, n, d in zip(self.middle, self.padded, spacing, strict=True)])
 
     def pieces(self, wide: int) -> int:
-        """In how many pieces the transform has to be made, of numbers of `wide` bytes, where they are put together from blocks."""
+        """Number of pieces of a transform computed by blocks, of numbers of `wide` bytes, that fit into memory."""
         return min(self.padded[1], math.ceil(COPIES * wide * self.count[0] * self.padded[1] / max(PIECE, OF_FREE * memory_free())))
 
     @property
     def samples(self) -> int:
-        """Of the transform."""
+        """Number of samples of the transform."""
         return self.padded[0] * self.padded[1]
 
 
@@ -118,7 +123,7 @@ def _pair(values: list[Number]) -> tuple[Number, Number]:
 
 
 def _even(n: int) -> int:
-    """The next even length whose transform is fast."""
+    """The next even length with a fast transform."""
     n = next_fast_len(n + n % 2)
     while n % 2:
         n = next_fast_len(n + 1)
@@ -126,7 +131,7 @@ def _even(n: int) -> int:
 
 
 def memory_free() -> int:
-    """Bytes of memory that are free, or a generous guess where the system does not say."""
+    """Free memory, bytes; an optimistic estimate where the operating system does not report it."""
     try:
         return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):

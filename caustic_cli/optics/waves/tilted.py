@@ -1,14 +1,14 @@
-"""Wave images on tilted screens: planes across the light, one behind the other, each seen where the screen passes through it.
+"""Wave images on tilted screens, from a stack of planes normal to the axis.
 
-Notation, at a plane at distance L_k whose light comes from feet x (see `wavefront`)
-    U, U_x      fields on the plane of u and of x u
-    P           (X |U|^2 - Re(conj(U) U_x)) / L, power times its mean slope: the transverse flux
-    d           P / |U|^2 of the light as a whole, by the mean map of feet to landing points
+Notation, on a plane at distance L_k, for light with intercepts x on the reference plane (see `wavefront`)
+    U, U_x      propagated fields of u and of x u
+    P           (X |U|^2 - Re(conj(U) U_x)) / L, power density times mean slope: the transverse flux
+    d           P / |U|^2 of the light as a whole, from a linear fit of the map from intercepts to landing points
 
-A point of the screen at height z over the plane takes |U|^2 and P where its light passes the plane, at (X - z a) / (1 + z b) with
-d = a + b X, thinner by 1 + z b along each axis, and gets (|U|^2 n_z + P . n) per area, n the screen's normal.  Planes are so close
-that the light's departure from the mean map, and waves that cross to make fringes of two pixels, move by less than STEP of a pixel
-in between.
+A point of the screen at height z above the nearest plane takes |U|^2 and P from the point where its light crosses that plane,
+(X - z a) / (1 + z b) with d = a + b X, diluted by 1 + z b along each axis.  Its irradiance is |U|^2 n_z + P . n, n the screen's
+normal.  The planes are so close that deviations from the linear map, and interference fringes of two pixels, shift by less than
+STEP of a pixel in between.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from caustic_cli.optics.waves.receiver import Plane, Receiver, dot
 from caustic_cli.optics.waves.sampling import NoWaveImage, Sampling
 from caustic_cli.optics.waves.wavefront import Wavefront
 
-#: Part of a pixel by which light may move between planes; most planes; points along each axis of a pixel.
+#: Tolerated shift of light between planes, in pixels; largest number of planes; sample points along each axis of a pixel.
 STEP, MOST_PLANES, A_PIXEL = 0.2, 400, 4
 
 
 def power_on_tilted(
     r: Receiver, plane: Plane, s: Sampling, front: Wavefront, length: float, behind: float, dtype: torch.dtype
 ) -> Tensor:
-    """Power on a tilted screen's pixels of one wavefront, float64.
+    """Power of one wavefront on a tilted screen's pixels, float64.
 
-    length, behind: wavelength in vacuum and in the medium before the screen, mm.
+    length, behind: wavelength in vacuum and in the image space, mm.
 
     Raises:
-        NoWaveImage: too many planes.
+        NoWaveImage: too many planes are needed.
     """
     e1, e2, e3 = plane.axes
     device = front.path.device
@@ -45,7 +45,7 @@ def power_on_tilted(
         for k in (0, 1)
     )
     x, y, z = (dot(r.middle, e) + dot(r.axes[0], e) * u[:, None] + dot(r.axes[1], e) * v[None, :] for e in (e1, e2, e3))
-    z = z - plane.z  # beyond the plane through the screen's middle
+    z = z - plane.z  # above the plane through the screen's centre
     facing = dot(r.axes[2], e3)
     nx, ny, nz = (math.copysign(1.0, facing) * dot(r.axes[2], e) for e in (e1, e2, e3))
 
@@ -88,7 +88,7 @@ def power_on_tilted(
 
 
 def _through(s, path, amplitude, foot, maps, point, normal, here, length, behind, dtype, pixel) -> Tensor:
-    """Power per area of the screen's points near one plane, 0 elsewhere."""
+    """Irradiance at the screen's sample points near one plane, 0 elsewhere."""
     u = torch.polar(amplitude.to(dtype), phase_of(path, s, length, behind).to(dtype))
     moments = (u, u * foot[0].to(dtype)[:, None], u * foot[1].to(dtype)[None, :])
     fields = [torch.fft.fft2(w, s=s.padded, norm="ortho") for w in moments]
@@ -103,7 +103,7 @@ def _through(s, path, amplitude, foot, maps, point, normal, here, length, behind
         for grid, moved in ((grid_x[:, None], fields[1]), (grid_y[None, :], fields[2]))
     ]
     total = density * normal[2] + flux[0] * normal[0] + flux[1] * normal[1]
-    for axis, width in ((0, pixel[0] / dx), (1, pixel[1] / dy)):  # what lies between the points of a pixel counts too
+    for axis, width in ((0, pixel[0] / dx), (1, pixel[1] / dy)):  # average over the area between the sample points
         half = int(0.5 * width / A_PIXEL)
         if half > 0:
             size, pad = ((2 * half + 1, 1), (half, 0)) if axis == 0 else ((1, 2 * half + 1), (0, half))
@@ -120,7 +120,7 @@ def _through(s, path, amplitude, foot, maps, point, normal, here, length, behind
 
 @torch.no_grad()
 def _mean_map(front: Wavefront, distance: float) -> list[tuple[float, float, float]]:
-    """For each axis (a, b, rest): light that lands at X has the slope a + b X, give or take rest."""
+    """Linear fit of the slope for each axis: (a, b, largest residual) of the slope a + b X of light that lands at X."""
     weight, found = front.density, []
     n, m = weight.shape
     foot = (

@@ -1,21 +1,24 @@
-"""The light behind a lens as a field: path and density on a plane, from an exact ray trace.
+"""The wavefront behind a lens: optical path and power density on a reference plane, from an exact ray trace.
 
-Notation, of a ray that lands on the screen's plane
-    X       where it lands, mm (two components)
-    q       its direction's components along the plane
+Notation, for a ray that lands on the screen's plane
+    X       landing point, mm (two components)
+    q       transverse direction cosines
     V       optical path length from the source to X, mm
-    L       distance of the screen from the last surface's middle, mm; n index of the medium behind it
-    x       X - L q, the foot of the ray
-    v       V - n L (1 + q^2 / 2), path of the foot
+    L       distance of the screen from the vertex of the last surface, mm; n index of the image space
+    x       X - L q, the intercept of the ray: the point of the reference plane, at distance L, from which paraxial propagation
+            leads to X
+    v       V - n L (1 + q^2 / 2), optical path to the intercept
 
-Fresnel's integral lets a ray from x of slope q land at x + L q after the path n L (1 + q^2 / 2).  Given as a function of its foot,
-light therefore lands exactly where the trace says and with its exact path, at any angle.  Feet lie within micrometres to tenths of
-a millimetre of where the rays leave the surface.  What is approximate is that light on that short way goes by rays: good where the
-Fresnel scale of the way is small against the relief.
+In the Fresnel approximation a ray from x with slope q lands at x + L q after the path n L (1 + q^2 / 2).  With the field given as a
+function of the intercept x, light therefore arrives at the traced landing point with the exact optical path, at any angle.
+Intercepts differ by micrometres to tenths of a millimetre from the points where rays leave the surface.  Geometrical optics over
+this short distance is the only approximation; it is good if the Fresnel scale of the distance is small compared with the surface
+structure.
 
-The field is wanted on an even grid of feet.  Rays are moved on the pupil until their feet are there (Newton's method, with the mean
-stretch for a slope), and what is left, e, is taken into account to first order: by Fermat's principle v(x) = v + n q . e up to e^2.
-The derivative by the heights is that at fixed x, as it should be, with rays held on the pupil.
+The field is needed on a uniform grid of intercepts.  Rays are aimed at the grid points by Newton's method on the pupil, with the
+mean magnification for the Jacobian (`ray_aiming`), and the remaining displacement e is corrected to first order: by Fermat's
+principle v(x) = v + n q . e up to O(e^2).  The derivative by the heights, with rays fixed on the pupil, is then the one at fixed x,
+as required.
 """
 
 from __future__ import annotations
@@ -30,35 +33,36 @@ from caustic_cli.optics.emission.coherent import Mode
 from caustic_cli.optics.interaction import Interaction, Parameters
 from caustic_cli.optics.system import System
 from caustic_cli.optics.trace import Tracer
-from caustic_cli.optics.waves.nodes import Refined, between, filled, interpolated, within_pupil
+from caustic_cli.optics.waves.interpolation import FineWavefront, extrapolated, interpolate, lagrange_weights, pupil_coverage
+from caustic_cli.optics.waves.ray_aiming import aimed_rays
 from caustic_cli.optics.waves.receiver import Plane, dot
 from caustic_cli.optics.waves.sampling import NoWaveImage
-from caustic_cli.optics.waves.seeking import sought
 
-#: Points along each side of the pupil from which extents are found.
+#: Points along each side of the pupil for a survey; fraction of rays outside the quantiles `mostly`.
 SURVEY, FEW = 65, 0.01
-#: Feet are sought until the path that this leaves out is below this part of a wavelength.
+#: Tolerance of ray aiming: error of the optical path relative to the wavelength.
 LEFT = 1e-3
-#: The same where it has to be exact: derivatives see the misses of feet to first order.
+#: The same for exact derivatives, whose error is of first order in the displacement.
 LEFT_EXACT = 1e-9
 CROSSES = (
-    "light crosses itself within the lens' own depth, so that no wavefront behind it stands for it; a flatter surface or a screen"
+    "rays cross within the depth of the lens, so that the light behind it has no single wavefront; a flatter surface or a screen"
     " farther away has one"
 )
-#: At the edges of what is dark rays may miss the grid by this part of a cell.
+#: Tolerated displacement from the grid at the edges of dark regions, in cells.
 AT_EDGE = 0.05
-#: Rays traced at a time.
+#: Rays per chunk.
 CHUNK = 1 << 19
-#: The part of the light that may lie where rays have crossed before the plane of the feet.
+#: Tolerated fraction of the power where rays cross in front of the reference plane.
 CROSSED = 1e-3
 STAGES = Requests.to(stages=True)
-#: Part of what is watched on the screen over which light beyond it is left out.
+#: Width of the taper at the edge of the computed region, relative to the region.
 SOFT = 0.02
 
 
 @dataclass
-class Feet:
-    """Rays by their feet, (N,) each: x, y, path v, directions qx, qy, landing X, Y, and power, a density on the pupil."""
+class Intercepts:
+    """Rays by their intercepts, (N,) each: x, y, path v, direction cosines qx, qy, landing points X, Y, and power, a density on the
+    pupil; see the module."""
 
     x: Tensor
     y: Tensor
@@ -72,9 +76,10 @@ class Feet:
 
 @dataclass(frozen=True)
 class Optics:
-    """What makes one wavefront of the light of one point of a source.
+    """The trace of one mode of a source for its wavefront.
 
-    wavelength: mm; label: nm, at which media are asked for their index, None where the system says it; plane: of the screen;
+    wavelength: mm; label: nm, at which the indices of media are evaluated, None if the system has them already; plane: of the
+    screen;
     distance: L, mm.
     """
 
@@ -88,34 +93,34 @@ class Optics:
 
     @property
     def index(self) -> float:
-        """Of the medium behind the last element."""
+        """Refractive index of the image space."""
         return self.system.media()[-1].index_at(self.label)
 
     def interactions(self, u: Tensor, v: Tensor) -> Interaction:
-        """Rays through points (N,) of the pupil, up to behind the last element."""
+        """Rays through points (N,) of the pupil at the last element, behind the interaction."""
         rays = self.mode.through(u, v, self.system.before.index_at(self.label))
         return Tracer(self.system, rays, requests=STAGES, wavelength=self.label).last(self.parameters)
 
-    def feet(self, u: Tensor, v: Tensor) -> Feet:
-        """The same by their feet."""
+    def intercepts(self, u: Tensor, v: Tensor) -> Intercepts:
+        """Intercepts of the rays through points (N,) of the pupil."""
         parts = []
         step = len(u) if torch.is_grad_enabled() else CHUNK
         for start in range(0, len(u), step):
-            parts.append(self.footed(self.interactions(u[start : start + step], v[start : start + step])))
+            parts.append(self.intercepts_of(self.interactions(u[start : start + step], v[start : start + step])))
         if len(parts) == 1:
             return parts[0]
-        return Feet(*(torch.cat([getattr(p, name) for p in parts]) for name in Feet.__dataclass_fields__))
+        return Intercepts(*(torch.cat([getattr(p, name) for p in parts]) for name in Intercepts.__dataclass_fields__))
 
     def landing(self, mode: Mode, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Where another mode's light lands, X, Y, mm, its power, and where it leaves the last element, mm."""
+        """Landing points X, Y of another mode's light, mm, its power, and its points on the last element, mm."""
         met = replace(self, mode=mode).interactions(u, v)
-        f, state = self.footed(met), met.state.spread()
+        f, state = self.intercepts_of(met), met.state.expanded()
         x, y = (c.expand(len(u)) if isinstance(c, Tensor) else torch.full_like(u, c) for c in state.origin[:2])
         return f.big_x, f.big_y, f.power, x, y
 
-    def footed(self, m: Interaction) -> Feet:
-        """Rays behind the last element by their feet."""
-        state, (e1, e2, e3) = m.state.spread(), self.plane.axes
+    def intercepts_of(self, m: Interaction) -> Intercepts:
+        """Intercepts of rays behind the last element."""
+        state, (e1, e2, e3) = m.state.expanded(), self.plane.axes
         o, d = state.full((state.origin[0], state.origin[1], state.origin[2] + state.datum)), state.full(state.direction)
         qx, qy, qz = (sum(a * b for a, b in zip(d, e, strict=True)) for e in (e1, e2, e3))
         t = (self.plane.z - sum(a * b for a, b in zip(o, e3, strict=True))) / qz
@@ -125,11 +130,11 @@ class Optics:
         n, far = self.index, self.distance
         path = state.path + n * t - n * far * (1.0 + 0.5 * (qx * qx + qy * qy))
         power = torch.where(ahead, state.power, torch.zeros_like(state.power))
-        return Feet(big_x - far * qx, big_y - far * qy, path, qx, qy, big_x, big_y, power)
+        return Intercepts(big_x - far * qx, big_y - far * qy, path, qx, qy, big_x, big_y, power)
 
 
 def distance_of(system: System, parameters: Parameters, plane: Plane) -> float:
-    """L: of a plane from the middle of the last surface, mm."""
+    """L, the distance of a plane from the centre of the last surface, mm."""
     last = system.elements[-1]
     x, y, z = last.pose.position
     if last.surface.shape is not None:
@@ -140,9 +145,12 @@ def distance_of(system: System, parameters: Parameters, plane: Plane) -> float:
 
 @dataclass(frozen=True)
 class Survey:
-    """Where light goes, from few rays: lows and highs of feet and of landing points, mm, and the mean stretch from the pupil's
-    u and v, in [0, 1], to feet: x = offset + scale u along each axis; magnification, root of the mean area of landing points over
-    that of feet; mostly, lows and highs of landing points beyond which the part FEW of rays is."""
+    """Extent of the light, from a coarse grid of rays.
+
+    light, landing: lower and upper limits of intercepts and of landing points, mm; offset, scale: linear fit x = offset + scale u
+    from the pupil's u and v, in [0, 1], to intercepts along each axis; magnification: square root of the mean area of landing
+    points over that of intercepts; mostly: limits of landing points without the fraction FEW of rays on each side.
+    """
 
     light: tuple
     landing: tuple
@@ -154,14 +162,14 @@ class Survey:
 
 @torch.no_grad()
 def survey(optics: Optics) -> Survey:
-    """Look where the light of a mode goes.
+    """Trace a coarse grid of rays of a mode.
 
     Raises:
-        NoWaveImage: nowhere.
+        NoWaveImage: no light reaches the screen.
     """
     line = torch.linspace(0.0, 1.0, SURVEY, dtype=torch.float64, device=device_of(optics))
     u, v = (c.reshape(-1) for c in torch.meshgrid(line, line, indexing="ij"))
-    f = optics.feet(u, v)
+    f = optics.intercepts(u, v)
     lit = f.power > 0
     pupil = optics.mode.scene.pupil
     if pupil.round:
@@ -197,20 +205,22 @@ def survey(optics: Optics) -> Survey:
 
 
 def _jacobian(a: Tensor, b: Tensor, dx: float, dy: float) -> Tensor:
-    """Determinant of the derivatives of two functions (n, m) of even samples."""
+    """Jacobian determinant of two functions (n, m) on a uniform grid."""
     (ax, ay), (bx, by) = (torch.gradient(c, spacing=(dx, dy), dim=(0, 1), edge_order=2) for c in (a, b))
     return ax * by - ay * bx
 
 
 @dataclass
 class Wavefront:
-    """Light on an even grid of feet: what each node has, (n, m) float64.
+    """The wavefront on a uniform grid of intercepts, (n, m) float64 each.
 
-    low, step: of the nodes, which stand in the middle of cells, mm; path: v less its mean, mm; density: power per mm^2; edge_x,
-    edge_y: distance inside the pupil's edges, mm on this plane, edge_y None for a circle; big_x, big_y: where light lands, mm;
-    shade: 0 where light is stopped behind the pupil, path and density going on from beside it, and 1 elsewhere; None for no such;
-    sensitivity: derivative of the path by the height of the last surface; at_x, at_y: points of that surface, mm; both None unless
-    asked for.
+    low, step: of the cells, whose centres are the nodes, mm; path: v minus its mean, mm; density: power per mm^2; edge_x, edge_y:
+    signed distances to the pupil's edges, mm on this plane, positive inside, edge_y None for a circle; big_x, big_y: landing
+    points, mm;
+    shade: 0 where light is blocked behind the pupil, with path and density extrapolated, and 1 elsewhere, None if nothing is
+    blocked;
+    sensitivity: derivative of the path by the height of the last surface; at_x, at_y: points of that surface, mm; these are None
+    unless requested.
     """
 
     low: tuple[float, float]
@@ -228,7 +238,7 @@ class Wavefront:
     _fine: tuple | None = field(default=None, init=False, repr=False)
 
     def within(self, middle: tuple[float, float], width: tuple[float, float]) -> Wavefront:
-        """Only the light that lands within a rectangle on the screen, mm; it ends softly.  Itself where that is all."""
+        """The wavefront tapered to light that lands within a rectangle on the screen, mm; itself if that is all."""
         density, lit = self.density, self.density > 0
         for big, m, w in zip((self.big_x, self.big_y), middle, width, strict=True):
             inside = ((0.5 * w - (big - m).abs()) / (SOFT * w)).clamp(0.0, 1.0)
@@ -237,23 +247,25 @@ class Wavefront:
         return self if density is self.density else replace(self, density=density)
 
     def power(self) -> float:
-        """Of all its light."""
-        lit = within_pupil(self.edge_x, self.edge_y, self.step).detach()
+        """Total power."""
+        lit = pupil_coverage(self.edge_x, self.edge_y, self.step).detach()
         if self.shade is not None:
             lit = lit * self.shade
         return float((self.density.detach() * lit).sum()) * self.step[0] * self.step[1]
 
-    def on(self, low: tuple[float, float], step: tuple[float, float], count: tuple[int, int]) -> Refined:
-        """The same on a finer grid; kept for the next who asks for that grid."""
+    def on(self, low: tuple[float, float], step: tuple[float, float], count: tuple[int, int]) -> FineWavefront:
+        """The wavefront on a finer grid; the last result is cached."""
         key = low, step, count
         if self._fine is not None and self._fine[0] == key:
             return self._fine[1]
-        x, y = (between(self.path.shape[k], self.low[k], self.step[k], low[k], step[k], count[k], self.path) for k in (0, 1))
+        x, y = (
+            lagrange_weights(self.path.shape[k], self.low[k], self.step[k], low[k], step[k], count[k], self.path) for k in (0, 1)
+        )
         bright = self.density > 0  # at 0 a root has no derivative
         root = torch.where(bright, self.density, torch.ones_like(self.density)).sqrt() * bright * (step[0] * step[1]) ** 0.5
-        path, root, edge_x = (interpolated(c, None, y) for c in (self.path, root, self.edge_x))
-        edge_y, shade = (None if c is None else interpolated(c, None, y) for c in (self.edge_y, self.shade))
-        fine = Refined(path, root, edge_x, edge_y, shade, step, x)
+        path, root, edge_x = (interpolate(c, None, y) for c in (self.path, root, self.edge_x))
+        edge_y, shade = (None if c is None else interpolate(c, None, y) for c in (self.edge_y, self.shade))
+        fine = FineWavefront(path, root, edge_x, edge_y, shade, step, x)
         self._fine = key, fine
         return fine
 
@@ -267,13 +279,13 @@ def wavefront(
     sensitive: bool = False,
     exact: bool = False,
 ) -> Wavefront:
-    """The light on a grid of `count` cells `step` wide from `low` on; differentiable by the heights in `optics.parameters`.
+    """The wavefront on a grid of `count` cells of width `step` from `low` on; differentiable by the heights in `optics.parameters`.
 
-    exact: seek feet until rounding is all that is left.
-    sensitive: with what its derivative by the height of the last surface needs, which is then not asked of autograd.
+    exact: aim rays to rounding accuracy.
+    sensitive: with the sensitivity to the height of the last surface, instead of derivatives by autograd.
 
     Raises:
-        NoWaveImage: light crosses itself before it gets there, so that no single wavefront stands for it.
+        NoWaveImage: rays cross in front of the reference plane, so that there is no single wavefront.
     """
     device = device_of(optics)
     differentiable = not sensitive and torch.is_grad_enabled() and any(h.requires_grad for h in optics.parameters.values())
@@ -282,25 +294,25 @@ def wavefront(
     shape = (len(x), len(y))
     x, y = (c.reshape(-1) for c in torch.meshgrid(x, y, indexing="ij"))
     with torch.no_grad():
-        f, held, behind = sought(optics, seen, (x, y), shape, step, left)
+        f, held, behind = aimed_rays(optics, seen, (x, y), shape, step, left)
     at: dict[str, Tensor] = {}
     if sensitive:
         with torch.no_grad():
             f, at = _sensitive(optics, *held)
     elif differentiable:
-        f = optics.feet(*held)
+        f = optics.intercepts(*held)
     ex, ey = x - f.x, y - f.y
     path = f.path + optics.index * (f.qx * ex + f.qy * ey)
     dark = (f.power <= 0) | (behind & ((ex.abs() > AT_EDGE * step[0]) | (ey.abs() > AT_EDGE * step[1]))).detach()
     if bool(dark.all()):
         raise NoWaveImage(CROSSES)
-    known = ~dark | (behind & (f.power > 0))  # beside the dark, rays from the edge of the light stand for its path
+    known = ~dark | (behind & (f.power > 0))  # next to dark regions use the path of rays from the edge of the light
     path = torch.where(known, path - path[~dark].detach().mean(), torch.zeros_like(path))
     dark = dark.view(shape)
     ex, ey = ex.view(shape), ey.view(shape)
-    # Where on the pupil light with its foot on the grid comes from, in mm of this plane; its stretch is the density's.
+    # Pupil point of the light at each grid point, scaled to mm on this plane; its Jacobian gives the density.
     px, py = (((h - 0.5) * c).view(shape) for h, c in zip(held, seen.scale, strict=True))
-    gone = [filled((p + e).detach() - c.view(shape), dark) + c.view(shape) for p, e, c in ((px, ex, x), (py, ey, y))]
+    gone = [extrapolated((p + e).detach() - c.view(shape), dark) + c.view(shape) for p, e, c in ((px, ex, x), (py, ey, y))]
     (pxx, pxy), (pyx, pyy) = (torch.gradient(p, spacing=step, dim=(0, 1), edge_order=2) for p in gone)
     px = torch.where(dark, gone[0], px + pxx * ex + pxy * ey)
     py = torch.where(dark, gone[1], py + pyx * ex + pyy * ey)
@@ -311,7 +323,7 @@ def wavefront(
     crossed = torch.where((squeeze.detach() <= 0) & ~dark, power.detach(), torch.zeros_like(power))
     if float(crossed.sum()) > CROSSED * float(power.detach().sum()):
         raise NoWaveImage(CROSSES)
-    power = torch.where(dark, filled(power.detach(), dark), power)
+    power = torch.where(dark, extrapolated(power.detach(), dark), power)
     by_x, by_y = torch.gradient(power.detach(), spacing=step, dim=(0, 1), edge_order=2)
     density = (power + torch.where(dark, torch.zeros_like(ex), by_x * ex + by_y * ey)).clamp_min(0.0) * squeeze.clamp_min(0.0)
     rx, ry = (abs(s) / 2.0 for s in seen.scale)
@@ -331,20 +343,20 @@ def wavefront(
     )
 
 
-def _sensitive(optics: Optics, u: Tensor, v: Tensor) -> tuple[Feet, dict[str, Tensor]]:
-    """Rays by their feet, with where they meet the last surface and how its height changes their path."""
-    feet, found = [], []
+def _sensitive(optics: Optics, u: Tensor, v: Tensor) -> tuple[Intercepts, dict[str, Tensor]]:
+    """Intercepts of rays, with their points on the last surface and the sensitivity of the path to its height."""
+    rays, found = [], []
     for start in range(0, len(u), CHUNK):
         m = optics.interactions(u[start : start + CHUNK], v[start : start + CHUNK])
-        feet.append(optics.footed(m))
+        rays.append(optics.intercepts_of(m))
         into = m.incoming[2]
         normal = m.element.pose.axes[2]
         out = sum(c * a for c, a in zip(m.state.full(m.state.direction), normal, strict=True))
         found.append((m.n_in * into - m.n_out * out, *(c.expand(out.shape) for c in m.local[:2])))
-    f = Feet(*(torch.cat([getattr(p, name) for p in feet]) for name in Feet.__dataclass_fields__))
+    f = Intercepts(*(torch.cat([getattr(p, name) for p in rays]) for name in Intercepts.__dataclass_fields__))
     return f, dict(zip(("sensitivity", "at_x", "at_y"), (torch.cat(c) for c in zip(*found, strict=True)), strict=True))
 
 
 def device_of(optics: Optics) -> torch.device:
-    """Of its surfaces' heights."""
+    """Device of the heights."""
     return next((h.device for h in optics.parameters.values()), torch.device("cpu"))

@@ -1,7 +1,8 @@
-"""Light sources, a file each (thesis 4.2), and the registry of their types by the name that [source] type has for them.
+"""Light sources, one file each (thesis 4.2), and the registry of source types by their names in [source] type.
 
-A new type of source is a file here that holds its class, a `Source`, and in TYPES what the [source] section says of it; it is
-found by itself.  Unless its rays are drawn as another's are (`Source.emission`), `optics/emission` has a file of it too.
+A new source type is a module of this package with its class, a `Source`, and with a list TYPES that describes its keys in the
+[source] section; it is discovered automatically.  Unless its rays are sampled like another type's (`Source.emission`),
+`optics/emission` needs a module for it, too.
 """
 
 from __future__ import annotations
@@ -26,33 +27,33 @@ __all__ = [
     "Points",
     "Source",
     "SourceType",
-    "either",
+    "alternatives",
+    "combined",
     "in_words",
     "light_of_all",
     "names",
     "own_keys",
     "register",
-    "together",
     "type_of",
     "used_by",
 ]
 
-#: Files in the order in which messages and comments name their types; others follow by name.
+#: Modules in the order in which messages and comments list their types; others follow in alphabetical order.
 _FIRST = ("plane", "points", "disc")
 _TYPES: dict[str, SourceType] = {}
 
 
 def register(type: SourceType) -> None:
-    """Make a type of source known to [source] type and source."""
+    """Add a source type to the registry."""
     _TYPES[type.name] = type
 
 
 def names() -> tuple[str, ...]:
-    """Of all types."""
+    """Names of all types."""
     return tuple(_TYPES)
 
 
-#: What people call sources, and how each is said.
+#: Common names of light sources, and the settings that describe each.
 CALLED = {
     "sun": f"sunlight is ⟨source⟩ disc with ⟨+source.angle⟩ {SUN:g}",
     "led": "an LED is ⟨source⟩ disc with ⟨+source.size⟩ 1x1, ⟨+source.position⟩ 0,0,-50 and ⟨+source.intensity⟩ lambertian",
@@ -63,10 +64,10 @@ CALLED = {
 
 
 def type_of(name: str, where: str = "⟨source.type⟩") -> SourceType:
-    """The type of that name.
+    """The source type of that name.
 
     Raises:
-        InputError: naming `where` it was asked for: there is none.
+        InputError: naming `where`: there is none.
     """
     if name in CALLED and name not in _TYPES:
         raise InputError(f"{where} must be one of {', '.join(names())}, got {name!r}: {CALLED[name]}")
@@ -74,13 +75,13 @@ def type_of(name: str, where: str = "⟨source.type⟩") -> SourceType:
 
 
 def in_words() -> str:
-    """All types in a line, as a comment has them."""
+    """All types in a line, for a comment."""
     *others, last = (type.note for type in _TYPES.values())
     return f"{', '.join(others)} or {last}"
 
 
 def own_keys() -> dict[str, tuple[str, str]]:
-    """Keys of [source] that one type alone brings along, each with its kind and comment."""
+    """Keys of [source] that belong to a single type, each with its kind and help."""
     return {key: spec for type in _TYPES.values() for key, spec in type.own.items()}
 
 
@@ -89,14 +90,14 @@ def used_by(key: str) -> tuple[str, ...]:
     return tuple(name for name, type in _TYPES.items() if key in type.keys)
 
 
-def either(names: Sequence[str]) -> str:
-    """Names in a clause."""
+def alternatives(names: Sequence[str]) -> str:
+    """Names as a clause: "a, b or c"."""
     *others, last = names
     return f"{', '.join(others)} or {last}" if others else last
 
 
-def together(first: Source, section: Table) -> Source:
-    """The first source of a [source] section, with the others where it names some."""
+def combined(first: Source, section: Table) -> Source:
+    """The source of a [source] section: `first`, or a `Several` of it and the further [[source]] tables."""
     if not section.get("also"):
         return first
     others = (type_of(table["type"], "⟨source.also.type⟩").from_settings(table, None) for table in section["also"])

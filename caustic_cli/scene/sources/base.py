@@ -1,11 +1,12 @@
-"""What every part of the program asks of a light source, whatever its type.  All shine along +z.
+"""The interface of light sources.  All emit towards +z.
 
-A source is one of three:
-    collimated   all rays run along +z, so they are sampled on the surface itself
-    distant      light from infinity: it stands nowhere, and its rays lean from +z by at most half_angle (0 if collimated)
-    near         it stands at points before the lens, each with an extent about it, and shines into a cone about +z
+A source is one of three kinds:
+    collimated   all rays are parallel to +z, so they can be sampled on the surface itself
+    distant      at infinity: it has no position, and its rays make an angle of at most half_angle with +z (0 if collimated)
+    near         at a finite distance in front of the lens: one or several positions, each with an extent, emitting into a cone
+    about +z
 
-A type of its own says `kind` and `power`; a near one also `points`, and `extent` if it has one; a distant one `half_angle`.
+A subclass defines `kind` and `power`; a near source also `points`, and `extent` if it has one; a distant one `half_angle`.
 """
 
 from __future__ import annotations
@@ -19,19 +20,20 @@ import numpy as np
 from caustic_cli.scene.sources.distribution import Distribution
 from caustic_cli.scene.sources.rayset import RaySet
 
-#: A cone that just covers the aperture is wider by this part, so that rounding leaves no corner dark.
+#: Relative margin of a cone that just covers the aperture, so that rounding leaves no corner dark.
 SLACK = 1e-9
 
 
 class Source:
-    """A light source: plain data, validated on construction.  Lengths in mm, powers in W, angles in rad unless said otherwise.
+    """A light source: plain data, validated on construction.  Lengths in mm, powers in W, angles in rad unless stated otherwise.
 
-    kind: its type, as [source] type names it; power: emitted into the cone, or through the aperture by a distant source;
-    profile: relative irradiance over the aperture, (a, b), or None if even; cone: half-angle of the cone as the user said it,
-    degrees, or None for the narrowest that covers the lens; intensity: uniform in solid angle, lambertian, or a table; aimed: rays
-    are sampled on the lens instead of all over the cone; collimated: see above; rays: those of a file, None of a source that has as
-    many as are asked for; brightness: relative radiance over `frame`, (a, b) [i, j], or None if even over an ellipse; spectra: of
-    several sources, wavelengths, nm, and relative powers of each.
+    kind: name of its type in [source] type; power: emitted into the cone, or through the aperture for a distant source; profile:
+    relative irradiance over the aperture, (a, b), or None if uniform; cone: half-angle of the emission cone as given, degrees, or
+    None for the narrowest that covers the lens; intensity: uniform in solid angle, lambertian, or tabulated; aimed: rays are
+    sampled over the lens instead of over the whole cone; collimated: see the module; rays: ray set of a file, None for a source
+    that is sampled;
+    brightness: relative radiance over `frame`, (a, b) [i, j], or None if uniform over an ellipse; spectra: of several sources,
+    wavelengths, nm, and relative powers of each.
     """
 
     kind: str
@@ -55,62 +57,62 @@ class Source:
 
     @property
     def members(self) -> tuple[Source, ...]:
-        """The sources that it is made of: itself, unless it is several."""
+        """The individual sources: itself, or the members of a `Several`."""
         return (self,)
 
     @property
     def fractions(self) -> tuple[float, ...]:
-        """Part of all power of each of its members."""
+        """Fraction of the total power of each member."""
         return (1.0,)
 
     @property
     def even(self) -> bool:
-        """Whether it is one source, evenly bright over the ellipse of its extent about each of its positions."""
+        """Whether it is a single source of uniform radiance over the ellipse of its extent."""
         return len(self.members) == 1 and self.brightness is None and self.rays is None
 
     def part(self, k: int, of: int) -> Source:
-        """The k-th of so many sources that shine alike and share no ray: itself, unless its rays are counted."""
+        """The k-th of `of` equivalent sources without common rays: itself, unless its rays are those of a file."""
         return self
 
     @property
     def distant(self) -> bool:
-        """Light from infinity."""
+        """Whether it is at infinity."""
         return self.collimated
 
     @property
     def half_angle(self) -> float:
-        """The most that rays of a distant source lean from z."""
+        """Largest angle of a distant source's rays to z."""
         return 0.0
 
     def points(self) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (k, 3) of a near source, and the parts (k,) of its power that leave there; none of a distant one."""
+        """Positions (k, 3) of a near source and the fractions (k,) of its power emitted there; empty for a distant one."""
         if self.distant:
             return np.zeros((0, 3)), np.zeros(0)
-        raise NotImplementedError(f"a near source of type {self.kind} has to say where its points are")
+        raise NotImplementedError(f"the near source type {self.kind} must define its points")
 
     @property
     def powers(self) -> tuple[float, ...]:
-        """W, of every position; of the whole for a distant source."""
+        """Power of each position, W; of a distant source its whole power."""
         return (self.power,) if self.distant else tuple(self.power * float(part) for part in self.points()[1])
 
     @property
     def extent(self) -> tuple[float, float]:
-        """Half widths about each position along x and y; 0 for points and for what is distant."""
+        """Half widths about each position along x and y; 0 for point sources and distant sources."""
         return 0.0, 0.0
 
     @property
     def frame(self) -> tuple[float, float]:
-        """Half widths of the rectangle that `brightness` is laid over: mm, or sines of the angle to z of a distant source."""
+        """Half widths of the rectangle over which `brightness` is defined: mm, or direction sines for a distant source."""
         return (math.sin(self.half_angle),) * 2 if self.distant else self.extent
 
     @property
     def nearest(self) -> float:
-        """z of what is nearest to the lens; minus infinity for a distant source."""
+        """z of the position nearest to the lens; minus infinity for a distant source."""
         return -math.inf if self.distant else float(self.points()[0][:, 2].max())
 
     @property
     def centre(self) -> tuple[float, float, float]:
-        """Mean position, weighted by power; minus infinity along z for a distant source."""
+        """Power-weighted mean position; z is minus infinity for a distant source."""
         if self.distant:
             return 0.0, 0.0, -math.inf
         x, y, z = np.average(self.points()[0], axis=0, weights=self.powers)
@@ -118,68 +120,68 @@ class Source:
 
     @property
     def several(self) -> bool:
-        """Whether light leaves from several positions."""
+        """Whether it has several positions."""
         return len(self.points()[0]) > 1
 
     @property
     def extended(self) -> bool:
-        """Whether some place of the lens sees light from more than one direction."""
+        """Whether it is extended: some point of the lens receives light from more than one direction."""
         return self.several or max(self.extent) > 0 or self.half_angle > 0
 
     @property
     def apart(self) -> bool:
-        """Whether it is several sources in places of their own, which the light of their centre does not stand for."""
+        """Whether it consists of separate sources that a single source at their centre cannot represent."""
         return False
 
     @property
     def sharp(self) -> bool:
-        """Whether each place of the lens sees one direction by the source's very type, so that no scale of a picture is blurred."""
+        """Whether its type is that of a point source or plane wave, so that no detail of a picture is blurred."""
         return not self.extended
 
     @property
     def emission(self) -> str:
-        """Name under which `optics.emission` knows how its rays are drawn."""
+        """Name under which `optics.emission` registers the sampling of its rays."""
         return self.kind
 
     @property
     def label(self) -> str:
-        """What to call it in a sentence."""
+        """Noun phrase for messages."""
         return f"the {self.kind}"
 
     @property
     def sized(self) -> bool:
-        """Whether it has a width of its own."""
+        """Whether it has a size."""
         return False
 
-    def misplaced(self, place: Callable[[Sequence[float]], tuple[float, float, float]], scale: float) -> Source:
-        """The source with its positions where `place` (x, y, z) mm has them, `scale` times as wide; from infinity, only that."""
+    def displaced(self, place: Callable[[Sequence[float]], tuple[float, float, float]], scale: float) -> Source:
+        """The source with its positions mapped by `place`, (x, y, z) mm, and its size scaled; a distant source is only scaled."""
         return self
 
     def pointlike(self) -> Source:
-        """The source without its extent: of all its light, that of its centre."""
+        """The point source or plane wave of the same power at its centre."""
         if self.extended:
-            raise NotImplementedError(f"an extended source of type {self.kind} has to say what it is without its extent")
+            raise NotImplementedError(f"the extended source type {self.kind} must define its point-like equivalent")
         return self
 
     def apparent_angle(self, z_in: float) -> float:
-        """Full angle under which a lens with its entrance at z_in sees the source, degrees."""
+        """Full angle subtended by the source at a lens with its entrance at z_in, degrees."""
         if self.distant:
             return math.degrees(2.0 * self.half_angle)
         return 2.0 * math.degrees(math.atan2(self._width() / 2.0, z_in - self.nearest))
 
     def extent_words(self, z_in: float) -> str:
-        """The same in a clause."""
+        """The apparent angle as a clause for messages."""
         return f"the lens sees the source under {self.apparent_angle(z_in):.3g} degrees"
 
     def blur(self, z_in: float, throw: float) -> float:
-        """Width in mm, on a screen `throw` mm beyond the entrance, over which an extended source blurs every point.
+        """Width in mm, on a screen `throw` mm beyond the entrance, of the image of each point: the blur of an extended source.
 
-        To first order the throw times the angle under which the lens sees the source: a lens can show nothing finer.
+        To first order it is the throw times the angle that the source subtends at the lens, which bounds the resolution.
         """
         return throw * 2.0 * self.half_angle if self.distant else throw * self._width() / (z_in - self.nearest)
 
     def cone_over(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> float:
-        """Half-angle of a near source: what it says, or the least that covers the aperture, `round` or not, from all of it."""
+        """Half-angle of the emission cone: as given, or the least that covers the aperture, `round` or not, from every point."""
         if self.distant:
             return self.half_angle
         if self.cone is not None:
@@ -190,7 +192,7 @@ class Source:
         return min((1.0 + SLACK) * float(np.arctan2(farthest, z_in - positions[:, 2]).max()), math.pi / 2.0)
 
     def incidence(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> float:
-        """A bound of how far its rays to the aperture lean from z, rad."""
+        """Upper bound of the angle to z of its rays into the aperture, rad."""
         if self.distant:
             return self.half_angle
         positions, extent = self.points()[0], self.extent
@@ -199,5 +201,5 @@ class Source:
         return min(self.cone_over(half_size, z_in, round), steepest)
 
     def _width(self) -> float:
-        """Full width of a near source along the axis where it is wider."""
+        """Full width of a near source along the wider axis, mm."""
         return float((np.ptp(self.points()[0][:, :2], axis=0) + 2.0 * np.array(self.extent)).max())

@@ -1,4 +1,4 @@
-"""A disc: an extended source before the lens, or at infinity such as the sun (thesis 4.2); evenly bright, or by a picture."""
+"""Disc sources: extended, at a finite distance or at infinity like the sun (thesis 4.2); of uniform radiance, or by a picture."""
 
 from __future__ import annotations
 
@@ -15,25 +15,32 @@ from caustic_cli.scene.sources.base import Source
 from caustic_cli.scene.sources.distribution import Distribution
 from caustic_cli.scene.sources.plane import PlaneWave
 from caustic_cli.scene.sources.points import Points
-from caustic_cli.scene.sources.section import SourceType, Table, check_shining, content, middle, shining, standing
+from caustic_cli.scene.sources.section import (
+    SourceType,
+    Table,
+    check_emission,
+    content,
+    emission_arguments,
+    position_defaults,
+    single_position,
+)
 
-#: Full angle under which the sun is seen, degrees.
+#: Angular diameter of the sun, degrees.
 SUN = 0.533
 
 
 @dataclass(frozen=True)
 class Disc(Source):
-    """An extended source: every point of an ellipse shines into a cone about +z.  Or, with `angle`, a far one such as the sun.
+    """An extended source: every point of an ellipse emits into a cone about +z; or, with `angle`, a disc at infinity like the sun.
 
     Args:
         position: of the centre, mm.
         size: full widths of the ellipse along x and y, mm.
         power: emitted into the cone, W; with `angle`, through the aperture.
         cone, intensity, aimed: as for `Points`.
-        angle: full angle under which the lens sees a round, evenly bright disc at infinity, degrees; position, size, cone,
-            intensity and aimed then mean nothing.
-        brightness: relative radiance over the rectangle about the ellipse, (a, b) [i, j] with i along +x, instead of an even
-            ellipse; of a disc at infinity over the sines of the angles to z.
+        angle: angular diameter of a disc at infinity, degrees; position, size, cone, intensity and aimed are then ignored.
+        brightness: relative radiance over the ellipse's bounding rectangle, (a, b) [i, j] with i along +x, instead of uniform
+            radiance; for a disc at infinity over direction sines.
     """
 
     position: tuple[float, float, float] = (0.0, 0.0, -50.0)
@@ -49,7 +56,7 @@ class Disc(Source):
 
     def __post_init__(self):
         check_all("source", self, "position", "size", "power")
-        check_shining(self)
+        check_emission(self)
         if self.angle is not None:
             check("source.angle", self.angle)
         if self.brightness is not None:
@@ -69,7 +76,7 @@ class Disc(Source):
 
     @property
     def half_angle(self) -> float:
-        """As of a source; with a picture, that of the outermost corner of its light."""
+        """As of a source; with a picture, the angle of the outermost corner of its lit pixels."""
         if self.angle is None:
             return 0.0
         half = math.radians(self.angle) / 2.0
@@ -84,7 +91,7 @@ class Disc(Source):
 
     @cached_property
     def _reach(self) -> tuple[float, float, float]:
-        """How far light of the picture is from its middle along x, along y and in all, in half widths."""
+        """Extent of the picture's lit pixels from its centre along x, along y and radially, in half widths."""
         assert self.brightness is not None
         lit = self.brightness > 0
         far = [np.maximum(np.abs(edge[:-1]), np.abs(edge[1:])) for edge in (np.linspace(-1.0, 1.0, n + 1) for n in lit.shape)]
@@ -93,7 +100,7 @@ class Disc(Source):
 
     @property
     def centre(self) -> tuple[float, float, float]:
-        """As of a source; with a picture, the mean of its light."""
+        """As of a source; with a picture, its centroid."""
         if self.distant or self.brightness is None:
             return super().centre
         cells = [(np.arange(n) + 0.5) * (2.0 / n) - 1.0 for n in self.brightness.shape]
@@ -106,12 +113,12 @@ class Disc(Source):
         )
 
     def points(self) -> tuple[np.ndarray, np.ndarray]:
-        """Its middle."""
+        """Its centre."""
         return super().points() if self.distant else (np.array([self.position], dtype=float), np.ones(1))
 
     @property
     def extent(self) -> tuple[float, float]:
-        """Half axes of the ellipse, or half widths of the rectangle that holds all light of the picture."""
+        """Half axes of the ellipse, or half widths of the rectangle that contains the picture's lit pixels."""
         if self.distant:
             return 0.0, 0.0
         wide, high = (1.0, 1.0) if self.brightness is None else self._reach[:2]
@@ -119,7 +126,7 @@ class Disc(Source):
 
     @property
     def sharp(self) -> bool:
-        """Never: the shape of its design does not hang on how small it is."""
+        """Never, so that the type of design does not depend on its size."""
         return False
 
     @property
@@ -128,22 +135,22 @@ class Disc(Source):
         return "far disc" if self.distant else "disc"
 
     def apparent_angle(self, z_in: float) -> float:
-        """As of a source; of a far one, the very number that was given."""
+        """As of a source; at infinity, the angle as given."""
         return super().apparent_angle(z_in) if self.angle is None else self.angle
 
     @property
     def sized(self) -> bool:
-        """By its size or its angle."""
+        """Always."""
         return True
 
-    def misplaced(self, place: Callable[[Sequence[float]], tuple[float, float, float]], scale: float) -> Source:
-        """A disc elsewhere, and larger."""
+    def displaced(self, place: Callable[[Sequence[float]], tuple[float, float, float]], scale: float) -> Source:
+        """The disc moved and scaled."""
         if self.angle is not None:
             return replace(self, angle=self.angle * scale)
         return replace(self, position=place(self.position), size=(self.size[0] * scale, self.size[1] * scale))
 
     def pointlike(self) -> Source:
-        """A plane wave, or a point in the middle."""
+        """A plane wave, or a point at its centre."""
         if self.distant:
             return PlaneWave(self.power)
         place = self.position if self.brightness is None else self.centre
@@ -155,13 +162,20 @@ def _build(table: Table, _profile) -> Disc:
     if light is None and table.get("file"):
         raise InputError("⟨source.file⟩ of a disc must be a picture of its brightness, an image or a 2-D .npy")
     return Disc(
-        middle(table, "disc"), tuple(table["size"]), table["power"], angle=table.get("angle"), brightness=light, **shining(table)
+        single_position(table, "disc"),
+        tuple(table["size"]),
+        table["power"],
+        angle=table.get("angle"),
+        brightness=light,
+        **emission_arguments(table),
     )
 
 
 def _idle(table: Table) -> dict[str, str]:
-    why = "has no meaning for a disc at infinity, which is an angle wide (⟨source_angle⟩)"
+    why = "has no meaning for a disc at infinity, whose size is an angle (⟨source_angle⟩)"
     return dict.fromkeys(("position", "size", "cone"), why) if "angle" in table else {}
 
 
-TYPES = (SourceType("disc", "disc", ("position", "size", "cone", "angle", "intensity", "aim", "file"), _build, standing, _idle),)
+TYPES = (
+    SourceType("disc", "disc", ("position", "size", "cone", "angle", "intensity", "aim", "file"), _build, position_defaults, _idle),
+)

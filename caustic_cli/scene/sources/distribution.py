@@ -1,13 +1,13 @@
-"""How a source's light is distributed over angles: the same into every solid angle, Lambertian, or by a table.
+"""Angular intensity distributions: isotropic, Lambertian, or tabulated.
 
 Notation
-    theta      angle from +z, rad; theta_c half-angle of the cone that a source shines into
-    I(theta)   relative intensity, power per solid angle; linear between the angles of a table, 0 beyond the last
-    F(theta)   2 pi integral of I sin theta from 0 to theta, in closed form
+    theta      angle from +z, rad; theta_c half-angle of the emission cone
+    I(theta)   relative radiant intensity, power per solid angle; linear between the angles of a table, 0 beyond the last
+    F(theta)   flux, 2 pi times the integral of I sin theta from 0 to theta, in closed form
 
 From theta_0 on, with t = theta - theta_0 and I = I_0 + b t, F grows by 2 pi (I_0 C + b M), where
 C = cos theta_0 - cos theta = 2 sin(theta_0 + t / 2) sin(t / 2) and M = sin theta_0 (t sin t - 2 sin^2(t / 2)) + cos theta_0
-(sin t - t cos t), both of which are taken by their series where t is small.
+(sin t - t cos t), both of which are evaluated by their series for small t.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ import numpy as np
 
 from caustic_cli.errors import InputError
 
-#: Angles of a table, at most.
+#: Largest number of angles of a table.
 MOST_ANGLES = 100_000
-#: Steps of a ray below which M is taken by its series, whose next term is then beyond the last digit, rad.
+#: Steps t below which M is evaluated by its series, whose first omitted term is then below a rounding, rad.
 SMALL = 0.05
-#: Steps of Newton's method, kept between bounds, by which angles are found that belong to parts of the flux.
+#: Most iterations of the safeguarded Newton method that inverts F.
 STEPS = 60
 
 
 @dataclass(frozen=True)
 class Distribution:
-    """Relative intensity at angles from the axis.
+    """A tabulated intensity distribution.
 
     Args:
-        angles: ascending from 0, at most 180, degrees; what lies beyond 90 means nothing here.
-        values: relative intensity at each, not negative.
+        angles: ascending from 0 to at most 180, degrees; values beyond 90 are ignored.
+        values: relative intensity at each angle, not negative.
 
     Raises:
-        InputError: they are none such.
+        InputError: a condition is violated, or there is no light within 90 degrees.
     """
 
     angles: tuple[float, ...]
@@ -57,7 +57,7 @@ class Distribution:
             raise InputError("must have light within 90 degrees of the axis")
 
     def flux(self, cone: float) -> float:
-        """F(theta_c) of a cone, rad.
+        """F(theta_c) for a cone of half-angle `cone`, rad.
 
         Raises:
             InputError: there is no light within it.
@@ -65,11 +65,11 @@ class Distribution:
         return float(_table(self, cone)[2][-1])
 
     def relative(self, angle: np.ndarray) -> np.ndarray:
-        """I at angles, rad."""
+        """I(theta) at angles, rad."""
         return np.interp(angle, np.radians(self.angles), self.values, right=0.0)
 
     def angle_of(self, part: np.ndarray, cone: float) -> np.ndarray:
-        """Angles within which such parts, in [0, 1], of the flux into a cone lie, rad."""
+        """Inverse of the cumulative flux: angles, rad, that enclose the fractions `part`, in [0, 1], of the flux into a cone."""
         angles, values, sums = _table(self, cone)
         wanted = np.clip(part, 0.0, 1.0) * sums[-1]
         k = np.clip(np.searchsorted(sums, wanted, side="right") - 1, 0, len(angles) - 2)
@@ -91,7 +91,7 @@ class Distribution:
 
 @lru_cache(maxsize=64)
 def _table(given: Distribution, cone: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Angles up to that of a cone or to the last, rad, intensities there, and F."""
+    """Angles of the table within a cone, rad, with intensities and F there."""
     angles = np.radians(given.angles)
     last = min(cone, angles[-1])
     angles = np.append(angles[angles < last], last)
@@ -104,7 +104,7 @@ def _table(given: Distribution, cone: float) -> tuple[np.ndarray, np.ndarray, np
 
 
 def _grown(first: np.ndarray, t: np.ndarray, value: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """I_0 C + b M."""
+    """I_0 C + b M: the increase of F / (2 pi) over a step t from angle `first`, with I_0 = value and b = slope."""
     s = t * t
     along = np.where(t < SMALL, s * (1 / 2 - s * (1 / 8 - s * (1 / 144 - s / 5760))), t * np.sin(t) - 2.0 * np.sin(0.5 * t) ** 2)
     across = np.where(t < SMALL, t * s * (1 / 3 - s * (1 / 30 - s * (1 / 840 - s / 45360))), np.sin(t) - t * np.cos(t))
@@ -113,7 +113,7 @@ def _grown(first: np.ndarray, t: np.ndarray, value: np.ndarray, slope: np.ndarra
 
 
 def relative(intensity: str | Distribution, tangent: np.ndarray) -> np.ndarray | float:
-    """Relative intensity of light whose angle from the axis has this tangent."""
+    """Relative intensity in directions whose angles to the axis have these tangents."""
     if isinstance(intensity, Distribution):
         return intensity.relative(np.arctan(tangent))
     return 1.0 / np.sqrt(1.0 + tangent * tangent) if intensity == "lambertian" else 1.0

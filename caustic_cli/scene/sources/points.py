@@ -1,4 +1,4 @@
-"""Point sources: one or several, or a grid of them that stands for an extended source (thesis 4.2.2)."""
+"""Point sources: one, several, or a grid of them that represents an extended source (thesis 4.2.2)."""
 
 from __future__ import annotations
 
@@ -12,23 +12,31 @@ from caustic_cli.config.table import check
 from caustic_cli.errors import InputError
 from caustic_cli.scene.sources.base import Source
 from caustic_cli.scene.sources.distribution import Distribution
-from caustic_cli.scene.sources.section import SourceType, Table, check_shining, middle, positions, shining, standing
+from caustic_cli.scene.sources.section import (
+    SourceType,
+    Table,
+    check_emission,
+    emission_arguments,
+    position_defaults,
+    positions,
+    single_position,
+)
 
-#: Most point sources at once.
+#: Largest number of point sources.
 MAX_POINTS = 1_000_000
 
 
 @dataclass(frozen=True)
 class Points(Source):
-    """Point sources, each with a position and a power, that shine into a cone about +z.
+    """Point sources, each with a position and a power, that emit into a cone about +z.
 
     Args:
         positions: (x, y, z) of each, mm.
-        powers: emitted into the cone by each, W; None for 1 W shared equally.
+        powers: emitted into the cone by each, W; None for 1 W in equal parts.
         cone: half-angle of the cone, degrees; None for the narrowest that covers the lens from every position.
-        intensity: uniform or lambertian, or a table.
-        aimed: rays are sampled where they meet the lens, with the weights that this asks for; otherwise all over the cone.
-        kind: point, or grid for points that stand for an extended source.
+        intensity: uniform, lambertian, or tabulated.
+        aimed: rays are sampled over the lens (importance sampling); otherwise over the whole cone.
+        kind: point, or grid for points that represent an extended source.
     """
 
     positions: tuple[tuple[float, float, float], ...]
@@ -50,13 +58,13 @@ class Points(Source):
         check("source.powers", self.powers)
         if not sum(self.powers) > 0:
             raise InputError("⟨source.powers⟩ must not all be 0")
-        check_shining(self)
+        check_emission(self)
 
     @classmethod
     def grid(
         cls, centre: Sequence[float], size: tuple[float, float], shape: tuple[int, int], power: float = 1.0, **options
     ) -> Points:
-        """shape = (N, M) equispaced points on a rectangle of full width and height `size` mm, borders included (fig. 6.4.1)."""
+        """A uniform grid of shape (N, M) on a rectangle of full width and height `size` mm, borders included (fig. 6.4.1)."""
         centre = check("source.position", centre)
         check("source.size", size)
         check("source.grid", shape)
@@ -66,7 +74,7 @@ class Points(Source):
 
     @property
     def power(self) -> float:
-        """Of all, W."""
+        """Total power, W."""
         return math.fsum(self.powers)
 
     def points(self) -> tuple[np.ndarray, np.ndarray]:
@@ -76,17 +84,17 @@ class Points(Source):
 
     @property
     def several(self) -> bool:
-        """As of a source, without an array of them."""
+        """As of a source."""
         return len(self.positions) > 1
 
     @property
     def apart(self) -> bool:
-        """Points in places of their own; a grid is one source."""
+        """Whether they are separate points; a grid is one source."""
         return self.several and self.kind == "point"
 
     @property
     def sharp(self) -> bool:
-        """One point; a grid's type is an extended source."""
+        """Whether it is a single point; a grid is an extended source."""
         return self.kind == "point" and not self.several
 
     @property
@@ -99,23 +107,23 @@ class Points(Source):
         return f"the source is {len(self.positions)} points" if self.several else "the source is a point"
 
     def blur(self, z_in: float, throw: float) -> float:
-        """As of a source; points in places of their own blur nothing, each makes a sharp picture."""
+        """As of a source; separate points have no blur, since each forms a sharp picture."""
         return super().blur(z_in, throw) if self.kind == "grid" else 0.0
 
     @property
     def sized(self) -> bool:
-        """A grid has a width; points are where they are said to be."""
+        """Whether it is a grid."""
         return self.kind == "grid"
 
-    def misplaced(self, place: Callable[[Sequence[float]], tuple[float, float, float]], scale: float) -> Source:
-        """Points elsewhere, those of a grid also farther apart about its centre."""
+    def displaced(self, place: Callable[[Sequence[float]], tuple[float, float, float]], scale: float) -> Source:
+        """The points moved; those of a grid are also scaled about its centre."""
         centre = np.array(self.centre)
         spread = scale if self.sized else 1.0
         wide = [p if spread == 1.0 else tuple(centre + (np.array(p) - centre) * spread) for p in self.positions]
         return replace(self, positions=tuple(place(p) for p in wide))
 
     def pointlike(self) -> Source:
-        """One point in the middle of all."""
+        """One point at the centre of all."""
         return Points((self.centre,), (self.power,), self.cone, self.intensity, self.aimed) if self.several else self
 
 
@@ -123,14 +131,18 @@ def _points(table: Table, _profile) -> Points:
     places = positions(table)
     parts = table.get("powers", [1.0] * len(places))
     total = math.fsum(parts)
-    return Points(places, tuple(table["power"] * p / total for p in parts) if total > 0 else tuple(parts), **shining(table))
+    return Points(
+        places, tuple(table["power"] * p / total for p in parts) if total > 0 else tuple(parts), **emission_arguments(table)
+    )
 
 
 def _grid(table: Table, _profile) -> Points:
-    return Points.grid(middle(table, "grid"), tuple(table["size"]), tuple(table["grid"]), table["power"], **shining(table))
+    return Points.grid(
+        single_position(table, "grid"), tuple(table["size"]), tuple(table["grid"]), table["power"], **emission_arguments(table)
+    )
 
 
 TYPES = (
-    SourceType("point", "point", ("position", "powers", "cone", "intensity", "aim"), _points, standing),
-    SourceType("grid", "grid (of points)", ("position", "size", "grid", "cone", "intensity", "aim"), _grid, standing),
+    SourceType("point", "point", ("position", "powers", "cone", "intensity", "aim"), _points, position_defaults),
+    SourceType("grid", "grid (of points)", ("position", "size", "grid", "cone", "intensity", "aim"), _grid, position_defaults),
 )

@@ -1,4 +1,4 @@
-"""Rays from a file: a light source as it was measured or simulated."""
+"""Ray-file sources: a measured or simulated ray set as a light source."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from caustic_cli.scene.sources.section import DISTANCE, SourceType, Table, conte
 
 @dataclass(frozen=True, eq=False)
 class Measured(Source):
-    """A set of rays that stands before the lens.  Light that does not run towards the lens is counted as missing it.
+    """A ray set in front of the lens.  Rays that do not reach the lens count as missing it.
 
-    As a whole it stands at the rays' point of closest approach and is as wide as they are there (`RaySet`).
+    Its position is the rays' point of closest approach, and its extent is their width there (`RaySet`).
 
     Args:
-        rays: in coordinates of their own, whose z axis is the scene's.
-        position: of the origin of those, mm.
+        rays: in the file's own coordinates, whose z axis is parallel to the scene's.
+        position: of the origin of these coordinates, mm.
         power: of all rays, W.
     """
 
@@ -36,29 +36,29 @@ class Measured(Source):
 
     def __post_init__(self):
         check_all("source", self, "position", "power")
-        _ = self.rays.forward  # refused here if there is none
+        _ = self.rays.forward  # raises if there is none
 
     def points(self) -> tuple[np.ndarray, np.ndarray]:
         """The point of closest approach."""
         return (self.rays.focus + self.position)[None, :], np.ones(1)
 
     def part(self, k: int, of: int) -> Source:
-        """As of a source: every ray is in one of them, by chance."""
+        """As of a source: a random partition of the rays."""
         return replace(self, rays=self.rays.part(k, of))
 
     @property
     def extent(self) -> tuple[float, float]:
-        """Half widths there."""
+        """Half widths of the rays there, mm."""
         return self.rays.spread
 
     @property
     def nearest(self) -> float:
-        """Where a ray starts that is nearest to the lens."""
+        """Largest z at which a ray starts, mm."""
         return self.rays.nearest + self.position[2]
 
     @property
     def sharp(self) -> bool:
-        """Never: the shape of its design does not hang on how small it is."""
+        """Never, so that the type of design does not depend on its size."""
         return False
 
     @property
@@ -67,7 +67,7 @@ class Measured(Source):
         return f"{self.rays.count:,} rays of a file"
 
     def pointlike(self) -> Source:
-        """A point where the rays approach each other most."""
+        """A point source at the point of closest approach."""
         return Points((self.centre,), (self.power,))
 
     def blur(self, z_in: float, throw: float) -> float:
@@ -79,12 +79,13 @@ class Measured(Source):
         return 2.0 * math.degrees(math.atan2(self._width() / 2.0, abs(z_in - self.centre[2])))
 
     def incidence(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> float:
-        """As of a source: of the very rays."""
+        """As of a source: the largest angle among the rays themselves."""
         d = self.rays.directions[self.crossing(half_size, z_in, round)[2]]
         return float(np.arctan2(np.hypot(d[:, 0], d[:, 1]), d[:, 2]).max(initial=0.0))
 
     def crossing(self, half_size: tuple[float, float], z: float, round: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Where rays pass the plane at z, x and y (N,) mm, and which of them carry light through an aperture there (N,)."""
+        """Intersections x, y (N,) mm of the rays with the plane at z, and which rays carry light through an aperture there,
+        (N,)."""
         p, d = self.rays.positions, self.rays.directions
         with np.errstate(divide="ignore", over="ignore", invalid="ignore"):  # rays along the plane, which carry nothing
             way = (z - self.position[2] - p[:, 2]) / d[:, 2]
@@ -105,8 +106,8 @@ def _build(table: Table, _profile) -> Measured:
     return Measured(rays, places[0], table["power"])
 
 
-def _standing(lens: Table) -> dict[str, Any]:
+def _position_defaults(lens: Table) -> dict[str, Any]:
     return {"position": [[0.0, 0.0, lens["z_in"] - DISTANCE * max(lens["size"])]]}
 
 
-TYPES = (SourceType("rays", "rays (of a file)", ("position", "file"), _build, _standing),)
+TYPES = (SourceType("rays", "rays (of a file)", ("position", "file"), _build, _position_defaults),)

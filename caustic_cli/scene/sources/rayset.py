@@ -1,10 +1,10 @@
-"""A set of rays measured or simulated on a light source, and what it says of that source as a whole.
+"""Ray sets: rays measured or simulated on a light source, and the position and size of the source derived from them.
 
 Notation, ray i
     p_i     a point of it, mm;  d_i  its unit direction;  w_i  its flux
-    c       point of closest approach to all rays: sum w_i |(1 - d_i d_i') (p_i - c)|^2 is least
+    c       point of closest approach to all rays, the minimiser of sum w_i |(1 - d_i d_i') (p_i - c)|^2
 
-Everything is in the file's own coordinates, whose z axis is that of emission.
+Coordinates are the file's own; emission is towards its +z.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from caustic_cli.errors import InputError
 
 #: Largest coordinate of a ray, mm.
 FARTHEST = 1e9
-#: Parallel rays meet nowhere: their point of closest approach is sought no farther from where they start, mm.
+#: Largest distance of the point of closest approach from the rays' starting points, mm: parallel rays have none.
 PARALLEL_AT = 1e6
-#: Fewer rays than these are not worth sharing out: a part of them may hold none that meets the lens.
+#: Least number of rays in a part: with fewer, a part may have none that reaches the lens.
 LEAST_SHARED = 50
-#: Wavelengths that are taken for such, nm.
+#: Range of valid wavelengths, nm.
 SHORTEST, LONGEST = 100.0, 20_000.0
 
 
@@ -31,15 +31,15 @@ class RaySet:
     """Rays of a source.
 
     Args:
-        positions: (N, 3) mm, a point of each ray, where it starts.
-        directions: (N, 3), any length but 0; kept as unit vectors.
-        flux: (N,) of each ray, not negative; relative, since a scene says the power of its source.
+        positions: (N, 3) mm, starting point of each ray.
+        directions: (N, 3), of any length but 0; stored as unit vectors.
+        flux: (N,) of each ray, not negative; relative, since the scene gives the power of its source.
         total: flux of the whole source, in `unit`.
         unit: W, or lm.
         wavelengths: (N,) nm, or None.
 
     Raises:
-        InputError: no rays, a number that is not finite, a direction without length, a negative flux, or none at all.
+        InputError: there are no rays, a number is not finite, a direction is zero, or a flux is negative or the total is 0.
     """
 
     positions: np.ndarray
@@ -86,7 +86,7 @@ class RaySet:
         return len(self.flux)
 
     def part(self, k: int, of: int) -> RaySet:
-        """The k-th of so many sets among which the rays are shared out at random, the same way always; all of them if too few."""
+        """The k-th part of a fixed random partition of the rays into `of` sets; all rays where there are too few."""
         if self.count < LEAST_SHARED * of:
             return self
         mine = np.sort(np.random.default_rng(0).permutation(self.count)[k::of])
@@ -95,26 +95,26 @@ class RaySet:
 
     @cached_property
     def forward(self) -> np.ndarray:
-        """Flux of every ray that runs towards +z, 0 of the others, (N,).
+        """Flux of the rays towards +z, 0 for the others, (N,).
 
         Raises:
-            InputError: none does.
+            InputError: there is none.
         """
         found = np.where(self.directions[:, 2] > 0, self.flux, 0.0)
         if not found.any():
-            raise InputError("has no ray that carries light towards +z, along which sources shine here")
+            raise InputError("has no ray that carries light towards +z, the direction of emission here")
         return found
 
     @cached_property
     def nearest(self) -> float:
-        """Largest z at which a ray with light starts towards +z, mm."""
+        """Largest z of the starting points of rays that carry light towards +z, mm."""
         return float(self.positions[self.forward > 0, 2].max())
 
     @cached_property
     def focus(self) -> np.ndarray:
-        """Point of closest approach c to the rays that run towards +z, weighted by flux, (3,) mm.
+        """Point of closest approach c of the rays towards +z, weighted by flux, (3,) mm.
 
-        Where rays are so nearly parallel that it lies more than PARALLEL_AT from their mean start, it is sought no farther.
+        For nearly parallel rays it is at most PARALLEL_AT from their mean starting point.
         """
         lit = self.forward > 0
         p, d, w = self.positions[lit], self.directions[lit], self.forward[lit] / self.forward.sum()
@@ -133,10 +133,10 @@ class RaySet:
 
     @cached_property
     def spread(self) -> tuple[float, float]:
-        """Half widths along x and y of the source where it is narrowest: twice the root mean square distance from `focus` at
-        which rays pass the plane of that, mm.  Of an evenly bright ellipse these are its half axes.
+        """Half widths along x and y of the beam waist: twice the root mean square distance from `focus` of the rays' intersections
+        with its transverse plane, mm.  For an ellipse of uniform radiance these are its half axes.
 
-        Light near the axis counts most, by (cos theta)^4: the depth of a source looks wide from aside.
+        Rays are weighted by (cos theta)^4, since the depth of a source widens it for oblique rays.
         """
         lit = self.forward > 0
         p, d, c = self.positions[lit], self.directions[lit], self.focus
@@ -149,6 +149,6 @@ class RaySet:
 
 
 def _refuse(wrong: np.ndarray, what: str) -> None:
-    """Name the first of the rays that are wrong."""
+    """Raise an error that names the first invalid ray."""
     if wrong.any():
         raise InputError(f"ray {int(np.argmax(wrong)) + 1} of {len(wrong):,} has {what}")

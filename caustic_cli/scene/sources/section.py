@@ -1,6 +1,6 @@
-"""The [source] section of project.toml: which types there are of it, the keys that each uses, and the reading of those they share.
+"""The [source] section of project.toml: the descriptor of a source type, and the reading of keys that several types share.
 
-A type of source is registered by a `SourceType`; everything that depends on the name of a type is looked up there.
+A `SourceType` registers a type; everything that depends on the name of a type is looked up there.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from caustic_cli.scene.sources.base import Source
 from caustic_cli.scene.sources.distribution import Distribution
 
 Table = Mapping[str, Any]
-#: The same power into every solid angle; in proportion to the cosine from +z.
+#: Isotropic; proportional to the cosine of the angle to +z.
 INTENSITIES = ("uniform", "lambertian")
-#: Keys of every source: the name of its type, and its power, W.
+#: Keys common to all sources: the name of the type, and the power, W.
 COMMON = ("type", "power")
-#: Of a source that stands somewhere, if not said: how far before the lens, how wide, in lens widths; the grid of fig. 6.4.1.
+#: Defaults of a near source: distance in front of the lens and width, in lens widths; the grid of fig. 6.4.1.
 DISTANCE, WIDTH, GRID = 5.0, 0.2, (25, 25)
 
 
 class Attached(str):
-    """The name of a file that [source] speaks of, together with what it holds; to whoever asks for text it is the name.
+    """A file name in the settings together with the file's content; used as a string it is the name.
 
-    data: the file's bytes; content: what was read from them.
+    data: the file's bytes; content: the object read from them.
     """
 
     data: bytes = b""
@@ -36,7 +36,7 @@ class Attached(str):
 
     @classmethod
     def of(cls, name: str, data: bytes, content: Any) -> Attached:
-        """A file of that name."""
+        """An attached file of that name."""
         found = cls(name)
         found.data, found.content = data, content
         return found
@@ -47,54 +47,58 @@ class Attached(str):
 
 
 def content(table: Table, key: str, kind: type) -> Any | None:
-    """What the file holds that a key names, if it is of that kind; None if not, or if there is no such file."""
+    """The content of the file that a key names, if it is of type `kind`; else None."""
     read = getattr(table.get(key), "content", None)
     return read if isinstance(read, kind) else None
 
 
-def nothing(_lens: Table) -> dict[str, Any]:
-    """Defaults of a type that needs none."""
+def no_defaults(_lens: Table) -> dict[str, Any]:
+    """Defaults of a type without any."""
     return {}
 
 
-def none_idle(_table: Table) -> dict[str, str]:
-    """Idle keys of a type that uses all of its keys always."""
+def no_idle_keys(_table: Table) -> dict[str, str]:
+    """Ignored keys of a type that always uses all of its keys."""
     return {}
 
 
 @dataclass(frozen=True)
 class SourceType:
-    """A type of source as [source] describes it.
+    """Descriptor of a source type.
 
-    name: [source] type; note: the name with what has to be said about it in a line; keys: of the section that it uses besides
-    COMMON; from_settings: makes it of the complete section and of the profile's irradiance, if one is named; defaults: of its keys,
-    from the [lens] section; idle: of a section, keys of the type that mean nothing beside the others, and why; own: keys of the
-    section that no other type has, each with its kind and help as of `table.Setting`.
+    name: value of [source] type; note: the name with a remark for a comment; keys: keys of the section that it uses besides COMMON;
+    from_settings: constructs the source from the complete section and the profile's irradiance, if any; defaults: of its keys, from
+    the [lens] section; idle: keys that the other keys of a section make meaningless, and why; own: keys that no other type has,
+    each with its kind and help as of `table.Setting`.
     """
 
     name: str
     note: str
     keys: tuple[str, ...]
     from_settings: Callable[[Table, np.ndarray | None], Source]
-    defaults: Callable[[Table], dict[str, Any]] = nothing
-    idle: Callable[[Table], dict[str, str]] = none_idle
+    defaults: Callable[[Table], dict[str, Any]] = no_defaults
+    idle: Callable[[Table], dict[str, str]] = no_idle_keys
     own: Mapping[str, tuple[str, str]] = field(default_factory=dict)
 
 
-def standing(lens: Table) -> dict[str, Any]:
-    """Where a source stands and how large it is: the same for all types that stand somewhere, so that a type may be changed."""
+def position_defaults(lens: Table) -> dict[str, Any]:
+    """Default position and size of a near source, the same for all near types, so that the type can be changed."""
     width = max(lens["size"])
     return {"position": [[0.0, 0.0, lens["z_in"] - DISTANCE * width]], "size": [WIDTH * width] * 2, "grid": list(GRID)}
 
 
-def shining(table: Table) -> dict[str, Any]:
-    """How a source that stands somewhere shines, as arguments of its class."""
+def emission_arguments(table: Table) -> dict[str, Any]:
+    """The emission keys of a near source as arguments of its class."""
     intensity = content(table, "intensity", Distribution) or str(table["intensity"])
     return {"cone": table.get("cone"), "intensity": intensity, "aimed": table["aim"]}
 
 
-def check_shining(source: Source) -> None:
-    """Refuse a cone or an intensity that there is none of."""
+def check_emission(source: Source) -> None:
+    """Check the cone and the intensity of a near source.
+
+    Raises:
+        InputError: one is invalid.
+    """
     if source.cone is not None:
         check("source.cone", source.cone)
     if not isinstance(source.intensity, Distribution) and source.intensity not in INTENSITIES:
@@ -102,12 +106,12 @@ def check_shining(source: Source) -> None:
 
 
 def positions(table: Table) -> tuple[tuple[float, float, float], ...]:
-    """All positions of the section."""
+    """All positions of the section, mm."""
     return tuple(tuple(p) for p in table["position"])
 
 
-def middle(table: Table, name: str) -> tuple[float, float, float]:
-    """The one position of a type that has a centre; a source at infinity has none, so nobody counts them.
+def single_position(table: Table, name: str) -> tuple[float, float, float]:
+    """The single position of a source type that has a centre; not checked for a source at infinity, which has none.
 
     Raises:
         InputError: there are several.

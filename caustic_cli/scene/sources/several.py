@@ -1,4 +1,4 @@
-"""Several sources that shine at once, each with its own power and wavelengths."""
+"""Several simultaneous sources, each with its own power and wavelengths."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from caustic_cli.scene.light import Light
 from caustic_cli.scene.sources.base import Source
 from caustic_cli.scene.sources.section import Table
 
-#: Most sources of one scene.
+#: Largest number of sources of a scene.
 MOST = 64
 
 
 @dataclass(frozen=True, eq=False)
 class Several(Source):
-    """Sources in one light; each is traced by itself, see `Scene.bands`.
+    """Mutually incoherent sources; each is traced separately, see `Scene.bands`.
 
     Args:
-        members: two or more, none of which is several itself.
-        spectra: wavelengths, nm, and relative powers of each; empty where it says none.
+        members: two or more sources, none of them a `Several`.
+        spectra: wavelengths, nm, and relative powers of each; empty if not given.
 
     Raises:
-        InputError: too few or too many, or only some of them say their wavelengths.
+        InputError: there are too few or too many, or only some of them have wavelengths.
     """
 
     members: tuple[Source, ...] = ()
@@ -37,21 +37,21 @@ class Several(Source):
         if not 2 <= len(self.members) <= MOST:
             raise InputError(f"[[source]] must be 1 to {MOST} sources, got {len(self.members)}")
         if len({bool(wavelengths) for wavelengths, _ in self.spectra}) > 1:
-            raise InputError("⟨source.also.wavelengths⟩ must be said of every source, or of none")
+            raise InputError("⟨source.also.wavelengths⟩ must be given for every source, or for none")
 
     @property
     def power(self) -> float:
-        """Of all, W."""
+        """Total power, W."""
         return math.fsum(one.power for one in self.members)
 
     @property
     def fractions(self) -> tuple[float, ...]:
-        """Part of all power of each."""
+        """Fraction of the total power of each."""
         return tuple(one.power / self.power for one in self.members)
 
     @property
     def collimated(self) -> bool:
-        """Whether all of them are, and even."""
+        """Whether all of them are, with uniform profiles."""
         return all(one.collimated and one.profile is None for one in self.members)
 
     @property
@@ -73,7 +73,7 @@ class Several(Source):
         return [one for one in self.members if not one.distant]
 
     def points(self) -> tuple[np.ndarray, np.ndarray]:
-        """Those of all that stand somewhere, by their power."""
+        """Positions of all near members, weighted by power."""
         if self.distant:
             return super().points()
         places, parts = zip(*(one.points() for one in self._near), strict=True)
@@ -93,17 +93,17 @@ class Several(Source):
 
     @property
     def extended(self) -> bool:
-        """Whether light comes to some place of the lens from more than one direction."""
+        """Whether some point of the lens receives light from more than one direction."""
         return self.apart or any(one.extended for one in self.members)
 
     @property
     def apart(self) -> bool:
-        """Whether they stand in different places, or some of them are such."""
+        """Whether their centres differ, or a member is `apart` itself."""
         return len({one.centre for one in self.members}) > 1 or any(one.apart for one in self.members)
 
     @property
     def sharp(self) -> bool:
-        """Whether all are, in one place."""
+        """Whether all are, at a common position."""
         return not self.apart and all(one.sharp for one in self.members)
 
     @property
@@ -124,7 +124,7 @@ class Several(Source):
         return max(one.apparent_angle(z_in) for one in self.members)
 
     def blur(self, z_in: float, throw: float) -> float:
-        """The largest; sources in places of their own make a picture each."""
+        """The largest; sources at different positions form a picture each."""
         return max(one.blur(z_in, throw) for one in self.members)
 
     def cone_over(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> float:
@@ -139,7 +139,7 @@ class Several(Source):
 
 
 def lights_of(section: Table, color: bool = False) -> list[Light]:
-    """The light of each source of a [source] section: its own wavelengths, the first's polarisation and unit of power."""
+    """The `Light` of each source of a [source] section: its own wavelengths, with the first's polarisation and unit of power."""
     state, unit = section.get("polarisation"), section.get("power_unit", "W")
     return [
         Light(state, tuple(t.get("wavelengths", ())), tuple(t.get("weights", ())), color=color, unit=unit)
@@ -148,7 +148,7 @@ def lights_of(section: Table, color: bool = False) -> list[Light]:
 
 
 def light_of_all(section: Table, color: bool = False) -> Light:
-    """The light of all of them: at the wavelengths of all, with their parts of all power."""
+    """The combined `Light` of all sources: all their wavelengths, weighted by power."""
     lights = lights_of(section, color)
     if len(lights) == 1:
         return lights[0]

@@ -1,6 +1,6 @@
-"""Rays refracted at the exit, carried to the screen and splatted there, in one kernel of a CUDA device.
+"""Fused CUDA kernel: refraction at the exit, transfer to the screen and splat.
 
-The functions of `kernels.plane`, with their notation: what becomes of a ray and all that is differentiated come from there, from
+The functions of `kernels.fused`, with their notation: the per-ray functions and their derivatives come from there, from
 `axial_refraction` and from `oblique_refraction`, a row of one ray at a time.  A kernel is made for each filter, so that its loops
 over pixels have a known length.
 """
@@ -17,7 +17,7 @@ from numba import cuda, float64, int64
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from caustic_cli.optics.kernels import axial_refraction, filter_weights, pixels, plane
+from caustic_cli.optics.kernels import axial_refraction, filter_weights, fused, pixels
 from caustic_cli.optics.kernels import oblique_refraction as oblique
 from caustic_cli.optics.kernels.arguments import Exit, Frame, Splat
 from caustic_cli.optics.kernels.axial_refraction import (
@@ -45,21 +45,21 @@ from caustic_cli.optics.kernels.axial_refraction import (
 from caustic_cli.optics.kernels.cuda import sums
 from caustic_cli.optics.kernels.cuda.launch import device, start
 from caustic_cli.optics.kernels.cuda.scatter import scatter, scatter_tangent, size_of_tangent, units
+from caustic_cli.optics.kernels.fused import COLUMNS, FRESNEL, LEAVING, MISSED, OFF_SCREEN, REFLECTED
 from caustic_cli.optics.kernels.oblique_refraction import MISSED_POWER
-from caustic_cli.optics.kernels.plane import COLUMNS, FRESNEL, LEAVING, MISSED, OFF_SCREEN, REFLECTED
 from caustic_cli.optics.reconstruction import Filter, padding
 from caustic_cli.scene import Screen
 
-limits, share, gather = device(pixels.limits), device(plane.share), device(plane.gather)
-carry, pull_axial, push_axial = device(plane.carry), device(axial_refraction.pull), device(axial_refraction.push)
+limits, share, gather = device(pixels.limits), device(fused.share), device(fused.gather)
+carry, pull_axial, push_axial = device(fused.carry), device(axial_refraction.pull), device(axial_refraction.push)
 aim_batch, pull_batch, push_oblique = device(oblique._aim), device(oblique._pull), device(oblique.push)
 VECTORS = axial_refraction.VECTORS + axial_refraction.SCRATCH
 
 
 class Setting(NamedTuple):
-    """What a kernel takes beside arrays: index and kind of Fresnel losses, as of an `Exit`, a `Frame`, and alpha of the filter."""
+    """Scalar arguments of a kernel: index and kind of Fresnel losses, as of an `Exit`, a `Frame`, and alpha of the filter."""
 
-    index: float  # type: ignore[assignment]  # nobody asks a `Setting` for the place of a value
+    index: float  # type: ignore[assignment]  # shadows `tuple.index`, which is not used
     fresnel: int
     frame: Frame
     alpha_x: float
@@ -68,9 +68,9 @@ class Setting(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """Rays below the exit, (N,) each on the device: where they begin, mm, what of their directions lies across, and their powers.
+    """Rays below the exit, (N,) each on the device: origins, mm, transverse direction components, and powers.
 
-    oblique: whether they have a direction each; else all run along z, and `along` is empty.
+    oblique: whether they have individual directions; otherwise all are parallel to z, and `along` is empty.
     """
 
     x: Tensor
@@ -81,7 +81,7 @@ class Light:
 
     @property
     def rays(self) -> tuple[Tensor, ...]:
-        """As the kernels take them."""
+        """Components in the order of the kernels' arguments."""
         return (self.x, self.y, *self.along, self.power)
 
 
@@ -234,7 +234,8 @@ def _kernels(slanted: bool, kind: int, vx: int, vy: int):
 
 
 class Splatting(NamedTuple):
-    """Everything but the hits: light, its sums' unit, start and height of the `Exit` (2,), the kernels and what they take."""
+    """All inputs except the intersections: light, unit of its sums, start and height of the `Exit` (2,), kernels and their
+    arguments."""
 
     light: Light
     unit: Tensor
@@ -255,7 +256,7 @@ def expose(
         place: (2,) float64 on the device, the heights where oblique rays begin and of the screen, above the zero of the sag, mm.
 
     Returns:
-        image (n_x, n_y) and the power leaving the lens (), float64, differentiable; what was lost, by name.
+        image (n_x, n_y) and the power behind the lens (), float64, differentiable; losses by name.
     """
     (nx, ny), (rx, ry) = screen.resolution, filter.reach
     vx, vy, kind = 2 * rx + 1, 2 * ry + 1, filter_weights.KINDS[filter.kind]
@@ -272,7 +273,7 @@ def expose(
 
 
 class _Image(torch.autograd.Function):
-    """Distance (or sag) and slopes -> padded image, power leaving the lens (), ledger."""
+    """Distance (or sag) and slopes -> padded image, power behind the lens (), ledger."""
 
     @staticmethod
     def forward(t: Tensor, gx: Tensor, gy: Tensor, how: Splatting):
@@ -307,7 +308,7 @@ class _Image(torch.autograd.Function):
 
 
 class _Pushed(torch.autograd.Function):
-    """The tangent of `_Image`, a function of its own because within torch.func a tensor's numbers are within reach only there."""
+    """The tangent of `_Image`, a separate function because within torch.func the data of a tensor is accessible only there."""
 
     @staticmethod
     def forward(how: Splatting, *values):

@@ -28,7 +28,7 @@ warnings.filterwarnings("ignore", "Grid size .* will likely result in GPU under-
 
 
 class _Within:
-    """The module `cuda` as a running kernel of the simulator sees it: only there has it atomics."""
+    """The module `cuda` inside a running kernel of the simulator, where alone it has atomics."""
 
     def __getattr__(self, name: str):
         from numba.cuda.simulator.kernel import _get_kernel_context  # noqa: PLC0415
@@ -46,13 +46,13 @@ def _min(a, b):
     return b if b < a else a
 
 
-#: What stands on the device for builtins of that name.
+#: Device implementations of builtins, by name.
 STAND_INS = {"max": _max, "min": _min}
 
 
 @cache
 def device(function: CPUDispatcher | Callable) -> Callable:
-    """A function for kernels to call: the plain Python of one that is compiled for the CPU, and of all that it calls.
+    """A device function: the Python code of a function compiled for the CPU, with all that it calls.
 
     Its sums of products may be contracted on the device, as on the CPU.
     """
@@ -71,19 +71,19 @@ def device(function: CPUDispatcher | Callable) -> Callable:
 
 
 def start(kernel, count: int, *arguments) -> None:
-    """Run a kernel over `count` rays; tensors are handed over without a copy, in tuples too."""
+    """Run a kernel over `count` rays; tensors, also in tuples, are passed without a copy."""
     if count:
         run(kernel, min(BLOCKS, -(-count // THREADS)), THREADS, tuple(_view(a) for a in arguments))
 
 
 def run(kernel, blocks: int, threads: int, arguments: tuple) -> None:
-    """Start a kernel on torch's current stream, in whose order its arrays are used and freed."""
+    """Launch a kernel on torch's current stream, so that its arrays are used and freed in order."""
     stream = () if SIMULATED else (cuda.external_stream(torch.cuda.current_stream().cuda_stream),)
     kernel[(blocks, threads, *stream)](*arguments)
 
 
 def array(tensor: Tensor):
-    """A tensor as kernels take it."""
+    """A tensor as a kernel argument."""
     return tensor.numpy() if SIMULATED else cuda.as_cuda_array(tensor)
 
 

@@ -1,4 +1,4 @@
-"""The stages ray by ray on a CUDA device: refraction, a mirror and the way to a plane, with adjoint and tangent.
+"""CUDA kernels of the stages ray by ray: refraction, reflection and transfer to a plane, with adjoint and tangent.
 
 The functions of `kernels.refraction`, `kernels.mirror` and `kernels.transfer`, a batch of one ray at a time.
 """
@@ -90,7 +90,7 @@ def _land_tangent(count, ray, surface, along, out):
 
 
 class Stage(NamedTuple):
-    """Kernels, how many components come out beside one of bool, and what the kernels take beside rays."""
+    """Kernels, number of output components besides a boolean one, and further arguments of the kernels."""
 
     forward: object
     adjoint: object
@@ -153,7 +153,7 @@ class _Stage(torch.autograd.Function):
 
 
 class _Pushed(torch.autograd.Function):
-    """The tangent of `_Stage`, a function of its own because within torch.func a tensor's numbers are within reach only there."""
+    """The tangent of `_Stage`, a separate function because within torch.func the data of a tensor is accessible only there."""
 
     @staticmethod
     def forward(stage: Stage, *values):

@@ -1,10 +1,11 @@
-"""Where a ray's shares go on a CUDA device: into an image of whole units, by atomic additions (`sums`).
+"""Accumulation of filter weights on a CUDA device: atomic additions to an image in fixed point (`sums`).
 
-A filter's shares are not negative and sum to 1, so that the power of all rays bounds every pixel.  Of a tangent
+Filter weights are non-negative and sum to 1, so the power of all rays bounds every pixel.  A tangent is bounded by
 
     |d image| <= sum over rays of |d W| sum a_i a_j + |W d p_x| sum |a'_i| a_j + |W d p_y| sum a_i |a'_j|
 
-does, where W is a ray's weight, a its shares along x and y, and a' their derivatives by its landing point p (`kernels.splat`).
+where W is the power of a ray, a its filter weights along x and y, and a' their derivatives by its landing point p
+(`kernels.splat`).
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ units = device(units_on_cpu)
 
 @device
 def scatter(image, i, k, weight, sx, sy, unit):
-    """Add shares (v_x, 1), (v_y, 1) of `weight` to the pixels from (i, k) on."""
+    """Add `weight` times filter weights (v_x, 1), (v_y, 1) to the pixels from (i, k) on."""
     for a in range(len(sx)):
         part = weight * sx[a, 0]
         for b in range(len(sy)):
@@ -28,7 +29,7 @@ def scatter(image, i, k, weight, sx, sy, unit):
 
 @device
 def scatter_tangent(image, i, k, change, move_x, move_y, sx, sy, dx, dy, unit):
-    """Add a ray's tangent; change, move_x, move_y: d W and W d p, less what normalises the shares."""
+    """Add a ray's tangent; change, move_x, move_y: d W and W d p, without the normalisation of the filter weights."""
     for a in range(len(sx)):
         along, across = change * sx[a, 0] + move_x * dx[a, 0], move_y * sx[a, 0]
         for b in range(len(sy)):
@@ -37,7 +38,7 @@ def scatter_tangent(image, i, k, change, move_x, move_y, sx, sy, dx, dy, unit):
 
 @device
 def size_of_tangent(change, move_x, move_y, sx, sy, dx, dy):
-    """The bound's part of one ray, with the arguments of `scatter_tangent`."""
+    """A ray's contribution to the bound, with the arguments of `scatter_tangent`."""
     total_x, total_y, slope_x, slope_y = 0.0, 0.0, 0.0, 0.0
     for a in range(len(sx)):
         total_x, slope_x = total_x + sx[a, 0], slope_x + abs(dx[a, 0])

@@ -1,4 +1,4 @@
-"""The stage on the screen on a CUDA device: landing points into an image, with adjoint and tangent.
+"""CUDA kernel for splatting: accumulation of landing points on pixels, with adjoint and tangent.
 
 The functions of `kernels.splat`, with their notation; a row of one ray at a time.
 """
@@ -148,7 +148,7 @@ class _Splat(torch.autograd.Function):
 
 
 class _Pushed(torch.autograd.Function):
-    """The tangent of `_Splat`, a function of its own because within torch.func a tensor's numbers are within reach only there."""
+    """The tangent of `_Splat`, a separate function because within torch.func the data of a tensor is accessible only there."""
 
     @staticmethod
     def forward(frame: Frame, *values):

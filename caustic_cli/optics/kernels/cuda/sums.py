@@ -1,7 +1,7 @@
-"""Sums that repeat bitwise, whatever order a device's threads add in: 64-bit fixed point.
+"""Bitwise reproducible sums, independent of the order of additions: 64-bit fixed point.
 
-Sums of integers do not depend on their order, those of floating-point numbers do.  So a term x is added as the nearest whole
-number of units 2^-k, by the device's atomic addition of integers.  With a bound B >= sum |x| over all terms of any one sum, k is
+Integer sums do not depend on the order of additions, floating-point sums do.  A term x is therefore rounded to an integer multiple
+of the unit 2^-k and added by integer atomics.  With a bound B >= sum |x| over all terms of any one sum, k is
 the largest for which
 
     B 2^k <= 2^62,    and then    |sum| <= sum (|x| 2^k + 1/2) <= 2^62 + N / 2 < 2^63
@@ -17,7 +17,7 @@ import math
 import torch
 from torch import Tensor
 
-#: Binary digits of the largest sum; the largest term, in units.
+#: Binary digits of the largest sum; largest term, in units.
 DIGITS, LARGEST = 62, 2.0**62
 #: Exponents k kept so that 2^k and 2^-k are normal numbers.
 LEAST_EXPONENT, MOST_EXPONENT = -1000, 1000
@@ -34,7 +34,7 @@ def unit_of(bound: Tensor) -> Tensor:
 
 
 def units(x: float, unit: float) -> int:
-    """A term in whole units; 0 for what no bound holds: NaN, or more than the bound, whose sum is NaN in any case."""
+    """A term in integer units; 0 for NaN, and for terms beyond the bound, whose sum is NaN in any case."""
     return math.floor(x * unit + 0.5) if abs(x * unit) <= LARGEST else 0
 
 

@@ -1,4 +1,4 @@
-"""The height field on a CUDA device, at points and where rays meet it: differentiable functions of heights and rays.
+"""Height fields on a CUDA device: evaluation and ray intersection as differentiable functions of heights and rays.
 
 The functions of `kernels.surface` and `kernels.ray_intersections`, with their notation; formulas are in `kernels.spline`,
 `kernels.intersect` and `kernels.batches`.  Here each ray goes its own way, by the scalar functions of those files.
@@ -25,7 +25,7 @@ from caustic_cli.optics.kernels.cuda.launch import device, start
 from caustic_cli.optics.kernels.intersect import HIT
 
 piece, jet, push_powers, value_at = (device(f) for f in (spline.piece, spline.jet, spline.push_powers, intersect._value))
-meet_alone, beyond = device(batches.meet_alone), device(batches.beyond)
+first_hit, beyond = device(batches.first_hit), device(batches.beyond)
 pull_alone, push_alone = device(batches.pull_alone), device(batches.push_alone)
 enter_alone, units = device(ray_intersections.enter_alone), device(sums.units)
 
@@ -70,7 +70,7 @@ class Axis(NamedTuple):
 
 
 class DeviceSurface:
-    """What kernels know of a height field of half widths (r_x, r_y) mm, made once for all heights."""
+    """Kernel data of a height field of half widths (r_x, r_y) mm, for any heights."""
 
     def __init__(self, spaces: tuple[SplineSpace, SplineSpace], half_size: tuple[float, float], place: torch.device):
         self.shape = tuple(s.n for s in spaces)
@@ -184,11 +184,11 @@ class _AtPoints(torch.autograd.Function):
         return *_AtPoints.apply(tangent.detach(), ctx.surface, u, v)[:3], None  # within torch.func numbers are within reach only so
 
 
-# Where rays meet it.
+# Ray intersections.
 
 
 @cuda.jit
-def _meet(rays, bounds, radius, geometry, scale, c, out, where):
+def _first_hits(rays, bounds, radius, geometry, scale, c, out, where):
     ox, oy, oz, dx, dy, dz = rays
     (bu, mu, wu, bv, mv, wv), (scale_x, scale_y), (t, gx, gy) = geometry, scale, out
     low, high, slope_u, slope_v, floor = bounds[0], bounds[1], bounds[2], bounds[3], bounds[4]
@@ -196,7 +196,7 @@ def _meet(rays, bounds, radius, geometry, scale, c, out, where):
         du, dv = dx[k] * scale_x, dy[k] * scale_y
         ray = (ox[k] * scale_x + 0.5, oy[k] * scale_y + 0.5, oz[k], du, dv, dz[k])
         ou, ov, up, way = enter_alone(ray, floor)
-        status, here, reach, zx, zy = meet_alone(
+        status, here, reach, zx, zy = first_hit(
             (ou, ov, up, du, dv, dz[k]), (low, high), (slope_u, slope_v), c, bu, mu, wu, bv, mv, wv, scale_x, scale_y
         )
         found = status == HIT and way + reach > 0.0 and not beyond(ou, ov, du, dv, reach, radius, scale_x, scale_y)
@@ -206,7 +206,7 @@ def _meet(rays, bounds, radius, geometry, scale, c, out, where):
 
 @cuda.jit
 def _pull_rays(rays, found, where, given, geometry, scale, c, out):
-    """X + L_Z Z_x, Y + L_Z Z_y and L_Z in `out`, and the hits' u and v."""
+    """X + L_Z Z_x, Y + L_Z Z_y and L_Z in `out`, and u and v of the intersections."""
     (ox, oy, dx, dy, dz), (t, gx, gy), (by_t, by_gx, by_gy) = rays, found, given
     (_, mu, wu, _, mv, wv), (scale_x, scale_y), (by_x, by_y, by_z, u, v) = geometry, scale, out
     wide = len(mv)
@@ -284,7 +284,7 @@ def hits_of_rays(
 
 
 def _sag(heights: Tensor) -> tuple[Tensor, Tensor]:
-    """Heights less their mean, and the mean (), float64: a sag small against the thickness keeps all its digits."""
+    """Heights minus their mean, and the mean (), float64: a sag small compared with the thickness keeps all its digits."""
     h = heights.detach().double()
     return h - h.mean(), h.mean()
 
@@ -307,7 +307,7 @@ class _Hits(torch.autograd.Function):
         rays = tuple(c.detach().contiguous() for c in (ox, oy, oz - middle, dx, dy, dz))
         out, where = tuple(torch.empty_like(ox) for _ in range(3)), torch.empty(ox.shape, dtype=torch.int64, device=ox.device)
         bounds, c = _bounds(surface, h), surface.coefficients(h)
-        start(_meet, len(ox), rays, bounds, radius, surface.geometry, surface.scale, c, out, where)
+        start(_first_hits, len(ox), rays, bounds, radius, surface.geometry, surface.scale, c, out, where)
         return *out, where >= 0, where
 
     @staticmethod
@@ -348,7 +348,7 @@ class _Hits(torch.autograd.Function):
 
 
 class _Pushed(torch.autograd.Function):
-    """The tangent of `_Hits`, a function of its own because within torch.func a tensor's numbers are within reach only there."""
+    """The tangent of `_Hits`, a separate function because within torch.func the data of a tensor is accessible only there."""
 
     @staticmethod
     def forward(surface: DeviceSurface, heights, ox, oy, dx, dy, dz, t, gx, gy, where, change, *moves):

@@ -1,7 +1,8 @@
-"""What a quality means: the default stages of a design, as tables of [[design.stages]].
+"""Default stages of a design, by quality, as tables of [[design.stages]].
 
-Early stages see the picture through a wide blur on a small control net with few rays, late ones at full detail.  The blur halves
-from stage to stage.  After a transport start, whose surface has every scale right, there is full detail at once.
+The stages form a coarse-to-fine continuation: early ones use a wide blur, a coarse control net and few rays, late ones the full
+resolution, and the blur is halved from stage to stage.  After an optimal-transport start, which is accurate at every scale, full
+resolution is used from the beginning.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ from caustic_cli.scene import Source
 
 Table = dict[str, Any]
 RAYS_PER_PIXEL = 9.0  # 750 x 750 rays on 250 x 250 pixels, tables D.1 and D.2
-WAVE_KEYS = ("control", "blur", "apron", "iterations", "tolerance")  # of a stage on rays that one on the wave image has too
-#: Of a default stage on rays or on the wave image: the part by which ten iterations have to lower the loss.
+WAVE_KEYS = ("control", "blur", "apron", "iterations", "tolerance")  # keys of a ray stage that a wave stage has, too
+#: Least relative decrease of the loss over ten iterations, in default stages on rays and on the wave image.
 TOLERANCE, WAVE_TOLERANCE = 2e-3, 1e-3
 
 
@@ -33,7 +34,7 @@ def on_rays(
     tolerance: float = TOLERANCE,
     oversample: int = 1,
 ) -> Table:
-    """A stage on the ray image, reconstructed with a 3 x 3 cosine."""
+    """A stage on the ray image, with a 3 x 3 raised-cosine filter."""
     return {
         "control": list(control),
         "rays": rays,
@@ -49,7 +50,7 @@ def on_rays(
 
 
 def on_waves(control: Sequence[int], waves: Sequence[float], apron: int, iterations: int) -> Table:
-    """A stage on the wave image at so many nanometres."""
+    """A stage on the wave image at wavelengths `waves`, nm."""
     return {
         "control": list(control),
         "waves": list(waves),
@@ -61,18 +62,18 @@ def on_waves(control: Sequence[int], waves: Sequence[float], apron: int, iterati
 
 
 def usual_sampler(source: Source) -> str:
-    """A tensor product of rays makes a plane wave cheap; others are intersected one by one."""
+    """The default sampler: tensor-product rays make a plane wave cheap; other rays are intersected individually."""
     return "lines" if source.collimated else "stratified"
 
 
 def completed_stage(table: Table, s: Settings, sampler: str) -> Table:
-    """A stage of the user's own with all that it does not say."""
+    """A user-defined stage with its missing keys completed."""
     base = stage_base(s, sampler)
     return {**({k: base[k] for k in WAVE_KEYS} if table.get("waves") else base), **table}
 
 
 def stage_base(s: Settings, sampler: str) -> Table:
-    """What a stage of the user's own says where it says nothing."""
+    """Defaults of a user-defined stage."""
     nx, ny = s["screen"]["resolution"]
     return on_rays(
         s["lens"]["control"],
@@ -93,8 +94,8 @@ def coarse_to_fine(
 ) -> list[Table]:
     """The default stages for a picture of `resolution` pixels, ending on `control` points with `rays` rays.
 
-    Blurs are 1/16 of the screen at first and halve down to none.  Control nets have a quarter, half and all of the
-    final knot spans, so knot insertion carries the surface on unchanged when those divide.
+    The blur starts at 1/16 of the screen and is halved down to none.  Control nets have a quarter, half and all of the final
+    knot spans, so that knot insertion preserves the surface if these are divisible.
     """
     check("quality", quality)
     early, late = {"draft": (15, 25), "standard": (25, 50), "fine": (40, 120)}[quality]
@@ -119,51 +120,52 @@ def coarse_to_fine(
     return stages
 
 
-#: What a quality means after a transport start: knot spans per pixel and their most; rays a pixel in the last stage and their most;
-#: pixels of the render to one of the screen, along each axis, where so many rays fall there; and of each stage its part of the rays
-#: and its iterations.
+#: Qualities after a transport start: knot spans per pixel and their largest number; rays per pixel in the last stage and their
+#: largest number; largest subdivision of pixels along each axis; and for each stage its fraction of the rays and its iterations.
 REFINEMENT = {
     "draft": (1.0, 256, 16, 1_000_000, 2, ((1.0, 14),)),
     "standard": (2.0, 957, 64, 8_000_000, 4, ((0.5, 8), (1.0, 24))),
     "fine": (2.0, 957, 256, 16_000_000, 4, ((0.125, 15), (0.25, 65), (1.0, 25))),
 }
-#: Gaps of a picture (`io.picture`) from which on creases decide its error, and what a quality means then: light that crosses a
-#: crease falls into the black, and a crease is as narrow as knot spans and the start's cells are.  On so fine a net iterations gain
-#: little: on 10 spans a pixel two more took thin lines from 0.094 to 0.093, and 12 spans in the same time to 0.081.
+#: Gaps of a picture (`io.picture`) from which on creases of the surface dominate its error, and the qualities then: light through a
+#: crease falls into dark regions, and a crease is as narrow as the knot spans and the cells of the start.  On such fine nets
+#: iterations gain little: with 10 spans per pixel two more iterations improved thin lines from 0.094 to 0.093, 12 spans in the same
+#: time to 0.081.
 GAPS = 0.5
-#: Knot spans of such a net at least: from there on the start is evaluated on finer cells than it is solved on.
+#: Least knot spans of such a net, from which on the start is evaluated on finer cells than it is solved on.
 LEAST_CREASED = 1152
 CREASED = {
     "draft": (6.0, 1536, 16, 1_000_000, 2, ((1.0, 2),)),
     "standard": (12.0, 3072, 64, 4_000_000, 4, ((1.0, 2),)),
     "fine": (16.0, 4096, 64, 4_000_000, 4, ((1.0, 2),)),
 }
-#: So many times the iterations where what is refined is seen through a source's blur only.
+#: Factor of the iterations where the image is blurred by the source.
 LONGER = 3
-#: Source cells of the transport start along the lens: one to so many rays of the last stage, within bounds.
+#: Source cells of the transport start along the lens: rays of the last stage per cell, and bounds of the number of cells.
 RAYS_PER_CELL, LEAST_CELLS, MOST_CELLS = 4, 256, 1024
-#: Largest prime factor of a length whose transforms are quick.
+#: Largest prime factor of a length with fast transforms.
 LARGEST_FACTOR = 50
-#: Knot spans of a net from which on its start has a cell to each of them.
+#: Knot spans of a net from which on its start has one cell per span.
 FINE_SPANS = 1024
 LEAST_SPANS = 32
-#: Of pictures with more than LARGE_PIXELS along an axis, or more than a quality has spans: spans, whose 1280 control points are a
-#: quick length; rays a pixel, and their most; and iterations, all with these: fewer rays a pixel teach the lens their noise.
+#: For pictures with more than LARGE_PIXELS along an axis, or more than the spans of a quality: spans (1280 control points are a
+#: fast transform length); rays per pixel and their largest number; and iterations, all with these rays, since with fewer the lens
+#: overfits the sampling noise.
 LARGE_PIXELS, LARGE_SPANS, LARGE_RAYS, MOST_RAYS, LARGE_PLAN = 700, 1277, 8, 16_000_000, ((1.0, 24),)
 LEAST_RAYS = 40_000
 
 
 def refinement_spans(pixels: int, quality: str) -> int:
-    """Knot spans along each axis of the lens for a screen of so many pixels: finer than the picture."""
+    """Knot spans along each axis of the lens for a screen of `pixels` pixels: finer than the picture."""
     return _spans(REFINEMENT, pixels, quality)
 
 
 def creased_control(pixels: int, degree: int, quality: str) -> int:
     """Control points along an axis for a picture with gaps.
 
-    Knot spans are whole cells of the transport's coarse solution, and a few more of these where their number or that of control
-    points would have a large prime factor: cosine transforms of such lengths, which the first surface and the preconditioner take,
-    are three times as slow.
+    The number of knot spans is a multiple of the cells of the coarse transport solution, increased where it or the number of
+    control points has a large prime factor: the cosine transforms of the initial surface and of the preconditioner are three times
+    as slow for such lengths.
     """
     spans = max(LEAST_CREASED, _spans(CREASED, pixels, quality))
     step = -(-spans // COARSE)
@@ -192,9 +194,9 @@ def _spans(plan: dict[str, tuple], pixels: int, quality: str) -> int:
 
 
 def transport_cells(rays: int, scattered: bool, spans: int = 0) -> int:
-    """Source cells along the lens of a transport start that so many rays refine on a net of so many knot spans.
+    """Source cells of a transport start along the lens, for a refinement with `rays` rays on a net of `spans` knot spans.
 
-    What a cell leaves bright or dark shows as stripes where the picture is dark, and takes many iterations to smooth.
+    Discretisation errors of the cells appear as stripes in dark regions, and take many iterations to smooth.
     """
     if spans >= FINE_SPANS and not scattered:
         return spans
@@ -210,15 +212,15 @@ def refinement(
     spread: bool = False,
     creased: bool = False,
 ) -> list[Table]:
-    """The default stages after a transport start, whose surface has every scale right already: full detail at once.
+    """The default stages after a transport start, which is accurate at every scale: full resolution from the beginning.
 
-    Rays stand in a regular grid: under a smooth filter, which the render's finer pixels leave narrow, such sums are far more exact
-    than those over random rays, whose noise a lens learns.
+    Rays form a regular grid: under a smooth filter, narrow thanks to the subdivided pixels, such a quadrature is far more accurate
+    than random rays, whose noise a lens would overfit.
 
     Args:
-        rays: of the last stage, None for what the quality says.
-        scattered: the source's rays have to be intersected one by one: take a quarter of them.
-        spread: as of a stage; the light that the source spreads beside the screen is no error there.
+        rays: of the last stage, None for the default of the quality.
+        scattered: the source's rays are intersected individually, so a quarter of them is used.
+        spread: as for a stage; light that the source spreads beyond the screen is not an error.
         creased: the picture has gaps, and the net is that of `creased_control`.
     """
     check("quality", quality)
@@ -245,8 +247,8 @@ def refinement(
     return stages
 
 
-#: The same of what is traced surface by surface, two free-form sides or a lens among other elements: rays for each pixel, most,
-#: finer, iterations; and the most knot spans of two sides.
+#: Qualities of systems without a fused kernel, two free-form sides or a lens among other elements: rays per pixel, largest number
+#: of rays, subdivision of pixels, iterations; and largest number of knot spans of two sides.
 TWO_SIDED = {
     "draft": (8, 500_000, 2, 30),
     "standard": (48, 3_000_000, 4, 50),
@@ -256,7 +258,7 @@ TWO_SIDED_SPANS = 384
 
 
 def two_sided(control: tuple[int, int], rays: int | None, resolution: tuple[int, int], quality: str = "standard") -> list[Table]:
-    """The stage of two free-form sides, or of a lens among other elements, after their start; arguments as of `refinement`."""
+    """The stage of two free-form sides, or of a lens among other elements, after their start; arguments as for `refinement`."""
     check("quality", quality)
     each, most, finer, iterations = TWO_SIDED[quality]
     pixels = resolution[0] * resolution[1]
@@ -266,12 +268,12 @@ def two_sided(control: tuple[int, int], rays: int | None, resolution: tuple[int,
     return [on_rays(control, rays, "grid", apron=apron, iterations=iterations, oversample=finer)]
 
 
-#: So many times the rays at most where every lenslet is judged by itself.
+#: Largest factor of the rays where every lenslet is compared with its own picture.
 MORE_LENSLETS = 4
 
 
 def each_lenslet(stages: list[Table], lenslets: int, resolution: tuple[int, int]) -> list[Table]:
-    """Stages after a transport start in which every lenslet of an array is judged by its own picture."""
+    """Stages after a transport start in which every lenslet of an array is compared with its own picture."""
     found = []
     for stage in stages:
         rays = stage["rays"] * min(MORE_LENSLETS, lenslets)
@@ -280,26 +282,26 @@ def each_lenslet(stages: list[Table], lenslets: int, resolution: tuple[int, int]
     return found
 
 
-#: What a quality means for the refinement on the wave image: wavelengths of white light, iterations of each stage, and how many
-#: seconds `waves = "auto"` may take for it on two cores.
+#: Qualities of the refinement on the wave image: wavelengths of white light, iterations of each stage, and the time budget of
+#: `waves = "auto"`, seconds on two cores.
 WAVES = {
     "draft": (3, (10,), 8.0),
     "standard": (5, (12, 20), 25.0),
     "fine": (8, (30, 30), 90.0),
 }
-#: Seconds on two cores for one sample of the field in one iteration: at each wavelength, and for the spline there.
+#: Time on two cores per sample of the field and iteration, s: at each wavelength, and for the spline.
 SECONDS_A_SAMPLE, SECONDS_A_POINT = 2.2e-8, 6e-8
-#: Fewer iterations than these are not worth an exact trace.
+#: Least number of iterations that is worth an exact trace.
 LEAST_WAVES = 5
 
 
 def wave_refinement(samples: float, wavelengths: int, quality: str = "standard", timed: bool = True) -> list[tuple[int, int]]:
-    """Stages on the wave image after those on rays: (wavelengths of white light, iterations) each.
+    """Stages on the wave image after those on rays: (number of wavelengths of white light, iterations) each.
 
     Args:
         samples: of the field at one wavelength.
-        wavelengths: of the source; 0 for white light.
-        timed: keep within the quality's time, with fewer iterations or none at all.
+        wavelengths: number of the source's wavelengths; 0 for white light.
+        timed: keep the time budget of the quality, with fewer iterations or none at all.
     """
     check("quality", quality)
     count, plan, seconds = WAVES[quality]

@@ -1,4 +1,4 @@
-"""CPU kernel for where rays start: the function of `sampling.random_numbers`, the reference it is tested against."""
+"""CPU kernel for random sample points of the aperture; its reference is `sampling.random_numbers`."""
 
 from __future__ import annotations
 

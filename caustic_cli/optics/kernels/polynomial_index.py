@@ -1,4 +1,4 @@
-"""Rays through a medium whose index is a polynomial of one variable, with the adjoint: the loops of `gradient.integrator`.
+"""Ray integration in a medium whose index is a polynomial of one variable, with the adjoint: `gradient.integrator` compiled.
 
 Notation, beside that of `integrator`
     s       r^2 = x^2 + y^2, or z;  e = grad s, (2 x, 2 y, 0) or (0, 0, 1)

@@ -1,4 +1,4 @@
-"""Functions known at nodes of an even grid: between these, and beside where they are known."""
+"""Interpolation of functions on a uniform grid, and extrapolation into dark regions."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-#: Points of the interpolation between nodes along an axis.
+#: Stencil points of the interpolation along an axis.
 POINTS = 6
-#: Finer rows that are made at a time.
+#: Fine rows that are computed at a time.
 BLOCK = 256
 
 
-def between(nodes: int, low: float, step: float, fine_low: float, fine_step: float, count: int, like: Tensor):
-    """First node and weights (count, POINTS) of Lagrange's interpolation at finer cells; None where they are the nodes."""
+def lagrange_weights(nodes: int, low: float, step: float, fine_low: float, fine_step: float, count: int, like: Tensor):
+    """Lagrange interpolation at `count` fine cells: first node (count,) and weights (count, POINTS); None if they are the nodes."""
     if nodes == count:
         return None
     x = (fine_low + fine_step * (torch.arange(count, dtype=torch.float64, device=like.device) + 0.5) - low) / step - 0.5
@@ -25,8 +25,8 @@ def between(nodes: int, low: float, step: float, fine_low: float, fine_step: flo
     return first, weights
 
 
-def _mixed(c: Tensor, first: Tensor, weights: Tensor) -> Tensor:
-    """Rows of c (n, m) in these mixtures (count, m), a block of them at a time by a matrix of the few rows that it needs."""
+def _combined_rows(c: Tensor, first: Tensor, weights: Tensor) -> Tensor:
+    """Linear combinations (count, m) of rows of c (n, m), block by block, each with a dense matrix of the rows that it needs."""
     found = []
     for start in range(0, len(first), BLOCK):
         at, w = first[start : start + BLOCK], weights[start : start + BLOCK]
@@ -44,17 +44,17 @@ def _product(factors: list[Tensor]) -> Tensor:
     return found
 
 
-def interpolated(c: Tensor, along_x, along_y) -> Tensor:
-    """A function (n, m) at finer rows and columns, by what `between` gives for each, None for the nodes themselves."""
+def interpolate(c: Tensor, along_x, along_y) -> Tensor:
+    """A function (n, m) at fine rows and columns, with the results of `lagrange_weights` for each axis."""
     if along_x is not None:
-        c = _mixed(c, *along_x)
+        c = _combined_rows(c, *along_x)
     if along_y is not None:
-        c = _mixed(c.T, *along_y).T.contiguous()
+        c = _combined_rows(c.T, *along_y).T.contiguous()
     return c
 
 
-def filled(c: Tensor, dark: Tensor) -> Tensor:
-    """A function (n, m) with what it is beside the dark in a few cells of that, 0 beyond."""
+def extrapolated(c: Tensor, dark: Tensor) -> Tensor:
+    """A function (n, m) extrapolated by neighbourhood averages into the nearest cells of the dark region; 0 farther inside."""
     if not bool(dark.any()):
         return c
     known, c = (~dark).to(c), torch.where(dark, torch.zeros_like(c), c)
@@ -67,10 +67,11 @@ def filled(c: Tensor, dark: Tensor) -> Tensor:
 
 
 @dataclass
-class Refined:
-    """A wavefront on a finer grid: its columns are there, rows are made when asked for.
+class FineWavefront:
+    """A wavefront on a fine grid: columns are interpolated already, rows on demand.
 
-    root: of the power of a whole cell; shade: see `Wavefront`; step: of the finer grid; along_x: of rows, see `between`.
+    root: square root of the power of a fully lit cell; shade: see `Wavefront`; step: of the fine grid; along_x: weights of the
+    rows, see `lagrange_weights`.
     """
 
     path: Tensor
@@ -82,8 +83,8 @@ class Refined:
     along_x: tuple[Tensor, Tensor] | None
 
     def rows(self, part: slice = slice(None)) -> tuple[Tensor, Tensor, Tensor]:
-        """Path, mm; root of the power of a whole cell; part of it that is lit: (rows, m) float64 each."""
-        lit = within_pupil(self._at(self.edge_x, part), None if self.edge_y is None else self._at(self.edge_y, part), self.step)
+        """Path, mm; square root of the power of a fully lit cell; lit fraction of the cell: (rows, m) float64 each."""
+        lit = pupil_coverage(self._at(self.edge_x, part), None if self.edge_y is None else self._at(self.edge_y, part), self.step)
         if self.shade is not None:
             lit = lit * self._at(self.shade, part).clamp(0.0, 1.0)
         return self._at(self.path, part), self._at(self.root, part), lit
@@ -95,11 +96,11 @@ class Refined:
         return path, root * lit
 
     def _at(self, c: Tensor, part: slice) -> Tensor:
-        return c[part] if self.along_x is None else interpolated(c, tuple(t[part] for t in self.along_x), None)
+        return c[part] if self.along_x is None else interpolate(c, tuple(t[part] for t in self.along_x), None)
 
 
-def within_pupil(edge_x: Tensor, edge_y: Tensor | None, step: tuple[float, float]) -> Tensor:
-    """Part of each cell that lies inside the pupil's edges."""
+def pupil_coverage(edge_x: Tensor, edge_y: Tensor | None, step: tuple[float, float]) -> Tensor:
+    """Fraction of each cell inside the pupil, from signed distances to its edges."""
     if edge_y is None:
         return (edge_x / (0.5 * (step[0] + step[1])) + 0.5).clamp(0.0, 1.0)
     return (edge_x / step[0] + 0.5).clamp(0.0, 1.0) * (edge_y / step[1] + 0.5).clamp(0.0, 1.0)

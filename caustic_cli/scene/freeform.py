@@ -1,4 +1,4 @@
-"""The free-form entrance of a lens with two free-form sides, and what its light does behind the picture."""
+"""A second free-form surface as data, and the target that it allows the light to meet behind the first picture."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from caustic_cli.scene.screen import Screen
 
 
 @dataclass(frozen=True, eq=False)
-class Front:
-    """A B-spline entrance over the lens' aperture.
+class FreeForm:
+    """A free-form surface with known control heights: a B-spline height field over an aperture.
 
     Args:
-        heights: (n, m) control heights, counted from the entrance's plane, mm.
-        degree, knots: as of a `Lens`.
+        heights: (n, m) control heights above the vertex plane, mm.
+        degree, knots: as for `Lens`.
     """
 
     heights: np.ndarray
@@ -27,12 +27,17 @@ class Front:
 
 
 @dataclass(frozen=True)
-class Second:
-    """What light does behind the picture, which a lens with one free-form side has no say in.
+class SecondTarget:
+    """What the light must do behind the first picture: form a second picture, converge to a focus, or leave collimated.
+
+    It takes two free-form surfaces: one determines where light arrives, two also determine its direction there.
 
     Args:
-        screen: farther on, where another picture is; None for light that goes on parallel to the axis, or towards a focus.
-        focus: (x, y, z), mm.
+        screen: screen of the second picture; None for collimated or focused light.
+        focus: (x, y, z), mm; None for collimated light, or a second picture.
+
+    Raises:
+        InputError: both are given, or a value is out of range.
     """
 
     screen: Screen | None = None
@@ -40,15 +45,15 @@ class Second:
 
     def __post_init__(self):
         if self.screen is not None and self.focus is not None:
-            raise InputError("⟨second.z⟩ and ⟨second.focus⟩ both say what light does behind the picture: give one of them")
+            raise InputError("⟨second.z⟩ and ⟨second.focus⟩ both define the light behind the picture: give one of them")
         if self.focus is not None:
             check("second.focus", self.focus)
 
     def check(self, screen: Screen) -> None:
-        """Refuse what does not lie behind the picture's screen.
+        """Check that the target lies behind the first picture's screen.
 
         Raises:
-            InputError: saying where it lies.
+            InputError: it does not, or that screen is tilted or curved.
         """
         if not screen.upright:
             raise InputError("the screen of a lens with two free-form sides must be plane and upright, without ⟨screen.tilt⟩")

@@ -1,7 +1,7 @@
-"""The kernels as differentiable torch functions: reverse mode by the written adjoint, forward mode by the tangent.
+"""The fused kernels as differentiable torch functions: reverse mode by the hand-written adjoint, forward mode by the tangent.
 
-A surface at the rays (along a tensor product of points, at scattered points, at the rays' hits) feeds one kernel that
-refracts, carries to the screen and splats.  All in float64, whatever precision the plain-torch reference would take.
+The surface at the rays (at a tensor product of points, at scattered points, or at intersections) is the input of one kernel that
+refracts, transfers to the screen and splats.  Everything is float64, whatever the precision of the plain-torch reference.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from caustic_cli.optics.bspline import SplineSpace
-from caustic_cli.optics.kernels import axial_refraction, blocks, filter_weights, pixels, plane, points
+from caustic_cli.optics.kernels import axial_refraction, blocks, filter_weights, fused, pixels, random_points
 from caustic_cli.optics.kernels.arguments import Exit, Frame, Splat
 from caustic_cli.optics.kernels.banded import AlongV
 from caustic_cli.optics.kernels.surface import FusedSurface, RayIntersections, scattered_surface
@@ -24,7 +24,7 @@ from caustic_cli.scene import Screen
 
 
 class _Workspace:
-    """Arrays that the kernels overwrite, kept from one call to the next."""
+    """Arrays that the kernels overwrite, reused from call to call."""
 
     def __init__(self) -> None:
         self.arrays: dict[str, np.ndarray] = {}
@@ -36,7 +36,7 @@ class _Workspace:
         return array
 
 
-#: Scattered rays are handed to the kernel in rows of so many.
+#: Length of the rows in which scattered rays are passed to the kernel.
 ROW = 1024
 
 
@@ -151,22 +151,22 @@ def _splat(
     """Call the kernel.  interface: n_in / n_out and the kind of Fresnel losses; start: height at which oblique rays begin, mm.
 
     Returns:
-        image (n_x, n_y) and the power leaving the lens (), float64, differentiable; what was lost, by name.
+        image (n_x, n_y) and the power behind the lens (), float64, differentiable; losses by name.
     """
     oblique, arguments = _arguments(rays, interface, height, start, screen, filter)
     padded, leaving, ledger = _Image.apply(*nets, rows, apart, arguments, workspace)
     (nx, ny), (rx, ry) = screen.resolution, filter.reach
     padded = padded[:, : ny + 4 * ry]  # beyond lies what rounds the scatter's steps up to four pixels
     image = padded[2 * rx : 2 * rx + nx, 2 * ry : 2 * ry + ny]
-    lost = {"missed_surface": ledger[plane.MISSED]} if oblique else {}
+    lost = {"missed_surface": ledger[fused.MISSED]} if oblique else {}
     return (
         image,
         leaving,
         lost
         | {
-            "fresnel": ledger[plane.FRESNEL],
-            "total_internal_reflection": ledger[plane.REFLECTED],
-            "off_screen": ledger[plane.OFF_SCREEN] + padding(padded.detach(), filter.reach),
+            "fresnel": ledger[fused.FRESNEL],
+            "total_internal_reflection": ledger[fused.REFLECTED],
+            "off_screen": ledger[fused.OFF_SCREEN] + padding(padded.detach(), filter.reach),
         },
     )
 
@@ -174,7 +174,7 @@ def _splat(
 def _arguments(
     rays, interface: tuple[float, str], height: float, start: float, screen: Screen, filter: Filter
 ) -> tuple[bool, tuple]:
-    """Whether rays are oblique, and what `plane` takes after the nets."""
+    """Whether rays are oblique, and the arguments of the `fused` kernels after the nets."""
     eta, fresnel = interface
     oblique = rays[2] is not _NONE
     exit_ = Exit(float(eta), axial_refraction.FRESNEL[fresnel], float(start), float(height))
@@ -184,13 +184,13 @@ def _arguments(
 
 
 def _layout(count: int) -> tuple[int, int]:
-    """Rows and columns for so many scattered rays: at least two rows, because one alone is always contiguous, see `_strided`."""
+    """Rows and columns for so many scattered rays: at least two rows, since a single one is always contiguous, see `_strided`."""
     rows = max(2, -(-count // ROW))
     return rows, -(-count // rows)
 
 
 def _strided(array: np.ndarray) -> np.ndarray:
-    """The same values read-only and not contiguous: tensor and scattered rays then share one compiled kernel."""
+    """The same values as a read-only, non-contiguous array: tensor-product and scattered rays then share one compiled kernel."""
     if array.flags.c_contiguous:
         wide = np.empty((array.shape[0], array.shape[1] + 1), array.dtype)
         wide[:, :-1] = array
@@ -198,19 +198,19 @@ def _strided(array: np.ndarray) -> np.ndarray:
     return array
 
 
-#: What stands for directions where all rays run along z.
+#: Placeholder for directions where all rays are parallel to z.
 _NONE = _strided(np.zeros((2, 2)))
 
 
 def compile_kernels() -> None:
-    """Have the kernels ready for a plane wave's rays: from the files kept, or compiled for this machine."""
+    """Load the kernels for plane waves from the cache, or compile them."""
     compile_surface()
     compile_splat()
     compile_adjoint()
 
 
 def compile_surface() -> None:
-    """What gives the surface at rays of a plane wave, and its adjoint."""
+    """Compile the evaluation of the surface at rays of a plane wave, and its adjoint."""
     space, at = SplineSpace.uniform(4, 3), torch.linspace(0.0, 1.0, ROW, dtype=torch.float64)
     heights = torch.zeros(4, 4, dtype=torch.float64, requires_grad=True)
     net, slope = AlongV(space, at, 0.5)(heights)
@@ -219,12 +219,12 @@ def compile_surface() -> None:
 
 
 def compile_splat() -> None:
-    """What bends, carries and splats the rays."""
+    """Compile the fused refraction, transfer and splat."""
     _Image.apply(*_example())
 
 
 def compile_adjoint() -> None:
-    """The adjoint of `compile_splat`'s kernel."""
+    """Compile the adjoint of the kernel of `compile_splat`."""
     *nets, rows, apart, arguments, workspace = _example()
     _adjoint(
         torch.zeros(_images(arguments, workspace)[0].shape[1:], dtype=torch.float64), 1.0, nets, rows, apart, arguments, workspace
@@ -232,7 +232,7 @@ def compile_adjoint() -> None:
 
 
 def _example() -> tuple:
-    """What `_Image` takes, for a few rays."""
+    """Arguments of `_Image` for a few rays."""
     space, at = SplineSpace.uniform(4, 3), torch.linspace(0.0, 1.0, 2, dtype=torch.float64)
     kernel = PlaneKernel((space, space), (1.0, 1.0), at, at, True, torch.tensor(0.25, dtype=torch.float64))
     (x, y, flux), net = kernel.rays, torch.zeros(4, 2, dtype=torch.float64)
@@ -243,15 +243,15 @@ def _example() -> tuple:
 
 
 class _Image(torch.autograd.Function):
-    """Three nets (n, b), and how `plane.forward` is to use them -> padded image, power leaving the lens (), ledger."""
+    """Three nets (n, b) and the arguments of `fused.forward` -> padded image, power behind the lens (), ledger."""
 
     @staticmethod
     def forward(net: Tensor, net_x: Tensor, net_y: Tensor, rows: tuple, apart: bool, arguments: tuple, workspace: _Workspace):
         images, scratch = _images(arguments, workspace)
-        ledgers = np.empty((len(images), plane.COLUMNS))
-        plane.forward(ALL, images, ledgers, scratch, *rows, *_arrays(net, net_x, net_y), *arguments)
+        ledgers = np.empty((len(images), fused.COLUMNS))
+        fused.forward(ALL, images, ledgers, scratch, *rows, *_arrays(net, net_x, net_y), *arguments)
         ledger = ledgers.sum(0)
-        leaving = torch.tensor(ledger[plane.LEAVING], dtype=torch.float64)
+        leaving = torch.tensor(ledger[fused.LEAVING], dtype=torch.float64)
         return torch.from_numpy(pixels.total(images)), leaving, torch.from_numpy(ledger)
 
     @staticmethod
@@ -274,7 +274,7 @@ class _Image(torch.autograd.Function):
         along = [torch.zeros_like(n) if t is None else t for t, n in zip(tangents[:3], nets, strict=True)]
         images, scratch = _images(ctx.arguments, ctx.workspace)
         leaving = np.empty(len(images))
-        plane.tangent(ALL, *_arrays(*along), images, leaving, scratch, *ctx.rows, *_arrays(*nets), *ctx.arguments)
+        fused.tangent(ALL, *_arrays(*along), images, leaving, scratch, *ctx.rows, *_arrays(*nets), *ctx.arguments)
         return torch.from_numpy(pixels.total(images)), torch.tensor(leaving.sum(), dtype=torch.float64), None
 
 
@@ -284,7 +284,7 @@ def _adjoint(
     """Derivatives by the three nets (n, b), a sum for each block: (3, blocks, n, b), or (3, 1, n, b) with `apart`."""
     scratch, shape = _images(arguments, workspace)[1], nets[0].shape
     sums = np.empty((3, 1, *shape)) if apart else workspace("nets", 3, len(scratch), *shape)
-    plane.backward(ALL, by_image.contiguous().numpy(), by_leaving, apart, sums, scratch, *rows, *_arrays(*nets), *arguments)
+    fused.backward(ALL, by_image.contiguous().numpy(), by_leaving, apart, sums, scratch, *rows, *_arrays(*nets), *arguments)
     return sums
 
 
@@ -293,7 +293,7 @@ def _images(arguments: tuple, workspace: _Workspace) -> tuple[np.ndarray, np.nda
     x, *_, frame, splat, _ = arguments
     count, nx, ny = blocks(), frame.pixels_x + 2 * (splat.size_x - 1), frame.pixels_y + 2 * (splat.size_y - 1)
     images = workspace("images", count, nx, ny + -splat.size_y % 4)
-    return images, workspace("scratch", count, plane.scratch_rows(splat), x.shape[1])
+    return images, workspace("scratch", count, fused.scratch_rows(splat), x.shape[1])
 
 
 def _arrays(*tensors: Tensor) -> list[np.ndarray]:
@@ -304,5 +304,5 @@ def scattered_points(keys, salts, start: int, stop: int, nu: int, nv: int, strat
     """The points u, v of rays start..stop of a stratified or uniform `Sampler`: (stop - start,) float64 each."""
     blocks()
     keys, salts = (tuple(np.uint64(k) for k in pair) for pair in (keys, salts))
-    u, v = (torch.from_numpy(a) for a in points.scatter(keys, salts, start, stop, nu, nv, stratified))
+    u, v = (torch.from_numpy(a) for a in random_points.scatter(keys, salts, start, stop, nu, nv, stratified))
     return u, v

@@ -1,4 +1,4 @@
-"""How far light behind the lens strays from the way it should go: parallel to the axis, or towards a focus."""
+"""Angular error of collimated or focused light: the angle of rays behind the lens to the axis, or to the direction of the focus."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Scene
 
 
-def misdirection(traced: Tracer, state: RayState, scene: Scene) -> Tensor:
-    """Sum over rays behind the lens of power times the square of the tangent of their angle to the way they should go."""
+def squared_angular_error(traced: Tracer, state: RayState, scene: Scene) -> Tensor:
+    """Sum over rays on the screen of power times the squared tangent of their angle to the intended direction, ();
+    differentiable."""
     ray = traced.onto(state, scene.screen)
     dz = torch.as_tensor(ray.direction[2])
     squares, focus = torch.zeros((), dtype=torch.float64), scene.second.focus if scene.second else None
@@ -26,5 +27,5 @@ def misdirection(traced: Tracer, state: RayState, scene: Scene) -> Tensor:
 
 
 def rms_angle(squares: float, power: float) -> float:
-    """Root mean square of the angle, rad."""
+    """Root mean square angle, rad, from such a sum and the total power."""
     return math.sqrt(squares / power) if power > 0 else math.nan

@@ -1,12 +1,13 @@
-"""What a scene has that other programs' files, as written here, cannot say."""
+"""Scene features that the export formats and Mitsuba scenes written here do not support."""
 
 from __future__ import annotations
 
 from caustic_cli.scene import Scene
 
 
-def beyond_plain(scene: Scene) -> list[str]:
-    """Names of all that goes beyond a clear lens of one index, unpolarised light and a screen straight on the axis."""
+def special_features(scene: Scene) -> list[str]:
+    """The features of a scene beyond a non-absorbing lens of homogeneous index, unpolarised monochromatic light and a plane screen
+    centred on the axis and perpendicular to it: noun phrases for messages, empty for a basic scene."""
     lens, screen, light = scene.lens, scene.screen, scene.light
     found = {
         "a mirror": lens.mirror,

@@ -1,21 +1,29 @@
-"""Rays that have their feet on a given grid, by Newton's method on the pupil; for `wavefront`."""
+"""Ray aiming: rays through the points of a given grid on the reference plane, by Newton's method on the pupil."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-#: Feet are sought so often at most, and at the edges of what is dark at least; rays that never saw light go so far to the middle
-#: each time.
+#: Largest number of iterations, and least number at the edges of dark regions; fraction of the distance to the centre of the light
+#: by which rays that have always been blocked move in each iteration.
 TRIES, AT_EDGES, INWARDS = 16, 10, 0.02
 
 
-def sought(optics, seen, at: tuple[Tensor, Tensor], shape: tuple[int, int], step: tuple[float, float], left: float) -> tuple:
-    """Rays (`Feet`) of an `Optics` surveyed as `seen`, with their feet at points (N,) each; where they pass the pupil; and which of
-    them stand at the edge of what is dark; left: see `_left`.
+def aimed_rays(optics, seen, at: tuple[Tensor, Tensor], shape: tuple[int, int], step: tuple[float, float], left: float) -> tuple:
+    """Rays with intercepts at given points of the reference plane.
 
-    Rays beyond the pupil's edges stay on them.  Where rays are stopped behind it their feet say nothing: they go back towards the
-    last ray that was not, and such as never were towards the middle.
+    Args:
+        optics, seen: the `Optics`, and its `Survey`.
+        at: x, y (N,) of the points, mm.
+        shape, step: of the grid that they form, mm.
+        left: tolerance of the path error, mm, see `_left`.
+
+    Returns:
+        `Intercepts` of the rays; their points of the pupil u, v; and whether a ray was blocked at some iteration, (N,).
+
+    Rays that leave the pupil are clamped to its edge.  The intercepts of rays that are blocked behind the pupil are undefined: such
+    a ray moves back towards its last unblocked position, or else towards the centre of the light.
     """
     x, y = at
     u, v = ((c - seen.offset[k]) / seen.scale[k] for k, c in enumerate(at))
@@ -24,7 +32,7 @@ def sought(optics, seen, at: tuple[Tensor, Tensor], shape: tuple[int, int], step
     held = u.clamp(0.0, 1.0), v.clamp(0.0, 1.0)
     for k in range(TRIES):
         hu, hv = u.clamp(0.0, 1.0), v.clamp(0.0, 1.0)
-        f = optics.feet(hu, hv)
+        f = optics.intercepts(hu, hv)
         lit = f.power > 0
         found, behind = found | lit, behind | ~lit
         held_u, held_v = (torch.where(lit | ~found, h, before) for h, before in zip((hu, hv), held, strict=True))
@@ -38,14 +46,15 @@ def sought(optics, seen, at: tuple[Tensor, Tensor], shape: tuple[int, int], step
             for a, h, b, m in zip(ahead, (hu, hv), held, middle, strict=True)
         )
     if bool(behind.any()):
-        f = optics.feet(*held)
+        f = optics.intercepts(*held)
     return f, held, behind
 
 
 def _left(
     f, x: Tensor, y: Tensor, shape: tuple[int, int], step: tuple[float, float], u: Tensor, v: Tensor, behind: Tensor
 ) -> float:
-    """Bound of the path left out where feet miss the grid by e: half e^2 times the wavefront's curvature there, mm."""
+    """Bound of the error of the optical path due to a displacement e from the grid points: e^2 / 2 times the wavefront's curvature,
+    mm."""
     inside = ~behind & (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
     if not bool(inside.any()):
         return 0.0

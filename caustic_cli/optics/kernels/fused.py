@@ -1,11 +1,11 @@
-"""Fused CPU kernel: refraction at the exit surface -> landing point -> splat, with its adjoint and its tangent.
+"""Fused CPU kernel: refraction at the exit surface -> landing point -> splat, with its adjoint and tangent.
 
-The stages of `optics.trace` by the plain-torch backend, a row of rays at a time without storing anything
-between rows; both are the reference it is tested against.  All of it in float64: float32 was no faster.
+It combines the stages of `optics.trace`, row by row of rays without intermediate storage; the plain-torch backend is its reference.
+Everything is float64, since float32 was no faster.
 
-Each of a fixed number of blocks of rows has an image of its own and they are added in order, so the result does not depend
-on timing, only on the number of blocks (the number of threads).  Only the scatter and the gather of pixels go ray by ray,
-four pixels at a time; the rest (`rows`, `axial_refraction`, `filter_weights`) goes a row at a time in vector instructions.
+Each of a fixed number of blocks of rows accumulates an image of its own, and these are added in order, so the result depends on the
+number of blocks (threads) but not on timing.  Only the scatter to and the gather from pixels are per ray, four pixels at a time;
+the rest (`rows`, `axial_refraction`, `filter_weights`) is vectorised over rows.
 """
 
 from __future__ import annotations
@@ -81,14 +81,14 @@ def _bend(v, i, surface, rays, exit_, frame):
 
 @njit(inline="always", **FAST)
 def _oblique(i, surface, rays):
-    """Row i as `oblique_refraction` takes it: oblique rays have a surface of their own each, and no row of it is a sum."""
+    """Row i in the format of `oblique_refraction`: each oblique ray has its own distance and slopes, without a contraction."""
     (_, _, _, net, net_x, net_y), (_, _, along_x, along_y, flux) = surface, rays
     return net[i], net_x[i], net_y[i], along_x[i], along_y[i], flux[i]
 
 
 @njit(inline="always", **FAST)
 def share(v, splat, sx, sy, dx, dy):
-    """Shares of one row's rays among pixels, and their slopes unless dx and dy are empty."""
+    """Filter weights of one row's rays, and their derivatives unless dx and dy are empty."""
     scratch = v[VECTORS:]
     if splat.size_x > 1:
         fraction(v[PX], v[PHI])
@@ -234,7 +234,7 @@ def _scatter_tangent(vectors, exit_, frame, splat, sx, sy, dx, dy, image):
 
 
 def scratch_rows(splat: Splat) -> int:
-    """Rows of ray vectors that a block works in."""
+    """Number of rows of a block's scratch memory."""
     return VECTORS + SCRATCH + 2 * (splat.size_x + splat.size_y)
 
 
@@ -250,7 +250,7 @@ def _cut(scratch, vx, vy):
 def forward(
     block, images, ledgers, scratch, first, bu, du, net, net_x, net_y, x, y, along_x, along_y, flux, exit_, frame, splat, oblique
 ):
-    """Blocks' ledgers (blocks, COLUMNS), power by what became of it, and their images, whose `pixels.total` is the padded one.
+    """Ledgers (blocks, COLUMNS) of the losses, and partial images, whose `pixels.total` is the padded image.
 
     The surface comes by rows.  Row i of the sag is sum_k bu[i, k] net[first[i] + k], of dz/dx the same with du and net_x,
     of dz/dy with bu and net_y.  first (a,) int64; bu, du (a, p + 1); nets (n, b); x, y mm and flux, parts of the
@@ -332,7 +332,7 @@ def backward(
 
     nets (3, 1 if apart else blocks, n, b) are overwritten: the `pixels.total` of each is the derivative by a net (n, b).
 
-    apart: no two rows share a row of the nets, so that one sum serves all blocks.  Otherwise net_x is taken to be net
+    apart: no two rows share a row of the nets, so that a single sum suffices for all blocks.  Otherwise net_x is taken to be net
     itself, and the sum of both derivatives comes as the first.  scratch: overwritten, as in `forward`.
     """
     if block == ALL:

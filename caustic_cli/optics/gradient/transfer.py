@@ -1,13 +1,12 @@
-"""From one surface to the next through a medium of varying index.
+"""Ray transfer to the next surface through a gradient-index medium.
 
-Notation, beside that of `integrator`
+Notation, in addition to that of `integrator`
     f(q)    height of a point above the next surface, in that surface's frame: z - Z(x, y);  f' = grad f . p along a ray
-    T       tau of the straight way to the surface's mean height, in `steps` steps: as good a guess as bending is weak
-    delta   what is then missing to the surface, one more step: found by Newton's method, f(q(T + delta)) = 0
+    T       tau of the straight path to the surface's mean height, integrated in `steps` steps: an estimate, good for weak gradients
+    delta   remaining step to the surface, from Newton's method for f(q(T + delta)) = 0
 
-T follows differentiably from the ray; a guess that misses by more than a step is moved by what it missed, and halved where the ray
-has turned away from the surface by then, which changes the steps and not the ray.  delta is differentiated at the root,
-d delta = -df / f'.
+T is a differentiable function of the ray.  If delta exceeds a step, T is increased by it; if the ray has turned away from the
+surface, T is halved.  This changes the steps but not the ray.  delta is differentiated at the root, d delta = -df / f'.
 """
 
 from __future__ import annotations
@@ -23,17 +22,20 @@ from caustic_cli.optics.gradient.integrator import ORDER, Flow, steps_for
 from caustic_cli.optics.surfaces.base import Surface
 from caustic_cli.optics.tolerances import PARALLEL
 
-#: Part of the way that rays may be off, and angle, rad: a thousandth of a pixel on any screen that a picture of 1000 pixels is on.
+#: Error tolerance of points relative to the path length, and of directions, rad: a thousandth of a pixel for a picture of 1000
+#: pixels.
 TOLERANCE = 1e-7
-#: A point is on the surface where it is so near, in parts of the way; most steps of Newton's iteration, most guesses of T.
+#: Tolerance of the distance to the surface relative to the path length; largest numbers of Newton iterations and of corrections of
+#: T.
 ON_SURFACE, NEWTON, GUESSES = 1e-12, 12, 12
 
 
-class Crossing(NamedTuple):
+class Transfer(NamedTuple):
     """Rays at the next surface.
 
-    point, direction: in the medium's frame, three (N,) each, mm and unit; n: there; path, length: optical and geometric, mm;
-    slopes: of the surface, two (N,) or the number 0; found: whether the surface is met; steps: that were taken.
+    point, direction: in the medium's frame, three (N,) each, mm and unit vectors; n: index there; path, length: optical and
+    geometric path length, mm; slopes: of the surface, two (N,) or the number 0; found: whether the surface is reached; steps:
+    number of steps.
     """
 
     point: tuple
@@ -47,12 +49,12 @@ class Crossing(NamedTuple):
 
 
 def index_at(march, field: IndexField, coefficients: Tensor | None, point) -> Tensor:
-    """n at points: the length that a ray at rest gains in one kick."""
+    """Refractive index at points, (N,): the length L of a ray with p = 0 after one kick of unit size."""
     zero, one = torch.zeros_like(point[0]), torch.ones_like(point[0])
     return march(field, coefficients, point, (zero, zero, zero), one, 1, 2).length
 
 
-def cross(
+def transfer(
     march: Callable[..., Flow],
     field: IndexField,
     coefficients: Tensor | None,
@@ -64,16 +66,16 @@ def cross(
     side: float,
     steps: int | None = None,
     order: int = ORDER,
-) -> Crossing:
-    """Rays to a surface through a field.
+) -> Transfer:
+    """Trace rays to a surface through an index field.
 
     Args:
         march: `flow` of a backend.
         point, direction: three (N,) float64 each, in the medium's frame.
-        surface, heights: what they run to.
-        seen: (points, vectors) of the medium's frame -> the same in the surface's.
-        side: from which the surface is met.
-        steps: None for as many as TOLERANCE asks for.
+        surface, heights: the next surface.
+        seen: transformation of (points, vectors) from the medium's frame to the surface's.
+        side: from which the surface is reached.
+        steps: number of steps; None for as many as TOLERANCE requires.
     """
     n = index_at(march, field, coefficients, point)
     p = tuple(n * d for d in direction)
@@ -86,7 +88,7 @@ def cross(
     near = ON_SURFACE * max(float(time.detach().abs().max()) * float(n.detach().mean()), 1e-3)
 
     def above(at: Flow):
-        """f, f' and the slopes; beyond its aperture a surface goes on level."""
+        """f, f', slopes, and whether the point is inside the aperture, beyond which the surface is continued at constant height."""
         (x, y, z), (px, py, pz) = seen(at.point, at.momentum)
         if surface.flat:
             return z, pz, (0.0, 0.0), torch.ones_like(z, dtype=torch.bool)
@@ -97,7 +99,7 @@ def cross(
         return z - height, pz - gx * px - gy * py, (gx, gy), within
 
     def missing(begin: Flow) -> tuple[Tensor, Tensor]:
-        """delta of rays from here, and whether they come to the surface."""
+        """delta of rays from this point on, and whether they reach the surface."""
         f, rate, _, _ = above(begin)
         delta = torch.zeros_like(f)
         ok = side * rate > PARALLEL
@@ -128,7 +130,7 @@ def cross(
     end = march(field, coefficients, arrived.point, arrived.momentum, delta, 1, order)
     _, _, slopes, within = above(end)
     norm = (end.momentum[0] ** 2 + end.momentum[1] ** 2 + end.momentum[2] ** 2).sqrt()
-    return Crossing(
+    return Transfer(
         end.point,
         tuple(c / norm for c in end.momentum),
         norm,

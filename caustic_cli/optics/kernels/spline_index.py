@@ -1,13 +1,13 @@
-"""Rays through a B-spline volume of refractive index, with the adjoint: the loops of `gradient.integrator` and of its fields.
+"""Ray integration through a B-spline volume of refractive index, with the adjoint: `gradient.integrator` compiled.
 
-Each ray runs by itself from beginning to end, so that it stays in registers.  Notation and formulas are those of `integrator`; with
-n a spline, F = n grad n and
+Each ray is integrated individually from beginning to end and stays in registers.  Notation and formulas are those of `integrator`;
+with n a spline, F = n grad n and
 
     (dF/dq)^T l = grad n (grad n . l) + n H l,    H the second derivatives of n
     d(F . l)/dc = (grad n . l) B + n (grad B . l),    B(q) the product of three basis functions
 
 An axis of a spline space has pieces, on each of which a basis function is a polynomial (`spline.Axis`); one along which the field
-does not change has a single piece and the function 1.  Beyond the box every basis function goes on along its tangent.
+does not change has a single piece and the function 1.  Outside the box basis functions are extrapolated linearly.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ WIDE = 16
 
 
 class VolumeAxis:
-    """What the kernels know of one axis: breaks, first basis functions and their polynomials, and x -> u = (x - low) over width."""
+    """Kernel data of one axis: breaks, first basis functions and their polynomials, and the map x -> u = (x - low) / width."""
 
     def __init__(self, space: SplineSpace | None, middle: float, half: float):
         if space is None:
