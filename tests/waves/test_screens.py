@@ -185,7 +185,7 @@ def test_parts_of_a_source_are_spread():
     field, heights = wavy(scene, 0.02)
     lines, at = lines_of(scene, field), {EXIT: heights}
     imager = Imager.of(lines, at, receiver_of(lines[0].system, screen))
-    few, more, one = (replace(imager, each=n).expose(lines, at).image.numpy() for n in (4, 12, 0))
+    few, more, one = (replace(imager, each=n).expose(lines, at).image.numpy() for n in (6, 18, 0))
     assert apart(few, more) < 0.6 * apart(one, more)
     assert float(few.sum()) == pytest.approx(float(more.sum()), rel=3e-3)  # where the source's edge is spread beyond the screen
 
