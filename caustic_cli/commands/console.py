@@ -207,25 +207,28 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
         black += [
             (f"a radius of {radius['radius_mm']:g} mm", f"first surface {with_it:.2%} in black, {without:.2%} without: {each}")
         ]
-    waves = []
+    error, waves = [("relative RMS error", number("relative_rms", ".4f") + of_rays)], []
     if "no_wave_image" in figures:
-        waves = [("of light as a wave", f"no image: {figures['no_wave_image']}")]
+        waves = [("wave image", f"none: {figures['no_wave_image']}")]
     elif "wave_relative_rms" in figures:
-        seen = f"relative RMS error {number('wave_relative_rms', '.4f')}, on the picture {number('wave_on_target', '.2%')}"
+        seen = f"on the picture {number('wave_on_target', '.2%')}"
         if figures.get("wave_in_black") is not None:
             seen += f", in black {number('wave_in_black', '.2%')}"
         if figures["wave_relative_rms"] is None:  # an archive has no target picture
             seen = f"on the screen {number('wave_on_screen', '.2%')}"
+        else:  # where light is a wave its error comes first, since that of the rays says little of it
+            of_waves = f"{number('wave_relative_rms', '.4f')} of the wave image, {_wavelengths(figures['wave_wavelengths'])}"
+            error = [("relative RMS error", of_waves), ("of the rays alone", error[0][1])]
         waves = [
-            ("of light as a wave", f"{seen}, {_wavelengths(figures['wave_wavelengths'])}"),
+            ("wave image", f"{seen}, {_wavelengths(figures['wave_wavelengths'])}"),
             *((f"{name} as a wave", value) for name, value in _absolute(figures, "wave_")),
             ("details light carries", number("resolvable", "d") + " across"),
         ]
     behind = []
     if figures.get("second_relative_rms") is not None:
-        error, known = number("second_relative_rms", ".4f"), figures.get("second_noise")
+        value, known = number("second_relative_rms", ".4f"), figures.get("second_noise")
         behind = [
-            ("second picture", f"relative RMS error {error}" + ("" if known is None else f", noise {known:.2g}")),
+            ("second picture", f"relative RMS error {value}" + ("" if known is None else f", noise {known:.2g}")),
             ("light on it", number("second_on_target", ".2%")),
         ]
     elif figures.get("angle_rms_mrad") is not None:
@@ -238,7 +241,7 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
     start = []
     if figures.get("start_relative_rms") is not None:
         known = f", noise {figures['start_noise']:.2g}" if "start_noise" in figures else ""
-        start = [("of its start, by rays", f"{figures['start_relative_rms']:.4f}{known}")]
+        start = [("of the initial surface, by rays", f"{figures['start_relative_rms']:.4f}{known}")]
     for row in figures.get("over", ()):
         values = ", ".join(f"{key} {row[key]:g}" for key in row if key not in OF_LENS)
         known = "" if row["noise"] is None else f", noise {row['noise']:.2g}"
@@ -248,7 +251,7 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
     if "etendue_limit" in figures:
         least.append(("etendue limit", number("etendue_limit", ".2%") + " of the light on the lens"))
     return [
-        ("relative RMS error", number("relative_rms", ".4f") + of_rays),
+        *error,
         *start,
         *least,
         ("loss (eq. 5.2.1)", number("loss", ".4e")),

@@ -19,7 +19,7 @@ GROUPS = {
     "Picture": ("target",),
     "Light source": ("source",),
     "Lens": ("lens",),
-    "Screen": ("screen",),
+    "Screen": ("screen", "second"),
     "Design": ("design",),
     "Effects": (),
     "Image": (),

@@ -236,7 +236,7 @@ _ROWS = (
             " uniform grid over the screen, borders included; a 2-D .npy [i, j] or a .tif of 32-bit floats",
             option=Option("--screen-shape", "FILE", BOTH)),
     # The target
-    Setting("mag", "number", "magnification: width of the picture over width of the lens", low=1e-3, high=1e3, default=3.0,
+    Setting("mag", "number", "width of the picture in lens widths", low=1e-3, high=1e3, default=3.0,
             why="table 6.1 of the thesis", option=Option("--mag")),
     Setting("margin", "number", "total width of the dark border relative to the picture", low=0.0, high=100.0, default=0.28,
             why="table 6.1 of the thesis: a screen 6.4 wide for a picture of 5, which shows stray light",
@@ -255,7 +255,7 @@ _ROWS = (
     Setting("target.color", "flag", "three colour channels (611, 549, 464 nm), with the glass' index for each", default=False,
             written=False, option=Option("--color")),
     # The second target, behind the picture: the lens then has two free-form sides
-    Setting("second.file", "text", "a second picture, formed by the same light on a screen farther away; in this directory",
+    Setting("second.file", "text", "second picture, formed by the same light on a screen farther away; in this directory",
             option=Option("--second", "PICTURE")),
     Setting("second.z", "number", "distance of that screen from the lens' origin", "mm", *DISTANCE,
             option=Option("--second-at", "MM")),
@@ -268,7 +268,7 @@ _ROWS = (
     Setting("second.focus", "points", "focus of the light behind the picture", "mm", *DISTANCE,
             option=Option("--focus", "X,Y,Z")),
     # Other lenses and fold mirrors, [[element]]
-    Setting("elements", "tables", "a further lens or a fold mirror on the axis, with the keys of an [[element]] table:"
+    Setting("elements", "tables", "further lens or fold mirror on the axis, with the keys of an [[element]] table:"
             " 'lens z=-40 thickness=4 radius=50,inf glass=N-BK7', 'mirror z=150 tilt=45,0'; may be repeated, in the order in which"
             " light reaches them", derived="none", option=Option("--element", "'TYPE KEY=VALUE...'")),
     Setting("element.type", "text", "singlet lens, or mirror, which folds the axis", choices=("lens", "mirror"),

@@ -275,7 +275,7 @@ def _row(
         made = BY_NAME[name].probe(scene, heights)
         if made is None:
             return None
-        scene, bare, amount = made.scene, made.bare, made.words
+        scene, bare, amount = made.scene, made.baseline, made.words
         plan = compile_plan(scene, field, heights)
     elif effect.fixed:
         return None
