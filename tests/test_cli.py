@@ -120,7 +120,7 @@ BAD = {
     "lens size text": (DESIGN + "--lens-size 10x10x10", "--lens-size"),
     "screen size": (DESIGN + "--screen-size -5", "--screen-size"),
     "margin": (DESIGN + "--margin -1", "--margin"),
-    "min thickness": (DESIGN + "--min-thickness 50 --thickness 5", "--min-thickness of 50 mm leaves the heights no room"),
+    "min thickness": (DESIGN + "--min-thickness 50 --thickness 5", "--min-thickness of 50 mm leaves no room for the heights"),
     "loss": (DESIGN + "--loss moon", "--loss"),
     "network": (DESIGN + "--network moon", "--network"),
     "network and lbfgs": (DESIGN + "--network sparse --optimizer lbfgs", "--optimizer"),
