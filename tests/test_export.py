@@ -13,12 +13,13 @@ from scipy.interpolate import BSpline, RectBivariateSpline
 
 from caustic_cli import __version__
 from caustic_cli.errors import InputError
-from caustic_cli.export import FORMATS, mesh, surface
+from caustic_cli.export import FORMATS, lighttools, mesh, surface
 from caustic_cli.export.accuracy import Deviation, of_bilinear, of_patches, of_spline, of_triangles
 from caustic_cli.export.lighttools import write_lighttools
 from caustic_cli.export.mesh import closed_mesh, patch
 from caustic_cli.export.stl import TRIANGLE, write_stl
 from caustic_cli.export.surface import STEPS_PER_SPAN, sample_grid
+from caustic_cli.io.archive import open_archive
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import EXIT, System
@@ -207,6 +208,29 @@ def test_retraced_from_the_cloud_alone_light_lands_where_the_tracer_puts_it(tmp_
     spread = np.hypot(landing.origin[0].numpy() - x, landing.origin[1].numpy() - y)
     assert spread.max() > 5  # mm: the lens does bend light
     assert np.hypot(landing.origin[0].numpy() - (x + reach * gx), landing.origin[1].numpy() - (y + reach * gy)).max() < 1e-6
+
+
+def test_a_large_spline_is_stored_on_fewer_knots_unless_the_exact_one_is_asked_for(tmp_path, monkeypatch):
+    """Smooth heights on 100 x 90 points in an archive of at most 200 kB: the spline's part is half, its deviation as measured."""
+    monkeypatch.setattr(lighttools, "USUAL_BYTES", 200_000)
+    monkeypatch.setattr(surface, "USUAL_BYTES", 200_000)
+    scene, field, heights = make(control=(100, 90), relief=0.0)
+    x, y = field.control_xy()
+    heights = heights + 1e-3 * torch.sin(9.0 * x[:, None]) * torch.cos(7.0 * y[None, :])
+    off = write_lighttools(tmp_path / "a.npz", scene, field, heights)
+    assert (tmp_path / "a.npz").stat().st_size < 200_000 and off.spline is not None
+    n, m = off.spline.samples
+    assert 0.4 < n * m * 24 / 100_000 <= 1.0
+    _, fewer, read = open_archive(tmp_path / "a.npz")
+    assert fewer.shape == (n, m)
+    u, v = (torch.from_numpy(c) for c in np.random.default_rng(2).uniform(-5.0, 5.0, (2, 2000)))
+    apart = float((fewer.at(read, u, v)[0] - field.at(heights, u, v)[0]).abs().max())
+    assert 0.3 * off.spline.height < apart <= 1.2 * off.spline.height < 3e-4
+    assert off.figures(scene)["spline"]["samples"] == [n, m]
+    whole = write_lighttools(tmp_path / "b.npz", scene, field, heights, tolerance=0.0)
+    assert whole.spline is None and torch.equal(open_archive(tmp_path / "b.npz")[2], heights)
+    with pytest.raises(InputError, match="must be 0, for the exact spline"):
+        write_lighttools(tmp_path / "c.npz", scene, field, heights, tolerance=1e-3)
 
 
 def test_archive_bytes_do_not_depend_on_the_day(tmp_path, monkeypatch):

@@ -53,7 +53,8 @@ def run(
             metavar="MM",
             help="Largest deviation from the surface.  stl, ply, obj, mitsuba: of the triangles, instead of --samples; heightmap:"
             " of bilinear interpolation (1e-4); gcode: of linear moves (a hundredth of the scallops); step: of a spline with as few"
-            " knots as possible, 0 for the exact one.  [default for step: at most 20 MB]",
+            " knots as possible, 0 for the exact one; lighttools: 0 for the exact spline.  [default for step and lighttools: at"
+            " most 20 MB]",
         ),
     ] = None,
     mould: Annotated[

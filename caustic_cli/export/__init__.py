@@ -29,7 +29,7 @@ MOULDS = (*SOLIDS, *AS_CUT)
 #: Formats that support two free-form sides.
 TWO_SIDED = ("lighttools", *SOLIDS, "mitsuba")
 #: Formats with a tolerance, and formats without samples.
-WITHIN, UNSAMPLED = (*MESHES, "step", "heightmap", "gcode"), ("step", "gcode")
+WITHIN, UNSAMPLED = (*MESHES, "lighttools", "step", "heightmap", "gcode"), ("step", "gcode")
 #: Further suffixes of formats.
 ALSO = {
     "step": (".stp",),

@@ -30,15 +30,17 @@ SEED = 0
 
 @dataclass(frozen=True)
 class Deviation:
-    """read_as: interpolation of the samples; samples: (nx, ny); height: largest |dZ|, mm; slope: RMS |dg|."""
+    """read_as: interpolation of the samples; samples: (nx, ny); height: largest |dZ|, mm; slope: RMS |dg|; spline: deviation of a
+    B-spline on fewer knots that is stored with the samples, if any."""
 
     read_as: str
     samples: tuple[int, int]
     height: float
     slope: float
+    spline: Deviation | None = None
 
     def figures(self, scene: Scene) -> dict:
-        """Figures for JSON: read_as, samples, height_error_mm, and shift_pixels in the scene of the lens."""
+        """Figures for JSON: read_as, samples, height_error_mm, and shift_pixels in the scene of the lens; spline: its own."""
         lens, screen = scene.lens, scene.screen
         gain = abs(screen.z - lens.offset.thickness) * (2.0 if lens.mirror else lens.index - 1.0) / min(screen.pixel)
         return {
@@ -46,6 +48,7 @@ class Deviation:
             "samples": list(self.samples),
             "height_error_mm": self.height,
             "shift_pixels": gain * self.slope,
+            **({} if self.spline is None else {"spline": self.spline.figures(scene)}),
         }
 
 

@@ -11,6 +11,7 @@ bytes whatever the day or the zlib.
 from __future__ import annotations
 
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +19,9 @@ from torch import Tensor
 
 from caustic_cli import __version__
 from caustic_cli.errors import InputError
-from caustic_cli.export.accuracy import Deviation, of_spline
-from caustic_cli.export.surface import SurfaceGrid, most_points, sample_grid
+from caustic_cli.export.accuracy import Deviation, of_poles, of_spline
+from caustic_cli.export.approximation import on_fewer_knots
+from caustic_cli.export.surface import USUAL_BYTES, SurfaceGrid, most_points, sample_grid
 from caustic_cli.io.files import MARK, atomic_path
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import entrance_of
@@ -27,14 +29,20 @@ from caustic_cli.scene import Lens, Light, Scene, Screen, Source
 from caustic_cli.scene.elements import SIDES
 
 FORMAT_VERSION = 1
-#: Bytes of a point in `points`, `normals` and `z`, and approximate bytes of all but these and control nets.
-A_POINT, BESIDE = 7 * 8, 100_000
+#: Bytes of a point in `points`, `normals` and `z`, and of a control point; approximate bytes of all but these.
+A_POINT, A_POLE, BESIDE = 7 * 8, 3 * 8, 100_000
 
 
 def write_lighttools(
-    path: str | Path, scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None
+    path: str | Path,
+    scene: Scene,
+    field: HeightField,
+    heights: Tensor,
+    samples: tuple[int, int] | None = None,
+    tolerance: float | None = None,
 ) -> Deviation:
-    """Write the archive atomically; the deviation of a spline through its point cloud, beside which the exact spline is stored.
+    """Write the archive atomically; the deviation of a spline through its point cloud.  The exact spline is stored with it, or, if
+    that alone would exceed `USUAL_BYTES`, an approximation on fewer knots within half of these.
 
     Keys: points, normals (N, 3); shape (2,); x (nx,), y (ny,), z (nx, ny); lens_half_size (2,), z_in, refractive_index;
     screen_half_size (2,), z_screen, resolution (2,); those of `_screen` and `_source`; fresnel unless exact; aperture if a circle;
@@ -44,12 +52,17 @@ def write_lighttools(
     Args:
         heights: (n, m) control heights, mm.
         samples: (nx, ny) of the point cloud; None for as many as `USUAL_BYTES` allow, at most a grid on the knots (`sample_grid`).
+        tolerance: 0 for the exact spline, whatever its size.
 
     Raises:
-        InputError: the samples are too few or too many, or the file cannot be written there.
+        InputError: the samples are too few or too many, the tolerance is not 0, or the file cannot be written there.
     """
+    if tolerance:
+        raise InputError(f"⟨tolerance⟩ of a LightTools archive must be 0, for the exact spline, or not given, got {tolerance:g} mm")
+    exact = tolerance == 0 or heights.numel() * A_POLE <= USUAL_BYTES
     grid = usual_cloud(scene, field, heights, samples)
-    x, y = (c.numpy() for c in field.control_xy())
+    written = (field, heights) if exact else on_fewer_knots(field, heights, USUAL_BYTES // 2 // A_POLE)
+    x, y = (c.numpy() for c in written[0].control_xy())
     x, y = np.broadcast_arrays(x[:, None], y[None, :])
     arrays = {
         "points": grid.points,
@@ -71,10 +84,10 @@ def write_lighttools(
         **({} if scene.lens.fresnel == "exact" else {"fresnel": np.array(scene.lens.fresnel)}),
         **_glass(scene.lens),
         **_light(scene.light),
-        "control_points": np.stack([x, y, heights.detach().double().cpu().numpy()], -1),
-        "degrees": np.array([s.degree for s in field.spaces], np.int64),
-        "knots_u": field.spaces[0].knots.numpy(),
-        "knots_v": field.spaces[1].knots.numpy(),
+        "control_points": np.stack([x, y, written[1].detach().double().cpu().numpy()], -1),
+        "degrees": np.array([s.degree for s in written[0].spaces], np.int64),
+        "knots_u": written[0].spaces[0].knots.numpy(),
+        "knots_v": written[0].spaces[1].knots.numpy(),
         **_entrance(scene),
         **_elements(scene),
         "unit": np.array("mm"),
@@ -85,13 +98,14 @@ def write_lighttools(
         np.savez(file, **arrays)  # dates every entry 1980-01-01
         with zipfile.ZipFile(file, "a") as archive:
             archive.comment = MARK
-    return of_spline(grid, field, heights)
+    off = of_spline(grid, field, heights)
+    return off if exact else replace(off, spline=of_poles(arrays["control_points"], written[0], field, heights))
 
 
 def usual_cloud(scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None) -> SurfaceGrid:
-    """Grid of the point cloud of an archive; arguments as in `write_lighttools`."""
-    nets = 24 * (heights.numel() + (0 if scene.lens.entrance is None else entrance_of(scene.lens).heights.numel()))
-    return sample_grid(field, heights, samples, most_points(A_POINT, nets + BESIDE))
+    """Grid of the point cloud of an archive; arguments as in `write_lighttools`.  Large splines leave it half of `USUAL_BYTES`."""
+    nets = A_POLE * (heights.numel() + (0 if scene.lens.entrance is None else entrance_of(scene.lens).heights.numel()))
+    return sample_grid(field, heights, samples, most_points(A_POINT, min(nets, USUAL_BYTES // 2) + BESIDE))
 
 
 def _glass(lens: Lens) -> dict[str, np.ndarray]:

@@ -107,7 +107,7 @@ def write(
         scripts.refuse(scene)
     off: Deviation | None = writer(path, part.scene, part.field, part.heights, **given)
     if scripts is not None:
-        scripts.write_script(path, scene, field, heights, **given)
+        scripts.write_script(path, scene, field, heights, given.get("samples"))
     return {} if off is None else off.figures(scene)
 
 
@@ -120,6 +120,12 @@ def accuracy_words(figures: dict) -> str:
         return "the spline itself" if figures["format"] == "step" else ""
     nx, ny = figures["samples"]
     exact = {"step": "; ⟨tolerance⟩ 0 writes the exact one", "lighttools": "; the exact spline is stored beside them"}
+    if spline := figures.get("spline"):
+        n, m = spline["samples"]
+        exact["lighttools"] = (
+            f"; the spline stored with them has {n} x {m} control points, heights at most {_length(spline['height_error_mm'])} off"
+            f" and light {_shift(spline['shift_pixels'])}; ⟨tolerance⟩ 0 stores the exact one"
+        )
     return (
         f"{nx} x {ny} points; read as {figures['read_as']}, heights are at most {_length(figures['height_error_mm'])} off and"
         f" light {_shift(figures['shift_pixels'])} (RMS){exact.get(figures['format'], '')}"
