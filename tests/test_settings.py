@@ -296,7 +296,9 @@ def test_a_picture_with_gaps_has_a_net_as_fine_as_its_creases_ask_for():
     assert complete(rays, 1.0, gaps=0.9 * GAPS)["design"] == plain["design"]
     own = {**rays, "lens": {"control": [203, 203]}}
     assert complete(own, 1.0, gaps=1.0)["design"]["stages"] == complete(own, 1.0)["design"]["stages"]
-    for other in ({}, {**rays, "source": {"type": "disc", "position": [[0.0, 0.0, -1000.0]]}}):  # seen as a wave; through a blur
+    blurred = {**rays, "source": {"type": "disc", "position": [[0.0, 0.0, -1000.0]]}}
+    tilted = {**rays, "screen": {"tilt": [0.0, 30.0]}}  # whose pixels are not those of the map
+    for other in ({}, blurred, tilted):  # the first is seen as a wave
         assert complete(other, 1.0, gaps=1.0)["lens"]["control"] == complete(other, 1.0)["lens"]["control"]
 
 

@@ -347,8 +347,10 @@ def _complete_design(
         stages = two_sided(tuple(lens["control"]), rays, (nx, ny), quality)
     elif moved:
         centre = source.pointlike() if spread else source
-        # Diffraction smooths creases more than a coarser net.
-        creased = gaps >= GAPS and not (own or waves or spread) and source.distant and max(array) == 1
+        # Diffraction smooths creases more than a coarser net, and the pixels of a tilted screen do not coincide with those that the
+        # map is solved for, which shows as lines: a flame at 30 degrees has an error of 0.205 on the finer net and 0.087 without.
+        aligned = source.distant and build_screen(s).upright
+        creased = gaps >= GAPS and not (own or waves or spread) and aligned and max(array) == 1
         if creased:
             lens["control"] = [creased_control(max(nx, ny), p, quality) for p in degree]
         stages = refinement(tuple(lens["control"]), rays, (nx, ny), quality, not centre.collimated, spread, creased)

@@ -16,10 +16,14 @@ import math
 import statistics
 import time
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 import torch
+
+try:
+    import drjit as dr
+    import mitsuba as mi
+except ImportError:
+    dr = mi = None
 
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.kernels.surface import FusedSurface, RayIntersections
@@ -32,6 +36,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("cells", type=int, nargs="*", default=[512, 1024, 1536], help="of Mitsuba's meshes, along an axis")
     cells = parser.parse_args().cells
+    if mi is None:
+        parser.error("Mitsuba 3 is needed: pip install mitsuba")
     mi.set_variant("llvm_ad_mono", "llvm_ad_rgb")
     space = SplineSpace.uniform(15, 3)
     field = HeightField((space, space), (HALF, HALF))
