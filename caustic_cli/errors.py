@@ -8,7 +8,7 @@ setting that a message recommends has a plus, ⟨+lens.size⟩, and the command 
 
 import difflib
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 #: A marked path.
 MARK = re.compile(r"⟨(\+?[a-z_.]+)⟩")
@@ -34,6 +34,12 @@ def near(name: str, known: Iterable[str]) -> str:
     """A hint for an unknown name: the closest known name, or all known names."""
     close = difflib.get_close_matches(name, known, 1, 0.5)
     return f"; did you mean {close[0]}?" if close else f"; known are {', '.join(known)}"
+
+
+def alternatives(names: Sequence[str]) -> str:
+    """Names as a clause: "a, b or c"."""
+    *others, last = names
+    return f"{', '.join(others)} or {last}" if others else last
 
 
 class CausticError(Exception):

@@ -83,6 +83,13 @@ def test_the_same_design_again_is_no_work(capfd, monkeypatch):
     assert 1000 < stamps[0] <= stamps[1] <= stamps[2] and stamps[3] == 1000  # make finds them newer than the picture
 
 
+def test_a_file_called_as_a_start_is_no_input(capfd):
+    """DESIGN starts from the offset, whatever the directory holds of that name."""
+    run(DESIGN, capfd)
+    Path("offset").write_text("notes")
+    assert "nothing to do" in run(DESIGN, capfd).err
+
+
 def test_force_designs_the_same_again(capfd):
     run([*DESIGN, "--quiet"], capfd)
     age("blob.caustic/checkpoints.h5")

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from caustic_cli.commands import console, options
-from caustic_cli.errors import InputError
+from caustic_cli.errors import InputError, alternatives
 from caustic_cli.export import FORMATS, MOULDS, UNSAMPLED, WITHIN, format_of
 from caustic_cli.export.milling import Milling
 
@@ -105,7 +104,7 @@ def run(
     for option, (given, takers) in options_of.items():
         if given and not set(takers) & set(formats):
             what = " (a spline, or a path along it, has no samples)" if option == "--samples" else ""
-            raise InputError(f"{option} belongs to --format {_either(takers)}, got {', '.join(formats)}{what}")
+            raise InputError(f"{option} belongs to --format {alternatives(takers)}, got {', '.join(formats)}{what}")
     if block is not None and not 0 < block < 1e6:
         raise InputError(f"--block must be greater than 0 mm, got {block:g}")
     _check_milling(milling)
@@ -133,11 +132,6 @@ def run(
             say.table("milling", rows(figures["milling"]))
     if json:
         console.emit_json(all_figures[0] if len(formats) == 1 else {"exports": all_figures})
-
-
-def _either(names: Sequence[str]) -> str:
-    """Names as a clause: "a, b or c"."""
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"
 
 
 def _check_milling(given: dict[str, Any]) -> None:

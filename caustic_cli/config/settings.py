@@ -19,7 +19,7 @@ import tomli_w
 
 from caustic_cli import __version__
 from caustic_cli.config.table import Setting, check, default, in_section
-from caustic_cli.errors import InputError, near
+from caustic_cli.errors import InputError, alternatives, near
 from caustic_cli.io.files import read_bytes
 from caustic_cli.scene import Component, Lens, Light, Offset, Scene, Screen, SecondTarget, Source, sources
 from caustic_cli.scene.gradient import KINDS, Gradient
@@ -330,7 +330,7 @@ def build_source(settings: Settings, profile: np.ndarray | None = None, type: st
     made, lit = sources.type_of(type or s["type"]), sources.used_by("profile")
     check("source.power", s["power"])  # before it is distributed to points
     if "profile" in s and not {made.name, s["type"]} & set(lit):
-        raise InputError(f"⟨source.profile⟩ belongs to type {sources.alternatives(lit)}, got type {s['type']}")
+        raise InputError(f"⟨source.profile⟩ belongs to type {alternatives(lit)}, got type {s['type']}")
     one = made.from_settings(s, profile)
     return one if type is not None else sources.combined(one, s)
 
@@ -423,9 +423,7 @@ def refuse_unused(source: dict[str, Any], given: Iterable[str], stages: Sequence
     keys = [path.removeprefix("source.") for path in given if path.startswith("source.")]
     for key in filter(sources.used_by, keys):
         if not types & set(sources.used_by(key)):
-            raise InputError(
-                f"⟨source.{key}⟩ belongs to ⟨source⟩ {sources.alternatives(sources.used_by(key))}, got {source['type']}"
-            )
+            raise InputError(f"⟨source.{key}⟩ belongs to ⟨source⟩ {alternatives(sources.used_by(key))}, got {source['type']}")
     if len(types) == 1 and types <= set(sources.names()):
         idle = sources.type_of(*types).idle(source)
         for key in keys:

@@ -84,7 +84,7 @@ class _Grid:
     def offset(self) -> np.ndarray:
         """Heights of the offset surface at the corners, mm."""
         offset = self.scene.lens.offset
-        return offset.thickness + offset.sag(self.x[:, None], self.y[None, :])
+        return offset.heights(self.x, self.y)
 
     @property
     def floor(self) -> float:

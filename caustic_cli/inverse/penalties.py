@@ -58,7 +58,7 @@ class Penalty:
         if self:  # the entrance of a two-sided lens is measured from the base, too
             x, y = (c.numpy() for c in field.control_xy())
             offset = scene.lens.offset
-            self.base = torch.from_numpy(offset.thickness + offset.sag(x[:, None], y[None, :])).to(device)
+            self.base = torch.from_numpy(offset.heights(x, y)).to(device)
             self.gain = (scene.lens.effective_index - 1.0) * (scene.screen.z - offset.thickness)
 
     def __bool__(self) -> bool:

@@ -89,8 +89,7 @@ def source_spread(scene: Scene, field: HeightField | None = None, heights: torch
         scene = replace(scene, lens=replace(scene.lens, control=(NET, NET), knots=None, array=(1, 1)))
         field = HeightField.of(scene.lens)
         x, y = (c.numpy() for c in field.control_xy())
-        offset = scene.lens.offset
-        heights = torch.from_numpy(offset.thickness + offset.sag(x[:, None], y[None, :]))
+        heights = torch.from_numpy(scene.lens.offset.heights(x, y))
     found = spread_at(scene, field, heights)
     if found is None or found.usual > SHIFTS * max(found.reach()) or max(found.reach()) > max(scene.screen.size):
         return None

@@ -43,9 +43,10 @@ def digest(full: Settings, *pictures: Picture | None) -> str:
     for file in attachments.of(full):
         found.update(hashlib.sha256(file.data).digest())
     start = Path(full["design"]["start"])
-    if is_project(start):
+    named = full["design"]["start"] in ("transport", "offset")  # whatever the directory holds of these names
+    if not named and is_project(start):
         found.update(_hash(start / CHECKPOINT).encode())
-    elif start.is_file():
+    elif not named and start.is_file():
         found.update(f"{_hash(start)}{_hash(beside(start))}".encode())  # and the JSON of a height map
     return found.hexdigest()
 

@@ -82,6 +82,10 @@ class Offset:
             total += np.divide(square, root, out=root)
         return total
 
+    def heights(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """f on the grid of points x (n,), y (m,): (n, m) float64 mm; raises as `sag`."""
+        return self.thickness + self.sag(x[:, None], y[None, :])
+
 
 def array_control(n: int, degree: int, lenslets: int) -> int:
     """The least number of control points, at least n, for which all lenslets of a row have equally many knot spans; see
@@ -225,7 +229,7 @@ class Lens:
         Raises:
             InputError: the lower bound exceeds the upper one somewhere.
         """
-        f = self.offset.thickness + self.offset.sag(x[:, None], y[None, :])
+        f = self.offset.heights(x, y)
         low = np.maximum(f + self.height_range[0], self.z_in + self.min_thickness)
         high = f + self.height_range[1]
         if not (low < high).all():

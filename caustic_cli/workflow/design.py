@@ -362,8 +362,7 @@ def sphere() -> tuple[Scene, HeightField, torch.Tensor]:
     scene = settings.build_scene(full)
     field = HeightField.of(scene.lens)
     x, y = (c.numpy() for c in field.control_xy())
-    offset = scene.lens.offset
-    return scene, field, torch.from_numpy(offset.thickness + offset.sag(x[:, None], y[None, :]))
+    return scene, field, torch.from_numpy(scene.lens.offset.heights(x, y))
 
 
 def _designer(project: Project, device: str) -> tuple[Designer, np.ndarray]:
@@ -440,7 +439,7 @@ def _make_room(full: Settings, said: Settings, first: torch.Tensor) -> bool:
     lens = settings.build_lens(full)
     offset = HeightField.of(replace(lens, control=tuple(first.shape)))
     x, y = (c.numpy() for c in offset.control_xy())
-    base = lens.offset.thickness + lens.offset.sag(x[:, None], y[None, :])
+    base = lens.offset.heights(x, y)
     departure = 2.0 * float(np.abs(first.numpy() - base).max())
     short = lens.z_in + lens.min_thickness - float(first.min())
     fixed, changed = said.get("lens", {}), False

@@ -8,7 +8,6 @@ A new source type is a module of this package with its class, a `Source`, and wi
 from __future__ import annotations
 
 import pkgutil
-from collections.abc import Sequence
 from importlib import import_module
 
 from caustic_cli.config import checks
@@ -27,7 +26,6 @@ __all__ = [
     "Points",
     "Source",
     "SourceType",
-    "alternatives",
     "combined",
     "in_words",
     "light_of_all",
@@ -88,12 +86,6 @@ def own_keys() -> dict[str, tuple[str, str]]:
 def used_by(key: str) -> tuple[str, ...]:
     """Names of the types that use a key of [source]."""
     return tuple(name for name, type in _TYPES.items() if key in type.keys)
-
-
-def alternatives(names: Sequence[str]) -> str:
-    """Names as a clause: "a, b or c"."""
-    *others, last = names
-    return f"{', '.join(others)} or {last}" if others else last
 
 
 def combined(first: Source, section: Table) -> Source:
