@@ -126,7 +126,7 @@ def test_blur_and_details():
     assert seen.resolvable == 43 and seen.matters
     assert seen.lens_for_all() == pytest.approx(58.6, abs=0.1)
     assert seen.sentence() == (
-        "light carries about 43 x 43 details here (diffraction 0.7 mm, source 0 mm, pixel 0.12 mm); a lens of 59 mm would carry 250"
+        "about 43 x 43 details are resolved (diffraction 0.7 mm, source 0 mm, pixel 0.12 mm); a lens of 59 mm would resolve 250"
     )
     assert not Resolution(0.7, 2.8, 0.12, 30.0, 10.0).matters  # the sun washes it out
     assert not Resolution(0.01, 0.0, 0.12, 30.0, 10.0).matters
@@ -191,7 +191,7 @@ OWN = "[[design.stages]]\ncontrol = [19, 19]\nrays = 4096\niterations = 1\n"
     ],
 )
 def test_what_is_said_before_a_design(extra, reason, _here, capfd, monkeypatch):
-    """One line on what light carries; one more where the wave image is left out although it matters, of why."""
+    """One line on what is resolved; one more where the wave image is left out although it matters, of why."""
     from caustic_cli.workflow import design as workflow  # noqa: PLC0415
 
     monkeypatch.setattr(workflow, "_run", begun)
@@ -201,7 +201,7 @@ def test_what_is_said_before_a_design(extra, reason, _here, capfd, monkeypatch):
     small = [a for a in SMALL if a != "--quiet" and not ("--resolution" in extra and a in ("--resolution", "32"))]
     assert cli.run(["design", "blob.png", *small, *extra, "-o", "p"]) == 0
     said = capfd.readouterr().err.splitlines()
-    carried = [k for k, line in enumerate(said) if line.startswith("light carries about")]
+    carried = [k for k, line in enumerate(said) if "details are resolved" in line]
     assert len(carried) == 1 and not any("blurs every point" in line for line in said)
     after = [line for line in said if line.startswith("the wave image is not refined: ")]
     assert after == said[carried[0] + 1 : carried[0] + 2] and reason in after[0] if reason else not after

@@ -222,7 +222,7 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
         waves = [
             ("wave image", f"{seen}, {_wavelengths(figures['wave_wavelengths'])}"),
             *((f"{name} as a wave", value) for name, value in _absolute(figures, "wave_")),
-            ("details light carries", number("resolvable", "d") + " across"),
+            ("details resolved", number("resolvable", "d") + " across"),
         ]
     behind = []
     if figures.get("second_relative_rms") is not None:

@@ -59,9 +59,7 @@ def advice(scene: Scene, target: np.ndarray, picture: tuple[float, float], field
     if width is None:
         return ""
     angle = math.degrees(width / throw)
-    return (
-        f"this picture stays sharp (a tenth of its contrast off) in light of up to {angle:.2g} degrees across; the sun's is {SUN:g}"
-    )
+    return f"the picture stays sharp (contrast reduced by a tenth) for sources of up to {angle:.2g} degrees; the sun has {SUN:g}"
 
 
 def disc(width: float) -> Spread:
@@ -115,7 +113,7 @@ def _of_blur(scene: Scene, target: np.ndarray, picture: tuple[float, float], spr
         ways.append(f"a source {f:.2g} times smaller or farther away")
     ways.append(f"a picture whose details are {f:.2g} times as coarse")
     return (
-        f"the source blurs this picture; it would be sharp (a tenth of its contrast off) with {', '.join(ways[:-1])}, or {ways[-1]}"
+        f"the source blurs this picture; it would be sharp (contrast reduced by a tenth) with {', '.join(ways[:-1])}, or {ways[-1]}"
     )
 
 

@@ -117,11 +117,11 @@ class Resolution:
         """The resolution limit as a sentence."""
         n = self.resolvable
         text = (
-            f"light carries about {n} x {n} details here (diffraction {self.diffraction:.2g} mm, source {self.source:.2g} mm"
+            f"about {n} x {n} details are resolved (diffraction {self.diffraction:.2g} mm, source {self.source:.2g} mm"
             f"{f' or {self.source / self.pixel:.2g} pixels' if self.source else ''}, pixel {self.pixel:.2g} mm)"
         )
         larger = self.lens_for_all()
-        return text + (f"; a lens of {larger:{'.0f' if larger >= 100 else '.2g'}} mm would carry {self.wanted}" if larger else "")
+        return text + (f"; a lens of {larger:{'.0f' if larger >= 100 else '.2g'}} mm would resolve {self.wanted}" if larger else "")
 
 
 @dataclass(frozen=True)
