@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from caustic_cli.config.completion import complete
 from caustic_cli.errors import InputError
 from caustic_cli.io.archive import open_archive
 from caustic_cli.project.project import Project
-from caustic_cli.scene import Disc, Lens, Light, PlaneWave, Scene, Screen
+from caustic_cli.scene import Disc, Lens, Light, PlaneWave, Points, Scene, Screen
 from caustic_cli.studies.design_report import write_report
 from caustic_cli.studies.irradiance import irradiance_figures, per_part, unit_figures
 from caustic_cli.workflow import evaluation
@@ -87,7 +88,10 @@ def test_irradiance_is_power_over_area():
     image = np.zeros((8, 4))
     image[:4, :2] = 1.0 / 8.0
     assert irradiance_figures(scene, image) == pytest.approx({"peak_irradiance": 100.0 / 2e-6, "mean_irradiance": 100.0 / 8e-6})
-    assert unit_figures(scene) == {"power": 100.0, "power_unit": "lm", "irradiance_unit": "lux"}
+    words = unit_figures(scene)
+    assert words == {"power": 100.0, "power_unit": "lm", "irradiance_unit": "lux", "fractions_of": "the power through the aperture"}
+    near = replace(scene, source=Points(((0.0, 0.0, -20.0),), cone=30.0))
+    assert unit_figures(near)["fractions_of"] == "the power within the cone of 30 degrees"
     in_watts = Scene(Disc(power=3.0), Lens(), scene.screen)
     assert irradiance_figures(in_watts, image)["peak_irradiance"] == pytest.approx(3.0 / 2.0)
     assert unit_figures(in_watts)["irradiance_unit"] == "W/mm^2"

@@ -257,7 +257,10 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
         ("loss (eq. 5.2.1)", number("loss", ".4e")),
         ("PSNR", number("psnr_db", ".2f") + " dB"),
         ("SSIM", number("ssim", ".4f")),
-        ("light on the screen", number("on_screen", ".2%")),
+        (
+            "light on the screen",
+            number("on_screen", ".2%") + (f" of {figures['fractions_of']}" if "fractions_of" in figures else ""),
+        ),
         ("light on the picture", number("on_target", ".2%")),
         *black,
         *behind,

@@ -92,9 +92,9 @@ For a design: least and largest height of the exit above the flat entrance.
 .B image_kept
 For a render: true if render.png is an earlier image of the same scene, with less noise.
 .TP
-.B on_screen, on_target, lost
+.B on_screen, on_target, lost, fractions_of
 Fractions of the source's power that land on the screen, that land where the target is bright, and that are lost, by cause;
-on_screen and all entries of lost sum to 1.
+on_screen and all entries of lost sum to 1; fractions_of names the power of which they are fractions.
 .TP
 .B wave_relative_rms, wave_on_target, wave_in_black, resolvable
 The same quantities for the wave image, where diffraction is simulated; number of details across the picture that the light can

@@ -42,6 +42,7 @@ def irradiance_figures(scene: Scene, image) -> dict[str, float]:
 
 
 def unit_figures(scene: Scene) -> dict[str, float | str]:
-    """Figures power, of the source, power_unit, and irradiance_unit."""
-    unit = scene.light.unit
-    return {"power": scene.source.power, "power_unit": unit, "irradiance_unit": UNITS[unit][0]}
+    """Figures power, of the source, power_unit, and irradiance_unit; fractions_of, what that power is."""
+    unit, lens = scene.light.unit, scene.lens
+    words = scene.source.power_words(lens.half_size, lens.z_in, lens.round)
+    return {"power": scene.source.power, "power_unit": unit, "irradiance_unit": UNITS[unit][0], "fractions_of": words}

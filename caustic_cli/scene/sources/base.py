@@ -191,6 +191,12 @@ class Source:
         farthest = np.hypot(*across) + (half_size[0] if round else 0.0)
         return min((1.0 + SLACK) * float(np.arctan2(farthest, z_in - positions[:, 2]).max()), math.pi / 2.0)
 
+    def power_words(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> str:
+        """What its power, of which all fractions are taken, is: a noun phrase for messages."""
+        if self.distant:
+            return "the power through the aperture"
+        return f"the power within the cone of {math.degrees(self.cone_over(half_size, z_in, round)):.3g} degrees"
+
     def incidence(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> float:
         """Upper bound of the angle to z of its rays into the aperture, rad."""
         if self.distant:

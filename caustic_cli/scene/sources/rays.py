@@ -66,6 +66,10 @@ class Measured(Source):
         """As of a source."""
         return f"{self.rays.count:,} rays of a file"
 
+    def power_words(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> str:
+        """That of the file's rays, wherever they go."""
+        return "the power of all rays of the file"
+
     def pointlike(self) -> Source:
         """A point source at the point of closest approach."""
         return Points((self.centre,), (self.power,))

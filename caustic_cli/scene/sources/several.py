@@ -133,6 +133,10 @@ class Several(Source):
             return math.pi / 2.0
         return max(one.cone_over(half_size, z_in, round) for one in self.members)
 
+    def power_words(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> str:
+        """The sum of all."""
+        return "the power of all sources"
+
     def incidence(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> float:
         """The greatest."""
         return max(one.incidence(half_size, z_in, round) for one in self.members)
