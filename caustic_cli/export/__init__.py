@@ -8,7 +8,7 @@ from caustic_cli.errors import InputError
 
 #: Format -> default suffix, module of `write_<format>`, description.
 FORMATS = {
-    "lighttools": (".npz", "lighttools", "point cloud with normals and the exact spline"),
+    "lighttools": (".npz", "lighttools", "point cloud with normals and the spline"),
     "zemax": (".dat", "zemax", "Grid Sag with exact derivatives"),
     "step": (".step", "step", "the spline as a solid"),
     "stl": (".stl", "stl", "closed mesh"),

@@ -248,10 +248,10 @@ def first_surface(
         fine = _Grid.of(scene, target, n)
         found = fine.truncated(coarse.scaled(found.z, fine), found.middle, passes, coarse.scaled(found.potential, fine))
         coarse, now = fine, time.monotonic()
-        left = max(0.0, seconds - (now - began))  # a pass on so many times the cells takes so many times as long
+        left = max(0.0, seconds - (now - began))  # the time of a pass is proportional to the number of cells
         within = int(min(cells, n * math.sqrt(left * passes / (now - started))))
     net = net_of(coarse.x, coarse.y, np.maximum(found.z, coarse.floor), field)
-    return InitialSurface(net.clamp_min(coarse.floor), found.middle)  # a spline through a kink undershoots
+    return InitialSurface(net.clamp_min(coarse.floor), found.middle)  # the spline undershoots at a kink
 
 
 def _refinement(cells: int, target: np.ndarray) -> int:
