@@ -9,7 +9,7 @@ import typer
 
 from caustic_cli.commands import console, options
 from caustic_cli.errors import InputError, alternatives
-from caustic_cli.export import FORMATS, MOULDS, UNSAMPLED, WITHIN, format_of
+from caustic_cli.export import FORMATS, MOST_BYTES, MOULDS, UNSAMPLED, WITHIN, format_of
 from caustic_cli.export.milling import Milling
 
 EXAMPLES = """Examples:
@@ -42,8 +42,8 @@ def run(
         str | None,
         typer.Option(
             metavar="N[xM]",
-            help="Points along x and y.  [default: 4 per knot span, so that every knot is a grid line; fewer if the file would"
-            " exceed 20 MB]",
+            help="Points along x and y.  [default: as few as keep the picture: its relative RMS error as read from the file is at"
+            " most 1.05 times that of the lens]",
         ),
     ] = None,
     tolerance: Annotated[
@@ -51,9 +51,17 @@ def run(
         typer.Option(
             metavar="MM",
             help="Largest deviation from the surface.  stl, ply, obj, mitsuba: of the triangles, instead of --samples; heightmap:"
-            " of bilinear interpolation (1e-4); gcode: of linear moves (a hundredth of the scallops); step: of a spline with as few"
-            " knots as possible, 0 for the exact one; lighttools: 0 for the exact spline.  [default for step and lighttools: at"
-            " most 20 MB]",
+            " of bilinear interpolation; gcode: of linear moves (a hundredth of the scallops); step: of a spline with as few"
+            " knots as possible, 0 for the exact one; lighttools: 0 for exact numbers.  [default: as --samples]",
+        ),
+    ] = None,
+    max_size: Annotated[
+        str | None,
+        typer.Option(
+            "--max-size",
+            metavar="SIZE",
+            help="Largest file, like 20MB.  Where the picture does not fit, the best below is written, with a warning.  "
+            "[default: 100MB]",
         ),
     ] = None,
     mould: Annotated[
@@ -98,6 +106,7 @@ def run(
         "--block": (block is not None, MOULDS),
         "--samples": (samples, [name for name in FORMATS if name not in UNSAMPLED]),
         "--tolerance": (tolerance is not None, WITHIN),
+        "--max-size": (max_size is not None, [name for name in FORMATS if name != "gcode"]),
         "--script": (script, ("lighttools",)),
         **{f"--{name.replace('_', '-')}": (True, ("gcode",)) for name in milling},
     }
@@ -108,17 +117,21 @@ def run(
     if block is not None and not 0 < block < 1e6:
         raise InputError(f"--block must be greater than 0 mm, got {block:g}")
     _check_milling(milling)
+    if max_size is not None and (samples is not None or tolerance is not None):
+        raise InputError("--max-size chooses the points itself: give it without --samples and --tolerance")
+    most = MOST_BYTES if max_size is None else options.size_in_bytes("--max-size", max_size)
     count = tuple(options.both(options.counts("--samples", samples))) if samples else None
     given_of = {"mould": mould or None, "block": block, "samples": count, "tolerance": tolerance, "milling": milling or None}
 
-    from caustic_cli.workflow.export import accuracy_words, export  # noqa: PLC0415
+    from caustic_cli.workflow.export import accuracy_words, export, exporter_of  # noqa: PLC0415
 
+    exporter, opened = exporter_of(project, at, say, most)
     all_figures = []
     for name in formats:
         given = {
             key: v for key, v in given_of.items() if v is not None and name in options_of.get(f"--{key}", (True, ("gcode",)))[1]
         }
-        figures, reused = export(project, name, output, script and name == "lighttools", given, force, say, at)
+        figures, reused = export(exporter, opened, name, output, script and name == "lighttools", given, force, at)
         all_figures.append(figures)
         if reused:
             continue

@@ -303,6 +303,8 @@ HELP = {
 }
 #: Settings that are options of every command.
 COMMON = {row.option.name.lstrip("-"): row for row in table.TABLE.values() if row.option and row.option.common}
+#: Least limit of the size of a file, bytes.
+LEAST_FILE = 10_000
 #: Units of length, mm.
 UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
 
@@ -345,6 +347,19 @@ def size(option: str, text: str) -> tuple[float, float] | tuple[float]:
     if min(values) <= 0:
         raise InputError(f"{option} must be greater than 0, got {text!r}")
     return values
+
+
+def size_in_bytes(option: str, text: str) -> int:
+    """A size of a file in bytes: "20MB", "1.5 GB", "500kB", "2000000".
+
+    Raises:
+        InputError: naming the option.
+    """
+    found = re.fullmatch(r"(\d{1,12}(?:\.\d{1,6})?) ?(B|kB|MB|GB)?", text.strip(), re.ASCII)
+    value = round(float(found[1]) * {"B": 1.0, "kB": 1e3, "MB": 1e6, "GB": 1e9}[found[2] or "B"]) if found else 0
+    if value < LEAST_FILE:
+        raise InputError(f"{option} must be a size of at least {LEAST_FILE // 1000} kB, like 20MB or 500kB, got {text!r}")
+    return value
 
 
 def power(option: str, text: str) -> tuple[float, str]:

@@ -30,6 +30,10 @@ MOULDS = (*SOLIDS, *AS_CUT)
 TWO_SIDED = ("lighttools", *SOLIDS, "mitsuba")
 #: Formats with a tolerance, and formats without samples.
 WITHIN, UNSAMPLED = (*MESHES, "lighttools", "step", "heightmap", "gcode"), ("step", "gcode")
+#: Default limit of the file size, bytes.
+MOST_BYTES = 100_000_000
+#: Formats among which one that keeps the picture is looked for where another does not.
+KEEPERS = ("lighttools", "step", "heightmap")
 #: Further suffixes of formats.
 ALSO = {
     "step": (".stp",),

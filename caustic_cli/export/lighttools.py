@@ -4,24 +4,26 @@ Lengths are mm, powers W (or lm), angles degrees.  Reals are float64, counts (`s
 `format_version`) int64, names strings; `numpy.load` reads it with allow_pickle=False.  Grids are indexed [i, j], i
 along +x and j along +y, and flattened row-major: x varies slowest.
 
-Arrays are stored uncompressed, in a fixed order and without the time of writing, so that the same lens gives the same
-bytes whatever the day or the zlib.
+Arrays are compressed by deflate, those of points column by column, in a fixed order and without the time of writing.  The control
+points and the cloud of a large net are rounded by less than 0.05 nm, its normals by 1e-7, so that they can be compressed; those of
+a smaller one, or of any on request, are exact.
 """
 
 from __future__ import annotations
 
+import math
 import zipfile
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from caustic_cli import __version__
 from caustic_cli.errors import InputError
-from caustic_cli.export.accuracy import Deviation, of_poles, of_spline
-from caustic_cli.export.approximation import on_fewer_knots
-from caustic_cli.export.surface import USUAL_BYTES, SurfaceGrid, most_points, sample_grid
+from caustic_cli.export import reading
+from caustic_cli.export.reading import Readings
+from caustic_cli.export.surface import Sampling, sample_grid, samplings
 from caustic_cli.io.files import MARK, atomic_path
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import entrance_of
@@ -29,8 +31,15 @@ from caustic_cli.scene import Lens, Light, Scene, Screen, Source
 from caustic_cli.scene.elements import SIDES
 
 FORMAT_VERSION = 1
-#: Bytes of a point in `points`, `normals` and `z`, and of a control point; approximate bytes of all but these.
-A_POINT, A_POLE, BESIDE = 7 * 8, 3 * 8, 100_000
+#: Quantum of rounded heights, mm, a power of two, and of the components of normals; least control points of a rounded net.
+QUANTUM, NORMAL_QUANTUM = 2.0**-24, 2.0**-23
+LARGE = 1 << 20
+#: Bytes of a point of the cloud and of a control point, compressed: exact and rounded; approximate bytes of all other arrays.
+A_POINT, A_POLE, BESIDE = (42.0, 12.0), (9.0, 4.5), 100_000
+#: The reading by which the density of the cloud is chosen: the spline is stored whatever the cloud.
+CHOSEN_BY = "cloud_error"
+#: Level of the compression; higher ones take several times as long for a hundredth.
+LEVEL = 4
 
 
 def write_lighttools(
@@ -38,11 +47,10 @@ def write_lighttools(
     scene: Scene,
     field: HeightField,
     heights: Tensor,
-    samples: tuple[int, int] | None = None,
+    samples: Sampling | None = None,
     tolerance: float | None = None,
-) -> Deviation:
-    """Write the archive atomically; the deviation of a spline through its point cloud.  The exact spline is stored with it, or, if
-    that alone would exceed `USUAL_BYTES`, an approximation on fewer knots within half of these.
+) -> None:
+    """Write the archive atomically: a point cloud, and the spline itself.
 
     Keys: points, normals (N, 3); shape (2,); x (nx,), y (ny,), z (nx, ny); lens_half_size (2,), z_in, refractive_index;
     screen_half_size (2,), z_screen, resolution (2,); those of `_screen` and `_source`; fresnel unless exact; aperture if a circle;
@@ -51,26 +59,28 @@ def write_lighttools(
 
     Args:
         heights: (n, m) control heights, mm.
-        samples: (nx, ny) of the point cloud; None for as many as `USUAL_BYTES` allow, at most a grid on the knots (`sample_grid`).
-        tolerance: 0 for the exact spline, whatever its size.
+        samples: density of the point cloud.
+        tolerance: 0 for exact numbers, whatever the size of the file.
 
     Raises:
         InputError: the samples are too few or too many, the tolerance is not 0, or the file cannot be written there.
     """
-    if tolerance:
-        raise InputError(f"⟨tolerance⟩ of a LightTools archive must be 0, for the exact spline, or not given, got {tolerance:g} mm")
-    exact = tolerance == 0 or heights.numel() * A_POLE <= USUAL_BYTES
-    grid = usual_cloud(scene, field, heights, samples)
-    written = (field, heights) if exact else on_fewer_knots(field, heights, USUAL_BYTES // 2 // A_POLE)
-    x, y = (c.numpy() for c in written[0].control_xy())
+    rounding = _rounding(field, tolerance)
+    grid = sample_grid(field, heights, samples)
+    points, normals = grid.points, grid.normals
+    net = _net(heights, rounding)
+    if rounding:
+        points[:, 2] = _multiples(points[:, 2], QUANTUM)
+        normals = _multiples(normals, NORMAL_QUANTUM)
+    x, y = (c.numpy() for c in field.control_xy())
     x, y = np.broadcast_arrays(x[:, None], y[None, :])
     arrays = {
-        "points": grid.points,
-        "normals": grid.normals,
-        "shape": np.array(grid.z.shape, np.int64),
+        "points": np.asfortranarray(points),
+        "normals": np.asfortranarray(normals),
+        "shape": np.array(grid.shape, np.int64),
         "x": grid.x,
         "y": grid.y,
-        "z": grid.z,
+        "z": points[:, 2].reshape(grid.shape),
         "lens_half_size": _reals(scene.lens.half_size),
         "z_in": _reals(scene.lens.z_in),
         "refractive_index": _reals(scene.lens.index),
@@ -84,28 +94,60 @@ def write_lighttools(
         **({} if scene.lens.fresnel == "exact" else {"fresnel": np.array(scene.lens.fresnel)}),
         **_glass(scene.lens),
         **_light(scene.light),
-        "control_points": np.stack([x, y, written[1].detach().double().cpu().numpy()], -1),
-        "degrees": np.array([s.degree for s in written[0].spaces], np.int64),
-        "knots_u": written[0].spaces[0].knots.numpy(),
-        "knots_v": written[0].spaces[1].knots.numpy(),
+        "control_points": np.asfortranarray(np.stack([x, y, net], -1)),
+        "degrees": np.array([s.degree for s in field.spaces], np.int64),
+        "knots_u": field.spaces[0].knots.numpy(),
+        "knots_v": field.spaces[1].knots.numpy(),
         **_entrance(scene),
         **_elements(scene),
         "unit": np.array("mm"),
         "format_version": np.array(FORMAT_VERSION, np.int64),
         "created_by": np.array(f"caustic {__version__}"),
     }
-    with atomic_path(path) as temporary, open(temporary, "w+b") as file:  # an open file: savez would rename `lens.dat`
-        np.savez(file, **arrays)  # dates every entry 1980-01-01
-        with zipfile.ZipFile(file, "a") as archive:
-            archive.comment = MARK
-    off = of_spline(grid, field, heights)
-    return off if exact else replace(off, spline=of_poles(arrays["control_points"], written[0], field, heights))
+    with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=LEVEL) as archive:
+        for name, array in arrays.items():
+            entry = zipfile.ZipInfo(f"{name}.npy")  # dated 1980-01-01
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            with archive.open(entry, "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, array, allow_pickle=False)
+        archive.comment = MARK
 
 
-def usual_cloud(scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None) -> SurfaceGrid:
-    """Grid of the point cloud of an archive; arguments as in `write_lighttools`.  Large splines leave it half of `USUAL_BYTES`."""
-    nets = A_POLE * (heights.numel() + (0 if scene.lens.entrance is None else entrance_of(scene.lens).heights.numel()))
-    return sample_grid(field, heights, samples, most_points(A_POINT, min(nets, USUAL_BYTES // 2) + BESIDE))
+def choices(scene: Scene, field: HeightField, heights: Tensor, limit: float) -> list[dict]:
+    """Densities of the cloud in archives of at most `limit` bytes, the smallest first."""
+    nets = [field.shape] if scene.lens.entrance is None else [field.shape, entrance_of(scene.lens).field.shape]
+    rounding = _rounding(field)
+    room = limit - BESIDE - A_POLE[rounding] * sum(math.prod(shape) for shape in nets)
+    return [{"samples": s} for s in samplings(field.spaces, max(4.0, room / A_POINT[rounding]))]
+
+
+def readings(
+    scene: Scene, field: HeightField, heights: Tensor, samples: Sampling | None = None, tolerance: float | None = None
+) -> Readings:
+    """The surface as read from the control points, and from the cloud."""
+    rounding = _rounding(field, tolerance)
+    grid = sample_grid(field, heights, samples)
+    return {
+        "error": lambda: reading.of_poles(field, torch.from_numpy(_net(heights, rounding))),
+        "cloud_error": lambda: reading.of_points(grid.x, grid.y, _multiples(grid.z, QUANTUM) if rounding else grid.z),
+    }
+
+
+def _rounding(field: HeightField, tolerance: float | None = None) -> bool:
+    """Whether the numbers of an archive are rounded; refuses a tolerance other than 0."""
+    if tolerance:
+        raise InputError(f"⟨tolerance⟩ of a LightTools archive must be 0, for exact numbers, or not given, got {tolerance:g} mm")
+    return tolerance is None and math.prod(field.shape) >= LARGE
+
+
+def _net(heights: Tensor, rounding: bool) -> np.ndarray:
+    net = heights.detach().double().cpu().numpy()
+    return _multiples(net, QUANTUM) if rounding else net
+
+
+def _multiples(values: np.ndarray, quantum: float) -> np.ndarray:
+    """Values rounded to multiples of a quantum, which end in zeros that can be compressed."""
+    return np.rint(values / quantum) * quantum
 
 
 def _glass(lens: Lens) -> dict[str, np.ndarray]:

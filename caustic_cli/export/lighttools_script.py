@@ -16,8 +16,7 @@ import numpy as np
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.export.lighttools import usual_cloud
-from caustic_cli.export.surface import SurfaceGrid
+from caustic_cli.export.surface import Sampling, SurfaceGrid, sample_grid
 from caustic_cli.export.text import CREATED, real
 from caustic_cli.io.files import atomic_path, write_bytes
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -174,9 +173,7 @@ def refuse(scene: Scene) -> None:
         raise InputError("⟨script⟩: its freeform solid is a rectangle, so a circular aperture cannot be written")
 
 
-def write_script(
-    path: str | Path, scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None
-) -> None:
+def write_script(path: str | Path, scene: Scene, field: HeightField, heights: Tensor, samples: Sampling | None = None) -> None:
     """Write script and block for an archive written by `write_lighttools` with the same arguments, of a scene that passes `refuse`.
 
     Raises:
@@ -189,7 +186,7 @@ def write_script(
     for word, value in words.items():
         text = text.replace(word, value.replace("\\", "\\\\").replace('"', '\\"'))
     write_bytes(script, text.encode())
-    _write_block(block, scene, usual_cloud(scene, field, heights, samples))
+    _write_block(block, scene, sample_grid(field, heights, samples))
 
 
 def _write_block(path: Path, scene: Scene, grid: SurfaceGrid) -> None:

@@ -17,6 +17,7 @@ A border, for the mount, is a flange around the aperture, half as high as the lo
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,25 +26,28 @@ from torch import Tensor
 
 from caustic_cli.config import checks
 from caustic_cli.errors import InputError
-from caustic_cli.export.bodies import bodies
+from caustic_cli.export.bodies import Body, bodies
+from caustic_cli.export.reading import Readings, of_facets, of_vertices, spline_through
 from caustic_cli.export.surface import (
     MAX_POINTS,
     MAX_SAMPLES,
     STEPS_PER_SPAN,
-    even_counts,
+    Sampling,
+    counts_of,
     grid_within,
-    most_points,
     sample_grid,
+    samplings,
     second_derivative_bounds,
-    usual_steps,
 )
 from caustic_cli.optics.surfaces.heightfield import HeightField
-from caustic_cli.optics.system import entrance_of
+from caustic_cli.optics.system import entrance_of, freeform_of
 from caustic_cli.scene import Lens, Scene
 
 STRETCH = 1.28
 #: Approximate bytes of walls and entrances in a mesh file.
 BESIDE = 1e6
+#: Most points along an axis of the mesh of another element's sphere.
+SPHERE = 401
 #: Height of the flange over the least height of the rim.
 FLANGE = 0.5
 
@@ -60,60 +64,83 @@ def closed_mesh(
     scene: Scene,
     field: HeightField,
     heights: Tensor,
-    samples: tuple[int, int] | None = None,
+    samples: Sampling | None = None,
     tolerance: float | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) float64 mm and faces (F, 3) int64 of the solid of the lens and of other elements.
 
     Args:
         heights: (n, m) control heights, mm.
-        samples: (nx, ny) points on the exit surface; None for a grid on the knots (`sample_grid`), as for other elements.
+        samples: density of points on the exit surface, as of `sample_grid`.
         tolerance: largest chord error of the triangles, mm, instead of samples.
 
     Raises:
         InputError: both samples and tolerance; too few or too many points; or the surface reaches the entrance.
     """
-    _, vertices, faces = exit_and_solids(scene, field, heights, samples, tolerance)
-    return vertices, faces
+    parts = [solid_of(scene.lens, *patches(scene.lens, field, heights, samples, tolerance))]
+    for body in bodies(scene):
+        own = None if tolerance is not None else body_samples(body, samples)
+        vertices, faces = solid_of(body.lens, *patches(body.lens, body.field, body.heights, own, tolerance))
+        parts.append((body.placed(vertices), faces))
+    counts = np.cumsum([0, *(len(v) for v, _ in parts)])
+    return np.concatenate([v for v, _ in parts]), np.concatenate([f + k for (_, f), k in zip(parts, counts, strict=False)])
 
 
-def exit_and_solids(
+def body_samples(body: Body, samples: Sampling | None) -> Sampling | None:
+    """Density of the mesh of another element: that of the exit where one of its surfaces was designed, else that of a sphere."""
+    designed = any(side is not None and side.knots is not None for side in body.component.surfaces)
+    counts = counts_of(body.field.spaces, STEPS_PER_SPAN)
+    return samples if designed else (min(SPHERE, counts[0]), min(SPHERE, counts[1]))
+
+
+def choices(scene: Scene, field: HeightField, heights: Tensor, limit: float, a_point: float) -> list[dict]:
+    """Densities of files of at most `limit` bytes, the smallest first; a_point: bytes of a point with its triangles."""
+    designed = 1 if scene.lens.entrance is None else 2
+    beside = BESIDE
+    for body in bodies(scene):
+        density = body_samples(body, None)
+        designed += density is None
+        beside += 0 if density is None else 2 * math.prod(counts_of(body.field.spaces, density)) * a_point
+    most = max(4.0, (limit - beside) / a_point / designed)
+    if not scene.lens.round:
+        return [{"samples": s} for s in samplings(field.spaces, most)]
+    found = [max(counts_of(field.spaces, s)) for s in samplings(field.spaces, math.inf)]  # the lattice of a disc is a square
+    across = [n for n in found if n * n <= most] or [max(2, math.isqrt(int(most)))]
+    return [{"samples": (n, n)} for n in across]
+
+
+def readings(
     scene: Scene,
     field: HeightField,
     heights: Tensor,
-    samples: tuple[int, int] | None = None,
+    samples: Sampling | None = None,
     tolerance: float | None = None,
-    a_point: float | None = None,
-) -> tuple[Patch, np.ndarray, np.ndarray]:
-    """Patch of the exit, and vertices and faces of all solids; arguments as in `closed_mesh`.
-
-    a_point: bytes per point with its triangles in a file, for the default number of points within `USUAL_BYTES`, divided equally
-    between the solids; None for no such limit.
-    """
-    most = None if a_point is None else most_points(a_point, BESIDE) // (1 + len(scene.elements))
-    sides = patches(scene.lens, field, heights, samples, tolerance, most)
-    parts = [solid_of(scene.lens, *sides)]
-    for body in bodies(scene):
-        vertices, faces = solid_of(body.lens, *patches(body.lens, body.field, body.heights, None, tolerance, most))
-        parts.append((body.placed(vertices), faces))
-    counts = np.cumsum([0, *(len(v) for v, _ in parts)])
-    vertices = np.concatenate([v for v, _ in parts])
-    return sides[-1], vertices, np.concatenate([f + k for (_, f), k in zip(parts, counts, strict=False)])
+    rounded: Callable[[np.ndarray], np.ndarray] = np.asarray,
+) -> Readings:
+    """The surface as read from a mesh through its vertices, and as flat facets; rounded: the points (nx, ny, 3) as written."""
+    *fronts, exit = patches(scene.lens, field, heights, samples, tolerance)
+    points, round = rounded(exit.points), scene.lens.round
+    front = None
+    if fronts and not round:
+        low = rounded(fronts[0].points)
+        front = freeform_of(*spline_through(low[:, 0, 0], low[0, :, 1], low[..., 2] - scene.lens.z_in))
+    return {
+        "error": lambda: of_vertices(points, triangles(points), round, front),
+        "facet_error": lambda: of_facets(points, round, entrance=front),
+    }
 
 
 def patches(
     lens: Lens,
     field: HeightField,
     heights: Tensor,
-    samples: tuple[int, int] | None = None,
+    samples: Sampling | None = None,
     tolerance: float | None = None,
-    most: int | None = None,
 ) -> tuple[Patch, ...]:
-    """Patches of the free-form sides of a solid, the exit last; arguments as in `closed_mesh`; most: default number of points of
-    all of them."""
+    """Patches of the free-form sides of a solid, the exit last; arguments as in `closed_mesh`."""
     if lens.entrance is None:
-        return (patch(lens, field, heights, samples, tolerance, most),)
-    return both_patches(lens, field, heights, samples, tolerance, None if most is None else most // 2)
+        return (patch(lens, field, heights, samples, tolerance),)
+    return both_patches(lens, field, heights, samples, tolerance)
 
 
 def solid_of(lens: Lens, *sides: Patch) -> tuple[np.ndarray, np.ndarray]:
@@ -125,14 +152,13 @@ def both_patches(
     lens: Lens,
     field: HeightField,
     heights: Tensor,
-    samples: tuple[int, int] | None = None,
+    samples: Sampling | None = None,
     tolerance: float | None = None,
-    most: int | None = None,
 ) -> tuple[Patch, Patch]:
     """Patches of the free-form entrance and the exit of a lens, with equal numbers of points; arguments as in `patch`."""
     entrance = entrance_of(lens)
     surfaces = (entrance.field, entrance.heights + lens.z_in), (field, heights)
-    found = [patch(lens, *surface, samples, tolerance, most) for surface in surfaces]
+    found = [patch(lens, *surface, samples, tolerance) for surface in surfaces]
     shapes = [p.points.shape[:2] for p in found]
     if shapes[0] != shapes[1]:
         found = [patch(lens, *surface, (max(s[0] for s in shapes), max(s[1] for s in shapes))) for surface in surfaces]
@@ -160,11 +186,10 @@ def patch(
     lens: Lens,
     field: HeightField,
     heights: Tensor,
-    samples: tuple[int, int] | None = None,
+    samples: Sampling | None = None,
     tolerance: float | None = None,
-    most: int | None = None,
 ) -> Patch:
-    """Patch of the exit surface within the aperture; samples or tolerance as in `closed_mesh`; most: default number of points.
+    """Patch of the exit surface within the aperture; samples or tolerance as in `closed_mesh`.
 
     Raises:
         InputError: both are given, there are too few or too many points, or a tolerance for a round lens with creases.
@@ -172,18 +197,15 @@ def patch(
     if samples is not None and tolerance is not None:
         raise InputError("⟨samples⟩ and ⟨tolerance⟩ both say how fine the mesh is: give one of them")
     if lens.round:
-        return _round_patch(field, heights, _across(field, heights, samples, tolerance, most))
-    if samples is None and most is not None and usual_steps(field.spaces, most) < STEPS_PER_SPAN:
-        samples = even_counts(field.spaces, most)  # knots on grid lines do not improve piecewise linear interpolation
+        return _round_patch(field, heights, _across(field, heights, samples, tolerance))
     grid = sample_grid(field, heights, samples) if tolerance is None else grid_within(field, heights, tolerance)
-    return Patch(*(a.reshape(*grid.z.shape, 3) for a in (grid.points, grid.normals)))
+    return Patch(*(a.reshape(*grid.shape, 3) for a in (grid.points, grid.normals)))
 
 
-def _across(field: HeightField, heights: Tensor, samples: tuple[int, int] | None, tolerance: float | None, most: int | None) -> int:
+def _across(field: HeightField, heights: Tensor, samples: Sampling | None, tolerance: float | None) -> int:
     """Number of points along a diameter of a round lens."""
     if tolerance is None:
-        counts = samples or [STEPS_PER_SPAN * (len(s.breaks) - 1) + 1 for s in field.spaces]
-        counts = counts if samples or most is None else [min(max(counts), math.isqrt(most))] * 2
+        counts = counts_of(field.spaces, STEPS_PER_SPAN if samples is None else samples)
         n, asked = max(checks.pair("⟨samples⟩", counts, lambda w, k: checks.whole(w, k, 2, MAX_SAMPLES))), "⟨samples⟩"
     else:
         checks.number("⟨tolerance⟩", tolerance, 0.0, open_low=True)

@@ -27,11 +27,12 @@ import numpy as np
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.export.accuracy import Deviation, of_triangles
+from caustic_cli.export import mesh
 from caustic_cli.export.bodies import bodies
 from caustic_cli.export.mesh import Patch, both_patches, patches, refuse_open, rim_of, triangles, walls
 from caustic_cli.export.ply import FACE, write_mesh
-from caustic_cli.export.surface import STEPS_PER_SPAN, most_points
+from caustic_cli.export.reading import Readings, of_facets
+from caustic_cli.export.surface import STEPS_PER_SPAN, Sampling
 from caustic_cli.export.text import CREATED, real
 from caustic_cli.io.files import write_bytes
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -78,11 +79,11 @@ def write_mitsuba(
     scene: Scene,
     field: HeightField,
     heights: Tensor,
-    samples: tuple[int, int] | None = None,
+    samples: Sampling | None = None,
     tolerance: float | None = None,
     dark: bool = False,
-) -> Deviation:
-    """Write the meshes and then the scene; returns the deviation of the triangles of the exit.
+) -> None:
+    """Write the meshes and then the scene.
 
     Arguments as in `closed_mesh`; `dark`: without an emitter.
 
@@ -90,23 +91,19 @@ def write_mitsuba(
         InputError: as `closed_mesh`; a source without an equivalent emitter; or the files cannot be written.
     """
     light = [] if dark else _light(scene)
-    *fronts, surface = patches(
-        scene.lens, field, heights, samples, tolerance, (1 if scene.lens.entrance is None else 2) * most_points(A_POINT, 1e3)
-    )
-    found, front = of_triangles(surface, field, heights, shaded=True), fronts[0] if fronts else None
+    *fronts, surface = patches(scene.lens, field, heights, samples, tolerance)
+    front = fronts[0] if fronts else None
     if scene.lens.mirror:
         _write_mirror(path, scene, surface, light)
-        return found
+        return
     if front is None:
         refuse_open(float(surface.points[..., 2].min()), scene.lens.z_in)
     exit_mesh, sides = companions(path, False)
     points, normals = (a.reshape(-1, 3) for a in (surface.points, surface.normals))
-    write_mesh(exit_mesh, points, triangles(surface.points), normals, text=False)
+    write_mesh(exit_mesh, points, triangles(surface.points), normals)
     rim = points[rim_of(*surface.points.shape[:2])]
     low = rim * [1.0, 1.0, 0.0] + [0.0, 0.0, scene.lens.z_in]
-    write_mesh(
-        sides, *_strip(rim, low if front is None else front.points.reshape(-1, 3)[rim_of(*front.points.shape[:2])]), text=False
-    )
+    write_mesh(sides, *_strip(rim, low if front is None else front.points.reshape(-1, 3)[rim_of(*front.points.shape[:2])]))
     lens, screen = scene.lens, scene.screen
     glass, onto, surfaces = _glass(lens.index), _onto(scene), len(System.of(scene).elements)
     rx, ry = lens.half_size
@@ -116,7 +113,7 @@ def write_mitsuba(
     entrance = [f'<shape type="{flat}" id="entrance">', f"  {glass}", f"  {place}", "</shape>"]
     if front is not None:
         mesh = companions(path, lens.round, two_sided=True)[-1]
-        write_mesh(mesh, front.points.reshape(-1, 3), triangles(front.points)[:, ::-1], -front.normals.reshape(-1, 3), text=False)
+        write_mesh(mesh, front.points.reshape(-1, 3), triangles(front.points)[:, ::-1], -front.normals.reshape(-1, 3))
         entrance = [f'<shape type="ply" id="entrance"><string name="filename" value={quoteattr(mesh.name)}/>{glass}</shape>']
     lines = [
         *_camera(screen, away, f'<scale x="-1"/><translate z="{real(screen.z - away)}"/>{onto}', surfaces + 2),
@@ -132,7 +129,19 @@ def write_mitsuba(
         "",
     ]
     write_bytes(path, "\n".join(lines).encode())
-    return found
+
+
+def choices(scene: Scene, field: HeightField, heights: Tensor, limit: float) -> list[dict]:
+    """Densities of files of at most `limit` bytes in all, the smallest first."""
+    return mesh.choices(scene, field, heights, limit, A_POINT)
+
+
+def readings(
+    scene: Scene, field: HeightField, heights: Tensor, samples: Sampling | None = None, tolerance: float | None = None
+) -> Readings:
+    """The exit as Mitsuba interpolates it: flat facets with the normals of the vertices."""
+    exit = patches(scene.lens, field, heights, samples, tolerance)[-1]
+    return {"error": lambda: of_facets(exit.points, scene.lens.round, exit.normals)}
 
 
 def _others(path: str | Path, scene: Scene) -> list[str]:
@@ -146,7 +155,7 @@ def _others(path: str | Path, scene: Scene) -> list[str]:
         outer = rims[0] * [FRAME, FRAME, 1.0]
         frame, around = _strip(outer, rims[0])
         sides, across = _strip(rims[1], rims[0])
-        write_mesh(black, body.placed(np.concatenate([frame, sides])), np.concatenate([around, across + len(frame)]), text=False)
+        write_mesh(black, body.placed(np.concatenate([frame, sides])), np.concatenate([around, across + len(frame)]))
         coating = _glass(body.component.index)
         if body.component.mirror:
             coating = MIRRORED
@@ -156,7 +165,7 @@ def _others(path: str | Path, scene: Scene) -> list[str]:
             faces, normals = triangles(seen.points), seen.normals.reshape(-1, 3)
             if side == "front":  # normals out of the glass, or towards the light
                 faces, normals = faces[:, ::-1], -normals
-            write_mesh(mesh, body.placed(seen.points.reshape(-1, 3)), faces, body.turned(normals), text=False)
+            write_mesh(mesh, body.placed(seen.points.reshape(-1, 3)), faces, body.turned(normals))
             lines.append(f'<shape type="ply" id="{name}"><string name="filename" value={quoteattr(mesh.name)}/>{coating}</shape>')
         lines.append(
             f'<shape type="ply"><string name="filename" value={quoteattr(black.name)}/>'
@@ -180,7 +189,7 @@ def _write_mirror(path: str | Path, scene: Scene, surface: Patch, light: list[st
         raise InputError("⟨format⟩ mitsuba: the screen would obstruct the light of this mirror's source")
     (mesh,) = companions(path, False, True)
     points, normals = (a.reshape(-1, 3) for a in (surface.points, surface.normals))
-    write_mesh(mesh, points, triangles(surface.points)[:, ::-1], -normals, text=False)  # towards the light
+    write_mesh(mesh, points, triangles(surface.points)[:, ::-1], -normals)  # towards the light
     away = 0.9 * (min(float(points[:, 2].min()), lens.z_in) - BEFORE - screen.z)
     lines = [
         *_camera(screen, away, f'<rotate y="1" angle="180"/><translate z="{real(screen.z + away)}"/>'),
@@ -272,7 +281,7 @@ def _round_holder(path: str | Path, radius: float, z: float, black: str) -> list
     parts = [_strip(inner * [a, a, 1.0], inner * [b, b, 1.0]) for a, b in itertools.pairwise(widths)]
     faces = np.concatenate([f + k * 2 * RING for k, (_, f) in enumerate(parts)])
     file = companions(path, True)[2]
-    write_mesh(file, np.concatenate([v for v, _ in parts]), faces, text=False)
+    write_mesh(file, np.concatenate([v for v, _ in parts]), faces)
     return [f'<shape type="ply" id="holder"><string name="filename" value={quoteattr(file.name)}/>{black}</shape>']
 
 

@@ -1,4 +1,7 @@
-"""Writer of Wavefront OBJ files of the closed solid: `v x y z` in mm with 17 digits, `f a b c` counted from 1."""
+"""Writer of Wavefront OBJ files of the closed solid: `v x y z` in mm, `f a b c` counted from 1.
+
+Lengths have DECIMALS decimals: at a distance of the points of 1 um, rounding changes slopes by less than 1e-6.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +9,17 @@ from pathlib import Path
 
 from torch import Tensor
 
-from caustic_cli.export.accuracy import Deviation, of_triangles
-from caustic_cli.export.mesh import exit_and_solids
-from caustic_cli.export.ply import A_POINT
+from caustic_cli.export import mesh
+from caustic_cli.export.reading import Reading
+from caustic_cli.export.surface import Sampling
 from caustic_cli.export.text import CREATED, rows
 from caustic_cli.io.files import atomic_path
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
+
+DECIMALS = 9
+#: Bytes of a point's three numbers and two triangles, as text, about.
+A_POINT = 3 * (DECIMALS + 4) + 2 * 25
 
 
 def write_obj(
@@ -20,13 +27,24 @@ def write_obj(
     scene: Scene,
     field: HeightField,
     heights: Tensor,
-    samples: tuple[int, int] | None = None,
+    samples: Sampling | None = None,
     tolerance: float | None = None,
-) -> Deviation:
-    """Write the solid atomically; arguments, errors and result as in `write_ply`."""
-    exit, vertices, faces = exit_and_solids(scene, field, heights, samples, tolerance, A_POINT)
+) -> None:
+    """Write the solid atomically; arguments and errors as in `write_ply`."""
+    vertices, faces = mesh.closed_mesh(scene, field, heights, samples, tolerance)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write(f"# {CREATED}\n# millimetres\no lens\n".encode())
-        file.writelines(rows(vertices, "v %.17g %.17g %.17g\n"))
+        file.writelines(rows(vertices.round(DECIMALS) + 0.0, f"v %.{DECIMALS}f %.{DECIMALS}f %.{DECIMALS}f\n"))
         file.writelines(rows(faces + 1, "f %d %d %d\n"))
-    return of_triangles(exit, field, heights)
+
+
+def choices(scene: Scene, field: HeightField, heights: Tensor, limit: float) -> list[dict]:
+    """Densities of files of at most `limit` bytes, the smallest first."""
+    return mesh.choices(scene, field, heights, limit, A_POINT)
+
+
+def readings(
+    scene: Scene, field: HeightField, heights: Tensor, samples: Sampling | None = None, tolerance: float | None = None
+) -> dict[str, Reading]:
+    """The surface as read from the mesh, with rounded lengths."""
+    return mesh.readings(scene, field, heights, samples, tolerance, lambda points: points.round(DECIMALS))

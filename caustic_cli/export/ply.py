@@ -1,8 +1,8 @@
-"""Writer of PLY files of the closed solid (G. Turk, The PLY Polygon File Format, 1994), as text.
+"""Writer of PLY files of the closed solid (G. Turk, The PLY Polygon File Format, 1994), little-endian binary.
 
-    ply, format, comments, properties; then per vertex x y z, float64 mm, 17 digits; then per triangle 3 and its vertices
+    ply, format, comments, properties, as text; then per vertex x y z, float64 mm; then per triangle 3 and its vertices, int32
 
-`write_mesh` can also write normals, and little-endian binary.
+`write_mesh` can also write normals.
 """
 
 from __future__ import annotations
@@ -12,16 +12,17 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from caustic_cli.export.accuracy import Deviation, of_triangles
-from caustic_cli.export.mesh import exit_and_solids
-from caustic_cli.export.text import CREATED, rows
+from caustic_cli.export import mesh
+from caustic_cli.export.reading import Reading
+from caustic_cli.export.surface import Sampling
+from caustic_cli.export.text import CREATED
 from caustic_cli.io.files import atomic_path
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 
-#: Bytes of a point's three numbers and two triangles, as text, at most.
-A_POINT = 3 * 21 + 2 * 23
 FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
+#: Bytes of a point's three numbers and two triangles.
+A_POINT = 3 * 8 + 2 * FACE.itemsize
 
 
 def write_ply(
@@ -29,27 +30,35 @@ def write_ply(
     scene: Scene,
     field: HeightField,
     heights: Tensor,
-    samples: tuple[int, int] | None = None,
+    samples: Sampling | None = None,
     tolerance: float | None = None,
-) -> Deviation:
-    """Write the solid atomically; returns the deviation of its triangles.
+) -> None:
+    """Write the solid atomically.
 
     Arguments and errors as in `closed_mesh`; InputError also if it cannot be written.
     """
-    exit, vertices, faces = exit_and_solids(scene, field, heights, samples, tolerance, A_POINT)
-    write_mesh(path, vertices, faces)
-    return of_triangles(exit, field, heights)
+    write_mesh(path, *mesh.closed_mesh(scene, field, heights, samples, tolerance))
 
 
-def write_mesh(
-    path: str | Path, vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None = None, text: bool = True
-) -> None:
+def choices(scene: Scene, field: HeightField, heights: Tensor, limit: float) -> list[dict]:
+    """Densities of files of at most `limit` bytes, the smallest first."""
+    return mesh.choices(scene, field, heights, limit, A_POINT)
+
+
+def readings(
+    scene: Scene, field: HeightField, heights: Tensor, samples: Sampling | None = None, tolerance: float | None = None
+) -> dict[str, Reading]:
+    """The surface as read from the mesh."""
+    return mesh.readings(scene, field, heights, samples, tolerance)
+
+
+def write_mesh(path: str | Path, vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None = None) -> None:
     """Write vertices (V, 3) mm, with unit normals (V, 3) if given, and triangles (F, 3)."""
     names = ("x", "y", "z") if normals is None else ("x", "y", "z", "nx", "ny", "nz")
     table = vertices if normals is None else np.concatenate([vertices, normals], 1)
     head = [
         "ply",
-        f"format {'ascii' if text else 'binary_little_endian'} 1.0",
+        "format binary_little_endian 1.0",
         f"comment {CREATED}",
         "comment millimetres",
         f"element vertex {len(vertices)}",
@@ -59,13 +68,9 @@ def write_mesh(
         "end_header",
         "",
     ]
+    records = np.empty(len(faces), FACE)
+    records["count"], records["corners"] = 3, faces
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write("\n".join(head).encode())
-        if text:
-            file.writelines(rows(table, " ".join(["%.17g"] * len(names)) + "\n"))
-            file.writelines(rows(faces, "3 %d %d %d\n"))
-            return
         file.write(table.astype("<f8").tobytes())
-        records = np.empty(len(faces), FACE)
-        records["count"], records["corners"] = 3, faces
         file.write(records.tobytes())

@@ -7,8 +7,8 @@ The poles of the exit surface are the control heights at the Greville abscissae;
 poles, in the planes x = const or y = const of the sides.  For a round lens the same surface is trimmed by a cylinder, along an
 interpolated curve.  A border for the mount is a flange, as in `mesh`.  Lengths are mm.
 
-Unless the exact spline is requested, lengths are rounded to `DIGIT` of the distance of the poles, and surfaces with too many poles
-for the default file size are approximated on fewer knots (`approximation`).
+Unless the exact spline is requested, lengths are rounded as far as light does not notice (`surface.decimals_for`), and surfaces may
+be approximated on fewer knots (`approximation`).
 
 The boundary representation is written bottom-up: vertices, edge curves, edge loops counter-clockwise about the outward normal of
 each face, faces, shell, solid; then the product.
@@ -28,11 +28,11 @@ from torch import Tensor
 
 from caustic_cli import __version__
 from caustic_cli.config import checks
-from caustic_cli.export.accuracy import Deviation, combined, of_poles
-from caustic_cli.export.approximation import allocate_points, on_fewer_knots
+from caustic_cli.export.approximation import on_fewer_knots
 from caustic_cli.export.bodies import bodies
 from caustic_cli.export.mesh import FLANGE, closed_mesh, refuse_open
-from caustic_cli.export.surface import STEPS_PER_SPAN, knot_lines, most_points, on_lines
+from caustic_cli.export.reading import Readings, of_poles
+from caustic_cli.export.surface import STEPS_PER_SPAN, decimals_for, knot_lines, on_lines
 from caustic_cli.export.text import CREATED
 from caustic_cli.io.files import atomic_path
 from caustic_cli.optics.bspline import SplineSpace
@@ -52,10 +52,7 @@ DATA;
 TAIL = "ENDSEC;\nEND-ISO-10303-21;\n"
 #: Tolerance within which vertices, edges and faces of the solid coincide, mm.
 UNCERTAINTY = 1e-7
-#: Rounding of lengths: unit of the last digit over the distance of the poles, which changes slopes by less than 1e-6; and at most,
-#: mm, which changes heights by half of that, 0.05 nm.
-DIGIT, COARSEST = 1e-6, 1e-7
-#: Fractions of the poles of a surface that are tried for a tolerance, in this order.
+#: Fractions of the poles of a surface to choose from, in this order.
 PARTS = [2.0 ** (-k / 2) for k in range(12, -1, -1)]
 #: UNCERTAINTY for the interpolated rim of a round lens, and most points on half of it.
 ROUND_UNCERTAINTY, MOST_ON_RIM = 1e-6, 1 << 15
@@ -153,32 +150,31 @@ class Solid:
 
 
 def write_step(
-    path: str | Path, scene: Scene, field: HeightField, heights: Tensor, tolerance: float | None = None
-) -> Deviation | None:
-    """Write the solid atomically; returns the deviation of its free-form sides, None if they are exact.
+    path: str | Path,
+    scene: Scene,
+    field: HeightField,
+    heights: Tensor,
+    tolerance: float | None = None,
+    poles: float = 1.0,
+) -> None:
+    """Write the solid atomically.
 
     Args:
         heights: (n, m) mm.
         tolerance: largest measured deviation of a surface, mm, reached with as few knots as possible; 0 for the exact spline; None
-            for a file of at most `USUAL_BYTES`.
+            for lengths that are rounded as far as light does not notice.
+        poles: fraction of the poles of the free-form lens, without a tolerance: its surfaces are approximated on fewer knots.
 
     Raises:
         InputError: the surface reaches the entrance, or the file cannot be written there.
     """
-    if tolerance is not None:
-        checks.number("⟨tolerance⟩", tolerance, 0.0)
-    mirror, heights = scene.lens.mirror, heights.detach().double().cpu()
-    if mirror:  # built upside down and reflected in z
-        heights = -heights
-        scene = replace(scene, lens=replace(scene.lens, z_in=-scene.lens.z_in))
+    solids, decimals = _solids(scene, field, heights, tolerance, poles)
     if scene.lens.entrance is None:
-        refuse_open(float(heights.min()), scene.lens.z_in)
+        lens, exit = solids[0].lens, solids[0].heights
+        refuse_open(float(exit.min()), lens.z_in)
     if scene.lens.entrance is not None or scene.elements:
         closed_mesh(scene, field, heights)  # raises an error if it is not a solid
-    solids = [Solid(scene.lens, field, heights, Pose()), *(Solid(b.lens, b.field, b.heights, b.pose) for b in bodies(scene))]
-    decimals = None if tolerance == 0 else _decimals(solids, tolerance)
-    solids, off = (solids, None) if decimals is None else approximated(solids, decimals, tolerance)
-    out, found = Entities(mirror, decimals), []
+    out, found = Entities(scene.lens.mirror, decimals), []
     for solid in solids:
         out.pose = solid.pose
         found.append(lens_solid(out, solid.lens, solid.field, solid.heights, poles_of(solid.field, solid.heights.numpy())))
@@ -190,44 +186,62 @@ def write_step(
         file.write(HEAD)
         file.writelines(out.lines)
         file.write(TAIL)
-    return off
 
 
-def approximated(solids: list[Solid], decimals: int, tolerance: float | None) -> tuple[list[Solid], Deviation]:
-    """The solids with sides approximated within the tolerance, mm, or to the default file size, and the deviation with rounded
-    poles."""
-    sides = [side for solid in solids for side in solid.sides]
-
-    def measured(side: tuple[HeightField, Tensor], most: int) -> tuple[tuple[HeightField, Tensor], Deviation]:
-        """A side with at most this number of poles, and its deviation."""
-        written = on_fewer_knots(*side, most)
-        return written, of_poles(poles_of(written[0], written[1].numpy()).round(decimals), written[0], *side)
-
-    if tolerance is None:
-        most = allocate_points([math.prod(f.shape) for f, _ in sides], most_points(max(_bytes(f, h, decimals) for f, h in sides)))
-        found = [measured(side, n) for side, n in zip(sides, most, strict=True)]
-    else:
-        found = []
-        for side in sides:
-            for part in PARTS:
-                fewer = measured(side, math.ceil(part * math.prod(side[0].shape)))
-                if fewer[1].height <= tolerance:
-                    break
-            found.append(fewer)
-    written = iter(side for side, _ in found)
-    return [solid.with_sides(*(next(written) for _ in solid.sides)) for solid in solids], combined([off for _, off in found])
+def choices(scene: Scene, field: HeightField, heights: Tensor, limit: float) -> list[dict]:
+    """Fractions of the poles of files of at most `limit` bytes, the smallest first; the smallest of all where none fits."""
+    solids, decimals = _solids(scene, field, heights, None, 1.0)
+    sizes = [math.prod(f.shape) * _bytes(f, h, decimals or 0) for solid in solids for f, h in solid.sides]
+    own = sum(sizes[: len(solids[0].sides)])
+    fits = [part for part in reversed(PARTS) if part * own + sum(sizes) - own <= limit]
+    return [{"poles": part} for part in reversed(fits)] or [{"poles": PARTS[0]}]
 
 
-def _decimals(solids: list[Solid], tolerance: float | None) -> int:
-    """Decimals of lengths in mm, for which rounding is negligible for the light and below a tenth of the tolerance."""
+def readings(scene: Scene, field: HeightField, heights: Tensor, tolerance: float | None = None, poles: float = 1.0) -> Readings:
+    """The surface as read from the poles, rounded as they are."""
+    solids, decimals = _solids(scene, field, heights, tolerance, poles)
+    up = -1.0 if scene.lens.mirror else 1.0
+    (exit, net), *fronts = solids[0].sides
+    written = [h if decimals is None else torch.from_numpy(h.numpy().round(decimals)) for h in (net, *(h for _, h in fronts))]
+    front = freeform_of(fronts[0][0], written[1]) if fronts else None
+    return {"error": lambda: of_poles(exit, up * written[0], front)}
+
+
+def _solids(
+    scene: Scene, field: HeightField, heights: Tensor, tolerance: float | None, poles: float
+) -> tuple[list[Solid], int | None]:
+    """The solids, those of a mirror reflected in z, with surfaces on as many knots as asked, and the decimals of lengths, None for
+    all; arguments as in `write_step`."""
+    if tolerance is not None:
+        checks.number("⟨tolerance⟩", tolerance, 0.0)
+    heights, lens = heights.detach().double().cpu(), scene.lens
+    if lens.mirror:  # built upside down and reflected in z
+        heights, lens = -heights, replace(lens, z_in=-lens.z_in)
+    solids = [Solid(lens, field, heights, Pose()), *(Solid(b.lens, b.field, b.heights, b.pose) for b in bodies(scene))]
+    if tolerance == 0:
+        return solids, None
     apart = min(2.0 * r / n for solid in solids for f, _ in solid.sides for r, n in zip(f.half_size, f.shape, strict=True))
-    return max(0, -math.floor(math.log10(min(DIGIT * apart, COARSEST, 0.1 * (tolerance or math.inf)))))
+    decimals = decimals_for(apart, tolerance)
+    if tolerance is None:
+        most = [math.ceil(poles * math.prod(f.shape)) for f, _ in solids[0].sides]
+        fewer = [on_fewer_knots(*side, n) for side, n in zip(solids[0].sides, most, strict=True)]
+        return [solids[0].with_sides(*fewer), *solids[1:]], decimals
+    return [solid.with_sides(*(_within(*side, tolerance, decimals) for side in solid.sides)) for solid in solids], decimals
+
+
+def _within(field: HeightField, heights: Tensor, tolerance: float, decimals: int) -> tuple[HeightField, Tensor]:
+    """A surface on the fewest knots of PARTS with rounded poles within the tolerance, mm; on all of its own if none suffices."""
+    for part in PARTS:
+        fewer, net = on_fewer_knots(field, heights, math.ceil(part * math.prod(field.shape)))
+        if of_poles(fewer, torch.from_numpy(net.numpy().round(decimals))).largest_deviation(field, heights) <= tolerance:
+            break
+    return fewer, net
 
 
 def _bytes(field: HeightField, heights: Tensor, decimals: int) -> int:
     """Upper bound of the bytes of a pole and its reference."""
     widest = (field.half_size[0], field.half_size[1], float(heights.abs().max()))
-    return len("#123456=CARTESIAN_POINT('',(,,));\n#123456,") + sum(len(f"{-w:.{decimals}f}") for w in widest)
+    return len("#1234567=CARTESIAN_POINT('',(,,));\n#1234567,") + sum(len(f"{-w:.{decimals}f}") for w in widest)
 
 
 def poles_of(field: HeightField, net: np.ndarray) -> np.ndarray:

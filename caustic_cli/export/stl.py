@@ -18,8 +18,9 @@ from torch import Tensor
 
 from caustic_cli import __version__
 from caustic_cli.errors import InputError
-from caustic_cli.export.accuracy import Deviation, of_triangles
-from caustic_cli.export.mesh import exit_and_solids
+from caustic_cli.export import mesh
+from caustic_cli.export.reading import Reading
+from caustic_cli.export.surface import Sampling
 from caustic_cli.io.files import atomic_path
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
@@ -36,22 +37,33 @@ def write_stl(
     scene: Scene,
     field: HeightField,
     heights: Tensor,
-    samples: tuple[int, int] | None = None,
+    samples: Sampling | None = None,
     tolerance: float | None = None,
-) -> Deviation:
-    """Write the solid atomically.  Arguments as in `closed_mesh`; returns the deviation of its triangles.
+) -> None:
+    """Write the solid atomically.  Arguments as in `closed_mesh`.
 
     Raises:
         InputError: as `closed_mesh`; points that coincide in float32; or the file cannot be written.
     """
-    exit, vertices, faces = exit_and_solids(scene, field, heights, samples, tolerance, 2 * TRIANGLE.itemsize)
+    vertices, faces = mesh.closed_mesh(scene, field, heights, samples, tolerance)
     vertices = vertices.astype("<f4")
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write(HEADER)
         file.write(np.array(len(faces), "<u4").tobytes())
         for start in range(0, len(faces), BLOCK):
             file.write(_records(vertices[faces[start : start + BLOCK]]).tobytes())
-    return of_triangles(exit, field, heights)
+
+
+def choices(scene: Scene, field: HeightField, heights: Tensor, limit: float) -> list[dict]:
+    """Densities of files of at most `limit` bytes, the smallest first."""
+    return mesh.choices(scene, field, heights, limit, 2 * TRIANGLE.itemsize)
+
+
+def readings(
+    scene: Scene, field: HeightField, heights: Tensor, samples: Sampling | None = None, tolerance: float | None = None
+) -> dict[str, Reading]:
+    """The surface as read from the mesh, in float32."""
+    return mesh.readings(scene, field, heights, samples, tolerance, lambda p: p.astype(np.float32).astype(np.float64))
 
 
 def _records(corners: np.ndarray) -> np.ndarray:

@@ -12,7 +12,8 @@ at p is half the mean of (v - p)^T D2z (v - p) over the corners v, weighted by p
 
 Other programs interpolate such a grid by a spline, which reproduces the designed surface only if every knot is a grid line: a
 not-a-knot bicubic with 4 steps per span reproduces a cubic lens to rounding (1e-10 mm on a screen 300 mm away); on an arbitrary
-grid of the same density the error is 1e-4 mm for a smooth relief and 0.1 mm for a rough one.
+grid of the same density the error is 1e-4 mm for a smooth relief and 0.1 mm for a rough one.  Which grid a lens needs for its
+picture is therefore measured (`workflow.export`), from the densities of `samplings`.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -30,26 +32,72 @@ from caustic_cli.errors import InputError
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.surfaces.heightfield import HeightField
 
-#: Equal steps per knot span of the default grid.  A not-a-knot bicubic is exact with 2; with 4 a natural spline, whose end
-#: conditions are wrong, has an error of some micrometres on the screen.
+#: Equal steps per knot span of a grid unless another is given.  A not-a-knot bicubic is exact with 1 except beside the border,
+#: and with 2 everywhere; with 4 a natural spline, whose end conditions are wrong, has an error of some micrometres on the screen.
 STEPS_PER_SPAN = 4
-#: Default limit of the file size, bytes.
-USUAL_BYTES = 20_000_000
 #: Most samples along one axis, and most points: 5e7 points are 2.8 GB of points, normals and heights.
 MAX_SAMPLES = 20_000
 MAX_POINTS = 50_000_000
+#: Points per knot span of the default grids to choose from, where they are fewer than one.
+FRACTIONS = tuple(2.0 ** (-k / 2) for k in range(6, 0, -1))
+#: Rounding of written lengths: unit of the last digit over the distance of the points, which changes slopes by less than 1e-6; and
+#: at most, mm, which changes heights by half of that, 0.05 nm.
+DIGIT, COARSEST = 1e-6, 1e-7
+
+#: Density of a grid: points (nx, ny) equally spaced over the aperture, or a number of equal steps in every knot span.
+Sampling = tuple[int, int] | int
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceGrid:
-    """The surface on grid lines x (nx,), y (ny,) mm: z (nx, ny) mm, slopes zx, zy, twist zxy (nx, ny); all float64."""
+    """The surface with control heights `net` (n, m) mm float64 on grid lines u (nx,), v (ny,) on [0, 1].
 
-    x: np.ndarray
-    y: np.ndarray
-    z: np.ndarray
-    zx: np.ndarray
-    zy: np.ndarray
-    zxy: np.ndarray
+    x (nx,), y (ny,) mm; z (nx, ny) mm, slopes zx, zy, twist zxy (nx, ny), all float64, each computed when it is first used.
+    """
+
+    field: HeightField
+    net: Tensor
+    u: Tensor
+    v: Tensor
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Points (nx, ny)."""
+        return len(self.u), len(self.v)
+
+    @cached_property
+    def x(self) -> np.ndarray:
+        return ((2.0 * self.u - 1.0) * self.field.half_size[0]).numpy()
+
+    @cached_property
+    def y(self) -> np.ndarray:
+        return ((2.0 * self.v - 1.0) * self.field.half_size[1]).numpy()
+
+    @cached_property
+    def _rows(self) -> tuple[Tensor, Tensor]:
+        """The net evaluated along x, and its derivative: (nx, m)."""
+        space, rx = self.field.spaces[0], self.field.half_size[0]
+        return along(space, self.u, self.net), along(space, self.u, self.net, 1) / (2.0 * rx)
+
+    def _across(self, rows: Tensor, derivative: int = 0) -> np.ndarray:
+        scale = (2.0 * self.field.half_size[1]) ** derivative
+        return (along(self.field.spaces[1], self.v, rows.T, derivative).T / scale).contiguous().numpy()
+
+    @cached_property
+    def z(self) -> np.ndarray:
+        return self._across(self._rows[0])
+
+    @cached_property
+    def zx(self) -> np.ndarray:
+        return self._across(self._rows[1])
+
+    @cached_property
+    def zy(self) -> np.ndarray:
+        return self._across(self._rows[0], 1)
+
+    @cached_property
+    def zxy(self) -> np.ndarray:
+        return self._across(self._rows[1], 1)
 
     @property
     def points(self) -> np.ndarray:
@@ -64,51 +112,64 @@ class SurfaceGrid:
         return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
-def most_points(a_point: float, beside: float = 0.0) -> int:
-    """Number of points in a file of `USUAL_BYTES` at `a_point` bytes each, with `beside` bytes of other contents."""
-    return max(4, int((USUAL_BYTES - beside) / a_point))
+def counts_of(spaces: Sequence[SplineSpace], sampling: Sampling) -> tuple[int, int]:
+    """Points (nx, ny) of a grid of this density."""
+    if isinstance(sampling, int):
+        nx, ny = (sampling * (len(s.breaks) - 1) + 1 for s in spaces)
+        return nx, ny
+    return sampling
 
 
-def usual_steps(spaces: Sequence[SplineSpace], most: int) -> int:
-    """Default steps per knot span: `STEPS_PER_SPAN`, or fewer for at most `most` points; 0 if one is too many."""
+def samplings(spaces: Sequence[SplineSpace], most: float, least: int = 2) -> list[Sampling]:
+    """Densities to choose from, fewest points first: equally spaced points at FRACTIONS of the knot spans, then up to
+    `STEPS_PER_SPAN` equal steps in every span, with at most `most` points in all and at least `least` along an axis; and the finest
+    equally spaced grid where one point per span is too many."""
     spans = [len(s.breaks) - 1 for s in spaces]
-    return next((k for k in range(STEPS_PER_SPAN, 0, -1) if math.prod(k * n + 1 for n in spans) <= most), 0)
+    found: list[Sampling] = []
+    for fraction in FRACTIONS:
+        nx, ny = (max(least, round(fraction * n) + 1) for n in spans)
+        if (nx, ny) not in found and nx <= spans[0] and ny <= spans[1]:
+            found.append((nx, ny))
+    found += range(1, STEPS_PER_SPAN + 1)
+    fits = [s for s in found if _allowed(counts_of(spaces, s), most, least)]
+    if not fits or fits[-1] == found[-1] or isinstance(fits[-1], int):
+        return fits or [even_counts(spaces, most, least)]
+    finest = even_counts(spaces, most, least)
+    return fits if finest == fits[-1] else [*fits, finest]
 
 
-def usual_counts(spaces: Sequence[SplineSpace], most: int, least: int = 2) -> tuple[int, int]:
-    """Points along x and y: `usual_steps` per knot span, or about `most` points in the proportion of the spans; at least
-    `least`."""
-    steps, (nx, ny) = usual_steps(spaces, most), (len(s.breaks) - 1 for s in spaces)
-    return (max(least, steps * nx + 1), max(least, steps * ny + 1)) if steps else even_counts(spaces, most, least)
+def _allowed(counts: tuple[int, int], most: float, least: int) -> bool:
+    return math.prod(counts) <= min(most, MAX_POINTS) and min(counts) >= least and max(counts) <= MAX_SAMPLES
 
 
-def even_counts(spaces: Sequence[SplineSpace], most: int, least: int = 2) -> tuple[int, int]:
+def even_counts(spaces: Sequence[SplineSpace], most: float, least: int = 2) -> tuple[int, int]:
     """About `most` points along x and y, in the proportion of their spans."""
     nx, ny = (len(s.breaks) - 1 for s in spaces)
-    across = math.sqrt(most * nx / ny)
-    return max(least, math.floor(across)), max(least, math.floor(across * ny / nx))
+    across = math.sqrt(min(most, MAX_POINTS) * nx / ny)
+    a, b = (min(MAX_SAMPLES, max(least, math.floor(n))) for n in (across, across * ny / nx))
+    return a, b
 
 
-def sample_grid(
-    field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None, most: int | None = None
-) -> SurfaceGrid:
-    """The surface and its slopes on a grid over the whole aperture, borders included.
+def decimals_for(distance: float, tolerance: float | None = None) -> int:
+    """Decimals of lengths in mm between points at this distance, mm, for which rounding is negligible for the light (DIGIT,
+    COARSEST) and below a tenth of a tolerance, mm."""
+    return max(0, -math.floor(math.log10(min(DIGIT * distance, COARSEST, 0.1 * (tolerance or math.inf)))))
+
+
+def sample_grid(field: HeightField, heights: Tensor, samples: Sampling | None = None) -> SurfaceGrid:
+    """The surface on a grid over the whole aperture, borders included.
 
     Args:
         heights: (n, m) control heights, mm.
-        samples: (nx, ny) points of an equispaced grid, or None for `STEPS_PER_SPAN` equal steps in every knot span:
-            STEPS_PER_SPAN (n - p) + 1 points along an axis with simple knots, every knot among them.
-        most: default number of points: fewer steps per span, or an equispaced grid, if necessary (`usual_counts`).
+        samples: (nx, ny) points of an equispaced grid, or equal steps in every knot span, so that every knot is a grid line; None
+            for `STEPS_PER_SPAN` of these.
 
     Raises:
         InputError: fewer than 2 or more than `MAX_SAMPLES` samples along an axis, more than `MAX_POINTS` points, or
             heights of another shape than the field.
     """
-    steps = STEPS_PER_SPAN if most is None else usual_steps(field.spaces, most)
-    if samples is None and steps:
-        return on_lines(field, heights, [knot_lines(s, steps) for s in field.spaces])
-    if samples is None and most is not None:
-        samples = usual_counts(field.spaces, most)
+    if samples is None or isinstance(samples, int):
+        return on_lines(field, heights, [knot_lines(s, STEPS_PER_SPAN if samples is None else samples) for s in field.spaces])
     counts = checks.pair("⟨samples⟩", samples, lambda where, n: checks.whole(where, n, 2, MAX_SAMPLES))
     return on_lines(field, heights, [torch.linspace(0.0, 1.0, n, dtype=torch.float64) for n in counts])
 
@@ -151,17 +212,12 @@ def on_lines(field: HeightField, heights: Tensor, lines: Sequence[Tensor], asked
     """
     if tuple(heights.shape) != field.shape:
         raise InputError(f"control heights must have shape {field.shape}, got {tuple(heights.shape)}")
-    (su, sv), (rx, ry), (u, v) = field.spaces, field.half_size, lines
+    u, v = lines
     if max(len(u), len(v)) > MAX_SAMPLES or len(u) * len(v) > MAX_POINTS:
         raise InputError(
             f"{asked} must give at most {MAX_SAMPLES} points along an axis and {MAX_POINTS:.0e} in all, got {len(u)} x {len(v)}"
         )
-    net = heights.detach().to("cpu", torch.float64)
-    rows, slopes = along(su, u, net), along(su, u, net, 1) / (2.0 * rx)  # (nx, m)
-    z, zy = along(sv, v, rows.T).T, along(sv, v, rows.T, 1).T / (2.0 * ry)
-    zx, zxy = along(sv, v, slopes.T).T, along(sv, v, slopes.T, 1).T / (2.0 * ry)
-    x, y = (2.0 * u - 1.0) * rx, (2.0 * v - 1.0) * ry
-    return SurfaceGrid(*(t.contiguous().numpy() for t in (x, y, z, zx, zy, zxy)))
+    return SurfaceGrid(field, heights.detach().to("cpu", torch.float64), u, v)
 
 
 def knot_lines(space: SplineSpace, steps: int | Tensor) -> Tensor:

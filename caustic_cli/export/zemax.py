@@ -18,8 +18,9 @@ import torch
 from torch import Tensor
 
 from caustic_cli.errors import InputError
-from caustic_cli.export.accuracy import Deviation, of_patches
-from caustic_cli.export.surface import most_points, sample_grid, usual_counts
+from caustic_cli.export import reading
+from caustic_cli.export.reading import Readings
+from caustic_cli.export.surface import STEPS_PER_SPAN, Sampling, SurfaceGrid, counts_of, sample_grid, samplings
 from caustic_cli.export.text import CREATED, real, rows
 from caustic_cli.io.files import atomic_path
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -32,22 +33,18 @@ DIGITS = 12
 A_ROW = 4 * (DIGITS + 6) + 3
 
 
-def write_zemax(
-    path: str | Path, scene: Scene, field: HeightField, heights: Tensor, samples: tuple[int, int] | None = None
-) -> Deviation:
-    """Write the grid atomically; returns the deviation of its patches.
+def write_zemax(path: str | Path, scene: Scene, field: HeightField, heights: Tensor, samples: Sampling | None = None) -> None:
+    """Write the grid atomically.
 
     Args:
         heights: (n, m) control heights, mm.
-        samples: (nx, ny) points, equispaced; None for `usual_counts`.
+        samples: density of points, always equispaced; None for `STEPS_PER_SPAN`.
 
     Raises:
         InputError: fewer than `LEAST` or too many points, or the file cannot be written there.
     """
-    grid = sample_grid(field, heights, samples or usual_counts(field.spaces, most_points(A_ROW), LEAST))
-    nx, ny = grid.z.shape
-    if min(nx, ny) < LEAST:
-        raise InputError(f"⟨samples⟩ of a zemax grid must be at least {LEAST} along each axis, got {nx} x {ny}")
+    grid = _grid(field, heights, samples)
+    nx, ny = grid.shape
     vertex = float(field.at(heights, *torch.zeros(2, 1, dtype=torch.float64), [(0, 0)])[0])
     columns = grid.z - vertex, grid.zx, grid.zy, grid.zxy
     table = np.stack([c[:, ::-1].T.ravel() for c in columns], -1)
@@ -65,4 +62,23 @@ def write_zemax(
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write("\r\n".join(head).encode())
         file.writelines(rows(table, f"{f'%.{DIGITS}g ' * 4}0\r\n"))
-    return of_patches(grid, field, heights)
+
+
+def choices(scene: Scene, field: HeightField, heights: Tensor, limit: float) -> list[dict]:
+    """Densities of files of at most `limit` bytes, the smallest first."""
+    return [{"samples": s} for s in samplings(field.spaces, limit / A_ROW, LEAST)]
+
+
+def readings(scene: Scene, field: HeightField, heights: Tensor, samples: Sampling | None = None) -> Readings:
+    """The surface as read from the grid, whose numbers are rounded by less than a float32 resolves."""
+    grid = _grid(field, heights, samples)
+    return {"error": lambda: reading.of_patches(grid, grid.z, grid.zx, grid.zy, grid.zxy)}
+
+
+def _grid(field: HeightField, heights: Tensor, samples: Sampling | None) -> SurfaceGrid:
+    nx, ny = (
+        (max(LEAST, n) for n in counts_of(field.spaces, STEPS_PER_SPAN)) if samples is None else counts_of(field.spaces, samples)
+    )
+    if min(nx, ny) < LEAST:
+        raise InputError(f"⟨samples⟩ of a zemax grid must be at least {LEAST} along each axis, got {nx} x {ny}")
+    return sample_grid(field, heights, (nx, ny))

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from caustic_cli.optics.image import Image
 from caustic_cli.optics.resolution import Resolution
+from caustic_cli.optics.surfaces.base import MeasuredSurface
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.waves import NoWaveImage, WaveImage, wave_image
 from caustic_cli.optics.waves.image import UNASKED, Perturbation
@@ -91,6 +92,16 @@ def unseen_figures(scene: Scene, field: HeightField, heights: Tensor, target: np
         return {}
     found = wave_image(scene, field, heights.detach(), wavelengths=others, finer=FINER)
     return {"wave_unseen_relative_rms": _judged(found, target)["relative_rms"], "wave_unseen_wavelengths": list(others)}
+
+
+def height_deviation(surface: MeasuredSurface, field: HeightField, heights: Tensor) -> Perturbation:
+    """Function of points (N,) mm that returns the height of a surface above the design, mm, constant beyond the aperture."""
+
+    def higher(x: Tensor, y: Tensor) -> Tensor:
+        x, y = (c.double().cpu().clamp(-r, r) for c, r in zip((x, y), field.half_size, strict=True))
+        return surface.at(None, x, y, [(0, 0)])[0] - field.at(heights, x, y, [(0, 0)])[0]
+
+    return higher
 
 
 def _judged(found: WaveImage, target: np.ndarray | None) -> dict:

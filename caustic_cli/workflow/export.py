@@ -3,27 +3,236 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass, field
+from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 from torch import Tensor
 
-from caustic_cli.errors import InputError
-from caustic_cli.export import FORMATS, TWO_SIDED
-from caustic_cli.export.accuracy import Deviation
+from caustic_cli.errors import InputError, alternatives
+from caustic_cli.export import AS_CUT, FORMATS, KEEPERS, MOST_BYTES, TWO_SIDED
 from caustic_cli.export.milling import Milling
-from caustic_cli.export.part import part_of
+from caustic_cli.export.part import Part, part_of, turned
+from caustic_cli.export.reading import Reading, Readings
 from caustic_cli.io.heightmaps import beside
+from caustic_cli.optics.plan import compile_plan
+from caustic_cli.optics.surfaces.base import MeasuredSurface
+from caustic_cli.optics.surfaces.facets import FacetSurface
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.project.project import Project
 from caustic_cli.project.uptodate import Outputs
 from caustic_cli.scene import Scene
-from caustic_cli.workflow.reporter import Reporter
+from caustic_cli.studies.picture_error import PictureError
+from caustic_cli.workflow.compilation import compile_for
+from caustic_cli.workflow.reporter import Listener, Reporter
+
+
+class Exporter:
+    """Exports of one lens, whose picture through each file is compared with its own.
+
+    Args:
+        scene, field, heights: of the lens, (n, m) mm.
+        target: its picture on the screen's pixels, None if it is not known.
+        waves: judge by the wave image.
+        seed: of the rays; most: largest file by default, bytes.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        field: HeightField,
+        heights: Tensor,
+        target: np.ndarray | None,
+        waves: bool = False,
+        seed: int = 0,
+        most: float = MOST_BYTES,
+        say: Reporter | None = None,
+    ):
+        self.scene, self.field, self.heights, self.target = scene, field, heights, target
+        self.waves, self.seed, self.most, self.say = waves, seed, most, say or Listener()
+
+    @cached_property
+    def picture(self) -> PictureError:
+        """The error of the lens' own picture, and of others."""
+        plan = compile_plan(self.scene, self.field, self.heights)
+        compile_for(plan.scene, "cpu", self.say, plan.requests)
+        return PictureError(plan, self.field, self.heights, self.target, self.waves, self.seed)
+
+    def write(
+        self,
+        path: Path,
+        format: str,
+        script: bool = False,
+        mould: bool = False,
+        block: float | None = None,
+        milling: dict | None = None,
+        **given,
+    ) -> dict:
+        """Write the files of the lens, see `files`, and return their figures: those of `figures`, or of milling; none for a format
+        whose module defines no `readings`.
+
+        given: samples or tolerance, mm; without these the smallest file of at most `most` bytes that keeps the picture, or else the
+        best.  For light of a single wavelength, the refractive index in the file is that at this wavelength.
+        """
+        scene = self.scene
+        if len(scene.light.wavelengths) == 1:
+            scene = scene.at(scene.light.wavelengths[0])
+        if scene.lens.entrance is not None and (script or mould or format not in TWO_SIDED):
+            raise InputError(
+                f"⟨format⟩ {format} holds one free-form side; of this lens, which has two, {', '.join(TWO_SIDED)} hold both,"
+                " without ⟨script⟩ or ⟨mould⟩"
+            )
+        if scene.elements and (script or format == "zemax"):
+            raise InputError(
+                f"⟨format⟩ {format} holds a single lens; with other elements {', '.join(TWO_SIDED)} hold the scene, without"
+                " ⟨script⟩"
+            )
+        part = part_of(format, scene, self.field, self.heights, mould, block)
+        home = _home(format)
+        writer = getattr(home, f"write_{format}")
+        if format == "gcode":
+            found = writer(path, part, Milling(**(milling or {})), **given)
+            return {"milling": found | _scallops(scene, self.field, found)}
+        scripts = import_module("caustic_cli.export.lighttools_script") if script else None
+        if scripts is not None:
+            scripts.refuse(scene)
+        arguments = _arguments(format, part)
+        file, judged = File(home, arguments, path if format == "heightmap" else None, part), hasattr(home, "readings")
+        choice = given if not judged or {"samples", "tolerance"} & set(given) else self.smallest(file)
+        written = writer(path, *arguments, **choice)
+        if scripts is not None:
+            scripts.write_script(path, scene, self.field, self.heights, choice.get("samples"))
+        found = self.figures(file, choice, format) if judged else {}
+        if written is not None:
+            found["heightmap"] = {key: value for key, value in written.items() if key != "spline"}
+        return found
+
+    def error(self, file: File, choice: dict, key: str | None = None) -> float:
+        """Relative RMS error of the picture through a file; key: which of its readings, that by which it is chosen unless given."""
+        key = key or file.chosen_by
+        which = (key, str(choice))
+        if which not in file.errors:
+            reading = file.readings(choice)[key]()
+            file.errors[which] = self.picture.through(*file.in_the_scene(reading), reading.entrance)
+        return file.errors[which]
+
+    def smallest(self, file: File) -> dict:
+        """The smallest choice that keeps the picture, or else the one with the least error of those tried.
+
+        The error falls with the size of the file, but for rounding: the choices are tried upwards or downwards from that with every
+        knot on a grid line.
+        """
+        choices, errors = file.choices(self.most), dict[int, float]()
+
+        def error(k: int) -> float:
+            if k not in errors:
+                errors[k] = self.error(file, choices[k])
+            return errors[k]
+
+        k = start = next((k for k, c in enumerate(choices) if c.get("samples") == 1), len(choices) - 1)
+        if error(k) <= self.picture.largest:
+            while k > 0 and error(k - 1) <= self.picture.largest:
+                k -= 1
+        else:
+            while k + 1 < len(choices) and error(k) > self.picture.largest and (k == start or error(k) < error(k - 1)):
+                k += 1
+            if error(k) > self.picture.largest:
+                k = start
+                while k > 0 and error(k - 1) < error(k):
+                    k -= 1
+                k = min(errors, key=lambda j: errors[j])
+        fewer = file.smaller(choices[k])
+        return fewer if fewer and self.error(file, fewer) <= self.picture.largest else choices[k]
+
+    def figures(self, file: File, choice: dict, format: str) -> dict:
+        """Figures of a file for JSON: error of the picture as read from it; lens_error, of the lens itself; error_by and noise;
+        errors of other readings (facet_error, cloud_error); keeps_picture; read_as, samples, height_error_mm; and keep_it, the
+        formats that keep a picture that this file does not."""
+        readings = file.readings(choice)
+        errors = {key: self.error(file, choice, key) for key in readings}
+        kept = errors["error"] <= self.picture.largest
+        own = readings["error"]()
+        found = {
+            **errors,
+            "error_by": self.picture.by,
+            "lens_error": self.picture.own if self.picture.known else None,
+            "noise": self.picture.noise,
+            "keeps_picture": kept,
+            "read_as": own.read_as,
+            "samples": list(own.samples if file.chosen_by == "error" else readings[file.chosen_by]().samples),
+            "height_error_mm": own.largest_deviation(file.part.field, file.part.heights, file.part.lens.round),
+        }
+        return found if kept else found | {"keep_it": [name for name in KEEPERS if name != format and self._keeps(name)]}
+
+    def _keeps(self, format: str) -> bool:
+        """Whether the largest file of a format keeps the picture."""
+        try:
+            part = part_of(format, self.scene, self.field, self.heights)
+        except InputError:
+            return False
+        if self.scene.lens.entrance is not None and format not in TWO_SIDED:
+            return False
+        path = Path(f"lens{FORMATS[format][0]}")
+        file = File(_home(format), _arguments(format, part), path if format == "heightmap" else None, part)
+        return self.error(file, file.choices(MOST_BYTES)[-1], "error") <= self.picture.largest
+
+
+@dataclass(frozen=True, eq=False)
+class File:
+    """A file of one format, to be chosen.
+
+    home: its module, with `choices` and `readings`; arguments: of these, which describe the lens; path: of height maps, whose
+    suffix determines their kind; part: the part in it; errors: of readings that have been traced, by their key and choice.
+    """
+
+    home: ModuleType
+    arguments: tuple
+    path: Path | None
+    part: Part
+    errors: dict[tuple[str, str], float] = field(default_factory=dict)
+
+    @property
+    def _more(self) -> dict:
+        return {} if self.path is None else {"path": self.path}
+
+    @property
+    def chosen_by(self) -> str:
+        """Key of the reading by which its size is chosen."""
+        return getattr(self.home, "CHOSEN_BY", "error")
+
+    def choices(self, limit: float) -> list[dict]:
+        """Arguments of the writer for files of at most `limit` bytes, the smallest first."""
+        return self.home.choices(*self.arguments, limit, **self._more)
+
+    def smaller(self, choice: dict) -> dict | None:
+        """The same choice with fewer bits, where the format has them."""
+        return self.home.smaller(self.path, choice) if hasattr(self.home, "smaller") else None
+
+    def readings(self, choice: dict) -> Readings:
+        """The surfaces as read from a file with this choice."""
+        return self.home.readings(*self.arguments, **self._more, **choice)
+
+    def in_the_scene(self, reading: Reading) -> tuple[HeightField | MeasuredSurface, Tensor | None]:
+        """The surface of a reading in the coordinates of the scene."""
+        if not self.part.turned:
+            return reading.surface, reading.heights
+        if isinstance(reading.surface, FacetSurface):
+            return reading.surface.turned(), None
+        return turned(reading.surface, reading.heights)
 
 
 def export(
-    project: Path, format: str, output: Path | None, script: bool, given: dict, force: bool, say: Reporter, at: str | None = None
+    exporter: Exporter,
+    opened: Project,
+    format: str,
+    output: Path | None,
+    script: bool,
+    given: dict,
+    force: bool,
+    at: str | None = None,
 ) -> tuple[dict, bool]:
     """Export the lens of a project.
 
@@ -41,19 +250,19 @@ def export(
     Raises:
         InputError: there is no lens, the format does not support it, or a file exists already; nothing was written.
     """
-    began, opened = time.monotonic(), Project.open(project).at(at)
+    began = time.monotonic()
     which = "" if at is None else f"-{at.replace(' ', '').replace(',', '-').replace('=', '-')}"
-    path = output or Path(project.resolve().stem + which + FORMATS[format][0])
-    scene = opened.scene()
-    written = files(path, scene, format, script)
-    values = {"at": at} if at is not None else {}
+    path = output or Path(opened.path.resolve().stem + which + FORMATS[format][0])
+    written = files(path, exporter.scene, format, script)
+    values = ({"at": at} if at is not None else {}) | ({"most": exporter.most} if exporter.most != MOST_BYTES else {})
     made = Outputs(opened, "export", {"format": format, "script": script, **values, **given}, written)
     if not force and (found := made.found()):
-        say.say(f"{path}: is up to date: the same options and the same project, so there is nothing to do; ⟨force⟩ repeats it")
+        exporter.say.say(
+            f"{path}: is up to date: the same options and the same project, so there is nothing to do; ⟨force⟩ repeats it"
+        )
         return found, True
     made.refuse_foreign(force)
-    scene, field, heights, _ = opened.lens(scene)
-    found = write(path, scene, field, heights, format, script, **given)
+    found = exporter.write(path, format, script, **given)
     more = {"beside": [str(file) for file in written[1:]]} if len(written) > 1 else {}
     figures = {
         "file": str(path),
@@ -66,79 +275,48 @@ def export(
     return figures, False
 
 
-def write(
-    path: Path,
-    scene: Scene,
-    field: HeightField,
-    heights: Tensor,
-    format: str,
-    script: bool = False,
-    mould: bool = False,
-    block: float | None = None,
-    milling: dict | None = None,
-    **given,
-) -> dict:
-    """Write the files of a lens, see `files`, and return their figures: samples and deviation of the surface that is read from them
-    (`export.accuracy`), or those of milling and height maps.
-
-    given: samples or tolerance, mm.  For light of a single wavelength, the refractive index in the file is that at this wavelength.
-    """
-    if len(scene.light.wavelengths) == 1:
-        scene = scene.at(scene.light.wavelengths[0])
-    if scene.lens.entrance is not None and (script or mould or format not in TWO_SIDED):
-        raise InputError(
-            f"⟨format⟩ {format} holds one free-form side; of this lens, which has two, {', '.join(TWO_SIDED)} hold both, without"
-            " ⟨script⟩ or ⟨mould⟩"
-        )
-    if scene.elements and (script or format == "zemax"):
-        raise InputError(
-            f"⟨format⟩ {format} holds a single lens; with other elements {', '.join(TWO_SIDED)} hold the scene, without ⟨script⟩"
-        )
-    part = part_of(format, scene, field, heights, mould, block)
-    writer = getattr(_home(format), f"write_{format}")
-    if format == "gcode":
-        found = writer(path, part, Milling(**(milling or {})), **given)
-        return {"milling": found | _scallops(scene, field, found)}
-    if format == "heightmap":
-        found = writer(path, part, **given)
-        return {"heightmap": {key: value for key, value in found.items() if key != "spline"}}
-    scripts = import_module("caustic_cli.export.lighttools_script") if script else None
-    if scripts is not None:
-        scripts.refuse(scene)
-    off: Deviation | None = writer(path, part.scene, part.field, part.heights, **given)
-    if scripts is not None:
-        scripts.write_script(path, scene, field, heights, given.get("samples"))
-    return {} if off is None else off.figures(scene)
+def exporter_of(project: Path, at: str | None, say: Reporter, most: float = MOST_BYTES) -> tuple[Exporter, Project]:
+    """The exporter of the lens of a project; arguments as of `export`."""
+    opened = Project.open(project).at(at)
+    scene = opened.scene()
+    target = opened.target(scene)
+    scene, field, heights, checkpoint = opened.lens(scene)
+    waves = checkpoint.results.get("wave_relative_rms") is not None
+    return Exporter(scene, field, heights, target, waves, opened.settings["design"]["seed"], most, say), opened
 
 
 def accuracy_words(figures: dict) -> str:
-    """Deviation of the exported surface from the designed one, as a phrase."""
-    if "heightmap" in figures:
-        said = figures["heightmap"]
-        return f"{said['columns']} x {said['rows']} points; between them heights are at most {_length(said['height_error_mm'])} off"
+    """The picture through the exported file, as a phrase."""
     if "read_as" not in figures:
-        return "the spline itself" if figures["format"] == "step" else ""
+        return ""
     nx, ny = figures["samples"]
-    exact = {"step": "; ⟨tolerance⟩ 0 writes the exact one", "lighttools": "; the exact spline is stored beside them"}
-    if spline := figures.get("spline"):
-        n, m = spline["samples"]
-        exact["lighttools"] = (
-            f"; the spline stored with them has {n} x {m} control points, heights at most {_length(spline['height_error_mm'])} off"
-            f" and light {_shift(spline['shift_pixels'])}; ⟨tolerance⟩ 0 stores the exact one"
-        )
-    return (
-        f"{nx} x {ny} points; read as {figures['read_as']}, heights are at most {_length(figures['height_error_mm'])} off and"
-        f" light {_shift(figures['shift_pixels'])} (RMS){exact.get(figures['format'], '')}"
-    )
+    noise = "" if not figures["noise"] else f" ± {figures['noise']:.2g}"
+    by = "of the wave image" if figures["error_by"] == "waves" else f"by rays{noise}"
+    if figures["lens_error"] is None:
+        judged = f"its image differs from the lens' own by {figures['error']:.2g} (relative RMS, by rays)"
+    else:
+        judged = f"relative RMS error {figures['error']:.4f} {by}, where the lens itself has {figures['lens_error']:.4f}"
+    others = [
+        f"{name} {figures[key]:.4f}"
+        for key, name in (("facet_error", "its flat facets have"), ("cloud_error", "its points, read as a bicubic spline, have"))
+        if key in figures
+    ]
+    if figures["height_error_mm"] > 0:
+        others.append(f"heights are at most {_length(figures['height_error_mm'])} off")
+    text = "; ".join([f"{nx} x {ny} points, read as {figures['read_as']}: {judged}", *others])
+    if figures["keeps_picture"]:
+        return text
+    kept = f"⟨format⟩ {alternatives(figures['keep_it'])} keeps it" if figures["keep_it"] else "no format keeps it in 100 MB"
+    return f"{text}; warning: this file does not keep the picture; {kept}"
+
+
+def _arguments(format: str, part: Part) -> tuple:
+    return (part,) if format in AS_CUT else (part.scene, part.field, part.heights)
 
 
 def _length(length: float) -> str:
     """A length, given in mm, in micrometres."""
     return f"{1e3 * length:.2g} µm" if length >= 1e-6 else "a nanometre"
-
-
-def _shift(pixels: float) -> str:
-    return f"{pixels:.2g} pixels" if pixels >= 0.001 else "a thousandth of a pixel"
 
 
 def _scallops(scene: Scene, field: HeightField, found: dict) -> dict:

@@ -27,10 +27,10 @@ from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Scene
 from caustic_cli.studies.retrace import FINAL_RAYS, RELATIVE_NOISE, evaluation_rays, retrace
-from caustic_cli.studies.waves import wave_figures
+from caustic_cli.studies.waves import height_deviation, wave_figures
 from caustic_cli.workflow.compilation import compile_for
-from caustic_cli.workflow.export import write
-from caustic_cli.workflow.machining import FINER, height_deviation
+from caustic_cli.workflow.export import Exporter
+from caustic_cli.workflow.machining import FINER
 from caustic_cli.workflow.reporter import Listener, Reporter
 
 
@@ -207,7 +207,9 @@ class Lens:
         path = Path(path)
         name = format_of(path, format)
         given: dict[str, Any] = {key: value for key, value in (("samples", samples), ("tolerance", tolerance)) if value is not None}
-        write(path, self.scene, self.field, self.heights, name, script, mould, block, milling, **given)
+        waves = self.figures.get("wave_relative_rms") is not None
+        exporter = Exporter(self.scene, self.field, self.heights, self.target, waves, self.seed)
+        exporter.write(path, name, script, mould, block, milling, **given)
         return path
 
     def save(self, path: str | Path, force: bool = False) -> Path:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -88,17 +87,6 @@ def form_deviation(cut: CutSurface, field: HeightField, heights: Tensor, round: 
         "cut_slope_rms": float(slopes.square().mean().sqrt()),
         "cut_slope_most": float(slopes.max()),
     }
-
-
-def height_deviation(cut: CutSurface, field: HeightField, heights: Tensor) -> Callable[[Tensor, Tensor], Tensor]:
-    """Function of points (N,) mm that returns the height of a machined surface above the design, mm, constant beyond the
-    aperture."""
-
-    def higher(x: Tensor, y: Tensor) -> Tensor:
-        x, y = (c.double().cpu().clamp(-r, r) for c, r in zip((x, y), field.half_size, strict=True))
-        return cut.at(None, x, y, [(0, 0)])[0] - field.at(heights, x, y, [(0, 0)])[0]
-
-    return higher
 
 
 def rows(figures: dict) -> list[tuple[str, str]]:

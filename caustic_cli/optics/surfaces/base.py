@@ -18,9 +18,11 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Generic, NamedTuple, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from caustic_cli.errors import InputError
 from caustic_cli.optics.backends import backend_for
 
 #: Orders of derivatives by (x, y): value and slopes; second derivatives.
@@ -81,3 +83,32 @@ class Surface(ABC, Generic[Heights]):
         rays."""
         (device,) = {c.device for c in (*origin, *direction) if isinstance(c, Tensor)} or {torch.device("cpu")}
         return backend_for(device).intersect(self, heights, origin, direction, side)
+
+
+class MeasuredSurface(Surface[None]):
+    """A surface without free parameters of which heights and slopes alone are known, and which may have edges: as a tool left it,
+    or as a mesh describes it."""
+
+    @abstractmethod
+    def heights_and_slopes(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Z, mm, Z_x and Z_y at points (N,) mm within `half_size`."""
+
+    def at(self, heights: None, x: Tensor, y: Tensor, orders: Sequence[tuple[int, int]] = FIRST) -> list[Tensor]:
+        """Height and slopes.
+
+        Raises:
+            InputError: higher derivatives are requested.
+        """
+        if not set(orders) <= set(FIRST):
+            raise InputError("a surface with edges has no second derivatives")
+        found = self.heights_and_slopes(*(c.detach().double().cpu().numpy() for c in (x, y)))
+        return [torch.from_numpy(np.ascontiguousarray(found[FIRST.index(order)])) for order in orders]
+
+    def intersect(self, heights: None, origin, direction, side: float) -> SurfaceIntersection:
+        """As of any surface; axial rays need no search."""
+        if side > 0 and not any(isinstance(c, Tensor) for c in direction) and tuple(direction) == (0.0, 0.0, 1.0):
+            x, y, oz = torch.broadcast_tensors(*(torch.as_tensor(c, dtype=torch.float64) for c in origin))
+            z, gx, gy = self.at(None, x, y)
+            found = (x.abs() <= self.half_size[0]) & (y.abs() <= self.half_size[1]) & (z >= oz)
+            return SurfaceIntersection(z - oz, gx, gy, found)
+        return super().intersect(heights, origin, direction, side)

@@ -11,11 +11,9 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from caustic_cli.errors import InputError
 from caustic_cli.optics.envelope import Envelope
-from caustic_cli.optics.surfaces.base import FIRST, Surface, SurfaceIntersection
+from caustic_cli.optics.surfaces.base import MeasuredSurface
 
 #: Points along each axis at which bounds are sampled.
 SURVEY = 801
@@ -24,7 +22,7 @@ BETWEEN = 1.2
 
 
 @dataclass(frozen=True, eq=False)
-class CutSurface(Surface[None]):
+class CutSurface(MeasuredSurface):
     """The minimum of the envelopes of one or several tools over an aperture.
 
     Args:
@@ -48,26 +46,18 @@ class CutSurface(Surface[None]):
         along, across = (BETWEEN * float(g.abs().max()) for g in (gx, gy))
         return (float(z.min()) - wide, float(z.max()) + wide), (along, across)
 
-    def at(self, heights: None, x: Tensor, y: Tensor, orders=FIRST) -> list[Tensor]:
-        """Height and slopes.
-
-        Raises:
-            InputError: higher derivatives are requested.
-        """
-        if not set(orders) <= set(FIRST):
-            raise InputError("a cut surface has edges and no second derivatives")
+    def heights_and_slopes(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of the lowest envelope at points (N,) mm."""
         across = -1.0 if self.turned else 1.0
-        px, py = x.detach().numpy(), across * y.detach().numpy()
-        found = []
+        y, found = across * y, []
         for one in self.envelopes:
-            z, cx, cy = one(px, py)
-            found.append((z, *one.slopes(px, py, cx, cy)))
+            z, cx, cy = one(x, y)
+            found.append((z, *one.slopes(x, y, cx, cy)))
         z, gx, gy = found[0]
         for other in found[1:]:
             lower = other[0] < z
             z, gx, gy = (np.where(lower, b, a) for a, b in zip((z, gx, gy), other, strict=True))
-        values = {(0, 0): self.base + across * z, (1, 0): across * gx, (0, 1): gy}
-        return [torch.from_numpy(np.ascontiguousarray(values[order])) for order in orders]
+        return self.base + across * z, across * gx, gy
 
     def hull(self, heights: None) -> tuple[float, float]:
         """From sampled points, with a margin for the points in between."""
@@ -76,12 +66,3 @@ class CutSurface(Surface[None]):
     def slope_bounds(self, heights: None) -> tuple[float, float]:
         """From the same points."""
         return self._survey[1]
-
-    def intersect(self, heights: None, origin, direction, side: float) -> SurfaceIntersection:
-        """As of any surface; axial rays need no search."""
-        if side > 0 and not any(isinstance(c, Tensor) for c in direction) and tuple(direction) == (0.0, 0.0, 1.0):
-            x, y, oz = torch.broadcast_tensors(*(torch.as_tensor(c, dtype=torch.float64) for c in origin))
-            z, gx, gy = self.at(None, x, y)
-            found = (x.abs() <= self.half_size[0]) & (y.abs() <= self.half_size[1]) & (z >= oz)
-            return SurfaceIntersection(z - oz, gx, gy, found)
-        return super().intersect(heights, origin, direction, side)
