@@ -394,8 +394,8 @@ def require_project(path: Path, archives: bool = False) -> None:
     """
     if (path / "project.toml").is_file() or (archives and path.suffix.lower() == ".npz" and path.is_file()):
         return
-    beside = path.with_name(path.name + ".caustic")
-    if (beside / "project.toml").is_file():
+    beside = path.parent / f"{path.name}.caustic"
+    if path.name and (beside / "project.toml").is_file():
         raise InputError(f"{path}: is not a caustic project; did you mean {beside}?")
     if path.is_file() and path.suffix.lower() in (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".gif", ".npy"):
         raise InputError(f"{path}: is a picture, not a project; caustic design {path} makes its lens first")

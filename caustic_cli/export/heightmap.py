@@ -24,7 +24,7 @@ from caustic_cli.export.accuracy import of_bilinear
 from caustic_cli.export.part import Part, surface_of
 from caustic_cli.export.surface import MAX_SAMPLES, SurfaceGrid, most_points, sample_grid, step_within
 from caustic_cli.export.text import CREATED
-from caustic_cli.io.files import SOFTWARE, atomic_path, write_bytes
+from caustic_cli.io.files import SOFTWARE, atomic_file, write_bytes
 from caustic_cli.io.heightmaps import COUNTS, SUFFIXES, VERSION, beside
 
 #: Largest deviation of the bilinear interpolation of the default points, mm.
@@ -68,8 +68,8 @@ def write_heightmap(path: str | Path, part: Part, samples: tuple[int, int] | Non
         tags = TiffImagePlugin.ImageFileDirectory_v2()
         tags[270] = CREATED
         more = {"format": "TIFF", "tiffinfo": tags}
-    with atomic_path(path) as temporary:
-        Image.fromarray(values).save(temporary, **more)
+    with atomic_file(path) as file:
+        Image.fromarray(values).save(file, **more)
     written = replace(grid, z=(low + scale * values.astype(np.float64))[::-1].T.copy())
     said = _said(part, grid, path.name, low, high, scale, quantum)
     said["height_error_mm"] = of_bilinear(written, part.field, part.heights).height

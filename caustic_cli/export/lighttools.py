@@ -22,7 +22,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.export.accuracy import Deviation, of_poles, of_spline
 from caustic_cli.export.approximation import on_fewer_knots
 from caustic_cli.export.surface import USUAL_BYTES, SurfaceGrid, most_points, sample_grid
-from caustic_cli.io.files import MARK, atomic_path
+from caustic_cli.io.files import MARK, atomic_file
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import entrance_of
 from caustic_cli.scene import Lens, Light, Scene, Screen, Source
@@ -94,7 +94,7 @@ def write_lighttools(
         "format_version": np.array(FORMAT_VERSION, np.int64),
         "created_by": np.array(f"caustic {__version__}"),
     }
-    with atomic_path(path) as temporary, open(temporary, "w+b") as file:  # an open file: savez would rename `lens.dat`
+    with atomic_file(path) as file:  # an open file: savez would rename `lens.dat`
         np.savez(file, **arrays)  # dates every entry 1980-01-01
         with zipfile.ZipFile(file, "a") as archive:
             archive.comment = MARK

@@ -10,7 +10,7 @@ from caustic_cli.export.accuracy import Deviation, of_triangles
 from caustic_cli.export.mesh import exit_and_solids
 from caustic_cli.export.ply import A_POINT
 from caustic_cli.export.text import CREATED, rows
-from caustic_cli.io.files import atomic_path
+from caustic_cli.io.files import atomic_file
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 
@@ -25,7 +25,7 @@ def write_obj(
 ) -> Deviation:
     """Write the solid atomically; arguments, errors and result as in `write_ply`."""
     exit, vertices, faces = exit_and_solids(scene, field, heights, samples, tolerance, A_POINT)
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+    with atomic_file(path) as file:
         file.write(f"# {CREATED}\n# millimetres\no lens\n".encode())
         file.writelines(rows(vertices, "v %.17g %.17g %.17g\n"))
         file.writelines(rows(faces + 1, "f %d %d %d\n"))

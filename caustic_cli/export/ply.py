@@ -15,7 +15,7 @@ from torch import Tensor
 from caustic_cli.export.accuracy import Deviation, of_triangles
 from caustic_cli.export.mesh import exit_and_solids
 from caustic_cli.export.text import CREATED, rows
-from caustic_cli.io.files import atomic_path
+from caustic_cli.io.files import atomic_file
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 
@@ -59,7 +59,7 @@ def write_mesh(
         "end_header",
         "",
     ]
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+    with atomic_file(path) as file:
         file.write("\n".join(head).encode())
         if text:
             file.writelines(rows(table, " ".join(["%.17g"] * len(names)) + "\n"))

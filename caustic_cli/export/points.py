@@ -15,7 +15,7 @@ from torch import Tensor
 from caustic_cli.export.accuracy import Deviation, of_spline
 from caustic_cli.export.surface import most_points, sample_grid
 from caustic_cli.export.text import CREATED, rows
-from caustic_cli.io.files import atomic_path
+from caustic_cli.io.files import atomic_file
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 
@@ -44,7 +44,7 @@ def write_xyz(
 def _write(path, field: HeightField, heights: Tensor, samples, head: str, form: str) -> Deviation:
     grid = sample_grid(field, heights, samples, most_points(A_POINT))
     points = grid.points.reshape(*grid.z.shape, 3).swapaxes(0, 1).reshape(-1, 3)
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+    with atomic_file(path) as file:
         file.write(head.encode())
         file.writelines(rows(points, form))
     return of_spline(grid, field, heights)

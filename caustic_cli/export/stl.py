@@ -20,7 +20,7 @@ from caustic_cli import __version__
 from caustic_cli.errors import InputError
 from caustic_cli.export.accuracy import Deviation, of_triangles
 from caustic_cli.export.mesh import exit_and_solids
-from caustic_cli.io.files import atomic_path
+from caustic_cli.io.files import atomic_file
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 
@@ -46,7 +46,7 @@ def write_stl(
     """
     exit, vertices, faces = exit_and_solids(scene, field, heights, samples, tolerance, 2 * TRIANGLE.itemsize)
     vertices = vertices.astype("<f4")
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+    with atomic_file(path) as file:
         file.write(HEADER)
         file.write(np.array(len(faces), "<u4").tobytes())
         for start in range(0, len(faces), BLOCK):

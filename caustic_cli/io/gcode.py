@@ -62,7 +62,7 @@ def read_program(path: str | Path) -> Program:
     Raises:
         InputError: it is invalid or not supported, with the line.
     """
-    with naming(path), open_regular(path, ACCEPTED, MOST_BYTES) as file:
+    with open_regular(path, ACCEPTED, MOST_BYTES) as file, naming(path):
         comments: dict[re.Pattern, str] = {}
         tools: list[tuple[str, float | None]] = [("", None)]
         moves: list[list[tuple]] = [[]]

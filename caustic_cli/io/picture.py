@@ -19,7 +19,7 @@ from scipy.ndimage import binary_closing
 
 from caustic_cli.errors import InputError
 from caustic_cli.io.arrays import open_npy
-from caustic_cli.io.files import NPY_HEADER, NPY_MAGIC, SOFTWARE, Piped, atomic_path, naming, open_regular
+from caustic_cli.io.files import NPY_HEADER, NPY_MAGIC, SOFTWARE, Piped, atomic_file, naming, open_regular
 
 #: Largest picture read, in pixels: a float64 copy of it is half a gigabyte.
 MAX_PIXELS = 8192 * 8192
@@ -280,7 +280,7 @@ def write_image(
 def said_of(path: str | Path) -> dict[str, str]:
     """Text entries of a PNG; empty if it cannot be read."""
     try:
-        with Image.open(path) as image:
+        with open_regular(path, ACCEPTED, MAX_BYTES) as file, Image.open(file) as image:
             return {key: value for key, value in image.info.items() if isinstance(value, str)}
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):  # no readable picture
         return {}
@@ -298,9 +298,9 @@ def write_npy(path: str | Path, array: np.ndarray) -> None:
     array = np.ascontiguousarray(array)
     text = repr({"descr": np.lib.format.dtype_to_descr(array.dtype), "fortran_order": False, "shape": array.shape})
     header = text.ljust(NPY_HEADER - 11) + "\n"
-    with atomic_path(path) as temporary, open(temporary, "wb") as f:
-        f.write(NPY_MAGIC + b"\x01\x00" + len(header).to_bytes(2, "little") + header.encode("latin1"))
-        f.write(array.tobytes())
+    with atomic_file(path) as file:
+        file.write(NPY_MAGIC + b"\x01\x00" + len(header).to_bytes(2, "little") + header.encode("latin1"))
+        file.write(array.tobytes())
 
 
 def _write_png(path: Path, image: Image.Image, said: Mapping[str, str] | None = None) -> None:
@@ -308,5 +308,5 @@ def _write_png(path: Path, image: Image.Image, said: Mapping[str, str] | None = 
     info.add_text("Software", SOFTWARE)
     for key, text in (said or {}).items():
         info.add_text(key, text)
-    with atomic_path(path) as temporary:
-        image.save(temporary, format="PNG", pnginfo=info)
+    with atomic_file(path) as file:
+        image.save(file, format="PNG", pnginfo=info)
