@@ -82,7 +82,7 @@ def read_program(path: str | Path) -> Program:
                 continue
             words = _WORD.findall(line)
             if _WORD.sub("", line).strip():
-                raise InputError(f"line {number}: {line[:60]!r} is no block of words; {ACCEPTED}")
+                raise InputError(f"line {number}: {line!r} is no block of words; {ACCEPTED}")
             moved = False
             for letter, value in words:
                 if letter in "XYZ":

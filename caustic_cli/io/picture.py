@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageOps, PngImagePlugin
+from PIL import Image, ImageOps, PngImagePlugin, UnidentifiedImageError
 from scipy.ndimage import binary_closing
 
 from caustic_cli.errors import InputError
@@ -186,7 +186,7 @@ def _read_image(path: Path | Piped, linear: bool, color: bool, white: bool) -> P
         except Image.DecompressionBombError as error:
             raise InputError(f"is too large; at most {MAX_PIXELS} pixels (8192 x 8192) are read") from error
         except Exception as error:  # a damaged file may cause any exception in a decoder
-            raise InputError(f"is not an image that can be read ({type(error).__name__}); {ACCEPTED}") from error
+            raise InputError(f"{undecoded(error)}; {ACCEPTED}") from error
     encoding = "linear" if linear else "srgb"
     if color and image.mode != "F" and not image.mode.startswith("I"):
         return _lit(path, image, Picture(_over_ground(image, linear, white), encoding))
@@ -206,6 +206,13 @@ def _read_image(path: Path | Piped, linear: bool, color: bool, white: bool) -> P
     if image.mode in ("1", "L") and not transparent:
         return Picture(np.array(image.convert("L")), encoding)
     return _lit(path, image, Picture(_luminance(image, linear, transparent, white), encoding))
+
+
+def undecoded(error: Exception) -> str:
+    """Why a file is no picture, from the exception of its decoder, as a predicate."""
+    if isinstance(error, UnidentifiedImageError):  # its message names an object of Python
+        return "is not an image of a known format"
+    return f"is an image that cannot be decoded ({str(error) or type(error).__name__})"
 
 
 def _lit(path: Path | Piped, image: Image.Image, picture: Picture) -> Picture:
