@@ -142,4 +142,4 @@ def _picture(path: Path, header: dict) -> np.ndarray:
         except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
             if isinstance(error, InputError):
                 raise
-            raise InputError(f"{undecoded(error)}; {ACCEPTED}") from error
+            raise InputError(f"{undecoded(error, 'a PNG or TIFF')}; {ACCEPTED}") from error

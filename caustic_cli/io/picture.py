@@ -208,10 +208,10 @@ def _read_image(path: Path | Piped, linear: bool, color: bool, white: bool) -> P
     return _lit(path, image, Picture(_luminance(image, linear, transparent, white), encoding))
 
 
-def undecoded(error: Exception) -> str:
-    """Why a file is no picture, from the exception of its decoder, as a predicate."""
+def undecoded(error: Exception, kind: str = "an image of a known format") -> str:
+    """Why a file is no picture of this kind, from the exception of its decoder, as a predicate."""
     if isinstance(error, UnidentifiedImageError):  # its message names an object of Python
-        return "is not an image of a known format"
+        return f"is not {kind}"
     return f"is an image that cannot be decoded ({str(error) or type(error).__name__})"
 
 

@@ -48,7 +48,7 @@ def _floats(data: bytes) -> np.ndarray:
     except InputError:
         raise
     except Exception as error:  # a damaged file may cause any exception in a decoder
-        raise InputError(f"{undecoded(error)}; {ACCEPTED}") from error
+        raise InputError(f"{undecoded(error, 'a TIFF')}; {ACCEPTED}") from error
 
 
 def _check(shape: tuple[int, ...], real: bool) -> None:

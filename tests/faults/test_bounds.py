@@ -531,6 +531,14 @@ def test_a_path_that_is_no_file_name_is_refused(name, here):
     assert sorted(p.name for p in Path().iterdir()) == before and os.readlink("link") == "nowhere"
 
 
+@pytest.mark.parametrize("name", ["loop", "link", "file"])
+def test_a_study_needs_a_directory_before_it_begins(name, here):
+    Path("loop").symlink_to("loop")
+    Path("link").symlink_to("nowhere")
+    Path("file").touch()
+    assert "is no directory" in refused_command("convergence", "--study", "rays", "--rays", "1000", "-o", name)
+
+
 @pytest.mark.parametrize("link", ["/proc/self/fd/1", "/dev/fd/1", "first"])
 def test_the_standard_output_is_not_replaced(link, here):
     """A descriptor that was redirected to a file leads to that file; the link is the device's, or the user's own."""
