@@ -7,11 +7,13 @@ The parser and its dependencies are imported by `run`, after `main` has installe
 from __future__ import annotations
 
 import errno
+import io
 import os
 import signal
 import sys
 import threading
 import warnings
+from typing import Any
 
 
 class SignalReceived(KeyboardInterrupt):
@@ -81,7 +83,7 @@ def _report(problem: Exception) -> int:
     """Print a one-line error message; returns the exit status."""
     from caustic_cli.commands import console  # noqa: PLC0415
     from caustic_cli.commands.help import usage_message  # noqa: PLC0415
-    from caustic_cli.errors import CausticError, InputError, is_out_of_memory  # noqa: PLC0415
+    from caustic_cli.errors import CausticError, InputError, is_out_of_memory, is_unloadable  # noqa: PLC0415
 
     if isinstance(problem, CausticError):
         console.error(f"{problem}")
@@ -92,10 +94,12 @@ def _report(problem: Exception) -> int:
         elif message := usage_message(problem):
             console.error(message)
         return 2
-    if is_out_of_memory(problem):
+    if is_unloadable(problem):
+        console.error("out of memory: the libraries cannot be loaded; a higher limit of the address space (ulimit -v) is needed")
+    elif is_out_of_memory(problem):
         console.error("out of memory; fewer --rays, a smaller --control or --resolution needs less")
     elif isinstance(problem, OSError) and problem.strerror:
-        console.error(f"{problem.filename or 'a file'}: {problem.strerror}")
+        console.error(": ".join(str(part) for part in (problem.filename, problem.strerror) if part is not None))
         return 2 if problem.errno in (errno.ENAMETOOLONG, errno.ELOOP) else 1  # such a name comes from the user
     elif names := _variables_of(problem):
         console.error(f"the environment's {', '.join(names)}: {problem}")
@@ -166,9 +170,9 @@ def _interrupted() -> int:
 
 
 def _open_streams() -> None:
-    """Redirect closed standard streams to the null device: otherwise the next opened file would get their descriptor, and with it
-    the output of libraries."""
-    for number, mode in enumerate(("r", "w", "w")):
+    """Open standard output and error as `_Output`, and those streams that are closed on the null device: otherwise the next opened
+    file would get their descriptor, and with it the output of libraries."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
         except OSError:
@@ -176,5 +180,32 @@ def _open_streams() -> None:
             if opened != number:
                 os.close(opened)
             os.set_inheritable(number, True)
-            stream = open(number, mode, encoding="utf-8", closefd=False)  # noqa: SIM115 - it stays
-            setattr(sys, ("stdin", "stdout", "stderr")[number], stream)
+        before = getattr(sys, name)
+        if number:
+            setattr(sys, name, _Output(number).as_text(before))
+        elif before is None:
+            sys.stdin = open(number, encoding="utf-8", closefd=False)  # noqa: SIM115 - it stays
+
+
+class _Output(io.FileIO):
+    """Standard output, whose first error names it, or standard error, which has none: on a full disk, for instance, a message is
+    worth less than the work that it is about.  Data after an error are lost, also those that Python writes when it exits."""
+
+    def __init__(self, number: int):
+        super().__init__(number, "w", closefd=False)
+        self.silent = number == 2
+
+    def as_text(self, like: io.TextIOWrapper | None) -> io.TextIOWrapper:
+        """A text stream of the encoding of another one, if there is one."""
+        encoding, errors = ("utf-8", "backslashreplace") if like is None else (like.encoding, like.errors)
+        return io.TextIOWrapper(io.BufferedWriter(self), encoding, errors, line_buffering=self.fileno() == 2 or self.isatty())
+
+    def write(self, data: Any) -> int | None:
+        """Write bytes; returns how many were written."""
+        try:
+            return super().write(data)
+        except OSError as error:
+            if self.silent:
+                return len(data)
+            self.silent, error.filename = True, "standard output"
+            raise

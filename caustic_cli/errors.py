@@ -17,6 +17,11 @@ LISTS = {"design.stages": "[[design.stages]]", "source.also": "[[source]]", "ele
 
 #: Torch's messages for lack of memory: on a CPU (its allocator, a failed mmap) and on a CUDA device.
 OUT_OF_MEMORY = ("out of memory", "not enough memory", "can't allocate memory", "Cannot allocate memory")
+#: The dynamic linker's message where a shared library does not fit into memory.
+UNLOADABLE = "failed to map segment"
+#: Longest message, characters.  A longer one repeats what it was given, and only its beginning is kept, which says what is wrong,
+#: and its end, which may say what would be accepted.
+LONGEST, BEGINNING, END = 600, 300, 160
 
 
 def plain_name(path: str) -> str:
@@ -28,6 +33,11 @@ def plain_name(path: str) -> str:
 def plain(text: str) -> str:
     """A text with its marks replaced by plain names."""
     return MARK.sub(lambda found: plain_name(found[1]), text)
+
+
+def shortened(text: str) -> str:
+    """A message without the middle of one that is longer than LONGEST characters."""
+    return text if len(text) <= LONGEST else f"{text[:BEGINNING]} ... [{len(text):,} characters] ... {text[-END:]}"
 
 
 def near(name: str, known: Iterable[str]) -> str:
@@ -45,11 +55,11 @@ def alternatives(names: Sequence[str]) -> str:
 class CausticError(Exception):
     """The program could not complete a task; the message is one line for the user (exit status 1).
 
-    Formatted in an f-string it keeps its marks, for the message of another error.
+    Formatted in an f-string it keeps its marks and its whole length, for the message of another error.
     """
 
     def __str__(self) -> str:
-        return plain(super().__str__())
+        return shortened(plain(super().__str__()))
 
     def __format__(self, spec: str) -> str:
         return format(super().__str__(), spec)
@@ -79,3 +89,8 @@ class Interrupted(CausticError):
 def is_out_of_memory(error: BaseException) -> bool:
     """Whether an error is an out-of-memory error of Python, NumPy or torch."""
     return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and any(s in str(error) for s in OUT_OF_MEMORY))
+
+
+def is_unloadable(error: BaseException | None) -> bool:
+    """Whether an error, or one that caused it, is that a shared library does not fit into memory."""
+    return error is not None and (UNLOADABLE in str(error) or is_unloadable(error.__cause__ or error.__context__))

@@ -131,6 +131,98 @@ def test_compiled_loops_are_kernels():
     assert compiled == {"optics/kernels"}
 
 
+#: Calls that open a file by its name, or take an open one in its place, and methods of paths, figures, pictures and arrays that do.
+OPENERS = {
+    "open",
+    "os.open",
+    "io.open",
+    "np.load",
+    "np.loadtxt",
+    "np.genfromtxt",
+    "np.fromfile",
+    "np.memmap",
+    "np.save",
+    "np.savez",
+}
+OPENERS |= {"np.savetxt", "np.savez_compressed", "Image.open", "h5py.File", "zipfile.ZipFile", "tomllib.load", "json.load"}
+OPENERS |= {"torch.load", "torch.save", "shutil.copy", "shutil.copyfile", "shutil.move"}
+METHODS = {"open", "read_text", "read_bytes", "write_text", "write_bytes", "save", "savefig", "tofile"}
+#: Objects of the package with a method of such a name, which is itself looked at, and members of an open archive.
+OWN_METHODS = {
+    "Project.open",
+    "checkpoint.save",
+    "project.save",
+    "self.project.save",
+    "self.open",
+    "self._zip.open",
+    "archive.open",
+}
+#: What gives an open regular file, a new file or its temporary name, and files in memory.
+SAFE = {"open_regular", "atomic_file", "atomic_path", "io.BytesIO", "_Bounded"}
+#: The opener itself; files of the package; the null device and the standard streams; a directory, for its lock.
+ELSEWHERE = {
+    ("io/files.py", "open"),
+    ("io/files.py", "os.open"),
+    ("config/presets/__init__.py", "path.read_text"),
+    ("export/page/__init__.py", "(here / f'page.{kind}').read_text"),
+    ("optics/kernels/cache.py", "p.read_bytes"),
+    ("optics/kernels/cache.py", "path.read_bytes"),
+    ("io/picture.py", "open"),
+    ("cli.py", "open"),
+    ("cli.py", "os.open"),
+    ("project/directory.py", "os.open"),
+}
+
+
+def opened_in(tree: ast.AST) -> set[str]:
+    """Names of the calls of a file that open another one, except those of what is open or in memory already: a call in SAFE, a name
+    that is bound to one or annotated as a file, or a method of an opened picture or figure with such an argument."""
+    safe = {
+        item.optional_vars.id
+        for node in ast.walk(tree)
+        if isinstance(node, ast.With)
+        for item in node.items
+        if isinstance(item.optional_vars, ast.Name) and isinstance(item.context_expr, ast.Call)
+        if ast.unparse(item.context_expr.func) in SAFE
+    }
+    safe |= {
+        node.targets[0].id
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name) and isinstance(node.value, ast.Call)
+        if ast.unparse(node.value.func) in SAFE
+    }
+    safe |= {
+        node.arg
+        for node in ast.walk(tree)
+        if isinstance(node, ast.arg) and node.annotation is not None and "IO" in ast.unparse(node.annotation)
+    }
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            name = ast.unparse(node.func)
+            by_method = isinstance(node.func, ast.Attribute) and node.func.attr in METHODS and name not in OWN_METHODS
+            of = node.args[0] if node.args else None
+            given = (isinstance(of, ast.Name) and of.id in safe) or (isinstance(of, ast.Call) and ast.unparse(of.func) in SAFE)
+            if (name in OPENERS or by_method) and not given:
+                found.add(name)
+    return found
+
+
+def test_the_reader_of_openers_sees_them():
+    bad = "with open(a) as f: pass\nImage.open(path)\nnp.load(io.open(p))\nfigure.savefig(path)\nPath(x).read_bytes()\n"
+    assert opened_in(ast.parse(bad)) == {"open", "Image.open", "io.open", "np.load", "figure.savefig", "Path(x).read_bytes"}
+    good = (
+        "with open_regular(p, '', 9) as f:\n    Image.open(f)\nnp.save(io.BytesIO(), a)\ndef g(file: BinaryIO): h5py.File(file)\n"
+    )
+    assert opened_in(ast.parse(good)) == set()
+
+
+def test_files_are_opened_in_one_place():
+    """Names that a user gives reach the operating system through `io.files` alone, which opens regular files only."""
+    found = {(str(p.relative_to(PACKAGE).as_posix()), name) for p in FILES for name in opened_in(ast.parse(p.read_text("utf-8")))}
+    assert found == ELSEWHERE
+
+
 def test_nobody_imports_the_command_line_but_itself():
     assert not [m for m, i in IMPORTS.items() if part_of(m) not in TOP and own(i) & {"cli", "commands"}]
     assert "commands" in own(IMPORTS["caustic_cli.cli"])

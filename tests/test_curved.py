@@ -436,7 +436,7 @@ def test_sags_from_files(tmp_path):
     np.save(tmp_path / "nan.npy", np.where(values > 0.5, np.nan, values))
     Image.fromarray(np.zeros((8, 8), np.uint8)).save(tmp_path / "codes.tif")
     (tmp_path / "text.tif").write_text("no picture")
-    for name, words in (("few.npy", "3 x 57"), ("nan.npy", "finite"), ("codes.tif", "no heights"), ("text.tif", "no TIFF")):
+    for name, words in (("few.npy", "3 x 57"), ("nan.npy", "finite"), ("codes.tif", "no heights"), ("text.tif", "not a TIFF")):
         with pytest.raises(InputError, match=words):
             read_sags(tmp_path / name)
 

@@ -120,9 +120,13 @@ def test_a_file_of_indices_is_kept(capfd):
         (("--gradient", "volume"), "index_file"),
         (("--gradient", "volume", "--index-file", "blob.png"), "npy"),
         (("--gradient", "volume", "--index-file", "none.npy"), "none.npy"),
+        (("--gradient", "volume", "--index-file", "text.npy"), "text.npy: has text, not real numbers; a .npy array of (n, m)"),
+        (("--gradient", "volume", "--index-file", "complex.npy"), "complex.npy: has complex numbers, not real numbers"),
     ],
 )
 def test_what_cannot_be_is_refused_in_a_line(capfd, options, words):
+    np.save("text.npy", np.full((4, 4), "1.5"))
+    np.save("complex.npy", np.full((4, 4), 1.5j))
     message = run(capfd, "design", "blob.png", *TINY, *options, "-o", "x.caustic", code=2)
     assert words in message and not (Path("x.caustic") / "index.npy").exists()
 

@@ -1,6 +1,7 @@
 """Pictures and files: what is read, how it lies, what is refused, and that a file is written whole or not at all."""
 
 import os
+import re
 import struct
 import tempfile
 import zlib
@@ -291,6 +292,23 @@ def test_refused_in_one_sentence(tmp_path, name):
     message = str(caught.value)
     assert str(path) in message and "\n" not in message
     assert word is None or word in message
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"not a picture", "is not an image of a known format; an image (PNG, JPEG, TIFF, ...) or a 2-D .npy array is needed"),
+        (b"P5 8 8 255\n...", "is an image that cannot be decoded (image file is truncated"),
+        (b"P5 8 8 x\n", "cannot be decoded"),
+        (b"\x93NUMPY???", "no header of a .npy array"),
+    ],
+)
+def test_a_picture_that_is_piped_in_and_cannot_be_read(data, words):
+    """What is wrong is said, not the type of an exception."""
+    with pytest.raises(InputError) as refused:
+        read_picture(files.Piped(data))
+    assert str(refused.value).startswith("standard input: ") and words in str(refused.value)
+    assert not re.search(r"\(\w*Error\)|0x", str(refused.value))
 
 
 @pytest.mark.parametrize("kind", ["png", "jpg", "tif", "npy"])

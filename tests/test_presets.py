@@ -65,6 +65,27 @@ def test_lists_are_results(capfd, option, words):
     assert len(out.splitlines()) == (1 + len(MATERIALS) if option == "--glass" else len(presets.names()))
 
 
+@pytest.mark.parametrize("option", ["--glass list --json", "--json --glass list", "none.png --mag 0 --glass list --json"])
+def test_the_list_of_materials_as_json(capfd, option):
+    assert cli.run(["design", *option.split()]) == 0
+    out, err = capfd.readouterr()
+    found = {row["name"]: row for row in json.loads(out)["glasses"]}
+    assert err == "" and out.count("\n") == 1 and set(found) == set(MATERIALS)
+    bk7 = found["N-BK7"]
+    assert bk7["n_d"] == pytest.approx(1.5168, abs=5e-5) and bk7["V_d"] == pytest.approx(64.17, abs=0.01) and "BK7" in bk7["also"]
+    assert found["NOA61"]["density"] is None and found["PRINT-RESIN"]["spread"] == 0.01
+
+
+def test_the_list_of_presets_as_json(capfd, monkeypatch):
+    assert cli.run(["design", "--preset", "list", "--json"]) == 0
+    out = capfd.readouterr().out
+    found = json.loads(out)["presets"]
+    assert [(row["name"], row["purpose"]) for row in found] == presets.rows()
+    monkeypatch.setenv("CAUSTIC_DESIGN_JSON", "1")
+    assert cli.run(["design", "--preset", "list"]) == 0
+    assert capfd.readouterr().out == out
+
+
 def logo(path: str | io.BytesIO) -> None:
     """A black ring on nothing."""
     image = Image.new("RGBA", (32, 32))

@@ -17,10 +17,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from caustic_cli.config.table import TABLE
-from caustic_cli.errors import MARK, InputError, plain_name
+from caustic_cli.errors import MARK, InputError, plain_name, shortened
 
-#: Largest length of an error line in characters: a longer one repeats the content of a file.
-LONGEST_LINE = 4000
 #: Seconds between lines of --progress json.
 LINE_EVERY = 0.5
 #: Keys of the figures of a network's lens that are not values of its inputs.
@@ -159,7 +157,7 @@ def emit(line: str) -> None:
 def error(message: str) -> None:
     """Print one line on stderr, even if quiet, with control characters replaced, for instance in a malicious file name."""
     line = "".join(c if c.isprintable() else "?" for c in " ".join(named(message).split()))
-    sys.stderr.write(f"caustic: {line if len(line) <= LONGEST_LINE else line[:LONGEST_LINE] + ' ...'}\n")
+    sys.stderr.write(f"caustic: {shortened(line)}\n")
 
 
 def _wavelengths(values: list[float]) -> str:

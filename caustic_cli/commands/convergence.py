@@ -101,8 +101,8 @@ def run(
         if given is not None and not any(_takes(name, option) for name in names):
             raise InputError(f"{option} has no meaning for --study {study}: leave it out")
     precision = options.dtype_of(dtype) if dtype else None
-    if output.exists() and not output.is_dir():
-        raise InputError(f"{output}: is a file; a directory for CSV, JSON and PNG is needed")
+    if (output.exists() or output.is_symlink()) and not output.is_dir():
+        raise InputError(f"{output}: is no directory; a directory for CSV, JSON and PNG is needed")
     if project is not None:
         options.require_project(project)
     device = options.start_torch(device, threads, say)

@@ -36,8 +36,6 @@ def run(
         typer.Option(
             metavar="NAME",
             help="Settings of a common product, such as plate-100 (list: all of them); --config and options take precedence.",
-            callback=options.listing("preset"),
-            is_eager=True,
         ),
     ] = None,
     config: Annotated[

@@ -100,7 +100,7 @@ def run(
     if output and len(formats) > 1:
         raise InputError("--out names one file; several formats are written beside each other under the project's own name")
     for name in formats:
-        format_of(output or Path(), name)
+        format_of(output, name)
     options_of = {
         "--mould": (mould, MOULDS),
         "--block": (block is not None, MOULDS),

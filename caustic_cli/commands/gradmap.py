@@ -64,7 +64,7 @@ def run(
     device = options.start_torch(device, threads, say)
 
     from caustic_cli.config.completion import filter_from  # noqa: PLC0415
-    from caustic_cli.io.files import refuse_foreign  # noqa: PLC0415
+    from caustic_cli.io.files import destination, refuse_foreign  # noqa: PLC0415
     from caustic_cli.io.picture import write_npy  # noqa: PLC0415
     from caustic_cli.project.project import Project  # noqa: PLC0415
     from caustic_cli.studies import gradmap  # noqa: PLC0415
@@ -78,6 +78,9 @@ def run(
     for i, j in points:
         if not (0 <= i < field.shape[0] and 0 <= j < field.shape[1]):
             raise InputError(f"--control must be I,J with I 0 to {field.shape[0] - 1} and J 0 to {field.shape[1] - 1}, got {i},{j}")
+
+    for path in [path for path in (output, npy) if path is not None]:
+        destination(path)  # refuses what is no file name, before others are made of it
 
     def place(base: Path, point: tuple[int, int]) -> Path:
         return base if len(points) == 1 else base.with_name(f"{base.stem}-{point[0]}-{point[1]}{base.suffix}")

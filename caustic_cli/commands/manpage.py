@@ -66,6 +66,9 @@ For a lens with two pictures, the second picture as used by the design and as la
 .TP
 .I NAME.caustic/report.png
 Target, caustic and its error, height and relief of the lens, error during each stage, and energy budget.
+.PP
+An output whose name is a link is written where the link leads.  Directories, devices, pipes and open streams, such as
+/dev/stdout, are refused, both as inputs and as outputs; a picture is read from standard input if TARGET is \-.
 .SH JSON
 With
 .BR \-\-json ,
@@ -121,6 +124,12 @@ relative RMS error of the resulting image; kkt_residual; power, as a fraction of
 .TP
 .B rays, iterations, seconds, image, project
 Number of rays traced, number of iterations, wall time, paths of files.
+.TP
+.B glasses, presets
+Of
+.BR "\-\-glass list" " and " "\-\-preset list" ,
+the materials: name, n_d, its spread between batches, the Abbe number V_d, density (g/cm^3), steepest_slope (mm per mm), range_nm,
+source, other names (also); or the presets: name, purpose.
 .SH ORIENTATION
 Arrays are indexed [i, j], with i along +x and j along +y.  Image files show the screen as seen from +z: column 0 is the \-x edge,
 row 0 the +y edge.  Seen from the side of the lens the picture is mirrored;

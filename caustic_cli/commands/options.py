@@ -9,6 +9,7 @@ import inspect
 import math
 import os
 import re
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,6 +21,11 @@ from caustic_cli.config import checks, table
 from caustic_cli.config.table import Setting
 from caustic_cli.errors import InputError, near, no_project
 
+#: Options whose value `list` prints all that are known: key in JSON, heading of the table, and the module that has them.
+LISTS = {
+    "glass": ("glasses", ("NAME", "n_d", "V_d", "g/cm^3", "steepest slope", "also"), "caustic_cli.scene.materials"),
+    "preset": ("presets", (), "caustic_cli.config.presets"),
+}
 #: Parameters of mallopt(3), from glibc's malloc.h.
 TRIM_THRESHOLD, MMAP_MAX = -1, -4
 Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout.")]
@@ -133,32 +139,40 @@ def _parameter(name: str, row: Setting) -> inspect.Parameter:
     if not flag:
         words += f"  [default: {default_words(row)}]"
     kind = bool if flag else list[str] | None if row.kind in ("points", "tables") else _scalar(row) | None
-    more: dict[str, Any] = {"callback": listing("glass"), "is_eager": True} if row.path == "lens.glass" else {}
-    annotation = Annotated[kind, typer.Option(option.name, metavar=option.metavar, help=words, **more)]
+    annotation = Annotated[kind, typer.Option(option.name, metavar=option.metavar, help=words)]
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False if flag else None, annotation=annotation)
 
 
-def listing(what: str):
-    """A callback for an option that prints all accepted values for the value `list`."""
+def with_lists(command: Any) -> None:
+    """Make a command print the known values of an option in LISTS that is given the value `list`, and nothing else: a table, or a
+    JSON object.  Its other options and arguments are then neither needed nor checked."""
+    parse, lists = command.parse_args, [p for p in command.params if p.name in LISTS]
 
-    def show(value: str | None) -> str | None:
-        if value != "list":
-            return value
-        if what == "glass":
-            from caustic_cli.scene import materials  # noqa: PLC0415
+    def parse_args(context, arguments):
+        given, _, _ = command.make_parser(context).parse_args(args=list(arguments))
 
-            heading = ("NAME", "n_d", "V_d", "g/cm^3", "steepest slope", "also")
-            table = [heading, *materials.rows()]
-        else:
-            from caustic_cli.config import presets  # noqa: PLC0415
+        def value(parameter):
+            return parameter.process_value(context, parameter.consume_value(context, given)[0])
 
-            table = presets.rows()
-        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-        for line in table:
-            console.emit("  ".join(f"{cell:<{width}}" for cell, width in zip(line, widths, strict=True)).rstrip())
-        raise typer.Exit()
+        for parameter in lists:
+            if value(parameter) == "list":
+                _print_list(parameter.name, any(value(p) for p in command.params if p.name == "json"))
+                raise typer.Exit()
+        return parse(context, arguments)
 
-    return show
+    command.parse_args = parse_args
+
+
+def _print_list(name: str, as_json: bool) -> None:
+    key, heading, module = LISTS[name]
+    source = import_module(module)
+    if as_json:
+        console.emit_json({key: source.described()})
+        return
+    table = [heading, *source.rows()] if heading else source.rows()
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    for line in table:
+        console.emit("  ".join(f"{cell:<{width}}" for cell, width in zip(line, widths, strict=True)).rstrip())
 
 
 def _capital(row: Setting) -> str:
@@ -409,8 +423,8 @@ def require_project(path: Path, archives: bool = False) -> None:
     """
     if (path / "project.toml").is_file() or (archives and path.suffix.lower() == ".npz" and path.is_file()):
         return
-    beside = path.with_name(path.name + ".caustic")
-    if (beside / "project.toml").is_file():
+    beside = path.parent / f"{path.name}.caustic"
+    if path.name and (beside / "project.toml").is_file():
         raise InputError(f"{path}: is not a caustic project; did you mean {beside}?")
     if path.is_file() and path.suffix.lower() in (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".gif", ".npy"):
         raise InputError(f"{path}: is a picture, not a project; caustic design {path} makes its lens first")

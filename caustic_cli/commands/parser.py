@@ -9,6 +9,7 @@ import typer
 from caustic_cli import __version__
 from caustic_cli.commands import console, convergence, design, export, gradmap, render
 from caustic_cli.commands.help import grouped
+from caustic_cli.commands.options import with_lists
 
 DESCRIPTION = """Design free-form lenses that project a picture as a caustic.
 
@@ -52,6 +53,7 @@ def parser():
     root = typer.main.get_command(app)
     for name, command in root.commands.items():
         grouped(name, command)
+        with_lists(command)
         for parameter in command.params:
             parameter.show_envvar = False  # every option has a variable, named in the manual page
     return root

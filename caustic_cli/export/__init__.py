@@ -48,15 +48,17 @@ BY_SUFFIX = {suffix: name for name, (suffix, _, _) in FORMATS.items()} | {
 }
 
 
-def format_of(path: Path, named: str | None = None) -> str:
-    """The format of a file, by its suffix unless it is named.
+def format_of(path: Path | None, named: str | None = None) -> str:
+    """The format of a file, by its suffix unless it is named; path: None for a default name.
 
     Raises:
-        InputError: the format is unknown, or contradicts the suffix.
+        InputError: the format is unknown, or contradicts the suffix, or the path has no name.
     """
     if named is not None and named not in FORMATS:
         raise InputError(f"⟨format⟩ must be one of {', '.join(FORMATS)}, got {named!r}")
-    suffix = path.suffix.lower()
+    if path is not None and not path.name:
+        raise InputError(f"{path}: is a directory; a file name is needed")
+    suffix = "" if path is None else path.suffix.lower()
     if named is None:
         if suffix not in BY_SUFFIX:
             known = ", ".join(BY_SUFFIX)

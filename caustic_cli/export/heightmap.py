@@ -34,7 +34,7 @@ from caustic_cli.export.surface import (
     step_within,
 )
 from caustic_cli.export.text import CREATED
-from caustic_cli.io.files import SOFTWARE, atomic_path, write_bytes
+from caustic_cli.io.files import SOFTWARE, atomic_file, write_bytes
 from caustic_cli.io.heightmaps import COUNTS, SUFFIXES, VERSION, beside
 
 #: Points per knot span with which the spline can be recovered from a map, and their least number for a tolerance.
@@ -87,8 +87,8 @@ def write_heightmap(
         tags[270] = CREATED
         more = {"format": "TIFF", "tiffinfo": tags}
     picture = np.ascontiguousarray(counts.values.T[::-1])  # rows from +y down
-    with atomic_path(path) as temporary:
-        Image.fromarray(picture).save(temporary, **more)
+    with atomic_file(path) as file:
+        Image.fromarray(picture).save(file, **more)
     said = _said(part, counts, path.name)
     said["height_error_mm"] = _bilinear_deviation(counts, part)
     write_bytes(beside(path), (json.dumps(said, indent=1, allow_nan=False) + "\n").encode())

@@ -24,7 +24,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.export import reading
 from caustic_cli.export.reading import Readings
 from caustic_cli.export.surface import Sampling, sample_grid, samplings
-from caustic_cli.io.files import MARK, atomic_path
+from caustic_cli.io.files import MARK, atomic_file
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import entrance_of
 from caustic_cli.scene import Lens, Light, Scene, Screen, Source
@@ -104,7 +104,7 @@ def write_lighttools(
         "format_version": np.array(FORMAT_VERSION, np.int64),
         "created_by": np.array(f"caustic {__version__}"),
     }
-    with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=LEVEL) as archive:
+    with atomic_file(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=LEVEL) as archive:
         for name, array in arrays.items():
             entry = zipfile.ZipInfo(f"{name}.npy")  # dated 1980-01-01
             entry.compress_type = zipfile.ZIP_DEFLATED

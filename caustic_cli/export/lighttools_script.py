@@ -18,7 +18,7 @@ from torch import Tensor
 from caustic_cli.errors import InputError
 from caustic_cli.export.surface import Sampling, SurfaceGrid, sample_grid
 from caustic_cli.export.text import CREATED, real
-from caustic_cli.io.files import atomic_path, write_bytes
+from caustic_cli.io.files import atomic_file, write_bytes
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 from caustic_cli.scene.features import special_features
@@ -192,7 +192,7 @@ def write_script(path: str | Path, scene: Scene, field: HeightField, heights: Te
 def _write_block(path: Path, scene: Scene, grid: SurfaceGrid) -> None:
     x, y = (np.linspace(-r, r, FLAT) for r in scene.lens.half_size)
     flat = np.stack(np.broadcast_arrays(x[:, None], y[None, :], scene.lens.z_in), -1)
-    with atomic_path(path) as temporary, open(temporary, "w", encoding="ascii", newline="\n") as file:
+    with atomic_file(path, "ascii") as file:
         file.write(f"# {CREATED}; millimetres.  Replace the two restorePoints blocks of a FreeformSolid by these.\n")
         for points, name in ((flat, "Front"), (grid.points.reshape(*grid.z.shape, 3), "Rear")):
             nu, nv = points.shape[:2]

@@ -10,10 +10,10 @@ from pathlib import Path
 from torch import Tensor
 
 from caustic_cli.export import mesh
-from caustic_cli.export.reading import Reading
+from caustic_cli.export.reading import Readings
 from caustic_cli.export.surface import Sampling
 from caustic_cli.export.text import CREATED, rows
-from caustic_cli.io.files import atomic_path
+from caustic_cli.io.files import atomic_file
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 
@@ -32,7 +32,7 @@ def write_obj(
 ) -> None:
     """Write the solid atomically; arguments and errors as in `write_ply`."""
     vertices, faces = mesh.closed_mesh(scene, field, heights, samples, tolerance)
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+    with atomic_file(path) as file:
         file.write(f"# {CREATED}\n# millimetres\no lens\n".encode())
         file.writelines(rows(vertices.round(DECIMALS) + 0.0, f"v %.{DECIMALS}f %.{DECIMALS}f %.{DECIMALS}f\n"))
         file.writelines(rows(faces + 1, "f %d %d %d\n"))
@@ -45,6 +45,6 @@ def choices(scene: Scene, field: HeightField, heights: Tensor, limit: float) -> 
 
 def readings(
     scene: Scene, field: HeightField, heights: Tensor, samples: Sampling | None = None, tolerance: float | None = None
-) -> dict[str, Reading]:
+) -> Readings:
     """The surface as read from the mesh, with rounded lengths."""
     return mesh.readings(scene, field, heights, samples, tolerance, lambda points: points.round(DECIMALS))

@@ -13,10 +13,10 @@ import numpy as np
 from torch import Tensor
 
 from caustic_cli.export import mesh
-from caustic_cli.export.reading import Reading
+from caustic_cli.export.reading import Readings
 from caustic_cli.export.surface import Sampling
 from caustic_cli.export.text import CREATED
-from caustic_cli.io.files import atomic_path
+from caustic_cli.io.files import atomic_file
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 
@@ -47,7 +47,7 @@ def choices(scene: Scene, field: HeightField, heights: Tensor, limit: float) -> 
 
 def readings(
     scene: Scene, field: HeightField, heights: Tensor, samples: Sampling | None = None, tolerance: float | None = None
-) -> dict[str, Reading]:
+) -> Readings:
     """The surface as read from the mesh."""
     return mesh.readings(scene, field, heights, samples, tolerance)
 
@@ -70,7 +70,7 @@ def write_mesh(path: str | Path, vertices: np.ndarray, faces: np.ndarray, normal
     ]
     records = np.empty(len(faces), FACE)
     records["count"], records["corners"] = 3, faces
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+    with atomic_file(path) as file:
         file.write("\n".join(head).encode())
         file.write(table.astype("<f8").tobytes())
         file.write(records.tobytes())

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from caustic_cli.export import reading
 from caustic_cli.export.reading import Readings
-from caustic_cli.export.surface import Sampling, counts_of, decimals_for, sample_grid, samplings
+from caustic_cli.export.surface import STEPS_PER_SPAN, Sampling, counts_of, decimals_for, sample_grid, samplings
 from caustic_cli.export.text import CREATED, rows
-from caustic_cli.io.files import atomic_path
+from caustic_cli.io.files import atomic_file
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 
@@ -51,7 +51,7 @@ def readings(scene: Scene, field: HeightField, heights: Tensor, samples: Samplin
 
 
 def _decimals(field: HeightField, samples: Sampling | None) -> int:
-    counts = counts_of(field.spaces, 1 if samples is None else samples)
+    counts = counts_of(field.spaces, STEPS_PER_SPAN if samples is None else samples)
     return decimals_for(min(2.0 * r / n for r, n in zip(field.half_size, counts, strict=True)))
 
 
@@ -64,6 +64,6 @@ def _rounded(field: HeightField, heights: Tensor, samples) -> tuple[np.ndarray, 
 def _write(path, field: HeightField, heights: Tensor, samples, head: str, separator: str) -> None:
     x, y, z, decimals = _rounded(field, heights, samples)
     points = np.stack([*np.broadcast_arrays(x[:, None], y[None, :]), z], -1).swapaxes(0, 1).reshape(-1, 3)
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+    with atomic_file(path) as file:
         file.write(head.encode())
         file.writelines(rows(points, separator.join([f"%.{decimals}f"] * 3) + "\n"))

@@ -34,7 +34,7 @@ from caustic_cli.export.mesh import FLANGE, closed_mesh, refuse_open
 from caustic_cli.export.reading import Readings, of_poles
 from caustic_cli.export.surface import STEPS_PER_SPAN, decimals_for, knot_lines, on_lines
 from caustic_cli.export.text import CREATED
-from caustic_cli.io.files import atomic_path
+from caustic_cli.io.files import atomic_file
 from caustic_cli.optics.bspline import SplineSpace
 from caustic_cli.optics.frames import Pose, rotate_to_global, to_global
 from caustic_cli.optics.surfaces.heightfield import HeightField
@@ -182,7 +182,7 @@ def write_step(
     rounded = scene.lens.round or any(e.round for e in scene.elements)
     digit = 0.0 if decimals is None else 10.0 ** (1 - decimals)
     _product(out, found, max(ROUND_UNCERTAINTY if rounded else UNCERTAINTY, digit))
-    with atomic_path(path) as temporary, open(temporary, "w", encoding="ascii", newline="\n") as file:
+    with atomic_file(path, "ascii") as file:
         file.write(HEAD)
         file.writelines(out.lines)
         file.write(TAIL)

@@ -19,9 +19,9 @@ from torch import Tensor
 from caustic_cli import __version__
 from caustic_cli.errors import InputError
 from caustic_cli.export import mesh
-from caustic_cli.export.reading import Reading
+from caustic_cli.export.reading import Readings
 from caustic_cli.export.surface import Sampling
-from caustic_cli.io.files import atomic_path
+from caustic_cli.io.files import atomic_file
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 
@@ -47,7 +47,7 @@ def write_stl(
     """
     vertices, faces = mesh.closed_mesh(scene, field, heights, samples, tolerance)
     vertices = vertices.astype("<f4")
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+    with atomic_file(path) as file:
         file.write(HEADER)
         file.write(np.array(len(faces), "<u4").tobytes())
         for start in range(0, len(faces), BLOCK):
@@ -61,7 +61,7 @@ def choices(scene: Scene, field: HeightField, heights: Tensor, limit: float) -> 
 
 def readings(
     scene: Scene, field: HeightField, heights: Tensor, samples: Sampling | None = None, tolerance: float | None = None
-) -> dict[str, Reading]:
+) -> Readings:
     """The surface as read from the mesh, in float32."""
     return mesh.readings(scene, field, heights, samples, tolerance, lambda p: p.astype(np.float32).astype(np.float64))
 

@@ -22,7 +22,7 @@ from caustic_cli.export import reading
 from caustic_cli.export.reading import Readings
 from caustic_cli.export.surface import STEPS_PER_SPAN, Sampling, SurfaceGrid, counts_of, sample_grid, samplings
 from caustic_cli.export.text import CREATED, real, rows
-from caustic_cli.io.files import atomic_path
+from caustic_cli.io.files import atomic_file
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.scene import Scene
 
@@ -59,7 +59,7 @@ def write_zemax(path: str | Path, scene: Scene, field: HeightField, heights: Ten
         f"{nx} {ny} {real((grid.x[-1] - grid.x[0]) / (nx - 1))} {real((grid.y[-1] - grid.y[0]) / (ny - 1))} 0 0 0",
         "",
     ]
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+    with atomic_file(path) as file:
         file.write("\r\n".join(head).encode())
         file.writelines(rows(table, f"{f'%.{DIGITS}g ' * 4}0\r\n"))
 

@@ -86,7 +86,13 @@ class Stored:
             return np.frombuffer(data, self.dtype).reshape(self.shape, order="F" if self.fortran else "C")
 
     def read_reals(self) -> np.ndarray:
-        """An array of numbers as float64."""
+        """An array of numbers as float64.
+
+        Raises:
+            InputError: as of `read`, or it is of text or complex numbers.
+        """
+        if self.dtype.kind not in "fiub":
+            raise InputError(f"has {'text' if self.dtype.kind in 'US' else 'complex numbers'}, not real numbers; {self.accepted}")
         values = self.read()
         with np.errstate(invalid="ignore", over="ignore"):  # signalling NaN; overflow to infinity
             return values.astype(np.float64)
@@ -100,7 +106,7 @@ def refusing(accepted: str) -> Iterator[None]:
     except DAMAGED as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"is not a readable .npy array, or .npz archive of such ({str(error)[:200]}); {accepted}") from error
+        raise InputError(f"is not a readable .npy array, or .npz archive of such ({error}); {accepted}") from error
 
 
 def _header(file: BinaryIO, size: int, unread: list[int], accepted: str, exact: bool) -> Stored:

@@ -62,7 +62,7 @@ def read_program(path: str | Path) -> Program:
     Raises:
         InputError: it is invalid or not supported, with the line.
     """
-    with naming(path), open_regular(path, ACCEPTED, MOST_BYTES) as file:
+    with open_regular(path, ACCEPTED, MOST_BYTES) as file, naming(path):
         comments: dict[re.Pattern, str] = {}
         tools: list[tuple[str, float | None]] = [("", None)]
         moves: list[list[tuple]] = [[]]
@@ -82,7 +82,7 @@ def read_program(path: str | Path) -> Program:
                 continue
             words = _WORD.findall(line)
             if _WORD.sub("", line).strip():
-                raise InputError(f"line {number}: {line[:60]!r} is no block of words; {ACCEPTED}")
+                raise InputError(f"line {number}: {line!r} is no block of words; {ACCEPTED}")
             moved = False
             for letter, value in words:
                 if letter in "XYZ":

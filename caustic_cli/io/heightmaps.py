@@ -17,6 +17,7 @@ from caustic_cli.config.checks import LENGTH
 from caustic_cli.config.table import TABLE
 from caustic_cli.errors import InputError
 from caustic_cli.io.files import naming, open_regular, read_bytes
+from caustic_cli.io.picture import undecoded
 from caustic_cli.optics.bspline import MAX_DEGREE, SplineSpace
 from caustic_cli.optics.surfaces.heightfield import HeightField
 
@@ -99,13 +100,13 @@ def _said(path: Path) -> dict[str, Any]:
         try:
             header = json.loads(data)
         except (ValueError, RecursionError) as error:
-            raise InputError(f"is no JSON ({str(error)[:100]}); {ACCEPTED}") from error
+            raise InputError(f"is no JSON ({error}); {ACCEPTED}") from error
         if not isinstance(header, dict) or header.get("height_map") != VERSION or header.get("unit") != "mm":
             raise InputError(f"does not describe a height_map {VERSION} in mm; {ACCEPTED}")
         for key in ("z_of_zero", "mm_per_count", "quantum_mm", "x_of_column_0", "y_of_row_0"):
             value = header.get(key)
             if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or abs(value) > LENGTH:
-                raise InputError(f"{key} must be a number within +-{LENGTH:g}, got {str(value)[:40]!r}")
+                raise InputError(f"{key} must be a number within +-{LENGTH:g}, got {value!r}")
         if not (header["x_of_column_0"] < 0 < header["y_of_row_0"] and header["quantum_mm"] > 0):
             raise InputError("x_of_column_0 must be below 0, y_of_row_0 and quantum_mm above")
         if not isinstance(header.get("turned"), bool):
@@ -141,4 +142,4 @@ def _picture(path: Path, header: dict) -> np.ndarray:
         except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
             if isinstance(error, InputError):
                 raise
-            raise InputError(f"is no readable picture ({str(error)[:100]}); {ACCEPTED}") from error
+            raise InputError(f"{undecoded(error, 'a PNG or TIFF')}; {ACCEPTED}") from error

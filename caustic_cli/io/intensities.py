@@ -35,7 +35,7 @@ def parse_distribution(data: bytes, where: str) -> Distribution:
             named = True
             continue
         if row is None:
-            raise InputError(f"{where}: line {number} is {line.strip()[:60]!r}; {TABLE}")
+            raise InputError(f"{where}: line {number} is {line.strip()!r}; {TABLE}")
         rows.append(row)
         if len(rows) > MOST_ANGLES:
             raise InputError(f"{where}: has more than {MOST_ANGLES:,} angles; {TABLE}")

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageOps, PngImagePlugin
+from PIL import Image, ImageOps, PngImagePlugin, UnidentifiedImageError
 from scipy.ndimage import binary_closing
 
 from caustic_cli.errors import InputError
 from caustic_cli.io.arrays import open_npy
-from caustic_cli.io.files import NPY_HEADER, NPY_MAGIC, SOFTWARE, Piped, atomic_path, naming, open_regular
+from caustic_cli.io.files import NPY_HEADER, NPY_MAGIC, SOFTWARE, Piped, atomic_file, naming, open_regular
 
 #: Largest picture read, in pixels: a float64 copy of it is half a gigabyte.
 MAX_PIXELS = 8192 * 8192
@@ -186,7 +186,7 @@ def _read_image(path: Path | Piped, linear: bool, color: bool, white: bool) -> P
         except Image.DecompressionBombError as error:
             raise InputError(f"is too large; at most {MAX_PIXELS} pixels (8192 x 8192) are read") from error
         except Exception as error:  # a damaged file may cause any exception in a decoder
-            raise InputError(f"is not an image that can be read ({type(error).__name__}); {ACCEPTED}") from error
+            raise InputError(f"{undecoded(error)}; {ACCEPTED}") from error
     encoding = "linear" if linear else "srgb"
     if color and image.mode != "F" and not image.mode.startswith("I"):
         return _lit(path, image, Picture(_over_ground(image, linear, white), encoding))
@@ -206,6 +206,13 @@ def _read_image(path: Path | Piped, linear: bool, color: bool, white: bool) -> P
     if image.mode in ("1", "L") and not transparent:
         return Picture(np.array(image.convert("L")), encoding)
     return _lit(path, image, Picture(_luminance(image, linear, transparent, white), encoding))
+
+
+def undecoded(error: Exception, kind: str = "an image of a known format") -> str:
+    """Why a file is no picture of this kind, from the exception of its decoder, as a predicate."""
+    if isinstance(error, UnidentifiedImageError):  # its message names an object of Python
+        return f"is not {kind}"
+    return f"is an image that cannot be decoded ({str(error) or type(error).__name__})"
 
 
 def _lit(path: Path | Piped, image: Image.Image, picture: Picture) -> Picture:
@@ -280,7 +287,7 @@ def write_image(
 def said_of(path: str | Path) -> dict[str, str]:
     """Text entries of a PNG; empty if it cannot be read."""
     try:
-        with Image.open(path) as image:
+        with open_regular(path, ACCEPTED, MAX_BYTES) as file, Image.open(file) as image:
             return {key: value for key, value in image.info.items() if isinstance(value, str)}
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):  # no readable picture
         return {}
@@ -298,9 +305,9 @@ def write_npy(path: str | Path, array: np.ndarray) -> None:
     array = np.ascontiguousarray(array)
     text = repr({"descr": np.lib.format.dtype_to_descr(array.dtype), "fortran_order": False, "shape": array.shape})
     header = text.ljust(NPY_HEADER - 11) + "\n"
-    with atomic_path(path) as temporary, open(temporary, "wb") as f:
-        f.write(NPY_MAGIC + b"\x01\x00" + len(header).to_bytes(2, "little") + header.encode("latin1"))
-        f.write(array.tobytes())
+    with atomic_file(path) as file:
+        file.write(NPY_MAGIC + b"\x01\x00" + len(header).to_bytes(2, "little") + header.encode("latin1"))
+        file.write(array.tobytes())
 
 
 def _write_png(path: Path, image: Image.Image, said: Mapping[str, str] | None = None) -> None:
@@ -308,5 +315,5 @@ def _write_png(path: Path, image: Image.Image, said: Mapping[str, str] | None = 
     info.add_text("Software", SOFTWARE)
     for key, text in (said or {}).items():
         info.add_text(key, text)
-    with atomic_path(path) as temporary:
-        image.save(temporary, format="PNG", pnginfo=info)
+    with atomic_file(path) as file:
+        image.save(file, format="PNG", pnginfo=info)

@@ -12,6 +12,7 @@ from caustic_cli.config.checks import LENGTH
 from caustic_cli.errors import InputError
 from caustic_cli.io.arrays import open_npy
 from caustic_cli.io.files import naming, read_bytes
+from caustic_cli.io.picture import undecoded
 from caustic_cli.scene.screen import MAX_SAGS
 
 #: Bytes of a file: MAX_SAGS by MAX_SAGS heights of 8 bytes, and its header.
@@ -47,7 +48,7 @@ def _floats(data: bytes) -> np.ndarray:
     except InputError:
         raise
     except Exception as error:  # a damaged file may cause any exception in a decoder
-        raise InputError(f"is no TIFF that can be read ({type(error).__name__}); {ACCEPTED}") from error
+        raise InputError(f"{undecoded(error, 'a TIFF')}; {ACCEPTED}") from error
 
 
 def _check(shape: tuple[int, ...], real: bool) -> None:

@@ -257,9 +257,7 @@ def _load(path: Path, file: BinaryIO) -> Checkpoint:
     except _Newer:
         raise
     except Exception as error:  # a damaged file may cause any exception in h5py
-        raise InputError(
-            f"{path}: is damaged or not a caustic checkpoint ({type(error).__name__}); an intact checkpoints.h5 is needed"
-        ) from error
+        raise InputError(f"{path}: is damaged or not a caustic checkpoint ({error}); an intact checkpoints.h5 is needed") from error
     nets = [z for z in (state.heights, state.start, state.unrounded) if z is not None]
     fits = tuple(state.heights.shape[-2:]) == (spaces[0].n, spaces[1].n)
     fits &= state.unrounded is None or (state.start is not None and state.start.shape == state.unrounded.shape)

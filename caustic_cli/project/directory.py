@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from caustic_cli.errors import InputError
-from caustic_cli.io.files import LEFT_BEHIND, PARTS, is_ours, refuse_special
+from caustic_cli.io.files import LEFT_BEHIND, PARTS, destination, is_ours
 from caustic_cli.project import attachments
 from caustic_cli.project.project import MADE, TOML, Project, is_project
 
@@ -74,11 +74,12 @@ def create(project: Project, force: bool) -> None:
         if path.exists():
             try:
                 project.hold.enter_context(locked(path))
-                for present in path.iterdir():
-                    if present.name.startswith((*PARTS, *MADE)):
-                        refuse_special(present)  # before anything is removed
-                for name in MADE:
-                    (path / name).unlink(missing_ok=True)
+                parts = [present for present in path.iterdir() if present.name.startswith((*PARTS, *MADE))]
+                for present in parts:
+                    destination(present)  # refuses what is no regular file before anything is removed
+                for present in parts:
+                    if present.name in MADE or present.is_symlink():  # where a link leads is not the project's
+                        present.unlink()
                 project.write(path)
             except BaseException:
                 project.hold.close()

@@ -117,7 +117,7 @@ class Project:
             build_stages(full), build_options(full)  # validates the design, too
             return cls(path, full, picture, _picture(path, profile, True) if profile else None, second, on_disk=True)
         except InputError as error:
-            raise InputError(f"{path / TOML}: {error!s}") from error
+            raise InputError(f"{path / TOML}: {plain(f'{error}')}") from error
 
     def error(self, words: str) -> InputError:
         """An error about its settings, which names their file if there is one."""

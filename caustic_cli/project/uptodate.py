@@ -20,11 +20,11 @@ from caustic_cli import __version__
 from caustic_cli.config import settings
 from caustic_cli.config.settings import Settings
 from caustic_cli.errors import CausticError, InputError
-from caustic_cli.io.files import open_regular, read_bytes, refuse_foreign, write_bytes
+from caustic_cli.io.files import read_bytes, refuse_foreign, sha256_of, write_bytes
 from caustic_cli.io.heightmaps import beside
 from caustic_cli.io.picture import Picture
 from caustic_cli.project import attachments
-from caustic_cli.project.checkpoint import MAX_BYTES, Checkpoint
+from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.project import CHECKPOINT, FARTHER, MADE, RENDER, WAVE, Project, is_project
 
 RECORD = ".outputs.json"
@@ -45,9 +45,9 @@ def digest(full: Settings, *pictures: Picture | None) -> str:
     start = Path(full["design"]["start"])
     named = full["design"]["start"] in ("transport", "offset")  # whatever the directory holds of these names
     if not named and is_project(start):
-        found.update(_hash(start / CHECKPOINT).encode())
+        found.update(sha256_of(start / CHECKPOINT).encode())
     elif not named and start.is_file():
-        found.update(f"{_hash(start)}{_hash(beside(start))}".encode())  # and the JSON of a height map
+        found.update(f"{sha256_of(start)}{sha256_of(beside(start))}".encode())  # and the JSON of a height map
     return found.hexdigest()
 
 
@@ -105,17 +105,17 @@ class Outputs:
     def __init__(self, project: Project, command: str, options: dict, paths: Iterable[Path | None]):
         self.record, self.paths = project.path / RECORD, [p for p in paths if p is not None]
         given = {k: str(v) for k, v in sorted(options.items())}
-        inputs = [digest(project.settings, project.picture, project.profile, project.second), _hash(project.path / CHECKPOINT)]
-        inputs += [_hash(Path(options[name])) for name in FILES if options.get(name)]
+        inputs = [digest(project.settings, project.picture, project.profile, project.second), sha256_of(project.path / CHECKPOINT)]
+        inputs += [sha256_of(Path(options[name])) for name in FILES if options.get(name)]
         self.asked = hashlib.sha256(json.dumps([command, given, inputs]).encode()).hexdigest()
-        self.key = " ".join(str(p.resolve()) for p in self.paths)
+        self.key = " ".join(map(os.path.realpath, self.paths))
 
     def found(self) -> dict | None:
         """Figures of an earlier run with the same inputs if all its files are unchanged; these are touched."""
         record = self._records().get(self.key)
         if not isinstance(record, dict) or record.get("asked") != self.asked or not isinstance(record.get("figures"), dict):
             return None
-        if record.get("files") != [_hash(p) for p in self.paths]:
+        if record.get("files") != [sha256_of(p) for p in self.paths]:
             return None
         _touch(self.paths)
         return record["figures"]
@@ -130,11 +130,11 @@ class Outputs:
         entries = [entry.get("files") for entry in self._records().values() if isinstance(entry, dict)]
         ours = {found for files in entries if isinstance(files, list) for found in files if found and isinstance(found, str)}
         for path in self.paths:
-            refuse_foreign(path, force or _hash(path) in ours)
+            refuse_foreign(path, force or sha256_of(path) in ours)
 
     def keep(self, figures: dict) -> None:
         """Record the outputs and their figures."""
-        entry = {"asked": self.asked, "files": [_hash(p) for p in self.paths], "figures": figures}
+        entry = {"asked": self.asked, "files": [sha256_of(p) for p in self.paths], "figures": figures}
         with contextlib.suppress(CausticError):  # a read-only project has no record; the outputs exist
             write_bytes(self.record, json.dumps(self._records() | {self.key: entry}, indent=1).encode())
 
@@ -144,15 +144,6 @@ class Outputs:
         except (ValueError, RecursionError):  # InputError is a ValueError
             return {}
         return record if isinstance(record, dict) else {}
-
-
-def _hash(path: Path) -> str:
-    """sha256 of a regular file of at most checkpoint.MAX_BYTES, "" if it cannot be read."""
-    try:
-        with open_regular(path, "", MAX_BYTES) as f:
-            return hashlib.file_digest(f, "sha256").hexdigest()
-    except (InputError, OSError):
-        return ""
 
 
 def _touch(paths: Iterable[Path]) -> None:

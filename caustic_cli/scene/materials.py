@@ -18,6 +18,7 @@ from __future__ import annotations
 import difflib
 import math
 from dataclasses import dataclass
+from typing import Any
 
 from caustic_cli.errors import InputError
 
@@ -136,6 +137,25 @@ def refractive_index(name: str, wavelength: float = D_LINE) -> float:
     if not low <= wavelength <= high:
         raise InputError(f"wavelength for {_BY_NAME[_plain(name)]} must be {low:g} to {high:g} nm, got {wavelength:g}")
     return found.index(wavelength)
+
+
+def described() -> list[dict[str, Any]]:
+    """The materials for JSON: name, n_d and its spread between batches, Abbe number V_d, density in g/cm^3 or None, steepest_slope
+    in mm per mm, range_nm, source, and other names; see `Material`."""
+    return [
+        {
+            "name": name,
+            "n_d": m.index(D_LINE),
+            "spread": m.spread,
+            "V_d": m.abbe,
+            "density": m.density,
+            "steepest_slope": m.steepest,
+            "range_nm": list(m.range_nm),
+            "source": m.source,
+            "also": list(m.also),
+        }
+        for name, m in MATERIALS.items()
+    ]
 
 
 def rows() -> list[tuple[str, str, str, str, str, str]]:

@@ -11,7 +11,7 @@ from matplotlib.image import AxesImage
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 
-from caustic_cli.io.files import atomic_path
+from caustic_cli.io.files import atomic_file
 from caustic_cli.io.picture import SOFTWARE, to_linear, to_srgb
 from caustic_cli.scene import Lens, Screen
 from caustic_cli.studies.report import COLOURS, plain_ticks
@@ -120,8 +120,8 @@ def write_report(
     _draw_losses(axes[1, 2], history, target.size, figures, stages)
     _draw_energy_balance(axes[1, 3], figures)
     _draw_relief(solid, relief, (rx, ry), unit)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=100, metadata={"Software": SOFTWARE})
+    with atomic_file(path) as file:
+        figure.savefig(file, format="png", dpi=100, metadata={"Software": SOFTWARE})
     plt.close(figure)
 
 

@@ -26,7 +26,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from caustic_cli.errors import InputError
-from caustic_cli.io.files import SOFTWARE, atomic_path
+from caustic_cli.io.files import SOFTWARE, atomic_file
 from caustic_cli.optics.emission import Rays, of_member
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.sampling import Sample
@@ -212,8 +212,8 @@ def plot_gradient(path: str | Path, gradient: Tensor, scene: Scene, title: str) 
         ylim=(low_y, high_y),
     )
     figure.colorbar(shown, label="change of a pixel, parts of the source's power per mm of height")
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png", metadata={"Software": SOFTWARE})
+    with atomic_file(path) as file:
+        figure.savefig(file, format="png", metadata={"Software": SOFTWARE})
 
 
 def shown_part(gradient: np.ndarray, screen: Screen) -> list[tuple[float, float]]:

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from caustic_cli.errors import InputError
-from caustic_cli.io.files import SOFTWARE, atomic_path, refuse_foreign, write_bytes
+from caustic_cli.io.files import SOFTWARE, atomic_file, refuse_foreign, write_bytes
 from caustic_cli.studies.fit import Order, pareto
 
 #: Colours, the first of them of Okabe and Ito, distinguishable with all kinds of colour vision; and a marker for each curve.
@@ -136,8 +136,8 @@ def plot(study: Study, path: str | Path, draw: Drawing | None = None) -> None:
     """Write one plot of a study, by default error against time."""
     figure = Figure(figsize=(7.2, 5.2), dpi=150, layout="constrained")
     (draw or draw_error_and_time)(study, figure)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png", metadata={"Software": SOFTWARE})
+    with atomic_file(path) as file:
+        figure.savefig(file, format="png", metadata={"Software": SOFTWARE})
 
 
 def draw_error_and_time(study: Study, figure: Figure) -> None:

@@ -43,7 +43,7 @@ from torch import Tensor
 
 from caustic_cli import __version__
 from caustic_cli.errors import InputError
-from caustic_cli.io.files import CREATED_BY, SOFTWARE, atomic_path, write_bytes
+from caustic_cli.io.files import CREATED_BY, SOFTWARE, atomic_file, write_bytes
 from caustic_cli.optics.backends import backend_for
 from caustic_cli.optics.effects import NO_REQUESTS, Requests
 from caustic_cli.optics.emission import rays_of
@@ -574,6 +574,6 @@ def write_plot(path: Path, found: Study) -> None:
         axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=2, fontsize=8, frameon=False)  # below all data
     for axis in (error, light):
         axis.yaxis.set_major_locator(MaxNLocator(integer=True))
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=100, metadata={"Software": SOFTWARE})
+    with atomic_file(path) as file:
+        figure.savefig(file, format="png", dpi=100, metadata={"Software": SOFTWARE})
     plt.close(figure)

@@ -27,7 +27,7 @@ import numpy as np
 from torch import Tensor
 
 from caustic_cli.errors import CausticError, InputError
-from caustic_cli.io.files import SOFTWARE, atomic_path
+from caustic_cli.io.files import SOFTWARE, atomic_file
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.frames import AxisSegment
 from caustic_cli.optics.sampling import stream
@@ -327,5 +327,5 @@ def write_panels(path: str | Path, found: Agreement, scene: Scene) -> None:
         xlabel="x on the screen (mm)",
         ylabel="y (mm)",
     )
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png", metadata={"Software": SOFTWARE})
+    with atomic_file(path) as file:
+        figure.savefig(file, format="png", metadata={"Software": SOFTWARE})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from pathlib import Path
 
@@ -105,12 +104,3 @@ def rows(figures: dict) -> list[tuple[str, str]]:
         ("cut too deep", f"up to {1e3 * f['cut_gouge_mm']:.3g} µm"),
         ("slopes off by", f"RMS {f['cut_slope_rms']:.3g}, up to {f['cut_slope_most']:.3g}"),
     ]
-
-
-def fingerprint(path: Path) -> str:
-    """Path and hash of a file, which change with its content."""
-    try:
-        with open(path, "rb") as file:
-            return f"{path} {hashlib.file_digest(file, 'sha256').hexdigest()}"
-    except OSError:
-        return str(path)

@@ -17,7 +17,7 @@ from caustic_cli.config.tolerances import read as read_tolerances
 from caustic_cli.errors import InputError
 from caustic_cli.export.mitsuba import quick_samples, write_mitsuba
 from caustic_cli.export.page import refuse_untraceable
-from caustic_cli.io.files import discard, refuse_foreign
+from caustic_cli.io.files import destination, discard, refuse_foreign, sha256_of
 from caustic_cli.io.picture import WIDE, said_of, write_image, write_npy
 from caustic_cli.optics.emission.measured import coarse_words
 from caustic_cli.optics.plan import Plan, parse_effects
@@ -35,7 +35,7 @@ from caustic_cli.workflow import page
 from caustic_cli.workflow.compilation import compile_for
 from caustic_cli.workflow.illumination import solve_brightness, target_illumination
 from caustic_cli.workflow.lens import Lens, is_archive, refuse_at
-from caustic_cli.workflow.machining import cut_surface, fingerprint, form_deviation
+from caustic_cli.workflow.machining import cut_surface, form_deviation
 from caustic_cli.workflow.reporter import Reporter
 from caustic_cli.workflow.tolerances import tolerances
 
@@ -102,8 +102,8 @@ class Request:
         """Parameters that determine the image, except for its noise, where they differ from their defaults."""
         usual = {f.name: f.default for f in fields(self)}
         names = ("reconstruction", "filter_size", "alpha", "screen_at", "effects", "at")
-        cut = {"cut": fingerprint(self.cut)} if self.cut else {}
-        given = {key: fingerprint(Path(value)) if key in FILES else value for key, value in dict(self.given).items()}
+        cut = {"cut": _fingerprint(self.cut)} if self.cut else {}
+        given = {key: _fingerprint(value) if key in FILES else value for key, value in dict(self.given).items()}
         return {name: getattr(self, name) for name in names if getattr(self, name) != usual[name]} | cut | given
 
     @property
@@ -124,10 +124,15 @@ class Request:
             "dtype",
             "at",
         )
-        cut = {"cut": fingerprint(self.cut)} if self.cut else {}
+        cut = {"cut": _fingerprint(self.cut)} if self.cut else {}
         off = {} if self.tolerances is None else {"tolerances": read_tolerances(self.tolerances)}
-        want = {"want": fingerprint(self.want)} if self.want else {}
+        want = {"want": _fingerprint(self.want)} if self.want else {}
         return {name: getattr(self, name) for name in names} | cut | off | want | dict(self.given)
+
+
+def _fingerprint(path: Path | str) -> str:
+    """Path and hash of a file, which change with its content; the path alone if it cannot be read."""
+    return f"{path} {sha256_of(path)}".rstrip()
 
 
 def render(asked: Request, device: str, say: Reporter) -> dict:
@@ -144,6 +149,8 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     parse_effects(asked.effects)
     if asked.image is not None and asked.image.suffix.lower() not in ("", ".png"):
         raise InputError(f"{asked.image}: ⟨out⟩ is a PNG, and its name must end in .png")
+    for path in [path for path in (asked.image, asked.npy, asked.html) if path is not None]:
+        destination(path)  # refuses what is no file name, before others are made of it
     archived = Lens.of_archive(asked.lens) if is_archive(asked.lens) else None
     if archived is not None and asked.tolerances is not None:
         raise InputError("⟨tolerances⟩ compares with the picture, which an archive does not hold; render its project")

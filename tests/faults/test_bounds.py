@@ -6,6 +6,7 @@ Each case is run by a process of its own (`fuzz.bounded`) that may take so many 
 import io
 import os
 import shutil
+import socket
 import struct
 import zipfile
 from contextlib import redirect_stderr, redirect_stdout
@@ -14,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fuzz import bounded, kinds
+from helpers import write_blob
 from PIL import Image
 
 from caustic_cli import cli
@@ -23,7 +25,7 @@ from caustic_cli.io import arrays, files, surfaces
 from caustic_cli.io.archive import open_archive
 from caustic_cli.io.picture import MAX_BYTES, read_picture
 from caustic_cli.io.surfaces import read_surface
-from caustic_cli.project import attachments, checkpoint, uptodate
+from caustic_cli.project import attachments, checkpoint
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 
@@ -64,6 +66,12 @@ def refused_command(*arguments: str) -> str:
     found = bounded(lambda: command(*arguments), 60)
     assert found.startswith("2 caustic: ") and found.count("\n") == 1, found
     return found
+
+
+def refused_commands(*orders: list[str]) -> None:
+    """Commands, in one process, that must each end with 2 and one line."""
+    found = bounded(lambda: "".join(command(*order) for order in orders), 60).splitlines()
+    assert len(found) == len(orders) and all(line.startswith("2 caustic: ") for line in found), found
 
 
 def refused(read, data: int = 200 * MEGABYTES, seconds: int = SECONDS) -> str:
@@ -424,6 +432,54 @@ def test_nobody_waits_for_a_pipe(name, here):
     assert Path(place).is_fifo()
 
 
+#: Options that name a file to be read, after a command that is valid without.
+PLAIN = "design a.caustic/target.png -o new.caustic --resolution 8 --control 5 --rays 100 --iterations 1"
+READ = {
+    "--config": f"{PLAIN} --config @.toml",
+    "--start": f"{PLAIN} --start @.npz",
+    "--second": f"{PLAIN} --second-at 400 --second @.png",
+    "--source-file": f"{PLAIN} --source disc --source-file @.png",
+    "--intensity": f"{PLAIN} --source point --intensity @.csv",
+    "--robust": f"{PLAIN} --robust @.toml",
+    "--screen-shape": f"{PLAIN} --screen-shape @.npy",
+    "--index-file": f"{PLAIN} --gradient volume --index-file @.npy",
+    "design": "design @.png",
+    "render": "render @.npz",
+    "render --source-file": "render a.caustic --source rays --source-file @.ray",
+    "render --intensity": "render a.caustic --source point --intensity @.csv",
+    "render --screen-shape": "render a.caustic --screen-shape @.npy",
+    "render --cut": "render a.caustic --cut @.nc",
+    "render --tolerances": "render a.caustic --tolerances @.toml",
+    "render --want": "render a.caustic --want @.png",
+}
+
+
+def special_files(suffix: str) -> list[str]:
+    """Names of what is no regular file: a pipe that nobody writes to, a directory, a socket, a loop of links, links to devices."""
+    os.mkfifo(f"pipe{suffix}")
+    Path(f"folder{suffix}").mkdir()
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(f"socket{suffix}")
+    Path(f"loop{suffix}").symlink_to(f"other{suffix}")
+    Path(f"other{suffix}").symlink_to(f"loop{suffix}")
+    for device in ("zero", "full"):
+        Path(f"{device}{suffix}").symlink_to(f"/dev/{device}")
+    return [f"{name}{suffix}" for name in ("pipe", "folder", "socket", "loop", "zero", "full")]
+
+
+@pytest.mark.parametrize("name", READ)
+def test_no_option_waits_for_what_is_no_file(name, here):
+    suffix = "." + READ[name].rpartition("@.")[2]
+    orders = [READ[name].replace(f"@{suffix}", file).split() for file in special_files(suffix)]
+    refused_commands(*orders)
+    assert not Path("new.caustic").exists()
+
+
+def test_a_device_by_its_own_name_is_refused(here):
+    options, devices = ("--cut", "--want", "--tolerances"), ("/dev/zero", "/dev/full")
+    refused_commands(*(["render", "a.caustic", option, device] for option in options for device in devices))
+
+
 def test_a_picture_from_the_standard_input(here):
     assert "not a regular file" in bounded(lambda: _from_a_pipe(lambda: command("design", "/dev/stdin")), 60)
 
@@ -451,6 +507,82 @@ def test_an_output_replaces_no_device_and_no_pipe(name, force, here):
     assert "not a regular file" in refused_command(*OUTPUTS[name], "/dev/full")
 
 
+WRITTEN = {
+    "render -o": "render a.caustic --rays 100 -o",
+    "render --npy": "render a.caustic --rays 100 -o a.png --npy",
+    "render --html": "render a.caustic --rays 100 -o a.png --html",
+    "gradmap -o": "gradmap a.caustic --rays 100 -o",
+    "export -o": "export a.caustic --format stl -o",
+    "export -o of a height map": "export a.caustic --format heightmap -o",
+    "export -o of a mesh": "export a.caustic --format mitsuba -o",
+    "export -o of a script": "export a.caustic --format lighttools --script -o",
+}
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_a_path_that_is_no_file_name_is_refused(name, here):
+    Path("loop").symlink_to("other")
+    Path("other").symlink_to("loop")
+    Path("link").symlink_to("nowhere")
+    before = sorted(p.name for p in Path().iterdir())
+    outputs = (".", "/", "", "loop", "link", "a.caustic/checkpoints.h5/a")
+    refused_commands(*([*WRITTEN[name].split(), output] for output in outputs))
+    assert "--force" in refused_command(*WRITTEN["export -o"].split(), "link")
+    assert sorted(p.name for p in Path().iterdir()) == before and os.readlink("link") == "nowhere"
+
+
+@pytest.mark.parametrize("name", ["loop", "link", "file"])
+def test_a_study_needs_a_directory_before_it_begins(name, here):
+    Path("loop").symlink_to("loop")
+    Path("link").symlink_to("nowhere")
+    Path("file").touch()
+    assert "is no directory" in refused_command("convergence", "--study", "rays", "--rays", "1000", "-o", name)
+
+
+@pytest.mark.parametrize("link", ["/proc/self/fd/1", "/dev/fd/1", "first"])
+def test_the_standard_output_is_not_replaced(link, here):
+    """A descriptor that was redirected to a file leads to that file; the link is the device's, or the user's own."""
+    Path("first").symlink_to("/proc/self/fd/1")
+    Path("out").symlink_to(link)
+    Path("log").write_text("begun\n")
+
+    def redirected() -> str:
+        with open("log", "a") as log:
+            os.dup2(log.fileno(), 1)
+        return command("export", "a.caustic", "--format", "stl", "-o", "out", "--force")
+
+    found = bounded(redirected, 60)
+    assert found.startswith("2 caustic: ") and "open stream" in found and os.readlink("out") == link
+    assert Path("log").read_text() == "begun\n"
+
+
+def test_an_output_is_written_where_its_link_leads(here):
+    Path("folder").mkdir()
+    Path("link.stl").symlink_to("folder/lens.stl")
+    order = ["export", "a.caustic", "--format", "stl", "--samples", "5", "-o", "link.stl"]
+    Path("folder/lens.stl").write_text("mine")
+    assert "was not made by caustic" in refused_command(*order)
+    assert bounded(lambda: command(*order, "--force"), 60).startswith("0")
+    assert files.is_ours("folder/lens.stl") and os.readlink("link.stl") == "folder/lens.stl"
+    Path("link.stl").unlink()
+    Path("link.stl").symlink_to("a.caustic/checkpoints.h5")
+    assert "part of the project" in refused_command(*order, "--force")
+    Path("link.stl").unlink()
+    Path("link.stl").symlink_to("nowhere")
+    assert bounded(lambda: command(*order, "--force"), 60).startswith("0")
+    assert files.is_ours("link.stl") and not Path("link.stl").is_symlink() and not Path("nowhere").exists()
+
+
+def test_a_new_design_spares_what_a_link_of_the_old_one_leads_to(here):
+    shutil.move("a.caustic/target.png", "mine.png")
+    before = Path("mine.png").read_bytes()
+    Path("a.caustic/target.png").symlink_to("../mine.png")
+    write_blob("other.png")
+    order = f"{PLAIN} --start offset --waves off --force".replace("a.caustic/target.png", "other.png").replace("new.", "a.")
+    assert bounded(lambda: command(*order.split()), 120, 1000 * MEGABYTES).startswith("0")
+    assert Path("mine.png").read_bytes() == before and not Path("a.caustic/target.png").is_symlink()
+
+
 def test_a_new_design_replaces_no_pipe(here):
     Path("a.caustic/checkpoints.h5").unlink()
     os.mkfifo("a.caustic/checkpoints.h5")
@@ -465,9 +597,9 @@ def test_writers_and_their_questions_keep_to_regular_files(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path / "pipe", tmp_path, Path("/dev/full"), Path("/dev/zero")):
         assert bounded(lambda path=path: f"{files.is_ours(path)}", SECONDS, 20 * MEGABYTES) == "False"
-        assert " a file name is needed" in refused(lambda path=path: files.refuse_special(path))
+        assert " a file name is needed" in refused(lambda path=path: files.destination(path))
     assert "not a regular file" in refused(lambda: files.write_bytes(tmp_path / "pipe", b"x"))
-    assert bounded(lambda: uptodate._hash(tmp_path / "pipe") or "none") == "none"
+    assert bounded(lambda: files.sha256_of(tmp_path / "pipe") or "none") == "none"
     assert (tmp_path / "pipe").is_fifo() and [p.name for p in tmp_path.iterdir()] == ["pipe"]
 
 

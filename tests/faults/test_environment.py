@@ -14,7 +14,7 @@ from helpers import write_blob
 from PIL import Image
 
 from caustic_cli import __version__, cli
-from caustic_cli.errors import InputError
+from caustic_cli.errors import LONGEST, InputError, is_unloadable
 from caustic_cli.io import files
 from caustic_cli.io.picture import read_picture
 
@@ -29,9 +29,9 @@ def _here(tmp_path, monkeypatch):
     write_blob("blob.png", 16, (5, 6), 15.0)
 
 
-def run(arguments, redirections="", **variables):
+def run(arguments, redirections="", before="", **variables):
     """A command in a process and a shell of its own."""
-    line = f"{shlex.join([sys.executable, '-m', 'caustic_cli', *arguments])} {redirections}"
+    line = f"{before}{shlex.join([sys.executable, '-m', 'caustic_cli', *arguments])} {redirections}"
     return subprocess.run(
         ["bash", "-c", line], env=ENVIRONMENT | variables, capture_output=True, text=True, check=False, timeout=60
     )
@@ -46,12 +46,67 @@ def test_closed_streams(redirections):
     assert (done.returncode, done.stdout) == (2, "") and done.stderr.count("\n") == ("2>&-" not in redirections)
 
 
+@pytest.mark.parametrize("arguments", [["--version"], ["--help"], ["design", "--help"], ["design", "--glass", "list", "--json"]])
+def test_a_full_standard_output_is_named(arguments):
+    done = run(arguments, "> /dev/full")
+    assert (done.returncode, done.stderr) == (1, "caustic: standard output: No space left on device\n")
+
+
+def test_a_full_standard_error_loses_messages_and_nothing_else():
+    assert run(["design", "none.png"], "2> /dev/full").returncode == 2
+    done = run(["design", "--glass", "list"], "2> /dev/full")
+    assert done.returncode == 0 and done.stdout.startswith("NAME")
+
+
+@pytest.mark.parametrize("kilobytes", [100_000, 400_000])
+def test_libraries_that_do_not_fit_into_memory(kilobytes):
+    done = run(["convergence", "--study", "rays"], before=f"ulimit -v {kilobytes}; ")
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1) and "caustic: out of memory" in done.stderr
+
+
+def test_a_library_that_another_library_could_not_load():
+    """llvmlite raises its own error from that of the loader."""
+    problem = OSError("Could not find/load shared object file")
+    problem.__cause__ = OSError("libllvmlite.so: failed to map segment from shared object")
+    assert is_unloadable(problem) and not is_unloadable(OSError("failed"))
+
+
 def test_no_file_takes_the_number_of_a_closed_stream():
     program = "import os, sys; from caustic_cli import cli; cli.run = lambda a: os.open('blob.png', os.O_RDONLY); cli.main()"
     done = subprocess.run(
         ["bash", "-c", f"{shlex.join([sys.executable, '-c', program])} <&- >&- 2>&-"], env=ENVIRONMENT, check=False
     )
     assert done.returncode > 2
+
+
+ECHOED = {
+    "a value of a file": "design blob.png --config values.toml",
+    "a text of a file": "design blob.png --config text.toml",
+    "a key": "design blob.png --config key.toml",
+    "a value": f"design blob.png --source-position {','.join(5000 * '1')}",
+    "a name": f"design blob.png --loss {5000 * 'a'}",
+    "an option": f"design blob.png --{5000 * 'a'}",
+    "a command": 5000 * "a",
+    "a path": f"render {5000 * 'a'}",
+    "a line of a table": "design blob.png --source point --intensity table.csv",
+}
+
+
+@pytest.mark.parametrize("name", ECHOED)
+def test_no_message_repeats_all_that_it_was_given(name, capfd):
+    Path("values.toml").write_text(f"[source]\nposition = {[1.5] * 5000}\n")
+    Path("text.toml").write_text(f'[lens]\ndegree = "{5000 * "x"}"\n')
+    Path("key.toml").write_text(f"[lens]\n{5000 * 'x'} = 3\n")
+    Path("table.csv").write_text(f"0 1\n1 {5000 * 'x'}\n")
+    assert cli.run(ECHOED[name].split()) == 2
+    err = capfd.readouterr().err
+    assert err.startswith("caustic: ") and err.count("\n") == 1 and 200 < len(err) < LONGEST and "characters] ..." in err
+
+
+def test_a_shortened_message_says_what_is_wrong_and_what_is_accepted():
+    wrong = InputError(f"a.nc: line 3: {5000 * 'x'!r} is no block of words; a program is needed")
+    assert str(wrong).startswith("a.nc: line 3: 'xxx") and str(wrong).endswith("is no block of words; a program is needed")
+    assert len(str(wrong)) < LONGEST and f"b: {wrong}".count("x") == 5000 and str(InputError(f"b: {wrong}")).count("[") == 1
 
 
 BAD = [

@@ -34,6 +34,11 @@ def rows() -> list[tuple[str, str]]:
     return [(name, _purpose(FOLDER / f"{name}.toml")) for name in names()]
 
 
+def described() -> list[dict[str, str]]:
+    """The presets for JSON: name and purpose."""
+    return [{"name": name, "purpose": purpose} for name, purpose in rows()]
+
+
 def _purpose(path: Path) -> str:
     """The comment that a preset's file begins with."""
     lines = path.read_text(encoding="utf-8").splitlines()

@@ -32,7 +32,7 @@ from caustic_cli.export.milling.offset import BallOffset, FlatOffset, shape_of
 from caustic_cli.export.milling.paths import raster, spacing, spiral, with_heights
 from caustic_cli.export.part import Part
 from caustic_cli.export.text import CREATED
-from caustic_cli.io.files import atomic_path
+from caustic_cli.io.files import atomic_file
 from caustic_cli.optics.surfaces.heightfield import HeightField
 
 #: Tolerance of the path over the scallop height; digits of a coordinate beyond those of the tolerance; least number of digits.
@@ -143,7 +143,7 @@ def write_gcode(path: str | Path, part: Part, milling: Milling | None = None, to
     safe, lines = top + m.safe_height, {"raster": 0, "raster-y": 1}
     shape = (lens.half_size, over, step, lens.round)
     passes = spiral(*shape) if m.path == "spiral" else raster(*shape, lines[m.path])
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+    with atomic_file(path) as file:
         out = _Writer(file, digits)
         out.say(*_head(part, m, step, scallop, top, digits, tolerance))
         place = file.tell()
