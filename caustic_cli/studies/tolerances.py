@@ -134,7 +134,6 @@ class Trials:
         self.smooth: dict[tuple[int, tuple[str, ...]], list[np.ndarray]] = {}
         if waves is not None:
             self.begin = self._rays(Misalignment(), self.heights, 0)
-            self.power = sum(float(part.power.sum()) for part in self.begin)
 
     def evaluate(self, values: Values, number: int | None = None, which: tuple[str, ...] | None = None) -> TrialFigures:
         """Figures under errors by (name, axis), and a realisation of the surface errors, all of them or only `which`."""
@@ -234,31 +233,34 @@ class Trials:
         return part.x + sx, part.y + sy
 
     def _moved(self, now: list[LandingPoints], smooth: list[np.ndarray]) -> np.ndarray:
-        """A wave image, given by splines, warped by the displacement of the rays."""
+        """A wave image, given by splines, warped by the displacement of the rays, and brighter or darker as they are."""
         shape, (wx, wy), (rx, ry) = self.target.shape[1:], self.scene.screen.pixel, self.scene.screen.half_size
         out = np.zeros(self.target.shape)
-        scale = sum(float(part.power.sum()) for part in now) / self.power
         grid = np.meshgrid(*(np.arange(n, dtype=float) for n in shape), indexing="ij")
         for channel in range(len(out)):
             pairs = [(a, b) for a, b in zip(self.begin, now, strict=True) if (a.channel or 0) == channel]
             if not pairs:
                 continue
-            sums = np.zeros((3, *shape))
+            sums = np.zeros((5, *shape))
             for a, b in pairs:
                 weight = torch.where(b.power > 0, a.power, 0.0)
                 i, j = ((a.x + rx) / wx).floor().long(), ((a.y + ry) / wy).floor().long()
-                inside = (i >= 0) & (i < shape[0]) & (j >= 0) & (j < shape[1]) & (weight > 0)
+                inside = (i >= 0) & (i < shape[0]) & (j >= 0) & (j < shape[1]) & (a.power > 0)
                 cell, w = (i * shape[1] + j)[inside], weight[inside]
-                for k, value in enumerate((torch.ones_like(w), ((b.x - a.x) / wx)[inside], ((b.y - a.y) / wy)[inside])):
-                    sums[k] += torch.bincount(cell, w * value, minlength=shape[0] * shape[1]).numpy().reshape(shape)
-            ux, uy = displacement(sums, self.near)
+                # rays that miss the screen now have a place of their own, which may be anywhere: they have no displacement
+                aside = [torch.where(w > 0, w * ((q - p) / width)[inside], 0.0) for p, q, width in ((a.x, b.x, wx), (a.y, b.y, wy))]
+                for k, value in enumerate((w, *aside, a.power[inside], b.power[inside])):
+                    sums[k] += torch.bincount(cell, value, minlength=shape[0] * shape[1]).numpy().reshape(shape)
+            ux, uy = smoothed_ratios(sums[0], sums[1:3], self.near)
+            (gain,) = smoothed_ratios(sums[3], sums[4:], self.near, 1.0)
             qx, qy = grid
             for _ in range(BACK):  # q + u(q) = p
                 at = [qx, qy]
                 qx, qy = (p - map_coordinates(u, at, order=1, mode="nearest") for p, u in zip(grid, (ux, uy), strict=True))
             (xx, xy), (yx, yy) = np.gradient(qx), np.gradient(qy)
             found = map_coordinates(smooth[channel], [qx, qy], order=3, mode="constant", prefilter=False)
-            out[channel] = scale * np.maximum(found, 0.0) * np.abs(xx * yy - xy * yx)
+            gain = map_coordinates(gain, [qx, qy], order=1, mode="nearest")
+            out[channel] = gain * np.maximum(found, 0.0) * np.abs(xx * yy - xy * yx)
         return out
 
     def _gain(self) -> tuple[float, float]:
@@ -309,17 +311,19 @@ def best_shift(image: np.ndarray, target: np.ndarray) -> tuple[float, tuple[floa
     return level, (shift[0], shift[1])
 
 
-def displacement(sums: np.ndarray, near: float) -> tuple[np.ndarray, np.ndarray]:
-    """Mean displacement on every pixel from the sums (3, n_x, n_y) over its rays of power, and of power times displacement.
+def smoothed_ratios(power: np.ndarray, sums: np.ndarray, near: float, without: float = 0.0) -> np.ndarray:
+    """Means (k, n_x, n_y) on every pixel of quantities of its rays, from the sums of their power (n_x, n_y) and of power times
+    quantity (k, n_x, n_y).
 
-    Gaussian average over `near` pixels; where there is too little light, the value of the nearest pixel with enough.
+    Gaussian average over `near` pixels; where there is too little light, the value of the nearest pixel with enough, or `without`
+    where there is none.
     """
-    weight, x, y = (gaussian_filter(s, near, mode="constant") for s in sums)
-    enough = weight > LIT * sums[0].mean()
+    weight = gaussian_filter(power, near, mode="constant")
+    enough = weight > LIT * power.mean()
     if not enough.any():
-        return np.zeros_like(x), np.zeros_like(y)
+        return np.full_like(sums, without)
     at = tuple(distance_transform_edt(~enough, return_distances=False, return_indices=True))
-    return (x[at] / weight[at]), (y[at] / weight[at])
+    return np.stack([gaussian_filter(s, near, mode="constant")[at] / weight[at] for s in sums])
 
 
 @dataclass(frozen=True)
