@@ -83,6 +83,9 @@ NOMINAL = 8
 #: Uniform slope of the exit, a finite-difference step for the effect of roughness.
 LEAN = 1e-5
 
+#: Most errors in the plot, and the height of one, inch.
+BARS, BAR_HEIGHT = 16, 0.33
+
 Values = dict[tuple[str, int], float]
 
 
@@ -550,7 +553,10 @@ def write_plot(path: Path, found: Study) -> None:
 
     from caustic_cli.studies.report import COLOURS  # noqa: PLC0415
 
-    figure, (error, light, bars) = plt.subplots(1, 3, figsize=(15.0, 5.6), constrained_layout=True)
+    shown = found.sensitivities[:BARS][::-1]
+    figure, (error, light, bars) = plt.subplots(
+        1, 3, figsize=(17.0, max(5.6, 1.6 + BAR_HEIGHT * len(shown))), constrained_layout=True
+    )
     f = figures(found)
     placing = {"as placed": found.of("relative_rms"), "after the best shift": found.of("shifted")}
     bins, both = min(40, max(8, len(found.judged) // 8)), np.concatenate(list(placing.values()))
@@ -569,15 +575,15 @@ def write_plot(path: Path, found: Study) -> None:
     light.axvline(f["nominal"]["on_target"], color="k", label=f"without errors: {f['nominal']['on_target']:.4f}")
     light.axvline(f["on_target"]["p5"], color=COLOURS[0], ls="--", label=f"95 % have at least {f['on_target']['p5']:.4f}")
     light.set(title="light on the picture", xlabel="part of the source's power", ylabel="draws")
-    shown = found.sensitivities[:16][::-1]
     bars.barh([f"{s.name}\n{s.sigma:.3g} {s.unit}".strip() for s in shown], [s.adds for s in shown], color=COLOURS[2])
     bars.axvline(f["nominal"]["relative_rms"], color="k", ls=":", label="error without errors")
-    bars.set(title="contribution of each error of one sigma, in quadrature", xlabel="relative RMS error")
+    bars.set(title="contribution of each error of one sigma,\nin quadrature", xlabel="relative RMS error")
     bars.tick_params(axis="y", labelsize=8)
     for axis in (error, light, bars):
         axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=2, fontsize=8, frameon=False)  # below all data
     for axis in (error, light):
         axis.yaxis.set_major_locator(MaxNLocator(integer=True))
+        axis.xaxis.set_major_locator(MaxNLocator(6))
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", dpi=100, metadata={"Software": SOFTWARE})
     plt.close(figure)
