@@ -111,6 +111,8 @@ def run(
     count = tuple(options.both(options.counts("--samples", samples))) if samples else None
     given_of = {"mould": mould or None, "block": block, "samples": count, "tolerance": tolerance, "milling": milling or None}
 
+    options.require_project(project, archives=True)  # before torch is loaded
+
     from caustic_cli.workflow.export import accuracy_words, export  # noqa: PLC0415
 
     all_figures = []
