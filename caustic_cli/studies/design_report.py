@@ -36,7 +36,7 @@ TICKS = 6
 #: Distance of a title from its panel, points: clear of the tick label at the upper end of the y axis.
 PAD = 9
 #: Characters of a line of a title.
-LINE = 44
+LINE = 50
 #: Positions of the panels.  An automatic layout took as long as drawing.
 PLACES = {"left": 0.035, "right": 0.95, "bottom": 0.065, "top": 0.925, "wspace": 0.62, "hspace": 0.42}
 #: Height of a panel of losses relative to that of the error, if that is another panel, and the space between panels relative to
