@@ -49,6 +49,7 @@ def _run(arguments: list[str]) -> int:
     from caustic_cli.errors import Interrupted  # noqa: PLC0415
 
     console.set_option_names({})
+    console.set_kept("")
     debug = "--debug" in arguments or bool(os.environ.get("CAUSTIC_DEBUG"))
     try:
         status = parser().main(arguments, prog_name="caustic", standalone_mode=False, auto_envvar_prefix="CAUSTIC")
@@ -161,11 +162,12 @@ def _ignore_signals() -> None:
 
 
 def _interrupted() -> int:
-    """Print which signal terminated the command; returns the exit status."""
+    """Print which signal terminated the command, and what is on disk if that is known; returns the exit status."""
     if _sent:
         _ignore_signals()
-    number = _sent[0] if _sent else signal.SIGINT
-    sys.stderr.write(f"caustic: {SIGNALS[number]}\n")
+    number, console = _sent[0] if _sent else signal.SIGINT, sys.modules.get("caustic_cli.commands.console")
+    kept = console.kept() if console is not None and hasattr(console, "kept") else ""  # the signal may come during its import
+    sys.stderr.write(f"caustic: {SIGNALS[number]}{f'; {kept}' if kept else ''}\n")
     return 128 + number
 
 

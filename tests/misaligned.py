@@ -61,3 +61,27 @@ def relative_rms(scene: Scene, field: HeightField, heights: torch.Tensor, e, tar
     a, b = (i / i.mean() for i in (image(scene, field, heights, e, rays // 2, rng) for _ in range(2)))
     t = target / target.mean()
     return float(np.sqrt(max(0.0, np.mean((a - t) * (b - t)))))
+
+
+def near_image(scene: Scene, field: HeightField, heights: torch.Tensor, e, intensity, rays: int, rng) -> np.ndarray:
+    """Fractions of the power, per unit of axial intensity, on the pixels: random rays of a point source at a finite distance.
+
+    intensity: relative, of the angle to the room's z, rad, and nothing else: the axis is the room's, whatever the lens does.
+    """
+    system, screen = room(scene, field, e)
+    (rx, ry), n = scene.lens.half_size, round(np.sqrt(rays))
+    (source,) = scene.source.points()[0]
+    at = [p + d for p, d in zip(source, (*e.source_shift, e.source_distance), strict=True)]
+    cells = (np.indices((n, n)).reshape(2, -1) + rng.random((2, n * n))) / n
+    z = scene.lens.z_in - BEFORE  # a plane of the room that all light of the lens passes
+    x, y = ((2.0 * c - 1.0) * (1.0 + 4.0 * BEYOND) * r + d for c, r, d in zip(cells, (rx, ry), e.lens_shift, strict=True))
+    area = 4.0 * (1.0 + 4.0 * BEYOND) ** 2 * rx * ry / (n * n)
+    dx, dy, h = x - at[0], y - at[1], z - at[2]
+    r = np.sqrt(dx * dx + dy * dy + h * h)
+    power = torch.from_numpy(intensity(np.arccos(h / r)) * h / r**3 * area)
+    direction = tuple(torch.from_numpy(c / r) for c in (dx, dy, np.full_like(x, h)))
+    state = RayState((torch.from_numpy(x), torch.from_numpy(y), z), direction, power)
+    with torch.no_grad():
+        landed = Tracer(system, state).land({EXIT: heights}, screen)[0]
+    edges = [np.linspace(-h, h, k + 1) for h, k in zip(scene.screen.half_size, scene.screen.resolution, strict=True)]
+    return np.histogram2d(landed.origin[0].numpy(), landed.origin[1].numpy(), edges, weights=landed.power.numpy())[0]

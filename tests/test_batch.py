@@ -1,5 +1,6 @@
 """Batch life: the same again is no work, progress a program can read, defaults from the environment, completion, make -j."""
 
+import io
 import json
 import os
 import shutil
@@ -9,10 +10,13 @@ from pathlib import Path
 
 import pytest
 from helpers import small_designs, write_blob
+from rich.console import Console
 
 from caustic_cli import cli
+from caustic_cli.commands.console import Reporter, ended_row
 from caustic_cli.inverse.designer import Designer
 from caustic_cli.project import checkpoint
+from caustic_cli.studies.radius import cost_of_radius
 from caustic_cli.workflow import design as workflow
 from caustic_cli.workflow import evaluation
 
@@ -198,6 +202,7 @@ def test_progress_as_json_lines(capfd):
     assert json.loads(out)["iterations"] == 3
     steps = [line for line in lines if line["event"] == "progress"]
     assert steps and steps[-1]["done"] == steps[-1]["total"] == 3 and "loss" in steps[-1]["text"] and steps[-1]["seconds"] >= 0
+    assert steps[-1]["seconds_left"] == 0 and all(step["seconds_left"] >= 0 for step in steps)
     assert {line["event"] for line in lines} == {"message", "progress", "result"}
     assert run([*DESIGN, "--progress", "json", "--quiet", "--force"], capfd).err == ""
     assert "--progress" in run([*DESIGN, "--progress", "moon"], capfd, 2).err
@@ -248,14 +253,96 @@ def test_make_gives_each_of_several_jobs_one_thread():
         shutil.copy(EXAMPLES / name, name)
     Path("caustic").write_text(
         '#!/bin/sh\necho "$@" >> log\nmkdir -p "${2%.png}.caustic"\n'
-        "[ $1 = design ] && touch ${2%.png}.caustic/checkpoints.h5 || touch $2/render.png\n"
+        "if [ $1 = design ]; then touch ${2%.png}.caustic/checkpoints.h5; echo stage 1/1 >&2; else touch $2/render.png; fi\n"
     )
     Path("caustic").chmod(0o755)
     for jobs, expected in ((["-j2"], True), ([], False)):
         subprocess.run(["make", *jobs, "CAUSTIC=./caustic"], check=True, capture_output=True)
         said = Path("log").read_text().splitlines()
+        assert all(Path(f"{name}.log").read_text() == "stage 1/1\n" for name in ("flame", "ball", "tophat"))
         assert len(said) == 6 and all(("--threads 1" in line) == expected for line in said)
         Path("log").unlink()
         done = subprocess.run(["make", *jobs, "CAUSTIC=./caustic"], check=True, capture_output=True, text=True)
         assert "Nothing to be done" in done.stdout
         subprocess.run(["make", "clean"], check=True, capture_output=True)
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+def test_make_takes_a_bare_picture_and_tabulates_a_batch():
+    """Settings are used where there are some; a design that fails says why, and leaves no figures."""
+    shutil.copy(EXAMPLES / "Makefile", "Makefile")
+    for name in ("plain", "set", "broken"):
+        paint(f"{name}.png", 5)
+    Path("set.toml").write_text("")
+    Path("caustic").write_text(
+        '#!/bin/sh\n[ $2 = broken.png ] && echo no light >&2 && exit 1\nmkdir -p "${2%.png}.caustic"; echo "$@" >&2\n'
+        "touch ${2%.png}.caustic/checkpoints.h5\n"
+        'echo \'{"error": 0.125, "error_by": "waves", "on_target": 0.5, "iterations": 3, "seconds": 1.5, "image": "x"}\'\n'
+    )
+    Path("caustic").chmod(0o755)
+    ask = ["make", "CAUSTIC=./caustic"]
+    subprocess.run([*ask, "PICTURES=plain set", "figures.csv"], check=True, capture_output=True)
+    assert Path("figures.csv").read_text().split() == [
+        "picture,error,error_by,on_target,iterations,seconds",
+        "plain,0.125,waves,0.5,3,1.5",
+        "set,0.125,waves,0.5,3,1.5",
+    ]
+    assert "--config" not in Path("plain.log").read_text() and "--config set.toml" in Path("set.log").read_text()
+    again = subprocess.run([*ask, "PICTURES=plain set", "figures.csv"], check=True, capture_output=True, text=True)
+    assert "design" not in again.stdout  # only the table, since PICTURES may be others
+    os.utime("set.toml", (2**31, 2**31))
+    again = subprocess.run([*ask, "-n", "PICTURES=plain set", "figures.csv"], check=True, capture_output=True, text=True)
+    assert "design set.png" in again.stdout and "design plain.png" not in again.stdout
+    done = subprocess.run([*ask, "PICTURES=broken", "figures.csv"], check=False, capture_output=True, text=True)
+    assert done.returncode == 2 and "no light" in done.stderr and not Path("broken.json").exists()
+
+
+# what a run says
+
+
+def test_an_interruption_before_the_first_checkpoint_says_what_is_kept(capfd, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(workflow, "first_heights", interrupt)
+        said = run([*DESIGN, "--quiet"], capfd, 130).err
+    assert said == "caustic: interrupted; before the first checkpoint: nothing was written to blob.caustic\n"
+    assert not Path("blob.caustic").exists()
+    with monkeypatch.context() as patch:
+        patch.setattr(workflow._Records, "keep", interrupt)
+        said = run([*DESIGN, "--quiet"], capfd, 130).err
+    assert "blob.caustic holds the settings and the picture" in said and "design --resume blob.caustic" in said
+    assert json.loads(run(["design", "--resume", "blob.caustic", "--json", "--quiet"], capfd).out)["iterations"] == 3
+    assert run(["render", "nowhere"], capfd, 2).err.count("\n") == 1  # and nothing of it is left for the next command
+
+
+def test_how_a_design_ended_is_said_in_words():
+    assert ended_row("iterations") == ("ended", "after all its iterations")
+    assert ended_row("no progress; its start was better and is kept")[1].endswith("progress; its start was better and is kept")
+    assert ended_row("no wave image")[1] == "no wave image"
+
+
+@pytest.mark.parametrize(
+    ("value", "noise", "words"),
+    [
+        (0.0123, 0.0004, "1.23% a mm, noise 0.04%"),
+        (-0.0123, None, "-1.23% a mm"),
+        (2e-6, 1e-7, "0.0002% a mm, noise 1e-05%"),
+        (2e-6, 1e-5, "no difference beyond the noise of 0.001% a mm"),
+        (0.0, None, "no difference"),
+    ],
+)
+def test_a_small_cost_is_not_rounded_to_nothing(value, noise, words):
+    assert cost_of_radius({"in_black_per_mm": value, "noise": noise}) == words
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_time_left_is_shown_on_every_terminal(width):
+    """Of the iterations, and of the evaluation after the last one."""
+    shown = io.StringIO()
+    reporter = Reporter()
+    reporter.console = Console(file=shown, force_terminal=True, width=width)
+    with reporter.progress(14) as show:
+        show("stage 1/1", "loss 0.1000  on screen 91.0%", 14, 14)
+    assert "14/14" in shown.getvalue() and "left" in shown.getvalue()
+    with reporter.waiting("evaluation with independent rays", 100.0):
+        pass
+    assert "evaluation with independent rays about 100 s left" in shown.getvalue()

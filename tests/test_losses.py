@@ -8,7 +8,8 @@ import torch
 from scipy.ndimage import gaussian_filter1d
 
 from caustic_cli.errors import CausticError, InputError
-from caustic_cli.inverse.losses import Loss, gaussian_matrix, parse
+from caustic_cli.inverse.loss_terms import parse
+from caustic_cli.inverse.losses import Loss, gaussian_matrix
 
 SHAPE = (9, 7)
 G = torch.Generator().manual_seed(2)

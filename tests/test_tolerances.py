@@ -19,14 +19,17 @@ from caustic_cli.inverse.losses import Loss
 from caustic_cli.inverse.objective import Evaluation
 from caustic_cli.inverse.robust import RobustObjective
 from caustic_cli.optics.emission import rays_of
+from caustic_cli.optics.emission.coherent import central_mode
 from caustic_cli.optics.form_error import FormErrors, refined
 from caustic_cli.optics.frames import Pose, rotate_to_global
-from caustic_cli.optics.misalignment import Misalignment, landing_points
+from caustic_cli.optics.misalignment import Misalignment, landing_points, reason_ignored
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT
 from caustic_cli.optics.trace import Tracer
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen
+from caustic_cli.scene.sources.distribution import Distribution
+from caustic_cli.scene.sources.several import Several
 from caustic_cli.scene.tolerances import KINDS, FormError, Waviness, hypercube
 from caustic_cli.studies import tolerances as study
 
@@ -168,6 +171,137 @@ def test_a_near_source_moves_against_the_lens():
         for e in (Misalignment(), nearer)
     ]
     assert power[1] / power[0] == pytest.approx((100.0 / 90.0) ** 2, rel=0.01)  # the lens catches more of the same light
+
+
+AT = (np.arange(100) + 0.5) / 10.0 - 5.0
+
+
+def beam(x: float = 0.0, y: float = 0.0) -> np.ndarray:
+    """A lopsided beam about (x, y) mm over the lens of `small`, on cells of 0.1 mm, and dark at its edges."""
+    u, v = AT[:, None] - x, AT[None, :] - y
+    return np.clip(1.0 - (u * u + 2.0 * v * v + 0.3 * u * v) / 12.0, 0.0, None)
+
+
+@pytest.mark.parametrize("aperture", ["rectangle", "circle"])
+def test_a_profile_moves_with_its_beam(aperture):
+    """A decentred beam, or a lens decentred the other way, is the beam that was drawn there; and no power is lost or gained."""
+    scene, field, heights = small(PlaneWave(profile=beam()))
+    scene = replace(scene, lens=replace(scene.lens, aperture=aperture))
+    there = replace(scene, source=PlaneWave(profile=beam(0.7, -0.4)))
+
+    def landed(s: Scene, e: Misalignment):
+        (found,) = landing_points(s, field, heights, rays_of(e.scene(s), "sobol", 20_000, 1), e)
+        return found
+
+    drawn, before = landed(there, Misalignment()), landed(scene, Misalignment())
+    within = AT[:, None] ** 2 + AT[None, :] ** 2 < (25.0 if aperture == "circle" else math.inf)
+    more = beam(0.7, -0.4)[within].sum() / beam()[within].sum()
+    for e in (Misalignment(source_shift=(0.7, -0.4)), Misalignment(lens_shift=(-0.7, 0.4), screen_shift=(-0.7, 0.4))):
+        found = landed(scene, e)
+        assert float((found.power / more - drawn.power).abs().max()) < 1e-3 * float(drawn.power.max())
+        assert float((found.x - drawn.x).abs().max()) < 1e-9
+    together = Misalignment(source_shift=(0.7, -0.4), lens_shift=(0.7, -0.4))
+    assert torch.equal(landed(scene, together).power, before.power)
+    assert float((before.power - drawn.power).abs().max()) > 0.3 * float(drawn.power.max())
+
+
+def test_the_decentre_of_a_beam_is_in_the_study():
+    """The sensitivity is the error of the drawn beam, in both directions; a uniform profile is as good as none."""
+    text = "draws = 10\n[source_shift]\nsigma = [0.5, 0]\n[lens_shift]\nsigma = [0.5, 0]"
+    scene, field, heights = small(PlaneWave(profile=beam()))
+    target = np.mean(study.Trials(scene, field, heights, np.ones((32, 32)), schema.parse(text, "t")).images({}), 0)[0]
+
+    def of(profile: np.ndarray | None) -> study.Trials:
+        lit = replace(scene, source=PlaneWave(profile=profile))
+        return study.Trials(lit, field, heights, target, schema.parse(text, "t"), rays=40_000)
+
+    found = {s.name: s for s in study.sensitivities(of(beam()))}
+    for sign, error in ((-1, found["source_shift x"].below), (1, found["source_shift x"].above)):
+        assert error == pytest.approx(of(beam(0.5 * sign)).evaluate({}).relative_rms, rel=0.01) and error > 0.1
+    values = {("source_shift", 0): 0.5}
+    still, moved = (of(np.full((3, 5), 2.0)).evaluate(v) for v in ({}, values))
+    assert moved.relative_rms == pytest.approx(still.relative_rms, rel=1e-9)
+    assert moved.on_screen == pytest.approx(still.on_screen, rel=1e-9)
+    assert list(study.study(of(None)).unused) == ["source_shift"]
+
+
+def test_a_robust_design_moves_the_beam():
+    """Opposite draws have the beam on opposite sides of the middle."""
+    scene, field, heights = small(PlaneWave(profile=beam()))
+    scenes: list[Scene] = []
+
+    class Flat:
+        loss = Loss("rms", torch.ones(32, 32, dtype=torch.float64))
+
+    def objective(s: Scene, _) -> Flat:
+        scenes.append(s)
+        return Flat()
+
+    RobustObjective(objective, scene, field, heights, schema.parse("[lens_shift]\nsigma = [0.5, 0]", "t"))
+    middles = []
+    for light in (s.source.profile for s in scenes):
+        x = (np.arange(len(light)) + 0.5) / len(light) * 10.0 - 5.0
+        middles.append(float(x @ light.sum(1) / light.sum()))
+    assert middles[0] == pytest.approx(0.0, abs=1e-9) and min(abs(m) for m in middles[1:]) > 0.05
+    assert middles[1] == pytest.approx(-middles[2], rel=0.05) and middles[3] == pytest.approx(-middles[4], rel=0.05)
+
+
+def test_a_wave_image_brightens_as_its_rays_do():
+    """The warped image of a decentred beam beside its own; both were the same as without the error while the beam stood still."""
+    scene, field, heights = small(PlaneWave(profile=np.exp(-(AT[:, None] ** 2 + AT[None, :] ** 2) / 8.0)))
+    errors = schema.parse("[source_shift]\nsigma = 0.5", "t")
+
+    def image(s: Scene, *_) -> np.ndarray:  # of rays: smooth, and quick
+        return np.mean(study.Trials(s, field, heights, np.ones((32, 32)), errors).images({}), 0)[0]
+
+    t = study.Trials(scene, field, heights, image(scene), errors, waves=image)
+    quick, own = t.by_waves({("source_shift", 0): 0.5}, None)
+    assert t.evaluate({}).relative_rms < 0.02 and own.relative_rms > 0.15
+    assert quick.relative_rms == pytest.approx(own.relative_rms, rel=0.1)
+
+
+@pytest.mark.parametrize("cone", [None, 7.0, 2.0], ids=["over the lens", "wide", "within the lens"])
+def test_a_tilted_lens_leaves_the_axis_of_a_source(cone):
+    """A narrow beam by its table, beside random rays of a source that stands in the room."""
+    angles = np.linspace(0.0, 8.0, 81)
+    table = Distribution(tuple(angles), tuple(np.exp(-((angles / 2.5) ** 2))))
+    scene, field, heights = small(Points(((0.0, 0.0, -50.0),), intensity=table, cone=cone))
+    scene = replace(scene, screen=replace(scene.screen, size=(60.0, 60.0)))
+    e = Misalignment(lens_tilt=(2.0, -1.0), source_shift=(0.3, -0.2), source_distance=2.0)
+    parts = landing_points(scene, field, heights, rays_of(e.scene(scene), "sobol", 100_000, 1), e)
+    edges = [np.linspace(-30.0, 30.0, 33)] * 2
+    found = sum(np.histogram2d(p.x.numpy(), p.y.numpy(), edges, weights=p.power.numpy())[0] for p in parts)
+
+    def intensity(angle: np.ndarray) -> np.ndarray:
+        values = np.interp(np.degrees(angle), table.angles, table.values, right=0.0)
+        return np.where(np.degrees(angle) <= (cone or 90.0), values, 0.0)
+
+    brute = misaligned.near_image(scene, field, heights, e, intensity, 400_000, np.random.default_rng(1))
+    brute /= table.flux(scene.source.cone_over(scene.lens.half_size, scene.lens.z_in))
+    assert found.sum() == pytest.approx(brute.sum(), rel=1e-3)
+    assert (
+        np.sqrt(np.mean((found - brute) ** 2)) < 0.1 * brute.mean()
+    )  # 3 to 4 % are the noise of the rays; 100 % with the lens' axis
+    modes = central_mode(e.scene(scene)).through(*torch.full((2, 1), 0.5, dtype=torch.float64))
+    straight = central_mode(replace(e, lens_tilt=(0.0, 0.0)).scene(scene)).through(*torch.full((2, 1), 0.5, dtype=torch.float64))
+    assert float(modes.power) > 0.9 * float(straight.power)
+
+
+def test_a_source_that_is_dark_on_its_axis_moves():
+    ring = Points(((0.0, 0.0, -100.0),), intensity=Distribution((0.0, 10.0), (0.0, 1.0)))
+    scene, field, heights = small(ring)
+    power = [
+        sum(float(p.power.sum()) for p in landing_points(scene, field, heights, rays_of(e.scene(scene), "sobol", 4000, 1), e))
+        for e in (Misalignment(), Misalignment(source_distance=10.0))
+    ]
+    assert power[1] / power[0] == pytest.approx((100.0 / 90.0) ** 3, rel=0.02)  # its intensity is proportional to the angle
+
+
+def test_the_size_of_one_of_several_sources_counts():
+    disc = Disc((0.0, 0.0, -100.0), (2.0, 2.0))
+    scene, _, _ = small(Several((disc, PlaneWave())))
+    assert not reason_ignored(scene, "source_size") and reason_ignored(replace(scene, source=PlaneWave()), "source_size")
+    assert Misalignment(source_size=0.1).scene(scene).source.members[0].size == pytest.approx((2.2, 2.2))
 
 
 def test_an_upright_scene_is_close():

@@ -13,8 +13,18 @@ import time
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
+from rich.text import Text
 
 from caustic_cli.config.table import TABLE
 from caustic_cli.errors import MARK, InputError, plain_name, shortened
@@ -23,8 +33,17 @@ from caustic_cli.errors import MARK, InputError, plain_name, shortened
 LINE_EVERY = 0.5
 #: Keys of the figures of a network's lens that are not values of its inputs.
 OF_LENS = ("relative_rms", "noise", "on_screen", "middle_relative_rms")
-#: Terminal width from which on a progress bar and clocks are shown.
+#: Terminal width from which on a progress bar and the time elapsed are shown.
 WIDE = 90
+
+
+class _TimeLeft(ProgressColumn):
+    """The rest of the expected time of a task, whose total is that time in s."""
+
+    def render(self, task: Task) -> Text:
+        """As of a column."""
+        left = (task.total or 0.0) - (task.elapsed or 0.0)
+        return Text(f"about {left:.0f} s left" if left >= 1.0 else "longer than expected" if left < -1.0 else "nearly done")
 
 
 class Reporter:
@@ -83,6 +102,14 @@ class Reporter:
             timer.cancel()
 
     @contextmanager
+    def waiting(self, what: str, seconds: float):
+        """On a terminal, a line with the time left of the `seconds` that the block is expected to take; nothing elsewhere."""
+        hidden = self.lines or not self.console.is_terminal or self.console.quiet
+        with Progress(TextColumn("{task.description}"), _TimeLeft(), console=self.console, transient=True, disable=hidden) as bar:
+            bar.add_task(what, total=seconds)
+            yield
+
+    @contextmanager
     def progress(self, total: int | None):
         """A progress bar on a terminal, nothing elsewhere; `total` may be set later.  JSON lines are printed every LINE_EVERY
         seconds."""
@@ -94,13 +121,23 @@ class Reporter:
                 now = time.monotonic()
                 if now - last >= LINE_EVERY or done == whole:
                     last = now
-                    self._line(event="progress", what=description, text=text, done=done, total=whole, seconds=round(now - began, 3))
+                    left = round((now - began) * (whole - done) / done, 3) if done and whole else None
+                    self._line(
+                        event="progress",
+                        what=description,
+                        text=text,
+                        done=done,
+                        total=whole,
+                        seconds=round(now - began, 3),
+                        seconds_left=left,
+                    )
 
             yield tell
             return
         numbers = [TextColumn("{task.description}"), MofNCompleteColumn(), TextColumn("{task.fields[text]}")]
-        clocks = [TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn()]
-        columns = [numbers[0], BarColumn(), *numbers[1:], *clocks] if self.console.width >= WIDE else numbers
+        left = [TextColumn("left"), TimeRemainingColumn()]
+        wide = self.console.width >= WIDE
+        columns = [numbers[0], BarColumn(), *numbers[1:], TimeElapsedColumn(), *left] if wide else [*numbers, *left]
         bar = Progress(
             *columns,
             console=self.console,
@@ -112,6 +149,20 @@ class Reporter:
             yield lambda description="", text="", done=None, whole=None: bar.update(
                 task, description=description, text=text, completed=done, total=whole
             )
+
+
+#: What is on disk if the command is interrupted now.
+_kept = [""]
+
+
+def set_kept(text: str) -> None:
+    """Set the clause on what is on disk that the message of an interruption adds."""
+    _kept[0] = text
+
+
+def kept() -> str:
+    """What is on disk if the command is interrupted now; "" if nothing is known."""
+    return named(_kept[0])
 
 
 #: Names of the options with which settings were given in this run, by path.
@@ -160,6 +211,20 @@ def error(message: str) -> None:
     sys.stderr.write(f"caustic: {shortened(line)}\n")
 
 
+#: Why a design ended, in words, by the first clause of `reason`.
+ENDED = {
+    "iterations": "after all its iterations",
+    "no progress": "since no iteration made progress",
+    "time limit": "at the time limit",
+}
+
+
+def ended_row(reason: str) -> tuple[str, str]:
+    """The row of a table that says why a design ended."""
+    first, *more = reason.split("; ", 1)
+    return "ended", "; ".join([ENDED.get(first, first), *more])
+
+
 def _wavelengths(values: list[float]) -> str:
     """Wavelengths as a clause."""
     if len(values) == 1:
@@ -199,12 +264,11 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
         black = [("light in black", number("in_black", ".2%") + ("" if known is None else f", noise {known:.2%}"))]
     radius = figures.get("min_radius")
     if radius is not None and radius["in_black_per_mm"] is not None:
+        from caustic_cli.studies.radius import cost_of_radius  # noqa: PLC0415
+
         with_it, without = radius["start_in_black"], radius["start_in_black_without"]
-        known = "" if radius["noise"] is None else f", noise {radius['noise']:.2%}"
-        each = f"{radius['in_black_per_mm']:.2%} a mm{known}"
-        black += [
-            (f"a radius of {radius['radius_mm']:g} mm", f"first surface {with_it:.2%} in black, {without:.2%} without: {each}")
-        ]
+        seen = f"first surface {with_it:.2%} in black, {without:.2%} without: {cost_of_radius(radius)}"
+        black += [(f"a radius of {radius['radius_mm']:g} mm", seen)]
     error, waves = [("relative RMS error", number("relative_rms", ".4f") + of_rays)], []
     if "no_wave_image" in figures:
         waves = [("wave image", f"none: {figures['no_wave_image']}")]

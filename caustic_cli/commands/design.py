@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,7 +10,7 @@ import typer
 
 from caustic_cli.commands import console, options
 from caustic_cli.config import checks
-from caustic_cli.config.table import TABLE
+from caustic_cli.config.table import TABLE, default
 from caustic_cli.errors import InputError
 
 EXAMPLES = """Examples:
@@ -90,6 +91,8 @@ def run(
         refuse_unwritable(movie, force)
     if not resume and speaks:
         from caustic_cli.config.presets import path_of  # noqa: PLC0415
+        from caustic_cli.config.settings import refuse_unused  # noqa: PLC0415
+        from caustic_cli.config.values import refuse_bad_file, refuse_bad_options  # noqa: PLC0415
         from caustic_cli.io.files import read_stdin  # noqa: PLC0415
         from caustic_cli.io.picture import ACCEPTED, MAX_BYTES, read_picture  # noqa: PLC0415
 
@@ -98,23 +101,30 @@ def run(
         # checked before torch is loaded and kernels are compiled
         if preset is not None:
             path_of(preset)
+        if config is not None:
+            refuse_bad_file(config, parameters=True)
+        refuse_bad_options(given)
+        if config is None and preset is None:
+            refuse_unused({"type": given.get("source.type", default("source.type"))}, given)
         picture = read_stdin(ACCEPTED, MAX_BYTES) if piped else target
         if config is None:  # a configuration may set its encoding
             read_picture(picture, "target.encoding" in given, given.get("target.color", False), given.get("invert", False))
+    project = target if target.is_dir() else path
+    if resume and speaks:
+        if not target.exists() and not project.exists():
+            raise InputError(f"{target}: no such project; --resume needs a directory made by caustic design")
+        options.require_project(project)
     device = options.start_torch(device, threads, say)
 
     from caustic_cli.inverse import ranks  # noqa: PLC0415
     from caustic_cli.workflow import library  # noqa: PLC0415
     from caustic_cli.workflow.design import follow  # noqa: PLC0415
 
-    with ranks.process_group(device) as rank:
+    with _saying_what_is_kept(path if not resume else project), ranks.process_group(device) as rank:
         if rank > 0:
             follow(device)
             return
         if resume:
-            project = target if target.is_dir() else path
-            if not target.exists() and not project.exists():
-                raise InputError(f"{target}: no such project; --resume needs a directory made by caustic design")
             lens = library.resume(
                 project, iterations=iterations, time_limit=time_limit, movie=movie, force=force, say=say, device=device
             )
@@ -122,9 +132,26 @@ def run(
             lens = library.design_of(
                 picture, given, preset=preset, config=config, out=path, force=force, movie=movie, say=say, device=device
             )
-    say.table(lens.figures["project"], [*console.figures_rows(lens.figures), ("ended by", lens.figures["reason"])])
+    say.table(lens.figures["project"], [*console.figures_rows(lens.figures), console.ended_row(lens.figures["reason"])])
     if json:
         console.emit_json(lens.figures)
+
+
+@contextmanager
+def _saying_what_is_kept(project: Path):
+    """Add to the message of an interruption before the first checkpoint what is on disk.  Later ones are answered by the design
+    itself, or leave a checkpoint."""
+    try:
+        yield
+    except BaseException:  # a signal may surface as another exception, see `cli`
+        if not (project / "checkpoints.h5").exists():
+            begun = (project / "project.toml").exists()
+            console.set_kept(
+                f"{project} holds the settings and the picture, and caustic design --resume {project} begins its iterations"
+                if begun
+                else f"before the first checkpoint: nothing was written to {project}"
+            )
+        raise
 
 
 def _beside_resume(given: dict[str, Any], preset: str | None, config: Path | None) -> list[str]:

@@ -123,6 +123,8 @@ def run(
     count = tuple(options.both(options.counts("--samples", samples))) if samples else None
     given_of = {"mould": mould or None, "block": block, "samples": count, "tolerance": tolerance, "milling": milling or None}
 
+    options.require_project(project, archives=True)  # before torch is loaded
+
     from caustic_cli.workflow.export import accuracy_words, export, exporter_of  # noqa: PLC0415
 
     exporter, opened = exporter_of(project, at, say, most)

@@ -416,12 +416,18 @@ def rays(option: str, text: str) -> int:
 
 
 def require_project(path: Path, archives: bool = False) -> None:
-    """Check that a path is a project, or an archive if accepted, before anything is loaded or compiled.
+    """Check that a path is a project whose settings are valid one by one, or an archive if accepted, before torch is loaded and
+    kernels are compiled.
 
     Raises:
         InputError: it is neither.
     """
-    if (path / "project.toml").is_file() or (archives and path.suffix.lower() == ".npz" and path.is_file()):
+    if (path / "project.toml").is_file():
+        from caustic_cli.config.values import refuse_bad_file  # noqa: PLC0415
+
+        refuse_bad_file(path / "project.toml")
+        return
+    if archives and path.suffix.lower() == ".npz" and path.is_file():
         return
     beside = path.parent / f"{path.name}.caustic"
     if path.name and (beside / "project.toml").is_file():

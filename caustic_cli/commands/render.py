@@ -167,6 +167,13 @@ def run(
     if screen_at is not None:
         console.set_option_names(console.option_names() | {"screen.z": "--screen-at"})
     options.require_project(project, archives=True)
+
+    from caustic_cli.config import tolerances as schema  # noqa: PLC0415
+    from caustic_cli.config.values import refuse_bad_options  # noqa: PLC0415
+
+    refuse_bad_options(given)
+    if tolerances is not None:
+        schema.read(tolerances)
     device = options.start_torch(device, threads, say)
 
     from caustic_cli.workflow.render import Request, render  # noqa: PLC0415

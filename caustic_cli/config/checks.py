@@ -47,7 +47,7 @@ def pair(where: str, value, check) -> tuple:
 def choice(where: str, value, names: Sequence[str]) -> str:
     """`value` if it is one of `names`."""
     if value not in names:
-        raise InputError(f"{where} must be one of {', '.join(names)}, got {value!r}")
+        raise InputError(f"{where} must be one of {', '.join(filter(None, names))}, got {value!r}")
     return value
 
 

@@ -25,7 +25,7 @@ from caustic_cli.inverse.initial_surface import departure_bound, sphere_net
 from caustic_cli.inverse.internal_rays import entrance_points
 from caustic_cli.inverse.lbfgs import UNFIT
 from caustic_cli.inverse.lenslets import ArrayObjective, lenslets
-from caustic_cli.inverse.losses import parse
+from caustic_cli.inverse.loss_terms import parse
 from caustic_cli.inverse.objective import Objective
 from caustic_cli.inverse.optimisers import Adam, QuasiNewton
 from caustic_cli.inverse.parametrisation import Architecture, FreeHeights, Heights, SidesTogether, parametrise

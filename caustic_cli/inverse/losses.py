@@ -22,10 +22,8 @@ import math
 import torch
 from torch import Tensor
 
-from caustic_cli.errors import CausticError, InputError
-
-LOSSES = ("rms", "rms-light", "throughput", "light", "diffusion", "uniformity")
-PENALTIES = ("laplacian", "curvature")
+from caustic_cli.errors import CausticError
+from caustic_cli.inverse.loss_terms import LOSSES, parse
 
 
 class NoLight(CausticError):
@@ -41,30 +39,6 @@ def gaussian_matrix(n: int, sigma: float) -> Tensor:
     kernel = torch.exp(-0.5 * (d / sigma) ** 2) * (d.abs() <= reach)
     k = torch.arange(-reach, reach + 1, dtype=torch.float64)
     return kernel / torch.exp(-0.5 * (k / sigma) ** 2).sum()
-
-
-def parse(text: str) -> list[tuple[float, str]]:
-    """ "rms-light + 0.1 laplacian" -> [(1.0, "rms-light"), (0.1, "laplacian")].
-
-    Raises:
-        InputError: an unknown name, a weight that is not a number of at least 0, or nothing that looks at the image.
-    """
-    terms = []
-    for part in text.split("+"):
-        weight, _, name = part.strip().rpartition(" ")
-        try:
-            value = float(weight.replace("*", "").strip() or 1.0)
-        except ValueError:
-            value = math.nan
-        if not (0.0 <= value < math.inf) or name not in LOSSES + PENALTIES:
-            raise InputError(
-                f"⟨design.loss⟩ must be names with weights such as 'rms-light + 0.1 laplacian', of"
-                f" {', '.join(LOSSES + PENALTIES)}; got {part.strip()!r}"
-            )
-        terms.append((value, name))
-    if not any(weight > 0 and name in LOSSES for weight, name in terms):
-        raise InputError(f"⟨design.loss⟩ must have one of {', '.join(LOSSES)} with a weight above 0, got {text!r}")
-    return terms
 
 
 class Loss:

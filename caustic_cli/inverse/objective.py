@@ -17,7 +17,8 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from caustic_cli.inverse import ranks
-from caustic_cli.inverse.losses import PENALTIES, ColorLoss, Loss, parse
+from caustic_cli.inverse.loss_terms import PENALTIES, parse
+from caustic_cli.inverse.losses import ColorLoss, Loss
 from caustic_cli.inverse.penalties import Penalty
 from caustic_cli.optics.emission import Rays
 from caustic_cli.optics.memory import smaller_chunk

@@ -5,8 +5,10 @@ axes as rows of R, its decentre d and the centre c of its entrance.  Rays are sa
 one seed have the same points there for all errors (common random numbers), so the difference of two images is due to the errors
 alone.
 
-Light from infinity arrives in the direction given by its own and the lens' tilt, over the whole aperture, with its profile fixed to
-the aperture.  The emission axis of a near source stays parallel to that of the lens, and its radiant intensity is kept.
+Light from infinity arrives in the direction given by its own and the lens' tilt, over the whole aperture.  A profile of its
+irradiance belongs to the beam: it moves over the aperture by the decentre of the source less that of the lens (to first order in
+the tilts, which foreshorten it by their cosine), and the power through the aperture changes accordingly.  Likewise the axis of a
+near source's emission keeps its direction where the lens is tilted, and its radiant intensity is kept.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -23,9 +25,11 @@ from torch import Tensor
 from caustic_cli.errors import InputError
 from caustic_cli.optics.effects import NO_REQUESTS, Requests
 from caustic_cli.optics.emission import Rays, of_member
-from caustic_cli.optics.emission.base import intensity_of
+from caustic_cli.optics.emission.base import relative_flux
+from caustic_cli.optics.emission.parallel import mean_irradiance
 from caustic_cli.optics.frames import Pose, rotate_to_global, rotate_to_local
 from caustic_cli.optics.rays import RayState
+from caustic_cli.optics.resampling import displaced
 from caustic_cli.optics.screen_shape import shape_of
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import EXIT, System
@@ -101,13 +105,19 @@ class Misalignment:
         scale = 1.0 + self.source_size
         if isinstance(source, Several):
             return replace(source, members=tuple(self._source(scene, one) for one in source.members))
+        if source.profile is not None:
+            aside = [s - d for s, d in zip(self.source_shift, self.lens_shift, strict=True)]
+            if not any(aside):
+                return source
+            across, along = (d / (2.0 * r) for d, r in zip(aside, scene.pupil.half_size, strict=True))
+            return replace(cast(Any, source), profile=displaced(source.profile, (across, along)))
         if isinstance(source, Measured):
             turn = np.array(self.lens_pose(scene).axes)
             rays = source.rays
             if any(self.lens_tilt):
                 rays = replace(rays, positions=rays.positions @ turn.T, directions=rays.directions @ turn.T)
             return replace(source, rays=rays, position=moved(source.position))
-        return source.displaced(moved, scale)
+        return source.displaced(moved, scale, rotate_to_local(self.lens_pose(scene), source.axis))
 
     def upright(self, scene: Scene) -> Scene:
         """An approximately equivalent scene with the lens in its nominal position, without the thickness error.
@@ -126,18 +136,19 @@ class Misalignment:
         return replace(changed, screen=replace(scene.screen, z=z, shift=(x, y)))
 
     def brightness(self, scene: Scene, changed: Scene) -> float:
-        """Factor of the power that keeps the radiant intensity of a near source whose cone is the narrowest that covers the lens,
-        since that cone changes with the source's position."""
+        """Factor of the power, of a scene with a single source, that keeps the irradiance of a beam with a profile, of which
+        another part passes the aperture; or the radiant intensity of a near source whose cone is the narrowest that covers the
+        lens, since that cone changes with the source's position."""
         before = scene.source
-        if before.distant or before.cone is not None or before.rays is not None or len(before.members) > 1:
+        if before.profile is not None and changed.source.profile is not None:
+            after, whole = (mean_irradiance(one, scene.pupil.round) for one in (changed.source.profile, before.profile))
+            return after / whole
+        if before.distant or before.cone is not None or before.rays is not None:
             return 1.0
-        axial = [
-            intensity_of(
-                s.source, s.source.cone_over(s.lens.half_size, s.lens.z_in, s.lens.round), torch.ones(1, dtype=torch.float64)
-            )
-            for s in (scene, changed)
-        ]
-        return float(axial[0]) / float(axial[1])
+        after, whole = (
+            relative_flux(s.source, s.source.cone_over(s.lens.half_size, s.lens.z_in, s.lens.round)) for s in (changed, scene)
+        )
+        return after / whole
 
     def directed(self, scene: Scene, source: Source, state: RayState) -> RayState:
         """Rays of light from infinity rotated by the tilts of source and lens; other rays unchanged."""
@@ -175,7 +186,6 @@ def landing_points(
         requests: of the plan of the nominal scene.
     """
     changed = errors.scene(scene)
-    scale = errors.brightness(scene, changed)
     (point, axes), shape = errors.screen(scene), shape_of(scene.screen)
     parameters = {EXIT: heights + errors.thickness}
     with torch.no_grad():
@@ -183,6 +193,7 @@ def landing_points(
             if errors.index and band.scene.lens.index == plain.scene.lens.index:  # a glass, by its formula
                 lens = replace(band.scene.lens, index=plain.scene.lens.index + errors.index)
                 band = replace(band, scene=replace(band.scene, lens=lens))
+            scale = band.weight * errors.brightness(plain.scene, band.scene)
             system = System.of(band.scene, field)
             for state in of_member(rays, band.member).chunks(CHUNK):
                 if not isinstance(state, RayState):
@@ -194,18 +205,20 @@ def landing_points(
                 for out in tracer(parameters):
                     middle = (point[0], point[1], point[2] - out.datum)
                     x, y, there = land(out.origin, out.direction, middle, axes, forward)
-                    power = torch.where(there, out.power, torch.zeros_like(out.power)) * (band.weight * scale)
+                    power = torch.where(there, out.power, torch.zeros_like(out.power)) * scale
                     yield LandingPoints(x.double(), y.double(), power.double(), band.channel)
 
 
 def reason_ignored(scene: Scene, error: str) -> str:
     """Why an error has no effect in a scene; "" if it has one."""
     source = scene.source
-    if error in ("source_shift", "source_distance") and source.distant:
+    if error == "source_shift" and source.distant and all(one.profile is None for one in source.members):
+        return "a source at infinity without a profile has no position; source_tilt is its direction"
+    if error == "source_distance" and source.distant:
         return "a source at infinity has no position; source_tilt is its direction"
     if error == "source_tilt" and not source.distant:
         return "the source is at a finite distance; source_shift moves it"
-    if error == "source_size" and not source.sized:
+    if error == "source_size" and not any(one.sized for one in source.members):
         return f"{source.label} has no size"
     if error == "index" and scene.lens.mirror:
         return "a mirror has no index"

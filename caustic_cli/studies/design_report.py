@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from textwrap import fill
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import FuncNorm, Normalize
 from matplotlib.image import AxesImage
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FuncFormatter, MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 
 from caustic_cli.io.files import atomic_file
 from caustic_cli.io.picture import SOFTWARE, to_linear, to_srgb
 from caustic_cli.scene import Lens, Screen
+from caustic_cli.studies.radius import cost_of_radius
 from caustic_cli.studies.report import COLOURS, plain_ticks
 
 #: Upper end of an irradiance scale below which ticks cannot be placed, as for a black image.
@@ -22,12 +25,23 @@ DARK = 1e-250
 NEARLY = 0.995
 #: Most points along an axis of the relief; fraction of the light below which a loss is not listed.
 RELIEF, LITTLE = 130, 5e-5
-#: Position of a colour bar relative to its panel: left, bottom, width, height.
-BAR = (1.03, 0.0, 0.046, 1.0)
+#: Width of a colour bar and its distance from the right or, below the labels of the x axis, from the lower edge of its panel, inch.
+BAR, BESIDE, BELOW = 0.16, 0.1, 0.56
+#: Ratio of width and height from which the colour bar of a panel lies below it.
+WIDE = 1.3
+#: Largest number of ticks; width of a character of a label, its height, and the space between two labels, inch.
+MOST_TICKS, CHARACTER, HEIGHT, GAP = 9, 0.085, 0.14, 0.12
+#: Ticks of a scale of encoded irradiance.
+TICKS = 6
+#: Distance of a title from its panel, points: clear of the tick label at the upper end of the y axis.
+PAD = 9
+#: Characters of a line of a title.
+LINE = 50
 #: Positions of the panels.  An automatic layout took as long as drawing.
 PLACES = {"left": 0.035, "right": 0.95, "bottom": 0.065, "top": 0.925, "wspace": 0.62, "hspace": 0.42}
-#: Height of the panel of blurred losses relative to that of the error.
-BLURRED = 0.6
+#: Height of a panel of losses relative to that of the error, if that is another panel, and the space between panels relative to
+#: their mean height.
+LESS, BETWEEN = 0.5, 0.6
 
 
 def write_report(
@@ -46,8 +60,8 @@ def write_report(
     """Write the panels.
 
     Args:
-        target, image: (n_x, n_y) irradiance; drawn at the same exposure and in the encoding of the picture, images with a colour
-            bar of absolute irradiance.
+        target, image: (n_x, n_y) irradiance; images are drawn in the encoding of the picture over their whole range, the target and
+            the image that the lens is judged by at the same exposure, with colour bars of absolute irradiance.
         heights: (a, b) surface heights on a regular grid over the aperture, mm; the best-fit paraboloid is subtracted, because it
             hides the relief; for a gradient index the index is drawn instead.
         history: (k, 5) rows iteration, stage, loss, on_screen, seconds.
@@ -58,50 +72,48 @@ def write_report(
 
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt  # noqa: PLC0415
-    from matplotlib.colors import FuncNorm, Normalize  # noqa: PLC0415
 
     figure = plt.figure(figsize=(22.0, 9.8))
     axes = figure.subplots(2, 4, gridspec_kw=PLACES)
     extent = [-screen.half_size[0], screen.half_size[0], -screen.half_size[1], screen.half_size[1]]
-    scale = target.sum() / target.max()
 
     def titled(name: str, relative: float | None) -> str:
         return name if relative is None else f"{name}\nrelative RMS error {relative:.3f}"
+
+    def absolute(picture: np.ndarray, prefix: str = "") -> np.ndarray:
+        return picture * (figures[f"{prefix}peak_irradiance"] / (picture.max() or 1.0))
 
     if waves is None:
         title = titled("caustic", figures["relative_rms"])
         if "least_relative_rms" in figures:
             title += f", {figures['least_relative_rms']:.3f} possible"
-        shown = [(target, "target"), (image, title)]
+        judged = absolute(image)
+        shown = [(judged, title, "")]
     else:
+        judged = absolute(waves, "wave_")
         shown = [
-            (target, "target"),
-            (image, titled("ray image", figures["relative_rms"])),
-            (waves, titled("wave image", figures["wave_relative_rms"])),
+            (absolute(image), titled("ray image", figures["relative_rms"]), ""),
+            (judged, titled("wave image", figures["wave_relative_rms"]), "wave_"),
         ]
         image = waves
-    for axis, (picture, title) in zip(axes[0], shown, strict=False):
-        part = picture / max(picture.sum(), 1e-300)
-        peak, brightest = figures["wave_peak_irradiance" if picture is waves else "peak_irradiance"], picture
-        if picture is target:
-            brightest = shown[1][0]
-        white = peak / (brightest.max() or 1.0) * brightest.sum() / scale
-        white = white if white > DARK else 1.0
+    goal = target * (judged.sum() / target.sum())
+    white = max(float(goal.max()), float(judged.max()))  # of both
+    for axis, (picture, title, prefix) in zip(axes[0], [(goal, "target", None), *shown], strict=False):
+        top = white if picture is goal or picture is judged else float(picture.max())
+        top = top if top > DARK else 1.0
         norm = (
-            FuncNorm((lambda e, w=white: to_srgb(e / w), lambda v, w=white: w * to_linear(v)), 0.0, white, clip=True)
+            FuncNorm((lambda e, w=top: to_srgb(e / w), lambda v, w=top: w * to_linear(v)), 0.0, top, clip=True)
             if encoding == "srgb"
-            else Normalize(0.0, white, clip=True)
+            else Normalize(0.0, top, clip=True)
         )
-        drawn = axis.imshow((part * scale * white).T, origin="lower", extent=extent, cmap="gray", norm=norm)
-        if picture is not target:
-            _bar(drawn, axis, _irradiance_words(figures, "wave_" if picture is waves else ""))
-        axis.set(title=title, xlabel="x on the screen (mm)", ylabel="y (mm)")
+        drawn = _draw_image(axis, picture, extent, title, cmap="gray", norm=norm)
+        if prefix is not None:
+            _bar(drawn, axis, _irradiance_words(figures, prefix))
     error = (image / max(image.sum(), 1e-300) - target / target.sum()) * target.size
     most = _scale_of(error, (image > 0) | (target > 0))
-    axis = axes[0, len(shown)]
-    drawn = axis.imshow(error.T, origin="lower", extent=extent, cmap="coolwarm", vmin=-most, vmax=most)
+    axis = axes[0, len(shown) + 1]
+    drawn = _draw_image(axis, error, extent, "error: too dark (blue), too bright (red)", cmap="coolwarm", vmin=-most, vmax=most)
     _bar(drawn, axis, "of the mean irradiance", extend="both")
-    axis.set(title="error: too dark (blue), too bright (red)", xlabel="x on the screen (mm)", ylabel="y (mm)")
     if waves is None:
         _draw_section(axes[0, 3], target, image, screen)
     rx, ry = lens.half_size
@@ -111,9 +123,8 @@ def write_report(
         if volume is None
         else (volume.mean(-1), "index", "index, mean along z")
     )
-    drawn = axes[1, 0].imshow(relief.T, origin="lower", extent=[-rx, rx, -ry, ry], cmap="viridis")
+    drawn = _draw_image(axes[1, 0], relief, [-rx, rx, -ry, ry], name, "x on the lens (mm)", cmap="viridis")
     _bar(drawn, axes[1, 0], unit)
-    axes[1, 0].set(title=name, xlabel="x on the lens (mm)", ylabel="y (mm)")
     place = axes[1, 1].get_subplotspec()
     axes[1, 1].remove()
     solid = figure.add_subplot(place, projection="3d")
@@ -125,9 +136,61 @@ def write_report(
     plt.close(figure)
 
 
+def _draw_image(
+    axis: Axes, picture: np.ndarray, extent: Sequence[float], title: str, xlabel: str = "x on the screen (mm)", **style
+) -> AxesImage:
+    """An image with its axes in mm, with as many ticks as fit."""
+    drawn = axis.imshow(picture.T, origin="lower", extent=tuple(extent), **style)
+    axis.set(xlabel=xlabel, ylabel="y (mm)")
+    axis.set_title(title, pad=PAD)
+    width, height = _size(axis)
+    axis.xaxis.set_major_locator(_ticks(extent[0], extent[1], width, True))
+    axis.yaxis.set_major_locator(_ticks(extent[2], extent[3], height, False))
+    return drawn
+
+
+def _ticks(low: float, high: float, length: float, across: bool) -> MaxNLocator:
+    """As many ticks as have room for their labels, side by side (`across`) or one above the other, on an axis of this length,
+    inch."""
+    for most in range(MOST_TICKS, 0, -1):
+        found = MaxNLocator(most, steps=[1, 2, 2.5, 5, 10], min_n_ticks=1)
+        values = found.tick_values(low, high)
+        label = max(len(f"{value:.6g}") for value in values) * CHARACTER if across else HEIGHT
+        if len(values) < 2 or (values[1] - values[0]) * length >= (label + GAP) * (high - low):
+            break
+    return found
+
+
+def _size(axis: Axes) -> tuple[float, float]:
+    """Width and height, inch, of an image with square pixels in its panel."""
+    place, (width, height) = axis.get_position(), axis.get_figure().get_size_inches()
+    (left, right), (bottom, top) = axis.get_xlim(), axis.get_ylim()
+    inch = min(place.width * width / (right - left), place.height * height / (top - bottom))
+    return inch * (right - left), inch * (top - bottom)
+
+
 def _bar(drawn: AxesImage, axis: Axes, label: str, extend: str = "neither") -> None:
-    """Add a colour bar as high as the panel."""
-    axis.get_figure().colorbar(drawn, cax=axis.inset_axes(BAR), label=label, extend=extend)
+    """Add a colour bar along the longer side of an image."""
+    width, height = _size(axis)
+    wide = width > WIDE * height
+    place = (0.0, -(BELOW + BAR) / height, 1.0, BAR / height) if wide else (1.0 + BESIDE / width, 0.0, BAR / width, 1.0)
+    bar = axis.get_figure().colorbar(
+        drawn,
+        cax=axis.inset_axes(place),
+        orientation="horizontal" if wide else "vertical",
+        label=label.replace("\n", ", ") if wide else label,
+        extend=extend,
+        ticks=_even_ticks(drawn.norm)
+        if isinstance(drawn.norm, FuncNorm)
+        else _ticks(*drawn.get_clim(), width if wide else height, wide),
+        format=FuncFormatter(lambda value, _: f"{value:.6g}".replace("-", "\N{MINUS SIGN}")),
+    )
+    bar.minorticks_off()
+
+
+def _even_ticks(norm: FuncNorm) -> list[float]:
+    """Values of two digits at nearly even distances on a scale from 0."""
+    return [float(f"{value:.1e}") for value in norm.inverse(np.linspace(0.0, 0.97, TICKS))]
 
 
 def _scale_of(error: np.ndarray, seen: np.ndarray) -> float:
@@ -144,7 +207,8 @@ def _draw_section(axis: Axes, target: np.ndarray, image: np.ndarray, screen: Scr
     y = ((row + 0.5) * (2.0 / target.shape[1]) - 1.0) * half[1]
     axis.step(x, image[:, row] / max(image.mean(), 1e-300), where="mid", color=COLOURS[1], lw=1.0, label="caustic")
     axis.step(x, target[:, row] / target.mean(), where="mid", color="black", lw=1.2, label="target")
-    axis.set(title=f"along y = {y:.3g} mm", xlabel="x on the screen (mm)", ylabel="of the mean irradiance")
+    axis.set(xlabel="x on the screen (mm)", ylabel="of the mean irradiance")
+    axis.set_title(f"along y = {y:.3g} mm", pad=PAD)
     axis.set_ylim(0.0, 1.25 * axis.get_ylim()[1])  # room for the legend above all data
     axis.legend(loc="upper right", ncols=2, frameon=False)
 
@@ -155,37 +219,41 @@ def _draw_relief(axis: Axes3D, relief: np.ndarray, half: tuple[float, float], un
     z = relief[::every, ::every]
     x, y = (np.linspace(-h, h, n) for h, n in zip(half, z.shape, strict=True))
     axis.plot_surface(*np.meshgrid(x, y, indexing="ij"), z, cmap="viridis", rcount=len(x), ccount=len(y), lw=0, antialiased=False)
-    axis.set_box_aspect((half[0] / max(half), half[1] / max(half), 0.35), zoom=1.15)
-    axis.set(xlabel="x (mm)", ylabel="y (mm)", zlabel=unit, title="the same in relief")
-    axis.zaxis.set_major_locator(MaxNLocator(3))
+    across, along = (h / max(half) for h in half)
+    axis.set_box_aspect((across, along, 0.35), zoom=1.15 * min(across, along) ** 0.1)
+    axis.set(zlabel=unit, title="the same in relief")
+    axis.set_xlabel("x (mm)", labelpad=9 * across)  # a long axis is seen end on: its label must clear those of its ticks
+    axis.set_ylabel("y (mm)", labelpad=34 - 25 * across)
+    for direction, length in ((axis.xaxis, across), (axis.yaxis, along), (axis.zaxis, 0.5)):
+        direction.set_major_locator(MaxNLocator(max(1, round(6 * length)), min_n_ticks=1))
     axis.view_init(elev=38, azim=-65)
 
 
 def _draw_losses(axis: Axes, history: np.ndarray, pixels: int, figures: dict, stages: Sequence[tuple[float, bool]]) -> None:
-    """Loss of each stage against time, and the retraced errors of the initial and the final lens.
+    """Loss of each stage against time, and the errors of the initial and the final lens by the image that the lens is judged by.
 
-    Stages with a blur have a panel of their own below: their losses decrease with the width of the blur and cannot be compared with
-    each other.
+    Losses by rays and by waves, and with a blur and without, have panels of their own: they cannot be compared with each other.
     """
     found = [int(k) for k in np.unique(history[:, 1])]
     how = {k: stages[k] if k < len(stages) else (0.0, False) for k in found}
-    mixed = len({waves for _, waves in how.values()}) > 1  # two different losses
-    last, least = (history[-1, 4], history[-1, 2] * pixels) if len(history) else (0.0, 0.0)
-    below = None
-    if any(blur > 0 for blur, _ in how.values()):
-        grid = axis.get_subplotspec().subgridspec(2, 1, height_ratios=(1.0, BLURRED))
-        axis.set_subplotspec(grid[0])
-        below = axis.get_figure().add_subplot(grid[1], sharex=axis)
-        below.set_title("loss of each stage, with blur", fontsize="medium")
+    by_waves = figures.get("wave_relative_rms") is not None
+    kinds = list(dict.fromkeys((waves, blur > 0) for blur, waves in how.values()))  # in the order of the stages
+    if (by_waves, False) not in kinds:
+        kinds.append((by_waves, False))
+    grid = axis.get_subplotspec().subgridspec(
+        len(kinds), 1, height_ratios=[1.0 if kind == (by_waves, False) else LESS for kind in kinds], hspace=BETWEEN
+    )
+    axis.set_subplotspec(grid[0])
+    panels = {kinds[0]: axis}
+    panels |= {kind: axis.get_figure().add_subplot(grid[k], sharex=axis) for k, kind in enumerate(kinds) if k > 0}
+    last = history[-1, 4] if len(history) else 0.0
     for k, (blur, waves) in how.items():
-        rows, colour = history[history[:, 1] == k], COLOURS[k % len(COLOURS)]
-        own = axis if blur == 0 or below is None else below
+        rows, colour, own = history[history[:, 1] == k], COLOURS[k % len(COLOURS)], panels[waves, blur > 0]
         own.semilogy(rows[:, 4], rows[:, 2] * pixels, color=colour, marker="." if len(rows) == 1 else None, lw=1.6)
-        kind = ", waves" if waves else ", rays" if mixed else ""
-        at, up = (rows[0], 4) if own is axis or k % 2 == 0 else (rows[-1], -11)  # above one line and below the next: many are short
+        at, up = (rows[0], 4) if blur == 0 or k % 2 == 0 else (rows[-1], -11)  # above one line and below the next: many are short
         late = at[4] > 0.7 * last
         own.annotate(
-            f"{blur:.2g} px" if blur > 0 else f"stage {k + 1}{kind}",
+            f"{blur:.2g} px" if blur > 0 else f"stage {k + 1}",
             (at[4], at[2] * pixels),
             xytext=(-3 if late else 3, up),
             textcoords="offset points",
@@ -193,13 +261,14 @@ def _draw_losses(axis: Axes, history: np.ndarray, pixels: int, figures: dict, st
             color=colour,
             fontsize="small",
         )
-    likeness = "wave_relative_rms" if figures.get("wave_relative_rms") is not None else "relative_rms"
+    likeness, judge = ("wave_relative_rms", panels[True, False]) if by_waves else ("relative_rms", panels[False, False])
+    least = min((float(line.get_ydata()[-1]) for line in judge.get_lines()), default=0.0)
     for key, at, words in ((f"start_{likeness}", 0.0, "start"), (likeness, last, "finished")):
         if figures.get(key):
-            axis.semilogy([at], [figures[key]], "o", color="black", ms=5, mfc="none" if at == 0.0 else "black")
+            judge.semilogy([at], [figures[key]], "o", color="black", ms=5, mfc="none" if at == 0.0 else "black")
             away = 10 if least < figures[key] else -10
             side = {"xytext": (6, 0), "ha": "left"} if at == 0.0 else {"xytext": (0, away), "ha": "right"}
-            axis.annotate(
+            judge.annotate(
                 f"{words} {figures[key]:.3f}",
                 (at, figures[key]),
                 textcoords="offset points",
@@ -208,15 +277,24 @@ def _draw_losses(axis: Axes, history: np.ndarray, pixels: int, figures: dict, st
                 bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0, "alpha": 0.8},
                 **side,
             )
-    axis.set(title="error: loss of the design (lines),\nretraced with independent rays (points)")
-    for own in (axis,) if below is None else (axis, below):
-        own.margins(x=0.08, y=0.12 if own is axis else 0.25)
+    for kind, own in panels.items():
+        own.set_title(_loss_words(*kind, points=own is judge), fontsize="medium")
+        own.margins(x=0.08, y=0.12 if own is judge else 0.8)  # room for the names of the stages
         own.set_ylabel("relative RMS")
         own.grid(alpha=0.3, which="both")
         plain_ticks(own.yaxis)
-    (below or axis).set_xlabel("s")
-    if below is not None:
-        axis.tick_params(labelbottom=False)
+        own.tick_params(labelbottom=own is panels[kinds[-1]])
+    panels[kinds[-1]].set_xlabel("s")
+
+
+def _loss_words(waves: bool, blurred: bool, points: bool) -> str:
+    """Title of a panel of losses."""
+    if blurred:
+        return f"loss by {'waves' if waves else 'rays'} of each stage, with blur"
+    if not points:
+        return f"loss by {'waves' if waves else 'rays'}"
+    judge = "wave image of the lens" if waves else "retraced with independent rays"
+    return f"error by {'waves' if waves else 'rays'}: loss of the design (lines),\n{judge} (points)"
 
 
 def _draw_energy_balance(axis: Axes, figures: dict) -> None:
@@ -227,17 +305,20 @@ def _draw_energy_balance(axis: Axes, figures: dict) -> None:
     axis.barh(range(len(parts)), [100.0 * value for _, value, _ in parts], 0.35, color=[colour for _, _, colour in parts])
     for k, (name, value, _) in enumerate(parts):
         axis.annotate(f"{name} {value:.2%}", (1.0, k - 0.22), va="bottom")
-    axis.set(title=_balance_words(figures), xlabel="% of the source's light", xlim=(0.0, 100.0), yticks=[])
+    axis.set(xlabel="% of the source's light", xlim=(0.0, 100.0), yticks=[])
+    axis.set_title("\n".join(fill(line, LINE) for line in _balance_words(figures).splitlines()), pad=PAD)
     axis.set_ylim(len(parts) - 0.5, -0.6)
 
 
 def _balance_words(figures: dict) -> str:
-    """Title of the energy balance: light in black regions of the picture, and what a least radius adds to that."""
-    words, radius = "where the light goes", figures.get("min_radius")
-    if figures.get("in_black") is not None:
-        words += f"\nof that on the screen, in black {figures['in_black']:.2%}"
+    """Title of the energy balance: light in black regions of the image that the lens is judged by, and what a least radius adds to
+    that."""
+    waves, radius = figures.get("wave_relative_rms") is not None, figures.get("min_radius")
+    words, black = ("where the light goes, by rays", "wave_in_black") if waves else ("where the light goes", "in_black")
+    if figures.get(black) is not None:
+        words += f"\nof that on the screen, in black {figures[black]:.2%}{', by waves' if waves else ''}"
     if radius is not None and radius["in_black_per_mm"] is not None:
-        words += f"\na radius of {radius['radius_mm']:g} mm: {radius['in_black_per_mm']:.2%} more a mm, on the first surface"
+        words += f"\na radius of {radius['radius_mm']:g} mm on the first surface, in black: {cost_of_radius(radius)}"
     return words
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -15,7 +16,7 @@ from pathlib import Path
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from caustic_cli.errors import InputError
 from caustic_cli.io.files import SOFTWARE, atomic_file, refuse_foreign, write_bytes
@@ -38,6 +39,8 @@ COLOURS = (
 )
 MARKERS = "osD^vP<>Xph*"
 
+#: Most intervals between evenly spaced ticks on a short logarithmic axis.
+EVEN = 4
 #: Factor by which a figure is widened for a legend beside it.
 BESIDE = 1.3
 
@@ -192,9 +195,13 @@ def draw_front(axes: Axes, study: Study) -> None:
 
 
 def plain_ticks(axis: Axis) -> None:
-    """Decimal tick labels at 1, 2 and 5 on a logarithmic axis of less than three decades; to be called after plotting."""
+    """Decimal tick labels at 1, 2 and 5 on a logarithmic axis of less than three decades, evenly spaced ones on an axis between
+    two of those; to be called after plotting."""
     low, high = axis.get_view_interval()
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 1000.0 * low else (1.0,)))
+    subs = (1.0, 2.0, 5.0) if high < 1000.0 * low else (1.0,)
+    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1) if 0 < low < high else range(0)
+    shown = sum(low <= sub * 10.0**decade <= high for decade in decades for sub in subs)
+    axis.set_major_locator(LogLocator(subs=subs) if shown > 1 else MaxNLocator(EVEN))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
 

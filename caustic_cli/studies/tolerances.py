@@ -83,6 +83,9 @@ NOMINAL = 8
 #: Uniform slope of the exit, a finite-difference step for the effect of roughness.
 LEAN = 1e-5
 
+#: Most errors in the plot, and the height of one, inch.
+BARS, BAR_HEIGHT = 16, 0.33
+
 Values = dict[tuple[str, int], float]
 
 
@@ -134,7 +137,6 @@ class Trials:
         self.smooth: dict[tuple[int, tuple[str, ...]], list[np.ndarray]] = {}
         if waves is not None:
             self.begin = self._rays(Misalignment(), self.heights, 0)
-            self.power = sum(float(part.power.sum()) for part in self.begin)
 
     def evaluate(self, values: Values, number: int | None = None, which: tuple[str, ...] | None = None) -> TrialFigures:
         """Figures under errors by (name, axis), and a realisation of the surface errors, all of them or only `which`."""
@@ -234,31 +236,34 @@ class Trials:
         return part.x + sx, part.y + sy
 
     def _moved(self, now: list[LandingPoints], smooth: list[np.ndarray]) -> np.ndarray:
-        """A wave image, given by splines, warped by the displacement of the rays."""
+        """A wave image, given by splines, warped by the displacement of the rays, and brighter or darker as they are."""
         shape, (wx, wy), (rx, ry) = self.target.shape[1:], self.scene.screen.pixel, self.scene.screen.half_size
         out = np.zeros(self.target.shape)
-        scale = sum(float(part.power.sum()) for part in now) / self.power
         grid = np.meshgrid(*(np.arange(n, dtype=float) for n in shape), indexing="ij")
         for channel in range(len(out)):
             pairs = [(a, b) for a, b in zip(self.begin, now, strict=True) if (a.channel or 0) == channel]
             if not pairs:
                 continue
-            sums = np.zeros((3, *shape))
+            sums = np.zeros((5, *shape))
             for a, b in pairs:
                 weight = torch.where(b.power > 0, a.power, 0.0)
                 i, j = ((a.x + rx) / wx).floor().long(), ((a.y + ry) / wy).floor().long()
-                inside = (i >= 0) & (i < shape[0]) & (j >= 0) & (j < shape[1]) & (weight > 0)
+                inside = (i >= 0) & (i < shape[0]) & (j >= 0) & (j < shape[1]) & (a.power > 0)
                 cell, w = (i * shape[1] + j)[inside], weight[inside]
-                for k, value in enumerate((torch.ones_like(w), ((b.x - a.x) / wx)[inside], ((b.y - a.y) / wy)[inside])):
-                    sums[k] += torch.bincount(cell, w * value, minlength=shape[0] * shape[1]).numpy().reshape(shape)
-            ux, uy = displacement(sums, self.near)
+                # rays that miss the screen now have a place of their own, which may be anywhere: they have no displacement
+                aside = [torch.where(w > 0, w * ((q - p) / width)[inside], 0.0) for p, q, width in ((a.x, b.x, wx), (a.y, b.y, wy))]
+                for k, value in enumerate((w, *aside, a.power[inside], b.power[inside])):
+                    sums[k] += torch.bincount(cell, value, minlength=shape[0] * shape[1]).numpy().reshape(shape)
+            ux, uy = smoothed_ratios(sums[0], sums[1:3], self.near)
+            (gain,) = smoothed_ratios(sums[3], sums[4:], self.near, 1.0)
             qx, qy = grid
             for _ in range(BACK):  # q + u(q) = p
                 at = [qx, qy]
                 qx, qy = (p - map_coordinates(u, at, order=1, mode="nearest") for p, u in zip(grid, (ux, uy), strict=True))
             (xx, xy), (yx, yy) = np.gradient(qx), np.gradient(qy)
             found = map_coordinates(smooth[channel], [qx, qy], order=3, mode="constant", prefilter=False)
-            out[channel] = scale * np.maximum(found, 0.0) * np.abs(xx * yy - xy * yx)
+            gain = map_coordinates(gain, [qx, qy], order=1, mode="nearest")
+            out[channel] = gain * np.maximum(found, 0.0) * np.abs(xx * yy - xy * yx)
         return out
 
     def _gain(self) -> tuple[float, float]:
@@ -309,17 +314,19 @@ def best_shift(image: np.ndarray, target: np.ndarray) -> tuple[float, tuple[floa
     return level, (shift[0], shift[1])
 
 
-def displacement(sums: np.ndarray, near: float) -> tuple[np.ndarray, np.ndarray]:
-    """Mean displacement on every pixel from the sums (3, n_x, n_y) over its rays of power, and of power times displacement.
+def smoothed_ratios(power: np.ndarray, sums: np.ndarray, near: float, without: float = 0.0) -> np.ndarray:
+    """Means (k, n_x, n_y) on every pixel of quantities of its rays, from the sums of their power (n_x, n_y) and of power times
+    quantity (k, n_x, n_y).
 
-    Gaussian average over `near` pixels; where there is too little light, the value of the nearest pixel with enough.
+    Gaussian average over `near` pixels; where there is too little light, the value of the nearest pixel with enough, or `without`
+    where there is none.
     """
-    weight, x, y = (gaussian_filter(s, near, mode="constant") for s in sums)
-    enough = weight > LIT * sums[0].mean()
+    weight = gaussian_filter(power, near, mode="constant")
+    enough = weight > LIT * power.mean()
     if not enough.any():
-        return np.zeros_like(x), np.zeros_like(y)
+        return np.full_like(sums, without)
     at = tuple(distance_transform_edt(~enough, return_distances=False, return_indices=True))
-    return (x[at] / weight[at]), (y[at] / weight[at])
+    return np.stack([gaussian_filter(s, near, mode="constant")[at] / weight[at] for s in sums])
 
 
 @dataclass(frozen=True)
@@ -546,7 +553,10 @@ def write_plot(path: Path, found: Study) -> None:
 
     from caustic_cli.studies.report import COLOURS  # noqa: PLC0415
 
-    figure, (error, light, bars) = plt.subplots(1, 3, figsize=(15.0, 5.6), constrained_layout=True)
+    shown = found.sensitivities[:BARS][::-1]
+    figure, (error, light, bars) = plt.subplots(
+        1, 3, figsize=(17.0, max(5.6, 1.6 + BAR_HEIGHT * len(shown))), constrained_layout=True
+    )
     f = figures(found)
     placing = {"as placed": found.of("relative_rms"), "after the best shift": found.of("shifted")}
     bins, both = min(40, max(8, len(found.judged) // 8)), np.concatenate(list(placing.values()))
@@ -565,15 +575,15 @@ def write_plot(path: Path, found: Study) -> None:
     light.axvline(f["nominal"]["on_target"], color="k", label=f"without errors: {f['nominal']['on_target']:.4f}")
     light.axvline(f["on_target"]["p5"], color=COLOURS[0], ls="--", label=f"95 % have at least {f['on_target']['p5']:.4f}")
     light.set(title="light on the picture", xlabel="part of the source's power", ylabel="draws")
-    shown = found.sensitivities[:16][::-1]
     bars.barh([f"{s.name}\n{s.sigma:.3g} {s.unit}".strip() for s in shown], [s.adds for s in shown], color=COLOURS[2])
     bars.axvline(f["nominal"]["relative_rms"], color="k", ls=":", label="error without errors")
-    bars.set(title="contribution of each error of one sigma, in quadrature", xlabel="relative RMS error")
+    bars.set(title="contribution of each error of one sigma,\nin quadrature", xlabel="relative RMS error")
     bars.tick_params(axis="y", labelsize=8)
     for axis in (error, light, bars):
         axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=2, fontsize=8, frameon=False)  # below all data
     for axis in (error, light):
         axis.yaxis.set_major_locator(MaxNLocator(integer=True))
+        axis.xaxis.set_major_locator(MaxNLocator(6))
     with atomic_file(path) as file:
         figure.savefig(file, format="png", dpi=100, metadata={"Software": SOFTWARE})
     plt.close(figure)

@@ -12,7 +12,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -51,7 +51,7 @@ from caustic_cli.project.project import CHECKPOINT, RENDER, Project, is_project
 from caustic_cli.scene import Scene
 from caustic_cli.studies.manufacture import preview, wall_and_stock
 from caustic_cli.workflow.compilation import announce_compilation, compile_usual
-from caustic_cli.workflow.evaluation import evaluate_and_write, expected_seconds
+from caustic_cli.workflow.evaluation import evaluate_and_write, evaluation_seconds, expected_seconds
 from caustic_cli.workflow.gradient_index import design_index, index_figures, is_free, limit_of
 from caustic_cli.workflow.movie import Movie
 from caustic_cli.workflow.reporter import Reporter
@@ -472,7 +472,8 @@ def _run(
     if movie is not None:
         movie.screen = designer.scene.screen
     total = chosen["iterations"] or sum(s.iterations for s in designer.stages)
-    with _signals(project.path is not None) as asked, say.progress(total) as show:
+    with _signals(project.path is not None) as asked, ExitStack() as shown:
+        show = shown.enter_context(say.progress(total))
         stage, saved = -1, time.monotonic()
 
         def on_iteration(now: State) -> None:
@@ -523,7 +524,9 @@ def _run(
             )
         keep_if_due(state)
         state.heights = rounded(designer.within_limits(state))
-        found = evaluate_and_write(project, designer, target, state, device, timed)
+        shown.close()
+        with say.waiting("evaluation with independent rays", evaluation_seconds(designer, state)):
+            found = evaluate_and_write(project, designer, target, state, device, timed)
         made = wall_and_stock(designer.scene, designer.field(found.state.stage), designer.exit(found.state))
         figures = (
             found.figures | made | {"iterations": state.total, "seconds": time.monotonic() - began, "reason": found.state.reason}

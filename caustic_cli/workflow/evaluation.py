@@ -14,7 +14,7 @@ import torch
 
 from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
 from caustic_cli.inverse.designer import Designer, State
-from caustic_cli.inverse.losses import parse
+from caustic_cli.inverse.loss_terms import parse
 from caustic_cli.inverse.source_limits import performance_limits
 from caustic_cli.inverse.target import grey
 from caustic_cli.io.files import discard
@@ -40,6 +40,8 @@ LIKENESS = {"rms", "rms-light", "throughput"}
 #: For `expected_seconds`: divisor of FINAL_RAYS for the probe, retraces and wave images of an evaluation, further retraces with a
 #: least radius, and time of the report, s.
 PROBE, RETRACES, WAVE_IMAGES, RADIUS, REPORT_SECONDS = 16, 2.5, 4, 1.5, 2.5
+#: Time of an iteration relative to that of its image alone.
+BACKWARD = 2.5
 #: Divisor of the rays for the initial surfaces of a lens with two free-form sides.
 STARTS = 4
 #: Divisor of the rays for each of the lenses of a network over ranges.
@@ -122,6 +124,17 @@ def expected_seconds(designer: Designer, target: np.ndarray, state: State, devic
         wave_figures(scene, field, state.heights.to(device), target, Resolution.before(scene, scene.screen.size), required=False)
         seconds += WAVE_IMAGES * (time.monotonic() - began)
     return seconds
+
+
+def evaluation_seconds(designer: Designer, state: State) -> float:
+    """Rough time of `evaluate_and_write`, s, without a probe: an iteration takes BACKWARD times as long as its image alone."""
+    history, seconds = np.array(state.history, dtype=float).reshape(-1, 5), {}
+    for k, stage in enumerate(designer.stages):
+        times = history[history[:, 1] == k, 4]
+        if len(times) > 1:
+            images = WAVE_IMAGES if stage.waves else RETRACES * evaluation_rays(designer.scene, FINAL_RAYS) / stage.rays
+            seconds[bool(stage.waves)] = images * float(np.median(np.diff(times))) / BACKWARD  # by the last stage of each kind
+    return REPORT_SECONDS + sum(seconds.values())
 
 
 def evaluate(

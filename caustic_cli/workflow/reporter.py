@@ -24,6 +24,9 @@ class Reporter(Protocol):
     def notify_if_slow(self, text: str, seconds: float = 4.0) -> AbstractContextManager[None]:
         """Report `text` if the block takes longer than `seconds`."""
 
+    def waiting(self, what: str, seconds: float) -> AbstractContextManager[None]:
+        """Show that the block does `what`, and the time left of the `seconds` that it is expected to take."""
+
 
 class Listener:
     """Reporter that calls functions, if any.
@@ -57,5 +60,10 @@ class Listener:
 
     @contextmanager
     def notify_if_slow(self, text: str, seconds: float = 4.0) -> Iterator[None]:
+        """Report nothing."""
+        yield
+
+    @contextmanager
+    def waiting(self, what: str, seconds: float) -> Iterator[None]:
         """Report nothing."""
         yield

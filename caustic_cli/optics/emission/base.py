@@ -91,12 +91,19 @@ class Emission:
 def intensity_of(source: Source, cone: float, secant: Tensor) -> Tensor | float:
     """Radiant intensity, 1/sr, of a near source of power 1 that emits into a cone of this half-angle, rad; secant: 1 / cos of the
     angle to the axis."""
+    given, flux = source.intensity, relative_flux(source, cone)
+    if isinstance(given, Distribution):
+        return _by_table(given, torch.atan(torch.sqrt((secant * secant - 1.0).clamp_min(0.0)))) / flux
+    return 1.0 / (flux * secant) if given == "lambertian" else 1.0 / flux
+
+
+def relative_flux(source: Source, cone: float) -> float:
+    """Flux of a near source into a cone of this half-angle, rad, where its relative intensity is as given: that of a table, cos
+    theta of a Lambertian source, or 1."""
     given = source.intensity
     if isinstance(given, Distribution):
-        return _by_table(given, torch.atan(torch.sqrt((secant * secant - 1.0).clamp_min(0.0)))) / given.flux(cone)
-    if given == "lambertian":
-        return 1.0 / (math.pi * math.sin(cone) ** 2 * secant)
-    return 1.0 / (4.0 * math.pi * math.sin(cone / 2.0) ** 2)
+        return given.flux(cone)
+    return math.pi * math.sin(cone) ** 2 if given == "lambertian" else 4.0 * math.pi * math.sin(cone / 2.0) ** 2
 
 
 def _by_table(given: Distribution, angle: Tensor) -> Tensor:

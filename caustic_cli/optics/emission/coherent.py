@@ -16,16 +16,17 @@ from torch import Tensor
 
 from caustic_cli.optics.emission.base import Illuminated, intensity_of
 from caustic_cli.optics.emission.brightness import points_by_brightness
+from caustic_cli.optics.emission.parallel import mean_irradiance
 from caustic_cli.optics.rays import RayState
 from caustic_cli.optics.sampling import Sample
 from caustic_cli.scene import Source
 
 #: Golden angle, rad, between successive points of Vogel's spiral.
 GOLDEN = math.pi * (3.0 - math.sqrt(5.0))
+#: Lower bound of the cosine of a ray to the axis of a source: beyond it there is no light.
+LEAST_COSINE = 1e-12
 #: Golden ratio, for an additive recurrence of low discrepancy.
 RATIO = (1.0 + math.sqrt(5.0)) / 2.0
-#: Points along each axis for the mean of a profile over a circle.
-ROUND = 1000
 
 
 @dataclass(frozen=True)
@@ -61,9 +62,14 @@ class Mode:
         dx, dy, h = x - px, y - py, pupil.z - pz
         r = torch.sqrt(dx * dx + dy * dy + h * h)
         cone = source.cone_over(pupil.half_size, pupil.z, pupil.round)
-        cosine = h / r
-        lit = cosine >= math.cos(cone) * (1.0 - 4.0 * torch.finfo(torch.float64).eps)
-        power = torch.where(lit, self.part * intensity_of(source, cone, r / h) * cosine / (r * r), torch.zeros_like(r))
+        cosine, secant = h / r, r / h
+        to_axis = cosine
+        if source.lean:
+            tx, ty, tz = source.axis
+            to_axis = (tx * dx + ty * dy + tz * h) / r
+            secant = 1.0 / to_axis.clamp_min(LEAST_COSINE)
+        lit = to_axis >= math.cos(cone) * (1.0 - 4.0 * torch.finfo(torch.float64).eps)
+        power = torch.where(lit, self.part * intensity_of(source, cone, secant) * cosine / (r * r), torch.zeros_like(r))
         return RayState((x, y, pupil.z), (dx / r, dy / r, cosine), power, path=index * r)
 
     def _even(self, u: Tensor, v: Tensor) -> Tensor:
@@ -75,13 +81,7 @@ class Mode:
             return torch.full_like(u, self.part / area)
         table = torch.as_tensor(np.asarray(profile), dtype=torch.float64, device=u.device)
         a, b = ((c * n).long().clamp(0, n - 1) for c, n in zip((u, v), table.shape, strict=True))
-        mean = table.mean()
-        if pupil.round:  # over the circle, which intersects cells of the profile
-            at = (torch.arange(ROUND).to(table) + 0.5) / ROUND
-            inside = ((2.0 * at[:, None] - 1.0) ** 2 + (2.0 * at[None, :] - 1.0) ** 2 <= 1.0).double()
-            i, j = ((at * n).long() for n in table.shape)
-            mean = (table[i[:, None], j[None, :]] * inside).sum() / inside.sum()
-        return self.part / area * table[a, b] / mean
+        return self.part / area * table[a, b] / mean_irradiance(np.asarray(profile), pupil.round)
 
 
 def central_mode(scene: Illuminated) -> Mode:

@@ -1,7 +1,7 @@
 """Sampling of near sources: points, and extended sources about their positions (thesis 4.2.2).
 
 Notation, for a source point at distance h in front of the entrance plane
-    theta   angle of a ray to +z; theta_c half-angle of the cone
+    theta   angle of a ray to the source's axis, +z except where errors of alignment tilt it; theta_c half-angle of the cone
     w       1 - cos theta = 2 sin^2(theta / 2), computed without the cancellation in 1 - cos
     rho     distance on the entrance plane from the projection of the source; r^2 = rho^2 + h^2
 
@@ -32,6 +32,8 @@ from caustic_cli.scene.sources.distribution import Distribution
 NEAR = 3.0
 #: Lower bound of the squared cosine of a ray parallel to the entrance; such a ray is clamped to the aperture.
 TINY = 1e-300
+#: Upper bound of the squared tangent of a ray within a hemisphere.
+BEYOND = 1e300
 
 
 class Near(Emission):
@@ -60,7 +62,8 @@ class Near(Emission):
             across, along = self._offsets(*aside)
             x0, y0 = x0 + across, y0 + along
         h = pupil.z - z0
-        radius = h * math.tan(cone) if cone < math.pi / 2 else torch.full_like(h, math.inf)
+        reach = cone + source.lean  # largest angle to z
+        radius = h * math.tan(reach) if reach < math.pi / 2 else torch.full_like(h, math.inf)
         lows = [x0 - radius, y0 - radius]
         highs = [x0 + radius, y0 + radius]
         # Distance from the projection of the source to the edge of the aperture.
@@ -74,6 +77,8 @@ class Near(Emission):
         sine, cosine = torch.sqrt(w * (2.0 - w)), 1.0 - w
         tangent = sine / cosine.clamp_min(1e-300)
         cx, cy = tangent * torch.cos(2 * math.pi * v), tangent * torch.sin(2 * math.pi * v)  # tangents along x and y
+        if source.lean:
+            cx, cy = _slopes_about(source.axis, cx, cy)
 
         lows = [torch.maximum(lo, torch.full_like(lo, -r)) for lo, r in zip(lows, (rx, ry), strict=True)]
         highs = [torch.minimum(hi, torch.full_like(hi, r)) for hi, r in zip(highs, (rx, ry), strict=True)]
@@ -83,9 +88,14 @@ class Near(Emission):
         tan_b, by_sine = _uniform_sine((lows[1] - y0) / (h * stretch), (highs[1] - y0) / (h * stretch), tall / (h * stretch), v)
         ay = tan_b * stretch
         rho2 = ax * ax + ay * ay  # in units of h
-        aimed = part * by_angle * by_sine * intensity_of(source, cone, torch.sqrt(1.0 + rho2))
-        limit = math.tan(cone) ** 2 * (1.0 + 2.0 * torch.finfo(torch.float64).eps) if cone < math.pi / 2 else math.inf
-        aimed = torch.where(rho2 <= limit, aimed, torch.zeros_like(aimed))
+        secant, tangent2 = torch.sqrt(1.0 + rho2), rho2  # of theta
+        if source.lean:
+            tx, ty, tz = source.axis
+            secant = secant / (tx * ax + ty * ay + tz).clamp_min(TINY)  # at 90 degrees and beyond there is no light
+            tangent2 = secant * secant - 1.0
+        aimed = part * by_angle * by_sine * intensity_of(source, cone, secant)
+        limit = math.tan(cone) ** 2 * (1.0 + 2.0 * torch.finfo(torch.float64).eps) if cone < math.pi / 2 else BEYOND
+        aimed = torch.where(tangent2 <= limit, aimed, torch.zeros_like(aimed))
 
         sx, sy = torch.where(from_cone, cx, ax), torch.where(from_cone, cy, ay)
         x, y = x0 + h * sx, y0 + h * sy
@@ -109,6 +119,17 @@ class NearDisc(Near):
             return x, y
         (ex, ey), turn = source.extent, 2 * math.pi * b
         return ex * a.sqrt() * torch.cos(turn), ey * a.sqrt() * torch.sin(turn)
+
+
+def _slopes_about(axis: tuple[float, float, float], x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """Slopes dx/dz and dy/dz of rays whose slopes to an axis are x and y, by the rotation that takes +z to it without twist;
+    infinite for those that do not ascend."""
+    a, b, c = axis
+    along = a * x + b * y
+    dz = c - along
+    turned = (x + a * (1.0 - along / (1.0 + c)), y + b * (1.0 - along / (1.0 + c)))
+    across, up = (torch.where(dz > 0, t / dz, math.inf) for t in turned)
+    return across, up
 
 
 def _one_minus_cosine(intensity: str | Distribution, cone: float, part: Tensor) -> Tensor:

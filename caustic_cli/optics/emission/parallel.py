@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 
 from caustic_cli.optics.emission.base import Illuminated
 from caustic_cli.optics.sampling import Sampler
+
+#: Points along each axis for the mean of a profile over a round aperture.
+ROUND = 1000
 
 
 def parallel(scene: Illuminated, kind: str, rays: int, seed: int = 0, device: str | torch.device = "cpu") -> Sampler:
@@ -13,6 +17,17 @@ def parallel(scene: Illuminated, kind: str, rays: int, seed: int = 0, device: st
     profile = None if scene.source.profile is None else torch.from_numpy(scene.source.profile)
     (rx, ry), round_ = scene.pupil.half_size, scene.pupil.round
     return Sampler.of_size(kind, rays, rx / ry, seed=seed, profile=profile, device=device, round=round_)
+
+
+def mean_irradiance(profile: np.ndarray, round_: bool) -> float:
+    """Mean of a relative irradiance over the aperture: the rectangle of the profile (a, b), or its inscribed ellipse, by ROUND
+    points along each axis."""
+    if not round_:
+        return float(profile.mean())
+    at = (np.arange(ROUND) + 0.5) / ROUND
+    inside = (2.0 * at[:, None] - 1.0) ** 2 + (2.0 * at[None, :] - 1.0) ** 2 <= 1.0
+    i, j = ((at * n).astype(int) for n in profile.shape)
+    return float(profile[i[:, None], j[None, :]][inside].mean())
 
 
 EMISSIONS = {"plane": parallel}

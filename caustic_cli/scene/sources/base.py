@@ -4,7 +4,7 @@ A source is one of three kinds:
     collimated   all rays are parallel to +z, so they can be sampled on the surface itself
     distant      at infinity: it has no position, and its rays make an angle of at most half_angle with +z (0 if collimated)
     near         at a finite distance in front of the lens: one or several positions, each with an extent, emitting into a cone
-    about +z
+    about +z, or about another axis
 
 A subclass defines `kind` and `power`; a near source also `points`, and `extent` if it has one; a distant one `half_angle`.
 """
@@ -30,7 +30,8 @@ class Source:
     kind: name of its type in [source] type; power: emitted into the cone, or through the aperture for a distant source; profile:
     relative irradiance over the aperture, (a, b), or None if uniform; cone: half-angle of the emission cone as given, degrees, or
     None for the narrowest that covers the lens; intensity: uniform in solid angle, lambertian, or tabulated; aimed: rays are
-    sampled over the lens instead of over the whole cone; collimated: see the module; rays: ray set of a file, None for a source
+    sampled over the lens instead of over the whole cone; axis: of the cone of a near source and of its intensity, a unit vector, +z
+    except where errors of alignment tilt it; collimated: see the module; rays: ray set of a file, None for a source
     that is sampled;
     brightness: relative radiance over `frame`, (a, b) [i, j], or None if uniform over an ellipse; spectra: of several sources,
     wavelengths, nm, and relative powers of each.
@@ -41,6 +42,7 @@ class Source:
     cone: float | None = None
     intensity: str | Distribution = "uniform"
     aimed: bool = True
+    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
     rays: RaySet | None = None
     brightness: np.ndarray | None = None
     spectra: tuple[tuple[tuple[float, ...], tuple[float, ...]], ...] = ()
@@ -153,8 +155,14 @@ class Source:
         """Whether it has a size."""
         return False
 
-    def displaced(self, place: Callable[[Sequence[float]], tuple[float, float, float]], scale: float) -> Source:
-        """The source with its positions mapped by `place`, (x, y, z) mm, and its size scaled; a distant source is only scaled."""
+    def displaced(
+        self,
+        place: Callable[[Sequence[float]], tuple[float, float, float]],
+        scale: float,
+        axis: tuple[float, float, float] | None = None,
+    ) -> Source:
+        """The source with its positions mapped by `place`, (x, y, z) mm, its size scaled, and another axis, if given, of a near
+        source's emission; a distant source is only scaled."""
         return self
 
     def pointlike(self) -> Source:
@@ -181,7 +189,8 @@ class Source:
         return throw * 2.0 * self.half_angle if self.distant else throw * self._width() / (z_in - self.nearest)
 
     def cone_over(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> float:
-        """Half-angle of the emission cone: as given, or the least that covers the aperture, `round` or not, from every point."""
+        """Half-angle of the emission cone about the axis: as given, or the least that covers the aperture, `round` or not, from
+        every point."""
         if self.distant:
             return self.half_angle
         if self.cone is not None:
@@ -189,7 +198,7 @@ class Source:
         positions, extent = self.points()[0], self.extent
         across = [np.abs(positions[:, k]) + extent[k] + (0.0 if round else half_size[k]) for k in (0, 1)]
         farthest = np.hypot(*across) + (half_size[0] if round else 0.0)
-        return min((1.0 + SLACK) * float(np.arctan2(farthest, z_in - positions[:, 2]).max()), math.pi / 2.0)
+        return min((1.0 + SLACK) * float(np.arctan2(farthest, z_in - positions[:, 2]).max()) + self.lean, math.pi / 2.0)
 
     def power_words(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> str:
         """What its power, of which all fractions are taken, is: a noun phrase for messages."""
@@ -204,7 +213,12 @@ class Source:
         positions, extent = self.points()[0], self.extent
         far = np.hypot(*(np.abs(positions[:, k]) + extent[k] + half_size[k] for k in (0, 1)))
         steepest = float(np.arctan2(far, z_in - positions[:, 2]).max())
-        return min(self.cone_over(half_size, z_in, round), steepest)
+        return min(self.cone_over(half_size, z_in, round) + self.lean, steepest)
+
+    @property
+    def lean(self) -> float:
+        """Angle of the axis to +z, rad."""
+        return math.atan2(math.hypot(self.axis[0], self.axis[1]), self.axis[2])
 
     def _width(self) -> float:
         """Full width of a near source along the wider axis, mm."""

@@ -31,14 +31,15 @@ SUN = 0.533
 
 @dataclass(frozen=True)
 class Disc(Source):
-    """An extended source: every point of an ellipse emits into a cone about +z; or, with `angle`, a disc at infinity like the sun.
+    """An extended source: every point of an ellipse emits into a cone about an axis; with `angle`, a disc at infinity like the sun.
 
     Args:
         position: of the centre, mm.
         size: full widths of the ellipse along x and y, mm.
         power: emitted into the cone, W; with `angle`, through the aperture.
-        cone, intensity, aimed: as for `Points`.
-        angle: angular diameter of a disc at infinity, degrees; position, size, cone, intensity and aimed are then ignored.
+        cone, intensity, aimed, axis: as for `Points`.
+        angle: angular diameter of a disc at infinity, degrees; position, size, cone, intensity, aimed and axis are then
+            ignored.
         brightness: relative radiance over the ellipse's bounding rectangle, (a, b) [i, j] with i along +x, instead of uniform
             radiance; for a disc at infinity over direction sines.
     """
@@ -51,6 +52,7 @@ class Disc(Source):
     aimed: bool = True
     angle: float | None = None
     brightness: np.ndarray | None = field(default=None, compare=False)
+    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
     kind = "disc"
 
@@ -143,18 +145,24 @@ class Disc(Source):
         """Always."""
         return True
 
-    def displaced(self, place: Callable[[Sequence[float]], tuple[float, float, float]], scale: float) -> Source:
+    def displaced(
+        self,
+        place: Callable[[Sequence[float]], tuple[float, float, float]],
+        scale: float,
+        axis: tuple[float, float, float] | None = None,
+    ) -> Source:
         """The disc moved and scaled."""
         if self.angle is not None:
             return replace(self, angle=self.angle * scale)
-        return replace(self, position=place(self.position), size=(self.size[0] * scale, self.size[1] * scale))
+        size = self.size[0] * scale, self.size[1] * scale
+        return replace(self, position=place(self.position), size=size, axis=axis or self.axis)
 
     def pointlike(self) -> Source:
         """A plane wave, or a point at its centre."""
         if self.distant:
             return PlaneWave(self.power)
         place = self.position if self.brightness is None else self.centre
-        return Points((place,), (self.power,), self.cone, self.intensity, self.aimed)
+        return Points((place,), (self.power,), self.cone, self.intensity, self.aimed, axis=self.axis)
 
 
 def _build(table: Table, _profile) -> Disc:

@@ -28,7 +28,7 @@ MAX_POINTS = 1_000_000
 
 @dataclass(frozen=True)
 class Points(Source):
-    """Point sources, each with a position and a power, that emit into a cone about +z.
+    """Point sources, each with a position and a power, that emit into a cone about an axis.
 
     Args:
         positions: (x, y, z) of each, mm.
@@ -37,6 +37,7 @@ class Points(Source):
         intensity: uniform, lambertian, or tabulated.
         aimed: rays are sampled over the lens (importance sampling); otherwise over the whole cone.
         kind: point, or grid for points that represent an extended source.
+        axis: of the cones and intensities, a unit vector.
     """
 
     positions: tuple[tuple[float, float, float], ...]
@@ -45,6 +46,7 @@ class Points(Source):
     intensity: str | Distribution = "uniform"
     aimed: bool = True
     kind: str = "point"
+    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
     def __post_init__(self):
         if not 1 <= len(self.positions) <= MAX_POINTS:
@@ -115,16 +117,23 @@ class Points(Source):
         """Whether it is a grid."""
         return self.kind == "grid"
 
-    def displaced(self, place: Callable[[Sequence[float]], tuple[float, float, float]], scale: float) -> Source:
+    def displaced(
+        self,
+        place: Callable[[Sequence[float]], tuple[float, float, float]],
+        scale: float,
+        axis: tuple[float, float, float] | None = None,
+    ) -> Source:
         """The points moved; those of a grid are also scaled about its centre."""
         centre = np.array(self.centre)
         spread = scale if self.sized else 1.0
         wide = [p if spread == 1.0 else tuple(centre + (np.array(p) - centre) * spread) for p in self.positions]
-        return replace(self, positions=tuple(place(p) for p in wide))
+        return replace(self, positions=tuple(place(p) for p in wide), axis=axis or self.axis)
 
     def pointlike(self) -> Source:
         """One point at the centre of all."""
-        return Points((self.centre,), (self.power,), self.cone, self.intensity, self.aimed) if self.several else self
+        return (
+            Points((self.centre,), (self.power,), self.cone, self.intensity, self.aimed, axis=self.axis) if self.several else self
+        )
 
 
 def _points(table: Table, _profile) -> Points:
