@@ -209,7 +209,7 @@ def retrace(
             enough = quiet is None or target is None or figures["noise"] <= quiet * figures["relative_rms"]
             if enough or 2 * len(parts[0]) > MOST_TIMES or rays * len(parts[0]) >= _available(scene):
                 break
-    require_energy_balance(figures, dtype)
+    require_energy_balance(counted, dtype)
     figures |= irradiance_figures(scene, counted.image) | unit_figures(scene)
     if filter is None or filter.reach == (0, 0):
         return counted, figures
@@ -223,13 +223,13 @@ def evaluation_rays(scene: Scene, usual: int = FINAL_RAYS) -> int:
     return round(usual * min(max(1.0, times), MOST_FINAL))
 
 
-def require_energy_balance(figures: dict, dtype: torch.dtype) -> None:
-    """Check the energy balance: all fractions are in [0, 1], and their sum is 1, within BALANCE.
+def require_energy_balance(exposure: Image, dtype: torch.dtype) -> None:
+    """Check the energy balance: the image and all losses are in [0, 1], and their sum is 1, within BALANCE.
 
     Raises:
         CausticError: naming the fractions.
     """
-    parts = {"on_screen": figures["on_screen"], **figures["lost"]}
+    parts = {"on_screen": float(exposure.image.sum()), **exposure.lost}
     room = BALANCE[dtype]
     if abs(math.fsum(parts.values()) - 1.0) <= room and all(-room <= part <= 1.0 + room for part in parts.values()):
         return
