@@ -234,6 +234,8 @@ def _draw_energy_balance(axis: Axes, figures: dict) -> None:
 def _balance_words(figures: dict) -> str:
     """Title of the energy balance: light in black regions of the picture, and what a least radius adds to that."""
     words, radius = "where the light goes", figures.get("min_radius")
+    if figures.get("of_source") is not None and figures["of_source"] != figures["on_target"]:
+        words += f"\non the picture {100.0 * figures['of_source']:.3g} % of all that the source emits"
     if figures.get("in_black") is not None:
         words += f"\nof that on the screen, in black {figures['in_black']:.2%}"
     if radius is not None and radius["in_black_per_mm"] is not None:

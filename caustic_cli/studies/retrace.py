@@ -19,7 +19,7 @@ from caustic_cli.optics.surfaces.cut import CutSurface
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Scene
-from caustic_cli.studies.irradiance import irradiance_figures, unit_figures
+from caustic_cli.studies.irradiance import irradiance_figures, source_figures, unit_figures
 from caustic_cli.studies.metrics import figures_of_merit
 from caustic_cli.studies.noise import black_error, image_noise, noise_bias, standard_error, variance_of
 
@@ -210,7 +210,7 @@ def retrace(
             if enough or 2 * len(parts[0]) > MOST_TIMES or rays * len(parts[0]) >= _available(scene):
                 break
     require_energy_balance(counted, dtype)
-    figures |= irradiance_figures(scene, counted.image) | unit_figures(scene)
+    figures |= irradiance_figures(scene, counted.image) | unit_figures(scene) | source_figures(scene, figures["on_target"])
     if filter is None or filter.reach == (0, 0):
         return counted, figures
     sampler = sampler_for(scene, counted.rays, seed, device)
