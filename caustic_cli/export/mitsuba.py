@@ -119,7 +119,7 @@ def write_mitsuba(
         write_mesh(mesh, front.points.reshape(-1, 3), triangles(front.points)[:, ::-1], -front.normals.reshape(-1, 3), text=False)
         entrance = [f'<shape type="ply" id="entrance"><string name="filename" value={quoteattr(mesh.name)}/>{glass}</shape>']
     lines = [
-        *_camera(screen, away, f'<scale x="-1"/><translate z="{real(screen.z - away)}"/>{onto}', surfaces + 2),
+        *_camera(screen, away, f'<scale x="-1"/>{_moved(screen, screen.z - away)}{onto}', surfaces + 2),
         *entrance,
         f'<shape type="ply" id="exit"><string name="filename" value={quoteattr(exit_mesh.name)}/>{glass}</shape>',
         f'<shape type="ply" id="sides"><string name="filename" value={quoteattr(sides.name)}/>'
@@ -183,7 +183,7 @@ def _write_mirror(path: str | Path, scene: Scene, surface: Patch, light: list[st
     write_mesh(mesh, points, triangles(surface.points)[:, ::-1], -normals, text=False)  # towards the light
     away = 0.9 * (min(float(points[:, 2].min()), lens.z_in) - BEFORE - screen.z)
     lines = [
-        *_camera(screen, away, f'<rotate y="1" angle="180"/><translate z="{real(screen.z + away)}"/>'),
+        *_camera(screen, away, f'<rotate y="1" angle="180"/>{_moved(screen, screen.z + away)}'),
         f'<shape type="ply" id="mirror"><string name="filename" value={quoteattr(mesh.name)}/>{MIRRORED}</shape>',
         *_screen(screen, ""),
         *(line.replace("</shape>", '<bsdf type="null"/></shape>') for line in light),
@@ -228,10 +228,15 @@ def _screen(screen: Screen, spin: str, onto: str = "") -> list[str]:
     return [
         '<shape type="rectangle" id="screen">',
         '  <bsdf type="diffuse"><rgb name="reflectance" value="1"/></bsdf>',
-        f'  <transform name="to_world">{spin}<scale x="{real(sx)}" y="{real(sy)}"/><translate z="{real(screen.z)}"/>{onto}'
-        "</transform>",
+        f'  <transform name="to_world">{spin}<scale x="{real(sx)}" y="{real(sy)}"/>{_moved(screen, screen.z)}{onto}</transform>',
         "</shape>",
     ]
+
+
+def _moved(screen: Screen, z: float) -> str:
+    """Translation to z on the line through the centre of the screen along its axis."""
+    shift = "".join(f' {axis}="{real(c)}"' for axis, c in zip("xy", screen.shift, strict=True) if c)
+    return f'<translate{shift} z="{real(z)}"/>'
 
 
 def quick_samples(field: HeightField) -> tuple[int, int]:
@@ -282,7 +287,7 @@ def _light(scene: Scene) -> list[str]:
     Raises:
         InputError: Mitsuba has no equivalent emitter.
     """
-    beyond = [name for name in special_features(scene) if name != "a mirror"]
+    beyond = [name for name in special_features(scene) if name not in ("a mirror", "a shifted screen")]
     if beyond:
         raise InputError(f"⟨format⟩ mitsuba is written for clear lenses and straight screens, not {', '.join(beyond)}")
     if scene.source.kind not in _EMITTERS:
