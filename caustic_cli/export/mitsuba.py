@@ -35,6 +35,7 @@ from caustic_cli.export.surface import STEPS_PER_SPAN, most_points
 from caustic_cli.export.text import CREATED, real
 from caustic_cli.io.files import write_bytes
 from caustic_cli.optics.surfaces.heightfield import HeightField
+from caustic_cli.optics.obstruction import refuse_obstructed
 from caustic_cli.optics.system import System
 from caustic_cli.scene import Component, Lens, Scene, Screen
 from caustic_cli.scene.elements import surface_name
@@ -173,11 +174,11 @@ def _write_mirror(path: str | Path, scene: Scene, surface: Patch, light: list[st
     """Write the scene of a mirror.
 
     Raises:
-        InputError: the screen would obstruct the source.
+        InputError: something obstructs the light of a near source, whose emitter stands where the source does.
     """
     screen, lens = scene.screen, scene.lens
-    if not scene.source.collimated and scene.source.nearest <= screen.z:
-        raise InputError("⟨format⟩ mitsuba: the screen would obstruct the light of this mirror's source")
+    if not scene.source.collimated:
+        refuse_obstructed(scene, designed=True)
     (mesh,) = companions(path, False, True)
     points, normals = (a.reshape(-1, 3) for a in (surface.points, surface.normals))
     write_mesh(mesh, points, triangles(surface.points)[:, ::-1], -normals, text=False)  # towards the light
