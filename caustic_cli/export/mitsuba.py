@@ -34,8 +34,8 @@ from caustic_cli.export.ply import FACE, write_mesh
 from caustic_cli.export.surface import STEPS_PER_SPAN, most_points
 from caustic_cli.export.text import CREATED, real
 from caustic_cli.io.files import write_bytes
-from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.obstruction import refuse_obstructed
+from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import System
 from caustic_cli.scene import Component, Lens, Scene, Screen
 from caustic_cli.scene.elements import surface_name
