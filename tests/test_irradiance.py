@@ -111,10 +111,27 @@ def test_a_unit_of_power_is_watts_or_lumens():
         settings.parse("[source]\npower_unit = 3", "here")
 
 
+def test_the_fraction_of_all_that_an_led_emits(capfd):
+    """A Lambertian one before a small lens: its own table's base is the cone over the lens; the same lens in its whole hemisphere,
+    whose cone is given, is the independent answer."""
+    led = ["--source", "disc", "--source-position", "0,0,-30", "--source-size", "1", "--intensity", "lambertian"]
+    assert cli.run(["design", "blob.png", *led, "--iterations", "3", *(a for a in TINY if a != "--quiet")]) == 0
+    out, err = capfd.readouterr()
+    figures = json.loads(out)
+    assert f"of all the source emits {100.0 * figures['of_source']:.3g}%: in all directions, Lambertian" in " ".join(err.split())
+    assert figures["of_source"] < 0.1 < figures["on_target"] and figures["source_emits"] == "in all directions, Lambertian"
+    narrow = run(capfd, *RENDER)
+    whole = run(capfd, *RENDER, "--cone", "90", "--force")
+    assert whole["on_target"] == pytest.approx(narrow["of_source"], rel=0.02)
+    assert whole["of_source"] == pytest.approx(whole["on_target"], rel=1e-12)
+    assert run(capfd, *RENDER, "--intensity", "uniform", "--cone", "40", "--force")["source_emits"] == "in its cone"
+
+
 @pytest.mark.parametrize("source", ["plane", "disc"])
 def test_design_and_render_say_lux_and_watts(source, capfd):
     figures = run(capfd, "design", "blob.png", "--source", source, "--power", "100lm", "--iterations", "3", *TINY)
     assert (figures["power"], figures["power_unit"], figures["irradiance_unit"]) == (100.0, "lm", "lux")
+    assert (figures["of_source"] == figures["on_target"]) == (source == "plane")
     wide, tall = Project.open("blob.caustic").scene().screen.half_size
     area = 4.0 * wide * tall
     assert figures["mean_irradiance"] == pytest.approx(1e8 * figures["on_screen"] / area, rel=1e-12)

@@ -2,7 +2,7 @@
 
 import ast
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,9 @@ from caustic_cli.optics.plan import compile_plan
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Disc, Lens, Offset, PlaneWave, Points, Scene, Screen, Source, sources
+from caustic_cli.scene.sources.distribution import Distribution
 from caustic_cli.scene.sources.section import SourceType
+from caustic_cli.scene.sources.several import Several
 from caustic_cli.studies import verify
 
 PACKAGE = Path(caustic_cli.__file__).parent
@@ -82,21 +84,88 @@ def test_positions_and_parts():
     assert positions.tolist() == [[1, 0, -8]] and parts.tolist() == [1.0]
 
 
+def farthest(x: float, y: float) -> float:
+    """Of the ellipse of the disc about (x, y), by brute force."""
+    turn = np.linspace(0.0, 2.0 * math.pi, 1_000_001)
+    return float(np.hypot(x + 2.0 * np.cos(turn), y + 1.5 * np.sin(turn)).max())
+
+
 @pytest.mark.parametrize(
     ("name", "tangent", "round_"),
     [
         ("point", math.hypot(6, 6) / 5, (math.hypot(1, 2) + 5) / 5),
         ("points", math.hypot(5, 4) / 5, 1.0),  # the nearer; the other asks for hypot(9, 4) / 9, and for 9 / 9
         ("grid", math.hypot(7, 6) / 5, (math.hypot(2, 2) + 5) / 5),
-        ("disc", math.hypot(8, 5.5) / 8, (math.hypot(3, 1.5) + 5) / 8),
+        ("disc", farthest(6, 4) / 8, (3 + 5) / 8),  # of an ellipse whose axes are 2 and 1.5, its middle at (1, 0)
+        ("disc of no size", math.hypot(6, 4) / 8, (1 + 5) / 8),
     ],
 )
 def test_the_cone_over_a_lens(name, tangent, round_):
     """Half size 5 x 4; round, of radius 5."""
     s = FACTS[name][0]
-    assert math.tan(s.cone_over((5.0, 4.0), 0.0)) == pytest.approx(tangent)
-    assert math.tan(s.cone_over((5.0, 5.0), 0.0, True)) == pytest.approx(round_)
+    assert math.tan(s.cone_over((5.0, 4.0), 0.0)) == pytest.approx(tangent, rel=1e-8)
+    assert math.tan(s.cone_over((5.0, 5.0), 0.0, True)) == pytest.approx(round_, rel=1e-8)
     assert Disc(cone=30.0).cone_over((5.0, 4.0), 0.0) == pytest.approx(math.pi / 6)
+
+
+def test_the_cone_of_a_disc_is_the_narrowest_that_covers_the_lens():
+    """The LED of the preset: 1 mm across, 60 mm before a lens of 30 x 30 mm, half the diagonal of both together."""
+    led = Disc((0.0, 0.0, -60.0), (1.0, 1.0))
+    assert math.degrees(led.cone_over((15.0, 15.0), 0.0)) == pytest.approx(19.894, abs=1e-3)
+    cross = np.zeros((5, 5))
+    cross[2, :] = cross[:, 2] = 1.0  # whose lit pixels do not reach the corners of their rectangle
+    tangent = (np.hypot(15.5, 15.1) / 60.0, (15.0 + math.hypot(0.5, 0.1)) / 60.0)
+    for found, round_ in zip(tangent, (False, True), strict=True):
+        one = replace(led, brightness=cross)
+        assert math.tan(one.cone_over((15.0, 15.0), 0.0, round_)) == pytest.approx(found, rel=1e-8)
+
+
+@pytest.mark.parametrize(
+    "source", [Disc((3.0, -1.0, -9.0), (4.0, 1.0)), Disc((0.0, 0.0, -9.0), (0.0, 7.0)), Disc((0.0, 0.0, -2.0))]
+)
+@pytest.mark.parametrize("round_", [False, True])
+def test_no_corner_of_a_lens_is_outside_the_cone_of_a_disc(source, round_):
+    """Nor is any other cone that is narrower by 1e-6 wide enough: by brute force over both borders."""
+    turn, edge = np.linspace(0.0, 2.0 * math.pi, 3601), np.linspace(-1.0, 1.0, 201)
+    (ex, ey), (px, py, pz), (rx, ry) = source.extent, source.position, (5.0, 5.0 if round_ else 3.0)
+    x, y = px + ex * np.cos(turn), py + ey * np.sin(turn)
+    one = np.ones_like(edge)
+    border = np.concatenate([[edge * rx, one * ry], [edge * rx, -one * ry], [one * rx, edge * ry], [-one * rx, edge * ry]], 1)
+    border = np.stack([rx * np.cos(turn), ry * np.sin(turn)]) if round_ else border
+    widest = float(np.hypot(x[:, None] - border[0], y[:, None] - border[1]).max())
+    tangent = math.tan(source.cone_over((rx, ry), 0.0, round_)) * -pz
+    assert widest <= tangent < widest * (1.0 + 1e-6)
+
+
+#: Power of a source, its cone over a lens of 10 x 10 mm at z = 0, and the fraction that it is of all its light.
+HALF, CORNER = (5.0, 5.0), math.atan(math.hypot(5.0, 5.0) / 20.0)
+TABLE = Distribution((0.0, 60.0, 120.0), (1.0, 1.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("source", "part", "words"),
+    [
+        (PlaneWave(), 1.0, "through the aperture"),
+        (Disc(angle=0.5), 1.0, "through the aperture"),
+        (Points(((0.0, 0.0, -20.0),)), 0.5 * (1.0 - math.cos(CORNER)), "in all directions, uniform"),
+        (Points(((0.0, 0.0, -20.0),), cone=10.0), 1.0, "in its cone"),
+        (Points(((0.0, 0.0, -20.0),), intensity="lambertian"), math.sin(CORNER) ** 2, "in all directions, Lambertian"),
+        (Points(((0.0, 0.0, -20.0),), cone=10.0, intensity="lambertian"), math.sin(math.radians(10.0)) ** 2, "Lambertian"),
+        (Points(((0.0, 0.0, -20.0),), cone=60.0, intensity=TABLE), None, "in all directions of its table"),
+        (
+            Several((PlaneWave(3.0), Points(((0.0, 0.0, -20.0),), (1.0,), intensity="lambertian"))),
+            4.0 / (3.0 + 1.0 / math.sin(CORNER) ** 2),
+            "by all sources",
+        ),
+    ],
+)
+def test_what_a_source_emits_in_all(source, part, words):
+    if part is None:  # of the table, by brute force
+        angles = np.radians((np.arange(120_000) + 0.5) / 1000.0)
+        flux = np.interp(np.degrees(angles), TABLE.angles, TABLE.values) * np.sin(angles)
+        part = flux[:60_000].sum() / flux.sum()
+    found, said = source.emitted(HALF, 0.0)
+    assert found == pytest.approx(part, rel=1e-8) and words in said
 
 
 @pytest.mark.parametrize(

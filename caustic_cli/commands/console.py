@@ -32,7 +32,7 @@ from caustic_cli.errors import MARK, InputError, plain_name, shortened
 #: Seconds between lines of --progress json.
 LINE_EVERY = 0.5
 #: Keys of the figures of a network's lens that are not values of its inputs.
-OF_LENS = ("relative_rms", "noise", "on_screen", "middle_relative_rms")
+OF_LENS = ("relative_rms", "noise", "on_screen", "of_source", "middle_relative_rms")
 #: Terminal width from which on a progress bar and the time elapsed are shown.
 WIDE = 90
 
@@ -324,6 +324,11 @@ def figures_rows(figures: dict) -> list[tuple[str, str]]:
             number("on_screen", ".2%") + (f" of {figures['fractions_of']}" if "fractions_of" in figures else ""),
         ),
         ("light on the picture", number("on_target", ".2%")),
+        *(
+            [("of all the source emits", f"{100.0 * figures['of_source']:.3g}%: {figures['source_emits']}")]
+            if figures.get("of_source") is not None
+            else []
+        ),
         *black,
         *behind,
         ("lost", lost or "nothing"),

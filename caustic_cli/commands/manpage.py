@@ -99,6 +99,11 @@ For a render: true if render.png is an earlier image of the same scene, with les
 Fractions of the source's power that land on the screen, that land where the target is bright, and that are lost, by cause;
 on_screen and all entries of lost sum to 1; fractions_of names the power of which they are fractions.
 .TP
+.B of_source, source_emits
+Fraction of all that the source emits which lands on the picture, and what that is: the power through the aperture for a plane wave
+or a disc at infinity; all rays of a ray file; for a point, grid or disc its Lambertian or tabulated distribution in all directions,
+and for a uniform one the cone if that is given, else all directions; for several sources that of all together.
+.TP
 .B wave_relative_rms, wave_on_target, wave_in_black, resolvable
 The same quantities for the wave image, where diffraction is simulated; number of details across the picture that the light can
 resolve.
@@ -106,7 +111,7 @@ resolve.
 .B least_relative_rms, etendue_limit
 For an extended source: the least error found behind its blur, and the largest fraction of the light that \['e]tendue permits.
 .TP
-.B second_relative_rms, second_noise, second_on_target, second_on_screen, second_image
+.B second_relative_rms, second_noise, second_on_target, second_on_screen, second_of_source, second_image
 The same quantities for a second picture behind the first; if the light is to continue parallel or towards a focus instead,
 .BR angle_rms_mrad ,
 the root mean square of its angular deviation.

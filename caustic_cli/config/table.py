@@ -134,8 +134,8 @@ _ROWS = (
             option=Option("--source-size", "W[xH]", BOTH)),
     Setting("source.grid", "wholes", "points of a grid along x and y", low=1, high=1000, derived="25 x 25",
             why="figure 6.4.1 of the thesis", option=Option("--source-grid", "N[xM]", BOTH)),
-    Setting("source.cone", "number", "half-angle of the cone about +z", "degrees", 1e-9, 90.0, derived="as wide as the lens",
-            option=Option("--cone", "DEG", BOTH)),
+    Setting("source.cone", "number", "half-angle of the cone about +z", "degrees", 1e-9, 90.0,
+            derived="the narrowest that covers the lens", option=Option("--cone", "DEG", BOTH)),
     Setting("source.angle", "number", "disc at infinity (the sun: 0.533): angular diameter", "degrees", 0.0, 170.0,
             derived="a disc at a finite distance", option=Option("--source-angle", "DEG", BOTH)),
     Setting("source.intensity", "text",
@@ -179,8 +179,8 @@ _ROWS = (
             written=False, option=Option("--absorption", "PER_MM", BOTH)),
     Setting("lens.roughness", "number", "standard deviation of the exit's microfacet slopes along an axis, mm per mm",
             low=0.0, high=1.0, default=0.0, written=False, option=Option("--roughness", "SLOPE", BOTH)),
-    Setting("lens.mirror", "flag", "the surface is a mirror, with the screen on the source's side", default=False, written=False,
-            option=Option("--mirror")),
+    Setting("lens.mirror", "flag", "the surface is a mirror, with the screen on the source's side, beside its light",
+            default=False, written=False, option=Option("--mirror")),
     Setting("lens.aperture", "text", "shape of the lens: rectangle, or circle, the largest within size",
             choices=("rectangle", "circle"), default="rectangle", written=False,
             option=Option("--aperture", "rectangle|circle")),
@@ -227,8 +227,8 @@ _ROWS = (
     Setting("screen.tilt", "numbers", "rotation of the screen about its own centre: about the fixed x axis, then about the"
             " fixed y axis", "degrees", -85.0, 85.0, default=[0.0, 0.0], written=False,
             option=Option("--screen-tilt", "A,B", BOTH)),
-    Setting("screen.shift", "numbers", "decentre of the screen", "mm", -1e9, 1e9, default=[0.0, 0.0],
-            written=False, option=Option("--screen-shift", "X,Y", BOTH)),
+    Setting("screen.shift", "numbers", "decentre of the screen; by default that of a mirror is shifted out of the light of its"
+            " source", "mm", -1e9, 1e9, default=[0.0, 0.0], written=False, option=Option("--screen-shift", "X,Y", BOTH)),
     Setting("screen.radius", "numbers", "radii of curvature of a curved screen along x and y: the same for a sphere, inf along"
             " one axis for a cylinder; positive bends the edges towards +z, away from a lens", "mm", derived="plane", written=False,
             option=Option("--screen-radius", "R[,RY]", BOTH)),

@@ -35,6 +35,7 @@ from caustic_cli.export.reading import Readings, of_facets
 from caustic_cli.export.surface import STEPS_PER_SPAN, Sampling
 from caustic_cli.export.text import CREATED, real
 from caustic_cli.io.files import write_bytes
+from caustic_cli.optics.obstruction import refuse_obstructed
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import System
 from caustic_cli.scene import Component, Lens, Scene, Screen
@@ -116,7 +117,7 @@ def write_mitsuba(
         write_mesh(mesh, front.points.reshape(-1, 3), triangles(front.points)[:, ::-1], -front.normals.reshape(-1, 3))
         entrance = [f'<shape type="ply" id="entrance"><string name="filename" value={quoteattr(mesh.name)}/>{glass}</shape>']
     lines = [
-        *_camera(screen, away, f'<scale x="-1"/><translate z="{real(screen.z - away)}"/>{onto}', surfaces + 2),
+        *_camera(screen, away, f'<scale x="-1"/>{_moved(screen, screen.z - away)}{onto}', surfaces + 2),
         *entrance,
         f'<shape type="ply" id="exit"><string name="filename" value={quoteattr(exit_mesh.name)}/>{glass}</shape>',
         f'<shape type="ply" id="sides"><string name="filename" value={quoteattr(sides.name)}/>'
@@ -182,17 +183,17 @@ def _write_mirror(path: str | Path, scene: Scene, surface: Patch, light: list[st
     """Write the scene of a mirror.
 
     Raises:
-        InputError: the screen would obstruct the source.
+        InputError: something obstructs the light of a near source, whose emitter stands where the source does.
     """
     screen, lens = scene.screen, scene.lens
-    if not scene.source.collimated and scene.source.nearest <= screen.z:
-        raise InputError("⟨format⟩ mitsuba: the screen would obstruct the light of this mirror's source")
+    if not scene.source.collimated:
+        refuse_obstructed(scene, designed=True)
     (mesh,) = companions(path, False, True)
     points, normals = (a.reshape(-1, 3) for a in (surface.points, surface.normals))
     write_mesh(mesh, points, triangles(surface.points)[:, ::-1], -normals)  # towards the light
     away = 0.9 * (min(float(points[:, 2].min()), lens.z_in) - BEFORE - screen.z)
     lines = [
-        *_camera(screen, away, f'<rotate y="1" angle="180"/><translate z="{real(screen.z + away)}"/>'),
+        *_camera(screen, away, f'<rotate y="1" angle="180"/>{_moved(screen, screen.z + away)}'),
         f'<shape type="ply" id="mirror"><string name="filename" value={quoteattr(mesh.name)}/>{MIRRORED}</shape>',
         *_screen(screen, ""),
         *(line.replace("</shape>", '<bsdf type="null"/></shape>') for line in light),
@@ -237,10 +238,15 @@ def _screen(screen: Screen, spin: str, onto: str = "") -> list[str]:
     return [
         '<shape type="rectangle" id="screen">',
         '  <bsdf type="diffuse"><rgb name="reflectance" value="1"/></bsdf>',
-        f'  <transform name="to_world">{spin}<scale x="{real(sx)}" y="{real(sy)}"/><translate z="{real(screen.z)}"/>{onto}'
-        "</transform>",
+        f'  <transform name="to_world">{spin}<scale x="{real(sx)}" y="{real(sy)}"/>{_moved(screen, screen.z)}{onto}</transform>',
         "</shape>",
     ]
+
+
+def _moved(screen: Screen, z: float) -> str:
+    """Translation to z on the line through the centre of the screen along its axis."""
+    shift = "".join(f' {axis}="{real(c)}"' for axis, c in zip("xy", screen.shift, strict=True) if c)
+    return f'<translate{shift} z="{real(z)}"/>'
 
 
 def quick_samples(field: HeightField) -> tuple[int, int]:
@@ -291,7 +297,7 @@ def _light(scene: Scene) -> list[str]:
     Raises:
         InputError: Mitsuba has no equivalent emitter.
     """
-    beyond = [name for name in special_features(scene) if name != "a mirror"]
+    beyond = [name for name in special_features(scene) if name not in ("a mirror", "a shifted screen")]
     if beyond:
         raise InputError(f"⟨format⟩ mitsuba is written for clear lenses and straight screens, not {', '.join(beyond)}")
     if scene.source.kind not in _EMITTERS:

@@ -311,10 +311,12 @@ def _draw_energy_balance(axis: Axes, figures: dict) -> None:
 
 
 def _balance_words(figures: dict) -> str:
-    """Title of the energy balance: light in black regions of the image that the lens is judged by, and what a least radius adds to
-    that."""
+    """Title of the energy balance: the fraction of all that the source emits, light in black regions of the image that the lens is
+    judged by, and what a least radius adds to that."""
     waves, radius = figures.get("wave_relative_rms") is not None, figures.get("min_radius")
     words, black = ("where the light goes, by rays", "wave_in_black") if waves else ("where the light goes", "in_black")
+    if figures.get("of_source") is not None and figures["of_source"] != figures["on_target"]:
+        words += f"\non the picture {100.0 * figures['of_source']:.3g} % of all that the source emits"
     if figures.get(black) is not None:
         words += f"\nof that on the screen, in black {figures[black]:.2%}{', by waves' if waves else ''}"
     if radius is not None and radius["in_black_per_mm"] is not None:

@@ -39,6 +39,7 @@ COLUMNS = {
     "error": "relative RMS between the retraced image and the target, each over its own mean",
     "noise": "standard error of `error`",
     "on_screen": "fraction of the source's power on the screen",
+    "of_source": "fraction of all that the source emits which lands on the picture",
     "front": "whether the lens is on the Pareto front: none other is both brighter and has a smaller error",
     "seconds": "of the design's iterations",
 }
@@ -91,6 +92,7 @@ def run_efficiency(
                 "error": figures["relative_rms"],
                 "noise": figures["noise"],
                 "on_screen": figures["on_screen"],
+                "of_source": figures["of_source"],
                 "seconds": lens.seconds,
             }
         )

@@ -27,7 +27,6 @@ Sources: thesis 5.2; Wang, Bovik, Sheikh, Simoncelli, IEEE Trans. Image Processi
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -42,7 +41,6 @@ if TYPE_CHECKING:
 SSIM_SIGMA, SSIM_RADIUS, SSIM_K1, SSIM_K2 = 1.5, 5, 0.01, 0.03
 #: Fraction of its peak below which a target counts as black.
 DARK = 0.01
-_FIGURES = ("loss", "relative_rms", "psnr_db", "ssim")
 
 
 def loss(image, target, variance=None) -> float:
@@ -103,10 +101,15 @@ def ssim(image, target, variance=None) -> float | None:
     return float(local.mean())
 
 
+#: Figures of an image against its target, and their names.
+_COMPARISONS = (loss, relative_rms, psnr_db, ssim)
+_FIGURES = tuple(figure.__name__ for figure in _COMPARISONS)
+
+
 def on_target(image, target) -> float:
     """Fraction of the source's power that lands where the target is not zero; `image` as a fraction of that power per pixel."""
     image, target = _pair(image, target)
-    return float(image[target > 0].sum())
+    return _sum(image[target > 0])
 
 
 def black(target) -> np.ndarray:
@@ -121,8 +124,8 @@ def in_black(image, target) -> float | None:
     None if the target has no black region, or the image is black.
     """
     image, dark = _array(image), black(target)
-    total = image.sum()
-    return float(image[dark].sum() / total) if dark.any() and total > 0 else None
+    total = _sum(image)
+    return _sum(image[dark]) / total if dark.any() and total > 0 else None
 
 
 def figures_of_merit(exposure: Image, target, variance=None) -> dict:
@@ -139,25 +142,35 @@ def figures_of_merit(exposure: Image, target, variance=None) -> dict:
 
     For a coloured image, (3, n_x, n_y) like its target, the first four are means over the colours that the target has; in_black is
     evaluated for each colour separately.
+
+    Powers of rays, 1/N each, sum to 1 only to rounding; parts are therefore fractions of the sum of all parts, whose deviation from
+    1 `retrace.require_energy_balance` checks.  An image without an account of losses, such as a wave image, is taken as it is.
     """
-    image = exposure.image
-    if image.ndim == 3 and target is not None:
-        noise = [None] * len(image) if variance is None else variance
-        parts = [
-            figures_of_merit(replace(exposure, image=i), t, v) for i, t, v in zip(image, target, noise, strict=True) if t.sum() > 0
-        ]
-        means = {k: None if None in (v := [p[k] for p in parts]) else math.fsum(v) / len(v) for k in _FIGURES}
-        sums = {k: math.fsum(p[k] for p in parts) for k in ("on_screen", "on_target")}
-        return means | {"in_black": in_black(image, target)} | sums | {k: parts[0][k] for k in ("lost", "rays")}
-    against = (loss, relative_rms, psnr_db, ssim)
+    image, lost = _array(exposure.image), {name: max(0.0, float(value)) for name, value in exposure.lost.items()}
+    whole = math.fsum([_sum(image), *lost.values()]) if lost else 1.0
+    if target is None:
+        compared: dict = dict.fromkeys((*_FIGURES, "in_black", "on_target"))
+    else:
+        target, noise = _array(target), None if variance is None else _array(variance)
+        colours = [(image, target, noise)]
+        if image.ndim == 3:
+            colours = list(zip(image, target, [None] * len(image) if noise is None else noise, strict=True))
+        found = [[figure(*one) for one in colours if image.ndim == 2 or one[1].sum() > 0] for figure in _COMPARISONS]
+        compared = {name: None if None in v else math.fsum(v) / len(v) for name, v in zip(_FIGURES, found, strict=True)}
+        compared["in_black"] = in_black(image, target)
+        compared["on_target"] = _sum(image[target > 0]) / whole
     return {
-        **{figure.__name__: None if target is None else figure(image, target, variance) for figure in against},
-        "in_black": None if target is None else in_black(image, target),
-        "on_screen": float(_array(image).sum()),
-        "on_target": None if target is None else on_target(image, target),
-        "lost": {name: float(value) for name, value in exposure.lost.items()},
+        **{name: compared[name] for name in (*_FIGURES, "in_black")},
+        "on_screen": _sum(image) / whole,
+        "on_target": compared["on_target"],
+        "lost": {name: value / whole for name, value in lost.items()},
         "rays": int(exposure.rays),
     }
+
+
+def _sum(a: np.ndarray) -> float:
+    """The correctly rounded sum, so that no part exceeds the whole."""
+    return math.fsum(a.ravel().tolist())
 
 
 def _array(a) -> np.ndarray:

@@ -19,7 +19,7 @@ from caustic_cli.optics.surfaces.cut import CutSurface
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.trace import expose
 from caustic_cli.scene import Scene
-from caustic_cli.studies.irradiance import irradiance_figures, unit_figures
+from caustic_cli.studies.irradiance import irradiance_figures, source_figures, unit_figures
 from caustic_cli.studies.metrics import figures_of_merit
 from caustic_cli.studies.noise import black_error, image_noise, noise_bias, standard_error, variance_of
 
@@ -209,8 +209,8 @@ def retrace(
             enough = quiet is None or target is None or figures["noise"] <= quiet * figures["relative_rms"]
             if enough or 2 * len(parts[0]) > MOST_TIMES or rays * len(parts[0]) >= _available(scene):
                 break
-    require_energy_balance(figures, dtype)
-    figures |= irradiance_figures(scene, counted.image) | unit_figures(scene)
+    require_energy_balance(counted, dtype)
+    figures |= irradiance_figures(scene, counted.image) | unit_figures(scene) | source_figures(scene, figures["on_target"])
     if filter is None or filter.reach == (0, 0):
         return counted, figures
     sampler = sampler_for(scene, counted.rays, seed, device)
@@ -223,13 +223,13 @@ def evaluation_rays(scene: Scene, usual: int = FINAL_RAYS) -> int:
     return round(usual * min(max(1.0, times), MOST_FINAL))
 
 
-def require_energy_balance(figures: dict, dtype: torch.dtype) -> None:
-    """Check the energy balance: all fractions are in [0, 1], and their sum is 1, within BALANCE.
+def require_energy_balance(exposure: Image, dtype: torch.dtype) -> None:
+    """Check the energy balance: the image and all losses are in [0, 1], and their sum is 1, within BALANCE.
 
     Raises:
         CausticError: naming the fractions.
     """
-    parts = {"on_screen": figures["on_screen"], **figures["lost"]}
+    parts = {"on_screen": float(exposure.image.sum()), **exposure.lost}
     room = BALANCE[dtype]
     if abs(math.fsum(parts.values()) - 1.0) <= room and all(-room <= part <= 1.0 + room for part in parts.values()):
         return

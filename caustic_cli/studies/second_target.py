@@ -35,15 +35,15 @@ def second_figures(
         scene: with its lens' designed entrance; heights: (n, m) mm of the exit; target: irradiance on the second screen.
 
     Returns:
-        figures: second_relative_rms, second_noise, second_on_target and second_on_screen of a second picture; angle_rms_mrad, the
-        RMS angle to the prescribed directions, weighted by power, for collimated or focused light.
+        figures: second_relative_rms, second_noise, second_on_target, second_on_screen and second_of_source of a second picture;
+        angle_rms_mrad, the RMS angle to the prescribed directions, weighted by power, for collimated or focused light.
     """
     second = scene.second
     assert second is not None
     if second.screen is not None:
         elsewhere = scene.onto(second.screen)
         exposure, found = retrace(elsewhere, field, heights, target, rays=rays, seed=seed, device=device, requests=requests)
-        names = ("relative_rms", "noise", "on_target", "on_screen")
+        names = ("relative_rms", "noise", "on_target", "on_screen", "of_source")
         return exposure.image.cpu().numpy(), {f"second_{name}": found[name] for name in names}
     squares = power = 0.0
     with torch.no_grad():

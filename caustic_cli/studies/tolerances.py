@@ -499,7 +499,8 @@ def rows(f: dict) -> list[tuple[str, str]]:
         ("evaluated", f"by {f['judged_by']}, {f['draws']} draws"),
         (
             "without errors",
-            f"relative RMS error {f['nominal']['relative_rms']:.4f}, light on the picture {f['nominal']['on_target']:.2%}",
+            f"relative RMS error {f['nominal']['relative_rms']:.4f}, light on the picture {f['nominal']['on_target']:.2%},"
+            f" {100.0 * f['nominal']['of_source']:.3g}% of all the source emits",
         ),
         (
             "relative RMS error",

@@ -24,7 +24,7 @@ from caustic_cli import __version__
 from caustic_cli.config import presets, settings
 from caustic_cli.config.completion import PLATE, WALL, Derivation, build_options, build_stages, complete, shape_words, without_waves
 from caustic_cli.config.default_stages import transport_cells
-from caustic_cli.config.settings import Settings
+from caustic_cli.config.settings import Settings, value_of
 from caustic_cli.errors import CausticError, InputError, Interrupted
 from caustic_cli.inverse import ranks
 from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
@@ -33,6 +33,7 @@ from caustic_cli.inverse.initial_surface import InitialSurface, first_surface
 from caustic_cli.inverse.initial_two_sided import first_sides
 from caustic_cli.inverse.lenslets import initial_array
 from caustic_cli.inverse.reachability import largest_magnification, refuse_unreachable
+from caustic_cli.inverse.scene_parameters import Ranges
 from caustic_cli.inverse.sharpness import advice
 from caustic_cli.inverse.source_limits import best_irradiance, performance_limits, point_source, source_spread
 from caustic_cli.inverse.surface_from_map import OutOfReach
@@ -41,6 +42,7 @@ from caustic_cli.io.files import Piped
 from caustic_cli.io.picture import Picture, read_picture
 from caustic_cli.io.surfaces import SUFFIXES, onto, read_surface
 from caustic_cli.optics.emission.measured import coarse_words
+from caustic_cli.optics.obstruction import clear_shift, refuse_obstructed
 from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import split_heights
@@ -140,6 +142,10 @@ def begin(
     profile = said.get("source", {}).get("profile")
     light = read_picture((config.parent if config else Path()) / profile, linear=True) if profile else None
     full = complete(said, picture.aspect, by, picture.lit, picture.gaps)
+    if value_of(full["lens"], "lens.mirror") and "shift" not in full["screen"] and any(shift := _beside_the_light(full)):
+        said["screen"] = said.get("screen", {}) | {"shift": list(shift)}
+        full = complete(said, picture.aspect, by, picture.lit, picture.gaps)
+        say.say(f"the screen is shifted by {shift[0]:g},{shift[1]:g} mm, beside the light of its source; ⟨+screen.shift⟩ places it")
     settings.refuse_unused(full["source"], given, [stage.get("source") for stage in full["design"]["stages"]])
     farther = full.get("second", {}).get("file")
     second = None
@@ -165,6 +171,8 @@ def begin(
     if out is not None and not force and (same := uptodate.same_design(out, project.asked)):
         return replace(same[0], found=same[1]), None
     designer, goal = _designer(project, "cpu")  # builds and thereby validates scene, target, stages, options
+    for scene in designer.scenes:
+        refuse_obstructed(scene)
     if out is not None:
         directory.check(out, force)  # before the transport, which may take a minute
     if designer.scene.second is None and not designer.scene.elements:
@@ -186,6 +194,12 @@ def begin(
     if out is not None:
         directory.create(project, force)
     return project, first
+
+
+def _beside_the_light(full: Settings) -> tuple[float, float]:
+    """Shift (x, y) mm of a mirror's screen with which it is nowhere in the light of its source; 0 if there is none."""
+    scene, over = settings.build_scene(full), Ranges.parse(value_of(full["design"], "design.over"))
+    return clear_shift([scene] if over is None else over.ends(scene)) or (0.0, 0.0)
 
 
 def first_heights(project: Project, said: Settings) -> tuple[Project, InitialHeights | None]:
@@ -309,6 +323,8 @@ def resume(
             raise project.error("⟨lens.gradient⟩ free cannot be resumed: design it anew, with more ⟨iterations⟩")
         project.hold.enter_context(directory.locked(project.path))
         designer, target = _designer(project, device)
+        for scene in designer.scenes:
+            refuse_obstructed(scene)
         begun = (project.path / CHECKPOINT).exists()  # else it was killed before its first checkpoint
         before = project.load() if begun else None
         state = before.state if begun else designer.begin(*designer.initial_heights(_solved(project, fixed=True)[0]) or ())
@@ -376,8 +392,8 @@ def _designer(project: Project, device: str) -> tuple[Designer, np.ndarray]:
 
 
 def _solved(project: Project, fixed: bool) -> tuple[torch.Tensor | None, float | None]:
-    """Initial heights on the control net of the first stage, by transport or from another lens, None for the offset surface; and
-    the thickness that belongs to them, None if unchanged.
+    """Initial heights on the control net of the first stage, by transport or from another lens, None for the offset surface as it
+    is; and the thickness that belongs to them, None if unchanged.
 
     fixed: the thickness is given by the user; a transport surface below the least thickness is raised, which leaves slopes
     unchanged.
@@ -387,7 +403,7 @@ def _solved(project: Project, fixed: bool) -> tuple[torch.Tensor | None, float |
     """
     start = project.settings["design"]["start"]
     if start == "offset":
-        return None, None
+        return _aimed_offset(project), None
     if start == "transport":
         designer, target = _designer(project, "cpu")
         scene, goal = designer.scene, grey(target)
@@ -424,6 +440,18 @@ def _solved(project: Project, fixed: bool) -> tuple[torch.Tensor | None, float |
             f"⟨design.start⟩: the lens of {start} is {other.settings['lens']['size']} mm, not {project.settings['lens']['size']} mm"
         )
     return onto(field, heights, net), None
+
+
+def _aimed_offset(project: Project) -> torch.Tensor | None:
+    """The offset surface with the slope that turns its light to the centre of a shifted screen; None for one that is not shifted,
+    or for a network, whose heights are relative to the offset surface."""
+    scene, shift = project.scene(), project.scene().screen.shift
+    if not any(shift) or project.settings["design"]["network"] != "none":
+        return None
+    lens = scene.lens
+    x, y = (c.numpy() for c in _designer(project, "cpu")[0].field(0).control_xy())
+    slope = [c / ((lens.effective_index - 1.0) * (scene.screen.z - lens.offset.thickness)) for c in shift]
+    return torch.from_numpy(lens.offset.heights(x, y) + slope[0] * x[:, None] + slope[1] * y[None, :])
 
 
 def _spare(lens: dict[str, Any], said: Settings, first: torch.Tensor) -> float:

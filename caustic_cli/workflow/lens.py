@@ -16,6 +16,7 @@ from caustic_cli.errors import InputError
 from caustic_cli.export import format_of
 from caustic_cli.inverse.designer import State
 from caustic_cli.io.archive import open_archive
+from caustic_cli.optics.obstruction import refuse_obstructed
 from caustic_cli.optics.plan import Plan, compile_plan, parse_effects
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.resolution import Resolution
@@ -111,7 +112,12 @@ class Lens:
 
     def plan(self, effects: str = "auto", steeper: float = 0.0) -> Plan:
         """The effects to simulate: those that the scene calls for ("auto"), only those that cannot be left out ("none"), or those
-        named; steeper: by how much the slopes of the traced surface may exceed those of the lens."""
+        named; steeper: by how much the slopes of the traced surface may exceed those of the lens.
+
+        Raises:
+            InputError: an effect is unknown, or something stands in the light.
+        """
+        refuse_obstructed(self.scene, designed=True)
         return compile_plan(self.scene, self.field, self.heights, parse_effects(effects), steeper)
 
     def render(

@@ -14,6 +14,7 @@ from caustic_cli.optics.waves import wave_image
 from caustic_cli.scene import Scene
 from caustic_cli.scene.tolerances import Tolerances
 from caustic_cli.studies import tolerances as study
+from caustic_cli.studies.irradiance import source_figures
 from caustic_cli.workflow.lens import Lens
 from caustic_cli.workflow.reporter import Reporter
 
@@ -45,6 +46,7 @@ def tolerances(lens: Lens, plan: Plan, asked: Tolerances, sheet: Path, plot: Pat
         )
         found = study.study(trials, lambda what, done, whole: show("tolerances", what, done, whole))
     figures = study.figures(found)
+    figures["nominal"] |= source_figures(plan.scene, figures["nominal"]["on_target"])
     study.write_csv(sheet, found)
     study.write_plot(plot, found)
     for name, why in found.unused.items():

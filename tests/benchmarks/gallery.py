@@ -96,7 +96,8 @@ def row(name: str, picture: Path, quality: str, folder: Path, out: Path) -> str:
         f"relative RMS error by rays {sharp['relative_rms']:.3f} ± {sharp['noise']:.4f}",
         f"of the wave image {sharp['wave_relative_rms']:.3f}" if sharp.get("wave_relative_rms") is not None else "",
         f"least possible error behind the source's blur {said['least_relative_rms']:.3f}" if said.get("least_relative_rms") else "",
-        f"light on the picture {sharp['on_target']:.1%}",
+        f"light on the picture {sharp['on_target']:.1%}"
+        + (f", {100.0 * sharp['of_source']:.3g}% of all the source emits" if sharp["of_source"] != sharp["on_target"] else ""),
         f"designed in {seconds:.0f} s",
     ]
     command = f"caustic design {picture.name} {options}".strip() + (f" --quality {quality}" if quality != "standard" else "")

@@ -195,10 +195,21 @@ class Source:
             return self.half_angle
         if self.cone is not None:
             return math.radians(self.cone)
-        positions, extent = self.points()[0], self.extent
-        across = [np.abs(positions[:, k]) + extent[k] + (0.0 if round else half_size[k]) for k in (0, 1)]
-        farthest = np.hypot(*across) + (half_size[0] if round else 0.0)
-        return min((1.0 + SLACK) * float(np.arctan2(farthest, z_in - positions[:, 2]).max()) + self.lean, math.pi / 2.0)
+        return min(self._covering(half_size, z_in, round) + self.lean, math.pi / 2.0)
+
+    def _covering(self, half_size: tuple[float, float], z_in: float, round: bool) -> float:
+        """Largest angle to z, rad, between a point of the source and one of the aperture."""
+        (x, y, z), (rx, ry) = self.points()[0].T, half_size
+        if round:
+            far = self._farthest(x, y) + rx
+        else:
+            far = np.max([self._farthest(x + a, y + b) for a in (-rx, rx) for b in (-ry, ry)], axis=0)
+        return min((1.0 + SLACK) * float(np.arctan2(far, z_in - z).max()), math.pi / 2.0)
+
+    def _farthest(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Largest distance from the origin, mm, of the points of a source about (x, y), (k,): of the rectangle of its extent."""
+        wide, high = self.extent
+        return np.hypot(np.abs(x) + wide, np.abs(y) + high)
 
     def power_words(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> str:
         """What its power, of which all fractions are taken, is: a noun phrase for messages."""
@@ -206,14 +217,25 @@ class Source:
             return "the power through the aperture"
         return f"the power within the cone of {math.degrees(self.cone_over(half_size, z_in, round)):.3g} degrees"
 
+    def emitted(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> tuple[float, str]:
+        """Fraction that its power is of all the light it emits, and what that is, in words: through the aperture for a distant
+        source; else its distribution in all directions, except that a uniform one ends at the edge of a cone that is given."""
+        if self.distant:
+            return 1.0, "through the aperture"
+        cone = self.cone_over(half_size, z_in, round)
+        if isinstance(self.intensity, Distribution):
+            return self.intensity.flux(cone) / self.intensity.flux(math.pi), "in all directions of its table"
+        if self.intensity == "lambertian":
+            return math.sin(cone) ** 2, "in all directions, Lambertian"
+        if self.cone is not None:
+            return 1.0, "in its cone"
+        return math.sin(0.5 * cone) ** 2, "in all directions, uniform"
+
     def incidence(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> float:
         """Upper bound of the angle to z of its rays into the aperture, rad."""
         if self.distant:
             return self.half_angle
-        positions, extent = self.points()[0], self.extent
-        far = np.hypot(*(np.abs(positions[:, k]) + extent[k] + half_size[k] for k in (0, 1)))
-        steepest = float(np.arctan2(far, z_in - positions[:, 2]).max())
-        return min(self.cone_over(half_size, z_in, round) + self.lean, steepest)
+        return min(self.cone_over(half_size, z_in, round) + self.lean, self._covering(half_size, z_in, round))
 
     @property
     def lean(self) -> float:

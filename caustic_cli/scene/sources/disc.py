@@ -27,6 +27,8 @@ from caustic_cli.scene.sources.section import (
 
 #: Angular diameter of the sun, degrees.
 SUN = 0.533
+#: Intervals of each step that locates the farthest point of an ellipse, and steps: the angle to 1e-6, the distance to 1e-12.
+ZOOM, ZOOMS = 64, 4
 
 
 @dataclass(frozen=True)
@@ -92,13 +94,20 @@ class Disc(Source):
         return (math.sin(math.radians(self.angle) / 2.0),) * 2
 
     @cached_property
+    def _corners(self) -> tuple[np.ndarray, np.ndarray]:
+        """Corners x, y of the picture's outermost lit pixels, in half widths: the first and the last lit pixel of each row."""
+        assert self.brightness is not None
+        (nx, ny), lit = self.brightness.shape, self.brightness > 0
+        (rows,) = np.nonzero(lit.any(1))
+        first, last = lit[rows].argmax(1), ny - lit[rows, ::-1].argmax(1)
+        x = np.concatenate([rows, rows, rows + 1, rows + 1]) * (2.0 / nx) - 1.0
+        return x, np.concatenate([first, last, first, last]) * (2.0 / ny) - 1.0
+
+    @cached_property
     def _reach(self) -> tuple[float, float, float]:
         """Extent of the picture's lit pixels from its centre along x, along y and radially, in half widths."""
-        assert self.brightness is not None
-        lit = self.brightness > 0
-        far = [np.maximum(np.abs(edge[:-1]), np.abs(edge[1:])) for edge in (np.linspace(-1.0, 1.0, n + 1) for n in lit.shape)]
-        corner = np.hypot(far[0][:, None], far[1][None, :])
-        return float(far[0][lit.any(1)].max()), float(far[1][lit.any(0)].max()), float(corner[lit].max())
+        x, y = self._corners
+        return float(np.abs(x).max()), float(np.abs(y).max()), float(np.hypot(x, y).max())
 
     @property
     def centre(self) -> tuple[float, float, float]:
@@ -125,6 +134,21 @@ class Disc(Source):
             return 0.0, 0.0
         wide, high = (1.0, 1.0) if self.brightness is None else self._reach[:2]
         return wide * self.size[0] / 2.0, high * self.size[1] / 2.0
+
+    def _farthest(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """As of a source: of the ellipse, or of the lit pixels of its picture."""
+        (fx, fy), (ax, ay) = self.frame, (np.abs(x), np.abs(y))
+        if self.brightness is not None:
+            return np.hypot(x[:, None] + fx * self._corners[0], y[:, None] + fy * self._corners[1]).max(1)
+        if fx == fy:
+            return np.hypot(ax, ay) + fx
+        low, high = np.zeros_like(ax), np.full_like(ax, 0.5 * math.pi)  # angle of the farthest point, which is in this quadrant
+        for _ in range(ZOOMS):
+            turn = np.linspace(low, high, ZOOM + 1)
+            far = np.hypot(ax + fx * np.cos(turn), ay + fy * np.sin(turn))
+            best, step = np.take_along_axis(turn, far.argmax(0)[None], 0)[0], (high - low) / ZOOM
+            low, high = np.maximum(low, best - step), np.minimum(high, best + step)
+        return far.max(0)
 
     @property
     def sharp(self) -> bool:

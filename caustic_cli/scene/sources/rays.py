@@ -70,6 +70,10 @@ class Measured(Source):
         """That of the file's rays, wherever they go."""
         return "the power of all rays of the file"
 
+    def emitted(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> tuple[float, str]:
+        """All rays of the file."""
+        return 1.0, "by all rays of the file"
+
     def pointlike(self) -> Source:
         """A point source at the point of closest approach."""
         return Points((self.centre,), (self.power,))

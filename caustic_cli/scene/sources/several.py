@@ -137,6 +137,11 @@ class Several(Source):
         """The sum of all."""
         return "the power of all sources"
 
+    def emitted(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> tuple[float, str]:
+        """Of all together."""
+        whole = math.fsum(one.power / one.emitted(half_size, z_in, round)[0] for one in self.members)
+        return self.power / whole, "by all sources, each in all its directions"
+
     def incidence(self, half_size: tuple[float, float], z_in: float, round: bool = False) -> float:
         """The greatest."""
         return max(one.incidence(half_size, z_in, round) for one in self.members)
