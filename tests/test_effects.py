@@ -531,7 +531,11 @@ def test_every_combination_is_traced_as_by_plain_torch(rays, light, lens, screen
             image = image + found.image
             lost = {name: lost.get(name, 0.0) + float(value) for name, value in found.lost.items()}
         assert float(image.detach().sum()) + sum(lost.values()) == pytest.approx(1.0, abs=1e-12)
-        return [image.detach(), torch.tensor([lost.get(name, 0.0) for name in LOSSES]), *torch.autograd.grad((image * by).sum(), heights)]
+        return [
+            image.detach(),
+            torch.tensor([lost.get(name, 0.0) for name in LOSSES]),
+            *torch.autograd.grad((image * by).sum(), heights),
+        ]
 
     compiled = traced()
     with plain():

@@ -355,6 +355,27 @@ def test_design_render_resume_and_files(_here, capfd):
     assert "single lens" in run(capfd, "export", "p", "--format", "zemax", code=2)
 
 
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--collimate",), "--collimate cannot be combined with --element"),
+        (("--focus", "0,0,900"), "--focus cannot be combined with --element"),
+        (("--second", "one.png", "--second-at", "500"), "--second cannot be combined with --element"),
+        (("--robust", "errors.toml"), "--robust errors.toml cannot be combined with --element"),
+        (("--waves", "on"), "--waves on cannot be combined with --element"),
+        (("--gradient", "selfoc", "--gradient-terms", "0.02"), "--gradient selfoc cannot be combined with --element"),
+        (("--mirror",), "--mirror cannot be combined with --element"),
+        (("--element", "lens z=60 free=front", "--network", "sparse"), "--network sparse cannot be combined with [[element]] free"),
+    ],
+)
+def test_what_other_elements_exclude_is_named_as_it_was_given(_here, capfd, options, words):
+    Path("errors.toml").write_text("[index]\nsigma = 0.001\n")
+    assert words in run(capfd, "design", "one.png", *SMALL, "--element", FIELD_LENS, *options, code=2)
+    Path("beside.toml").write_text("[[element]]\nz = -30.0\n")
+    said = run(capfd, "design", "one.png", *SMALL, "--config", "beside.toml", "--collimate", code=2)
+    assert "--collimate cannot be combined with [[element]]:" in said
+
+
 def test_surfaces_of_two_lenses_are_shaped_together(_here, capfd, monkeypatch):
     monkeypatch.setattr(default_stages, "LEAST_CELLS", 256)
     beside = ("--element", "lens z=60 thickness=6 radius=150,-150 index=1.5 size=26 free=both")

@@ -113,6 +113,9 @@ def test_a_file_of_indices_is_kept(capfd):
         (("--gradient", "free", "--waves", "on"), "a homogeneous lens"),
         (("--gradient", "free", "--loss", "rms"), "rms-light"),
         (("--gradient", "free", "--mirror"), "mirror"),
+        (("--gradient", "free", "--element", "lens z=20"), "--gradient free cannot be combined with --element"),
+        (("--gradient", "free", "--robust", "errors.toml"), "--robust errors.toml averages over errors of a designed surface"),
+        (("--gradient", "free", "--start", "old.npz"), "--start of a free gradient must be transport"),
         (("--gradient", "lens"), "must be one of"),
         (("--gradient", "selfoc"), "gradient_terms"),
         (("--gradient", "selfoc", "--gradient-terms", "0.1,x"), "separated by commas"),
@@ -123,6 +126,7 @@ def test_a_file_of_indices_is_kept(capfd):
     ],
 )
 def test_what_cannot_be_is_refused_in_a_line(capfd, options, words):
+    Path("errors.toml").write_text("[index]\nsigma = 0.001\n")
     message = run(capfd, "design", "blob.png", *TINY, *options, "-o", "x.caustic", code=2)
     assert words in message and not (Path("x.caustic") / "index.npy").exists()
 

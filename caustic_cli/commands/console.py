@@ -17,7 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from caustic_cli.config.table import TABLE
-from caustic_cli.errors import MARK, InputError, plain_name
+from caustic_cli.errors import LISTS, MARK, InputError, plain_name
 
 #: Largest length of an error line in characters: a longer one repeats the content of a file.
 LONGEST_LINE = 4000
@@ -139,7 +139,7 @@ def named(text: str) -> str:
         row = TABLE.get(path[1:]) if path.startswith("+") else None
         if row and row.option:
             return row.option.name
-        return _option_names.get(path) or (plain_name(path) if "." in path else "--" + path.replace("_", "-"))
+        return _option_names.get(path) or (plain_name(path) if "." in path or path in LISTS else "--" + path.replace("_", "-"))
 
     return MARK.sub(lambda found: name(found[1]), text)
 

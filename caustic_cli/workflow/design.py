@@ -105,11 +105,8 @@ def begin(
         read[-1]["screen"] = attachments.with_shape(read[-1]["screen"], config.parent)
     if config and "lens" in read[-1]:
         read[-1]["lens"] = attachments.with_index(read[-1]["lens"], config.parent)
-    chosen: Settings = {}
-    for path, value in given.items():
-        section, _, key = path.rpartition(".")
-        chosen.setdefault(section, {})[key] = value
-    said = settings.merged({}, *read, chosen)
+    chosen = settings.by_section(given)
+    said = settings.merged({}, *map(settings.implied, (*read, chosen)))
     if {"index", "glass"} <= {*said.get("lens", {})}:  # only where both are given at the same level
         glass = said["lens"].pop("glass")
         say.say(f"⟨lens.index⟩ {said['lens']['index']:g} is used at all wavelengths, and {glass} is ignored")
