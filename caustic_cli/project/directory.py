@@ -16,8 +16,9 @@ from pathlib import Path
 
 from caustic_cli.errors import InputError
 from caustic_cli.io.files import LEFT_BEHIND, PARTS, is_ours, refuse_special
-from caustic_cli.project import attachments
-from caustic_cli.project.project import MADE, TOML, Project, is_project
+from caustic_cli.project import attachments, checkpoint, uptodate
+from caustic_cli.project.checkpoint import Checkpoint
+from caustic_cli.project.project import CHECKPOINT, MADE, TOML, Project, is_project
 
 try:
     import fcntl
@@ -60,8 +61,8 @@ def _of_a_new_project(path: Path) -> bool:
     )
 
 
-def create(project: Project, force: bool) -> None:
-    """Create a project directory and lock it (`Project.hold`).
+def create(project: Project, force: bool, state: Checkpoint | None = None) -> None:
+    """Create a project directory, with its checkpoint if there is a `state`, and lock it (`Project.hold`).
 
     A new directory is written beside its path and renamed, so that it appears complete or not at all.
 
@@ -79,7 +80,7 @@ def create(project: Project, force: bool) -> None:
                         refuse_special(present)  # before anything is removed
                 for name in MADE:
                     (path / name).unlink(missing_ok=True)
-                project.write(path)
+                _write(project, path, state)
             except BaseException:
                 project.hold.close()
                 raise
@@ -94,7 +95,7 @@ def create(project: Project, force: bool) -> None:
             os.umask(umask)
             staging.chmod(0o777 & ~umask)
             project.hold.enter_context(locked(staging))
-            project.write(staging)
+            _write(project, staging, state)
             os.rename(staging, path)
         except BaseException:
             project.hold.close()
@@ -102,6 +103,13 @@ def create(project: Project, force: bool) -> None:
             raise
     except OSError as error:
         raise InputError(f"{path}: cannot be written to ({error.strerror}); -o DIR chooses another place") from error
+
+
+def _write(project: Project, path: Path, state: Checkpoint | None) -> None:
+    uptodate.record_begun(project, path)
+    project.write(path)
+    if state is not None:
+        checkpoint.save(path / CHECKPOINT, state)
 
 
 @contextlib.contextmanager

@@ -159,8 +159,10 @@ def begin(
     )
     if recorded and is_free(project):
         raise InputError("⟨movie⟩ records the design of a surface; ⟨lens.gradient⟩ free designs the index")
-    if out is not None and not force and (same := uptodate.same_design(out, project.asked)):
-        return replace(same[0], found=same[1]), None
+    if out is not None and not force:
+        if same := uptodate.same_design(out, project.asked):
+            return replace(same[0], found=same[1]), None
+        force = uptodate.is_begun(out, project.asked)  # and interrupted before the first checkpoint: it is begun anew
     designer, goal = _designer(project, "cpu")  # builds and thereby validates scene, target, stages, options
     if out is not None:
         directory.check(out, force)  # before the transport, which may take a minute
@@ -325,8 +327,7 @@ def resume(
             changed = project.settings["design"] | {"iterations": iterations}
             project = replace(project, settings=project.settings | {"design": changed})
             project.write_settings()
-        if begun:
-            project = replace(project, asked=uptodate.asked_of(project, before))
+        project = replace(project, asked=uptodate.asked_of(project, before) if begun else uptodate.begun(project))
         return _run(project, designer, target, state, say, began, time_limit, device, movie)
 
 

@@ -239,9 +239,9 @@ class Lens:
         place = Path(path)
         project = replace(self.project, path=place)
         directory.check(place, force)
-        directory.create(project, force)
-        with project.hold:
-            project.save(Checkpoint(self.state, self.field.spaces, self.provenance, self.figures, uptodate.inputs(project)))
+        state = Checkpoint(self.state, self.field.spaces, self.provenance, self.figures, uptodate.inputs(project))
+        directory.create(project, force, state)
+        project.hold.close()
         return place
 
 
