@@ -55,7 +55,8 @@ def check(path: Path, force: bool) -> None:
 def _of_a_new_project(path: Path) -> bool:
     """Whether a file belongs to an incomplete project, whose design was killed before its project.toml was written."""
     return path.is_file() and (
-        path.name.startswith(tuple(f".{stem}" for stem in (*PICTURES, *attachments.ALL, TOML)))
+        path.name.startswith(tuple(f".{stem}" for stem in (*PICTURES, *attachments.ALL, TOML, uptodate.RECORD)))
+        or uptodate.is_record(path)
         or (path.stem in PICTURES and is_ours(path))
         or (path.stem.split("-")[0] in attachments.ALL and any(map(is_ours, path.parent.glob("target.*"))))
     )

@@ -81,6 +81,11 @@ def record_begun(project: Project, path: Path) -> None:
     _write_records(path / RECORD, {BEGUN: {"asked": project.asked, "settings": _undesigned(project)}})
 
 
+def is_record(path: Path) -> bool:
+    """Whether a file is the record of a design."""
+    return path.name == RECORD and BEGUN in _records(path)
+
+
 def begun(project: Project) -> str:
     """Digest of the user's input of a project without a checkpoint, "" if it has one, or has been edited since its creation."""
     if (project.path / CHECKPOINT).exists():
