@@ -16,6 +16,7 @@ from caustic_cli import cli, load
 from caustic_cli.config import default_stages
 from caustic_cli.errors import InputError
 from caustic_cli.export.bodies import CLOSE, bodies
+from caustic_cli.export.lighttools import write_lighttools
 from caustic_cli.export.mesh import closed_mesh
 from caustic_cli.inverse.incidence import incident
 from caustic_cli.inverse.initial_surface import first_surface, sphere_net
@@ -353,6 +354,19 @@ def test_design_render_resume_and_files(_here, capfd):
         said = run(capfd, "render", "p", study, *files, "--quiet", "--force", code=2)
         assert "element" in said, study
     assert "single lens" in run(capfd, "export", "p", "--format", "zemax", code=2)
+
+
+def test_an_archive_holds_the_glass_of_every_lens(tmp_path):
+    """Whose index is another at each wavelength; one of them is given by its index."""
+    lens = Lens((10.0, 10.0), control=(6, 6), glass="N-BK7", index=1.5168, offset=Offset(4.0))
+    beside = thick(20.0), thick(30.0, glass="N-SF11")
+    scene = Scene(PlaneWave(), lens, Screen((20.0, 20.0), 90.0, (8, 8)), Light(wavelengths=(450.0, 650.0)), elements=beside)
+    field, heights = HeightField.of(lens), torch.full((6, 6), 4.0, dtype=torch.float64)
+    write_lighttools(tmp_path / "a.npz", scene, field, heights, (9, 9))
+    again, *of_exit = open_archive(tmp_path / "a.npz")
+    assert [e.glass for e in again.elements] == [None, "N-SF11"]
+    one, other = (expose(s, *of, rays_of(s, "grid", 900)).image for s, *of in ((scene, field, heights), (again, *of_exit)))
+    assert torch.allclose(one, other, atol=1e-12)
 
 
 @pytest.mark.parametrize(

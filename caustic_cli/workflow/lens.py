@@ -23,7 +23,7 @@ from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.surfaces.cut import CutSurface
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import entrance_of
-from caustic_cli.project import directory, uptodate
+from caustic_cli.project import attachments, directory, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Scene
@@ -96,9 +96,14 @@ class Lens:
         return cls(scene, field, heights, target, dict(checkpoint.results), project, checkpoint.state, checkpoint.provenance)
 
     @classmethod
-    def of_archive(cls, path: str | Path) -> Lens:
-        """The lens of an exported `.npz` archive."""
-        return cls(*open_archive(path), None, {})
+    def of_archive(cls, path: str | Path, given: Mapping[str, Any] | None = None) -> Lens:
+        """The lens of an exported `.npz` archive; given: path in `config.table` -> value, which may be the `source.file` of its
+        rays only, if its source is a ray file."""
+        other, rays = dict(given or {}), None
+        if "source.file" in other and other.get("source.type", "rays") == "rays":
+            rays = attachments.rays_of(other.pop("source.file"))
+            other.pop("source.type", None)
+        return cls(*open_archive(path, rays), None, {}).under(other)
 
     def under(self, given: Mapping[str, Any]) -> Lens:
         """The lens in its scene with other settings of light or screen: path in `config.table` -> value.
@@ -254,10 +259,10 @@ def load(path: str | Path, at: str | None = None, **given: Any) -> Lens:
     Raises:
         InputError: there is none, it is damaged, a keyword is unknown, or a value is out of range.
     """
-    other = _other_scene(given, ("path", "at"))
+    other = _other_scene(given, ("at", *signature(Lens.render).parameters))
     if is_archive(Path(path)):
         refuse_at(at)
-        return Lens.of_archive(path).under(other)
+        return Lens.of_archive(path, other)
     return Lens.of(Project.open(path).at(at), other)
 
 

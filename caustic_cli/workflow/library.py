@@ -180,8 +180,11 @@ def _lens(done: workflow.Result, device: str) -> Lens:
 
 
 def render(lens: Lens | str | Path, rays: float | None = None, **options: Any) -> Render:
-    """`Lens.render` of a lens, or of a project or an archive, with the same keywords."""
-    return (lens if isinstance(lens, Lens) else load(lens)).render(rays, **options)
+    """`Lens.render` of a lens, or of a project or an archive, with the keywords of `load`, too."""
+    if isinstance(lens, Lens):
+        return lens.render(rays, **options)
+    own = {name: options.pop(name) for name in signature(Lens.render).parameters if name in options}
+    return load(lens, **options).render(rays, **own)
 
 
 def trace(
