@@ -111,6 +111,7 @@ def _write(project: Project, path: Path, state: Checkpoint | None) -> None:
     project.write(path)
     if state is not None:
         checkpoint.save(path / CHECKPOINT, state)
+        uptodate.forget_begun(path)
 
 
 @contextlib.contextmanager

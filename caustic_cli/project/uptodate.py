@@ -81,6 +81,19 @@ def record_begun(project: Project, path: Path) -> None:
     _write_records(path / RECORD, {BEGUN: {"asked": project.asked, "settings": _undesigned(project)}})
 
 
+def forget_begun(path: Path) -> None:
+    """Remove this entry from the record of a project directory, whose checkpoint holds the inputs from now on."""
+    record = _records(path / RECORD)
+    if BEGUN not in record:
+        return
+    del record[BEGUN]
+    with contextlib.suppress(CausticError, OSError):  # what remains is not read beside a checkpoint
+        if record:
+            write_bytes(path / RECORD, json.dumps(record, indent=1).encode())
+        else:
+            (path / RECORD).unlink()
+
+
 def is_record(path: Path) -> bool:
     """Whether a file is the record of a design."""
     return path.name == RECORD and BEGUN in _records(path)

@@ -568,8 +568,8 @@ class _Records:
         self.project, self.designer, self.inputs = project, designer, uptodate.inputs(project)
         self.provenance = provenance(project, device)
         self._resumes = f"caustic design ⟨resume⟩ {project.path} continues from it"
-        before = project.path is not None and (project.path / CHECKPOINT).exists()
-        self._safe = f"the one before is intact, {self._resumes}" if before else "nothing of it is on disk"
+        self._before = project.path is not None and (project.path / CHECKPOINT).exists()
+        self._safe = f"the one before is intact, {self._resumes}" if self._before else "nothing of it is on disk"
         self.seconds = 0.0  # that the last checkpoint took
 
     def keep(self, now: State, figures: dict[str, Any] | None = None) -> None:
@@ -585,6 +585,9 @@ class _Records:
             self.project.save(Checkpoint(now, self.designer.field(now.stage).spaces, self.provenance, figures or {}, self.inputs))
         except CausticError as error:
             raise CausticError(f"{error} after iteration {now.total}; {self._safe}") from error
+        if not self._before:  # the first checkpoint
+            uptodate.forget_begun(self.project.path)
+            self._before = True
         self._safe = f"the one of iteration {now.total} is intact, {self._resumes}"
         self.seconds = time.monotonic() - began
 
