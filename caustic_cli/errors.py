@@ -25,8 +25,11 @@ LONGEST, BEGINNING, END = 600, 300, 160
 
 
 def plain_name(path: str) -> str:
-    """A path as in project.toml: [lens] size; or mag for a parameter without a section."""
-    section, _, key = path.removeprefix("+").rpartition(".")
+    """A path as in project.toml: [lens] size, or [[element]] for a list of tables; mag for a parameter without a section."""
+    path = path.removeprefix("+")
+    if path in LISTS:
+        return LISTS[path]
+    section, _, key = path.rpartition(".")
     return f"{LISTS.get(section, f'[{section}]')} {key}" if section else key
 
 

@@ -2,15 +2,18 @@
 
 import math
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
 import torch
+from helpers import pairwise
 
+from caustic_cli.optics.backends import plain
 from caustic_cli.optics.effects import NO_REQUESTS, Requests
 from caustic_cli.optics.emission import rays_of
 from caustic_cli.optics.interface import reflectances
-from caustic_cli.optics.rays import RayState
+from caustic_cli.optics.rays import LOSSES, RayState
 from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.reintersection import next_intersection
 from caustic_cli.optics.sampling import Sampler
@@ -487,3 +490,55 @@ def test_gradients_against_differences(case, kernels):
         difference = float(value(heights + step * along) - value(heights - step * along)) / (2 * step)
     assert float((gradient * along).sum()) == pytest.approx(difference, rel=2e-5)
     assert abs(difference) > 1e-4
+
+
+# All of them together
+
+#: Kinds of light: rays of an axial plane wave remain a grid as long as they can, with one power for all or, through a circle or
+#: with a profile, a power each.
+SOURCES = (
+    PlaneWave(),
+    PlaneWave(profile=np.random.default_rng(0).uniform(0.1, 1.0, (6, 5))),
+    Points(((0.5, -0.3, -40.0), (0.0, 1.0, -50.0))),
+    Disc((0.0, 0.0, -40.0), (2.0, 1.0)),
+    Disc(angle=0.5),
+)
+LIT = ((None, "none"), (None, "schlick"), (None, "exact"), (30.0, "exact"), (30.0, "schlick"))
+SCREENS = ({}, {"tilt": (10.0, -20.0)}, {"shift": (1.0, 2.0)}, {"radius": (60.0, 60.0)})
+
+
+@pytest.mark.parametrize(
+    ("rays", "light", "lens", "screen", "requests"),
+    pairwise(
+        [*product(SOURCES, ("lines", "stratified"), ("rectangle", "circle"))],
+        LIT,
+        [{}, {"absorption": 0.05, "roughness": 0.01}, {"mirror": True}],
+        SCREENS,
+        [NO_REQUESTS, DETOURS, STAGES],
+    ),
+)
+def test_every_combination_is_traced_as_by_plain_torch(rays, light, lens, screen, requests):
+    """Image, losses and gradient by the kernels, as by the reference in plain torch: 1e-10 of the largest value."""
+    (source, sampler, aperture), (polarisation, fresnel) = rays, light
+    lens = Lens((10.0, 10.0), control=(9, 8), degree=(3, 2), offset=Offset(3.0), fresnel=fresnel, aperture=aperture, **lens)
+    lit = Scene(source, lens, Screen((20.0, 20.0), -60.0 if lens.mirror else 60.0, (12, 12), **screen), Light(polarisation))
+    by = torch.rand((12, 12), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+
+    def traced() -> list[torch.Tensor]:
+        heights, image, lost = bumpy(lit, 0.03).requires_grad_(), 0.0, {}
+        for part in tracers(lit, HeightField.of(lens), rays_of(lit, sampler, 200, 1), torch.float64, 90, requests):
+            found = part.expose({EXIT: heights}, lit.screen, Filter("cosine", (3, 3)))
+            image = image + found.image
+            lost = {name: lost.get(name, 0.0) + float(value) for name, value in found.lost.items()}
+        assert float(image.detach().sum()) + sum(lost.values()) == pytest.approx(1.0, abs=1e-12)
+        return [
+            image.detach(),
+            torch.tensor([lost.get(name, 0.0) for name in LOSSES]),
+            *torch.autograd.grad((image * by).sum(), heights),
+        ]
+
+    compiled = traced()
+    with plain():
+        reference = traced()
+    for a, b in zip(compiled, reference, strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=1e-10 * max(float(b.abs().max()), 1.0))

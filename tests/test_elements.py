@@ -16,6 +16,7 @@ from caustic_cli import cli, load
 from caustic_cli.config import default_stages
 from caustic_cli.errors import InputError
 from caustic_cli.export.bodies import CLOSE, bodies
+from caustic_cli.export.lighttools import write_lighttools
 from caustic_cli.export.mesh import closed_mesh
 from caustic_cli.inverse.incidence import incident
 from caustic_cli.inverse.initial_surface import first_surface, sphere_net
@@ -353,6 +354,40 @@ def test_design_render_resume_and_files(_here, capfd):
         said = run(capfd, "render", "p", study, *files, "--quiet", "--force", code=2)
         assert "element" in said, study
     assert "single lens" in run(capfd, "export", "p", "--format", "zemax", code=2)
+
+
+def test_an_archive_holds_the_glass_of_every_lens(tmp_path):
+    """Whose index is another at each wavelength; one of them is given by its index."""
+    lens = Lens((10.0, 10.0), control=(6, 6), glass="N-BK7", index=1.5168, offset=Offset(4.0))
+    beside = thick(20.0), thick(30.0, glass="N-SF11")
+    scene = Scene(PlaneWave(), lens, Screen((20.0, 20.0), 90.0, (8, 8)), Light(wavelengths=(450.0, 650.0)), elements=beside)
+    field, heights = HeightField.of(lens), torch.full((6, 6), 4.0, dtype=torch.float64)
+    write_lighttools(tmp_path / "a.npz", scene, field, heights, (9, 9))
+    again, *of_exit = open_archive(tmp_path / "a.npz")
+    assert [e.glass for e in again.elements] == [None, "N-SF11"]
+    one, other = (expose(s, *of, rays_of(s, "grid", 900)).image for s, *of in ((scene, field, heights), (again, *of_exit)))
+    assert torch.allclose(one, other, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--collimate",), "--collimate cannot be combined with --element"),
+        (("--focus", "0,0,900"), "--focus cannot be combined with --element"),
+        (("--second", "one.png", "--second-at", "500"), "--second cannot be combined with --element"),
+        (("--robust", "errors.toml"), "--robust errors.toml cannot be combined with --element"),
+        (("--waves", "on"), "--waves on cannot be combined with --element"),
+        (("--gradient", "selfoc", "--gradient-terms", "0.02"), "--gradient selfoc cannot be combined with --element"),
+        (("--mirror",), "--mirror cannot be combined with --element"),
+        (("--element", "lens z=60 free=front", "--network", "sparse"), "--network sparse cannot be combined with [[element]] free"),
+    ],
+)
+def test_what_other_elements_exclude_is_named_as_it_was_given(_here, capfd, options, words):
+    Path("errors.toml").write_text("[index]\nsigma = 0.001\n")
+    assert words in run(capfd, "design", "one.png", *SMALL, "--element", FIELD_LENS, *options, code=2)
+    Path("beside.toml").write_text("[[element]]\nz = -30.0\n")
+    said = run(capfd, "design", "one.png", *SMALL, "--config", "beside.toml", "--collimate", code=2)
+    assert "--collimate cannot be combined with [[element]]:" in said
 
 
 def test_surfaces_of_two_lenses_are_shaped_together(_here, capfd, monkeypatch):

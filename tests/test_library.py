@@ -9,12 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import small_designs
+from helpers import begun, small_designs
 
 import caustic_cli
 from caustic_cli import cli, design, load, render, trace
+from caustic_cli.config import keywords
+from caustic_cli.config.table import TABLE, options_of
 from caustic_cli.errors import CausticError, InputError
+from caustic_cli.project.project import Project
 from caustic_cli.scene import Lens, Offset, PlaneWave, Points, Scene, Screen
+from caustic_cli.workflow import design as workflow
 
 SMALL = {"lens": {"size": [2.0, 2.0]}, "screen": {"z": 60.0, "resolution": [32, 32]}}
 
@@ -164,6 +168,15 @@ def test_progress_and_sections(lens):
         ({"settings": {"lens": {"size": [1, -2]}}}, r"\[lens\] size"),
         ({"settings": {"glass": {}}}, r"\[glass\] is not a section"),
         ({"rays": 0.5}, "rays must be a whole number"),
+        ({"resolutoin": 24}, "resolutoin is not a keyword of design; did you mean resolution"),
+        ({"moon": 1}, "moon is not a keyword of design; keywords are named like the options of caustic design"),
+        ({"resolution": "fine"}, "resolution must be a pair"),
+        ({"lens_size": [1.0, -2.0]}, r"\[lens\] size"),
+        ({"settings": {"lens": 5}}, "lens must be a section"),
+        ({"source": [{"type": "plane"}]}, "source must be a type or a section"),
+        ({"source": {"type": "disc"}, "settings": {"source": [{"type": "point"}]}}, "source must be a type or a section"),
+        ({"lens_aperture": "circle", "settings": {"lens": [{}]}}, r"\[lens\] is a list of tables"),
+        ({"element": [{"type": "lamp", "z": 20.0}]}, r"\[\[element\]\] type must be one of"),
     ],
 )
 def test_what_is_wrong_is_said_in_the_library_s_terms(arguments, message):
@@ -171,6 +184,92 @@ def test_what_is_wrong_is_said_in_the_library_s_terms(arguments, message):
         design(**{"picture": picture(), "mag": 2, "waves": "off"} | arguments)
     assert "--" not in str(error.value)
     assert isinstance(error.value, CausticError) and list(Path().iterdir()) == []
+
+
+def test_every_setting_is_a_keyword():
+    """By the name of its option, or by section and key: with its default it passes the checks of its type."""
+    known = keywords.keywords("design")
+    of_tables = [path for path in TABLE if path.rpartition(".")[0] in ("element", "design.stages")]
+    named = {*TABLE}.difference(of_tables, ["elements", "screen.size"])  # screen_size stands for both of its paths
+    assert set(known.values()) == named | {"element", "design.stages"}
+    for path, row in TABLE.items():
+        if row.option and path != "elements":
+            assert known[row.option.name[2:].replace("-", "_")] == path
+    usual = {name: TABLE[path].default for name, path in known.items() if path in TABLE and TABLE[path].default is not None}
+    given = keywords.checked(keywords.from_keywords("design", usual), {}, "here")
+    assert len(given) > 40 and all(given[path] == TABLE[path].default for path in given)
+    assert set(keywords.keywords("render").values()) == {row.path for row in options_of("render")}
+
+
+def test_keywords_say_what_sections_say(monkeypatch):
+    """By option's name, by section and key, or in a section; a single number for both axes, or with the picture's aspect."""
+    monkeypatch.setattr(workflow, "_run", begun)
+    by_sections = {"lens": {"size": [2.0, 2.0], "control": [9, 9], "z_in": 0.1}, "screen": {"resolution": [24, 24], "z": 60.0}}
+    sections = {**by_sections, "target": {"encoding": "linear"}, "element": [{"z": 20.0}], "design": {"network": "none"}}
+    first = design(picture(), settings=sections, waves="off").project.settings
+    second = design(
+        torch.from_numpy(picture()),
+        lens_size=2,
+        control=np.int64(9),
+        lens_z_in=0.1,
+        resolution=24,
+        throw=60,
+        linear=True,
+        sheet=False,
+        element=[{"z": 20.0}],
+        network=None,
+        waves="off",
+    ).project.settings
+    assert second.pop("target").pop("sheet") is False
+    first.pop("target")
+    assert first == second
+
+
+@pytest.mark.parametrize("network", ["sparse", "dense"])
+def test_a_network_is_trained_by_adam_whatever_it_is_asked_by(network, monkeypatch):
+    """By an option, a configuration, a keyword or a section; an optimiser given at the same place is kept."""
+    monkeypatch.setattr(workflow, "_run", begun)
+    np.save("blob.npy", picture())
+    small = {"resolution": 24, "lens_size": 2, "throw": 60, "control": 7}
+    Path("c.toml").write_text(f"[design]\nnetwork = '{network}'\n[lens]\ncontrol = [7, 7]\n")
+    assert cli.run(["design", "blob.npy", "--config", "c.toml", "--resolution", "24", "--quiet"]) == 0
+    made = [Project.open("blob.caustic").settings]
+    made += [
+        design(picture(), **small, **by).project.settings
+        for by in ({"network": network}, {"settings": {"design": {"network": network}}})
+    ]
+    assert all(one["design"]["optimizer"] == "adam" for one in made)
+    with pytest.raises(InputError, match="optimizer"):
+        design(picture(), **small, network=network, optimizer="lbfgs")
+
+
+def test_an_angle_is_of_a_disc_whatever_it_is_given_by(monkeypatch):
+    monkeypatch.setattr(workflow, "_run", begun)
+    small = {"resolution": 24, "lens_size": 2, "throw": 60, "control": 7}
+    for by in ({"source_angle": 0.5}, {"settings": {"source": {"angle": 0.5}}}):
+        assert design(picture(), **small, **by).project.settings["source"]["type"] == "disc"
+
+
+def test_a_render_under_another_light(lens, capfd):
+    """As the command line renders the project, of a lens in memory and of its project; unknown keywords are named."""
+    lens.save("lens.caustic")
+    options = ["--source", "point", "--screen-shift", "1,0", "--rays", "5e4", "--seed", "3", "--quiet", "--npy", "image.npy"]
+    assert cli.run(["render", "lens.caustic", *options, "--threads", "1"]) == 0
+    for one in (lens, "lens.caustic"):
+        image = render(one, 5e4, seed=3, source="point", screen_shift=[1, 0]).image
+        np.testing.assert_allclose(image, np.load("image.npy"), rtol=0, atol=1e-12)
+    assert np.array_equal(load("lens.caustic", source="point", screen_shift=[1, 0]).render(5e4, seed=3).image, image)
+    assert lens.render(1e4, source_angle=0.5).figures["on_screen"] > 0.5
+    for wrong, words in (
+        ({"screen_titl": [0, 20]}, "did you mean screen_tilt"),
+        ({"resolution": 24}, "resolution is not a keyword of render, which keeps the lens"),
+        ({"efects": "none"}, "did you mean effects"),
+    ):
+        with pytest.raises(InputError, match=words):
+            render(lens, 1e4, **wrong)
+    lens.export("lens.npz")
+    with pytest.raises(InputError, match="an archive's source is fixed"):
+        render("lens.npz", 1e4, source="point")
 
 
 def test_the_door_is_light():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from PIL import Image
 
 from caustic_cli import cli
 from caustic_cli.errors import InputError
-from caustic_cli.inverse import initial_surface
+from caustic_cli.inverse import initial_surface, reachability
 from caustic_cli.inverse.incidence import incident
 from caustic_cli.inverse.initial_surface import InitialSurface, first_surface
 from caustic_cli.inverse.losses import Loss
@@ -139,6 +140,28 @@ def test_a_picture_out_of_reach_is_refused(scene):
     with pytest.raises(InputError, match="no light can be refracted to the picture: it would have to be deflected by at least"):
         refuse_unreachable(scene, blob())
     refuse_unreachable(replace(scene, screen=replace(scene.screen, shift=(0.0, 0.0))), blob())
+
+
+def test_the_points_of_a_source_are_searched_a_few_at_a_time(monkeypatch):
+    """The same angle whatever the size of a block, in memory that does not grow with the number of points."""
+    screen = Screen((30.0, 30.0), 100.0, (48, 48), shift=(400.0, 0.0))
+
+    def refused(points: int) -> tuple[str, int]:
+        """What is said of a grid of points x points, and the bytes that it takes."""
+        grid = Points.grid((0.0, 0.0, -20.0), (2.0, 1.0), (points, points), intensity="lambertian")
+        tracemalloc.start()
+        with pytest.raises(InputError, match="deflected by at least") as error:
+            refuse_unreachable(Scene(grid, Lens(aperture="circle"), screen), blob())
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return str(error.value), most
+
+    said, most = zip(*map(refused, (4, 16)), strict=True)
+    assert most[1] < 1.1 * most[0] < 2e8
+    monkeypatch.setattr(reachability, "PAIRS", 1 << 40)
+    whole = refused(4)
+    monkeypatch.setattr(reachability, "PAIRS", 1)
+    assert refused(4)[0] == whole[0] == said[0] and refused(4)[1] < 0.2 * whole[1]
 
 
 def test_light_that_misses_the_lens_is_refused():

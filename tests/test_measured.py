@@ -13,7 +13,7 @@ from helpers import small_designs, write_blob
 from rayfiles import cone_of, lighttools, tm25, zemax
 from test_emission import LENS, heights, scene
 
-from caustic_cli import cli
+from caustic_cli import cli, load, render
 from caustic_cli.config import settings
 from caustic_cli.config.completion import complete
 from caustic_cli.errors import CausticError, InputError
@@ -258,6 +258,32 @@ def test_a_design_from_a_file_stands_alone(here, capfd, form, name):
     run(capfd, "design", "--resume", "blob.caustic", "--iterations", 10)
     disc, _ = run(capfd, "render", "blob.caustic", "--rays", "40000", "-o", "disc.png", "--source", "disc", "--source-size", "0.4")
     assert disc["on_screen"] > 0.3
+
+
+def test_an_archive_is_read_back_with_its_rays(here, capfd):
+    """Which it does not contain: with them it gives the same image, other rays are refused, and a start needs none."""
+    Path("led.tm25ray").write_bytes(tm25(*cone_of(5000, 12.0)))
+    Path("other.dat").write_bytes(zemax(*cone_of(5000, 12.0, (0, 0), 1)))
+    small = ("--resolution", "24", "--control", "12", "--rays", "2000", "--iterations", "1")
+    run(capfd, "design", "blob.png", *small, "--source", "rays", "--source-file", "led.tm25ray", "-o", "p")
+    lens = load("p")
+    lens.export("lens.npz")
+    image = lens.render(2000, seed=1).image
+    for name in ("led.tm25ray", "p/source.tm25ray"):
+        assert np.array_equal(render("lens.npz", 2000, seed=1, source_file=name).image, image)
+    found, _ = run(capfd, "render", "lens.npz", "--rays", "2000", "--source", "rays", "--source-file", "led.tm25ray")
+    assert found["on_screen"] > 0.05
+    run(capfd, "design", "blob.png", *small, "--start", "lens.npz", "-o", "q")
+    load("q").export("plane.npz")
+    for archive, arguments, words in (
+        ("lens.npz", (), "lens.npz: its source is a ray file, which an archive does not contain: --source-file names it"),
+        ("lens.npz", ("--source-file", "other.dat"), "--source-file holds other rays than those of its source"),
+        ("lens.npz", ("--source-file", "blob.png"), "blob.png: is not a ray file"),
+        ("lens.npz", ("--source-file", "led.tm25ray", "--screen-shift", "1,0"), "--screen-shift: an archive's source is fixed"),
+        ("plane.npz", ("--source-file", "led.tm25ray"), "belongs to an archive whose source is a ray file"),
+        ("plane.npz", ("--source", "rays"), "--source: an archive's source is fixed"),
+    ):
+        assert words in run(capfd, "render", archive, *arguments, code=2)
 
 
 def test_another_file_is_another_design(here, capfd):

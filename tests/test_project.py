@@ -303,7 +303,7 @@ def test_a_new_design_leaves_nothing_of_the_one_before(copy):
         (copy / name).write_bytes(b"of before")
     (copy / "notes.txt").write_text("mine")
     directory.create(Project.open(copy), True)
-    assert sorted(p.name for p in copy.iterdir()) == ["notes.txt", "project.toml", "target.npy"]
+    assert sorted(p.name for p in copy.iterdir()) == [".outputs.json", "notes.txt", "project.toml", "target.npy"]
 
 
 def test_a_directory_that_cannot_be_replaced_is_unlocked_again(copy):

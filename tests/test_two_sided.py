@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import small_designs
+from helpers import begun, small_designs
 from PIL import Image
 
 from caustic_cli import cli, load
 from caustic_cli.export.mesh import closed_mesh
 from caustic_cli.inverse.initial_two_sided import first_sides
+from caustic_cli.inverse.source_limits import source_spread
 from caustic_cli.inverse.two_sided import TwoSidedObjective
 from caustic_cli.io.archive import open_archive
 from caustic_cli.optics.emission import rays_of
@@ -20,9 +21,11 @@ from caustic_cli.optics.reconstruction import Filter
 from caustic_cli.optics.surfaces import HeightField
 from caustic_cli.optics.system import ENTRANCE, EXIT, System, split_heights
 from caustic_cli.optics.trace import expose, render
+from caustic_cli.project.project import Project
 from caustic_cli.scene import Lens, Offset, PlaneWave, Points, Scene, Screen, SecondTarget
 from caustic_cli.studies.retrace import retrace
 from caustic_cli.studies.second_target import second_figures
+from caustic_cli.workflow import design as workflow
 
 HALF, PIXELS = 6.0, 40
 NEAR = Screen((2 * HALF, 2 * HALF), 50.0, (PIXELS, PIXELS))
@@ -234,6 +237,13 @@ def test_two_pictures_by_the_command_line(_here, capfd):
     image.rotate(90).save("p/second.png")
     again = run(capfd, *render)
     assert again["second_relative_rms"] != seen["second_relative_rms"] and again["relative_rms"] == seen["relative_rms"]
+
+
+def test_a_disc_s_light_is_collimated(_here, capfd, monkeypatch):
+    """Of an extended source: no limit is stated by the blur of a surface that is not designed yet."""
+    monkeypatch.setattr(workflow, "_run", begun)
+    run(capfd, "design", "one.png", *SMALL, "--source", "disc", "--collimate", "-o", "p")
+    assert source_spread(Project.open("p").scene()) is None
 
 
 @pytest.mark.parametrize(

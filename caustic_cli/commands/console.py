@@ -27,7 +27,7 @@ from rich.table import Table
 from rich.text import Text
 
 from caustic_cli.config.table import TABLE
-from caustic_cli.errors import MARK, InputError, plain_name, shortened
+from caustic_cli.errors import LISTS, MARK, InputError, plain_name, shortened
 
 #: Seconds between lines of --progress json.
 LINE_EVERY = 0.5
@@ -188,7 +188,7 @@ def named(text: str) -> str:
         row = TABLE.get(path[1:]) if path.startswith("+") else None
         if row and row.option:
             return row.option.name
-        return _option_names.get(path) or (plain_name(path) if "." in path else "--" + path.replace("_", "-"))
+        return _option_names.get(path) or (plain_name(path) if "." in path or path in LISTS else "--" + path.replace("_", "-"))
 
     return MARK.sub(lambda found: name(found[1]), text)
 

@@ -78,10 +78,6 @@ def run(
             f"--resume goes on with a project as it is, so {', '.join(names)} cannot be given;"
             " --iterations and --time-limit can, and project.toml can be edited"
         )
-    if "source.angle" in given:
-        given.setdefault("source.type", "disc")
-    if given.get("design.network") in ("sparse", "dense"):
-        given.setdefault("design.optimizer", "adam")
     piped = not resume and str(target) == "-"
     path = out or Path(f"{'picture' if piped else target.stem or 'design'}.caustic")
     picture: Any = target

@@ -162,8 +162,6 @@ def run(
     given = {
         path: value for path, value in given.items() if not path.startswith("design.")
     }  # seed and dtype apply to this render's rays
-    if "source.angle" in given:
-        given.setdefault("source.type", "disc")
     if screen_at is not None:
         console.set_option_names(console.option_names() | {"screen.z": "--screen-at"})
     options.require_project(project, archives=True)

@@ -85,7 +85,7 @@ def complete_second(s: Settings) -> None:
         InputError: keys contradict each other, or are combined with unsupported features.
     """
     second = s.get("second", {})
-    said = [key for key in ("file", "collimate", "focus") if second.get(key)]
+    said = _of_second(s)
     if not said:
         for key in ("z", "size"):
             if key in second:
@@ -116,6 +116,11 @@ def complete_second(s: Settings) -> None:
             )
     if source.get("also") or source["type"] == "rays":
         raise InputError(f"⟨second.{said[0]}⟩ needs one source that is no ray file")
+
+
+def _of_second(s: Settings) -> list[str]:
+    """Keys given of those that define the light behind the picture."""
+    return [key for key in ("file", "collimate", "focus") if s.get("second", {}).get(key)]
 
 
 def complete_second_size(s: Settings) -> None:
@@ -154,17 +159,23 @@ def complete_elements(s: Settings) -> None:
         s.pop("element", None)
         return
     s["element"] = {"list": tables}
-    free = any(table.get("free", "none") != "none" for table in tables)
     check_compatible_with_elements(
         {
-            "second.file": "second" in s,
-            "design.robust": bool(design.get("robust")),
-            "design.waves": design["waves"] == "on",
-            "design.network": free and design["network"] != "none",
-            "design.optimizer": free and design["optimizer"] != "lbfgs",
-            "target.color": free and value_of(s["target"], "target.color"),
-        },
+            **{f"second.{key}": True for key in _of_second(s)},
+            "design.robust": design.get("robust"),
+            "design.waves": design["waves"] == "on" and "on",
+            "lens.gradient": s["lens"].get("gradient"),
+        }
     )
+    if any(table.get("free", "none") != "none" for table in tables):
+        check_compatible_with_elements(
+            {
+                "design.network": design["network"] != "none" and design["network"],
+                "design.optimizer": design["optimizer"] != "lbfgs" and design["optimizer"],
+                "target.color": value_of(s["target"], "target.color"),
+            },
+            free=True,
+        )
     lens, picture, throw = s["lens"]["size"], s["target"]["size"], abs(s["screen"]["z"])
     for table in tables:
         if "z" in table:
@@ -199,12 +210,18 @@ def complete_index_design(s: Settings, source: Source, quality: str, rays: int |
         raise InputError("⟨lens.array⟩ cannot be combined with a free gradient, whose sides are flat")
     if value_of(s["target"], "target.color"):
         raise InputError("⟨target.color⟩ is not for a free gradient, whose index is designed at one wavelength")
+    if robust := design.get("robust"):
+        raise InputError(
+            f"⟨design.robust⟩ {robust} averages over errors of a designed surface, but ⟨lens.gradient⟩ free designs the index"
+        )
+    if design.setdefault("start", "offset") not in ("offset", "transport"):
+        raise InputError(f"⟨design.start⟩ of a free gradient must be transport, got {design['start']}")
     for key, only in (("network", "none"), ("optimizer", "lbfgs"), ("loss", default("design.loss"))):
         if design[key] != only:
             raise InputError(f"⟨design.{key}⟩ of a free gradient must be {only}, got {design[key]}")
     if check("design.waves", design["waves"]) == "on":
         raise InputError("⟨design.waves⟩ on needs a homogeneous lens: with a gradient index there is no wave image")
-    design["start"] = "offset"
+    design["start"] = "offset"  # of the surface, which is flat; the index starts from optimal transport
     design.setdefault("preconditioner", "laplacian")
     if "stages" not in design:
         last = refinement(tuple(lens["control"]), rays, tuple(screen["resolution"]), quality)[-1]

@@ -156,21 +156,23 @@ def _refuse_deep(text: str, where: str) -> None:
             raise InputError(f"{where}: line {text.count(chr(10), 0, found.start()) + 1} {wrong}")
 
 
-def checked(given: Mapping[str, Any], where: str) -> Settings:
-    """Settings given as Python or NumPy values, with the same checks as those of a file."""
+def checked(given: Mapping[str, Any], where: str, parameters: bool = False) -> Settings:
+    """Settings given as Python or NumPy values, with the same checks as those of a file; parameters: as for `parse`."""
 
     def plain(value):
         if isinstance(value, Mapping):
             return {str(k): plain(v) for k, v in value.items()}
         if isinstance(value, np.ndarray | np.generic):
             return plain(value.tolist())
+        if isinstance(value, Path):
+            return str(value)
         return [plain(v) for v in value] if isinstance(value, list | tuple) else value
 
     try:
         text = tomli_w.dumps(plain(given))
     except TypeError as error:
         raise InputError(f"{where}: holds what is neither text, a number, true or false nor a list of such ({error})") from error
-    return parse(text, where)
+    return parse(text, where, parameters)
 
 
 def _fits(value) -> bool:
@@ -205,7 +207,7 @@ def _typed(where: str, key: str, value, keys: dict[str, Setting]):
         if not all(isinstance(p, list) and len(p) == 3 for p in points):
             raise InputError(f"{where} must be [x, y, z] or a list of such, got {value!r}")
         return [[_numeric(where, v, False) for v in p] for p in points]
-    if not isinstance(value, list) or (kind != "list" and len(value) != 2):
+    if not isinstance(value, list) or (kind != "list" and len(value) not in (2, keys[key].both)):
         raise InputError(f"{where} must be a pair [x, y], got {value!r}")
     return [_numeric(where, v, kind == "wholes") for v in value]
 
@@ -429,6 +431,29 @@ def refuse_unused(source: dict[str, Any], given: Iterable[str], stages: Sequence
         for key in keys:
             if key in idle:
                 raise InputError(f"⟨source.{key}⟩ {idle[key]}")
+
+
+def by_section(given: Mapping[str, Any]) -> Settings:
+    """Settings from values by their paths in `config.table`; parameters without a section become the section ""."""
+    found: Settings = {}
+    for path, value in given.items():
+        section, _, key = path.rpartition(".")
+        found.setdefault(section, {})[key] = value
+    return found
+
+
+def implied(given: Settings) -> Settings:
+    """Settings of one level, a file or the options, with those that they imply: a diameter at infinity a disc, and a network adam.
+
+    A type or an optimiser of the same level takes precedence, those of other levels do not.
+    """
+    source, design = given.get("source", {}), given.get("design", {})
+    out = dict(given)
+    if "angle" in source:
+        out["source"] = {"type": "disc", **source}
+    if design.get("network", "none") != "none":
+        out["design"] = {"optimizer": "adam", **design}
+    return out
 
 
 def merged(first: Settings, *others: Settings) -> Settings:

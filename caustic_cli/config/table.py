@@ -77,6 +77,13 @@ class Setting:
         return self.path.rpartition(".")[2]
 
     @property
+    def both(self) -> int:
+        """How many numbers a single one stands for, where its option takes one or two: both of a pair, or the first of a parameter
+        whose second is derived; 0 where two must be given."""
+        single = self.kind in ("numbers", "wholes") and self.option is not None and "[" in (self.option.metavar or "")
+        return (2 if self.section else 1) if single else 0
+
+    @property
     def note(self) -> str:
         """The comment in project.toml: unit and description."""
         return ", ".join(filter(None, (self.unit, self.help)))
@@ -270,7 +277,7 @@ _ROWS = (
     # Other lenses and fold mirrors, [[element]]
     Setting("elements", "tables", "further lens or fold mirror on the axis, with the keys of an [[element]] table:"
             " 'lens z=-40 thickness=4 radius=50,inf glass=N-BK7', 'mirror z=150 tilt=45,0'; may be repeated, in the order in which"
-            " light reaches them", derived="none", option=Option("--element", "'TYPE KEY=VALUE...'")),
+            " light reaches them", derived="none", option=Option("--element", "'TYPE KEY=VALUE...'"), speaks_for=("element",)),
     Setting("element.type", "text", "singlet lens, or mirror, which folds the axis", choices=("lens", "mirror"),
             derived="lens"),
     Setting("element.z", "number", "position of its first vertex; behind a mirror measured along the folded axis", "mm", *DISTANCE),

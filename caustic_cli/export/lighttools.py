@@ -184,15 +184,18 @@ def _entrance(scene: Scene) -> dict[str, np.ndarray]:
 
 
 def _elements(scene: Scene) -> dict[str, np.ndarray]:
-    """Keys of k other lenses and mirrors, in the order of the light: element_type, element_aperture, k words separated by commas;
-    element_z, element_thickness, element_index, element_absorption (k,); element_curvature (k, 2), 1/mm, of front and back;
-    element_size, element_tilt (k, 2), degrees; of designed surfaces element_1_front_heights (n, m) from their vertex' plane, mm,
-    with their degrees, knots_u and knots_v.  Behind a mirror z counts along the folded axis."""
+    """Keys of k other lenses and mirrors, in the order of the light: element_type, element_aperture, and element_glass if one is of
+    a glass, k words separated by commas, the last empty for an index; element_z, element_thickness, element_index,
+    element_absorption (k,); element_curvature (k, 2), 1/mm, of front and back; element_size, element_tilt (k, 2), degrees; of
+    designed surfaces element_1_front_heights (n, m) from their vertex' plane, mm, with their degrees, knots_u and knots_v.  Behind
+    a mirror z counts along the folded axis."""
     found, elements = {}, scene.elements
     if not elements:
         return {}
     for key, name in (("type", "kind"), ("aperture", "aperture")):
         found[f"element_{key}"] = np.array(",".join(getattr(e, name) for e in elements))
+    if any(e.glass for e in elements):
+        found["element_glass"] = np.array(",".join(e.glass or "" for e in elements))
     for key in ("z", "thickness", "index", "absorption", "size", "tilt"):
         found[f"element_{key}"] = _reals([getattr(e, key) for e in elements])
     found["element_curvature"] = 1.0 / _reals([e.radius for e in elements])
@@ -271,9 +274,11 @@ def _of_disc(scene: Scene) -> dict[str, np.ndarray]:
 
 
 def _of_rays(scene: Scene) -> dict[str, np.ndarray]:
-    """Keys of a ray file, which is not included: the cone about the point where its rays are closest to each other."""
+    """Keys of a ray file, which is not included: the cone about the point where its rays are closest to each other, and
+    `source_rays_sha256`, by which the file is recognised."""
     source, lens = scene.source, scene.lens
-    return {"cone_half_angle": _reals(np.degrees(source.cone_over(lens.half_size, lens.z_in, lens.round)))}
+    cone = _reals(np.degrees(source.cone_over(lens.half_size, lens.z_in, lens.round)))
+    return {"cone_half_angle": cone, "source_rays_sha256": np.array(source.rays.digest)}
 
 
 #: Further keys of a source, by its kind.

@@ -8,7 +8,7 @@ leave a thick lens through its sides, at the least height.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -19,6 +19,10 @@ from caustic_cli.scene.sources.distribution import relative
 
 #: Points along each axis of the entrance, and of the picture at most.
 ENTRANCE, PICTURE = 17, 15
+#: Pairs of a ray in the glass and a point of the picture treated at a time, 50 bytes each.
+PAIRS = 1 << 20
+#: Points of an extended source, in parts of its half widths along x and y: its centre, and its outermost along each axis.
+AROUND = np.array([(0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)]).T
 
 
 def refuse_unreachable(scene: Scene, target: np.ndarray) -> None:
@@ -30,14 +34,28 @@ def refuse_unreachable(scene: Scene, target: np.ndarray) -> None:
     lens = scene.lens
     if lens.mirror or scene.source.rays is not None or scene.source.apart:
         return
-    x, y, d = _in_glass(scene)
-    if not len(x):
+    goal, most, lit = _lit(scene, target), -1.0, False
+    for x, y, d in _in_glass(scene, max(1, PAIRS // goal.shape[1])):
+        lit = lit or len(x) > 0
+        most = max(most, _largest_cosine(scene, x, y, d, goal))
+        if lens.inside * most > 1.0:
+            return
+    if not lit:
         raise InputError(
             "[source] none of its light falls on the lens: its position, direction or cone miss the aperture of"
             f" {lens.size[0]:g} x {lens.size[1]:g} mm at z = {lens.z_in:g} mm"
         )
-    goal = _lit(scene, target)
-    most = -1.0
+    turn, limit = (math.degrees(math.acos(min(1.0, c))) for c in (most, 1.0 / lens.inside))
+    raise InputError(
+        "[screen] no light can be refracted to the picture: it would have to be deflected by at least"
+        f" {turn:.3g} degrees, and glass of index {lens.inside:g} deflects it by less than {limit:.3g}; a picture"
+        " closer to the undeflected light, or a higher index, is needed"
+    )
+
+
+def _largest_cosine(scene: Scene, x: np.ndarray, y: np.ndarray, d: np.ndarray, goal: np.ndarray) -> float:
+    """Largest cosine of a deflection from rays in the glass, as of `_in_glass`, to points of the picture (3, m); at least -1."""
+    lens, most = scene.lens, -1.0
     for height in (lens.offset.thickness, lens.z_in + lens.min_thickness):
         over = (height - lens.z_in) / d[2]
         at = np.stack([x + over * d[0], y + over * d[1], np.full_like(x, height)])
@@ -45,13 +63,7 @@ def refuse_unreachable(scene: Scene, target: np.ndarray) -> None:
         if within.any():
             t = goal[:, None, :] - at[:, within, None]
             most = max(most, float(((t * d[:, within, None]).sum(0) / np.sqrt((t * t).sum(0)))[t[2] > 0].max(initial=-1.0)))
-    if not lens.inside * most > 1.0:
-        turn, limit = (math.degrees(math.acos(min(1.0, c))) for c in (most, 1.0 / lens.inside))
-        raise InputError(
-            "[screen] no light can be refracted to the picture: it would have to be deflected by at least"
-            f" {turn:.3g} degrees, and glass of index {lens.inside:g} deflects it by less than {limit:.3g}; a picture"
-            " closer to the undeflected light, or a higher index, is needed"
-        )
+    return most
 
 
 def largest_magnification(scene: Scene, picture: Sequence[float]) -> float | None:
@@ -70,8 +82,11 @@ def largest_magnification(scene: Scene, picture: Sequence[float]) -> float | Non
     return None if root < 0 else float((along + math.sqrt(root)) / square * goal[0] / corner[0])
 
 
-def _in_glass(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points x, y (k,) of the entrance where light of the source falls, mm, and its unit directions in the glass there (3, k)."""
+def _in_glass(scene: Scene, rays: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Points x, y (k,) of the entrance where light of the source falls, mm, and its unit directions in the glass there (3, k).
+
+    The points of a source in turn, about `rays` rays at a time, so that the memory does not depend on their number.
+    """
     source, lens = scene.source, scene.lens
     x, y = (c.ravel() for c in np.meshgrid(*(np.linspace(-h, h, ENTRANCE) for h in lens.half_size), indexing="ij"))
     if lens.round:
@@ -79,23 +94,29 @@ def _in_glass(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         x, y = x[inside], y[inside]
     if source.distant:
         sine = math.sin(source.half_angle)
-        tangents = [(np.full_like(x, sine * a), np.full_like(y, sine * b)) for a, b in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))]
-        tangents = [(a / np.sqrt(1.0 - a * a - b * b), b / np.sqrt(1.0 - a * a - b * b)) for a, b in tangents]
-        lit = [np.ones_like(x, dtype=bool)] * len(tangents)
-    else:
-        (wide, high), cone = source.extent, min(source.cone_over(lens.half_size, lens.z_in, lens.round), 0.5 * math.pi)
-        tangents, lit = [], []
-        for x0, y0, z0 in source.points()[0]:
-            for a, b in ((0, 0), (wide, 0), (-wide, 0), (0, high), (0, -high)):
-                p, q = (x - x0 - a) / (lens.z_in - z0), (y - y0 - b) / (lens.z_in - z0)
-                tangents.append((p, q))
-                q = np.hypot(p, q)
-                lit.append((np.arctan(q) <= cone * (1.0 + 1e-9)) & (relative(source.intensity, q) > 0))
-    p, q = (np.concatenate(c) for c in zip(*tangents, strict=True))
-    length = np.sqrt(1.0 + p * p + q * q)
-    dx, dy = p / (length * lens.inside), q / (length * lens.inside)
-    keep = np.concatenate(lit)
-    return np.tile(x, len(lit))[keep], np.tile(y, len(lit))[keep], np.stack([dx, dy, np.sqrt(1.0 - dx * dx - dy * dy)])[:, keep]
+        a, b = (sine * c[:, None] for c in AROUND)
+        along = np.sqrt(1.0 - a * a - b * b)
+        yield _refracted(scene, x, y, a / along + 0.0 * x, b / along + 0.0 * y)
+        return
+    cone = min(source.cone_over(lens.half_size, lens.z_in, lens.round), 0.5 * math.pi)
+    around = AROUND if max(source.extent) > 0 else AROUND[:, :1]
+    (a, b), points = (w * c for w, c in zip(source.extent, around, strict=True)), source.points()[0]
+    each = max(1, rays // (len(x) * around.shape[1]))
+    for first in range(0, len(points), each):
+        x0, y0, z0 = (c[:, None, None] for c in points[first : first + each].T)
+        p, q = (x - x0 - a[:, None]) / (lens.z_in - z0), (y - y0 - b[:, None]) / (lens.z_in - z0)
+        tangent = np.hypot(p, q)
+        lit = (np.arctan(tangent) <= cone * (1.0 + 1e-9)) & (relative(source.intensity, tangent) > 0)
+        yield _refracted(scene, x, y, p, q, lit)
+
+
+def _refracted(scene: Scene, x: np.ndarray, y: np.ndarray, p: np.ndarray, q: np.ndarray, lit: np.ndarray | None = None):
+    """As `_in_glass`, of rays with tangents p, q (..., k) through x, y (k,), those that are `lit`."""
+    n, length = scene.lens.inside, np.sqrt(1.0 + p * p + q * q)
+    dx, dy = p / (length * n), q / (length * n)
+    keep = np.ones(p.shape, dtype=bool) if lit is None else lit
+    x, y = (np.broadcast_to(c, p.shape)[keep] for c in (x, y))
+    return x, y, np.stack([dx, dy, np.sqrt(1.0 - dx * dx - dy * dy)])[:, keep]
 
 
 def _lit(scene: Scene, target: np.ndarray) -> np.ndarray:

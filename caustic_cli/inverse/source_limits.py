@@ -82,8 +82,10 @@ def best_irradiance(scene: Scene, target: np.ndarray, spread: Spread, steps: int
 
 def source_spread(scene: Scene, field: HeightField | None = None, heights: torch.Tensor | None = None) -> Spread | None:
     """The point-spread function of an extended source; None for a point source, where the blur is not well approximated by a
-    convolution, or where it is wider than the screen."""
+    convolution, where it is wider than the screen, or before several surfaces are designed."""
     if not scene.source.extended or scene.source.apart or any(scene.screen.tilt) or scene.screen.curved or scene.elements:
+        return None
+    if heights is None and scene.joint:  # the offset of one surface does not represent a lens with several
         return None
     if heights is None:
         scene = replace(scene, lens=replace(scene.lens, control=(NET, NET), knots=None, array=(1, 1)))

@@ -24,16 +24,20 @@ from caustic_cli.scene.materials import material
 from caustic_cli.scene.screen import MAX_SAGS, Sags
 from caustic_cli.scene.sources.distribution import MOST_ANGLES, Distribution
 from caustic_cli.scene.sources.points import MAX_POINTS
+from caustic_cli.scene.sources.rays import Measured
+from caustic_cli.scene.sources.rayset import RaySet
 
 #: Most cells along an axis of a picture of a source.
 MOST_CELLS = 1 << 16
 
 
-def open_archive(path: str | Path) -> tuple[Scene, HeightField, Tensor]:
+def open_archive(path: str | Path, rays: RaySet | None = None) -> tuple[Scene, HeightField, Tensor]:
     """Scene, spline spaces and control heights (n, m) mm of an archive made by `caustic export format lighttools`.
 
+    rays: those of its source, if that is a ray file, which an archive does not contain.
+
     Raises:
-        InputError: it cannot be read, something is missing, or something is out of range.
+        InputError: it cannot be read, something is missing, the rays are missing or others, or something is out of range.
     """
     with open_npz(Path(path), ACCEPTED) as data:
         field, heights = surface_of(data)
@@ -58,7 +62,7 @@ def open_archive(path: str | Path) -> tuple[Scene, HeightField, Tensor]:
             entrance, low = surface_of(data, "entrance_")
             lens = replace(lens, entrance=freeform_of(entrance, low - lens.z_in))
         screen = _screen(data)
-        scene = Scene(_source(data), lens, screen, _light(data), elements=_elements(data))
+        scene = Scene(_source(data, rays), lens, screen, _light(data), elements=_elements(data))
         check_exit_above_entrance(scene, field, heights)
         return scene, field, heights
 
@@ -79,8 +83,12 @@ def _elements(data: Archive) -> tuple[Component, ...]:
         return ()
     kinds, apertures = (data.text(f"element_{key}").split(",") for key in ("type", "aperture"))
     count = len(kinds)
-    if len(apertures) != count:
-        raise InputError(f"element_aperture must name {count} apertures, got {len(apertures)}")
+    glasses = data.text("element_glass", "," * (count - 1)).split(",")
+    for key, words in (("aperture", apertures), ("glass", glasses)):
+        if len(words) != count:
+            raise InputError(f"element_{key} must be {count} words separated by commas, got {len(words)}")
+    for glass in filter(None, glasses):
+        material(glass)
     z, thickness, index, absorption = (
         data.reals(f"element_{key}", count).tolist() for key in ("z", "thickness", "index", "absorption")
     )
@@ -94,7 +102,8 @@ def _elements(data: Archive) -> tuple[Component, ...]:
             tuple(1.0 / c if c else math.inf for c in bent[k]),
             index[k],
             absorption[k],
-            aperture=apertures[k],
+            glasses[k] or None,
+            apertures[k],
             tilt=tuple(tilt[k]),
             surfaces=tuple(_front(data, f"element_{k + 1}_{side}_") for side in SIDES),
         )
@@ -134,11 +143,25 @@ def _radius(data: Archive) -> tuple[float, float]:
     return x, y
 
 
-def _source(data: Archive) -> Source:
+def _source(data: Archive, rays: RaySet | None) -> Source:
     kind = data.text("source_type")
+    if kind == "rays":
+        return _measured(data, rays)
     if kind not in _READERS:
-        raise InputError(f"source_type must be plane, point, grid or disc, got {kind!r}")
+        raise InputError(f"source_type must be plane, point, grid, disc or rays, got {kind!r}")
+    if rays is not None:
+        raise InputError(f"⟨source.file⟩ belongs to an archive whose source is a ray file, and this one's is of type {kind}")
     return _READERS[kind](data)
+
+
+def _measured(data: Archive, rays: RaySet | None) -> Measured:
+    """A ray file at the position at which its point of closest approach is that of the archive."""
+    if rays is None:
+        raise InputError("its source is a ray file, which an archive does not contain: ⟨+source.file⟩ names it")
+    if "source_rays_sha256" in data and data.text("source_rays_sha256") != rays.digest:
+        raise InputError("⟨source.file⟩ holds other rays than those of its source; render its project under another light")
+    x, y, z = np.subtract(_positions(data)[0], rays.focus).tolist()
+    return Measured(rays, (x, y, z), _power(data))
 
 
 def _plane(data: Archive) -> PlaneWave:

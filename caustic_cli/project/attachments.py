@@ -18,6 +18,7 @@ from caustic_cli.io.picture import read_picture
 from caustic_cli.io.rayfiles import ACCEPTED, MAX_BYTES, SUFFIXES, parse_rays
 from caustic_cli.io.sags import read_sags
 from caustic_cli.scene.gradient import MOST_VALUES, checked_volume
+from caustic_cli.scene.sources.rayset import RaySet
 from caustic_cli.scene.sources.section import Attached
 
 #: Name in a project of the file of [design] robust.
@@ -51,6 +52,15 @@ def attached(source: Mapping[str, Any], folder: Path | None = None) -> dict[str,
     if "also" in source:
         found["also"] = [attached(table, folder) for table in source["also"]]
     return found
+
+
+def rays_of(name: str) -> RaySet:
+    """The rays of a ray file.
+
+    Raises:
+        InputError: the file is missing, too large, or not a ray file.
+    """
+    return parse_rays(read_bytes(Path(name), MAX_BYTES, ACCEPTED), name)
 
 
 def with_errors(design: Mapping[str, Any], folder: Path | None = None) -> dict[str, Any]:

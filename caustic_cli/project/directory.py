@@ -16,8 +16,9 @@ from pathlib import Path
 
 from caustic_cli.errors import InputError
 from caustic_cli.io.files import LEFT_BEHIND, PARTS, destination, is_ours
-from caustic_cli.project import attachments
-from caustic_cli.project.project import MADE, TOML, Project, is_project
+from caustic_cli.project import attachments, checkpoint, uptodate
+from caustic_cli.project.checkpoint import Checkpoint
+from caustic_cli.project.project import CHECKPOINT, MADE, TOML, Project, is_project
 
 try:
     import fcntl
@@ -54,14 +55,15 @@ def check(path: Path, force: bool) -> None:
 def _of_a_new_project(path: Path) -> bool:
     """Whether a file belongs to an incomplete project, whose design was killed before its project.toml was written."""
     return path.is_file() and (
-        path.name.startswith(tuple(f".{stem}" for stem in (*PICTURES, *attachments.ALL, TOML)))
+        path.name.startswith(tuple(f".{stem}" for stem in (*PICTURES, *attachments.ALL, TOML, uptodate.RECORD)))
+        or uptodate.is_record(path)
         or (path.stem in PICTURES and is_ours(path))
         or (path.stem.split("-")[0] in attachments.ALL and any(map(is_ours, path.parent.glob("target.*"))))
     )
 
 
-def create(project: Project, force: bool) -> None:
-    """Create a project directory and lock it (`Project.hold`).
+def create(project: Project, force: bool, state: Checkpoint | None = None) -> None:
+    """Create a project directory, with its checkpoint if there is a `state`, and lock it (`Project.hold`).
 
     A new directory is written beside its path and renamed, so that it appears complete or not at all.
 
@@ -80,7 +82,7 @@ def create(project: Project, force: bool) -> None:
                 for present in parts:
                     if present.name in MADE or present.is_symlink():  # where a link leads is not the project's
                         present.unlink()
-                project.write(path)
+                _write(project, path, state)
             except BaseException:
                 project.hold.close()
                 raise
@@ -95,7 +97,7 @@ def create(project: Project, force: bool) -> None:
             os.umask(umask)
             staging.chmod(0o777 & ~umask)
             project.hold.enter_context(locked(staging))
-            project.write(staging)
+            _write(project, staging, state)
             os.rename(staging, path)
         except BaseException:
             project.hold.close()
@@ -103,6 +105,14 @@ def create(project: Project, force: bool) -> None:
             raise
     except OSError as error:
         raise InputError(f"{path}: cannot be written to ({error.strerror}); -o DIR chooses another place") from error
+
+
+def _write(project: Project, path: Path, state: Checkpoint | None) -> None:
+    uptodate.record_begun(project, path)
+    project.write(path)
+    if state is not None:
+        checkpoint.save(path / CHECKPOINT, state)
+        uptodate.forget_begun(path)
 
 
 @contextlib.contextmanager

@@ -157,11 +157,11 @@ class Project:
         changed = {section: dict(values) for section, values in self.settings.items()}
         changed["design"].pop("over", None)  # does not apply to another light
         before = changed["source"]["type"]
-        for path, value in given.items():
-            section, _, key = path.rpartition(".")
-            changed[section][key] = value
+        own = settings.implied(settings.by_section(given))
+        for section, values in own.items():
+            changed[section] |= values
         changed["screen"] = attachments.with_shape(changed["screen"])
-        _change(changed["source"], before, {path.rpartition(".")[2] for path in given if path.startswith("source.")})
+        _change(changed["source"], before, {*own.get("source", ())})
         settings.refuse_unused(changed["source"], given)
         if changed["source"]["type"] not in sources.used_by("profile"):
             changed["source"].pop("profile", None)

@@ -1,7 +1,7 @@
 """Incremental work: outputs with unchanged inputs and options are kept, and only their time stamps are updated.
 
-The hashes of the inputs of a design are stored in its checkpoint, those of other outputs in the RECORD of the project.  Outputs are
-touched, checkpoint first, so that make finds them newer than their prerequisites.
+The hashes of the inputs of a design are stored in its checkpoint and, until there is one, in the RECORD of the project, which holds
+those of other outputs.  Outputs are touched, checkpoint first, so that make finds them newer than their prerequisites.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.project import CHECKPOINT, FARTHER, MADE, RENDER, WAVE, Project, is_project
 
 RECORD = ".outputs.json"
+#: Entry of the design itself.
+BEGUN = "design"
 #: Largest record read, bytes; a larger file is not a record of this program.
 MOST_RECORDED = 1 << 24
 #: Settings of a single run that name files.
@@ -74,6 +76,55 @@ def same_design(path: Path, asked: str) -> tuple[Project, Checkpoint] | None:
     return (project, checkpoint) if asked == asked_of(project, checkpoint) else None
 
 
+def record_begun(project: Project, path: Path) -> None:
+    """Record the inputs of a design in its directory, so that the same command is recognised before the first checkpoint."""
+    _write_records(path / RECORD, {BEGUN: {"asked": project.asked, "settings": _undesigned(project)}})
+
+
+def forget_begun(path: Path) -> None:
+    """Remove this entry from the record of a project directory, whose checkpoint holds the inputs from now on."""
+    record = _records(path / RECORD)
+    if BEGUN not in record:
+        return
+    del record[BEGUN]
+    with contextlib.suppress(CausticError, OSError):  # what remains is not read beside a checkpoint
+        if record:
+            write_bytes(path / RECORD, json.dumps(record, indent=1).encode())
+        else:
+            (path / RECORD).unlink()
+
+
+def is_record(path: Path) -> bool:
+    """Whether a file is the record of a design."""
+    return path.name == RECORD and BEGUN in _records(path)
+
+
+def begun(project: Project) -> str:
+    """Digest of the user's input of a project without a checkpoint, "" if it has one, or has been edited since its creation."""
+    if (project.path / CHECKPOINT).exists():
+        return ""
+    record = _records(project.path / RECORD).get(BEGUN)
+    if not isinstance(record, dict) or record.get("settings") != _undesigned(project):
+        return ""
+    return str(record.get("asked", ""))
+
+
+def is_begun(path: Path, asked: str) -> bool:
+    """Whether the design of this input digest at `path` was interrupted before its first checkpoint."""
+    try:
+        return is_project(path) and asked == begun(Project.open(path))
+    except InputError:  # damaged: reported when the directory is to be used
+        return False
+
+
+def _undesigned(project: Project) -> str:
+    """Hash of a project's settings and files without the refractive index that was designed, a file that settings name."""
+    full, lens = project.settings, project.settings["lens"]
+    if lens.get("gradient") == "free":
+        full = full | {"lens": {key: value for key, value in lens.items() if key != "index_file"}}
+    return digest(full, project.picture, project.profile, project.second)
+
+
 def finished(project: Project, checkpoint: Checkpoint) -> dict | None:
     """Figures of a finished design with complete outputs, which are touched; None if it is unfinished or an output is missing."""
     waves = checkpoint.results.get("wave_relative_rms") is not None
@@ -112,7 +163,7 @@ class Outputs:
 
     def found(self) -> dict | None:
         """Figures of an earlier run with the same inputs if all its files are unchanged; these are touched."""
-        record = self._records().get(self.key)
+        record = _records(self.record).get(self.key)
         if not isinstance(record, dict) or record.get("asked") != self.asked or not isinstance(record.get("figures"), dict):
             return None
         if record.get("files") != [sha256_of(p) for p in self.paths]:
@@ -127,7 +178,7 @@ class Outputs:
         Raises:
             InputError: as of `io.files.refuse_foreign`.
         """
-        entries = [entry.get("files") for entry in self._records().values() if isinstance(entry, dict)]
+        entries = [entry.get("files") for entry in _records(self.record).values() if isinstance(entry, dict)]
         ours = {found for files in entries if isinstance(files, list) for found in files if found and isinstance(found, str)}
         for path in self.paths:
             refuse_foreign(path, force or sha256_of(path) in ours)
@@ -136,14 +187,20 @@ class Outputs:
         """Record the outputs and their figures."""
         entry = {"asked": self.asked, "files": [sha256_of(p) for p in self.paths], "figures": figures}
         with contextlib.suppress(CausticError):  # a read-only project has no record; the outputs exist
-            write_bytes(self.record, json.dumps(self._records() | {self.key: entry}, indent=1).encode())
+            _write_records(self.record, {self.key: entry})
 
-    def _records(self) -> dict:
-        try:
-            record = json.loads(read_bytes(self.record, MOST_RECORDED, "").decode())
-        except (ValueError, RecursionError):  # InputError is a ValueError
-            return {}
-        return record if isinstance(record, dict) else {}
+
+def _records(path: Path) -> dict:
+    try:
+        record = json.loads(read_bytes(path, MOST_RECORDED, "").decode())
+    except (ValueError, RecursionError):  # InputError is a ValueError
+        return {}
+    return record if isinstance(record, dict) else {}
+
+
+def _write_records(path: Path, entries: dict) -> None:
+    """Add entries to a record, or replace them."""
+    write_bytes(path, json.dumps(_records(path) | entries, indent=1).encode())
 
 
 def _touch(paths: Iterable[Path]) -> None:

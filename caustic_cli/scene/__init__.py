@@ -90,8 +90,9 @@ class Scene:
         if not self.elements:
             return
         lens = self.lens
+        second = "second.file" if self.second is None else self.second.setting
         wrong = {"lens.mirror": lens.mirror, "lens.gradient": lens.gradient is not None, "lens.array": lens.arrayed}
-        check_compatible_with_elements(wrong | {"second.file": self.two_sided, "source.type": self.source.rays is not None})
+        check_compatible_with_elements(wrong | {second: self.two_sided, "source.type": self.source.rays is not None and "rays"})
         check_positions(self.elements, (lens.z_in, lens.offset.thickness), self.source.nearest, self.screen.z)
 
     @property

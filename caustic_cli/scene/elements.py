@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from caustic_cli.config.table import check, default
@@ -209,12 +209,15 @@ def check_positions(elements: Sequence[Component], lens: tuple[float, float], so
         )
 
 
-def check_compatible_with_elements(wrong: dict[str, bool]) -> None:
-    """Refuse settings that do not support other elements: paths, and whether each is set.
+def check_compatible_with_elements(wrong: Mapping[str, object], free: bool = False) -> None:
+    """Refuse settings that do not support other elements, or `free` ones: their paths and values, true or false for those that are
+    set or not.
 
     Raises:
-        InputError: naming the setting.
+        InputError: naming the setting and its value.
     """
-    for path, there in wrong.items():
-        if there:
-            raise InputError(f"⟨{path}⟩ cannot be combined with [[element]]: it is not implemented beside other lenses and mirrors")
+    name, others = ("⟨element.free⟩", "free surfaces") if free else ("⟨element⟩", "lenses and mirrors")
+    for path, value in wrong.items():
+        if value:
+            said = f"⟨{path}⟩" if value is True else f"⟨{path}⟩ {value}"
+            raise InputError(f"{said} cannot be combined with {name}: it is not implemented beside other {others}")

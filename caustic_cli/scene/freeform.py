@@ -49,6 +49,11 @@ class SecondTarget:
         if self.focus is not None:
             check("second.focus", self.focus)
 
+    @property
+    def setting(self) -> str:
+        """Path of the setting that defines it."""
+        return "second.file" if self.screen is not None else "second.collimate" if self.focus is None else "second.focus"
+
     def check(self, screen: Screen) -> None:
         """Check that the target lies behind the first picture's screen.
 

@@ -107,11 +107,8 @@ def begin(
         read[-1]["screen"] = attachments.with_shape(read[-1]["screen"], config.parent)
     if config and "lens" in read[-1]:
         read[-1]["lens"] = attachments.with_index(read[-1]["lens"], config.parent)
-    chosen: Settings = {}
-    for path, value in given.items():
-        section, _, key = path.rpartition(".")
-        chosen.setdefault(section, {})[key] = value
-    said = settings.merged({}, *read, chosen)
+    chosen = settings.by_section(given)
+    said = settings.merged({}, *map(settings.implied, (*read, chosen)))
     if {"index", "glass"} <= {*said.get("lens", {})}:  # only where both are given at the same level
         glass = said["lens"].pop("glass")
         say.say(f"⟨lens.index⟩ {said['lens']['index']:g} is used at all wavelengths, and {glass} is ignored")
@@ -168,8 +165,10 @@ def begin(
     )
     if recorded and is_free(project):
         raise InputError("⟨movie⟩ records the design of a surface; ⟨lens.gradient⟩ free designs the index")
-    if out is not None and not force and (same := uptodate.same_design(out, project.asked)):
-        return replace(same[0], found=same[1]), None
+    if out is not None and not force:
+        if same := uptodate.same_design(out, project.asked):
+            return replace(same[0], found=same[1]), None
+        force = uptodate.is_begun(out, project.asked)  # and interrupted before the first checkpoint: it is begun anew
     designer, goal = _designer(project, "cpu")  # builds and thereby validates scene, target, stages, options
     for scene in designer.scenes:
         refuse_obstructed(scene)
@@ -344,8 +343,7 @@ def resume(
             changed = project.settings["design"] | {"iterations": iterations}
             project = replace(project, settings=project.settings | {"design": changed})
             project.write_settings()
-        if begun:
-            project = replace(project, asked=uptodate.asked_of(project, before))
+        project = replace(project, asked=uptodate.asked_of(project, before) if begun else uptodate.begun(project))
         return _run(project, designer, target, state, say, began, time_limit, device, movie)
 
 
@@ -601,8 +599,8 @@ class _Records:
         self.project, self.designer, self.inputs = project, designer, uptodate.inputs(project)
         self.provenance = provenance(project, device)
         self._resumes = f"caustic design ⟨resume⟩ {project.path} continues from it"
-        before = project.path is not None and (project.path / CHECKPOINT).exists()
-        self._safe = f"the one before is intact, {self._resumes}" if before else "nothing of it is on disk"
+        self._before = project.path is not None and (project.path / CHECKPOINT).exists()
+        self._safe = f"the one before is intact, {self._resumes}" if self._before else "nothing of it is on disk"
         self.seconds = 0.0  # that the last checkpoint took
 
     def keep(self, now: State, figures: dict[str, Any] | None = None) -> None:
@@ -618,6 +616,9 @@ class _Records:
             self.project.save(Checkpoint(now, self.designer.field(now.stage).spaces, self.provenance, figures or {}, self.inputs))
         except CausticError as error:
             raise CausticError(f"{error} after iteration {now.total}; {self._safe}") from error
+        if not self._before:  # the first checkpoint
+            uptodate.forget_begun(self.project.path)
+            self._before = True
         self._safe = f"the one of iteration {now.total} is intact, {self._resumes}"
         self.seconds = time.monotonic() - began
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from inspect import signature
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caustic_cli.config import checks
+from caustic_cli.config import checks, keywords
 from caustic_cli.errors import InputError
 from caustic_cli.export import format_of
 from caustic_cli.inverse.designer import State
@@ -23,7 +24,7 @@ from caustic_cli.optics.resolution import Resolution
 from caustic_cli.optics.surfaces.cut import CutSurface
 from caustic_cli.optics.surfaces.heightfield import HeightField
 from caustic_cli.optics.system import entrance_of
-from caustic_cli.project import directory, uptodate
+from caustic_cli.project import attachments, directory, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.project import Project
 from caustic_cli.scene import Scene
@@ -96,9 +97,28 @@ class Lens:
         return cls(scene, field, heights, target, dict(checkpoint.results), project, checkpoint.state, checkpoint.provenance)
 
     @classmethod
-    def of_archive(cls, path: str | Path) -> Lens:
-        """The lens of an exported `.npz` archive."""
-        return cls(*open_archive(path), None, {})
+    def of_archive(cls, path: str | Path, given: Mapping[str, Any] | None = None) -> Lens:
+        """The lens of an exported `.npz` archive; given: path in `config.table` -> value, which may be the `source.file` of its
+        rays only, if its source is a ray file."""
+        other, rays = dict(given or {}), None
+        if "source.file" in other and other.get("source.type", "rays") == "rays":
+            rays = attachments.rays_of(other.pop("source.file"))
+            other.pop("source.type", None)
+        return cls(*open_archive(path, rays), None, {}).under(other)
+
+    def under(self, given: Mapping[str, Any]) -> Lens:
+        """The lens in its scene with other settings of light or screen: path in `config.table` -> value.
+
+        Raises:
+            InputError: it comes from an archive, whose scene is fixed, or a value is out of range.
+        """
+        if not given:
+            return self
+        if self.project is None:
+            raise InputError(f"⟨{next(iter(given))}⟩: an archive's source is fixed; render its project under another light")
+        scene = self.project.scene(given)
+        scene = replace(scene, lens=replace(scene.lens, entrance=self.scene.lens.entrance), elements=self.scene.elements)
+        return replace(self, scene=scene, target=self.project.target(scene))
 
     @property
     def seed(self) -> int:
@@ -132,6 +152,7 @@ class Lens:
         device: str = "cpu",
         say: Reporter | None = None,
         cut: CutSurface | None = None,
+        **given: Any,
     ) -> Render:
         """Retrace the lens with independent rays, with the effects that the scene calls for.
 
@@ -144,17 +165,23 @@ class Lens:
             effects: as of `plan`, or a plan.
             dtype: of the ray arithmetic.
             cut: a machined surface instead of that of the lens (`workflow.machining`).
+            given: settings of another light or screen, by the names of the options of `caustic render` (`source="point"`,
+                `screen_tilt=[0, 20]`), see `config.keywords`.
+
+        Raises:
+            InputError: a keyword is unknown, or a value is out of range.
         """
-        plan = effects if isinstance(effects, Plan) else self.plan(effects)
+        lens = self.under(_other_scene(given, signature(Lens.render).parameters))
+        plan = effects if isinstance(effects, Plan) else lens.plan(effects)
         compile_for(plan.scene, device, say or Listener(), plan.requests)
         exposure, figures = retrace(
             plan.scene,
-            self.field if cut is None else cut,
-            self.heights,
-            self.target,
+            lens.field if cut is None else cut,
+            lens.heights,
+            lens.target,
             rays=evaluation_rays(plan.scene, FINAL_RAYS) if rays is None else count(rays),
             quiet=RELATIVE_NOISE if rays is None else None,
-            seed=self.seed if seed is None else seed,
+            seed=lens.seed if seed is None else seed,
             filter=filter,
             tolerance=tolerance,
             device=device,
@@ -225,24 +252,31 @@ class Lens:
         place = Path(path)
         project = replace(self.project, path=place)
         directory.check(place, force)
-        directory.create(project, force)
-        with project.hold:
-            project.save(Checkpoint(self.state, self.field.spaces, self.provenance, self.figures, uptodate.inputs(project)))
+        state = Checkpoint(self.state, self.field.spaces, self.provenance, self.figures, uptodate.inputs(project))
+        directory.create(project, force, state)
+        project.hold.close()
         return place
 
 
-def load(path: str | Path, at: str | None = None) -> Lens:
+def load(path: str | Path, at: str | None = None, **given: Any) -> Lens:
     """The lens of a project directory, or of an exported .npz archive.
 
-    at: parameter values for a network trained over ranges, "throw=300"; the middle of each range that is not named.
+    at: parameter values for a network trained over ranges, "throw=300"; the middle of each range that is not named; given: settings
+    of another light or screen, as for `Lens.render`.
 
     Raises:
-        InputError: there is none, it is damaged, or `at` is out of range.
+        InputError: there is none, it is damaged, a keyword is unknown, or a value is out of range.
     """
+    other = _other_scene(given, ("at", *signature(Lens.render).parameters))
     if is_archive(Path(path)):
         refuse_at(at)
-        return Lens.of_archive(path)
-    return Lens.of(Project.open(path).at(at))
+        return Lens.of_archive(path, other)
+    return Lens.of(Project.open(path).at(at), other)
+
+
+def _other_scene(given: Mapping[str, Any], own: Iterable[str]) -> dict[str, Any]:
+    """Path -> value of keywords that change light or screen; own: names of the function's other parameters."""
+    return keywords.checked(keywords.from_keywords("render", given, own), {}, "render")
 
 
 def refuse_at(at: str | None) -> None:

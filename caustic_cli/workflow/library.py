@@ -16,6 +16,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from inspect import signature
 from pathlib import Path
 from typing import Any, cast
 
@@ -23,7 +24,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caustic_cli.config import settings as schema
+from caustic_cli.config import keywords
 from caustic_cli.errors import InputError
 from caustic_cli.io.files import Piped
 from caustic_cli.io.picture import Picture
@@ -54,17 +55,14 @@ def design(
     quality: str | None = None,
     rays: float | None = None,
     settings: Mapping[str, Mapping[str, Any] | Sequence[Mapping[str, Any]]] | None = None,
-    linear: bool | None = None,
-    waves: str | None = None,
-    time_limit: float | None = None,
     preset: str | None = None,
-    invert: bool = False,
     out: str | Path | None = None,
     force: bool = False,
     movie: str | Path | None = None,
     on_progress: Progress | None = None,
     on_message: Callable[[str], None] | None = None,
     device: str = "cpu",
+    **given: Any,
 ) -> Lens:
     """Design a lens for a picture, as `caustic design` does.
 
@@ -76,42 +74,34 @@ def design(
         quality: draft, standard or fine; rays: of the last stage.
         settings: further sections and keys of project.toml: {"lens": {"size": [20, 20]}, "design": {"max_slope": 0.5}},
             and tables of other elements: {"element": [{"type": "mirror", "z": 120.0, "tilt": [45, 0]}]}.
-        linear: whether values of the file are irradiance rather than sRGB codes.
-        waves: auto, on or off: refine the wave image after the ray image.
-        time_limit: seconds for the optimisation.
         preset: name of a set of settings, "plate-100", see `config.presets`.
-        invert: exchange dark and bright in the picture file.
         out: a project directory to keep checkpoints and pictures in; without it, no file is touched.
         force: replace a project there.
         movie: a GIF or MP4 file that shows the image at its iterations.
         on_progress, on_message: callbacks.
         device: cpu or cuda.
+        given: any other setting, by the name of its option (`resolution=128`, `lens_size=[20, 20]`, `linear=True`, `waves="off"`)
+            or by its section and key in project.toml (`lens_z_in=1.0`), see `config.keywords`; `element` and `stages` are lists
+            of tables.
 
     Raises:
-        InputError: a value is out of range, or the picture cannot be reached in this scene.
+        InputError: a keyword is unknown, a value is out of range, or the picture cannot be reached in this scene.
         CausticError: the design could not be completed.
     """
-    sections: dict[str, Any] = {
-        section: dict(values) if isinstance(values, Mapping) else list(values) for section, values in (settings or {}).items()
-    }
-    if source is not None:
-        sections["source"] = sections.get("source", {}) | ({"type": source} if isinstance(source, str) else dict(source))
-    design = {key: value for key, value in (("waves", waves), ("time_limit", time_limit)) if value is not None}
-    if design:
-        sections["design"] = sections.get("design", {}) | design
-    if linear:
-        sections["target"] = sections.get("target", {}) | {"encoding": "linear"}
-    by = {"mag": mag, "margin": margin, "throw": throw, "quality": quality, "rays": None if rays is None else count(rays)}
-    by["invert"] = invert or None
-    given = {
-        f"{section}.{key}": value
-        for section, values in schema.checked(sections, "settings").items()
-        for key, value in values.items()
-    }
-    given |= {path: value for path, value in by.items() if value is not None}
+    by_name = {"mag": mag, "margin": margin, "throw": throw, "quality": quality, **given}
+    by_name["rays"] = None if rays is None else count(rays)
+    sections: dict[str, Any] = dict(settings or {})
+    before = sections.get("source", {})
+    if source is None or isinstance(source, str):
+        by_name["source"] = source
+    elif isinstance(source, Mapping) and isinstance(before, Mapping):
+        sections["source"] = {**before, **source}
+    else:
+        raise InputError("source must be a type or a section; several are given in settings, as a list of sections")
+    chosen = keywords.checked(keywords.from_keywords("design", by_name, signature(design).parameters), sections, "settings")
     return design_of(
         picture if isinstance(picture, str | Path) else _picture(picture),
-        given,
+        chosen,
         preset=preset,
         out=None if out is None else Path(out),
         force=force,
@@ -190,8 +180,11 @@ def _lens(done: workflow.Result, device: str) -> Lens:
 
 
 def render(lens: Lens | str | Path, rays: float | None = None, **options: Any) -> Render:
-    """`Lens.render` of a lens, or of a project or an archive."""
-    return (lens if isinstance(lens, Lens) else load(lens)).render(rays, **options)
+    """`Lens.render` of a lens, or of a project or an archive, with the keywords of `load`, too."""
+    if isinstance(lens, Lens):
+        return lens.render(rays, **options)
+    own = {name: options.pop(name) for name in signature(Lens.render).parameters if name in options}
+    return load(lens, **options).render(rays, **own)
 
 
 def trace(

@@ -151,14 +151,12 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
         raise InputError(f"{asked.image}: ⟨out⟩ is a PNG, and its name must end in .png")
     for path in [path for path in (asked.image, asked.npy, asked.html) if path is not None]:
         destination(path)  # refuses what is no file name, before others are made of it
-    archived = Lens.of_archive(asked.lens) if is_archive(asked.lens) else None
+    archived = Lens.of_archive(asked.lens, asked.given) if is_archive(asked.lens) else None
     if archived is not None and asked.tolerances is not None:
         raise InputError("⟨tolerances⟩ compares with the picture, which an archive does not hold; render its project")
     if archived:
         refuse_at(asked.at)
     project = None if archived else Project.open(asked.lens).at(asked.at)
-    if archived and asked.given:
-        raise InputError(f"⟨{next(iter(asked.given))}⟩: an archive's source is fixed; render its project under another light")
     image_path = asked.image or (asked.lens / RENDER if project else Path(asked.lens.stem + "-render.png"))
 
     def companion(name: str) -> Path:

@@ -5,16 +5,23 @@ import shutil
 from pathlib import Path
 
 import pytest
+import torch
 from helpers import write_blob
 
-from caustic_cli import cli
+from caustic_cli import cli, load
 from caustic_cli.errors import CausticError
 from caustic_cli.export import FORMATS
+from caustic_cli.project import directory
 from caustic_cli.studies import report
 from caustic_cli.studies.report import Study
+from caustic_cli.workflow import design as workflow
 from caustic_cli.workflow import evaluation
 
 DESIGN = ["design", "blob.png", "--resolution", "16", "--control", "9", "--rays", "2000", "--start", "offset", "--iterations", "1"]
+
+
+def write_picture():
+    write_blob("blob.png", 16, (5, 6), 15.0)
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +31,7 @@ def designed(tmp_path_factory):
         patch.chdir(folder)
         patch.setattr(evaluation, "FINAL_RAYS", 2000)
         patch.setattr(evaluation, "write_report", lambda *args: None)
-        write_blob("blob.png", 16, (5, 6), 15.0)
+        write_picture()
         assert cli.run([*DESIGN, "--quiet", "--threads", "1"]) == 0
     return folder / "blob.caustic"
 
@@ -33,6 +40,63 @@ def designed(tmp_path_factory):
 def _here(designed, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     shutil.copytree(designed, "blob.caustic")
+
+
+class Killed(Exception):
+    """In place of a kill, behind which nothing more is written either."""
+
+
+def killed(*_):
+    raise Killed
+
+
+@pytest.mark.parametrize("at", ["first stage", "first checkpoint", "index"])
+def test_a_design_killed_before_its_first_checkpoint_is_begun_anew(at, capfd, monkeypatch):
+    """By the same command, as if nothing had been there; another command, or an edit, still finds a design in its way."""
+    where, name = (workflow, "_run") if at == "first stage" else (workflow._Records, "keep")
+    options = ["--quiet", "--threads", "1", *(["--gradient", "free", "--index-control", "8"] if at == "index" else [])]
+    command = [*(a for a in DESIGN if at != "index" or a not in ("--start", "offset")), *options]
+    shutil.rmtree("blob.caustic")
+    write_picture()
+    with monkeypatch.context() as patch:
+        patch.setattr(where, name, killed)
+        assert cli.run(command) == 1
+    files = {p.name: p.read_bytes() for p in Path("blob.caustic").iterdir()}
+    assert "project.toml" in files and "checkpoints.h5" not in files and ("index.npy" in files) == (at == "index")
+    capfd.readouterr()
+    assert cli.run([*command, "--mag", "2"]) == 2 and "holds a design already" in capfd.readouterr().err
+    toml = Path("blob.caustic/project.toml")
+    toml.write_text(toml.read_text().replace("seed = 0", "seed = 7"))
+    assert cli.run(command) == 2 and "holds a design already" in capfd.readouterr().err
+    toml.write_bytes(files["project.toml"])
+    assert {p.name: p.read_bytes() for p in Path("blob.caustic").iterdir()} == files
+    assert cli.run([*command, "-o", "whole.caustic"]) == cli.run(command) == 0
+    again, whole = (load(f"{name}.caustic") for name in ("blob", "whole"))
+    assert torch.equal(again.heights, whole.heights) and again.figures["relative_rms"] == whole.figures["relative_rms"]
+    assert cli.run([*command[: command.index("--quiet")], *command[command.index("--quiet") + 1 :]]) == 0
+    assert "nothing to do" in capfd.readouterr().err
+
+
+def test_a_resumed_design_remembers_its_command(capfd, monkeypatch):
+    """Resumed before its first checkpoint, it is found by the command that began it, which has nothing left to do."""
+    shutil.rmtree("blob.caustic")
+    write_picture()
+    with monkeypatch.context() as patch:
+        patch.setattr(workflow, "_run", killed)
+        assert cli.run([*DESIGN, "--quiet", "--threads", "1"]) == 1
+    assert cli.run(["design", "--resume", "blob.caustic", "--quiet", "--threads", "1"]) == 0
+    capfd.readouterr()
+    assert cli.run([*DESIGN, "--threads", "1"]) == 0 and "nothing to do" in capfd.readouterr().err
+
+
+def test_a_lens_is_saved_as_a_whole(monkeypatch):
+    lens = load("blob.caustic")
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(directory.checkpoint, "save", killed)
+        lens.save("saved.caustic")
+    assert not Path("saved.caustic").exists()
+    lens.save("saved.caustic")
+    assert torch.equal(load("saved.caustic").heights, lens.heights)
 
 
 @pytest.mark.parametrize("format", FORMATS)

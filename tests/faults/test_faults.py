@@ -97,7 +97,7 @@ def test_a_full_disk_ends_in_1_with_what_was_there_before(capfd):
     after = content("blob.caustic")
     assert {k: v for k, v in after.items() if k != "project.toml"} == {k: v for k, v in before.items() if k != "project.toml"}
     assert sorted(p.name for p in Path().iterdir()) == ["blob.caustic", "blob.png", "new.caustic"]
-    assert sorted(p.name for p in Path("new.caustic").iterdir()) == ["project.toml", "target.png"]
+    assert sorted(p.name for p in Path("new.caustic").iterdir()) == [".outputs.json", "project.toml", "target.png"]
     run(["design", "--resume", "new.caustic", "--quiet"], capfd, 0)  # with room again, it begins
     assert Project.open("new.caustic").load().state.total == 3
 

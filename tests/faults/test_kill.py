@@ -98,7 +98,8 @@ def lost_seconds(times: np.ndarray, total: int) -> tuple[float, float]:
 
 
 def test_a_killed_design_goes_on_and_nothing_is_lost(server):
-    """Fresh designs, designs begun anew and resumed ones, killed anywhere from their first moment on."""
+    """Fresh designs, designs begun anew and resumed ones, killed anywhere from their first moment on; before the first
+    checkpoint the same command needs no --force."""
     for _ in range(2):  # the first waits for the server
         began = time.monotonic()
         assert server([*DESIGN, "--iterations", "20", "-o", "first", "--force"])[0] == 0, server.log.read_text()
@@ -107,7 +108,7 @@ def test_a_killed_design_goes_on_and_nothing_is_lost(server):
     for kill in range(KILLS):
         fresh, begun = not path.exists(), (path / "checkpoints.h5").exists()
         anew = fresh or chance.random() < 0.2
-        arguments = [*DESIGN, *([] if fresh else ["--force"])] if anew else ["design", "--resume", str(path), "--quiet"]
+        arguments = [*DESIGN, *(["--force"] if begun else [])] if anew else ["design", "--resume", str(path), "--quiet"]
         times = killed(server, arguments, chance.uniform(0.0, span))
         if anew and (fresh or (times > 0).any()):
             total = 0

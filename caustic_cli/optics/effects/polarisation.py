@@ -86,8 +86,8 @@ class FieldPropagation(Action):
             across = 2.0 * (e[2] - e[0] * gx - e[1] * gy) / norm2
             e = (across * normal[0] - e[0], across * normal[1] - e[1], across * normal[2] - e[2])
         else:
+            # What all rays share stays one number: before a plane entrance they may still be a grid, see `RayState.expanded`.
             gx, gy = (torch.as_tensor(g, dtype=state.power.dtype, device=state.power.device) for g in (gx, gy))
-            d = state.full(d)
             t, _, c, s = refract(d, gx, gy, m.n_in / m.n_out)
-            e = transmitted_field(state.full(e), d, t, normal, c, s, m.n_in / m.n_out)
+            e = transmitted_field(e, d, t, normal, c, s, m.n_in / m.n_out)
         state.polarised = rotate_to_global(pose, (e[0], e[1], flip * e[2]))

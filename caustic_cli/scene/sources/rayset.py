@@ -9,6 +9,7 @@ Coordinates are the file's own; emission is towards its +z.
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -84,6 +85,14 @@ class RaySet:
     def count(self) -> int:
         """Number of rays."""
         return len(self.flux)
+
+    @cached_property
+    def digest(self) -> str:
+        """sha256 of the rays, whatever the format of their file."""
+        found = hashlib.sha256()
+        for values in (self.positions, self.directions, self.flux, self.wavelengths):
+            found.update(b"" if values is None else np.ascontiguousarray(values, "<f8").tobytes())
+        return found.hexdigest()
 
     def part(self, k: int, of: int) -> RaySet:
         """The k-th part of a fixed random partition of the rays into `of` sets; all rays where there are too few."""
