@@ -116,6 +116,7 @@ def test_a_file_of_indices_is_kept(capfd):
         (("--gradient", "free", "--element", "lens z=20"), "--gradient free cannot be combined with --element"),
         (("--gradient", "free", "--robust", "errors.toml"), "--robust errors.toml averages over errors of a designed surface"),
         (("--gradient", "free", "--start", "old.npz"), "--start of a free gradient must be transport"),
+        (("--index-control", "12"), "--index-control belongs to --gradient free"),
         (("--gradient", "lens"), "must be one of"),
         (("--gradient", "selfoc"), "gradient_terms"),
         (("--gradient", "selfoc", "--gradient-terms", "0.1,x"), "separated by commas"),

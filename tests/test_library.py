@@ -176,6 +176,8 @@ def test_progress_and_sections(lens):
         ({"source": [{"type": "plane"}]}, "source must be a type or a section"),
         ({"source": {"type": "disc"}, "settings": {"source": [{"type": "point"}]}}, "source must be a type or a section"),
         ({"lens_aperture": "circle", "settings": {"lens": [{}]}}, r"\[lens\] is a list of tables"),
+        ({"color": True}, r"\[target\] color needs the file of a picture"),
+        ({"index_range": [1.4, 1.6]}, r"\[lens\] index_range belongs to \[lens\] gradient free"),
         ({"element": [{"type": "lamp", "z": 20.0}]}, r"\[\[element\]\] type must be one of"),
     ],
 )

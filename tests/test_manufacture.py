@@ -135,6 +135,15 @@ def test_limits_that_contradict_say_so(rough, monkeypatch):
         within_limits(field, heights, (heights - 1e-6, heights + 1e-6), 1e-3)
 
 
+def test_creases_between_lenslets_are_beyond_a_slope():
+    """Between the points at which it is enforced the slope there stays several times as large: that is said."""
+    control = (22, 13)
+    lens = Lens((9.0, 6.0), control=control, degree=(3, 2), array=(3, 2))
+    heights = 5.0 + 0.02 * torch.from_numpy(np.random.default_rng(1).uniform(-1, 1, control))
+    with pytest.raises(CausticError, match="no surface near the designed one obeys the limits"):
+        within_limits(HeightField.of(lens), heights, (heights - 1, heights + 1), 0.005)
+
+
 @pytest.mark.parametrize("radius", [0.0, 2.0, 200.0])
 def test_the_penalty_of_a_radius(radius, rough):
     field, heights, _ = rough

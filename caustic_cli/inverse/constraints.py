@@ -57,6 +57,8 @@ def within_limits(
             return found
         if found is not heights:
             room += max(1.5 * over, LEFT)
+        if room >= 1.0:  # between the points it exceeds the limits many times over, as at the creases between lenslets
+            break
         found = _descend(_Constraints(field, bounds, max_slope * (1.0 - room), min_radius / (1.0 - room), A_SPAN), found)
     if asked.excess(found) <= 0:
         return found

@@ -134,11 +134,16 @@ def begin(
     if not said.get("source", {}).get("weights", True):  # an empty list: weights may follow from the picture
         del said["source"]["weights"]
     if goal.get("color", False):
+        if isinstance(target, Picture):
+            raise InputError("⟨target.color⟩ needs the file of a picture: an array (n_x, n_y) has no colours")
         light = [float(c) for c in picture.irradiance().sum((1, 2))]
         said.setdefault("source", {}).setdefault("weights", [c / sum(light) for c in light])
     profile = said.get("source", {}).get("profile")
     light = read_picture((config.parent if config else Path()) / profile, linear=True) if profile else None
     full = complete(said, picture.aspect, by, picture.lit, picture.gaps)
+    for key in ("index_range", "index_control", "index_layers"):
+        if f"lens.{key}" in given and full["lens"].get("gradient") != "free":
+            raise InputError(f"⟨lens.{key}⟩ belongs to ⟨+lens.gradient⟩ free")
     if value_of(full["lens"], "lens.mirror") and "shift" not in full["screen"] and any(shift := _beside_the_light(full)):
         said["screen"] = said.get("screen", {}) | {"shift": list(shift)}
         full = complete(said, picture.aspect, by, picture.lit, picture.gaps)
