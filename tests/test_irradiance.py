@@ -10,6 +10,7 @@ import pytest
 from helpers import small_designs, write_blob
 
 from caustic_cli import cli
+from caustic_cli.commands.console import figures_rows
 from caustic_cli.commands.options import power
 from caustic_cli.config import settings
 from caustic_cli.config.completion import complete
@@ -150,7 +151,7 @@ def test_the_table_and_the_report_say_it_too(capfd, monkeypatch):
     out, err = capfd.readouterr()
     figures = json.loads(out)
     peak, mean = (figures[f"{k}_irradiance"] for k in ("peak", "mean"))
-    assert f"peak {peak:.4g} W/mm^2, mean {mean:.4g} W/mm^2" in err
+    assert f"peak {peak:.4g} W/mm^2, mean {mean:.4g} W/mm^2" in dict(figures_rows(figures))["irradiance"]
     label, low, high, most, full = bars[0]
     assert label == f"irradiance (W/mm²)\npeak {peak:.3g}, mean {mean:.3g}"
     assert low == 0 < high and most == pytest.approx(peak) and full == pytest.approx(1.0)

@@ -263,7 +263,7 @@ def test_a_design_for_light(_here, capfd):
     assert cli.run(["export", "waves", "--format", "lighttools", "-o", "lens.npz", "--quiet"]) == 0
     capfd.readouterr()
     assert cli.run(["render", "lens.npz", "--rays", "4000", "--effects", "diffraction"]) == 0
-    assert re.search(r"wave image +on the screen 99", capfd.readouterr().err) and Path("lens-render-wave.png").exists()
+    assert re.search(r"wave image +on the screen 99", capfd.readouterr().out) and Path("lens-render-wave.png").exists()
     none = json.loads(_render(capfd, "waves", "--effects", "fresnel"))
     assert "wave_relative_rms" not in none and not Path("waves/wave.png").exists() and Path("ray-wave.png").exists()
     design(capfd, "blob.png", *SMALL, "-o", "waves")  # the same again is no work, but what is missing is made

@@ -1,4 +1,4 @@
-"""Console output: results to stdout, messages and progress to stderr.
+"""Console output: results to stdout, as tables or as one JSON object; messages and progress to stderr.
 
 Results are not printed through Rich, which wraps lines at 80 columns when piped.
 """
@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 import sys
+import textwrap
 import threading
 import time
 from contextlib import contextmanager
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.table import Table
 
 from caustic_cli.config.table import TABLE
 from caustic_cli.errors import MARK, InputError, plain_name
@@ -25,24 +26,25 @@ LONGEST_LINE = 4000
 LINE_EVERY = 0.5
 #: Keys of the figures of a network's lens that are not values of its inputs.
 OF_LENS = ("relative_rms", "noise", "on_screen", "middle_relative_rms")
-#: Terminal width from which on a progress bar and clocks are shown.
-WIDE = 90
+#: Terminal width from which on a progress bar and clocks are shown, and least width of the values of a table on a terminal.
+WIDE, NARROW = 90, 24
 
 
 class Reporter:
-    """Messages to the user on stderr, unless `quiet`.  Colour follows the terminal and NO_COLOR.
+    """Messages to the user on stderr, unless `quiet`; results on stdout, unless `as_json`: a JSON object stands for them there.
+    Colour follows the terminal and NO_COLOR.
 
-    With `progress` json the output is for programs: one JSON object per line, with the `event` message, progress or result.
+    With `progress` json stderr is for programs: one JSON object per line, with the `event` message, progress or result.
 
     Raises:
         InputError: `progress` is neither auto nor json.
     """
 
-    def __init__(self, quiet: bool = False, progress: str = "auto"):
+    def __init__(self, quiet: bool = False, progress: str = "auto", as_json: bool = False):
         if progress not in ("auto", "json"):
             raise InputError(f"--progress must be auto or json, got {progress!r}")
         self.console = Console(stderr=True, quiet=quiet, highlight=False, soft_wrap=True)
-        self.lines = progress == "json"
+        self.lines, self.as_json = progress == "json", as_json
 
     def say(self, text: str) -> None:
         """Print a message."""
@@ -57,21 +59,22 @@ class Reporter:
             sys.stderr.write(json.dumps(values) + "\n")
             sys.stderr.flush()
 
+    def result(self, *lines: str) -> None:
+        """Print lines of results."""
+        if not self.as_json:
+            for line in lines:
+                emit(named(line))
+
     def table(self, title: str, rows: list[tuple[str, str]]) -> None:
-        """Print a table of names and values."""
+        """Print a table of names and values as results; on a terminal, values are folded beside their names."""
         if self.lines:
             self._line(event="result", title=title, rows=dict(rows))
-            return
-        if not self.console.is_terminal:  # a log: no wrapping or truncation
-            width = max(len(name) for name, _ in rows)
-            self.say("\n".join([title, *(f"  {name:<{width}}  {value}" for name, value in rows)]))
-            return
-        table = Table(title=title, show_header=False, title_justify="left", title_style="bold")
-        table.add_column(no_wrap=True)
-        table.add_column(overflow="fold")
+        width = max(len(name) for name, _ in rows)
+        wide = max(NARROW, shutil.get_terminal_size().columns - width - 4) if sys.stdout.isatty() else math.inf
+        self.result(title)
         for name, value in rows:
-            table.add_row(name, value)
-        self.console.print(table)
+            folded = textwrap.wrap(value, int(wide)) if len(value) > wide else [value]
+            self.result(*(f"  {label:<{width}}  {part}" for label, part in zip((name, *("",) * len(folded)), folded, strict=False)))
 
     @contextmanager
     def notify_if_slow(self, text: str, seconds: float = 4.0):
@@ -151,14 +154,20 @@ def emit_json(value: dict) -> None:
 
 
 def emit(line: str) -> None:
-    """Print a line of results on stdout."""
-    sys.stdout.write(line + "\n")
+    """Print a line of results on stdout, with control characters replaced, and those escaped that its encoding lacks."""
+    encoding = sys.stdout.encoding or "utf-8"
+    sys.stdout.write(printable(line).encode(encoding, "backslashreplace").decode(encoding) + "\n")
     sys.stdout.flush()
 
 
+def printable(text: str) -> str:
+    """A text with control characters replaced, for instance those of a malicious file name."""
+    return "".join(c if c.isprintable() else "?" for c in text)
+
+
 def error(message: str) -> None:
-    """Print one line on stderr, even if quiet, with control characters replaced, for instance in a malicious file name."""
-    line = "".join(c if c.isprintable() else "?" for c in " ".join(named(message).split()))
+    """Print one line on stderr, even if quiet, with control characters replaced."""
+    line = printable(" ".join(named(message).split()))
     sys.stderr.write(f"caustic: {line if len(line) <= LONGEST_LINE else line[:LONGEST_LINE] + ' ...'}\n")
 
 

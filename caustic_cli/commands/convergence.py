@@ -90,7 +90,7 @@ def run(
     debug: options.Debug = False,
 ) -> None:
     """Measure errors and computing times for many settings."""
-    began, say = time.monotonic(), console.Reporter(quiet, progress)
+    began, say = time.monotonic(), console.Reporter(quiet, progress, json)
     if study not in (*STUDIES, "all"):
         raise InputError(f"--study must be one of {', '.join(STUDIES)} or all, got {study!r}")
     if networks and study != "design":

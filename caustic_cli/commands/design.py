@@ -68,7 +68,7 @@ def run(
 ) -> None:
     """Compute the lens whose caustic is the picture TARGET."""
     speaks = checks.rank_and_size()[0] == 0  # under torchrun, rank 0
-    say = console.Reporter(quiet or not speaks, progress)
+    say = console.Reporter(quiet or not speaks, progress, json)
     iterations, time_limit = given.get("design.iterations"), given.get("design.time_limit")
     if iterations is not None and not 1 <= iterations <= 10**9:
         raise InputError(f"--iterations must be a whole number 1 to 1e9, got {iterations}")

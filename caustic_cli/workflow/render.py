@@ -134,8 +134,7 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
     """Trace a lens and write its irradiance image.
 
     Returns:
-        the figures of the JSON table; `effects`, `report` and `verify` if requested; `reused` if they were up to date and nothing
-        was done.
+        the figures of the JSON table; `effects`, `report` and `verify` if requested; those of the earlier run if all is up to date.
 
     Raises:
         InputError: there is no lens, a value is out of range, or a file exists already; nothing was written.
@@ -175,7 +174,7 @@ def render(asked: Request, device: str, say: Reporter) -> dict:
         say.say(
             f"{image_path}: is up to date: the same options and the same project, so there is nothing to do; ⟨force⟩ repeats it"
         )
-        return figures | {"reused": True}
+        return figures
     lens = archived or Lens.of(cast(Project, project), asked.given)
     if asked.screen_at is not None:
         lens = replace(lens, scene=replace(lens.scene, screen=replace(lens.scene.screen, z=asked.screen_at)))
