@@ -148,8 +148,7 @@ def test_the_table_and_the_report_say_it_too(capfd, monkeypatch):
 
     monkeypatch.setattr(Figure, "colorbar", colorbar)
     assert cli.run(["design", "blob.png", "--power", "2W", "--iterations", "3", *(a for a in TINY if a != "--quiet")]) == 0
-    out, err = capfd.readouterr()
-    figures = json.loads(out)
+    figures = json.loads(capfd.readouterr().out)
     peak, mean = (figures[f"{k}_irradiance"] for k in ("peak", "mean"))
     assert f"peak {peak:.4g} W/mm^2, mean {mean:.4g} W/mm^2" in dict(figures_rows(figures))["irradiance"]
     label, low, high, most, full = bars[0]

@@ -124,7 +124,7 @@ def run(
             lens = library.design_of(
                 picture, given, preset=preset, config=config, out=path, force=force, movie=movie, say=say, device=device
             )
-    say.table(lens.figures["project"], [*console.figures_rows(lens.figures), ("ended by", lens.figures["reason"])])
+    say.table(lens.figures["project"], console.figures_rows(lens.figures))
     if json:
         console.emit_json(lens.figures)
 

@@ -160,6 +160,19 @@ def figures_of_merit(exposure: Image, target, variance=None) -> dict:
     }
 
 
+def judged(figures: dict, by_waves: bool) -> dict:
+    """The figure a lens is judged by, to be put before its other figures.
+
+    by_waves: judge it by its wave image, where there is one.
+
+    Returns:
+        error, wave_relative_rms or relative_rms, and error_by, waves or rays; both None without a target.
+    """
+    by = "waves" if by_waves and figures.get("wave_relative_rms") is not None else "rays"
+    error = figures.get("wave_relative_rms" if by == "waves" else "relative_rms")
+    return {"error": error, "error_by": None if error is None else by}
+
+
 def _array(a) -> np.ndarray:
     """An array, or a tensor on any device, as float64."""
     return np.asarray(a.detach().cpu() if hasattr(a, "detach") else a, dtype=np.float64)

@@ -47,7 +47,7 @@ from caustic_cli.optics.system import split_heights
 from caustic_cli.project import attachments, directory, uptodate
 from caustic_cli.project.checkpoint import Checkpoint
 from caustic_cli.project.packing import expected_bytes, rounded
-from caustic_cli.project.project import CHECKPOINT, RENDER, Project, is_project
+from caustic_cli.project.project import CHECKPOINT, Project, is_project
 from caustic_cli.scene import Scene
 from caustic_cli.studies.manufacture import preview, wall_and_stock
 from caustic_cli.workflow.compilation import announce_compilation, compile_usual
@@ -529,7 +529,7 @@ def _run(
             found.figures | made | {"iterations": state.total, "seconds": time.monotonic() - began, "reason": found.state.reason}
         )
         if project.path is not None:
-            figures |= {"image": str(project.path / RENDER), "project": str(project.path)}
+            figures |= uptodate.made_by(project, figures.get("wave_relative_rms") is not None)
         records.keep(found.state, figures)
         if movie is not None:
             movie.finish(found.image if found.waves is None else found.waves, found.figures)
@@ -556,7 +556,7 @@ def _run_index(project: Project, say: Reporter, began: float, device: str) -> Re
         figures = judged.figures | index_figures(project)
         figures |= {"iterations": state.total, "seconds": time.monotonic() - began, "reason": state.reason}
         if project.path is not None:
-            figures |= {"image": str(project.path / RENDER), "project": str(project.path)}
+            figures |= uptodate.made_by(project, figures.get("wave_relative_rms") is not None)
         _Records(project, designer, device).keep(state, figures)
         if asked:
             raise Interrupted(f"interrupted after {state.total} iterations; {project.path} is complete", 128 + asked[0])
