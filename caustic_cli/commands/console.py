@@ -246,7 +246,7 @@ def _limits(figures: dict) -> list[tuple[str, str]]:
     """What an extended source allows."""
     rows = []
     if "least_relative_rms" in figures:
-        rows = [("least possible", _number(figures, "least_relative_rms", ".4f") + ", behind the source's blur")]
+        rows = [("least possible", _number(figures, "least_relative_rms", ".4f") + " or more for any lens, by the source's blur")]
     if "etendue_limit" in figures:
         rows.append(("etendue limit", _number(figures, "etendue_limit", ".2%") + " of the light on the lens"))
     return rows

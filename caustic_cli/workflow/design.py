@@ -25,7 +25,8 @@ from caustic_cli.config import presets, settings
 from caustic_cli.config.completion import PLATE, WALL, Derivation, build_options, build_stages, complete, shape_words, without_waves
 from caustic_cli.config.default_stages import transport_cells
 from caustic_cli.config.settings import Settings
-from caustic_cli.errors import CausticError, InputError, Interrupted
+from caustic_cli.config.table import TABLE
+from caustic_cli.errors import CausticError, InputError, Interrupted, at_most
 from caustic_cli.inverse import ranks
 from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
 from caustic_cli.inverse.designer import Designer, InitialHeights, State
@@ -34,7 +35,7 @@ from caustic_cli.inverse.initial_two_sided import first_sides
 from caustic_cli.inverse.lenslets import initial_array
 from caustic_cli.inverse.reachability import largest_magnification, refuse_unreachable
 from caustic_cli.inverse.sharpness import advice
-from caustic_cli.inverse.source_limits import best_irradiance, performance_limits, point_source, source_spread
+from caustic_cli.inverse.source_limits import best_irradiance, point_source, source_spread
 from caustic_cli.inverse.surface_from_map import OutOfReach
 from caustic_cli.inverse.target import grey
 from caustic_cli.io.files import Piped
@@ -181,7 +182,8 @@ def begin(
             project, first = first_heights(project, said)
         except OutOfReach as error:
             most = largest_magnification(designer.scene, project.settings["target"]["size"])
-            within = f"; ⟨+mag⟩ of at most about {most:.2g} is within reach at this throw" if most else ""
+            most = min(most or 0.0, TABLE["mag"].high)
+            within = f"; ⟨+mag⟩ of at most about {at_most(most, 2)} is within reach at this throw" if most else ""
             raise InputError(f"{error}{within}") from error
     if out is not None:
         directory.create(project, force)
@@ -276,7 +278,7 @@ def _say_limits(project: Project, designer: Designer, target: np.ndarray, first:
     if not designer.scene.elements:
         say.say(seen.sentence())
     timed = math.isfinite(project.settings["design"]["time_limit"])
-    words = performance_limits(designer.scene, grey(target), steps=SMOOTH_STEPS if timed else None).sentence()
+    words = designer.source_limits(SMOOTH_STEPS if timed else None).sentence()
     if words:
         say.say(words)
     if designer.scene.joint:
@@ -541,7 +543,7 @@ def _run(
     field = designer.field(found.state.stage)
     scene, heights = split_heights(designer.scene, field, found.state.heights)
     size = tuple(project.settings["target"]["size"])
-    if not timed and scene.second is None and (words := advice(scene, grey(target), size, field, heights)):
+    if not timed and scene.second is None and (words := advice(scene, grey(target), size)):
         say.say(words)
     return Result(project, scene, field, heights, target, found.state, figures)
 

@@ -15,7 +15,6 @@ import torch
 from caustic_cli.inverse.deconvolution import SMOOTH_STEPS
 from caustic_cli.inverse.designer import Designer, State
 from caustic_cli.inverse.losses import parse
-from caustic_cli.inverse.source_limits import performance_limits
 from caustic_cli.inverse.target import grey
 from caustic_cli.io.files import discard
 from caustic_cli.io.picture import WIDE, write_image
@@ -201,9 +200,9 @@ def evaluate(
         rounded = began or trace(designer.within_limits(replace(state, heights=designer.begun(state))))[1]
         unrounded = trace(designer.begun(state, rounded=False))[1]
         figures |= {"min_radius": radius_figures(designer.options.min_radius, rounded, unrounded)}
-    bounds = performance_limits(scene, grey(target), field, state.heights, SMOOTH_STEPS if timed else None)
-    if bounds.light is not None:
-        figures |= {"least_relative_rms": bounds.light.error}
+    bounds = designer.source_limits(SMOOTH_STEPS if timed else None)
+    if bounds.error is not None:
+        figures |= {"least_relative_rms": bounds.error}
     if bounds.etendue is not None:
         figures |= {"etendue_limit": bounds.etendue}
     if light is not None:
