@@ -130,6 +130,7 @@ def test_design_and_render_say_lux_and_watts(source, capfd):
     assert 'power_unit = "lm"' in (Project.open("blob.caustic").path / "project.toml").read_text()
     assert cli.run(["export", "blob.caustic", "--format", "lighttools", "-o", "a.npz", "--quiet"]) == 0
     assert open_archive("a.npz")[0].light.unit == "lm"
+    capfd.readouterr()
     of_archive = run(capfd, "render", "a.npz", *RENDER[2:])
     assert of_archive["irradiance_unit"] == "lux"
     assert of_archive["mean_irradiance"] == pytest.approx(same["mean_irradiance"], rel=1e-3)
